@@ -1,0 +1,340 @@
+"""Every number of a fit, with its unit, its default and where it comes from.
+
+Sources: "paper" is P2GS (CVPR 2026) by section; "3DGS" is the official configuration of Kerbl et
+al. 2023; "ours" is measured, see BUILD_NOTES.md. A weight or option set to None leaves the trace.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Literal
+
+PresetName = Literal["paper", "paper_appendix", "robust"]
+ExposureLossForm = Literal[
+    "literal_same_pose", "literal_pixels", "exposed", "observed_linear", "observed_ldr"
+]
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """Which photographs are used, and how."""
+
+    test_every: int = 8
+    """Hold out every n-th view of each camera, sorted by name; 0 holds out none
+    (paper, Experiments: 1/8 of the frames)."""
+    max_width: int | None = None
+    """Shrink images to at most this many pixels across; None keeps them as they are."""
+    images: str | None = None
+    """Image folder, where it is not `images/` beside the model."""
+    allow_missing: bool = False
+    """Skip frames whose image file is missing instead of stopping."""
+    cache_mb: int = 2048
+    """Decoded photographs kept in memory, MB; the rest is decoded again when needed."""
+
+
+@dataclass(frozen=True)
+class RenderConfig:
+    """Projection, tiling and compositing."""
+
+    implementation: Literal["reference", "xla"] | None = None
+    """Rasterizer; None picks the fastest that runs here."""
+    sh_degree: int = 3
+    """Highest spherical-harmonics degree (3DGS: 3)."""
+    radiance: Literal["exp", "softplus", "linear"] = "exp"
+    """Activation from spherical harmonics to radiance; `linear` is 3DGS's max(0, sh + 1/2)."""
+    near: float = 0.05
+    """Near plane, scene units."""
+    blur: float = 0.3
+    """Variance added to the 2D covariance, pixels^2 (3DGS: 0.3)."""
+    tile: tuple[int, int] = (16, 8)
+    """Tile width and height in pixels (ours: KERNEL.md)."""
+    chunk: int = 16
+    """List entries a lane composites per iteration (ours: KERNEL.md)."""
+    pixels_in_flight: int = 32768
+    """Pixels composited at once: lanes times tile size (ours: KERNEL.md)."""
+    alpha_cutoff: float = 1.0 / 255.0
+    """Contributions below this opacity are skipped. The error it causes in a pixel is at most the
+    cutoff times the sum of the skipped radiances."""
+    alpha_max: float = 0.999
+    """Largest opacity of one splat at one pixel (keeps 1 - alpha invertible)."""
+    transmittance_stop: float | None = 1e-4
+    """A tile stops when every pixel's transmittance is below this; the error is at most this
+    times the largest radiance behind. None composites everything."""
+
+
+@dataclass(frozen=True)
+class PhotometryConfig:
+    """The image formation model y = T(e L)."""
+
+    curve: Literal["power", "srgb"] = "srgb"
+    """Base tone curve; `power` with pivot 1 is the paper's x^(1/gamma)."""
+    pivot: float = 0.18
+    """Linear value that a change of gamma leaves alone: y = OETF(x0 (eL/x0)^(2.2/gamma))
+    (ours: mid-grey beats white 2.5-5x in EV, PHOTOMETRY section 3; the paper's is 1)."""
+    clamp: bool = False
+    """Clamp the exposed radiance to [1e-6, 10] and the result to [0, 1] as the paper does (paper,
+    Tone-mapping estimation); unclamped predictions meet a censored loss instead (ours)."""
+    parameterization: Literal["log", "linear"] = "log"
+    """What the optimiser sees: logarithms (ours), or e and gamma themselves (paper)."""
+    start: Literal["tracks", "random"] = "tracks"
+    """Where exposures start: robust log-ratios over the tracks (ours), or N(1, 0.05^2) (paper,
+    Exposure modeling)."""
+    start_std: float = 0.05
+    """Standard deviation of the random start (paper, Exposure modeling)."""
+    freeze_until: float = 0.6
+    """Fraction of the run during which exposure and gamma stay at their start, where that start
+    comes from tracks (ours: PHOTOMETRY section 4)."""
+
+
+@dataclass(frozen=True)
+class RelativeExposureConfig:
+    """The relative-exposure loss L_exp (paper, eq. 8) and its readings (PHOTOMETRY section 3)."""
+
+    weight: float | None = None
+    """lambda_exp (paper: 0.01 in the main text, 0.1 in the appendix); None leaves it out."""
+    form: ExposureLossForm = "literal_same_pose"
+    """Which reading of the printed formula."""
+    huber_delta: float = 0.05
+    """Transition of the Huber loss in LDR units, `observed_ldr` only."""
+
+
+@dataclass(frozen=True)
+class RegularizerConfig:
+    """What fixes the gauges (paper, eq. 9; PHOTOMETRY section 4). None leaves a term out."""
+
+    exposure_scale: float | None = None
+    """lambda_escale E[(e - 1)^2] (paper: 0.01)."""
+    exposure_variance: float | None = None
+    """lambda_evar Var(e) (paper: 0.1)."""
+    gamma_prior: float | None = None
+    """lambda_gamma E[(gamma - 2.2)^2] (paper: 0.1)."""
+    log_exposure_mean: float | None = 0.01
+    """(mean log e)^2, the scale gauge (ours)."""
+    gamma_mean_variance: float | None = 0.1
+    """(mean gamma - 2.2)^2 + Var gamma, the power gauge (ours)."""
+    opacity: float | None = 0.01
+    """Mean opacity (3DGS-MCMC: 0.01); empties splats so that relocation can reuse them."""
+    scale: float | None = 0.01
+    """Mean scale in units of the scene extent (3DGS-MCMC: 0.01)."""
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """The composed loss (paper, eq. 5)."""
+
+    dssim_weight: float | None = 0.2
+    """lambda_dssim (paper, Photometric reconstruction: 0.2)."""
+    censored: bool = True
+    """Where the photograph is saturated, penalise only predictions below the threshold (ours)."""
+    saturation: float = 250.0 / 255.0
+    """Photographed values from here on count as saturated (ours: PHOTOMETRY section 3)."""
+    black: float = 4.0 / 255.0
+    """Photographed values up to here carry no exposure information (PHOTOMETRY section 3)."""
+    relative_exposure: RelativeExposureConfig = field(default_factory=RelativeExposureConfig)
+    """The relative-exposure loss."""
+    regularizers: RegularizerConfig = field(default_factory=RegularizerConfig)
+    """The regularisers."""
+
+
+@dataclass(frozen=True)
+class OptimizerConfig:
+    """Adam and its learning rates; all rates are per step."""
+
+    means: float = 1.6e-4
+    """Times the scene extent (3DGS: 1.6e-4)."""
+    means_final: float = 1.6e-6
+    """Reached at the end, exponentially (3DGS: 1.6e-6)."""
+    sh_dc: float = 2.5e-3
+    """Degree 0 (3DGS: 2.5e-3)."""
+    sh_rest: float = 1.25e-4
+    """Degrees 1-3 (3DGS: 2.5e-3 / 20)."""
+    opacities: float = 5e-2
+    """Logits (3DGS: 5e-2)."""
+    scales: float = 5e-3
+    """Logarithms (3DGS: 5e-3)."""
+    quats: float = 1e-3
+    """(3DGS: 1e-3)."""
+    exposures: float = 1e-2
+    """Raw exposures (ours: 1e-2 without tracks, 1e-3 to tune after a start from tracks)."""
+    gammas: float = 1e-3
+    """Raw gammas (ours)."""
+    photometry_final: float = 0.01
+    """Exposure and gamma rates decay exponentially to this fraction (ours)."""
+    final: float = 1.0
+    """All other rates decay exponentially to this fraction (3DGS: no decay)."""
+    eps: float = 1e-15
+    """Adam's epsilon (3DGS: 1e-15)."""
+
+
+@dataclass(frozen=True)
+class DensifyConfig:
+    """How the population grows. Times are fractions of the run (3DGS's are of 30k steps)."""
+
+    method: Literal["mcmc", "adaptive"] | None = "mcmc"
+    """`mcmc` relocates within a budget, `adaptive` is the 3DGS schedule (paper), None keeps the
+    seeds."""
+    max_gaussians: int | None = None
+    """Upper bound on the population; None chooses from the seeds and the pixels."""
+    start: float = 1.0 / 60.0
+    """First densification (3DGS: step 500)."""
+    stop: float = 0.5
+    """Last densification (3DGS: step 15000)."""
+    every: float = 1.0 / 300.0
+    """Interval (3DGS: 100 steps)."""
+    min_every_steps: int = 25
+    """Never densify more often than this many steps (ours: statistics need views)."""
+    reset_every: float = 0.1
+    """Opacity reset interval, adaptive only (3DGS: 3000 steps)."""
+    grad_threshold: float = 2e-4
+    """Mean screen-space gradient norm above which a Gaussian is cloned or split (3DGS)."""
+    clone_scale: float = 0.01
+    """Below this scale, in scene extents, clone; above it, split (3DGS: percent_dense)."""
+    prune_opacity: float = 0.005
+    """Gaussians less opaque than this are removed or relocated (3DGS)."""
+    prune_scale: float = 0.1
+    """Gaussians larger than this, in scene extents, are removed after the first reset (3DGS)."""
+    growth: float = 1.05
+    """Factor by which MCMC grows the population each time (3DGS-MCMC)."""
+    noise: float = 5e5
+    """Scale of the MCMC noise on the means, times their learning rate (3DGS-MCMC)."""
+
+
+@dataclass(frozen=True)
+class InitConfig:
+    """From seed points to Gaussians."""
+
+    opacity: float = 0.1
+    """Initial peak opacity (3DGS: 0.1)."""
+    max_seeds: int = 200_000
+    """Seed points kept, sampled evenly; the rest is reported."""
+    shell: Literal["auto", "on", "off"] = "auto"
+    """A far shell of Gaussians where views look past every seed point."""
+    shell_count: int = 4000
+    """Directions on the whole sphere from which the shell is drawn."""
+    shell_radius: float = 30.0
+    """Its distance, in scene extents."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """The run."""
+
+    steps: int = 2000
+    """Optimisation steps, one view each."""
+    budget_s: float | None = None
+    """Wall-clock seconds for the whole run; the number of steps then follows from the measured
+    step time."""
+    seed: int = 0
+    """Seeds every random choice."""
+    coarse_to_fine: tuple[float, ...] = (0.25, 0.5)
+    """Fractions of the run spent below quarter and below half resolution: at first images are
+    shrunk 4x until the first fraction, then 2x until the second."""
+    sh_every: float = 1.0 / 30.0
+    """Raise the spherical-harmonics degree each such fraction of the run (3DGS: 1000 steps)."""
+    log_every: int = 10
+    """Steps between log lines; also how often the host looks at the device."""
+    checkpoint_every_s: float = 30.0
+    """Seconds between checkpoints."""
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """All of it."""
+
+    preset: PresetName = "robust"
+    """Which preset the values started from."""
+    data: DataConfig = field(default_factory=DataConfig)
+    render: RenderConfig = field(default_factory=RenderConfig)
+    photometry: PhotometryConfig = field(default_factory=PhotometryConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+    optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
+    densify: DensifyConfig = field(default_factory=DensifyConfig)
+    init: InitConfig = field(default_factory=InitConfig)
+    train: TrainConfig = field(default_factory=TrainConfig)
+
+
+def _robust() -> FitConfig:
+    return FitConfig()
+
+
+def _paper(exposure_weight: float, name: PresetName) -> FitConfig:
+    """Return the method exactly as printed; BUILD_NOTES.md says what it does."""
+    return FitConfig(
+        preset=name,
+        render=RenderConfig(radiance="linear"),
+        photometry=PhotometryConfig(
+            curve="power",
+            pivot=1.0,
+            clamp=True,
+            parameterization="linear",
+            start="random",
+            freeze_until=0.0,
+        ),
+        loss=LossConfig(
+            censored=False,
+            relative_exposure=RelativeExposureConfig(weight=exposure_weight),
+            regularizers=RegularizerConfig(
+                exposure_scale=0.01,
+                exposure_variance=0.1,
+                gamma_prior=0.1,
+                log_exposure_mean=None,
+                gamma_mean_variance=None,
+                opacity=None,
+                scale=None,
+            ),
+        ),
+        # The paper prints no rates for e and gamma: 1e-3, as 3DGS's exposure compensation ends at.
+        optimizer=OptimizerConfig(exposures=1e-3, gammas=1e-3, photometry_final=1.0),
+        densify=DensifyConfig(method="adaptive"),
+        init=InitConfig(shell="off"),
+        train=TrainConfig(steps=30_000, coarse_to_fine=()),
+    )
+
+
+def preset(name: PresetName) -> FitConfig:
+    """Return the configuration of a preset.
+
+    Args:
+        name: `paper` (as printed, lambda_exp 0.01), `paper_appendix` (lambda_exp 0.1) or `robust`.
+
+    Raises:
+        KeyError: there is no such preset.
+    """
+    return {
+        "robust": _robust,
+        "paper": lambda: _paper(0.01, "paper"),
+        "paper_appendix": lambda: _paper(0.1, "paper_appendix"),
+    }[name]()
+
+
+def to_dict(config: FitConfig) -> dict:
+    """Return nested plain values, as saved in `config.json`."""
+    return dataclasses.asdict(config)
+
+
+def from_dict(values: dict) -> FitConfig:
+    """Rebuild a configuration from `to_dict`'s result.
+
+    Raises:
+        TypeError: a field is unknown to this version.
+    """
+    return _build(FitConfig, values)
+
+
+def _build(cls, values: dict):
+    kwargs = {}
+    for f in dataclasses.fields(cls):
+        if f.name not in values:
+            continue
+        value = values[f.name]
+        factory = f.default_factory
+        if dataclasses.is_dataclass(factory) and isinstance(value, dict):
+            value = _build(factory, value)
+        elif isinstance(value, list):
+            value = tuple(value)
+        kwargs[f.name] = value
+    unknown = set(values) - {f.name for f in dataclasses.fields(cls)}
+    if unknown:
+        raise TypeError(f"unknown field(s) in {cls.__name__}: {', '.join(sorted(unknown))}")
+    return cls(**kwargs)

@@ -1,0 +1,276 @@
+"""Every record that travels through the program, on one page.
+
+Device records are `equinox.Module` pytrees; host records are frozen dataclasses of numpy arrays.
+
+Conventions (docs/conventions.md): OpenCV camera axes (x right, y down, z forward), world-to-camera
+`viewmats`, pixel centres at +0.5 as COLMAP, lengths in scene units (metres where the source is
+metric), radiance linear and relative to the gauge of `Photometry`, LDR in [0, 1].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Float32, Int, UInt8
+
+Split = Literal["train", "test"]
+GAMMA_SRGB = 2.2
+
+
+class Gaussians(eqx.Module):
+    """The scene: N anisotropic Gaussians carrying linear HDR radiance.
+
+    Attributes:
+        means: centres, scene units.
+        quats: rotations, wxyz, normalised when used.
+        log_scales: log standard deviations along the rotated axes, log scene units.
+        opacity_logits: logits of the peak opacity.
+        sh: spherical-harmonics coefficients, K = (degree + 1)^2, of pre-activation radiance.
+    """
+
+    means: Float[Array, "n 3"]
+    quats: Float[Array, "n 4"]
+    log_scales: Float[Array, "n 3"]
+    opacity_logits: Float[Array, " n"]
+    sh: Float[Array, "n k 3"]
+
+    @property
+    def capacity(self) -> int:
+        """Number of slots, alive or not."""
+        return self.means.shape[0]
+
+
+class Photometry(eqx.Module):
+    """What each camera did to the light: an exposure and a gamma for every training view.
+
+    Attributes:
+        raw_exposures: exposures as the optimiser sees them: log e (`log`) or e (`linear`).
+        raw_gammas: gammas likewise: log(gamma / 2.2) (`log`) or gamma (`linear`).
+        parameterization: `log` keeps both positive by construction; `linear` is the paper's.
+    """
+
+    raw_exposures: Float[Array, " v"]
+    raw_gammas: Float[Array, " v"]
+    parameterization: Literal["log", "linear"] = eqx.field(static=True, default="log")
+
+    @property
+    def exposures(self) -> Float[Array, " v"]:
+        """Exposures e > 0, dimensionless."""
+        if self.parameterization == "log":
+            return jnp.exp(self.raw_exposures)
+        return jnp.maximum(self.raw_exposures, 1e-3)
+
+    @property
+    def gammas(self) -> Float[Array, " v"]:
+        """Gammas > 0."""
+        if self.parameterization == "log":
+            return GAMMA_SRGB * jnp.exp(self.raw_gammas)
+        return jnp.maximum(self.raw_gammas, 1e-3)
+
+
+class Params(eqx.Module):
+    """The one differentiable pytree: what optax sees."""
+
+    gaussians: Gaussians
+    photometry: Photometry
+
+
+class Camera(eqx.Module):
+    """A pinhole camera.
+
+    Attributes:
+        viewmat: world-to-camera, OpenCV axes.
+        K: intrinsics in pixels, pixel centres at +0.5.
+        width: pixels, static.
+        height: pixels, static.
+    """
+
+    viewmat: Float[Array, "4 4"]
+    K: Float[Array, "3 3"]
+    width: int = eqx.field(static=True)
+    height: int = eqx.field(static=True)
+
+
+class Splats2D(eqx.Module):
+    """Gaussians projected into one view.
+
+    The inverse 2D covariance is kept as its Cholesky factor: with u = a11 dx + a12 dy and
+    v = a22 dy the exponent is log o - (u^2 + v^2) / 2.
+
+    Attributes:
+        means2d: projected centres, pixels.
+        conic_factor: (a11, a12, a22), 1 / pixels.
+        cov_diagonal: (Sxx, Syy) of the 2D covariance, pixels^2: the extent of the box.
+        log_opacities: log peak opacity (-100 where not visible).
+        depths: z in the camera, scene units.
+        visible: in front of the near plane and well defined.
+    """
+
+    means2d: Float[Array, "n 2"]
+    conic_factor: Float[Array, "n 3"]
+    cov_diagonal: Float[Array, "n 2"]
+    log_opacities: Float[Array, " n"]
+    depths: Float[Array, " n"]
+    visible: Bool[Array, " n"]
+
+
+class TileList(eqx.Module):
+    """Which Gaussians each tile composites, in depth order, as one flat list.
+
+    Attributes:
+        gaussian_ids: ids sorted by (tile, depth), padded to the capacity M.
+        offsets: start of every tile in `gaussian_ids`; the last is the number of entries used.
+        count: entries before the exact tile test: what the capacity must hold.
+        overflow: count > M; the list is then incomplete and the result must be discarded.
+    """
+
+    gaussian_ids: Int[Array, " m"]
+    offsets: Int[Array, " t1"]
+    count: Int[Array, ""]
+    overflow: Bool[Array, ""]
+
+
+class Render(eqx.Module):
+    """One rendered view.
+
+    Attributes:
+        linear: linear HDR radiance, premultiplied by alpha (black background).
+        alpha: accumulated opacity in [0, 1].
+        depth: alpha-weighted camera z; divide by alpha for the expected depth.
+        count: tile-list entries this view needed.
+        overflow: the tile list did not fit: discard this render and grow the capacity.
+        visible: which Gaussians were in the image.
+    """
+
+    linear: Float[Array, "h w 3"]
+    alpha: Float[Array, "h w"]
+    depth: Float[Array, "h w"]
+    count: Int[Array, ""]
+    overflow: Bool[Array, ""]
+    visible: Bool[Array, " n"]
+
+
+class Population(eqx.Module):
+    """Which slots are alive, and the statistics densification needs; never differentiated.
+
+    Attributes:
+        alive: slots in use.
+        grad2d_sum: summed norms of the screen-space mean gradients, in units of half the image.
+        seen_count: number of views that contributed to `grad2d_sum`.
+        max_radii: largest projected radius seen, as a fraction of the image's longer side.
+    """
+
+    alive: Bool[Array, " n"]
+    grad2d_sum: Float[Array, " n"]
+    seen_count: Float[Array, " n"]
+    max_radii: Float[Array, " n"]
+
+
+class Batch(eqx.Module):
+    """One training view on the device.
+
+    Attributes:
+        camera: its camera, at the resolution of `ldr`.
+        ldr: the photograph, display-encoded, [0, 1].
+        mask: 1 = use, 0 = ignore.
+        view_index: its row in `Photometry`.
+    """
+
+    camera: Camera
+    ldr: Float[Array, "h w 3"]
+    mask: Float[Array, "h w"]
+    view_index: Int[Array, ""]
+
+
+# ------------------------------------------------------------------ host records
+
+
+@dataclass(frozen=True)
+class Distortion:
+    """Lens distortion in OpenCV's (k1, k2, p1, p2[, k3...]) order; all zero means pinhole."""
+
+    coefficients: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class View:
+    """One photograph and how it was taken.
+
+    Attributes:
+        name: path relative to the image folder; views are sorted by it.
+        image_path: where the pixels are.
+        camera: name of the physical camera that took it ("0", "front_left").
+        viewmat: world-to-camera, OpenCV axes.
+        K: pinhole intrinsics of the *undistorted* image, at `width` x `height`.
+        width: pixels.
+        height: pixels.
+        distortion: what to remove on load, or None.
+        mask_path: optional mask (0 = ignore).
+        exif_ev: log2(time * ISO / N^2) from EXIF, or None where it is incomplete.
+        split: `train` or `test`.
+    """
+
+    name: str
+    image_path: Path
+    camera: str
+    viewmat: Float32[np.ndarray, "4 4"]
+    K: Float32[np.ndarray, "3 3"]
+    width: int
+    height: int
+    distortion: Distortion | None = None
+    mask_path: Path | None = None
+    exif_ev: float | None = None
+    split: Split = "train"
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Observations of seed points in views, in undistorted pixels at full resolution.
+
+    Attributes:
+        view_indices: row in `Scene.views`.
+        point_indices: row in `Scene.points`.
+        xy: pixel position, centres at +0.5.
+    """
+
+    view_indices: Int[np.ndarray, " o"]
+    point_indices: Int[np.ndarray, " o"]
+    xy: Float32[np.ndarray, "o 2"]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Everything a fit starts from.
+
+    Attributes:
+        root: the folder the user named.
+        format: which reader produced it.
+        views: sorted by name.
+        points: seed points, scene units.
+        point_colors: their display-encoded colours.
+        tracks: observations of the points, or None.
+        notes: what the reader wants the user to know (skipped frames, unregistered images, ...).
+    """
+
+    root: Path
+    format: str
+    views: tuple[View, ...]
+    points: Float32[np.ndarray, "p 3"]
+    point_colors: UInt8[np.ndarray, "p 3"]
+    tracks: Tracks | None = None
+    notes: tuple[str, ...] = field(default_factory=tuple)
+
+    @property
+    def train_indices(self) -> tuple[int, ...]:
+        """Rows of the training views."""
+        return tuple(i for i, v in enumerate(self.views) if v.split == "train")
+
+    @property
+    def test_indices(self) -> tuple[int, ...]:
+        """Rows of the held-out views."""
+        return tuple(i for i, v in enumerate(self.views) if v.split == "test")
