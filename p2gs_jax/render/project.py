@@ -1,0 +1,131 @@
+"""From 3D Gaussians to 2D splats: the local affine approximation of EWA splatting."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from p2gs_jax.config import RenderConfig
+from p2gs_jax.photometry.radiance import radiance_activation
+from p2gs_jax.render import spherical_harmonics
+from p2gs_jax.types import Camera, Gaussians, Splats2D
+
+INVISIBLE_LOG_OPACITY = -100.0
+# Outside this range float32 products of scales and focal lengths leave the normal numbers.
+LOG_SCALE_RANGE = (-16.0, 9.0)
+# Beyond this many half images from the axis the affine approximation is evaluated at the border.
+TANGENT_LIMIT = 1.3
+
+
+def rotation_matrices(quats: Float[Array, "n 4"]) -> list[list[Float[Array, " n"]]]:
+    """Return rotation matrices of wxyz quaternions as 3x3 nested lists of vectors.
+
+    Quaternions are normalised first; a zero quaternion gives the identity.
+    """
+    squared = jnp.sum(quats * quats, -1, keepdims=True)
+    tiny = squared < 1e-30
+    unit = jnp.where(
+        tiny, jnp.array([1.0, 0, 0, 0], quats.dtype), quats / jnp.sqrt(jnp.where(tiny, 1, squared))
+    )
+    w, x, y, z = unit[:, 0], unit[:, 1], unit[:, 2], unit[:, 3]
+    return [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+
+
+def project(
+    gaussians: Gaussians,
+    alive: Bool[Array, " n"],
+    camera: Camera,
+    cfg: RenderConfig,
+    means2d_probe: Float[Array, "n 2"] | None = None,
+) -> Splats2D:
+    """Project Gaussians into a view.
+
+    The determinant of the 2D covariance is summed from squared minors (Cauchy-Binet) rather than
+    taken as a difference, so needles keep a positive determinant in float32.
+
+    Args:
+        gaussians: the scene.
+        alive: slots in use; the others become invisible.
+        camera: the view.
+        cfg: near plane and blur.
+        means2d_probe: zeros added to the projected centres in units of half the image; its
+            gradient is the screen-space statistic that densification wants.
+
+    Returns:
+        The splats; those that are not alive, not in front of the near plane or not finite are
+        invisible and have zero gradients.
+    """
+    R, t = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
+    fx, fy, cx, cy = camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]
+    means = gaussians.means
+    x, y, z_raw = (
+        means[:, 0] * R[i, 0] + means[:, 1] * R[i, 1] + means[:, 2] * R[i, 2] + t[i]
+        for i in range(3)
+    )
+    visible = alive & (z_raw > cfg.near)
+    # Masking the inputs, not the results, keeps the gradients of invisible splats at exactly zero.
+    z = jnp.where(visible, z_raw, 1.0)
+    x, y = jnp.where(visible, x, 0.0), jnp.where(visible, y, 0.0)
+    inverse_z = 1.0 / z
+
+    limit_x = TANGENT_LIMIT * camera.width / (2 * fx)
+    limit_y = TANGENT_LIMIT * camera.height / (2 * fy)
+    tangent_x = jnp.clip(x * inverse_z, -limit_x, limit_x)
+    tangent_y = jnp.clip(y * inverse_z, -limit_y, limit_y)
+    j00, j02 = fx * inverse_z, -fx * tangent_x * inverse_z
+    j11, j12 = fy * inverse_z, -fy * tangent_y * inverse_z
+    JR = (
+        [j00 * R[0, k] + j02 * R[2, k] for k in range(3)],
+        [j11 * R[1, k] + j12 * R[2, k] for k in range(3)],
+    )
+    Q = rotation_matrices(gaussians.quats)
+    scales = jnp.exp(jnp.clip(gaussians.log_scales, *LOG_SCALE_RANGE))
+    V = [
+        [sum(JR[i][k] * Q[k][axis] for k in range(3)) * scales[:, axis] for axis in range(3)]
+        for i in range(2)
+    ]
+    s_xx, s_yy = (sum(v * v for v in V[i]) for i in range(2))
+    s_xy = sum(V[0][axis] * V[1][axis] for axis in range(3))
+    minors = [V[0][i] * V[1][j] - V[0][j] * V[1][i] for i, j in ((0, 1), (0, 2), (1, 2))]
+    det = sum(m * m for m in minors) + cfg.blur * (s_xx + s_yy) + cfg.blur**2
+    c_xx, c_yy = s_xx + cfg.blur, s_yy + cfg.blur
+
+    mean_x, mean_y = fx * x * inverse_z + cx, fy * y * inverse_z + cy
+    if means2d_probe is not None:
+        mean_x = mean_x + means2d_probe[:, 0] * (camera.width / 2)
+        mean_y = mean_y + means2d_probe[:, 1] * (camera.height / 2)
+    finite = jnp.isfinite(det) & jnp.isfinite(mean_x) & jnp.isfinite(mean_y) & (det > 0)
+    visible = visible & finite
+    a11 = jnp.sqrt(c_yy / det)
+    log_opacities = jnp.where(
+        visible, -jax.nn.softplus(-gaussians.opacity_logits), INVISIBLE_LOG_OPACITY
+    )
+    return Splats2D(
+        means2d=jnp.stack([mean_x, mean_y], -1),
+        conic_factor=jnp.stack([a11, -s_xy / c_yy * a11, jax.lax.rsqrt(c_yy)], -1),
+        cov_diagonal=jnp.stack([c_xx, c_yy], -1),
+        log_opacities=log_opacities,
+        depths=z,
+        visible=visible,
+    )
+
+
+def view_radiance(
+    gaussians: Gaussians,
+    camera: Camera,
+    cfg: RenderConfig,
+    active_degree: Int[Array, ""] | int | None = None,
+) -> Float[Array, "n 3"]:
+    """Return each Gaussian's linear HDR radiance towards the camera, >= 0."""
+    center = -camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3]
+    offset = gaussians.means - center
+    squared = jnp.sum(offset * offset, -1, keepdims=True)
+    directions = offset * jax.lax.rsqrt(jnp.maximum(squared, 1e-20))
+    return radiance_activation(
+        spherical_harmonics.evaluate(gaussians.sh, directions, active_degree), cfg.radiance
+    )

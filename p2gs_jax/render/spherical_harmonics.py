@@ -1,0 +1,91 @@
+"""Real spherical harmonics to degree 3, in the sign convention of 3DGS."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+C0 = 0.28209479177387814
+C1 = 0.4886025119029199
+C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
+C3 = (
+    0.5900435899266435,
+    2.890611442640554,
+    0.4570457994644658,
+    0.3731763325901154,
+    1.445305721320277,
+)
+MAX_DEGREE = 3
+
+
+def coefficient_count(degree: int) -> int:
+    """Return (degree + 1)^2."""
+    return (degree + 1) ** 2
+
+
+def degree_of(count: int) -> int:
+    """Return the degree that has `count` coefficients.
+
+    Raises:
+        ValueError: `count` is not 1, 4, 9 or 16.
+    """
+    for degree in range(MAX_DEGREE + 1):
+        if coefficient_count(degree) == count:
+            return degree
+    raise ValueError(f"{count} spherical-harmonics coefficients belong to no degree up to 3")
+
+
+def basis(directions: Float[Array, "n 3"], degree: int) -> list[Float[Array, " n"]]:
+    """Return the (degree + 1)^2 basis values of unit directions, as separate vectors."""
+    x, y, z = directions[:, 0], directions[:, 1], directions[:, 2]
+    values = [jnp.full_like(x, C0)]
+    if degree >= 1:
+        values += [-C1 * y, C1 * z, -C1 * x]
+    if degree >= 2:
+        xx, yy, zz = x * x, y * y, z * z
+        values += [
+            C2[0] * x * y,
+            -C2[0] * y * z,
+            C2[1] * (2.0 * zz - xx - yy),
+            -C2[0] * x * z,
+            C2[2] * (xx - yy),
+        ]
+    if degree >= 3:
+        values += [
+            -C3[0] * y * (3.0 * xx - yy),
+            C3[1] * x * y * z,
+            -C3[2] * y * (4.0 * zz - xx - yy),
+            C3[3] * z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
+            -C3[2] * x * (4.0 * zz - xx - yy),
+            C3[4] * z * (xx - yy),
+            -C3[0] * x * (xx - 3.0 * yy),
+        ]
+    return values
+
+
+def evaluate(
+    sh: Float[Array, "n k 3"],
+    directions: Float[Array, "n 3"],
+    active_degree: Int[Array, ""] | int | None = None,
+) -> Float[Array, "n 3"]:
+    """Evaluate spherical harmonics in the given directions.
+
+    Args:
+        sh: coefficients, K = (degree + 1)^2.
+        directions: unit vectors from the camera to the Gaussians, world axes.
+        active_degree: coefficients above this degree are ignored; traced, so that raising it
+            does not recompile. None uses all.
+
+    Returns:
+        Pre-activation values per channel.
+    """
+    degree = degree_of(sh.shape[1])
+    values = basis(directions, degree)
+    total = values[0][:, None] * sh[:, 0]
+    for d in range(1, degree + 1):
+        band = sum(
+            values[k][:, None] * sh[:, k]
+            for k in range(coefficient_count(d - 1), coefficient_count(d))
+        )
+        total = total + (band if active_degree is None else jnp.where(active_degree >= d, band, 0))
+    return total

@@ -1,0 +1,278 @@
+"""Values and gradients of the fast rasterizer against the float64 oracle and finite differences."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import camera, cast, street
+
+from p2gs_jax.config import RenderConfig
+from p2gs_jax.render import bin_tiles, project, render_linear, required_capacity, view_radiance
+from p2gs_jax.types import Gaussians
+
+CFG = RenderConfig(pixels_in_flight=2048)
+ORACLE = dataclasses.replace(CFG, implementation="reference")
+CAPACITY = 40_000
+FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
+
+
+def alive_of(g):
+    return jnp.ones(g.capacity, bool)
+
+
+@functools.partial(jax.jit, static_argnames=("cfg", "capacity"))
+def render(g, cam, cfg=CFG, capacity=CAPACITY, alive=None):
+    return render_linear(g, alive_of(g) if alive is None else alive, cam, cfg, capacity)
+
+
+def weights_for(cam, seed=0):
+    rng = np.random.default_rng(seed)
+    shape = (cam.height, cam.width)
+    return rng.normal(size=(*shape, 3)), rng.normal(size=shape), rng.normal(size=shape) * 0.05
+
+
+def scalar(g, cam, cfg, weights, capacity=CAPACITY):
+    r = render_linear(g, alive_of(g), cam, cfg, capacity)
+    a, b, c = (jnp.asarray(w, r.linear.dtype) for w in weights)
+    return jnp.sum(r.linear * a) + jnp.sum(r.alpha * b) + jnp.sum(r.depth * c)
+
+
+@pytest.fixture(scope="module")
+def oracle():
+    """Float64 image and gradient of the shared street."""
+    with jax.enable_x64(True):
+        g, cam = street(dtype=np.float64)
+        weights = weights_for(cam)
+        r = render(g, cam, ORACLE)
+        v = jax.jit(jax.grad(lambda g: scalar(g, cam, ORACLE, weights)))(g)
+        return jax.tree.map(np.asarray, r), jax.tree.map(np.asarray, v), weights
+
+
+@pytest.mark.parametrize("tile", [(16, 8), (16, 16), (8, 8)])
+@pytest.mark.parametrize("stop", [1e-4, None])
+def test_values_and_gradients_match_oracle(oracle, tile, stop):
+    expected, v_expected, weights = oracle
+    cfg = dataclasses.replace(CFG, tile=tile, transmittance_stop=stop)
+    g, cam = street()
+    r = render(g, cam, cfg)
+    assert not bool(r.overflow)
+    # The stop rule hides at most its transmittance times the largest value behind it.
+    brightest = float(view_radiance(g, cam, cfg).max())
+    for name, largest in (("linear", brightest), ("alpha", 1.0), ("depth", 150.0)):
+        a, b = np.asarray(getattr(r, name)), getattr(expected, name)
+        assert np.abs(a - b).max() <= 2e-5 * np.abs(b).max() + (stop or 0) * largest, name
+    v = jax.jit(jax.grad(lambda g: scalar(g, cam, cfg, weights)))(g)
+    for name in FIELDS:
+        a, b = np.asarray(getattr(v, name)), getattr(v_expected, name)
+        error = np.linalg.norm(a - b) / np.linalg.norm(b)
+        assert error < (2e-4 if stop is None else 1e-3), (name, error)
+
+
+def test_oracle_gradient_matches_finite_differences():
+    with jax.enable_x64(True):
+        g, cam = street(n=40, width=20, height=15, seed=5, dtype=np.float64)
+        # Above a vanishing cutoff the image is smooth, so central differences are meaningful.
+        cfg = dataclasses.replace(ORACLE, alpha_cutoff=1e-12, blur=0.3)
+        weights = weights_for(cam)
+        f = jax.jit(lambda g: scalar(g, cam, cfg, weights))
+        v = jax.jit(jax.grad(lambda g: scalar(g, cam, cfg, weights)))(g)
+        rng = np.random.default_rng(1)
+        for name in FIELDS:
+            direction = jnp.asarray(rng.normal(size=getattr(g, name).shape))
+            h = 1e-6
+
+            def moved(sign, name=name, direction=direction, h=h):
+                return dataclasses.replace(g, **{name: getattr(g, name) + sign * h * direction})
+
+            numeric = (f(moved(1)) - f(moved(-1))) / (2 * h)
+            exact = jnp.sum(getattr(v, name) * direction)
+            assert abs(numeric - exact) <= 1e-6 * max(abs(exact), 1.0), name
+
+
+def test_garden_statistics_match_oracle(shared_data):
+    """Real trained-scene statistics: a crop of the garden, seen through one of its cameras."""
+    data = np.load(shared_data("garden_crop") / "test_garden.npz")
+    rng = np.random.default_rng(0)
+    pick = rng.choice(len(data["means3d"]), 4000, replace=False)
+    g = Gaussians(
+        means=data["means3d"][pick],
+        quats=rng.normal(size=(4000, 4)),
+        log_scales=np.log(rng.uniform(0.002, 0.08, (4000, 3))),
+        opacity_logits=rng.normal(0, 2, 4000),
+        sh=np.log(data["colors"][pick][:, None] / 255.0 + 0.01) / 0.28,
+    )
+    shrink = 0.1
+    K = data["Ks"][0] * np.array([[shrink], [shrink], [1]])
+
+    def image(cfg, dtype):
+        cam = cast(camera(64, 42, viewmat=data["viewmats"][0]), dtype)
+        cam = dataclasses.replace(cam, K=jnp.asarray(K, dtype))
+        return np.asarray(render(cast(jax.tree.map(jnp.asarray, g), dtype), cam, cfg).linear)
+
+    fast = image(CFG, jnp.float32)
+    with jax.enable_x64(True):
+        exact = image(ORACLE, jnp.float64)
+    psnr = 10 * np.log10(exact.max() ** 2 / np.mean((fast - exact) ** 2))
+    assert psnr > 95, psnr
+
+
+def test_probe_gradient_is_screen_space_gradient():
+    g, cam = street(n=200)
+    weights = weights_for(cam)
+
+    def f(probe):
+        r = render_linear(g, alive_of(g), cam, CFG, CAPACITY, means2d_probe=probe)
+        return jnp.sum(r.linear * jnp.asarray(weights[0], jnp.float32))
+
+    probe = jnp.zeros((200, 2))
+    v = jax.jit(jax.grad(f))(probe)
+    assert jnp.all(jnp.isfinite(v))
+    assert float(jnp.abs(v).max()) > 0
+
+
+@pytest.mark.parametrize("value", [(16, 16), (32, 4)])
+def test_tile_size_does_not_change_the_image(value):
+    g, cam = street(n=400)
+    cfg = dataclasses.replace(CFG, transmittance_stop=None)
+    a = render(g, cam, cfg).linear
+    b = render(g, cam, dataclasses.replace(cfg, tile=value)).linear
+    np.testing.assert_allclose(a, b, atol=2e-5 * float(a.max()))
+
+
+def test_permutation_invariance():
+    g, cam = street(n=500)
+    order = np.random.default_rng(0).permutation(500)
+    a = render(g, cam).linear
+    b = render(jax.tree.map(lambda x: x[order], g), cam).linear
+    np.testing.assert_allclose(a, b, atol=1e-5 * float(a.max()))
+
+
+def test_dead_gaussians_are_invisible_and_get_no_gradient():
+    g, cam = street(n=300)
+    alive = jnp.arange(300) < 200
+
+    def f(g):
+        return jnp.sum(render_linear(g, alive, cam, CFG, CAPACITY).linear ** 2)
+
+    kept = jax.tree.map(lambda a: a[:200], g)
+    np.testing.assert_allclose(
+        render(g, cam, alive=alive).linear, render(kept, cam).linear, rtol=1e-5, atol=1e-6
+    )
+    v = jax.jit(jax.grad(f))(g)
+    for name in FIELDS:
+        assert not np.any(np.asarray(getattr(v, name))[200:]), name
+
+
+def test_capacity_is_exact_and_overflow_is_said():
+    g, cam = street(n=300)
+    need = int(required_capacity(g, alive_of(g), cam, CFG))
+    fits, short = (render(g, cam, CFG, c) for c in (need, need - 1))
+    assert int(fits.count) == need
+    assert not bool(fits.overflow)
+    assert bool(short.overflow)
+    np.testing.assert_allclose(fits.linear, render(g, cam).linear, rtol=1e-5)
+
+
+def one(mean=(0, 0, 4), log_scale=-1.0, logit=2.0, sh=0.0, quat=(1, 0, 0, 0), n=1):
+    return Gaussians(
+        means=jnp.tile(jnp.array([mean], jnp.float32), (n, 1)),
+        quats=jnp.tile(jnp.array([quat], jnp.float32), (n, 1)),
+        log_scales=jnp.full((n, 3), log_scale, jnp.float32),
+        opacity_logits=jnp.full((n,), logit, jnp.float32),
+        sh=jnp.full((n, 1, 3), sh, jnp.float32),
+    )
+
+
+@pytest.mark.parametrize(
+    ("case", "g"),
+    [
+        ("behind", one(mean=(0, 0, -3))),
+        ("on the near plane", one(mean=(0, 0, 0.05))),
+        ("just before it", one(mean=(0.2, 0, 0.0501))),
+        ("far outside", one(mean=(1e4, 0, 1))),
+        ("zero quaternion", one(quat=(0, 0, 0, 0))),
+        ("huge quaternion", one(quat=(1e15, 2e15, 0, 0))),
+        ("tiny", one(log_scale=-16.0)),
+        ("covers everything", one(log_scale=7.0)),
+        ("transparent", one(logit=-80.0)),
+        ("opaque", one(logit=40.0)),
+        ("black", one(sh=-80.0)),
+        ("very bright", one(sh=40.0)),
+        ("identical twins", one(n=7)),
+        ("a thousand in one place", one(n=1000, logit=-2.0)),
+    ],
+)
+def test_hard_cases_stay_finite(case, g):
+    cam = camera(37, 21, 30.0)
+
+    def f(g):
+        r = render_linear(g, alive_of(g), cam, CFG, 20_000)
+        return jnp.sum(r.linear) + jnp.sum(r.alpha) + jnp.sum(r.depth), r
+
+    v, r = jax.jit(jax.grad(f, has_aux=True))(g)
+    assert not bool(r.overflow)
+    for leaf in jax.tree.leaves((v, r.linear, r.alpha, r.depth)):
+        assert np.all(np.isfinite(leaf)), case
+    assert float(r.alpha.min()) >= 0
+    assert float(r.alpha.max()) <= 1
+    if case in ("behind", "far outside", "transparent"):
+        assert float(r.alpha.max()) == 0
+        assert not any(np.any(leaf) for leaf in jax.tree.leaves(v))
+
+
+def test_needle_matches_oracle():
+    """A needle 10^5 times longer than wide: the determinant must not cancel."""
+    g = one(log_scale=-8.0)
+    g = dataclasses.replace(
+        g, log_scales=jnp.array([[3.0, -8.5, -8.5]]), quats=jnp.array([[0.9, 0.1, 0.3, 0.2]])
+    )
+    cam = camera(60, 40, 50.0)
+    fast = render(g, cam).linear
+    with jax.enable_x64(True):
+        exact = render(cast(g, jnp.float64), cast(cam, jnp.float64), ORACLE).linear
+    np.testing.assert_allclose(fast, exact, atol=2e-4)
+
+
+def test_one_pixel_image_and_empty_scene():
+    cam = camera(1, 1, 2.0)
+    assert float(render(one(), cam).alpha[0, 0]) > 0.5
+    dead = render(one(), cam, alive=jnp.zeros(1, bool))
+    assert float(dead.alpha[0, 0]) == 0
+
+
+def test_depth_order_decides_who_is_in_front():
+    near = one(mean=(0, 0, 2), sh=1.0, logit=40.0, log_scale=1.0)
+    far = one(mean=(0, 0, 5), sh=-3.0, logit=40.0, log_scale=1.0)
+    both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), far, near)
+    cam = camera(16, 16, 16.0)
+    r = render(both, cam)
+    assert abs(float(r.depth[8, 8]) - 2.0) < 0.01
+    assert float(r.linear[8, 8, 0]) == pytest.approx(np.exp(0.2820948), rel=2e-3)
+
+
+def test_tile_lists_match_brute_force():
+    """Every splat that reaches a pixel centre of a tile is listed there, in depth order."""
+    g, cam = street(n=300)
+    splats = project(g, alive_of(g), cam, CFG)
+    tiles = bin_tiles(splats, cam.width, cam.height, CAPACITY, CFG)
+    ids, offsets = np.asarray(tiles.gaussian_ids), np.asarray(tiles.offsets)
+    m, f = np.asarray(splats.means2d, np.float64), np.asarray(splats.conic_factor, np.float64)
+    x, y = np.meshgrid(np.arange(cam.width) + 0.5, np.arange(cam.height) + 0.5)
+    dx, dy = x[None] - m[:, 0, None, None], y[None] - m[:, 1, None, None]
+    a11, a12, a22 = (f[:, i, None, None] for i in range(3))
+    e = np.asarray(splats.log_opacities)[:, None, None] - 0.5 * (
+        (a11 * dx + a12 * dy) ** 2 + (a22 * dy) ** 2
+    )
+    across = -(-cam.width // CFG.tile[0])
+    for t in range(len(offsets) - 1):
+        listed = ids[offsets[t] : offsets[t + 1]]
+        depths = np.asarray(splats.depths)[listed]
+        assert np.all(np.diff(depths) >= 0)
+        row, col = divmod(t, across)
+        block = e[:, row * 8 : row * 8 + 8, col * 16 : col * 16 + 16]
+        needed = set(np.nonzero((block > np.log(1 / 255)).any((1, 2)))[0])
+        assert needed <= set(listed.tolist())
+        assert len(set(listed.tolist())) == len(listed)
