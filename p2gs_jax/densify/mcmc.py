@@ -1,0 +1,123 @@
+"""3DGS as Markov chain Monte Carlo: relocate transparent Gaussians, explore with noise.
+
+Source: Kheradmand et al. 2024. The scale correction for N Gaussians in one place is written there
+as an alternating double sum of binomials; substituting 1/sqrt(k+1) = 2/sqrt(pi) int exp(-(k+1)t^2)
+turns it into (2/sqrt(pi)) int_0^inf 1 - (1 - o exp(-t^2))^N dt, which has no cancellation (ours).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from p2gs_jax.config import DensifyConfig
+from p2gs_jax.densify.population import Outcome, fresh_population, logit, opacities
+from p2gs_jax.render.project import rotation_matrices
+from p2gs_jax.types import Gaussians, Population
+
+# Noise falls off above this opacity, with this steepness (Kheradmand et al. 2024).
+NOISE_OPACITY, NOISE_STEEPNESS = 0.005, 100.0
+_NODES = np.linspace(0.0, 4.5, 49, dtype=np.float32)
+_WEIGHTS = np.full(49, _NODES[1], np.float32)
+_WEIGHTS[0] = _WEIGHTS[-1] = _NODES[1] / 2
+
+
+def share(
+    opacity: Float[Array, " n"], copies: Float[Array, " n"]
+) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """Return opacity and scale factor of each of `copies` Gaussians that together look like one.
+
+    Args:
+        opacity: of the one, in (0, 1).
+        copies: how many share its place, >= 1.
+    """
+    new = 1 - jnp.exp(jnp.log1p(-jnp.minimum(opacity, 1 - 1e-6)) / copies)
+    behind = jnp.log1p(-new[:, None] * jnp.exp(-(_NODES**2)))
+    integrand = -jnp.expm1(copies[:, None] * behind)
+    denominator = 2 / np.sqrt(np.pi) * (integrand @ _WEIGHTS)
+    return new, opacity / denominator
+
+
+def transparent(
+    gaussians: Gaussians, population: Population, cfg: DensifyConfig
+) -> Bool[Array, " n"]:
+    """Return which live Gaussians are too transparent to keep their place."""
+    return population.alive & (opacities(gaussians) <= cfg.prune_opacity)
+
+
+def relocate_and_grow(
+    key: PRNGKeyArray,
+    gaussians: Gaussians,
+    population: Population,
+    births: Int[Array, ""],
+    cfg: DensifyConfig,
+) -> Outcome:
+    """Move transparent Gaussians onto opaque ones and add `births` new ones there.
+
+    Targets are drawn in proportion to opacity; everyone in one place shares its look.
+
+    Args:
+        key: randomness.
+        gaussians: the scene.
+        population: who is alive.
+        births: new Gaussians wanted; those without a free slot are counted in `refused`.
+        cfg: opacity threshold.
+    """
+    n = population.alive.shape[0]
+    dead = transparent(gaussians, population, cfg)
+    healthy = population.alive & ~dead
+    # Births go to the first `births` empty slots.
+    order = jnp.cumsum(~population.alive) - 1
+    newborn = ~population.alive & (order < births)
+    movers = (dead | newborn) & jnp.any(healthy)
+    weights = jnp.where(healthy, opacities(gaussians), 0.0)
+    cumulative = jnp.cumsum(weights)
+    draws = jax.random.uniform(key, (n,)) * cumulative[-1]
+    target = jnp.clip(jnp.searchsorted(cumulative, draws, side="right"), 0, n - 1)
+    target = jnp.where(movers, target, n)
+    arrivals = jnp.zeros(n, jnp.float32).at[target].add(1.0, mode="drop")
+    opacity, factor = share(opacities(gaussians), 1 + arrivals)
+    shared = arrivals > 0
+    gaussians = dataclasses.replace(
+        gaussians,
+        opacity_logits=jnp.where(
+            shared, logit(jnp.maximum(opacity, cfg.prune_opacity)), gaussians.opacity_logits
+        ),
+        log_scales=jnp.where(
+            shared[:, None], gaussians.log_scales + jnp.log(factor)[:, None], gaussians.log_scales
+        ),
+    )
+    source = jnp.where(movers, jnp.minimum(target, n - 1), jnp.arange(n))
+    gaussians = jax.tree.map(lambda a: a[source], gaussians)
+    refused = births - jnp.sum(newborn)
+    return Outcome(
+        gaussians, fresh_population(population.alive | (newborn & movers)), movers | shared, refused
+    )
+
+
+def exploration_noise(
+    key: PRNGKeyArray,
+    gaussians: Gaussians,
+    alive: Bool[Array, " n"],
+    rate: Float[Array, ""],
+) -> Float[Array, "n 3"]:
+    """Return the noise to add to the means after a step.
+
+    It has the shape of each Gaussian's covariance and reaches only nearly transparent ones.
+
+    Args:
+        key: randomness.
+        gaussians: the scene.
+        alive: slots in use.
+        rate: noise scale times the learning rate of the means.
+    """
+    gate = jax.nn.sigmoid(NOISE_STEEPNESS * (NOISE_OPACITY - opacities(gaussians)))
+    R = rotation_matrices(gaussians.quats)
+    variance = jnp.exp(2 * gaussians.log_scales)
+    raw = jax.random.normal(key, gaussians.means.shape) * (gate * alive * rate)[:, None]
+    local = [sum(R[i][j] * raw[:, i] for i in range(3)) * variance[:, j] for j in range(3)]
+    return jnp.stack([sum(R[i][j] * local[j] for j in range(3)) for i in range(3)], -1)

@@ -1,0 +1,92 @@
+"""Slots: allocation, growth and the moves that all densification methods share.
+
+The arrays keep their shape inside jit; only `grow`, on the host and between steps, enlarges them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from p2gs_jax.types import Gaussians, Population
+
+# Logit of an opacity that no cutoff lets through: what empty slots hold.
+EMPTY_LOGIT = -20.0
+GROWTH_BUCKET = 1.5
+
+
+class Outcome(NamedTuple):
+    """The new population and what must follow from it."""
+
+    gaussians: Gaussians
+    population: Population
+    reset_moments: Bool[Array, " n"]
+    """Slots whose optimiser moments must be zeroed."""
+    refused: Int[Array, ""]
+    """Requests for which there was no slot: counted, never silent."""
+
+
+def fresh_population(alive: Bool[Array, " n"]) -> Population:
+    """Return a population with empty statistics."""
+    zeros = jnp.zeros(alive.shape, jnp.float32)
+    return Population(alive, zeros, zeros, zeros)
+
+
+def empty_gaussians(count: int, like: Gaussians) -> Gaussians:
+    """Return harmless contents for `count` empty slots."""
+    shape = jax.tree.map(lambda a: jnp.zeros((count, *a.shape[1:]), a.dtype), like)
+    return dataclasses.replace(
+        shape,
+        quats=shape.quats.at[:, 0].set(1.0),
+        opacity_logits=jnp.full((count,), EMPTY_LOGIT, like.opacity_logits.dtype),
+    )
+
+
+def bucket_for(needed: int, current: int, limit: int | None) -> int:
+    """Return the capacity to grow to: at least `needed`, in steps of 1.5, at most `limit`."""
+    capacity = current
+    while capacity < needed:
+        capacity = int(capacity * GROWTH_BUCKET) + 256
+    return capacity if limit is None else max(min(capacity, limit), needed)
+
+
+def grow(tree, fill):
+    """Append the slots of `fill` to every array of `tree`."""
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), tree, fill)
+
+
+def free_slots(alive: Bool[Array, " n"]) -> Int[Array, " n"]:
+    """Return slot indices, empty ones first, each group in order."""
+    return jnp.argsort(alive, stable=True).astype(jnp.int32)
+
+
+def place(
+    requests: Bool[Array, " n"], alive: Bool[Array, " n"]
+) -> tuple[Int[Array, " n"], Int[Array, ""]]:
+    """Assign an empty slot to each request, in order.
+
+    Returns:
+        The slot of every requester (n, out of bounds, where there is none) and how many requests
+        found no slot.
+    """
+    n = alive.shape[0]
+    rank = jnp.cumsum(requests) - 1
+    room = n - jnp.sum(alive)
+    granted = requests & (rank < room)
+    slot = jnp.where(granted, free_slots(alive)[jnp.clip(rank, 0, n - 1)], n)
+    return slot, jnp.sum(requests) - jnp.sum(granted)
+
+
+def opacities(gaussians: Gaussians) -> Float[Array, " n"]:
+    """Return peak opacities in (0, 1)."""
+    return jax.nn.sigmoid(gaussians.opacity_logits)
+
+
+def logit(p: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Return log(p / (1 - p)), with p kept off 0 and 1."""
+    p = jnp.clip(p, 1e-6, 1 - 1e-6)
+    return jnp.log(p) - jnp.log1p(-p)

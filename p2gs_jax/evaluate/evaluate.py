@@ -1,0 +1,213 @@
+"""Judging a finished fit: every view, every protocol, with names that say what was compared.
+
+Protocols (PHOTOMETRY section 6): `per_view` renders a training view with its own exposure and
+gamma; `averaged` uses the mean parameters over the training views (paper, Rendering for
+evaluation); `exposure_fitted` solves one scalar exposure from the photograph, because a held-out
+view has none of its own; against reference photographs of one common exposure, `scale_aligned`
+solves one scalar for all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float32
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.evaluate.alignment import fit_exposure
+from p2gs_jax.evaluate.metrics import psnr, ssim
+from p2gs_jax.photometry.formation import display, formation
+from p2gs_jax.render.host import RenderView
+from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.types import Params, Photometry, Scene
+
+
+@dataclass(frozen=True)
+class MeanParameters:
+    """Parameters of a view that has none of its own.
+
+    Attributes:
+        exposure: arithmetic mean over the training views (paper, eq. 7).
+        exposure_geometric: geometric mean, which the gauges leave in place.
+        gamma: arithmetic mean.
+    """
+
+    exposure: float
+    exposure_geometric: float
+    gamma: float
+
+
+def mean_parameters(photometry: Photometry) -> MeanParameters:
+    """Return the means over the training views."""
+    e = np.asarray(photometry.exposures, np.float64)
+    return MeanParameters(
+        float(e.mean()),
+        float(np.exp(np.log(e).mean())),
+        float(np.asarray(photometry.gammas, np.float64).mean()),
+    )
+
+
+@dataclass(frozen=True)
+class ViewResult:
+    """One view, rendered and judged.
+
+    Attributes:
+        index: row in `Scene.views`.
+        linear: linear radiance.
+        alpha: opacity.
+        depth: alpha-weighted depth.
+        ldr: display image with the exposure that belongs to it (own, or fitted).
+        photograph: what was taken.
+        exposure: that exposure.
+        gamma: that gamma.
+    """
+
+    index: int
+    linear: Float32[np.ndarray, "h w 3"]
+    alpha: Float32[np.ndarray, "h w"]
+    depth: Float32[np.ndarray, "h w"]
+    ldr: Float32[np.ndarray, "h w 3"]
+    photograph: Float32[np.ndarray, "h w 3"]
+    exposure: float
+    gamma: float
+
+
+class _Collector:
+    """Per-view scores and their means."""
+
+    def __init__(self):
+        self.rows: dict[str, dict[str, float]] = {}
+
+    def add(self, name: str, ldr, target, mask, **extra: float) -> None:
+        self.rows[name] = {
+            "psnr": float(psnr(ldr, target, mask)),
+            "ssim": float(ssim(ldr, target, mask)),
+            **extra,
+        }
+
+    def summary(self) -> dict:
+        if not self.rows:
+            return {}
+        keys = next(iter(self.rows.values())).keys()
+        means = {k: float(np.mean([r[k] for r in self.rows.values()])) for k in keys}
+        return {**means, "per_view": self.rows}
+
+
+def evaluate(
+    params: Params,
+    alive: Bool[np.ndarray, " n"],
+    scene: Scene,
+    store: ImageStore,
+    render: RenderView,
+    cfg: FitConfig,
+    *,
+    reference: Mapping[int, Float32[np.ndarray, "h w 3"]] | Callable | None = None,
+    on_view: Callable[[ViewResult], None] = lambda result: None,
+    on_progress: Callable[[int, int], None] = lambda done, count: None,
+) -> dict:
+    """Render and judge all views.
+
+    Args:
+        params: the fit.
+        alive: which Gaussians exist.
+        scene: views and their splits.
+        store: photographs.
+        render: from `make_renderer`.
+        cfg: formation model.
+        reference: view row -> photograph under the common exposure, or None where there is none.
+        on_view: receives every rendered view (held-out views last).
+        on_progress: views done, views in all.
+
+    Returns:
+        The `train`, `test` and `reference` parts of `metrics.json`.
+    """
+    mean = mean_parameters(params.photometry)
+    exposures = np.asarray(params.photometry.exposures)
+    gammas = np.asarray(params.photometry.gammas)
+    own, averaged = _Collector(), _Collector()
+    test_averaged, test_fitted = _Collector(), _Collector()
+    reference_views: list[tuple[int, np.ndarray, np.ndarray, np.ndarray]] = []
+
+    def shown(linear, exposure, gamma):
+        ldr = formation(linear, jnp.float32(exposure), jnp.float32(gamma), cfg.photometry)
+        return np.asarray(display(ldr))
+
+    rows = [*scene.train_indices, *scene.test_indices]
+    for done, index in enumerate(rows):
+        view = scene.views[index]
+        photograph, mask = store.get(index, 1)
+        result = render(params.gaussians, jnp.asarray(alive), store.camera(index, 1))
+        linear = result.linear
+        ldr_mean = shown(linear, mean.exposure, mean.gamma)
+        if view.split == "train":
+            e, g = float(exposures[done]), float(gammas[done])
+            ldr = shown(linear, e, g)
+            own.add(view.name, ldr, photograph, mask)
+            averaged.add(view.name, ldr_mean, photograph, mask)
+        else:
+            g = mean.gamma
+            e = float(fit_exposure(linear, photograph, mask, g, cfg.photometry))
+            ldr = shown(linear, e, g)
+            test_averaged.add(view.name, ldr_mean, photograph, mask)
+            test_fitted.add(view.name, ldr, photograph, mask, exposure=e)
+        truth = None if reference is None else _lookup(reference, index)
+        if truth is not None:
+            reference_views.append((index, np.asarray(linear), truth, mask))
+        on_view(
+            ViewResult(
+                index,
+                np.asarray(linear),
+                np.asarray(result.alpha),
+                np.asarray(result.depth),
+                ldr,
+                photograph,
+                e,
+                g,
+            )
+        )
+        on_progress(done + 1, len(rows))
+
+    metrics = {
+        "train": {**own.summary(), "averaged": averaged.summary()},
+        "test": {"averaged": test_averaged.summary(), "exposure_fitted": test_fitted.summary()},
+    }
+    metrics["train"]["per_view"] = metrics["train"].pop("per_view", {})
+    if reference_views:
+        metrics["reference"] = _against_reference(reference_views, scene, mean, shown, cfg)
+    return metrics
+
+
+def _lookup(reference, index: int):
+    return reference(index) if callable(reference) else reference.get(index)
+
+
+def _against_reference(views, scene: Scene, mean: MeanParameters, shown, cfg: FitConfig) -> dict:
+    """Judge all views against photographs of one common exposure."""
+    scales = [
+        float(fit_exposure(jnp.asarray(linear), truth, mask, mean.gamma, cfg.photometry))
+        for _, linear, truth, mask in views
+    ]
+    common = float(np.exp(np.median(np.log(scales))))
+    protocols = {
+        "averaged": mean.exposure,
+        "geometric": mean.exposure_geometric,
+        "scale_aligned": common,
+    }
+    out = {}
+    for name, exposure in protocols.items():
+        parts = {"all": _Collector(), "train": _Collector(), "test": _Collector()}
+        for index, linear, truth, mask in views:
+            view = scene.views[index]
+            ldr = shown(jnp.asarray(linear), exposure, mean.gamma)
+            for part in ("all", view.split):
+                parts[part].add(view.name, ldr, truth, mask)
+        out[name] = {
+            **parts["all"].summary(),
+            "exposure": exposure,
+            "train": parts["train"].summary(),
+            "test": parts["test"].summary(),
+        }
+    return out

@@ -1,0 +1,1 @@
+"""From seed points to Gaussians: what a fit starts from."""

@@ -1,0 +1,112 @@
+"""What the photographs show at tracks and at shell directions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+
+from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.types import Scene
+
+# Averaging a few pixels quiets noise and hides the misplacement of a fraction of a pixel.
+PATCH = 3
+
+
+class TrackColors(NamedTuple):
+    """Display-encoded colours of seed points in the training views.
+
+    Attributes:
+        views: row in `Photometry` (training views only).
+        points: row in `Scene.points`.
+        colors: [0, 1].
+    """
+
+    views: Int[np.ndarray, " o"]
+    points: Int[np.ndarray, " o"]
+    colors: Float32[np.ndarray, "o 3"]
+
+
+def sample(
+    ldr: Float32[np.ndarray, "h w 3"],
+    mask: Float32[np.ndarray, "h w"],
+    xy: Float[np.ndarray, "o 2"],
+) -> tuple[Float32[np.ndarray, "o 3"], Bool[np.ndarray, " o"]]:
+    """Return bilinear patch averages at pixel positions, and which of them are valid.
+
+    Args:
+        ldr: photograph.
+        mask: 1 = use.
+        xy: positions, pixel centres at +0.5.
+    """
+    height, width = mask.shape
+    smooth = cv2.blur(ldr, (PATCH, PATCH), borderType=cv2.BORDER_REFLECT)
+    position = (xy - 0.5).astype(np.float32)
+    inside = (
+        (position[:, 0] >= 1)
+        & (position[:, 1] >= 1)
+        & (position[:, 0] <= width - 2)
+        & (position[:, 1] <= height - 2)
+    )
+    safe = np.where(inside[:, None], position, 1.0).astype(np.float32)
+    left, top = np.floor(safe).astype(int).T
+    fx, fy = (safe - np.floor(safe)).T
+
+    def at(image):
+        f = fx[:, None] if image.ndim == 3 else fx
+        g = fy[:, None] if image.ndim == 3 else fy
+        upper = image[top, left] * (1 - f) + image[top, left + 1] * f
+        lower = image[top + 1, left] * (1 - f) + image[top + 1, left + 1] * f
+        return upper * (1 - g) + lower * g
+
+    return at(smooth).astype(np.float32), inside & (at(mask) > 0.99)
+
+
+def track_colors(
+    scene: Scene, store: ImageStore, on_view: Callable[[int, int], None] = lambda i, n: None
+) -> TrackColors:
+    """Sample every track in every training view.
+
+    Args:
+        scene: with tracks.
+        store: photographs, sampled at their training resolution.
+        on_view: progress: views done, views in all.
+    """
+    assert scene.tracks is not None
+    views, points, colors = [], [], []
+    order = np.argsort(scene.tracks.view_indices, kind="stable")
+    bounds = np.searchsorted(scene.tracks.view_indices[order], np.arange(len(scene.views) + 1))
+    for row, index in enumerate(scene.train_indices):
+        pick = order[bounds[index] : bounds[index + 1]]
+        if len(pick):
+            ldr, mask = store.get(index, 1)
+            view = scene.views[index]
+            scale = [mask.shape[1] / view.width, mask.shape[0] / view.height]
+            color, valid = sample(ldr, mask, scene.tracks.xy[pick] * scale)
+            views.append(np.full(int(valid.sum()), row))
+            points.append(scene.tracks.point_indices[pick][valid])
+            colors.append(color[valid])
+        on_view(row + 1, len(scene.train_indices))
+    if not views:
+        return TrackColors(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3), np.float32))
+    return TrackColors(*(np.concatenate(a) for a in (views, points, colors)))
+
+
+def sample_pairs(
+    tracks: TrackColors, count: int, seed: int
+) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
+    """Draw pairs of observations of the same point; rows of `tracks`, in different views."""
+    order = np.argsort(tracks.points, kind="stable")
+    bounds = np.flatnonzero(np.diff(tracks.points[order], prepend=-1, append=-1))
+    lengths = np.diff(bounds)
+    starts, lengths = bounds[:-1][lengths >= 2], lengths[lengths >= 2]
+    if not len(starts):
+        return np.zeros(0, int), np.zeros(0, int)
+    rng = np.random.default_rng((seed, 11))
+    pick = rng.integers(0, len(starts), count)
+    first = rng.integers(0, lengths[pick])
+    second = (first + rng.integers(1, lengths[pick])) % lengths[pick]
+    return order[starts[pick] + first], order[starts[pick] + second]

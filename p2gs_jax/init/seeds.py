@@ -1,0 +1,99 @@
+"""Seed points with linearised colours become Gaussians."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.photometry.radiance import radiance_preactivation
+from p2gs_jax.render.spherical_harmonics import C0, coefficient_count
+from p2gs_jax.types import Gaussians, View
+
+NEIGHBOURS = 3
+# 3DGS: the radius of the camera centres, with ten percent to spare.
+EXTENT_MARGIN = 1.1
+MIN_RADIANCE = 1e-3
+# No seed starts wider than this fraction of its distance from the nearest camera.
+MAX_ANGLE = 0.05
+
+
+def camera_centers(views: tuple[View, ...] | list[View]) -> Float[np.ndarray, "v 3"]:
+    """Return camera centres in world coordinates."""
+    return np.stack([-v.viewmat[:3, :3].T @ v.viewmat[:3, 3] for v in views])
+
+
+def scene_extent(views: list[View], points: Float[np.ndarray, "p 3"]) -> float:
+    """Return the radius that scales means' rates and densification thresholds (3DGS).
+
+    Where all cameras stand in one place, the median distance of the points is used.
+    """
+    centers = camera_centers(views)
+    middle = centers.mean(0)
+    radius = float(np.linalg.norm(centers - middle, axis=1).max()) * EXTENT_MARGIN
+    if len(points):
+        distance = float(np.median(np.linalg.norm(points - middle, axis=1)))
+        radius = max(radius, 0.05 * distance)
+    return max(radius, 1e-3)
+
+
+def subsample(count: int, limit: int, seed: int) -> np.ndarray:
+    """Return which seeds to keep, sorted, at most `limit`, drawn evenly."""
+    if count <= limit:
+        return np.arange(count)
+    return np.sort(np.random.default_rng((seed, 7)).choice(count, limit, replace=False))
+
+
+def gaussians_from_points(
+    points: Float[np.ndarray, "p 3"],
+    radiance: Float[np.ndarray, "p 3"],
+    views: list[View],
+    cfg: FitConfig,
+    *,
+    scales: Float[np.ndarray, " p"] | None = None,
+    opacity: float | None = None,
+) -> Gaussians:
+    """Return one isotropic Gaussian per point.
+
+    Args:
+        points: scene units.
+        radiance: linear radiance in the gauge of the exposures.
+        views: training views, for the distance that bounds the scales.
+        cfg: activation, degree, opacity.
+        scales: standard deviations; None takes the mean distance to three neighbours (3DGS).
+        opacity: initial opacity; None takes the configured one.
+    """
+    count = len(points)
+    if scales is None:
+        if count > NEIGHBOURS:
+            distances, _ = cKDTree(points).query(points, k=NEIGHBOURS + 1)
+            scales = np.sqrt(np.mean(distances[:, 1:] ** 2, axis=1))
+        else:
+            scales = np.full(count, 0.01)
+        to_camera, _ = cKDTree(camera_centers(views)).query(points)
+        scales = np.clip(scales, 1e-7, np.maximum(MAX_ANGLE * to_camera, 1e-6))
+    start = cfg.init.opacity if opacity is None else opacity
+    dc = np.asarray(
+        radiance_preactivation(
+            jnp.asarray(np.maximum(radiance, MIN_RADIANCE), jnp.float32), cfg.render.radiance
+        )
+    )
+    sh = np.zeros((count, coefficient_count(cfg.render.sh_degree), 3), np.float32)
+    sh[:, 0] = dc / C0
+    quats = np.zeros((count, 4), np.float32)
+    quats[:, 0] = 1.0
+    return Gaussians(
+        means=jnp.asarray(points, jnp.float32),
+        quats=jnp.asarray(quats),
+        log_scales=jnp.asarray(np.repeat(np.log(scales)[:, None], 3, 1), jnp.float32),
+        opacity_logits=jnp.full((count,), float(np.log(start / (1 - start))), jnp.float32),
+        sh=jnp.asarray(sh),
+    )
+
+
+def merge(a: Gaussians, b: Gaussians) -> Gaussians:
+    """Return both sets of Gaussians, `a` first."""
+    return jax.tree.map(lambda x, y: jnp.concatenate([x, y]), a, b)

@@ -1,0 +1,129 @@
+"""Relative exposure consistency: L_exp and its readings (paper, eq. 8; PHOTOMETRY section 3).
+
+Printed: L_exp = (1/M) sum |alpha_ij L_i - L_j|_1 with alpha_ij = e_j / e_i and L free of exposure.
+At the truth L_i = L_j for the same surface, so the printed formula is zero only where all
+exposures are equal; each reading below is one way of making sense of it.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from p2gs_jax.config import LossConfig, PhotometryConfig
+from p2gs_jax.photometry.formation import inverse_tone_map, tone_map
+
+
+class Observations(Protocol):
+    """Colours of the same surface points in two views; see `losses.total.TrackPairs`."""
+
+    colors_i: Float[Array, "m 3"]
+    colors_j: Float[Array, "m 3"]
+    views_i: Int[Array, " m"]
+    views_j: Int[Array, " m"]
+
+
+class ExposurePairs(eqx.Module):
+    """What the readings need.
+
+    Attributes:
+        linear_i: render of view i, linear.
+        linear_j: render of view j, for `literal_pixels` and `exposed`.
+        view_i: row of view i.
+        view_j: row of view j.
+        exposures: all exposures.
+        gammas: all gammas.
+        pairs: corresponding observations, for the `observed` readings.
+    """
+
+    linear_i: Float[Array, "h w 3"]
+    linear_j: Float[Array, "h w 3"] | None
+    view_i: Int[Array, ""]
+    view_j: Int[Array, ""]
+    exposures: Float[Array, " v"]
+    gammas: Float[Array, " v"]
+    pairs: Observations | None
+
+
+def _per_pixel_l1(difference: Float[Array, "... 3"]) -> Float[Array, ""]:
+    """Return (1/M) times the L1 norm over pixels and channels, M the number of pixels."""
+    return jnp.mean(jnp.sum(jnp.abs(difference), -1))
+
+
+def literal_same_pose(linear_i, e_i, e_j) -> Float[Array, ""]:
+    """Both radiances at one pose: |e_j/e_i - 1| L. Zero iff the exposures are equal."""
+    return _per_pixel_l1((e_j / e_i - 1) * linear_i)
+
+
+def literal_pixels(linear_i, linear_j, e_i, e_j) -> Float[Array, ""]:
+    """Renders of two poses, pixel by pixel: compares unrelated surface points."""
+    return _per_pixel_l1(e_j / e_i * linear_i - linear_j)
+
+
+def exposed(linear_i, linear_j, e_j) -> Float[Array, ""]:
+    """Both radiances under the same exposure: e_j (L_i - L_j). Zero at one pose."""
+    return _per_pixel_l1(e_j * (linear_i - linear_j))
+
+
+def usable(colors: Float[Array, "m 3"], cfg: LossConfig) -> Float[Array, "m 3"]:
+    """Return 1 where a photographed value is neither near black nor saturated."""
+    return ((colors > cfg.black) & (colors < cfg.saturation)).astype(colors.dtype)
+
+
+def _linear_pair(pairs: Observations, exposures, gammas, photometry: PhotometryConfig):
+    ratio = (exposures[pairs.views_j] / exposures[pairs.views_i])[:, None]
+    gamma_i, gamma_j = gammas[pairs.views_i][:, None], gammas[pairs.views_j][:, None]
+    return ratio * inverse_tone_map(pairs.colors_i, gamma_i, photometry), gamma_j
+
+
+def observed_linear(
+    pairs: Observations, exposures, gammas, cfg: LossConfig, photometry: PhotometryConfig
+) -> Float[Array, ""]:
+    """alpha T_i^-1(I_i(u)) against T_j^-1(I_j(w(u))), at corresponding surface points."""
+    predicted, gamma_j = _linear_pair(pairs, exposures, gammas, photometry)
+    seen = inverse_tone_map(pairs.colors_j, gamma_j, photometry)
+    weight = usable(pairs.colors_i, cfg) * usable(pairs.colors_j, cfg)
+    return jnp.mean(jnp.sum(weight * jnp.abs(predicted - seen), -1))
+
+
+def huber(x: Float[Array, "..."], delta: float) -> Float[Array, "..."]:
+    """Return the Huber loss with slope 1 in its tails."""
+    a = jnp.abs(x)
+    return jnp.where(a < delta, 0.5 * a * a / delta, a - 0.5 * delta)
+
+
+def observed_ldr(
+    pairs: Observations, exposures, gammas, cfg: LossConfig, photometry: PhotometryConfig
+) -> Float[Array, ""]:
+    """Huber(T_j(alpha T_i^-1(I_i(u))) - I_j(w(u))): PIR in display units, scale-invariant."""
+    predicted, gamma_j = _linear_pair(pairs, exposures, gammas, photometry)
+    weight = usable(pairs.colors_i, cfg) * usable(pairs.colors_j, cfg)
+    residual = tone_map(predicted, gamma_j, photometry) - pairs.colors_j
+    return jnp.mean(jnp.sum(weight * huber(residual, cfg.relative_exposure.huber_delta), -1))
+
+
+def relative_exposure_loss(
+    given: ExposurePairs, cfg: LossConfig, photometry: PhotometryConfig
+) -> Float[Array, ""]:
+    """Return the configured reading, unweighted.
+
+    Raises:
+        ValueError: the reading needs a second render or observations that were not given.
+    """
+    form = cfg.relative_exposure.form
+    e_i, e_j = given.exposures[given.view_i], given.exposures[given.view_j]
+    if form == "literal_same_pose":
+        return literal_same_pose(given.linear_i, e_i, e_j)
+    if form in ("literal_pixels", "exposed"):
+        if given.linear_j is None:
+            raise ValueError(f"the reading {form!r} needs the render of a second view")
+        if form == "exposed":
+            return exposed(given.linear_i, given.linear_j, e_j)
+        return literal_pixels(given.linear_i, given.linear_j, e_i, e_j)
+    if given.pairs is None:
+        raise ValueError(f"the reading {form!r} needs corresponding observations")
+    reading = observed_linear if form == "observed_linear" else observed_ldr
+    return reading(given.pairs, given.exposures, given.gammas, cfg, photometry)

@@ -1,0 +1,23 @@
+"""Power, logarithm and division that stay finite, in value and in gradient, over all of float32."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+def safe_log(x: Float[Array, "..."], floor: float) -> Float[Array, "..."]:
+    """Return log(max(x, floor)); the gradient is zero below the floor."""
+    above = x > floor
+    return jnp.where(above, jnp.log(jnp.where(above, x, 1.0)), jnp.log(floor))
+
+
+def safe_div(a: Float[Array, "..."], b: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return a / b, and 0 with zero gradient where b is 0."""
+    nonzero = b != 0
+    return jnp.where(nonzero, a / jnp.where(nonzero, b, 1.0), 0.0)
+
+
+def positive_pow(x: Float[Array, "..."], p: Float[Array, "..."], floor: float):
+    """Return max(x, floor)^p through exp(p log x); the gradient to x is zero below the floor."""
+    return jnp.exp(p * safe_log(x, floor))

@@ -1,0 +1,99 @@
+"""The image formation model: radiance, times exposure, through a tone curve (paper, Sec. 3.3).
+
+Paper: y = clamp(clamp(eL, 1e-6, 10)^(1/gamma), 0, 1). Robust (PHOTOMETRY section 4):
+y = OETF(x0 (eL/x0)^(2.2/gamma)) with a pivot x0 at mid-grey that a change of gamma leaves alone,
+continued above 1 so that over-bright predictions keep a gradient.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from p2gs_jax.config import PhotometryConfig
+from p2gs_jax.numerics import positive_pow, safe_log
+from p2gs_jax.types import GAMMA_SRGB
+
+EXPOSED_FLOOR, EXPOSED_CEILING = 1e-6, 10.0  # paper, Tone-mapping estimation
+SRGB_LINEAR_END, SRGB_ENCODED_END = 0.0031308, 0.04045
+# Darkest photographed value that is inverted: half a code of 8 bits.
+LDR_FLOOR = 0.5 / 255.0
+
+
+def oetf(linear: Float[Array, "..."], curve: str) -> Float[Array, "..."]:
+    """Encode linear values with the base curve; values above 1 continue it."""
+    if curve == "power":
+        return positive_pow(linear, 1.0 / GAMMA_SRGB, EXPOSED_FLOOR)
+    toe = linear <= SRGB_LINEAR_END
+    high = 1.055 * positive_pow(jnp.where(toe, 1.0, linear), 1.0 / 2.4, EXPOSED_FLOOR) - 0.055
+    return jnp.where(toe, 12.92 * linear, high)
+
+
+def eotf(encoded: Float[Array, "..."], curve: str) -> Float[Array, "..."]:
+    """Decode: the inverse of `oetf` on [0, inf)."""
+    if curve == "power":
+        return positive_pow(encoded, GAMMA_SRGB, 1e-3)
+    toe = encoded <= SRGB_ENCODED_END
+    base = (jnp.where(toe, 1.0, encoded) + 0.055) / 1.055
+    return jnp.where(toe, encoded / 12.92, positive_pow(base, 2.4, 1e-3))
+
+
+def expose(linear: Float[Array, "..."], exposure: Float[Array, ""]) -> Float[Array, "..."]:
+    """Return e L (paper, eq. 5 of Exposure modeling)."""
+    return exposure * linear
+
+
+def tone_map(
+    exposed: Float[Array, "..."], gamma: Float[Array, ""], cfg: PhotometryConfig
+) -> Float[Array, "..."]:
+    """Return the display-encoded image of exposed radiance.
+
+    Args:
+        exposed: e L, any value; below 1e-6 it counts as 1e-6 with zero gradient.
+        gamma: > 0; dT/dgamma = -(ln x / gamma^2) x^(1/gamma) in the paper's form.
+        cfg: base curve, pivot, clamping.
+    """
+    if cfg.clamp:
+        exposed = jnp.minimum(exposed, EXPOSED_CEILING)
+    log_x = safe_log(exposed, EXPOSED_FLOOR)
+    if cfg.curve == "power" and cfg.pivot == 1.0:
+        y = jnp.exp(log_x / gamma)
+    else:
+        log_pivot = float(np.log(cfg.pivot))
+        log_linear = log_pivot + (log_x - log_pivot) * (GAMMA_SRGB / gamma)
+        if cfg.curve == "power":
+            y = jnp.exp(log_linear / GAMMA_SRGB)
+        else:
+            toe = log_linear <= float(np.log(SRGB_LINEAR_END))
+            low = 12.92 * jnp.exp(jnp.where(toe, log_linear, 0.0))
+            high = 1.055 * jnp.exp(jnp.where(toe, 0.0, log_linear) / 2.4) - 0.055
+            y = jnp.where(toe, low, high)
+    return jnp.clip(y, 0.0, 1.0) if cfg.clamp else y
+
+
+def inverse_tone_map(
+    ldr: Float[Array, "..."], gamma: Float[Array, ""], cfg: PhotometryConfig
+) -> Float[Array, "..."]:
+    """Return the exposed radiance e L of display values; values below half a code count as that."""
+    y = jnp.maximum(ldr, LDR_FLOOR)
+    if cfg.curve == "power" and cfg.pivot == 1.0:
+        return jnp.exp(gamma * jnp.log(y))
+    log_linear = jnp.log(eotf(y, cfg.curve))
+    log_pivot = float(np.log(cfg.pivot))
+    return jnp.exp(log_pivot + (log_linear - log_pivot) * (gamma / GAMMA_SRGB))
+
+
+def formation(
+    linear: Float[Array, "..."],
+    exposure: Float[Array, ""],
+    gamma: Float[Array, ""],
+    cfg: PhotometryConfig,
+) -> Float[Array, "..."]:
+    """Return T(e L): what the camera records of radiance `linear`."""
+    return tone_map(expose(linear, exposure), gamma, cfg)
+
+
+def display(ldr: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Clamp to what a display or an 8-bit file can hold."""
+    return jnp.clip(ldr, 0.0, 1.0)

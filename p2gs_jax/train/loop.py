@@ -1,0 +1,434 @@
+"""The host loop: bursts of jitted steps, and between them everything that changes shapes.
+
+Within a burst the host only dispatches. After it the host reads the fault flag and the reports,
+densifies, logs, replans the pace and checkpoints. All decisions follow from the seed and the step
+number (and, under a time budget, from paces that the checkpoint remembers), so a resumed run takes
+the same path as an uninterrupted one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.densify import adaptive, mcmc
+from p2gs_jax.densify.population import bucket_for
+from p2gs_jax.errors import DivergenceError
+from p2gs_jax.export.atomic import append_jsonl, read_jsonl, write_text
+from p2gs_jax.export.checkpoint import CheckpointStore
+from p2gs_jax.losses.total import OBSERVED_FORMS, SECOND_RENDER_FORMS, Partner, TrackPairs
+from p2gs_jax.render import required_capacity
+from p2gs_jax.render.host import capacity_bucket
+from p2gs_jax.train import schedule
+from p2gs_jax.train.optimizer import make_optimizer, zero_moments
+from p2gs_jax.train.schedule import Pace
+from p2gs_jax.train.state import (
+    FAULT_NONFINITE,
+    FAULT_OVERFLOW,
+    Fault,
+    FitState,
+    grow_state,
+    initial_state,
+    replace_gaussians,
+)
+from p2gs_jax.train.step import Controls, StepReport, finite_names, make_step
+from p2gs_jax.train.views import TrainingViews
+from p2gs_jax.types import Params
+
+# A fresh tile list leaves this much room above the largest view sampled.
+CAPACITY_MARGIN = 1.3
+CAPACITY_SAMPLES = 6
+PAIRS_PER_STEP = 4096
+MAX_BURST = 50
+
+
+@dataclass
+class HostState:
+    """What the host remembers between bursts; saved with every checkpoint.
+
+    Attributes:
+        step: steps completed.
+        progress: fraction of the run completed.
+        pace: progress per step.
+        elapsed_s: seconds of earlier sessions and of this one.
+        densified_at: progress of the last densification.
+        reset_at: progress of the last opacity reset.
+        refused: densification requests that found no slot, summed.
+        overflows: tile lists grown.
+        capacities: tile-list capacity for every "WxH".
+        step_s: running estimate of the seconds a step takes at this level.
+    """
+
+    step: int = 0
+    progress: float = 0.0
+    pace: float = 0.0
+    elapsed_s: float = 0.0
+    densified_at: float = 0.0
+    reset_at: float = 0.0
+    refused: int = 0
+    overflows: int = 0
+    capacities: dict[str, int] = field(default_factory=dict)
+    step_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class LogRecord:
+    """One line of `log.jsonl`, and what the live display shows."""
+
+    step: int
+    progress: float
+    loss: float
+    psnr: float
+    gaussians: int
+    shrink: int
+    entries: int
+    seconds: float
+    step_seconds: float
+    terms: dict[str, float]
+
+
+@dataclass(frozen=True)
+class TrainResult:
+    """The end of a run."""
+
+    state: FitState
+    host: HostState
+    max_gaussians: int
+
+
+def default_max_gaussians(seeds: int, width: int, height: int) -> int:
+    """Return the population limit where none is configured: one per four pixels, or the seeds."""
+    return max(int(1.25 * seeds), min(width * height // 4, 400_000), 1000)
+
+
+class Trainer:
+    """Runs one fit from its initial parameters to its final ones.
+
+    Args:
+        cfg: everything.
+        views: the training views.
+        extent: scene extent, scene units.
+        pairs: corresponding observations, for the relative-exposure readings that need them.
+        run_dir: where `log.jsonl` and `checkpoints/` go.
+        on_log: called with every log record.
+        on_message: called with everything the user must know.
+    """
+
+    def __init__(
+        self,
+        cfg: FitConfig,
+        views: TrainingViews,
+        extent: float,
+        pairs: TrackPairs | None,
+        run_dir: Path,
+        on_log: Callable[[LogRecord], None] = lambda record: None,
+        on_message: Callable[[str], None] = lambda text: None,
+    ):
+        self.cfg, self.views, self.extent, self.pairs = cfg, views, extent, pairs
+        self.run_dir, self.on_log, self.on_message = run_dir, on_log, on_message
+        self.optimizer = make_optimizer(cfg)
+        self.step_fn = make_step(cfg, self.optimizer, extent)
+        self.checkpoints = CheckpointStore(run_dir / "checkpoints")
+        self.log_path = run_dir / "log.jsonl"
+        sizes = [views.camera(i, 1) for i in range(len(views))]
+        self.width, self.height = max((c.width, c.height) for c in sizes)
+        self.levels = schedule.levels(
+            cfg.train, min(c.width for c in sizes), min(c.height for c in sizes)
+        )
+        self.sh_degree = cfg.render.sh_degree
+        self._count = jax.jit(lambda g, alive, cam: required_capacity(g, alive, cam, cfg.render))
+        self._densify_adaptive = jax.jit(adaptive.apply)
+        self._propose = jax.jit(functools.partial(adaptive.propose, cfg=cfg.densify))
+        self._relocate = jax.jit(functools.partial(mcmc.relocate_and_grow, cfg=cfg.densify))
+        self._zero_moments = jax.jit(zero_moments)
+
+    # -------------------------------------------------------------- starting and resuming
+
+    def _restore(self, template: FitState) -> tuple[FitState, HostState] | None:
+        step = self.checkpoints.latest_step()
+        if step is None:
+            return None
+        meta = self.checkpoints.read_meta(step)
+        like = jax.eval_shape(lambda: grow_state(template, meta["gaussian_capacity"]))
+        state, meta = self.checkpoints.restore(step, like, on_message=self.on_message)
+        state = jax.tree.map(jnp.asarray, state)
+        host = HostState(**meta["host"])
+        kept = [line for line in read_jsonl(self.log_path) if line["step"] <= host.step]
+        write_text(self.log_path, "".join(_json_line(line) for line in kept))
+        self.on_message(f"Resuming after step {host.step} ({host.progress:.0%}).")
+        return state, host
+
+    def _save(self, state: FitState, host: HostState) -> None:
+        meta = {
+            "host": dataclasses.asdict(host),
+            "gaussian_capacity": state.params.gaussians.capacity,
+        }
+        self.checkpoints.save(host.step, state, meta)
+
+    # -------------------------------------------------------------- the run
+
+    def run(
+        self, params: Params, alive, *, resume: bool = False, reserve_s: float = 0.0
+    ) -> TrainResult:
+        """Optimise until the run is complete.
+
+        Args:
+            params: initial parameters.
+            alive: which Gaussians exist.
+            resume: continue from the newest checkpoint, if there is one.
+            reserve_s: seconds of a time budget to leave for what follows.
+
+        Raises:
+            DivergenceError: a loss term or gradient is not finite.
+        """
+        train = self.cfg.train
+        seeds = int(np.sum(np.asarray(alive)))
+        limit = self.cfg.densify.max_gaussians
+        if limit is None and self.cfg.densify.method == "mcmc":
+            limit = default_max_gaussians(seeds, self.width, self.height)
+        if self.cfg.densify.method == "mcmc":
+            assert limit is not None
+            limit = max(limit, seeds)
+        state = initial_state(params, alive, self.optimizer)
+        if self.cfg.densify.method == "mcmc":
+            state = grow_state(state, max(limit or 0, seeds))
+        pace = Pace.from_config(train, reserve_s)
+        host = HostState(pace=pace.per_step)
+        if resume and (restored := self._restore(state)) is not None:
+            state, host = restored
+            pace = dataclasses.replace(pace, per_step=host.pace)
+        elif self.log_path.exists():
+            self.log_path.unlink()
+
+        session_start = time.monotonic()
+        before = host.elapsed_s
+        last_save = session_start
+        planned_level = None
+        while host.progress < 1.0 - 0.5 * host.pace:
+            state, reports = self._burst(state, host)
+            host.elapsed_s = before + time.monotonic() - session_start
+            shrink = schedule.shrink_at(host.progress, self.levels)
+            if reports:
+                self._log(reports, state, host, shrink)
+                state = self._maybe_densify(state, host, limit)
+            if pace.deadline_s is not None and host.step_s > 0:
+                pace = dataclasses.replace(pace, per_step=host.pace)
+                compile_s = 8.0
+                if planned_level != shrink or host.step % 5 == 0:
+                    pace = pace.replan(
+                        host.progress, host.elapsed_s, host.step_s, self.levels, compile_s
+                    )
+                    planned_level = shrink
+                host.pace = pace.per_step
+                if host.elapsed_s > pace.deadline_s:
+                    self.on_message(
+                        f"The time budget ended the run at {host.progress:.0%} of its schedule."
+                    )
+                    break
+            if time.monotonic() - last_save > train.checkpoint_every_s:
+                self._save(state, host)
+                last_save = time.monotonic()
+        self._save(state, host)
+        return TrainResult(state, host, limit or state.params.gaussians.capacity)
+
+    def _burst(
+        self, state: FitState, host: HostState
+    ) -> tuple[FitState, list[tuple[int, float, StepReport]]]:
+        """Dispatch steps up to the next point where the host must look, then look.
+
+        On overflow the steps that the device refused are taken back and the tile list grows.
+        """
+        shrink = schedule.shrink_at(host.progress, self.levels)
+        length = self.cfg.train.log_every - host.step % self.cfg.train.log_every
+        length = max(1, min(length, MAX_BURST))
+        reports: list[tuple[int, float, StepReport]] = []
+        progress = host.progress
+        begin = time.monotonic()
+        compiled = False
+        keys = []
+        for k in range(length):
+            if progress >= 1.0 - 0.5 * host.pace:
+                break
+            if schedule.shrink_at(progress, self.levels) != shrink:
+                break
+            step = host.step + k
+            index = self.views.index_at(step)
+            self.views.prefetch(self.views.index_at(step + 1), shrink)
+            batch = self.views.batch(index, shrink)
+            key = f"{batch.camera.width}x{batch.camera.height}"
+            if key not in host.capacities:
+                host.capacities[key] = self._fresh_capacity(state, shrink, key)
+                compiled = True
+            keys.append(key)
+            controls = Controls(
+                jnp.float32(progress),
+                jnp.int32(schedule.sh_degree_at(progress, self.cfg.train, self.sh_degree)),
+            )
+            state, report = self.step_fn(
+                state, batch, self._partner(step, shrink), controls, capacity=host.capacities[key]
+            )
+            reports.append((step, progress, report))
+            progress = progress + host.pace
+        kind = int(state.fault.kind)
+        done = int(state.step) - host.step
+        if kind == FAULT_NONFINITE:
+            self._diverged(state, host.step + done, reports[done][2])
+        if kind == FAULT_OVERFLOW:
+            key = keys[done]
+            host.capacities[key] = capacity_bucket(int(state.fault.needed), 1.1)
+            host.overflows += 1
+            state = dataclasses.replace(state, fault=Fault.none())
+            compiled = True
+        if not compiled and done:
+            self._time(host, (time.monotonic() - begin) / done)
+        elif done:
+            host.step_s = 0.0
+        reports = reports[:done]
+        host.step += done
+        for _ in range(done):
+            host.progress += host.pace
+        return state, reports
+
+    @staticmethod
+    def _time(host: HostState, seconds: float) -> None:
+        host.step_s = seconds if host.step_s == 0 else 0.7 * host.step_s + 0.3 * seconds
+
+    def _fresh_capacity(self, state: FitState, shrink: int, key: str) -> int:
+        """Return a tile-list capacity for a new image size, from a sample of its views."""
+        picks = np.linspace(0, len(self.views) - 1, CAPACITY_SAMPLES).round().astype(int)
+        cameras = [self.views.camera(int(i), shrink) for i in sorted(set(picks))]
+        same = [c for c in cameras if f"{c.width}x{c.height}" == key] or cameras[:1]
+        needed = max(
+            int(self._count(state.params.gaussians, state.population.alive, c)) for c in same
+        )
+        return capacity_bucket(needed, CAPACITY_MARGIN)
+
+    def _partner(self, step: int, shrink: int) -> Partner:
+        """Return the second view of the relative-exposure loss, as much of it as is needed."""
+        relative = self.cfg.loss.relative_exposure
+        if relative.weight is None:
+            return Partner(jnp.int32(0))
+        other = self.views.partner_at(step)
+        camera, pairs = None, None
+        if relative.form in SECOND_RENDER_FORMS:
+            camera = self.views.camera(other, shrink)
+        if relative.form in OBSERVED_FORMS and self.pairs is not None:
+            count = self.pairs.views_i.shape[0]
+            rng = np.random.default_rng((self.cfg.train.seed, 2, step))
+            pick = rng.integers(0, count, min(PAIRS_PER_STEP, count))
+            pairs = jax.tree.map(lambda a: a[pick], self.pairs)
+        return Partner(jnp.int32(other), camera, pairs)
+
+    def _diverged(self, state: FitState, step: int, report: StepReport) -> None:
+        names = finite_names(report.terms)
+        name = names[int(state.fault.term)]
+        latest = self.checkpoints.latest_step()
+        where = (
+            "no checkpoint was written yet"
+            if latest is None
+            else f"the last good checkpoint is step {latest} in {self.checkpoints.folder}"
+        )
+        raise DivergenceError(
+            f"Step {step + 1}: the {name} is not finite; {where}.",
+            fix="lower the learning rates (--optimizer.*) or report the scene; "
+            "--resume continues from the last good checkpoint",
+        )
+
+    # -------------------------------------------------------------- between bursts
+
+    def _log(self, reports, state: FitState, host: HostState, shrink: int) -> None:
+        last = reports[-1][2]
+        record = LogRecord(
+            step=host.step,
+            progress=round(host.progress, 6),
+            loss=_mean(r.loss for _, _, r in reports),
+            psnr=_mean(r.psnr for _, _, r in reports),
+            gaussians=int(jnp.sum(state.population.alive)),
+            shrink=shrink,
+            entries=int(last.entries),
+            seconds=round(host.elapsed_s, 3),
+            step_seconds=round(host.step_s, 5),
+            terms={k: _mean(r.terms[k] for _, _, r in reports) for k in last.terms},
+        )
+        append_jsonl(self.log_path, dataclasses.asdict(record))
+        self.on_log(record)
+
+    def _maybe_densify(self, state: FitState, host: HostState, limit: int | None) -> FitState:
+        d = self.cfg.densify
+        if d.method is None or not d.start <= host.progress < d.stop:
+            return state
+        interval = max(d.every, d.min_every_steps * host.pace)
+        if host.progress - host.densified_at < interval:
+            return state
+        host.densified_at = host.progress
+        key = jax.random.fold_in(jax.random.key(self.cfg.train.seed + 1), host.step)
+        if d.method == "mcmc":
+            return self._relocate_step(key, state, host, limit)
+        return self._adaptive_step(key, state, host, limit)
+
+    def _relocate_step(self, key, state: FitState, host: HostState, limit) -> FitState:
+        alive = int(jnp.sum(state.population.alive))
+        births = min(int(math.ceil(alive * self.cfg.densify.growth)), limit or alive) - alive
+        outcome = self._relocate(
+            key, state.params.gaussians, state.population, jnp.int32(max(births, 0))
+        )
+        return self._settle(state, outcome, host)
+
+    def _adaptive_step(self, key, state: FitState, host: HostState, limit) -> FitState:
+        d = self.cfg.densify
+        gaussians, population = state.params.gaussians, state.population
+        prune_large = host.progress > d.reset_every
+        proposal = self._propose(gaussians, population, self.extent, prune_large)
+        wanted = int(proposal.wanted)
+        capacity = bucket_for(wanted, gaussians.capacity, limit)
+        if limit is not None:
+            capacity = min(capacity, max(limit, gaussians.capacity))
+        if capacity > gaussians.capacity:
+            extra = capacity - gaussians.capacity
+            state = grow_state(state, capacity)
+            proposal = jax.tree.map(
+                lambda a: jnp.concatenate([a, jnp.zeros(extra, bool)]) if a.ndim else a, proposal
+            )
+        outcome = self._densify_adaptive(key, state.params.gaussians, state.population, proposal)
+        state = self._settle(state, outcome, host)
+        if host.progress - host.reset_at >= d.reset_every:
+            host.reset_at = host.progress
+            state = replace_gaussians(
+                state,
+                adaptive.reset_opacities(state.params.gaussians),
+                state.population,
+                self._zero_moments(state.opt_state, state.population.alive),
+            )
+        return state
+
+    def _settle(self, state: FitState, outcome, host: HostState) -> FitState:
+        refused = int(outcome.refused)
+        if refused > 0:
+            if host.refused == 0:
+                self.on_message(
+                    f"Step {host.step}: {refused} Gaussians wanted to grow but the limit is "
+                    "reached; raise --densify.max-gaussians to let them. Counted from here on."
+                )
+            host.refused += refused
+        opt_state = self._zero_moments(state.opt_state, outcome.reset_moments)
+        return replace_gaussians(state, outcome.gaussians, outcome.population, opt_state)
+
+
+def _mean(values) -> float:
+    return float(np.mean([float(v) for v in values]))
+
+
+def _json_line(record: dict) -> str:
+    import json
+
+    return json.dumps(record) + "\n"

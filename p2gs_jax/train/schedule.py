@@ -1,0 +1,104 @@
+"""What changes as a run proceeds, as functions of the fraction completed; and the time budget.
+
+Every schedule reads `progress` in [0, 1] instead of a step number, so a run can be fitted to a
+wall-clock budget by changing only how much progress one step makes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+from p2gs_jax.config import TrainConfig
+
+MIN_LEVEL_PIXELS = 96
+# Pixels are not all of the cost of a step: measured time falls by this power of their number.
+PIXEL_EXPONENT = 0.75
+FIRST_PLAN_STEPS = 12
+MIN_STEPS_LEFT = 8
+
+
+def levels(cfg: TrainConfig, width: int, height: int) -> tuple[tuple[float, int], ...]:
+    """Return (end of level as a progress, factor by which images are shrunk) in order.
+
+    Levels that would make images smaller than 96 pixels across are left out.
+    """
+    shrinks = [2 ** (len(cfg.coarse_to_fine) - i) for i in range(len(cfg.coarse_to_fine))]
+    kept = [
+        (end, shrink)
+        for end, shrink in zip(cfg.coarse_to_fine, shrinks, strict=True)
+        if min(width, height) // shrink >= MIN_LEVEL_PIXELS
+    ]
+    return (*kept, (1.0, 1))
+
+
+def shrink_at(progress: float, plan: tuple[tuple[float, int], ...]) -> int:
+    """Return the factor by which images are shrunk at this point of the run."""
+    return next((shrink for end, shrink in plan if progress < end), 1)
+
+
+def sh_degree_at(progress: float, cfg: TrainConfig, highest: int) -> int:
+    """Return the spherical-harmonics degree in use (3DGS: one more every 1000 of 30k steps)."""
+    return min(highest, int(progress / cfg.sh_every + 1e-9))
+
+
+def crossed(before: float, after: float, interval: float) -> bool:
+    """Return whether a multiple of `interval` lies in (before, after]."""
+    return int(after / interval + 1e-9) > int(before / interval + 1e-9)
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How much progress a step makes, and what is known about its cost.
+
+    Attributes:
+        per_step: progress of one step.
+        deadline_s: seconds into the run at which optimisation must end, or None.
+    """
+
+    per_step: float
+    deadline_s: float | None = None
+
+    @classmethod
+    def from_config(cls, cfg: TrainConfig, reserve_s: float) -> Pace:
+        """Return the pace before anything was measured.
+
+        Args:
+            cfg: steps or budget.
+            reserve_s: seconds to keep for evaluation and files after the last step.
+        """
+        deadline = None if cfg.budget_s is None else max(cfg.budget_s - reserve_s, 5.0)
+        return cls(1.0 / max(cfg.steps, 1), deadline)
+
+    def replan(
+        self,
+        progress: float,
+        elapsed_s: float,
+        step_s: float,
+        plan: tuple[tuple[float, int], ...],
+        compile_s: float,
+    ) -> Pace:
+        """Return the pace that ends on time, given the measured step time at this level.
+
+        Args:
+            progress: where the run is.
+            elapsed_s: seconds since the run began.
+            step_s: measured seconds per step at the present level.
+            plan: levels, see `levels`.
+            compile_s: seconds that the first step of a further level is expected to cost.
+        """
+        if self.deadline_s is None:
+            return self
+        shrink_now = shrink_at(progress, plan)
+        cost, start, ahead = 0.0, 0.0, 0
+        for end, shrink in plan:
+            part = max(end - max(start, progress), 0.0)
+            ratio = (shrink_now / shrink) ** (2 * PIXEL_EXPONENT)
+            cost += part * step_s * ratio
+            ahead += part > 0 and shrink != shrink_now
+            start = end
+        left = self.deadline_s - elapsed_s - ahead * compile_s
+        per_step = cost / max(left, 1e-3)
+        return dataclasses.replace(
+            self, per_step=min(per_step, (1.0 - progress) / MIN_STEPS_LEFT + 1e-12)
+        )

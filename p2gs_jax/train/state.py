@@ -1,0 +1,91 @@
+"""The state of a fit: what a step maps to its successor and a checkpoint holds."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Int
+
+from p2gs_jax.densify.population import empty_gaussians, fresh_population, grow
+from p2gs_jax.train.optimizer import map_moments
+from p2gs_jax.types import Gaussians, Params, Population
+
+FAULT_NONE, FAULT_OVERFLOW, FAULT_NONFINITE = 0, 1, 2
+
+
+class Fault(eqx.Module):
+    """Why the state stopped advancing; sticky, so the host need not look after every step.
+
+    Attributes:
+        kind: 0 none, 1 tile list overflow, 2 something is not finite.
+        needed: entries that the tile list needed.
+        term: index into the names of loss terms and gradients that was not finite.
+    """
+
+    kind: Int[Array, ""]
+    needed: Int[Array, ""]
+    term: Int[Array, ""]
+
+    @classmethod
+    def none(cls) -> Fault:
+        """Return the state of health."""
+        return cls(*(jnp.int32(0) for _ in range(3)))
+
+
+class FitState(eqx.Module):
+    """Everything that a step reads and writes.
+
+    Attributes:
+        params: the differentiable pytree.
+        opt_state: optax's.
+        population: who is alive.
+        step: steps completed.
+        fault: while it is set, steps leave the state as it is.
+    """
+
+    params: Params
+    opt_state: optax.OptState
+    population: Population
+    step: Int[Array, ""]
+    fault: Fault
+
+
+def initial_state(
+    params: Params, alive: Array, optimizer: optax.GradientTransformation
+) -> FitState:
+    """Return the state before the first step."""
+    return FitState(
+        params, optimizer.init(params), fresh_population(alive), jnp.int32(0), Fault.none()
+    )
+
+
+def grow_state(state: FitState, capacity: int) -> FitState:
+    """Return the state with room for `capacity` Gaussians; the new slots are empty."""
+    gaussians = state.params.gaussians
+    extra = capacity - gaussians.capacity
+    if extra <= 0:
+        return state
+    empty = empty_gaussians(extra, gaussians)
+    zeros = jax.tree.map(jnp.zeros_like, empty)
+    return dataclasses.replace(
+        state,
+        params=dataclasses.replace(state.params, gaussians=grow(gaussians, empty)),
+        opt_state=map_moments(state.opt_state, lambda m: grow(m, zeros)),
+        population=grow(state.population, fresh_population(jnp.zeros(extra, bool))),
+    )
+
+
+def replace_gaussians(
+    state: FitState, gaussians: Gaussians, population: Population, opt_state: optax.OptState
+) -> FitState:
+    """Return the state with another population."""
+    return dataclasses.replace(
+        state,
+        params=dataclasses.replace(state.params, gaussians=gaussians),
+        population=population,
+        opt_state=opt_state,
+    )

@@ -1,0 +1,59 @@
+"""Training views on their way to the device: order, prefetch, resolution."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+
+from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.types import Batch, Camera
+
+
+class TrainingViews:
+    """Photographs of the training views at any level of the coarse-to-fine schedule.
+
+    Args:
+        store: decodes and caches photographs.
+        rows: rows of the training views in the scene, in the order of `Photometry`.
+        seed: decides the order of every epoch.
+    """
+
+    def __init__(self, store: ImageStore, rows: Sequence[int], seed: int):
+        self.store = store
+        self.rows = tuple(rows)
+        self.seed = seed
+        self._orders: dict[int, np.ndarray] = {}
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def index_at(self, step: int) -> int:
+        """Return the row in `Photometry` of the view of a step; every epoch is a permutation."""
+        epoch, position = divmod(step, len(self.rows))
+        if epoch not in self._orders:
+            order = np.random.default_rng((self.seed, epoch)).permutation(len(self.rows))
+            self._orders = {epoch: order}
+        return int(self._orders[epoch][position])
+
+    def partner_at(self, step: int) -> int:
+        """Return a second view, different from that of the step where there are two."""
+        count = len(self.rows)
+        offset = int(np.random.default_rng((self.seed, 1, step)).integers(1, max(count, 2)))
+        return (self.index_at(step) + offset) % count
+
+    def prefetch(self, index: int, shrink: int) -> None:
+        """Begin decoding a view in the background."""
+        self.store.prefetch(self.rows[index], shrink)
+
+    def camera(self, index: int, shrink: int) -> Camera:
+        """Return the camera of a training view at a level."""
+        return self.store.camera(self.rows[index], shrink)
+
+    def batch(self, index: int, shrink: int) -> Batch:
+        """Return a training view on the device."""
+        ldr, mask = self.store.get(self.rows[index], shrink)
+        return Batch(
+            self.camera(index, shrink), jnp.asarray(ldr), jnp.asarray(mask), jnp.int32(index)
+        )
