@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import json
 import math
 import time
 from collections.abc import Callable
@@ -30,7 +31,7 @@ from p2gs_jax.losses.total import OBSERVED_FORMS, SECOND_RENDER_FORMS, Partner, 
 from p2gs_jax.render import required_capacity
 from p2gs_jax.render.host import capacity_bucket
 from p2gs_jax.train import schedule
-from p2gs_jax.train.optimizer import make_optimizer, zero_moments
+from p2gs_jax.train.optimizer import make_optimizer, zero_moments, zero_opacity_moments
 from p2gs_jax.train.schedule import Pace
 from p2gs_jax.train.state import (
     FAULT_NONFINITE,
@@ -378,7 +379,12 @@ class Trainer:
 
     def _relocate_step(self, key, state: FitState, host: HostState, limit) -> FitState:
         alive = int(jnp.sum(state.population.alive))
-        births = min(int(math.ceil(alive * self.cfg.densify.growth)), limit or alive) - alive
+        room = max((limit or alive) / max(alive, 1), 1.0)
+        # A short run has few events: grow so that the limit is reached at the last of them.
+        d = self.cfg.densify
+        events = (d.stop - host.progress) / max(d.every, d.min_every_steps * host.pace)
+        factor = max(d.growth, room ** (1 / max(events, 1.0)))
+        births = min(int(math.ceil(alive * factor)), limit or alive) - alive
         outcome = self._relocate(
             key, state.params.gaussians, state.population, jnp.int32(max(births, 0))
         )
@@ -407,7 +413,7 @@ class Trainer:
                 state,
                 adaptive.reset_opacities(state.params.gaussians),
                 state.population,
-                self._zero_moments(state.opt_state, state.population.alive),
+                zero_opacity_moments(state.opt_state),
             )
         return state
 
@@ -429,6 +435,4 @@ def _mean(values) -> float:
 
 
 def _json_line(record: dict) -> str:
-    import json
-
     return json.dumps(record) + "\n"

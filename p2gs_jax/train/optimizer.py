@@ -94,3 +94,11 @@ def zero_moments(opt_state, where: Bool[Array, " n"]):
         )
 
     return map_moments(opt_state, zero)
+
+
+def zero_opacity_moments(opt_state):
+    """Forget the opacity moments of all slots (3DGS, at an opacity reset)."""
+    return map_moments(
+        opt_state,
+        lambda m: dataclasses.replace(m, opacity_logits=jnp.zeros_like(m.opacity_logits)),
+    )

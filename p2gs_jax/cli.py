@@ -1,0 +1,217 @@
+"""The command line: `p2gs-jax fit | render | eval | demo`.
+
+Every configuration field is an option. Bad input ends with one message and exit code 2.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import re
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+# Quiet the native libraries before they load; our own messages say what matters.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
+os.environ.setdefault("GLOG_minloglevel", "2")
+
+import tyro
+
+from p2gs_jax import config as configs
+from p2gs_jax.errors import UserError
+
+PRESETS = ("robust", "paper", "paper_appendix")
+
+
+def parse_duration(text: str) -> float:
+    """Return seconds of `90`, `90s`, `5m`, `1h30m`.
+
+    Raises:
+        UserError: the text is no duration.
+    """
+    match = re.fullmatch(r"(?:(\d+)h)?(?:(\d+(?:\.\d+)?)m)?(?:(\d+(?:\.\d+)?)s?)?", text.strip())
+    if match is None or not any(match.groups()):
+        raise UserError(f"--budget {text!r} is no duration.", fix="write 90s, 5m or 1h30m")
+    hours, minutes, seconds = (float(g or 0) for g in match.groups())
+    total = 3600 * hours + 60 * minutes + seconds
+    if total <= 0:
+        raise UserError(f"--budget {text!r} leaves no time.", fix="write 90s, 5m or 1h30m")
+    return total
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Fit a linear HDR radiance field, exposures and gammas to photographs."""
+
+    scene: Annotated[Path, tyro.conf.Positional]
+    """COLMAP model, transforms.json, or a folder of photographs."""
+    out: Path
+    """Run folder to create."""
+    config: Annotated[configs.FitConfig, tyro.conf.arg(name="")]
+    steps: int | None = None
+    """Optimisation steps (default: the preset's)."""
+    budget: str | None = None
+    """Wall-clock limit for the whole run, such as 5m; replaces --steps."""
+    max_width: int | None = None
+    """Shrink images to at most this many pixels across."""
+    seed: int | None = None
+    """Seeds every random choice."""
+    test_every: int | None = None
+    """Hold out every n-th view of each camera; 0 holds out none."""
+    images: str | None = None
+    """Image folder, where it is not images/ beside the model."""
+    allow_missing: bool = False
+    """Skip frames whose image is missing."""
+    reference: Path | None = None
+    """Photographs of the same views under one common exposure, to judge against."""
+    resume: bool = False
+    """Continue an interrupted run."""
+
+
+@dataclass(frozen=True)
+class Render:
+    """Render views of a finished run at any exposure and gamma."""
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """Run folder."""
+    out: Path | None = None
+    """Where to write (default: RUN/renders/all)."""
+    split: str = "all"
+    """Which views: all, train or test."""
+    exposure_ev: float | None = None
+    """Exposure in stops relative to the mean; default: each view's own."""
+    gamma: float | None = None
+    """Gamma; default: each view's own."""
+
+
+@dataclass(frozen=True)
+class Eval:
+    """Judge a finished run again, against its photographs or a reference."""
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """Run folder."""
+    reference: Path | None = None
+    """Photographs of the same views under one common exposure."""
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Make a small street with known exposures, fit it, and compare."""
+
+    out: Path = Path("runs/demo")
+    """Folder for the street and the run."""
+    preset: str = "robust"
+    """robust, paper or paper_appendix."""
+    budget: str = "150s"
+    """Wall-clock limit of the fit."""
+    frames: int = 10
+    """Frames per camera."""
+    width: int = 320
+    """Image width, pixels."""
+    iso_std: float = 4.0
+    """Standard deviation of the ISO about 8."""
+    seed: int = 0
+    """Seeds the street, its exposures and the fit."""
+
+
+def _preset_from(argv: list[str]) -> configs.FitConfig:
+    """Return the preset that `--preset` names: its values become the defaults of all options."""
+    name = "robust"
+    for i, arg in enumerate(argv):
+        if arg == "--preset" and i + 1 < len(argv):
+            name = argv[i + 1]
+        elif arg.startswith("--preset="):
+            name = arg.split("=", 1)[1]
+    if name not in PRESETS:
+        raise UserError(f"there is no preset {name!r}.", fix=f"choose {', '.join(PRESETS)}")
+    return configs.preset(name)
+
+
+def resolve(args: Fit) -> configs.FitConfig:
+    """Return the configuration with the short options applied.
+
+    Raises:
+        UserError: a value makes no sense.
+    """
+    cfg = args.config
+    data, train = cfg.data, cfg.train
+    for name in ("max_width", "test_every", "images"):
+        if getattr(args, name) is not None:
+            data = dataclasses.replace(data, **{name: getattr(args, name)})
+    if args.allow_missing:
+        data = dataclasses.replace(data, allow_missing=True)
+    if args.seed is not None:
+        train = dataclasses.replace(train, seed=args.seed)
+    if args.steps is not None:
+        train = dataclasses.replace(train, steps=args.steps)
+    if args.budget is not None:
+        train = dataclasses.replace(train, budget_s=parse_duration(args.budget))
+    _check(data.max_width is None or data.max_width >= 16, "--max-width must be at least 16")
+    _check(data.test_every >= 0, "--test-every must be 0 or more")
+    _check(train.steps >= 1, "--steps must be at least 1")
+    return dataclasses.replace(cfg, data=data, train=train)
+
+
+def _check(condition: bool, text: str) -> None:
+    if not condition:
+        raise UserError(text + ".")
+
+
+def _run(argv: list[str]) -> int:
+    defaults = _preset_from(argv)
+    subcommands = {
+        "fit": Annotated[
+            Fit, tyro.conf.subcommand("fit", default=Fit(tyro.MISSING, tyro.MISSING, defaults))
+        ],
+        "render": Annotated[Render, tyro.conf.subcommand("render")],
+        "eval": Annotated[Eval, tyro.conf.subcommand("eval")],
+        "demo": Annotated[Demo, tyro.conf.subcommand("demo")],
+    }
+    union = (
+        subcommands["fit"] | subcommands["render"] | subcommands["eval"] | subcommands["demo"]
+    )
+    args = tyro.cli(
+        union,
+        prog="p2gs-jax",
+        description="Photometrically consistent Gaussian splatting in JAX.",
+        args=argv,
+    )
+    # Imported here so that --help answers at once.
+    from p2gs_jax import commands
+
+    if isinstance(args, Fit):
+        return commands.fit_command(args.scene, args.out, resolve(args), args.reference, args.resume)
+    if isinstance(args, Render):
+        return commands.render_command(
+            args.run, args.out, args.split, args.exposure_ev, args.gamma
+        )
+    if isinstance(args, Eval):
+        return commands.eval_command(args.run, args.reference)
+    return commands.demo_command(
+        args.out,
+        _preset_from(["--preset", args.preset]),
+        budget_s=parse_duration(args.budget),
+        frames=args.frames,
+        width=args.width,
+        iso_std=args.iso_std,
+        seed=args.seed,
+    )
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Run the command line and exit: 0 done, 2 bad input, 130 interrupted."""
+    try:
+        code = _run(sys.argv[1:] if argv is None else argv)
+    except UserError as error:
+        print(f"p2gs-jax: error: {error}", file=sys.stderr)
+        code = 2
+    except KeyboardInterrupt:
+        print("p2gs-jax: interrupted; --resume continues from the last checkpoint", file=sys.stderr)
+        code = 130
+    sys.exit(code)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,180 @@
+"""What each subcommand does, once its options are parsed."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.demo import run_demo
+from p2gs_jax.errors import UserError
+from p2gs_jax.evaluate.alignment import fit_exposure
+from p2gs_jax.evaluate.evaluate import ViewResult, evaluate, mean_parameters
+from p2gs_jax.export.atomic import write_json
+from p2gs_jax.finish import load_reference, tone_function, write_view
+from p2gs_jax.fit import fit
+from p2gs_jax.progress import TerminalReporter
+from p2gs_jax.render.host import make_renderer
+from p2gs_jax.run_folder import load_run
+from p2gs_jax.scene.images import ImageStore
+
+
+def _out() -> Console:
+    return Console(highlight=False)
+
+
+def fit_command(
+    scene: Path, out: Path, cfg: FitConfig, reference: Path | None, resume: bool
+) -> int:
+    """Fit a scene; print where the results are and how good they are."""
+    with TerminalReporter() as reporter:
+        result = fit(scene, out, cfg, reference=reference, resume=resume, reporter=reporter)
+    print_metrics(result.metrics, out)
+    return 0
+
+
+def print_metrics(metrics: dict, out: Path) -> None:
+    """Print the scores of a run as a table."""
+    console = _out()
+    table = Table(title="How well it fits", title_justify="left")
+    for name in ("views", "protocol", "PSNR dB", "SSIM"):
+        table.add_column(name, justify="left" if name in ("views", "protocol") else "right")
+
+    def row(views: str, protocol: str, part: dict | None) -> None:
+        if part and "psnr" in part:
+            table.add_row(views, protocol, f"{part['psnr']:.2f}", f"{part['ssim']:.4f}")
+
+    row("training", "own exposure and gamma", metrics["train"])
+    row("training", "mean parameters", metrics["train"]["averaged"])
+    row("held out", "mean parameters", metrics["test"]["averaged"])
+    row("held out", "one exposure fitted to each photograph", metrics["test"]["exposure_fitted"])
+    for name, part in metrics.get("reference", {}).items():
+        row("all", f"reference photographs, {name.replace('_', ' ')}", part)
+        row("held out", f"reference photographs, {name.replace('_', ' ')}", part["test"])
+    console.print(table)
+    counts = metrics.get("counts", {})
+    if counts:
+        console.print(
+            f"{counts['gaussians']} Gaussians, {counts['steps']} steps, "
+            f"{1e3 * metrics['seconds_per_step']:.0f} ms a step."
+        )
+    console.print(f"Results: {out} (open {out / 'summary.png'} first)")
+
+
+def render_command(
+    run_dir: Path, out: Path | None, split: str, exposure_ev: float | None, gamma: float | None
+) -> int:
+    """Render views of a run as EXR and PNG."""
+    if split not in ("all", "train", "test"):
+        raise UserError(f"--split {split!r} is unknown.", fix="choose all, train or test")
+    if gamma is not None and gamma <= 0:
+        raise UserError("--gamma must be positive.")
+    run = load_run(run_dir)
+    folder = out or run_dir / "renders" / "all"
+    store = ImageStore(run.scene.views, run.cfg.data)
+    render = make_renderer(run.cfg.render)
+    mean = mean_parameters(run.params.photometry)
+    exposures = np.asarray(run.params.photometry.exposures)
+    gammas = np.asarray(run.params.photometry.gammas)
+    row_of = {index: k for k, index in enumerate(run.scene.train_indices)}
+    alive = jnp.ones(run.params.gaussians.capacity, bool)
+    rows = [i for i, v in enumerate(run.scene.views) if split in ("all", v.split)]
+    begin = time.monotonic()
+    with TerminalReporter() as reporter:
+        for done, index in enumerate(rows):
+            photograph, mask = store.get(index, 1)
+            result = render(run.params.gaussians, alive, store.camera(index, 1))
+            k = row_of.get(index)
+            g = gamma if gamma is not None else (mean.gamma if k is None else float(gammas[k]))
+            if exposure_ev is not None:
+                e = mean.exposure_geometric * 2**exposure_ev
+            elif k is not None:
+                e = float(exposures[k])
+            else:
+                e = float(fit_exposure(result.linear, photograph, mask, g, run.cfg.photometry))
+            view = ViewResult(
+                index,
+                np.asarray(result.linear),
+                np.asarray(result.alpha),
+                np.asarray(result.depth),
+                tone_function(e, g, run.cfg)(result.linear),
+                photograph,
+                e,
+                g,
+            )
+            write_view(folder, run.scene.views[index].name, view, store)
+            reporter.stage("Rendering", done + 1, len(rows))
+    _out().print(f"{len(rows)} views in {time.monotonic() - begin:.1f} s: {folder}")
+    return 0
+
+
+def eval_command(run_dir: Path, reference: Path | None) -> int:
+    """Judge a run again and rewrite its metrics."""
+    run = load_run(run_dir)
+    folder = reference or run.reference
+    truth = None if folder is None else load_reference(folder, run.scene, run.cfg)
+    with TerminalReporter() as reporter:
+        metrics = evaluate(
+            run.params,
+            np.ones(run.params.gaussians.capacity, bool),
+            run.scene,
+            ImageStore(run.scene.views, run.cfg.data),
+            make_renderer(run.cfg.render),
+            run.cfg,
+            reference=truth,
+            on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
+        )
+    path = run_dir / "metrics.json"
+    kept = _kept_metrics(path)
+    write_json(path, {**metrics, **kept})
+    print_metrics({**metrics, **kept}, run_dir)
+    return 0
+
+
+def _kept_metrics(path: Path) -> dict:
+    """Return what only the fit itself knows: counts, times, notes."""
+    try:
+        old = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+    return {k: old[k] for k in ("counts", "seconds", "seconds_per_step", "notes") if k in old}
+
+
+def demo_command(
+    out: Path,
+    cfg: FitConfig,
+    *,
+    budget_s: float,
+    frames: int,
+    width: int,
+    iso_std: float,
+    seed: int,
+) -> int:
+    """Make a street, fit it, and print recovered against true exposures."""
+    cfg = dataclasses.replace(
+        cfg, train=dataclasses.replace(cfg.train, budget_s=budget_s, seed=seed)
+    )
+    with TerminalReporter() as reporter:
+        result = run_demo(
+            out, cfg, frames=frames, width=width, iso_std=iso_std, seed=seed, reporter=reporter
+        )
+    console = _out()
+    table = Table(title="Exposures, in stops from their mean", title_justify="left")
+    for name in ("view", "true", "recovered", "error"):
+        table.add_column(name, justify="left" if name == "view" else "right")
+    for name, true, found in result.rows:
+        table.add_row(name, f"{true:+.2f}", f"{found:+.2f}", f"{found - true:+.3f}")
+    console.print(table)
+    console.print(
+        f"Exposure error: {result.error['ev']:.3f} EV RMS after scale alignment "
+        f"(largest {result.error['ev_max']:.3f})."
+    )
+    print_metrics(result.metrics, result.run_dir)
+    return 0

@@ -1,0 +1,253 @@
+"""The end of a fit: judge it and write what the run folder promises (docs/files.md)."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.errors import UserError
+from p2gs_jax.evaluate.evaluate import MeanParameters, ViewResult, evaluate, mean_parameters
+from p2gs_jax.export.atomic import write_json
+from p2gs_jax.export.exr import write_exr
+from p2gs_jax.export.photometry_json import write_photometry
+from p2gs_jax.export.ply import write_radiance, write_splats
+from p2gs_jax.export.png import write_png
+from p2gs_jax.export.summary import write_summary
+from p2gs_jax.photometry.formation import display, formation
+from p2gs_jax.prepare import Prepared
+from p2gs_jax.progress import Reporter
+from p2gs_jax.render.host import make_renderer
+from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.types import Params, Scene
+
+SUMMARY_VIEWS = 4
+
+Reference = Callable[[int], np.ndarray | None]
+
+
+def load_reference(folder: str | Path, scene: Scene, cfg: FitConfig) -> Reference:
+    """Return a function from a view's row to its photograph under the common exposure.
+
+    Args:
+        folder: photographs named as the scene's.
+        scene: the views.
+        cfg: image size.
+
+    Raises:
+        UserError: the folder does not exist or holds no photograph of any view.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise UserError(f"{folder} is not a folder.", fix="give --reference a folder of photographs")
+    rows = {}
+    for row, view in enumerate(scene.views):
+        named = [folder / view.name, *sorted(folder.glob(str(Path(view.name).with_suffix(".*"))))]
+        found = next((p for p in named if p.is_file()), None)
+        if found is not None:
+            rows[row] = dataclasses.replace(view, image_path=found, mask_path=None)
+    if not rows:
+        raise UserError(
+            f"{folder} holds no photograph with the name of a view (for example "
+            f"{scene.views[0].name}).",
+            fix="name the reference photographs as the scene's images",
+        )
+    order = sorted(rows)
+    store = ImageStore(tuple(rows[r] for r in order), cfg.data)
+    where = {r: i for i, r in enumerate(order)}
+    return lambda row: store.get(where[row], 1)[0] if row in where else None
+
+
+def tone_function(exposure: float, gamma: float, cfg: FitConfig):
+    """Return linear radiance -> display values for one exposure and gamma, in numpy."""
+
+    def tone(linear):
+        ldr = formation(
+            jnp.asarray(linear), jnp.float32(exposure), jnp.float32(gamma), cfg.photometry
+        )
+        return np.asarray(display(ldr))
+
+    return tone
+
+
+def write_models(params: Params, run_dir: Path, cfg: FitConfig) -> None:
+    """Write `splats.ply` (display colours) and `radiance.ply` (linear)."""
+    mean = mean_parameters(params.photometry)
+    alive = np.ones(params.gaussians.capacity, bool)
+    write_splats(
+        run_dir / "splats.ply",
+        params.gaussians,
+        alive,
+        tone=tone_function(mean.exposure_geometric, mean.gamma, cfg),
+        activation=cfg.render.radiance,
+    )
+    write_radiance(
+        run_dir / "radiance.ply", params.gaussians, alive, activation=cfg.render.radiance
+    )
+
+
+def photometry_views(params: Params, scene: Scene, fitted: dict[int, float]) -> list[dict]:
+    """Return the `views` of `photometry.json`; held-out views have no exposure of their own."""
+    exposures = np.asarray(params.photometry.exposures)
+    gammas = np.asarray(params.photometry.gammas)
+    rows = {index: k for k, index in enumerate(scene.train_indices)}
+    out = []
+    for index, view in enumerate(scene.views):
+        k = rows.get(index)
+        e = None if k is None else float(exposures[k])
+        out.append(
+            {
+                "image": view.name,
+                "camera": view.camera,
+                "exposure": e,
+                "exposure_ev": None if e is None else float(np.log2(e)),
+                "gamma": None if k is None else float(gammas[k]),
+                "exif_ev": view.exif_ev,
+                "split": view.split,
+                "exposure_fitted": fitted.get(index),
+            }
+        )
+    return out
+
+
+def photometry_model(params: Params, cfg: FitConfig) -> tuple[str, dict, str]:
+    """Return (model, curve, gauge) as `photometry.json` names them."""
+    gauge = (
+        "mean log exposure over the training views is 0; radiance is relative to it"
+        if params.photometry.parameterization == "log"
+        else "soft: the mean exposure is pulled towards 1 (paper, eq. 9)"
+    )
+    curve = {"name": cfg.photometry.curve, "pivot": cfg.photometry.pivot}
+    return "per-view exposure + per-view gamma", curve, gauge
+
+
+def finish(
+    params: Params,
+    prepared: Prepared,
+    run_dir: Path,
+    cfg: FitConfig,
+    reporter: Reporter,
+    *,
+    truth: Reference | None,
+    counts: dict,
+    seconds: dict,
+    true_ev: np.ndarray | None = None,
+) -> dict:
+    """Evaluate, export and return what `metrics.json` holds.
+
+    Args:
+        params: live Gaussians and photometry.
+        prepared: scene and photographs.
+        run_dir: the run folder.
+        cfg: everything.
+        reporter: receives progress.
+        truth: photographs under one common exposure, or None.
+        counts: numbers for `metrics.json`.
+        seconds: times for `metrics.json`.
+        true_ev: true exposures of the training views for the plot, or None.
+    """
+    begin = time.monotonic()
+    scene, store = prepared.scene, prepared.store
+    mean = mean_parameters(params.photometry)
+    fitted: dict[int, float] = {}
+    shown: dict[int, ViewResult] = {}
+    picks = _summary_rows(scene)
+    folder = run_dir / "renders"
+
+    def on_view(result: ViewResult) -> None:
+        view = scene.views[result.index]
+        if view.split == "test":
+            fitted[result.index] = result.exposure
+            write_view(folder, view.name, result, store)
+        if result.index in picks:
+            shown[result.index] = result
+
+    metrics = evaluate(
+        params,
+        np.ones(params.gaussians.capacity, bool),
+        scene,
+        store,
+        make_renderer(cfg.render),
+        cfg,
+        reference=truth,
+        on_view=on_view,
+        on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
+    )
+    reporter.stage("Writing files")
+    write_models(params, run_dir, cfg)
+    model, curve, gauge = photometry_model(params, cfg)
+    write_photometry(
+        run_dir / "photometry.json",
+        model=model,
+        curve=curve,
+        gauge=gauge,
+        mean=dataclasses.asdict(mean),
+        views=photometry_views(params, scene, fitted),
+    )
+    _write_summary(run_dir / "summary.png", shown, picks, params, scene, mean, cfg, true_ev)
+    metrics["counts"] = counts
+    metrics["seconds"] = {**seconds, "evaluation_and_files": time.monotonic() - begin}
+    steps = max(int(counts.get("steps", 0)), 1)
+    metrics["seconds_per_step"] = seconds.get("optimisation", 0.0) / steps
+    metrics["notes"] = prepared.notes
+    write_json(run_dir / "metrics.json", metrics)
+    return metrics
+
+
+def write_view(folder: Path, name: str, result: ViewResult, store: ImageStore) -> None:
+    """Write one view as EXR, PNG and its photograph, under the photograph's own name."""
+    stem = folder / Path(name).with_suffix("")
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    camera = store.camera(result.index, 1)
+    write_exr(
+        stem.with_suffix(".exr"),
+        result.linear,
+        depth=result.depth,
+        alpha=result.alpha,
+        exposure=result.exposure,
+        gamma=result.gamma,
+        camera=camera,
+    )
+    write_png(stem.with_name(f"{stem.name}.render.png"), result.ldr)
+    write_png(stem.with_name(f"{stem.name}.photograph.png"), result.photograph)
+
+
+def _summary_rows(scene: Scene) -> list[int]:
+    """Return which views the summary shows: held-out ones first, spread over cameras and time."""
+    pool = list(scene.test_indices) or list(scene.train_indices)
+    if len(pool) < SUMMARY_VIEWS:
+        pool += [i for i in scene.train_indices if i not in pool]
+    picks = np.linspace(0, len(pool) - 1, min(SUMMARY_VIEWS, len(pool))).round().astype(int)
+    return [pool[i] for i in picks]
+
+
+def _write_summary(
+    path: Path,
+    shown: dict[int, ViewResult],
+    picks: list[int],
+    params: Params,
+    scene: Scene,
+    mean: MeanParameters,
+    cfg: FitConfig,
+    true_ev: np.ndarray | None,
+) -> None:
+    common = tone_function(mean.exposure_geometric, mean.gamma, cfg)
+    views = [shown[i] for i in picks]
+    train = [scene.views[i] for i in scene.train_indices]
+    exif = [v.exif_ev for v in train]
+    write_summary(
+        path,
+        photographs=[v.photograph for v in views],
+        rendered=[v.ldr for v in views],
+        linear_tonemapped=[common(v.linear) for v in views],
+        names=[f"{scene.views[v.index].name} ({scene.views[v.index].split})" for v in views],
+        exposures_ev=np.log2(np.asarray(params.photometry.exposures)),
+        cameras=[v.camera for v in train],
+        true_ev=true_ev,
+        exif_ev=None if any(e is None for e in exif) else np.asarray(exif, float),
+    )

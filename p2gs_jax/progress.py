@@ -1,0 +1,99 @@
+"""Where a fit says what it does: a live display in a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import sys
+from typing import Protocol
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from p2gs_jax.train.loop import LogRecord
+
+
+class Reporter(Protocol):
+    """What a fit tells its user."""
+
+    def message(self, text: str) -> None:
+        """Say something the user must know."""
+        ...
+
+    def stage(self, name: str, done: int = 0, total: int = 0) -> None:
+        """Begin or advance a stage."""
+        ...
+
+    def log(self, record: LogRecord) -> None:
+        """Show the state of the optimisation."""
+        ...
+
+
+class Silent:
+    """A reporter that says nothing."""
+
+    def message(self, text: str) -> None:
+        """Ignore."""
+
+    def stage(self, name: str, done: int = 0, total: int = 0) -> None:
+        """Ignore."""
+
+    def log(self, record: LogRecord) -> None:
+        """Ignore."""
+
+
+def clock(seconds: float) -> str:
+    """Return m:ss or h:mm:ss."""
+    whole = max(int(seconds), 0)
+    hours, minutes, rest = whole // 3600, whole // 60 % 60, whole % 60
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+class TerminalReporter:
+    """Messages as lines; progress as one live line in a terminal and not at all elsewhere.
+
+    Use as a context manager.
+    """
+
+    def __init__(self, console: Console | None = None):
+        self.console = console or Console(file=sys.stderr, highlight=False)
+        self.live: Live | None = None
+
+    def __enter__(self) -> TerminalReporter:
+        if self.console.is_terminal:
+            self.live = Live(console=self.console, refresh_per_second=8, transient=True)
+            self.live.start()
+        return self
+
+    def __exit__(self, *exc) -> None:
+        if self.live is not None:
+            self.live.stop()
+
+    def message(self, text: str) -> None:
+        """Print a line that stays."""
+        self.console.print(Text(text))
+
+    def stage(self, name: str, done: int = 0, total: int = 0) -> None:
+        """Show a stage and how far it is."""
+        if self.live is not None:
+            text = f"{name} {done}/{total}" if total else f"{name} ..."
+            self.live.update(Text(text))
+
+    def log(self, record: LogRecord) -> None:
+        """Show loss, PSNR, Gaussians, views per second and the time left."""
+        if self.live is None:
+            return
+        left = record.seconds * (1 - record.progress) / max(record.progress, 1e-3)
+        rate = 1 / record.step_seconds if record.step_seconds else 0.0
+        bar = "█" * int(24 * record.progress)
+        table = Table.grid(padding=(0, 2))
+        table.add_row(
+            f"{bar:<24} {record.progress:4.0%}",
+            f"step {record.step}",
+            f"loss {record.loss:.4f}",
+            f"PSNR {record.psnr:.2f} dB",
+            f"{record.gaussians} Gaussians",
+            f"{rate:.1f} views/s",
+            f"{clock(left)} left",
+        )
+        self.live.update(table)

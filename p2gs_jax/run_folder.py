@@ -1,0 +1,90 @@
+"""Reading a finished run back."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from p2gs_jax.config import FitConfig, from_dict
+from p2gs_jax.errors import UserError
+from p2gs_jax.export.photometry_json import read_photometry
+from p2gs_jax.export.ply import read_ply
+from p2gs_jax.scene import load_scene
+from p2gs_jax.types import GAMMA_SRGB, Params, Photometry, Scene
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run.
+
+    Attributes:
+        folder: where it lies.
+        params: the fit.
+        cfg: how it was made.
+        scene: what it was fitted to.
+        reference: photographs under one common exposure, or None.
+    """
+
+    folder: Path
+    params: Params
+    cfg: FitConfig
+    scene: Scene
+    reference: Path | None
+
+
+def load_run(folder: Path) -> Run:
+    """Read parameters, configuration and scene of a finished run.
+
+    Raises:
+        UserError: the folder is no run, is unfinished, or its scene has moved.
+    """
+    config_path = folder / "config.json"
+    if not config_path.is_file():
+        raise UserError(
+            f"{folder} is not a run folder: {config_path.name} is missing.",
+            fix="name the folder that was given to `p2gs-jax fit --out`",
+        )
+    for name in ("radiance.ply", "photometry.json"):
+        if not (folder / name).is_file():
+            raise UserError(
+                f"{folder} is unfinished: {name} is missing.",
+                fix="finish it with `p2gs-jax fit ... --resume`",
+            )
+    try:
+        saved = json.loads(config_path.read_text())
+        cfg = from_dict(saved["fit"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise UserError(
+            f"{config_path} cannot be read: {error}.", fix="fit again with this version"
+        ) from error
+    scene = load_scene(Path(saved["scene"]), cfg.data, folder / "cache", lambda text: None)
+    gaussians = read_ply(folder / "radiance.ply")
+    views = {v["image"]: v for v in read_photometry(folder / "photometry.json")["views"]}
+    train = [views.get(scene.views[i].name) for i in scene.train_indices]
+    if any(v is None or v["exposure"] is None for v in train):
+        raise UserError(
+            f"{folder / 'photometry.json'} does not belong to the scene {saved['scene']}: its "
+            "training views differ.",
+            fix="restore the scene folder as it was during the fit",
+        )
+    exposures = np.array([v["exposure"] for v in train if v is not None])
+    gammas = np.array([v["gamma"] for v in train if v is not None])
+    if cfg.photometry.parameterization == "log":
+        raw = np.log(exposures), np.log(gammas / GAMMA_SRGB)
+    else:
+        raw = exposures, gammas
+    photometry = Photometry(
+        *(jnp.asarray(a, jnp.float32) for a in raw), cfg.photometry.parameterization
+    )
+    reference = saved.get("reference")
+    return Run(
+        folder,
+        Params(gaussians, photometry),
+        cfg,
+        scene,
+        None if reference is None else Path(reference),
+    )

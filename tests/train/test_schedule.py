@@ -1,0 +1,39 @@
+"""Schedules follow progress; the pace follows the clock."""
+
+import pytest
+
+from p2gs_jax.config import TrainConfig
+from p2gs_jax.train import schedule
+from p2gs_jax.train.schedule import Pace
+
+
+def test_levels_and_degrees():
+    cfg = TrainConfig(coarse_to_fine=(0.25, 0.5))
+    plan = schedule.levels(cfg, 1000, 600)
+    assert plan == ((0.25, 4), (0.5, 2), (1.0, 1))
+    assert [schedule.shrink_at(p, plan) for p in (0.0, 0.24, 0.25, 0.6, 1.0)] == [4, 4, 2, 1, 1]
+    assert schedule.levels(cfg, 300, 200) == ((0.5, 2), (1.0, 1))
+    degrees = [schedule.sh_degree_at(p, cfg, 3) for p in (0.0, 1 / 30, 0.09, 0.5)]
+    assert degrees == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("step_s", [0.02, 0.1, 0.5])
+@pytest.mark.parametrize("real_exponent", [0.6, 0.9])
+def test_a_replanned_run_ends_on_time(step_s, real_exponent):
+    """Simulated: the true cost of a level differs from the assumed one, and replanning copes."""
+    plan = ((0.25, 4), (0.5, 2), (1.0, 1))
+    pace, elapsed, progress, steps = Pace(1 / 2000, 60.0), 0.0, 0.0, 0
+    while progress < 1 - 0.5 * pace.per_step and elapsed < 90:
+        shrink = schedule.shrink_at(progress, plan)
+        cost = step_s / shrink ** (2 * real_exponent)
+        elapsed += 10 * cost
+        progress += 10 * pace.per_step
+        steps += 10
+        pace = pace.replan(progress, elapsed, cost, plan, compile_s=0.0)
+    assert elapsed == pytest.approx(60.0, abs=10 * step_s + 1.0)
+
+
+def test_without_a_budget_the_pace_is_fixed():
+    pace = Pace.from_config(TrainConfig(steps=400), reserve_s=9.0)
+    assert pace.per_step == 1 / 400
+    assert pace.replan(0.1, 1.0, 1.0, ((1.0, 1),), 0.0) is pace
