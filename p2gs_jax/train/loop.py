@@ -156,16 +156,17 @@ class Trainer:
     # -------------------------------------------------------------- starting and resuming
 
     def _restore(self, template: FitState) -> tuple[FitState, HostState] | None:
-        step = self.checkpoints.latest_step()
-        if step is None:
+        found = self.checkpoints.restore_latest(
+            lambda meta: jax.eval_shape(lambda: grow_state(template, meta["gaussian_capacity"])),
+            self.on_message,
+        )
+        if found is None:
             return None
-        meta = self.checkpoints.read_meta(step)
-        like = jax.eval_shape(lambda: grow_state(template, meta["gaussian_capacity"]))
-        state, meta = self.checkpoints.restore(step, like, on_message=self.on_message)
-        state = jax.tree.map(jnp.asarray, state)
-        host = HostState(**meta["host"])
+        state = jax.tree.map(jnp.asarray, found[0])
+        host = HostState(**found[1]["host"])
+        self.checkpoints.discard_after(host.step)
         kept = [line for line in read_jsonl(self.log_path) if line["step"] <= host.step]
-        write_text(self.log_path, "".join(_json_line(line) for line in kept))
+        write_text(self.log_path, "".join(json.dumps(line) + "\n" for line in kept))
         self.on_message(f"Resuming after step {host.step} ({host.progress:.0%}).")
         return state, host
 
@@ -433,6 +434,3 @@ class Trainer:
 def _mean(values) -> float:
     return float(np.mean([float(v) for v in values]))
 
-
-def _json_line(record: dict) -> str:
-    return json.dumps(record) + "\n"

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import numpy as np
 
+from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Batch, Camera
 
@@ -49,7 +50,7 @@ class TrainingViews:
 
     def camera(self, index: int, shrink: int) -> Camera:
         """Return the camera of a training view at a level."""
-        return self.store.camera(self.rows[index], shrink)
+        return camera_of(self.store, self.rows[index], shrink)
 
     def batch(self, index: int, shrink: int) -> Batch:
         """Return a training view on the device."""

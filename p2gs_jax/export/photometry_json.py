@@ -1,0 +1,69 @@
+"""`photometry.json`: what each camera did to the light, for other tools to read."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TypedDict
+
+from p2gs_jax.errors import UserError
+from p2gs_jax.export.atomic import write_json
+
+
+class ViewPhotometry(TypedDict):
+    """One view.
+
+    Attributes:
+        image: name in the scene.
+        camera: physical camera.
+        exposure: e > 0, or null for a held-out view, which has none.
+        exposure_ev: log2 of it.
+        gamma: gamma, or null.
+        exif_ev: log2(t ISO / N^2) from EXIF, or null.
+        split: train or test.
+        exposure_fitted: for a held-out view, the scalar solved from its photograph.
+    """
+
+    image: str
+    camera: str
+    exposure: float | None
+    exposure_ev: float | None
+    gamma: float | None
+    exif_ev: float | None
+    split: str
+    exposure_fitted: float | None
+
+
+class PhotometryFile(TypedDict):
+    """The file: model, tone curve, gauge, mean parameters, views."""
+
+    model: str
+    curve: dict
+    gauge: str
+    mean: dict
+    views: list[ViewPhotometry]
+
+
+def write_photometry(
+    path: Path, *, model: str, curve: dict, gauge: str, mean: dict, views: list[ViewPhotometry]
+) -> None:
+    """Write the file atomically."""
+    write_json(
+        path, {"model": model, "curve": curve, "gauge": gauge, "mean": mean, "views": views}
+    )
+
+
+def read_photometry(path: Path) -> PhotometryFile:
+    """Read the file.
+
+    Raises:
+        UserError: it is no such file.
+    """
+    try:
+        data = json.loads(Path(path).read_text())
+        missing = [k for k in PhotometryFile.__annotations__ if k not in data]
+    except (OSError, ValueError, TypeError) as error:
+        raise UserError(f"{path} cannot be read: {error}") from error
+    if missing:
+        raise UserError(f"{path} is incomplete: {', '.join(missing)} missing")
+    return data
