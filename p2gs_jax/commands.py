@@ -13,7 +13,6 @@ from rich.console import Console
 from rich.table import Table
 
 from p2gs_jax.config import FitConfig
-from p2gs_jax.demo import run_demo
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.alignment import fit_exposure
 from p2gs_jax.evaluate.evaluate import ViewResult, evaluate, mean_parameters
@@ -23,6 +22,7 @@ from p2gs_jax.fit import fit
 from p2gs_jax.progress import TerminalReporter
 from p2gs_jax.render.host import make_renderer
 from p2gs_jax.run_folder import load_run
+from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
 
 
@@ -90,7 +90,7 @@ def render_command(
     with TerminalReporter() as reporter:
         for done, index in enumerate(rows):
             photograph, mask = store.get(index, 1)
-            result = render(run.params.gaussians, alive, store.camera(index, 1))
+            result = render(run.params.gaussians, alive, camera_of(store, index))
             k = row_of.get(index)
             g = gamma if gamma is not None else (mean.gamma if k is None else float(gammas[k]))
             if exposure_ev is not None:
@@ -158,6 +158,8 @@ def demo_command(
     seed: int,
 ) -> int:
     """Make a street, fit it, and print recovered against true exposures."""
+    from p2gs_jax.demo import run_demo
+
     cfg = dataclasses.replace(
         cfg, train=dataclasses.replace(cfg.train, budget_s=budget_s, seed=seed)
     )

@@ -23,6 +23,7 @@ from p2gs_jax.photometry.formation import display, formation
 from p2gs_jax.prepare import Prepared
 from p2gs_jax.progress import Reporter
 from p2gs_jax.render.host import make_renderer
+from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Params, Scene
 
@@ -203,7 +204,7 @@ def write_view(folder: Path, name: str, result: ViewResult, store: ImageStore) -
     """Write one view as EXR, PNG and its photograph, under the photograph's own name."""
     stem = folder / Path(name).with_suffix("")
     stem.parent.mkdir(parents=True, exist_ok=True)
-    camera = store.camera(result.index, 1)
+    camera = camera_of(store, result.index)
     write_exr(
         stem.with_suffix(".exr"),
         result.linear,

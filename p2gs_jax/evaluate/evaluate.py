@@ -21,6 +21,7 @@ from p2gs_jax.evaluate.alignment import fit_exposure
 from p2gs_jax.evaluate.metrics import psnr, ssim
 from p2gs_jax.photometry.formation import display, formation
 from p2gs_jax.render.host import RenderView
+from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Params, Photometry, Scene
 
@@ -139,7 +140,7 @@ def evaluate(
     for done, index in enumerate(rows):
         view = scene.views[index]
         photograph, mask = store.get(index, 1)
-        result = render(params.gaussians, jnp.asarray(alive), store.camera(index, 1))
+        result = render(params.gaussians, jnp.asarray(alive), camera_of(store, index))
         linear = result.linear
         ldr_mean = shown(linear, mean.exposure, mean.gamma)
         if view.split == "train":

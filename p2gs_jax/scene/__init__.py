@@ -1,1 +1,118 @@
-""""""
+"""From a folder on disk to a `Scene`: which format it is, and everything every format needs."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+from p2gs_jax.config import DataConfig
+from p2gs_jax.errors import UserError
+from p2gs_jax.scene.colmap import find_model, load_colmap
+from p2gs_jax.scene.exif import read_exif_ev
+from p2gs_jax.scene.files import list_images
+from p2gs_jax.scene.images import ImageStore, camera_at, size_at
+from p2gs_jax.scene.split import assign_split
+from p2gs_jax.scene.structure_from_motion import load_images
+from p2gs_jax.scene.transforms import load_transforms
+from p2gs_jax.scene.triangulate import triangulate
+from p2gs_jax.types import Scene, View
+
+__all__ = ["ImageStore", "camera_at", "load_scene", "size_at"]
+
+
+def load_scene(
+    root: Path,
+    cfg: DataConfig,
+    work_dir: Path | None = None,
+    report: Callable[[str], None] = lambda message: None,
+) -> Scene:
+    """Read a scene; the format is found from what lies in the folder.
+
+    In this order: a COLMAP model in `sparse/0`, `sparse` or the folder itself; `transforms.json`
+    in it, or `root` itself where that is a .json file; photographs in `images/` or the folder
+    itself, whose cameras are then found by structure from motion. Poses without points get theirs
+    by triangulation.
+
+    Args:
+        root: folder, or .json file.
+        cfg: which photographs are used, and how.
+        work_dir: results of long computations are kept here for a resume; None keeps nothing.
+        report: told about progress, one line at a time.
+
+    Returns:
+        Views sorted by name, with split, masks and EXIF exposures; points; tracks; notes.
+
+    Raises:
+        UserError: there is no scene, or it is broken; the message names the file.
+    """
+    root = Path(root)
+    if not root.exists():
+        raise UserError(f"{root} does not exist", fix="check the path of the scene")
+    scene = _read(root, cfg, work_dir, report)
+    if len(scene.points) == 0:
+        scene = triangulate(scene, work_dir, report)
+    views, mask_notes = _attach_masks(scene.views)
+    views = tuple(
+        dataclasses.replace(view, exif_ev=read_exif_ev(view.image_path)) for view in views
+    )
+    return dataclasses.replace(
+        scene,
+        views=assign_split(views, cfg.test_every),
+        notes=(*scene.notes, *mask_notes),
+    )
+
+
+def _read(
+    root: Path, cfg: DataConfig, work_dir: Path | None, report: Callable[[str], None]
+) -> Scene:
+    if root.is_file():
+        if root.suffix.lower() != ".json":
+            raise UserError(
+                f"{root} is a file, but no transforms.json",
+                fix="name the folder of the scene, or its transforms.json",
+            )
+        return load_transforms(root, root, cfg)
+    model = find_model(root)
+    if model is not None:
+        return load_colmap(root, model, cfg)
+    if (root / "transforms.json").is_file():
+        return load_transforms(root, root / "transforms.json", cfg)
+    folders = [root / cfg.images] if cfg.images is not None else [root / "images", root]
+    for folder in folders:
+        # Subfolders of the root itself may hold anything: masks, or the results of other runs.
+        paths = list_images(folder, recursive=folder != root)
+        if paths:
+            return load_images(root, folder, paths, cfg, work_dir, report)
+    looked = ", ".join(str(folder) for folder in folders)
+    raise UserError(
+        f"no scene in {root}: there is no COLMAP model (cameras, images and points3D as .bin or "
+        f".txt, in sparse/0, sparse or the folder itself), no transforms.json, and no photographs "
+        f"(looked in {looked})",
+        fix="name the folder that holds one of these",
+    )
+
+
+def _attach_masks(views: tuple[View, ...]) -> tuple[tuple[View, ...], list[str]]:
+    """Find masks in `masks/` beside the image folder or in it, where a reader named none."""
+    masked = tuple(
+        view if view.mask_path else dataclasses.replace(view, mask_path=_mask_of(view))
+        for view in views
+    )
+    without = [view.name for view in masked if view.mask_path is None]
+    if not without or len(without) == len(masked):
+        return masked, []
+    listed = ", ".join(without[:5]) + (", ..." if len(without) > 5 else "")
+    return masked, [f"{len(without)} of {len(masked)} views have no mask: {listed}"]
+
+
+def _mask_of(view: View) -> Path | None:
+    image_folder = view.image_path
+    for _ in Path(view.name).parts:
+        image_folder = image_folder.parent
+    for folder in (image_folder.parent / "masks", image_folder / "masks"):
+        path = folder / view.name
+        for p in (path, path.with_suffix(".png"), path.with_name(path.name + ".png")):
+            if p.is_file():
+                return p
+    return None

@@ -1,0 +1,232 @@
+"""A COLMAP model and its photographs as a Scene."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from p2gs_jax.config import DataConfig
+from p2gs_jax.errors import UserError
+from p2gs_jax.scene.colmap_model import (
+    CameraRecord,
+    ImageRecord,
+    Model,
+    is_model,
+    read_model,
+    unsupported_camera,
+)
+from p2gs_jax.scene.files import check_missing, check_size
+from p2gs_jax.scene.geometry import (
+    intrinsics,
+    make_distortion,
+    scale_intrinsics,
+    undistort_points,
+)
+from p2gs_jax.types import Distortion, Scene, Tracks, View
+
+_FIX = "export the model again from COLMAP"
+_HUGE = 1e30  # no finite number in float32 arithmetic from here on
+
+
+def find_model(root: Path) -> Path | None:
+    """Return the folder of the COLMAP model of a scene: `sparse/0`, `sparse` or the root itself."""
+    candidates = (root / "sparse" / "0", root / "sparse", root)
+    return next((folder for folder in candidates if is_model(folder)), None)
+
+
+def load_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
+    """Read a COLMAP model; views have no split, masks or EXIF yet.
+
+    Args:
+        root: the folder the user named.
+        folder: where the model lies.
+        cfg: where the images are, and whether some may be missing.
+
+    Raises:
+        UserError: a file is broken, images are missing or of another size, the camera model is
+            not supported, or there is nothing in the model.
+    """
+    model = read_model(folder)
+    _check_model(model)
+    images = sorted(model.images, key=lambda image: image.name)
+    image_folder = _image_folder(root, folder, cfg, images)
+    missing = [image.name for image in images if not (image_folder / image.name).is_file()]
+    notes = check_missing(missing, len(images), model.images_path, cfg)
+    skipped = set(missing)
+    images = [image for image in images if image.name not in skipped]
+
+    fallback = _camera_names(images)
+    views, resized = [], []
+    for image in images:
+        camera = model.cameras[image.camera_id]
+        K, distortion = _lens(model.cameras_path, camera)
+        path = image_folder / image.name
+        width, height, sx, sy, differs = check_size(
+            path, camera.width, camera.height, model.cameras_path
+        )
+        if differs:
+            resized.append((width, height, camera))
+        views.append(
+            View(
+                name=image.name,
+                image_path=path,
+                camera=subfolder(image.name) or fallback[image.camera_id],
+                viewmat=_viewmat(image, model.images_path),
+                K=scale_intrinsics(K, sx, sy).astype(np.float32),
+                width=width,
+                height=height,
+                distortion=distortion,
+            )
+        )
+    if resized:
+        w, h, camera = resized[0]
+        notes.append(
+            f"{len(resized)} images have another size than their camera (the first: {w}x{h} "
+            f"instead of {camera.width}x{camera.height}): intrinsics were rescaled"
+        )
+    others = sorted(p.name for p in folder.parent.iterdir() if p != folder and is_model(p))
+    if folder.name == "0" and others:
+        notes.append(f"used the model {folder}; beside it lie {', '.join(others)}, not used")
+    return Scene(
+        root=root,
+        format="colmap",
+        views=tuple(views),
+        points=model.xyz.astype(np.float32),
+        point_colors=model.rgb,
+        tracks=tracks_of(model, views),
+        notes=tuple(notes),
+    )
+
+
+def tracks_of(model: Model, views: Sequence[View]) -> Tracks | None:
+    """Return every observation of the model's points, in undistorted pixels of the views.
+
+    Observations of points that the model does not have (some tools thin points3D without touching
+    the images file) and of images that are not among the views are left out.
+
+    Args:
+        model: what COLMAP wrote; keypoints are at the resolution of its cameras.
+        views: matched by name; keypoints are rescaled to their size.
+    """
+    if len(model.point_ids) == 0:
+        return None
+    rows: Mapping[str, int] = {view.name: i for i, view in enumerate(views)}
+    view_rows, point_rows, positions = [], [], []
+    for image in sorted(model.images, key=lambda image: image.name):
+        row = rows.get(image.name)
+        if row is None or len(image.point_ids) == 0:
+            continue
+        view, camera = views[row], model.cameras[image.camera_id]
+        at = np.searchsorted(model.point_ids, image.point_ids).clip(max=len(model.point_ids) - 1)
+        known = (model.point_ids[at] == image.point_ids) & (np.abs(image.xy) < _HUGE).all(axis=1)
+        scale = (view.width / camera.width, view.height / camera.height)
+        positions.append(undistort_points(image.xy[known] * scale, view.K, view.distortion))
+        point_rows.append(at[known])
+        view_rows.append(np.full(int(known.sum()), row))
+    if not positions:
+        return None
+    return Tracks(
+        view_indices=np.concatenate(view_rows).astype(np.int32),
+        point_indices=np.concatenate(point_rows).astype(np.int32),
+        xy=np.concatenate(positions),
+    )
+
+
+def subfolder(name: str) -> str | None:
+    """Return the top folder of an image's relative name, or None."""
+    parts = PurePosixPath(name).parts
+    return parts[0] if len(parts) > 1 else None
+
+
+def _camera_names(images: Sequence[ImageRecord]) -> dict[int, str]:
+    """Name cameras by id; a model with one camera per image does not know which are the same."""
+    uses = Counter(image.camera_id for image in images)
+    alone = len(uses) > 1 and max(uses.values()) == 1
+    return {camera_id: "0" if alone else str(camera_id) for camera_id in uses}
+
+
+def _check_model(model: Model) -> None:
+    if not model.cameras:
+        raise UserError(f"{model.cameras_path} holds no cameras", fix=_FIX)
+    if not model.images:
+        raise UserError(
+            f"{model.images_path} holds no registered images",
+            fix="COLMAP's mapping found nothing; run it again on these photographs",
+        )
+    twice = [name for name, n in Counter(i.name for i in model.images).items() if n > 1]
+    if twice:
+        raise UserError(f"{model.images_path} lists {twice[0]} more than once", fix=_FIX)
+    for image in model.images:
+        if image.camera_id not in model.cameras:
+            raise UserError(
+                f"{model.images_path}: {image.name} was taken by camera {image.camera_id}, which "
+                f"{model.cameras_path} does not have",
+                fix=_FIX,
+            )
+    bad = int((~(np.abs(model.xyz) < _HUGE).all(axis=1)).sum())
+    if bad:
+        raise UserError(
+            f"{model.points_path}: {bad} of {len(model.xyz)} points are not finite", fix=_FIX
+        )
+
+
+def _image_folder(root: Path, folder: Path, cfg: DataConfig, images: Sequence[ImageRecord]) -> Path:
+    if cfg.images is not None:
+        chosen = root / cfg.images
+        if not chosen.is_dir():
+            raise UserError(
+                f"the image folder {chosen} does not exist", fix="correct the option --images"
+            )
+        return chosen
+    bases = dict.fromkeys((root, folder.parent, folder.parent.parent))
+    for base in bases:
+        if (base / "images").is_dir():
+            return base / "images"
+    if any((root / image.name).is_file() for image in images):
+        return root
+    raise UserError(
+        f"no image folder for the COLMAP model {folder}: looked for "
+        + ", ".join(str(base / "images") for base in bases),
+        fix="name the folder with --images",
+    )
+
+
+def _viewmat(image: ImageRecord, path: Path) -> Float[np.ndarray, "4 4"]:
+    finite = (np.abs([*image.qvec, *image.tvec]) < _HUGE).all()
+    norm = np.linalg.norm(image.qvec) if finite else 0.0
+    if norm < 1e-6:
+        raise UserError(f"{path}: the pose of {image.name} is not finite", fix=_FIX)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = Rotation.from_quat(np.roll(image.qvec / norm, -1)).as_matrix()
+    viewmat[:3, 3] = image.tvec
+    return viewmat.astype(np.float32)
+
+
+def _lens(path: Path, camera: CameraRecord) -> tuple[Float[np.ndarray, "3 3"], Distortion | None]:
+    """Return K and distortion; COLMAP's radial and tangential terms are OpenCV's."""
+    p = camera.params
+    match camera.model:
+        case "SIMPLE_PINHOLE":
+            fx, fy, cx, cy, *lens = p[0], p[0], p[1], p[2]
+        case "PINHOLE":
+            fx, fy, cx, cy, *lens = p
+        case "SIMPLE_RADIAL":
+            fx, fy, cx, cy, *lens = p[0], p[0], p[1], p[2], p[3], 0.0, 0.0, 0.0
+        case "RADIAL":
+            fx, fy, cx, cy, *lens = p[0], p[0], p[1], p[2], p[3], p[4], 0.0, 0.0
+        case "OPENCV":
+            fx, fy, cx, cy, *lens = p
+        case _:
+            raise unsupported_camera(path, camera.model)
+    if not ((np.abs(p) < _HUGE).all() and fx > 0 and fy > 0 and camera.width and camera.height):
+        raise UserError(
+            f"{path}: a {camera.model} camera of {camera.width}x{camera.height} pixels has "
+            f"impossible parameters {p}",
+            fix=_FIX,
+        )
+    return intrinsics(fx, fy, cx, cy), make_distortion(tuple(lens))

@@ -1,0 +1,306 @@
+"""Reads COLMAP's cameras, images and points3D files, binary or text, into plain records.
+
+Why not `pycolmap.Reconstruction`: version 4.2.1 accepts a `cameras.bin` cut in half without a word
+and never returns from a truncated `points3D.bin`. Here every count is checked against the bytes
+that are there. Newer models' `rigs.bin` and `frames.bin` are not needed: `images.bin` still holds
+every registered image with its own pose. tests/scene/test_colmap.py holds this to pycolmap.
+
+Format: https://colmap.github.io/format.html
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from p2gs_jax.errors import UserError
+
+_STEMS = ("cameras", "images", "points3D")
+_FIX = "copy the model again from where it was made, or export it again from COLMAP"
+# (name, number of parameters) by COLMAP's model id.
+_MODELS = (
+    ("SIMPLE_PINHOLE", 3),
+    ("PINHOLE", 4),
+    ("SIMPLE_RADIAL", 4),
+    ("RADIAL", 5),
+    ("OPENCV", 8),
+    ("OPENCV_FISHEYE", 8),
+    ("FULL_OPENCV", 12),
+    ("FOV", 5),
+    ("SIMPLE_RADIAL_FISHEYE", 4),
+    ("RADIAL_FISHEYE", 5),
+    ("THIN_PRISM_FISHEYE", 12),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+)
+
+
+@dataclass(frozen=True)
+class CameraRecord:
+    """One entry of `cameras`: COLMAP's model name, size in pixels, parameters in its order."""
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class ImageRecord:
+    """One entry of `images`.
+
+    Attributes:
+        name: path relative to the image folder.
+        camera_id: key into `Model.cameras`.
+        qvec: world-to-camera rotation, wxyz.
+        tvec: world-to-camera translation, scene units.
+        xy: keypoints that have a 3D point, pixels of the photograph, centres at +0.5.
+        point_ids: their points' ids.
+    """
+
+    name: str
+    camera_id: int
+    qvec: Float[np.ndarray, " 4"]
+    tvec: Float[np.ndarray, " 3"]
+    xy: Float[np.ndarray, "n 2"]
+    point_ids: Int[np.ndarray, " n"]
+
+
+@dataclass(frozen=True)
+class Model:
+    """A COLMAP model as its files state it; `points` are sorted by id.
+
+    Attributes:
+        cameras_path: the cameras file, for messages.
+        images_path: the images file.
+        points_path: the points3D file.
+        cameras: by id.
+        images: in the file's order.
+        point_ids: ascending.
+        xyz: scene units.
+        rgb: display-encoded colours.
+    """
+
+    cameras_path: Path
+    images_path: Path
+    points_path: Path
+    cameras: dict[int, CameraRecord]
+    images: tuple[ImageRecord, ...]
+    point_ids: Int[np.ndarray, " p"]
+    xyz: Float[np.ndarray, "p 3"]
+    rgb: UInt8[np.ndarray, "p 3"]
+
+
+def is_model(folder: Path) -> bool:
+    """Whether the folder looks like a COLMAP model, complete or not."""
+    stems = ("cameras", "points3D")
+    return any((folder / f"{stem}.{ext}").is_file() for stem in stems for ext in ("bin", "txt"))
+
+
+def read_model(folder: Path) -> Model:
+    """Read the model in a folder; binary files win where both kinds are complete.
+
+    Raises:
+        UserError: a file is missing, truncated or malformed; the message names it.
+    """
+    for ext in ("bin", "txt"):
+        paths = [folder / f"{stem}.{ext}" for stem in _STEMS]
+        if all(path.is_file() for path in paths):
+            break
+    else:
+        ext = "txt" if (folder / "cameras.txt").is_file() else "bin"
+        paths = [folder / f"{stem}.{ext}" for stem in _STEMS]
+        absent = ", ".join(str(path) for path in paths if not path.is_file())
+        raise UserError(f"incomplete COLMAP model: {absent} does not exist", fix=_FIX)
+    cameras_path, images_path, points_path = paths
+    readers = (
+        (_binary_cameras, _binary_images, _binary_points)
+        if ext == "bin"
+        else (_text_cameras, _text_images, _text_points)
+    )
+    ids, xyz, rgb = readers[2](points_path)
+    order = np.argsort(ids, kind="stable")
+    return Model(
+        cameras_path=cameras_path,
+        images_path=images_path,
+        points_path=points_path,
+        cameras=readers[0](cameras_path),
+        images=tuple(readers[1](images_path)),
+        point_ids=ids[order],
+        xyz=xyz[order],
+        rgb=rgb[order],
+    )
+
+
+class _Cursor:
+    """Walks through a binary file and refuses to walk past its end."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        self.data = path.read_bytes()
+        self.position = 0
+
+    def unpack(self, layout: str) -> tuple:
+        size = struct.calcsize(layout)
+        start = self.skip(size)
+        return struct.unpack_from(layout, self.data, start)
+
+    def skip(self, size: int) -> int:
+        """Move on by `size` bytes and return where they start."""
+        start = self.position
+        if start + size > len(self.data):
+            raise self.error(
+                f"truncated: it ends at byte {len(self.data)} in the middle of a record"
+            )
+        self.position = start + size
+        return start
+
+    def string(self) -> str:
+        end = self.data.find(b"\0", self.position)
+        if end < 0:
+            raise self.error(f"truncated: it ends at byte {len(self.data)} in the middle of a name")
+        start, self.position = self.position, end + 1
+        return self.data[start:end].decode("utf-8", "replace")
+
+    def count(self, record_size: int) -> int:
+        """Read a number of records that need at least `record_size` bytes each."""
+        (n,) = self.unpack("<Q")
+        if n * record_size > len(self.data) - self.position:
+            raise self.error(
+                f"truncated: it announces {n} entries and has {len(self.data)} bytes in all"
+            )
+        return n
+
+    def error(self, what: str) -> UserError:
+        return UserError(f"{self.path} is {what}", fix=_FIX)
+
+
+def _binary_cameras(path: Path) -> dict[int, CameraRecord]:
+    cursor = _Cursor(path)
+    cameras = {}
+    for _ in range(cursor.count(24)):
+        camera_id, model_id, width, height = cursor.unpack("<iiQQ")
+        if not 0 <= model_id < len(_MODELS):
+            raise unsupported_camera(path, f"number {model_id}")
+        model, n = _MODELS[model_id]
+        cameras[camera_id] = CameraRecord(model, width, height, cursor.unpack(f"<{n}d"))
+    return cameras
+
+
+_KEYPOINT = np.dtype([("xy", "<f8", 2), ("id", "<i8")])
+
+
+def _binary_images(path: Path) -> Iterator[ImageRecord]:
+    cursor = _Cursor(path)
+    for _ in range(cursor.count(73)):
+        _, *pose, camera_id = cursor.unpack("<I7dI")
+        name = cursor.string()
+        n = cursor.count(_KEYPOINT.itemsize)
+        start = cursor.skip(n * _KEYPOINT.itemsize)
+        keypoints = np.frombuffer(cursor.data, _KEYPOINT, n, start)
+        yield _image(name, camera_id, pose, keypoints["xy"], keypoints["id"])
+
+
+def _binary_points(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    cursor = _Cursor(path)
+    n = cursor.count(51)
+    ids, xyz, rgb = np.empty(n, np.int64), np.empty((n, 3)), np.empty((n, 3), np.uint8)
+    for i in range(n):
+        ids[i], *rest = cursor.unpack("<q3d3Bd")
+        xyz[i], rgb[i] = rest[:3], rest[3:6]
+        cursor.skip(8 * cursor.count(8))  # tracks: the images file has them too
+    return ids, xyz, rgb
+
+
+def _text_cameras(path: Path) -> dict[int, CameraRecord]:
+    cameras = {}
+    for number, line in _text_lines(path):
+        try:
+            camera_id, model, width, height, *params = line.split()
+            values = tuple(map(float, params))
+            cameras[int(camera_id)] = CameraRecord(model, int(width), int(height), values)
+        except ValueError as error:
+            raise _malformed(path, number, error) from None
+        if dict(_MODELS).get(model, len(values)) != len(values):
+            raise _malformed(path, number, f"{len(values)} parameters for the model {model}")
+    return cameras
+
+
+def _text_images(path: Path) -> Iterator[ImageRecord]:
+    lines = _text_lines(path, blank=True)
+    for number, line in lines:
+        if not line:
+            continue
+        try:
+            _, *pose, camera_id, name = line.split(maxsplit=9)
+            values = [float(value) for value in pose]
+            if len(values) != 7:
+                raise ValueError("an image line needs 10 fields")
+            # An image without keypoints has an empty second line, which editors may have cut.
+            number, line = next(lines, (number, ""))
+            keypoints = np.array(line.split(), np.float64).reshape(-1, 3)
+            record = _image(name, int(camera_id), values, keypoints[:, :2], keypoints[:, 2])
+        except ValueError as error:
+            raise _malformed(path, number, error) from None
+        yield record
+
+
+def _text_points(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    ids: list[int] = []
+    xyz: list[list[float]] = []
+    rgb: list[list[int]] = []
+    for number, line in _text_lines(path):
+        fields = line.split(maxsplit=8)
+        try:
+            if len(fields) < 8:
+                raise ValueError("a point line needs at least 8 fields")
+            ids.append(int(fields[0]))
+            xyz.append([float(value) for value in fields[1:4]])
+            rgb.append([int(value) & 255 for value in fields[4:7]])
+        except ValueError as error:
+            raise _malformed(path, number, error) from None
+    return (
+        np.array(ids, np.int64),
+        np.array(xyz, np.float64).reshape(-1, 3),
+        np.array(rgb, np.uint8).reshape(-1, 3),
+    )
+
+
+def _text_lines(path: Path, *, blank: bool = False) -> Iterator[tuple[int, str]]:
+    """Yield (line number, stripped line) without comments."""
+    with path.open(encoding="utf-8", errors="replace") as file:
+        for number, raw in enumerate(file, 1):
+            line = raw.strip()
+            if not line.startswith("#") and (line or blank):
+                yield number, line
+
+
+def _image(
+    name: str, camera_id: int, pose: list[float], xy: np.ndarray, ids: np.ndarray
+) -> ImageRecord:
+    tracked = ids >= 0
+    return ImageRecord(
+        name=name.replace("\\", "/"),
+        camera_id=camera_id,
+        qvec=np.array(pose[:4]),
+        tvec=np.array(pose[4:]),
+        xy=np.asarray(xy[tracked], np.float64),
+        point_ids=ids[tracked].astype(np.int64),
+    )
+
+
+def _malformed(path: Path, line: int, what: object) -> UserError:
+    return UserError(f"{path} is malformed in line {line}: {what}", fix=_FIX)
+
+
+def unsupported_camera(path: Path, model: str) -> UserError:
+    """Return the error for a camera model that no pinhole with k1, k2, p1, p2 can express."""
+    return UserError(
+        f"{path} uses the camera model {model}; supported are PINHOLE, SIMPLE_PINHOLE, "
+        "SIMPLE_RADIAL, RADIAL and OPENCV",
+        fix="run `colmap image_undistorter` and use the folder it writes",
+    )

@@ -1,0 +1,57 @@
+"""The exposure a camera wrote into its file."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from pathlib import Path
+
+from PIL import ExifTags, Image
+
+_EXPOSURE_TIME, _F_NUMBER = 0x829A, 0x829D
+# PhotographicSensitivity is 16 bits: 65535 there means "see the others".
+_SENSITIVITIES = (0x8827, 0x8833, 0x8832, 0x8831)
+_DEFAULT_ISO = 100.0
+
+
+def read_exif_ev(path: Path) -> float | None:
+    """Return log2(time * ISO / N^2) in stops, or None where time or F-number is missing.
+
+    A missing ISO counts as 100: only differences between views matter, and cameras that do not
+    record it usually keep it. Exposure bias is ignored; the shutter already contains it.
+
+    Args:
+        path: any image; broken or absent EXIF gives None, never an error.
+    """
+    tags = _exif_tags(path)
+    time, aperture = _positive(tags.get(_EXPOSURE_TIME)), _positive(tags.get(_F_NUMBER))
+    if time is None or aperture is None:
+        return None
+    isos = (_positive(tags.get(tag)) for tag in _SENSITIVITIES)
+    iso = next((value for value in isos if value not in (None, 65535.0)), None) or _DEFAULT_ISO
+    return math.log2(time * iso / aperture**2)
+
+
+def read_exif_camera(path: Path) -> str:
+    """Return make, model and focal length as one string; empty where EXIF says nothing."""
+    tags = _exif_tags(path)
+    parts = (tags.get(tag) for tag in (0x010F, 0x0110, 0x920A))
+    return " ".join(str(part).strip("\0 ") for part in parts if part is not None)
+
+
+def _exif_tags(path: Path) -> dict:
+    # PIL raises many kinds of errors on malformed EXIF (struct, Syntax, Value, OS, ...).
+    try:
+        with warnings.catch_warnings(action="ignore"), Image.open(path) as image:
+            exif = image.getexif()
+            return {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
+    except Exception:
+        return {}
+
+
+def _positive(value: object) -> float | None:
+    try:
+        number = float(value[0] if isinstance(value, tuple) else value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, ZeroDivisionError, IndexError):
+        return None
+    return number if math.isfinite(number) and number > 0 else None

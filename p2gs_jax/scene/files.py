@@ -1,0 +1,112 @@
+"""Image files on disk: which there are, how large, and what to say when one is missing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+from PIL import Image
+
+from p2gs_jax.config import DataConfig
+from p2gs_jax.errors import UserError
+
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".ppm"})
+_ASPECT_TOLERANCE = 0.01
+
+
+def list_images(folder: Path, *, recursive: bool = True) -> list[Path]:
+    """Return the images in a folder, sorted by relative path; hidden ones are left out.
+
+    Args:
+        folder: may be absent.
+        recursive: look into its subfolders too.
+    """
+    if not folder.is_dir():
+        return []
+    files = folder.rglob("*") if recursive else folder.iterdir()
+    found = (p for p in files if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file())
+    relative = (p.relative_to(folder) for p in found)
+    visible = (p for p in relative if not any(part.startswith(".") for part in p.parts))
+    return [folder / p for p in sorted(visible, key=lambda p: p.as_posix())]
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Return (width, height) as stored, before any EXIF rotation.
+
+    Raises:
+        UserError: the file is no image.
+    """
+    try:
+        with Image.open(path) as image:
+            return image.size
+    except Exception:  # PIL's error types are not a closed set
+        pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        if pixels is None:
+            raise undecodable(path) from None
+        return pixels.shape[1], pixels.shape[0]
+
+
+def undecodable(path: Path) -> UserError:
+    """Return the error for a file that is no readable image."""
+    size = path.stat().st_size if path.is_file() else 0
+    return UserError(
+        f"cannot decode the image {path} ({size} bytes)",
+        fix="copy or export that photograph again, or remove it from the scene",
+    )
+
+
+def check_missing(missing: Sequence[str], total: int, source: Path, cfg: DataConfig) -> list[str]:
+    """Complain about images that a model names and the disk does not have.
+
+    Args:
+        missing: their names.
+        total: how many images the model names.
+        source: the file or folder that names them.
+        cfg: `allow_missing` turns the complaint into a note.
+
+    Returns:
+        Notes for the user: none or one.
+
+    Raises:
+        UserError: images are missing and that is not allowed, or no image is left.
+    """
+    if not missing:
+        return []
+    listed = ", ".join(missing[:5]) + (", ..." if len(missing) > 5 else "")
+    message = f"{len(missing)} of the {total} images named by {source} do not exist: {listed}"
+    if not cfg.allow_missing:
+        raise UserError(
+            message,
+            fix="add them, name their folder with --images, or skip them with --allow-missing",
+        )
+    if len(missing) == total:
+        raise UserError(message, fix="point --images at the folder that holds them")
+    return [f"skipped: {message}"]
+
+
+def check_size(
+    path: Path, width: int, height: int, source: Path
+) -> tuple[int, int, float, float, bool]:
+    """Compare an image file with the size its camera has in the model.
+
+    Args:
+        path: the image.
+        width: pixels, according to the model.
+        height: pixels, according to the model.
+        source: the file that says so.
+
+    Returns:
+        Real width and height, the factors from model to file, and whether they differ.
+
+    Raises:
+        UserError: the file is no image, or has another shape than the camera.
+    """
+    w, h = image_size(path)
+    sx, sy = w / width, h / height
+    if abs(sx / sy - 1.0) > _ASPECT_TOLERANCE:
+        raise UserError(
+            f"wrong size: {path} is {w}x{h}, but {source} says {width}x{height}",
+            fix="use the photographs from which the model was made, neither cropped nor rotated",
+        )
+    return w, h, sx, sy, (w, h) != (width, height)

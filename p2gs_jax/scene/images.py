@@ -1,0 +1,289 @@
+"""Photographs as arrays: decoded on demand, undistorted, shrunk, and kept within a memory bound."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32
+from PIL import Image
+
+from p2gs_jax.config import DataConfig
+from p2gs_jax.errors import UserError
+from p2gs_jax.scene.files import undecodable
+from p2gs_jax.scene.geometry import scale_intrinsics, undistortion_maps
+from p2gs_jax.types import View
+
+_FULL = 0.999  # a pixel is valid only where all of its sources are
+_ALPHA_VALID = 0.5
+_MAX_PREFETCHED = 4
+
+
+def size_at(view: View, max_width: int | None, shrink: float = 1.0) -> tuple[int, int]:
+    """Return (width, height) in pixels of a view after both reductions.
+
+    Args:
+        view: at its full size.
+        max_width: the full size is first reduced to at most this many pixels across.
+        shrink: and then divided by this factor, >= 1.
+    """
+    width = view.width if max_width is None else min(view.width, max_width)
+    scale = width / view.width / max(float(shrink), 1.0)
+    return max(1, round(view.width * scale)), max(1, round(view.height * scale))
+
+
+def camera_at(
+    view: View, max_width: int | None, shrink: float = 1.0
+) -> tuple[Float32[np.ndarray, "3 3"], int, int]:
+    """Return K, width and height of a view at the size of `size_at`.
+
+    Width and height are rounded separately, and K follows each of them exactly.
+    """
+    width, height = size_at(view, max_width, shrink)
+    K = scale_intrinsics(view.K, width / view.width, height / view.height)
+    return K.astype(np.float32), width, height
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A photograph as it is cached: as integers where nothing but decoding was needed."""
+
+    pixels: np.ndarray
+    valid: np.ndarray  # bool
+    scale: float  # what 1.0 is in `pixels`
+
+    @property
+    def nbytes(self) -> int:
+        return self.pixels.nbytes + self.valid.nbytes
+
+    def arrays(self) -> tuple[np.ndarray, np.ndarray]:
+        if self.pixels.dtype == np.float32:
+            ldr = self.pixels  # shared with the cache and therefore read-only
+        else:
+            ldr = self.pixels.astype(np.float32) / np.float32(self.scale)
+        return ldr, self.valid.astype(np.float32)
+
+
+class ImageStore:
+    """The photographs of a scene.
+
+    Decoded images are kept up to `cfg.cache_mb`, least recently used first out; the most recent
+    one is always kept. Beyond that only images being worked on take memory. All methods may be
+    called from any thread.
+    """
+
+    def __init__(self, views: Sequence[View], cfg: DataConfig):
+        """Prepare; nothing is read yet.
+
+        Args:
+            views: whose photographs.
+            cfg: `max_width` and `cache_mb`.
+        """
+        self._views = tuple(views)
+        self._max_width = cfg.max_width
+        self._limit = cfg.cache_mb * 2**20
+        self._cache: OrderedDict[tuple[int, int, int], _Entry] = OrderedDict()
+        self._bytes = 0
+        self._pending: dict[tuple[int, int, int], Future[_Entry]] = {}
+        self._lock = threading.Lock()
+        self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="decode")
+
+    @property
+    def cached_bytes(self) -> int:
+        """Bytes of decoded photographs held now."""
+        with self._lock:
+            return self._bytes
+
+    def get(
+        self, index: int, shrink: float = 1.0
+    ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
+        """Return a photograph and its mask at the size of `size_at`.
+
+        Args:
+            index: row of the view.
+            shrink: factor >= 1 below the full size.
+
+        Returns:
+            Display-encoded colours in [0, 1], possibly read-only, and the mask: 1 = use, 0 =
+            ignore (masked, transparent, or outside the photograph after undistortion).
+
+        Raises:
+            UserError: the file or its mask is missing, broken or of another size than the model's.
+        """
+        key = self._key(index, shrink)
+        with self._lock:
+            entry = self._cache.get(key)
+            pending = self._pending.get(key)
+            if entry is not None:
+                self._cache.move_to_end(key)
+        if entry is None:
+            entry = self._load(key) if pending is None else pending.result()
+        return entry.arrays()
+
+    def camera(
+        self, index: int, shrink: float = 1.0
+    ) -> tuple[Float32[np.ndarray, "4 4"], Float32[np.ndarray, "3 3"], int, int]:
+        """Return viewmat, K, width and height of a view at the size that `get` gives it."""
+        view = self._views[index]
+        return (view.viewmat, *camera_at(view, self._max_width, shrink))
+
+    def prefetch(self, index: int, shrink: float = 1.0) -> None:
+        """Start decoding in the background; `get` then waits only for what is left.
+
+        Requests beyond a short queue are dropped; errors are raised by `get`.
+        """
+        key = self._key(index, shrink)
+        with self._lock:
+            if key in self._cache or key in self._pending:
+                return
+            if len(self._pending) >= _MAX_PREFETCHED:
+                return
+            self._pending[key] = self._worker.submit(self._load_pending, key)
+
+    def close(self) -> None:
+        """Stop the background thread and drop everything."""
+        self._worker.shutdown(wait=True, cancel_futures=True)
+        with self._lock:
+            self._cache.clear()
+            self._pending.clear()
+            self._bytes = 0
+
+    def _key(self, index: int, shrink: float) -> tuple[int, int, int]:
+        return (index, *size_at(self._views[index], self._max_width, shrink))
+
+    def _load_pending(self, key: tuple[int, int, int]) -> _Entry:
+        try:
+            return self._load(key)
+        finally:
+            with self._lock:
+                self._pending.pop(key, None)
+
+    def _load(self, key: tuple[int, int, int]) -> _Entry:
+        index, width, height = key
+        entry = _prepare(self._views[index], width, height)
+        with self._lock:
+            if key not in self._cache:
+                self._cache[key] = entry
+                self._bytes += entry.nbytes
+            while self._bytes > self._limit and len(self._cache) > 1:
+                _, dropped = self._cache.popitem(last=False)
+                self._bytes -= dropped.nbytes
+        return entry
+
+
+def _prepare(view: View, width: int, height: int) -> _Entry:
+    """Decode, undistort and shrink one photograph."""
+    pixels, valid = _decode(view.image_path)
+    if pixels.shape[:2] != (view.height, view.width):
+        raise UserError(
+            f"{view.image_path} is {pixels.shape[1]}x{pixels.shape[0]} pixels, but was "
+            f"{view.width}x{view.height} when the scene was read",
+            fix="do not change the photographs during a run; start the run again",
+        )
+    if view.mask_path is not None:
+        valid &= _decode_mask(view)
+    scale = float(np.iinfo(pixels.dtype).max)
+    shrunk = (width, height) != (view.width, view.height)
+    if view.distortion is not None or shrunk:
+        ldr = pixels.astype(np.float32) / np.float32(scale)
+        if view.distortion is not None:
+            maps = undistortion_maps(view.K, view.distortion, view.width, view.height)
+            ldr = cv2.remap(ldr, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            valid = _resample_valid(valid, lambda v: cv2.remap(v, *maps, cv2.INTER_LINEAR))
+        if shrunk:
+            size = (width, height)
+            ldr = cv2.resize(ldr, size, interpolation=cv2.INTER_AREA)
+            valid = _resample_valid(
+                valid, lambda v: cv2.resize(v, size, interpolation=cv2.INTER_AREA)
+            )
+        pixels, scale = ldr, 1.0
+    pixels.flags.writeable = False
+    return _Entry(pixels, valid, scale)
+
+
+def _resample_valid(
+    valid: Bool[np.ndarray, "h w"], resample: Callable[[np.ndarray], np.ndarray]
+) -> Bool[np.ndarray, "h2 w2"]:
+    return np.asarray(resample(valid.astype(np.float32))) >= _FULL
+
+
+def _decode(path: Path) -> tuple[np.ndarray, Bool[np.ndarray, "h w"]]:
+    """Return pixels as stored, [h w 3] uint8 or uint16 in RGB order, and where they are opaque.
+
+    EXIF rotation is ignored, as COLMAP does: poses belong to the stored raster.
+    """
+    raw = _read_raster(path)
+    if raw.dtype not in (np.uint8, np.uint16):
+        raise UserError(
+            f"{path} has {raw.dtype} pixels; photographs need 8 or 16 bits per channel",
+            fix="export it as PNG or JPEG",
+        )
+    valid = np.ones(raw.shape[:2], bool)
+    channels = 1 if raw.ndim == 2 else raw.shape[2]
+    if channels in (2, 4):
+        valid = raw[..., -1] >= _ALPHA_VALID * np.iinfo(raw.dtype).max
+    if channels <= 2:
+        raw = raw[..., None] if raw.ndim == 2 else raw[..., :1]
+        raw = np.repeat(raw, 3, axis=2)
+    return np.ascontiguousarray(raw[..., 2::-1]), valid
+
+
+def _decode_mask(view: View) -> Bool[np.ndarray, "h w"]:
+    """Return where the mask is not zero, at the view's size."""
+    assert view.mask_path is not None
+    raw = _read_raster(view.mask_path)
+    # A mask may carry an opaque alpha channel beside its values.
+    colours = raw if raw.ndim == 2 else raw[..., : 3 if raw.shape[2] >= 3 else 1].max(axis=2)
+    mask = colours > 0
+    h, w = mask.shape
+    if abs(w / h / (view.width / view.height) - 1.0) > 0.01:
+        raise UserError(
+            f"wrong size: the mask {view.mask_path} is {w}x{h}, its photograph "
+            f"{view.width}x{view.height}",
+            fix="make the mask at the size of the photograph",
+        )
+    if (w, h) == (view.width, view.height):
+        return mask
+    how = cv2.INTER_AREA if w > view.width else cv2.INTER_LINEAR
+    return _resample_valid(
+        mask, lambda v: cv2.resize(v, (view.width, view.height), interpolation=how)
+    )
+
+
+def _read_raster(path: Path) -> np.ndarray:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise UserError(
+            f"cannot read {path}: {error.strerror or error}", fix="put the file back"
+        ) from None
+    try:
+        raw = cv2.imdecode(
+            np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
+        )
+    except cv2.error:
+        raw = None
+    if raw is None or not _complete(path, data):
+        raise undecodable(path)
+    return raw
+
+
+def _complete(path: Path, data: bytes) -> bool:
+    """Whether the file was not cut: OpenCV fills the rest of a truncated image with grey."""
+    if data[:2] == b"\xff\xd8" and data.rstrip(b"\0")[-2:] == b"\xff\xd9":
+        return True
+    if data[:4] == b"\x89PNG" and b"IEND" in data[-64:]:
+        return True
+    try:
+        with Image.open(path) as image:
+            image.load()
+    except (OSError, SyntaxError, ValueError):
+        # Formats that Pillow does not know are left to OpenCV's judgement.
+        return data[:2] != b"\xff\xd8" and data[:4] != b"\x89PNG"
+    return True

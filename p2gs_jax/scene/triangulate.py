@@ -1,0 +1,130 @@
+"""Seed points and tracks for views whose poses are known: SIFT, matching, triangulation."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from p2gs_jax.errors import UserError
+from p2gs_jax.scene.cache import cached_folder, file_fingerprints
+from p2gs_jax.scene.colmap import tracks_of
+from p2gs_jax.scene.colmap_model import read_model
+from p2gs_jax.scene.features import extract, match, pairs_by_pose, quiet_colmap
+from p2gs_jax.types import Scene, View
+
+
+def triangulate(scene: Scene, work_dir: Path | None, report: Callable[[str], None]) -> Scene:
+    """Return the scene with points and tracks; poses and intrinsics stay as they are.
+
+    Args:
+        scene: its views' names must be relative to one folder.
+        work_dir: keeps the result under `triangulated/`.
+        report: told what is going on.
+
+    Raises:
+        UserError: no point could be triangulated.
+    """
+    views = scene.views
+    if len(views) < 2:
+        raise _failed(scene.root)
+    key = {
+        "pycolmap": pycolmap.__version__,
+        "files": file_fingerprints([view.image_path for view in views]),
+        "cameras": [
+            [view.name, view.viewmat.tolist(), view.K.tolist(), _coefficients(view)]
+            for view in views
+        ],
+    }
+
+    def build(folder: Path) -> None:
+        _build(folder, views, report)
+
+    with cached_folder(work_dir, "triangulated", key, build) as folder:
+        model = read_model(folder)
+        tracks = tracks_of(model, views)
+    if tracks is None:
+        raise _failed(scene.root)
+    report(f"triangulated {len(model.xyz)} points with {len(tracks.xy)} observations")
+    return dataclasses.replace(
+        scene, points=model.xyz.astype(np.float32), point_colors=model.rgb, tracks=tracks
+    )
+
+
+def _failed(root: Path) -> UserError:
+    return UserError(
+        f"no point could be triangulated from the poses in {root}",
+        fix="check that there are several photographs, that they are sharp, and that the poses "
+        "are theirs",
+    )
+
+
+def _build(folder: Path, views: Sequence[View], report: Callable[[str], None]) -> None:
+    quiet_colmap()
+    names = [view.name for view in views]
+    image_folder = _image_folder(views[0])
+    database = folder / "database.db"
+    report(f"no seed points: detecting features in {len(views)} images")
+    # Intrinsics are held fixed, so it does not matter that every image has its own camera.
+    extract(database, image_folder, names, mode=pycolmap.CameraMode.PER_IMAGE)
+    prior = _set_cameras(database, views)
+    pairs = pairs_by_pose(names, np.stack([view.viewmat for view in views]))
+    n = len(views) * (len(views) - 1) // 2 if pairs is None else len(pairs)
+    report(f"matching {n} image pairs")
+    match(database, pairs)
+    report("triangulating")
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = 0
+    model = pycolmap.triangulate_points(
+        prior, database, image_folder, folder, refine_intrinsics=False, options=options
+    )
+    model.write(folder)
+    database.unlink()  # large, and not needed again
+
+
+def _set_cameras(database: Path, views: Sequence[View]) -> pycolmap.Reconstruction:
+    """Overwrite the guessed cameras in the database; return a model of the known poses."""
+    known = {view.name: view for view in views}
+    reconstruction = pycolmap.Reconstruction()
+    db = pycolmap.Database.open(database)
+    try:
+        for image in db.read_all_images():
+            view = known[image.name]
+            camera = _camera(view, image.camera_id)
+            db.update_camera(camera)
+            reconstruction.add_camera_with_trivial_rig(camera)
+            pose = pycolmap.Rigid3d(view.viewmat[:3].astype(np.float64))
+            reconstruction.add_image_with_trivial_frame(
+                pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id),
+                pose,
+            )
+    finally:
+        db.close()
+    return reconstruction
+
+
+def _camera(view: View, camera_id: int) -> pycolmap.Camera:
+    k1, k2, p1, p2, *higher = _coefficients(view)
+    K = view.K.astype(np.float64)
+    params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], k1, k2, p1, p2]
+    if higher:
+        params += [*higher, 0.0, 0.0, 0.0]
+    return pycolmap.Camera(
+        camera_id=camera_id,
+        model="FULL_OPENCV" if higher else "OPENCV",
+        width=view.width,
+        height=view.height,
+        params=params,
+        has_prior_focal_length=True,
+    )
+
+
+def _coefficients(view: View) -> tuple[float, ...]:
+    return view.distortion.coefficients if view.distortion else (0.0, 0.0, 0.0, 0.0)
+
+
+def _image_folder(view: View) -> Path:
+    return Path(str(view.image_path)[: -len(view.name)] or ".")

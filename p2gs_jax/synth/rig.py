@@ -1,0 +1,97 @@
+"""The tri-camera rig of the paper's CARLA data, driven along the street.
+
+CARLA (Unreal) coordinates are left-handed: x forward, y right, z up; positive yaw turns right and
+positive pitch looks up. Our world is right-handed: x forward, y left, z up, that is y negated.
+Cameras are OpenCV: x right, y down, z forward.
+
+Intrinsics (paper, appendix "CARLA Dataset"): f = W / (2 tan 30 deg), c = (W - 1)/2 where pixel
+centres are integers; with centres at +0.5, as everywhere in this program, c = W/2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+FOV_DEGREES = 60.0
+_FLIP = np.diag([1.0, -1.0, 1.0])  # CARLA's left-handed axes to ours, and back
+
+
+@dataclass(frozen=True)
+class Mount:
+    """A camera on the vehicle, in CARLA's axes.
+
+    Attributes:
+        location: x forward, y right, z up, m.
+        rotation: roll, pitch, yaw, degrees, Unreal's sense.
+    """
+
+    location: tuple[float, float, float]
+    rotation: tuple[float, float, float]
+
+
+MOUNTS: dict[str, Mount] = {
+    "front": Mount((1.539, 0.025, 3.845), (0.696, 0.420, 0.338)),
+    "front_left": Mount((1.494, -0.091, 3.845), (0.003, 1.387, -44.205)),
+    "front_right": Mount((1.489, 0.095, 3.846), (0.189, 0.111, 44.756)),
+}
+"""The paper's mount table."""
+
+
+def carla_rotation(roll: float, pitch: float, yaw: float) -> Float[np.ndarray, "3 3"]:
+    """Return Unreal's rotation; its columns are the forward, right and up axes, left-handed.
+
+    Args:
+        roll: degrees.
+        pitch: degrees, positive up.
+        yaw: degrees, positive to the right.
+    """
+    (cr, cp, cy), (sr, sp, sy) = np.cos(a := np.deg2rad([roll, pitch, yaw])), np.sin(a)
+    return np.array(
+        [
+            [cp * cy, cy * sp * sr - sy * cr, -cy * sp * cr - sy * sr],
+            [cp * sy, sy * sp * sr + cy * cr, -sy * sp * cr + cy * sr],
+            [sp, -cp * sr, cp * cr],
+        ]
+    )
+
+
+def camera_viewmat(
+    mount: Mount, vehicle: tuple[float, float, float]
+) -> Float[np.ndarray, "4 4"]:
+    """Return world-to-camera (OpenCV) of a camera on a vehicle that heads along +x.
+
+    Args:
+        mount: where the camera sits.
+        vehicle: the vehicle's origin in our world, m.
+    """
+    forward, right, up = (_FLIP @ carla_rotation(*mount.rotation)).T
+    R = np.stack([right, -up, forward])
+    center = np.asarray(vehicle) + _FLIP @ np.asarray(mount.location)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = R
+    viewmat[:3, 3] = -R @ center
+    return viewmat
+
+
+def intrinsics(width: int, height: int) -> Float[np.ndarray, "3 3"]:
+    """Return K in pixels, centres at +0.5, for a horizontal field of view of 60 degrees."""
+    f = width / (2.0 * np.tan(np.deg2rad(FOV_DEGREES) / 2.0))
+    return np.array([[f, 0.0, width / 2.0], [0.0, f, height / 2.0], [0.0, 0.0, 1.0]])
+
+
+def drive(
+    frames: int, *, step: float = 0.9, lane: float = -1.75, start: float = 0.0
+) -> Float[np.ndarray, "frames 3"]:
+    """Return the vehicle's origin at every frame, m.
+
+    Args:
+        frames: how many.
+        step: metres a frame.
+        lane: y of the lane's middle; negative is the right-hand side.
+        start: x of the first frame.
+    """
+    x = start + step * np.arange(frames)
+    return np.stack([x, np.full(frames, lane), np.zeros(frames)], axis=1)
