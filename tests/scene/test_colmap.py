@@ -1,0 +1,227 @@
+import numpy as np
+import pycolmap
+import pytest
+from scene.helpers import copy_model, reprojection_errors, write_tiny_model
+
+from p2gs_jax.config import DataConfig
+from p2gs_jax.errors import UserError
+from p2gs_jax.scene import load_scene
+
+CFG = DataConfig()
+SETS = ("sceaux_castle", "sceaux_castle/undistorted", "bundler_et", "kitti_stereo_a")
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_points_project_onto_their_tracks(shared_data, name):
+    scene = load_scene(shared_data(name), CFG)
+    errors = reprojection_errors(scene)
+    assert np.median(errors) < 0.7
+    assert errors.mean() < 1.0
+    assert [v.name for v in scene.views] == sorted(v.name for v in scene.views)
+    assert scene.format == "colmap"
+    assert scene.notes == ()
+
+
+def test_sceaux_distortion_is_kept_and_undistorted_variant_has_none(shared_data):
+    distorted = load_scene(shared_data("sceaux_castle"), CFG)
+    straight = load_scene(shared_data("sceaux_castle/undistorted"), CFG)
+    assert distorted.views[0].distortion.coefficients == pytest.approx(
+        (-0.155351, 0, 0, 0), abs=1e-6
+    )
+    assert all(v.distortion is None for v in straight.views)
+    # Both hold the same points: rays must agree whatever the pixels are called.
+    for a, b in zip(distorted.views, straight.views, strict=True):
+        assert np.allclose(a.viewmat, b.viewmat, atol=1e-6)
+    rays = []
+    for scene in (distorted, straight):
+        K = scene.views[0].K
+        order = np.lexsort((scene.tracks.point_indices, scene.tracks.view_indices))
+        rays.append((scene.tracks.xy[order] - K[:2, 2]) / K[[0, 1], [0, 1]])
+    assert np.abs(rays[0] - rays[1]).max() * 1048 < 0.05
+
+
+def test_kitti_cameras_are_named_after_their_folders(shared_data):
+    scene = load_scene(shared_data("kitti_stereo_a"), CFG)
+    assert {v.camera for v in scene.views} == {"left", "right"}
+    for camera in ("left", "right"):
+        views = [v for v in scene.views if v.camera == camera]
+        assert [i for i, v in enumerate(views) if v.split == "test"] == [0, 8, 16, 24, 32]
+    centres = {v.name: -v.viewmat[:3, :3].T.astype(float) @ v.viewmat[:3, 3] for v in scene.views}
+    baseline = np.linalg.norm(centres["left/000000.png"] - centres["right/000000.png"])
+    assert baseline == pytest.approx(0.537, abs=0.01)
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_reader_agrees_with_pycolmap(shared_data, name):
+    folder = shared_data(name)
+    scene = load_scene(folder, CFG)
+    truth = pycolmap.Reconstruction(folder / "sparse" / "0")
+    assert len(scene.views) == truth.num_reg_images()
+    assert len(scene.tracks.xy) == truth.compute_num_observations()
+    ids = sorted(truth.points3D)
+    assert np.array_equal(scene.points, np.array([truth.points3D[i].xyz for i in ids], np.float32))
+    assert np.array_equal(scene.point_colors, [truth.points3D[i].color for i in ids])
+    by_name = {image.name: image for image in truth.images.values()}
+    for row, view in enumerate(scene.views):
+        image = by_name[view.name]
+        assert np.allclose(view.viewmat[:3], image.cam_from_world().matrix(), atol=1e-5)
+        assert np.allclose(view.K, image.camera.calibration_matrix(), atol=1e-3)
+        mine = {ids[p] for p in scene.tracks.point_indices[scene.tracks.view_indices == row]}
+        assert mine == {p.point3D_id for p in image.points2D if p.has_point3D()}
+
+
+@pytest.mark.parametrize("with_rigs", [True, False])
+def test_text_equals_binary(shared_data, tmp_path, with_rigs):
+    source = shared_data("bundler_et")
+    model = copy_model(source, tmp_path, text=True)
+    if not with_rigs:
+        for stem in ("rigs", "frames"):
+            (model / f"{stem}.txt").unlink()
+    a, b = load_scene(source, CFG), load_scene(tmp_path, CFG)
+    assert np.array_equal(a.points, b.points)
+    assert np.array_equal(a.tracks.xy, b.tracks.xy)
+    assert np.array_equal(a.tracks.point_indices, b.tracks.point_indices)
+    for x, y in zip(a.views, b.views, strict=True):
+        assert np.allclose(x.viewmat, y.viewmat, atol=1e-6)
+        assert np.allclose(x.K, y.K)
+
+
+def test_model_may_lie_in_the_folder_itself(shared_data):
+    source = shared_data("bundler_et")
+    a, b = load_scene(source / "sparse" / "0", CFG), load_scene(source, CFG)
+    assert [v.image_path for v in a.views] == [v.image_path for v in b.views]
+
+
+@pytest.mark.parametrize("keep", [0.0, 0.3, 0.5, 0.97])
+@pytest.mark.parametrize("stem", ["cameras", "images", "points3D"])
+def test_truncated_binary_names_the_file(shared_data, tmp_path, stem, keep):
+    file = copy_model(shared_data("bundler_et"), tmp_path) / f"{stem}.bin"
+    data = file.read_bytes()
+    file.write_bytes(data[: int(keep * len(data))])
+    with pytest.raises(UserError, match=f"{stem}.bin is truncated"):
+        load_scene(tmp_path, CFG)
+
+
+@pytest.mark.parametrize("stem", ["cameras", "images", "points3D"])
+def test_garbage_is_a_user_error(shared_data, tmp_path, stem):
+    file = copy_model(shared_data("bundler_et"), tmp_path) / f"{stem}.bin"
+    rng = np.random.default_rng(0)
+    file.write_bytes(rng.integers(0, 256, 4096, dtype=np.uint8).tobytes())
+    with pytest.raises(UserError, match=f"{stem}.bin"):
+        load_scene(tmp_path, CFG)
+
+
+@pytest.mark.parametrize("stem", ["cameras", "images", "points3D"])
+def test_absent_file_is_named(shared_data, tmp_path, stem):
+    (copy_model(shared_data("bundler_et"), tmp_path) / f"{stem}.bin").unlink()
+    with pytest.raises(UserError, match=f"{stem}.bin does not exist"):
+        load_scene(tmp_path, CFG)
+
+
+def test_text_line_is_named(tmp_path):
+    write_tiny_model(tmp_path, points="7 0.1 zwei 4 10 20 30 0.5 1 0\n")
+    with pytest.raises(UserError, match=r"points3D.txt is malformed in line 1"):
+        load_scene(tmp_path, CFG)
+
+
+def test_tiny_model_and_names_with_blanks(tmp_path):
+    write_tiny_model(tmp_path)
+    scene = load_scene(tmp_path, CFG)
+    assert [v.name for v in scene.views] == ["im 0.png", "im 1.png"]
+    assert reprojection_errors(scene).max() < 1e-5
+    assert [v.split for v in scene.views] == ["test", "train"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"cameras": ""}, "cameras.txt holds no cameras"),
+        ({"n": 0}, "images.txt holds no registered images"),
+        ({"pose": "1 0 0 0 nan 0 0"}, "images.txt: the pose of im 0.png is not finite"),
+        ({"pose": "0 0 0 0 0 0 0"}, "images.txt: the pose of im 0.png is not finite"),
+        ({"points": "7 nan 0 4 1 2 3 0.5 1 0\n"}, "points3D.txt: 1 of 1 points are not finite"),
+        (
+            {"cameras": "1 OPENCV_FISHEYE 40 30 50 50 20 15 0 0 0 0\n"},
+            "cameras.txt uses the camera model OPENCV_FISHEYE",
+        ),
+        ({"cameras": "1 PINHOLE 40 30 50 50 20\n"}, "cameras.txt is malformed in line 2"),
+        ({"cameras": "1 PINHOLE 40 30 0 50 20 15\n"}, "cameras.txt: .* impossible parameters"),
+        ({"cameras": "2 PINHOLE 40 30 50 50 20 15\n"}, "taken by camera 1"),
+        ({"cameras": "1 PINHOLE 30 40 50 50 15 20\n"}, "wrong size: .*im 0.png is 40x30"),
+    ],
+)
+def test_broken_models(tmp_path, change, message):
+    write_tiny_model(tmp_path, **change)
+    with pytest.raises(UserError, match=message):
+        load_scene(tmp_path, CFG)
+
+
+def test_unsupported_camera_says_what_to_run(tmp_path):
+    write_tiny_model(tmp_path, cameras="1 FOV 40 30 50 50 20 15 0.1\n")
+    with pytest.raises(UserError) as info:
+        load_scene(tmp_path, CFG)
+    assert "image_undistorter" in info.value.fix
+
+
+def test_missing_images_are_listed_or_skipped(tmp_path):
+    write_tiny_model(tmp_path, n=10)
+    for i in range(7):
+        (tmp_path / "images" / f"im {i}.png").unlink()
+    with pytest.raises(UserError, match="7 of the 10 images") as info:
+        load_scene(tmp_path, CFG)
+    assert "im 4.png, ..." in str(info.value)
+    assert "im 5.png" not in str(info.value)
+    assert "--allow-missing" in info.value.fix
+    scene = load_scene(tmp_path, DataConfig(allow_missing=True))
+    assert [v.name for v in scene.views] == ["im 7.png", "im 8.png", "im 9.png"]
+    assert "7 of the 10 images" in scene.notes[0]
+    assert scene.tracks.view_indices.tolist() == [0, 1, 2]
+
+
+def test_undecodable_image_is_named(tmp_path):
+    write_tiny_model(tmp_path)
+    (tmp_path / "images" / "im 1.png").write_bytes(b"not an image")
+    with pytest.raises(UserError, match=r"cannot decode the image .*im 1.png"):
+        load_scene(tmp_path, CFG)
+
+
+def test_smaller_images_rescale_the_cameras(tmp_path):
+    write_tiny_model(tmp_path, cameras="1 SIMPLE_RADIAL 80 60 100 40 30 0.1\n")
+    scene = load_scene(tmp_path, CFG)
+    view = scene.views[0]
+    assert (view.width, view.height) == (40, 30)
+    assert np.allclose(view.K, [[50, 0, 20], [0, 50, 15], [0, 0, 1]])
+    # The keypoint (21.25, 17.5) of the 80x60 image, halved and undistorted.
+    x, y = (21.25 / 2 - 20) / 50, (17.5 / 2 - 15) / 50
+    ux, uy = (scene.tracks.xy[0] - [20, 15]) / 50
+    factor = 1 + 0.1 * (ux**2 + uy**2)
+    assert (ux * factor, uy * factor) == pytest.approx((x, y), abs=1e-6)
+    assert "rescaled" in scene.notes[0]
+
+
+def test_image_folder_option(tmp_path):
+    write_tiny_model(tmp_path)
+    (tmp_path / "images").rename(tmp_path / "photos")
+    with pytest.raises(UserError, match="no image folder") as info:
+        load_scene(tmp_path, CFG)
+    assert "--images" in info.value.fix
+    assert load_scene(tmp_path, DataConfig(images="photos")).views[0].image_path.is_file()
+    with pytest.raises(UserError, match="nowhere does not exist"):
+        load_scene(tmp_path, DataConfig(images="nowhere"))
+
+
+def test_points_thinned_by_another_tool(tmp_path):
+    write_tiny_model(tmp_path, points="9 0.1 0.2 4 10 20 30 0.5\n8 0 0 4 10 20 30 0.5\n")
+    scene = load_scene(tmp_path, CFG)
+    assert len(scene.points) == 2
+    assert len(scene.tracks.xy) == 0
+
+
+def test_poses_without_points_are_triangulated(shared_data, tmp_path):
+    source = shared_data("bundler_et")
+    model = copy_model(source, tmp_path, text=True)
+    (model / "points3D.txt").write_text("# none\n")
+    scene = load_scene(tmp_path, CFG)
+    assert scene.format == "colmap"
+    assert len(scene.points) > 300
+    assert np.median(reprojection_errors(scene)) < 1.0
