@@ -3,9 +3,16 @@
 The public interface. Everything else may change between releases.
 """
 
+from typing import TYPE_CHECKING
+
 from p2gs_jax.config import FitConfig, preset
 from p2gs_jax.errors import DivergenceError, UserError
 from p2gs_jax.types import Camera, Gaussians, Params, Photometry, Render, Scene
+
+if TYPE_CHECKING:
+    from p2gs_jax.fit import fit
+    from p2gs_jax.render import render_linear
+    from p2gs_jax.run_folder import load_run
 
 __all__ = [
     "Camera",

@@ -11,7 +11,7 @@ import re
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Union
 
 # Quiet the native libraries before they load; our own messages say what matters.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
@@ -160,20 +160,15 @@ def _check(condition: bool, text: str) -> None:
 
 
 def _run(argv: list[str]) -> int:
-    defaults = _preset_from(argv)
-    subcommands = {
-        "fit": Annotated[
-            Fit, tyro.conf.subcommand("fit", default=Fit(tyro.MISSING, tyro.MISSING, defaults))
-        ],
-        "render": Annotated[Render, tyro.conf.subcommand("render")],
-        "eval": Annotated[Eval, tyro.conf.subcommand("eval")],
-        "demo": Annotated[Demo, tyro.conf.subcommand("demo")],
-    }
-    union = (
-        subcommands["fit"] | subcommands["render"] | subcommands["eval"] | subcommands["demo"]
-    )
-    args = tyro.cli(
-        union,
+    fit_default = Fit(tyro.MISSING, tyro.MISSING, _preset_from(argv))
+    commands_union = Union[  # noqa: UP007 (annotated members cannot be joined with |)
+        Annotated[Fit, tyro.conf.subcommand("fit", default=fit_default)],
+        Annotated[Render, tyro.conf.subcommand("render")],
+        Annotated[Eval, tyro.conf.subcommand("eval")],
+        Annotated[Demo, tyro.conf.subcommand("demo")],
+    ]
+    args: Any = tyro.cli(
+        commands_union,  # pyright: ignore[reportArgumentType]
         prog="p2gs-jax",
         description="Photometrically consistent Gaussian splatting in JAX.",
         args=argv,
@@ -182,11 +177,11 @@ def _run(argv: list[str]) -> int:
     from p2gs_jax import commands
 
     if isinstance(args, Fit):
-        return commands.fit_command(args.scene, args.out, resolve(args), args.reference, args.resume)
-    if isinstance(args, Render):
-        return commands.render_command(
-            args.run, args.out, args.split, args.exposure_ev, args.gamma
+        return commands.fit_command(
+            args.scene, args.out, resolve(args), args.reference, args.resume
         )
+    if isinstance(args, Render):
+        return commands.render_command(args.run, args.out, args.split, args.exposure_ev, args.gamma)
     if isinstance(args, Eval):
         return commands.eval_command(args.run, args.reference)
     return commands.demo_command(

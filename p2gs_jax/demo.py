@@ -76,13 +76,16 @@ def run_demo(
     write_json(marker, wanted)
     height = round(width * 1300 / 1920 / 4) * 4
     reporter.stage("Making the street")
-    write_street(
-        street, frames=frames, width=width, height=height, iso_std=iso_std, seed=seed
-    )
+    write_street(street, frames=frames, width=width, height=height, iso_std=iso_std, seed=seed)
     reporter.message(f"Made a street: 3 cameras, {frames} frames each, {width}x{height}.")
     truth = read_true_exposures(street / "truth" / "exposures.csv")
     result = fit(
-        street, run_dir, cfg, reference=street / "reference", reporter=reporter, true_exposures=truth
+        street,
+        run_dir,
+        cfg,
+        reference=street / "reference",
+        reporter=reporter,
+        true_exposures=truth,
     )
     names = [result.scene.views[i].name for i in result.scene.train_indices]
     true = np.array([truth[n] for n in names])
@@ -90,8 +93,7 @@ def run_demo(
     error = exposure_error(found, true)
     a, b = np.log2(found), np.log2(true)
     rows = [
-        (n, float(y), float(x))
-        for n, x, y in zip(names, a - a.mean(), b - b.mean(), strict=True)
+        (n, float(y), float(x)) for n, x, y in zip(names, a - a.mean(), b - b.mean(), strict=True)
     ]
     result.metrics["exposures"] = dict(error)
     write_json(run_dir / "metrics.json", result.metrics)

@@ -15,7 +15,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.evaluate import MeanParameters, ViewResult, evaluate, mean_parameters
 from p2gs_jax.export.atomic import write_json
 from p2gs_jax.export.exr import write_exr
-from p2gs_jax.export.photometry_json import write_photometry
+from p2gs_jax.export.photometry_json import ViewPhotometry, write_photometry
 from p2gs_jax.export.ply import write_radiance, write_splats
 from p2gs_jax.export.png import write_png
 from p2gs_jax.export.summary import write_summary
@@ -45,7 +45,9 @@ def load_reference(folder: str | Path, scene: Scene, cfg: FitConfig) -> Referenc
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise UserError(f"{folder} is not a folder.", fix="give --reference a folder of photographs")
+        raise UserError(
+            f"{folder} is not a folder.", fix="give --reference a folder of photographs"
+        )
     rows = {}
     for row, view in enumerate(scene.views):
         named = [folder / view.name, *sorted(folder.glob(str(Path(view.name).with_suffix(".*"))))]
@@ -92,12 +94,14 @@ def write_models(params: Params, run_dir: Path, cfg: FitConfig) -> None:
     )
 
 
-def photometry_views(params: Params, scene: Scene, fitted: dict[int, float]) -> list[dict]:
+def photometry_views(
+    params: Params, scene: Scene, fitted: dict[int, float]
+) -> list[ViewPhotometry]:
     """Return the `views` of `photometry.json`; held-out views have no exposure of their own."""
     exposures = np.asarray(params.photometry.exposures)
     gammas = np.asarray(params.photometry.gammas)
     rows = {index: k for k, index in enumerate(scene.train_indices)}
-    out = []
+    out: list[ViewPhotometry] = []
     for index, view in enumerate(scene.views):
         k = rows.get(index)
         e = None if k is None else float(exposures[k])

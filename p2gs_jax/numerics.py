@@ -18,6 +18,8 @@ def safe_div(a: Float[Array, "..."], b: Float[Array, "..."]) -> Float[Array, "..
     return jnp.where(nonzero, a / jnp.where(nonzero, b, 1.0), 0.0)
 
 
-def positive_pow(x: Float[Array, "..."], p: Float[Array, "..."], floor: float):
+def positive_pow(
+    x: Float[Array, "..."], p: Float[Array, "..."] | float, floor: float
+) -> Float[Array, "..."]:
     """Return max(x, floor)^p through exp(p log x); the gradient to x is zero below the floor."""
     return jnp.exp(p * safe_log(x, floor))

@@ -80,9 +80,7 @@ def prepare(scene: Scene, cfg: FitConfig, reporter: Reporter) -> Prepared:
     tracks: TrackColors | None = None
     start: TrackStart | None = None
     if scene.tracks is not None and len(scene.tracks.xy):
-        tracks = track_colors(
-            scene, store, lambda i, n: reporter.stage("Sampling tracks", i, n)
-        )
+        tracks = track_colors(scene, store, lambda i, n: reporter.stage("Sampling tracks", i, n))
     if cfg.photometry.start == "tracks":
         if tracks is not None and len(tracks.points):
             start = start_from_tracks(
@@ -108,9 +106,7 @@ def prepare(scene: Scene, cfg: FitConfig, reporter: Reporter) -> Prepared:
     gaussians = gaussians_from_points(points, radiance, views, cfg)
     shell = find_shell(views, scene.points, extent, cfg.init)
     if shell is not None:
-        gaussians = merge(
-            gaussians, _shell_gaussians(shell, scene, store, photometry, views, cfg)
-        )
+        gaussians = merge(gaussians, _shell_gaussians(shell, scene, store, photometry, views, cfg))
         notes.append(
             f"{shell.empty_fraction:.0%} of the images look past every seed point: a far shell "
             f"of {len(shell.points)} Gaussians was added (--init.shell off leaves it out)."

@@ -74,11 +74,11 @@ def load_run(folder: Path) -> Run:
     exposures = np.array([v["exposure"] for v in train if v is not None])
     gammas = np.array([v["gamma"] for v in train if v is not None])
     if cfg.photometry.parameterization == "log":
-        raw = np.log(exposures), np.log(gammas / GAMMA_SRGB)
-    else:
-        raw = exposures, gammas
+        exposures, gammas = np.log(exposures), np.log(gammas / GAMMA_SRGB)
     photometry = Photometry(
-        *(jnp.asarray(a, jnp.float32) for a in raw), cfg.photometry.parameterization
+        jnp.asarray(exposures, jnp.float32),
+        jnp.asarray(gammas, jnp.float32),
+        cfg.photometry.parameterization,
     )
     reference = saved.get("reference")
     return Run(

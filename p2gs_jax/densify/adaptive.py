@@ -1,4 +1,4 @@
-"""The 3DGS schedule: clone small, split large, prune transparent, reset opacities (as the paper)."""
+"""The 3DGS schedule, as the paper: clone small, split large, prune, reset opacities."""
 
 from __future__ import annotations
 

@@ -56,9 +56,7 @@ def exposure_error(
     }
 
 
-def align_scale(
-    linear: Float[np.ndarray, "... 3"], truth: Float[np.ndarray, "... 3"]
-) -> float:
+def align_scale(linear: Float[np.ndarray, "... 3"], truth: Float[np.ndarray, "... 3"]) -> float:
     """Return the factor c for which c * linear matches truth best in the median of logarithms."""
     keep = (linear > 0) & (truth > 0)
     ratio = np.log(truth[keep].astype(np.float64)) - np.log(linear[keep].astype(np.float64))

@@ -48,9 +48,7 @@ def write_photometry(
     path: Path, *, model: str, curve: dict, gauge: str, mean: dict, views: list[ViewPhotometry]
 ) -> None:
     """Write the file atomically."""
-    write_json(
-        path, {"model": model, "curve": curve, "gauge": gauge, "mean": mean, "views": views}
-    )
+    write_json(path, {"model": model, "curve": curve, "gauge": gauge, "mean": mean, "views": views})
 
 
 def read_photometry(path: Path) -> PhotometryFile:

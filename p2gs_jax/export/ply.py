@@ -6,6 +6,7 @@ carries the linear pre-activation coefficients, untouched.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
@@ -39,7 +40,7 @@ def field_names(coefficients: int) -> list[str]:
 
 def _live(gaussians: Gaussians, alive: Bool[np.ndarray, " n"]) -> Gaussians:
     rows = np.flatnonzero(np.asarray(alive))
-    return jax.tree.map(lambda a: np.asarray(a)[rows], gaussians)
+    return jax.tree.map(lambda a: a[rows], gaussians)
 
 
 def _write(path: Path, g: Gaussians, comments: list[str]) -> int:
@@ -115,9 +116,8 @@ def write_splats(
         activation: of the spherical harmonics.
     """
     g = _live(gaussians, alive)
-    shown = Gaussians(
-        g.means, g.quats, g.log_scales, g.opacity_logits, display_sh(g.sh, tone, activation)
-    )
+    sh = jnp.asarray(display_sh(np.asarray(g.sh), tone, activation))
+    shown = dataclasses.replace(g, sh=sh)
     return _write(path, shown, ["p2gs-jax: display colours, tone-mapped"])
 
 

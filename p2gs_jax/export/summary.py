@@ -45,7 +45,7 @@ def write_summary(
         exif_ev: from EXIF, where it is complete.
     """
     columns = len(photographs)
-    aspect = np.mean([p.shape[0] / p.shape[1] for p in photographs])
+    aspect = float(np.mean([p.shape[0] / p.shape[1] for p in photographs]))
     cell = 3.0 if aspect < 1.2 else 2.0
     figure = plt.figure(figsize=(cell * columns + 0.9, 3 * cell * aspect + 3.4), dpi=110)
     grid = figure.add_gridspec(

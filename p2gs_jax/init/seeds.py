@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.photometry.radiance import radiance_preactivation
@@ -47,6 +47,18 @@ def subsample(count: int, limit: int, seed: int) -> np.ndarray:
     return np.sort(np.random.default_rng((seed, 7)).choice(count, limit, replace=False))
 
 
+def neighbour_scales(
+    points: Float[np.ndarray, "p 3"], views: list[View]
+) -> Float[np.ndarray, " p"]:
+    """Return the RMS distance to the three nearest neighbours (3DGS), bounded by the view."""
+    to_camera, _ = KDTree(camera_centers(views)).query(points)
+    if len(points) <= NEIGHBOURS:
+        return MAX_ANGLE * np.asarray(to_camera)
+    distances, _ = KDTree(points).query(points, k=NEIGHBOURS + 1)
+    scales = np.sqrt(np.mean(np.asarray(distances)[:, 1:] ** 2, axis=1))
+    return np.clip(scales, 1e-7, np.maximum(MAX_ANGLE * np.asarray(to_camera), 1e-6))
+
+
 def gaussians_from_points(
     points: Float[np.ndarray, "p 3"],
     radiance: Float[np.ndarray, "p 3"],
@@ -68,13 +80,7 @@ def gaussians_from_points(
     """
     count = len(points)
     if scales is None:
-        if count > NEIGHBOURS:
-            distances, _ = cKDTree(points).query(points, k=NEIGHBOURS + 1)
-            scales = np.sqrt(np.mean(distances[:, 1:] ** 2, axis=1))
-        else:
-            scales = np.full(count, 0.01)
-        to_camera, _ = cKDTree(camera_centers(views)).query(points)
-        scales = np.clip(scales, 1e-7, np.maximum(MAX_ANGLE * to_camera, 1e-6))
+        scales = neighbour_scales(points, views)
     start = cfg.init.opacity if opacity is None else opacity
     dc = np.asarray(
         radiance_preactivation(

@@ -50,9 +50,7 @@ def _ssim_terms(x, y):
 
 
 @jax.custom_vjp
-def ssim_map(
-    x: Float[Array, "3 h w"], y: Float[Array, "3 h w"]
-) -> Float[Array, "3 h w"]:
+def ssim_map(x: Float[Array, "3 h w"], y: Float[Array, "3 h w"]) -> Float[Array, "3 h w"]:
     """Return the SSIM map of two images, channels first (Wang et al. 2004; 11x11, sigma 1.5).
 
     The gradient flows to `x` only.

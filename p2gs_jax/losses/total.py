@@ -7,7 +7,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.losses.image import photometric_loss
@@ -124,9 +124,7 @@ def total_loss(
     if cfg.densify.method == "mcmc":
         reg = cfg.loss.regularizers
         if reg.opacity is not None:
-            terms["opacity"] = reg.opacity * opacity_regularizer(
-                params.gaussians, population.alive
-            )
+            terms["opacity"] = reg.opacity * opacity_regularizer(params.gaussians, population.alive)
         if reg.scale is not None:
             terms["scale"] = reg.scale * scale_regularizer(
                 params.gaussians, population.alive, extent

@@ -410,9 +410,9 @@ def rasterize_xla(
         stop=cfg.transmittance_stop,
     )
     rows = _pack_rows(splats, radiance, plan)
-    image = _composite(rows, tiles.gaussian_ids, tiles.offsets, plan)
+    tiled: Array = _composite(rows, tiles.gaussian_ids, tiles.offsets, plan)
     image = (
-        image.reshape(down, across, COEFFICIENTS, tile_y, tile_x)
+        tiled.reshape(down, across, COEFFICIENTS, tile_y, tile_x)
         .transpose(0, 3, 1, 4, 2)
         .reshape(down * tile_y, across * tile_x, COEFFICIENTS)[:height, :width]
     )

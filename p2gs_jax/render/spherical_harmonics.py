@@ -38,11 +38,11 @@ def degree_of(count: int) -> int:
 def basis(directions: Float[Array, "n 3"], degree: int) -> list[Float[Array, " n"]]:
     """Return the (degree + 1)^2 basis values of unit directions, as separate vectors."""
     x, y, z = directions[:, 0], directions[:, 1], directions[:, 2]
+    xx, yy, zz = x * x, y * y, z * z
     values = [jnp.full_like(x, C0)]
     if degree >= 1:
         values += [-C1 * y, C1 * z, -C1 * x]
     if degree >= 2:
-        xx, yy, zz = x * x, y * y, z * z
         values += [
             C2[0] * x * y,
             -C2[0] * y * z,

@@ -68,13 +68,10 @@ def sky(town: Town, view: Float[Array, "3 r"], *, clouds: bool) -> Float[Array, 
     if not clouds:
         return clear
     reach = 1.0 / (up + 0.10)
-    x, y = view[0] * reach, view[1] * reach
-    z = jnp.zeros_like(x)
-    shape = (
-        0.55 * _noise(0.55 * x, 0.9 * y, z, town.seed + 11)[0]
-        + 0.30 * _noise(1.3 * x, 1.9 * y, z, town.seed + 12)[0]
-        + 0.15 * _noise(3.1 * x, 4.1 * y, z, town.seed + 13)[0]
-    )
+    x = _column((0.6, 1.4, 3.3)) * (view[0] * reach)
+    y = _column((1.3, 2.6, 5.3)) * (view[1] * reach)
+    octaves = _noise(x, y, jnp.zeros_like(x), tuple(town.seed + 11 + k for k in range(3)))[0]
+    shape = 0.50 * octaves[0] + 0.32 * octaves[1] + 0.18 * octaves[2]
     cover = _smooth(0.02, 0.42, shape) * _smooth(0.0, 0.10, up)
     white = _column((2.9, 2.75, 2.55)) * (0.62 + 0.38 * _smooth(0.1, 0.5, shape))
     return clear + 0.85 * cover * (white - clear)
@@ -105,16 +102,17 @@ def paint(
     slant = jnp.maximum(jnp.abs(jnp.sum(normal * view, 0)), 0.12)
     footprint = footprint / jnp.sqrt(slant)
 
-    wave = np.full(len(Material), 0.10, np.float32)
-    wave[[Material.ROAD, Material.PAVEMENT, Material.FOLIAGE, Material.BARK]] = 0.07, 0.08, 0.15, 0.05
-    fine_wave = jnp.asarray(wave)[material]
-    wave[:] = 1.6
-    wave[[Material.ROAD, Material.FOLIAGE, Material.CAR_BODY]] = 2.7, 0.55, 0.6
-    coarse_wave = jnp.asarray(wave)[material]
-    fine = _noise(*(p / fine_wave), town.seed + 1) * _detail(footprint, fine_wave)
-    medium = _noise(*(p / (4.0 * fine_wave)), town.seed + 2) * _detail(footprint, 4.0 * fine_wave)
-    fine = 0.6 * fine + 0.5 * medium
-    coarse = _noise(*(p / coarse_wave), town.seed + 3) * _detail(footprint, coarse_wave)
+    fine_wave = _by_material(
+        0.10,
+        {Material.ROAD: 0.07, Material.PAVEMENT: 0.08, Material.FOLIAGE: 0.16, Material.BARK: 0.05},
+    )[material]
+    coarse_wave = _by_material(
+        1.6, {Material.ROAD: 2.7, Material.FOLIAGE: 0.55, Material.CAR_BODY: 0.6}
+    )[material]
+    waves = jnp.stack([fine_wave, 4.0 * fine_wave, coarse_wave])
+    noise = _noise(*(p[:, None] / waves), (town.seed + 1, town.seed + 2, town.seed + 3))
+    noise = noise * _detail(footprint, waves)
+    fine, coarse = 0.7 * noise[:, 0] + 0.55 * noise[:, 1], noise[:, 2]
     point = _Point(
         p, normal, *rows.reshape(-1, p.shape[1])[:12].reshape(4, 3, -1), *rows[12:16],
         index, footprint, fine, coarse,
@@ -147,11 +145,13 @@ def paint(
     albedo = jnp.select([c[None] for c in cases], [v[0] for v in paints.values()])
     emission = jnp.select([c[None] for c in cases], [v[1] for v in paints.values()])
     gloss = jnp.select(cases, [v[2] for v in paints.values()])
-    relief = jnp.where(material == Material.FOLIAGE, 1.0, 0.05)
+    relief = jnp.where(material == Material.FOLIAGE, 1.3, 0.05)
     bent = normal + relief * (fine + 0.5 * coarse)
     bent = bent / jnp.sqrt(jnp.sum(bent**2, 0) + 1e-9)
     flat = gloss > 0.3
-    return Surface(jnp.clip(albedo, 0.002, 0.9), emission, gloss, normal, jnp.where(flat, normal, bent))
+    return Surface(
+        jnp.clip(albedo, 0.002, 0.9), emission, gloss, normal, jnp.where(flat, normal, bent)
+    )
 
 
 # ------------------------------------------------------------------ materials
@@ -161,7 +161,7 @@ def _road(s: _Point, seed: int) -> Array:
     x, y = s.p[0], s.p[1]
     across = jnp.abs(y)
     crossing = (x > CROSS_STREET[0] + 1.0) & (x < CROSS_STREET[1] - 1.0)
-    tyre = jnp.exp(-(((across - 1.75) ** 2) - 0.75) ** 2 * 6.0)
+    tyre = jnp.exp(-((((across - 1.75) ** 2) - 0.75) ** 2) * 6.0)
     tone = 0.105 * (1.0 + 0.30 * s.coarse[0] + 0.22 * s.fine[0] + 0.10 * tyre * (~crossing))
     patch = _hash(jnp.floor(x / 3.1), jnp.floor(y / 1.9), 0.0 * x, seed + 5)
     edge = _box(_cell(x, 3.1), 0.85, s.footprint) * _box(_cell(y, 1.9), 0.7, s.footprint)
@@ -216,7 +216,7 @@ def _facade(s: _Point, seed: int) -> tuple[Array, Array, Array]:
     floor = jnp.floor((z - GROUND_FLOOR_HEIGHT) / FLOOR_HEIGHT)
     dz = z - GROUND_FLOOR_HEIGHT - (floor + 0.5) * FLOOR_HEIGHT - 0.05
     seen = s.row.astype(jnp.float32) + 0.25 * along_y
-    draw = [_hash(column, floor, seen, seed + 20 + k) for k in range(3)]
+    draw = _hash3(column, floor, seen, seed + 20)
 
     wall = s.color * _masonry(s, u, z, seed)
     drip = jnp.exp(-jnp.abs(dz + 1.15) * 2.5) * jnp.clip(s.coarse[2] + 0.3, 0.0, 1.0)
@@ -260,10 +260,12 @@ def _facade(s: _Point, seed: int) -> tuple[Array, Array, Array]:
         _box(z - 2.45, 0.04, f),
     ) * (~gate)
     goods = _hash(jnp.floor(u / 0.42), jnp.floor(z / 0.36), seen, seed + 30)
-    tint = jnp.stack([_hash(jnp.floor(u / 0.42), jnp.floor(z / 0.36), seen, seed + k) for k in (31, 32, 33)])
-    shelf = _box(_cell(u, 0.42), 0.16, f) * _box(_cell(z, 0.36), 0.13, f) * (goods > 0.35) * (z < 2.4)
+    tint = _hash3(jnp.floor(u / 0.42), jnp.floor(z / 0.36), seen, seed + 31)
+    shelf = (
+        _box(_cell(u, 0.42), 0.16, f) * _box(_cell(z, 0.36), 0.13, f) * (goods > 0.35) * (z < 2.4)
+    )
     shelf = shelf * (~(door | gate))
-    show = 0.03 + shelf * 0.34 * (0.25 + tint)
+    show = 0.03 + shelf * 0.30 * (0.35 + 0.45 * tint[:1] + 0.3 * tint)
     show = jnp.where(gate, 0.004, show)
     bright = jnp.where(draw[1] > 0.55, 1.1 * draw[2] + 0.35, 0.06) * (~gate)
     front = _shop_color(s)
@@ -277,7 +279,14 @@ def _facade(s: _Point, seed: int) -> tuple[Array, Array, Array]:
     albedo = jnp.where(shop, base, albedo)
     warm_shop = _column((1.0, 0.80, 0.55))
     ambient = 0.35 + 0.65 * _smooth(0.4, 3.0, z)
-    shop_light = hole * (1.0 - rim) * bright * ambient * warm_shop * (0.12 + shelf * (0.4 + tint))
+    shop_light = (
+        hole
+        * (1.0 - rim)
+        * bright
+        * ambient
+        * warm_shop
+        * (0.12 + shelf * (0.5 + 0.45 * tint[:1] + 0.3 * tint))
+    )
     emission = jnp.where(shop, shop_light, emission)
     gloss = jnp.where(shop, hole * (1.0 - rim) * (~gate), gloss)
 
@@ -285,9 +294,7 @@ def _facade(s: _Point, seed: int) -> tuple[Array, Array, Array]:
     dz0 = z - 2.0
     window = _box(du, half_w, f) * _box(dz0, 0.85, f) * house
     band = _box(du, half_w + 0.15, f) * _box(dz0, 1.0, f) * house
-    sash0 = jnp.maximum(
-        1.0 - _box(du, half_w - 0.06, f) * _box(dz0, 0.79, f), _box(du, 0.035, f)
-    )
+    sash0 = jnp.maximum(1.0 - _box(du, half_w - 0.06, f) * _box(dz0, 0.79, f), _box(du, 0.035, f))
     albedo = albedo + band * (s.accent - albedo)
     albedo = albedo + window * (0.03 + sash0 * (frame - 0.03) - albedo)
     gloss = jnp.where(house, window * (1.0 - sash0), gloss)
@@ -326,9 +333,9 @@ def _masonry(s: _Point, u: Array, z: Array, seed: int) -> Array:
 
 
 def _foliage(s: _Point) -> Array:
-    clumps = 1.0 + 0.50 * s.fine[0] + 0.45 * s.coarse[0]
+    clumps = 1.0 + 0.9 * s.fine[0] + 0.5 * s.coarse[0]
     autumn = jnp.clip(0.5 * s.fine[1] + 0.6 * s.coarse[1], 0.0, 1.0)
-    leaf = s.color * jnp.maximum(clumps, 0.15)
+    leaf = s.color * jnp.maximum(clumps, 0.12)
     return leaf + autumn * (_column((0.30, 0.27, 0.05)) - leaf) * 0.5
 
 
@@ -344,9 +351,7 @@ def _car_body(s: _Point) -> tuple[Array, Array]:
     deck = s.lo[2] < 0.5
     seams = jnp.maximum(_box(u - 0.75, 0.012, f), _box(u + 0.42, 0.012, f)) * (z > 0.36)
     seams = jnp.maximum(seams, _box(z - 0.33, 0.03, f)) * flank
-    arches = jnp.minimum(
-        (jnp.abs(u) - half + 0.78) ** 2 + (z - 0.33) ** 2, jnp.full_like(u, 1.0)
-    )
+    arches = jnp.minimum((jnp.abs(u) - half + 0.78) ** 2 + (z - 0.33) ** 2, jnp.full_like(u, 1.0))
     arch = (arches < 0.40**2) * flank
     handle = (_box(u + 0.25, 0.08, f) + _box(u + 1.2, 0.08, f)) * _box(z - 0.74, 0.02, f) * flank
     plate = _box(v, 0.26, f) * _box(z - 0.47, 0.06, f) * ends
@@ -419,6 +424,7 @@ def _awning(s: _Point) -> Array:
 
 # ------------------------------------------------------------------ building blocks
 
+
 def _normal(town: Town, p: Array, index: Array, lo: Array, hi: Array) -> Array:
     """Return the unit normal of the primitive, the ground's where index is P."""
     middle, half = (lo + hi) / 2, jnp.maximum((hi - lo) / 2, 1e-6)
@@ -460,10 +466,10 @@ def _smooth(low: float, high: float, x: Array) -> Array:
     return t * t * (3.0 - 2.0 * t)
 
 
-def _bits(x: Array, y: Array, z: Array, seed: int) -> Array:
+def _bits(x: Array, y: Array, z: Array, salt: Array) -> Array:
     """Return 32 well-mixed bits of integer lattice coordinates (Wang-style finaliser)."""
     h = x * jnp.uint32(0x8DA6B343) + y * jnp.uint32(0xD8163841) + z * jnp.uint32(0xCB1AB31F)
-    h = h + jnp.uint32((seed * 0x9E3779B9) & 0xFFFFFFFF)
+    h = h + salt
     h = (h ^ (h >> 16)) * jnp.uint32(0x7FEB352D)
     h = (h ^ (h >> 15)) * jnp.uint32(0x846CA68B)
     return h ^ (h >> 16)
@@ -475,20 +481,43 @@ def _lattice(x: Array) -> Array:
 
 def _hash(x: Array, y: Array, z: Array, seed: int) -> Array:
     """Return a number in [0, 1) for every lattice cell (z in quarters)."""
-    bits = _bits(_lattice(x), _lattice(y), _lattice(4.0 * z), seed)
+    bits = _bits(
+        _lattice(x), _lattice(y), _lattice(4.0 * z), jnp.uint32((seed * 0x9E3779B9) & 0xFFFFFFFF)
+    )
     return (bits >> 8).astype(jnp.float32) / 2.0**24
 
 
-def _noise(x: Array, y: Array, z: Array, seed: int) -> Array:
-    """Return three channels of smooth value noise, about [-1, 1], wavelength about 2 cells."""
+def _hash3(x: Array, y: Array, z: Array, seed: int) -> Array:
+    """Return three numbers in [0, 1) for every lattice cell (z in quarters), [3 R]."""
+    bits = _bits(
+        _lattice(x), _lattice(y), _lattice(4.0 * z), jnp.uint32((seed * 0x9E3779B9) & 0xFFFFFFFF)
+    )
+    return jnp.stack(
+        [((bits >> (2 + 10 * c)) & 1023).astype(jnp.float32) / 1024.0 for c in range(3)]
+    )
+
+
+def _noise(x: Array, y: Array, z: Array, seeds: tuple[int, ...]) -> Array:
+    """Return smooth value noise, about [-1, 1], wavelength about 2 cells.
+
+    Args:
+        x: coordinates in cells, [S R]; a row for each seed.
+        y: likewise.
+        z: likewise.
+        seeds: of the S rows.
+
+    Returns:
+        Three independent channels, [3 S R].
+    """
     base = [jnp.floor(a) for a in (x, y, z)]
     w = [(a - b) for a, b in zip((x, y, z), base, strict=True)]
     w = [a * a * (3.0 - 2.0 * a) for a in w]
     cell = [_lattice(b) for b in base]
+    salt = jnp.asarray([(s * 0x9E3779B9) & 0xFFFFFFFF for s in seeds], jnp.uint32)[:, None]
     total = [jnp.zeros_like(x) for _ in range(3)]
     for corner in range(8):
         offset = [(corner >> k) & 1 for k in range(3)]
-        bits = _bits(*(c + jnp.uint32(o) for c, o in zip(cell, offset, strict=True)), seed)
+        bits = _bits(*(c + jnp.uint32(o) for c, o in zip(cell, offset, strict=True)), salt)
         weight = jnp.ones_like(x)
         for k in range(3):
             weight = weight * (w[k] if offset[k] else 1.0 - w[k])
@@ -496,6 +525,10 @@ def _noise(x: Array, y: Array, z: Array, seed: int) -> Array:
             value = ((bits >> (2 + 10 * c)) & 1023).astype(jnp.float32) / 511.5 - 1.0
             total[c] = total[c] + weight * value
     return jnp.stack(total)
+
+
+def _by_material(default: float, values: dict[Material, float]) -> Array:
+    return jnp.asarray([values.get(m, default) for m in Material], jnp.float32)
 
 
 def _column(values) -> Array:

@@ -307,9 +307,7 @@ def _vista(build: _Builder) -> None:
         (0.30, 0.12, 0.08),
         top=(113.0, 125.0, -25.0, 25.0),
     )
-    build.add(
-        (105.0, -4.0, 0.0), (113.0, 4.0, 24.0), Material.FACADE, wall, accent=trim, style=2.0
-    )
+    build.add((105.0, -4.0, 0.0), (113.0, 4.0, 24.0), Material.FACADE, wall, accent=trim, style=2.0)
     build.add((104.6, -4.4, 23.6), (113.4, 4.4, 24.4), Material.PLAIN, trim)
     build.add(
         (104.8, -4.2, 24.4),
@@ -334,14 +332,14 @@ def _trees(build: _Builder) -> None:
             )
             hue = build.uniform(0.0, 1.0)
             leaf = (0.10 + 0.10 * hue, 0.22 + 0.04 * hue, 0.035)
-            for j in range(6):
+            for j in range(9):
                 angle = 2.4 * j + build.uniform(-0.4, 0.4)
-                spread = 0.0 if j == 0 else 0.85
-                r = 1.25 if j == 0 else build.uniform(0.75, 1.05)
+                spread = 0.0 if j == 0 else build.uniform(0.75, 1.05) - 0.05 * j
+                r = 1.15 if j == 0 else build.uniform(0.55, 0.85)
                 center = (
                     x + spread * np.cos(angle),
                     y + spread * np.sin(angle),
-                    trunk + 1.0 + 0.28 * j + build.uniform(-0.15, 0.15),
+                    trunk + 1.35 if j == 0 else trunk + 0.75 + 0.2 * j + build.uniform(-0.1, 0.1),
                 )
                 build.blob(center, (r, r, 0.85 * r), Material.FOLIAGE, leaf)
 

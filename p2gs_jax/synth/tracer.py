@@ -40,11 +40,20 @@ class Tracer:
     def __init__(self, town: Town):
         """Keep the town; nothing is compiled yet."""
         self.town = town
-        self._render = jax.jit(self._render_tiles, static_argnums=(2, 3, 4))
+        # Most of a small job is compilation; without LLVM's slowest passes it takes two thirds.
+        self._render = jax.jit(
+            self._render_tiles,
+            static_argnums=(2, 3, 4),
+            compiler_options={"xla_llvm_disable_expensive_passes": True},
+        )
 
     def render(
-        self, viewmat: Float[np.ndarray, "4 4"], K: Float[np.ndarray, "3 3"],
-        width: int, height: int, supersample: int = 2,
+        self,
+        viewmat: Float[np.ndarray, "4 4"],
+        K: Float[np.ndarray, "3 3"],
+        width: int,
+        height: int,
+        supersample: int = 2,
     ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
         """Return linear radiance, and camera z at the pixel centres (inf: sky), m.
 
@@ -56,8 +65,11 @@ class Tracer:
             supersample: samples a pixel along each axis; the pixel is their mean.
         """
         linear, depth = self._render(
-            jnp.asarray(viewmat, jnp.float32), jnp.asarray(K, jnp.float32),
-            width, height, supersample,
+            jnp.asarray(viewmat, jnp.float32),
+            jnp.asarray(K, jnp.float32),
+            width,
+            height,
+            supersample,
         )
         return np.asarray(linear), np.asarray(depth)
 
@@ -118,7 +130,8 @@ def radiance(
     view = direction / jnp.sqrt(jnp.sum(direction**2, 0))
     surface = paint(town, p, view, index, jnp.where(hit, t, 1.0) * pixel_angle)
     lit = _light(town, p, view, surface, hit)
-    return jnp.where(hit, lit, sky(town, view, clouds=True))
+    above = lax.cond(jnp.all(hit), jnp.zeros_like, lambda view: sky(town, view, clouds=True), view)
+    return jnp.where(hit, lit, above)
 
 
 def _light(town: Town, p: Array, view: Array, surface: Surface, hit: Array) -> Array:
@@ -267,7 +280,9 @@ def open_sky(
 
     def nearer(distance: Callable) -> Callable:
         def body(best, row: Array, *item: Array):
-            return tuple(jnp.minimum(b, distance(q, *item)) for b, q in zip(best, probes, strict=True))
+            return tuple(
+                jnp.minimum(b, distance(q, *item)) for b, q in zip(best, probes, strict=True)
+            )
 
         return body
 

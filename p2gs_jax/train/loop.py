@@ -215,7 +215,6 @@ class Trainer:
         session_start = time.monotonic()
         before = host.elapsed_s
         last_save = session_start
-        planned_level = None
         while host.progress < 1.0 - 0.5 * host.pace:
             state, reports = self._burst(state, host)
             host.elapsed_s = before + time.monotonic() - session_start
@@ -223,15 +222,11 @@ class Trainer:
             if reports:
                 self._log(reports, state, host, shrink)
                 state = self._maybe_densify(state, host, limit)
-            if pace.deadline_s is not None and host.step_s > 0:
-                pace = dataclasses.replace(pace, per_step=host.pace)
-                compile_s = 8.0
-                if planned_level != shrink or host.step % 5 == 0:
-                    pace = pace.replan(
-                        host.progress, host.elapsed_s, host.step_s, self.levels, compile_s
-                    )
-                    planned_level = shrink
-                host.pace = pace.per_step
+            if pace.deadline_s is not None:
+                if host.step_s > 0:
+                    pace = dataclasses.replace(pace, per_step=host.pace)
+                    pace = pace.replan(host.progress, host.elapsed_s, host.step_s)
+                    host.pace = pace.per_step
                 if host.elapsed_s > pace.deadline_s:
                     self.on_message(
                         f"The time budget ended the run at {host.progress:.0%} of its schedule."
@@ -293,8 +288,6 @@ class Trainer:
             compiled = True
         if not compiled and done:
             self._time(host, (time.monotonic() - begin) / done)
-        elif done:
-            host.step_s = 0.0
         reports = reports[:done]
         host.step += done
         for _ in range(done):
@@ -385,7 +378,7 @@ class Trainer:
         d = self.cfg.densify
         events = (d.stop - host.progress) / max(d.every, d.min_every_steps * host.pace)
         factor = max(d.growth, room ** (1 / max(events, 1.0)))
-        births = min(int(math.ceil(alive * factor)), limit or alive) - alive
+        births = min(math.ceil(alive * factor), limit or alive) - alive
         outcome = self._relocate(
             key, state.params.gaussians, state.population, jnp.int32(max(births, 0))
         )
@@ -433,4 +426,3 @@ class Trainer:
 
 def _mean(values) -> float:
     return float(np.mean([float(v) for v in values]))
-

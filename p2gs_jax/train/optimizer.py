@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,8 +17,9 @@ from p2gs_jax.types import Gaussians, Params, Photometry
 def scale_by_rates() -> optax.GradientTransformationExtraArgs:
     """Multiply each update by minus its own learning rate, given at update time as `rates`."""
 
-    def update(updates, state, params=None, *, rates: Params, **_):
+    def update(updates, state, params=None, **extra: Any):
         del params
+        rates: Params = extra["rates"]
         return jax.tree.map(lambda u, r: -r * u, updates, rates), state
 
     return optax.GradientTransformationExtraArgs(lambda params: optax.EmptyState(), update)

@@ -12,10 +12,8 @@ from dataclasses import dataclass
 from p2gs_jax.config import TrainConfig
 
 MIN_LEVEL_PIXELS = 96
-# Pixels are not all of the cost of a step: measured time falls by this power of their number.
-PIXEL_EXPONENT = 0.75
-FIRST_PLAN_STEPS = 12
 MIN_STEPS_LEFT = 8
+MAX_SPEED_UP = 1.5
 
 
 def levels(cfg: TrainConfig, width: int, height: int) -> tuple[tuple[float, int], ...]:
@@ -42,11 +40,6 @@ def sh_degree_at(progress: float, cfg: TrainConfig, highest: int) -> int:
     return min(highest, int(progress / cfg.sh_every + 1e-9))
 
 
-def crossed(before: float, after: float, interval: float) -> bool:
-    """Return whether a multiple of `interval` lies in (before, after]."""
-    return int(after / interval + 1e-9) > int(before / interval + 1e-9)
-
-
 @dataclass(frozen=True)
 class Pace:
     """How much progress a step makes, and what is known about its cost.
@@ -70,35 +63,21 @@ class Pace:
         deadline = None if cfg.budget_s is None else max(cfg.budget_s - reserve_s, 5.0)
         return cls(1.0 / max(cfg.steps, 1), deadline)
 
-    def replan(
-        self,
-        progress: float,
-        elapsed_s: float,
-        step_s: float,
-        plan: tuple[tuple[float, int], ...],
-        compile_s: float,
-    ) -> Pace:
-        """Return the pace that ends on time, given the measured step time at this level.
+    def replan(self, progress: float, elapsed_s: float, step_s: float) -> Pace:
+        """Return the pace at which the run ends on time.
+
+        Under a budget, progress is the share of time: every level of the schedule gets its share
+        of the seconds, whatever its steps cost, and compilation counts like any other second.
 
         Args:
             progress: where the run is.
             elapsed_s: seconds since the run began.
             step_s: measured seconds per step at the present level.
-            plan: levels, see `levels`.
-            compile_s: seconds that the first step of a further level is expected to cost.
         """
         if self.deadline_s is None:
             return self
-        shrink_now = shrink_at(progress, plan)
-        cost, start, ahead = 0.0, 0.0, 0
-        for end, shrink in plan:
-            part = max(end - max(start, progress), 0.0)
-            ratio = (shrink_now / shrink) ** (2 * PIXEL_EXPONENT)
-            cost += part * step_s * ratio
-            ahead += part > 0 and shrink != shrink_now
-            start = end
-        left = self.deadline_s - elapsed_s - ahead * compile_s
-        per_step = cost / max(left, 1e-3)
-        return dataclasses.replace(
-            self, per_step=min(per_step, (1.0 - progress) / MIN_STEPS_LEFT + 1e-12)
-        )
+        left = max(self.deadline_s - elapsed_s, 1e-3)
+        wanted = (1.0 - progress) * step_s / left
+        # One slow burst (another program, a page fault) must not use up the schedule.
+        bounded = min(wanted, MAX_SPEED_UP * self.per_step, (1.0 - progress) / MIN_STEPS_LEFT)
+        return dataclasses.replace(self, per_step=max(bounded, 1e-9))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -59,7 +60,11 @@ def initial_state(
 ) -> FitState:
     """Return the state before the first step."""
     return FitState(
-        params, optimizer.init(params), fresh_population(alive), jnp.int32(0), Fault.none()
+        params,
+        optimizer.init(cast(Any, params)),
+        fresh_population(alive),
+        jnp.int32(0),
+        Fault.none(),
     )
 
 

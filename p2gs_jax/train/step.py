@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -78,9 +78,7 @@ def _recentered(photometry: Photometry, cfg: FitConfig) -> Photometry:
     return dataclasses.replace(photometry, raw_exposures=raw - jnp.mean(raw))
 
 
-def _observed(
-    population: Population, v_probe: Array, aux: LossAux, state: FitState
-) -> Population:
+def _observed(population: Population, v_probe: Array, aux: LossAux, state: FitState) -> Population:
     """Add this view to the densification statistics."""
     seen = aux.render.visible & (jnp.sum(jnp.abs(v_probe), -1) > 0)
     return dataclasses.replace(
@@ -130,10 +128,11 @@ def make_step(cfg: FitConfig, optimizer: optax.GradientTransformationExtraArgs, 
 
         def advance(state: FitState) -> FitState:
             rates = learning_rates(controls.progress, extent, state.params, cfg)
+            # optax annotates trees as nests of containers and does not know our records.
             updates, opt_state = optimizer.update(
-                grads, state.opt_state, state.params, rates=rates
+                cast(Any, grads), state.opt_state, cast(Any, state.params), rates=rates
             )
-            params = optax.apply_updates(state.params, updates)
+            params = cast(Params, optax.apply_updates(cast(Any, state.params), updates))
             gaussians, population = params.gaussians, state.population
             if cfg.densify.method == "mcmc":
                 key = jax.random.fold_in(jax.random.key(cfg.train.seed), state.step)
