@@ -7,9 +7,9 @@ from jaxtyping import Array, Float
 
 
 def safe_log(x: Float[Array, "..."], floor: float) -> Float[Array, "..."]:
-    """Return log(max(x, floor)); the gradient is zero below the floor."""
-    above = x > floor
-    return jnp.where(above, jnp.log(jnp.where(above, x, 1.0)), jnp.log(floor))
+    """Return log(max(x, floor)); the gradient is zero at and below the floor, NaN stays NaN."""
+    below = x <= floor
+    return jnp.where(below, jnp.log(floor), jnp.log(jnp.where(below, 1.0, x)))
 
 
 def safe_div(a: Float[Array, "..."], b: Float[Array, "..."]) -> Float[Array, "..."]:

@@ -6,10 +6,12 @@ channel-first: points and colours are [3 R].
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float, Int
 
 from p2gs_jax.synth.town import (
@@ -110,41 +112,59 @@ def paint(
         1.6, {Material.ROAD: 2.7, Material.FOLIAGE: 0.55, Material.CAR_BODY: 0.6}
     )[material]
     waves = jnp.stack([fine_wave, 4.0 * fine_wave, coarse_wave])
-    noise = _noise(*(p[:, None] / waves), (town.seed + 1, town.seed + 2, town.seed + 3))
+    x, y, z = p[:, None] / waves
+    noise = _noise(x, y, z, (town.seed + 1, town.seed + 2, town.seed + 3))
     noise = noise * _detail(footprint, waves)
     fine, coarse = 0.7 * noise[:, 0] + 0.55 * noise[:, 1], noise[:, 2]
     point = _Point(
-        p, normal, *rows.reshape(-1, p.shape[1])[:12].reshape(4, 3, -1), *rows[12:16],
-        index, footprint, fine, coarse,
-    )  # fmt: skip
+        p=p,
+        normal=normal,
+        lo=rows[0:3],
+        hi=rows[3:6],
+        color=rows[6:9],
+        accent=rows[9:12],
+        style=rows[12],
+        bay=rows[13],
+        use=rows[14],
+        random=rows[15],
+        row=index,
+        footprint=footprint,
+        fine=fine,
+        coarse=coarse,
+    )
 
     none = jnp.zeros_like(p)
     dull = jnp.zeros_like(footprint)
     mottled = point.color * (1.0 + 0.16 * fine[0] + 0.16 * coarse[0])
-    facade, facade_light, facade_gloss = _facade(point, town.seed)
-    glass, glass_gloss = _car_glass(point)
-    body, body_light = _car_body(point)
-    bark = point.color * (1.0 + 0.35 * fine[0])
-    paints: dict[Material, tuple[Array, Array, Array]] = {
-        Material.ROAD: (_road(point, town.seed), none, dull),
-        Material.PAVEMENT: (_pavement(point, town.seed), none, dull),
-        Material.FACADE: (facade, facade_light, facade_gloss),
-        Material.PLAIN: (mottled, none, dull),
-        Material.CAR_BODY: (body, body_light, dull + 0.7),
-        Material.CAR_GLASS: (glass, none, glass_gloss),
-        Material.WHEEL: (_wheel(point), none, dull),
-        Material.BARK: (bark, none, dull),
-        Material.FOLIAGE: (_foliage(point), none, dull),
-        Material.METAL: (mottled, none, dull + 0.25),
-        Material.EMISSIVE: (0.0 * none + 0.05, point.color, dull),
-        Material.SIGN: (_sign(point), none, dull),
-        Material.TILES: (_tiles(point, town.seed), none, dull),
-        Material.AWNING: (_awning(point), none, dull),
+    seed = town.seed
+    paints: dict[Material, Callable[[], tuple[Array, Array, Array]]] = {
+        Material.ROAD: lambda: (_road(point, seed), none, dull),
+        Material.PAVEMENT: lambda: (_pavement(point, seed), none, dull),
+        Material.FACADE: lambda: _facade(point, seed),
+        Material.PLAIN: lambda: (mottled, none, dull),
+        Material.CAR_BODY: lambda: (_car_body(point), none, dull + 0.7),
+        Material.CAR_GLASS: lambda: _car_glass(point),
+        Material.WHEEL: lambda: (_wheel(point), none, dull),
+        Material.BARK: lambda: (point.color * (1.0 + 0.35 * fine[0]), none, dull),
+        Material.FOLIAGE: lambda: (_foliage(point), none, dull),
+        Material.METAL: lambda: (mottled, none, dull + 0.25),
+        Material.EMISSIVE: lambda: (none + 0.05, point.color, dull),
+        Material.SIGN: lambda: (_sign(point), none, dull),
+        Material.TILES: lambda: (_tiles(point, seed), none, dull),
+        Material.AWNING: lambda: (_awning(point), none, dull),
     }
-    cases = [material == m for m in paints]
-    albedo = jnp.select([c[None] for c in cases], [v[0] for v in paints.values()])
-    emission = jnp.select([c[None] for c in cases], [v[1] for v in paints.values()])
-    gloss = jnp.select(cases, [v[2] for v in paints.values()])
+    albedo, emission, gloss = none, none, dull
+    for name, brush in paints.items():
+        here = material == name
+
+        def stroke(so_far, brush=brush, here=here):
+            return tuple(
+                jnp.where(here, new, old) for new, old in zip(brush(), so_far, strict=True)
+            )
+
+        # A tile sees few materials: the others cost nothing.
+        so_far = (albedo, emission, gloss)
+        albedo, emission, gloss = lax.cond(jnp.any(here), stroke, lambda x: x, so_far)
     relief = jnp.where(material == Material.FOLIAGE, 1.3, 0.05)
     bent = normal + relief * (fine + 0.5 * coarse)
     bent = bent / jnp.sqrt(jnp.sum(bent**2, 0) + 1e-9)
@@ -339,7 +359,7 @@ def _foliage(s: _Point) -> Array:
     return leaf + autumn * (_column((0.30, 0.27, 0.05)) - leaf) * 0.5
 
 
-def _car_body(s: _Point) -> tuple[Array, Array]:
+def _car_body(s: _Point) -> Array:
     f = s.footprint
     middle = (s.lo + s.hi) / 2
     ahead = jnp.where(s.style == 0.0, 1.0, s.style)
@@ -365,10 +385,10 @@ def _car_body(s: _Point) -> tuple[Array, Array]:
     tone = tone + jnp.clip(handle, 0.0, 1.0) * deck * (0.35 - tone)
     tone = tone + plate * deck * (0.62 - tone)
     tone = tone + lights * deck * (lens - tone)
-    return tone, jnp.zeros_like(tone)
+    return tone
 
 
-def _car_glass(s: _Point) -> tuple[Array, Array]:
+def _car_glass(s: _Point) -> tuple[Array, Array, Array]:
     f = s.footprint
     middle = (s.lo + s.hi) / 2
     u = (s.p[0] - middle[0]) * s.style
@@ -382,7 +402,8 @@ def _car_glass(s: _Point) -> tuple[Array, Array]:
     body = jnp.clip(jnp.where(flank, pillars, corner) + rim, 0.0, 1.0)
     body = jnp.where(s.normal[2] > 0.9, 1.0, body)
     seats = 0.018 + 0.03 * _box(height - 0.25, 0.25, f) * (jnp.abs(s.coarse[0]) > 0.2)
-    return seats + body * (s.color - seats), 1.0 - 0.3 * body
+    paint = seats + body * (s.color - seats)
+    return paint, jnp.zeros_like(paint), 1.0 - 0.3 * body
 
 
 def _wheel(s: _Point) -> Array:
@@ -517,10 +538,11 @@ def _noise(x: Array, y: Array, z: Array, seeds: tuple[int, ...]) -> Array:
     total = [jnp.zeros_like(x) for _ in range(3)]
     for corner in range(8):
         offset = [(corner >> k) & 1 for k in range(3)]
-        bits = _bits(*(c + jnp.uint32(o) for c, o in zip(cell, offset, strict=True)), salt)
+        i, j, k = (c + jnp.uint32(o) for c, o in zip(cell, offset, strict=True))
+        bits = _bits(i, j, k, salt)
         weight = jnp.ones_like(x)
-        for k in range(3):
-            weight = weight * (w[k] if offset[k] else 1.0 - w[k])
+        for axis in range(3):
+            weight = weight * (w[axis] if offset[axis] else 1.0 - w[axis])
         for c in range(3):
             value = ((bits >> (2 + 10 * c)) & 1023).astype(jnp.float32) / 511.5 - 1.0
             total[c] = total[c] + weight * value

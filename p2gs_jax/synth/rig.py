@@ -58,7 +58,9 @@ def carla_rotation(roll: float, pitch: float, yaw: float) -> Float[np.ndarray, "
     )
 
 
-def camera_viewmat(mount: Mount, vehicle: tuple[float, float, float]) -> Float[np.ndarray, "4 4"]:
+def camera_viewmat(
+    mount: Mount, vehicle: Float[np.ndarray, " 3"] | tuple[float, float, float]
+) -> Float[np.ndarray, "4 4"]:
     """Return world-to-camera (OpenCV) of a camera on a vehicle that heads along +x.
 
     Args:

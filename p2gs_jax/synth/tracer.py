@@ -1,10 +1,11 @@
 """Ray caster: linear HDR radiance and depth of a town, on the CPU through XLA.
 
-Every sample finds its nearest primitive by scanning all of them (a loop over P whose body is
-vectorised over a few thousand rays that stay in cache), is painted by `paint`, and is lit by the
-sun (one shadow ray), the sky and the ground (ambient, occluded by what lies within 5 m: the distance
-field of the town at three points along the normal, smooth and the same from every view). Radiance
-is averaged over the pixel in linear space.
+The image is cut into tiles. Each tile makes short lists of the primitives that its rays can meet,
+that can shade its points, and that are near them; loops over these lists are vectorised over the
+tile's few thousand rays. A sample finds its nearest primitive, is painted by `paint`, and is lit
+by the sun (one shadow ray), the sky and the ground (ambient, occluded by what lies within 5 m: the
+distance field of the town at three points along the normal, smooth and the same from every view).
+Radiance is averaged over the pixel in linear space.
 
 Arrays are channel-first: points and directions are [3 R].
 """
@@ -304,7 +305,7 @@ def _over(town: Town, among: Array, carry, box: Callable, tapered=None, ellipsoi
     """Fold the bodies over the primitives in `among`: body(carry, row, *geometry) -> carry."""
     first_blob = town.n_boxes + town.n_tapered
     nowhere = np.full((_UNROLL, 3), 1e9, np.float32)
-    shut = np.tile(np.float32([[0, 0, 1, -1e9], [0, 0, -1, -1e9]]), (_UNROLL, 3, 1))
+    shut = np.tile(np.array([[0, 0, 1, -1e9], [0, 0, -1, -1e9]], np.float32), (_UNROLL, 3, 1))
     corners = (np.concatenate([town.lo, nowhere]), np.concatenate([town.hi, 1.5 * nowhere]))
     kinds = (
         (box, 0, town.n_boxes, corners, 0),

@@ -2,7 +2,7 @@
 
     images/<camera>/<frame>.png      eight-bit sRGB photographs at the drawn ISO
     reference/<camera>/<frame>.png   the same views at ISO 8
-    truth/linear/<camera>/<frame>.exr   linear radiance R G B (half) and camera z Z (float, inf: sky)
+    truth/linear/<camera>/<frame>.exr   radiance R G B (half), camera z Z (float; inf: sky)
     truth/sky_masks/<camera>/<frame>.png   255 where the pixel's centre sees the sky
     truth/exposures.csv              image, camera, iso, exposure, exposure_ev
     sparse/0/*.bin                   PINHOLE cameras, poses, seed points with tracks
@@ -22,6 +22,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import OpenEXR
@@ -39,6 +40,17 @@ FORMAT = "p2gs-jax street, version 1"
 _DEPTH_TOLERANCE = 0.01
 _SEED_RANGE = 90.0  # m: farther points are not triangulated
 _PINHOLE = 1  # COLMAP's model id
+
+
+class _Views(NamedTuple):
+    """The photographs as COLMAP needs them."""
+
+    names: Sequence[str]
+    cameras: Sequence[str]
+    viewmats: Float64[np.ndarray, "v 4 4"]
+    K: Float64[np.ndarray, "3 3"]
+    width: int
+    height: int
 
 
 @dataclass(frozen=True)
@@ -148,19 +160,8 @@ def write_street(
         xy, seen = _observations(xyz, viewmats, K, depths)
         kept = seen.sum(0) >= 2
         xyz, rgb, xy, seen = xyz[kept], rgb[kept], xy[:, kept], seen[:, kept]
-        _write_colmap(
-            temporary / "sparse" / "0",
-            names,
-            cameras,
-            viewmats,
-            K,
-            width,
-            height,
-            xyz,
-            rgb,
-            xy,
-            seen,
-        )
+        views = _Views(names, cameras, viewmats, K, width, height)
+        _write_colmap(temporary / "sparse" / "0", views, xyz, rgb, xy, seen)
         _write_exposures(temporary / "truth" / "exposures.csv", names, cameras, iso)
         card = {
             "format": FORMAT,
@@ -274,7 +275,7 @@ def _seeds(
     rng = np.random.default_rng([seed, 3])
     rows = np.flatnonzero(sampled)
     xyz, rgb = [], []
-    for row in rows:
+    for row in rows.tolist():
         y, x = np.nonzero(depths[row] < _SEED_RANGE)
         pick = rng.choice(len(x), min(len(x), -(-points // len(rows))), replace=False)
         x, y = x[pick], y[pick]
@@ -331,12 +332,7 @@ def _write_exposures(
 
 def _write_colmap(
     folder: Path,
-    names: Sequence[str],
-    cameras: Sequence[str],
-    viewmats: np.ndarray,
-    K: np.ndarray,
-    width: int,
-    height: int,
+    views: _Views,
     xyz: Float[np.ndarray, "p 3"],
     rgb: UInt8[np.ndarray, "p 3"],
     xy: Float[np.ndarray, "v p 2"],
@@ -345,21 +341,22 @@ def _write_colmap(
     """Write cameras.bin, images.bin, points3D.bin (https://colmap.github.io/format.html)."""
     folder.mkdir(parents=True)
     ids = {camera: i + 1 for i, camera in enumerate(MOUNTS)}
-    params = (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+    params = (views.K[0, 0], views.K[1, 1], views.K[0, 2], views.K[1, 2])
+    size = (views.width, views.height)
     data = [struct.pack("<Q", len(ids))]
     for camera_id in ids.values():
-        data.append(struct.pack("<iiQQ4d", camera_id, _PINHOLE, width, height, *params))
+        data.append(struct.pack("<iiQQ4d", camera_id, _PINHOLE, *size, *params))
     (folder / "cameras.bin").write_bytes(b"".join(data))
 
     keypoint = np.dtype([("xy", "<f8", 2), ("id", "<i8")])
-    data = [struct.pack("<Q", len(names))]
-    for row, name in enumerate(names):
-        x, y, z, w = Rotation.from_matrix(viewmats[row][:3, :3]).as_quat(canonical=True)
-        pose = (w, x, y, z, *viewmats[row][:3, 3])
+    data = [struct.pack("<Q", len(views.names))]
+    for row, name in enumerate(views.names):
+        x, y, z, w = Rotation.from_matrix(views.viewmats[row][:3, :3]).as_quat(canonical=True)
+        pose = (w, x, y, z, *views.viewmats[row][:3, 3])
         which = np.flatnonzero(seen[row])
         keypoints = np.empty(len(which), keypoint)
         keypoints["xy"], keypoints["id"] = xy[row, which], which + 1
-        data.append(struct.pack("<I7dI", row + 1, *pose, ids[cameras[row]]))
+        data.append(struct.pack("<I7dI", row + 1, *pose, ids[views.cameras[row]]))
         data.append(name.encode() + b"\0" + struct.pack("<Q", len(which)) + keypoints.tobytes())
     (folder / "images.bin").write_bytes(b"".join(data))
 

@@ -108,8 +108,8 @@ class TrainResult:
 
 
 def default_max_gaussians(seeds: int, width: int, height: int) -> int:
-    """Return the population limit where none is configured: one per four pixels, or the seeds."""
-    return max(int(1.25 * seeds), min(width * height // 4, 400_000), 1000)
+    """Return the population limit where none is configured: one per ten pixels, or the seeds."""
+    return max(int(1.25 * seeds), min(width * height // 10, 400_000), 1000)
 
 
 class Trainer:

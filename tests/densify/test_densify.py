@@ -57,7 +57,9 @@ def test_place_fills_empty_slots_in_order_and_counts_the_rest():
     assert int(refused) == 1
 
 
-@pytest.mark.parametrize(("needed", "current", "limit"), [(10, 20, None), (50, 20, None), (90, 20, 95)])
+@pytest.mark.parametrize(
+    ("needed", "current", "limit"), [(10, 20, None), (50, 20, None), (90, 20, 95)]
+)
 def test_bucket_holds_what_is_needed(needed, current, limit):
     capacity = bucket_for(needed, current, limit)
     assert capacity >= max(needed, current if needed <= current else 0)

@@ -1,0 +1,288 @@
+"""The properties of PHOTOMETRY section 7 that a formation model and its losses must have."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from p2gs_jax.config import (
+    LossConfig,
+    PhotometryConfig,
+    RelativeExposureConfig,
+    RenderConfig,
+    preset,
+)
+from p2gs_jax.evaluate.metrics import his, std_luminance
+from p2gs_jax.losses import relative_exposure as rel
+from p2gs_jax.losses.image import photometric_loss
+from p2gs_jax.losses.regularizers import closed_form_scale, photometry_regularizers
+from p2gs_jax.losses.total import TrackPairs
+from p2gs_jax.photometry.formation import formation, inverse_tone_map, tone_map
+from p2gs_jax.render import render_linear
+from p2gs_jax.types import Camera, Gaussians, Photometry
+
+PAPER = PhotometryConfig(curve="power", pivot=1.0, clamp=True, parameterization="linear")
+ROBUST = PhotometryConfig()
+POWER = PhotometryConfig(curve="power")
+MODELS = pytest.mark.parametrize("cfg", [PAPER, ROBUST, POWER], ids=["paper", "robust", "power"])
+FEW = settings(max_examples=25, deadline=None)
+SEEDS = st.integers(0, 2**31 - 1)
+SCALES = st.floats(0.2, 5.0)
+GAMMAS = st.floats(1.4, 3.2)
+
+
+def radiance(seed, n=64, low=-6.0, high=-0.5):
+    rng = np.random.default_rng(seed)
+    return jnp.asarray(np.exp2(rng.uniform(low, high, (n, 3))), jnp.float32)
+
+
+@MODELS
+@FEW
+@given(seed=SEEDS, c=SCALES, e=st.floats(0.3, 1.2), gamma=GAMMAS)
+def test_1_scale_gauge(cfg, seed, c, e, gamma):
+    """L -> cL, e -> e/c leaves LDR alone, away from the clamps."""
+    L = radiance(seed)
+    a = formation(L, jnp.float32(e), jnp.float32(gamma), cfg)
+    b = formation(c * L, jnp.float32(e) / jnp.float32(c), jnp.float32(gamma), cfg)
+    np.testing.assert_allclose(a, b, atol=1e-6)
+
+
+@pytest.mark.parametrize("cfg", [PAPER, dataclasses.replace(POWER, pivot=1.0)])
+@FEW
+@given(seed=SEEDS, k=st.floats(0.5, 2.0), e=st.floats(0.3, 1.2))
+def test_2_power_gauge(cfg, seed, k, e):
+    """L -> L^k, e -> e^k, gamma -> k gamma leaves LDR alone."""
+    L = radiance(seed, low=-4.0)
+    e = jnp.float32(e)
+    a = formation(L, e, jnp.float32(2.2), cfg)
+    b = formation(L**k, e**k, jnp.float32(2.2 * k), cfg)
+    np.testing.assert_allclose(a, b, atol=2e-6)
+
+
+@FEW
+@given(seed=SEEDS, k=st.floats(0.5, 2.0), e=st.floats(0.3, 1.2))
+def test_2_power_gauge_about_a_pivot(seed, k, e):
+    """With a pivot the gauge acts on x / x0: it is exact for every base curve."""
+    L, x0 = radiance(seed, low=-4.0), ROBUST.pivot
+    e = jnp.float32(e)
+    a = formation(L, e, jnp.float32(2.2), ROBUST)
+    b = formation(x0 * (L / x0) ** k, e**k, jnp.float32(2.2 * k), ROBUST)
+    np.testing.assert_allclose(a, b, atol=4e-6)
+
+
+def scalar_loss(L, log_e, gamma, target, cfg):
+    ldr = formation(L, jnp.exp(log_e), gamma, cfg)
+    return jnp.sum((ldr - target) ** 2)
+
+
+@MODELS
+@FEW
+@given(seed=SEEDS, gamma=GAMMAS)
+def test_3_and_4_gauges_in_the_gradient(cfg, seed, gamma):
+    """e dLoss/de = L dLoss/dL; and the power gauge's generator annihilates the loss."""
+    L = radiance(seed, low=-4.0)
+    target = radiance(seed + 1)
+    log_e, gamma = jnp.float32(-0.2), jnp.float32(gamma)
+    v_L, v_e, v_gamma = jax.grad(scalar_loss, argnums=(0, 1, 2))(L, log_e, gamma, target, cfg)
+    radial = float(jnp.sum(L * v_L))
+    assert float(v_e) == pytest.approx(radial, rel=1e-5, abs=1e-6)
+    # d/dk of (L/x0)^k, e^k, k gamma at k = 1.
+    log_L = jnp.log(L / cfg.pivot)
+    generator = float(log_e * v_e) + float(jnp.sum(L * log_L * v_L)) + float(gamma * v_gamma)
+    size = float(jnp.sum(jnp.abs(L * log_L * v_L))) + abs(float(gamma * v_gamma))
+    assert abs(generator) <= 2e-6 * max(size, 1.0)
+
+
+@MODELS
+@FEW
+@given(seed=SEEDS, gamma=GAMMAS)
+def test_5_inverse(cfg, seed, gamma):
+    rng = np.random.default_rng(seed)
+    x = jnp.asarray(np.exp(rng.uniform(np.log(2e-3), 0.0, 256)), jnp.float32)
+    y = tone_map(x, jnp.float32(gamma), cfg)
+    kept = np.asarray(y) > 1 / 255
+    back = np.asarray(inverse_tone_map(y, jnp.float32(gamma), cfg))
+    # The curve's slope turns the last bit of y into a few bits of x.
+    np.testing.assert_allclose(back[kept], np.asarray(x)[kept], rtol=2e-5)
+
+
+@MODELS
+@FEW
+@given(gamma=GAMMAS, e=SCALES)
+def test_6_monotone(cfg, gamma, e):
+    x = jnp.logspace(-7, 2, 400, dtype=jnp.float32)
+    y = np.asarray(formation(x, jnp.float32(e), jnp.float32(gamma), cfg))
+    assert np.all(np.diff(y) >= -1e-7)
+    assert y.min() >= 0
+    if cfg.clamp:
+        assert y.max() <= 1
+    z = np.asarray(formation(x, jnp.float32(1.1 * e), jnp.float32(gamma), cfg))
+    assert np.all(z >= y - 1e-7)
+
+
+@FEW
+@given(gamma=GAMMAS)
+def test_7_gamma_derivative(gamma):
+    """dT/dgamma = -(ln x / gamma^2) x^(1/gamma) (paper, Tone-mapping estimation)."""
+    x = jnp.linspace(0.01, 0.99, 99, dtype=jnp.float32)
+    slope = jax.jvp(lambda g: tone_map(x, g, PAPER), (jnp.float32(gamma),), (jnp.float32(1),))[1]
+    expected = -(np.log(x) / gamma**2) * np.asarray(x) ** (1 / gamma)
+    np.testing.assert_allclose(slope, expected, rtol=1e-5, atol=1e-6)
+
+
+@FEW
+@given(seed=SEEDS)
+def test_8_ratios_compose(seed):
+    e = np.exp(np.random.default_rng(seed).normal(0, 1, 3)).astype(np.float32)
+    alpha = e[None, :] / e[:, None]
+    np.testing.assert_allclose(alpha[0, 1] * alpha[1, 2], alpha[0, 2], rtol=1e-6)
+    np.testing.assert_allclose(alpha[0, 1] * alpha[1, 0], 1, rtol=1e-6)
+
+
+@FEW
+@given(seed=SEEDS, e_i=SCALES, e_j=SCALES)
+def test_9_and_10_what_the_literal_readings_do(seed, e_i, e_j):
+    L = radiance(seed).reshape(8, 8, 3)
+    same = float(rel.literal_same_pose(L, jnp.float32(e_i), jnp.float32(e_i)))
+    assert same == 0
+    apart = float(rel.literal_same_pose(L, jnp.float32(e_i), jnp.float32(e_j)))
+    if abs(e_i - e_j) > 1e-3:
+        assert apart > 0
+    expected = abs(np.float32(e_j) / np.float32(e_i) - 1) * float(jnp.mean(jnp.sum(L, -1)))
+    assert apart == pytest.approx(expected, rel=1e-4, abs=1e-6)
+    assert float(rel.exposed(L, L, jnp.float32(e_j))) == 0
+
+
+def observed(seed, cfg, noise_free=True, views=5, n=400):
+    """Observations of the same radiances by views of known exposure and gamma."""
+    rng = np.random.default_rng(seed)
+    e = np.exp2(rng.normal(0, 0.7, views)).astype(np.float32)
+    gammas = np.full(views, 2.2, np.float32)
+    L = np.exp2(rng.uniform(-5, 0, (n, 3)))
+    i = rng.integers(0, views, n)
+    j = (i + rng.integers(1, views, n)) % views
+    I = [
+        np.asarray(formation(jnp.asarray(L, jnp.float32), e[k][:, None], gammas[k][:, None], cfg))
+        for k in (i, j)
+    ]
+    I = [np.clip(a, 0, 1) for a in I]
+    if not noise_free:
+        I = [np.rint(a * 255) / 255 for a in I]
+    pairs = TrackPairs(*(jnp.asarray(a) for a in (*I, i.astype(np.int32), j.astype(np.int32))))
+    return pairs, jnp.asarray(e), jnp.asarray(gammas)
+
+
+LOSS = LossConfig(relative_exposure=RelativeExposureConfig(1.0, "observed_ldr"))
+
+
+@pytest.mark.parametrize("cfg", [ROBUST, POWER], ids=["robust", "power"])
+@FEW
+@given(seed=SEEDS, c=SCALES)
+def test_11_observed_readings(cfg, seed, c):
+    """Zero at the truth, small with 8 bits, and the LDR one invariant to a common factor."""
+    pairs, e, gammas = observed(seed, cfg)
+    for reading in (rel.observed_linear, rel.observed_ldr):
+        assert float(reading(pairs, e, gammas, LOSS, cfg)) < 1e-5
+        flat = float(reading(pairs, jnp.ones_like(e), gammas, LOSS, cfg))
+        assert flat > 0.01
+        a, b = (float(reading(pairs, s * jnp.sqrt(e), gammas, LOSS, cfg)) for s in (1.0, c))
+        assert a == pytest.approx(b, rel=1e-5, abs=1e-6)
+    pairs, e, gammas = observed(seed, cfg, noise_free=False)
+    assert float(rel.observed_ldr(pairs, e, gammas, LOSS, cfg)) <= 0.01
+
+
+@FEW
+@given(seed=SEEDS)
+def test_12_closed_form_scale(seed):
+    reg = preset("paper").loss.regularizers
+    e = jnp.asarray(np.exp(np.random.default_rng(seed).normal(0, 0.5, 20)), jnp.float32)
+
+    def loss(c):
+        terms = photometry_regularizers(Photometry(c * e, jnp.full(20, 2.2), "linear"), reg)
+        return terms["exposure_scale"] + terms["exposure_variance"]
+
+    best = closed_form_scale(e, 0.01, 0.1)
+    assert abs(float(jax.grad(loss)(best))) < 1e-4 * float(jnp.abs(jax.grad(loss)(best * 1.5)))
+
+
+@FEW
+@given(seed=SEEDS, c=SCALES)
+def test_14_means_and_gauges(seed, c):
+    e = np.exp(np.random.default_rng(seed).normal(0, 1, 30))
+    geometric = lambda x: np.exp(np.log(x).mean())
+    assert geometric(c * e) == pytest.approx(c * geometric(e))
+    assert np.mean(c * e) == pytest.approx(c * np.mean(e))
+    assert geometric(e**1.7) == pytest.approx(geometric(e) ** 1.7)
+    assert np.mean(e**1.7) != pytest.approx(np.mean(e) ** 1.7, rel=1e-3)
+
+
+@FEW
+@given(seed=SEEDS, c=SCALES)
+def test_15_his(seed, c):
+    rng = np.random.default_rng(seed)
+    frame = rng.uniform(0, 1, (1, 6, 7, 3)).astype(np.float32)
+    video = np.repeat(frame, 4, 0)
+    e = np.exp(rng.normal(0, 0.5, 4)).astype(np.float32)
+    assert float(his(jnp.asarray(video), jnp.full(4, 1.3))) == 0
+    moving = jnp.asarray(rng.uniform(0, 1, (4, 6, 7, 3)), jnp.float32)
+    a, b = float(his(moving, jnp.asarray(e))), float(his(moving, jnp.asarray(c * e)))
+    assert a > 0
+    assert a == pytest.approx(b, rel=1e-5)
+
+
+@FEW
+@given(seed=SEEDS)
+def test_16_std_luminance_ignores_order(seed):
+    rng = np.random.default_rng(seed)
+    video = rng.uniform(0, 1, (5, 6, 7, 3)).astype(np.float32)
+    a = float(std_luminance(jnp.asarray(video)))
+    b = float(std_luminance(jnp.asarray(video[rng.permutation(5)])))
+    assert a == pytest.approx(b, rel=1e-5)
+    assert float(std_luminance(jnp.asarray(np.repeat(video[:1], 4, 0)))) < 1e-6
+
+
+@pytest.mark.parametrize("censored", [True, False])
+@FEW
+@given(seed=SEEDS)
+def test_17_masked_pixels_get_zero_gradient(censored, seed):
+    rng = np.random.default_rng(seed)
+    mask = (rng.uniform(size=(24, 30)) > 0.3).astype(np.float32)
+    target = jnp.asarray(rng.uniform(0, 1, (24, 30, 3)), jnp.float32)
+    ldr = jnp.asarray(rng.uniform(0, 1.2, (24, 30, 3)), jnp.float32)
+    cfg = LossConfig(censored=censored)
+    v = jax.grad(lambda x: sum(photometric_loss(x, target, jnp.asarray(mask), cfg).values()))(ldr)
+    assert not np.any(np.asarray(v)[mask == 0])
+    assert np.any(np.asarray(v)[mask == 1])
+
+
+@FEW
+@given(seed=SEEDS, e_i=SCALES, e_j=SCALES)
+def test_18_principle_of_invariant_radiance(seed, e_i, e_j):
+    """For one pose, exposed linear renders have the ratio e_i / e_j at every pixel."""
+    rng = np.random.default_rng(seed)
+    n = 30
+    g = Gaussians(
+        means=jnp.asarray(rng.normal(0, 0.5, (n, 3)) + np.array([0, 0, 3]), jnp.float32),
+        quats=jnp.asarray(rng.normal(size=(n, 4)), jnp.float32),
+        log_scales=jnp.full((n, 3), -1.5),
+        opacity_logits=jnp.zeros(n),
+        sh=jnp.asarray(rng.normal(0, 2, (n, 1, 3)), jnp.float32),
+    )
+    cam = Camera(jnp.eye(4), jnp.array([[20.0, 0, 12], [0, 20.0, 8], [0, 0, 1]]), 24, 16)
+    linear = np.asarray(_render(g, cam))
+    lit = linear > 1e-6
+    a, b = np.float32(e_i) * linear, np.float32(e_j) * linear
+    np.testing.assert_allclose(a[lit] / b[lit], np.float32(e_i) / np.float32(e_j), rtol=1e-6)
+
+
+_render = jax.jit(
+    lambda g, cam: (
+        render_linear(
+            g, jnp.ones(g.capacity, bool), cam, RenderConfig(pixels_in_flight=512), 2048
+        ).linear
+    )
+)

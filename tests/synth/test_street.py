@@ -1,0 +1,185 @@
+"""The street's files agree with each other, with the sensor model and with COLMAP's reader."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+from scipy.ndimage import map_coordinates
+
+from p2gs_jax.config import DataConfig
+from p2gs_jax.errors import UserError
+from p2gs_jax.scene.colmap import load_colmap
+from p2gs_jax.synth import read_truth, write_street
+from p2gs_jax.synth.rig import MOUNTS, camera_viewmat, carla_rotation, intrinsics
+from p2gs_jax.synth.sensor import draw_iso, photograph, srgb_decode, srgb_encode
+from p2gs_jax.synth.town import build_town
+
+SIZE = {"frames": 4, "width": 192, "height": 128, "points": 4000, "seed": 3}
+
+
+def read_png(path: Path) -> np.ndarray:
+    return np.asarray(Image.open(path))
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory):
+    return write_street(tmp_path_factory.mktemp("street") / "scene", **SIZE)
+
+
+@pytest.fixture(scope="module")
+def scene(street):
+    return load_colmap(street.root, street.root / "sparse" / "0", DataConfig())
+
+
+def test_every_file_is_deterministic_in_the_seed(street, tmp_path):
+    again = write_street(tmp_path / "scene", **SIZE)
+    files = sorted(p.relative_to(street.root) for p in street.root.rglob("*") if p.is_file())
+    assert files == sorted(p.relative_to(again.root) for p in again.root.rglob("*") if p.is_file())
+    for file in files:
+        assert (street.root / file).read_bytes() == (again.root / file).read_bytes(), file
+    assert not list(tmp_path.glob(".scene-*"))
+
+
+def test_another_seed_makes_another_town():
+    a, b = build_town(0), build_town(1)
+    assert a.size != b.size or not np.array_equal(a.hi, b.hi)
+
+
+@pytest.mark.parametrize("std", [2.0, 4.0])
+def test_iso_is_rounded_normal_with_a_floor(std):
+    iso = draw_iso((20_000,), std, seed=0)
+    assert iso.dtype.kind == "i"
+    assert iso.min() >= 1
+    assert np.mean(iso) == pytest.approx(8.0, abs=0.15)
+    assert np.std(iso) == pytest.approx(std, rel=0.06)
+    np.testing.assert_array_equal(draw_iso((5, 3), 0.0, seed=1), 8)
+
+
+def test_srgb_round_trip():
+    x = np.linspace(0, 1, 1001)
+    np.testing.assert_allclose(srgb_decode(srgb_encode(x)), x, atol=1e-12)
+
+
+def test_rig_follows_the_papers_mounts():
+    K = intrinsics(1920, 1300)
+    np.testing.assert_allclose(K[0], [1662.77, 0, 960.0], atol=0.01)  # 959.5 with integer centres
+    for name, mount in MOUNTS.items():
+        viewmat = camera_viewmat(mount, (10.0, -1.75, 0.0))
+        R, center = viewmat[:3, :3], -viewmat[:3, :3].T @ viewmat[:3, 3]
+        np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(R) == pytest.approx(1.0)
+        x, y, z = mount.location
+        np.testing.assert_allclose(center, [10 + x, -1.75 - y, z], atol=1e-12)
+        _, pitch, yaw = mount.rotation
+        forward = R[2]  # right-handed, y left: a positive CARLA yaw turns to negative y
+        assert np.rad2deg(np.arctan2(-forward[1], forward[0])) == pytest.approx(yaw, abs=1e-9)
+        assert np.rad2deg(np.arcsin(forward[2])) == pytest.approx(pitch, abs=1e-9)
+        assert R[1, 2] < -0.99, f"{name}: image y points down"
+    np.testing.assert_allclose(carla_rotation(0, 0, 90) @ [1, 0, 0], [0, 1, 0], atol=1e-12)
+
+
+def test_photographs_are_the_exposed_truth(street):
+    with (street.root / "truth" / "exposures.csv").open(newline="") as file:
+        rows = {row["image"]: row for row in csv.DictReader(file)}
+    checked = 0
+    for i, name in enumerate(street.names):
+        linear = street.linear(i)
+        reference = read_png(street.root / "reference" / name)
+        shot = read_png(street.root / "images" / name)
+        assert shot.shape == (street.height, street.width, 3)
+        np.testing.assert_allclose(255 * srgb_encode(linear), reference, atol=0.51)
+        np.testing.assert_array_equal(shot, photograph(linear, float(rows[name]["exposure"])))
+        e = float(rows[name]["exposure"])
+        assert e == street.exposures[i] == int(rows[name]["iso"]) / 8
+        assert float(rows[name]["exposure_ev"]) == pytest.approx(np.log2(e), abs=1e-5)
+        good = (reference > 40) & (reference < 250) & (shot > 40) & (shot < 250)
+        if good.sum() > 500:
+            ratio = srgb_decode(shot[good] / 255) / srgb_decode(reference[good] / 255)
+            assert np.median(ratio) == pytest.approx(e, rel=0.01)
+            checked += 1
+    assert checked >= len(street.names) // 2
+
+
+def test_radiance_spans_three_orders_and_is_well_exposed(street):
+    linear = np.stack([street.linear(i) for i in range(len(street.names))])
+    assert np.isfinite(linear).all()
+    assert (linear >= 0).all()
+    low, high = np.percentile(linear, [0.05, 99.95])
+    assert high / low > 1000
+    middle = (linear > 0.02) & (linear < 1.0)
+    assert middle.mean() > 0.6
+
+
+def test_sky_masks_and_depth_agree(street):
+    for i, name in enumerate(street.names):
+        depth = street.depth(i)
+        mask = read_png(street.root / "truth" / "sky_masks" / name)
+        np.testing.assert_array_equal(mask == 255, np.isinf(depth))
+        assert set(np.unique(mask)) <= {0, 255}
+        assert depth.min() > 0.5
+
+
+def test_colmap_model_is_what_pycolmap_reads(street, scene):
+    model = pycolmap.Reconstruction(str(street.root / "sparse" / "0"))
+    assert model.is_valid()
+    assert model.num_cameras() == 3
+    assert model.num_points3D() == street.points
+    assert model.compute_num_observations() == street.observations
+    model.update_point_3d_errors()
+    assert model.compute_mean_reprojection_error() < 1e-6
+    assert [v.name for v in scene.views] == list(street.names)
+    for view, viewmat in zip(scene.views, street.viewmats, strict=True):
+        np.testing.assert_allclose(view.viewmat, viewmat, atol=1e-5)
+        np.testing.assert_allclose(view.K, street.K, rtol=1e-6)
+
+
+def test_tracks_land_on_their_points_and_see_one_radiance(street, scene):
+    tracks = scene.tracks
+    local_log = np.full(len(tracks.xy), np.nan)
+    for i, view in enumerate(scene.views):
+        rows = np.flatnonzero(tracks.view_indices == i)
+        p = scene.points[tracks.point_indices[rows]] @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+        xy = (p / p[:, 2:]) @ view.K.T
+        np.testing.assert_allclose(xy[:, :2], tracks.xy[rows], atol=0.02)
+        reference = srgb_decode(read_png(street.root / "reference" / view.name) / 255.0)
+        u, v = tracks.xy[rows].T - 0.5
+        value = map_coordinates(reference[..., 1], [v, u], order=1, mode="nearest")
+        usable = (value > 0.01) & (value < 0.95)
+        local_log[rows[usable]] = np.log2(value[usable])
+    order = np.argsort(tracks.point_indices, kind="stable")
+    point, value = tracks.point_indices[order], local_log[order]
+    neighbours = (point[1:] == point[:-1]) & np.isfinite(value[1:]) & np.isfinite(value[:-1])
+    assert neighbours.sum() > 5000
+    assert np.median(np.abs(np.diff(value)[neighbours])) < 0.1
+    assert len(tracks.xy) / len(scene.points) > 3
+
+
+def test_seed_colours_are_from_photographs_of_views_that_are_not_held_out(street, scene):
+    found = np.zeros(len(scene.points), bool)
+    for i, view in enumerate(scene.views):
+        if view.name.endswith("000000.png"):
+            continue
+        rows = np.flatnonzero(scene.tracks.view_indices == i)
+        ids = scene.tracks.point_indices[rows]
+        x, y = np.floor(scene.tracks.xy[rows]).astype(int).T
+        colors = read_png(view.image_path)[y, x]
+        centred = np.abs(scene.tracks.xy[rows] % 1.0 - 0.5).max(1) < 1e-3
+        found[ids[centred & (colors == scene.point_colors[ids]).all(1)]] = True
+    assert found.all()
+
+
+def test_card_and_refusals(street, tmp_path):
+    card = json.loads((street.root / "dataset.json").read_text())
+    assert card["seed"] == SIZE["seed"]
+    assert card["points"] == street.points
+    linear, depth = read_truth(street.root / "truth" / "linear" / "front" / "000001.exr")
+    assert linear.shape == (*depth.shape, 3)
+    with pytest.raises(UserError, match="not an empty folder"):
+        write_street(street.root)
+    with pytest.raises(UserError, match="cannot render"):
+        write_street(tmp_path / "x", frames=0)
+    assert not (tmp_path / "x").exists()
