@@ -26,7 +26,7 @@ CFG = DensifyConfig()
 def made(n=8, seed=0, opacity=0.6):
     rng = np.random.default_rng(seed)
     return Gaussians(
-        means=jnp.asarray(rng.normal(0, 0.5, (n, 3)) + [0, 0, 4], jnp.float32),
+        means=jnp.asarray(rng.normal(0, 0.5, (n, 3)) + np.array([0, 0, 4]), jnp.float32),
         quats=jnp.asarray(rng.normal(size=(n, 4)), jnp.float32),
         log_scales=jnp.full((n, 3), -2.0),
         opacity_logits=jnp.full((n,), float(np.log(opacity / (1 - opacity)))),

@@ -55,7 +55,7 @@ def test_standard_errors_have_the_size_of_the_errors():
 
 
 def test_common_factor_and_order_do_not_matter():
-    e, _, v, p, colors = drive()
+    _e, _, v, p, colors = drive()
     s = solve(v, p, colors)
     order = np.random.default_rng(1).permutation(len(v))
     t = solve(v[order], p[order], colors[order])
@@ -66,7 +66,7 @@ def test_common_factor_and_order_do_not_matter():
 
 
 def test_disconnected_views_are_said_and_centred_apart():
-    e, _, v, p, colors = drive()
+    _e, _, v, p, colors = drive()
     s = solve(np.where(p < 750, v % 15, 15 + v % 15), p, colors)
     assert len(set(s.component)) == 2
     assert any("2 groups" in w for w in s.warnings)

@@ -213,7 +213,10 @@ def test_12_closed_form_scale(seed):
 @given(seed=SEEDS, c=SCALES)
 def test_14_means_and_gauges(seed, c):
     e = np.exp(np.random.default_rng(seed).normal(0, 1, 30))
-    geometric = lambda x: np.exp(np.log(x).mean())
+
+    def geometric(x):
+        return np.exp(np.log(x).mean())
+
     assert geometric(c * e) == pytest.approx(c * geometric(e))
     assert np.mean(c * e) == pytest.approx(c * np.mean(e))
     assert geometric(e**1.7) == pytest.approx(geometric(e) ** 1.7)
