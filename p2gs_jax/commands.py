@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from p2gs_jax.config import FitConfig
+from p2gs_jax.demo import run_demo
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.alignment import fit_exposure
 from p2gs_jax.evaluate.evaluate import ViewResult, evaluate, mean_parameters
@@ -158,8 +159,6 @@ def demo_command(
     seed: int,
 ) -> int:
     """Make a street, fit it, and print recovered against true exposures."""
-    from p2gs_jax.demo import run_demo
-
     cfg = dataclasses.replace(
         cfg, train=dataclasses.replace(cfg.train, budget_s=budget_s, seed=seed)
     )

@@ -51,6 +51,7 @@ CAPACITY_MARGIN = 1.3
 CAPACITY_SAMPLES = 6
 PAIRS_PER_STEP = 4096
 MAX_BURST = 50
+NEARLY_DONE = 0.99
 
 
 @dataclass
@@ -228,9 +229,10 @@ class Trainer:
                     pace = pace.replan(host.progress, host.elapsed_s, host.step_s)
                     host.pace = pace.per_step
                 if host.elapsed_s > pace.deadline_s:
-                    self.on_message(
-                        f"The time budget ended the run at {host.progress:.0%} of its schedule."
-                    )
+                    if host.progress < NEARLY_DONE:
+                        self.on_message(
+                            f"The budget ended the run at {host.progress:.0%} of its schedule."
+                        )
                     break
             if time.monotonic() - last_save > train.checkpoint_every_s:
                 self._save(state, host)

@@ -1,0 +1,128 @@
+"""Wrong input: one message that says what to do, exit code 2, never a traceback."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from p2gs_jax.cli import main, parse_duration
+from p2gs_jax.errors import UserError
+
+
+def run(capsys, *argv):
+    with pytest.raises(SystemExit) as stop:
+        main([str(a) for a in argv])
+    out = capsys.readouterr()
+    assert "Traceback" not in out.err + out.out
+    return stop.value.code, out.err + out.out
+
+
+def images(folder, count=3, size=(40, 30)):
+    folder.mkdir(parents=True, exist_ok=True)
+    for i in range(count):
+        cv2.imwrite(str(folder / f"{i:03d}.png"), np.full((*size[::-1], 3), 60 + i, np.uint8))
+
+
+def transforms(root, frames=4, **extra):
+    data = {"fl_x": 40, "fl_y": 40, "cx": 20, "cy": 15, "w": 40, "h": 30, "frames": []}
+    for i in range(frames):
+        pose = np.eye(4)
+        pose[0, 3] = i
+        data["frames"].append(
+            {"file_path": f"images/{i:03d}.png", "transform_matrix": pose.tolist()}
+        )
+    (root / "transforms.json").write_text(json.dumps(data | extra))
+
+
+def test_no_such_scene(capsys, tmp_path):
+    code, text = run(capsys, "fit", tmp_path / "nowhere", "--out", tmp_path / "run")
+    assert code == 2
+    assert "nowhere" in text
+
+
+def test_empty_scene(capsys, tmp_path):
+    (tmp_path / "scene").mkdir()
+    code, text = run(capsys, "fit", tmp_path / "scene", "--out", tmp_path / "run")
+    assert code == 2
+    assert "scene" in text
+
+
+def test_missing_frames_are_listed(capsys, tmp_path):
+    images(tmp_path / "images", 3)
+    transforms(tmp_path, 5)
+    code, text = run(capsys, "fit", tmp_path, "--out", tmp_path / "run")
+    assert code == 2
+    assert "003.png" in text
+    assert "--allow-missing" in text
+
+
+def test_existing_run_is_not_overwritten(capsys, tmp_path):
+    run_dir = tmp_path / "run"
+    run_dir.mkdir()
+    (run_dir / "config.json").write_text("{}")
+    code, text = run(capsys, "fit", tmp_path, "--out", run_dir)
+    assert code == 2
+    assert "--resume" in text
+    assert (run_dir / "config.json").read_text() == "{}"
+
+
+@pytest.mark.parametrize(
+    "option",
+    [
+        ("--budget", "soon"),
+        ("--budget", "0s"),
+        ("--steps", "0"),
+        ("--max-width", "3"),
+        ("--test-every", "-1"),
+        ("--preset", "best"),
+    ],
+)
+def test_senseless_options(capsys, tmp_path, option):
+    code, text = run(capsys, "fit", tmp_path, "--out", tmp_path / "run", *option)
+    assert code == 2
+    assert option[0] in text or "preset" in text
+
+
+def test_unknown_option(capsys, tmp_path):
+    code, _ = run(capsys, "fit", tmp_path, "--out", tmp_path / "run", "--speed", "9")
+    assert code == 2
+
+
+@pytest.mark.parametrize("command", ["render", "eval"])
+def test_not_a_run_folder(capsys, tmp_path, command):
+    code, text = run(capsys, command, tmp_path)
+    assert code == 2
+    assert "config.json" in text
+
+
+def test_unfinished_run(capsys, tmp_path):
+    (tmp_path / "config.json").write_text("{}")
+    code, text = run(capsys, "eval", tmp_path)
+    assert code == 2
+    assert "--resume" in text
+
+
+def test_demo_does_not_overwrite_strangers(capsys, tmp_path):
+    (tmp_path / "thesis.tex").write_text("precious")
+    code, text = run(capsys, "demo", "--out", tmp_path)
+    assert code == 2
+    assert "other files" in text
+    assert (tmp_path / "thesis.tex").read_text() == "precious"
+
+
+def test_durations():
+    assert parse_duration("90") == parse_duration("90s") == 90
+    assert parse_duration("5m") == 300
+    assert parse_duration("1h30m") == 5400
+    assert parse_duration("1m30s") == 90
+    for text in ("", "m", "-5m", "5 minutes"):
+        with pytest.raises(UserError):
+            parse_duration(text)
+
+
+def test_every_configuration_field_is_an_option(capsys):
+    code, text = run(capsys, "fit", "--help")
+    assert code == 0
+    for option in ("--loss.dssim-weight", "--densify.method", "--render.tile", "--train.log-every"):
+        assert option in text
