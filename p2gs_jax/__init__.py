@@ -3,6 +3,7 @@
 The public interface. Everything else may change between releases.
 """
 
+from importlib import import_module
 from typing import TYPE_CHECKING
 
 from p2gs_jax.config import FitConfig, preset
@@ -10,9 +11,11 @@ from p2gs_jax.errors import DivergenceError, UserError
 from p2gs_jax.types import Camera, Gaussians, Params, Photometry, Render, Scene
 
 if TYPE_CHECKING:
-    from p2gs_jax.fit import fit
+    from p2gs_jax.evaluate.alignment import exposure_error
+    from p2gs_jax.pipeline import fit
     from p2gs_jax.render import render_linear
     from p2gs_jax.run_folder import load_run
+    from p2gs_jax.synth import write_street
 
 __all__ = [
     "Camera",
@@ -24,25 +27,26 @@ __all__ = [
     "Render",
     "Scene",
     "UserError",
+    "exposure_error",
     "fit",
     "load_run",
     "preset",
     "render_linear",
+    "write_street",
 ]
+
+
+_LAZY = {
+    "exposure_error": "p2gs_jax.evaluate.alignment",
+    "fit": "p2gs_jax.pipeline",
+    "load_run": "p2gs_jax.run_folder",
+    "render_linear": "p2gs_jax.render",
+    "write_street": "p2gs_jax.synth",
+}
 
 
 def __getattr__(name: str):
     """Import what is heavy only when it is used."""
-    if name == "fit":
-        from p2gs_jax.fit import fit
-
-        return fit
-    if name == "load_run":
-        from p2gs_jax.run_folder import load_run
-
-        return load_run
-    if name == "render_linear":
-        from p2gs_jax.render import render_linear
-
-        return render_linear
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name not in _LAZY:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_LAZY[name]), name)

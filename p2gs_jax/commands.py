@@ -19,7 +19,7 @@ from p2gs_jax.evaluate.alignment import fit_exposure
 from p2gs_jax.evaluate.evaluate import ViewResult, evaluate, mean_parameters
 from p2gs_jax.export.atomic import write_json
 from p2gs_jax.finish import load_reference, tone_function, write_view
-from p2gs_jax.fit import fit
+from p2gs_jax.pipeline import fit
 from p2gs_jax.progress import TerminalReporter
 from p2gs_jax.render.host import make_renderer
 from p2gs_jax.run_folder import load_run

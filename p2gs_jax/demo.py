@@ -13,7 +13,7 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.alignment import ExposureError, exposure_error
 from p2gs_jax.export.atomic import write_json
-from p2gs_jax.fit import fit
+from p2gs_jax.pipeline import fit
 from p2gs_jax.progress import Reporter
 from p2gs_jax.synth.write import write_street
 
