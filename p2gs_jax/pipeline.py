@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ import numpy as np
 from p2gs_jax.config import FitConfig
 from p2gs_jax.config import to_dict as config_to_dict
 from p2gs_jax.errors import UserError
-from p2gs_jax.export.atomic import write_json
+from p2gs_jax.export.atomic import plain, write_json
 from p2gs_jax.finish import finish, load_reference
 from p2gs_jax.photometry.track_start import TrackStart
 from p2gs_jax.prepare import Prepared, load, prepare
@@ -114,7 +115,7 @@ def fit(
     reporter = reporter or Silent()
     scene_dir, run_dir = Path(scene_dir), Path(run_dir)
     begin = time.monotonic()
-    check_run_dir(run_dir, resume)
+    check_run_dir(run_dir, resume, cfg)
     run_dir.mkdir(parents=True, exist_ok=True)
     scene = load(scene_dir, run_dir, cfg, reporter)
     truth = load_reference(reference, scene, cfg) if reference is not None else None
@@ -175,16 +176,44 @@ def _finish_estimate(scene: Scene, cfg: FitConfig) -> float:
     return min(8.0 + 1.2e-6 * pixels, 0.25 * cfg.train.budget_s)
 
 
-def check_run_dir(run_dir: Path, resume: bool) -> None:
-    """Refuse to overwrite a run that another configuration began.
+def check_run_dir(run_dir: Path, resume: bool, cfg: FitConfig) -> None:
+    """Refuse to overwrite a run, and to continue one under other options.
 
     Raises:
-        UserError: the folder holds a run and `resume` is not set, or is not a folder.
+        UserError: the folder holds a run and `resume` is not set, is not a folder, or holds a run
+            that was begun with other options.
     """
     if run_dir.exists() and not run_dir.is_dir():
         raise UserError(f"{run_dir} is a file.", fix="name a folder with --out")
-    if not resume and (run_dir / "config.json").exists():
+    path = run_dir / "config.json"
+    if not path.exists():
+        return
+    if not resume:
         raise UserError(
             f"{run_dir} already holds a run.",
             fix="add --resume to continue it, or name another folder with --out",
         )
+    try:
+        saved = json.loads(path.read_text())["fit"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise UserError(
+            f"{path} cannot be read ({error}).", fix="start again in another folder"
+        ) from error
+    other = _differences(saved, plain(config_to_dict(cfg)))
+    if other:
+        raise UserError(
+            f"{run_dir} was begun with other options: {'; '.join(other[:6])}.",
+            fix="repeat the options it was begun with, or name another folder with --out",
+        )
+
+
+def _differences(saved: dict, now: dict, prefix: str = "") -> list[str]:
+    """Return "name: then, now" for every value that differs."""
+    out = []
+    for key in sorted(set(saved) | set(now)):
+        a, b = saved.get(key), now.get(key)
+        if isinstance(a, dict) and isinstance(b, dict):
+            out += _differences(a, b, f"{prefix}{key}.")
+        elif a != b:
+            out.append(f"{prefix}{key} was {a}, now {b}")
+    return out

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from p2gs_jax.cli import main, parse_duration
+from p2gs_jax.config import preset, to_dict
 from p2gs_jax.errors import UserError
 
 
@@ -109,6 +110,15 @@ def test_demo_does_not_overwrite_strangers(capsys, tmp_path):
     assert code == 2
     assert "other files" in text
     assert (tmp_path / "thesis.tex").read_text() == "precious"
+
+
+def test_resuming_under_other_options_is_refused(capsys, tmp_path):
+    cfg = to_dict(preset("robust"))
+    cfg["train"]["seed"] = 7
+    (tmp_path / "config.json").write_text(json.dumps({"scene": "s", "fit": cfg}))
+    code, text = run(capsys, "fit", tmp_path, "--out", tmp_path, "--resume")
+    assert code == 2
+    assert "train.seed was 7, now 0" in text
 
 
 def test_durations():
