@@ -145,20 +145,20 @@ class OptimizerConfig:
     """Times the scene extent (3DGS: 1.6e-4)."""
     means_final: float = 1.6e-6
     """Reached at the end, exponentially (3DGS: 1.6e-6)."""
-    sh_dc: float = 2.5e-3
-    """Degree 0 (3DGS: 2.5e-3)."""
-    sh_rest: float = 1.25e-4
-    """Degrees 1-3 (3DGS: 2.5e-3 / 20)."""
+    sh_dc: float = 2e-2
+    """Degree 0 (3DGS: 2.5e-3 for LDR colours; ours: 8 times that for log radiance)."""
+    sh_rest: float = 1e-3
+    """Degrees 1-3 (3DGS: 2.5e-3 / 20; ours: 8 times that)."""
     opacities: float = 5e-2
     """Logits (3DGS: 5e-2)."""
     scales: float = 5e-3
     """Logarithms (3DGS: 5e-3)."""
     quats: float = 1e-3
     """(3DGS: 1e-3)."""
-    exposures: float = 1e-2
-    """Raw exposures (ours: 1e-2 without tracks, 1e-3 to tune after a start from tracks)."""
-    gammas: float = 1e-3
-    """Raw gammas (ours)."""
+    exposures: float = 1e-3
+    """Raw exposures (ours: PHOTOMETRY section 4; ten times this where no tracks gave a start)."""
+    gammas: float = 1e-4
+    """Raw gammas (ours: likewise)."""
     photometry_final: float = 0.01
     """Exposure and gamma rates decay exponentially to this fraction (ours)."""
     final: float = 1.0
@@ -285,7 +285,9 @@ def _paper(exposure_weight: float, name: PresetName) -> FitConfig:
             ),
         ),
         # The paper prints no rates for e and gamma: 1e-3, as 3DGS's exposure compensation ends at.
-        optimizer=OptimizerConfig(exposures=1e-3, gammas=1e-3, photometry_final=1.0),
+        optimizer=OptimizerConfig(
+            sh_dc=2.5e-3, sh_rest=1.25e-4, exposures=1e-3, gammas=1e-3, photometry_final=1.0
+        ),
         densify=DensifyConfig(method="adaptive"),
         init=InitConfig(shell="off"),
         train=TrainConfig(steps=30_000, coarse_to_fine=()),

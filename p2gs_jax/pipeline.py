@@ -128,6 +128,7 @@ def fit(
         },
     )
     prepared = prepare(scene, cfg, reporter)
+    cfg = prepared.cfg
     result = optimise(
         prepared,
         run_dir,

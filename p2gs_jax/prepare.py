@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -38,6 +39,7 @@ class Prepared:
         extent: scene extent, scene units.
         start: exposures from the tracks, or None.
         pairs: corresponding observations, or None.
+        cfg: the configuration, adapted to what the scene offers.
         notes: what the user should know.
     """
 
@@ -47,6 +49,7 @@ class Prepared:
     extent: float
     start: TrackStart | None
     pairs: TrackPairs | None
+    cfg: FitConfig
     notes: list[str] = field(default_factory=list)
 
 
@@ -95,6 +98,7 @@ def prepare(scene: Scene, cfg: FitConfig, reporter: Reporter) -> Prepared:
             notes += start.warnings
         else:
             notes.append("No tracks: exposures start at 1 and are learned from the first step.")
+            cfg = without_tracks(cfg)
     photometry = _photometry(start, len(views), cfg)
     keep = subsample(len(scene.points), cfg.init.max_seeds, cfg.train.seed)
     if len(keep) < len(scene.points):
@@ -114,7 +118,20 @@ def prepare(scene: Scene, cfg: FitConfig, reporter: Reporter) -> Prepared:
     for note in notes:
         reporter.message(note)
     pairs = _pairs(tracks, cfg)
-    return Prepared(scene, store, Params(gaussians, photometry), extent, start, pairs, notes)
+    return Prepared(scene, store, Params(gaussians, photometry), extent, start, pairs, cfg, notes)
+
+
+def without_tracks(cfg: FitConfig) -> FitConfig:
+    """Return the configuration for exposures that must be learned from nothing.
+
+    They move from the first step, ten times as fast (PHOTOMETRY section 4).
+    """
+    o = cfg.optimizer
+    return dataclasses.replace(
+        cfg,
+        photometry=dataclasses.replace(cfg.photometry, freeze_until=0.0),
+        optimizer=dataclasses.replace(o, exposures=10 * o.exposures, gammas=10 * o.gammas),
+    )
 
 
 def _photometry(start: TrackStart | None, count: int, cfg: FitConfig) -> Photometry:

@@ -228,7 +228,7 @@ class Trainer:
                     pace = dataclasses.replace(pace, per_step=host.pace)
                     pace = pace.replan(host.progress, host.elapsed_s, host.step_s)
                     host.pace = pace.per_step
-                if host.elapsed_s > pace.deadline_s:
+                if host.elapsed_s > (pace.deadline_s or math.inf):
                     if host.progress < NEARLY_DONE:
                         self.on_message(
                             f"The budget ended the run at {host.progress:.0%} of its schedule."
