@@ -1,0 +1,105 @@
+"""Seeds, samples and the far shell."""
+
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from p2gs_jax.config import FitConfig, InitConfig, preset
+from p2gs_jax.init.observations import TrackColors, sample, sample_pairs
+from p2gs_jax.init.seeds import gaussians_from_points, scene_extent, subsample
+from p2gs_jax.init.shell import find_shell
+from p2gs_jax.render import view_radiance
+from p2gs_jax.types import Camera, View
+
+
+def view(x=0.0, width=160, height=90, yaw=0.0):
+    c, s = np.cos(yaw), np.sin(yaw)
+    viewmat = np.eye(4, dtype=np.float32)
+    viewmat[:3, :3] = [[c, 0, -s], [0, 1, 0], [s, 0, c]]
+    viewmat[:3, 3] = -viewmat[:3, :3] @ [x, 0, 0]
+    K = np.array([[100, 0, 80], [0, 100, 45], [0, 0, 1]], np.float32)
+    return View(f"{x}.png", Path("none"), "0", viewmat, K, width, height)
+
+
+def test_samples_sit_at_pixel_centres():
+    rng = np.random.default_rng(0)
+    ramp = np.repeat(np.linspace(0, 1, 50, dtype=np.float32)[None, :, None], 40, 0)
+    image = np.repeat(ramp, 3, 2)
+    xy = rng.uniform(4, 36, (100, 2))
+    colors, valid = sample(image, np.ones((40, 50), np.float32), xy)
+    assert valid.all()
+    np.testing.assert_allclose(colors[:, 0], (xy[:, 0] - 0.5) / 49, atol=1e-5)
+
+
+def test_samples_outside_and_masked_are_invalid():
+    mask = np.ones((40, 50), np.float32)
+    mask[:20] = 0
+    xy = np.array([[-3.0, 30], [25, 10], [25, 30], [60, 30], [25, 20.4]])
+    _, valid = sample(np.zeros((40, 50, 3), np.float32), mask, xy)
+    assert valid.tolist() == [False, False, True, False, False]
+
+
+def test_pairs_are_two_views_of_one_point():
+    rng = np.random.default_rng(0)
+    tracks = TrackColors(
+        rng.permutation(200) % 20, np.repeat(np.arange(50), 4), rng.uniform(size=(200, 3))
+    )
+    i, j = sample_pairs(tracks, 1000, 0)
+    assert np.all(tracks.points[i] == tracks.points[j])
+    assert np.all(i != j)
+    lonely = TrackColors(np.arange(5), np.arange(5), np.zeros((5, 3)))
+    assert len(sample_pairs(lonely, 10, 0)[0]) == 0
+
+
+def street_points(ground_only):
+    rng = np.random.default_rng(0)
+    ground = np.stack([rng.uniform(-30, 30, 4000), np.full(4000, 1.5), rng.uniform(2, 40, 4000)], 1)
+    if ground_only:
+        return ground.astype(np.float32)
+    wall = np.stack([rng.uniform(-60, 60, 6000), rng.uniform(-30, 5, 6000), np.full(6000, 40)], 1)
+    return np.concatenate([ground, wall]).astype(np.float32)
+
+
+def test_shell_only_where_views_look_past_the_seeds():
+    views = [view(x) for x in (0.0, 1.0, 2.0)]
+    points = street_points(ground_only=True)
+    shell = find_shell(views, points, 2.0, InitConfig())
+    assert shell is not None
+    direction = shell.points - [1.0, 0, 0]
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    assert np.all(direction[:, 2] > 0)  # in front of the cameras
+    assert np.quantile(direction[:, 1], 0.95) < 0.05  # y points down: the sky is above
+    assert np.linalg.norm(shell.points, axis=1).min() > np.linalg.norm(points, axis=1).max()
+    assert shell.seen.any(1).all()
+
+
+def test_no_shell_where_seeds_cover_the_views_or_it_is_switched_off():
+    views = [view(x) for x in (0.0, 1.0, 2.0)]
+    assert find_shell(views, street_points(ground_only=False), 2.0, InitConfig()) is None
+    points = street_points(ground_only=True)
+    assert find_shell(views, points, 2.0, InitConfig(shell="off")) is None
+
+
+@pytest.mark.parametrize("name", ["robust", "paper"])
+def test_seeds_carry_their_radiance(name):
+    cfg = preset(name)
+    rng = np.random.default_rng(0)
+    points = rng.normal(0, 1, (100, 3)).astype(np.float32) + np.array([0, 0, 6], np.float32)
+    radiance = np.exp(rng.normal(-1, 1, (100, 3))).astype(np.float32)
+    views = [view(0.0), view(1.0)]
+    g = gaussians_from_points(points, radiance, views, cfg)
+    cam = Camera(jnp.eye(4), jnp.eye(3), 8, 8)
+    np.testing.assert_allclose(view_radiance(g, cam, cfg.render), radiance, rtol=1e-4, atol=1e-5)
+    assert np.all(np.isfinite(g.log_scales))
+
+
+def test_extent_and_subsample():
+    views = [view(x) for x in (0.0, 10.0)]
+    assert scene_extent(views, np.zeros((0, 3), np.float32)) == pytest.approx(5.5)
+    assert scene_extent([view(0.0)], np.full((5, 3), 10, np.float32)) > 0.5
+    kept = subsample(1000, 100, 0)
+    assert len(kept) == 100
+    assert np.all(np.diff(kept) > 0)
+    assert FitConfig() == preset("robust")
