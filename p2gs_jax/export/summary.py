@@ -14,7 +14,7 @@ from jaxtyping import Float, Float32
 
 from p2gs_jax.export.atomic import atomic_write
 
-ROWS = ("photograph", "render,\nits own exposure", "render,\none exposure for all")
+ROWS = ("photograph", "render,\nits own\nexposure", "render,\none exposure\nfor all")
 MARKERS = "osD^vPX*"
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 
@@ -69,7 +69,7 @@ def write_summary(
             if r == 0:
                 axis.set_title(names[c], fontsize=8)
             if c == 0:
-                axis.set_ylabel(ROWS[r], fontsize=9)
+                axis.set_ylabel(ROWS[r], fontsize=8, rotation=0, ha="right", va="center")
     axis = figure.add_subplot(grid[3, :])
     _plot_exposures(axis, exposures_ev, cameras, true_ev, exif_ev)
     with atomic_write(path) as temporary:
