@@ -186,6 +186,8 @@ class DensifyConfig:
     """Never densify more often than this many steps (ours: statistics need views)."""
     reset_every: float = 0.1
     """Opacity reset interval, adaptive only (3DGS: 3000 steps)."""
+    min_reset_steps: int = 300
+    """Never reset opacities more often than this many steps (ours: they must grow back)."""
     grad_threshold: float = 2e-4
     """Mean screen-space gradient norm above which a Gaussian is cloned or split (3DGS)."""
     clone_scale: float = 0.01

@@ -32,8 +32,8 @@ class Outcome(NamedTuple):
 
 def fresh_population(alive: Bool[Array, " n"]) -> Population:
     """Return a population with empty statistics."""
-    zeros = jnp.zeros(alive.shape, jnp.float32)
-    return Population(alive, zeros, zeros, zeros)
+    # Three arrays, not one three times: the step donates its input and each may be given away once.
+    return Population(alive, *(jnp.zeros(alive.shape, jnp.float32) for _ in range(3)))
 
 
 def empty_gaussians(count: int, like: Gaussians) -> Gaussians:

@@ -24,7 +24,7 @@ import numpy as np
 from p2gs_jax.config import FitConfig
 from p2gs_jax.densify import adaptive, mcmc
 from p2gs_jax.densify.population import bucket_for
-from p2gs_jax.errors import DivergenceError
+from p2gs_jax.errors import DivergenceError, UserError
 from p2gs_jax.export.atomic import append_jsonl, read_jsonl, write_text
 from p2gs_jax.export.checkpoint import CheckpointStore
 from p2gs_jax.losses.total import OBSERVED_FORMS, SECOND_RENDER_FORMS, Partner, TrackPairs
@@ -389,7 +389,7 @@ class Trainer:
     def _adaptive_step(self, key, state: FitState, host: HostState, limit) -> FitState:
         d = self.cfg.densify
         gaussians, population = state.params.gaussians, state.population
-        prune_large = host.progress > d.reset_every
+        prune_large = host.reset_at > 0
         proposal = self._propose(gaussians, population, self.extent, prune_large)
         wanted = int(proposal.wanted)
         capacity = bucket_for(wanted, gaussians.capacity, limit)
@@ -403,7 +403,7 @@ class Trainer:
             )
         outcome = self._densify_adaptive(key, state.params.gaussians, state.population, proposal)
         state = self._settle(state, outcome, host)
-        if host.progress - host.reset_at >= d.reset_every:
+        if host.progress - host.reset_at >= max(d.reset_every, d.min_reset_steps * host.pace):
             host.reset_at = host.progress
             state = replace_gaussians(
                 state,
@@ -422,6 +422,11 @@ class Trainer:
                     "reached; raise --densify.max-gaussians to let them. Counted from here on."
                 )
             host.refused += refused
+        if not bool(jnp.any(outcome.population.alive)):
+            raise UserError(
+                f"Step {host.step}: densification removed every Gaussian.",
+                fix="lower --densify.prune-opacity or raise --densify.prune-scale",
+            )
         opt_state = self._zero_moments(state.opt_state, outcome.reset_moments)
         return replace_gaussians(state, outcome.gaussians, outcome.population, opt_state)
 

@@ -1,0 +1,45 @@
+"""A scene small enough to fit in seconds."""
+
+import cv2
+import numpy as np
+
+
+def make_scene(root, views=6, points=150, size=(112, 100), seed=0):
+    """Write coloured dots seen by a row of cameras, under exposures that differ, as COLMAP text."""
+    rng = np.random.default_rng(seed)
+    width, height = size
+    focal = 90.0
+    xyz = np.concatenate([rng.uniform(-1.5, 1.5, (points, 2)), rng.uniform(3, 6, (points, 1))], 1)
+    color = rng.uniform(0.05, 0.9, (points, 3))
+    e = np.exp2(rng.normal(0, 0.5, views))
+    model = root / "sparse" / "0"
+    model.mkdir(parents=True)
+    (root / "images").mkdir()
+    observations = {p: [] for p in range(points)}
+    lines = []
+    for v in range(views):
+        t = np.array([0.5 - v / (views - 1), 0.0, 0.0])
+        image = np.full((height, width, 3), 0.2 * e[v])
+        found = []
+        local = xyz + t
+        uv = local[:, :2] / local[:, 2:] * focal + [width / 2, height / 2]
+        for p in np.argsort(-local[:, 2]):
+            if 3 < uv[p, 0] < width - 3 and 3 < uv[p, 1] < height - 3:
+                center = tuple(round(c * 16 - 8) for c in uv[p])
+                cv2.circle(image, center, 3 * 16, (e[v] * color[p]).tolist(), -1, cv2.LINE_AA, 4)
+                observations[p].append((v + 1, len(found)))
+                found.append(f"{uv[p, 0]:.4f} {uv[p, 1]:.4f} {p + 1}")
+        encoded = np.clip(image, 0, 1) ** (1 / 2.2)
+        cv2.imwrite(str(root / "images" / f"{v}.png"), np.rint(encoded * 255)[..., ::-1])
+        lines += [f"{v + 1} 1 0 0 0 {t[0]} {t[1]} {t[2]} 1 {v}.png", " ".join(found)]
+    (model / "images.txt").write_text("\n".join(lines) + "\n")
+    (model / "cameras.txt").write_text(
+        f"1 PINHOLE {width} {height} {focal} {focal} {width / 2} {height / 2}\n"
+    )
+    rows = []
+    for p, track in observations.items():
+        rgb = " ".join(str(int(255 * c ** (1 / 2.2))) for c in color[p])
+        pairs = " ".join(f"{i} {k}" for i, k in track)
+        rows.append(f"{p + 1} {xyz[p, 0]} {xyz[p, 1]} {xyz[p, 2]} {rgb} 0.5 {pairs}")
+    (model / "points3D.txt").write_text("\n".join(rows) + "\n")
+    return root
