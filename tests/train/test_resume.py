@@ -11,7 +11,7 @@ import time
 import pytest
 from tiny_scene import make_scene
 
-STEPS = 60
+STEPS = 120
 
 
 def command(scene, run, *extra):
