@@ -254,5 +254,7 @@ def _write_summary(
         exposures_ev=np.log2(np.asarray(params.photometry.exposures)),
         cameras=[v.camera for v in train],
         true_ev=true_ev,
-        exif_ev=None if any(e is None for e in exif) else np.asarray(exif, float),
+        exif_ev=None
+        if all(e is None for e in exif)
+        else np.array([np.nan if e is None else e for e in exif]),
     )

@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from p2gs_jax.errors import UserError
+
 
 @contextlib.contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
@@ -38,7 +40,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
 
 def plain(value: Any) -> Any:
-    """Return `value` as JSON types; NaN and infinities become null."""
+    """Return `value` as JSON types, numpy's and jax's included; NaN and infinities become null."""
     if isinstance(value, dict):
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
@@ -55,7 +57,7 @@ def plain(value: Any) -> Any:
 def write_text(path: Path, text: str) -> None:
     """Write a text file atomically."""
     with atomic_write(path) as temporary:
-        temporary.write_text(text)
+        temporary.write_text(text, encoding="utf-8")
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -64,22 +66,46 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def append_jsonl(path: Path, record: dict) -> None:
-    """Append one line to a JSON-lines file."""
-    with Path(path).open("a") as file:
-        file.write(json.dumps(plain(record), allow_nan=False) + "\n")
+    """Append one line to a JSON-lines file, in one write call; a line torn before it goes."""
+    line = json.dumps(plain(record), allow_nan=False).encode() + b"\n"
+    with Path(path).open("ab+", buffering=0) as file:
+        end = file.seek(0, os.SEEK_END)
+        if end:
+            file.seek(end - 1)
+            if file.read(1) != b"\n":
+                line = _mend(file) + line
+        file.write(line)
+
+
+def _mend(file) -> bytes:
+    """Cut a torn last line off; return the newline that a whole one lacks."""
+    file.seek(0)
+    content = file.read()
+    start = content.rfind(b"\n") + 1
+    try:
+        json.loads(content[start:].decode())
+    except ValueError:
+        file.truncate(start)
+        return b""
+    return b"\n"
 
 
 def read_jsonl(path: Path) -> list[dict]:
-    """Return the records of a JSON-lines file; a last line torn by a kill is left out."""
+    """Return the records of a JSON-lines file; a last line torn by a kill is left out.
+
+    Raises:
+        UserError: another line is no JSON.
+    """
     try:
-        lines = Path(path).read_text().splitlines()
+        lines = Path(path).read_bytes().rstrip(b"\n").split(b"\n")
     except FileNotFoundError:
         return []
     records = []
-    for number, line in enumerate(lines):
+    for number, line in enumerate(lines, start=1):
         try:
-            records.append(json.loads(line))
-        except ValueError:
-            if number < len(lines) - 1:
-                raise
+            if line:
+                records.append(json.loads(line.decode()))
+        except ValueError as error:
+            if number < len(lines):
+                raise UserError(f"{path}, line {number}, is not JSON: {error}") from error
     return records

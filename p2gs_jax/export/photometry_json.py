@@ -47,8 +47,15 @@ class PhotometryFile(TypedDict):
 def write_photometry(
     path: Path, *, model: str, curve: dict, gauge: str, mean: dict, views: list[ViewPhotometry]
 ) -> None:
-    """Write the file atomically."""
-    write_json(path, {"model": model, "curve": curve, "gauge": gauge, "mean": mean, "views": views})
+    """Write the file atomically.
+
+    Raises:
+        ValueError: a view lacks a field.
+    """
+    data = {"model": model, "curve": curve, "gauge": gauge, "mean": mean, "views": views}
+    if problem := _problem(data):
+        raise ValueError(problem)
+    write_json(path, data)
 
 
 def read_photometry(path: Path) -> PhotometryFile:
@@ -58,10 +65,28 @@ def read_photometry(path: Path) -> PhotometryFile:
         UserError: it is no such file.
     """
     try:
-        data = json.loads(Path(path).read_text())
-        missing = [k for k in PhotometryFile.__annotations__ if k not in data]
-    except (OSError, ValueError, TypeError) as error:
+        data = json.loads(Path(path).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
         raise UserError(f"{path} cannot be read: {error}") from error
-    if missing:
-        raise UserError(f"{path} is incomplete: {', '.join(missing)} missing")
+    if problem := _problem(data):
+        raise UserError(f"{path} is incomplete: {problem}")
     return data
+
+
+def _problem(data) -> str | None:
+    """Return what keeps `data` from being a `PhotometryFile`, or None."""
+    if missing := _missing(data, PhotometryFile):
+        return missing
+    if not isinstance(data["views"], list):
+        return "views is no list"
+    for number, view in enumerate(data["views"]):
+        if missing := _missing(view, ViewPhotometry):
+            return f"view {number}: {missing}"
+    return None
+
+
+def _missing(data, kind: type) -> str | None:
+    if not isinstance(data, dict):
+        return "not an object"
+    names = [k for k in kind.__annotations__ if k not in data]
+    return f"{', '.join(names)} missing" if names else None

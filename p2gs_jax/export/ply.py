@@ -46,7 +46,7 @@ def _live(gaussians: Gaussians, alive: Bool[np.ndarray, " n"]) -> Gaussians:
 def _write(path: Path, g: Gaussians, comments: list[str]) -> int:
     count, coefficients = g.sh.shape[:2]
     # All coefficients of red, then green, then blue.
-    rest = np.asarray(g.sh[:, 1:]).transpose(0, 2, 1).reshape(count, -1)
+    rest = np.asarray(g.sh[:, 1:]).transpose(0, 2, 1).reshape(count, 3 * (coefficients - 1))
     columns = np.concatenate(
         [
             g.means,
@@ -84,9 +84,10 @@ def display_sh(
     out = np.empty_like(sh)
     for start in range(0, len(sh), CHUNK):
         part = sh[start : start + CHUNK]
-        values = np.einsum("dk,nkc->ndc", table, part).astype(np.float32)
+        values = np.einsum("dk,nkc->ndc", table, part, optimize=True).astype(np.float32)
         colors = tone(np.asarray(radiance_activation(jnp.asarray(values), activation)))
-        out[start : start + CHUNK] = np.einsum("kd,ndc->nkc", inverse, np.asarray(colors) - 0.5)
+        shown = np.clip(colors, 0, 1) - 0.5
+        out[start : start + CHUNK] = np.einsum("kd,ndc->nkc", inverse, shown, optimize=True)
     return out
 
 
@@ -105,6 +106,8 @@ def write_splats(
     *,
     tone: Callable[[np.ndarray], np.ndarray],
     activation: RadianceKind,
+    exposure: float = 1.0,
+    gamma: float | None = None,
 ) -> int:
     """Write live Gaussians with display colours; return how many.
 
@@ -112,13 +115,20 @@ def write_splats(
         path: the file.
         gaussians: linear radiance.
         alive: which to write.
-        tone: linear radiance -> display values in [0, 1].
+        tone: exposed radiance -> display values, clamped to [0, 1] here.
         activation: of the spherical harmonics.
+        exposure: multiplies the radiance before `tone`; leave it at 1 where `tone` exposes.
+        gamma: what `tone` uses, recorded in a comment.
     """
     g = _live(gaussians, alive)
-    sh = jnp.asarray(display_sh(np.asarray(g.sh), tone, activation))
-    shown = dataclasses.replace(g, sh=sh)
-    return _write(path, shown, ["p2gs-jax: display colours, tone-mapped"])
+    sh = display_sh(np.asarray(g.sh), lambda linear: tone(exposure * linear), activation)
+    shown = dataclasses.replace(g, sh=jnp.asarray(sh))
+    comments = ["p2gs-jax: display colours, tone-mapped"]
+    if exposure != 1.0:
+        comments.append(f"p2gs-jax: exposure {exposure:.6g}")
+    if gamma is not None:
+        comments.append(f"p2gs-jax: gamma {gamma:.6g}")
+    return _write(path, shown, comments)
 
 
 def write_radiance(

@@ -11,11 +11,18 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Float, Float32
+from matplotlib.ticker import MaxNLocator
 
 from p2gs_jax.export.atomic import atomic_write
 
 ROWS = ("photograph", "render,\nits own\nexposure", "render,\none exposure\nfor all")
 MARKERS = "osD^vPX*"
+# Sizes in inches, so that margins and text keep their distance whatever the photographs' shape.
+LEFT, RIGHT, TOP, BOTTOM = 1.15, 0.15, 0.32, 0.5
+GAP, PLOT, LEGEND_LINE = 0.06, 2.3, 0.19
+TITLE_SIZE, TEXT_SIZE = 8, 8.5
+# Largest mean width of a character of DejaVu Sans, in font sizes.
+CHARACTER = 0.62
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 
 
@@ -41,68 +48,98 @@ def write_summary(
         names: of the columns.
         exposures_ev: recovered, per training view, in stops.
         cameras: physical camera of each training view.
-        true_ev: truth, where it is known.
-        exif_ev: from EXIF, where it is complete.
+        true_ev: truth in stops up to a constant, NaN where it is not known.
+        exif_ev: from EXIF, likewise.
     """
     columns = len(photographs)
     aspect = float(np.mean([p.shape[0] / p.shape[1] for p in photographs]))
-    cell = 3.0 if aspect < 1.2 else 2.0
-    figure = plt.figure(figsize=(cell * columns + 0.9, 3 * cell * aspect + 3.4), dpi=110)
-    grid = figure.add_gridspec(
-        4,
-        columns,
-        height_ratios=[cell * aspect] * 3 + [2.4],
-        hspace=0.06,
-        wspace=0.03,
-        left=0.11 if columns > 2 else 0.16,
-        right=0.985,
-        top=0.955,
-        bottom=0.075,
-    )
+    cell_w = max(2.0 if aspect > 1.2 else 3.0, 6.0 / columns)
+    cell_h = cell_w * aspect
+    width = LEFT + columns * cell_w + (columns - 1) * GAP + RIGHT
+    entries = _curves(np.asarray(exposures_ev, float), cameras, true_ev, exif_ev)
+    label_w = max(len(label) for *_, label in entries) * CHARACTER * TEXT_SIZE / 72 + 0.6
+    per_line = max(1, int((width - LEFT - RIGHT) / label_w))
+    legend_h = LEGEND_LINE * -(-sum(bool(e[-1]) for e in entries) // per_line) + 0.16
+    height = TOP + 3 * (cell_h + GAP) + legend_h + PLOT + BOTTOM
+    figure = plt.figure(figsize=(width, height), dpi=110)
+
+    def place(left: float, top: float, w: float, h: float):
+        return figure.add_axes((left / width, 1 - (top + h) / height, w / width, h / height))
+
     for r, images in enumerate((photographs, rendered, linear_tonemapped)):
         for c, image in enumerate(images):
-            axis = figure.add_subplot(grid[r, c])
+            left, top = LEFT + c * (cell_w + GAP), TOP + r * (cell_h + GAP)
+            axis = place(left, top, cell_w, cell_h)
             axis.imshow(np.clip(image, 0, 1), interpolation="lanczos")
             axis.set_xticks([])
             axis.set_yticks([])
             axis.set_frame_on(False)
             if r == 0:
-                axis.set_title(names[c], fontsize=8)
+                axis.set_title(_shorten(names[c], cell_w), fontsize=TITLE_SIZE, pad=4)
             if c == 0:
-                axis.set_ylabel(ROWS[r], fontsize=8, rotation=0, ha="right", va="center")
-    axis = figure.add_subplot(grid[3, :])
-    _plot_exposures(axis, exposures_ev, cameras, true_ev, exif_ev)
+                position = ((LEFT - 0.1) / width, 1 - (top + cell_h / 2) / height)
+                figure.text(*position, ROWS[r], fontsize=TEXT_SIZE, ha="right", va="center")
+    top = TOP + 3 * (cell_h + GAP) + legend_h
+    _plot_exposures(place(LEFT, top, width - LEFT - RIGHT, PLOT), entries, per_line)
     with atomic_write(path) as temporary:
         figure.savefig(temporary)
     plt.close(figure)
 
 
-def _plot_exposures(axis, exposures_ev, cameras, true_ev, exif_ev) -> None:
-    centered = np.asarray(exposures_ev) - np.mean(exposures_ev)
-    where = np.arange(len(centered))
-    for k, camera in enumerate(dict.fromkeys(cameras)):
-        rows = np.array([c == camera for c in cameras])
-        axis.plot(
-            where[rows],
-            centered[rows],
-            MARKERS[k % len(MARKERS)] + "-",
-            color=COLORS[k % len(COLORS)],
-            markersize=4.5,
-            linewidth=1,
-            label=f"recovered, camera {camera}",
-        )
-    for values, label, style in ((true_ev, "true", "k--"), (exif_ev, "EXIF", "k:")):
+def _shorten(name: str, inches: float) -> str:
+    """Return the end of a name, as much as fits."""
+    room = int(inches * 72 / (CHARACTER * TITLE_SIZE))
+    return name if len(name) <= room else "…" + name[1 - room :]
+
+
+def _curves(exposures_ev, cameras, true_ev, exif_ev) -> list[tuple]:
+    """Return (views, stops from the mean, style, label) of every line; one label per kind."""
+    centered = exposures_ev - np.mean(exposures_ev)
+    order = dict.fromkeys(cameras)
+    owner = np.array(list(cameras))
+    out = []
+    for k, camera in enumerate(order):
+        rows = np.flatnonzero(owner == camera)
+        style = {
+            "marker": MARKERS[k % len(MARKERS)],
+            "color": COLORS[k % len(COLORS)],
+            "markersize": 4.5,
+            "linewidth": 1,
+        }
+        out.append((rows, centered[rows], style, f"recovered, camera {camera}"))
+    for values, label, line in ((true_ev, "true", "--"), (exif_ev, "EXIF", ":")):
         if values is None:
             continue
-        values = np.asarray(values) - np.mean(values)
-        for k, camera in enumerate(dict.fromkeys(cameras)):
-            rows = np.array([c == camera for c in cameras])
-            axis.plot(
-                where[rows], values[rows], style, linewidth=1.2, label=label if k == 0 else None
-            )
-    axis.set_ylabel("exposure, EV\nfrom the mean", fontsize=9)
-    axis.set_xlabel("training view", fontsize=9)
+        values = np.asarray(values, float)
+        known = np.isfinite(values)
+        if not known.any():
+            continue
+        values = values - np.mean(values[known] - centered[known])
+        style = {"color": "black", "linestyle": line, "linewidth": 1.2}
+        for camera in order:
+            rows = np.flatnonzero((owner == camera) & known)
+            if len(rows):
+                lone = {"marker": "_", "markersize": 7} if len(rows) == 1 else {}
+                out.append((rows, values[rows], style | lone, label))
+                label = ""
+    return out
+
+
+def _plot_exposures(axis, entries: list[tuple], legend_columns: int) -> None:
+    for rows, values, style, label in entries:
+        axis.plot(rows, values, label=label or None, **style)
+    axis.set_ylabel("exposure, EV\nfrom the mean", fontsize=TEXT_SIZE)
+    axis.set_xlabel("training view", fontsize=TEXT_SIZE)
     axis.tick_params(labelsize=8)
+    axis.xaxis.set_major_locator(MaxNLocator(integer=True, steps=[1, 2, 5, 10]))
     axis.grid(alpha=0.3)
-    axis.margins(x=0.01, y=0.15)
-    axis.legend(fontsize=8, ncol=4, loc="best", framealpha=0.85)
+    axis.margins(x=0.01, y=0.08)
+    axis.legend(
+        fontsize=TEXT_SIZE,
+        ncol=legend_columns,
+        loc="lower left",
+        bbox_to_anchor=(0, 1.0),
+        borderaxespad=0.2,
+        borderpad=0,
+        frameon=False,
+    )

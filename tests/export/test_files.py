@@ -2,6 +2,7 @@
 
 import os
 
+import cv2
 import jax.numpy as jnp
 import numpy as np
 import OpenEXR
@@ -10,10 +11,11 @@ from plyfile import PlyData
 
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.atomic import append_jsonl, atomic_write, read_jsonl, write_json
-from p2gs_jax.export.checkpoint import CheckpointStore
 from p2gs_jax.export.exr import read_exr, write_exr
 from p2gs_jax.export.photometry_json import read_photometry, write_photometry
 from p2gs_jax.export.ply import display_sh, field_names, read_ply, write_radiance, write_splats
+from p2gs_jax.export.png import side_by_side, write_png
+from p2gs_jax.export.summary import _curves, _shorten, write_summary
 from p2gs_jax.types import Camera, Gaussians
 
 
@@ -41,6 +43,31 @@ def test_atomic_write_leaves_the_old_file_on_failure(tmp_path):
 def test_json_has_no_nan(tmp_path):
     write_json(tmp_path / "a.json", {"a": float("nan"), "b": jnp.float32(2), "c": np.arange(2)})
     assert "NaN" not in (tmp_path / "a.json").read_text()
+
+
+@pytest.mark.parametrize("tail", [b'{"step": 3, "lo', b'{"name": "\xc3', b"\x00\x00\x00", b"{"])
+def test_appending_after_a_torn_line_loses_only_that_line(tmp_path, tail):
+    path = tmp_path / "log.jsonl"
+    append_jsonl(path, {"step": 1})
+    path.write_bytes(path.read_bytes() + tail)
+    assert [r["step"] for r in read_jsonl(path)] == [1]
+    append_jsonl(path, {"step": 2})
+    append_jsonl(path, {"step": 3})
+    assert [r["step"] for r in read_jsonl(path)] == [1, 2, 3]
+
+
+def test_a_whole_line_without_its_newline_is_kept(tmp_path):
+    path = tmp_path / "log.jsonl"
+    path.write_text('{"step": 1}')
+    append_jsonl(path, {"step": 2})
+    assert [r["step"] for r in read_jsonl(path)] == [1, 2]
+
+
+def test_a_broken_line_in_the_middle_is_named(tmp_path):
+    path = tmp_path / "log.jsonl"
+    path.write_text('{"step": 1}\n{"st\n{"step": 3}\n')
+    with pytest.raises(UserError, match="line 2"):
+        read_jsonl(path)
 
 
 def test_torn_last_line_is_left_out(tmp_path):
@@ -104,6 +131,28 @@ def test_display_colours_are_exact_for_degree_0_and_close_for_3(tmp_path):
     assert "display" in PlyData.read(str(tmp_path / "s.ply")).comments[0]
 
 
+def test_display_colours_are_clamped_and_exposed(tmp_path):
+    g = gaussians(degree=0)
+    shown = display_sh(np.asarray(g.sh), lambda x: 9 * x - 1, "linear")
+    colors = 0.28209479 * shown[:, 0] + 0.5
+    assert colors.min() > -1e-6
+    assert colors.max() < 1 + 1e-6
+    path = tmp_path / "s.ply"
+    write_splats(
+        path, g, np.ones(50, bool), tone=tone, activation="softplus", exposure=0.5, gamma=2.2
+    )
+    expected = tone(0.5 * np.log1p(np.exp(0.28209479 * np.asarray(g.sh[:, 0]))))
+    np.testing.assert_allclose(0.28209479 * read_ply(path).sh[:, 0] + 0.5, expected, atol=1e-5)
+    assert "p2gs-jax: exposure 0.5" in PlyData.read(str(path)).comments
+
+
+def test_nobody_alive(tmp_path):
+    dead = np.zeros(50, bool)
+    assert write_radiance(tmp_path / "r.ply", gaussians(), dead, activation="exp") == 0
+    assert read_ply(tmp_path / "r.ply").sh.shape == (0, 16, 3)
+    assert write_splats(tmp_path / "s.ply", gaussians(), dead, tone=tone, activation="exp") == 0
+
+
 def test_not_a_ply(tmp_path):
     (tmp_path / "x.ply").write_text("hello")
     with pytest.raises(UserError, match=r"x\.ply"):
@@ -137,6 +186,15 @@ def test_exr_never_overflows_half(tmp_path):
     np.testing.assert_array_equal(read_exr(tmp_path / "b.exr")[0], linear / 100)
 
 
+@pytest.mark.parametrize(("value", "pixel"), [(65504.0, np.float16), (65505.0, np.float32)])
+def test_exr_switches_to_float_where_half_ends(tmp_path, value, pixel):
+    linear = np.full((2, 3, 3), value, np.float32)
+    write_exr(tmp_path / "a.exr", linear, alpha=np.ones((2, 3), np.float32))
+    with OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True) as file:
+        assert {c: file.channels()[c].pixels.dtype for c in "RGBA"} == dict.fromkeys("RGBA", pixel)
+    np.testing.assert_array_equal(read_exr(tmp_path / "a.exr")[0], linear)
+
+
 def test_broken_exr(tmp_path):
     (tmp_path / "x.exr").write_bytes(b"no")
     with pytest.raises(UserError, match=r"x\.exr"):
@@ -162,34 +220,64 @@ def test_photometry_round_trip(tmp_path):
         read_photometry(path)
 
 
-def test_checkpoints_are_exact_and_the_last_two_are_kept(tmp_path):
-    store = CheckpointStore(tmp_path / "c")
-    assert store.latest_step() is None
-    trees = {s: {"a": gaussians(seed=s), "n": jnp.int32(s)} for s in (1, 2, 3)}
-    for s, tree in trees.items():
-        store.save(s, tree, {"capacity": 50 + s})
-    store = CheckpointStore(tmp_path / "c")
-    assert store.latest_step() == 3
-    tree, meta = store.restore_latest(lambda meta: trees[3])
-    assert meta == {"capacity": 53}
-    np.testing.assert_array_equal(tree["a"].sh, trees[3]["a"].sh)
-    assert int(tree["n"]) == 3
-    assert store.restore(2, trees[2])["n"] == 2
-    with pytest.raises(UserError):
-        store.restore(1, trees[1])
+def test_photometry_of_incomplete_views(tmp_path):
+    path = tmp_path / "photometry.json"
+    with pytest.raises(ValueError, match=r"view 0: .*gamma"):
+        write_photometry(path, model="m", curve={}, gauge="g", mean={}, views=[{"image": "a"}])
+    assert not path.exists()
+    path.write_text('{"model": 1, "curve": 1, "gauge": 1, "mean": 1, "views": [3]}')
+    with pytest.raises(UserError, match="view 0: not an object"):
+        read_photometry(path)
 
 
-def test_a_broken_newest_checkpoint_falls_back(tmp_path):
-    store = CheckpointStore(tmp_path / "c")
-    for s in (1, 2):
-        store.save(s, {"x": jnp.full(1000, float(s))}, {"s": s})
-    for path in (tmp_path / "c" / "2").rglob("*"):
-        if path.is_file():
-            path.write_bytes(b"")
-    told = []
-    found = CheckpointStore(tmp_path / "c").restore_latest(
-        lambda m: {"x": jnp.zeros(1000)}, told.append
+def test_png_rounds_and_keeps_the_channel_order(tmp_path):
+    ldr = np.array([[[1.0, 0.5, 0.0], [2.0, -1.0, np.nan]]], np.float32)
+    write_png(tmp_path / "a.png", ldr)
+    back = cv2.imread(str(tmp_path / "a.png"))[..., ::-1]
+    np.testing.assert_array_equal(back, [[[255, 128, 0], [255, 0, 0]]])
+
+
+def test_side_by_side():
+    row = side_by_side([np.zeros((2, 3, 3)), np.full((4, 1, 3), 0.5)], gap=2, background=1.0)
+    assert row.shape == (4, 6, 3)
+    np.testing.assert_array_equal(row[0, :, 0], [0, 0, 0, 1, 1, 0.5])
+    np.testing.assert_array_equal(row[3, :, 0], [1, 1, 1, 1, 1, 0.5])
+
+
+@pytest.mark.parametrize("columns", [1, 5])
+def test_summary_is_written_with_gaps_in_exif_and_long_names(tmp_path, columns):
+    images = [np.full((24, 32, 3), 0.5, np.float32)] * columns
+    exif = np.arange(9.0)
+    exif[[1, 4, 7, 8]] = np.nan
+    write_summary(
+        tmp_path / "s.png",
+        photographs=images,
+        rendered=images,
+        linear_tonemapped=images,
+        names=["a/very/long/folder/" * 5 + "0001.jpg (test)"] * columns,
+        exposures_ev=np.linspace(-1, 1, 9),
+        cameras=["left", "mid", "right"] * 3,
+        true_ev=np.full(9, np.nan),
+        exif_ev=exif,
     )
-    assert found is not None
-    assert float(found[0]["x"][0]) == 1.0
-    assert told
+    assert cv2.imread(str(tmp_path / "s.png")).shape[1] > 600
+
+
+def test_curves_of_the_summary_share_one_level():
+    ev, cameras = np.array([1.0, 3.0, 2.0, 6.0]), ["a", "b", "a", "b"]
+    exif = ev + 5
+    exif[0] = np.nan
+    curves = _curves(ev, cameras, None, exif)
+    labels = ["recovered, camera a", "recovered, camera b", "EXIF", ""]
+    assert [label for *_, label in curves] == labels
+    assert curves[0][2]["marker"] != curves[1][2]["marker"]
+    np.testing.assert_allclose(curves[1][1], curves[3][1])
+    np.testing.assert_allclose(curves[0][1][1:], curves[2][1])
+
+
+def test_names_are_cut_to_the_width():
+    assert _shorten("a.jpg", 3.0) == "a.jpg"
+    short = _shorten("x" * 100 + "/b.jpg (test)", 2.0)
+    assert short.startswith("…")
+    assert short.endswith("/b.jpg (test)")
+    assert len(short) < 35
