@@ -109,6 +109,7 @@ class Splats2D(eqx.Module):
         log_opacities: log peak opacity (-100 where not visible).
         depths: z in the camera, scene units.
         visible: in front of the near plane and well defined.
+        log_cutoffs: log opacity below which a contribution is skipped.
     """
 
     means2d: Float[Array, "n 2"]
@@ -117,6 +118,7 @@ class Splats2D(eqx.Module):
     log_opacities: Float[Array, " n"]
     depths: Float[Array, " n"]
     visible: Bool[Array, " n"]
+    log_cutoffs: Float[Array, " n"]
 
 
 class TileList(eqx.Module):
@@ -125,7 +127,7 @@ class TileList(eqx.Module):
     Attributes:
         gaussian_ids: ids sorted by (tile, depth), padded to the capacity M.
         offsets: start of every tile in `gaussian_ids`; the last is the number of entries used.
-        count: entries before the exact tile test: what the capacity must hold.
+        count: what the capacity must hold for the list to be complete.
         overflow: count > M; the list is then incomplete and the result must be discarded.
     """
 
@@ -141,7 +143,8 @@ class Render(eqx.Module):
     Attributes:
         linear: linear HDR radiance, premultiplied by alpha (black background).
         alpha: accumulated opacity in [0, 1].
-        depth: alpha-weighted camera z; divide by alpha for the expected depth.
+        depth: alpha-weighted camera z; divide by alpha for the expected depth. None if it was
+            not asked for.
         count: tile-list entries this view needed.
         overflow: the tile list did not fit: discard this render and grow the capacity.
         visible: which Gaussians were in the image.
@@ -149,7 +152,7 @@ class Render(eqx.Module):
 
     linear: Float[Array, "h w 3"]
     alpha: Float[Array, "h w"]
-    depth: Float[Array, "h w"]
+    depth: Float[Array, "h w"] | None
     count: Int[Array, ""]
     overflow: Bool[Array, ""]
     visible: Bool[Array, " n"]

@@ -97,6 +97,7 @@ def total_loss(
         capacity,
         active_degree=active_degree,
         means2d_probe=means2d_probe,
+        with_depth=False,
     )
     exposures, gammas = params.photometry.exposures, params.photometry.gammas
     i, j = batch.view_index, partner.view_index
@@ -114,6 +115,7 @@ def total_loss(
                 cfg.render,
                 capacity,
                 active_degree=active_degree,
+                with_depth=False,
             ).linear
         terms["relative_exposure"] = relative.weight * relative_exposure_loss(
             ExposurePairs(render.linear, linear_j, i, j, exposures, gammas, partner.pairs),

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Literal
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from p2gs_jax.config import RenderConfig
+from p2gs_jax.render.binning import bin_tiles, count_entries
+from p2gs_jax.render.cutoff import log_cutoffs
 from p2gs_jax.render.project import project, view_radiance
 from p2gs_jax.render.rasterize_reference import rasterize_reference
 from p2gs_jax.render.rasterize_xla import rasterize_xla
-from p2gs_jax.render.tiles import bin_tiles, count_entries
 from p2gs_jax.types import Camera, Gaussians, Render, Splats2D, TileList
 
 __all__ = [
@@ -34,7 +36,8 @@ def rasterize(
     cfg: RenderConfig,
     *,
     implementation: Literal["reference", "xla"] | None = None,
-) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"], Float[Array, "h w"]]:
+    with_depth: bool = True,
+) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"], Float[Array, "h w"] | None]:
     """Composite splats into linear radiance, alpha and alpha-weighted depth.
 
     Args:
@@ -46,18 +49,20 @@ def rasterize(
         cfg: tile, chunk, cutoff, termination.
         implementation: `reference` (dense, any precision), `xla` (lane queue), or None for the
             fastest that runs here.
+        with_depth: render depth too; without it, None in its place and about 5 % less work.
 
     Raises:
         ValueError: no such implementation, or `xla` without a tile list.
     """
     name = implementation or "xla"
     if name == "reference":
-        return rasterize_reference(splats, radiance, width, height, cfg)
+        linear, alpha, depth = rasterize_reference(splats, radiance, width, height, cfg)
+        return linear, alpha, depth if with_depth else None
     if name != "xla":
         raise ValueError(f"there is no rasterizer {name!r}; choose 'reference' or 'xla'")
     if tiles is None:
         raise ValueError("the xla rasterizer needs a tile list: pass bin_tiles(...)")
-    return rasterize_xla(splats, radiance, tiles, width, height, cfg)
+    return rasterize_xla(splats, radiance, tiles, width, height, cfg, with_depth)
 
 
 def render_linear(
@@ -69,6 +74,7 @@ def render_linear(
     *,
     active_degree: Int[Array, ""] | int | None = None,
     means2d_probe: Float[Array, "n 2"] | None = None,
+    with_depth: bool = True,
 ) -> Render:
     """Render linear HDR radiance of one view (paper, eq. 4).
 
@@ -80,12 +86,14 @@ def render_linear(
         capacity: tile-list entries; see `required_capacity`.
         active_degree: highest spherical-harmonics degree in use, None for all.
         means2d_probe: see `project`.
+        with_depth: see `rasterize`.
 
     Returns:
         The render. Where `overflow` is set it must be discarded and the capacity grown.
     """
     splats = project(gaussians, alive, camera, cfg, means2d_probe)
     radiance = view_radiance(gaussians, camera, cfg, active_degree)
+    splats = _with_cutoffs(splats, radiance, cfg)
     if cfg.implementation == "reference":
         tiles, count = None, jnp.int32(0)
         overflow = jnp.array(False)
@@ -100,6 +108,7 @@ def render_linear(
         camera.height,
         cfg,
         implementation=cfg.implementation,
+        with_depth=with_depth,
     )
     return Render(linear, alpha, depth, count, overflow, splats.visible)
 
@@ -108,4 +117,13 @@ def required_capacity(
     gaussians: Gaussians, alive: Bool[Array, " n"], camera: Camera, cfg: RenderConfig
 ) -> Int[Array, ""]:
     """Return the exact tile-list capacity one view needs."""
-    return count_entries(project(gaussians, alive, camera, cfg), camera.width, camera.height, cfg)
+    splats = project(gaussians, alive, camera, cfg)
+    if cfg.cutoff_rule == "radiance":
+        splats = _with_cutoffs(splats, view_radiance(gaussians, camera, cfg), cfg)
+    return count_entries(splats, camera.width, camera.height, cfg)
+
+
+def _with_cutoffs(splats: Splats2D, radiance: Float[Array, "n 3"], cfg: RenderConfig) -> Splats2D:
+    if cfg.cutoff_rule == "opacity":
+        return splats
+    return dataclasses.replace(splats, log_cutoffs=log_cutoffs(splats, radiance, cfg))

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render import render_linear, required_capacity
+from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.types import Camera, Gaussians, Render
 
 CAPACITY_STEP = 1.25
@@ -30,7 +31,7 @@ def make_renderer(cfg: RenderConfig) -> RenderView:
     """Return a function that renders one view exactly, growing its tile lists when it must."""
     capacities: dict[tuple[int, int], int] = {}
 
-    @functools.partial(jax.jit, static_argnames="capacity")
+    @functools.partial(jax.jit, static_argnames="capacity", compiler_options=compiler_options())
     def render(gaussians, alive, camera, capacity):
         return render_linear(gaussians, alive, camera, cfg, capacity)
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.photometry.radiance import radiance_activation
 from p2gs_jax.render import spherical_harmonics
+from p2gs_jax.render.xla_cpu import columns
 from p2gs_jax.types import Camera, Gaussians, Splats2D
 
 INVISIBLE_LOG_OPACITY = -100.0
@@ -23,12 +25,11 @@ def rotation_matrices(quats: Float[Array, "n 4"]) -> list[list[Float[Array, " n"
 
     Quaternions are normalised first; a zero quaternion gives the identity.
     """
-    squared = jnp.sum(quats * quats, -1, keepdims=True)
+    raw = columns(quats)
+    squared = sum(c * c for c in raw)
     tiny = squared < 1e-30
-    unit = jnp.where(
-        tiny, jnp.array([1.0, 0, 0, 0], quats.dtype), quats / jnp.sqrt(jnp.where(tiny, 1, squared))
-    )
-    w, x, y, z = unit[:, 0], unit[:, 1], unit[:, 2], unit[:, 3]
+    inverse = jax.lax.rsqrt(jnp.where(tiny, 1, squared))
+    w, x, y, z = (jnp.where(tiny, float(i == 0), c * inverse) for i, c in enumerate(raw))
     return [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
@@ -62,11 +63,8 @@ def project(
     """
     R, t = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
     fx, fy, cx, cy = camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]
-    means = gaussians.means
-    x, y, z_raw = (
-        means[:, 0] * R[i, 0] + means[:, 1] * R[i, 1] + means[:, 2] * R[i, 2] + t[i]
-        for i in range(3)
-    )
+    means = columns(gaussians.means)
+    x, y, z_raw = (sum(means[k] * R[i, k] for k in range(3)) + t[i] for i in range(3))
     visible = alive & (z_raw > cfg.near)
     # Masking the inputs, not the results, keeps the gradients of invisible splats at exactly zero.
     z = jnp.where(visible, z_raw, 1.0)
@@ -84,9 +82,9 @@ def project(
         [j11 * R[1, k] + j12 * R[2, k] for k in range(3)],
     )
     Q = rotation_matrices(gaussians.quats)
-    scales = jnp.exp(jnp.clip(gaussians.log_scales, *LOG_SCALE_RANGE))
+    scales = [jnp.exp(jnp.clip(s, *LOG_SCALE_RANGE)) for s in columns(gaussians.log_scales)]
     V = [
-        [sum(JR[i][k] * Q[k][axis] for k in range(3)) * scales[:, axis] for axis in range(3)]
+        [sum(JR[i][k] * Q[k][axis] for k in range(3)) * scales[axis] for axis in range(3)]
         for i in range(2)
     ]
     s_xx, s_yy = (sum(v * v for v in V[i]) for i in range(2))
@@ -112,6 +110,7 @@ def project(
         log_opacities=log_opacities,
         depths=z,
         visible=visible,
+        log_cutoffs=jnp.full_like(z, float(np.log(cfg.alpha_cutoff))),
     )
 
 

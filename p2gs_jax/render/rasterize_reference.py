@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from p2gs_jax.config import RenderConfig
@@ -22,7 +21,7 @@ def rasterize_reference(
     height: int,
     cfg: RenderConfig,
 ) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"], Float[Array, "h w"]]:
-    """Composite splats front to back, untruncated (paper, eq. 4).
+    """Composite splats front to back, without a stop rule (paper, eq. 4).
 
     Memory is O(N H W): tests only.
 
@@ -38,7 +37,7 @@ def rasterize_reference(
     a11, a12, a22 = (s.conic_factor[:, i, None, None] for i in range(3))
     exponent = s.log_opacities[:, None, None] - 0.5 * ((a11 * dx + a12 * dy) ** 2 + (a22 * dy) ** 2)
     alpha = jnp.where(
-        exponent > float(np.log(cfg.alpha_cutoff)),
+        exponent > s.log_cutoffs[:, None, None],
         jnp.minimum(jnp.exp(exponent), cfg.alpha_max),
         0.0,
     )

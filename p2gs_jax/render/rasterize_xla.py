@@ -4,10 +4,11 @@ B lanes each own one tile. Every iteration a lane composites the next C entries 
 its list ends, or all its pixels are opaque, it writes its tile and takes the next one, longest
 lists first. Work wasted on padding is bounded by C per tile, whatever the spread of list lengths.
 
-Rows. A Gaussian is a row of ten floats: mean x, y; conic factor a11, a12, a22; log opacity; three
-radiances; depth. Factor and opacity are pre-scaled so that the exponent per pixel is
-e = row - (u^2 + v^2) and alpha = exp(2^s e), with s chosen so that a degree-6 polynomial and s
-squarings are exact to float32 down to the alpha cutoff. Row N is a dummy that absorbs padding.
+Rows. A Gaussian is a row of floats: mean x, y; conic factor a11, a12, a22; log opacity; three
+radiances; depth if asked for; its own log cutoff if they differ. Factor, opacity and cutoff are
+pre-scaled so that the exponent per pixel is e = row - (u^2 + v^2) and alpha = exp(2^s e), with s
+chosen so that a polynomial on [-0.7, 0] and s squarings reach the cutoff. Row N is a dummy that
+absorbs padding.
 
 Backward. The same queue, front to back. With R the gradient-weighted light still to come,
 q = w (radiance . g) and R -= q after each entry, the gradient to the exponent of one entry is
@@ -24,17 +25,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from p2gs_jax.config import RenderConfig
-from p2gs_jax.render import tiles as tiling
+from p2gs_jax.render.binning.boxes import bits_for, grid_size
+from p2gs_jax.render.binning.sorting import sort_payloads
+from p2gs_jax.render.cutoff import SMALLEST_CUTOFF
+from p2gs_jax.render.xla_cpu import materialize
 from p2gs_jax.types import Splats2D, TileList
 
 DUMMY_LOG_OPACITY = -100.0
 # The backward pass spends more on bookkeeping an iteration and wants more pixels in flight.
 BACKWARD_LANE_FACTOR = 2
 PREFIX_GROUP = 8
-COEFFICIENTS = 5  # three radiances, depth, transmittance
+GEOMETRY = 6  # columns of a row before its channels
+# Pixels darker than this, relative to the brightest splat, are held to its absolute error.
+DARKEST = 1e-4
 
 
 class _Plan(NamedTuple):
@@ -47,9 +53,12 @@ class _Plan(NamedTuple):
     lanes: int
     chunk: int
     gaussians: int
+    channels: int
     log_cutoff: float
+    own_cutoffs: bool
     alpha_max: float
-    stop: float | None
+    stop_error: float | None
+    exp_degree: int | None
 
     @property
     def tile_count(self) -> int:
@@ -74,39 +83,39 @@ class _Plan(NamedTuple):
         return x.astype(jnp.float32), y.astype(jnp.float32)
 
 
-def _scaled_exp(x: Array, squarings: int) -> Array:
-    """Return exp(2^squarings x) for x in about [-0.7, 0.03]; other values are masked by callers."""
-    p = 1 + x * (1 + x * (0.5 + x * (1 / 6 + x * (1 / 24 + x * (1 / 120 + x * (1 / 720))))))
-    for _ in range(squarings):
+@functools.cache
+def _exp_coefficients(degree: int) -> tuple[float, ...]:
+    """Return the polynomial that interpolates exp at the Chebyshev nodes of [-0.7, 0]."""
+    fit = np.polynomial.chebyshev.Chebyshev.interpolate(np.exp, degree, [-0.7, 0.0])
+    return tuple(float(c) for c in fit.convert(kind=np.polynomial.Polynomial).coef)
+
+
+def _scaled_exp(x: Array, plan: _Plan) -> Array:
+    """Return exp(2^squarings x) for x in [-0.7, 0]; other values are masked by callers."""
+    if plan.exp_degree is None:
+        return jnp.exp(plan.exponent_scale * x)
+    *rest, p = _exp_coefficients(plan.exp_degree)
+    for c in reversed(rest):
+        p = c + x * p
+    for _ in range(plan.squarings):
         p = p * p
-    return p
-
-
-def _materialize(nonzero: Int[Array, ""], compute):
-    """Force `compute()` into memory.
-
-    XLA's CPU backend fuses through `optimization_barrier` and then recomputes the whole chain in
-    each consumer (1155 against 421 CPU ms, KERNEL.md); a conditional on a predicate that it
-    cannot see through survives.
-    """
-    shape = jax.eval_shape(compute)
-    return lax.cond(nonzero > 0, compute, lambda: jnp.zeros(shape.shape, shape.dtype))
+    return jnp.asarray(p)
 
 
 def _pack_rows(splats: Splats2D, radiance: Float[Array, "n 3"], plan: _Plan):
     factor = float(np.sqrt(0.5 / plan.exponent_scale))
-    rows = jnp.concatenate(
-        [
-            splats.means2d,
-            splats.conic_factor * factor,
-            splats.log_opacities[:, None] / plan.exponent_scale,
-            radiance,
-            splats.depths[:, None],
-        ],
-        axis=1,
-    )
-    rows = jnp.where(splats.visible[:, None], rows, 0.0)
-    dummy = jnp.zeros((1, 10), rows.dtype).at[0, 5].set(DUMMY_LOG_OPACITY)
+    columns = [
+        splats.means2d,
+        splats.conic_factor * factor,
+        splats.log_opacities[:, None] / plan.exponent_scale,
+        radiance,
+    ]
+    if plan.channels == 4:
+        columns.append(splats.depths[:, None])
+    if plan.own_cutoffs:
+        columns.append(splats.log_cutoffs[:, None] / plan.exponent_scale)
+    rows = jnp.where(splats.visible[:, None], jnp.concatenate(columns, axis=1), 0.0)
+    dummy = jnp.zeros((1, rows.shape[1]), rows.dtype).at[0, GEOMETRY - 1].set(DUMMY_LOG_OPACITY)
     return jnp.concatenate([rows, dummy])
 
 
@@ -114,7 +123,7 @@ class _Entries(NamedTuple):
     """What a lane needs of its next C entries: gathered rows and their alphas."""
 
     ids: Array  # [B C]
-    rows: Array  # [B C 10]
+    rows: Array  # [B C row]
     u0: Array  # [B C], u at the tile centre
     v0: Array
     dx0: Array  # tile centre minus mean
@@ -122,11 +131,11 @@ class _Entries(NamedTuple):
     alpha: Array  # [B C P]
 
 
-def _gather(rows, ids_list, tile, position, end, local, plan: _Plan, nonzero) -> _Entries:
+def _gather(rows, ids_list, tile, position, end, local, plan: _Plan, always) -> _Entries:
     local_x, local_y = local
     entry = position[:, None] + jnp.arange(plan.chunk)
-    ids = _materialize(
-        nonzero,
+    ids = materialize(
+        always,
         lambda: jnp.where(
             entry < end[:, None], ids_list.at[entry].get(mode="promise_in_bounds"), plan.gaussians
         ),
@@ -140,10 +149,9 @@ def _gather(rows, ids_list, tile, position, end, local, plan: _Plan, nonzero) ->
     u = u0[..., None] + a11[..., None] * local_x + a12[..., None] * local_y
     v = v0[..., None] + a22[..., None] * local_y
     exponent = log_opacity[..., None] - (u * u + v * v)
+    cutoff = row[..., -1:] if plan.own_cutoffs else plan.log_cutoff / plan.exponent_scale
     alpha = jnp.where(
-        exponent > plan.log_cutoff / plan.exponent_scale,
-        jnp.minimum(_scaled_exp(exponent, plan.squarings), plan.alpha_max),
-        0.0,
+        exponent > cutoff, jnp.minimum(_scaled_exp(exponent, plan), plan.alpha_max), 0.0
     )
     return _Entries(ids, row, u0, v0, dx0, dy0, alpha)
 
@@ -160,13 +168,13 @@ class _Queue(NamedTuple):
     def build(cls, starts, ends, plan: _Plan):
         count, lanes = plan.tile_count, plan.lanes
         lane = jnp.arange(lanes, dtype=jnp.int32)
-        bits = tiling.bits_for(count)
+        bits = bits_for(count)
         limit = 2 ** (32 - bits) - 1
         length = jnp.minimum(ends - starts, limit).astype(jnp.uint32)
         key = (jnp.uint32(limit) - length) << bits | jnp.arange(count, dtype=jnp.uint32)
         parked = jnp.zeros(lanes + 1, jnp.int32)
         return cls(
-            jnp.concatenate([tiling.sort_payloads(key, bits), count + lane]),
+            jnp.concatenate([sort_payloads(key, bits), count + lane]),
             jnp.concatenate([starts, parked]),
             jnp.concatenate([ends, parked]),
             lane,
@@ -188,30 +196,34 @@ def _padded(ids_list, plan: _Plan):
 
 
 def _forward(rows, ids_list, offsets, plan: _Plan):
-    """Return the image [T 5 P] and where each tile stopped [T]."""
+    """Return the channels of the image and the transmittance, [T P] each, and the stops [T]."""
     count, lanes, pixels = plan.tile_count, plan.lanes, plan.pixels
     local = plan.local_pixels()
     ids_list = _padded(ids_list, plan)
     queue = _Queue.build(offsets[:-1], offsets[1:], plan)
     tile = queue.order[:lanes]
+    radiance = rows[:, GEOMETRY : GEOMETRY + 3]
+    brightest = jnp.maximum(jnp.max(radiance), 1e-30)
 
     def body(state):
         next_tile, tile, position, fresh, sums, image, stops = state
         end = queue.ends[tile]
-        entries = _gather(
-            rows, ids_list, tile, position, end, local, plan, jnp.minimum(next_tile, 1)
-        )
-        transmittance = jnp.where(fresh[:, None], 1.0, sums[4])
-        channels = [jnp.where(fresh[:, None], 0.0, sums[k]) for k in range(4)]
+        entries = _gather(rows, ids_list, tile, position, end, local, plan, next_tile > 0)
+        transmittance = jnp.where(fresh[:, None], 1.0, sums[-1])
+        channels = [jnp.where(fresh[:, None], 0.0, a) for a in sums[:-1]]
         for c in range(plan.chunk):
             weight = entries.alpha[:, c] * transmittance
-            channels = [channels[k] + weight * entries.rows[:, c, 6 + k, None] for k in range(4)]
+            channels = [
+                a + weight * entries.rows[:, c, GEOMETRY + k, None] for k, a in enumerate(channels)
+            ]
             transmittance = transmittance - weight
         sums = (*channels, transmittance)
         position = jnp.minimum(position + plan.chunk, end)
         done = position >= end
-        if plan.stop is not None:
-            done = done | (jnp.max(transmittance, -1) < plan.stop)
+        if plan.stop_error is not None:
+            so_far = functools.reduce(jnp.maximum, channels[:3]) / brightest
+            hidden = transmittance - plan.stop_error * jnp.maximum(so_far, DARKEST)
+            done = done | (jnp.max(hidden, -1) <= 0)
         target = jnp.where(done, tile, count + lanes)
         image = tuple(
             a.at[target].set(b, mode="drop", unique_indices=True)
@@ -226,15 +238,15 @@ def _forward(rows, ids_list, offsets, plan: _Plan):
         tile,
         queue.starts[tile],
         jnp.ones(lanes, bool),
-        tuple(jnp.zeros((lanes, pixels), jnp.float32) for _ in range(COEFFICIENTS)),
+        tuple(jnp.zeros((lanes, pixels), jnp.float32) for _ in range(plan.channels + 1)),
         tuple(
-            jnp.full((count + lanes, pixels), 1.0 if k == 4 else 0.0, jnp.float32)
-            for k in range(COEFFICIENTS)
+            jnp.full((count + lanes, pixels), float(k == plan.channels), jnp.float32)
+            for k in range(plan.channels + 1)
         ),
         jnp.zeros(count + lanes, jnp.int32),
     )
     state = lax.while_loop(lambda s: jnp.any(s[1] < count), body, state)
-    return jnp.stack([a[:count] for a in state[5]], 1), state[6][:count]
+    return tuple(a[:count] for a in state[5]), state[6][:count]
 
 
 def _prefixes(first, values, step, group: int):
@@ -249,7 +261,7 @@ def _prefixes(first, values, step, group: int):
 
 
 def _backward(rows, ids_list, offsets, stops, image, v_image, plan: _Plan):
-    """Return the gradient of the rows [N+1 10] from that of the image [T 5 P]."""
+    """Return the gradient of the rows from those of the channels and transmittance."""
     plan = plan._replace(lanes=plan.lanes * BACKWARD_LANE_FACTOR)
     count, lanes, pixels, chunk = plan.tile_count, plan.lanes, plan.pixels, plan.chunk
     local_x, local_y = plan.local_pixels()
@@ -265,17 +277,17 @@ def _backward(rows, ids_list, offsets, stops, image, v_image, plan: _Plan):
     def pad(a):
         return jnp.concatenate([a, jnp.zeros((lanes, *a.shape[1:]), a.dtype)])
 
-    light = pad(jnp.sum(image * v_image, 1))
-    v_channels = pad(v_image[:, :4])
+    light = pad(sum(a * v for a, v in zip(image, v_image, strict=True)))
+    v_channels = pad(jnp.stack(v_image[:-1], 1))
     tile = queue.order[:lanes]
     group = PREFIX_GROUP if chunk % PREFIX_GROUP == 0 else 1
     within = jnp.arange(group)[:, None]
 
     def body(state):
         next_tile, tile, position, fresh, transmittance, remaining, v_rows = state
-        nonzero = jnp.minimum(next_tile, 1)
+        always = next_tile > 0
         end = queue.ends[tile]
-        entries = _gather(rows, ids_list, tile, position, end, (local_x, local_y), plan, nonzero)
+        entries = _gather(rows, ids_list, tile, position, end, (local_x, local_y), plan, always)
         alpha, row = entries.alpha, entries.rows
         v_out = v_channels.at[tile].get(mode="promise_in_bounds")
         transmittance = jnp.where(fresh[:, None], 1.0, transmittance)
@@ -285,8 +297,8 @@ def _backward(rows, ids_list, offsets, stops, image, v_image, plan: _Plan):
 
         # Transmittance before each entry in two levels: across groups, then within.
         grouped = alpha.reshape(lanes, -1, group, pixels)
-        t_groups = _materialize(
-            nonzero, lambda: _prefixes(transmittance, alpha, lambda t, a: t * (1 - a), group)
+        t_groups = materialize(
+            always, lambda: _prefixes(transmittance, alpha, lambda t, a: t * (1 - a), group)
         )
 
         def weights():
@@ -295,13 +307,18 @@ def _backward(rows, ids_list, offsets, stops, image, v_image, plan: _Plan):
                 before = before * jnp.where(within > j, 1 - grouped[:, :, j : j + 1], 1.0)
             return (grouped * before).reshape(lanes, chunk, pixels)
 
-        w = _materialize(nonzero, weights)
-        q = _materialize(
-            nonzero,
-            lambda: w * sum(row[:, :, 6 + k, None] * v_out[:, k, None] for k in range(4)),
+        w = materialize(always, weights)
+        q = materialize(
+            always,
+            lambda: (
+                w
+                * sum(
+                    row[:, :, GEOMETRY + k, None] * v_out[:, k, None] for k in range(plan.channels)
+                )
+            ),
         )
         q_grouped = q.reshape(lanes, -1, group, pixels)
-        r_groups = _materialize(nonzero, lambda: _prefixes(remaining, q, lambda r, x: r - x, group))
+        r_groups = materialize(always, lambda: _prefixes(remaining, q, lambda r, x: r - x, group))
         after = r_groups[:, :, None]
         for j in range(group):
             after = after - jnp.where(within >= j, q_grouped[:, :, j : j + 1], 0.0)
@@ -351,9 +368,11 @@ def _backward(rows, ids_list, offsets, stops, image, v_image, plan: _Plan):
         jnp.ones(lanes, bool),
         blank,
         blank,
-        jnp.zeros_like(rows),
+        jnp.zeros((rows.shape[0], GEOMETRY + plan.channels), jnp.float32),
     )
-    return lax.while_loop(lambda s: jnp.any(s[1] < count), body, state)[6]
+    v_rows = lax.while_loop(lambda s: jnp.any(s[1] < count), body, state)[6]
+    # A splat's own cutoff has no gradient.
+    return jnp.pad(v_rows, ((0, 0), (0, rows.shape[1] - v_rows.shape[1])))
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(3,))
@@ -374,6 +393,12 @@ def _composite_bwd(plan: _Plan, residuals, v_image):
 _composite.defvjp(_composite_fwd, _composite_bwd)
 
 
+def _untile(channel, plan: _Plan):
+    """Return a channel [T P] as an image."""
+    grid = channel.reshape(plan.down, plan.across, plan.tile_y, plan.tile_x)
+    return grid.transpose(0, 2, 1, 3).reshape(plan.down * plan.tile_y, plan.across * plan.tile_x)
+
+
 def rasterize_xla(
     splats: Splats2D,
     radiance: Float[Array, "n 3"],
@@ -381,7 +406,8 @@ def rasterize_xla(
     width: int,
     height: int,
     cfg: RenderConfig,
-) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"], Float[Array, "h w"]]:
+    with_depth: bool = True,
+) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"], Float[Array, "h w"] | None]:
     """Composite splats tile by tile.
 
     Args:
@@ -391,12 +417,16 @@ def rasterize_xla(
         width: image width, pixels.
         height: image height, pixels.
         cfg: tile, chunk, lanes, cutoff, termination.
+        with_depth: composite depth too.
 
     Returns:
-        Linear radiance (black background), alpha, and alpha-weighted depth.
+        Linear radiance (black background), alpha, and alpha-weighted depth or None.
     """
     tile_x, tile_y = cfg.tile
-    across, down = tiling.grid_size(width, height, cfg.tile)
+    across, down = grid_size(width, height, cfg.tile)
+    smallest = cfg.alpha_cutoff
+    if cfg.cutoff_rule == "radiance":
+        smallest = min(smallest, SMALLEST_CUTOFF)
     plan = _Plan(
         across=across,
         down=down,
@@ -405,15 +435,15 @@ def rasterize_xla(
         lanes=max(1, min(cfg.pixels_in_flight // (tile_x * tile_y), across * down)),
         chunk=cfg.chunk,
         gaussians=splats.depths.shape[0],
-        log_cutoff=float(np.log(cfg.alpha_cutoff)),
+        channels=4 if with_depth else 3,
+        log_cutoff=float(np.log(smallest)),
+        own_cutoffs=cfg.cutoff_rule == "radiance",
         alpha_max=cfg.alpha_max,
-        stop=cfg.transmittance_stop,
+        stop_error=cfg.stop_error,
+        exp_degree=cfg.exp_degree,
     )
     rows = _pack_rows(splats, radiance, plan)
-    tiled: Array = _composite(rows, tiles.gaussian_ids, tiles.offsets, plan)
-    image = (
-        tiled.reshape(down, across, COEFFICIENTS, tile_y, tile_x)
-        .transpose(0, 3, 1, 4, 2)
-        .reshape(down * tile_y, across * tile_x, COEFFICIENTS)[:height, :width]
-    )
-    return image[..., :3], 1 - image[..., 4], image[..., 3]
+    tiled: tuple[Array, ...] = _composite(rows, tiles.gaussian_ids, tiles.offsets, plan)
+    *channels, transmittance = (_untile(a, plan)[:height, :width] for a in tiled)
+    depth = channels[3] if with_depth else None
+    return jnp.stack(channels[:3], -1), 1 - transmittance, depth

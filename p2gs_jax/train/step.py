@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Int
 from p2gs_jax.config import FitConfig
 from p2gs_jax.densify.mcmc import exploration_noise
 from p2gs_jax.losses.total import LossAux, Partner, total_loss
+from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.train.optimizer import learning_rates, means_rate
 from p2gs_jax.train.state import (
     FAULT_NONE,
@@ -102,7 +103,12 @@ def make_step(cfg: FitConfig, optimizer: optax.GradientTransformationExtraArgs, 
     """
     wants_probe = cfg.densify.method == "adaptive"
 
-    @functools.partial(jax.jit, static_argnames="capacity", donate_argnums=0)
+    @functools.partial(
+        jax.jit,
+        static_argnames="capacity",
+        donate_argnums=0,
+        compiler_options=compiler_options(),
+    )
     def step(
         state: FitState, batch: Batch, partner: Partner, controls: Controls, *, capacity: int
     ) -> tuple[FitState, StepReport]:

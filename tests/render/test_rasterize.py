@@ -55,7 +55,7 @@ def oracle():
 @pytest.mark.parametrize("stop", [1e-4, None])
 def test_values_and_gradients_match_oracle(oracle, tile, stop):
     expected, v_expected, weights = oracle
-    cfg = dataclasses.replace(CFG, tile=tile, transmittance_stop=stop)
+    cfg = dataclasses.replace(CFG, tile=tile, stop_error=stop)
     g, cam = street()
     r = render(g, cam, cfg)
     assert not bool(r.overflow)
@@ -136,7 +136,7 @@ def test_probe_gradient_is_screen_space_gradient():
 @pytest.mark.parametrize("value", [(16, 16), (32, 4)])
 def test_tile_size_does_not_change_the_image(value):
     g, cam = street(n=400)
-    cfg = dataclasses.replace(CFG, transmittance_stop=None)
+    cfg = dataclasses.replace(CFG, stop_error=None)
     a = render(g, cam, cfg).linear
     b = render(g, cam, dataclasses.replace(cfg, tile=value)).linear
     np.testing.assert_allclose(a, b, atol=2e-5 * float(a.max()))

@@ -1,29 +1,18 @@
-"""Binning: which Gaussians each tile composites, in depth order, without a per-tile cap.
+"""Binning by sorts: what a GPU wants, and the fallback wherever loops are not compiled.
 
-Integer work throughout, no gradients. Single-operand uint32 sorts of packed keys are about five
-times as fast per element on XLA's CPU backend as comparator or multi-operand sorts (KERNEL.md).
+Integer work throughout. Single-operand uint32 sorts of packed keys are about five times as fast
+per element on XLA's CPU backend as comparator or multi-operand sorts (KERNEL.md).
 """
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from p2gs_jax.config import RenderConfig
+from p2gs_jax.render.binning.boxes import bits_for, boxes, depth_keys, grid_size
 from p2gs_jax.types import Splats2D, TileList
-
-
-def grid_size(width: int, height: int, tile: tuple[int, int]) -> tuple[int, int]:
-    """Return the number of tiles across and down."""
-    return -(-width // tile[0]), -(-height // tile[1])
-
-
-def bits_for(count: int) -> int:
-    """Return how many bits tell `count` things apart (at least one)."""
-    return max(1, int(count - 1).bit_length())
 
 
 def sort_payloads(keys: UInt32[Array, " n"], payload_bits: int) -> Int[Array, " n"]:
@@ -35,19 +24,15 @@ def sort_payloads(keys: UInt32[Array, " n"], payload_bits: int) -> Int[Array, " 
 def depth_order(depths: Float[Array, " n"], visible: Bool[Array, " n"]) -> Int[Array, " n"]:
     """Return a stable argsort of positive depths, invisible ones last.
 
-    Two least-significant-digit passes over the bits of the float. Exact while the visible depths'
-    bit range fits two digits of 32 - log2(N) bits each; beyond that the lowest mantissa bits tie
-    and the index decides.
+    Two least-significant-digit passes. Exact while the visible depths' bit range fits two digits
+    of 32 - log2(N) bits each; beyond that the lowest mantissa bits tie and the index decides.
     """
     n = depths.shape[0]
     payload_bits = bits_for(n)
     digit_bits = 32 - payload_bits
-    bits = lax.bitcast_convert_type(depths.astype(jnp.float32), jnp.uint32)
-    low = jnp.min(jnp.where(visible, bits, jnp.uint32(0xFFFFFFFF)))
-    high = jnp.max(jnp.where(visible, bits, 0))
-    span = jnp.maximum(high, low) - low + 1
+    key, span = depth_keys(depths, visible)
     excess = (32 - lax.clz(span)).astype(jnp.int32) - 2 * digit_bits
-    key = jnp.where(visible, bits - low, span) >> jnp.maximum(0, excess).astype(jnp.uint32)
+    key = key >> jnp.maximum(0, excess).astype(jnp.uint32)
     key = jnp.minimum(key, jnp.uint32(2 ** min(2 * digit_bits, 32) - 1))
     index = jnp.arange(n, dtype=jnp.uint32)
     low_digit = key & jnp.uint32(2**digit_bits - 1)
@@ -56,60 +41,42 @@ def depth_order(depths: Float[Array, " n"], visible: Bool[Array, " n"]) -> Int[A
     return by_low[sort_payloads(high_digit << payload_bits | index, payload_bits)]
 
 
-def _boxes(splats: Splats2D, width: int, height: int, tile: tuple[int, int], cutoff: float):
-    """Return (visible, reach, x0, y0, tiles across, entries): the tiles of each bounding box.
+def _extents(splats: Splats2D, width: int, height: int, cfg: RenderConfig):
+    """Return (boxes, x0, y0, tiles across, entries): the tiles of each bounding box."""
+    box = boxes(splats, width, height)
+    tile_x, tile_y = cfg.tile
+    x0, y0 = box.first[:, 0] // tile_x, box.first[:, 1] // tile_y
+    across = jnp.maximum(box.last[:, 0] // tile_x + 1 - x0, 1)
+    down = box.last[:, 1] // tile_y + 1 - y0
+    return box, x0, y0, across, jnp.where(box.visible, across * down, 0)
 
-    `reach` is log(opacity / cutoff): the exponent at which a splat falls below the cutoff.
-    """
-    reach = splats.log_opacities - float(np.log(cutoff))
-    radius = jnp.sqrt(2 * jnp.maximum(reach, 0.0))[:, None] * jnp.sqrt(splats.cov_diagonal)
-    size = jnp.array([width, height], jnp.float32)
-    # Pixel centres sit at +0.5: the first and last centres inside the box.
-    first = jnp.clip(jnp.ceil(splats.means2d - radius - 0.5), 0, size).astype(jnp.int32)
-    last = jnp.clip(jnp.floor(splats.means2d + radius - 0.5), -1, size - 1).astype(jnp.int32)
-    visible = splats.visible & (reach > 0) & jnp.all(last >= first, -1)
-    x0, y0 = first[:, 0] // tile[0], first[:, 1] // tile[1]
-    across = jnp.maximum(last[:, 0] // tile[0] + 1 - x0, 1)
-    entries = jnp.where(visible, across * (last[:, 1] // tile[1] + 1 - y0), 0)
-    return visible, reach, x0, y0, across, entries
+
+def _too_many(entries: Int[Array, " n"]) -> Bool[Array, ""]:
+    """Return whether the sum of `entries` leaves int32."""
+    return jnp.sum(entries.astype(jnp.float32)) > 2.0**30
 
 
 def count_entries(splats: Splats2D, width: int, height: int, cfg: RenderConfig) -> Int[Array, ""]:
-    """Return the tile-list capacity this view needs."""
-    return jnp.sum(_boxes(splats, width, height, cfg.tile, cfg.alpha_cutoff)[-1])
+    """Return the tile-list capacity this view needs: tiles of all bounding boxes."""
+    entries = _extents(splats, width, height, cfg)[-1]
+    return jnp.where(_too_many(entries), 2**30, jnp.sum(entries))
 
 
 def bin_tiles(
     splats: Splats2D, width: int, height: int, capacity: int, cfg: RenderConfig
 ) -> TileList:
-    """List the Gaussians of every tile in depth order.
-
-    A tile gets a Gaussian only if its ellipse at the alpha cutoff reaches a pixel centre of it.
-
-    Args:
-        splats: the view's splats (gradients are not used).
-        width: image width, pixels.
-        height: image height, pixels.
-        capacity: entries the list can hold, before the exact ellipse test.
-        cfg: tile size and alpha cutoff.
-
-    Returns:
-        The list; if `overflow` is set it is incomplete and must not be composited.
-    """
-    splats = jax.tree.map(lax.stop_gradient, splats)
+    """See `p2gs_jax.render.binning.bin_tiles`."""
     tile_x, tile_y = cfg.tile
     across_tiles, down_tiles = grid_size(width, height, cfg.tile)
     tile_count = across_tiles * down_tiles
     n = splats.depths.shape[0]
-    visible, reach, x0, y0, across, entries = _boxes(
-        splats, width, height, cfg.tile, cfg.alpha_cutoff
-    )
-    order = depth_order(splats.depths, visible)
+    box, x0, y0, across, entries = _extents(splats, width, height, cfg)
+    order = depth_order(splats.depths, box.visible)
 
     # Expand boxes into entries, in depth order: a scatter of starts and a running maximum.
     ends = jnp.cumsum(entries[order])
     starts = ends - entries[order]
-    count = ends[-1]
+    count = jnp.where(_too_many(entries), 2**30, ends[-1])
     rank = lax.cummax(
         jnp.zeros(capacity, jnp.int32)
         .at[jnp.where(entries[order] > 0, starts, capacity)]
@@ -121,12 +88,12 @@ def bin_tiles(
         [
             splats.means2d,
             splats.conic_factor,
-            jnp.stack([reach, *(v.astype(jnp.float32) for v in (x0, y0, across))], -1),
+            jnp.stack([box.reach, *(v.astype(jnp.float32) for v in (x0, y0, across))], -1),
         ],
         axis=1,
     )
     row = table.at[ids].get(mode="promise_in_bounds")
-    mean_x, mean_y, a11, a12, a22, reach_, x0_, y0_, across_ = (row[:, i] for i in range(9))
+    mean_x, mean_y, a11, a12, a22, reach, x0_, y0_, across_ = (row[:, i] for i in range(9))
     nth = (position - starts[rank]).astype(jnp.float32)
     # Integer division is scalar code on the CPU; this float floor is exact below 2^22 tiles.
     down = jnp.floor((nth + 0.5) / across_)
@@ -146,7 +113,7 @@ def bin_tiles(
         quadratic(near_x, jnp.clip(-B / C * near_x, top, bottom)),
         quadratic(jnp.clip(-B / A * near_y, left, right), near_y),
     )
-    keep = (position < count) & (0.5 * smallest <= reach_ + 1e-4)
+    keep = (position < count) & (0.5 * smallest <= reach + 1e-4)
     tile_id = jnp.where(keep, (line * across_tiles + col).astype(jnp.int32), tile_count)
 
     rank_bits = bits_for(n)
