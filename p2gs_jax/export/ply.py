@@ -79,7 +79,7 @@ def display_sh(
     """
     directions = _sphere(DIRECTIONS)
     degree = degree_of(sh.shape[1])
-    table = np.stack([np.asarray(b) for b in basis(jnp.asarray(directions), degree)], 1)
+    table = np.stack([np.asarray(b) for b in basis(tuple(jnp.asarray(directions).T), degree)], 1)
     inverse = np.linalg.pinv(table)
     out = np.empty_like(sh)
     for start in range(0, len(sh), CHUNK):

@@ -1,7 +1,8 @@
 """Photometric reconstruction: L1 and D-SSIM, masked and censored (paper, eq. 6).
 
-SSIM's blurs are two banded matrix products each, the fastest form on a CPU (KERNEL.md), and its
-gradient is written out: three more blurs instead of autodiff through five.
+SSIM is memory-bound. Its blurs are eleven shifted adds per axis, one colour channel at a time so
+that its maps stay in cache, and its gradient is written out: three more blurs, done while the
+moments are at hand, instead of autodiff through five (BUILD_NOTES, "The step").
 """
 
 from __future__ import annotations
@@ -11,72 +12,84 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jax import lax
+from jaxtyping import Array, Bool, Float
 
 from p2gs_jax.config import LossConfig
+from p2gs_jax.render.xla_cpu import materialize, opaque_true
 
 WINDOW, SIGMA = 11, 1.5
 C1, C2 = 0.01**2, 0.03**2
 
 
-@functools.lru_cache(maxsize=32)
-def _band(size: int) -> np.ndarray:
-    """Return the [size size] matrix that blurs one axis, zero-padded as 3DGS does."""
+@functools.cache
+def _kernel() -> tuple[float, ...]:
     offsets = np.arange(WINDOW) - WINDOW // 2
     kernel = np.exp(-(offsets**2) / (2 * SIGMA**2))
-    kernel /= kernel.sum()
-    distance = np.arange(size)[:, None] - np.arange(size)[None, :]
-    inside = np.abs(distance) <= WINDOW // 2
-    return np.where(inside, kernel[np.clip(distance + WINDOW // 2, 0, WINDOW - 1)], 0.0)
+    return tuple(float(k) for k in kernel / kernel.sum())
 
 
-def _blur(maps: Float[Array, "m h w"]) -> Float[Array, "m h w"]:
+def _blur(maps: Float[Array, "m h w"], always: Bool[Array, ""]) -> Float[Array, "m h w"]:
+    """Return the maps blurred along both axes, zero-padded as 3DGS does."""
     height, width = maps.shape[-2:]
-    rows = jnp.asarray(_band(height), maps.dtype)
-    columns = jnp.asarray(_band(width), maps.dtype)
-    return jnp.einsum("ij,mjk->mik", rows, maps @ columns)
+    margin = WINDOW // 2
+    padded = materialize(always, lambda: jnp.pad(maps, ((0, 0), (margin,) * 2, (margin,) * 2)))
+    across = materialize(
+        always,
+        lambda: sum(k * padded[:, :, i : i + width] for i, k in enumerate(_kernel())),
+    )
+    return jnp.asarray(sum(k * across[:, i : i + height] for i, k in enumerate(_kernel())))
 
 
-def _moments(x, y):
-    """Return the five blurred maps of SSIM, each [3 h w]."""
-    return jnp.split(_blur(jnp.concatenate([x, y, x * x, y * y, x * y])), 5)
-
-
-def _ssim_terms(x, y):
-    mx, my, mxx, myy, mxy = _moments(x, y)
+def _ssim_terms(x: Float[Array, "h w"], y: Float[Array, "h w"], always: Bool[Array, ""]):
+    mx, my, mxx, myy, mxy = _blur(jnp.stack([x, y, x * x, y * y, x * y]), always)
     a1, a2 = 2 * mx * my + C1, 2 * (mxy - mx * my) + C2
     b1, b2 = mx * mx + my * my + C1, mxx - mx * mx + myy - my * my + C2
     return mx, my, a1, a2, b1, b2
 
 
+def ssim_map(x: Float[Array, "c h w"], y: Float[Array, "c h w"]) -> Float[Array, "c h w"]:
+    """Return the SSIM map of two images, channels first (Wang et al. 2004; 11x11, sigma 1.5)."""
+
+    def channel(pair):
+        _, _, a1, a2, b1, b2 = _ssim_terms(*pair, opaque_true(pair[0][0, 0]))
+        return a1 * a2 / (b1 * b2)
+
+    return lax.map(channel, (x, y))
+
+
 @jax.custom_vjp
-def ssim_map(x: Float[Array, "3 h w"], y: Float[Array, "3 h w"]) -> Float[Array, "3 h w"]:
-    """Return the SSIM map of two images, channels first (Wang et al. 2004; 11x11, sigma 1.5).
-
-    The gradient flows to `x` only.
-    """
-    _, _, a1, a2, b1, b2 = _ssim_terms(x, y)
-    return a1 * a2 / (b1 * b2)
+def _masked_sum(
+    x: Float[Array, "c h w"], y: Float[Array, "c h w"], mask: Float[Array, "h w"]
+) -> Float[Array, ""]:
+    """Return the sum of mask times SSIM; the gradient flows to `x` only."""
+    return jnp.sum(ssim_map(x, y) * mask)
 
 
-def _ssim_fwd(x, y):
-    terms = _ssim_terms(x, y)
-    _, _, a1, a2, b1, b2 = terms
-    return a1 * a2 / (b1 * b2), (x, y, *terms)
+def _masked_sum_fwd(x, y, mask):
+    always = opaque_true(mask[0, 0])
+
+    def channel(pair):
+        x, y = pair
+        mx, my, a1, a2, b1, b2 = _ssim_terms(x, y, always)
+        s = a1 * a2 / (b1 * b2)
+        # Derivatives to the blurred maps of x, x^2 and xy, everything else held.
+        d_mxx = -s / b2
+        d_mxy = 2 * a1 / (b1 * b2)
+        d_mx = 2 * my * (a2 - a1) / (b1 * b2) - 2 * mx * s / b1 + 2 * mx * s / b2
+        back = _blur(mask * jnp.stack([d_mx, d_mxx, d_mxy]), always)
+        return jnp.sum(s * mask), back[0] + 2 * x * back[1] + y * back[2]
+
+    total, gradient = lax.map(channel, (x, y))
+    return jnp.sum(total), (gradient, mask)
 
 
-def _ssim_bwd(residuals, v):
-    x, y, mx, my, a1, a2, b1, b2 = residuals
-    s = a1 * a2 / (b1 * b2)
-    # Derivatives to the blurred maps of x, x^2 and xy, everything else held.
-    d_mxx = -s / b2
-    d_mxy = 2 * a1 / (b1 * b2)
-    d_mx = 2 * my * (a2 - a1) / (b1 * b2) - 2 * mx * s / b1 + 2 * mx * s / b2
-    back = jnp.split(_blur(jnp.concatenate([v * d_mx, v * d_mxx, v * d_mxy])), 3)
-    return back[0] + 2 * x * back[1] + y * back[2], jnp.zeros_like(y)
+def _masked_sum_bwd(residuals, v):
+    gradient, mask = residuals
+    return v * gradient, jnp.zeros_like(gradient), jnp.zeros_like(mask)
 
 
-ssim_map.defvjp(_ssim_fwd, _ssim_bwd)
+_masked_sum.defvjp(_masked_sum_fwd, _masked_sum_bwd)
 
 
 def ssim(
@@ -84,7 +97,7 @@ def ssim(
 ) -> Float[Array, ""]:
     """Return the mean SSIM over valid pixels; invalid ones are black in both images."""
     x, y = ((a * mask[..., None]).transpose(2, 0, 1) for a in (ldr, target))
-    return jnp.sum(ssim_map(x, y) * mask) / jnp.maximum(3 * jnp.sum(mask), 1.0)
+    return _masked_sum(x, y, mask) / jnp.maximum(3 * jnp.sum(mask), 1.0)
 
 
 def censor(

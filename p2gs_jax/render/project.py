@@ -122,9 +122,9 @@ def view_radiance(
 ) -> Float[Array, "n 3"]:
     """Return each Gaussian's linear HDR radiance towards the camera, >= 0."""
     center = -camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3]
-    offset = gaussians.means - center
-    squared = jnp.sum(offset * offset, -1, keepdims=True)
-    directions = offset * jax.lax.rsqrt(jnp.maximum(squared, 1e-20))
+    offset = [m - c for m, c in zip(columns(gaussians.means), center, strict=True)]
+    inverse = jax.lax.rsqrt(jnp.maximum(sum(o * o for o in offset), 1e-20))
+    x, y, z = (o * inverse for o in offset)
     return radiance_activation(
-        spherical_harmonics.evaluate(gaussians.sh, directions, active_degree), cfg.radiance
+        spherical_harmonics.evaluate(gaussians.sh, (x, y, z), active_degree), cfg.radiance
     )

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
+
+from p2gs_jax.render.xla_cpu import stack_columns
 
 C0 = 0.28209479177387814
 C1 = 0.4886025119029199
@@ -35,9 +38,11 @@ def degree_of(count: int) -> int:
     raise ValueError(f"{count} spherical-harmonics coefficients belong to no degree up to 3")
 
 
-def basis(directions: Float[Array, "n 3"], degree: int) -> list[Float[Array, " n"]]:
+def basis(
+    directions: tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]], degree: int
+) -> list[Float[Array, " n"]]:
     """Return the (degree + 1)^2 basis values of unit directions, as separate vectors."""
-    x, y, z = directions[:, 0], directions[:, 1], directions[:, 2]
+    x, y, z = directions
     xx, yy, zz = x * x, y * y, z * z
     values = [jnp.full_like(x, C0)]
     if degree >= 1:
@@ -63,16 +68,38 @@ def basis(directions: Float[Array, "n 3"], degree: int) -> list[Float[Array, " n
     return values
 
 
+@jax.custom_vjp
+def _combine(values: Float[Array, "n k"], sh: Float[Array, "n k 3"]) -> Float[Array, "n 3"]:
+    """Return sum_k values[:, k] sh[:, k], with a gradient that is one outer product.
+
+    The plain gradient pads and adds K slices (29 against 9 ms for 100k Gaussians of degree 3).
+    """
+    return sum((values[:, k, None] * sh[:, k] for k in range(sh.shape[1])), jnp.zeros(()))
+
+
+def _combine_fwd(values, sh):
+    return _combine(values, sh), (values, sh)
+
+
+def _combine_bwd(residuals, v):
+    values, sh = residuals
+    v_values = sum(sh[:, :, c] * v[:, None, c] for c in range(3))
+    return v_values, values[:, :, None] * v[:, None, :]
+
+
+_combine.defvjp(_combine_fwd, _combine_bwd)
+
+
 def evaluate(
     sh: Float[Array, "n k 3"],
-    directions: Float[Array, "n 3"],
+    directions: tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]],
     active_degree: Int[Array, ""] | int | None = None,
 ) -> Float[Array, "n 3"]:
     """Evaluate spherical harmonics in the given directions.
 
     Args:
         sh: coefficients, K = (degree + 1)^2.
-        directions: unit vectors from the camera to the Gaussians, world axes.
+        directions: x, y and z of unit vectors from the camera to the Gaussians, world axes.
         active_degree: coefficients above this degree are ignored; traced, so that raising it
             does not recompile. None uses all.
 
@@ -80,12 +107,11 @@ def evaluate(
         Pre-activation values per channel.
     """
     degree = degree_of(sh.shape[1])
-    values = basis(directions, degree)
-    total = values[0][:, None] * sh[:, 0]
-    for d in range(1, degree + 1):
-        band = sum(
-            values[k][:, None] * sh[:, k]
-            for k in range(coefficient_count(d - 1), coefficient_count(d))
-        )
-        total = total + (band if active_degree is None else jnp.where(active_degree >= d, band, 0))
-    return total
+    columns = basis(directions, degree)
+    if active_degree is not None:
+        degrees = [d for d in range(degree + 1) for _ in range(2 * d + 1)]
+        columns = [
+            c if d == 0 else jnp.where(active_degree >= d, c, 0.0)
+            for d, c in zip(degrees, columns, strict=True)
+        ]
+    return _combine(stack_columns(columns), sh)

@@ -5,7 +5,7 @@ None of them changes a result; on other backends they are harmless. BUILD_NOTES,
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 import jax
@@ -47,6 +47,11 @@ def compiler_options() -> dict[str, int] | None:
     return _CPU_OPTIONS if jax.default_backend() == "cpu" else None
 
 
+def opaque_true(sample: Float[Array, ""]) -> Bool[Array, ""]:
+    """Return true, in a way that XLA cannot know, whatever the sample is (NaN included)."""
+    return (sample == sample) | (sample != 0)
+
+
 def materialize(always: Bool[Array, ""], compute):
     """Force the arrays that `compute()` returns into memory.
 
@@ -54,7 +59,7 @@ def materialize(always: Bool[Array, ""], compute):
     each consumer (1155 against 421 CPU ms, KERNEL.md); a conditional survives.
 
     Args:
-        always: true, but computed from data, so that XLA cannot know.
+        always: true, but computed from data, so that XLA cannot know: `opaque_true`.
         compute: a function without arguments.
     """
     shapes = jax.eval_shape(compute)
@@ -74,13 +79,17 @@ def columns(a: Float[Array, "n k"]) -> tuple[Float[Array, " n"], ...]:
     return tuple(a[:, i] for i in range(a.shape[1]))
 
 
+def stack_columns(vectors: Sequence[Float[Array, " n"]]) -> Float[Array, "n k"]:
+    """Return vectors as the columns of a matrix, each computed once (see `columns`)."""
+    return jnp.stack(materialize(opaque_true(vectors[-1][0]), lambda: list(vectors)), 1)
+
+
 def _columns_fwd(a):
     return columns(a), a[:1, :1].sum()
 
 
 def _columns_bwd(sample, v_columns):
-    always = (sample == sample) | (sample != 0)
-    return (jnp.stack(materialize(always, lambda: v_columns), 1),)
+    return (jnp.stack(materialize(opaque_true(sample), lambda: v_columns), 1),)
 
 
 columns.defvjp(_columns_fwd, _columns_bwd)

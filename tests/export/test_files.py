@@ -123,7 +123,7 @@ def test_display_colours_are_exact_for_degree_0_and_close_for_3(tmp_path):
     d = np.array([0.36, 0.48, 0.8])
     from p2gs_jax.render.spherical_harmonics import basis
 
-    table = np.array([float(b[0]) for b in basis(jnp.asarray(d[None], jnp.float32), 3)])
+    table = np.array([float(b[0]) for b in basis(tuple(jnp.asarray(d[:, None], jnp.float32)), 3)])
     expected = tone(np.exp(np.einsum("k,nkc->nc", table, mild)))
     found = np.einsum("k,nkc->nc", table, shown) + 0.5
     assert np.abs(found - expected).max() < 0.03

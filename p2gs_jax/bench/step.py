@@ -1,0 +1,145 @@
+"""Where the milliseconds of an optimisation step go, part by part."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from p2gs_jax.bench.scenes import BenchScene
+from p2gs_jax.bench.timing import interleaved
+from p2gs_jax.config import FitConfig
+from p2gs_jax.densify import mcmc
+from p2gs_jax.losses.image import photometric_loss
+from p2gs_jax.losses.total import Partner
+from p2gs_jax.photometry.formation import formation
+from p2gs_jax.render import bin_tiles, project, rasterize, required_capacity, view_radiance
+from p2gs_jax.render.host import capacity_bucket
+from p2gs_jax.render.xla_cpu import compiler_options
+from p2gs_jax.train.optimizer import learning_rates, make_optimizer
+from p2gs_jax.train.state import initial_state
+from p2gs_jax.train.step import Controls, make_step
+from p2gs_jax.types import Batch, Params, Photometry
+
+
+class StepCost(NamedTuple):
+    """Medians of one run, milliseconds; forward and backward together.
+
+    Attributes:
+        parts: name of the part to its time; `rasterizer` includes binning.
+        whole: the jitted step as training runs it.
+        compilations: programs that the step was compiled into while its capacity stayed.
+    """
+
+    parts: dict[str, float]
+    whole: float
+    compilations: int
+
+    @property
+    def beside_rasterizer(self) -> float:
+        """Loss, optimiser, transfer and densification together."""
+        return sum(self.parts[k] for k in ("loss", "optimizer", "transfer", "densify (a step)"))
+
+
+def measure_step(scene: BenchScene, cfg: FitConfig, repeats: int = 7) -> StepCost:
+    """Time a full step and its parts on one view.
+
+    Args:
+        scene: what to fit; its own image at half the exposure is the photograph.
+        cfg: as for a fit.
+        repeats: timed runs of each part.
+    """
+    gaussians, camera = scene.gaussians, scene.camera
+    alive = jnp.ones(gaussians.capacity, bool)
+    capacity = capacity_bucket(int(required_capacity(gaussians, alive, camera, cfg.render)), 1.1)
+    params = Params(gaussians, Photometry(jnp.zeros(4), jnp.zeros(4)))
+    optimizer = make_optimizer(cfg)
+    state = initial_state(params, alive, optimizer)
+    state_population = jax.tree.map(jnp.copy, state.population)
+    rng = np.random.default_rng(0)
+    shape = (camera.height, camera.width)
+    photograph = rng.integers(0, 256, (*shape, 3), np.uint8)
+    ldr, mask = jnp.asarray(photograph / np.float32(255)), jnp.ones(shape)
+    batch = Batch(camera, ldr, mask, jnp.int32(0))
+    controls = Controls(jnp.float32(0.5), jnp.int32(cfg.render.sh_degree))
+
+    def jit(f):
+        return jax.jit(f, compiler_options=compiler_options())
+
+    splats_of = lambda g: project(g, alive, camera, cfg.render)  # noqa: E731
+    radiance_of = lambda g: view_radiance(g, camera, cfg.render)  # noqa: E731
+    splats, radiance = jit(splats_of)(gaussians), jit(radiance_of)(gaussians)
+    linear = jnp.full((*shape, 3), 0.3)
+    v_linear = jnp.full_like(linear, 1e-3)
+    differentiable = (
+        splats.means2d,
+        splats.conic_factor,
+        splats.log_opacities,
+    )
+
+    def raster(leaves, radiance):
+        s = dataclasses.replace(
+            splats, means2d=leaves[0], conic_factor=leaves[1], log_opacities=leaves[2]
+        )
+        tiles = bin_tiles(s, camera.width, camera.height, capacity, cfg.render)
+        return rasterize(
+            s, radiance, tiles, camera.width, camera.height, cfg.render, with_depth=False
+        )[0]
+
+    def both(f):
+        def run(v, *args):
+            out, pull = jax.vjp(f, *args)
+            return out, pull(v)
+
+        return jit(run)
+
+    def loss(linear):
+        y = formation(linear, jnp.float32(0.5), jnp.float32(2.2), cfg.photometry)
+        return sum(photometric_loss(y, ldr, mask, cfg.loss).values())
+
+    def update(params, opt_state, grads):
+        rates = learning_rates(jnp.float32(0.5), 1.0, params, cfg)
+        updates, opt_state = optimizer.update(grads, opt_state, params, rates=rates)
+        return optax.apply_updates(cast(Any, params), updates), opt_state
+
+    v_splats = jax.tree.map(jnp.ones_like, differentiable)
+
+    def geometry(g):
+        s = splats_of(g)
+        return s.means2d, s.conic_factor, s.log_opacities
+
+    raster_both, geometry_both = both(raster), both(geometry)
+    radiance_both = both(radiance_of)
+    loss_both, apply = jit(jax.value_and_grad(loss)), jit(update)
+    relocate = jax.jit(
+        lambda g: mcmc.relocate_and_grow(
+            jax.random.key(0), g, state_population, jnp.int32(0), cfg.densify
+        )
+    )
+    jobs = {
+        "project": lambda: geometry_both(v_splats, gaussians),
+        "radiance (SH)": lambda: radiance_both(radiance, gaussians),
+        "rasterizer": lambda: raster_both(v_linear, differentiable, radiance),
+        "loss": lambda: loss_both(linear),
+        "optimizer": lambda: apply(params, state.opt_state, params),
+        "densify (a step)": lambda: relocate(gaussians),
+        "transfer": lambda: jax.device_put(photograph).astype(jnp.float32) / 255,
+    }
+    step = make_step(cfg, optimizer, 1.0)
+    partner = Partner(jnp.int32(0))
+    # The step donates its state: the parts above keep their own copy of it.
+    holder = [jax.tree.map(jnp.copy, state)]
+
+    def whole():
+        holder[0], report = step(holder[0], batch, partner, controls, capacity=capacity)
+        return report.loss
+
+    jobs["whole"] = whole
+    times = interleaved(jobs, repeats)
+    whole_ms = times.pop("whole")
+    times["densify (a step)"] /= cfg.densify.min_every_steps
+    return StepCost(times, whole_ms, cast(Any, step)._cache_size())
