@@ -1,1 +1,1 @@
-"""Benches: speed, and the error it is bought with, measured in one process and reported together."""
+"""Benches: speed, and the error it is bought with, measured in one process."""

@@ -91,6 +91,8 @@ def render_linear(
     Returns:
         The render. Where `overflow` is set it must be discarded and the capacity grown.
     """
+    if gaussians.capacity == 0:
+        return _nothing(camera, with_depth)
     splats = project(gaussians, alive, camera, cfg, means2d_probe)
     radiance = view_radiance(gaussians, camera, cfg, active_degree)
     splats = _with_cutoffs(splats, radiance, cfg)
@@ -117,10 +119,24 @@ def required_capacity(
     gaussians: Gaussians, alive: Bool[Array, " n"], camera: Camera, cfg: RenderConfig
 ) -> Int[Array, ""]:
     """Return the exact tile-list capacity one view needs."""
+    if gaussians.capacity == 0:
+        return jnp.int32(0)
     splats = project(gaussians, alive, camera, cfg)
     if cfg.cutoff_rule == "radiance":
         splats = _with_cutoffs(splats, view_radiance(gaussians, camera, cfg), cfg)
     return count_entries(splats, camera.width, camera.height, cfg)
+
+
+def _nothing(camera: Camera, with_depth: bool) -> Render:
+    blank = jnp.zeros((camera.height, camera.width))
+    return Render(
+        linear=jnp.zeros((*blank.shape, 3)),
+        alpha=blank,
+        depth=blank if with_depth else None,
+        count=jnp.int32(0),
+        overflow=jnp.array(False),
+        visible=jnp.zeros(0, bool),
+    )
 
 
 def _with_cutoffs(splats: Splats2D, radiance: Float[Array, "n 3"], cfg: RenderConfig) -> Splats2D:

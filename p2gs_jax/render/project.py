@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,10 +28,12 @@ def rotation_matrices(quats: Float[Array, "n 4"]) -> list[list[Float[Array, " n"
     Quaternions are normalised first; a zero quaternion gives the identity.
     """
     raw = columns(quats)
-    squared = sum(c * c for c in raw)
-    tiny = squared < 1e-30
-    inverse = jax.lax.rsqrt(jnp.where(tiny, 1, squared))
-    w, x, y, z = (jnp.where(tiny, float(i == 0), c * inverse) for i, c in enumerate(raw))
+    # Dividing by the largest component first keeps the square in range, whatever the length.
+    largest = jax.lax.stop_gradient(functools.reduce(jnp.maximum, [jnp.abs(c) for c in raw]))
+    zero = largest < 1e-30
+    raw = [c / jnp.where(zero, 1, largest) for c in raw]
+    inverse = jax.lax.rsqrt(jnp.where(zero, 1, sum(c * c for c in raw)))
+    w, x, y, z = (jnp.where(zero, float(i == 0), c * inverse) for i, c in enumerate(raw))
     return [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
