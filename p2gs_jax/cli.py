@@ -1,4 +1,4 @@
-"""The command line: `p2gs-jax fit | render | eval | demo`.
+"""The command line: `p2gs-jax fit | render | eval | demo | bench`.
 
 Every configuration field is an option. Bad input ends with one message and exit code 2.
 """
@@ -116,6 +116,22 @@ class Demo:
     """Seeds the street, its exposures and the fit."""
 
 
+@dataclass(frozen=True)
+class Bench:
+    """Measure the renderer on this machine: speed against error, growth, memory, hard cases."""
+
+    parts: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """speed_error, growth, memory, step, hard_cases; none named runs all."""
+    out: Path = Path("runs/bench")
+    """Folder for tables, JSON and plots."""
+    quick: bool = False
+    """Fewer and smaller: two minutes instead of half an hour."""
+    baseline: Path | None = None
+    """Compare speed_error with this file; exit code 1 where it is worse."""
+    write_baseline: Path | None = None
+    """Write what speed_error measured, for a later --baseline."""
+
+
 def _preset_from(argv: list[str]) -> configs.FitConfig:
     """Return the preset that `--preset` names: its values become the defaults of all options."""
     name = "robust"
@@ -166,6 +182,7 @@ def _run(argv: list[str]) -> int:
         Annotated[Render, tyro.conf.subcommand("render")],
         Annotated[Eval, tyro.conf.subcommand("eval")],
         Annotated[Demo, tyro.conf.subcommand("demo")],
+        Annotated[Bench, tyro.conf.subcommand("bench")],
     ]
     args: Any = tyro.cli(
         commands_union,  # pyright: ignore[reportArgumentType]
@@ -184,6 +201,10 @@ def _run(argv: list[str]) -> int:
         return commands.render_command(args.run, args.out, args.split, args.exposure_ev, args.gamma)
     if isinstance(args, Eval):
         return commands.eval_command(args.run, args.reference)
+    if isinstance(args, Bench):
+        return commands.bench_command(
+            args.parts, args.out, args.quick, args.baseline, args.write_baseline
+        )
     return commands.demo_command(
         args.out,
         _preset_from(["--preset", args.preset]),
@@ -196,7 +217,10 @@ def _run(argv: list[str]) -> int:
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run the command line and exit: 0 done, 2 bad input, 130 interrupted."""
+    """Run the command line and exit.
+
+    Codes: 0 done, 1 worse than a baseline, 2 bad input, 130 interrupted.
+    """
     try:
         code = _run(sys.argv[1:] if argv is None else argv)
     except UserError as error:

@@ -12,6 +12,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from p2gs_jax.bench import run as benches
 from p2gs_jax.config import FitConfig
 from p2gs_jax.demo import run_demo
 from p2gs_jax.errors import UserError
@@ -179,3 +180,35 @@ def demo_command(
     )
     print_metrics(result.metrics, result.run_dir)
     return 0
+
+
+def bench_command(
+    parts: tuple[str, ...],
+    out: Path,
+    quick: bool,
+    baseline: Path | None,
+    write_baseline: Path | None,
+) -> int:
+    """Run benches, print their tables; 1 where something is worse than the baseline allows."""
+    for name in parts:
+        if name not in benches.PARTS:
+            raise UserError(
+                f"there is no bench {name!r}.", fix=f"choose {', '.join(benches.PARTS)}"
+            )
+    chosen = tuple(p for p in benches.PARTS if not parts or p in parts)
+    if (baseline or write_baseline) and "speed_error" not in chosen:
+        raise UserError("a baseline concerns speed_error.", fix="name that part as well")
+    with TerminalReporter() as reporter:
+        text, complaints = benches.run(
+            chosen,
+            out=out,
+            quick=quick,
+            baseline=baseline,
+            write_baseline=write_baseline,
+            on_progress=reporter.stage,
+        )
+    print(text)
+    print(f"Results: {out}")
+    for complaint in complaints:
+        print(f"WORSE than {baseline}: {complaint}")
+    return 1 if complaints else 0

@@ -30,14 +30,20 @@ def compiled_loop(f: F) -> F:
     XLA outlines loops that it considers small and compiles them whole. The attribute set here asks
     for that whatever the size: a counting sort then takes 6 ns an entry where `lax.sort` takes 54.
 
+    `sequential_vmap` makes vmap a loop over calls, since batched scatters cannot be compiled so,
+    and keeps the call whole under differentiation: partial evaluation would hoist its constants
+    into a call without arguments, which XLA 0.10 turns into invalid code.
+
     Args:
-        f: a pure function of arrays, without matrix products, sorts or convolutions.
+        f: a pure function of arrays, without matrix products, sorts or convolutions; not
+            differentiable.
     """
 
+    @jax.custom_batching.sequential_vmap
     def call(*args):
         # `inlineable` keeps XLA from dissolving the call before the backend sees its attribute.
         with set_xla_metadata(**{SMALL_CALL: "true", "inlineable": "false"}):
-            return jax.jit(f)(*args)
+            return jax.jit(f)(*lax.optimization_barrier(args))
 
     return call  # pyright: ignore[reportReturnType]
 

@@ -1,0 +1,58 @@
+"""Holding a bench against the committed baseline."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from p2gs_jax.bench.metrics import METRICS
+from p2gs_jax.bench.speed_error import Point
+from p2gs_jax.errors import UserError
+from p2gs_jax.export.atomic import write_json
+
+
+def values(points: list[Point]) -> dict[str, dict[str, float]]:
+    """Return per variant what the gate compares.
+
+    The total error shows what the rules leave out; `numerics ...` shows the implementation alone.
+    """
+    rows = {}
+    for p in points:
+        row = {**p.error, **p.ratios}
+        row |= {f"numerics {k}": v for k, v in (p.numerics or {}).items()}
+        rows[p.variant.name] = row
+    return rows
+
+
+def write_baseline(path: Path, points: list[Point]) -> None:
+    """Write the baseline that `check` reads."""
+    write_json(path, values(points))
+
+
+def check(path: Path, points: list[Point]) -> list[str]:
+    """Return one sentence for each value that is worse than the baseline allows.
+
+    Raises:
+        UserError: the baseline is missing, damaged, or lacks a variant or metric.
+    """
+    try:
+        baseline = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise UserError(
+            f"{path} is no baseline: {error}", fix="write one with --write-baseline"
+        ) from error
+    complaints = []
+    for name, row in values(points).items():
+        for metric, value in row.items():
+            known = baseline.get(name, {}).get(metric)
+            if not isinstance(known, int | float):
+                raise UserError(
+                    f"{path} has no {metric!r} of {name!r}", fix="write it anew: --write-baseline"
+                )
+            declared = METRICS[metric.removeprefix("numerics ")]
+            if declared.worse(value, known):
+                complaints.append(
+                    f"{name}: {declared.title} ({metric}) is {value:.3g}, baseline {known:.3g}, "
+                    f"tolerance {declared.tolerance:g}"
+                )
+    return complaints

@@ -1,0 +1,87 @@
+"""What a bench measures: each metric declared once, with its direction and tolerance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from p2gs_jax.bench.oracle import Truth
+from p2gs_jax.types import Gaussians
+
+FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
+# Radiances below this part of the image's largest are held to it in relative errors.
+DARKEST = 1e-4
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One column of a bench.
+
+    Attributes:
+        title: table heading, with the unit.
+        better: which way is good.
+        tolerance: how far a value may be worse than the baseline before the gate closes; a factor
+            where `absolute` is false, else in the metric's unit.
+        absolute: see `tolerance`.
+    """
+
+    title: str
+    better: Literal["lower", "higher"]
+    tolerance: float
+    absolute: bool = False
+
+    def worse(self, value: float, baseline: float) -> bool:
+        """Return whether `value` is worse than `baseline` allows; NaN always is."""
+        sign = 1.0 if self.better == "lower" else -1.0
+        limit = (
+            baseline + sign * self.tolerance if self.absolute else baseline * self.tolerance**sign
+        )
+        return not sign * value <= sign * limit
+
+
+# Accuracy is deterministic up to the order of float32 sums; times are ratios to a reference
+# workload of the same run and still move with the machine.
+METRICS = {
+    "max_abs": Metric("max abs", "lower", 1.25),
+    "relative": Metric("relative max", "lower", 1.25),
+    "psnr": Metric("PSNR dB", "higher", 0.5, absolute=True),
+    "gradient": Metric("gradient rel. L2", "lower", 1.25),
+    "forward": Metric("forward / reference", "lower", 2.0),
+    "both": Metric("forward + backward / reference", "lower", 2.0),
+}
+ACCURACY = ("max_abs", "relative", "psnr", "gradient")
+
+
+def srgb(linear: np.ndarray) -> np.ndarray:
+    """Return the sRGB encoding of linear values, clipped to [0, 1]."""
+    x = np.clip(linear, 0, 1)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)
+
+
+def errors(
+    linear: Float[np.ndarray, "h w 3"], gradient: Gaussians, truth: Truth
+) -> dict[str, float]:
+    """Return the accuracy metrics of a render and its gradient.
+
+    `max_abs` is in linear radiance exposed so that the truth's mean is 0.18; `relative` is the
+    largest error of a pixel over its brightest channel; `psnr` is of the sRGB encoding of the
+    exposed image; `gradient` is the relative L2 error of the worst parameter group.
+    """
+    exposure = 0.18 / max(float(truth.linear.mean()), 1e-30)
+    error = np.abs(linear - truth.linear)
+    brightest = truth.linear.max(-1)
+    brightest = np.maximum(brightest, DARKEST * brightest.max())
+    mse = np.mean((srgb(linear * exposure) - srgb(truth.linear * exposure)) ** 2)
+    groups = []
+    for name in FIELDS:
+        a, b = np.asarray(getattr(gradient, name), np.float64), getattr(truth.gradient, name)
+        groups.append(np.linalg.norm(a - b) / max(np.linalg.norm(b), 1e-30))
+    return {
+        "max_abs": float(error.max() * exposure),
+        "relative": float((error.max(-1) / brightest).max()),
+        "psnr": float(-10 * np.log10(max(mse, 1e-30))),
+        "gradient": float(max(groups)),
+    }

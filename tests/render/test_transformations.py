@@ -1,0 +1,72 @@
+"""Rendering inside other JAX programs: batched, looped, repeated, over constants."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from p2gs_jax.bench.scenes import street
+from p2gs_jax.config import RenderConfig
+from p2gs_jax.render import bin_tiles, project, render_linear
+from p2gs_jax.render.xla_cpu import SMALL_CALL
+
+CFG = RenderConfig(pixels_in_flight=2048, binning="counting")
+SCENE = street(2000, 64, 48, radius=3.0)
+ALIVE = jnp.ones(2000, bool)
+VIEWS = np.tile(np.eye(4, dtype=np.float32), (3, 1, 1))
+VIEWS[:, 0, 3] = [0.0, 0.2, -0.1]
+# Large, because XLA treats small constants and loops in another way.
+CAPACITY = 300_000
+
+
+def image(gaussians, viewmat):
+    camera = dataclasses.replace(SCENE.camera, viewmat=viewmat)
+    return render_linear(gaussians, ALIVE, camera, CFG, CAPACITY, with_depth=False).linear
+
+
+@pytest.fixture(scope="module")
+def one_by_one():
+    return np.stack([jax.jit(image)(SCENE.gaussians, m) for m in VIEWS])
+
+
+def test_vmap(one_by_one):
+    batched = jax.jit(jax.vmap(image, (None, 0)))(SCENE.gaussians, VIEWS)
+    np.testing.assert_allclose(batched, one_by_one, rtol=1e-5, atol=1e-6)
+
+
+def test_several_views_in_one_program(one_by_one):
+    together = jax.jit(lambda g: jnp.stack([image(g, m) for m in VIEWS]))(SCENE.gaussians)
+    np.testing.assert_allclose(together, one_by_one, rtol=1e-5, atol=1e-6)
+
+
+def test_a_program_of_constants(one_by_one):
+    views = jnp.asarray(VIEWS)
+    constant = jax.jit(lambda: jnp.stack([image(SCENE.gaussians, m) for m in views]))()
+    np.testing.assert_allclose(constant, one_by_one, rtol=1e-5, atol=1e-6)
+
+
+def test_gradient_of_a_loop_over_views():
+    def looped(g):
+        return jnp.sum(jax.lax.map(lambda m: jnp.sum(image(g, m) ** 2), jnp.asarray(VIEWS)))
+
+    def unrolled(g):
+        return sum(jnp.sum(image(g, m) ** 2) for m in VIEWS)
+
+    a, b = (jax.jit(jax.grad(f))(SCENE.gaussians) for f in (looped, unrolled))
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-4 * float(jnp.abs(y).max()))
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="an attribute of XLA's CPU backend")
+def test_loops_are_compiled_whole():
+    """Losing the attribute on the way through XLA would cost a factor of ten, silently."""
+
+    def binned(g):
+        splats = project(g, ALIVE, SCENE.camera, CFG)
+        return bin_tiles(splats, 64, 48, CAPACITY, CFG).offsets
+
+    text = jax.jit(binned).lower(SCENE.gaussians).compile().as_text()
+    calls = [line for line in text.splitlines() if " call(" in line and SMALL_CALL in line]
+    assert len(calls) >= 4
