@@ -4,7 +4,8 @@ python experiments/against_prototype.py PATH/best.py --garden PATH/test_garden.n
 
 The file must define `project(p, viewmat, K, width, height)`, `binning(...)` and
 `render(p, viewmat, K, width, height, capacity)` as the project's first prototype does. Each
-program is compiled once; medians over interleaved runs; both are given 512-bit vectors.
+program is compiled once; medians over interleaved runs. Each is compiled as it is used: ours with
+512-bit vectors, the other plainly; --same-options gives both 512-bit vectors.
 """
 
 from __future__ import annotations
@@ -33,18 +34,20 @@ def load(path: Path):
     """Import the other rasterizer from its file; its neighbours are importable to it."""
     sys.path.insert(0, str(path.parent))
     spec = importlib.util.spec_from_file_location("other_rasterizer", path)
-    assert spec is not None and spec.loader is not None
+    assert spec is not None
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("other", type=Path)
     parser.add_argument("--garden", type=Path)
     parser.add_argument("--repeats", type=int, default=9)
     parser.add_argument("--depth", action="store_true", help="render depth as well, as it does")
+    parser.add_argument("--same-options", action="store_true")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     other = load(args.other)
@@ -78,7 +81,7 @@ def main() -> None:
             scene = type(g)(p["means"], p["quats"], p["log_scales"], p["opac"], g.sh)
             return project(scene, jnp.ones(scene.capacity, bool), camera, cfg)
 
-        need = jax.jit(lambda p, w=w, h=h: count_entries(ours_splats(p), w, h, cfg))(p)  # noqa: B023
+        need = jax.jit(lambda p, w=w, h=h: count_entries(ours_splats(p), w, h, cfg))(p)
         capacity = capacity_bucket(int(need))
 
         def ours(p, w=w, h=h, capacity=capacity, splats=ours_splats):
@@ -91,7 +94,7 @@ def main() -> None:
 
         jobs, images = {}, {}
         for label, f in (("other", theirs), ("ours", ours)):
-            options = compiler_options()
+            options = compiler_options() if label == "ours" or args.same_options else None
             forward = jax.jit(f, compiler_options=options).lower(p).compile()
             loss = jax.value_and_grad(lambda p, f=f: jnp.mean(jnp.square(f(p) - 0.5)))
             both = jax.jit(loss, compiler_options=options).lower(p).compile()

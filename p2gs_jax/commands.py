@@ -195,7 +195,7 @@ def bench_command(
             raise UserError(
                 f"there is no bench {name!r}.", fix=f"choose {', '.join(benches.PARTS)}"
             )
-    chosen = tuple(p for p in benches.PARTS if not parts or p in parts)
+    chosen: tuple[benches.Part, ...] = tuple(p for p in benches.PARTS if not parts or p in parts)
     if (baseline or write_baseline) and "speed_error" not in chosen:
         raise UserError("a baseline concerns speed_error.", fix="name that part as well")
     with TerminalReporter() as reporter:

@@ -48,6 +48,7 @@ class Curve(NamedTuple):
         samples: in growing order.
         forward_exponent: least squares in log-log.
         both_exponent: likewise.
+        last_exponents: slopes between the last two samples, where fixed costs no longer show.
     """
 
     axis: str
@@ -55,6 +56,7 @@ class Curve(NamedTuple):
     samples: list[Sample]
     forward_exponent: float
     both_exponent: float
+    last_exponents: tuple[float, float]
 
 
 def scenes(quick: bool = False) -> dict[str, tuple[str, list[tuple[float, BenchScene]]]]:
@@ -99,6 +101,10 @@ def _curve(axis: str, held: str, samples: list[Sample]) -> Curve:
         samples,
         exponent(work, [s.forward for s in samples]),
         exponent(work, [s.both for s in samples]),
+        (
+            exponent(work[-2:], [s.forward for s in samples[-2:]]),
+            exponent(work[-2:], [s.both for s in samples[-2:]]),
+        ),
     )
 
 

@@ -14,6 +14,7 @@ matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.ticker import FormatStrFormatter
 
 from p2gs_jax.bench.growth import Curve
 from p2gs_jax.bench.hard_cases import CASES, Gap
@@ -95,10 +96,7 @@ PANELS = (
 
 
 def speed_error_plot(path: Path, points: list[Point], title: str) -> None:
-    """Draw milliseconds against error: image, gradient, and what is not due to the cutoff.
-
-    Labels of the first two panels are given to the points that no other beats.
-    """
+    """Draw milliseconds against error: image, gradient, and what is not due to the cutoff."""
     figure, axes = plt.subplots(1, 3, figsize=(15, 5), layout="constrained")
     knobs = list(dict.fromkeys(p.variant.knob for p in points))
     # Milliseconds of the default's batch: a batch on a slower machine is scaled by the reference.
@@ -128,30 +126,40 @@ def speed_error_plot(path: Path, points: list[Point], title: str) -> None:
                 label=p.variant.knob,
                 zorder=4 if star else 3,
             )
-            if panel.numerics or p in best:
-                axis.annotate(
-                    p.variant.setting,
-                    (x, y),
-                    textcoords="offset points",
-                    xytext=(6, 4),
-                    fontsize=7,
-                    color="#333333",
-                    rotation=30 if panel.numerics else 0,
-                )
+        _label(axis, [(p.variant.setting, *at(p)) for p in [*best, *shown]])
         line = sorted(at(p) for p in best)
         axis.step(*zip(*line, strict=True), where="post", color="#999999", lw=1, zorder=1)
         axis.set_xscale("log")
         axis.set_yscale("log")
         axis.set_xlabel(panel.xlabel)
         axis.set_ylabel(panel.ylabel)
-        axis.xaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
-        axis.xaxis.set_minor_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
+        axis.xaxis.set_major_formatter(FormatStrFormatter("%g"))
+        axis.xaxis.set_minor_formatter(FormatStrFormatter("%g"))
         axis.tick_params(axis="x", which="both", labelsize=7)
         axis.grid(alpha=0.25)
     entries = dict(zip(*reversed(axes[0].get_legend_handles_labels()), strict=True))
     figure.legend(entries.values(), entries.keys(), fontsize=8, loc="outside right upper")
     figure.suptitle(title, fontsize=10)
     _save(path, figure)
+
+
+def _label(axis, points: list[tuple[str, float, float]]) -> None:
+    """Name points, the first ones first, where no other name stands."""
+    x, y = (np.log([p[i] for p in points]) for i in (1, 2))
+    x, y = (a - a.min() for a in (x, y))
+    x, y = x / max(x.max(), 1e-9), y / max(y.max(), 1e-9)
+    taken: list[tuple[float, float]] = []
+    for (text, at_x, at_y), u, v in zip(points, x, y, strict=True):
+        if text and not any(abs(u - a) < 0.13 and abs(v - b) < 0.04 for a, b in taken):
+            taken.append((float(u), float(v)))
+            axis.annotate(
+                text,
+                (at_x, at_y),
+                textcoords="offset points",
+                xytext=(6, 5),
+                fontsize=7,
+                color="#333333",
+            )
 
 
 def growth_table(curves: list[Curve]) -> str:
@@ -169,10 +177,21 @@ def growth_table(curves: list[Curve]) -> str:
                     f"{s.entries / 1e3:.0f}k",
                     f"{s.temporaries / 1e6:.0f}",
                     f"{c.forward_exponent:.2f} / {c.both_exponent:.2f}" if last else "",
+                    "{:.2f} / {:.2f}".format(*c.last_exponents) if last else "",
                 ]
             )
     return markdown(
-        ["what grows", "work", "fwd ms", "fwd+bwd ms", "entries", "MB", "exponents"], rows
+        [
+            "what grows",
+            "work",
+            "fwd ms",
+            "fwd+bwd ms",
+            "entries",
+            "MB",
+            "power",
+            "of the last step",
+        ],
+        rows,
     )
 
 

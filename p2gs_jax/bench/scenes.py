@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from p2gs_jax.types import Camera, Gaussians
 
@@ -102,7 +102,7 @@ def garden(path: Path, degree: int = 0) -> BenchScene:
     data, rng = np.load(path), np.random.default_rng(1)
     means = data["means3d"]
     count = len(means)
-    near = cKDTree(means).query(means, k=4)[0][:, 1:].mean(1)
+    near = KDTree(means).query(means, k=4)[0][:, 1:].mean(1)
     log_scales = np.log(np.maximum(near, 1e-4))[:, None] + rng.normal(0, 0.4, (count, 3))
     logits, quats = rng.normal(0, 2, count), rng.normal(size=(count, 4))
     log_radiance = np.log(data["colors"] / 255 + 1e-3)

@@ -13,13 +13,14 @@ import numpy as np
 def interleaved(jobs: Mapping[str, Callable[[], Any]], repeats: int = 7) -> dict[str, float]:
     """Return the median wall time of each job, milliseconds.
 
-    All jobs run once to warm up, then in turns, so that a machine that slows down slows all.
+    The jobs run in turns, so that a machine that slows down slows all, and each runs untimed
+    first in every turn, so that it does not pay for the memory and caches of the one before (a
+    small job after a large one read 2-3 times its time).
     """
-    for job in jobs.values():
-        jax.block_until_ready(job())
     times: dict[str, list[float]] = {name: [] for name in jobs}
     for _ in range(repeats):
         for name, job in jobs.items():
+            jax.block_until_ready(job())
             start = time.perf_counter()
             jax.block_until_ready(job())
             times[name].append(time.perf_counter() - start)

@@ -52,7 +52,7 @@ def ssim_map(x: Float[Array, "c h w"], y: Float[Array, "c h w"]) -> Float[Array,
     """Return the SSIM map of two images, channels first (Wang et al. 2004; 11x11, sigma 1.5)."""
 
     def channel(pair):
-        _, _, a1, a2, b1, b2 = _ssim_terms(*pair, opaque_true(pair[0][0, 0]))
+        _, _, a1, a2, b1, b2 = _ssim_terms(pair[0], pair[1], opaque_true(pair[0][0, 0]))
         return a1 * a2 / (b1 * b2)
 
     return lax.map(channel, (x, y))

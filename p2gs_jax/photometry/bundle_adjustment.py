@@ -1,0 +1,350 @@
+"""Photometric bundle adjustment: exposures, gammas and a response from colours of shared points.
+
+Model, in logarithms relative to the pivot x0: F(I) - log x0 = a_v (h_v + l_p) + noise, with h the
+log exposure, l the log radiance of a point and channel, a = 2.2 / gamma, and F the log response
+(`response.py`). With b = a h this is b_v + a_v l_p: linear but for one product. Point radiances are
+eliminated exactly (variable projection), what remains is the Schur complement over the views: its
+entries are sums over pairs of observations of a point, so cost and memory grow with those pairs,
+never with points times views. Outliers are weighted away: a few L1 rounds, then Geman-McClure
+(PHOTOMETRY section 4: 0 / 10 / 30 % outliers give .005 / .005 / .006 EV). One round is a map from
+parameters to parameters; optimistix iterates it to its fixed point.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from p2gs_jax.photometry.observations import Rows
+from p2gs_jax.photometry.response import FREE, KNOTS
+
+L1_ROUNDS, MOST_ROUNDS = 4, 60
+TOLERANCE = 1e-5
+GEMAN_MCCLURE = 3.0
+SMALLEST_SCALE = 0.3
+A_RANGE = (0.3, 3.0)
+# Anchors and damping relative to the mean diagonal of the normal matrix.
+ANCHOR, DAMPING = 10.0, 1e-8
+EMPTY = 1e-9
+
+
+class Theta(eqx.Module):
+    """What is solved for.
+
+    Attributes:
+        b: a h per view.
+        a: 2.2 / gamma per view.
+        c: response spline at its free knots; empty where the response is given.
+    """
+
+    b: Float[Array, " v"]
+    a: Float[Array, " v"]
+    c: Float[Array, " k"]
+
+
+class System(eqx.Module):
+    """Which directions are free, and what is known besides the photographs.
+
+    Attributes:
+        basis: columns are the free directions in (b, a, c); zero columns are allowed.
+        anchors: rows whose product with (b, a) is held at its target: the gauges.
+        targets: of `anchors`.
+        log_exposure: prior mean of h.
+        log_exposure_precision: inverse variance of that; 0 for none.
+        a_precision: inverse variance of a about 1; 0 for none.
+        bend: matrix whose quadratic form keeps the spline smooth, (k, k).
+    """
+
+    basis: Float[Array, "d q"]
+    anchors: Float[Array, "g 2v"]
+    targets: Float[Array, " g"]
+    log_exposure: Float[Array, " v"]
+    log_exposure_precision: Float[Array, " v"]
+    a_precision: Float[Array, " v"]
+    bend: Float[Array, "k k"]
+
+
+class Fit(NamedTuple):
+    """A solution and what its errors are computed from.
+
+    Attributes:
+        theta: the parameters.
+        radiance: log radiance of each row's point relative to the pivot.
+        precision: of `radiance`.
+        residual: of each observation, log units.
+        weight: robust weight over variance, as used.
+        scale: robust standard deviation of one observation in units of its stated one.
+        normal: reduced normal matrix over (b, a, c), without gauges and priors.
+        scores: sum over rows of the outer products of their scores, for robust standard errors.
+        curvature: mean second derivative of the robust loss over its weight (1 for squares).
+        rounds: iterations.
+    """
+
+    theta: Theta
+    radiance: Float[Array, "r 3"]
+    precision: Float[Array, "r 3"]
+    residual: Float[Array, "r m 3"]
+    weight: Float[Array, "r m 3"]
+    scale: Float[Array, ""]
+    normal: Float[Array, "d d"]
+    scores: Float[Array, "d d"]
+    curvature: Float[Array, ""]
+    rounds: Float[Array, ""]
+
+
+class _Local(NamedTuple):
+    """Everything per observation at given parameters."""
+
+    weight: Float[Array, "r m 3"]
+    sigma: Float[Array, "r m 3"]
+    residual: Float[Array, "r m 3"]
+    radiance: Float[Array, "r 3"]
+    precision: Float[Array, "r 3"]
+    scale: Float[Array, ""]
+    curvature: Float[Array, ""]
+
+
+def masked_median(values: Float[Array, "..."], used: Float[Array, "..."]) -> Float[Array, ""]:
+    """Return the median of non-negative values where `used` > 0, to 1e-6 relative, by bisection.
+
+    Sorting a million values costs more than a round of the adjustment.
+    """
+    half = 0.5 * jnp.sum(used > 0)
+
+    def narrow(_, bounds):
+        low, high = bounds
+        middle = 0.5 * (low + high)
+        below = jnp.sum((jnp.log(values + 1e-12) < middle) & (used > 0)) < half
+        return jnp.where(below, middle, low), jnp.where(below, high, middle)
+
+    low, high = jax.lax.fori_loop(0, 30, narrow, (jnp.float64(-14.0), jnp.float64(14.0)))
+    return jnp.exp(0.5 * (low + high))
+
+
+def _bend(rows: Rows, c: Float[Array, " k"]):
+    """Return what the spline adds to z, and its change of the standard deviation."""
+    full = jnp.zeros(len(KNOTS)).at[np.array(FREE)].set(c)
+    return (1 - rows.fraction) * full[rows.knot] + rows.fraction * full[rows.knot + 1]
+
+
+def _hats(rows: Rows) -> Float[Array, "r m 3 k"]:
+    """Return the spline's basis at every observation, free knots only."""
+    knots = jnp.asarray(np.array(FREE))
+    left = (rows.knot[..., None] == knots) * (1 - rows.fraction)[..., None]
+    return left + (rows.knot[..., None] + 1 == knots) * rows.fraction[..., None]
+
+
+def _radiance(rows: Rows, theta: Theta, z, weight):
+    a, b = theta.a[rows.views][..., None], theta.b[rows.views][..., None]
+    precision = jnp.sum(weight * a**2, 1)
+    return jnp.sum(weight * a * (z - b), 1) / (precision + EMPTY), precision
+
+
+def _local(rows: Rows, theta: Theta, weight, gm) -> _Local:
+    """Return residuals and the weights they imply.
+
+    Args:
+        rows: observations.
+        theta: parameters.
+        weight: from the round before; decides the point radiances that residuals are taken from.
+        gm: true for Geman-McClure, false for L1.
+    """
+    z = rows.z + _bend(rows, theta.c) if theta.c.size else rows.z
+    radiance, _ = _radiance(rows, theta, z, weight)
+    a, b = theta.a[rows.views][..., None], theta.b[rows.views][..., None]
+    residual = z - b - a * radiance[:, None]
+    u = residual / rows.sigma
+    scale = jnp.maximum(1.4826 * masked_median(jnp.abs(u), rows.weight), SMALLEST_SCALE)
+    l1 = 1 / jnp.maximum(jnp.abs(u) / scale, 0.5)
+    # One weight for the whole observation: an outlier is wrong in all channels.
+    channels = jnp.maximum(jnp.sum(rows.weight, -1), 1)
+    square = jnp.sum(u**2 * rows.weight, -1) / channels / (GEMAN_MCCLURE * scale) ** 2
+    robust = (1 / (1 + square) ** 2)[..., None]
+    weight = rows.weight / rows.sigma**2 * jnp.where(gm, robust, l1)
+    radiance, precision = _radiance(rows, theta, z, weight)
+    used = jnp.sum(rows.weight, -1) > 0
+    bent = jnp.where(used, (1 - 3 * square) / (1 + square) ** 3, 0)
+    curvature = jnp.sum(bent) / jnp.maximum(jnp.sum(jnp.where(used, robust[..., 0], 0)), 1e-9)
+    residual = z - b - a * radiance[:, None]
+    return _Local(weight, rows.sigma, residual, radiance, precision, scale, curvature)
+
+
+def _pair_sums(rows: Rows, factors: Float[Array, "r m f x"], views: int) -> Float[Array, "d d"]:
+    """Return sum over rows of the outer products of per-view vectors, as a (x V, x V) matrix.
+
+    Args:
+        rows: for the views of each slot.
+        factors: f vectors per row; entry (m, f, x) belongs to the view of slot m, parameter x.
+        views: V.
+    """
+    x = factors.shape[-1]
+    blocks = jnp.einsum("rmfx,rnfy->rmnxy", factors, factors)
+    at = rows.views[:, :, None] * views + rows.views[:, None, :]
+    sums = jax.ops.segment_sum(blocks.reshape(-1, x * x), at.reshape(-1), views * views)
+    return sums.reshape(views, views, x, x).transpose(2, 0, 3, 1).reshape(x * views, x * views)
+
+
+def _assemble(rows: Rows, theta: Theta, local: _Local):
+    """Return the reduced normal matrix and right side over (b, a, c)."""
+    views = theta.b.shape[0]
+    w, residual = local.weight, local.residual
+    level = local.radiance[:, None]
+
+    def per_view(values):
+        return jax.ops.segment_sum(values.reshape(-1), rows.views.reshape(-1), views)
+
+    h_bb, h_ba, h_aa = (per_view(jnp.sum(w * level**k, -1)) for k in range(3))
+    g_b, g_a = (per_view(jnp.sum(w * residual * level**k, -1)) for k in range(2))
+    coupling = w * theta.a[rows.views][..., None] / jnp.sqrt(local.precision + EMPTY)[:, None]
+    factors = jnp.stack([coupling, coupling * level], -1)
+    diagonal = jnp.block([[jnp.diag(h_bb), jnp.diag(h_ba)], [jnp.diag(h_ba), jnp.diag(h_aa)]])
+    normal = diagonal - _pair_sums(rows, factors, views)
+    right = jnp.concatenate([g_b, g_a])
+    if not theta.c.size:
+        return normal, right
+    # The spline moves z itself: d residual / dc is +hat where d residual / db is -1.
+    hats = _hats(rows)
+    h_cc = jnp.einsum("rmc,rmck,rmcl->kl", w, hats, hats)
+    moved = w[..., None] * hats
+    h_bc, h_ac = (
+        -jax.ops.segment_sum(
+            jnp.sum(moved * level[..., None] ** k, 2).reshape(-1, theta.c.size),
+            rows.views.reshape(-1),
+            views,
+        )
+        for k in range(2)
+    )
+    through = -jnp.einsum("rmc,rmck->rck", coupling, hats)
+    s_cc = jnp.einsum("rck,rcl->kl", through, through)
+    s_vc = jnp.einsum("rmcx,rck->rmxk", factors, through)
+    s_bc, s_ac = (
+        jax.ops.segment_sum(s_vc[:, :, k].reshape(-1, theta.c.size), rows.views.reshape(-1), views)
+        for k in range(2)
+    )
+    side = jnp.concatenate([h_bc - s_bc, h_ac - s_ac])
+    g_c = -jnp.einsum("rmc,rmck->k", w * residual, hats)
+    normal = jnp.block([[normal, side], [side.T, h_cc - s_cc]])
+    return normal, jnp.concatenate([right, g_c])
+
+
+def _known(system: System, theta: Theta, normal, right):
+    """Add priors and gauges to the normal equations."""
+    views = theta.b.shape[0]
+    tau, mu = system.log_exposure_precision, system.log_exposure
+    # Prior on h through b = a h: residual b - a mu.
+    gap = theta.b - theta.a * mu
+    rows_b, rows_a = jnp.arange(views), views + jnp.arange(views)
+    normal = normal.at[rows_b, rows_b].add(tau).at[rows_b, rows_a].add(-tau * mu)
+    normal = normal.at[rows_a, rows_b].add(-tau * mu).at[rows_a, rows_a].add(tau * mu**2)
+    normal = normal.at[rows_a, rows_a].add(system.a_precision)
+    right = right.at[rows_b].add(-tau * gap).at[rows_a].add(tau * mu * gap)
+    right = right.at[rows_a].add(system.a_precision * (1 - theta.a))
+    strength = ANCHOR * (jnp.mean(jnp.diagonal(normal)[:views]) + EMPTY)
+    both = jnp.concatenate([theta.b, theta.a])
+    pulled = system.targets - system.anchors @ both
+    normal = normal.at[: 2 * views, : 2 * views].add(strength * system.anchors.T @ system.anchors)
+    right = right.at[: 2 * views].add(strength * system.anchors.T @ pulled)
+    if theta.c.size:
+        stiffness = jnp.mean(jnp.diagonal(normal)[2 * views :])
+        normal = normal.at[2 * views :, 2 * views :].add(stiffness * system.bend)
+        right = right.at[2 * views :].add(-stiffness * system.bend @ theta.c)
+    return normal, right
+
+
+def _solve(normal, right, basis):
+    """Return the step in (b, a, c) along the free directions."""
+    reduced = basis.T @ normal @ basis
+    scale = jax.lax.rsqrt(jnp.maximum(jnp.diagonal(reduced), 1e-30))
+    free = jnp.diagonal(reduced) > 1e-30
+    balanced = reduced * scale[:, None] * scale[None]
+    balanced = jnp.where(free[:, None] & free[None], balanced, 0)
+    balanced = balanced + jnp.diag(jnp.where(free, DAMPING, 1.0))
+    factor = jax.scipy.linalg.cho_factor(balanced)
+    step = jax.scipy.linalg.cho_solve(factor, jnp.where(free, scale * (basis.T @ right), 0))
+    return basis @ (scale * step)
+
+
+def _round(rows: Rows, system: System, theta: Theta, weight, gm):
+    local = _local(rows, theta, weight, gm)
+    normal, right = _known(system, theta, *_assemble(rows, theta, local))
+    step = _solve(normal, right, system.basis)
+    v = theta.b.shape[0]
+    moved = Theta(
+        theta.b + step[:v],
+        jnp.clip(theta.a + step[v : 2 * v], *A_RANGE),
+        theta.c + step[2 * v :],
+    )
+    return moved, local.weight
+
+
+def _scores(rows: Rows, theta: Theta, local: _Local):
+    """Return the sum of outer products of row scores over (b, a, c)."""
+    views = theta.b.shape[0]
+    g = local.weight * local.residual
+    factors = jnp.stack([jnp.sum(g, -1), jnp.sum(g * local.radiance[:, None], -1)], -1)
+    scores = _pair_sums(rows, factors[:, :, None], views)
+    if not theta.c.size:
+        return scores
+    s_c = -jnp.einsum("rmc,rmck->rk", g, _hats(rows))
+    cross = jnp.einsum("rmx,rk->rmxk", factors, s_c)
+    side = jnp.concatenate(
+        [
+            jax.ops.segment_sum(
+                cross[:, :, x].reshape(-1, theta.c.size), rows.views.reshape(-1), views
+            )
+            for x in range(2)
+        ]
+    )
+    return jnp.block([[scores, side], [side.T, s_c.T @ s_c]])
+
+
+@jax.jit
+def solve(rows: Rows, system: System, start: Theta) -> Fit:
+    """Adjust exposures, gammas and response to observations (float64).
+
+    Args:
+        rows: observations.
+        system: free directions, gauges, priors.
+        start: where to begin.
+    """
+    # Weighted by the noise alone at first.
+    weight = rows.weight / rows.sigma**2
+
+    def l1(_, state):
+        return _round(rows, system, state[0], state[1], False)
+
+    state = jax.lax.fori_loop(0, L1_ROUNDS, l1, (start, weight))
+    found = optx.fixed_point(
+        lambda s, _: _round(rows, system, s[0], s[1], True),
+        optx.FixedPointIteration(rtol=0.0, atol=TOLERANCE, norm=_largest_step),
+        state,
+        max_steps=MOST_ROUNDS,
+        throw=False,
+    )
+    theta, weight = found.value
+    local = _local(rows, theta, weight, True)
+    normal, _ = _assemble(rows, theta, local)
+    return Fit(
+        theta,
+        local.radiance,
+        local.precision,
+        local.residual,
+        local.weight,
+        local.scale,
+        normal,
+        _scores(rows, theta, local),
+        jnp.maximum(local.curvature, 0.1),
+        found.stats["num_steps"].astype(jnp.float64),
+    )
+
+
+def _largest_step(state) -> Float[Array, ""]:
+    """Return the largest change of a parameter; weights follow from them."""
+    theta, _ = state
+    return jnp.max(jnp.abs(jnp.concatenate([theta.b, theta.a, theta.c])))

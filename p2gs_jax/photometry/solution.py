@@ -1,0 +1,411 @@
+"""Solving one photometric model, with error bars."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from p2gs_jax.photometry.bundle_adjustment import Fit, System, Theta, solve
+from p2gs_jax.photometry.observations import Layout, Observations, make_rows
+from p2gs_jax.photometry.response import FREE, KNOTS, Response
+from p2gs_jax.types import GAMMA_SRGB
+
+Level = Literal["camera", "view"]
+ModelName = Literal[
+    "constant",
+    "camera_exposure",
+    "camera_exposure_gamma",
+    "view_exposure",
+    "view_exposure_camera_gamma",
+    "view_exposure_gamma",
+]
+MIN_OBSERVATIONS = 15
+# Standard deviation of a = 2.2 / gamma about 1 (gammas of 1.9 to 2.6 are within one of these).
+A_PRIOR = 0.15
+# A known exposure that is to be kept: stops.
+FIXED_EV = 1e-5
+# Smoothness of the spline relative to its mean information.
+BEND = 3e-3
+LN2 = float(np.log(2.0))
+
+
+class Model(NamedTuple):
+    """What varies.
+
+    Attributes:
+        exposure: per what the exposure varies; None if it does not.
+        gamma: likewise.
+    """
+
+    exposure: Level | None
+    gamma: Level | None
+
+
+# From the simplest to the richest.
+LADDER: dict[ModelName, Model] = {
+    "constant": Model(None, None),
+    "camera_exposure": Model("camera", None),
+    "camera_exposure_gamma": Model("camera", "camera"),
+    "view_exposure": Model("view", None),
+    "view_exposure_camera_gamma": Model("view", "camera"),
+    "view_exposure_gamma": Model("view", "view"),
+}
+
+
+@dataclass(frozen=True)
+class KnownExposures:
+    """What is known of the exposures besides the photographs.
+
+    Attributes:
+        log_exposures: natural logarithm; NaN where nothing is known.
+        deviation_ev: standard deviation in stops; 0 keeps the value.
+    """
+
+    log_exposures: Float[np.ndarray, " v"]
+    deviation_ev: float = 0.0
+
+
+@dataclass(frozen=True)
+class PhotometricSolution:
+    """Exposures, gammas and response, with what is known about their errors.
+
+    Attributes:
+        model: what varies.
+        response: base curve and spline.
+        log_exposures: natural logarithm; mean 0 over each component unless exposures were known.
+        exposure_errors: standard errors of `log_exposures` (robust, gauge fixed); inf where
+            unobserved.
+        gammas: per view.
+        gamma_errors: standard errors; 0 where gamma is not modelled.
+        observations_per_view: usable observations.
+        component: views with equal numbers share a scale; others cannot be compared.
+        point_log_radiance: natural logarithm per channel; NaN where unobserved.
+        residual_ev: robust standard deviation of one observation, in stops.
+        view_residual_ev: the same per view.
+        outliers: share of observations that the robust loss ignores.
+        rounds: iterations.
+        warnings: what the user should know.
+    """
+
+    model: ModelName
+    response: Response
+    log_exposures: Float[np.ndarray, " v"]
+    exposure_errors: Float[np.ndarray, " v"]
+    gammas: Float[np.ndarray, " v"]
+    gamma_errors: Float[np.ndarray, " v"]
+    observations_per_view: Int[np.ndarray, " v"]
+    component: Int[np.ndarray, " v"]
+    point_log_radiance: Float[np.ndarray, "p 3"]
+    residual_ev: float
+    view_residual_ev: Float[np.ndarray, " v"]
+    outliers: float
+    rounds: int
+    warnings: tuple[str, ...]
+
+    @property
+    def exposures_ev(self) -> Float[np.ndarray, " v"]:
+        """Exposures in stops."""
+        return self.log_exposures / LN2
+
+
+class Problem(NamedTuple):
+    """Observations laid out once, for any number of models.
+
+    Attributes:
+        observations: the colours.
+        layout: where each lies.
+        usable: 1 where a value can be used.
+        component: label of each view.
+        log_pivot: log of the value that gamma leaves alone.
+        known: exposures known beforehand, or None.
+    """
+
+    observations: Observations
+    layout: Layout
+    usable: Float[np.ndarray, "o 3"]
+    component: Int[np.ndarray, " v"]
+    log_pivot: float
+    known: KnownExposures | None
+
+
+def make_problem(
+    observations: Observations,
+    *,
+    black: float,
+    saturation: float,
+    pivot: float,
+    known: KnownExposures | None = None,
+) -> Problem:
+    """Lay observations out for `fit_model`.
+
+    Args:
+        observations: the colours.
+        black: values up to here say nothing.
+        saturation: values from here on say nothing.
+        pivot: linear value that gamma leaves alone.
+        known: exposures known beforehand.
+    """
+    usable = observations.usable(black, saturation)
+    return Problem(
+        observations,
+        Layout(observations),
+        usable,
+        observations.components(usable),
+        float(np.log(pivot)),
+        known,
+    )
+
+
+def _level_basis(level: Level | None, cameras: np.ndarray) -> np.ndarray:
+    views = len(cameras)
+    columns = np.zeros((views, views))
+    if level == "view":
+        columns = np.eye(views)
+    elif level == "camera":
+        columns[:, : cameras.max() + 1] = np.eye(cameras.max() + 1)[cameras]
+    return columns
+
+
+def make_system(problem: Problem, model: Model, spline: bool) -> System:
+    """Return free directions, gauges and priors of a model."""
+    cameras, views = problem.observations.cameras, problem.observations.view_count
+    knots = len(FREE) if spline else 0
+    d = 2 * views + knots
+    basis = np.zeros((d, d))
+    basis[:views, :views] = _level_basis(model.exposure, cameras)
+    basis[views : 2 * views, views : 2 * views] = _level_basis(model.gamma, cameras)
+    basis[2 * views :, 2 * views :] = np.eye(knots)
+
+    known = problem.known
+    log_exposure, precision = np.zeros(views), np.zeros(views)
+    if known is not None:
+        given = np.isfinite(known.log_exposures)
+        log_exposure = np.where(given, known.log_exposures, 0.0)
+        precision = given / (max(known.deviation_ev, FIXED_EV) * LN2) ** 2
+    anchors, targets = np.zeros((2 * views, 2 * views)), np.zeros(2 * views)
+    for label in np.unique(problem.component):
+        members = problem.component == label
+        if not (precision[members] > 0).any():
+            anchors[label, :views] = members / members.sum()
+        if (precision[members] > 0).sum() < 2 or np.ptp(log_exposure[members]) < 1e-3:
+            anchors[views + label, views:] = members / members.sum()
+            targets[views + label] = 1.0
+    second = np.diff(np.eye(len(KNOTS)), 2, axis=0)[:, list(FREE)]
+    return System(
+        basis=jnp.asarray(basis),
+        anchors=jnp.asarray(anchors),
+        targets=jnp.asarray(targets),
+        log_exposure=jnp.asarray(log_exposure),
+        log_exposure_precision=jnp.asarray(precision),
+        a_precision=jnp.full(views, 1 / A_PRIOR**2 if model.gamma else 0.0),
+        bend=jnp.asarray(BEND * second.T @ second)[:knots, :knots],
+    )
+
+
+def solve_model(
+    problem: Problem,
+    name: ModelName,
+    response: Response,
+    *,
+    use: Float[np.ndarray, " o"] | None = None,
+    spline: bool = False,
+) -> tuple[Fit, System]:
+    """Solve one model; see `fit_model`.
+
+    Args:
+        problem: observations.
+        name: what varies.
+        response: what decodes the colours.
+        use: 0 keeps an observation out.
+        spline: solve for a spline over the response's base as well.
+    """
+    with jax.enable_x64(True):
+        weight = problem.usable if use is None else problem.usable * use[:, None]
+        rows = make_rows(problem.observations, problem.layout, weight, response, problem.log_pivot)
+        system = make_system(problem, LADDER[name], spline)
+        views = problem.observations.view_count
+        start = Theta(system.log_exposure, jnp.ones(views), jnp.zeros(len(FREE) if spline else 0))
+        fit = jax.tree.map(np.asarray, solve(rows, system, start))
+        return fit, jax.tree.map(np.asarray, system)
+
+
+def covariance(fit: Fit, system: System) -> Float[np.ndarray, "d d"]:
+    """Return the robust covariance of (b, a, c): bread, meat, bread (Huber; White).
+
+    Residuals of the three channels of an observation, and of a point, are not independent: the
+    meat is summed over points, and counts them once.
+    """
+    v = len(fit.theta.b)
+    bread, meat = fit.normal * fit.curvature, fit.scores.copy()
+    tau, mu = np.asarray(system.log_exposure_precision), np.asarray(system.log_exposure)
+    prior = np.zeros_like(bread)
+    i = np.arange(v)
+    prior[i, i] = tau
+    prior[i, v + i] = prior[v + i, i] = -tau * mu
+    prior[v + i, v + i] = tau * mu**2 + np.asarray(system.a_precision)
+    strength = 10 * (np.diag(bread)[:v].mean() + 1e-9)
+    gauge = np.zeros_like(bread)
+    gauge[: 2 * v, : 2 * v] = strength * system.anchors.T @ system.anchors
+    free = np.abs(system.basis).sum(0) > 0
+    g = np.asarray(system.basis)[:, free]
+    if not g.size:
+        return np.zeros_like(bread)
+    inverse = np.linalg.pinv(g.T @ (bread + prior + gauge) @ g, hermitian=True)
+    # A prior is itself an observation with variance 1 / precision: it is its own meat.
+    return g @ inverse @ (g.T @ (meat + prior) @ g) @ inverse @ g.T
+
+
+def fit_model(
+    problem: Problem, name: ModelName, response: Response | None = None
+) -> PhotometricSolution:
+    """Solve exposures and gammas of one model.
+
+    Args:
+        problem: from `make_problem`.
+        name: what varies.
+        response: what decodes the colours; default sRGB.
+    """
+    response = response or Response()
+    fit, system = solve_model(problem, name, response)
+    return describe(problem, name, response, fit, system)
+
+
+def fit_response(problem: Problem, base: Response, use=None) -> Response:
+    """Return the base with the spline that fits best beside per-view exposures."""
+    fit, _ = solve_model(problem, "view_exposure", base, use=use, spline=True)
+    full = np.zeros(len(KNOTS))
+    full[list(FREE)] = fit.theta.c
+    return Response(base.base, tuple(float(x) for x in full))
+
+
+def describe(
+    problem: Problem, name: ModelName, response: Response, fit: Fit, system: System
+) -> PhotometricSolution:
+    """Turn a raw fit into exposures in their gauge, with errors and warnings."""
+    o, component = problem.observations, problem.component
+    a, h = fit.theta.a, fit.theta.b / fit.theta.a
+    per_view = np.bincount(o.views[problem.usable.any(1)], minlength=o.view_count)
+    active = per_view > 0
+    free_scale = np.ones(o.view_count, bool)
+    if problem.known is not None:
+        given = np.isfinite(problem.known.log_exposures)
+        anchored = np.unique(component[given])
+        free_scale = ~np.isin(component, anchored)
+        active = active | given
+    shift, to_h = _centering(a, h, component, active, free_scale)
+    cov = covariance(fit, system)[: 2 * o.view_count, : 2 * o.view_count]
+    h_errors = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", to_h, cov, to_h), 0))
+    gamma = GAMMA_SRGB / a
+    a_errors = np.sqrt(np.maximum(np.diag(cov)[o.view_count :], 0))
+    h = np.where(active, h - shift, 0.0)
+
+    residual = problem.layout.take(fit.residual) / a[o.views][:, None]
+    view_residuals = np.full(o.view_count, np.nan)
+    for view in range(o.view_count):
+        mine = (o.views == view)[:, None] & (problem.usable > 0)
+        if mine.any():
+            view_residuals[view] = 1.4826 * np.median(np.abs(residual[mine])) / LN2
+    used = problem.usable > 0
+    everything = 1.4826 * float(np.median(np.abs(residual[used]))) / LN2 if used.any() else 0.0
+    sigma_weight = problem.layout.take(fit.weight)
+    ideal = _ideal_weight(problem, response)
+    ignored = (sigma_weight / np.maximum(ideal, 1e-30))[used] < 0.25
+    return PhotometricSolution(
+        model=name,
+        response=response,
+        log_exposures=h,
+        exposure_errors=np.where(active, h_errors, np.inf),
+        gammas=np.where(active, gamma, GAMMA_SRGB),
+        gamma_errors=np.where(active, gamma / a * a_errors, np.inf),
+        observations_per_view=per_view,
+        component=component,
+        point_log_radiance=_point_radiance(problem, fit, shift, active),
+        residual_ev=everything,
+        view_residual_ev=view_residuals,
+        outliers=float(ignored.mean()) if ignored.size else 0.0,
+        rounds=int(fit.rounds),
+        warnings=_warnings(per_view, component, active),
+    )
+
+
+def _ideal_weight(problem: Problem, response: Response) -> Float[np.ndarray, "o 3"]:
+    with jax.enable_x64(True):
+        rows = make_rows(
+            problem.observations, problem.layout, problem.usable, response, problem.log_pivot
+        )
+        return problem.layout.take(np.asarray(rows.weight / rows.sigma**2))
+
+
+def _centering(a, h, component, active, free_scale):
+    """Return what is subtracted from h, and the derivative of the result by (b, a)."""
+    views = len(a)
+    jacobian = np.concatenate([np.diag(1 / a), np.diag(-h / a)], 1)
+    shift = np.zeros(views)
+    center = np.eye(views)
+    for label in np.unique(component):
+        members = (component == label) & active & free_scale
+        if members.any():
+            shift[component == label] = h[members].mean()
+            center[np.ix_(component == label, members)] -= 1 / members.sum()
+    return shift, center @ jacobian
+
+
+def _point_radiance(problem: Problem, fit: Fit, shift, active) -> Float[np.ndarray, "p 3"]:
+    """Combine the rows of each point; the gauge shift of its views goes the other way."""
+    o, layout = problem.observations, problem.layout
+    rows = len(layout.point_of_row)
+    precision, level = fit.precision[:rows], fit.radiance[:rows]
+    total = np.zeros((o.point_count, 3))
+    weight = np.zeros((o.point_count, 3))
+    np.add.at(total, layout.point_of_row, precision * level)
+    np.add.at(weight, layout.point_of_row, precision)
+    moved = np.zeros(o.point_count)
+    seen = problem.usable.any(1)
+    moved[o.points[seen]] = shift[o.views[seen]]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        level = total / weight + moved[:, None] + problem.log_pivot
+    return np.where(weight > 0, level, np.nan)
+
+
+def _warnings(per_view, component, active) -> tuple[str, ...]:
+    out = []
+    few = np.flatnonzero(per_view < MIN_OBSERVATIONS)
+    if len(few):
+        out.append(
+            f"{len(few)} training view(s) have fewer than {MIN_OBSERVATIONS} usable track "
+            f"observations; their exposures are uncertain (rows {_listed(few)})."
+        )
+    groups = len(set(component[active].tolist()))
+    if groups > 1:
+        out.append(
+            f"The tracks fall into {groups} groups of views that share no point: exposures can "
+            "be compared only inside a group."
+        )
+    return tuple(out)
+
+
+def _listed(rows: np.ndarray) -> str:
+    head = ", ".join(str(r) for r in rows[:8])
+    return head + (", ..." if len(rows) > 8 else "")
+
+
+__all__ = [
+    "LADDER",
+    "KnownExposures",
+    "Model",
+    "ModelName",
+    "PhotometricSolution",
+    "Problem",
+    "covariance",
+    "describe",
+    "fit_model",
+    "fit_response",
+    "make_problem",
+    "make_system",
+    "solve_model",
+]

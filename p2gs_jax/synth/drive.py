@@ -1,0 +1,176 @@
+"""Points of known radiance seen by three cameras on a car: observations without images.
+
+What a photometric adjustment sees of a drive, with every quantity known: three cameras, frames one
+unit apart, facades, road and sky, 4-6 stops of contrast plus a bright sky, 8-bit photographs with
+photon noise, texture and outliers (our own proxy; PHOTOMETRY section 3 describes the like).
+"""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from p2gs_jax.photometry.observations import Observations
+
+Exposures = Literal["constant", "iso2", "iso4", "cameras", "auto"]
+Curve = Literal["srgb", "power", "filmic"]
+YAWS = (0.0, -44.2, 44.8)
+HALF_WIDTH, HALF_HEIGHT = 30.0, 21.0
+NEAREST, FARTHEST = 3.0, 45.0
+LONGEST_TRACK, SHORTEST_TRACK = 30, 3
+SHOT_NOISE, READ_NOISE = 2e-4, 1e-6
+
+
+class Drive(NamedTuple):
+    """Who sees what.
+
+    Attributes:
+        views: row of the view of each observation; view = camera * frames + frame.
+        points: row of its point.
+        radiance: linear, (P, 3).
+        cameras: of each view.
+        frames: number of frames.
+    """
+
+    views: Int[np.ndarray, " o"]
+    points: Int[np.ndarray, " o"]
+    radiance: Float[np.ndarray, "p 3"]
+    cameras: Int[np.ndarray, " v"]
+    frames: int
+
+
+def make_drive(frames: int = 20, points: int = 1200, seed: int = 0, seen: float = 0.6) -> Drive:
+    """Return visibility and radiance of a random street.
+
+    Args:
+        frames: per camera.
+        points: before those seen fewer than three times are dropped.
+        seed: of the random numbers.
+        seen: chance that a visible point was matched.
+    """
+    rng = np.random.default_rng(seed)
+    sky, road = points // 8, points // 4
+    facade = points - sky - road
+    x = np.concatenate([rng.uniform(-5, frames + 45, facade), rng.uniform(3, frames + 40, road)])
+    side = rng.choice([-1, 1], facade) * rng.uniform(8, 20, facade)
+    y = np.concatenate([side, rng.uniform(-7, 7, road)])
+    z = np.concatenate([rng.uniform(-2, 6, facade), np.full(road, -2.0)])
+    sky_azimuth, sky_height = rng.uniform(-75, 75, sky), rng.uniform(8, 20, sky)
+    views, ids = [], []
+    for frame in range(frames):
+        distance = np.hypot(x - frame, y)
+        azimuth = np.concatenate([np.degrees(np.arctan2(y, x - frame)), sky_azimuth])
+        height = np.concatenate([np.degrees(np.arctan2(z, distance)), sky_height])
+        distance = np.concatenate([distance, np.full(sky, 10.0)])
+        for camera, yaw in enumerate(YAWS):
+            inside = (
+                (np.abs(azimuth - yaw) < HALF_WIDTH)
+                & (np.abs(height) < HALF_HEIGHT)
+                & (distance > NEAREST)
+                & (distance < FARTHEST)
+                & (rng.random(points) < seen)
+            )
+            found = np.flatnonzero(inside)
+            views.append(np.full(len(found), camera * frames + frame))
+            ids.append(found)
+    v, p = np.concatenate(views), np.concatenate(ids)
+    shuffled = rng.permutation(len(v))
+    v, p = v[shuffled], p[shuffled]
+    order = np.argsort(p, kind="stable")
+    v, p = v[order], p[order]
+    counts = np.bincount(p, minlength=points)
+    rank = np.arange(len(p)) - np.concatenate([[0], np.cumsum(counts)])[p]
+    keep = (rank < LONGEST_TRACK) & (counts[p] >= SHORTEST_TRACK)
+    v, p = v[keep], p[keep]
+    kind = np.repeat([0, 1, 2], [facade, road, sky])
+    used, p = np.unique(p, return_inverse=True)
+    kind = kind[used]
+    mean, spread = np.array([-2.5, -2.5, 0.3])[kind], np.array([1.3, 0.5, 0.5])[kind]
+    stops = (mean + spread * rng.standard_normal(len(used)))[:, None]
+    stops = stops + 0.3 * rng.standard_normal((len(used), 3))
+    stops[kind == 2] += [-0.3, 0.0, 0.3]
+    return Drive(v, p, 2.0**stops, np.repeat([0, 1, 2], frames), frames)
+
+
+def make_exposures(drive: Drive, kind: Exposures, seed: int = 2) -> Float[np.ndarray, " v"]:
+    """Return exposures > 0 of every view.
+
+    Args:
+        drive: for the number of views.
+        kind: `constant`; `iso2`, `iso4`: ISO ~ N(8, std), rounded, at least 1, over 8; `cameras`:
+            a gain per camera; `auto`: slow drifts as of an automatic exposure.
+        seed: of the ISO values.
+    """
+    frame = np.tile(np.arange(drive.frames), 3)
+    if kind == "constant":
+        return np.ones(len(drive.cameras))
+    if kind in ("iso2", "iso4"):
+        draws = np.random.default_rng(seed).normal(8, float(kind[-1]), len(drive.cameras))
+        return np.maximum(np.round(draws), 1) / 8
+    if kind == "cameras":
+        return np.array([1.0, 0.7, 1.4])[drive.cameras]
+    phase = 2 * np.pi * frame / drive.frames * 1.3 + np.array([0, 2.1, 4.2])[drive.cameras]
+    return 2.0 ** (0.8 * np.sin(phase) + np.array([0, -0.3, 0.3])[drive.cameras])
+
+
+def encode(exposed: Float[np.ndarray, "..."], curve: Curve) -> Float[np.ndarray, "..."]:
+    """Return display values, not yet clipped or rounded."""
+    if curve == "filmic":
+        # An S-curve as film and game engines use (Narkowicz's fit), before the sRGB encoding.
+        x = 0.8 * exposed
+        exposed = np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0, 1)
+    if curve == "power":
+        return exposed ** (1 / 2.2)
+    high = 1.055 * np.maximum(exposed, 1e-12) ** (1 / 2.4) - 0.055
+    return np.where(exposed <= 0.0031308, 12.92 * exposed, high)
+
+
+def observe(
+    drive: Drive,
+    exposures: Float[np.ndarray, " v"],
+    *,
+    curve: Curve = "srgb",
+    gammas: Float[np.ndarray, " v"] | None = None,
+    outliers: float = 0.08,
+    texture: float = 0.03,
+    noise: float = 1.0,
+    bits: int | None = 8,
+    seed: int = 3,
+) -> Observations:
+    """Photograph the points.
+
+    Args:
+        drive: who sees what.
+        exposures: of every view.
+        curve: response.
+        gammas: of every view, replacing the curve by x^(1 / gamma) about white.
+        outliers: share of observations that show another point.
+        texture: standard deviation of log radiance between views, common to the channels.
+        noise: factor of photon noise and texture.
+        bits: of the photographs; None does not round.
+        seed: of the random numbers.
+    """
+    rng = np.random.default_rng(seed)
+    v, p = drive.views, drive.points
+    shown = p.copy()
+    wrong = rng.random(len(p)) < outliers
+    shown[wrong] = rng.integers(0, len(drive.radiance), int(wrong.sum()))
+    exposed = exposures[v][:, None] * drive.radiance[shown]
+    exposed = exposed * np.exp(noise * texture * rng.standard_normal((len(p), 1)))
+    shot = np.sqrt(SHOT_NOISE * exposed + READ_NOISE)
+    exposed = np.maximum(exposed + noise * shot * rng.standard_normal(exposed.shape), 0)
+    ldr = exposed ** (1 / gammas[v][:, None]) if gammas is not None else encode(exposed, curve)
+    ldr = np.clip(ldr, 0, 1)
+    if bits is not None:
+        ldr = np.round(ldr * (2**bits - 1)) / (2**bits - 1)
+    return Observations(
+        views=v,
+        points=p,
+        colors=ldr,
+        spread=np.zeros_like(ldr),
+        view_count=len(drive.cameras),
+        point_count=len(drive.radiance),
+        cameras=drive.cameras,
+    )
