@@ -1,4 +1,4 @@
-"""The command line: `p2gs-jax fit | render | eval | demo | bench`.
+"""The command line: `p2gs-jax fit | calibrate | render | eval | demo | bench`.
 
 Every configuration field is an option. Bad input ends with one message and exit code 2.
 """
@@ -66,8 +66,35 @@ class Fit:
     """Skip frames whose image is missing."""
     reference: Path | None = None
     """Photographs of the same views under one common exposure, to judge against."""
+    known_exposures: str | None = None
+    """Exposures to keep: a CSV file (image, exposure or ev), or exif."""
+    known_deviation_ev: float | None = None
+    """Treat them as uncertain by this many stops instead of keeping them."""
     resume: bool = False
     """Continue an interrupted run."""
+
+
+@dataclass(frozen=True)
+class Calibrate:
+    """Exposures, gammas and tone curve alone, with error bars, in seconds: no splatting."""
+
+    scene: Annotated[Path, tyro.conf.Positional]
+    """COLMAP model, transforms.json, or a folder of photographs."""
+    out: Path
+    """Folder for photometry.json and calibration.png."""
+    config: Annotated[configs.FitConfig, tyro.conf.arg(name="")]
+    known_exposures: str | None = None
+    """Exposures to keep: a CSV file (image, exposure or ev), or exif."""
+    known_deviation_ev: float | None = None
+    """Treat them as uncertain by this many stops instead of keeping them."""
+    compare_with: str | None = None
+    """Stated exposures to compare with: exif or a CSV file (default: EXIF)."""
+    static: bool = False
+    """A folder of photographs from one fixed viewpoint at several exposures."""
+    max_width: int | None = None
+    """Shrink images to at most this many pixels across."""
+    images: str | None = None
+    """Image folder, where it is not images/ beside the model."""
 
 
 @dataclass(frozen=True)
@@ -145,6 +172,34 @@ def _preset_from(argv: list[str]) -> configs.FitConfig:
     return configs.preset(name)
 
 
+def _known(cfg: configs.FitConfig, args: Fit | Calibrate) -> configs.FitConfig:
+    p = cfg.photometry
+    if args.known_exposures is not None:
+        p = dataclasses.replace(p, known=args.known_exposures)
+    if args.known_deviation_ev is not None:
+        p = dataclasses.replace(p, known_deviation_ev=args.known_deviation_ev)
+    _check(p.known_deviation_ev >= 0, "--known-deviation-ev must be 0 or more")
+    _check(
+        args.known_deviation_ev is None or p.known is not None,
+        "--known-deviation-ev says nothing without --known-exposures",
+    )
+    return dataclasses.replace(cfg, photometry=p)
+
+
+def resolve_calibration(args: Calibrate) -> configs.FitConfig:
+    """Return the configuration with the short options applied.
+
+    Raises:
+        UserError: a value makes no sense.
+    """
+    data = args.config.data
+    for name in ("max_width", "images"):
+        if getattr(args, name) is not None:
+            data = dataclasses.replace(data, **{name: getattr(args, name)})
+    _check(data.max_width is None or data.max_width >= 16, "--max-width must be at least 16")
+    return _known(dataclasses.replace(args.config, data=data), args)
+
+
 def resolve(args: Fit) -> configs.FitConfig:
     """Return the configuration with the short options applied.
 
@@ -167,7 +222,7 @@ def resolve(args: Fit) -> configs.FitConfig:
     _check(data.max_width is None or data.max_width >= 16, "--max-width must be at least 16")
     _check(data.test_every >= 0, "--test-every must be 0 or more")
     _check(train.steps >= 1, "--steps must be at least 1")
-    return dataclasses.replace(cfg, data=data, train=train)
+    return _known(dataclasses.replace(cfg, data=data, train=train), args)
 
 
 def _check(condition: bool, text: str) -> None:
@@ -177,8 +232,10 @@ def _check(condition: bool, text: str) -> None:
 
 def _run(argv: list[str]) -> int:
     fit_default = Fit(tyro.MISSING, tyro.MISSING, _preset_from(argv))
+    calibrate_default = Calibrate(tyro.MISSING, tyro.MISSING, _preset_from(argv))
     commands_union = Union[  # noqa: UP007 (annotated members cannot be joined with |)
         Annotated[Fit, tyro.conf.subcommand("fit", default=fit_default)],
+        Annotated[Calibrate, tyro.conf.subcommand("calibrate", default=calibrate_default)],
         Annotated[Render, tyro.conf.subcommand("render")],
         Annotated[Eval, tyro.conf.subcommand("eval")],
         Annotated[Demo, tyro.conf.subcommand("demo")],
@@ -196,6 +253,10 @@ def _run(argv: list[str]) -> int:
     if isinstance(args, Fit):
         return commands.fit_command(
             args.scene, args.out, resolve(args), args.reference, args.resume
+        )
+    if isinstance(args, Calibrate):
+        return commands.calibrate_command(
+            args.scene, args.out, resolve_calibration(args), args.compare_with, args.static
         )
     if isinstance(args, Render):
         return commands.render_command(args.run, args.out, args.split, args.exposure_ev, args.gamma)

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from p2gs_jax.bench import run as benches
+from p2gs_jax.calibrate import WEAK_GAMMA, Calibration, calibrate
 from p2gs_jax.config import FitConfig
 from p2gs_jax.demo import run_demo
 from p2gs_jax.errors import UserError
@@ -40,6 +41,56 @@ def fit_command(
         result = fit(scene, out, cfg, reference=reference, resume=resume, reporter=reporter)
     print_metrics(result.metrics, out)
     return 0
+
+
+def calibrate_command(
+    scene: Path, out: Path, cfg: FitConfig, compare_with: str | None, static: bool
+) -> int:
+    """Solve the photometry alone; print it as a table."""
+    with TerminalReporter() as reporter:
+        result = calibrate(scene, out, cfg, compare_with=compare_with, reporter=reporter)
+    print_calibration(result)
+    _out().print(f"Results: {out} (open {out / 'calibration.png'} first)")
+    return 0
+
+
+def print_calibration(result: Calibration) -> None:
+    """Print exposures and gammas with their standard errors, and what to make of them."""
+    console, s = _out(), result.selection.solution
+    table = Table(title="Exposures in stops from their mean", title_justify="left")
+    table.add_column("view")
+    table.add_column("camera")
+    for name in ("exposure", "EXIF or file", "gap", "gamma", "residual EV"):
+        table.add_column(name, justify="right")
+    stated = result.stated_ev
+    both = np.isfinite(stated) & np.isfinite(s.exposure_errors)
+    offset = float(np.median(s.exposures_ev[both] - stated[both])) if both.any() else 0.0
+    for i, view in enumerate(result.scene.views):
+        error = s.exposure_errors[i] / np.log(2)
+        known = bool(np.isfinite(error))
+        weak = " (weakly identified)" if s.gamma_errors[i] > WEAK_GAMMA else ""
+        given = np.isfinite(stated[i])
+        table.add_row(
+            view.name,
+            view.camera,
+            f"{s.exposures_ev[i]:+.2f} +- {error:.2f}" if known else "unknown",
+            f"{stated[i] + offset:+.2f}" if given else "",
+            f"{result.agreement.gap_ev[i]:+.2f}" + (" !" if result.agreement.disagrees[i] else "")
+            if given and known
+            else "",
+            f"{s.gammas[i]:.2f} +- {s.gamma_errors[i]:.2f}{weak}"
+            if known and s.gamma_errors[i] > 0
+            else f"{s.gammas[i]:.2f}",
+            f"{s.view_residual_ev[i]:.2f}" if known else "",
+        )
+    console.print(table)
+    for message in result.messages:
+        console.print(message)
+    console.print(
+        f"{result.observations} observations, {100 * s.outliers:.0f} % ignored as outliers; "
+        f"residual {s.residual_ev:.2f} EV; {result.seconds['reading']:.1f} s reading, "
+        f"{result.seconds['adjustment']:.1f} s adjusting."
+    )
 
 
 def print_metrics(metrics: dict, out: Path) -> None:

@@ -11,6 +11,14 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 PresetName = Literal["paper", "paper_appendix", "robust"]
+PhotometricModel = Literal[
+    "constant",
+    "camera_exposure",
+    "camera_exposure_gamma",
+    "view_exposure",
+    "view_exposure_camera_gamma",
+    "view_exposure_gamma",
+]
 ExposureLossForm = Literal[
     "literal_same_pose", "literal_pixels", "exposed", "observed_linear", "observed_ldr"
 ]
@@ -79,8 +87,19 @@ class RenderConfig:
 class PhotometryConfig:
     """The image formation model y = T(e L)."""
 
-    curve: Literal["power", "srgb"] = "srgb"
+    select: bool = True
+    """Choose `model` and `curve` on held-out track observations; where there are none, or with
+    --photometry.no-select, they are used as given (ours: PHOTOMETRY section 5)."""
+    model: PhotometricModel = "view_exposure_gamma"
+    """What varies between views; what does not vary is not learned."""
+    curve: Literal["power", "srgb", "spline"] = "srgb"
     """Base tone curve; `power` with pivot 1 is the paper's x^(1/gamma)."""
+    spline: tuple[float, ...] | None = None
+    """Log exposure that `spline` adds to sRGB's at its ten knots (photometry/response.py)."""
+    known: str | None = None
+    """Exposures known beforehand: a CSV file (image, exposure or ev), or `exif`."""
+    known_deviation_ev: float = 0.0
+    """Standard deviation of the known exposures, stops; 0 keeps them as they are."""
     pivot: float = 0.18
     """Linear value that a change of gamma leaves alone: y = OETF(x0 (eL/x0)^(2.2/gamma))
     (ours: mid-grey beats white 2.5-5x in EV, PHOTOMETRY section 3; the paper's is 1)."""
@@ -90,8 +109,8 @@ class PhotometryConfig:
     parameterization: Literal["log", "linear"] = "log"
     """What the optimiser sees: logarithms (ours), or e and gamma themselves (paper)."""
     start: Literal["tracks", "random"] = "tracks"
-    """Where exposures start: robust log-ratios over the tracks (ours), or N(1, 0.05^2) (paper,
-    Exposure modeling)."""
+    """Where exposures start: a photometric bundle adjustment over the tracks (ours), or
+    N(1, 0.05^2) (paper, Exposure modeling)."""
     start_std: float = 0.05
     """Standard deviation of the random start (paper, Exposure modeling)."""
     freeze_until: float = 0.6
@@ -278,6 +297,7 @@ def _paper(exposure_weight: float, name: PresetName) -> FitConfig:
         preset=name,
         render=RenderConfig(radiance="linear"),
         photometry=PhotometryConfig(
+            select=False,
             curve="power",
             pivot=1.0,
             clamp=True,

@@ -127,8 +127,11 @@ def photometry_model(params: Params, cfg: FitConfig) -> tuple[str, dict, str]:
         if params.photometry.parameterization == "log"
         else "soft: the mean exposure is pulled towards 1 (paper, eq. 9)"
     )
-    curve = {"name": cfg.photometry.curve, "pivot": cfg.photometry.pivot}
-    return "per-view exposure + per-view gamma", curve, gauge
+    p = cfg.photometry
+    curve = {"name": p.curve, "pivot": p.pivot, "spline": p.spline}
+    if p.known is not None:
+        gauge = f"known exposures ({p.known}); radiance is in their units"
+    return p.model, curve, gauge
 
 
 def finish(

@@ -18,7 +18,7 @@ from p2gs_jax.config import to_dict as config_to_dict
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.atomic import plain, write_json
 from p2gs_jax.finish import finish, load_reference
-from p2gs_jax.photometry.track_start import TrackStart
+from p2gs_jax.photometry.selection import Selection
 from p2gs_jax.prepare import Prepared, load, prepare
 from p2gs_jax.progress import Reporter, Silent
 from p2gs_jax.train.loop import Trainer, TrainResult
@@ -77,14 +77,14 @@ class FitResult:
         scene: what it was fitted to.
         metrics: what `metrics.json` holds.
         run_dir: the run folder.
-        start: exposures from the tracks, or None.
+        selection: what the bundle adjustment found, or None.
     """
 
     params: Params
     scene: Scene
     metrics: dict
     run_dir: Path
-    start: TrackStart | None
+    selection: Selection | None
 
 
 def fit(
@@ -163,7 +163,7 @@ def fit(
         if true_exposures is None
         else np.log2([true_exposures[scene.views[i].name] for i in scene.train_indices]),
     )
-    return FitResult(params, scene, metrics, run_dir, prepared.start)
+    return FitResult(params, scene, metrics, run_dir, prepared.selection)
 
 
 def _finish_estimate(scene: Scene, cfg: FitConfig) -> float:

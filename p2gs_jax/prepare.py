@@ -11,15 +11,19 @@ import numpy as np
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
-from p2gs_jax.init.observations import TrackColors, sample, sample_pairs, track_colors
+from p2gs_jax.init.observations import sample, sample_pairs, track_colors
 from p2gs_jax.init.seeds import gaussians_from_points, merge, scene_extent, subsample
 from p2gs_jax.init.shell import Shell, find_shell
 from p2gs_jax.losses.total import OBSERVED_FORMS, TrackPairs
 from p2gs_jax.photometry.formation import inverse_tone_map
-from p2gs_jax.photometry.track_start import TrackStart, start_from_tracks
+from p2gs_jax.photometry.observations import Observations
+from p2gs_jax.photometry.response import Response
+from p2gs_jax.photometry.selection import Selection, select
+from p2gs_jax.photometry.solution import KnownExposures, PhotometricSolution
 from p2gs_jax.progress import Reporter
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.known_exposures import read_known_exposures
 from p2gs_jax.types import GAMMA_SRGB, Gaussians, Params, Photometry, Scene
 
 PAIR_POOL = 200_000
@@ -37,7 +41,7 @@ class Prepared:
         store: photographs.
         params: initial parameters.
         extent: scene extent, scene units.
-        start: exposures from the tracks, or None.
+        selection: photometric model, exposures and their errors from the tracks, or None.
         pairs: corresponding observations, or None.
         cfg: the configuration, adapted to what the scene offers.
         notes: what the user should know.
@@ -47,7 +51,7 @@ class Prepared:
     store: ImageStore
     params: Params
     extent: float
-    start: TrackStart | None
+    selection: Selection | None
     pairs: TrackPairs | None
     cfg: FitConfig
     notes: list[str] = field(default_factory=list)
@@ -80,25 +84,20 @@ def prepare(scene: Scene, cfg: FitConfig, reporter: Reporter) -> Prepared:
     views = [scene.views[i] for i in scene.train_indices]
     notes = list(scene.notes)
     extent = scene_extent(views, scene.points)
-    tracks: TrackColors | None = None
-    start: TrackStart | None = None
+    tracks: Observations | None = None
+    selection: Selection | None = None
     if scene.tracks is not None and len(scene.tracks.xy):
         tracks = track_colors(scene, store, lambda i, n: reporter.stage("Sampling tracks", i, n))
     if cfg.photometry.start == "tracks":
         if tracks is not None and len(tracks.points):
-            start = start_from_tracks(
-                tracks.views,
-                tracks.points,
-                tracks.colors,
-                view_count=len(views),
-                point_count=len(scene.points),
-                cfg=cfg.photometry,
-                loss=cfg.loss,
-            )
-            notes += start.warnings
+            reporter.stage("Photometric bundle adjustment")
+            selection = calibrate_observations(tracks, scene, cfg)
+            notes += [*selection.reasons, *selection.solution.warnings]
+            cfg = with_selection(cfg, selection)
         else:
             notes.append("No tracks: exposures start at 1 and are learned from the first step.")
             cfg = without_tracks(cfg)
+    start = None if selection is None else selection.solution
     photometry = _photometry(start, len(views), cfg)
     keep = subsample(len(scene.points), cfg.init.max_seeds, cfg.train.seed)
     if len(keep) < len(scene.points):
@@ -118,7 +117,63 @@ def prepare(scene: Scene, cfg: FitConfig, reporter: Reporter) -> Prepared:
     for note in notes:
         reporter.message(note)
     pairs = _pairs(tracks, cfg)
-    return Prepared(scene, store, Params(gaussians, photometry), extent, start, pairs, cfg, notes)
+    return Prepared(
+        scene, store, Params(gaussians, photometry), extent, selection, pairs, cfg, notes
+    )
+
+
+def calibrate_observations(
+    observations: Observations, scene: Scene, cfg: FitConfig, seed: int | None = None
+) -> Selection:
+    """Choose the photometric model and solve it.
+
+    Args:
+        observations: colours of shared points in the training views.
+        scene: for known exposures.
+        cfg: options; with `photometry.select` off the given model and curve are solved.
+        seed: which observations are held out; default the run's.
+
+    Raises:
+        UserError: the known exposures cannot be read.
+    """
+    p = cfg.photometry
+    known = None
+    if p.known is not None:
+        views = [scene.views[i] for i in scene.train_indices]
+        known = KnownExposures(read_known_exposures(p.known, views), p.known_deviation_ev)
+    given = Response("power" if p.curve == "power" else "srgb", p.spline)
+    return select(
+        observations,
+        black=cfg.loss.black,
+        saturation=cfg.loss.saturation,
+        pivot=p.pivot,
+        known=known,
+        seed=cfg.train.seed if seed is None else seed,
+        fixed=None if p.select else (p.model, given),
+    )
+
+
+def with_selection(cfg: FitConfig, selection: Selection) -> FitConfig:
+    """Return the configuration under the chosen model and curve.
+
+    Known exposures that are to be kept are not learned, and no regulariser pulls at their mean.
+    """
+    solution, p = selection.solution, cfg.photometry
+    spline = solution.response.spline
+    curve = "spline" if spline is not None else solution.response.base
+    cfg = dataclasses.replace(
+        cfg,
+        photometry=dataclasses.replace(p, model=solution.model, curve=curve, spline=spline),
+    )
+    if p.known is None:
+        return cfg
+    regularizers = dataclasses.replace(cfg.loss.regularizers, log_exposure_mean=None)
+    frozen = 1.0 if p.known_deviation_ev == 0 else p.freeze_until
+    return dataclasses.replace(
+        cfg,
+        loss=dataclasses.replace(cfg.loss, regularizers=regularizers),
+        photometry=dataclasses.replace(cfg.photometry, freeze_until=frozen),
+    )
 
 
 def without_tracks(cfg: FitConfig) -> FitConfig:
@@ -134,7 +189,7 @@ def without_tracks(cfg: FitConfig) -> FitConfig:
     )
 
 
-def _photometry(start: TrackStart | None, count: int, cfg: FitConfig) -> Photometry:
+def _photometry(start: PhotometricSolution | None, count: int, cfg: FitConfig) -> Photometry:
     p = cfg.photometry
     if start is not None:
         log_exposures = np.asarray(start.log_exposures)
@@ -143,20 +198,23 @@ def _photometry(start: TrackStart | None, count: int, cfg: FitConfig) -> Photome
         log_exposures = np.log(np.maximum(draws, 0.1))
     else:
         log_exposures = np.zeros(count)
+    gammas = np.full(count, GAMMA_SRGB) if start is None else start.gammas
     if p.parameterization == "log":
-        return Photometry(jnp.asarray(log_exposures, jnp.float32), jnp.zeros(count), "log")
+        exposures, gammas = log_exposures, np.log(gammas / GAMMA_SRGB)
+    else:
+        exposures = np.exp(log_exposures)
     return Photometry(
-        jnp.asarray(np.exp(log_exposures), jnp.float32), jnp.full((count,), GAMMA_SRGB), "linear"
+        jnp.asarray(exposures, jnp.float32), jnp.asarray(gammas, jnp.float32), p.parameterization
     )
 
 
-def _linearize(colors: np.ndarray, cfg: FitConfig) -> np.ndarray:
+def _linearize(colors: np.ndarray, cfg: FitConfig, gamma: float = GAMMA_SRGB) -> np.ndarray:
     return np.asarray(
-        inverse_tone_map(jnp.asarray(colors, jnp.float32), jnp.float32(GAMMA_SRGB), cfg.photometry)
+        inverse_tone_map(jnp.asarray(colors, jnp.float32), jnp.float32(gamma), cfg.photometry)
     )
 
 
-def _seed_radiance(scene: Scene, start: TrackStart | None, cfg: FitConfig) -> np.ndarray:
+def _seed_radiance(scene: Scene, start: PhotometricSolution | None, cfg: FitConfig) -> np.ndarray:
     """Return linear radiance per seed: from the track start where it knows, else from colours."""
     radiance = _linearize(scene.point_colors.astype(np.float32) / 255.0, cfg)
     if start is not None:
@@ -179,8 +237,9 @@ def _shell_gaussians(
         ldr, mask = store.get(index, SHELL_SHRINK)
         view = scene.views[index]
         scale = [mask.shape[1] / view.width, mask.shape[0] / view.height]
-        colors, valid = sample(ldr, mask, shell.xy[seen, row] * scale)
-        total[seen[valid]] += _linearize(colors[valid], cfg) / exposures[row]
+        colors, _, valid = sample(ldr, mask, shell.xy[seen, row] * scale)
+        linear = _linearize(colors[valid], cfg, float(photometry.gammas[row]))
+        total[seen[valid]] += linear / exposures[row]
         weight[seen[valid]] += 1
     seen = weight > 0
     radiance = total[seen] / weight[seen, None]
@@ -194,7 +253,7 @@ def _shell_gaussians(
     )
 
 
-def _pairs(tracks: TrackColors | None, cfg: FitConfig) -> TrackPairs | None:
+def _pairs(tracks: Observations | None, cfg: FitConfig) -> TrackPairs | None:
     relative = cfg.loss.relative_exposure
     if relative.weight is None or relative.form not in OBSERVED_FORMS:
         return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,9 +10,9 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from p2gs_jax.config import FitConfig, from_dict
+from p2gs_jax.config import FitConfig, PhotometryConfig, from_dict
 from p2gs_jax.errors import UserError
-from p2gs_jax.export.photometry_json import read_photometry
+from p2gs_jax.export.photometry_json import PhotometryFile, read_photometry
 from p2gs_jax.export.ply import read_ply
 from p2gs_jax.scene import load_scene
 from p2gs_jax.types import GAMMA_SRGB, Params, Photometry, Scene
@@ -34,6 +35,28 @@ class Run:
     cfg: FitConfig
     scene: Scene
     reference: Path | None
+
+
+def resolved(cfg: PhotometryConfig, saved: PhotometryFile) -> PhotometryConfig:
+    """Return the options with the model and curve that the fit chose.
+
+    Raises:
+        UserError: the file names none.
+    """
+    curve, model = saved["curve"], saved["model"]
+    try:
+        spline = curve.get("spline")
+        return dataclasses.replace(
+            cfg,
+            select=False,
+            model=model,  # pyright: ignore[reportArgumentType]
+            curve=curve["name"],
+            spline=None if spline is None else tuple(map(float, spline)),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(
+            f"photometry.json names no tone curve ({error}).", fix="fit again with this version"
+        ) from error
 
 
 def load_run(folder: Path) -> Run:
@@ -63,7 +86,9 @@ def load_run(folder: Path) -> Run:
         ) from error
     scene = load_scene(Path(saved["scene"]), cfg.data, folder / "cache", lambda text: None)
     gaussians = read_ply(folder / "radiance.ply")
-    views = {v["image"]: v for v in read_photometry(folder / "photometry.json")["views"]}
+    photometry_file = read_photometry(folder / "photometry.json")
+    cfg = dataclasses.replace(cfg, photometry=resolved(cfg.photometry, photometry_file))
+    views = {v["image"]: v for v in photometry_file["views"]}
     train = [views.get(scene.views[i].name) for i in scene.train_indices]
     if any(v is None or v["exposure"] is None for v in train):
         raise UserError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TypedDict
+from typing import Any, NotRequired, TypedDict
 
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.atomic import write_json
@@ -22,6 +22,8 @@ class ViewPhotometry(TypedDict):
         exif_ev: log2(t ISO / N^2) from EXIF, or null.
         split: train or test.
         exposure_fitted: for a held-out view, the scalar solved from its photograph.
+        exposure_ev_error: standard error of `exposure_ev` from the bundle adjustment, or null.
+        gamma_error: standard error of `gamma`, or null.
     """
 
     image: str
@@ -32,6 +34,8 @@ class ViewPhotometry(TypedDict):
     exif_ev: float | None
     split: str
     exposure_fitted: float | None
+    exposure_ev_error: NotRequired[float | None]
+    gamma_error: NotRequired[float | None]
 
 
 class PhotometryFile(TypedDict):
@@ -85,8 +89,8 @@ def _problem(data) -> str | None:
     return None
 
 
-def _missing(data, kind: type) -> str | None:
+def _missing(data, kind: Any) -> str | None:
     if not isinstance(data, dict):
         return "not an object"
-    names = [k for k in kind.__annotations__ if k not in data]
+    names = sorted(k for k in kind.__required_keys__ if k not in data)
     return f"{', '.join(names)} missing" if names else None

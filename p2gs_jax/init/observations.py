@@ -9,33 +9,37 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
+from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Scene
 
 # Averaging a few pixels quiets noise and hides the misplacement of a fraction of a pixel.
 PATCH = 3
+# A track's position is uncertain by this much, in pixels of the sampled image; where the image is
+# steep, so is its colour.
+POSITION_DEVIATION = 0.5
 
 
-class TrackColors(NamedTuple):
-    """Display-encoded colours of seed points in the training views.
+class Samples(NamedTuple):
+    """Colours of an image at some positions.
 
     Attributes:
-        views: row in `Photometry` (training views only).
-        points: row in `Scene.points`.
-        colors: [0, 1].
+        colors: bilinear patch averages.
+        spread: standard deviation of `colors` from uncertain positions: gradient times that.
+        valid: inside the image and its mask.
     """
 
-    views: Int[np.ndarray, " o"]
-    points: Int[np.ndarray, " o"]
     colors: Float32[np.ndarray, "o 3"]
+    spread: Float32[np.ndarray, "o 3"]
+    valid: Bool[np.ndarray, " o"]
 
 
 def sample(
     ldr: Float32[np.ndarray, "h w 3"],
     mask: Float32[np.ndarray, "h w"],
     xy: Float[np.ndarray, "o 2"],
-) -> tuple[Float32[np.ndarray, "o 3"], Bool[np.ndarray, " o"]]:
-    """Return bilinear patch averages at pixel positions, and which of them are valid.
+) -> Samples:
+    """Sample an image at pixel positions.
 
     Args:
         ldr: photograph.
@@ -62,12 +66,25 @@ def sample(
         lower = image[top + 1, left] * (1 - f) + image[top + 1, left + 1] * f
         return upper * (1 - g) + lower * g
 
-    return at(smooth).astype(np.float32), inside & (at(mask) > 0.99)
+    slope_x = 0.5 * (smooth[:, 2:] - smooth[:, :-2])
+    slope_y = 0.5 * (smooth[2:] - smooth[:-2])
+    steepness = np.zeros_like(smooth)
+    steepness[:, 1:-1] += slope_x**2
+    steepness[1:-1] += slope_y**2
+    spread = POSITION_DEVIATION * np.sqrt(at(steepness))
+    valid = inside & (at(mask) > 0.99)
+    return Samples(at(smooth).astype(np.float32), spread.astype(np.float32), valid)
+
+
+def camera_rows(scene: Scene) -> Int[np.ndarray, " v"]:
+    """Return the physical camera of each training view as 0, 1, ..."""
+    names = [scene.views[i].camera for i in scene.train_indices]
+    return np.unique(names, return_inverse=True)[1]
 
 
 def track_colors(
     scene: Scene, store: ImageStore, on_view: Callable[[int, int], None] = lambda i, n: None
-) -> TrackColors:
+) -> Observations:
     """Sample every track in every training view.
 
     Args:
@@ -76,7 +93,7 @@ def track_colors(
         on_view: progress: views done, views in all.
     """
     assert scene.tracks is not None
-    views, points, colors = [], [], []
+    views, points, samples = [], [], []
     order = np.argsort(scene.tracks.view_indices, kind="stable")
     bounds = np.searchsorted(scene.tracks.view_indices[order], np.arange(len(scene.views) + 1))
     for row, index in enumerate(scene.train_indices):
@@ -85,18 +102,30 @@ def track_colors(
             ldr, mask = store.get(index, 1)
             view = scene.views[index]
             scale = [mask.shape[1] / view.width, mask.shape[0] / view.height]
-            color, valid = sample(ldr, mask, scene.tracks.xy[pick] * scale)
-            views.append(np.full(int(valid.sum()), row))
-            points.append(scene.tracks.point_indices[pick][valid])
-            colors.append(color[valid])
+            found = sample(ldr, mask, scene.tracks.xy[pick] * scale)
+            views.append(np.full(int(found.valid.sum()), row))
+            points.append(scene.tracks.point_indices[pick][found.valid])
+            samples.append((found.colors[found.valid], found.spread[found.valid]))
         on_view(row + 1, len(scene.train_indices))
-    if not views:
-        return TrackColors(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3), np.float32))
-    return TrackColors(*(np.concatenate(a) for a in (views, points, colors)))
+    return gather(scene, views, points, samples)
+
+
+def gather(scene: Scene, views: list, points: list, samples: list) -> Observations:
+    """Join what was sampled view by view."""
+    empty = np.zeros((0, 3), np.float32)
+    return Observations(
+        views=np.concatenate(views) if views else np.zeros(0, int),
+        points=np.concatenate(points) if points else np.zeros(0, int),
+        colors=np.concatenate([c for c, _ in samples]) if samples else empty,
+        spread=np.concatenate([s for _, s in samples]) if samples else empty,
+        view_count=len(scene.train_indices),
+        point_count=len(scene.points),
+        cameras=camera_rows(scene),
+    )
 
 
 def sample_pairs(
-    tracks: TrackColors, count: int, seed: int
+    tracks: Observations, count: int, seed: int
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
     """Draw pairs of observations of the same point; rows of `tracks`, in different views."""
     order = np.argsort(tracks.points, kind="stable")

@@ -13,12 +13,38 @@ from jaxtyping import Array, Float
 
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.numerics import positive_pow, safe_log
+from p2gs_jax.photometry.response import DARKEST, Response, log_exposed
 from p2gs_jax.types import GAMMA_SRGB
 
 EXPOSED_FLOOR, EXPOSED_CEILING = 1e-6, 10.0  # paper, Tone-mapping estimation
 SRGB_LINEAR_END, SRGB_ENCODED_END = 0.0031308, 0.04045
 # Darkest photographed value that is inverted: half a code of 8 bits.
 LDR_FLOOR = 0.5 / 255.0
+SPLINE_TABLE = 1024
+
+
+def _spline_table(cfg: PhotometryConfig) -> tuple[float, float, np.ndarray]:
+    """Return (first log value, step, display values) of a response over equal steps of log x."""
+    if cfg.spline is None:
+        raise ValueError("the curve 'spline' needs the values of its spline")
+    y = np.linspace(DARKEST, 1.0, 4096)
+    z = np.maximum.accumulate(log_exposed(y, Response("srgb", cfg.spline))[0])
+    z = z + 1e-9 * np.arange(len(z))
+    grid = np.linspace(z[0], z[-1], SPLINE_TABLE)
+    return float(grid[0]), float(grid[1] - grid[0]), np.interp(grid, z, y)
+
+
+def _spline_encode(log_linear: Float[Array, "..."], cfg: PhotometryConfig):
+    """Encode through the table; linear in x below it, linear in log x above it."""
+    first, step, table = _spline_table(cfg)
+    place = (log_linear - first) / step
+    left = jnp.clip(jnp.floor(place), 0, SPLINE_TABLE - 2).astype(jnp.int32)
+    values = jnp.asarray(table, log_linear.dtype)
+    # Above the table the last segment goes on, so that over-bright predictions keep a gradient.
+    inside = values[left] + (place - left) * (values[left + 1] - values[left])
+    dark = place < 0
+    below = table[0] * jnp.exp(jnp.where(dark, log_linear - first, 0.0))
+    return jnp.where(dark, below, inside)
 
 
 def oetf(linear: Float[Array, "..."], curve: str) -> Float[Array, "..."]:
@@ -64,6 +90,8 @@ def tone_map(
         log_linear = log_pivot + (log_x - log_pivot) * (GAMMA_SRGB / gamma)
         if cfg.curve == "power":
             y = jnp.exp(log_linear / GAMMA_SRGB)
+        elif cfg.curve == "spline":
+            y = _spline_encode(log_linear, cfg)
         else:
             toe = log_linear <= float(np.log(SRGB_LINEAR_END))
             low = 12.92 * jnp.exp(jnp.where(toe, log_linear, 0.0))
@@ -79,7 +107,12 @@ def inverse_tone_map(
     y = jnp.maximum(ldr, LDR_FLOOR)
     if cfg.curve == "power" and cfg.pivot == 1.0:
         return jnp.exp(gamma * jnp.log(y))
-    log_linear = jnp.log(eotf(y, cfg.curve))
+    if cfg.curve == "spline":
+        first, step, table = _spline_table(cfg)
+        logs = first + step * np.arange(SPLINE_TABLE)
+        log_linear = jnp.interp(y, jnp.asarray(table, y.dtype), jnp.asarray(logs, y.dtype))
+    else:
+        log_linear = jnp.log(eotf(y, cfg.curve))
     log_pivot = float(np.log(cfg.pivot))
     return jnp.exp(log_pivot + (log_linear - log_pivot) * (gamma / GAMMA_SRGB))
 

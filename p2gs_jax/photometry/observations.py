@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 
 from p2gs_jax.photometry.response import Response, deviation, hat, log_exposed
 
-LONGEST_ROW = 32
+LONGEST_ROW = 16
 ROW_BUCKET = 512
 
 

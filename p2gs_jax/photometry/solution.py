@@ -10,20 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from p2gs_jax.config import PhotometricModel as ModelName
 from p2gs_jax.photometry.bundle_adjustment import Fit, System, Theta, solve
 from p2gs_jax.photometry.observations import Layout, Observations, make_rows
 from p2gs_jax.photometry.response import FREE, KNOTS, Response
 from p2gs_jax.types import GAMMA_SRGB
 
 Level = Literal["camera", "view"]
-ModelName = Literal[
-    "constant",
-    "camera_exposure",
-    "camera_exposure_gamma",
-    "view_exposure",
-    "view_exposure_camera_gamma",
-    "view_exposure_gamma",
-]
 MIN_OBSERVATIONS = 15
 # Standard deviation of a = 2.2 / gamma about 1 (gammas of 1.9 to 2.6 are within one of these).
 A_PRIOR = 0.15
@@ -230,7 +223,7 @@ def solve_model(
         system = make_system(problem, LADDER[name], spline)
         views = problem.observations.view_count
         start = Theta(system.log_exposure, jnp.ones(views), jnp.zeros(len(FREE) if spline else 0))
-        fit = jax.tree.map(np.asarray, solve(rows, system, start))
+        fit = jax.tree.map(np.asarray, solve(rows, system, start, LADDER[name].gamma is not None))
         return fit, jax.tree.map(np.asarray, system)
 
 

@@ -133,6 +133,7 @@ def observe(
     *,
     curve: Curve = "srgb",
     gammas: Float[np.ndarray, " v"] | None = None,
+    pivot: float = 1.0,
     outliers: float = 0.08,
     texture: float = 0.03,
     noise: float = 1.0,
@@ -145,7 +146,8 @@ def observe(
         drive: who sees what.
         exposures: of every view.
         curve: response.
-        gammas: of every view, replacing the curve by x^(1 / gamma) about white.
+        gammas: of every view, replacing the curve by x^(1 / gamma) about the pivot.
+        pivot: linear value that gammas leave alone (encoded by 2.2).
         outliers: share of observations that show another point.
         texture: standard deviation of log radiance between views, common to the channels.
         noise: factor of photon noise and texture.
@@ -161,7 +163,10 @@ def observe(
     exposed = exposed * np.exp(noise * texture * rng.standard_normal((len(p), 1)))
     shot = np.sqrt(SHOT_NOISE * exposed + READ_NOISE)
     exposed = np.maximum(exposed + noise * shot * rng.standard_normal(exposed.shape), 0)
-    ldr = exposed ** (1 / gammas[v][:, None]) if gammas is not None else encode(exposed, curve)
+    if gammas is None:
+        ldr = encode(exposed, curve)
+    else:
+        ldr = pivot ** (1 / 2.2) * (exposed / pivot) ** (1 / gammas[v][:, None])
     ldr = np.clip(ldr, 0, 1)
     if bits is not None:
         ldr = np.round(ldr * (2**bits - 1)) / (2**bits - 1)

@@ -72,7 +72,9 @@ def learning_rates(progress: Array, extent: float, like: Params, cfg: FitConfig)
             sh=sh,
         ),
         photometry=Photometry(
-            o.exposures * gate, o.gammas * gate, like.photometry.parameterization
+            o.exposures * gate * cfg.photometry.model.startswith("view"),
+            o.gammas * gate * (cfg.photometry.model == "view_exposure_gamma"),
+            like.photometry.parameterization,
         ),
     )
 

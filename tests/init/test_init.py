@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import FitConfig, InitConfig, preset
-from p2gs_jax.init.observations import TrackColors, sample, sample_pairs
+from p2gs_jax.init.observations import sample, sample_pairs
 from p2gs_jax.init.seeds import gaussians_from_points, scene_extent, subsample
 from p2gs_jax.init.shell import find_shell
+from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.render import view_radiance
 from p2gs_jax.types import Camera, View
 
@@ -28,28 +29,33 @@ def test_samples_sit_at_pixel_centres():
     ramp = np.repeat(np.linspace(0, 1, 50, dtype=np.float32)[None, :, None], 40, 0)
     image = np.repeat(ramp, 3, 2)
     xy = rng.uniform(4, 36, (100, 2))
-    colors, valid = sample(image, np.ones((40, 50), np.float32), xy)
+    colors, spread, valid = sample(image, np.ones((40, 50), np.float32), xy)
     assert valid.all()
     np.testing.assert_allclose(colors[:, 0], (xy[:, 0] - 0.5) / 49, atol=1e-5)
+    # Half a pixel of misplacement on a ramp of 1/49 a pixel.
+    np.testing.assert_allclose(spread[:, 0], 0.5 / 49, rtol=1e-3)
 
 
 def test_samples_outside_and_masked_are_invalid():
     mask = np.ones((40, 50), np.float32)
     mask[:20] = 0
     xy = np.array([[-3.0, 30], [25, 10], [25, 30], [60, 30], [25, 20.4]])
-    _, valid = sample(np.zeros((40, 50, 3), np.float32), mask, xy)
+    valid = sample(np.zeros((40, 50, 3), np.float32), mask, xy).valid
     assert valid.tolist() == [False, False, True, False, False]
+
+
+def observations(views, points):
+    colors = np.zeros((len(views), 3))
+    return Observations(views, points, colors, colors, 20, 50, np.zeros(20, int))
 
 
 def test_pairs_are_two_views_of_one_point():
     rng = np.random.default_rng(0)
-    tracks = TrackColors(
-        rng.permutation(200) % 20, np.repeat(np.arange(50), 4), rng.uniform(size=(200, 3))
-    )
+    tracks = observations(rng.permutation(200) % 20, np.repeat(np.arange(50), 4))
     i, j = sample_pairs(tracks, 1000, 0)
     assert np.all(tracks.points[i] == tracks.points[j])
     assert np.all(i != j)
-    lonely = TrackColors(np.arange(5), np.arange(5), np.zeros((5, 3)))
+    lonely = observations(np.arange(5), np.arange(5))
     assert len(sample_pairs(lonely, 10, 0)[0]) == 0
 
 

@@ -1,0 +1,200 @@
+"""Photometry alone: exposures, gammas and tone curve of a scene in seconds, without splatting."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.errors import UserError
+from p2gs_jax.export.atomic import write_json
+from p2gs_jax.export.calibration_plot import write_calibration_plot
+from p2gs_jax.export.photometry_json import ViewPhotometry, write_photometry
+from p2gs_jax.init.observations import track_colors
+from p2gs_jax.photometry.agreement import Agreement, compare
+from p2gs_jax.photometry.selection import Selection
+from p2gs_jax.photometry.solution import LN2
+from p2gs_jax.prepare import calibrate_observations
+from p2gs_jax.progress import Reporter, Silent
+from p2gs_jax.scene import load_scene
+from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.known_exposures import read_known_exposures
+from p2gs_jax.types import Scene
+
+WEAK_GAMMA = 0.1
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What `p2gs-jax calibrate` finds.
+
+    Attributes:
+        scene: all its views are used.
+        selection: model, exposures, gammas, errors, reasons.
+        stated_ev: exposures from EXIF or a file, stops; NaN where unknown.
+        agreement: of the two.
+        observations: used.
+        seconds: of reading and sampling, and of the adjustment.
+    """
+
+    scene: Scene
+    selection: Selection
+    stated_ev: np.ndarray
+    agreement: Agreement
+    observations: int
+    seconds: dict[str, float]
+
+    @property
+    def messages(self) -> list[str]:
+        """What the user should know, in plain words."""
+        s = self.selection.solution
+        out = [*self.scene.notes, *self.selection.reasons, *s.warnings]
+        if self.agreement.views:
+            out.append(self.agreement.sentence())
+        return out
+
+
+def calibrate(
+    scene_dir: str | Path,
+    out: str | Path,
+    cfg: FitConfig | None = None,
+    *,
+    compare_with: str | None = None,
+    reporter: Reporter | None = None,
+) -> Calibration:
+    """Solve the photometry of a scene and write `photometry.json` and `calibration.png`.
+
+    Args:
+        scene_dir: COLMAP model, transforms.json, or folder of photographs.
+        out: folder for the results; created.
+        cfg: options (data, photometry and the thresholds of loss); default `robust`.
+        compare_with: stated exposures to compare with: `exif` or a CSV file; default EXIF where
+            photographs carry it.
+        reporter: receives progress.
+
+    Raises:
+        UserError: something the user can mend.
+    """
+    cfg = cfg or FitConfig()
+    cfg = dataclasses.replace(cfg, data=dataclasses.replace(cfg.data, test_every=0))
+    reporter = reporter or Silent()
+    out = Path(out)
+    begin = time.monotonic()
+    reporter.stage("Reading the scene")
+    scene = load_scene(Path(scene_dir), cfg.data, out / "cache", reporter.message)
+    if scene.tracks is None or not len(scene.tracks.xy):
+        raise UserError(
+            f"{scene_dir} has no tracks: which pixels show the same point is not known.",
+            fix="give a COLMAP model with its images.bin, or the photographs alone",
+        )
+    store = ImageStore(scene.views, cfg.data)
+    observations = track_colors(scene, store, lambda i, n: reporter.stage("Sampling tracks", i, n))
+    sampled = time.monotonic()
+    reporter.stage("Photometric bundle adjustment")
+    selection = calibrate_observations(observations, scene, cfg)
+    solved = time.monotonic()
+    stated = _stated(compare_with, scene)
+    s = selection.solution
+    agreement = compare(s.exposures_ev, s.exposure_errors / LN2, stated)
+    result = Calibration(
+        scene,
+        selection,
+        stated,
+        agreement,
+        len(observations.views),
+        {"reading": sampled - begin, "adjustment": solved - sampled},
+    )
+    _write(result, out, cfg)
+    return result
+
+
+def _stated(source: str | None, scene: Scene) -> np.ndarray:
+    views = list(scene.views)
+    if source is None:
+        return np.array([np.nan if v.exif_ev is None else v.exif_ev for v in views], float)
+    return read_known_exposures(source, views) / LN2
+
+
+def view_rows(result: Calibration) -> list[ViewPhotometry]:
+    """Return the views as `photometry.json` lists them."""
+    s = result.selection.solution
+    rows: list[ViewPhotometry] = []
+    for i, view in enumerate(result.scene.views):
+        known = bool(np.isfinite(s.exposure_errors[i]))
+        rows.append(
+            {
+                "image": view.name,
+                "camera": view.camera,
+                "exposure": float(np.exp(s.log_exposures[i])) if known else None,
+                "exposure_ev": float(s.exposures_ev[i]) if known else None,
+                "exposure_ev_error": float(s.exposure_errors[i] / LN2) if known else None,
+                "gamma": float(s.gammas[i]) if known else None,
+                "gamma_error": float(s.gamma_errors[i]) if known else None,
+                "exif_ev": view.exif_ev,
+                "split": "train",
+                "exposure_fitted": None,
+            }
+        )
+    return rows
+
+
+def _write(result: Calibration, out: Path, cfg: FitConfig) -> None:
+    s = result.selection.solution
+    curve = "spline" if s.response.spline is not None else s.response.base
+    exposures = np.exp(s.log_exposures[np.isfinite(s.exposure_errors)])
+    write_photometry(
+        out / "photometry.json",
+        model=s.model,
+        curve={"name": curve, "pivot": cfg.photometry.pivot, "spline": s.response.spline},
+        gauge="mean log exposure is 0 over each connected group of views"
+        if cfg.photometry.known is None
+        else f"known exposures ({cfg.photometry.known})",
+        mean={
+            "exposure_arithmetic": float(exposures.mean()) if len(exposures) else 1.0,
+            "exposure_geometric": float(np.exp(np.log(exposures).mean()))
+            if len(exposures)
+            else 1.0,
+            "gamma": float(s.gammas.mean()),
+        },
+        views=view_rows(result),
+    )
+    write_json(
+        out / "calibration.json",
+        {
+            "messages": result.messages,
+            "observations": result.observations,
+            "seconds": result.seconds,
+            "residual_ev": s.residual_ev,
+            "view_residual_ev": s.view_residual_ev,
+            "outliers": s.outliers,
+            "component": s.component,
+            "observations_per_view": s.observations_per_view,
+            "agreement": result.agreement._asdict(),
+            "candidates": [
+                {
+                    "model": c.model,
+                    "curve": c.response.name,
+                    "parameters": c.parameters,
+                    "density": c.density,
+                    "behind": c.behind,
+                    "behind_error": c.behind_error,
+                }
+                for c in result.selection.candidates
+            ],
+        },
+    )
+    write_calibration_plot(
+        out / "calibration.png",
+        exposures_ev=np.where(np.isfinite(s.exposure_errors), s.exposures_ev, np.nan),
+        errors_ev=np.where(np.isfinite(s.exposure_errors), s.exposure_errors / LN2, np.nan),
+        stated_ev=result.stated_ev,
+        cameras=[v.camera for v in result.scene.views],
+        residual_ev=s.view_residual_ev,
+        response=s.response,
+        gammas=s.gammas,
+        pivot=cfg.photometry.pivot,
+    )

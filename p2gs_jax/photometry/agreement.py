@@ -1,0 +1,85 @@
+"""Do the pixels agree with what the cameras say they did?"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+# A view disagrees when its gap exceeds this, and three standard errors.
+NOTICEABLE_EV = 0.2
+STANDARD_ERRORS = 3.0
+
+
+class Agreement(NamedTuple):
+    """Recovered exposures against stated ones (EXIF), scale aligned.
+
+    Attributes:
+        views: how many have both.
+        correlation: of the two, in stops; NaN where one of them does not vary.
+        slope: recovered over stated, least squares; other than 1 is the power gauge or tone
+            mapping.
+        rms_ev: RMS gap in stops.
+        gap_ev: recovered minus stated, median removed; NaN where either is missing.
+        disagrees: views whose gap is noticeable and significant.
+    """
+
+    views: int
+    correlation: float
+    slope: float
+    rms_ev: float
+    gap_ev: Float[np.ndarray, " v"]
+    disagrees: Bool[np.ndarray, " v"]
+
+    def sentence(self, source: str = "EXIF") -> str:
+        """Say it in words."""
+        if self.views < 2:
+            return f"{source} gives the exposure of {self.views} view(s): nothing to compare."
+        head = (
+            f"{source} of {self.views} views: correlation {self.correlation:.3f}, slope "
+            f"{self.slope:.2f}, RMS {self.rms_ev:.2f} EV."
+        )
+        count = int(self.disagrees.sum())
+        if not count:
+            return head + f" {source} and the pixels agree within {NOTICEABLE_EV:g} EV."
+        worst = float(np.nanmax(np.abs(self.gap_ev)))
+        return head + (
+            f" {source} disagrees with the pixels in {count} of {self.views} views, by up to "
+            f"{worst:.2f} EV."
+        )
+
+
+def compare(
+    exposures_ev: Float[np.ndarray, " v"],
+    errors_ev: Float[np.ndarray, " v"],
+    stated_ev: Float[np.ndarray, " v"],
+) -> Agreement:
+    """Compare recovered with stated exposures.
+
+    Args:
+        exposures_ev: recovered, stops.
+        errors_ev: their standard errors; inf where unknown.
+        stated_ev: stated, stops up to a constant; NaN where unknown.
+    """
+    both = np.isfinite(stated_ev) & np.isfinite(errors_ev)
+    gap = np.full(len(exposures_ev), np.nan)
+    count = int(both.sum())
+    if count < 2:
+        nowhere = np.zeros(len(gap), bool)
+        return Agreement(count, float("nan"), float("nan"), float("nan"), gap, nowhere)
+    a, b = exposures_ev[both], stated_ev[both]
+    difference = a - b
+    gap[both] = difference - np.median(difference)
+    a, b = a - a.mean(), b - b.mean()
+    varies = a @ a > 1e-9 and b @ b > 1e-9
+    with np.errstate(invalid="ignore"):
+        disagrees = np.abs(gap) > np.maximum(NOTICEABLE_EV, STANDARD_ERRORS * errors_ev)
+    return Agreement(
+        count,
+        float(a @ b / np.sqrt((a @ a) * (b @ b))) if varies else float("nan"),
+        float(a @ b / (b @ b)) if varies else float("nan"),
+        float(np.sqrt(np.mean((difference - difference.mean()) ** 2))),
+        gap,
+        disagrees & both,
+    )

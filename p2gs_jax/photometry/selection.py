@@ -1,0 +1,282 @@
+"""Model only what the scene needs: ladder of models times base curves, judged on held-out colours.
+
+Criterion: expected log predictive density of held-out observations in display units, so that
+models under different curves can be compared. The simplest model within max(2 standard errors,
+0.01 nat) of the best is taken; the best itself over-selects (PHOTOMETRY section 5). Curve and model
+are chosen together: a wrong curve fixed first drives every criterion to a gamma per view.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from p2gs_jax.photometry.bundle_adjustment import Fit
+from p2gs_jax.photometry.observations import Observations
+from p2gs_jax.photometry.response import (
+    BASES,
+    Response,
+    deviation,
+    log_exposed,
+    log_slope_minimum,
+    monotone,
+)
+from p2gs_jax.photometry.solution import (
+    LADDER,
+    LN2,
+    KnownExposures,
+    ModelName,
+    PhotometricSolution,
+    Problem,
+    fit_model,
+    fit_response,
+    make_problem,
+    solve_model,
+)
+
+HELD_OUT = 0.2
+STANDARD_ERRORS, SMALLEST_GAIN = 2.0, 0.01
+# The predictive density is a mixture: outliers exist, and must not decide.
+OUTLIERS, OUTLIER_DEVIATION = 0.1, 1.2
+# A response needs this spread of exposures (stops), and may not collapse.
+SPLINE_SPREAD_EV, SPLINE_SLOPE = 0.2, 0.5
+# Candidates are compared on at most this many observations; the chosen one is solved on all.
+MOST_OBSERVATIONS = 80_000
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One model under one curve.
+
+    Attributes:
+        model: what varies.
+        response: base curve and spline.
+        parameters: free parameters, gauges not counted.
+        density: mean held-out log density, nat per observation.
+        behind: how far behind the best candidate, nat per observation.
+        behind_error: standard error of that, over views.
+    """
+
+    model: ModelName
+    response: Response
+    parameters: int
+    density: float
+    behind: float
+    behind_error: float
+
+    def density_gap(self, other: Candidate) -> float:
+        """Return by how much another candidate predicts better, nat per observation."""
+        return other.density - self.density
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What was chosen, and why.
+
+    Attributes:
+        solution: the chosen model on all observations.
+        candidates: everything compared, the best density first.
+        reasons: sentences for the user.
+    """
+
+    solution: PhotometricSolution
+    candidates: tuple[Candidate, ...]
+    reasons: tuple[str, ...]
+
+
+def parameter_count(model: ModelName, response: Response, cameras: int, views: int) -> int:
+    """Return free parameters; each level loses one to its gauge."""
+    size = {None: 0, "camera": cameras - 1, "view": views - 1}
+    return sum(size[level] for level in LADDER[model]) + response.extra_parameters
+
+
+def _densities(
+    problem: Problem, fit: Fit, response: Response, held: np.ndarray, scale: float
+) -> Float[np.ndarray, " h"]:
+    """Return log densities of the held-out observations, NaN where nothing can be said."""
+    o, layout = problem.observations, problem.layout
+    y = np.asarray(o.colors, np.float64)[held]
+    _, slope = log_exposed(y, response)
+    residual = layout.take(fit.residual)[held]
+    precision = fit.precision[layout.row[held]]
+    a = fit.theta.a[o.views[held]][:, None]
+    ideal = layout.take(stated_deviation(problem, response))[held]
+    variance = (scale * ideal) ** 2 + (scale * a) ** 2 / np.maximum(precision, 1e-9)
+    known = (problem.usable[held] > 0) & (precision > 1e-3)
+
+    def normal(v):
+        return -0.5 * residual**2 / v - 0.5 * np.log(2 * np.pi * v)
+
+    mixture = np.logaddexp(
+        np.log(1 - OUTLIERS) + normal(variance),
+        np.log(OUTLIERS) + normal(variance + OUTLIER_DEVIATION**2),
+    )
+    density = mixture + np.log(np.maximum(slope, 1e-3))
+    # Channels are correlated: an observation counts once, as their mean.
+    count = known.sum(1)
+    return np.where(count > 0, (density * known).sum(1) / np.maximum(count, 1), np.nan)
+
+
+def stated_deviation(problem: Problem, response: Response) -> Float[np.ndarray, "r m 3"]:
+    """Return the stated standard deviation of every slot under a response."""
+    o = problem.observations
+    y = np.asarray(o.colors, np.float64)
+    _, slope = log_exposed(y, response)
+    return problem.layout.place(deviation(y, slope, o.spread, response.base), 1.0)
+
+
+def _subset(observations: Observations, seed: int) -> Observations:
+    """Return the observations of randomly chosen points, not more than MOST_OBSERVATIONS."""
+    o = observations
+    if len(o.points) <= MOST_OBSERVATIONS:
+        return o
+    rng = np.random.default_rng((seed, 5))
+    order = rng.permutation(o.point_count)
+    lengths = np.bincount(o.points, minlength=o.point_count)[order]
+    kept = order[np.cumsum(lengths) <= MOST_OBSERVATIONS]
+    chosen = np.zeros(o.point_count, bool)
+    chosen[kept] = True
+    pick = chosen[o.points]
+    return Observations(
+        o.views[pick],
+        o.points[pick],
+        o.colors[pick],
+        o.spread[pick],
+        o.view_count,
+        o.point_count,
+        o.cameras,
+    )
+
+
+def _responses(problem: Problem, use, notes: list[str]) -> list[Response]:
+    """Return the base curves, and the fitted spline where it can be identified."""
+    out = [Response(base) for base in BASES]
+    fit, _ = solve_model(problem, "view_exposure", out[0], use=use)
+    spread = float(np.std(fit.theta.b)) / LN2
+    if spread < SPLINE_SPREAD_EV:
+        notes.append(
+            f"Exposures differ by {spread:.2f} EV (standard deviation): too little to tell the "
+            "shape of the tone curve, so only standard curves were tried."
+        )
+        return out
+    spline = fit_response(problem, out[0], use)
+    if monotone(spline) and log_slope_minimum(spline) > SPLINE_SLOPE:
+        out.append(spline)
+    else:
+        notes.append("A fitted tone curve collapsed; only standard curves were compared.")
+    return out
+
+
+def select(
+    observations: Observations,
+    *,
+    black: float,
+    saturation: float,
+    pivot: float,
+    known: KnownExposures | None = None,
+    seed: int = 0,
+    fixed: tuple[ModelName, Response] | None = None,
+) -> Selection:
+    """Choose model and curve on held-out observations and solve the choice on all of them.
+
+    Args:
+        observations: colours of shared points.
+        black: values up to here say nothing.
+        saturation: values from here on say nothing.
+        pivot: linear value that gamma leaves alone.
+        known: exposures known beforehand; used in the final solution only.
+        seed: which observations are held out.
+        fixed: solve this model under this curve instead of choosing.
+    """
+    if fixed is not None:
+        problem = make_problem(
+            observations, black=black, saturation=saturation, pivot=pivot, known=known
+        )
+        return Selection(fit_model(problem, *fixed), (), ())
+    small = make_problem(
+        _subset(observations, seed), black=black, saturation=saturation, pivot=pivot
+    )
+    o = small.observations
+    held = np.random.default_rng((seed, 7)).random(len(o.points)) < HELD_OUT
+    use = (~held).astype(np.float64)
+    notes: list[str] = []
+    curves = _responses(small, use, notes)
+    fits: dict[tuple[ModelName, Response], Fit] = {
+        (model, curve): solve_model(small, model, curve, use=use)[0]
+        for curve in curves
+        for model in LADDER
+    }
+    scale = min(float(f.scale) for f in fits.values())
+    where = np.flatnonzero(held)
+    density = {k: _densities(small, f, k[1], where, scale) for k, f in fits.items()}
+    mean = {k: float(np.nanmean(d)) for k, d in density.items()}
+    best = max(mean, key=lambda k: mean[k])
+    cameras, views = int(o.cameras.max()) + 1, o.view_count
+    candidates = []
+    for (model, curve), d in density.items():
+        behind, error = _behind(density[best], d, o.views[where], views)
+        count = parameter_count(model, curve, cameras, views)
+        candidates.append(Candidate(model, curve, count, mean[model, curve], behind, error))
+    chosen = choose(candidates)
+    candidates.sort(key=lambda c: -c.density)
+    problem = make_problem(
+        observations, black=black, saturation=saturation, pivot=pivot, known=known
+    )
+    solution = fit_model(problem, chosen.model, chosen.response)
+    return Selection(solution, tuple(candidates), (*notes, *_reasons(chosen, candidates)))
+
+
+def choose(candidates: list[Candidate]) -> Candidate:
+    """Return the simplest candidate that is not clearly worse than the best."""
+
+    def good(c: Candidate) -> bool:
+        return c.behind <= max(STANDARD_ERRORS * c.behind_error, SMALLEST_GAIN)
+
+    ordered = sorted(candidates, key=lambda c: (c.parameters, -c.density))
+    first = next(c for c in ordered if good(c))
+    # Curves cost nothing within a model: take the best of them.
+    same = [c for c in candidates if (c.model, c.parameters) == (first.model, first.parameters)]
+    return max(same, key=lambda c: c.density)
+
+
+def _behind(best, other, views, view_count: int) -> tuple[float, float]:
+    """Return the mean difference and its standard error, clustered by view."""
+    difference = best - other
+    known = np.isfinite(difference)
+    if not known.any():
+        return 0.0, np.inf
+    sums = np.bincount(views[known], difference[known], view_count)
+    error = sums.std() * np.sqrt(view_count) / known.sum()
+    return float(difference[known].mean()), float(error)
+
+
+WORDS: dict[ModelName, str] = {
+    "constant": "one exposure for all views",
+    "camera_exposure": "an exposure per camera",
+    "camera_exposure_gamma": "an exposure and a gamma per camera",
+    "view_exposure": "an exposure per view",
+    "view_exposure_camera_gamma": "an exposure per view and a gamma per camera",
+    "view_exposure_gamma": "an exposure and a gamma per view",
+}
+
+
+def _reasons(chosen: Candidate, candidates: list[Candidate]) -> list[str]:
+    out = [f"Chosen: {WORDS[chosen.model]}, {chosen.response.name} curve."]
+    simpler = [c for c in candidates if c.parameters < chosen.parameters]
+    if simpler:
+        c = max(simpler, key=lambda c: c.density)
+        out.append(
+            f"Simpler ({WORDS[c.model]}, {c.response.name}) predicts held-out colours worse by "
+            f"{c.density_gap(chosen):.3f} nat an observation."
+        )
+    richer = [c for c in candidates if c.parameters > chosen.parameters]
+    if richer:
+        c = max(richer, key=lambda c: c.density)
+        out.append(
+            f"Richer ({WORDS[c.model]}, {c.response.name}) would gain "
+            f"{-c.density_gap(chosen):.3f} nat for {c.parameters - chosen.parameters} more "
+            "parameters."
+        )
+    return out

@@ -1,0 +1,45 @@
+"""The model is as rich as the scene needs, and the user is told why."""
+
+import numpy as np
+import pytest
+
+from p2gs_jax.photometry.response import Response
+from p2gs_jax.photometry.selection import Candidate, choose, select
+from p2gs_jax.synth.drive import make_drive, make_exposures, observe
+
+LIMITS = {"black": 4 / 255, "saturation": 250 / 255, "pivot": 0.18}
+DRIVE = make_drive(20, 1200)
+
+CASES = [
+    ("constant", "srgb", None, "constant", None),
+    ("cameras", "power", None, "camera_exposure", "power"),
+    ("iso4", "srgb", None, "view_exposure", "srgb"),
+    ("iso2", "filmic", None, "view_exposure", "spline over srgb"),
+    ("iso2", "power", "camera", "view_exposure_camera_gamma", "power"),
+]
+
+
+@pytest.mark.parametrize(("exposures", "curve", "gamma", "model", "response"), CASES)
+def test_what_varies_is_found(exposures, curve, gamma, model, response):
+    truth = make_exposures(DRIVE, exposures)
+    gammas = None if gamma is None else np.array([2.0, 2.2, 2.45])[DRIVE.cameras]
+    s = select(observe(DRIVE, truth, curve=curve, gammas=gammas), **LIMITS)
+    assert s.solution.model == model
+    if response is not None:
+        assert s.solution.response.name == response
+    assert any(r.startswith("Chosen:") for r in s.reasons)
+    if exposures == "constant":
+        assert any("too little to tell the shape" in r for r in s.reasons)
+
+
+def candidate(model, parameters, density, behind, error):
+    return Candidate(model, Response(), parameters, density, behind, error)
+
+
+def test_the_simplest_that_is_not_clearly_worse_wins():
+    simple = candidate("constant", 0, -1.0, 0.5, 0.01)
+    middle = candidate("camera_exposure", 2, -0.51, 0.008, 0.001)
+    rich = candidate("view_exposure", 40, -0.5, 0.0, 0.0)
+    assert choose([rich, simple, middle]) is middle
+    # Two standard errors count, where they are more than the smallest gain.
+    assert choose([rich, candidate("constant", 0, -0.6, 0.1, 0.06), middle]).model == "constant"
