@@ -17,7 +17,7 @@ from p2gs_jax.export.photometry_json import ViewPhotometry, write_photometry
 from p2gs_jax.init.observations import track_colors
 from p2gs_jax.photometry.agreement import Agreement, compare
 from p2gs_jax.photometry.selection import Selection
-from p2gs_jax.photometry.solution import LN2
+from p2gs_jax.photometry.solution import LADDER, LN2
 from p2gs_jax.prepare import calibrate_observations
 from p2gs_jax.progress import Reporter, Silent
 from p2gs_jax.scene import load_scene
@@ -26,6 +26,8 @@ from p2gs_jax.scene.known_exposures import read_known_exposures
 from p2gs_jax.types import Scene
 
 WEAK_GAMMA = 0.1
+LEVELS = (0.05, 0.1, 0.18, 0.3, 0.5, 0.8)
+BETTER = 0.8
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,7 @@ class Calibration:
         selection: model, exposures, gammas, errors, reasons.
         stated_ev: exposures from EXIF or a file, stops; NaN where unknown.
         agreement: of the two.
+        level_note: where in the tonal range they agree better, if anywhere.
         observations: used.
         seconds: of reading and sampling, and of the adjustment.
     """
@@ -45,6 +48,7 @@ class Calibration:
     selection: Selection
     stated_ev: np.ndarray
     agreement: Agreement
+    level_note: list[str]
     observations: int
     seconds: dict[str, float]
 
@@ -55,6 +59,7 @@ class Calibration:
         out = [*self.scene.notes, *self.selection.reasons, *s.warnings]
         if self.agreement.views:
             out.append(self.agreement.sentence())
+            out += self.level_note
         return out
 
 
@@ -105,11 +110,30 @@ def calibrate(
         selection,
         stated,
         agreement,
+        _level_note(selection, stated, agreement, cfg.photometry.pivot),
         len(observations.views),
         {"reading": sampled - begin, "adjustment": solved - sampled},
     )
     _write(result, out, cfg)
     return result
+
+
+def _level_note(selection: Selection, stated, agreement: Agreement, pivot: float) -> list[str]:
+    """Say at which level stated exposures agree best, where gammas make them depend on it."""
+    s = selection.solution
+    if LADDER[s.model].gamma is None or agreement.views < 3:
+        return []
+    errors = s.exposure_errors / LN2
+    options = {x: compare(s.exposures_ev_at(x, pivot), errors, stated) for x in LEVELS}
+    level = min(options, key=lambda x: options[x].rms_ev)
+    best = options[level]
+    if not best.rms_ev < BETTER * agreement.rms_ev:
+        return []
+    return [
+        f"Read at a linear value of {level:g} instead of {pivot:g}, correlation is "
+        f"{best.correlation:.3f}, slope {best.slope:.2f}, RMS {best.rms_ev:.2f} EV: the cameras "
+        "did not only change exposure, they also moved other tones against it."
+    ]
 
 
 def _stated(source: str | None, scene: Scene) -> np.ndarray:

@@ -27,6 +27,7 @@ from p2gs_jax.render.host import make_renderer
 from p2gs_jax.run_folder import load_run
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.static_stack import calibrate_stack, write_stack
 
 
 def _out() -> Console:
@@ -47,10 +48,38 @@ def calibrate_command(
     scene: Path, out: Path, cfg: FitConfig, compare_with: str | None, static: bool
 ) -> int:
     """Solve the photometry alone; print it as a table."""
+    if static:
+        return _static_command(scene, out, cfg, compare_with)
     with TerminalReporter() as reporter:
         result = calibrate(scene, out, cfg, compare_with=compare_with, reporter=reporter)
     print_calibration(result)
     _out().print(f"Results: {out} (open {out / 'calibration.png'} first)")
+    return 0
+
+
+def _static_command(folder: Path, out: Path, cfg: FitConfig, compare_with: str | None) -> int:
+    with TerminalReporter() as reporter:
+        reporter.stage("Solving the stack")
+        result = calibrate_stack(folder, known=cfg.photometry.known, compare_with=compare_with)
+        write_stack(result, out)
+    console, s = _out(), result.solution
+    table = Table(title="Exposures in stops from their mean", title_justify="left")
+    table.add_column("frame")
+    for name in ("exposure", "stated", "usable points", "signal"):
+        table.add_column(name, justify="right")
+    for i, name in enumerate(result.names):
+        error = s.exposure_errors[i] / np.log(2)
+        table.add_row(
+            name,
+            f"{s.exposures_ev[i]:+.2f} +- {error:.2f}" if np.isfinite(error) else "unknown",
+            f"{result.stated_ev[i]:+.2f}" if np.isfinite(result.stated_ev[i]) else "",
+            str(s.observations_per_view[i]),
+            "yes" if result.signal[i] else "little",
+        )
+    console.print(table)
+    for message in result.messages:
+        console.print(message)
+    console.print(f"Response: {s.response.name}; residual {s.residual_ev:.2f} EV. Results: {out}")
     return 0
 
 

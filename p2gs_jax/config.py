@@ -95,7 +95,7 @@ class PhotometryConfig:
     curve: Literal["power", "srgb", "spline"] = "srgb"
     """Base tone curve; `power` with pivot 1 is the paper's x^(1/gamma)."""
     spline: tuple[float, ...] | None = None
-    """Log exposure that `spline` adds to sRGB's at its ten knots (photometry/response.py)."""
+    """Log exposure that `spline` adds to sRGB's at its knots (photometry/response.py)."""
     known: str | None = None
     """Exposures known beforehand: a CSV file (image, exposure or ev), or `exif`."""
     known_deviation_ev: float = 0.0

@@ -90,7 +90,7 @@ def write_calibration_plot(
     srgb = log_exposed(y, Response())[0] / np.log(2)
     right.plot(srgb, y, "k--", lw=0.9, label="sRGB")
     right.set_title(f"Tone curve: {response.name}", loc="left", fontsize=10)
-    right.set_xlabel("exposed radiance, stops below white")
+    right.set_xlabel("log2 of the exposed radiance (0: white)")
     right.set_ylabel("photographed value")
     right.set_xlim(-9, 1)
     right.grid(alpha=0.25)

@@ -9,6 +9,9 @@ from typing import Any, NotRequired, TypedDict
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.atomic import write_json
 
+# Absent from files of runs without a bundle adjustment.
+OPTIONAL = frozenset({"exposure_ev_error", "gamma_error"})
+
 
 class ViewPhotometry(TypedDict):
     """One view.
@@ -92,5 +95,5 @@ def _problem(data) -> str | None:
 def _missing(data, kind: Any) -> str | None:
     if not isinstance(data, dict):
         return "not an object"
-    names = sorted(k for k in kind.__required_keys__ if k not in data)
+    names = [k for k in kind.__annotations__ if k not in data and k not in OPTIONAL]
     return f"{', '.join(names)} missing" if names else None

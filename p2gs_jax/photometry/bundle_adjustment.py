@@ -23,7 +23,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from p2gs_jax.photometry.observations import Rows
-from p2gs_jax.photometry.response import FREE, KNOTS
+from p2gs_jax.photometry.response import FLOOR, FREE, KNOTS, SMALLEST_SLOPE
 
 L1_ROUNDS, MOST_ROUNDS = 4, 60
 TOLERANCE = 1e-5
@@ -107,6 +107,7 @@ class _Local(NamedTuple):
 
     weight: Float[Array, "r m 3"]
     sigma: Float[Array, "r m 3"]
+    slope: Float[Array, "r m 3"]
     residual: Float[Array, "r m 3"]
     radiance: Float[Array, "r 3"]
     precision: Float[Array, "r 3"]
@@ -135,10 +136,14 @@ def masked_median(values: Float[Array, "..."], used: Float[Array, "..."]) -> Flo
     return jnp.exp(0.5 * (low + high))
 
 
-def _bend(rows: Rows, c: Float[Array, " k"]):
-    """Return what the spline adds to z, and its change of the standard deviation."""
+def _bent(rows: Rows, c: Float[Array, " k"]):
+    """Return z, its standard deviation and dz/dy under the spline."""
     full = jnp.zeros(len(KNOTS)).at[np.array(FREE)].set(c)
-    return (1 - rows.fraction) * full[rows.knot] + rows.fraction * full[rows.knot + 1]
+    z = rows.z + (1 - rows.fraction) * full[rows.knot] + rows.fraction * full[rows.knot + 1]
+    steeper = (jnp.diff(full) / np.diff(KNOTS))[rows.knot]
+    slope = jnp.maximum(rows.slope + steeper, SMALLEST_SLOPE * rows.slope)
+    of_pixel = jnp.maximum(rows.sigma**2 - FLOOR**2, 0) * (slope / rows.slope) ** 2
+    return z, jnp.sqrt(of_pixel + FLOOR**2), slope
 
 
 def _hats(rows: Rows) -> Float[Array, "r m 3 k"]:
@@ -163,24 +168,26 @@ def _local(rows: Rows, theta: Theta, weight, gm) -> _Local:
         weight: from the round before; decides the point radiances that residuals are taken from.
         gm: true for Geman-McClure, false for L1.
     """
-    z = rows.z + _bend(rows, theta.c) if theta.c.size else rows.z
+    z, sigma, slope = rows.z, rows.sigma, rows.slope
+    if theta.c.size:
+        z, sigma, slope = _bent(rows, theta.c)
     radiance, _ = _radiance(rows, theta, z, weight)
     a, b = theta.a[rows.views][..., None], theta.b[rows.views][..., None]
     residual = z - b - a * radiance[:, None]
-    u = residual / rows.sigma
+    u = residual / sigma
     scale = jnp.maximum(1.4826 * masked_median(jnp.abs(u), rows.weight), SMALLEST_SCALE)
     l1 = 1 / jnp.maximum(jnp.abs(u) / scale, 0.5)
     # One weight for the whole observation: an outlier is wrong in all channels.
     channels = jnp.maximum(jnp.sum(rows.weight, -1), 1)
     square = jnp.sum(u**2 * rows.weight, -1) / channels / (GEMAN_MCCLURE * scale) ** 2
     robust = (1 / (1 + square) ** 2)[..., None]
-    weight = rows.weight / rows.sigma**2 * jnp.where(gm, robust, l1)
+    weight = rows.weight / sigma**2 * jnp.where(gm, robust, l1)
     radiance, precision = _radiance(rows, theta, z, weight)
     used = jnp.sum(rows.weight, -1) > 0
     bent = jnp.where(used, (1 - 3 * square) / (1 + square) ** 3, 0)
     curvature = jnp.sum(bent) / jnp.maximum(jnp.sum(jnp.where(used, robust[..., 0], 0)), 1e-9)
     residual = z - b - a * radiance[:, None]
-    return _Local(weight, rows.sigma, residual, radiance, precision, scale, curvature)
+    return _Local(weight, sigma, slope, residual, radiance, precision, scale, curvature)
 
 
 def _pair_sums(rows: Rows, factors: Float[Array, "r m f x"], views: int) -> Float[Array, "d d"]:
@@ -257,8 +264,27 @@ def _assemble(rows: Rows, theta: Theta, local: _Local, gammas: bool):
     )
     side = jnp.concatenate([h_bc - s_bc, h_ac - s_ac])
     g_c = -jnp.einsum("rmc,rmck->k", w * residual, hats)
+    v_log, h_log = _log_slopes(rows, local)
+    g_c, h_cc = g_c + v_log, h_cc + h_log
     normal = jnp.block([[normal, side], [side.T, h_cc - s_cc]])
     return normal, jnp.concatenate([right, g_c])
+
+
+def _log_slopes(rows: Rows, local: _Local):
+    """Return gradient and curvature of the sum of log dz/dy over the spline's free knots.
+
+    A density over photographed values carries the slope of the transform. Without it, a curve that
+    is flat nearly everywhere and jumps once explains everything: the residuals vanish with it.
+    """
+    intervals = len(KNOTS) - 1
+    share = local.weight * local.sigma**2 * local.scale**2
+
+    def per_interval(values):
+        return jax.ops.segment_sum(values.reshape(-1), rows.knot.reshape(-1), intervals)
+
+    steps = np.diff(np.eye(len(KNOTS)), axis=0)[:, list(FREE)] / np.diff(KNOTS)[:, None]
+    first, second = (per_interval(share / local.slope**k) for k in (1, 2))
+    return steps.T @ first, steps.T @ (second[:, None] * steps)
 
 
 def _known(system: System, theta: Theta, normal, right):

@@ -69,6 +69,7 @@ class Rows(eqx.Module):
         weight: 1 used, 0 masked, held out or empty.
         knot: left spline knot.
         fraction: of the way to the next knot.
+        slope: dz/dy under the base curve.
     """
 
     views: Int[Array, "r m"]
@@ -77,6 +78,7 @@ class Rows(eqx.Module):
     weight: Float[Array, "r m 3"]
     knot: Int[Array, "r m 3"]
     fraction: Float[Array, "r m 3"]
+    slope: Float[Array, "r m 3"]
 
 
 class Layout:
@@ -138,4 +140,5 @@ def make_rows(
         weight=jnp.asarray(layout.place(np.asarray(weight, np.float64))),
         knot=jnp.asarray(layout.place(knot.astype(np.int32))),
         fraction=jnp.asarray(layout.place(fraction)),
+        slope=jnp.asarray(layout.place(slope, 1.0)),
     )

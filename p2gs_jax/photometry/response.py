@@ -15,8 +15,13 @@ from jaxtyping import Float, Int
 Base = Literal["srgb", "power"]
 BASES: tuple[Base, ...] = ("srgb", "power")
 # The spline's knots in display values; two of them are held, which fixes scale and power.
-KNOTS = np.array([0.02, 0.08, 0.16, 0.26, 0.38, 0.5, 0.62, 0.74, 0.86, 0.98])
-HELD = (3, 7)
+KNOTS = np.array(
+    [
+        *(0.02, 0.05, 0.08, 0.12, 0.16, 0.21, 0.26, 0.32, 0.38, 0.44),
+        *(0.5, 0.56, 0.62, 0.68, 0.74, 0.8, 0.86, 0.9, 0.94, 0.98),
+    ]
+)
+HELD = (6, 16)
 FREE = tuple(k for k in range(len(KNOTS)) if k not in HELD)
 DARKEST = 0.5 / 255
 # Noise model: 8-bit quantisation, photon and read noise (linear units), and a floor in log units

@@ -23,7 +23,7 @@ A_PRIOR = 0.15
 # A known exposure that is to be kept: stops.
 FIXED_EV = 1e-5
 # Smoothness of the spline relative to its mean information.
-BEND = 3e-3
+BEND, BEND_SPACING = 3e-3, 0.12
 LN2 = float(np.log(2.0))
 
 
@@ -104,6 +104,19 @@ class PhotometricSolution:
     def exposures_ev(self) -> Float[np.ndarray, " v"]:
         """Exposures in stops."""
         return self.log_exposures / LN2
+
+    def exposures_ev_at(self, level: float, pivot: float) -> Float[np.ndarray, " v"]:
+        """Return exposures in stops as they act on one level of tone.
+
+        Where gammas differ between views, "the exposure" depends on where it is read: at the
+        pivot by definition, at another level it includes what gamma does there.
+
+        Args:
+            level: linear value of the base curve, 1 = white.
+            pivot: linear value that gammas leave alone.
+        """
+        a = GAMMA_SRGB / self.gammas
+        return (self.log_exposures + np.log(level / pivot) * (1 - 1 / a)) / LN2
 
 
 class Problem(NamedTuple):
@@ -188,7 +201,10 @@ def make_system(problem: Problem, model: Model, spline: bool) -> System:
         if (precision[members] > 0).sum() < 2 or np.ptp(log_exposure[members]) < 1e-3:
             anchors[views + label, views:] = members / members.sum()
             targets[views + label] = 1.0
-    second = np.diff(np.eye(len(KNOTS)), 2, axis=0)[:, list(FREE)]
+    gaps = np.diff(KNOTS)
+    second = np.diff(np.diff(np.eye(len(KNOTS)), axis=0) / gaps[:, None], axis=0)[:, list(FREE)]
+    between = 0.5 * (gaps[1:] + gaps[:-1])
+    second = second * (BEND_SPACING**1.5 / np.sqrt(between))[:, None]
     return System(
         basis=jnp.asarray(basis),
         anchors=jnp.asarray(anchors),
