@@ -63,7 +63,7 @@ def without_frame(result: StackResult, frame: int, times: np.ndarray):
             pivot=PIVOT,
             known=KnownExposures(known),
         )
-        response = fit_response(problem, Response("srgb"))
+        response = fit_response(problem, Response("srgb")) or Response("srgb")
         solved = fit_model(problem, "view_exposure", response)
         level = solved.point_log_radiance[:, channel]
         predicted[:, channel] = predict(np.log(times[frame]), level, response)

@@ -20,7 +20,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.alignment import fit_exposure
 from p2gs_jax.evaluate.evaluate import ViewResult, evaluate, mean_parameters
 from p2gs_jax.export.atomic import write_json
-from p2gs_jax.finish import load_reference, tone_function, write_view
+from p2gs_jax.finish import find_radiance, load_reference, tone_function, write_view
 from p2gs_jax.pipeline import fit
 from p2gs_jax.progress import TerminalReporter
 from p2gs_jax.render.host import make_renderer
@@ -141,6 +141,13 @@ def print_metrics(metrics: dict, out: Path) -> None:
         row("all", f"reference photographs, {name.replace('_', ' ')}", part)
         row("held out", f"reference photographs, {name.replace('_', ' ')}", part["test"])
     console.print(table)
+    hdr = metrics.get("radiance")
+    if hdr:
+        console.print(
+            f"Radiance against HDR truth: {hdr['stops_median']:.3f} stops median, "
+            f"{hdr['stops_rms']:.3f} RMS; PU21 {hdr['pu21_psnr']:.2f} dB / {hdr['pu21_ssim']:.4f}; "
+            f"colour difference {hdr['delta_e_itp']:.1f} Delta E ITP."
+        )
     counts = metrics.get("counts", {})
     if counts:
         console.print(
@@ -211,6 +218,7 @@ def eval_command(run_dir: Path, reference: Path | None) -> int:
             make_renderer(run.cfg.render),
             run.cfg,
             reference=truth,
+            radiance=find_radiance(run.scene, run.cfg),
             on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
         )
     path = run_dir / "metrics.json"

@@ -7,14 +7,16 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import jax.numpy as jnp
 import numpy as np
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.evaluate import MeanParameters, ViewResult, evaluate, mean_parameters
+from p2gs_jax.evaluate.radiance import Truth
 from p2gs_jax.export.atomic import write_json
-from p2gs_jax.export.exr import write_exr
+from p2gs_jax.export.exr import read_exr, write_exr
 from p2gs_jax.export.photometry_json import ViewPhotometry, write_photometry
 from p2gs_jax.export.ply import write_radiance, write_splats
 from p2gs_jax.export.png import write_png
@@ -64,6 +66,29 @@ def load_reference(folder: str | Path, scene: Scene, cfg: FitConfig) -> Referenc
     store = ImageStore(tuple(rows[r] for r in order), cfg.data)
     where = {r: i for i, r in enumerate(order)}
     return lambda row: store.get(where[row], 1)[0] if row in where else None
+
+
+def find_radiance(scene: Scene, cfg: FitConfig) -> Truth | None:
+    """Return true linear radiance by view row where the scene carries it (`truth/linear`).
+
+    Synthetic scenes do; it is used for judging only.
+    """
+    folder = scene.root / "truth" / "linear"
+    if not folder.is_dir():
+        return None
+    store = ImageStore(scene.views, cfg.data)
+
+    def radiance(row: int) -> np.ndarray | None:
+        path = (folder / scene.views[row].name).with_suffix(".exr")
+        if not path.is_file():
+            return None
+        linear, _ = read_exr(path)
+        camera = camera_of(store, row)
+        if linear.shape[:2] == (camera.height, camera.width):
+            return linear
+        return cv2.resize(linear, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+
+    return radiance
 
 
 def tone_function(exposure: float, gamma: float, cfg: FitConfig):
@@ -183,6 +208,7 @@ def finish(
         make_renderer(cfg.render),
         cfg,
         reference=truth,
+        radiance=find_radiance(prepared.scene, cfg),
         on_view=on_view,
         on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
     )

@@ -17,12 +17,7 @@ from p2gs_jax.export.photometry_json import write_photometry
 from p2gs_jax.init.observations import sample
 from p2gs_jax.photometry.agreement import compare
 from p2gs_jax.photometry.observations import Observations
-from p2gs_jax.photometry.response import (
-    Response,
-    log_exposed,
-    log_slope_minimum,
-    monotone,
-)
+from p2gs_jax.photometry.response import Response, log_exposed
 from p2gs_jax.photometry.solution import (
     LN2,
     KnownExposures,
@@ -402,7 +397,7 @@ def choose_response(problem: Problem) -> tuple[Response, list[str]]:
     options = []
     for base in (Response("srgb"), Response("power")):
         bent = fit_response(problem, base)
-        if monotone(bent) and log_slope_minimum(bent) > 0.2:
+        if bent is not None:
             options.append(bent)
     if not options:
         return Response(), ["A fitted response collapsed: sRGB was used as it is."]

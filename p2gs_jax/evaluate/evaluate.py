@@ -19,7 +19,8 @@ from jaxtyping import Bool, Float32
 from p2gs_jax.config import FitConfig
 from p2gs_jax.evaluate.alignment import fit_exposure
 from p2gs_jax.evaluate.metrics import psnr, ssim
-from p2gs_jax.photometry.formation import display, formation
+from p2gs_jax.evaluate.radiance import RadianceScores, Truth
+from p2gs_jax.photometry.formation import display, formation, inverse_tone_map
 from p2gs_jax.render.host import RenderView
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
@@ -106,6 +107,7 @@ def evaluate(
     cfg: FitConfig,
     *,
     reference: Mapping[int, Float32[np.ndarray, "h w 3"]] | Callable | None = None,
+    radiance: Truth | None = None,
     on_view: Callable[[ViewResult], None] = lambda result: None,
     on_progress: Callable[[int, int], None] = lambda done, count: None,
 ) -> dict:
@@ -119,17 +121,19 @@ def evaluate(
         render: from `make_renderer`.
         cfg: formation model.
         reference: view row -> photograph under the common exposure, or None where there is none.
+        radiance: view row -> true linear radiance at the size of the photographs, or None.
         on_view: receives every rendered view (held-out views last).
         on_progress: views done, views in all.
 
     Returns:
-        The `train`, `test` and `reference` parts of `metrics.json`.
+        The `train`, `test`, `reference` and `radiance` parts of `metrics.json`.
     """
     mean = mean_parameters(params.photometry)
     exposures = np.asarray(params.photometry.exposures)
     gammas = np.asarray(params.photometry.gammas)
     own, averaged = _Collector(), _Collector()
     test_averaged, test_fitted = _Collector(), _Collector()
+    scores = RadianceScores()
     reference_views: list[tuple[int, np.ndarray, np.ndarray, np.ndarray]] = []
 
     def shown(linear, exposure, gamma):
@@ -154,6 +158,9 @@ def evaluate(
             ldr = shown(linear, e, g)
             test_averaged.add(view.name, ldr_mean, photograph, mask)
             test_fitted.add(view.name, ldr, photograph, mask, exposure=e)
+        hdr = None if radiance is None else radiance(index)
+        if hdr is not None:
+            scores.add(view.name, view.split, np.asarray(linear), hdr, mask)
         truth = None if reference is None else _lookup(reference, index)
         if truth is not None:
             reference_views.append((index, np.asarray(linear), truth, mask))
@@ -176,6 +183,10 @@ def evaluate(
         "test": {"averaged": test_averaged.summary(), "exposure_fitted": test_fitted.summary()},
     }
     metrics["train"]["per_view"] = metrics["train"].pop("per_view", {})
+    if scores.views:
+        gamma, saturated = jnp.float32(mean.gamma), jnp.float32(cfg.loss.saturation)
+        exposed = float(inverse_tone_map(saturated, gamma, cfg.photometry))
+        metrics["radiance"] = scores.summary(exposed / float(np.median(exposures)))
     if reference_views:
         metrics["reference"] = _against_reference(reference_views, scene, mean, shown, cfg)
     return metrics

@@ -26,7 +26,6 @@ from p2gs_jax.photometry.observations import Rows
 from p2gs_jax.photometry.response import FLOOR, FREE, KNOTS, SMALLEST_SLOPE
 
 L1_ROUNDS, MOST_ROUNDS = 4, 60
-TOLERANCE = 1e-5
 GEMAN_MCCLURE = 3.0
 SMALLEST_SCALE = 0.3
 A_RANGE = (0.3, 3.0)
@@ -359,30 +358,37 @@ def _scores(rows: Rows, theta: Theta, local: _Local, gammas: bool):
 
 
 @functools.partial(jax.jit, static_argnames="gammas")
-def solve(rows: Rows, system: System, start: Theta, gammas: bool) -> Fit:
+def solve(
+    rows: Rows, system: System, start: Theta, tolerance: Float[Array, ""], gammas: bool
+) -> Fit:
     """Adjust exposures, gammas and response to observations (float64).
 
     Args:
         rows: observations.
         system: free directions, gauges, priors.
         start: where to begin.
+        tolerance: largest change of a parameter in a round that counts as none.
         gammas: whether any gamma is free; without, a quarter of the work.
     """
     # Weighted by the noise alone at first.
     weight = rows.weight / rows.sigma**2
 
-    def l1(_, state):
-        return _round(rows, system, state[0], state[1], False, gammas)
+    def one_round(state, _):
+        theta, weight, rounds = state
+        theta, weight = _round(rows, system, theta, weight, rounds >= L1_ROUNDS, gammas)
+        return theta, weight, jnp.minimum(rounds + 1, L1_ROUNDS + 1.0)
 
-    state = jax.lax.fori_loop(0, L1_ROUNDS, l1, (start, weight))
     found = optx.fixed_point(
-        lambda s, _: _round(rows, system, s[0], s[1], True, gammas),
-        optx.FixedPointIteration(rtol=0.0, atol=TOLERANCE, norm=_largest_step),
-        state,
+        one_round,
+        # The norm receives changes over `atol`; dividing by the tolerance keeps it a traced value.
+        optx.FixedPointIteration(
+            rtol=0.0, atol=1.0, norm=lambda state: _largest_step(state) / tolerance
+        ),
+        (start, weight, jnp.float64(0)),
         max_steps=MOST_ROUNDS,
         throw=False,
     )
-    theta, weight = found.value
+    theta, weight, _ = found.value
     local = _local(rows, theta, weight, True)
     normal, _ = _assemble(rows, theta, local, gammas)
     return Fit(
@@ -400,6 +406,6 @@ def solve(rows: Rows, system: System, start: Theta, gammas: bool) -> Fit:
 
 
 def _largest_step(state) -> Float[Array, ""]:
-    """Return the largest change of a parameter; weights follow from them."""
-    theta, _ = state
-    return jnp.max(jnp.abs(jnp.concatenate([theta.b, theta.a, theta.c])))
+    """Return the largest change of a parameter; weights follow, and the L1 rounds are counted."""
+    theta, _, rounds = state
+    return jnp.max(jnp.abs(jnp.concatenate([theta.b, theta.a, theta.c, rounds[None]])))

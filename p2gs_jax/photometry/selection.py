@@ -8,6 +8,8 @@ are chosen together: a wrong curve fixed first drives every criterion to a gamma
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,12 +22,11 @@ from p2gs_jax.photometry.response import (
     Response,
     deviation,
     log_exposed,
-    log_slope_minimum,
-    monotone,
 )
 from p2gs_jax.photometry.solution import (
     LADDER,
     LN2,
+    ROUGH,
     KnownExposures,
     ModelName,
     PhotometricSolution,
@@ -40,10 +41,12 @@ HELD_OUT = 0.2
 STANDARD_ERRORS, SMALLEST_GAIN = 2.0, 0.01
 # The predictive density is a mixture: outliers exist, and must not decide.
 OUTLIERS, OUTLIER_DEVIATION = 0.1, 1.2
-# A response needs this spread of exposures (stops), and may not collapse.
-SPLINE_SPREAD_EV, SPLINE_SLOPE = 0.2, 0.5
+# A response needs this spread of exposures, stops.
+SPLINE_SPREAD_EV = 0.2
 # Candidates are compared on at most this many observations; the chosen one is solved on all.
 MOST_OBSERVATIONS = 80_000
+# A curve has few parameters; its basis is the most expensive one.
+SPLINE_OBSERVATIONS = 12_000
 
 
 @dataclass(frozen=True)
@@ -84,6 +87,11 @@ class Selection:
     solution: PhotometricSolution
     candidates: tuple[Candidate, ...]
     reasons: tuple[str, ...]
+
+
+def rungs(cameras: np.ndarray) -> list[ModelName]:
+    """Return the models that differ: with one camera, "per camera" means "for all"."""
+    return [m for m in LADDER if cameras.max(initial=0) > 0 or "camera" not in LADDER[m]]
 
 
 def parameter_count(model: ModelName, response: Response, cameras: int, views: int) -> int:
@@ -127,46 +135,43 @@ def stated_deviation(problem: Problem, response: Response) -> Float[np.ndarray, 
     return problem.layout.place(deviation(y, slope, o.spread, response.base), 1.0)
 
 
-def _subset(observations: Observations, seed: int) -> Observations:
-    """Return the observations of randomly chosen points, not more than MOST_OBSERVATIONS."""
+def _subset(observations: Observations, seed: int, most: int) -> Observations:
+    """Return the observations of randomly chosen points, not more than `most`."""
     o = observations
-    if len(o.points) <= MOST_OBSERVATIONS:
+    if len(o.points) <= most:
         return o
     rng = np.random.default_rng((seed, 5))
     order = rng.permutation(o.point_count)
     lengths = np.bincount(o.points, minlength=o.point_count)[order]
-    kept = order[np.cumsum(lengths) <= MOST_OBSERVATIONS]
+    kept = order[np.cumsum(lengths) <= most]
     chosen = np.zeros(o.point_count, bool)
     chosen[kept] = True
-    pick = chosen[o.points]
-    return Observations(
-        o.views[pick],
-        o.points[pick],
-        o.colors[pick],
-        o.spread[pick],
-        o.view_count,
-        o.point_count,
-        o.cameras,
-    )
+    return _picked(o, chosen[o.points])
 
 
-def _responses(problem: Problem, use, notes: list[str]) -> list[Response]:
-    """Return the base curves, and the fitted spline where it can be identified."""
-    out = [Response(base) for base in BASES]
-    fit, _ = solve_model(problem, "view_exposure", out[0], use=use)
-    spread = float(np.std(fit.theta.b)) / LN2
-    if spread < SPLINE_SPREAD_EV:
+def _picked(o: Observations, pick: np.ndarray) -> Observations:
+    taken = {k: getattr(o, k)[pick] for k in ("views", "points", "colors", "spread")}
+    return dataclasses.replace(o, **taken)
+
+
+def _spline(problem: Problem, spread: float, notes: list[str]) -> Response | None:
+    """Return a fitted curve where one can be identified.
+
+    Args:
+        problem: training observations.
+        spread: standard deviation of log exposures under sRGB.
+        notes: receives why there is none.
+    """
+    if spread / LN2 < SPLINE_SPREAD_EV:
         notes.append(
-            f"Exposures differ by {spread:.2f} EV (standard deviation): too little to tell the "
-            "shape of the tone curve, so only standard curves were tried."
+            f"Exposures differ by {spread / LN2:.2f} EV (standard deviation): too little to tell "
+            "the shape of the tone curve, so only standard curves were tried."
         )
-        return out
-    spline = fit_response(problem, out[0], use)
-    if monotone(spline) and log_slope_minimum(spline) > SPLINE_SLOPE:
-        out.append(spline)
-    else:
+        return None
+    found = fit_response(problem, Response(), spread=spread)
+    if found is None:
         notes.append("A fitted tone curve collapsed; only standard curves were compared.")
-    return out
+    return found
 
 
 def select(
@@ -195,19 +200,25 @@ def select(
             observations, black=black, saturation=saturation, pivot=pivot, known=known
         )
         return Selection(fit_model(problem, *fixed), (), ())
-    small = make_problem(
-        _subset(observations, seed), black=black, saturation=saturation, pivot=pivot
-    )
+    make = functools.partial(make_problem, black=black, saturation=saturation, pivot=pivot)
+    small = make(_subset(observations, seed, MOST_OBSERVATIONS))
     o = small.observations
     held = np.random.default_rng((seed, 7)).random(len(o.points)) < HELD_OUT
     use = (~held).astype(np.float64)
     notes: list[str] = []
-    curves = _responses(small, use, notes)
-    fits: dict[tuple[ModelName, Response], Fit] = {
-        (model, curve): solve_model(small, model, curve, use=use)[0]
-        for curve in curves
-        for model in LADDER
-    }
+    fits: dict[tuple[ModelName, Response], Fit] = {}
+
+    def solve_all(curve: Response) -> None:
+        for model in rungs(o.cameras):
+            fits[model, curve], _ = solve_model(small, model, curve, use=use, tolerance=ROUGH)
+
+    for base in BASES:
+        solve_all(Response(base))
+    training = _subset(_picked(o, ~held), seed, SPLINE_OBSERVATIONS)
+    spread = float(np.std(fits["view_exposure", Response("srgb")].theta.b))
+    spline = _spline(make(training), spread, notes)
+    if spline is not None:
+        solve_all(spline)
     scale = min(float(f.scale) for f in fits.values())
     where = np.flatnonzero(held)
     density = {k: _densities(small, f, k[1], where, scale) for k, f in fits.items()}
@@ -221,9 +232,7 @@ def select(
         candidates.append(Candidate(model, curve, count, mean[model, curve], behind, error))
     chosen = choose(candidates)
     candidates.sort(key=lambda c: -c.density)
-    problem = make_problem(
-        observations, black=black, saturation=saturation, pivot=pivot, known=known
-    )
+    problem = make(observations, known=known)
     solution = fit_model(problem, chosen.model, chosen.response)
     return Selection(solution, tuple(candidates), (*notes, *_reasons(chosen, candidates)))
 

@@ -13,17 +13,19 @@ from jaxtyping import Float, Int
 from p2gs_jax.config import PhotometricModel as ModelName
 from p2gs_jax.photometry.bundle_adjustment import Fit, System, Theta, solve
 from p2gs_jax.photometry.observations import Layout, Observations, make_rows
-from p2gs_jax.photometry.response import FREE, KNOTS, Response
+from p2gs_jax.photometry.response import FREE, KNOTS, Response, log_slope_minimum, monotone
 from p2gs_jax.types import GAMMA_SRGB
 
 Level = Literal["camera", "view"]
 MIN_OBSERVATIONS = 15
+TOLERANCE, ROUGH = 1e-5, 1e-3
 # Standard deviation of a = 2.2 / gamma about 1 (gammas of 1.9 to 2.6 are within one of these).
 A_PRIOR = 0.15
 # A known exposure that is to be kept: stops.
 FIXED_EV = 1e-5
 # Smoothness of the spline relative to its mean information.
 BEND, BEND_SPACING = 3e-3, 0.12
+STRETCH, FLATTEST = 1.6, 0.3
 LN2 = float(np.log(2.0))
 
 
@@ -223,6 +225,7 @@ def solve_model(
     *,
     use: Float[np.ndarray, " o"] | None = None,
     spline: bool = False,
+    tolerance: float = TOLERANCE,
 ) -> tuple[Fit, System]:
     """Solve one model; see `fit_model`.
 
@@ -232,6 +235,7 @@ def solve_model(
         response: what decodes the colours.
         use: 0 keeps an observation out.
         spline: solve for a spline over the response's base as well.
+        tolerance: change of a parameter, log units, at which the rounds end.
     """
     with jax.enable_x64(True):
         weight = problem.usable if use is None else problem.usable * use[:, None]
@@ -239,8 +243,9 @@ def solve_model(
         system = make_system(problem, LADDER[name], spline)
         views = problem.observations.view_count
         start = Theta(system.log_exposure, jnp.ones(views), jnp.zeros(len(FREE) if spline else 0))
-        fit = jax.tree.map(np.asarray, solve(rows, system, start, LADDER[name].gamma is not None))
-        return fit, jax.tree.map(np.asarray, system)
+        gammas = LADDER[name].gamma is not None
+        fit = solve(rows, system, start, jnp.float64(tolerance), gammas)
+        return jax.tree.map(np.asarray, fit), jax.tree.map(np.asarray, system)
 
 
 def covariance(fit: Fit, system: System) -> Float[np.ndarray, "d d"]:
@@ -284,12 +289,30 @@ def fit_model(
     return describe(problem, name, response, fit, system)
 
 
-def fit_response(problem: Problem, base: Response, use=None) -> Response:
-    """Return the base with the spline that fits best beside per-view exposures."""
-    fit, _ = solve_model(problem, "view_exposure", base, use=use, spline=True)
+def fit_response(
+    problem: Problem, base: Response, *, spread: float | None = None
+) -> Response | None:
+    """Return the base with the spline that fits best beside per-view exposures.
+
+    None where it collapsed: it falls somewhere, is flat over mid tones, or stretches the exposures
+    by more than STRETCH (which no photograph contradicts: the power gauge).
+
+    Args:
+        problem: observations.
+        base: curve to bend.
+        spread: standard deviation of log exposures under the base; solved if not given.
+    """
+    fit, _ = solve_model(problem, "view_exposure", base, spline=True, tolerance=ROUGH)
+    if spread is None:
+        plain, _ = solve_model(problem, "view_exposure", base, tolerance=ROUGH)
+        spread = float(np.std(plain.theta.b))
     full = np.zeros(len(KNOTS))
     full[list(FREE)] = fit.theta.c
-    return Response(base.base, tuple(float(x) for x in full))
+    response = Response(base.base, tuple(float(x) for x in full))
+    stretch = (np.std(fit.theta.b) + 1e-3) / (spread + 1e-3)
+    if problem.known is None and not 1 / STRETCH < stretch < STRETCH:
+        return None
+    return response if monotone(response) and log_slope_minimum(response) > FLATTEST else None
 
 
 def describe(

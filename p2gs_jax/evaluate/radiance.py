@@ -1,0 +1,164 @@
+"""Recovered radiance against HDR truth: stops, PU21, colour (PHOTOMETRY section 6)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import colour
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from p2gs_jax.evaluate.metrics import ssim
+
+Truth = Callable[[int], Float[np.ndarray, "h w 3"] | None]
+
+# PU21, "banding + glare" (Mantiuk and Azimi, Picture Coding Symposium 2021), domain in cd/m^2.
+PU21 = (0.353487901, 0.3734658629, 8.277049286e-05, 0.9062562627, 0.09150303166, 0.9099517204)
+PU21_SCALE = 596.3148142
+PU21_RANGE = (0.005, 10_000.0)
+# PU21 maps 100 cd/m^2, a standard display's white, to this; PSNR and SSIM take it as their peak.
+PU21_PEAK = 256.0
+WHITE_NITS = 100.0
+# Pixels kept per view for alignment, and rows kept for the colour difference.
+ALIGNMENT_PIXELS = 20_000
+STOPS_CAP = 3.0
+
+
+def pu21_encode(nits: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """Return perceptually uniform values of absolute luminance, about 0 to 596."""
+    y = np.clip(nits, *PU21_RANGE) ** PU21[3]
+    ratio = (PU21[0] + PU21[1] * y) / (1 + PU21[2] * y)
+    return PU21_SCALE * (ratio ** PU21[4] - PU21[5])
+
+
+def pu21_psnr(linear, truth, mask: Bool[np.ndarray, "h w"], white: float) -> float:
+    """Return PSNR of PU21-encoded radiance, dB.
+
+    Args:
+        linear: recovered radiance, aligned.
+        truth: true radiance.
+        mask: which pixels count.
+        white: radiance shown as 100 cd/m^2.
+    """
+    a, b = (pu21_encode(x / white * WHITE_NITS) for x in (linear, truth))
+    mse = float(np.mean((a - b)[mask] ** 2)) if mask.any() else float("nan")
+    return float(20 * np.log10(PU21_PEAK) - 10 * np.log10(max(mse, 1e-12)))
+
+
+def pu21_ssim(linear, truth, mask: Bool[np.ndarray, "h w"], white: float) -> float:
+    """Return SSIM of PU21-encoded radiance; see `pu21_psnr`."""
+    a, b = (
+        jnp.asarray(pu21_encode(x / white * WHITE_NITS) / PU21_PEAK, jnp.float32)
+        for x in (linear, truth)
+    )
+    return float(ssim(a, b, jnp.asarray(mask, jnp.float32)))
+
+
+def delta_e_itp(linear, truth, mask: Bool[np.ndarray, "h w"], white: float) -> float:
+    """Return the mean colour difference of BT.2124 (1 = just noticeable), sRGB primaries."""
+    if not mask.any():
+        return float("nan")
+
+    def encoded(x):
+        nits = np.clip(x[mask] / white * WHITE_NITS, 0, PU21_RANGE[1])
+        wide = colour.RGB_to_RGB(nits, "sRGB", "ITU-R BT.2020")
+        return colour.RGB_to_ICtCp(np.maximum(wide, 0))
+
+    return float(np.mean(colour.difference.delta_E_ITP(encoded(linear), encoded(truth))))
+
+
+@dataclass
+class RadianceScores:
+    """Collects views, then scores them under one common alignment.
+
+    Attributes:
+        views: (name, split, recovered, truth, mask) of each view.
+    """
+
+    views: list[tuple[str, str, np.ndarray, np.ndarray, np.ndarray]] = field(default_factory=list)
+
+    def add(self, name: str, split: str, linear, truth, mask) -> None:
+        """Keep one view."""
+        self.views.append((name, split, linear, truth, np.asarray(mask) > 0.5))
+
+    def summary(self, brightest: float) -> dict:
+        """Return means over all, training and held-out views.
+
+        Args:
+            brightest: recovered radiance from which on at least half of the training photographs
+                are saturated: pixels above it are left out of the stops.
+
+        Returns:
+            `stops_median` and `stops_rms` after one common scale, `stops_rms_power` after scale
+            and power, `pu21_psnr`, `pu21_ssim`, `delta_e_itp`; and the alignment.
+        """
+        if not self.views:
+            return {}
+        logs = self._sample(brightest)
+        shift = float(np.median(logs[1] - logs[0])) if logs.size else 0.0
+        power, offset = _power(logs)
+        scale = float(np.exp(shift))
+        white = brightest * scale
+        rows: dict[str, dict[str, float]] = {}
+        for name, _, linear, truth, mask in self.views:
+            keep = mask & (truth.min(-1) > 0) & (linear.max(-1) < brightest)
+            a, b = np.log2(np.maximum(linear[keep], 1e-12)), np.log2(truth[keep])
+            stops = np.minimum(np.abs(a + shift / np.log(2) - b), STOPS_CAP)
+            bent = np.minimum(np.abs(power * a + offset / np.log(2) - b), STOPS_CAP)
+            rows[name] = {
+                "stops_median": float(np.median(stops)) if stops.size else float("nan"),
+                "stops_rms": float(np.sqrt(np.mean(stops**2))) if stops.size else float("nan"),
+                "stops_rms_power": float(np.sqrt(np.mean(bent**2))) if bent.size else float("nan"),
+                "pu21_psnr": pu21_psnr(linear * scale, truth, mask, white),
+                "pu21_ssim": pu21_ssim(linear * scale, truth, mask, white),
+                "delta_e_itp": delta_e_itp(linear * scale, truth, mask, white),
+            }
+        splits = {name: split for name, split, *_ in self.views}
+        parts = {
+            part: {
+                k: _mean([rows[n][k] for n in rows if part in ("all", splits[n])])
+                for k in next(iter(rows.values()))
+            }
+            for part in ("all", "train", "test")
+            if part == "all" or part in splits.values()
+        }
+        return {
+            **parts["all"],
+            **{k: v for k, v in parts.items() if k != "all"},
+            "scale": scale,
+            "power": power,
+            "per_view": rows,
+        }
+
+    def _sample(self, brightest: float) -> np.ndarray:
+        rng = np.random.default_rng(0)
+        parts = []
+        for _, _, linear, truth, mask in self.views:
+            keep = mask & (truth.min(-1) > 0) & (linear.min(-1) > 0)
+            keep &= linear.max(-1) < brightest
+            pixels = np.flatnonzero(keep)
+            pick = rng.permutation(pixels)[:ALIGNMENT_PIXELS]
+            parts.append(
+                np.stack([np.log(x.reshape(-1, 3)[pick]).ravel() for x in (linear, truth)])
+            )
+        return np.concatenate(parts, 1) if parts else np.zeros((2, 0))
+
+
+def _mean(values: list[float]) -> float:
+    known = [v for v in values if np.isfinite(v)]
+    return float(np.mean(known)) if known else float("nan")
+
+
+def _power(logs: np.ndarray) -> tuple[float, float]:
+    """Return (power, offset) with log truth ~ power log linear + offset, outliers cut once."""
+    if logs.shape[1] < 2 or np.ptp(logs[0]) < 1e-6:
+        return 1.0, 0.0
+    keep = np.ones(logs.shape[1], bool)
+    power, offset = 1.0, 0.0
+    for _ in range(3):
+        power, offset = np.polyfit(logs[0][keep], logs[1][keep], 1)
+        gap = np.abs(power * logs[0] + offset - logs[1])
+        keep = gap < 3 * max(float(np.median(gap)), 1e-3)
+    return float(power), float(offset)

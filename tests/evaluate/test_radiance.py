@@ -1,0 +1,81 @@
+"""HDR metrics: zero where nothing is wrong, known values, and blind to the gauges they align."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from p2gs_jax.evaluate.radiance import RadianceScores, delta_e_itp, pu21_encode, pu21_psnr
+
+EVERYWHERE = np.ones((24, 32), bool)
+
+
+def image(seed=0):
+    rng = np.random.default_rng(seed)
+    return np.exp(rng.normal(-1, 1, (24, 32, 3)))
+
+
+def scores(linear, truth, brightest=1e9):
+    s = RadianceScores()
+    s.add("a", "train", linear, truth, EVERYWHERE)
+    s.add("b", "test", linear, truth, EVERYWHERE)
+    return s.summary(brightest)
+
+
+def test_pu21_reference_values():
+    # The published encoding maps 100 cd/m^2 to 256 and its darkest value to 0.
+    assert pu21_encode(np.array(100.0)) == pytest.approx(256, abs=0.5)
+    assert pu21_encode(np.array(0.005)) == pytest.approx(0, abs=1e-3)
+    assert np.all(np.diff(pu21_encode(np.geomspace(0.005, 1e4, 200))) > 0)
+
+
+@settings(max_examples=10, deadline=None)
+@given(c=st.floats(0.05, 20.0))
+def test_a_common_factor_costs_nothing(c):
+    truth = image()
+    result = scores(truth / c, truth, 1e9)
+    assert result["stops_rms"] < 1e-6
+    assert result["stops_rms_power"] < 1e-4
+    assert result["scale"] == pytest.approx(c, rel=1e-6)
+    assert result["train"]["pu21_psnr"] > 100
+
+
+def test_a_power_costs_stops_until_it_is_aligned():
+    truth = image()
+    result = scores(truth**0.8, truth)
+    assert result["stops_rms"] > 0.1
+    assert result["stops_rms_power"] < 1e-4
+    assert result["power"] == pytest.approx(1.25, rel=1e-4)
+
+
+def test_errors_are_measured_in_stops_and_capped():
+    truth = image()
+    wrong = truth * np.exp2(np.random.default_rng(1).normal(0, 0.5, truth.shape))
+    assert scores(wrong, truth)["stops_rms"] == pytest.approx(0.5, abs=0.03)
+    black = truth.copy()
+    black[:2] = 1e-9
+    assert scores(black, truth)["stops_rms"] < 3
+
+
+def test_saturated_pixels_do_not_count():
+    truth = image()
+    wrong = truth.copy()
+    wrong[truth.max(-1) > 2] *= 30
+    assert scores(wrong, truth)["stops_rms"] > 0.5
+    assert scores(wrong, truth, brightest=1.9)["stops_rms"] < 1e-6
+
+
+def test_colour_difference_sees_hue():
+    truth = image()
+    assert delta_e_itp(truth, truth, EVERYWHERE, 1.0) == pytest.approx(0, abs=1e-9)
+    red = truth * [1.2, 1.0, 0.9]
+    assert delta_e_itp(red, truth, EVERYWHERE, 1.0) > 3
+    assert pu21_psnr(red, truth, EVERYWHERE, 1.0) < 40
+
+
+def test_nothing_to_judge():
+    assert RadianceScores().summary(1.0) == {}
+    none = np.zeros((24, 32), bool)
+    s = RadianceScores()
+    s.add("a", "train", image(), image(), none)
+    assert np.isnan(s.summary(1.0)["stops_rms"])

@@ -1,0 +1,87 @@
+"""Responses: derivatives, inverse, monotony, and the bent curve in image formation."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from p2gs_jax.config import PhotometryConfig
+from p2gs_jax.photometry.formation import inverse_tone_map, tone_map
+from p2gs_jax.photometry.response import (
+    FREE,
+    HELD,
+    KNOTS,
+    Response,
+    deviation,
+    log_exposed,
+    log_slope_minimum,
+    monotone,
+)
+from p2gs_jax.photometry.solution import fit_response, make_problem
+from p2gs_jax.synth.drive import encode, make_drive, make_exposures, observe
+
+BENT = Response("srgb", tuple(0.3 * np.sin(3 * KNOTS) - 0.1))
+CFG = PhotometryConfig(curve="spline", spline=BENT.spline)
+
+
+@pytest.mark.parametrize("response", [Response("srgb"), Response("power"), BENT])
+def test_slope_is_the_derivative(response):
+    y = np.linspace(0.03, 0.97, 61) + 1e-4
+    step = 1e-6
+    numeric = (log_exposed(y + step, response)[0] - log_exposed(y - step, response)[0]) / (2 * step)
+    np.testing.assert_allclose(log_exposed(y, response)[1], numeric, rtol=1e-5)
+
+
+def test_knots_and_held_ones():
+    assert np.all(np.diff(KNOTS) > 0)
+    assert set(FREE) | set(HELD) == set(range(len(KNOTS)))
+    assert monotone(BENT)
+    falling = Response("srgb", tuple(np.where(KNOTS > 0.6, -3.0, 0.0)))
+    assert not monotone(falling)
+    assert log_slope_minimum(falling) < 0
+
+
+def test_dark_and_uncertain_values_say_less():
+    y = np.array([0.02, 0.1, 0.5])
+    slope = log_exposed(y, Response())[1]
+    plain = deviation(y, slope)
+    assert np.all(np.diff(plain) < 0)
+    assert np.all(deviation(y, slope, spread=0.05) > plain)
+
+
+def test_formation_follows_the_spline():
+    y = jnp.linspace(0.01, 0.995, 200)
+    exposed = jnp.exp(jnp.asarray(log_exposed(np.asarray(y), BENT)[0]))
+    np.testing.assert_allclose(tone_map(exposed, jnp.float32(2.2), CFG), y, atol=2e-3)
+    for gamma in (1.8, 2.2, 2.6):
+        back = inverse_tone_map(y, jnp.float32(gamma), CFG)
+        np.testing.assert_allclose(tone_map(back, jnp.float32(gamma), CFG), y, atol=2e-4)
+
+
+def test_formation_by_spline_is_monotone_and_never_dead():
+    x = jnp.asarray(np.geomspace(2e-6, 50, 500), jnp.float32)
+    value, slope = jax.vmap(jax.value_and_grad(lambda v: tone_map(v, jnp.float32(2.2), CFG)))(x)
+    assert np.all(np.diff(value) > 0)
+    assert np.all(np.isfinite(slope))
+    assert np.all(np.asarray(slope) > 0)
+
+
+def test_a_filmic_curve_is_found():
+    drive = make_drive(20, 1200)
+    exposures = make_exposures(drive, "iso4")
+    problem = make_problem(
+        observe(drive, exposures, curve="filmic", outliers=0.05),
+        black=4 / 255,
+        saturation=250 / 255,
+        pivot=0.18,
+    )
+    found = fit_response(problem, Response("srgb"))
+    assert found is not None
+    x = np.geomspace(0.02, 0.5, 50)
+    z = log_exposed(encode(x, "filmic"), found)[0]
+    # Up to scale and power, which no photograph can tell.
+    line = np.polyfit(np.log(x), z, 1)
+    assert np.abs(np.polyval(line, np.log(x)) - z).max() < 0.06
+    plain = log_exposed(encode(x, "filmic"), Response("srgb"))[0]
+    straight = np.polyfit(np.log(x), plain, 1)
+    assert np.abs(np.polyval(straight, np.log(x)) - plain).max() > 0.12

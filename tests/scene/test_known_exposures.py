@@ -1,0 +1,60 @@
+"""Known exposures: CSV in several spellings, EXIF, and what is wrong with a file."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from p2gs_jax.errors import UserError
+from p2gs_jax.scene.known_exposures import read_known_exposures
+from p2gs_jax.types import View
+
+
+def views(*names, exif=None):
+    eye4, eye3 = np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32)
+    return [View(n, Path(n), "0", eye4, eye3, 4, 4, exif_ev=exif) for n in names]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("image,exposure\na.png,2\nb.png,0.5\n", [1, -1]),
+        ("image,ev\na.png,1\nb.png,-1\n", [1, -1]),
+        ("\ufefffile, exposure_time_s\na.png,4\nb.png,1\n", [2, 0]),
+        ("# comment\nimage,exposure\nb.png,0.5\nz.png,3\n", [np.nan, -1]),
+    ],
+)
+def test_csv(tmp_path, text, expected):
+    path = tmp_path / "e.csv"
+    path.write_text(text, encoding="utf-8")
+    found = read_known_exposures(str(path), views("front/a.png", "b.png")) / np.log(2)
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_exif():
+    found = read_known_exposures("exif", [*views("a", exif=1.5), *views("b")])
+    np.testing.assert_allclose(found / np.log(2), [1.5, np.nan])
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("image,value\na.png,1\n", "columns image, value"),
+        ("image,exposure\na.png,-1\n", "line 2"),
+        ("image,exposure\na.png,bright\n", "'bright'"),
+        ("image,exposure\nother.png,1\n", "names none of the 1"),
+        ("", "columns none"),
+    ],
+)
+def test_bad_files_are_explained(tmp_path, text, words):
+    path = tmp_path / "e.csv"
+    path.write_text(text)
+    with pytest.raises(UserError, match=words):
+        read_known_exposures(str(path), views("a.png"))
+
+
+def test_nothing_known():
+    with pytest.raises(UserError, match="EXIF"):
+        read_known_exposures("exif", views("a"))
+    with pytest.raises(UserError, match="cannot be read"):
+        read_known_exposures("nowhere.csv", views("a"))
