@@ -14,6 +14,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.export.atomic import write_json
 from p2gs_jax.export.calibration_plot import write_calibration_plot
 from p2gs_jax.export.photometry_json import ViewPhotometry, write_photometry
+from p2gs_jax.init.correspondence import projected_colors
 from p2gs_jax.init.observations import track_colors
 from p2gs_jax.photometry.agreement import Agreement, compare
 from p2gs_jax.photometry.selection import Selection
@@ -91,29 +92,60 @@ def calibrate(
     begin = time.monotonic()
     reporter.stage("Reading the scene")
     scene = load_scene(Path(scene_dir), cfg.data, out / "cache", reporter.message)
-    if scene.tracks is None or not len(scene.tracks.xy):
+    store = ImageStore(scene.views, cfg.data)
+    if scene.tracks is not None and len(scene.tracks.xy):
+        observations = track_colors(
+            scene, store, lambda i, n: reporter.stage("Sampling tracks", i, n)
+        )
+    elif len(scene.points):
+        observations = projected_colors(
+            scene,
+            store,
+            cfg.train.seed,
+            lambda i, n: reporter.stage("Projecting points", i, n),
+        )
+    else:
         raise UserError(
-            f"{scene_dir} has no tracks: which pixels show the same point is not known.",
+            f"{scene_dir} has neither tracks nor points: which pixels show the same surface is "
+            "not known.",
             fix="give a COLMAP model with its images.bin, or the photographs alone",
         )
-    store = ImageStore(scene.views, cfg.data)
-    observations = track_colors(scene, store, lambda i, n: reporter.stage("Sampling tracks", i, n))
     sampled = time.monotonic()
     reporter.stage("Photometric bundle adjustment")
     selection = calibrate_observations(observations, scene, cfg)
     solved = time.monotonic()
+    seconds = {"reading": sampled - begin, "adjustment": solved - sampled}
+    return conclude(
+        scene, selection, len(observations.views), seconds, out, cfg, compare_with=compare_with
+    )
+
+
+def conclude(
+    scene: Scene,
+    selection: Selection,
+    observations: int,
+    seconds: dict[str, float],
+    out: Path,
+    cfg: FitConfig,
+    *,
+    compare_with: str | None,
+) -> Calibration:
+    """Compare a solution with stated exposures and write the files.
+
+    Args:
+        scene: its views are those of the solution.
+        selection: the solution.
+        observations: how many it used.
+        seconds: see `Calibration`.
+        out: folder.
+        cfg: options.
+        compare_with: see `calibrate`.
+    """
     stated = _stated(compare_with, scene)
     s = selection.solution
     agreement = compare(s.exposures_ev, s.exposure_errors / LN2, stated)
-    result = Calibration(
-        scene,
-        selection,
-        stated,
-        agreement,
-        _level_note(selection, stated, agreement, cfg.photometry.pivot),
-        len(observations.views),
-        {"reading": sampled - begin, "adjustment": solved - sampled},
-    )
+    note = _level_note(selection, stated, agreement, cfg.photometry.pivot)
+    result = Calibration(scene, selection, stated, agreement, note, observations, seconds)
     _write(result, out, cfg)
     return result
 
@@ -178,7 +210,7 @@ def _write(result: Calibration, out: Path, cfg: FitConfig) -> None:
         if cfg.photometry.known is None
         else f"known exposures ({cfg.photometry.known})",
         mean={
-            "exposure_arithmetic": float(exposures.mean()) if len(exposures) else 1.0,
+            "exposure": float(exposures.mean()) if len(exposures) else 1.0,
             "exposure_geometric": float(np.exp(np.log(exposures).mean()))
             if len(exposures)
             else 1.0,

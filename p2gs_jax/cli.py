@@ -79,7 +79,8 @@ class Calibrate:
     """Exposures, gammas and tone curve alone, with error bars, in seconds: no splatting."""
 
     scene: Annotated[Path, tyro.conf.Positional]
-    """COLMAP model, transforms.json, or a folder of photographs."""
+    """COLMAP model, transforms.json, a folder of photographs, or a finished run (correspondences
+    then go through its rendered depth)."""
     out: Path
     """Folder for photometry.json and calibration.png."""
     config: Annotated[configs.FitConfig, tyro.conf.arg(name="")]

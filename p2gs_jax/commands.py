@@ -23,6 +23,7 @@ from p2gs_jax.export.atomic import write_json
 from p2gs_jax.finish import find_radiance, load_reference, tone_function, write_view
 from p2gs_jax.pipeline import fit
 from p2gs_jax.progress import TerminalReporter
+from p2gs_jax.refine import calibrate_run
 from p2gs_jax.render.host import make_renderer
 from p2gs_jax.run_folder import load_run
 from p2gs_jax.scene.device import camera_of
@@ -50,8 +51,12 @@ def calibrate_command(
     """Solve the photometry alone; print it as a table."""
     if static:
         return _static_command(scene, out, cfg, compare_with)
+    is_run = (scene / "config.json").is_file() and (scene / "radiance.ply").is_file()
     with TerminalReporter() as reporter:
-        result = calibrate(scene, out, cfg, compare_with=compare_with, reporter=reporter)
+        if is_run:
+            result = calibrate_run(scene, out, compare_with=compare_with, reporter=reporter)
+        else:
+            result = calibrate(scene, out, cfg, compare_with=compare_with, reporter=reporter)
     print_calibration(result)
     _out().print(f"Results: {out} (open {out / 'calibration.png'} first)")
     return 0

@@ -11,6 +11,7 @@ import numpy as np
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
+from p2gs_jax.init.correspondence import projected_colors
 from p2gs_jax.init.observations import sample, sample_pairs, track_colors
 from p2gs_jax.init.seeds import gaussians_from_points, merge, scene_extent, subsample
 from p2gs_jax.init.shell import Shell, find_shell
@@ -88,6 +89,14 @@ def prepare(scene: Scene, cfg: FitConfig, reporter: Reporter) -> Prepared:
     selection: Selection | None = None
     if scene.tracks is not None and len(scene.tracks.xy):
         tracks = track_colors(scene, store, lambda i, n: reporter.stage("Sampling tracks", i, n))
+    elif cfg.photometry.start == "tracks":
+        notes.append("No tracks: seed points are projected into the views instead.")
+        tracks = projected_colors(
+            scene,
+            store,
+            cfg.train.seed,
+            lambda i, n: reporter.stage("Projecting points", i, n),
+        )
     if cfg.photometry.start == "tracks":
         if tracks is not None and len(tracks.points):
             reporter.stage("Photometric bundle adjustment")
@@ -95,7 +104,9 @@ def prepare(scene: Scene, cfg: FitConfig, reporter: Reporter) -> Prepared:
             notes += [*selection.reasons, *selection.solution.warnings]
             cfg = with_selection(cfg, selection)
         else:
-            notes.append("No tracks: exposures start at 1 and are learned from the first step.")
+            notes.append(
+                "No point is seen twice: exposures start at 1 and are learned from the first step."
+            )
             cfg = without_tracks(cfg)
     start = None if selection is None else selection.solution
     photometry = _photometry(start, len(views), cfg)

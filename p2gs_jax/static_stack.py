@@ -350,7 +350,7 @@ def write_stack(result: StackResult, out: Path) -> None:
         model=s.model,
         curve={"name": curve, "pivot": PIVOT, "spline": s.response.spline},
         gauge="mean log exposure is 0; exposures and response can be stretched together",
-        mean={"exposure_geometric": 1.0, "gamma": 2.2},
+        mean={"exposure": 1.0, "exposure_geometric": 1.0, "gamma": 2.2},
         views=[
             {
                 "image": name,
