@@ -22,6 +22,7 @@ from p2gs_jax.export.ply import write_radiance, write_splats
 from p2gs_jax.export.png import write_png
 from p2gs_jax.export.summary import write_summary
 from p2gs_jax.photometry.formation import display, formation
+from p2gs_jax.photometry.solution import LN2, PhotometricSolution
 from p2gs_jax.prepare import Prepared
 from p2gs_jax.progress import Reporter
 from p2gs_jax.render.host import make_renderer
@@ -120,9 +121,19 @@ def write_models(params: Params, run_dir: Path, cfg: FitConfig) -> None:
 
 
 def photometry_views(
-    params: Params, scene: Scene, fitted: dict[int, float]
+    params: Params,
+    scene: Scene,
+    fitted: dict[int, float],
+    solution: PhotometricSolution | None = None,
 ) -> list[ViewPhotometry]:
-    """Return the `views` of `photometry.json`; held-out views have no exposure of their own."""
+    """Return the `views` of `photometry.json`; held-out views have no exposure of their own.
+
+    Args:
+        params: the fit.
+        scene: its views.
+        fitted: exposures solved for held-out views.
+        solution: what the fit started from; its standard errors are passed on.
+    """
     exposures = np.asarray(params.photometry.exposures)
     gammas = np.asarray(params.photometry.gammas)
     rows = {index: k for k, index in enumerate(scene.train_indices)}
@@ -142,6 +153,9 @@ def photometry_views(
                 "exposure_fitted": fitted.get(index),
             }
         )
+        if k is not None and solution is not None and np.isfinite(solution.exposure_errors[k]):
+            out[-1]["exposure_ev_error"] = float(solution.exposure_errors[k] / LN2)
+            out[-1]["gamma_error"] = float(solution.gamma_errors[k])
     return out
 
 
@@ -221,7 +235,12 @@ def finish(
         curve=curve,
         gauge=gauge,
         mean=dataclasses.asdict(mean),
-        views=photometry_views(params, scene, fitted),
+        views=photometry_views(
+            params,
+            scene,
+            fitted,
+            None if prepared.selection is None else prepared.selection.solution,
+        ),
     )
     _write_summary(run_dir / "summary.png", shown, picks, params, scene, mean, cfg, true_ev)
     metrics["counts"] = counts

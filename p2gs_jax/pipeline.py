@@ -18,6 +18,7 @@ from p2gs_jax.config import to_dict as config_to_dict
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.atomic import plain, write_json
 from p2gs_jax.finish import finish, load_reference
+from p2gs_jax.photometry.gauge import recentre
 from p2gs_jax.photometry.selection import Selection
 from p2gs_jax.prepare import Prepared, load, prepare
 from p2gs_jax.progress import Reporter, Silent
@@ -139,6 +140,8 @@ def fit(
         reserve_s=_finish_estimate(scene, cfg),
     )
     params = compact(result)
+    if cfg.photometry.parameterization == "log" and cfg.photometry.known is None:
+        params = recentre(params, cfg.render.radiance)
     metrics = finish(
         params,
         prepared,

@@ -87,6 +87,11 @@ def prepare(scene: Scene, cfg: FitConfig, reporter: Reporter) -> Prepared:
     extent = scene_extent(views, scene.points)
     tracks: Observations | None = None
     selection: Selection | None = None
+    if cfg.photometry.known is not None and cfg.photometry.start != "tracks":
+        raise UserError(
+            f"the preset {cfg.preset!r} starts exposures at random: known ones would be ignored.",
+            fix="leave out --known-exposures, or add --photometry.start tracks",
+        )
     if scene.tracks is not None and len(scene.tracks.xy):
         tracks = track_colors(scene, store, lambda i, n: reporter.stage("Sampling tracks", i, n))
     elif cfg.photometry.start == "tracks":

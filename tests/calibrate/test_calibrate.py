@@ -63,6 +63,15 @@ def test_command_keeps_known_exposures(street, tmp_path, capsys):
         assert view["exposure"] == pytest.approx(5 * truth[view["image"]], rel=1e-3)
 
 
+def test_fit_refuses_known_exposures_it_would_ignore(street, tmp_path, capsys):
+    path = tmp_path / "known.csv"
+    path.write_text("image,exposure\n" + "\n".join(f"{k},1" for k in read_truth(street)))
+    argv = ("fit", street, "--out", tmp_path / "r", "--preset", "paper", "--known-exposures", path)
+    code, text = run(capsys, *argv)
+    assert code == 2
+    assert "starts exposures at random" in text
+
+
 def test_castle_says_that_exif_and_pixels_disagree(shared_data, tmp_path):
     root = shared_data("sceaux_castle")
     result = calibrate(

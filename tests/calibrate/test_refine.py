@@ -22,6 +22,8 @@ def test_a_run_gives_its_exposures_again(tmp_path):
         data=dataclasses.replace(cfg.data, test_every=0),
     )
     result = p2gs_jax.fit(street.root, tmp_path / "run", cfg)
+    started = read_photometry(tmp_path / "run" / "photometry.json")["views"]
+    assert all(0 < v["exposure_ev_error"] < 0.1 for v in started)
     again = calibrate_run(tmp_path / "run", tmp_path / "out")
     assert again.observations > 1000
     found = np.exp(again.selection.solution.log_exposures)

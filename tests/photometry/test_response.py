@@ -41,6 +41,15 @@ def test_knots_and_held_ones():
     assert log_slope_minimum(falling) < 0
 
 
+def test_values_below_the_first_code_are_clamped():
+    y = np.array([0.0, 1e-6, 0.001, 0.5 / 255])
+    for response in (Response("srgb"), Response("power"), BENT):
+        z, slope = log_exposed(y, response)
+        assert np.all(np.isfinite(z))
+        assert np.ptp(z) == 0
+        assert np.all(np.isfinite(deviation(y, slope)))
+
+
 def test_dark_and_uncertain_values_say_less():
     y = np.array([0.02, 0.1, 0.5])
     slope = log_exposed(y, Response())[1]

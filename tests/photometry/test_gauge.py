@@ -1,0 +1,41 @@
+"""Recentring is exact: the same photographs, mean log exposure 0."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from p2gs_jax.photometry.gauge import recentre
+from p2gs_jax.photometry.radiance import radiance_activation
+from p2gs_jax.types import Gaussians, Params, Photometry
+
+
+def params(parameterization):
+    rng = np.random.default_rng(0)
+    zeros = jnp.zeros((20, 3))
+    sh = jnp.asarray(rng.normal(0, 0.5, (20, 4, 3)), jnp.float32).at[:, 0].add(2.0)
+    e = jnp.asarray(np.exp(rng.normal(0.7, 0.5, 9)), jnp.float32)
+    raw = jnp.log(e) if parameterization == "log" else e
+    gaussians = Gaussians(zeros, jnp.zeros((20, 4)), zeros, jnp.zeros(20), sh)
+    return Params(gaussians, Photometry(raw, jnp.zeros(9), parameterization))
+
+
+def exposed(p, activation):
+    # Any direction: the basis values of degree 1 are arbitrary here, that of degree 0 is constant.
+    basis = jnp.array([0.28209479, 0.3, -0.2, 0.4])
+    value = jnp.einsum("k,nkc->nc", basis, p.gaussians.sh)
+    return p.photometry.exposures[:, None, None] * radiance_activation(value, activation)
+
+
+@pytest.mark.parametrize("parameterization", ["log", "linear"])
+@pytest.mark.parametrize("activation", ["exp", "linear"])
+def test_photographs_stay_and_the_mean_goes(activation, parameterization):
+    p = params(parameterization)
+    q = recentre(p, activation)
+    assert abs(float(jnp.mean(jnp.log(q.photometry.exposures)))) < 1e-6
+    np.testing.assert_allclose(exposed(q, activation), exposed(p, activation), rtol=2e-6)
+    assert abs(float(jnp.mean(jnp.log(p.photometry.exposures)))) > 0.3
+
+
+def test_softplus_is_left_alone():
+    p = params("log")
+    assert recentre(p, "softplus") is p
