@@ -25,9 +25,8 @@ from p2gs_jax.bench.timing import interleaved
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render import bin_tiles, count_entries, project, rasterize
 from p2gs_jax.render.host import capacity_bucket
+from p2gs_jax.render.spherical_harmonics import C0
 from p2gs_jax.render.xla_cpu import compiler_options
-
-SH_C0 = 0.28209479177387814
 
 
 def load(path: Path):
@@ -67,7 +66,7 @@ def main() -> None:
             "quats": g.quats,
             "log_scales": g.log_scales,
             "opac": g.opacity_logits,
-            "colors": jnp.exp(SH_C0 * g.sh[:, 0]),
+            "colors": jnp.exp(C0 * g.sh[:, 0]),
         }
         view = np.asarray(camera.viewmat), np.asarray(camera.K)
         theirs_need = jax.jit(

@@ -13,17 +13,17 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.atomic import write_json
 from p2gs_jax.export.calibration_plot import write_calibration_plot
-from p2gs_jax.export.photometry_json import ViewPhotometry, write_photometry
-from p2gs_jax.init.correspondence import projected_colors
-from p2gs_jax.init.observations import track_colors
+from p2gs_jax.export.photometry_json import write_solution
+from p2gs_jax.init.correspondence import has_tracks, surface_colors
+from p2gs_jax.numerics import LN2
 from p2gs_jax.photometry.agreement import Agreement, compare
 from p2gs_jax.photometry.selection import Selection
-from p2gs_jax.photometry.solution import LADDER, LN2
+from p2gs_jax.photometry.solution import LADDER
 from p2gs_jax.prepare import calibrate_observations
 from p2gs_jax.progress import Reporter, Silent
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.scene.known_exposures import read_known_exposures
+from p2gs_jax.scene.known_exposures import stated_ev
 from p2gs_jax.types import Scene
 
 WEAK_GAMMA = 0.1
@@ -38,7 +38,8 @@ class Calibration:
     Attributes:
         scene: all its views are used.
         selection: model, exposures, gammas, errors, reasons.
-        stated_ev: exposures from EXIF or a file, stops; NaN where unknown.
+        stated_ev: exposures from EXIF or a file, stops, laid over the recovered ones; NaN where
+            unknown.
         agreement: of the two.
         level_note: where in the tonal range they agree better, if anywhere.
         observations: used.
@@ -93,23 +94,15 @@ def calibrate(
     reporter.stage("Reading the scene")
     scene = load_scene(Path(scene_dir), cfg.data, out / "cache", reporter.message)
     store = ImageStore(scene.views, cfg.data)
-    if scene.tracks is not None and len(scene.tracks.xy):
-        observations = track_colors(
-            scene, store, lambda i, n: reporter.stage("Sampling tracks", i, n)
-        )
-    elif len(scene.points):
-        observations = projected_colors(
-            scene,
-            store,
-            cfg.train.seed,
-            lambda i, n: reporter.stage("Projecting points", i, n),
-        )
-    else:
+    if not (has_tracks(scene) or len(scene.points)):
         raise UserError(
             f"{scene_dir} has neither tracks nor points: which pixels show the same surface is "
             "not known.",
             fix="give a COLMAP model with its images.bin, or the photographs alone",
         )
+    observations = surface_colors(
+        scene, store, cfg.train.seed, lambda i, n: reporter.stage("Sampling colours", i, n)
+    )
     sampled = time.monotonic()
     reporter.stage("Photometric bundle adjustment")
     selection = calibrate_observations(observations, scene, cfg)
@@ -141,11 +134,12 @@ def conclude(
         cfg: options.
         compare_with: see `calibrate`.
     """
-    stated = _stated(compare_with, scene)
+    stated = stated_ev(compare_with, list(scene.views))
     s = selection.solution
     agreement = compare(s.exposures_ev, s.exposure_errors / LN2, stated)
     note = _level_note(selection, stated, agreement, cfg.photometry.pivot)
-    result = Calibration(scene, selection, stated, agreement, note, observations, seconds)
+    laid_over = stated + agreement.offset_ev
+    result = Calibration(scene, selection, laid_over, agreement, note, observations, seconds)
     _write(result, out, cfg)
     return result
 
@@ -168,56 +162,10 @@ def _level_note(selection: Selection, stated, agreement: Agreement, pivot: float
     ]
 
 
-def _stated(source: str | None, scene: Scene) -> np.ndarray:
-    views = list(scene.views)
-    if source is None:
-        return np.array([np.nan if v.exif_ev is None else v.exif_ev for v in views], float)
-    return read_known_exposures(source, views) / LN2
-
-
-def view_rows(result: Calibration) -> list[ViewPhotometry]:
-    """Return the views as `photometry.json` lists them."""
-    s = result.selection.solution
-    rows: list[ViewPhotometry] = []
-    for i, view in enumerate(result.scene.views):
-        known = bool(np.isfinite(s.exposure_errors[i]))
-        rows.append(
-            {
-                "image": view.name,
-                "camera": view.camera,
-                "exposure": float(np.exp(s.log_exposures[i])) if known else None,
-                "exposure_ev": float(s.exposures_ev[i]) if known else None,
-                "exposure_ev_error": float(s.exposure_errors[i] / LN2) if known else None,
-                "gamma": float(s.gammas[i]) if known else None,
-                "gamma_error": float(s.gamma_errors[i]) if known else None,
-                "exif_ev": view.exif_ev,
-                "split": "train",
-                "exposure_fitted": None,
-            }
-        )
-    return rows
-
-
 def _write(result: Calibration, out: Path, cfg: FitConfig) -> None:
-    s = result.selection.solution
-    curve = "spline" if s.response.spline is not None else s.response.base
-    exposures = np.exp(s.log_exposures[np.isfinite(s.exposure_errors)])
-    write_photometry(
-        out / "photometry.json",
-        model=s.model,
-        curve={"name": curve, "pivot": cfg.photometry.pivot, "spline": s.response.spline},
-        gauge="mean log exposure is 0 over each connected group of views"
-        if cfg.photometry.known is None
-        else f"known exposures ({cfg.photometry.known})",
-        mean={
-            "exposure": float(exposures.mean()) if len(exposures) else 1.0,
-            "exposure_geometric": float(np.exp(np.log(exposures).mean()))
-            if len(exposures)
-            else 1.0,
-            "gamma": float(s.gammas.mean()),
-        },
-        views=view_rows(result),
-    )
+    s, p = result.selection.solution, cfg.photometry
+    views = result.scene.views
+    write_solution(out / "photometry.json", s, views=views, pivot=p.pivot, known=p.known)
     write_json(
         out / "calibration.json",
         {
@@ -245,12 +193,8 @@ def _write(result: Calibration, out: Path, cfg: FitConfig) -> None:
     )
     write_calibration_plot(
         out / "calibration.png",
-        exposures_ev=np.where(np.isfinite(s.exposure_errors), s.exposures_ev, np.nan),
-        errors_ev=np.where(np.isfinite(s.exposure_errors), s.exposure_errors / LN2, np.nan),
+        s,
+        cameras=[v.camera for v in views],
         stated_ev=result.stated_ev,
-        cameras=[v.camera for v in result.scene.views],
-        residual_ev=s.view_residual_ev,
-        response=s.response,
-        gammas=s.gammas,
-        pivot=cfg.photometry.pivot,
+        pivot=p.pivot,
     )

@@ -12,7 +12,6 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from p2gs_jax.bench import run as benches
 from p2gs_jax.calibrate import WEAK_GAMMA, Calibration, calibrate
 from p2gs_jax.config import FitConfig
 from p2gs_jax.demo import run_demo
@@ -21,6 +20,7 @@ from p2gs_jax.evaluate.alignment import fit_exposure
 from p2gs_jax.evaluate.evaluate import ViewResult, evaluate, mean_parameters
 from p2gs_jax.export.atomic import write_json
 from p2gs_jax.finish import find_radiance, load_reference, tone_function, write_view
+from p2gs_jax.numerics import LN2
 from p2gs_jax.pipeline import fit
 from p2gs_jax.progress import TerminalReporter
 from p2gs_jax.refine import calibrate_run
@@ -54,7 +54,14 @@ def calibrate_command(
     is_run = (scene / "config.json").is_file() and (scene / "radiance.ply").is_file()
     with TerminalReporter() as reporter:
         if is_run:
-            result = calibrate_run(scene, out, compare_with=compare_with, reporter=reporter)
+            if cfg.data != FitConfig().data:
+                raise UserError(
+                    f"{scene} is a finished run: it keeps its own image size and folder.",
+                    fix="leave out --max-width, --images and --data options",
+                )
+            result = calibrate_run(
+                scene, out, cfg.photometry, compare_with=compare_with, reporter=reporter
+            )
         else:
             result = calibrate(scene, out, cfg, compare_with=compare_with, reporter=reporter)
     print_calibration(result)
@@ -63,9 +70,19 @@ def calibrate_command(
 
 
 def _static_command(folder: Path, out: Path, cfg: FitConfig, compare_with: str | None) -> int:
+    if cfg.data != FitConfig().data:
+        raise UserError(
+            "--static reads every photograph of the folder at its own size.",
+            fix="leave out --max-width, --images and --data options",
+        )
     with TerminalReporter() as reporter:
         reporter.stage("Solving the stack")
-        result = calibrate_stack(folder, known=cfg.photometry.known, compare_with=compare_with)
+        result = calibrate_stack(
+            folder,
+            known=cfg.photometry.known,
+            known_deviation_ev=cfg.photometry.known_deviation_ev,
+            compare_with=compare_with,
+        )
         write_stack(result, out)
     console, s = _out(), result.solution
     table = Table(title="Exposures in stops from their mean", title_justify="left")
@@ -73,7 +90,7 @@ def _static_command(folder: Path, out: Path, cfg: FitConfig, compare_with: str |
     for name in ("exposure", "stated", "usable points", "signal"):
         table.add_column(name, justify="right")
     for i, name in enumerate(result.names):
-        error = s.exposure_errors[i] / np.log(2)
+        error = s.exposure_errors[i] / LN2
         table.add_row(
             name,
             f"{s.exposures_ev[i]:+.2f} +- {error:.2f}" if np.isfinite(error) else "unknown",
@@ -97,10 +114,8 @@ def print_calibration(result: Calibration) -> None:
     for name in ("exposure", "EXIF or file", "gap", "gamma", "residual EV"):
         table.add_column(name, justify="right")
     stated = result.stated_ev
-    both = np.isfinite(stated) & np.isfinite(s.exposure_errors)
-    offset = float(np.median(s.exposures_ev[both] - stated[both])) if both.any() else 0.0
     for i, view in enumerate(result.scene.views):
-        error = s.exposure_errors[i] / np.log(2)
+        error = s.exposure_errors[i] / LN2
         known = bool(np.isfinite(error))
         weak = " (weakly identified)" if s.gamma_errors[i] > WEAK_GAMMA else ""
         given = np.isfinite(stated[i])
@@ -108,7 +123,7 @@ def print_calibration(result: Calibration) -> None:
             view.name,
             view.camera,
             f"{s.exposures_ev[i]:+.2f} +- {error:.2f}" if known else "unknown",
-            f"{stated[i] + offset:+.2f}" if given else "",
+            f"{stated[i]:+.2f}" if given else "",
             f"{result.agreement.gap_ev[i]:+.2f}" + (" !" if result.agreement.disagrees[i] else "")
             if given and known
             else "",
@@ -214,16 +229,17 @@ def eval_command(run_dir: Path, reference: Path | None) -> int:
     run = load_run(run_dir)
     folder = reference or run.reference
     truth = None if folder is None else load_reference(folder, run.scene, run.cfg)
+    store = ImageStore(run.scene.views, run.cfg.data)
     with TerminalReporter() as reporter:
         metrics = evaluate(
             run.params,
             np.ones(run.params.gaussians.capacity, bool),
             run.scene,
-            ImageStore(run.scene.views, run.cfg.data),
+            store,
             make_renderer(run.cfg.render),
             run.cfg,
             reference=truth,
-            radiance=find_radiance(run.scene, run.cfg),
+            radiance=find_radiance(run.scene, store),
             on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
         )
     path = run_dir / "metrics.json"
@@ -283,6 +299,9 @@ def bench_command(
     write_baseline: Path | None,
 ) -> int:
     """Run benches, print their tables; 1 where something is worse than the baseline allows."""
+    # Imported here: its scenes are arrays, and other commands should not wait for them.
+    from p2gs_jax.bench import run as benches
+
     for name in parts:
         if name not in benches.PARTS:
             raise UserError(

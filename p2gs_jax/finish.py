@@ -69,7 +69,7 @@ def load_reference(folder: str | Path, scene: Scene, cfg: FitConfig) -> Referenc
     return lambda row: store.get(where[row], 1)[0] if row in where else None
 
 
-def find_radiance(scene: Scene, cfg: FitConfig) -> Truth | None:
+def find_radiance(scene: Scene, store: ImageStore) -> Truth | None:
     """Return true linear radiance by view row where the scene carries it (`truth/linear`).
 
     Synthetic scenes do; it is used for judging only.
@@ -77,7 +77,6 @@ def find_radiance(scene: Scene, cfg: FitConfig) -> Truth | None:
     folder = scene.root / "truth" / "linear"
     if not folder.is_dir():
         return None
-    store = ImageStore(scene.views, cfg.data)
 
     def radiance(row: int) -> np.ndarray | None:
         path = (folder / scene.views[row].name).with_suffix(".exr")
@@ -222,7 +221,7 @@ def finish(
         make_renderer(cfg.render),
         cfg,
         reference=truth,
-        radiance=find_radiance(prepared.scene, cfg),
+        radiance=find_radiance(scene, store),
         on_view=on_view,
         on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
     )

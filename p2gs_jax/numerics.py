@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
+
+LN2 = math.log(2.0)
 
 
 def safe_log(x: Float[Array, "..."], floor: float) -> Float[Array, "..."]:

@@ -13,13 +13,13 @@ from jaxtyping import Bool, Float, UInt8
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.atomic import write_json
 from p2gs_jax.export.calibration_plot import write_calibration_plot
-from p2gs_jax.export.photometry_json import write_photometry
+from p2gs_jax.export.photometry_json import write_solution
 from p2gs_jax.init.observations import sample
+from p2gs_jax.numerics import LN2
 from p2gs_jax.photometry.agreement import compare
 from p2gs_jax.photometry.observations import Observations
-from p2gs_jax.photometry.response import Response, log_exposed
+from p2gs_jax.photometry.response import BASES, Response, log_exposed
 from p2gs_jax.photometry.solution import (
-    LN2,
     KnownExposures,
     PhotometricSolution,
     Problem,
@@ -28,7 +28,7 @@ from p2gs_jax.photometry.solution import (
     make_problem,
 )
 from p2gs_jax.scene.exif import read_exif_ev
-from p2gs_jax.scene.known_exposures import read_known_exposures
+from p2gs_jax.scene.known_exposures import read_known_exposures, stated_ev
 from p2gs_jax.types import View
 
 POINTS, CANDIDATES = 4000, 40_000
@@ -73,8 +73,9 @@ class StackResult:
     """What a stack says.
 
     Attributes:
-        names: file names.
+        views: the photographs; poses mean nothing.
         solution: exposures and common response.
+        known: where known exposures came from, or None.
         stated_ev: stated exposures in stops, moved to the recovered ones; NaN where unknown.
         signal: frames in which enough points are neither black nor saturated.
         shifts: pixels by which each frame was moved to fit its neighbour.
@@ -86,8 +87,9 @@ class StackResult:
         messages: what the user should know.
     """
 
-    names: list[str]
+    views: tuple[View, ...]
     solution: PhotometricSolution
+    known: str | None
     stated_ev: Float[np.ndarray, " v"]
     signal: Bool[np.ndarray, " v"]
     shifts: Float[np.ndarray, "v 2"]
@@ -97,6 +99,11 @@ class StackResult:
     problem: Problem
     xy: Float[np.ndarray, "p 2"]
     messages: tuple[str, ...]
+
+    @property
+    def names(self) -> list[str]:
+        """File names."""
+        return [v.name for v in self.views]
 
     @property
     def one_response(self) -> bool:
@@ -249,6 +256,7 @@ def calibrate_stack(
     folder: Path,
     *,
     known: str | None = None,
+    known_deviation_ev: float = 0.0,
     compare_with: str | None = None,
     seed: int = 0,
 ) -> StackResult:
@@ -260,6 +268,7 @@ def calibrate_stack(
     Args:
         folder: photographs of one viewpoint.
         known: exposures to keep: `exif` or a CSV file; the response is then solved with them.
+        known_deviation_ev: their standard deviation, stops; 0 keeps them as they are.
         compare_with: stated exposures to report beside the recovered ones; default EXIF.
         seed: of the sampled positions.
 
@@ -268,11 +277,10 @@ def calibrate_stack(
     """
     stack = read_stack(folder)
     views = [_view(path) for path in stack.files]
-    given = None if known is None else KnownExposures(read_known_exposures(known, views))
-    if compare_with is not None:
-        stated = read_known_exposures(compare_with, views) / LN2
-    else:
-        stated = np.array([np.nan if v.exif_ev is None else v.exif_ev for v in views], float)
+    given = None
+    if known is not None:
+        given = KnownExposures(read_known_exposures(known, views), known_deviation_ev)
+    stated = stated_ev(compare_with, views)
     shifts = align(stack.images)
     black = black_level(stack.images, stack.valid)
     xy = choose_points(stack, black, seed)
@@ -280,8 +288,7 @@ def calibrate_stack(
     problem = make_problem(
         observations, black=black, saturation=SATURATED, pivot=PIVOT, known=given
     )
-    response, notes = choose_response(problem)
-    solution = fit_model(problem, "view_exposure", response)
+    solution, notes = solve_response(problem)
     signal = np.array([signal_share(i[stack.valid], black) > SIGNAL for i in stack.images])
     left = residuals(problem, solution)
     curve, local = unexplained(problem, left, xy, stack.valid.shape, signal)
@@ -308,15 +315,11 @@ def calibrate_stack(
     )
     if agreement.views >= 2:
         messages.append(agreement.sentence("The stated exposures"))
-    offset = (
-        np.nanmedian(np.where(signal, solution.exposures_ev - stated, np.nan))
-        if (np.isfinite(stated) & signal).any()
-        else 0.0
-    )
     return StackResult(
-        stack.names,
+        tuple(views),
         solution,
-        stated + offset,
+        known,
+        stated + agreement.offset_ev,
         signal,
         shifts,
         black,
@@ -344,27 +347,13 @@ def _view(path: Path) -> View:
 def write_stack(result: StackResult, out: Path) -> None:
     """Write `photometry.json`, `calibration.json` and `calibration.png`."""
     s = result.solution
-    curve = "spline" if s.response.spline is not None else s.response.base
-    write_photometry(
+    write_solution(
         out / "photometry.json",
-        model=s.model,
-        curve={"name": curve, "pivot": PIVOT, "spline": s.response.spline},
+        s,
+        views=result.views,
+        pivot=PIVOT,
+        known=result.known,
         gauge="mean log exposure is 0; exposures and response can be stretched together",
-        mean={"exposure": 1.0, "exposure_geometric": 1.0, "gamma": 2.2},
-        views=[
-            {
-                "image": name,
-                "camera": "0",
-                "exposure": float(np.exp(s.log_exposures[i])),
-                "exposure_ev": float(s.exposures_ev[i]),
-                "exposure_ev_error": float(s.exposure_errors[i] / LN2),
-                "gamma": 2.2,
-                "exif_ev": None,
-                "split": "train",
-                "exposure_fitted": None,
-            }
-            for i, name in enumerate(result.names)
-        ],
     )
     write_json(
         out / "calibration.json",
@@ -381,29 +370,21 @@ def write_stack(result: StackResult, out: Path) -> None:
     )
     write_calibration_plot(
         out / "calibration.png",
-        exposures_ev=s.exposures_ev,
-        errors_ev=np.where(np.isfinite(s.exposure_errors), s.exposure_errors / LN2, np.nan),
+        s,
+        cameras=[v.camera for v in result.views],
         stated_ev=result.stated_ev,
-        cameras=["0"] * len(result.names),
-        residual_ev=s.view_residual_ev,
-        response=s.response,
-        gammas=s.gammas,
         pivot=PIVOT,
     )
 
 
-def choose_response(problem: Problem) -> tuple[Response, list[str]]:
-    """Return the better base with its spline; a stack holds every level in many frames."""
-    options = []
-    for base in (Response("srgb"), Response("power")):
-        bent = fit_response(problem, base)
-        if bent is not None:
-            options.append(bent)
+def solve_response(problem: Problem) -> tuple[PhotometricSolution, list[str]]:
+    """Solve exposures under the better base with its spline; a stack holds every level often."""
+    bent = [fit_response(problem, Response(base)) for base in BASES]
+    options = [fit_model(problem, "view_exposure", r) for r in bent if r is not None]
     if not options:
-        return Response(), ["A fitted response collapsed: sRGB was used as it is."]
-    fits = [fit_model(problem, "view_exposure", r) for r in options]
-    best = min(range(len(options)), key=lambda i: fits[i].residual_ev)
-    return options[best], []
+        collapsed = "A fitted response collapsed: sRGB was used as it is."
+        return fit_model(problem, "view_exposure"), [collapsed]
+    return min(options, key=lambda s: s.residual_ev), []
 
 
 def residuals(problem: Problem, solution: PhotometricSolution) -> Float[np.ndarray, "o 3"]:
@@ -421,14 +402,3 @@ def predict(
     y = np.linspace(1 / 510, 1, 4096)
     z = np.maximum.accumulate(log_exposed(y, response)[0])
     return np.interp(log_exposure + log_radiance, z, y)
-
-
-__all__ = [
-    "Stack",
-    "StackResult",
-    "align",
-    "calibrate_stack",
-    "observe_stack",
-    "predict",
-    "read_stack",
-]

@@ -13,11 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from p2gs_jax.bench.metrics import FIELDS
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render import project, render_linear, required_capacity, view_radiance
+from p2gs_jax.render.spherical_harmonics import C0
 from p2gs_jax.types import Camera, Gaussians
 
-FIELDS = tuple(f.name for f in dataclasses.fields(Gaussians))
 # A near plane that float32 represents exactly, so that "on the plane" means the same in float64.
 NEAR = 0.0625
 CONFIG = RenderConfig(near=NEAR, pixels_in_flight=1024)
@@ -48,7 +49,7 @@ def splats(
     def rows(value, width):
         return np.broadcast_to(np.asarray(value, np.float64), (n, width) if width else (n,))
 
-    sh = np.log(np.maximum(rows(radiance, 3), 1e-35))[:, None] / 0.28209479177387814
+    sh = np.log(np.maximum(rows(radiance, 3), 1e-35))[:, None] / C0
     leaves = (rows(mean, 3), rows(quat, 4), np.log(rows(scales, 3)), rows(logit, 0), sh)
     return Gaussians(*(jnp.asarray(a, jnp.float32) for a in leaves))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Literal
 
@@ -9,9 +10,10 @@ import numpy as np
 from jaxtyping import Float
 
 from p2gs_jax.bench.oracle import Truth
+from p2gs_jax.synth.sensor import srgb_encode
 from p2gs_jax.types import Gaussians
 
-FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
+FIELDS = tuple(f.name for f in dataclasses.fields(Gaussians))
 # Radiances below this part of the image's largest are held to it in relative errors.
 DARKEST = 1e-4
 
@@ -55,12 +57,6 @@ METRICS = {
 ACCURACY = ("max_abs", "relative", "psnr", "gradient")
 
 
-def srgb(linear: np.ndarray) -> np.ndarray:
-    """Return the sRGB encoding of linear values, clipped to [0, 1]."""
-    x = np.clip(linear, 0, 1)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)
-
-
 def errors(
     linear: Float[np.ndarray, "h w 3"], gradient: Gaussians, truth: Truth
 ) -> dict[str, float]:
@@ -74,7 +70,7 @@ def errors(
     error = np.abs(linear - truth.linear)
     brightest = truth.linear.max(-1)
     brightest = np.maximum(brightest, DARKEST * brightest.max())
-    mse = np.mean((srgb(linear * exposure) - srgb(truth.linear * exposure)) ** 2)
+    mse = np.mean((srgb_encode(linear * exposure) - srgb_encode(truth.linear * exposure)) ** 2)
     groups = []
     for name in FIELDS:
         a, b = np.asarray(getattr(gradient, name), np.float64), getattr(truth.gradient, name)

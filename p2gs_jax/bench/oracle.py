@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render import project, rasterize, view_radiance
-from p2gs_jax.render.cutoff import log_cutoffs
+from p2gs_jax.render.cutoff import with_cutoffs
 from p2gs_jax.types import Camera, Gaussians, Splats2D
 
 BLOCK = (32, 24)
@@ -60,28 +60,19 @@ def truth(
     """
     with jax.enable_x64(True):
         scene, view = jax.tree.map(lambda a: jnp.asarray(a, jnp.float64), (gaussians, camera))
-        (leaves, radiance), pull = jax.vjp(lambda g: _prepared(g, view, cfg), scene)
-        splats = _splats(leaves, scene, view, cfg)
+        (leaves, radiance), pull, splats = jax.vjp(
+            lambda g: _prepared(g, view, cfg), scene, has_aux=True
+        )
         linear, v_leaves, v_radiance = _blocks(splats, leaves, radiance, camera, cfg, cotangent)
         (gradient,) = pull((v_leaves, v_radiance))
         return Truth(linear, jax.tree.map(np.asarray, gradient))
 
 
 def _prepared(gaussians: Gaussians, view: Camera, cfg: RenderConfig):
-    s = project(gaussians, jnp.ones(gaussians.capacity, bool), view, cfg)
     radiance = view_radiance(gaussians, view, cfg)
-    return (s.means2d, s.conic_factor, s.log_opacities), radiance
-
-
-def _splats(leaves, gaussians: Gaussians, view: Camera, cfg: RenderConfig) -> Splats2D:
-    s = project(gaussians, jnp.ones(gaussians.capacity, bool), view, cfg)
-    if cfg.cutoff_rule == "radiance":
-        s = dataclasses.replace(
-            s, log_cutoffs=log_cutoffs(s, view_radiance(gaussians, view, cfg), cfg)
-        )
-    return dataclasses.replace(
-        s, means2d=leaves[0], conic_factor=leaves[1], log_opacities=leaves[2]
-    )
+    alive = jnp.ones(gaussians.capacity, bool)
+    s = with_cutoffs(project(gaussians, alive, view, cfg), radiance, cfg)
+    return ((s.means2d, s.conic_factor, s.log_opacities), radiance), s
 
 
 @functools.partial(jax.jit, static_argnames=("cfg",))

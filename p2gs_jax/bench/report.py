@@ -14,7 +14,7 @@ matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.ticker import FormatStrFormatter
+from matplotlib.ticker import FormatStrFormatter, NullFormatter
 
 from p2gs_jax.bench.growth import Curve
 from p2gs_jax.bench.hard_cases import CASES, Gap
@@ -225,6 +225,7 @@ def growth_plot(path: Path, curves: list[Curve]) -> None:
         ):
             axis.loglog(work, times, marker=marker, label=f"{label}: power {p:.2f}")
         axis.set_xlabel(c.axis, fontsize=8)
+        axis.xaxis.set_minor_formatter(NullFormatter())
         axis.tick_params(labelsize=7)
         axis.grid(alpha=0.25)
         axis.legend(fontsize=7)

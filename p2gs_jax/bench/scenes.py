@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import KDTree
 
+from p2gs_jax.render.spherical_harmonics import C0
 from p2gs_jax.types import Camera, Gaussians
 
 
@@ -35,7 +36,7 @@ def _camera(width: int, height: int, focal: float) -> Camera:
 def _gaussians(means, quats, log_scales, logits, log_radiance, degree: int, rng) -> Gaussians:
     sh = rng.normal(0, 0.1, (len(means), (degree + 1) ** 2, 3))
     # exp(C0 sh0) is the radiance seen from everywhere.
-    sh[:, 0] = log_radiance / 0.28209479177387814
+    sh[:, 0] = log_radiance / C0
     leaves = (means, quats, log_scales, logits, sh)
     return Gaussians(*(jnp.asarray(a, jnp.float32) for a in leaves))
 

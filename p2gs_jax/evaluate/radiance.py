@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-import colour
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
 from p2gs_jax.evaluate.metrics import ssim
+from p2gs_jax.numerics import LN2
 
 Truth = Callable[[int], Float[np.ndarray, "h w 3"] | None]
 
@@ -61,6 +61,9 @@ def delta_e_itp(linear, truth, mask: Bool[np.ndarray, "h w"], white: float) -> f
     if not mask.any():
         return float("nan")
 
+    # Imported here: it takes as long to load as a small scene to read.
+    import colour
+
     def encoded(x):
         nits = np.clip(x[mask] / white * WHITE_NITS, 0, PU21_RANGE[1])
         wide = colour.RGB_to_RGB(nits, "sRGB", "ITU-R BT.2020")
@@ -105,8 +108,8 @@ class RadianceScores:
         for name, _, linear, truth, mask in self.views:
             keep = mask & (truth.min(-1) > 0) & (linear.max(-1) < brightest)
             a, b = np.log2(np.maximum(linear[keep], 1e-12)), np.log2(truth[keep])
-            stops = np.minimum(np.abs(a + shift / np.log(2) - b), STOPS_CAP)
-            bent = np.minimum(np.abs(power * a + offset / np.log(2) - b), STOPS_CAP)
+            stops = np.minimum(np.abs(a + shift / LN2 - b), STOPS_CAP)
+            bent = np.minimum(np.abs(power * a + offset / LN2 - b), STOPS_CAP)
             rows[name] = {
                 "stops_median": float(np.median(stops)) if stops.size else float("nan"),
                 "stops_rms": float(np.sqrt(np.mean(stops**2))) if stops.size else float("nan"),

@@ -14,7 +14,10 @@ from jaxtyping import Float
 from matplotlib.ticker import MaxNLocator
 
 from p2gs_jax.export.atomic import atomic_write
+from p2gs_jax.numerics import LN2
 from p2gs_jax.photometry.response import Response, log_exposed
+from p2gs_jax.photometry.solution import PhotometricSolution
+from p2gs_jax.types import GAMMA_SRGB
 
 MARKERS = "osD^vPX*"
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
@@ -23,35 +26,30 @@ MOST_CURVES = 12
 
 def write_calibration_plot(
     path: Path,
+    solution: PhotometricSolution,
     *,
-    exposures_ev: Float[np.ndarray, " v"],
-    errors_ev: Float[np.ndarray, " v"],
-    stated_ev: Float[np.ndarray, " v"],
     cameras: list[str],
-    residual_ev: Float[np.ndarray, " v"],
-    response: Response,
-    gammas: Float[np.ndarray, " v"],
+    stated_ev: Float[np.ndarray, " v"],
     pivot: float,
 ) -> None:
     """Draw what a calibration found.
 
     Args:
         path: the PNG.
-        exposures_ev: per view, stops; NaN where unobserved.
-        errors_ev: standard errors.
-        stated_ev: EXIF or a file, stops up to a constant; NaN where unknown.
+        solution: exposures, gammas, response and residuals.
         cameras: physical camera of each view.
-        residual_ev: robust residual per view.
-        response: base curve and spline.
-        gammas: per view.
+        stated_ev: EXIF or a file, stops, laid over the recovered ones; NaN where unknown.
         pivot: linear value that gammas leave alone.
     """
+    s = solution
+    seen = np.isfinite(s.exposure_errors)
+    exposures_ev = np.where(seen, s.exposures_ev, np.nan)
+    errors_ev = np.where(seen, s.exposure_errors / LN2, np.nan)
     figure, (top, middle, right) = plt.subplots(
         1, 3, figsize=(13, 4), width_ratios=(2.2, 1.1, 1.1), layout="constrained"
     )
     names = list(dict.fromkeys(cameras))
     groups = [np.array([c == name for c in cameras]) for name in names]
-    offset = np.nanmedian(exposures_ev - stated_ev) if np.isfinite(stated_ev).any() else 0.0
     for i, (name, mine) in enumerate(zip(names, groups, strict=True)):
         at = np.flatnonzero(mine)
         color, marker = COLORS[i % len(COLORS)], MARKERS[i % len(MARKERS)]
@@ -66,10 +64,10 @@ def write_calibration_plot(
             color=color,
             label=f"camera {name}" if len(names) > 1 else "recovered, 2 standard errors",
         )
-        middle.plot(at, residual_ev[mine], marker, ms=4, color=color)
+        middle.plot(at, s.view_residual_ev[mine], marker, ms=4, color=color)
         if np.isfinite(stated_ev[mine]).any():
             label = "EXIF or file" if i == 0 else None
-            top.plot(at, stated_ev[mine] + offset, "k_", ms=9, mew=1.6, label=label)
+            top.plot(at, stated_ev[mine], "k_", ms=9, mew=1.6, label=label)
     top.set_title("Exposure", loc="left", fontsize=10)
     top.set_ylabel("stops from the mean")
     middle.set_title("Residual of an observation", loc="left", fontsize=10)
@@ -82,14 +80,14 @@ def write_calibration_plot(
     if len(names) <= 12:
         top.legend(fontsize=7)
     y = np.linspace(0.02, 1, 300)
-    base = log_exposed(y, response)[0] - np.log(pivot)
-    distinct = np.unique(np.round(gammas, 3))
+    base = log_exposed(y, s.response)[0] - np.log(pivot)
+    distinct = np.unique(np.round(s.gammas, 3))
     for gamma in distinct[:: max(1, len(distinct) // MOST_CURVES)]:
-        stops = (base * gamma / 2.2 + np.log(pivot)) / np.log(2)
+        stops = (base * gamma / GAMMA_SRGB + np.log(pivot)) / LN2
         right.plot(stops, y, lw=0.9, label=f"gamma {gamma:.2f}")
-    srgb = log_exposed(y, Response())[0] / np.log(2)
+    srgb = log_exposed(y, Response())[0] / LN2
     right.plot(srgb, y, "k--", lw=0.9, label="sRGB")
-    right.set_title(f"Tone curve: {response.name}", loc="left", fontsize=10)
+    right.set_title(f"Tone curve: {s.response.name}", loc="left", fontsize=10)
     right.set_xlabel("log2 of the exposed radiance (0: white)")
     right.set_ylabel("photographed value")
     right.set_xlim(-9, 1)

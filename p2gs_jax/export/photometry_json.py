@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NotRequired, TypedDict
 
+import numpy as np
+
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.atomic import write_json
+from p2gs_jax.numerics import LN2
+from p2gs_jax.photometry.solution import PhotometricSolution
+from p2gs_jax.types import View
 
 # Absent from files of runs without a bundle adjustment.
 OPTIONAL = frozenset({"exposure_ev_error", "gamma_error"})
@@ -63,6 +69,66 @@ def write_photometry(
     if problem := _problem(data):
         raise ValueError(problem)
     write_json(path, data)
+
+
+def write_solution(
+    path: Path,
+    solution: PhotometricSolution,
+    *,
+    views: Sequence[View],
+    pivot: float,
+    known: str | None,
+    gauge: str = "mean log exposure is 0 over each connected group of views",
+) -> None:
+    """Write the file from a photometric solution; views it knows nothing about get nulls.
+
+    Args:
+        path: the file.
+        solution: exposures, gammas, response.
+        views: its views, in order.
+        pivot: linear value that gammas leave alone.
+        known: where known exposures came from, or None.
+        gauge: what fixes the scale where none are known, in words.
+    """
+    s = solution
+    seen = np.isfinite(s.exposure_errors)
+    e = np.exp(s.log_exposures[seen])
+    rows: list[ViewPhotometry] = []
+    for i, view in enumerate(views):
+        values = (
+            np.exp(s.log_exposures[i]),
+            s.exposures_ev[i],
+            s.exposure_errors[i] / LN2,
+            s.gammas[i],
+            s.gamma_errors[i],
+        )
+        exposure, ev, ev_error, gamma, gamma_error = (float(v) if seen[i] else None for v in values)
+        rows.append(
+            {
+                "image": view.name,
+                "camera": view.camera,
+                "exposure": exposure,
+                "exposure_ev": ev,
+                "exposure_ev_error": ev_error,
+                "gamma": gamma,
+                "gamma_error": gamma_error,
+                "exif_ev": view.exif_ev,
+                "split": "train",
+                "exposure_fitted": None,
+            }
+        )
+    write_photometry(
+        path,
+        model=s.model,
+        curve={"name": s.response.curve, "pivot": pivot, "spline": s.response.spline},
+        gauge=gauge if known is None else f"known exposures ({known})",
+        mean={
+            "exposure": float(e.mean()) if e.size else 1.0,
+            "exposure_geometric": float(np.exp(np.log(e).mean())) if e.size else 1.0,
+            "gamma": float(s.gammas.mean()),
+        },
+        views=rows,
+    )
 
 
 def read_photometry(path: Path) -> PhotometryFile:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import minimum_filter
 
-from p2gs_jax.init.observations import gather, sample
+from p2gs_jax.init.observations import gather, sample, track_colors
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Scene, View
@@ -57,6 +57,30 @@ def unoccluded(
     return visible
 
 
+def has_tracks(scene: Scene) -> bool:
+    """Return whether the scene says which pixels show the same point."""
+    return scene.tracks is not None and len(scene.tracks.xy) > 0
+
+
+def surface_colors(
+    scene: Scene,
+    store: ImageStore,
+    seed: int,
+    on_view: Callable[[int, int], None] = lambda i, n: None,
+) -> Observations:
+    """Return colours of shared points: at the tracks, or of projected points where there are none.
+
+    Args:
+        scene: with tracks or points.
+        store: photographs.
+        seed: see `projected_colors`.
+        on_view: progress.
+    """
+    if has_tracks(scene):
+        return track_colors(scene, store, on_view)
+    return projected_colors(scene, store, seed, on_view)
+
+
 def projected_colors(
     scene: Scene,
     store: ImageStore,
@@ -83,7 +107,9 @@ def projected_colors(
         visible = unoccluded(xy, z, view.width, view.height)[chosen]
         where.append(xy[chosen])
         seen.append(visible)
-    return sample_where_seen(scene, store, chosen, where, _thinned(np.stack(seen), rng), on_view)
+    return sample_where_seen(
+        scene, store, chosen, where, thinned(np.stack(seen), rng, MOST_PER_POINT), on_view
+    )
 
 
 def sample_where_seen(
@@ -120,9 +146,9 @@ def sample_where_seen(
     return gather(scene, views, points, samples)
 
 
-def _thinned(seen: Bool[np.ndarray, "v p"], rng) -> Bool[np.ndarray, "v p"]:
-    """Return at most MOST_PER_POINT views of each point, evenly at random."""
+def thinned(seen: Bool[np.ndarray, "v p"], rng, most: int) -> Bool[np.ndarray, "v p"]:
+    """Return at most `most` views of each point, evenly at random."""
     order = rng.random(seen.shape)
     order[~seen] = 2.0
     rank = np.argsort(np.argsort(order, axis=0), axis=0)
-    return seen & (rank < MOST_PER_POINT)
+    return seen & (rank < most)

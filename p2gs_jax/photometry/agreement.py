@@ -21,6 +21,7 @@ class Agreement(NamedTuple):
         slope: recovered over stated, least squares; other than 1 is the power gauge or tone
             mapping.
         rms_ev: RMS gap in stops.
+        offset_ev: what to add to stated exposures to lay them over the recovered ones.
         gap_ev: recovered minus stated, median removed; NaN where either is missing.
         disagrees: views whose gap is noticeable and significant.
     """
@@ -29,6 +30,7 @@ class Agreement(NamedTuple):
     correlation: float
     slope: float
     rms_ev: float
+    offset_ev: float
     gap_ev: Float[np.ndarray, " v"]
     disagrees: Bool[np.ndarray, " v"]
 
@@ -65,12 +67,13 @@ def compare(
     both = np.isfinite(stated_ev) & np.isfinite(errors_ev)
     gap = np.full(len(exposures_ev), np.nan)
     count = int(both.sum())
-    if count < 2:
-        nowhere = np.zeros(len(gap), bool)
-        return Agreement(count, float("nan"), float("nan"), float("nan"), gap, nowhere)
     a, b = exposures_ev[both], stated_ev[both]
     difference = a - b
-    gap[both] = difference - np.median(difference)
+    offset = float(np.median(difference)) if count else 0.0
+    if count < 2:
+        nan, nowhere = float("nan"), np.zeros(len(gap), bool)
+        return Agreement(count, nan, nan, nan, offset, gap, nowhere)
+    gap[both] = difference - offset
     a, b = a - a.mean(), b - b.mean()
     varies = a @ a > 1e-9 and b @ b > 1e-9
     with np.errstate(invalid="ignore"):
@@ -80,6 +83,7 @@ def compare(
         float(a @ b / np.sqrt((a @ a) * (b @ b))) if varies else float("nan"),
         float(a @ b / (b @ b)) if varies else float("nan"),
         float(np.sqrt(np.mean((difference - difference.mean()) ** 2))),
+        offset,
         gap,
         disagrees & both,
     )

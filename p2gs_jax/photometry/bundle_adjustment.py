@@ -286,23 +286,31 @@ def _log_slopes(rows: Rows, local: _Local):
     return steps.T @ first, steps.T @ (second[:, None] * steps)
 
 
+def prior_matrix(system: System) -> Float[Array, "2v 2v"]:
+    """Return the normal matrix of the priors: of h by b = a h (residual b - a mu), and of a."""
+    tau, mu = system.log_exposure_precision, system.log_exposure
+    cross = jnp.diag(-tau * mu)
+    of_a = jnp.diag(tau * mu**2 + system.a_precision)
+    return jnp.block([[jnp.diag(tau), cross], [cross, of_a]])
+
+
+def gauge_strength(normal: Float[Array, "d d"], views: int) -> Float[Array, ""]:
+    """Return how hard the anchors hold, on the scale of the exposures' information."""
+    return ANCHOR * (jnp.mean(jnp.diagonal(normal)[:views]) + EMPTY)
+
+
 def _known(system: System, theta: Theta, normal, right):
     """Add priors and gauges to the normal equations."""
     views = theta.b.shape[0]
-    tau, mu = system.log_exposure_precision, system.log_exposure
-    # Prior on h through b = a h: residual b - a mu.
-    gap = theta.b - theta.a * mu
-    rows_b, rows_a = jnp.arange(views), views + jnp.arange(views)
-    normal = normal.at[rows_b, rows_b].add(tau).at[rows_b, rows_a].add(-tau * mu)
-    normal = normal.at[rows_a, rows_b].add(-tau * mu).at[rows_a, rows_a].add(tau * mu**2)
-    normal = normal.at[rows_a, rows_a].add(system.a_precision)
-    right = right.at[rows_b].add(-tau * gap).at[rows_a].add(tau * mu * gap)
-    right = right.at[rows_a].add(system.a_precision * (1 - theta.a))
-    strength = ANCHOR * (jnp.mean(jnp.diagonal(normal)[:views]) + EMPTY)
-    both = jnp.concatenate([theta.b, theta.a])
+    both, part = jnp.concatenate([theta.b, theta.a]), slice(0, 2 * views)
+    prior = prior_matrix(system)
+    normal = normal.at[part, part].add(prior)
+    right = right.at[part].add(-prior @ both)
+    right = right.at[views : 2 * views].add(system.a_precision)
+    strength = gauge_strength(normal, views)
     pulled = system.targets - system.anchors @ both
-    normal = normal.at[: 2 * views, : 2 * views].add(strength * system.anchors.T @ system.anchors)
-    right = right.at[: 2 * views].add(strength * system.anchors.T @ pulled)
+    normal = normal.at[part, part].add(strength * system.anchors.T @ system.anchors)
+    right = right.at[part].add(strength * system.anchors.T @ pulled)
     if theta.c.size:
         stiffness = jnp.mean(jnp.diagonal(normal)[2 * views :])
         normal = normal.at[2 * views :, 2 * views :].add(stiffness * system.bend)

@@ -7,9 +7,8 @@ import dataclasses
 import jax.numpy as jnp
 
 from p2gs_jax.photometry.radiance import RadianceKind
+from p2gs_jax.render.spherical_harmonics import C0
 from p2gs_jax.types import Params
-
-SH_C0 = 0.28209479177387814
 
 
 def recentre(params: Params, activation: RadianceKind) -> Params:
@@ -26,10 +25,10 @@ def recentre(params: Params, activation: RadianceKind) -> Params:
     log_scale = jnp.mean(jnp.log(photometry.exposures))
     factor = jnp.exp(log_scale)
     if activation == "exp":
-        sh = sh.at[:, 0].add(log_scale / SH_C0)
+        sh = sh.at[:, 0].add(log_scale / C0)
     else:
         # radiance = value + 1/2: the half must grow with the rest.
-        sh = (sh * factor).at[:, 0].add((factor - 1) * 0.5 / SH_C0)
+        sh = (sh * factor).at[:, 0].add((factor - 1) * 0.5 / C0)
     if photometry.parameterization == "log":
         raw = photometry.raw_exposures - log_scale
     else:

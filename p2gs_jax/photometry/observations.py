@@ -39,6 +39,12 @@ class Observations:
     point_count: int
     cameras: Int[np.ndarray, " v"]
 
+    def decoded(self, response: Response):
+        """Return log exposed radiance, its stated standard deviation and dz/dy, each (O, 3)."""
+        y = np.asarray(self.colors, np.float64)
+        z, slope = log_exposed(y, response)
+        return z, deviation(y, slope, self.spread, response.base), slope
+
     def usable(self, black: float, saturation: float) -> Float[np.ndarray, "o 3"]:
         """Return 1 where a value is neither near black nor saturated and its point is shared."""
         keep = (self.colors > black) & (self.colors < saturation)
@@ -129,10 +135,8 @@ def make_rows(
         response: what decodes the colours.
         log_pivot: log of the linear value that gamma leaves alone.
     """
-    y = np.asarray(observations.colors, np.float64)
-    z, slope = log_exposed(y, response)
-    sigma = deviation(y, slope, observations.spread, response.base)
-    knot, fraction = hat(y)
+    z, sigma, slope = observations.decoded(response)
+    knot, fraction = hat(np.asarray(observations.colors, np.float64))
     return Rows(
         views=jnp.asarray(layout.place(observations.views.astype(np.int32))),
         z=jnp.asarray(layout.place(z - log_pivot)),

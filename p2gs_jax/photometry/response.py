@@ -49,6 +49,11 @@ class Response:
         return self.base if self.spline is None else f"spline over {self.base}"
 
     @property
+    def curve(self) -> Literal["srgb", "power", "spline"]:
+        """The name of the curve in `PhotometryConfig` and `photometry.json`."""
+        return self.base if self.spline is None else "spline"
+
+    @property
     def extra_parameters(self) -> int:
         """Parameters besides those of the base curve."""
         return 0 if self.spline is None else len(FREE)

@@ -15,17 +15,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from p2gs_jax.numerics import LN2
 from p2gs_jax.photometry.bundle_adjustment import Fit
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import (
     BASES,
     Response,
-    deviation,
-    log_exposed,
 )
 from p2gs_jax.photometry.solution import (
     LADDER,
-    LN2,
     ROUGH,
     KnownExposures,
     ModelName,
@@ -105,13 +103,11 @@ def _densities(
 ) -> Float[np.ndarray, " h"]:
     """Return log densities of the held-out observations, NaN where nothing can be said."""
     o, layout = problem.observations, problem.layout
-    y = np.asarray(o.colors, np.float64)[held]
-    _, slope = log_exposed(y, response)
+    sigma, slope = (a[held] for a in o.decoded(response)[1:])
     residual = layout.take(fit.residual)[held]
     precision = fit.precision[layout.row[held]]
     a = fit.theta.a[o.views[held]][:, None]
-    ideal = layout.take(stated_deviation(problem, response))[held]
-    variance = (scale * ideal) ** 2 + (scale * a) ** 2 / np.maximum(precision, 1e-9)
+    variance = (scale * sigma) ** 2 + (scale * a) ** 2 / np.maximum(precision, 1e-9)
     known = (problem.usable[held] > 0) & (precision > 1e-3)
 
     def normal(v):
@@ -125,14 +121,6 @@ def _densities(
     # Channels are correlated: an observation counts once, as their mean.
     count = known.sum(1)
     return np.where(count > 0, (density * known).sum(1) / np.maximum(count, 1), np.nan)
-
-
-def stated_deviation(problem: Problem, response: Response) -> Float[np.ndarray, "r m 3"]:
-    """Return the stated standard deviation of every slot under a response."""
-    o = problem.observations
-    y = np.asarray(o.colors, np.float64)
-    _, slope = log_exposed(y, response)
-    return problem.layout.place(deviation(y, slope, o.spread, response.base), 1.0)
 
 
 def _subset(observations: Observations, seed: int, most: int) -> Observations:
@@ -195,12 +183,9 @@ def select(
         seed: which observations are held out.
         fixed: solve this model under this curve instead of choosing.
     """
-    if fixed is not None:
-        problem = make_problem(
-            observations, black=black, saturation=saturation, pivot=pivot, known=known
-        )
-        return Selection(fit_model(problem, *fixed), (), ())
     make = functools.partial(make_problem, black=black, saturation=saturation, pivot=pivot)
+    if fixed is not None:
+        return Selection(fit_model(make(observations, known=known), *fixed), (), ())
     small = make(_subset(observations, seed, MOST_OBSERVATIONS))
     o = small.observations
     held = np.random.default_rng((seed, 7)).random(len(o.points)) < HELD_OUT
@@ -232,8 +217,7 @@ def select(
         candidates.append(Candidate(model, curve, count, mean[model, curve], behind, error))
     chosen = choose(candidates)
     candidates.sort(key=lambda c: -c.density)
-    problem = make(observations, known=known)
-    solution = fit_model(problem, chosen.model, chosen.response)
+    solution = fit_model(make(observations, known=known), chosen.model, chosen.response)
     return Selection(solution, tuple(candidates), (*notes, *_reasons(chosen, candidates)))
 
 

@@ -11,7 +11,15 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from p2gs_jax.config import PhotometricModel as ModelName
-from p2gs_jax.photometry.bundle_adjustment import Fit, System, Theta, solve
+from p2gs_jax.numerics import LN2
+from p2gs_jax.photometry.bundle_adjustment import (
+    Fit,
+    System,
+    Theta,
+    gauge_strength,
+    prior_matrix,
+    solve,
+)
 from p2gs_jax.photometry.observations import Layout, Observations, make_rows
 from p2gs_jax.photometry.response import FREE, KNOTS, Response, log_slope_minimum, monotone
 from p2gs_jax.types import GAMMA_SRGB
@@ -26,7 +34,6 @@ FIXED_EV = 1e-5
 # Smoothness of the spline relative to its mean information.
 BEND, BEND_SPACING = 3e-3, 0.12
 STRETCH, FLATTEST = 1.6, 0.3
-LN2 = float(np.log(2.0))
 
 
 class Model(NamedTuple):
@@ -254,24 +261,21 @@ def covariance(fit: Fit, system: System) -> Float[np.ndarray, "d d"]:
     Residuals of the three channels of an observation, and of a point, are not independent: the
     meat is summed over points, and counts them once.
     """
-    v = len(fit.theta.b)
+    both = slice(0, 2 * len(fit.theta.b))
     bread, meat = fit.normal * fit.curvature, fit.scores.copy()
-    tau, mu = np.asarray(system.log_exposure_precision), np.asarray(system.log_exposure)
-    prior = np.zeros_like(bread)
-    i = np.arange(v)
-    prior[i, i] = tau
-    prior[i, v + i] = prior[v + i, i] = -tau * mu
-    prior[v + i, v + i] = tau * mu**2 + np.asarray(system.a_precision)
-    strength = 10 * (np.diag(bread)[:v].mean() + 1e-9)
-    gauge = np.zeros_like(bread)
-    gauge[: 2 * v, : 2 * v] = strength * system.anchors.T @ system.anchors
+    with jax.enable_x64(True):
+        prior = np.asarray(prior_matrix(system))
+        bread[both, both] += prior
+        strength = float(gauge_strength(jnp.asarray(bread), len(fit.theta.b)))
+    # A prior is itself an observation with variance 1 / precision: it is its own meat.
+    meat[both, both] += prior
+    bread[both, both] += strength * system.anchors.T @ system.anchors
     free = np.abs(system.basis).sum(0) > 0
     g = np.asarray(system.basis)[:, free]
     if not g.size:
         return np.zeros_like(bread)
-    inverse = np.linalg.pinv(g.T @ (bread + prior + gauge) @ g, hermitian=True)
-    # A prior is itself an observation with variance 1 / precision: it is its own meat.
-    return g @ inverse @ (g.T @ (meat + prior) @ g) @ inverse @ g.T
+    inverse = np.linalg.pinv(g.T @ bread @ g, hermitian=True)
+    return g @ inverse @ (g.T @ meat @ g) @ inverse @ g.T
 
 
 def fit_model(
@@ -331,22 +335,15 @@ def describe(
         active = active | given
     shift, to_h = _centering(a, h, component, active, free_scale)
     cov = covariance(fit, system)[: 2 * o.view_count, : 2 * o.view_count]
-    h_errors = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", to_h, cov, to_h), 0))
+    h_errors = np.sqrt(np.maximum(((to_h @ cov) * to_h).sum(1), 0))
     gamma = GAMMA_SRGB / a
     a_errors = np.sqrt(np.maximum(np.diag(cov)[o.view_count :], 0))
     h = np.where(active, h - shift, 0.0)
 
-    residual = problem.layout.take(fit.residual) / a[o.views][:, None]
-    view_residuals = np.full(o.view_count, np.nan)
-    for view in range(o.view_count):
-        mine = (o.views == view)[:, None] & (problem.usable > 0)
-        if mine.any():
-            view_residuals[view] = 1.4826 * np.median(np.abs(residual[mine])) / LN2
     used = problem.usable > 0
-    everything = 1.4826 * float(np.median(np.abs(residual[used]))) / LN2 if used.any() else 0.0
-    sigma_weight = problem.layout.take(fit.weight)
-    ideal = _ideal_weight(problem, response)
-    ignored = (sigma_weight / np.maximum(ideal, 1e-30))[used] < 0.25
+    residual = np.abs(problem.layout.take(fit.residual) / a[o.views][:, None])
+    ideal = 1 / o.decoded(response)[1] ** 2
+    ignored = (problem.layout.take(fit.weight) / ideal)[used] < 0.25
     return PhotometricSolution(
         model=name,
         response=response,
@@ -356,21 +353,30 @@ def describe(
         gamma_errors=np.where(active, gamma / a * a_errors, np.inf),
         observations_per_view=per_view,
         component=component,
-        point_log_radiance=_point_radiance(problem, fit, shift, active),
-        residual_ev=everything,
-        view_residual_ev=view_residuals,
+        point_log_radiance=_point_radiance(problem, fit, shift),
+        residual_ev=_spread_ev(residual[used]) if used.any() else 0.0,
+        view_residual_ev=_per_view_ev(o.views, residual, used, o.view_count),
         outliers=float(ignored.mean()) if ignored.size else 0.0,
         rounds=int(fit.rounds),
         warnings=_warnings(per_view, component, active),
     )
 
 
-def _ideal_weight(problem: Problem, response: Response) -> Float[np.ndarray, "o 3"]:
-    with jax.enable_x64(True):
-        rows = make_rows(
-            problem.observations, problem.layout, problem.usable, response, problem.log_pivot
-        )
-        return problem.layout.take(np.asarray(rows.weight / rows.sigma**2))
+def _spread_ev(absolute: Float[np.ndarray, " n"]) -> float:
+    """Return the robust standard deviation, in stops, of residuals given without sign."""
+    return 1.4826 * float(np.median(absolute)) / LN2
+
+
+def _per_view_ev(views, absolute, used, count: int) -> Float[np.ndarray, " v"]:
+    """Return that of every view; NaN where it has none."""
+    out = np.full(count, np.nan)
+    order = np.argsort(views, kind="stable")
+    bounds = np.searchsorted(views[order], np.arange(count + 1))
+    for view in range(count):
+        mine = order[bounds[view] : bounds[view + 1]]
+        if used[mine].any():
+            out[view] = _spread_ev(absolute[mine][used[mine]])
+    return out
 
 
 def _centering(a, h, component, active, free_scale):
@@ -387,7 +393,7 @@ def _centering(a, h, component, active, free_scale):
     return shift, center @ jacobian
 
 
-def _point_radiance(problem: Problem, fit: Fit, shift, active) -> Float[np.ndarray, "p 3"]:
+def _point_radiance(problem: Problem, fit: Fit, shift) -> Float[np.ndarray, "p 3"]:
     """Combine the rows of each point; the gauge shift of its views goes the other way."""
     o, layout = problem.observations, problem.layout
     rows = len(layout.point_of_row)

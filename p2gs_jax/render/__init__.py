@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Literal
 
 import jax.numpy as jnp
@@ -10,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render.binning import bin_tiles, count_entries
-from p2gs_jax.render.cutoff import log_cutoffs
+from p2gs_jax.render.cutoff import with_cutoffs
 from p2gs_jax.render.project import project, view_radiance
 from p2gs_jax.render.rasterize_reference import rasterize_reference
 from p2gs_jax.render.rasterize_xla import rasterize_xla
@@ -95,7 +94,7 @@ def render_linear(
         return _nothing(camera, with_depth)
     splats = project(gaussians, alive, camera, cfg, means2d_probe)
     radiance = view_radiance(gaussians, camera, cfg, active_degree)
-    splats = _with_cutoffs(splats, radiance, cfg)
+    splats = with_cutoffs(splats, radiance, cfg)
     if cfg.implementation == "reference":
         tiles, count = None, jnp.int32(0)
         overflow = jnp.array(False)
@@ -123,7 +122,7 @@ def required_capacity(
         return jnp.int32(0)
     splats = project(gaussians, alive, camera, cfg)
     if cfg.cutoff_rule == "radiance":
-        splats = _with_cutoffs(splats, view_radiance(gaussians, camera, cfg), cfg)
+        splats = with_cutoffs(splats, view_radiance(gaussians, camera, cfg), cfg)
     return count_entries(splats, camera.width, camera.height, cfg)
 
 
@@ -137,9 +136,3 @@ def _nothing(camera: Camera, with_depth: bool) -> Render:
         overflow=jnp.array(False),
         visible=jnp.zeros(0, bool),
     )
-
-
-def _with_cutoffs(splats: Splats2D, radiance: Float[Array, "n 3"], cfg: RenderConfig) -> Splats2D:
-    if cfg.cutoff_rule == "opacity":
-        return splats
-    return dataclasses.replace(splats, log_cutoffs=log_cutoffs(splats, radiance, cfg))

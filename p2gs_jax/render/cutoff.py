@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -27,3 +29,10 @@ def log_cutoffs(
     mean = jnp.sum(jnp.where(shown, log_l, 0)) / jnp.maximum(jnp.sum(shown), 1)
     lowered = float(np.log(cfg.alpha_cutoff)) - jnp.maximum(log_l - mean, 0)
     return jnp.maximum(lowered, float(np.log(min(SMALLEST_CUTOFF, cfg.alpha_cutoff))))
+
+
+def with_cutoffs(splats: Splats2D, radiance: Float[Array, "n 3"], cfg: RenderConfig) -> Splats2D:
+    """Return splats with the cutoffs that `cfg.cutoff_rule` gives them."""
+    if cfg.cutoff_rule == "opacity":
+        return splats
+    return dataclasses.replace(splats, log_cutoffs=log_cutoffs(splats, radiance, cfg))

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from p2gs_jax.errors import UserError
+from p2gs_jax.numerics import LN2
 from p2gs_jax.types import View
 
-LN2 = float(np.log(2.0))
 KINDS = ("ev", "exposure", "rel_exposure_ev", "exposure_time_s")
 
 
@@ -28,7 +28,7 @@ def read_known_exposures(source: str, views: list[View]) -> Float[np.ndarray, " 
         UserError: the file cannot be used, or says nothing about any of the views.
     """
     if source == "exif":
-        values = np.array([np.nan if v.exif_ev is None else v.exif_ev * LN2 for v in views])
+        values = _exif_ev(views) * LN2
         if not np.isfinite(values).any():
             raise UserError(
                 "no photograph carries exposure time, f-number and ISO in its EXIF.",
@@ -48,6 +48,25 @@ def read_known_exposures(source: str, views: list[View]) -> Float[np.ndarray, " 
             fix=f"write names as the scene does, for example {example}",
         )
     return values
+
+
+def stated_ev(source: str | None, views: list[View]) -> Float[np.ndarray, " v"]:
+    """Return stated exposures in stops, up to a constant; NaN where nothing is stated.
+
+    Args:
+        source: see `read_known_exposures`; None takes EXIF where there is any.
+        views: the views wanted, in order.
+
+    Raises:
+        UserError: see `read_known_exposures`.
+    """
+    if source is None:
+        return _exif_ev(views)
+    return read_known_exposures(source, views) / LN2
+
+
+def _exif_ev(views: list[View]) -> Float[np.ndarray, " v"]:
+    return np.array([np.nan if v.exif_ev is None else v.exif_ev for v in views], float)
 
 
 def _read(path: Path) -> dict[str, float]:

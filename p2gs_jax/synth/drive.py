@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from p2gs_jax.photometry.observations import Observations
+from p2gs_jax.synth.sensor import srgb_encode
 
 Exposures = Literal["constant", "iso2", "iso4", "cameras", "auto"]
 Curve = Literal["srgb", "power", "filmic"]
@@ -116,15 +117,12 @@ def make_exposures(drive: Drive, kind: Exposures, seed: int = 2) -> Float[np.nda
 
 
 def encode(exposed: Float[np.ndarray, "..."], curve: Curve) -> Float[np.ndarray, "..."]:
-    """Return display values, not yet clipped or rounded."""
+    """Return display values, not yet rounded."""
     if curve == "filmic":
         # An S-curve as film and game engines use (Narkowicz's fit), before the sRGB encoding.
         x = 0.8 * exposed
-        exposed = np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0, 1)
-    if curve == "power":
-        return exposed ** (1 / 2.2)
-    high = 1.055 * np.maximum(exposed, 1e-12) ** (1 / 2.4) - 0.055
-    return np.where(exposed <= 0.0031308, 12.92 * exposed, high)
+        exposed = x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14)
+    return exposed ** (1 / 2.2) if curve == "power" else srgb_encode(exposed)
 
 
 def observe(

@@ -11,6 +11,7 @@ import optax
 from jaxtyping import Array, Bool, Float
 
 from p2gs_jax.config import FitConfig
+from p2gs_jax.photometry.solution import LADDER
 from p2gs_jax.types import Gaussians, Params, Photometry
 
 
@@ -63,6 +64,7 @@ def learning_rates(progress: Array, extent: float, like: Params, cfg: FitConfig)
     bands = like.gaussians.sh.shape[1]
     sh = jnp.full((bands, 1), o.sh_rest).at[0].set(o.sh_dc) * decay
     gate = photometry_gate(progress, cfg)
+    varies = LADDER[cfg.photometry.model]
     return Params(
         gaussians=Gaussians(
             means=means_rate(progress, extent, cfg),
@@ -72,8 +74,8 @@ def learning_rates(progress: Array, extent: float, like: Params, cfg: FitConfig)
             sh=sh,
         ),
         photometry=Photometry(
-            o.exposures * gate * cfg.photometry.model.startswith("view"),
-            o.gammas * gate * (cfg.photometry.model == "view_exposure_gamma"),
+            o.exposures * gate * (varies.exposure == "view"),
+            o.gammas * gate * (varies.gamma == "view"),
             like.photometry.parameterization,
         ),
     )

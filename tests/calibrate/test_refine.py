@@ -24,7 +24,7 @@ def test_a_run_gives_its_exposures_again(tmp_path):
     result = p2gs_jax.fit(street.root, tmp_path / "run", cfg)
     started = read_photometry(tmp_path / "run" / "photometry.json")["views"]
     assert all(0 < v["exposure_ev_error"] < 0.1 for v in started)
-    again = calibrate_run(tmp_path / "run", tmp_path / "out")
+    again = calibrate_run(tmp_path / "run", tmp_path / "out", cfg.photometry)
     assert again.observations > 1000
     found = np.exp(again.selection.solution.log_exposures)
     known = np.asarray(result.params.photometry.exposures)
