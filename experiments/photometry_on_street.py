@@ -22,6 +22,27 @@ import p2gs_jax
 from p2gs_jax.config import FitConfig
 from p2gs_jax.prepare import without_tracks
 
+FORMATS = {"ev": ".3f", "ev_power": ".3f", "stops": ".3f", "gaussians": ".0f", "seconds": ".0f"}
+
+
+def ldr_splatting(robust: FitConfig, sh_dc: float) -> FitConfig:
+    """Return 3DGS in display values under robust's schedule: no exposure, no tone curve."""
+    photometry = dataclasses.replace(
+        robust.photometry,
+        start="random",
+        start_std=0.0,
+        select=False,
+        model="constant",
+        curve="linear",
+    )
+    optimizer = dataclasses.replace(robust.optimizer, sh_dc=sh_dc, sh_rest=sh_dc / 20)
+    return dataclasses.replace(
+        robust,
+        photometry=photometry,
+        optimizer=optimizer,
+        render=dataclasses.replace(robust.render, radiance="linear"),
+    )
+
 
 def variants() -> dict[str, FitConfig]:
     """Return the formulations compared."""
@@ -29,22 +50,33 @@ def variants() -> dict[str, FitConfig]:
     photometry = dataclasses.replace(robust.photometry, start="random", start_std=0.0, select=False)
     learned = without_tracks(dataclasses.replace(robust, photometry=photometry))
 
-    def reading(form: str, weight: float) -> FitConfig:
+    def reading(form: str, weight: float, correspondence: str = "depth") -> FitConfig:
         relative = dataclasses.replace(
             learned.loss.relative_exposure,
             weight=weight,
             form=form,  # pyright: ignore[reportArgumentType]
+            correspondence=correspondence,  # pyright: ignore[reportArgumentType]
         )
         return dataclasses.replace(
             learned, loss=dataclasses.replace(learned.loss, relative_exposure=relative)
         )
 
-    tuned = dataclasses.replace(
+    frozen = dataclasses.replace(
         robust, photometry=dataclasses.replace(robust.photometry, freeze_until=1.0)
     )
+    softplus = dataclasses.replace(
+        robust, render=dataclasses.replace(robust.render, radiance="softplus")
+    )
+    quantization = dataclasses.replace(
+        robust, loss=dataclasses.replace(robust.loss, quantization=0.5 / 255)
+    )
+    uncensored = dataclasses.replace(robust, loss=dataclasses.replace(robust.loss, censored=False))
     return {
         "robust": robust,
-        "robust, exposures frozen": tuned,
+        "robust, exposures frozen": frozen,
+        "robust, softplus radiance": softplus,
+        "robust, quantisation-aware": quantization,
+        "robust, not censored": uncensored,
         "robust, exposures learned from 1": learned,
         "... + literal_same_pose .01": reading("literal_same_pose", 0.01),
         "... + literal_same_pose .1": reading("literal_same_pose", 0.1),
@@ -52,6 +84,11 @@ def variants() -> dict[str, FitConfig]:
         "... + exposed .01": reading("exposed", 0.01),
         "... + observed_linear .1": reading("observed_linear", 0.1),
         "... + observed_ldr .1": reading("observed_ldr", 0.1),
+        "... + observed_linear .1, tracks": reading("observed_linear", 0.1, "tracks"),
+        "... + observed_ldr .1, tracks": reading("observed_ldr", 0.1, "tracks"),
+        "LDR splatting, sh 2.5e-3": ldr_splatting(robust, 2.5e-3),
+        "LDR splatting, sh 5e-3": ldr_splatting(robust, 5e-3),
+        "LDR splatting, sh 1e-2": ldr_splatting(robust, 1e-2),
         "paper": p2gs_jax.preset("paper"),
         "paper_appendix": p2gs_jax.preset("paper_appendix"),
     }
@@ -71,6 +108,8 @@ def judge(run: Path, street: Path) -> dict[str, float]:
     error = p2gs_jax.exposure_error(*np.array(pairs).T)
     aligned = metrics["reference"]["scale_aligned"]
     return {
+        "gaussians": metrics["counts"]["gaussians"],
+        "seconds": metrics["seconds"]["optimisation"],
         "ev": error["ev"],
         "ev_power": error["ev_scale_power"],
         "stops": metrics["radiance"]["stops_rms"],
@@ -87,6 +126,8 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--stds", type=float, nargs="+", default=[2.0, 4.0])
     parser.add_argument("--only", nargs="+", help="names of variants")
+    parser.add_argument("--width", type=int, default=320, help="pixels; 2/3 as many down")
+    parser.add_argument("--max-gaussians", type=int, help="the same limit for every variant")
     args = parser.parse_args()
     table: dict[str, dict[str, list[float]]] = {}
     for std in args.stds:
@@ -95,27 +136,29 @@ def main() -> None:
                 continue
             rows = []
             for seed in args.seeds:
-                street = args.out / f"street_std{std:g}_{seed}"
+                street = args.out / f"street_std{std:g}_{seed}_{args.width}"
                 if not street.exists():
-                    p2gs_jax.write_street(street, iso_std=std, seed=seed)
+                    height = round(args.width * 0.675)
+                    p2gs_jax.write_street(
+                        street, iso_std=std, seed=seed, width=args.width, height=height
+                    )
                 slug = "".join(c if c.isalnum() else "_" for c in name)
-                run = args.out / f"std{std:g}_{seed}_{slug}_{args.steps}"
+                limit = f"_{args.max_gaussians}" if args.max_gaussians else ""
+                run = args.out / f"std{std:g}_{seed}_{args.width}_{slug}_{args.steps}{limit}"
                 if not (run / "metrics.json").exists():
                     train = dataclasses.replace(cfg.train, steps=args.steps, seed=seed)
+                    densify = dataclasses.replace(cfg.densify, max_gaussians=args.max_gaussians)
                     p2gs_jax.fit(
                         street,
                         run,
-                        dataclasses.replace(cfg, train=train),
+                        dataclasses.replace(cfg, train=train, densify=densify),
                         reference=street / "reference",
                         resume=(run / "config.json").exists(),
                     )
                 rows.append(judge(run, street))
             key = f"std {std:g}, {name}"
             table[key] = {k: [r[k] for r in rows] for k in rows[0]}
-            cells = [
-                f"{np.mean(v):.3f}" if "ev" in k or k == "stops" else f"{np.mean(v):.2f}"
-                for k, v in table[key].items()
-            ]
+            cells = [f"{np.mean(v):{FORMATS.get(k, '.2f')}}" for k, v in table[key].items()]
             if len(table) == 1:
                 print("| street, formulation | " + " | ".join(table[key]) + " |")
                 print("|---|" + "---:|" * len(cells))

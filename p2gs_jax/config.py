@@ -92,8 +92,9 @@ class PhotometryConfig:
     --photometry.no-select, they are used as given (ours: PHOTOMETRY section 5)."""
     model: PhotometricModel = "view_exposure_gamma"
     """What varies between views; what does not vary is not learned."""
-    curve: Literal["power", "srgb", "spline"] = "srgb"
-    """Base tone curve; `power` with pivot 1 is the paper's x^(1/gamma)."""
+    curve: Literal["power", "srgb", "spline", "linear"] = "srgb"
+    """Base tone curve; `power` with pivot 1 is the paper's x^(1/gamma), `linear` is none: display
+    values splatted as they are (3DGS)."""
     spline: tuple[float, ...] | None = None
     """Log exposure that `spline` adds to sRGB's at its knots (photometry/response.py)."""
     known: str | None = None
@@ -128,6 +129,9 @@ class RelativeExposureConfig:
     """Which reading of the printed formula."""
     huber_delta: float = 0.05
     """Transition of the Huber loss in LDR units, `observed_ldr` only."""
+    correspondence: Literal["depth", "tracks"] = "depth"
+    """Where the `observed` readings find the same surface in another photograph: through the
+    rendered depth, with an occlusion test, or at track observations."""
 
 
 @dataclass(frozen=True)
@@ -162,6 +166,9 @@ class LossConfig:
     """Photographed values from here on count as saturated (ours: PHOTOMETRY section 3)."""
     black: float = 4.0 / 255.0
     """Photographed values up to here carry no exposure information (PHOTOMETRY section 3)."""
+    quantization: float | None = None
+    """Half the interval that a stored value stands for (0.5 / 255 for 8 bits): predictions within
+    it are right and get no gradient. None compares with the stored value (ours: BUILD_NOTES)."""
     relative_exposure: RelativeExposureConfig = field(default_factory=RelativeExposureConfig)
     """The relative-exposure loss."""
     regularizers: RegularizerConfig = field(default_factory=RegularizerConfig)

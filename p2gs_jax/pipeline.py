@@ -48,7 +48,9 @@ def optimise(
         spent_s: seconds of the budget that are already gone.
         reserve_s: seconds of the budget to keep for evaluation and files.
     """
-    views = TrainingViews(prepared.store, prepared.scene.train_indices, cfg.train.seed)
+    views = TrainingViews(
+        prepared.store, prepared.scene.train_indices, cfg.train.seed, prepared.overlaps
+    )
     trainer = Trainer(
         cfg,
         views,

@@ -11,11 +11,12 @@ import numpy as np
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
-from p2gs_jax.init.correspondence import projected_colors
-from p2gs_jax.init.observations import sample, sample_pairs, track_colors
+from p2gs_jax.init.correspondence import has_tracks, surface_colors
+from p2gs_jax.init.observations import overlapping_views, sample, sample_pairs
 from p2gs_jax.init.seeds import gaussians_from_points, merge, scene_extent, subsample
 from p2gs_jax.init.shell import Shell, find_shell
-from p2gs_jax.losses.total import OBSERVED_FORMS, TrackPairs
+from p2gs_jax.losses.relative_exposure import ColorPairs
+from p2gs_jax.losses.total import OBSERVED_FORMS
 from p2gs_jax.photometry.formation import inverse_tone_map
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import Response
@@ -28,6 +29,8 @@ from p2gs_jax.scene.known_exposures import read_known_exposures
 from p2gs_jax.types import GAMMA_SRGB, Gaussians, Params, Photometry, Scene
 
 PAIR_POOL = 200_000
+# Views that share this many points are worth comparing through depth.
+FEWEST_SHARED = 30
 # Shell colours come from small images: a direction covers many pixels.
 SHELL_SHRINK = 4
 SHELL_OPACITY = 0.5
@@ -44,6 +47,7 @@ class Prepared:
         extent: scene extent, scene units.
         selection: photometric model, exposures and their errors from the tracks, or None.
         pairs: corresponding observations, or None.
+        overlaps: for every training view the ones that show the same surfaces, or None.
         cfg: the configuration, adapted to what the scene offers.
         notes: what the user should know.
     """
@@ -53,7 +57,8 @@ class Prepared:
     params: Params
     extent: float
     selection: Selection | None
-    pairs: TrackPairs | None
+    pairs: ColorPairs | None
+    overlaps: list[np.ndarray] | None
     cfg: FitConfig
     notes: list[str] = field(default_factory=list)
 
@@ -92,15 +97,11 @@ def prepare(scene: Scene, cfg: FitConfig, reporter: Reporter) -> Prepared:
             f"the preset {cfg.preset!r} starts exposures at random: known ones would be ignored.",
             fix="leave out --known-exposures, or add --photometry.start tracks",
         )
-    if scene.tracks is not None and len(scene.tracks.xy):
-        tracks = track_colors(scene, store, lambda i, n: reporter.stage("Sampling tracks", i, n))
-    elif cfg.photometry.start == "tracks":
-        notes.append("No tracks: seed points are projected into the views instead.")
-        tracks = projected_colors(
-            scene,
-            store,
-            cfg.train.seed,
-            lambda i, n: reporter.stage("Projecting points", i, n),
+    if has_tracks(scene) or cfg.photometry.start == "tracks":
+        if not has_tracks(scene):
+            notes.append("No tracks: seed points are projected into the views instead.")
+        tracks = surface_colors(
+            scene, store, cfg.train.seed, lambda i, n: reporter.stage("Sampling colours", i, n)
         )
     if cfg.photometry.start == "tracks":
         if tracks is not None and len(tracks.points):
@@ -132,9 +133,16 @@ def prepare(scene: Scene, cfg: FitConfig, reporter: Reporter) -> Prepared:
         )
     for note in notes:
         reporter.message(note)
-    pairs = _pairs(tracks, cfg)
     return Prepared(
-        scene, store, Params(gaussians, photometry), extent, selection, pairs, cfg, notes
+        scene,
+        store,
+        Params(gaussians, photometry),
+        extent,
+        selection,
+        _pairs(tracks, cfg),
+        _overlaps(tracks, cfg),
+        cfg,
+        notes,
     )
 
 
@@ -175,12 +183,11 @@ def with_selection(cfg: FitConfig, selection: Selection) -> FitConfig:
     Known exposures that are to be kept are not learned, and no regulariser pulls at their mean.
     """
     solution, p = selection.solution, cfg.photometry
-    spline = solution.response.spline
-    curve = "spline" if spline is not None else solution.response.base
-    cfg = dataclasses.replace(
-        cfg,
-        photometry=dataclasses.replace(p, model=solution.model, curve=curve, spline=spline),
+    response = solution.response
+    chosen = dataclasses.replace(
+        p, model=solution.model, curve=response.curve, spline=response.spline
     )
+    cfg = dataclasses.replace(cfg, photometry=chosen)
     if p.known is None:
         return cfg
     regularizers = dataclasses.replace(cfg.loss.regularizers, log_exposure_mean=None)
@@ -269,19 +276,34 @@ def _shell_gaussians(
     )
 
 
-def _pairs(tracks: Observations | None, cfg: FitConfig) -> TrackPairs | None:
+def _compares_photographs(cfg: FitConfig, correspondence: str) -> bool:
+    """Return whether the relative-exposure loss compares photographs in the given way."""
     relative = cfg.loss.relative_exposure
-    if relative.weight is None or relative.form not in OBSERVED_FORMS:
+    observed = relative.weight is not None and relative.form in OBSERVED_FORMS
+    return observed and relative.correspondence == correspondence
+
+
+def _overlaps(tracks: Observations | None, cfg: FitConfig) -> list[np.ndarray] | None:
+    """Return which views to compare through depth: those that share enough points."""
+    if tracks is None or not len(tracks.points) or not _compares_photographs(cfg, "depth"):
+        return None
+    return overlapping_views(tracks, FEWEST_SHARED)
+
+
+def _pairs(tracks: Observations | None, cfg: FitConfig) -> ColorPairs | None:
+    if not _compares_photographs(cfg, "tracks"):
         return None
     if tracks is None or not len(tracks.points):
         raise UserError(
-            f"the relative-exposure loss {relative.form!r} needs tracks, and this scene has none.",
-            fix="choose another --loss.relative-exposure.form, or a scene with tracks",
+            "the relative-exposure loss was to compare photographs at tracks, and this scene has "
+            "none.",
+            fix="use --loss.relative-exposure.correspondence depth, or a scene with tracks",
         )
     first, second = sample_pairs(tracks, PAIR_POOL, cfg.train.seed)
-    return TrackPairs(
+    return ColorPairs(
         jnp.asarray(tracks.colors[first]),
         jnp.asarray(tracks.colors[second]),
         jnp.asarray(tracks.views[first], jnp.int32),
         jnp.asarray(tracks.views[second], jnp.int32),
+        jnp.ones(len(first)),
     )

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
+from scipy.sparse import csr_array
 
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.scene.images import ImageStore
@@ -139,3 +140,18 @@ def sample_pairs(
     first = rng.integers(0, lengths[pick])
     second = (first + rng.integers(1, lengths[pick])) % lengths[pick]
     return order[starts[pick] + first], order[starts[pick] + second]
+
+
+def overlapping_views(tracks: Observations, fewest: int) -> list[Int[np.ndarray, " k"]]:
+    """Return for every view the others that share at least `fewest` points with it.
+
+    A view that shares fewer with all of them keeps the one it shares most with, if any.
+    """
+    ones = np.ones(len(tracks.views), np.float32)
+    shape = (tracks.view_count, tracks.point_count)
+    seen = csr_array((ones, (tracks.views, tracks.points)), shape=shape)
+    seen.data[:] = 1
+    shared = (seen @ seen.T).toarray()
+    np.fill_diagonal(shared, 0)
+    enough = np.minimum(fewest, np.maximum(shared.max(1, initial=0), 1))
+    return [np.flatnonzero(row >= least) for row, least in zip(shared, enough, strict=True)]

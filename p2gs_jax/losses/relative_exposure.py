@@ -7,8 +7,6 @@ exposures are equal; each reading below is one way of making sense of it.
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -17,13 +15,26 @@ from p2gs_jax.config import LossConfig, PhotometryConfig
 from p2gs_jax.photometry.formation import inverse_tone_map, tone_map
 
 
-class Observations(Protocol):
-    """Colours of the same surface points in two views; see `losses.total.TrackPairs`."""
+class ColorPairs(eqx.Module):
+    """Photographed colours of the same surface points in two training views.
+
+    Attributes:
+        colors_i: display-encoded colours in the first view.
+        colors_j: and in the second.
+        views_i: rows in `Photometry`.
+        views_j: likewise.
+        valid: 1 = use.
+    """
 
     colors_i: Float[Array, "m 3"]
     colors_j: Float[Array, "m 3"]
     views_i: Int[Array, " m"]
     views_j: Int[Array, " m"]
+    valid: Float[Array, " m"]
+
+
+# Where less than this share of the pairs is valid, the mean is taken as if that many were.
+FEWEST_VALID = 0.01
 
 
 class ExposurePairs(eqx.Module):
@@ -45,7 +56,7 @@ class ExposurePairs(eqx.Module):
     view_j: Int[Array, ""]
     exposures: Float[Array, " v"]
     gammas: Float[Array, " v"]
-    pairs: Observations | None
+    pairs: ColorPairs | None
 
 
 def _per_pixel_l1(difference: Float[Array, "... 3"]) -> Float[Array, ""]:
@@ -73,20 +84,28 @@ def usable(colors: Float[Array, "m 3"], cfg: LossConfig) -> Float[Array, "m 3"]:
     return ((colors > cfg.black) & (colors < cfg.saturation)).astype(colors.dtype)
 
 
-def _linear_pair(pairs: Observations, exposures, gammas, photometry: PhotometryConfig):
+def _linear_pair(pairs: ColorPairs, exposures, gammas, photometry: PhotometryConfig):
     ratio = (exposures[pairs.views_j] / exposures[pairs.views_i])[:, None]
     gamma_i, gamma_j = gammas[pairs.views_i][:, None], gammas[pairs.views_j][:, None]
     return ratio * inverse_tone_map(pairs.colors_i, gamma_i, photometry), gamma_j
 
 
+def _mean_over_pairs(
+    error: Float[Array, "m 3"], pairs: ColorPairs, cfg: LossConfig
+) -> Float[Array, ""]:
+    """Return the mean over valid pairs; values near black or saturated count as zero."""
+    weight = usable(pairs.colors_i, cfg) * usable(pairs.colors_j, cfg) * pairs.valid[:, None]
+    fewest = FEWEST_VALID * pairs.valid.size
+    return jnp.sum(weight * error) / jnp.maximum(jnp.sum(pairs.valid), fewest)
+
+
 def observed_linear(
-    pairs: Observations, exposures, gammas, cfg: LossConfig, photometry: PhotometryConfig
+    pairs: ColorPairs, exposures, gammas, cfg: LossConfig, photometry: PhotometryConfig
 ) -> Float[Array, ""]:
     """alpha T_i^-1(I_i(u)) against T_j^-1(I_j(w(u))), at corresponding surface points."""
     predicted, gamma_j = _linear_pair(pairs, exposures, gammas, photometry)
     seen = inverse_tone_map(pairs.colors_j, gamma_j, photometry)
-    weight = usable(pairs.colors_i, cfg) * usable(pairs.colors_j, cfg)
-    return jnp.mean(jnp.sum(weight * jnp.abs(predicted - seen), -1))
+    return _mean_over_pairs(jnp.abs(predicted - seen), pairs, cfg)
 
 
 def huber(x: Float[Array, "..."], delta: float) -> Float[Array, "..."]:
@@ -96,13 +115,12 @@ def huber(x: Float[Array, "..."], delta: float) -> Float[Array, "..."]:
 
 
 def observed_ldr(
-    pairs: Observations, exposures, gammas, cfg: LossConfig, photometry: PhotometryConfig
+    pairs: ColorPairs, exposures, gammas, cfg: LossConfig, photometry: PhotometryConfig
 ) -> Float[Array, ""]:
     """Huber(T_j(alpha T_i^-1(I_i(u))) - I_j(w(u))): PIR in display units, scale-invariant."""
     predicted, gamma_j = _linear_pair(pairs, exposures, gammas, photometry)
-    weight = usable(pairs.colors_i, cfg) * usable(pairs.colors_j, cfg)
     residual = tone_map(predicted, gamma_j, photometry) - pairs.colors_j
-    return jnp.mean(jnp.sum(weight * huber(residual, cfg.relative_exposure.huber_delta), -1))
+    return _mean_over_pairs(huber(residual, cfg.relative_exposure.huber_delta), pairs, cfg)
 
 
 def relative_exposure_loss(

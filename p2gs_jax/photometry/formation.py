@@ -49,6 +49,8 @@ def _spline_encode(log_linear: Float[Array, "..."], cfg: PhotometryConfig):
 
 def oetf(linear: Float[Array, "..."], curve: str) -> Float[Array, "..."]:
     """Encode linear values with the base curve; values above 1 continue it."""
+    if curve == "linear":
+        return linear
     if curve == "power":
         return positive_pow(linear, 1.0 / GAMMA_SRGB, EXPOSED_FLOOR)
     toe = linear <= SRGB_LINEAR_END
@@ -58,6 +60,8 @@ def oetf(linear: Float[Array, "..."], curve: str) -> Float[Array, "..."]:
 
 def eotf(encoded: Float[Array, "..."], curve: str) -> Float[Array, "..."]:
     """Decode: the inverse of `oetf` on [0, inf)."""
+    if curve == "linear":
+        return encoded
     if curve == "power":
         return positive_pow(encoded, GAMMA_SRGB, 1e-3)
     toe = encoded <= SRGB_ENCODED_END
@@ -90,6 +94,8 @@ def tone_map(
         log_linear = log_pivot + (log_x - log_pivot) * (GAMMA_SRGB / gamma)
         if cfg.curve == "power":
             y = jnp.exp(log_linear / GAMMA_SRGB)
+        elif cfg.curve == "linear":
+            y = jnp.exp(log_linear)
         elif cfg.curve == "spline":
             y = _spline_encode(log_linear, cfg)
         else:

@@ -27,7 +27,8 @@ from p2gs_jax.densify.population import bucket_for
 from p2gs_jax.errors import DivergenceError, UserError
 from p2gs_jax.export.atomic import append_jsonl, read_jsonl, write_text
 from p2gs_jax.export.checkpoint import CheckpointStore
-from p2gs_jax.losses.total import OBSERVED_FORMS, SECOND_RENDER_FORMS, Partner, TrackPairs
+from p2gs_jax.losses.relative_exposure import ColorPairs
+from p2gs_jax.losses.total import OBSERVED_FORMS, SECOND_RENDER_FORMS, Partner
 from p2gs_jax.render import required_capacity
 from p2gs_jax.render.host import capacity_bucket
 from p2gs_jax.train import schedule
@@ -131,7 +132,7 @@ class Trainer:
         cfg: FitConfig,
         views: TrainingViews,
         extent: float,
-        pairs: TrackPairs | None,
+        pairs: ColorPairs | None,
         run_dir: Path,
         on_log: Callable[[LogRecord], None] = lambda record: None,
         on_message: Callable[[str], None] = lambda text: None,
@@ -316,15 +317,17 @@ class Trainer:
         if relative.weight is None:
             return Partner(jnp.int32(0))
         other = self.views.partner_at(step)
-        camera, pairs = None, None
+        camera, batch, pairs = None, None, None
         if relative.form in SECOND_RENDER_FORMS:
             camera = self.views.camera(other, shrink)
-        if relative.form in OBSERVED_FORMS and self.pairs is not None:
+        elif relative.form in OBSERVED_FORMS and relative.correspondence == "depth":
+            batch = self.views.batch(other, shrink)
+        elif relative.form in OBSERVED_FORMS and self.pairs is not None:
             count = self.pairs.views_i.shape[0]
             rng = np.random.default_rng((self.cfg.train.seed, 2, step))
             pick = rng.integers(0, count, min(PAIRS_PER_STEP, count))
             pairs = jax.tree.map(lambda a: a[pick], self.pairs)
-        return Partner(jnp.int32(other), camera, pairs)
+        return Partner(jnp.int32(other), camera, batch, pairs)
 
     def _diverged(self, state: FitState, step: int, report: StepReport) -> None:
         names = finite_names(report.terms)

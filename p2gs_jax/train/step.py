@@ -128,9 +128,9 @@ def make_step(cfg: FitConfig, optimizer: optax.GradientTransformationExtraArgs, 
         )
         broken, term = _first_nonfinite(aux, grads)
         kind = jnp.where(
-            aux.render.overflow, FAULT_OVERFLOW, jnp.where(broken, FAULT_NONFINITE, FAULT_NONE)
+            aux.overflow, FAULT_OVERFLOW, jnp.where(broken, FAULT_NONFINITE, FAULT_NONE)
         ).astype(jnp.int32)
-        fault = Fault(kind, aux.render.count, term)
+        fault = Fault(kind, aux.entries, term)
 
         def advance(state: FitState) -> FitState:
             rates = learning_rates(controls.progress, extent, state.params, cfg)
@@ -162,6 +162,6 @@ def make_step(cfg: FitConfig, optimizer: optax.GradientTransformationExtraArgs, 
         squared = mask * (jnp.clip(aux.ldr, 0, 1) - batch.ldr) ** 2
         mse = jnp.sum(squared) / jnp.maximum(3 * jnp.sum(batch.mask), 1)
         psnr = -10 * jnp.log10(jnp.maximum(mse, 1e-10))
-        return state, StepReport(loss, aux.terms, psnr, aux.render.count)
+        return state, StepReport(loss, aux.terms, psnr, aux.entries)
 
     return step

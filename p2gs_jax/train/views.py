@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Int
 
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
@@ -19,12 +20,20 @@ class TrainingViews:
         store: decodes and caches photographs.
         rows: rows of the training views in the scene, in the order of `Photometry`.
         seed: decides the order of every epoch.
+        overlaps: for every training view the ones that show the same surfaces; None: all others.
     """
 
-    def __init__(self, store: ImageStore, rows: Sequence[int], seed: int):
+    def __init__(
+        self,
+        store: ImageStore,
+        rows: Sequence[int],
+        seed: int,
+        overlaps: Sequence[Int[np.ndarray, " k"]] | None = None,
+    ):
         self.store = store
         self.rows = tuple(rows)
         self.seed = seed
+        self.overlaps = overlaps
         self._orders: dict[int, np.ndarray] = {}
 
     def __len__(self) -> int:
@@ -39,10 +48,15 @@ class TrainingViews:
         return int(self._orders[epoch][position])
 
     def partner_at(self, step: int) -> int:
-        """Return a second view, different from that of the step where there are two."""
+        """Return a second view, different from that of the step where there are two.
+
+        Drawn from those that overlap it, where it is known which do.
+        """
+        rng, index = np.random.default_rng((self.seed, 1, step)), self.index_at(step)
+        if self.overlaps is not None and len(self.overlaps[index]):
+            return int(rng.choice(self.overlaps[index]))
         count = len(self.rows)
-        offset = int(np.random.default_rng((self.seed, 1, step)).integers(1, max(count, 2)))
-        return (self.index_at(step) + offset) % count
+        return (index + int(rng.integers(1, max(count, 2)))) % count
 
     def prefetch(self, index: int, shrink: int) -> None:
         """Begin decoding a view in the background."""

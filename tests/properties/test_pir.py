@@ -20,7 +20,6 @@ from p2gs_jax.evaluate.metrics import his, std_luminance
 from p2gs_jax.losses import relative_exposure as rel
 from p2gs_jax.losses.image import photometric_loss
 from p2gs_jax.losses.regularizers import closed_form_scale, photometry_regularizers
-from p2gs_jax.losses.total import TrackPairs
 from p2gs_jax.photometry.formation import formation, inverse_tone_map, tone_map
 from p2gs_jax.render import render_linear
 from p2gs_jax.types import Camera, Gaussians, Photometry
@@ -172,7 +171,8 @@ def observed(seed, cfg, noise_free=True, views=5, n=400):
     I = [np.clip(a, 0, 1) for a in I]
     if not noise_free:
         I = [np.rint(a * 255) / 255 for a in I]
-    pairs = TrackPairs(*(jnp.asarray(a) for a in (*I, i.astype(np.int32), j.astype(np.int32))))
+    rows = (i.astype(np.int32), j.astype(np.int32), np.ones(n, np.float32))
+    pairs = rel.ColorPairs(*(jnp.asarray(a) for a in (*I, *rows)))
     return pairs, jnp.asarray(e), jnp.asarray(gammas)
 
 

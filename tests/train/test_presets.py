@@ -54,12 +54,21 @@ def test_opacity_resets_empty_the_scene_and_it_grows_back(tmp_path):
     assert max(np.diff(losses)) > 0.01  # the reset
 
 
-@pytest.mark.parametrize(
-    "form", [pytest.param(f, marks=[] if f == "observed_ldr" else pytest.mark.slow) for f in FORMS]
-)
-def test_every_reading_runs(tmp_path, form):
+READINGS = [
+    *(
+        pytest.param(f, "depth", marks=[] if f == "observed_ldr" else pytest.mark.slow)
+        for f in FORMS
+    ),
+    pytest.param("observed_ldr", "tracks", marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize(("form", "correspondence"), READINGS)
+def test_every_reading_runs(tmp_path, form, correspondence):
     cfg = small(p2gs_jax.preset("robust"))
-    relative = dataclasses.replace(cfg.loss.relative_exposure, weight=0.01, form=form)
+    relative = dataclasses.replace(
+        cfg.loss.relative_exposure, weight=0.01, form=form, correspondence=correspondence
+    )
     cfg = dataclasses.replace(cfg, loss=dataclasses.replace(cfg.loss, relative_exposure=relative))
     result = p2gs_jax.fit(make_scene(tmp_path / "scene"), tmp_path / "run", cfg)
     assert "relative_exposure" in check(result, tmp_path / "run")[0]["terms"]

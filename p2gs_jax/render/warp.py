@@ -1,0 +1,110 @@
+"""Where a pixel of one view lies in another, by rendered depth, and whether it is seen there."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from p2gs_jax.types import Camera, Render
+
+# A pixel has a surface where the render is this opaque.
+OPAQUE = 0.95
+# It is seen in another view where that view's own depth agrees within this share.
+DEPTH_TOLERANCE = 0.03
+
+
+class Warp(NamedTuple):
+    """Pixels of one view in another.
+
+    Attributes:
+        xy: positions in the other view, pixels, centres at +0.5.
+        seen: the pixel shows a surface, and the other view shows the same one.
+    """
+
+    xy: Float[Array, "h w 2"]
+    seen: Bool[Array, "h w"]
+
+
+def surface_depth(render: Render) -> Float[Array, "h w"]:
+    """Return the expected depth where the render is opaque, and 0 elsewhere.
+
+    Raises:
+        ValueError: it was rendered without depth.
+    """
+    if render.depth is None:
+        raise ValueError("the warp needs depth: render with with_depth=True")
+    opaque = render.alpha > OPAQUE
+    return jnp.where(opaque, render.depth / jnp.where(opaque, render.alpha, 1.0), 0.0)
+
+
+def unproject(depth: Float[Array, "h w"], camera: Camera) -> Float[Array, "h w 3"]:
+    """Return world positions of pixel centres at the given camera depths."""
+    y, x = jnp.mgrid[: camera.height, : camera.width]
+    xy = jnp.stack([x, y], -1) + 0.5
+    focal, center = jnp.diag(camera.K)[:2], camera.K[:2, 2]
+    local = jnp.concatenate([(xy - center) / focal, jnp.ones((*depth.shape, 1))], -1)
+    rotation, translation = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
+    return (local * depth[..., None] - translation) @ rotation
+
+
+def project_points(
+    points: Float[Array, "*n 3"], camera: Camera
+) -> tuple[Float[Array, "*n 2"], Float[Array, "*n"]]:
+    """Return pixel positions (centres at +0.5) and camera z; positions behind it mean nothing."""
+    local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    z = local[..., 2]
+    ahead = jnp.where(z > 1e-6, z, 1.0)
+    return local[..., :2] / ahead[..., None] * jnp.diag(camera.K)[:2] + camera.K[:2, 2], z
+
+
+def visible(
+    xy: Float[Array, "*n 2"], z: Float[Array, "*n"], depth: Float[Array, "h w"]
+) -> Bool[Array, "*n"]:
+    """Return which projected points lie on the surface that a view shows at their pixel.
+
+    Args:
+        xy: positions in the view.
+        z: their depths in it.
+        depth: what the view shows, 0 where it shows nothing; see `surface_depth`.
+    """
+    height, width = depth.shape
+    at = jnp.floor(xy).astype(jnp.int32)
+    x, y = at[..., 0], at[..., 1]
+    inside = (z > 1e-6) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
+    shown = depth[jnp.where(inside, y, 0), jnp.where(inside, x, 0)]
+    return inside & (shown > 0) & (jnp.abs(shown - z) < DEPTH_TOLERANCE * z)
+
+
+def warp(
+    depth: Float[Array, "h w"],
+    camera: Camera,
+    other_depth: Float[Array, "h2 w2"],
+    other_camera: Camera,
+) -> Warp:
+    """Return where the pixels of one view lie in another (PHOTOMETRY section 3, w(u)).
+
+    Args:
+        depth: of this view, 0 where it shows no surface.
+        camera: this view.
+        other_depth: of the other view, likewise.
+        other_camera: the other view.
+    """
+    xy, z = project_points(unproject(depth, camera), other_camera)
+    return Warp(xy, (depth > 0) & visible(xy, z, other_depth))
+
+
+def sample_bilinear(image: Float[Array, "h w c"], xy: Float[Array, "*n 2"]) -> Float[Array, "*n c"]:
+    """Return the image at positions (centres at +0.5); beyond the border, the border's values."""
+    height, width, _ = image.shape
+    limit = jnp.array([width - 1.0, height - 1.0])
+    position = jnp.clip(xy - 0.5, 0.0, limit)
+    corner = jnp.minimum(jnp.floor(position), limit - 1).astype(jnp.int32)
+    corner = jnp.maximum(corner, 0)
+    fx, fy = (position - corner)[..., :1], (position - corner)[..., 1:]
+    left, top = corner[..., 0], corner[..., 1]
+    right, bottom = jnp.minimum(left + 1, width - 1), jnp.minimum(top + 1, height - 1)
+    upper = image[top, left] * (1 - fx) + image[top, right] * fx
+    lower = image[bottom, left] * (1 - fx) + image[bottom, right] * fx
+    return upper * (1 - fy) + lower * fy
