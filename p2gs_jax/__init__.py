@@ -11,10 +11,13 @@ from p2gs_jax.errors import DivergenceError, UserError
 from p2gs_jax.types import Camera, Gaussians, Params, Photometry, Render, Scene
 
 if TYPE_CHECKING:
+    from p2gs_jax.calibration import calibrate
     from p2gs_jax.evaluate.alignment import exposure_error
     from p2gs_jax.pipeline import fit
+    from p2gs_jax.refine import calibrate_run
     from p2gs_jax.render import render_linear
     from p2gs_jax.run_folder import load_run
+    from p2gs_jax.static_stack import calibrate_stack
     from p2gs_jax.synth import write_street
 
 __all__ = [
@@ -27,6 +30,9 @@ __all__ = [
     "Render",
     "Scene",
     "UserError",
+    "calibrate",
+    "calibrate_run",
+    "calibrate_stack",
     "exposure_error",
     "fit",
     "load_run",
@@ -37,6 +43,9 @@ __all__ = [
 
 
 _LAZY = {
+    "calibrate": "p2gs_jax.calibration",
+    "calibrate_run": "p2gs_jax.refine",
+    "calibrate_stack": "p2gs_jax.static_stack",
     "exposure_error": "p2gs_jax.evaluate.alignment",
     "fit": "p2gs_jax.pipeline",
     "load_run": "p2gs_jax.run_folder",

@@ -12,7 +12,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from p2gs_jax.calibrate import WEAK_GAMMA, Calibration, calibrate
+from p2gs_jax.calibration import WEAK_GAMMA, Calibration, calibrate
 from p2gs_jax.config import FitConfig
 from p2gs_jax.demo import run_demo
 from p2gs_jax.errors import UserError

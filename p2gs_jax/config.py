@@ -129,9 +129,10 @@ class RelativeExposureConfig:
     """Which reading of the printed formula."""
     huber_delta: float = 0.05
     """Transition of the Huber loss in LDR units, `observed_ldr` only."""
-    correspondence: Literal["depth", "tracks"] = "depth"
-    """Where the `observed` readings find the same surface in another photograph: through the
-    rendered depth, with an occlusion test, or at track observations."""
+    correspondence: Literal["tracks", "depth"] | None = None
+    """Where the `observed` readings find the same surface in another photograph: at track
+    observations, or through the rendered depth with an occlusion test. None: at tracks where the
+    scene has any (ours: measured better and cheaper in BUILD_NOTES)."""
 
 
 @dataclass(frozen=True)

@@ -114,6 +114,7 @@ def prepare(scene: Scene, cfg: FitConfig, reporter: Reporter) -> Prepared:
                 "No point is seen twice: exposures start at 1 and are learned from the first step."
             )
             cfg = without_tracks(cfg)
+    cfg = with_correspondence(cfg, tracks)
     start = None if selection is None else selection.solution
     photometry = _photometry(start, len(views), cfg)
     keep = subsample(len(scene.points), cfg.init.max_seeds, cfg.train.seed)
@@ -197,6 +198,16 @@ def with_selection(cfg: FitConfig, selection: Selection) -> FitConfig:
         loss=dataclasses.replace(cfg.loss, regularizers=regularizers),
         photometry=dataclasses.replace(cfg.photometry, freeze_until=frozen),
     )
+
+
+def with_correspondence(cfg: FitConfig, tracks: Observations | None) -> FitConfig:
+    """Return the configuration with a way to compare photographs that the scene allows."""
+    relative = cfg.loss.relative_exposure
+    if relative.correspondence is not None:
+        return cfg
+    found = tracks is not None and len(tracks.points) > 0
+    relative = dataclasses.replace(relative, correspondence="tracks" if found else "depth")
+    return dataclasses.replace(cfg, loss=dataclasses.replace(cfg.loss, relative_exposure=relative))
 
 
 def without_tracks(cfg: FitConfig) -> FitConfig:

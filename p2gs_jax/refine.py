@@ -9,7 +9,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from p2gs_jax.calibrate import Calibration, conclude
+from p2gs_jax.calibration import Calibration, conclude
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.init.correspondence import sample_where_seen, thinned

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from p2gs_jax.calibrate import calibrate
+from p2gs_jax import calibrate
 from p2gs_jax.cli import main
 from p2gs_jax.config import preset
 from p2gs_jax.errors import UserError

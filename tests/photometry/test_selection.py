@@ -32,8 +32,8 @@ def test_what_varies_is_found(exposures, curve, gamma, model, response):
         assert any("too little to tell the shape" in r for r in s.reasons)
 
 
-def candidate(model, parameters, density, behind, error):
-    return Candidate(model, Response(), parameters, density, behind, error)
+def candidate(model, parameters, density, behind, error, codes=9.0):
+    return Candidate(model, Response(), parameters, density, behind, error, codes)
 
 
 def test_the_simplest_that_is_not_clearly_worse_wins():
@@ -43,3 +43,17 @@ def test_the_simplest_that_is_not_clearly_worse_wins():
     assert choose([rich, simple, middle]) is middle
     # Two standard errors count, where they are more than the smallest gain.
     assert choose([rich, candidate("constant", 0, -0.6, 0.1, 0.06), middle]).model == "constant"
+    # A difference that nobody can see does not count, however sure it is.
+    assert choose([rich, candidate("constant", 0, -0.9, 0.4, 0.01, 0.8), middle]).parameters == 0
+
+
+def test_sharp_images_do_not_earn_parameters_for_invisible_differences():
+    """Noise-free, 160 views' worth of observations, exposures a hundredth of a stop apart."""
+    drive = make_drive(20, 6000, 1)
+    cameras = np.array([1.0, 1.006, 0.995])[drive.cameras]
+    wobble = np.exp2(0.004 * np.sin(np.arange(len(drive.cameras))))
+    seen = observe(drive, cameras * wobble, noise=0.0, outliers=0.0, bits=None)
+    found = select(seen, **LIMITS)
+    assert found.solution.model == "constant"
+    assert found.candidates[0].model != "constant"
+    assert any("codes in any view" in r for r in found.reasons)

@@ -93,7 +93,7 @@ def test_3_and_4_gauges_in_the_gradient(cfg, seed, gamma):
     log_L = jnp.log(L / cfg.pivot)
     generator = float(log_e * v_e) + float(jnp.sum(L * log_L * v_L)) + float(gamma * v_gamma)
     size = float(jnp.sum(jnp.abs(L * log_L * v_L))) + abs(float(gamma * v_gamma))
-    assert abs(generator) <= 2e-6 * max(size, 1.0)
+    assert abs(generator) <= 1e-6 * max(size, 1.0)
 
 
 @MODELS
@@ -106,7 +106,7 @@ def test_5_inverse(cfg, seed, gamma):
     kept = np.asarray(y) > 1 / 255
     back = np.asarray(inverse_tone_map(y, jnp.float32(gamma), cfg))
     # The curve's slope turns the last bit of y into a few bits of x.
-    np.testing.assert_allclose(back[kept], np.asarray(x)[kept], rtol=2e-5)
+    np.testing.assert_allclose(back[kept], np.asarray(x)[kept], rtol=5e-6)
 
 
 @MODELS
@@ -190,7 +190,7 @@ def test_11_observed_readings(cfg, seed, c):
         flat = float(reading(pairs, jnp.ones_like(e), gammas, LOSS, cfg))
         assert flat > 0.01
         a, b = (float(reading(pairs, s * jnp.sqrt(e), gammas, LOSS, cfg)) for s in (1.0, c))
-        assert a == pytest.approx(b, rel=1e-5, abs=1e-6)
+        assert a == pytest.approx(b, rel=1e-6, abs=1e-6)
     pairs, e, gammas = observed(seed, cfg, noise_free=False)
     assert float(rel.observed_ldr(pairs, e, gammas, LOSS, cfg)) <= 0.01
 

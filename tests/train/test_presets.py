@@ -59,7 +59,7 @@ READINGS = [
         pytest.param(f, "depth", marks=[] if f == "observed_ldr" else pytest.mark.slow)
         for f in FORMS
     ),
-    pytest.param("observed_ldr", "tracks", marks=pytest.mark.slow),
+    pytest.param("observed_ldr", None, marks=pytest.mark.slow),
 ]
 
 
