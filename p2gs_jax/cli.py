@@ -250,7 +250,9 @@ def _run(argv: list[str]) -> int:
     )
     # Imported here so that --help answers at once.
     from p2gs_jax import commands
+    from p2gs_jax.compile_cache import use_compile_cache
 
+    use_compile_cache()
     if isinstance(args, Fit):
         return commands.fit_command(
             args.scene, args.out, resolve(args), args.reference, args.resume

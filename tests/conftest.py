@@ -1,8 +1,16 @@
 """Shared fixtures; real data is used where it lies beside the checkout and skipped elsewhere."""
 
+import os
+import tempfile
 from pathlib import Path
 
 import pytest
+
+# Programs compiled by one test or its child processes serve the others of the session; a fresh
+# session compiles everything once.
+_COMPILED = tempfile.TemporaryDirectory(prefix="p2gs-compiled-")
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", _COMPILED.name)
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 

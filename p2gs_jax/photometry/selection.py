@@ -46,7 +46,7 @@ OUTLIERS, OUTLIER_DEVIATION = 0.1, 1.2
 # A response needs this spread of exposures, stops.
 SPLINE_SPREAD_EV = 0.2
 # Candidates are compared on at most this many observations; the chosen one is solved on all.
-MOST_OBSERVATIONS = 80_000
+MOST_OBSERVATIONS = 40_000
 # A curve has few parameters; its basis is the most expensive one.
 SPLINE_OBSERVATIONS = 12_000
 

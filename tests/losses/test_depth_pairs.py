@@ -39,10 +39,13 @@ def wall(x: float, exposure: float, row: int) -> tuple[Render, Batch]:
     return render, Batch(camera(x), jnp.clip(ldr, 0, 1), one, jnp.int32(row))
 
 
+paired = jax.jit(depth_pairs)
+
+
 @settings(max_examples=15, deadline=None)
 @given(x=st.floats(-1.5, 1.5), e_i=st.floats(0.4, 1.5), e_j=st.floats(0.4, 1.5))
 def test_zero_at_the_true_exposures_and_not_elsewhere(x, e_i, e_j):
-    pairs = depth_pairs(*wall(0.0, e_i, 0), *wall(x, e_j, 1))
+    pairs = paired(*wall(0.0, e_i, 0), *wall(x, e_j, 1))
     inside = 1 - abs(x) * FOCAL / DEPTH / WIDTH
     assert float(jnp.mean(pairs.valid)) == pytest.approx(inside, abs=1.5 / WIDTH)
     gammas = jnp.full(2, 2.2)
@@ -69,7 +72,7 @@ def test_hidden_and_masked_pixels_do_not_count():
 
 
 def test_nothing_in_common_costs_nothing():
-    pairs = depth_pairs(*wall(0.0, 1.0, 0), *wall(100.0, 1.0, 1))
+    pairs = paired(*wall(0.0, 1.0, 0), *wall(100.0, 1.0, 1))
     assert not np.any(pairs.valid)
     loss = LossConfig(relative_exposure=RelativeExposureConfig(1.0, "observed_ldr"))
 
