@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float32
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.evaluate.alignment import fit_exposure
+from p2gs_jax.evaluate.consistency import VideoScores
 from p2gs_jax.evaluate.metrics import psnr, ssim
 from p2gs_jax.evaluate.radiance import RadianceScores, Truth
 from p2gs_jax.photometry.formation import display, formation, inverse_tone_map
@@ -122,11 +123,11 @@ def evaluate(
         cfg: formation model.
         reference: view row -> photograph under the common exposure, or None where there is none.
         radiance: view row -> true linear radiance at the size of the photographs, or None.
-        on_view: receives every rendered view (held-out views last).
+        on_view: receives every rendered view.
         on_progress: views done, views in all.
 
     Returns:
-        The `train`, `test`, `reference` and `radiance` parts of `metrics.json`.
+        The `train`, `test`, `consistency`, `reference` and `radiance` parts of `metrics.json`.
     """
     mean = mean_parameters(params.photometry)
     exposures = np.asarray(params.photometry.exposures)
@@ -140,15 +141,16 @@ def evaluate(
         ldr = formation(linear, jnp.float32(exposure), jnp.float32(gamma), cfg.photometry)
         return np.asarray(display(ldr))
 
-    rows = [*scene.train_indices, *scene.test_indices]
-    for done, index in enumerate(rows):
-        view = scene.views[index]
+    videos = {name: VideoScores() for name in ("per_view", "averaged", "photographs")}
+    row_of = {index: row for row, index in enumerate(scene.train_indices)}
+    # In the order of their names, so that the frames of a camera follow each other.
+    for index, view in enumerate(scene.views):
         photograph, mask = store.get(index, 1)
         result = render(params.gaussians, jnp.asarray(alive), camera_of(store, index))
         linear = result.linear
         ldr_mean = shown(linear, mean.exposure, mean.gamma)
         if view.split == "train":
-            e, g = float(exposures[done]), float(gammas[done])
+            e, g = float(exposures[row_of[index]]), float(gammas[row_of[index]])
             ldr = shown(linear, e, g)
             own.add(view.name, ldr, photograph, mask)
             averaged.add(view.name, ldr_mean, photograph, mask)
@@ -176,13 +178,17 @@ def evaluate(
                 g,
             )
         )
-        on_progress(done + 1, len(rows))
+        videos["per_view"].add(view.camera, ldr, e)
+        videos["averaged"].add(view.camera, ldr_mean, mean.exposure)
+        videos["photographs"].add(view.camera, photograph, e)
+        on_progress(index + 1, len(scene.views))
 
     metrics = {
         "train": {**own.summary(), "averaged": averaged.summary()},
         "test": {"averaged": test_averaged.summary(), "exposure_fitted": test_fitted.summary()},
     }
     metrics["train"]["per_view"] = metrics["train"].pop("per_view", {})
+    metrics["consistency"] = {name: video.summary() for name, video in videos.items()}
     if scores.views:
         gamma, saturated = jnp.float32(mean.gamma), jnp.float32(cfg.loss.saturation)
         exposed = float(inverse_tone_map(saturated, gamma, cfg.photometry))

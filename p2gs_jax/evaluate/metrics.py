@@ -1,4 +1,4 @@
-"""Image, HDR and consistency metrics (paper, appendix Metrics; PHOTOMETRY section 6)."""
+"""Image and HDR metrics (paper, appendix Metrics; PHOTOMETRY section 6)."""
 
 from __future__ import annotations
 
@@ -8,9 +8,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from p2gs_jax.losses.image import ssim as _ssim
-from p2gs_jax.photometry.formation import eotf
-
-BT601 = np.array([0.299, 0.587, 0.114])
 
 
 @jax.jit
@@ -24,31 +21,6 @@ def psnr(
 
 
 ssim = jax.jit(_ssim)
-
-
-def his_paper(ldr: Float[Array, "t h w 3"], exposures: Float[Array, " t"]) -> Float[Array, ""]:
-    """Return the HDR inconsistency score as printed: OETF^-1(R_t) e_t, RMS over pixels.
-
-    It multiplies by e where undoing an exposure means dividing, and is zero for a black video:
-    never report it without PSNR.
-    """
-    scaled = eotf(ldr, "srgb") * exposures[:, None, None, None]
-    return jnp.mean(_frame_rms(scaled))
-
-
-def his(ldr: Float[Array, "t h w 3"], exposures: Float[Array, " t"]) -> Float[Array, ""]:
-    """Return the corrected score: divided by e and by the mean radiance; invariant to e -> c e."""
-    radiance = eotf(ldr, "srgb") / exposures[:, None, None, None]
-    return jnp.mean(_frame_rms(radiance)) / jnp.maximum(jnp.mean(radiance), 1e-12)
-
-
-def _frame_rms(frames: Float[Array, "t h w 3"]) -> Float[Array, " t1"]:
-    return jnp.sqrt(jnp.mean((frames[:-1] - frames[1:]) ** 2, axis=(1, 2, 3)))
-
-
-def std_luminance(ldr: Float[Array, "n h w 3"]) -> Float[Array, ""]:
-    """Return the standard deviation over views of mean BT.601 luminance (paper, appendix)."""
-    return jnp.std(jnp.mean(ldr @ jnp.asarray(BT601, ldr.dtype), axis=(1, 2)))
 
 
 def hdr_error_stops(

@@ -16,7 +16,13 @@ from p2gs_jax.config import (
     RenderConfig,
     preset,
 )
-from p2gs_jax.evaluate.metrics import his, std_luminance
+from p2gs_jax.evaluate.consistency import (
+    VideoScores,
+    his,
+    his_paper,
+    std_luminance,
+    std_luminance_relative,
+)
 from p2gs_jax.losses import relative_exposure as rel
 from p2gs_jax.losses.image import photometric_loss
 from p2gs_jax.losses.regularizers import closed_form_scale, photometry_regularizers
@@ -235,6 +241,32 @@ def test_15_his(seed, c):
     a, b = float(his(moving, jnp.asarray(e))), float(his(moving, jnp.asarray(c * e)))
     assert a > 0
     assert a == pytest.approx(b, rel=1e-5)
+    assert float(his_paper(jnp.asarray(video), jnp.full(4, 1.3))) == 0
+    assert float(his_paper(moving, jnp.asarray(e))) > 0
+
+
+@FEW
+@given(seed=SEEDS)
+def test_scores_frame_by_frame_are_those_of_the_videos(seed):
+    """One camera: the definition; two: frames of different cameras are never compared."""
+    rng = np.random.default_rng(seed)
+    video = rng.uniform(0, 1, (5, 6, 7, 3)).astype(np.float32)
+    e = np.exp(rng.normal(0, 0.5, 5)).astype(np.float32)
+    one, two = VideoScores(), VideoScores()
+    for frame, exposure in zip(video, e, strict=True):
+        one.add("left", frame, float(exposure))
+        two.add("left", frame, float(exposure))
+        two.add("right", 0.5 * np.ones_like(frame), 1.0)
+    whole = {
+        "his_paper": his_paper(jnp.asarray(video), jnp.asarray(e)),
+        "his": his(jnp.asarray(video), jnp.asarray(e)),
+        "std_luminance": std_luminance(jnp.asarray(video)),
+        "std_luminance_relative": std_luminance_relative(jnp.asarray(video)),
+    }
+    for name, value in one.summary().items():
+        assert value == pytest.approx(float(whole[name]), rel=1e-5)
+    assert two.summary()["his_paper"] == pytest.approx(float(whole["his_paper"]) / 2, rel=1e-5)
+    assert VideoScores().summary() == {}
 
 
 @FEW
