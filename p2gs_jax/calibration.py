@@ -174,6 +174,7 @@ def _write(result: Calibration, out: Path, cfg: FitConfig) -> None:
             "seconds": result.seconds,
             "residual_ev": s.residual_ev,
             "view_residual_ev": s.view_residual_ev,
+            "view_balance_ev": s.view_balance_ev,
             "outliers": s.outliers,
             "component": s.component,
             "observations_per_view": s.observations_per_view,

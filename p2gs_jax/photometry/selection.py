@@ -248,12 +248,16 @@ def select(
     return Selection(solution, tuple(candidates), (*notes, *_reasons(chosen, candidates)))
 
 
+def _likely(c: Candidate) -> bool:
+    """Return whether a candidate predicts about as well as the best."""
+    return c.behind <= max(STANDARD_ERRORS * c.behind_error, SMALLEST_GAIN)
+
+
 def choose(candidates: list[Candidate]) -> Candidate:
     """Return the simplest candidate that is not clearly worse than the best."""
 
     def good(c: Candidate) -> bool:
-        likely = c.behind <= max(STANDARD_ERRORS * c.behind_error, SMALLEST_GAIN)
-        return likely or c.codes <= INVISIBLE_CODES
+        return _likely(c) or c.codes <= INVISIBLE_CODES
 
     ordered = sorted(candidates, key=lambda c: (c.parameters, -c.density))
     first = next(c for c in ordered if good(c))
@@ -300,7 +304,7 @@ def _reasons(chosen: Candidate, candidates: list[Candidate]) -> list[str]:
             f"{-c.density_gap(chosen):.3f} nat for {c.parameters - chosen.parameters} more "
             "parameters."
         )
-    if chosen.behind > SMALLEST_GAIN:
+    if not _likely(chosen):
         out.append(
             f"What predicts best ({WORDS[candidates[0].model]}, {candidates[0].response.name}) "
             f"differs by at most {chosen.codes:.1f} of 255 codes in any view."

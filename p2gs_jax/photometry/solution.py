@@ -26,6 +26,8 @@ from p2gs_jax.types import GAMMA_SRGB
 
 Level = Literal["camera", "view"]
 MIN_OBSERVATIONS = 15
+# A channel off by this much in a view is worth a word.
+NOTICEABLE_BALANCE_EV = 0.1
 TOLERANCE, ROUGH = 1e-5, 1e-3
 # Standard deviation of a = 2.2 / gamma about 1 (gammas of 1.9 to 2.6 are within one of these).
 A_PRIOR = 0.15
@@ -89,6 +91,8 @@ class PhotometricSolution:
         point_log_radiance: natural logarithm per channel; NaN where unobserved.
         residual_ev: robust standard deviation of one observation, in stops.
         view_residual_ev: the same per view.
+        view_balance_ev: median residual of red, green, blue in each view less their mean, stops:
+            what a scalar exposure leaves of a white balance; NaN where unobserved.
         outliers: share of observations that the robust loss ignores.
         rounds: iterations.
         warnings: what the user should know.
@@ -105,6 +109,7 @@ class PhotometricSolution:
     point_log_radiance: Float[np.ndarray, "p 3"]
     residual_ev: float
     view_residual_ev: Float[np.ndarray, " v"]
+    view_balance_ev: Float[np.ndarray, "v 3"]
     outliers: float
     rounds: int
     warnings: tuple[str, ...]
@@ -341,7 +346,8 @@ def describe(
     h = np.where(active, h - shift, 0.0)
 
     used = problem.usable > 0
-    residual = np.abs(problem.layout.take(fit.residual) / a[o.views][:, None])
+    residual = problem.layout.take(fit.residual) / a[o.views][:, None]
+    view_residual, balance = _per_view_ev(o.views, residual, used, o.view_count)
     ideal = 1 / o.decoded(response)[1] ** 2
     ignored = (problem.layout.take(fit.weight) / ideal)[used] < 0.25
     return PhotometricSolution(
@@ -355,28 +361,35 @@ def describe(
         component=component,
         point_log_radiance=_point_radiance(problem, fit, shift),
         residual_ev=_spread_ev(residual[used]) if used.any() else 0.0,
-        view_residual_ev=_per_view_ev(o.views, residual, used, o.view_count),
+        view_residual_ev=view_residual,
+        view_balance_ev=balance,
         outliers=float(ignored.mean()) if ignored.size else 0.0,
         rounds=int(fit.rounds),
-        warnings=_warnings(per_view, component, active),
+        warnings=_warnings(per_view, component, active, balance),
     )
 
 
-def _spread_ev(absolute: Float[np.ndarray, " n"]) -> float:
-    """Return the robust standard deviation, in stops, of residuals given without sign."""
-    return 1.4826 * float(np.median(absolute)) / LN2
+def _spread_ev(residual: Float[np.ndarray, " n"]) -> float:
+    """Return the robust standard deviation of residuals, in stops."""
+    return 1.4826 * float(np.median(np.abs(residual))) / LN2
 
 
-def _per_view_ev(views, absolute, used, count: int) -> Float[np.ndarray, " v"]:
-    """Return that of every view; NaN where it has none."""
-    out = np.full(count, np.nan)
+def _per_view_ev(
+    views, residual, used, count: int
+) -> tuple[Float[np.ndarray, " v"], Float[np.ndarray, "v 3"]]:
+    """Return the spread of every view and its colour balance; NaN where it has none."""
+    spread, balance = np.full(count, np.nan), np.full((count, 3), np.nan)
     order = np.argsort(views, kind="stable")
     bounds = np.searchsorted(views[order], np.arange(count + 1))
     for view in range(count):
         mine = order[bounds[view] : bounds[view + 1]]
-        if used[mine].any():
-            out[view] = _spread_ev(absolute[mine][used[mine]])
-    return out
+        seen = used[mine]
+        if seen.any():
+            spread[view] = _spread_ev(residual[mine][seen])
+        if (seen.sum(0) >= MIN_OBSERVATIONS).all():
+            medians = np.array([np.median(residual[mine, c][seen[:, c]]) for c in range(3)])
+            balance[view] = (medians - np.mean(medians)) / LN2
+    return spread, balance
 
 
 def _centering(a, h, component, active, free_scale):
@@ -410,7 +423,7 @@ def _point_radiance(problem: Problem, fit: Fit, shift) -> Float[np.ndarray, "p 3
     return np.where(weight > 0, level, np.nan)
 
 
-def _warnings(per_view, component, active) -> tuple[str, ...]:
+def _warnings(per_view, component, active, balance) -> tuple[str, ...]:
     out = []
     few = np.flatnonzero(per_view < MIN_OBSERVATIONS)
     if len(few):
@@ -423,6 +436,19 @@ def _warnings(per_view, component, active) -> tuple[str, ...]:
         out.append(
             f"The tracks fall into {groups} groups of views that share no point: exposures can "
             "be compared only inside a group."
+        )
+    off = np.nan_to_num(np.abs(balance).max(1))
+    tinted = np.flatnonzero(off > NOTICEABLE_BALANCE_EV)
+    if len(tinted):
+        worst = int(off.argmax())
+        channels = ", ".join(
+            f"{name} {value:+.2f}"
+            for name, value in zip(("red", "green", "blue"), balance[worst], strict=True)
+        )
+        out.append(
+            f"White balance changes: {len(tinted)} training view(s) are tinted against the others "
+            f"(rows {_listed(tinted)}; row {worst} by {channels} EV). An exposure here is one "
+            "number for all channels."
         )
     return tuple(out)
 

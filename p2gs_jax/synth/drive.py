@@ -127,7 +127,7 @@ def encode(exposed: Float[np.ndarray, "..."], curve: Curve) -> Float[np.ndarray,
 
 def observe(
     drive: Drive,
-    exposures: Float[np.ndarray, " v"],
+    exposures: Float[np.ndarray, " v"] | Float[np.ndarray, "v 3"],
     *,
     curve: Curve = "srgb",
     gammas: Float[np.ndarray, " v"] | None = None,
@@ -142,7 +142,7 @@ def observe(
 
     Args:
         drive: who sees what.
-        exposures: of every view.
+        exposures: of every view, or of every channel of it (a white balance).
         curve: response.
         gammas: of every view, replacing the curve by x^(1 / gamma) about the pivot.
         pivot: linear value that gammas leave alone (encoded by 2.2).
@@ -157,7 +157,7 @@ def observe(
     shown = p.copy()
     wrong = rng.random(len(p)) < outliers
     shown[wrong] = rng.integers(0, len(drive.radiance), int(wrong.sum()))
-    exposed = exposures[v][:, None] * drive.radiance[shown]
+    exposed = exposures.reshape(len(exposures), -1)[v] * drive.radiance[shown]
     exposed = exposed * np.exp(noise * texture * rng.standard_normal((len(p), 1)))
     shot = np.sqrt(SHOT_NOISE * exposed + READ_NOISE)
     exposed = np.maximum(exposed + noise * shot * rng.standard_normal(exposed.shape), 0)

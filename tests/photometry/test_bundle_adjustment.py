@@ -209,3 +209,16 @@ def test_long_tracks_are_split_and_lose_little():
     s = fit_model(problem, "view_exposure")
     assert ev(s, truth) < 0.012
     assert np.isfinite(s.point_log_radiance).mean() > 0.9
+
+
+def test_a_white_balance_that_changes_is_measured_and_said():
+    truth = make_exposures(DRIVE, "iso2")
+    gains = np.repeat(truth[:, None], 3, 1)
+    gains[7] *= np.exp2([0.3, 0.0, -0.3])
+    s = fit_model(make_problem(observe(DRIVE, gains), **LIMITS), "view_exposure")
+    np.testing.assert_allclose(s.view_balance_ev[7], [0.3, 0.0, -0.3], atol=0.03)
+    others = np.delete(s.view_balance_ev, 7, 0)
+    assert np.nanmax(np.abs(others)) < 0.05
+    assert any("White balance changes: 1 training view" in w and "rows 7" in w for w in s.warnings)
+    plain = fit_model(make_problem(observe(DRIVE, truth), **LIMITS), "view_exposure")
+    assert not any("White balance" in w for w in plain.warnings)
