@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from p2gs_jax.render import render_linear
     from p2gs_jax.run_folder import load_run
     from p2gs_jax.static_stack import calibrate_stack
-    from p2gs_jax.synth import write_street
+    from p2gs_jax.synth.write import write_street
 
 __all__ = [
     "Camera",
@@ -50,7 +50,7 @@ _LAZY = {
     "fit": "p2gs_jax.pipeline",
     "load_run": "p2gs_jax.run_folder",
     "render_linear": "p2gs_jax.render",
-    "write_street": "p2gs_jax.synth",
+    "write_street": "p2gs_jax.synth.write",
 }
 
 

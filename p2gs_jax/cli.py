@@ -1,4 +1,4 @@
-"""The command line: `p2gs-jax fit | calibrate | render | eval | demo | bench`.
+"""The command line: `p2gs-jax fit | calibrate | render | eval | demo | synth | bench`.
 
 Every configuration field is an option. Bad input ends with one message and exit code 2.
 """
@@ -9,7 +9,7 @@ import dataclasses
 import os
 import re
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Union
 
@@ -21,6 +21,8 @@ import tyro
 
 from p2gs_jax import config as configs
 from p2gs_jax.errors import UserError
+from p2gs_jax.synth.sensor import Sensor
+from p2gs_jax.synth.town import Layout
 
 PRESETS = ("robust", "paper", "paper_appendix")
 
@@ -145,6 +147,31 @@ class Demo:
 
 
 @dataclass(frozen=True)
+class Synth:
+    """Make a data set by the paper's protocol: a drive through a town by three cameras and a
+    LiDAR, with linear HDR truth."""
+
+    out: Annotated[Path, tyro.conf.Positional]
+    """Folder to create."""
+    sensor: Sensor = field(default_factory=Sensor)
+    """What the cameras do to the light."""
+    frames: int = 100
+    """Frames per camera (paper: 100, at 10 Hz)."""
+    width: int = 480
+    """Image width, pixels (paper: 1920); the height follows as 1300 / 1920 of it."""
+    layout: Layout = "town"
+    """town: with an underpass and a sun of its own for every seed; street: the demo's."""
+    supersample: int = 2
+    """Samples a pixel along each axis."""
+    points: int = 60_000
+    """Seed points sampled for the COLMAP model; those seen once are dropped."""
+    lidar: bool = True
+    """Write KITTI's calibration, poses and LiDAR scans."""
+    seed: int = 0
+    """Seeds the town, the ISO and the points."""
+
+
+@dataclass(frozen=True)
 class Bench:
     """Measure the renderer on this machine: speed against error, growth, memory, hard cases."""
 
@@ -240,6 +267,7 @@ def _run(argv: list[str]) -> int:
         Annotated[Render, tyro.conf.subcommand("render")],
         Annotated[Eval, tyro.conf.subcommand("eval")],
         Annotated[Demo, tyro.conf.subcommand("demo")],
+        Annotated[Synth, tyro.conf.subcommand("synth")],
         Annotated[Bench, tyro.conf.subcommand("bench")],
     ]
     args: Any = tyro.cli(
@@ -265,6 +293,18 @@ def _run(argv: list[str]) -> int:
         return commands.render_command(args.run, args.out, args.split, args.exposure_ev, args.gamma)
     if isinstance(args, Eval):
         return commands.eval_command(args.run, args.reference)
+    if isinstance(args, Synth):
+        return commands.synth_command(
+            args.out,
+            args.sensor,
+            frames=args.frames,
+            width=args.width,
+            layout=args.layout,
+            supersample=args.supersample,
+            points=args.points,
+            lidar=args.lidar,
+            seed=args.seed,
+        )
     if isinstance(args, Bench):
         return commands.bench_command(
             args.parts, args.out, args.quick, args.baseline, args.write_baseline

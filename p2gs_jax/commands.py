@@ -29,6 +29,8 @@ from p2gs_jax.run_folder import load_run
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.static_stack import calibrate_stack, write_stack
+from p2gs_jax.synth.sensor import Sensor
+from p2gs_jax.synth.write import write_street
 
 
 def _out() -> Console:
@@ -288,6 +290,23 @@ def demo_command(
         f"(largest {result.error['ev_max']:.3f})."
     )
     print_metrics(result.metrics, result.run_dir)
+    return 0
+
+
+def synth_command(out: Path, sensor: Sensor, *, width: int, **options) -> int:
+    """Make a data set.
+
+    Args:
+        out: folder to create.
+        sensor: what the cameras do to the light.
+        width: pixels.
+        options: see `write_street`.
+    """
+    console = _out()
+    begin = time.monotonic()
+    height = max(round(width * 1300 / 1920), 1)
+    write_street(out, sensor=sensor, width=width, height=height, report=console.print, **options)
+    console.print(f"{time.monotonic() - begin:.0f} s. Fit it: p2gs-jax fit {out} --out RUN")
     return 0
 
 

@@ -35,6 +35,8 @@ class DataConfig:
     """Shrink images to at most this many pixels across; None keeps them as they are."""
     images: str | None = None
     """Image folder, where it is not `images/` beside the model."""
+    format: Literal["colmap", "transforms", "rig", "images"] | None = None
+    """How to read the scene; None takes the first of these that the folder holds."""
     allow_missing: bool = False
     """Skip frames whose image file is missing instead of stopping."""
     cache_mb: int = 2048

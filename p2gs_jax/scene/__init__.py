@@ -12,6 +12,7 @@ from p2gs_jax.scene.colmap import find_model, load_colmap
 from p2gs_jax.scene.exif import read_exif_ev
 from p2gs_jax.scene.files import list_images
 from p2gs_jax.scene.images import ImageStore, camera_at, size_at
+from p2gs_jax.scene.rig import is_rig, load_rig
 from p2gs_jax.scene.split import assign_split
 from p2gs_jax.scene.structure_from_motion import load_images
 from p2gs_jax.scene.transforms import load_transforms
@@ -29,10 +30,10 @@ def load_scene(
 ) -> Scene:
     """Read a scene; the format is found from what lies in the folder.
 
-    In this order: a COLMAP model in `sparse/0`, `sparse` or the folder itself; `transforms.json`
-    in it, or `root` itself where that is a .json file; photographs in `images/` or the folder
-    itself, whose cameras are then found by structure from motion. Poses without points get theirs
-    by triangulation.
+    In this order, unless `cfg.format` names one: a COLMAP model in `sparse/0`, `sparse` or the
+    folder itself; `transforms.json` in it, or `root` itself where that is a .json file; a rig with
+    KITTI's calib.txt and poses.txt; photographs in `images/` or the folder itself, whose cameras
+    are then found by structure from motion. Poses without points get theirs by triangulation.
 
     Args:
         root: folder, or .json file.
@@ -74,10 +75,17 @@ def _read(
             )
         return load_transforms(root, root, cfg)
     model = find_model(root)
-    if model is not None:
+    if model is not None and cfg.format in (None, "colmap"):
         return load_colmap(root, model, cfg)
-    if (root / "transforms.json").is_file():
+    if (root / "transforms.json").is_file() and cfg.format in (None, "transforms"):
         return load_transforms(root, root / "transforms.json", cfg)
+    if is_rig(root) and cfg.format in (None, "rig"):
+        return load_rig(root, cfg)
+    if cfg.format not in (None, "images"):
+        raise UserError(
+            f"{root} holds no scene in the format {cfg.format!r}",
+            fix="leave out --data.format, or name the folder that holds one",
+        )
     folders = [root / cfg.images] if cfg.images is not None else [root / "images", root]
     for folder in folders:
         # Subfolders of the root itself may hold anything: masks, or the results of other runs.
@@ -87,7 +95,8 @@ def _read(
     looked = ", ".join(str(folder) for folder in folders)
     raise UserError(
         f"no scene in {root}: there is no COLMAP model (cameras, images and points3D as .bin or "
-        f".txt, in sparse/0, sparse or the folder itself), no transforms.json, and no photographs "
+        f".txt, in sparse/0, sparse or the folder itself), no transforms.json, no calib.txt with "
+        f"poses.txt, and no photographs "
         f"(looked in {looked})",
         fix="name the folder that holds one of these",
     )

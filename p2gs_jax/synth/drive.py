@@ -13,15 +13,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from p2gs_jax.photometry.observations import Observations
-from p2gs_jax.synth.sensor import srgb_encode
+from p2gs_jax.synth.sensor import READ_NOISE, SHOT_NOISE, Curve, encode
 
 Exposures = Literal["constant", "iso2", "iso4", "cameras", "auto"]
-Curve = Literal["srgb", "power", "filmic"]
 YAWS = (0.0, -44.2, 44.8)
 HALF_WIDTH, HALF_HEIGHT = 30.0, 21.0
 NEAREST, FARTHEST = 3.0, 45.0
 LONGEST_TRACK, SHORTEST_TRACK = 30, 3
-SHOT_NOISE, READ_NOISE = 2e-4, 1e-6
 
 
 class Drive(NamedTuple):
@@ -114,15 +112,6 @@ def make_exposures(drive: Drive, kind: Exposures, seed: int = 2) -> Float[np.nda
         return np.array([1.0, 0.7, 1.4])[drive.cameras]
     phase = 2 * np.pi * frame / drive.frames * 1.3 + np.array([0, 2.1, 4.2])[drive.cameras]
     return 2.0 ** (0.8 * np.sin(phase) + np.array([0, -0.3, 0.3])[drive.cameras])
-
-
-def encode(exposed: Float[np.ndarray, "..."], curve: Curve) -> Float[np.ndarray, "..."]:
-    """Return display values, not yet rounded."""
-    if curve == "filmic":
-        # An S-curve as film and game engines use (Narkowicz's fit), before the sRGB encoding.
-        x = 0.8 * exposed
-        exposed = x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14)
-    return exposed ** (1 / 2.2) if curve == "power" else srgb_encode(exposed)
 
 
 def observe(

@@ -1,15 +1,58 @@
-"""The sensor: ISO drawn per photograph, sRGB, eight bits (paper, appendix "Exposure Control").
+"""The cameras' pipeline: ISO drawn per photograph, sRGB, eight bits (paper, appendix "Exposure
+Control"), and on request what real ones add: a filmic curve, gains, drift, vignetting, white
+balance, noise.
 
-Exposure is ISO / 8: ISO-Const photographs (ISO 8) show the truth with e = 1.
+Exposure is ISO / 8 times the gains: ISO-Const photographs (ISO 8) show the truth with e = 1.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+Curve = Literal["srgb", "power", "filmic"]
 ISO_REFERENCE = 8
 ISO_MINIMUM = 1
+# Variances of photon noise per unit of exposed radiance, and of read noise.
+SHOT_NOISE, READ_NOISE = 2e-4, 1e-6
+DRIFT_PERIODS = 1.3
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """What the cameras do to the light. The defaults are the paper's ISO-Var(4)."""
+
+    iso_std: float = 4.0
+    """Spread of the ISO about 8 (paper: 2 and 4); 0 is ISO-Const."""
+    curve: Curve = "srgb"
+    """Response; `filmic` bends it into an S before sRGB."""
+    camera_gain_ev: float = 0.0
+    """Standard deviation of a fixed gain per camera, stops."""
+    drift_ev: float = 0.0
+    """Amplitude of a slow automatic exposure, each camera at its own phase, stops."""
+    vignetting: float = 0.0
+    """Share of the light lost in the corners."""
+    white_balance_ev: float = 0.0
+    """Standard deviation of red and blue gains per camera, stops."""
+    noise: float = 0.0
+    """Standard deviation of photon and read noise, 1 = a small sensor in daylight."""
+
+
+class Shots(NamedTuple):
+    """How every photograph was taken.
+
+    Attributes:
+        iso: drawn ISO.
+        exposures: factor on radiance, ISO-Const without gains = 1.
+        balance: factors on red, green, blue.
+    """
+
+    iso: Int[np.ndarray, " v"]
+    exposures: Float[np.ndarray, " v"]
+    balance: Float[np.ndarray, "v 3"]
 
 
 def draw_iso(shape: tuple[int, ...], std: float, seed: int) -> Int[np.ndarray, "..."]:
@@ -24,6 +67,28 @@ def draw_iso(shape: tuple[int, ...], std: float, seed: int) -> Int[np.ndarray, "
     return np.maximum(np.rint(ISO_REFERENCE + std * noise), ISO_MINIMUM).astype(np.int64)
 
 
+def draw_shots(sensor: Sensor, frames: int, cameras: int, seed: int) -> Shots:
+    """Return how all photographs are taken, camera by camera, frame by frame.
+
+    Args:
+        sensor: the pipeline.
+        frames: of each camera.
+        cameras: how many.
+        seed: of everything drawn.
+    """
+    iso = draw_iso((frames, cameras), sensor.iso_std, seed).T.ravel()
+    rng = np.random.default_rng([seed, 4])
+    gain = sensor.camera_gain_ev * rng.standard_normal(cameras)
+    tint = sensor.white_balance_ev * rng.standard_normal((cameras, 2))
+    phase = 2 * np.pi * rng.random(cameras)
+    turn = 2 * np.pi * DRIFT_PERIODS * np.arange(frames) / max(frames, 1)
+    stops = gain[:, None] + sensor.drift_ev * np.sin(turn + phase[:, None])
+    balance = np.exp2(np.stack([tint[:, 0], np.zeros(cameras), tint[:, 1]], 1))
+    return Shots(
+        iso, iso / ISO_REFERENCE * np.exp2(stops.ravel()), np.repeat(balance, frames, axis=0)
+    )
+
+
 def srgb_encode(linear: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """Return the sRGB encoding (IEC 61966-2-1) of linear values, clipped to [0, 1]."""
     x = np.clip(linear, 0.0, 1.0)
@@ -36,7 +101,49 @@ def srgb_decode(encoded: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     return np.where(y <= 0.04045, y / 12.92, ((np.maximum(y, 0.0) + 0.055) / 1.055) ** 2.4)
 
 
-def photograph(linear: Float[np.ndarray, "h w 3"], exposure: float) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the eight-bit sRGB photograph of linear radiance at an exposure."""
-    encoded = srgb_encode(np.asarray(linear, np.float64) * exposure)
-    return np.rint(255.0 * encoded).astype(np.uint8)
+def encode(exposed: Float[np.ndarray, "..."], curve: Curve) -> Float[np.ndarray, "..."]:
+    """Return display values of exposed radiance, not yet rounded."""
+    if curve == "power":
+        return np.clip(exposed, 0.0, 1.0) ** (1 / 2.2)
+    if curve == "filmic":
+        # An S-curve as film and game engines use (Narkowicz's fit), before the sRGB encoding.
+        x = 0.8 * exposed
+        exposed = x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14)
+    return srgb_encode(exposed)
+
+
+def vignette(height: int, width: int, lost: float) -> Float[np.ndarray, "h w 1"]:
+    """Return the light that reaches each pixel: 1 in the centre, 1 - lost in the corners."""
+    y, x = np.mgrid[:height, :width] + 0.5
+    squared = (x / width - 0.5) ** 2 + (y / height - 0.5) ** 2
+    return (1 - lost * squared / 0.5)[..., None]
+
+
+def photograph(
+    linear: Float[np.ndarray, "h w 3"],
+    exposure: float,
+    sensor: Sensor | None = None,
+    *,
+    balance: Float[np.ndarray, " 3"] | None = None,
+    rng: np.random.Generator | None = None,
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Return the eight-bit photograph of linear radiance.
+
+    Args:
+        linear: radiance.
+        exposure: factor on it.
+        sensor: curve, vignetting and noise; None is plain sRGB.
+        balance: factors on red, green, blue.
+        rng: of the noise; needed where there is any.
+    """
+    sensor = sensor or Sensor()
+    exposed = np.asarray(linear, np.float64) * exposure
+    if balance is not None:
+        exposed = exposed * balance
+    if sensor.vignetting:
+        exposed = exposed * vignette(*exposed.shape[:2], sensor.vignetting)
+    if sensor.noise:
+        assert rng is not None
+        deviation = sensor.noise * np.sqrt(SHOT_NOISE * exposed + READ_NOISE)
+        exposed = np.maximum(exposed + deviation * rng.standard_normal(exposed.shape), 0.0)
+    return np.rint(255.0 * encode(exposed, sensor.curve)).astype(np.uint8)

@@ -9,17 +9,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import IntEnum
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float32, Int32
 
 Vec3 = tuple[float, float, float]
+Layout = Literal["street", "town"]
 
 ROAD_HALF_WIDTH = 5.6
 KERB_HEIGHT = 0.14
 FACADE_LINE = 9.0
 CROSS_STREET = (27.0, 36.0)
 """The side street's extent along x, between the buildings' corners."""
+UNDERPASS = (54.0, 68.0)
+"""Where a house stands across the street, along x."""
+UNDERPASS_HEIGHT = 5.2
 FLOOR_HEIGHT = 3.2
 GROUND_FLOOR_HEIGHT = 4.0
 
@@ -78,6 +83,7 @@ class Town:
         params: (style, bay width m, ground-floor use, random number in [0, 1)).
         light: sun and sky.
         seed: of the textures' noise.
+        underpass: its extent along x, or None.
     """
 
     n_boxes: int
@@ -91,6 +97,7 @@ class Town:
     params: Float32[np.ndarray, "p 4"]
     light: Light
     seed: int
+    underpass: tuple[float, float] | None = None
 
     @property
     def size(self) -> int:
@@ -113,6 +120,7 @@ class _Solid:
 @dataclass
 class _Builder:
     rng: np.random.Generator
+    clear: tuple[float, float] | None = None
     solids: list[_Solid] = field(default_factory=list)
 
     def add(
@@ -136,6 +144,10 @@ class _Builder:
             _Solid(1 if top else kind, a, b, material, color, accent, params, top)  # pyright: ignore[reportArgumentType]
         )
 
+    def is_clear(self, x: float, reach: float) -> bool:
+        """Return whether nothing may stand within reach of x."""
+        return self.clear is not None and (self.clear[0] - reach < x < self.clear[1] + reach)
+
     def blob(self, center: Vec3, radii: Vec3, material: Material, color: Vec3) -> None:
         c, r = np.array(center), np.array(radii)
         self.add(tuple(c - r), tuple(c + r), material, color, kind=2)
@@ -147,20 +159,64 @@ class _Builder:
         return items[int(self.rng.integers(len(items)))]
 
 
-def build_town(seed: int = 0) -> Town:
+def build_town(seed: int = 0, layout: Layout = "street") -> Town:
     """Return one street with a crossing, houses, trees, parked cars, lamps and signs.
 
     Args:
         seed: of everything that is drawn at random.
+        layout: `town` adds an underpass, deep in shadow, and draws the place of the sun.
     """
-    build = _Builder(np.random.default_rng([seed, 1]))
+    build = _Builder(np.random.default_rng([seed, 1]), UNDERPASS if layout == "town" else None)
     _pavements(build)
     _houses(build)
     _vista(build)
     _trees(build)
     _cars(build)
     _lamps_and_signs(build)
-    return _pack(build.solids, seed)
+    if layout == "town":
+        _underpass(build)
+    return _pack(build, seed, _light(seed) if layout == "town" else Light())
+
+
+def _light(seed: int) -> Light:
+    """Return a sun at 35 to 55 degrees from a direction that shades one side of the street."""
+    rng = np.random.default_rng([seed, 5])
+    azimuth = np.deg2rad(rng.uniform(200.0, 340.0) if rng.random() < 0.5 else rng.uniform(20, 160))
+    height = np.deg2rad(rng.uniform(35.0, 55.0))
+    flat = np.cos(height)
+    x, y, z = flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(height)
+    return Light(sun_direction=(float(x), float(y), float(z)))
+
+
+def _underpass(build: _Builder) -> None:
+    """A house built across the street on two thick walls: 14 m of shadow to drive through."""
+    x0, x1 = UNDERPASS
+    wall, trim = (0.55, 0.47, 0.38), (0.70, 0.66, 0.57)
+    top = UNDERPASS_HEIGHT + 2 * FLOOR_HEIGHT + 0.5
+    build.add(
+        (x0, -FACADE_LINE - 0.5, UNDERPASS_HEIGHT),
+        (x1, FACADE_LINE + 0.5, top),
+        Material.FACADE,
+        wall,
+        accent=trim,
+        style=2.0,
+    )
+    for side in (-1.0, 1.0):
+        build.add(
+            (x0, side * 7.6, 0.0),
+            (x1, side * (FACADE_LINE + 0.5), UNDERPASS_HEIGHT),
+            Material.PLAIN,
+            _STONE,
+        )
+        build.add(
+            (x0 + 6.0, side * 7.4, UNDERPASS_HEIGHT - 0.5),
+            (x0 + 8.0, side * 7.6, UNDERPASS_HEIGHT - 0.3),
+            Material.EMISSIVE,
+            (1.6, 1.3, 0.8),
+        )
+    build.add(
+        (x0 - 0.3, -FACADE_LINE, top), (x1 + 0.3, FACADE_LINE, top + 0.5), Material.PLAIN, trim
+    )
 
 
 _WALLS: list[tuple[Vec3, float]] = [  # albedo, style: 0 brick, 1 plaster, 2 stone
@@ -324,6 +380,8 @@ def _trees(build: _Builder) -> None:
             x = first + step * i + build.uniform(-0.8, 0.8)
             if CROSS_STREET[0] - 1.5 < x < CROSS_STREET[1] + 1.5 or x > 84.0:
                 continue
+            if build.is_clear(x, 2.5):
+                continue
             y = side * 6.7
             trunk = build.uniform(2.3, 2.9)
             w = build.uniform(0.11, 0.16)
@@ -350,7 +408,9 @@ def _cars(build: _Builder) -> None:
     k = 0
     for side, centers in spots.items():
         for x in centers:
-            _car(build, x + build.uniform(-0.4, 0.4), side * 4.45, side, _PAINTS[paints[k % 8]])
+            if not build.is_clear(x, 3.5):
+                at = x + build.uniform(-0.4, 0.4)
+                _car(build, at, side * 4.45, side, _PAINTS[paints[k % 8]])
             k += 1
 
 
@@ -396,6 +456,8 @@ def _car(build: _Builder, x: float, y: float, side: float, paint: Vec3) -> None:
 def _lamps_and_signs(build: _Builder) -> None:
     for side, xs in ((1.0, (11.5, 39.0, 66.0)), (-1.0, (20.5, 52.0, 80.0))):
         for x in xs:
+            if build.is_clear(x, 0.5):
+                continue
             y, arm = side * 6.0, side * 4.3
             build.add((x - 0.06, y - 0.06, 0.0), (x + 0.06, y + 0.06, 6.6), Material.METAL, _STEEL)
             build.add((x - 0.04, arm, 6.52), (x + 0.04, y, 6.6), Material.METAL, _STEEL)
@@ -460,8 +522,8 @@ def _taper_planes(solid: _Solid) -> np.ndarray:
     return np.concatenate([normals, (normals * anchors).sum(1, keepdims=True)], axis=1)
 
 
-def _pack(solids: list[_Solid], seed: int) -> Town:
-    solids = sorted(solids, key=lambda s: s.kind)
+def _pack(build: _Builder, seed: int, light: Light) -> Town:
+    solids = sorted(build.solids, key=lambda s: s.kind)
     tapered = [s for s in solids if s.kind == 1]
 
     def column(name: str) -> np.ndarray:
@@ -477,6 +539,7 @@ def _pack(solids: list[_Solid], seed: int) -> Town:
         color=column("color"),
         accent=column("accent"),
         params=column("params"),
-        light=Light(),
+        light=light,
+        underpass=build.clear,
         seed=seed,
     )

@@ -21,7 +21,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Float32, Int
 
 from p2gs_jax.synth.paint import Surface, paint, sky
-from p2gs_jax.synth.town import Material, Town
+from p2gs_jax.synth.town import FACADE_LINE, UNDERPASS_HEIGHT, Material, Town
 
 _TILE = 32  # pixels: a tile's rays stay in the second-level cache and share a list of primitives
 _UNROLL = 4
@@ -29,6 +29,7 @@ _OFFSET = 4e-3  # shadow rays start this far off the surface, m
 _REACH = (0.35, 1.4)  # distances along the normal where the distance field is read, m
 _WEIGHT = (0.30, 0.30)  # how much of the ambient light each can take
 _CANYON_REACH, _CANYON_WEIGHT = 5.0, 0.28  # the same for the houses alone
+_DARKEST, _DAYLIGHT_REACH = 0.05, 2.5  # share of ambient light deep in an underpass; m
 _AMBIENT_UP = (0.27, 0.325, 0.43)
 
 
@@ -149,6 +150,8 @@ def _light(town: Town, p: Array, view: Array, surface: Surface, hit: Array) -> A
     up = surface.shading_normal[2]
     ambient = _column(_AMBIENT_UP) * (0.56 + 0.44 * up) + _column(light.bounce) * (0.5 - 0.5 * up)
     ambient = ambient * open_sky(town, p, n, lower, upper)
+    if town.underpass is not None:
+        ambient = ambient * _daylight(p, town.underpass)
     diffuse = surface.albedo * (_column(light.sun) * sun + ambient)
     # Glossy paint and glass: the sky and, below it, a nondescript street; a broad sun highlight.
     cosine = jnp.clip(-jnp.sum(view * n, 0), 0.0, 1.0)
@@ -160,6 +163,14 @@ def _light(town: Town, p: Array, view: Array, surface: Surface, hit: Array) -> A
     lobe = jnp.maximum(jnp.sum(mirrored * to_sun, 0), 0.0) ** 80
     highlight = _column(light.sun) * (6.0 * lobe * (sun > 0))
     return diffuse + fresnel * (seen + highlight) + surface.emission
+
+
+def _daylight(p: Float[Array, "3 r"], underpass: tuple[float, float]) -> Float[Array, " r"]:
+    """Return the share of ambient light that reaches points under a house: less from both ends."""
+    inside = (jnp.abs(p[1]) < FACADE_LINE + 0.5) & (p[2] < UNDERPASS_HEIGHT + 0.01)
+    depth = jnp.minimum(p[0] - underpass[0], underpass[1] - p[0])
+    left = _DARKEST + (1 - _DARKEST) * jnp.exp(-jnp.maximum(depth, 0.0) / _DAYLIGHT_REACH)
+    return jnp.where(inside, left, 1.0)
 
 
 def nearest_hit(

@@ -14,7 +14,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.alignment import exposure_error
 from p2gs_jax.export.photometry_json import read_photometry
 from p2gs_jax.static_stack import calibrate_stack, read_stack
-from p2gs_jax.synth import write_street
+from p2gs_jax.synth.write import write_street
 
 
 def run(capsys, *argv):

@@ -8,7 +8,7 @@ import p2gs_jax
 from p2gs_jax.evaluate.alignment import exposure_error
 from p2gs_jax.export.photometry_json import read_photometry
 from p2gs_jax.refine import calibrate_run
-from p2gs_jax.synth import write_street
+from p2gs_jax.synth.write import write_street
 
 
 def test_a_run_gives_its_exposures_again(tmp_path):

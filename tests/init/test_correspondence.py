@@ -17,7 +17,7 @@ from p2gs_jax.init.correspondence import (
 from p2gs_jax.prepare import calibrate_observations
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.synth import write_street
+from p2gs_jax.synth.write import write_street
 
 
 def test_a_wall_hides_what_is_behind_it():

@@ -67,7 +67,7 @@ def test_extreme_gammas_stay_finite(gamma):
 
 
 @pytest.mark.parametrize("x", [0.0, -1e-3, 1e-8, 0.0031308, 1.0])
-@pytest.mark.parametrize("curve", ["srgb", "power"])
+@pytest.mark.parametrize("curve", ["srgb", "power", "linear"])
 def test_curves_have_finite_gradients(x, curve):
     for f in (oetf, eotf):
         assert np.isfinite(float(jax.grad(lambda v: f(v, curve))(jnp.float32(x))))  # noqa: B023

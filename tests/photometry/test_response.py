@@ -6,19 +6,21 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import PhotometryConfig
-from p2gs_jax.photometry.formation import inverse_tone_map, tone_map
+from p2gs_jax.photometry.formation import eotf, inverse_tone_map, tone_map
 from p2gs_jax.photometry.response import (
     FREE,
     HELD,
     KNOTS,
     Response,
+    base_log,
     deviation,
     log_exposed,
     log_slope_minimum,
     monotone,
 )
 from p2gs_jax.photometry.solution import fit_response, make_problem
-from p2gs_jax.synth.drive import encode, make_drive, make_exposures, observe
+from p2gs_jax.synth.drive import make_drive, make_exposures, observe
+from p2gs_jax.synth.sensor import encode
 
 BENT = Response("srgb", tuple(0.3 * np.sin(3 * KNOTS) - 0.1))
 CFG = PhotometryConfig(curve="spline", spline=BENT.spline)
@@ -48,6 +50,14 @@ def test_values_below_the_first_code_are_clamped():
         assert np.all(np.isfinite(z))
         assert np.ptp(z) == 0
         assert np.all(np.isfinite(deviation(y, slope)))
+
+
+@pytest.mark.parametrize("base", ["srgb", "power"])
+def test_the_host_decodes_as_the_device_does(base):
+    y = np.linspace(0.01, 1.0, 200)
+    np.testing.assert_allclose(
+        np.exp(base_log(y, base)[0]), eotf(jnp.asarray(y, jnp.float32), base), rtol=5e-6
+    )
 
 
 def test_dark_and_uncertain_values_say_less():

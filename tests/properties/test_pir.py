@@ -33,7 +33,10 @@ from p2gs_jax.types import Camera, Gaussians, Photometry
 PAPER = PhotometryConfig(curve="power", pivot=1.0, clamp=True, parameterization="linear")
 ROBUST = PhotometryConfig()
 POWER = PhotometryConfig(curve="power")
-MODELS = pytest.mark.parametrize("cfg", [PAPER, ROBUST, POWER], ids=["paper", "robust", "power"])
+LDR = PhotometryConfig(curve="linear")
+MODELS = pytest.mark.parametrize(
+    "cfg", [PAPER, ROBUST, POWER, LDR], ids=["paper", "robust", "power", "ldr splatting"]
+)
 FEW = settings(max_examples=25, deadline=None)
 SEEDS = st.integers(0, 2**31 - 1)
 SCALES = st.floats(0.2, 5.0)

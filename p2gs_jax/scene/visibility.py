@@ -1,0 +1,48 @@
+"""Which points a view sees, judged by the points alone."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.ndimage import minimum_filter
+
+from p2gs_jax.types import View
+
+# A point is hidden where a nearer one lies within about this many point spacings in the image.
+SPACINGS = 1.5
+# ... and nearer by more than this share of its depth.
+DEPTH_MARGIN = 0.05
+
+
+def project_points(
+    points: Float[np.ndarray, "p 3"], view: View
+) -> tuple[Float[np.ndarray, "p 2"], Float[np.ndarray, " p"]]:
+    """Return pixel positions at full resolution (centres at +0.5) and camera z."""
+    local = points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+    z = local[:, 2]
+    ahead = np.where(z > 1e-6, z, 1.0)
+    focal, center = view.K[[0, 1], [0, 1]], view.K[[0, 1], [2, 2]]
+    return local[:, :2] / ahead[:, None] * focal + center, z
+
+
+def unoccluded(
+    xy: Float[np.ndarray, "p 2"], z: Float[np.ndarray, " p"], width: int, height: int
+) -> Bool[np.ndarray, " p"]:
+    """Return which projected points no nearer point hides.
+
+    A coarse depth buffer of the points themselves, its cells as wide as their spacing; sparse
+    foregrounds let some background through, which the robust loss has to bear.
+    """
+    inside = (z > 1e-6) & (xy >= 0).all(1) & (xy[:, 0] < width) & (xy[:, 1] < height)
+    count = int(inside.sum())
+    if count == 0:
+        return inside
+    cell = max(2.0, SPACINGS * np.sqrt(width * height / count))
+    across, down = int(np.ceil(width / cell)) + 1, int(np.ceil(height / cell)) + 1
+    at = (xy[inside] / cell).astype(int)
+    nearest = np.full((down, across), np.inf)
+    np.minimum.at(nearest, (at[:, 1], at[:, 0]), z[inside])
+    nearest = minimum_filter(nearest, 3, mode="constant", cval=np.inf)
+    visible = np.zeros(len(z), bool)
+    visible[inside] = z[inside] <= nearest[at[:, 1], at[:, 0]] * (1 + DEPTH_MARGIN)
+    return visible

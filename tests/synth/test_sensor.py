@@ -1,0 +1,93 @@
+"""What the cameras add to the light is what was asked for, and nothing by default."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from p2gs_jax.synth.sensor import Sensor, draw_shots, encode, photograph, srgb_decode, vignette
+from p2gs_jax.synth.town import UNDERPASS, Material, build_town
+from p2gs_jax.synth.write import write_street
+
+
+def test_by_default_exposure_is_iso_over_eight():
+    shots = draw_shots(Sensor(), 10, 3, seed=0)
+    np.testing.assert_array_equal(shots.exposures, shots.iso / 8)
+    np.testing.assert_array_equal(shots.balance, 1)
+    constant = draw_shots(Sensor(iso_std=0.0), 10, 3, seed=0)
+    np.testing.assert_array_equal(constant.exposures, 1)
+
+
+def test_gain_drift_and_tint_are_each_cameras_own():
+    still = draw_shots(Sensor(iso_std=0, camera_gain_ev=0.5, white_balance_ev=0.2), 20, 3, seed=1)
+    gains = np.log2(still.exposures).reshape(3, 20)
+    assert np.ptp(gains, axis=1).max() < 1e-12
+    assert np.ptp(gains[:, 0]) > 0.1
+    np.testing.assert_array_equal(still.balance[:, 1], 1)
+    assert np.ptp(still.balance.reshape(3, 20, 3), axis=1).max() == 0
+    assert still.balance[:, 0].std() > 0.01
+    drift = np.log2(draw_shots(Sensor(iso_std=0, drift_ev=1.0), 100, 3, seed=1).exposures)
+    drift = drift.reshape(3, 100)
+    assert np.abs(np.diff(drift, axis=1)).max() < 0.1
+    assert 0.9 < np.abs(drift).max() <= 1.0
+    assert np.abs(drift[0] - drift[1]).max() > 0.3
+
+
+def test_vignetting_spares_the_centre():
+    light = vignette(65, 97, 0.4)[..., 0]
+    assert light[32, 48] == pytest.approx(1, abs=1e-3)
+    assert light[0, 0] == pytest.approx(0.6, abs=0.02)
+    np.testing.assert_allclose(light, light[::-1, ::-1])
+    flat = np.full((65, 97, 3), 0.2)
+    shot = srgb_decode(photograph(flat, 1.0, Sensor(vignetting=0.4)) / 255.0)[..., 0]
+    np.testing.assert_allclose(shot, 0.2 * light, atol=0.003)
+
+
+def test_noise_has_the_stated_size_and_needs_a_generator():
+    flat = np.full((100, 100, 3), 0.2)
+    rng = np.random.default_rng(0)
+    noisy = srgb_decode(photograph(flat, 1.0, Sensor(noise=1.0), rng=rng) / 255.0)
+    assert noisy.std() == pytest.approx(np.sqrt(2e-4 * 0.2 + 1e-6), rel=0.1)
+    assert photograph(flat, 1.0).std() == 0
+    with pytest.raises(AssertionError):
+        photograph(flat, 1.0, Sensor(noise=1.0))
+
+
+def test_the_filmic_curve_is_an_s():
+    x = np.logspace(-3, 0, 100)
+    y = encode(x, "filmic")
+    assert np.all(np.diff(y) > 0)
+    slope = np.gradient(np.log(y), np.log(x))
+    assert slope.max() > slope[0]
+    assert slope[-1] < 0.5 * slope.max()
+
+
+def test_towns_have_an_underpass_and_their_own_sun():
+    towns = [build_town(seed, "town") for seed in range(3)]
+    assert len({t.light.sun_direction for t in towns}) == 3
+    for town in towns:
+        assert np.linalg.norm(town.light.sun_direction) == pytest.approx(1)
+        across = (town.lo[:, 1] < -9) & (town.hi[:, 1] > 9) & (town.lo[:, 2] > 4)
+        assert np.any(across & (town.lo[:, 0] == UNDERPASS[0]))
+        inside = (town.lo[:, 0] < UNDERPASS[1]) & (town.hi[:, 0] > UNDERPASS[0])
+        for thing in (Material.CAR_BODY, Material.WHEEL, Material.FOLIAGE, Material.BARK):
+            assert not np.any(inside & (town.material == thing))
+    assert build_town(0).underpass is None
+
+
+def test_the_data_set_card_and_table_say_what_was_done(tmp_path):
+    sensor = Sensor(iso_std=2.0, camera_gain_ev=0.3, white_balance_ev=0.1, vignetting=0.2)
+    street = write_street(
+        tmp_path / "scene", frames=2, width=64, height=48, points=200, sensor=sensor, seed=5
+    )
+    card = json.loads((street.root / "dataset.json").read_text())
+    assert card["sensor"]["camera_gain_ev"] == 0.3
+    assert card["lidar"] is None
+    assert not (street.root / "velodyne").exists()
+    with (street.root / "truth" / "exposures.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [float(r["exposure"]) for r in rows] == pytest.approx(street.exposures, rel=1e-5)
+    assert {r["red"] for r in rows if r["camera"] == "front"} != {
+        r["red"] for r in rows if r["camera"] == "front_left"
+    }
