@@ -1,4 +1,4 @@
-"""The command line: `p2gs-jax fit | calibrate | render | eval | demo | synth | bench`.
+"""The command line: `p2gs-jax fit | calibrate | render | eval | demo | synth | sweep | bench`.
 
 Every configuration field is an option. Bad input ends with one message and exit code 2.
 """
@@ -172,6 +172,18 @@ class Synth:
 
 
 @dataclass(frozen=True)
+class Sweep:
+    """Fit a scene under many configurations and seeds, into one table; run again to continue."""
+
+    file: Annotated[Path, tyro.conf.Positional]
+    """TOML file; docs/sweeps.md says what it may contain."""
+    out: Path | None = None
+    """Folder of the runs and the table (default: the file's, or its name)."""
+    max_parallel: int | None = None
+    """Fits at a time (default: the file's, or 1)."""
+
+
+@dataclass(frozen=True)
 class Bench:
     """Measure the renderer on this machine: speed against error, growth, memory, hard cases."""
 
@@ -268,6 +280,7 @@ def _run(argv: list[str]) -> int:
         Annotated[Eval, tyro.conf.subcommand("eval")],
         Annotated[Demo, tyro.conf.subcommand("demo")],
         Annotated[Synth, tyro.conf.subcommand("synth")],
+        Annotated[Sweep, tyro.conf.subcommand("sweep")],
         Annotated[Bench, tyro.conf.subcommand("bench")],
     ]
     args: Any = tyro.cli(
@@ -293,6 +306,8 @@ def _run(argv: list[str]) -> int:
         return commands.render_command(args.run, args.out, args.split, args.exposure_ev, args.gamma)
     if isinstance(args, Eval):
         return commands.eval_command(args.run, args.reference)
+    if isinstance(args, Sweep):
+        return commands.sweep_command(args.file, args.out, args.max_parallel)
     if isinstance(args, Synth):
         return commands.synth_command(
             args.out,

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from p2gs_jax.calibration import WEAK_GAMMA, Calibration, calibrate
 from p2gs_jax.config import FitConfig
@@ -29,6 +30,7 @@ from p2gs_jax.run_folder import load_run
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.static_stack import calibrate_stack, write_stack
+from p2gs_jax.sweep import read_sweep, sweep
 from p2gs_jax.synth.sensor import Sensor
 from p2gs_jax.synth.write import write_street
 
@@ -308,6 +310,30 @@ def synth_command(out: Path, sensor: Sensor, *, width: int, **options) -> int:
     write_street(out, sensor=sensor, width=width, height=height, report=console.print, **options)
     console.print(f"{time.monotonic() - begin:.0f} s. Fit it: p2gs-jax fit {out} --out RUN")
     return 0
+
+
+def sweep_command(path: Path, out: Path | None, max_parallel: int | None) -> int:
+    """Run a sweep and print its table; 1 where a run failed.
+
+    Args:
+        path: see `read_sweep`.
+        out: replaces the file's folder.
+        max_parallel: replaces the file's number.
+    """
+    console = _out()
+    wanted = read_sweep(path)
+    result = sweep(
+        wanted.scene,
+        out or wanted.out,
+        wanted.configs,
+        seeds=wanted.seeds,
+        reference=wanted.reference,
+        max_parallel=max_parallel or wanted.max_parallel,
+        report=lambda line: console.print(Text(line)),
+    )
+    print(result.to_markdown())
+    console.print(Text(f"Results: {result.out} (sweep.json, sweep.md)"))
+    return 0 if all(row["status"] == "done" for row in result.rows) else 1
 
 
 def bench_command(

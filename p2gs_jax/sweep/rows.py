@@ -1,0 +1,90 @@
+"""One line of a sweep's table: what a finished run says about itself."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from p2gs_jax.evaluate.alignment import exposure_error
+
+# Name of the column, path in metrics.json, digits.
+COLUMNS: tuple[tuple[str, tuple[str, ...], int], ...] = (
+    ("gaussians", ("counts", "gaussians"), 0),
+    ("steps", ("counts", "steps"), 0),
+    ("seconds", ("seconds", "optimisation"), 0),
+    ("train_psnr", ("train", "psnr"), 2),
+    ("train_ssim", ("train", "ssim"), 4),
+    ("test_psnr_averaged", ("test", "averaged", "psnr"), 2),
+    ("test_psnr_fitted", ("test", "exposure_fitted", "psnr"), 2),
+    ("reference_psnr_averaged", ("reference", "averaged", "psnr"), 2),
+    ("reference_psnr", ("reference", "scale_aligned", "psnr"), 2),
+    ("reference_test_psnr", ("reference", "scale_aligned", "test", "psnr"), 2),
+    ("radiance_stops", ("radiance", "stops_rms"), 3),
+    ("ev", (), 4),
+    ("ev_power", (), 4),
+)
+
+
+def read_row(run: Path, scene: Path) -> dict[str, Any]:
+    """Return the columns that a finished run has, by name.
+
+    Args:
+        run: its folder.
+        scene: where `truth/exposures.csv` may lie.
+    """
+    metrics = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
+    row: dict[str, Any] = {}
+    for name, path, _ in COLUMNS:
+        value = metrics
+        for key in path:
+            value = value.get(key) if isinstance(value, Mapping) else None
+        if path and value is not None:
+            row[name] = value
+    return row | _exposures(run, scene)
+
+
+def _exposures(run: Path, scene: Path) -> dict[str, float]:
+    """Return errors of the exposures where the scene knows them."""
+    path = scene / "truth" / "exposures.csv"
+    if not path.is_file():
+        return {}
+    with path.open(newline="", encoding="utf-8") as file:
+        truth = {row["image"]: float(row["exposure"]) for row in csv.DictReader(file)}
+    views = json.loads((run / "photometry.json").read_text(encoding="utf-8"))["views"]
+    pairs = [(v["exposure"], truth[v["image"]]) for v in views if v["exposure"] is not None]
+    if len(pairs) < 2:
+        return {}
+    error = exposure_error(*np.array(pairs).T)
+    return {"ev": error["ev"], "ev_power": error["ev_scale_power"]}
+
+
+def to_markdown(rows: list[dict[str, Any]]) -> str:
+    """Return a table: a line per configuration, means over its seeds; failures with reasons."""
+    names = list(dict.fromkeys(row["name"] for row in rows))
+    shown = [(c, d) for c, _, d in COLUMNS if any(c in row for row in rows)]
+    lines = [
+        "| configuration | seeds | " + " | ".join(c for c, _ in shown) + " |",
+        "|---|---:|" + "---:|" * len(shown),
+    ]
+    failures = []
+    for name in names:
+        mine = [row for row in rows if row["name"] == name]
+        done = [row for row in mine if row["status"] == "done"]
+        cells = []
+        for column, digits in shown:
+            values = [row[column] for row in done if column in row]
+            cells.append(f"{np.mean(values):.{digits}f}" if values else "-")
+        lines.append(f"| {name} | {len(done)} of {len(mine)} | " + " | ".join(cells) + " |")
+        failures += [
+            f"- {name}, seed {row['seed']}: {row['status']}: {row.get('reason', '')}"
+            for row in mine
+            if row["status"] != "done"
+        ]
+    if failures:
+        lines += ["", "Not finished:", "", *failures]
+    return "\n".join(lines) + "\n"

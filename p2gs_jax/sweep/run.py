@@ -1,0 +1,169 @@
+"""Many fits of one scene: in processes of their own, resumable, into one table."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from p2gs_jax.config import FitConfig, to_dict
+from p2gs_jax.errors import UserError
+from p2gs_jax.export.atomic import plain, write_json, write_text
+from p2gs_jax.sweep.rows import read_row, to_markdown
+from p2gs_jax.sweep.worker import REASON
+
+TABLE, TABLE_TEXT, JOBS = "sweep.json", "sweep.md", "jobs"
+
+
+@dataclass(frozen=True)
+class SweepResult:
+    """What a sweep found.
+
+    Attributes:
+        rows: one dict per configuration and seed: name, seed, status (`done` or `failed`), run, the
+            reason of a failure, and the columns of `rows.COLUMNS` that the run has.
+        out: the folder, with sweep.json and sweep.md.
+    """
+
+    rows: list[dict[str, Any]]
+    out: Path
+
+    def to_markdown(self) -> str:
+        """Return the table, means over seeds."""
+        return to_markdown(self.rows)
+
+
+def slug(name: str) -> str:
+    """Return a folder name for a configuration's name."""
+    return re.sub(r"[^A-Za-z0-9.+-]+", "_", name).strip("_.") or "_"
+
+
+def sweep(
+    scene: str | Path,
+    out: str | Path,
+    configs: Mapping[str, FitConfig],
+    *,
+    seeds: Sequence[int] = (0,),
+    reference: str | Path | None = None,
+    max_parallel: int = 1,
+    report: Callable[[str], None] = lambda line: None,
+) -> SweepResult:
+    """Fit a scene under every configuration and seed.
+
+    Finished runs in `out` are kept, interrupted ones continue, failed ones are tried again; a
+    failure ends its run, not the sweep. The table is written anew after every run.
+
+    Args:
+        scene: see `fit`.
+        out: folder of the runs and the table.
+        configs: by name.
+        seeds: each replaces `train.seed`.
+        reference: see `fit`.
+        max_parallel: processes at a time; one uses all cores.
+        report: receives a line per run.
+
+    Raises:
+        UserError: nothing to do, names that would share a folder, or a folder of other options.
+    """
+    scene, out = Path(scene), Path(out)
+    if not configs or not seeds:
+        raise UserError("a sweep needs at least one configuration and one seed.")
+    if max_parallel < 1:
+        raise UserError("max_parallel must be at least 1.")
+    folders = [slug(name) for name in configs]
+    if len(set(folders)) < len(folders):
+        twice = sorted({f for f in folders if folders.count(f) > 1})
+        raise UserError(
+            f"several configurations would share the folder {', '.join(twice)}.",
+            fix="give them names that differ in letters or digits",
+        )
+    out.mkdir(parents=True, exist_ok=True)
+    jobs = []
+    for name, cfg in configs.items():
+        for seed in seeds:
+            seeded = dataclasses.replace(cfg, train=dataclasses.replace(cfg.train, seed=seed))
+            run = out / slug(name) / f"seed_{seed}"
+            _check_same(run, seeded)
+            jobs.append({"name": name, "seed": seed, "run": run, "cfg": seeded})
+    rows: list[dict[str, Any]] = [
+        {"name": j["name"], "seed": j["seed"], "run": str(j["run"]), "status": "waiting"}
+        for j in jobs
+    ]
+
+    def one(k: int) -> None:
+        job, row = jobs[k], rows[k]
+        begin = time.monotonic()
+        kept = (job["run"] / "metrics.json").exists()
+        if not kept:
+            _run(job, scene, reference, out / JOBS / f"{slug(job['name'])}_{job['seed']}.json")
+        if (job["run"] / "metrics.json").exists():
+            row.update(status="done", **read_row(job["run"], scene))
+            said = "kept" if kept else f"{time.monotonic() - begin:.0f} s"
+        else:
+            row.update(status="failed", reason=_reason(job["run"]))
+            said = f"failed: {row['reason']}"
+        report(f"[{k + 1}/{len(jobs)}] {job['name']}, seed {job['seed']}: {said}")
+        _write_table(out, rows)
+
+    with ThreadPoolExecutor(max_parallel) as pool:
+        list(pool.map(one, range(len(jobs))))
+    return SweepResult(rows, out)
+
+
+def _write_table(out: Path, rows: list[dict[str, Any]]) -> None:
+    write_json(out / TABLE, rows)
+    write_text(out / TABLE_TEXT, to_markdown(rows))
+
+
+def _check_same(run: Path, cfg: FitConfig) -> None:
+    """Refuse to mix runs of different options under one name."""
+    path = run / "config.json"
+    if not path.exists():
+        return
+    try:
+        saved = json.loads(path.read_text(encoding="utf-8"))["fit"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise UserError(
+            f"{path} cannot be read ({error}).", fix="remove that run, or use another folder"
+        ) from error
+    if saved != plain(to_dict(cfg)):
+        raise UserError(
+            f"{run} holds a run of the same name with other options.",
+            fix="rename the configuration, or use another folder",
+        )
+
+
+def _run(job: dict[str, Any], scene: Path, reference, job_path: Path) -> None:
+    """Run one fit in a process of its own and wait for it."""
+    run: Path = job["run"]
+    run.mkdir(parents=True, exist_ok=True)
+    write_json(
+        job_path,
+        {
+            "scene": str(scene.absolute()),
+            "run": str(run.absolute()),
+            "reference": None if reference is None else str(Path(reference).absolute()),
+            "fit": to_dict(job["cfg"]),
+        },
+    )
+    command = [sys.executable, "-m", "p2gs_jax.sweep.worker", str(job_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode and not (run / REASON).exists():
+        tail = (done.stderr.strip().splitlines() or ["no message"])[-1]
+        reason = f"the process ended with code {done.returncode}: {tail}"
+        write_json(run / REASON, {"reason": reason})
+
+
+def _reason(run: Path) -> str:
+    try:
+        return json.loads((run / REASON).read_text(encoding="utf-8"))["reason"]
+    except (OSError, ValueError, KeyError):
+        return "it left no metrics.json and no reason"

@@ -1,0 +1,47 @@
+"""One fit of a sweep, in a process of its own: `python -m p2gs_jax.sweep.worker JOB.json`."""
+
+from __future__ import annotations
+
+import json
+import sys
+import traceback
+from pathlib import Path
+
+from p2gs_jax.compile_cache import use_compile_cache
+from p2gs_jax.config import from_dict
+from p2gs_jax.errors import UserError
+from p2gs_jax.export.atomic import write_json
+from p2gs_jax.pipeline import fit
+
+REASON = "failure.json"
+
+
+def main(job_path: Path) -> int:
+    """Run the fit that a job file describes; 0 where it succeeded.
+
+    A failure leaves its reason in the run folder.
+    """
+    job = json.loads(job_path.read_text(encoding="utf-8"))
+    run = Path(job["run"])
+    use_compile_cache()
+    try:
+        fit(
+            job["scene"],
+            run,
+            from_dict(job["fit"]),
+            reference=job["reference"],
+            resume=(run / "config.json").exists(),
+        )
+    except UserError as error:
+        write_json(run / REASON, {"reason": str(error)})
+        return 2
+    except Exception as error:
+        text = "".join(traceback.format_exception(error))
+        write_json(run / REASON, {"reason": f"{type(error).__name__}: {error}", "traceback": text})
+        return 1
+    (run / REASON).unlink(missing_ok=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(Path(sys.argv[1])))

@@ -1,0 +1,154 @@
+"""Sweeps vary what they are told to, keep what is finished, and name what failed."""
+
+import json
+
+import pytest
+from tiny_scene import make_scene
+
+import p2gs_jax
+from p2gs_jax.cli import main
+from p2gs_jax.sweep import grid, read_sweep, sweep, with_fields
+from p2gs_jax.sweep.rows import to_markdown
+
+BASE = p2gs_jax.preset("robust")
+SMALL = with_fields(BASE, {"train.steps": 12, "densify.max_gaussians": 300, "render.sh_degree": 0})
+
+
+def test_fields_are_replaced_by_their_dotted_names():
+    cfg = with_fields(
+        BASE,
+        {
+            "loss.relative_exposure.weight": 1,
+            "loss.relative_exposure.form": "observed_ldr",
+            "train.coarse_to_fine": [0.5],
+            "data.max_width": None,
+            "photometry.select": False,
+        },
+    )
+    assert cfg.loss.relative_exposure.weight == 1.0
+    assert isinstance(cfg.loss.relative_exposure.weight, float)
+    assert cfg.train.coarse_to_fine == (0.5,)
+    assert not cfg.photometry.select
+    assert cfg.optimizer == BASE.optimizer
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "text"),
+    [
+        ("loss.wieght", 1.0, "no configuration field"),
+        ("train.steps.more", 1, "too deep"),
+        ("train.steps", 1.5, "not one of its values"),
+        ("train.steps", True, "not one of its values"),
+        ("photometry.curve", "cubic", "'srgb'"),
+        ("loss", 1.0, "not one of its values"),
+        ("photometry.select", 1, "not one of its values"),
+    ],
+)
+def test_wrong_fields_and_values_are_named(field, value, text):
+    with pytest.raises(p2gs_jax.UserError, match=text):
+        with_fields(BASE, {field: value})
+
+
+def test_a_grid_has_every_combination():
+    configs = grid(BASE, loss__relative_exposure__weight=[None, 0.1], render__sh_degree=[0, 1, 3])
+    assert len(configs) == 6
+    assert configs["weight 0.1, sh_degree 3"].loss.relative_exposure.weight == 0.1
+    assert configs["weight None, sh_degree 0"].render.sh_degree == 0
+
+
+def test_a_sweep_keeps_what_is_done_and_names_what_failed(tmp_path):
+    scene = make_scene(tmp_path / "scene")
+    configs = {
+        "good": SMALL,
+        "empty": with_fields(
+            p2gs_jax.preset("paper"),
+            {"train.steps": 60, "densify.prune_opacity": 0.99, "densify.min_every_steps": 5},
+        ),
+    }
+    said = []
+    result = sweep(scene, tmp_path / "out", configs, seeds=[0, 1], report=said.append)
+    status = {(r["name"], r["seed"]): r["status"] for r in result.rows}
+    assert status == {
+        ("good", 0): "done",
+        ("good", 1): "done",
+        ("empty", 0): "failed",
+        ("empty", 1): "failed",
+    }
+    good = result.rows[0]
+    assert good["steps"] == 12
+    assert good["train_psnr"] > 5
+    assert "every Gaussian" in result.rows[2]["reason"]
+    assert json.loads((tmp_path / "out" / "sweep.json").read_text()) == result.rows
+    table = (tmp_path / "out" / "sweep.md").read_text()
+    assert "| good | 2 of 2 |" in table
+    assert "empty, seed 0: failed" in table
+    stamp = (tmp_path / "out" / "good" / "seed_0" / "metrics.json").stat().st_mtime_ns
+    again = sweep(scene, tmp_path / "out", {"good": SMALL}, seeds=[0, 1], report=said.append)
+    assert [r["status"] for r in again.rows] == ["done", "done"]
+    assert said[-1].endswith("kept")
+    assert (tmp_path / "out" / "good" / "seed_0" / "metrics.json").stat().st_mtime_ns == stamp
+    other = {"good": with_fields(SMALL, {"train.steps": 13})}
+    with pytest.raises(p2gs_jax.UserError, match="other options"):
+        sweep(scene, tmp_path / "out", other)
+    twins = {"a b": SMALL, "a_b": SMALL}
+    with pytest.raises(p2gs_jax.UserError, match="share the folder"):
+        sweep(scene, tmp_path / "out", twins)
+
+
+def test_a_file_describes_a_sweep(tmp_path):
+    path = tmp_path / "s.toml"
+    path.write_text(
+        """
+scene = "street"
+reference = "street/reference"
+seeds = [0, 3]
+[set]
+"train.steps" = 600
+[grid]
+"loss.relative_exposure.weight" = ["none", 0.01]
+[[case]]
+name = "paper"
+preset = "paper"
+"densify.max_gaussians" = 30000
+"""
+    )
+    wanted = read_sweep(path)
+    assert wanted.scene == tmp_path / "street"
+    assert wanted.out == tmp_path / "s"
+    assert wanted.reference == tmp_path / "street" / "reference"
+    assert wanted.seeds == (0, 3)
+    assert list(wanted.configs) == ["weight None", "weight 0.01", "paper"]
+    assert wanted.configs["paper"].preset == "paper"
+    assert all(cfg.train.steps == 600 for cfg in wanted.configs.values())
+    assert wanted.configs["paper"].densify.max_gaussians == 30000
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("scene = ", "no TOML"),
+        ("sceen = 'x'", "unknown key 'sceen'"),
+        ("seeds = [1]", "names no scene"),
+        ("scene = 'x'\nseeds = 3", "list of whole numbers"),
+        ("scene = 'x'\npreset = 'best'", "no preset 'best'"),
+        ("scene = 'x'\n[grid]\n'train.stepz' = [1]", "no configuration field"),
+    ],
+)
+def test_a_wrong_file_says_what_is_wrong(tmp_path, capsys, text, message):
+    path = tmp_path / "s.toml"
+    path.write_text(text)
+    with pytest.raises(SystemExit) as code:
+        main(["sweep", str(path)])
+    assert code.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+def test_means_are_over_finished_seeds_only():
+    rows = [
+        {"name": "a", "seed": 0, "status": "done", "train_psnr": 20.0},
+        {"name": "a", "seed": 1, "status": "done", "train_psnr": 22.0},
+        {"name": "a", "seed": 2, "status": "failed", "reason": "fell over"},
+    ]
+    table = to_markdown(rows)
+    assert "| a | 2 of 3 | 21.00 |" in table
+    assert "fell over" in table
