@@ -11,7 +11,7 @@ import re
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Union
+from typing import Annotated, Any, Union, get_args
 
 # Quiet the native libraries before they load; our own messages say what matters.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
@@ -24,7 +24,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.synth.sensor import Sensor
 from p2gs_jax.synth.town import Layout
 
-PRESETS = ("robust", "paper", "paper_appendix")
+PRESETS: tuple[configs.PresetName, ...] = get_args(configs.PresetName)
 
 
 def parse_duration(text: str) -> float:

@@ -10,7 +10,17 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Literal
 
-PresetName = Literal["paper", "paper_appendix", "robust"]
+Appearance = Literal["affine", "bilateral", "curve"]
+PresetName = Literal[
+    "paper",
+    "paper_appendix",
+    "robust",
+    "3dgs",
+    "3dgs_gain",
+    "3dgs_affine",
+    "3dgs_bilateral",
+    "3dgs_curve",
+]
 PhotometricModel = Literal[
     "constant",
     "camera_exposure",
@@ -116,6 +126,9 @@ class PhotometryConfig:
     N(1, 0.05^2) (paper, Exposure modeling)."""
     start_std: float = 0.05
     """Standard deviation of the random start (paper, Exposure modeling)."""
+    appearance: Appearance | None = None
+    """A learned correction of display values per view, as baselines have: a colour matrix (3DGS's
+    exposure compensation), a bilateral grid of them, or a curve (photometry/appearance.py)."""
     freeze_until: float = 0.6
     """Fraction of the run during which exposure and gamma stay at their start, where that start
     comes from tracks (ours: PHOTOMETRY section 4)."""
@@ -151,6 +164,8 @@ class RegularizerConfig:
     """(mean log e)^2, the scale gauge (ours)."""
     gamma_mean_variance: float | None = 0.1
     """(mean gamma - 2.2)^2 + Var gamma, the power gauge (ours)."""
+    appearance: float | None = 10.0
+    """Roughness of bilateral grids (bilateral-guided radiance fields: 10)."""
     opacity: float | None = 0.01
     """Mean opacity (3DGS-MCMC: 0.01); empties splats so that relocation can reuse them."""
     scale: float | None = 0.01
@@ -200,6 +215,10 @@ class OptimizerConfig:
     """Raw exposures (ours: PHOTOMETRY section 4; ten times this where no tracks gave a start)."""
     gammas: float = 1e-4
     """Raw gammas (ours: likewise)."""
+    appearance: float = 1e-2
+    """Corrections of display values (3DGS's exposure compensation starts at 1e-2)."""
+    appearance_final: float = 0.1
+    """They decay exponentially to this fraction (3DGS: 0.1)."""
     photometry_final: float = 0.01
     """Exposure and gamma rates decay exponentially to this fraction (ours)."""
     final: float = 1.0
@@ -345,11 +364,46 @@ def _paper(exposure_weight: float, name: PresetName) -> FitConfig:
     )
 
 
+def _ldr(
+    name: PresetName,
+    *,
+    appearance: Appearance | None = None,
+    gain: bool = False,
+    rate: float = 1e-2,
+) -> FitConfig:
+    """Return 3DGS in display values under the schedule, renderer and budget of `robust`.
+
+    Exposures start at 1; without `gain` they stay there. Rates of the colours: the best of three
+    (BUILD_NOTES, "LDR splatting").
+    """
+    robust = _robust()
+    return dataclasses.replace(
+        robust,
+        preset=name,
+        render=dataclasses.replace(robust.render, radiance="linear"),
+        photometry=PhotometryConfig(
+            select=False,
+            model="view_exposure" if gain else "constant",
+            curve="linear",
+            start="random",
+            start_std=0.0,
+            freeze_until=0.0,
+            appearance=appearance,
+        ),
+        loss=dataclasses.replace(robust.loss, censored=False),
+        optimizer=dataclasses.replace(
+            robust.optimizer, sh_dc=5e-3, sh_rest=2.5e-4, exposures=1e-2, appearance=rate
+        ),
+    )
+
+
 def preset(name: PresetName) -> FitConfig:
     """Return the configuration of a preset.
 
     Args:
-        name: `paper` (as printed, lambda_exp 0.01), `paper_appendix` (lambda_exp 0.1) or `robust`.
+        name: `robust`; `paper` (as printed, lambda_exp 0.01) or `paper_appendix` (0.1); baselines
+            that splat display values: `3dgs`, with a gain per view `3dgs_gain`, or with a learned
+            correction per view `3dgs_affine`, `3dgs_bilateral`, `3dgs_curve`.
 
     Raises:
         KeyError: there is no such preset.
@@ -358,6 +412,11 @@ def preset(name: PresetName) -> FitConfig:
         "robust": _robust,
         "paper": lambda: _paper(0.01, "paper"),
         "paper_appendix": lambda: _paper(0.1, "paper_appendix"),
+        "3dgs": lambda: _ldr("3dgs"),
+        "3dgs_gain": lambda: _ldr("3dgs_gain", gain=True),
+        "3dgs_affine": lambda: _ldr("3dgs_affine", appearance="affine"),
+        "3dgs_bilateral": lambda: _ldr("3dgs_bilateral", appearance="bilateral", rate=2e-3),
+        "3dgs_curve": lambda: _ldr("3dgs_curve", appearance="curve"),
     }[name]()
 
 

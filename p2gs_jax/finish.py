@@ -15,7 +15,7 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.evaluate import MeanParameters, ViewResult, evaluate, mean_parameters
 from p2gs_jax.evaluate.radiance import Truth
-from p2gs_jax.export.atomic import write_json
+from p2gs_jax.export.atomic import write_array, write_json
 from p2gs_jax.export.exr import read_exr, write_exr
 from p2gs_jax.export.photometry_json import ViewPhotometry, write_photometry
 from p2gs_jax.export.ply import write_radiance, write_splats
@@ -31,6 +31,7 @@ from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Params, Scene
 
 SUMMARY_VIEWS = 4
+APPEARANCE = "appearance.npy"
 
 Reference = Callable[[int], np.ndarray | None]
 
@@ -91,13 +92,12 @@ def find_radiance(scene: Scene, store: ImageStore) -> Truth | None:
     return radiance
 
 
-def tone_function(exposure: float, gamma: float, cfg: FitConfig):
+def tone_function(exposure: float, gamma: float, cfg: FitConfig, appearance=None):
     """Return linear radiance -> display values for one exposure and gamma, in numpy."""
 
     def tone(linear):
-        ldr = formation(
-            jnp.asarray(linear), jnp.float32(exposure), jnp.float32(gamma), cfg.photometry
-        )
+        e, g = jnp.float32(exposure), jnp.float32(gamma)
+        ldr = formation(jnp.asarray(linear), e, g, cfg.photometry, appearance)
         return np.asarray(display(ldr))
 
     return tone
@@ -241,6 +241,8 @@ def finish(
             None if prepared.selection is None else prepared.selection.solution,
         ),
     )
+    if params.appearance is not None:
+        write_array(run_dir / APPEARANCE, np.asarray(params.appearance))
     _write_summary(run_dir / "summary.png", shown, picks, params, scene, mean, cfg, true_ev)
     metrics["counts"] = counts
     metrics["seconds"] = {**seconds, "evaluation_and_files": time.monotonic() - begin}

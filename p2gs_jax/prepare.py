@@ -17,6 +17,7 @@ from p2gs_jax.init.seeds import gaussians_from_points, merge, scene_extent, subs
 from p2gs_jax.init.shell import Shell, find_shell
 from p2gs_jax.losses.relative_exposure import ColorPairs
 from p2gs_jax.losses.total import OBSERVED_FORMS
+from p2gs_jax.photometry.appearance import identity
 from p2gs_jax.photometry.formation import inverse_tone_map
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import Response
@@ -97,6 +98,12 @@ def prepare(scene: Scene, cfg: FitConfig, reporter: Reporter) -> Prepared:
             f"the preset {cfg.preset!r} starts exposures at random: known ones would be ignored.",
             fix="leave out --known-exposures, or add --photometry.start tracks",
         )
+    if cfg.photometry.curve == "linear" and cfg.photometry.start == "tracks":
+        raise UserError(
+            "the curve 'linear' splats display values; the tracks' bundle adjustment does not know "
+            "it.",
+            fix="add --photometry.start random, or use a preset whose name begins with 3dgs",
+        )
     if has_tracks(scene) or cfg.photometry.start == "tracks":
         if not has_tracks(scene):
             notes.append("No tracks: seed points are projected into the views instead.")
@@ -137,7 +144,7 @@ def prepare(scene: Scene, cfg: FitConfig, reporter: Reporter) -> Prepared:
     return Prepared(
         scene,
         store,
-        Params(gaussians, photometry),
+        Params(gaussians, photometry, _appearance(len(views), cfg)),
         extent,
         selection,
         _pairs(tracks, cfg),
@@ -240,6 +247,11 @@ def _photometry(start: PhotometricSolution | None, count: int, cfg: FitConfig) -
     return Photometry(
         jnp.asarray(exposures, jnp.float32), jnp.asarray(gammas, jnp.float32), p.parameterization
     )
+
+
+def _appearance(count: int, cfg: FitConfig):
+    kind = cfg.photometry.appearance
+    return None if kind is None else identity(kind, count)
 
 
 def _linearize(colors: np.ndarray, cfg: FitConfig, gamma: float = GAMMA_SRGB) -> np.ndarray:

@@ -14,6 +14,8 @@ from p2gs_jax.config import FitConfig, PhotometryConfig, from_dict
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.photometry_json import PhotometryFile, read_photometry
 from p2gs_jax.export.ply import read_ply
+from p2gs_jax.finish import APPEARANCE
+from p2gs_jax.photometry.appearance import identity
 from p2gs_jax.scene import load_scene
 from p2gs_jax.types import GAMMA_SRGB, Params, Photometry, Scene
 
@@ -108,8 +110,24 @@ def load_run(folder: Path) -> Run:
     reference = saved.get("reference")
     return Run(
         folder,
-        Params(gaussians, photometry),
+        Params(gaussians, photometry, _appearance(folder, cfg, len(train))),
         cfg,
         scene,
         None if reference is None else Path(reference),
     )
+
+
+def _appearance(folder: Path, cfg: FitConfig, views: int):
+    """Return the corrections of display values that the run learned, or None."""
+    if cfg.photometry.appearance is None:
+        return None
+    path = folder / APPEARANCE
+    try:
+        corrections = np.load(path, allow_pickle=False)
+    except (OSError, ValueError) as error:
+        raise UserError(
+            f"{path} cannot be read: {error}.", fix="finish the fit again with --resume"
+        ) from error
+    if corrections.shape != identity(cfg.photometry.appearance, views).shape:
+        raise UserError(f"{path} does not belong to this run.", fix="fit again")
+    return jnp.asarray(corrections)

@@ -78,6 +78,8 @@ class Params(eqx.Module):
 
     gaussians: Gaussians
     photometry: Photometry
+    appearance: Float[Array, "v ..."] | None = None
+    """Corrections of display values per training view (photometry/appearance.py), or None."""
 
 
 class Camera(eqx.Module):

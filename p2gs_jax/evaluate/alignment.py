@@ -70,6 +70,7 @@ def fit_exposure(
     mask: Float[Array, "h w"],
     gamma: Float[Array, ""] | float,
     cfg: PhotometryConfig,
+    appearance: Float[Array, "..."] | None = None,
 ) -> Float[Array, ""]:
     """Return the one exposure with which a render fits a photograph best, in squared LDR error.
 
@@ -78,7 +79,8 @@ def fit_exposure(
     """
 
     def error(log2_exposure):
-        ldr = display(formation(linear, jnp.exp2(log2_exposure), jnp.asarray(gamma), cfg))
+        exposure = jnp.exp2(log2_exposure)
+        ldr = display(formation(linear, exposure, jnp.asarray(gamma), cfg, appearance))
         return jnp.sum(mask[..., None] * (ldr - photograph) ** 2)
 
     grid = jnp.linspace(-SEARCH_STOPS, SEARCH_STOPS, SEARCH_STEPS)

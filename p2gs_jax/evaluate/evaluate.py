@@ -137,9 +137,12 @@ def evaluate(
     scores = RadianceScores()
     reference_views: list[tuple[int, np.ndarray, np.ndarray, np.ndarray]] = []
 
-    def shown(linear, exposure, gamma):
-        ldr = formation(linear, jnp.float32(exposure), jnp.float32(gamma), cfg.photometry)
-        return np.asarray(display(ldr))
+    corrections = params.appearance
+    mean_correction = None if corrections is None else jnp.mean(corrections, axis=0)
+
+    def shown(linear, exposure, gamma, correction=mean_correction):
+        e, g = jnp.float32(exposure), jnp.float32(gamma)
+        return np.asarray(display(formation(linear, e, g, cfg.photometry, correction)))
 
     videos = {name: VideoScores() for name in ("per_view", "averaged", "photographs")}
     row_of = {index: row for row, index in enumerate(scene.train_indices)}
@@ -151,12 +154,12 @@ def evaluate(
         ldr_mean = shown(linear, mean.exposure, mean.gamma)
         if view.split == "train":
             e, g = float(exposures[row_of[index]]), float(gammas[row_of[index]])
-            ldr = shown(linear, e, g)
+            ldr = shown(linear, e, g, None if corrections is None else corrections[row_of[index]])
             own.add(view.name, ldr, photograph, mask)
             averaged.add(view.name, ldr_mean, photograph, mask)
         else:
             g = mean.gamma
-            e = float(fit_exposure(linear, photograph, mask, g, cfg.photometry))
+            e = float(fit_exposure(linear, photograph, mask, g, cfg.photometry, mean_correction))
             ldr = shown(linear, e, g)
             test_averaged.add(view.name, ldr_mean, photograph, mask)
             test_fitted.add(view.name, ldr, photograph, mask, exposure=e)
@@ -194,7 +197,9 @@ def evaluate(
         exposed = float(inverse_tone_map(saturated, gamma, cfg.photometry))
         metrics["radiance"] = scores.summary(exposed / float(np.median(exposures)))
     if reference_views:
-        metrics["reference"] = _against_reference(reference_views, scene, mean, shown, cfg)
+        metrics["reference"] = _against_reference(
+            reference_views, scene, mean, shown, cfg, mean_correction
+        )
     return metrics
 
 
@@ -202,10 +207,14 @@ def _lookup(reference, index: int):
     return reference(index) if callable(reference) else reference.get(index)
 
 
-def _against_reference(views, scene: Scene, mean: MeanParameters, shown, cfg: FitConfig) -> dict:
+def _against_reference(
+    views, scene: Scene, mean: MeanParameters, shown, cfg: FitConfig, correction
+) -> dict:
     """Judge all views against photographs of one common exposure."""
     scales = [
-        float(fit_exposure(jnp.asarray(linear), truth, mask, mean.gamma, cfg.photometry))
+        float(
+            fit_exposure(jnp.asarray(linear), truth, mask, mean.gamma, cfg.photometry, correction)
+        )
         for _, linear, truth, mask in views
     ]
     common = float(np.exp(np.median(np.log(scales))))

@@ -65,6 +65,12 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(plain(value), indent=2, allow_nan=False) + "\n")
 
 
+def write_array(path: Path, array: np.ndarray) -> None:
+    """Write a .npy file atomically."""
+    with atomic_write(path) as temporary:
+        np.save(temporary, array)
+
+
 def append_jsonl(path: Path, record: dict) -> None:
     """Append one line to a JSON-lines file, in one write call; a line torn before it goes."""
     line = json.dumps(plain(record), allow_nan=False).encode() + b"\n"

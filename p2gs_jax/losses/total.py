@@ -22,6 +22,7 @@ from p2gs_jax.losses.relative_exposure import (
     ExposurePairs,
     relative_exposure_loss,
 )
+from p2gs_jax.photometry.appearance import roughness
 from p2gs_jax.photometry.formation import formation
 from p2gs_jax.render import render_linear
 from p2gs_jax.render.warp import sample_bilinear, surface_depth, warp
@@ -139,7 +140,8 @@ def total_loss(
     entries, overflow = render.count, render.overflow
     exposures, gammas = params.photometry.exposures, params.photometry.gammas
     i, j = batch.view_index, partner.view_index
-    ldr = formation(render.linear, exposures[i], gammas[i], cfg.photometry)
+    appearance = None if params.appearance is None else params.appearance[i]
+    ldr = formation(render.linear, exposures[i], gammas[i], cfg.photometry, appearance)
     terms = dict(photometric_loss(ldr, batch.ldr, batch.mask, cfg.loss))
 
     if relative.weight is not None:
@@ -160,6 +162,10 @@ def total_loss(
             cfg.photometry,
         )
     terms |= photometry_regularizers(params.photometry, cfg.loss.regularizers)
+    smoothness = cfg.loss.regularizers.appearance
+    if cfg.photometry.appearance == "bilateral" and smoothness is not None:
+        assert params.appearance is not None
+        terms["appearance"] = smoothness * roughness(params.appearance, "bilateral")
     if cfg.densify.method == "mcmc":
         reg = cfg.loss.regularizers
         if reg.opacity is not None:

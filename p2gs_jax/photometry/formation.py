@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.numerics import positive_pow, safe_log
+from p2gs_jax.photometry.appearance import corrected
 from p2gs_jax.photometry.response import DARKEST, Response, log_exposed
 from p2gs_jax.types import GAMMA_SRGB
 
@@ -128,9 +129,21 @@ def formation(
     exposure: Float[Array, ""],
     gamma: Float[Array, ""],
     cfg: PhotometryConfig,
+    appearance: Float[Array, "..."] | None = None,
 ) -> Float[Array, "..."]:
-    """Return T(e L): what the camera records of radiance `linear`."""
-    return tone_map(expose(linear, exposure), gamma, cfg)
+    """Return T(e L): what the camera records of radiance `linear`.
+
+    Args:
+        linear: radiance; an image where there is a correction.
+        exposure: e.
+        gamma: of T.
+        cfg: base curve, pivot, clamping, kind of correction.
+        appearance: the view's correction of display values, or None.
+    """
+    ldr = tone_map(expose(linear, exposure), gamma, cfg)
+    if cfg.appearance is None or appearance is None:
+        return ldr
+    return corrected(ldr, appearance, cfg.appearance)
 
 
 def display(ldr: Float[Array, "..."]) -> Float[Array, "..."]:

@@ -78,6 +78,9 @@ def learning_rates(progress: Array, extent: float, like: Params, cfg: FitConfig)
             o.gammas * gate * (varies.gamma == "view"),
             like.photometry.parameterization,
         ),
+        appearance=None
+        if like.appearance is None
+        else jnp.asarray(o.appearance * o.appearance_final**progress),
     )
 
 

@@ -55,6 +55,7 @@ GRADIENT_NAMES = (
     *(f"gradient of {f.name}" for f in dataclasses.fields(Gaussians)),
     "gradient of exposures",
     "gradient of gammas",
+    "gradient of appearance",
 )
 
 
@@ -147,7 +148,7 @@ def make_step(cfg: FitConfig, optimizer: optax.GradientTransformationExtraArgs, 
                 gaussians = dataclasses.replace(gaussians, means=gaussians.means + noise)
             if wants_probe:
                 population = _observed(population, v_probe, aux, state)
-            params = Params(gaussians, _recentered(params.photometry, cfg))
+            params = Params(gaussians, _recentered(params.photometry, cfg), params.appearance)
             return FitState(params, opt_state, population, state.step + 1, state.fault)
 
         def stay(state: FitState) -> FitState:

@@ -74,6 +74,37 @@ def test_every_reading_runs(tmp_path, form, correspondence):
     assert "relative_exposure" in check(result, tmp_path / "run")[0]["terms"]
 
 
+BASELINES = ("3dgs", "3dgs_gain", "3dgs_affine", "3dgs_bilateral", "3dgs_curve")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=[] if n == "3dgs_affine" else pytest.mark.slow) for n in BASELINES],
+)
+def test_baselines_run_and_come_back_as_they_were_saved(tmp_path, name):
+    scene = make_scene(tmp_path / "scene")
+    result = p2gs_jax.fit(scene, tmp_path / "run", small(p2gs_jax.preset(name)))
+    check(result, tmp_path / "run")
+    again = p2gs_jax.load_run(tmp_path / "run").params
+    saved = result.params.appearance
+    exposures = np.asarray(again.photometry.exposures)
+    np.testing.assert_allclose(exposures, result.params.photometry.exposures, rtol=1e-5)
+    if name in ("3dgs", "3dgs_gain"):
+        assert saved is None
+        assert again.appearance is None
+        assert (np.ptp(exposures) > 1e-3) == (name == "3dgs_gain")
+    else:
+        np.testing.assert_array_equal(again.appearance, saved)
+        assert float(np.abs(np.asarray(saved)).max()) > 1e-3
+
+
+def test_display_values_know_no_track_start(tmp_path):
+    cfg = p2gs_jax.preset("3dgs")
+    cfg = dataclasses.replace(cfg, photometry=dataclasses.replace(cfg.photometry, start="tracks"))
+    with pytest.raises(p2gs_jax.UserError, match="splats display values"):
+        p2gs_jax.fit(make_scene(tmp_path / "scene"), tmp_path / "run", cfg)
+
+
 def test_a_population_that_dies_is_said(tmp_path):
     cfg = small(p2gs_jax.preset("paper"), steps=60)
     cfg = dataclasses.replace(cfg, densify=dataclasses.replace(cfg.densify, prune_opacity=0.99))
