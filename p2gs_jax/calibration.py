@@ -40,6 +40,7 @@ class Calibration:
         selection: model, exposures, gammas, errors, reasons.
         stated_ev: exposures from EXIF or a file, stops, laid over the recovered ones; NaN where
             unknown.
+        stated_by: what stated them, for reports.
         agreement: of the two.
         level_note: where in the tonal range they agree better, if anywhere.
         observations: used.
@@ -49,6 +50,7 @@ class Calibration:
     scene: Scene
     selection: Selection
     stated_ev: np.ndarray
+    stated_by: str
     agreement: Agreement
     level_note: list[str]
     observations: int
@@ -60,7 +62,7 @@ class Calibration:
         s = self.selection.solution
         out = [*self.scene.notes, *self.selection.reasons, *s.warnings]
         if self.agreement.views:
-            out.append(self.agreement.sentence())
+            out.append(self.agreement.sentence(self.stated_by))
             out += self.level_note
         return out
 
@@ -139,7 +141,10 @@ def conclude(
     agreement = compare(s.exposures_ev, s.exposure_errors / LN2, stated)
     note = _level_note(selection, stated, agreement, cfg.photometry.pivot)
     laid_over = stated + agreement.offset_ev
-    result = Calibration(scene, selection, laid_over, agreement, note, observations, seconds)
+    source = "EXIF" if compare_with in (None, "exif") else Path(str(compare_with)).name
+    result = Calibration(
+        scene, selection, laid_over, source, agreement, note, observations, seconds
+    )
     _write(result, out, cfg)
     return result
 
