@@ -24,6 +24,8 @@ from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
 
 POINTS, MOST_PER_POINT = 40_000, 8
+# More than `warp.OPAQUE`: a loss averages over a wrong correspondence, a solution is bent by it.
+OPAQUE = 0.98
 
 
 def rendered_observations(run: Run, seed: int = 0, reporter: Reporter | None = None):
@@ -46,7 +48,7 @@ def rendered_observations(run: Run, seed: int = 0, reporter: Reporter | None = N
     depths, points = [], []
     each = POINTS // len(scene.train_indices)
     for done, camera in enumerate(cameras):
-        depth = surface_depth(render(run.params.gaussians, alive, camera))
+        depth = surface_depth(render(run.params.gaussians, alive, camera), OPAQUE)
         depths.append(depth)
         pick = rng.permutation(np.flatnonzero(np.asarray(depth) > 0))[:each]
         points.append(np.asarray(unproject(depth, camera)).reshape(-1, 3)[pick])

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from p2gs_jax.types import Camera, Render
 
-# A pixel has a surface where the render is this opaque.
+# A pixel has a surface where the render is this opaque, unless the caller asks for more.
 OPAQUE = 0.95
 # It is seen in another view where that view's own depth agrees within this share.
 DEPTH_TOLERANCE = 0.03
@@ -27,16 +27,20 @@ class Warp(NamedTuple):
     seen: Bool[Array, "h w"]
 
 
-def surface_depth(render: Render) -> Float[Array, "h w"]:
+def surface_depth(render: Render, opaque: float = OPAQUE) -> Float[Array, "h w"]:
     """Return the expected depth where the render is opaque, and 0 elsewhere.
+
+    Args:
+        render: with depth.
+        opaque: the alpha above which a pixel has a surface.
 
     Raises:
         ValueError: it was rendered without depth.
     """
     if render.depth is None:
         raise ValueError("the warp needs depth: render with with_depth=True")
-    opaque = render.alpha > OPAQUE
-    return jnp.where(opaque, render.depth / jnp.where(opaque, render.alpha, 1.0), 0.0)
+    surface = render.alpha > opaque
+    return jnp.where(surface, render.depth / jnp.where(surface, render.alpha, 1.0), 0.0)
 
 
 def unproject(depth: Float[Array, "h w"], camera: Camera) -> Float[Array, "h w 3"]:

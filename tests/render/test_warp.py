@@ -76,6 +76,7 @@ def test_surface_depth_divides_by_alpha_and_needs_opacity():
         jnp.zeros((1, 2, 3)), alpha, 7.0 * alpha, jnp.int32(0), jnp.array(False), jnp.zeros(0, bool)
     )
     np.testing.assert_allclose(surface_depth(render), [[7.0, 0.0]], rtol=1e-6)
+    np.testing.assert_array_equal(surface_depth(render, 0.985), 0.0)
     with pytest.raises(ValueError, match="with_depth"):
         surface_depth(dataclasses.replace(render, depth=None))
 
