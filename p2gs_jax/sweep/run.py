@@ -16,7 +16,8 @@ from typing import Any
 
 from p2gs_jax.config import FitConfig, to_dict
 from p2gs_jax.errors import UserError
-from p2gs_jax.export.atomic import plain, write_json, write_text
+from p2gs_jax.export.atomic import write_json, write_text
+from p2gs_jax.pipeline import check_run_dir
 from p2gs_jax.sweep.rows import read_row, to_markdown
 from p2gs_jax.sweep.worker import REASON
 
@@ -91,7 +92,7 @@ def sweep(
         for seed in seeds:
             seeded = dataclasses.replace(cfg, train=dataclasses.replace(cfg.train, seed=seed))
             run = out / slug(name) / f"seed_{seed}"
-            _check_same(run, seeded)
+            check_run_dir(run, True, seeded)
             jobs.append({"name": name, "seed": seed, "run": run, "cfg": seeded})
     rows: list[dict[str, Any]] = [
         {"name": j["name"], "seed": j["seed"], "run": str(j["run"]), "status": "waiting"}
@@ -121,24 +122,6 @@ def sweep(
 def _write_table(out: Path, rows: list[dict[str, Any]]) -> None:
     write_json(out / TABLE, rows)
     write_text(out / TABLE_TEXT, to_markdown(rows))
-
-
-def _check_same(run: Path, cfg: FitConfig) -> None:
-    """Refuse to mix runs of different options under one name."""
-    path = run / "config.json"
-    if not path.exists():
-        return
-    try:
-        saved = json.loads(path.read_text(encoding="utf-8"))["fit"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise UserError(
-            f"{path} cannot be read ({error}).", fix="remove that run, or use another folder"
-        ) from error
-    if saved != plain(to_dict(cfg)):
-        raise UserError(
-            f"{run} holds a run of the same name with other options.",
-            fix="rename the configuration, or use another folder",
-        )
 
 
 def _run(job: dict[str, Any], scene: Path, reference, job_path: Path) -> None:
