@@ -6,7 +6,6 @@ python experiments/presets_on_street.py --out runs/presets --budget-s 120
 from __future__ import annotations
 
 import argparse
-import csv
 import dataclasses
 import json
 from pathlib import Path
@@ -14,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 import p2gs_jax
+from p2gs_jax.synth.exposures import read_true_exposures
 
 PRESETS = ("robust", "paper", "paper_appendix")
 
@@ -28,8 +28,7 @@ def main() -> None:
     street = args.out / "street"
     if not street.exists():
         p2gs_jax.write_street(street, iso_std=args.iso_std, seed=args.seed)
-    with (street / "truth" / "exposures.csv").open(newline="") as file:
-        truth = {row["image"]: float(row["exposure"]) for row in csv.DictReader(file)}
+    truth = read_true_exposures(street)
     rows = []
     for name in PRESETS:
         cfg = p2gs_jax.preset(name)

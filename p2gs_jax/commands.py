@@ -31,6 +31,7 @@ from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.static_stack import calibrate_stack, write_stack
 from p2gs_jax.sweep import read_sweep, sweep
+from p2gs_jax.synth.rig import image_height
 from p2gs_jax.synth.sensor import Sensor
 from p2gs_jax.synth.write import write_street
 
@@ -312,7 +313,7 @@ def synth_command(out: Path, sensor: Sensor, *, width: int, **options) -> int:
     """
     console = _out()
     begin = time.monotonic()
-    height = max(round(width * 1300 / 1920), 1)
+    height = image_height(width)
     write_street(out, sensor=sensor, width=width, height=height, report=console.print, **options)
     console.print(f"{time.monotonic() - begin:.0f} s. Fit it: p2gs-jax fit {out} --out RUN")
     return 0

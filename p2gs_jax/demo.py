@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,8 @@ from p2gs_jax.evaluate.alignment import ExposureError, exposure_error
 from p2gs_jax.export.atomic import write_json
 from p2gs_jax.pipeline import fit
 from p2gs_jax.progress import Reporter
+from p2gs_jax.synth.exposures import read_true_exposures
+from p2gs_jax.synth.rig import image_height
 from p2gs_jax.synth.write import write_street
 
 
@@ -33,12 +34,6 @@ class DemoResult:
     error: ExposureError
     metrics: dict
     run_dir: Path
-
-
-def read_true_exposures(path: Path) -> dict[str, float]:
-    """Return image name -> true exposure."""
-    with path.open(newline="") as file:
-        return {row["image"]: float(row["exposure"]) for row in csv.DictReader(file)}
 
 
 def run_demo(
@@ -74,11 +69,11 @@ def run_demo(
     for folder in (street, run_dir):
         shutil.rmtree(folder, ignore_errors=True)
     write_json(marker, wanted)
-    height = round(width * 1300 / 1920 / 4) * 4
+    height = image_height(width, multiple=4)
     reporter.stage("Making the street")
     write_street(street, frames=frames, width=width, height=height, iso_std=iso_std, seed=seed)
     reporter.message(f"Made a street: 3 cameras, {frames} frames each, {width}x{height}.")
-    truth = read_true_exposures(street / "truth" / "exposures.csv")
+    truth = read_true_exposures(street)
     result = fit(
         street,
         run_dir,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from p2gs_jax.evaluate.alignment import exposure_error
+from p2gs_jax.synth.exposures import read_true_exposures
 
 # Name of the column, path in metrics.json, digits.
 COLUMNS: tuple[tuple[str, tuple[str, ...], int], ...] = (
@@ -50,11 +50,9 @@ def read_row(run: Path, scene: Path) -> dict[str, Any]:
 
 def _exposures(run: Path, scene: Path) -> dict[str, float]:
     """Return errors of the exposures where the scene knows them."""
-    path = scene / "truth" / "exposures.csv"
-    if not path.is_file():
+    truth = read_true_exposures(scene)
+    if not truth:
         return {}
-    with path.open(newline="", encoding="utf-8") as file:
-        truth = {row["image"]: float(row["exposure"]) for row in csv.DictReader(file)}
     views = json.loads((run / "photometry.json").read_text(encoding="utf-8"))["views"]
     pairs = [(v["exposure"], truth[v["image"]]) for v in views if v["exposure"] is not None]
     if len(pairs) < 2:

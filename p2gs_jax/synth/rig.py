@@ -15,6 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+# Pixels of the paper's images.
+IMAGE_WIDTH, IMAGE_HEIGHT = 1920, 1300
 FOV_DEGREES = 60.0
 _FLIP = np.diag([1.0, -1.0, 1.0])  # CARLA's left-handed axes to ours, and back
 
@@ -74,6 +76,16 @@ def camera_viewmat(
     viewmat[:3, :3] = R
     viewmat[:3, 3] = -R @ center
     return viewmat
+
+
+def image_height(width: int, *, multiple: int = 1) -> int:
+    """Return the height, pixels, that gives images of a width the proportions of the paper's.
+
+    Args:
+        width: pixels.
+        multiple: the height is rounded to a multiple of it, and is not 0.
+    """
+    return max(round(width * IMAGE_HEIGHT / IMAGE_WIDTH / multiple), 1) * multiple
 
 
 def intrinsics(width: int, height: int) -> Float[np.ndarray, "3 3"]:

@@ -15,11 +15,10 @@ all.
 
 from __future__ import annotations
 
-import csv
 import json
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -31,11 +30,12 @@ from PIL import Image
 
 from p2gs_jax.errors import UserError
 from p2gs_jax.synth.colmap_files import DriveViews, write_colmap
+from p2gs_jax.synth.exposures import write_true_exposures
 from p2gs_jax.synth.kitti_files import write_calibration, write_poses, write_scan
 from p2gs_jax.synth.lidar import Lidar, Scanner
 from p2gs_jax.synth.rig import MOUNTS, camera_viewmat, drive, intrinsics
 from p2gs_jax.synth.seed_points import observe_seeds, sample_seeds
-from p2gs_jax.synth.sensor import ISO_REFERENCE, Sensor, Shots, draw_shots, photograph
+from p2gs_jax.synth.sensor import ISO_REFERENCE, Sensor, draw_shots, photograph
 from p2gs_jax.synth.town import Layout, Town, build_town
 from p2gs_jax.synth.tracer import Tracer
 
@@ -164,7 +164,7 @@ def write_street(
         xyz, rgb, xy, seen = xyz[kept], rgb[kept], xy[:, kept], seen[:, kept]
         views = DriveViews(names, cameras, viewmats, K, width, height)
         write_colmap(temporary / "sparse" / "0", views, xyz, rgb, xy, seen)
-        _write_exposures(temporary / "truth" / "exposures.csv", names, cameras, shots)
+        write_true_exposures(temporary, names, cameras, shots)
         if lidar:
             say(f"scanning {frames} frames")
             _write_kitti(temporary, town, track, viewmats.reshape(len(MOUNTS), frames, 4, 4), K)
@@ -284,17 +284,3 @@ def _write_kitti(root: Path, town: Town, track: np.ndarray, viewmats: np.ndarray
     write_poses(root / "lidar_poses.txt", to_kitti @ lidar_to_world)
     for frame, vehicle in enumerate(track):
         write_scan(root / "velodyne" / f"{frame:06d}.bin", scanner.scan(vehicle))
-
-
-def _write_exposures(
-    path: Path, names: Sequence[str], cameras: Sequence[str], shots: Shots
-) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(("image", "camera", "iso", "exposure", "exposure_ev", "red", "blue"))
-        for row, (name, camera) in enumerate(zip(names, cameras, strict=True)):
-            e, (red, _, blue) = shots.exposures[row], shots.balance[row]
-            exposure = (f"{e:.6g}", f"{np.log2(e):.6f}")
-            writer.writerow(
-                (name, camera, int(shots.iso[row]), *exposure, f"{red:.6g}", f"{blue:.6g}")
-            )

@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 
+from p2gs_jax.synth.exposures import read_true_exposures
 from p2gs_jax.synth.sensor import Sensor, draw_shots, encode, photograph, srgb_decode, vignette
 from p2gs_jax.synth.town import UNDERPASS, Material, build_town
 from p2gs_jax.synth.write import write_street
@@ -88,6 +89,9 @@ def test_the_data_set_card_and_table_say_what_was_done(tmp_path):
     with (street.root / "truth" / "exposures.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [float(r["exposure"]) for r in rows] == pytest.approx(street.exposures, rel=1e-5)
+    read = read_true_exposures(street.root)
+    assert tuple(read) == street.names
+    assert list(read.values()) == [float(r["exposure"]) for r in rows]
     assert {r["red"] for r in rows if r["camera"] == "front"} != {
         r["red"] for r in rows if r["camera"] == "front_left"
     }

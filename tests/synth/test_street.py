@@ -13,7 +13,7 @@ from scipy.ndimage import map_coordinates
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.colmap import load_colmap
-from p2gs_jax.synth.rig import MOUNTS, camera_viewmat, carla_rotation, intrinsics
+from p2gs_jax.synth.rig import MOUNTS, camera_viewmat, carla_rotation, image_height, intrinsics
 from p2gs_jax.synth.sensor import draw_iso, photograph, srgb_decode, srgb_encode
 from p2gs_jax.synth.town import build_town
 from p2gs_jax.synth.write import read_truth, write_street
@@ -80,6 +80,11 @@ def test_rig_follows_the_papers_mounts():
         assert np.rad2deg(np.arcsin(forward[2])) == pytest.approx(pitch, abs=1e-9)
         assert R[1, 2] < -0.99, f"{name}: image y points down"
     np.testing.assert_allclose(carla_rotation(0, 0, 90) @ [1, 0, 0], [0, 1, 0], atol=1e-12)
+
+
+def test_heights_keep_the_papers_proportions():
+    assert [image_height(w) for w in (1920, 480, 1)] == [1300, 325, 1]
+    assert [image_height(w, multiple=4) for w in (320, 160)] == [216, 108]
 
 
 def test_photographs_are_the_exposed_truth(street):
