@@ -192,6 +192,7 @@ def _write(result: Calibration, out: Path, cfg: FitConfig) -> None:
                     "density": c.density,
                     "behind": c.behind,
                     "behind_error": c.behind_error,
+                    "codes": c.codes,
                 }
                 for c in result.selection.candidates
             ],

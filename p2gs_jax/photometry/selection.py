@@ -13,6 +13,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -105,17 +106,37 @@ def parameter_count(model: ModelName, response: Response, cameras: int, views: i
     return sum(size[level] for level in LADDER[model]) + response.extra_parameters
 
 
-def _densities(
+class _HeldOut(NamedTuple):
+    """What a fit says about held-out observations, NaN where it can say nothing.
+
+    Attributes:
+        densities: log densities.
+        errors: photographed minus predicted display values.
+    """
+
+    densities: Float[np.ndarray, " h"]
+    errors: Float[np.ndarray, "h 3"]
+
+
+def _judged(
     problem: Problem, fit: Fit, response: Response, held: np.ndarray, scale: float
-) -> Float[np.ndarray, " h"]:
-    """Return log densities of the held-out observations, NaN where nothing can be said."""
+) -> _HeldOut:
+    """Return what a fit says about held-out observations.
+
+    Args:
+        problem: all observations.
+        fit: on those that are not held out.
+        response: what it was fitted under.
+        held: rows of the held-out observations.
+        scale: of the stated deviations.
+    """
     o, layout = problem.observations, problem.layout
     sigma, slope = (a[held] for a in o.decoded(response)[1:])
     residual = layout.take(fit.residual)[held]
     precision = fit.precision[layout.row[held]]
+    known = (problem.usable[held] > 0) & (precision > 1e-3)
     a = fit.theta.a[o.views[held]][:, None]
     variance = (scale * sigma) ** 2 + (scale * a) ** 2 / np.maximum(precision, 1e-9)
-    known = (problem.usable[held] > 0) & (precision > 1e-3)
 
     def normal(v):
         return -0.5 * residual**2 / v - 0.5 * np.log(2 * np.pi * v)
@@ -127,16 +148,10 @@ def _densities(
     density = mixture + np.log(np.maximum(slope, 1e-3))
     # Channels are correlated: an observation counts once, as their mean.
     count = known.sum(1)
-    return np.where(count > 0, (density * known).sum(1) / np.maximum(count, 1), np.nan)
-
-
-def _display_errors(
-    problem: Problem, fit: Fit, response: Response, held: np.ndarray
-) -> Float[np.ndarray, "h 3"]:
-    """Return photographed minus predicted display values, NaN where nothing can be said."""
-    slope = problem.observations.decoded(response)[2][held]
-    known = (problem.usable[held] > 0) & (fit.precision[problem.layout.row[held]] > 1e-3)
-    return np.where(known, problem.layout.take(fit.residual)[held] / slope, np.nan)
+    return _HeldOut(
+        np.where(count > 0, (density * known).sum(1) / np.maximum(count, 1), np.nan),
+        np.where(known, residual / slope, np.nan),
+    )
 
 
 def _largest_difference(a, b, views, view_count: int) -> float:
@@ -231,16 +246,15 @@ def select(
         solve_all(spline)
     scale = min(float(f.scale) for f in fits.values())
     where = np.flatnonzero(held)
-    density = {k: _densities(small, f, k[1], where, scale) for k, f in fits.items()}
-    errors = {k: _display_errors(small, f, k[1], where) for k, f in fits.items()}
-    mean = {k: float(np.nanmean(d)) for k, d in density.items()}
+    judged = {k: _judged(small, f, k[1], where, scale) for k, f in fits.items()}
+    mean = {k: float(np.nanmean(j.densities)) for k, j in judged.items()}
     best = max(mean, key=lambda k: mean[k])
     cameras, views = int(o.cameras.max()) + 1, o.view_count
     candidates = []
-    for (model, curve), d in density.items():
-        behind, error = _behind(density[best], d, o.views[where], views)
+    for (model, curve), found in judged.items():
+        behind, error = _behind(judged[best].densities, found.densities, o.views[where], views)
         count = parameter_count(model, curve, cameras, views)
-        codes = _largest_difference(errors[best], errors[model, curve], o.views[where], views)
+        codes = _largest_difference(judged[best].errors, found.errors, o.views[where], views)
         candidates.append(Candidate(model, curve, count, mean[model, curve], behind, error, codes))
     chosen = choose(candidates)
     candidates.sort(key=lambda c: -c.density)

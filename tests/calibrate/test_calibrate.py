@@ -48,7 +48,9 @@ def test_street(street, tmp_path):
     assert result.selection.solution.model == "view_exposure"
     assert all(v["exposure_ev_error"] < 0.2 for v in saved["views"])
     assert (tmp_path / "out" / "calibration.png").stat().st_size > 10_000
-    assert json.loads((tmp_path / "out" / "calibration.json").read_text())["candidates"]
+    candidates = json.loads((tmp_path / "out" / "calibration.json").read_text())["candidates"]
+    assert candidates[0]["codes"] == 0
+    assert max(c["codes"] for c in candidates) > 1
 
 
 def test_command_keeps_known_exposures(street, tmp_path, capsys):
