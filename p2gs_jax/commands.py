@@ -197,8 +197,7 @@ def render_command(
     mean = mean_parameters(run.params.photometry)
     exposures = np.asarray(run.params.photometry.exposures)
     gammas = np.asarray(run.params.photometry.gammas)
-    corrections = run.params.appearance
-    mean_correction = None if corrections is None else jnp.mean(corrections, axis=0)
+    mean_correction = run.params.mean_correction
     row_of = {index: k for k, index in enumerate(run.scene.train_indices)}
     alive = jnp.ones(run.params.gaussians.capacity, bool)
     rows = [i for i, v in enumerate(run.scene.views) if split in ("all", v.split)]
@@ -209,9 +208,10 @@ def render_command(
             result = render(run.params.gaussians, alive, camera_of(store, index))
             k = row_of.get(index)
             g = gamma if gamma is not None else (mean.gamma if k is None else float(gammas[k]))
-            correction = mean_correction
-            if corrections is not None and k is not None and exposure_ev is None:
-                correction = corrections[k]
+            if k is None or exposure_ev is not None:
+                correction = mean_correction
+            else:
+                correction = run.params.correction(k)
             if exposure_ev is not None:
                 e = mean.exposure_geometric * 2**exposure_ev
             elif k is not None:

@@ -81,6 +81,15 @@ class Params(eqx.Module):
     appearance: Float[Array, "v ..."] | None = None
     """Corrections of display values per training view (photometry/appearance.py), or None."""
 
+    def correction(self, row: Int[Array, ""] | int) -> Float[Array, "..."] | None:
+        """Return the correction of the training view in a row of `Photometry`, or None."""
+        return None if self.appearance is None else self.appearance[row]
+
+    @property
+    def mean_correction(self) -> Float[Array, "..."] | None:
+        """The mean over the training views, for views that have none of their own, or None."""
+        return None if self.appearance is None else jnp.mean(self.appearance, axis=0)
+
 
 class Camera(eqx.Module):
     """A pinhole camera.

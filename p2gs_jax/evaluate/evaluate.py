@@ -137,12 +137,16 @@ def evaluate(
     scores = RadianceScores()
     reference_views: list[tuple[int, np.ndarray, np.ndarray, np.ndarray]] = []
 
-    corrections = params.appearance
-    mean_correction = None if corrections is None else jnp.mean(corrections, axis=0)
+    mean_correction = params.mean_correction
 
     def shown(linear, exposure, gamma, correction=mean_correction):
         e, g = jnp.float32(exposure), jnp.float32(gamma)
         return np.asarray(display(formation(linear, e, g, cfg.photometry, correction)))
+
+    def fitted(linear, photograph, mask) -> float:
+        """Solve the exposure of a view that has none of its own."""
+        tone = cfg.photometry
+        return float(fit_exposure(linear, photograph, mask, mean.gamma, tone, mean_correction))
 
     videos = {name: VideoScores() for name in ("per_view", "averaged", "photographs")}
     row_of = {index: row for row, index in enumerate(scene.train_indices)}
@@ -153,13 +157,13 @@ def evaluate(
         linear = result.linear
         ldr_mean = shown(linear, mean.exposure, mean.gamma)
         if view.split == "train":
-            e, g = float(exposures[row_of[index]]), float(gammas[row_of[index]])
-            ldr = shown(linear, e, g, None if corrections is None else corrections[row_of[index]])
+            row = row_of[index]
+            e, g = float(exposures[row]), float(gammas[row])
+            ldr = shown(linear, e, g, params.correction(row))
             own.add(view.name, ldr, photograph, mask)
             averaged.add(view.name, ldr_mean, photograph, mask)
         else:
-            g = mean.gamma
-            e = float(fit_exposure(linear, photograph, mask, g, cfg.photometry, mean_correction))
+            e, g = fitted(linear, photograph, mask), mean.gamma
             ldr = shown(linear, e, g)
             test_averaged.add(view.name, ldr_mean, photograph, mask)
             test_fitted.add(view.name, ldr, photograph, mask, exposure=e)
@@ -197,9 +201,7 @@ def evaluate(
         exposed = float(inverse_tone_map(saturated, gamma, cfg.photometry))
         metrics["radiance"] = scores.summary(exposed / float(np.median(exposures)))
     if reference_views:
-        metrics["reference"] = _against_reference(
-            reference_views, scene, mean, shown, cfg, mean_correction
-        )
+        metrics["reference"] = _against_reference(reference_views, scene, mean, shown, fitted)
     return metrics
 
 
@@ -207,16 +209,17 @@ def _lookup(reference, index: int):
     return reference(index) if callable(reference) else reference.get(index)
 
 
-def _against_reference(
-    views, scene: Scene, mean: MeanParameters, shown, cfg: FitConfig, correction
-) -> dict:
-    """Judge all views against photographs of one common exposure."""
-    scales = [
-        float(
-            fit_exposure(jnp.asarray(linear), truth, mask, mean.gamma, cfg.photometry, correction)
-        )
-        for _, linear, truth, mask in views
-    ]
+def _against_reference(views, scene: Scene, mean: MeanParameters, shown, fitted) -> dict:
+    """Judge all views against photographs of one common exposure.
+
+    Args:
+        views: row, linear radiance, reference photograph and mask of each.
+        scene: their names and splits.
+        mean: exposures to show them at.
+        shown: (linear, exposure, gamma) -> display image.
+        fitted: (linear, photograph, mask) -> the exposure that fits best.
+    """
+    scales = [fitted(jnp.asarray(linear), truth, mask) for _, linear, truth, mask in views]
     common = float(np.exp(np.median(np.log(scales))))
     protocols = {
         "averaged": mean.exposure,

@@ -140,8 +140,8 @@ def total_loss(
     entries, overflow = render.count, render.overflow
     exposures, gammas = params.photometry.exposures, params.photometry.gammas
     i, j = batch.view_index, partner.view_index
-    appearance = None if params.appearance is None else params.appearance[i]
-    ldr = formation(render.linear, exposures[i], gammas[i], cfg.photometry, appearance)
+    correction = params.correction(i)
+    ldr = formation(render.linear, exposures[i], gammas[i], cfg.photometry, correction)
     terms = dict(photometric_loss(ldr, batch.ldr, batch.mask, cfg.loss))
 
     if relative.weight is not None:
