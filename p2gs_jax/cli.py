@@ -133,7 +133,8 @@ class Demo:
     out: Path = Path("runs/demo")
     """Folder for the street and the run."""
     preset: str = "robust"
-    """robust, paper or paper_appendix."""
+    """A preset of `fit`: robust, paper, paper_appendix, 3dgs, 3dgs_gain, 3dgs_affine,
+    3dgs_bilateral or 3dgs_curve."""
     budget: str = "150s"
     """Wall-clock limit of the fit."""
     frames: int = 10

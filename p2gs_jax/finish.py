@@ -21,8 +21,9 @@ from p2gs_jax.export.photometry_json import ViewPhotometry, write_photometry
 from p2gs_jax.export.ply import write_radiance, write_splats
 from p2gs_jax.export.png import write_png
 from p2gs_jax.export.summary import write_summary
+from p2gs_jax.numerics import LN2
 from p2gs_jax.photometry.formation import display, formation
-from p2gs_jax.photometry.solution import LN2, PhotometricSolution
+from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.prepare import Prepared
 from p2gs_jax.progress import Reporter
 from p2gs_jax.render.host import make_renderer

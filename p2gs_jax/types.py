@@ -20,6 +20,8 @@ from jaxtyping import Array, Bool, Float, Float32, Int, UInt8
 
 Split = Literal["train", "test"]
 GAMMA_SRGB = 2.2
+# Weights of red, green and blue in the luminance of display values (BT.601).
+LUMINANCE = (0.299, 0.587, 0.114)
 
 
 class Gaussians(eqx.Module):

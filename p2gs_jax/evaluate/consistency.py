@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from p2gs_jax.photometry.formation import eotf
-
-BT601 = np.array([0.299, 0.587, 0.114])
+from p2gs_jax.types import LUMINANCE
 
 
 def his_paper(ldr: Float[Array, "t h w 3"], exposures: Float[Array, " t"]) -> Float[Array, ""]:
@@ -39,7 +38,7 @@ def _frame_rms(frames: Float[Array, "t h w 3"]) -> Float[Array, " t1"]:
 
 def mean_luminances(ldr: Float[Array, "n h w 3"]) -> Float[Array, " n"]:
     """Return the mean BT.601 luminance of every frame."""
-    return jnp.mean(ldr @ jnp.asarray(BT601, ldr.dtype), axis=(1, 2))
+    return jnp.mean(ldr @ jnp.asarray(LUMINANCE, ldr.dtype), axis=(1, 2))
 
 
 def std_luminance(ldr: Float[Array, "n h w 3"]) -> Float[Array, ""]:
@@ -82,7 +81,7 @@ class VideoScores:
             self._corrected.append(_rms(before / e - linear / exposure))
         self._last[camera] = linear, exposure
         self._radiance.append(float(np.mean(linear)) / exposure)
-        self._luminance.append(float(np.mean(np.asarray(ldr, np.float64) @ BT601)))
+        self._luminance.append(float(np.mean(np.asarray(ldr, np.float64) @ LUMINANCE)))
 
     def summary(self) -> dict[str, float]:
         """Return `his_paper`, `his`, `std_luminance` and `std_luminance_relative`."""

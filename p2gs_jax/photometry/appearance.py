@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from p2gs_jax.config import Appearance
+from p2gs_jax.types import LUMINANCE
 
 # Luminance levels, rows and columns of a bilateral grid, as its authors use.
 GRID = (8, 16, 16)
 CURVE_KNOTS = 16
-LUMINANCE = (0.299, 0.587, 0.114)
 
 
 def identity(kind: Appearance, views: int) -> Float[Array, "v ..."]:

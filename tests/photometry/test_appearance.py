@@ -8,8 +8,9 @@ from scipy.interpolate import RegularGridInterpolator
 
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.evaluate.alignment import fit_exposure
-from p2gs_jax.photometry.appearance import GRID, LUMINANCE, corrected, identity, roughness
+from p2gs_jax.photometry.appearance import GRID, corrected, identity, roughness
 from p2gs_jax.photometry.formation import formation
+from p2gs_jax.types import LUMINANCE
 
 KINDS = ("affine", "bilateral", "curve")
 IMAGE = jnp.asarray(np.random.default_rng(0).uniform(0.02, 0.98, (20, 28, 3)), jnp.float32)
