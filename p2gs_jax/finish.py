@@ -108,11 +108,14 @@ def write_models(params: Params, run_dir: Path, cfg: FitConfig) -> None:
     """Write `splats.ply` (display colours) and `radiance.ply` (linear)."""
     mean = mean_parameters(params.photometry)
     alive = np.ones(params.gaussians.capacity, bool)
+    # A bilateral grid depends on the place in the image: splats cannot carry it.
+    spatial = cfg.photometry.appearance == "bilateral"
+    correction = None if spatial else params.mean_correction
     write_splats(
         run_dir / "splats.ply",
         params.gaussians,
         alive,
-        tone=tone_function(mean.exposure_geometric, mean.gamma, cfg),
+        tone=tone_function(mean.exposure_geometric, mean.gamma, cfg, correction),
         activation=cfg.render.radiance,
     )
     write_radiance(
@@ -291,7 +294,7 @@ def _write_summary(
     cfg: FitConfig,
     true_ev: np.ndarray | None,
 ) -> None:
-    common = tone_function(mean.exposure_geometric, mean.gamma, cfg)
+    common = tone_function(mean.exposure_geometric, mean.gamma, cfg, params.mean_correction)
     views = [shown[i] for i in picks]
     train = [scene.views[i] for i in scene.train_indices]
     exif = [v.exif_ev for v in train]

@@ -200,7 +200,7 @@ def check_run_dir(run_dir: Path, resume: bool, cfg: FitConfig) -> None:
             fix="add --resume to continue it, or name another folder with --out",
         )
     try:
-        saved = json.loads(path.read_text())["fit"]
+        saved = dict(json.loads(path.read_text())["fit"])
     except (ValueError, KeyError, TypeError) as error:
         raise UserError(
             f"{path} cannot be read ({error}).", fix="start again in another folder"

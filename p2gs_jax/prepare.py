@@ -12,7 +12,7 @@ import numpy as np
 from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.init.correspondence import has_tracks, surface_colors
-from p2gs_jax.init.observations import overlapping_views, sample, sample_pairs
+from p2gs_jax.init.observations import COARSEST, overlapping_views, sample, sample_pairs
 from p2gs_jax.init.seeds import gaussians_from_points, merge, scene_extent, subsample
 from p2gs_jax.init.shell import Shell, find_shell
 from p2gs_jax.losses.relative_exposure import ColorPairs
@@ -174,7 +174,7 @@ def calibrate_observations(
         views = [scene.views[i] for i in scene.train_indices]
         known = KnownExposures(read_known_exposures(p.known, views), p.known_deviation_ev)
     given = Response("power" if p.curve == "power" else "srgb", p.spline)
-    return select(
+    selection = select(
         observations,
         black=cfg.loss.black,
         saturation=cfg.loss.saturation,
@@ -183,6 +183,14 @@ def calibrate_observations(
         seed=cfg.train.seed if seed is None else seed,
         fixed=None if p.select else (p.model, given),
     )
+    coarse = observations.too_coarse
+    if not coarse:
+        return selection
+    said = (
+        f"{coarse} of {coarse + len(observations.points)} observations were left out: their pixels "
+        f"cover more than {COARSEST:g} times what the closest view of the point resolves."
+    )
+    return dataclasses.replace(selection, reasons=(said, *selection.reasons))
 
 
 def with_selection(cfg: FitConfig, selection: Selection) -> FitConfig:

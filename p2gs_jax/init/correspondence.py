@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from p2gs_jax.init.observations import gather, sample, track_colors
+from p2gs_jax.init.observations import Gathering, track_colors
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.scene.visibility import project_points, unoccluded
@@ -92,20 +92,12 @@ def sample_where_seen(
         kept: which view samples which point.
         on_view: progress.
     """
-    views, points, samples = [], [], []
-    for row, index in enumerate(scene.train_indices):
+    found = Gathering(scene, UNCERTAINTY)
+    for row in range(len(scene.train_indices)):
         pick = np.flatnonzero(kept[row])
-        if len(pick):
-            ldr, mask = store.get(index, 1)
-            view = scene.views[index]
-            scale = [mask.shape[1] / view.width, mask.shape[0] / view.height]
-            found = sample(ldr, mask, where[row][pick] * scale)
-            valid = found.valid
-            views.append(np.full(int(valid.sum()), row))
-            points.append(chosen[pick[valid]])
-            samples.append((found.colors[valid], UNCERTAINTY * found.spread[valid]))
+        found.add(row, store, chosen[pick], where[row][pick])
         on_view(row + 1, len(scene.train_indices))
-    return gather(scene, views, points, samples)
+    return found.observations()
 
 
 def thinned(seen: Bool[np.ndarray, "v p"], rng, most: int) -> Bool[np.ndarray, "v p"]:

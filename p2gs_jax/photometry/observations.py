@@ -29,6 +29,7 @@ class Observations:
         view_count: number of views.
         point_count: number of points.
         cameras: physical camera of each view, 0, 1, ...
+        too_coarse: observations of these points that were left out for their scale.
     """
 
     views: Int[np.ndarray, " o"]
@@ -38,6 +39,7 @@ class Observations:
     view_count: int
     point_count: int
     cameras: Int[np.ndarray, " v"]
+    too_coarse: int = 0
 
     def decoded(self, response: Response):
         """Return log exposed radiance, its stated standard deviation and dz/dy, each (O, 3)."""

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,10 +15,12 @@ from p2gs_jax.init.correspondence import (
     projected_colors,
     unoccluded,
 )
+from p2gs_jax.init.observations import track_colors
 from p2gs_jax.prepare import calibrate_observations
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.synth.write import write_street
+from p2gs_jax.types import Scene, Tracks, View
 
 
 def test_a_wall_hides_what_is_behind_it():
@@ -68,3 +71,47 @@ def test_exposures_without_tracks(street, tmp_path):
         truth = {r["image"]: float(r["exposure"]) for r in csv.DictReader(file)}
     expected = np.array([truth[scene.views[i].name] for i in scene.train_indices])
     assert exposure_error(np.exp(solved.log_exposures), expected)["ev"] < 0.03
+
+
+class Grey:
+    """Photographs of one grey."""
+
+    def get(self, index, shrink):
+        return np.full((40, 60, 3), 0.5, np.float32), np.ones((40, 60), np.float32)
+
+
+def seen_from(distances):
+    """Return a scene of one point and a view at every distance from it; behind where negative."""
+    K = np.array([[50.0, 0, 30], [0, 50, 20], [0, 0, 1]], np.float32)
+    views = []
+    for k, distance in enumerate(distances):
+        viewmat = np.eye(4, dtype=np.float32)
+        viewmat[2, 3] = distance
+        views.append(View(f"{k}.png", Path(f"{k}.png"), "0", viewmat, K, 60, 40))
+    count = len(distances)
+    tracks = Tracks(np.arange(count), np.zeros(count, int), np.full((count, 2), 20.0, np.float32))
+    points = np.zeros((1, 3), np.float32)
+    return Scene(Path("."), "made", tuple(views), points, np.zeros((1, 3), np.uint8), tracks)
+
+
+def test_observations_from_too_far_away_are_left_out_and_counted():
+    found = track_colors(seen_from([2.0, 7.9, 8.1, 30.0]), Grey())
+    assert found.views.tolist() == [0, 1]
+    assert found.too_coarse == 2
+
+
+def test_a_track_behind_its_camera_is_not_the_closest():
+    found = track_colors(seen_from([-1.0, 3.0, 5.0]), Grey())
+    assert found.views.tolist() == [1, 2]
+    assert found.too_coarse == 1
+
+
+def test_what_was_left_out_is_said(street, tmp_path):
+    cfg = preset("robust")
+    scene = load_scene(street, cfg.data, tmp_path, lambda text: None)
+    observations = track_colors(scene, ImageStore(scene.views, cfg.data))
+    assert not any(
+        "left out" in r for r in calibrate_observations(observations, scene, cfg).reasons
+    )
+    some = dataclasses.replace(observations, too_coarse=7)
+    assert calibrate_observations(some, scene, cfg).reasons[0].startswith("7 of ")
