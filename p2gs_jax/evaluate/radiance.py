@@ -146,7 +146,8 @@ class RadianceScores:
             parts.append(
                 np.stack([np.log(x.reshape(-1, 3)[pick]).ravel() for x in (linear, truth)])
             )
-        return np.concatenate(parts, 1) if parts else np.zeros((2, 0))
+        # Single precision is too coarse for a line through half a million points.
+        return np.concatenate(parts, 1).astype(np.float64) if parts else np.zeros((2, 0))
 
 
 def _mean(values: list[float]) -> float:

@@ -20,7 +20,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Float32, Int
 
-from p2gs_jax.synth.paint import Surface, paint, sky
+from p2gs_jax.synth.paint import paint, sky
+from p2gs_jax.synth.surface import Surface
 from p2gs_jax.synth.town import FACADE_LINE, UNDERPASS_HEIGHT, Material, Town
 
 _TILE = 32  # pixels: a tile's rays stay in the second-level cache and share a list of primitives
