@@ -72,6 +72,8 @@ class Fit:
     """Exposures to keep: a CSV file (image, exposure or ev), or exif."""
     known_deviation_ev: float | None = None
     """Treat them as uncertain by this many stops instead of keeping them."""
+    lpips_weights: str | None = None
+    """Weights of LPIPS (.npz, docs/files.md): judge with it as well."""
     resume: bool = False
     """Continue an interrupted run."""
 
@@ -124,6 +126,8 @@ class Eval:
     """Run folder."""
     reference: Path | None = None
     """Photographs of the same views under one common exposure."""
+    lpips_weights: str | None = None
+    """Weights of LPIPS (.npz, docs/files.md; default: the run's)."""
 
 
 @dataclass(frozen=True)
@@ -248,7 +252,7 @@ def resolve(args: Fit) -> configs.FitConfig:
         UserError: a value makes no sense.
     """
     cfg = args.config
-    data, train = cfg.data, cfg.train
+    data, train, evaluation = cfg.data, cfg.train, cfg.evaluation
     for name in ("max_width", "test_every", "images"):
         if getattr(args, name) is not None:
             data = dataclasses.replace(data, **{name: getattr(args, name)})
@@ -260,10 +264,13 @@ def resolve(args: Fit) -> configs.FitConfig:
         train = dataclasses.replace(train, steps=args.steps)
     if args.budget is not None:
         train = dataclasses.replace(train, budget_s=parse_duration(args.budget))
+    if args.lpips_weights is not None:
+        evaluation = dataclasses.replace(evaluation, lpips_weights=args.lpips_weights)
     _check(data.max_width is None or data.max_width >= 16, "--max-width must be at least 16")
     _check(data.test_every >= 0, "--test-every must be 0 or more")
     _check(train.steps >= 1, "--steps must be at least 1")
-    return _known(dataclasses.replace(cfg, data=data, train=train), args)
+    cfg = dataclasses.replace(cfg, data=data, train=train, evaluation=evaluation)
+    return _known(cfg, args)
 
 
 def _check(condition: bool, text: str) -> None:
@@ -306,7 +313,7 @@ def _run(argv: list[str]) -> int:
     if isinstance(args, Render):
         return commands.render_command(args.run, args.out, args.split, args.exposure_ev, args.gamma)
     if isinstance(args, Eval):
-        return commands.eval_command(args.run, args.reference)
+        return commands.eval_command(args.run, args.reference, args.lpips_weights)
     if isinstance(args, Sweep):
         return commands.sweep_command(args.file, args.out, args.max_parallel)
     if isinstance(args, Synth):

@@ -19,6 +19,7 @@ from p2gs_jax.demo import run_demo
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.alignment import fit_exposure
 from p2gs_jax.evaluate.evaluate import ViewResult, evaluate, mean_parameters
+from p2gs_jax.evaluate.lpips_weights import read_lpips_weights
 from p2gs_jax.export.atomic import write_json
 from p2gs_jax.finish import find_radiance, load_reference, tone_function, write_view
 from p2gs_jax.numerics import LN2
@@ -151,17 +152,18 @@ def print_metrics(metrics: dict, out: Path) -> None:
     """Print the scores of a run as a table."""
     console = _out()
     table = Table(title="How well it fits", title_justify="left")
-    for name in ("views", "protocol", "PSNR dB", "SSIM"):
+    for name in ("views", "protocol", "PSNR dB", "SSIM", "LPIPS"):
         table.add_column(name, justify="left" if name in ("views", "protocol") else "right")
 
     def row(views: str, protocol: str, part: dict | None) -> None:
         if part and "psnr" in part:
-            table.add_row(views, protocol, f"{part['psnr']:.2f}", f"{part['ssim']:.4f}")
+            lpips = f"{part['lpips']:.4f}" if "lpips" in part else "n/a"
+            table.add_row(views, protocol, f"{part['psnr']:.2f}", f"{part['ssim']:.4f}", lpips)
 
     row("training", "own exposure and gamma", metrics["train"])
     row("training", "mean parameters", metrics["train"]["averaged"])
     row("held out", "mean parameters", metrics["test"]["averaged"])
-    row("held out", "one exposure fitted to each photograph", metrics["test"]["exposure_fitted"])
+    row("held out", "exposure fitted to each photograph", metrics["test"]["exposure_fitted"])
     for name, part in metrics.get("reference", {}).items():
         row("all", f"reference photographs, {name.replace('_', ' ')}", part)
         row("held out", f"reference photographs, {name.replace('_', ' ')}", part["test"])
@@ -235,9 +237,19 @@ def render_command(
     return 0
 
 
-def eval_command(run_dir: Path, reference: Path | None) -> int:
-    """Judge a run again and rewrite its metrics."""
+def eval_command(run_dir: Path, reference: Path | None, lpips_weights: str | None) -> int:
+    """Judge a run again and rewrite its metrics.
+
+    Args:
+        run_dir: the run folder.
+        reference: replaces the run's.
+        lpips_weights: replaces the run's.
+    """
     run = load_run(run_dir)
+    lpips_weights = lpips_weights or run.cfg.evaluation.lpips_weights
+    weights = None if lpips_weights is None else read_lpips_weights(lpips_weights)
+    if weights is not None:
+        weights.require_sizes(run.scene.views, run.cfg.data.max_width)
     folder = reference or run.reference
     truth = None if folder is None else load_reference(folder, run.scene, run.cfg)
     store = ImageStore(run.scene.views, run.cfg.data)
@@ -251,6 +263,7 @@ def eval_command(run_dir: Path, reference: Path | None) -> int:
             run.cfg,
             reference=truth,
             radiance=find_radiance(run.scene, store),
+            lpips_weights=weights,
             on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
         )
     path = run_dir / "metrics.json"

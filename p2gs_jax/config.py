@@ -301,6 +301,15 @@ class TrainConfig:
 
 
 @dataclass(frozen=True)
+class EvaluationConfig:
+    """How a finished fit is judged; nothing here changes the fit."""
+
+    lpips_weights: str | None = None
+    """Weights of LPIPS (Zhang et al. 2018), a .npz that docs/files.md tells how to write; None
+    leaves LPIPS out."""
+
+
+@dataclass(frozen=True)
 class FitConfig:
     """All of it."""
 
@@ -314,6 +323,7 @@ class FitConfig:
     densify: DensifyConfig = field(default_factory=DensifyConfig)
     init: InitConfig = field(default_factory=InitConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
 
 
 def _robust() -> FitConfig:

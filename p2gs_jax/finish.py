@@ -14,6 +14,7 @@ import numpy as np
 from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.evaluate import MeanParameters, ViewResult, evaluate, mean_parameters
+from p2gs_jax.evaluate.lpips import LpipsWeights
 from p2gs_jax.evaluate.radiance import Truth
 from p2gs_jax.export.atomic import write_array, write_json
 from p2gs_jax.export.exr import read_exr, write_exr
@@ -184,6 +185,7 @@ def finish(
     reporter: Reporter,
     *,
     truth: Reference | None,
+    lpips_weights: LpipsWeights | None,
     counts: dict,
     seconds: dict,
     true_ev: np.ndarray | None = None,
@@ -197,6 +199,7 @@ def finish(
         cfg: everything.
         reporter: receives progress.
         truth: photographs under one common exposure, or None.
+        lpips_weights: for LPIPS, or None to leave it out.
         counts: numbers for `metrics.json`.
         seconds: times for `metrics.json`.
         true_ev: true exposures of the training views for the plot, or None.
@@ -226,6 +229,7 @@ def finish(
         cfg,
         reference=truth,
         radiance=find_radiance(scene, store),
+        lpips_weights=lpips_weights,
         on_view=on_view,
         on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
     )

@@ -16,12 +16,15 @@ import numpy as np
 from p2gs_jax.config import FitConfig
 from p2gs_jax.config import to_dict as config_to_dict
 from p2gs_jax.errors import UserError
+from p2gs_jax.evaluate.lpips import LpipsWeights
+from p2gs_jax.evaluate.lpips_weights import read_lpips_weights
 from p2gs_jax.export.atomic import plain, write_json
 from p2gs_jax.finish import finish, load_reference
 from p2gs_jax.photometry.gauge import recentre
 from p2gs_jax.photometry.selection import Selection
 from p2gs_jax.prepare import Prepared, load, prepare
 from p2gs_jax.progress import Reporter, Silent
+from p2gs_jax.scene.images import size_at
 from p2gs_jax.train.loop import Trainer, TrainResult
 from p2gs_jax.train.views import TrainingViews
 from p2gs_jax.types import Params, Scene
@@ -119,8 +122,13 @@ def fit(
     scene_dir, run_dir = Path(scene_dir), Path(run_dir)
     begin = time.monotonic()
     check_run_dir(run_dir, resume, cfg)
+    # What judging needs is read first: a wrong file should not cost a fit.
+    path = cfg.evaluation.lpips_weights
+    lpips_weights = None if path is None else read_lpips_weights(path)
     run_dir.mkdir(parents=True, exist_ok=True)
     scene = load(scene_dir, run_dir, cfg, reporter)
+    if lpips_weights is not None:
+        lpips_weights.require_sizes(scene.views, cfg.data.max_width)
     truth = load_reference(reference, scene, cfg) if reference is not None else None
     write_json(
         run_dir / "config.json",
@@ -139,7 +147,7 @@ def fit(
         reporter,
         resume=resume,
         spent_s=time.monotonic() - begin,
-        reserve_s=_finish_estimate(scene, cfg),
+        reserve_s=_finish_estimate(scene, cfg, lpips_weights, truth is not None),
     )
     params = compact(result)
     if cfg.photometry.parameterization == "log" and cfg.photometry.known is None:
@@ -151,6 +159,7 @@ def fit(
         cfg,
         reporter,
         truth=truth,
+        lpips_weights=lpips_weights,
         counts={
             "gaussians": params.gaussians.capacity,
             "seed_points": len(scene.points),
@@ -171,19 +180,34 @@ def fit(
     return FitResult(params, scene, metrics, run_dir, prepared.selection)
 
 
-def _finish_estimate(scene: Scene, cfg: FitConfig) -> float:
-    """Return a guess of the seconds that evaluation and files will take."""
+def _finish_estimate(
+    scene: Scene, cfg: FitConfig, lpips_weights: LpipsWeights | None, reference: bool
+) -> float:
+    """Return a guess of the seconds that evaluation and files will take.
+
+    Args:
+        scene: its views are judged.
+        cfg: their size, and the budget, of which a quarter at most is kept.
+        lpips_weights: whether LPIPS is computed, and on which network.
+        reference: whether each view is compared with a reference photograph as well.
+    """
     if cfg.train.budget_s is None:
         return 0.0
-    pixels = 0.0
+    pixels = 0
     for view in scene.views:
-        shrink = min(1.0, (cfg.data.max_width or view.width) / view.width)
-        pixels += view.width * view.height * shrink**2
-    return min(8.0 + 1.2e-6 * pixels, 0.25 * cfg.train.budget_s)
+        width, height = size_at(view, cfg.data.max_width)
+        pixels += width * height
+    per_pixel = 1.2e-6
+    if lpips_weights is not None:
+        # Under two protocols, and three more against a reference.
+        per_pixel += (5 if reference else 2) * lpips_weights.network.seconds_per_pixel
+    return min(8.0 + per_pixel * pixels, 0.25 * cfg.train.budget_s)
 
 
 def check_run_dir(run_dir: Path, resume: bool, cfg: FitConfig) -> None:
     """Refuse to overwrite a run, and to continue one under other options.
+
+    Options of the evaluation may differ: they do not change the fit.
 
     Raises:
         UserError: the folder holds a run and `resume` is not set, is not a folder, or holds a run
@@ -205,7 +229,10 @@ def check_run_dir(run_dir: Path, resume: bool, cfg: FitConfig) -> None:
         raise UserError(
             f"{path} cannot be read ({error}).", fix="start again in another folder"
         ) from error
-    other = _differences(saved, plain(config_to_dict(cfg)))
+    now = plain(config_to_dict(cfg))
+    for options in (saved, now):
+        options.pop("evaluation", None)
+    other = _differences(saved, now)
     if other:
         raise UserError(
             f"{run_dir} was begun with other options: {'; '.join(other[:6])}.",

@@ -9,6 +9,7 @@ solves one scalar for all of them.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -19,6 +20,7 @@ from jaxtyping import Bool, Float32
 from p2gs_jax.config import FitConfig
 from p2gs_jax.evaluate.alignment import fit_exposure
 from p2gs_jax.evaluate.consistency import VideoScores
+from p2gs_jax.evaluate.lpips import LpipsWeights, lpips
 from p2gs_jax.evaluate.metrics import psnr, ssim
 from p2gs_jax.evaluate.radiance import RadianceScores, Truth
 from p2gs_jax.photometry.formation import display, formation, inverse_tone_map
@@ -78,18 +80,22 @@ class ViewResult:
     gamma: float
 
 
+def _score(lpips_weights: LpipsWeights | None, ldr, target, mask) -> dict[str, float]:
+    """Return how an image compares with a photograph; LPIPS where there are weights for it."""
+    row = {"psnr": float(psnr(ldr, target, mask)), "ssim": float(ssim(ldr, target, mask))}
+    if lpips_weights is not None:
+        row["lpips"] = float(lpips(lpips_weights, ldr, target, mask))
+    return row
+
+
 class _Collector:
     """Per-view scores and their means."""
 
     def __init__(self):
         self.rows: dict[str, dict[str, float]] = {}
 
-    def add(self, name: str, ldr, target, mask, **extra: float) -> None:
-        self.rows[name] = {
-            "psnr": float(psnr(ldr, target, mask)),
-            "ssim": float(ssim(ldr, target, mask)),
-            **extra,
-        }
+    def add(self, name: str, row: dict[str, float]) -> None:
+        self.rows[name] = row
 
     def summary(self) -> dict:
         if not self.rows:
@@ -109,6 +115,7 @@ def evaluate(
     *,
     reference: Mapping[int, Float32[np.ndarray, "h w 3"]] | Callable | None = None,
     radiance: Truth | None = None,
+    lpips_weights: LpipsWeights | None = None,
     on_view: Callable[[ViewResult], None] = lambda result: None,
     on_progress: Callable[[int, int], None] = lambda done, count: None,
 ) -> dict:
@@ -123,15 +130,21 @@ def evaluate(
         cfg: formation model.
         reference: view row -> photograph under the common exposure, or None where there is none.
         radiance: view row -> true linear radiance at the size of the photographs, or None.
+        lpips_weights: adds `lpips` wherever a view is compared with a photograph; None leaves it
+            out.
         on_view: receives every rendered view.
         on_progress: views done, views in all.
 
     Returns:
         The `train`, `test`, `consistency`, `reference` and `radiance` parts of `metrics.json`.
+
+    Raises:
+        UserError: an image is too small for LPIPS.
     """
     mean = mean_parameters(params.photometry)
     exposures = np.asarray(params.photometry.exposures)
     gammas = np.asarray(params.photometry.gammas)
+    score = functools.partial(_score, lpips_weights)
     own, averaged = _Collector(), _Collector()
     test_averaged, test_fitted = _Collector(), _Collector()
     scores = RadianceScores()
@@ -160,13 +173,13 @@ def evaluate(
             row = row_of[index]
             e, g = float(exposures[row]), float(gammas[row])
             ldr = shown(linear, e, g, params.correction(row))
-            own.add(view.name, ldr, photograph, mask)
-            averaged.add(view.name, ldr_mean, photograph, mask)
+            own.add(view.name, score(ldr, photograph, mask))
+            averaged.add(view.name, score(ldr_mean, photograph, mask))
         else:
             e, g = fitted(linear, photograph, mask), mean.gamma
             ldr = shown(linear, e, g)
-            test_averaged.add(view.name, ldr_mean, photograph, mask)
-            test_fitted.add(view.name, ldr, photograph, mask, exposure=e)
+            test_averaged.add(view.name, score(ldr_mean, photograph, mask))
+            test_fitted.add(view.name, {**score(ldr, photograph, mask), "exposure": e})
         hdr = None if radiance is None else radiance(index)
         if hdr is not None:
             scores.add(view.name, view.split, np.asarray(linear), hdr, mask)
@@ -201,7 +214,9 @@ def evaluate(
         exposed = float(inverse_tone_map(saturated, gamma, cfg.photometry))
         metrics["radiance"] = scores.summary(exposed / float(np.median(exposures)))
     if reference_views:
-        metrics["reference"] = _against_reference(reference_views, scene, mean, shown, fitted)
+        metrics["reference"] = _against_reference(
+            reference_views, scene, mean, shown, fitted, score
+        )
     return metrics
 
 
@@ -209,7 +224,7 @@ def _lookup(reference, index: int):
     return reference(index) if callable(reference) else reference.get(index)
 
 
-def _against_reference(views, scene: Scene, mean: MeanParameters, shown, fitted) -> dict:
+def _against_reference(views, scene: Scene, mean: MeanParameters, shown, fitted, score) -> dict:
     """Judge all views against photographs of one common exposure.
 
     Args:
@@ -218,6 +233,7 @@ def _against_reference(views, scene: Scene, mean: MeanParameters, shown, fitted)
         mean: exposures to show them at.
         shown: (linear, exposure, gamma) -> display image.
         fitted: (linear, photograph, mask) -> the exposure that fits best.
+        score: (display image, photograph, mask) -> scores by name.
     """
     scales = [fitted(jnp.asarray(linear), truth, mask) for _, linear, truth, mask in views]
     common = float(np.exp(np.median(np.log(scales))))
@@ -232,8 +248,9 @@ def _against_reference(views, scene: Scene, mean: MeanParameters, shown, fitted)
         for index, linear, truth, mask in views:
             view = scene.views[index]
             ldr = shown(jnp.asarray(linear), exposure, mean.gamma)
+            row = score(ldr, truth, mask)
             for part in ("all", view.split):
-                parts[part].add(view.name, ldr, truth, mask)
+                parts[part].add(view.name, row)
         out[name] = {
             **parts["all"].summary(),
             "exposure": exposure,

@@ -9,6 +9,7 @@ import pytest
 from p2gs_jax.cli import main, parse_duration
 from p2gs_jax.config import preset, to_dict
 from p2gs_jax.errors import UserError
+from p2gs_jax.pipeline import check_run_dir
 
 
 def run(capsys, *argv):
@@ -119,6 +120,23 @@ def test_resuming_under_other_options_is_refused(capsys, tmp_path):
     code, text = run(capsys, "fit", tmp_path, "--out", tmp_path, "--resume")
     assert code == 2
     assert "train.seed was 7, now 0" in text
+
+
+def test_resuming_under_another_evaluation_is_allowed(tmp_path):
+    cfg = to_dict(preset("robust"))
+    for evaluation in (None, {"lpips_weights": "alex.npz"}):
+        if evaluation is None:
+            del cfg["evaluation"]  # as an older version wrote it
+        else:
+            cfg["evaluation"] = evaluation
+        (tmp_path / "config.json").write_text(json.dumps({"scene": "s", "fit": cfg}))
+        check_run_dir(tmp_path, True, preset("robust"))
+    cfg["train"]["seed"] = 7
+    (tmp_path / "config.json").write_text(json.dumps({"scene": "s", "fit": cfg}))
+    with pytest.raises(UserError) as error:
+        check_run_dir(tmp_path, True, preset("robust"))
+    assert "train.seed" in str(error.value)
+    assert "evaluation" not in str(error.value)
 
 
 def test_durations():
