@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from p2gs_jax.init.observations import Gathering, track_colors
+from p2gs_jax.init.observations import point_colors, track_colors
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.scene.visibility import project_points, unoccluded
@@ -92,12 +92,10 @@ def sample_where_seen(
         kept: which view samples which point.
         on_view: progress.
     """
-    found = Gathering(scene, UNCERTAINTY)
-    for row in range(len(scene.train_indices)):
-        pick = np.flatnonzero(kept[row])
-        found.add(row, store, chosen[pick], where[row][pick])
-        on_view(row + 1, len(scene.train_indices))
-    return found.observations()
+    picks = [np.flatnonzero(row) for row in kept]
+    points = [chosen[pick] for pick in picks]
+    xy = [where[row][pick] for row, pick in enumerate(picks)]
+    return point_colors(scene, store, points, xy, uncertainty=UNCERTAINTY, on_view=on_view)
 
 
 def thinned(seen: Bool[np.ndarray, "v p"], rng, most: int) -> Bool[np.ndarray, "v p"]:

@@ -19,9 +19,8 @@ PATCH = 3
 # A track's position is uncertain by this much, in pixels of the sampled image; where the image is
 # steep, so is its colour.
 POSITION_DEVIATION = 0.5
-# A pixel that is more than this many times wider than the finest that shows the point
-# averages other texture and mixes in neighbours. On a drive of 100 frames such observations made
-# selection take a gamma per view, .043 EV; without them .003 (BUILD_NOTES).
+# Patches are widened to the coarsest view of a point, which is at most this many times coarser than
+# the finest: what is still farther away mixes in neighbours (BUILD_NOTES).
 COARSEST = 4.0
 
 
@@ -29,7 +28,7 @@ class Samples(NamedTuple):
     """Colours of an image at some positions.
 
     Attributes:
-        colors: bilinear patch averages.
+        colors: averages over patches, display-encoded.
         spread: standard deviation of `colors` from uncertain positions: gradient times that.
         valid: inside the image and its mask.
     """
@@ -43,6 +42,7 @@ def sample(
     ldr: Float32[np.ndarray, "h w 3"],
     mask: Float32[np.ndarray, "h w"],
     xy: Float[np.ndarray, "o 2"],
+    wider: Float[np.ndarray, " o"] | None = None,
 ) -> Samples:
     """Sample an image at pixel positions.
 
@@ -50,15 +50,41 @@ def sample(
         ldr: photograph.
         mask: 1 = use.
         xy: positions, pixel centres at +0.5.
+        wider: factors by which the averaged patches are wider than PATCH; None: 1.
     """
+    factors = np.ones(len(xy)) if wider is None else wider
+    # Odd, so that patches are centred.
+    widths = 2 * np.rint((PATCH * factors - 1) / 2).astype(int) + 1
+    colors, spread = (np.zeros((len(xy), 3), np.float32) for _ in range(2))
+    valid = np.zeros(len(xy), bool)
+    linear = _decode(ldr)
+    for width in np.unique(widths).tolist():
+        pick = np.flatnonzero(widths == width)
+        smooth = _encode(cv2.blur(linear, (width, width), borderType=cv2.BORDER_REFLECT))
+        found = _sample_smooth(smooth, mask, xy[pick], width // 2)
+        colors[pick], spread[pick], valid[pick] = found
+    return Samples(colors, spread, valid)
+
+
+def _decode(ldr: np.ndarray) -> np.ndarray:
+    """Return linear values: light averages linearly, whatever the exposure."""
+    return np.where(ldr <= 0.04045, ldr / 12.92, ((ldr + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def _encode(linear: np.ndarray) -> np.ndarray:
+    bright = 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055
+    return np.where(linear <= 0.0031308, 12.92 * linear, bright).astype(np.float32)
+
+
+def _sample_smooth(smooth, mask, xy, margin: int) -> Samples:
+    """Sample an image that is smooth already; `margin` pixels of its border are not used."""
     height, width = mask.shape
-    smooth = cv2.blur(ldr, (PATCH, PATCH), borderType=cv2.BORDER_REFLECT)
     position = (xy - 0.5).astype(np.float32)
     inside = (
-        (position[:, 0] >= 1)
-        & (position[:, 1] >= 1)
-        & (position[:, 0] <= width - 2)
-        & (position[:, 1] <= height - 2)
+        (position[:, 0] >= margin)
+        & (position[:, 1] >= margin)
+        & (position[:, 0] <= width - 1 - margin)
+        & (position[:, 1] <= height - 1 - margin)
     )
     safe = np.where(inside[:, None], position, 1.0).astype(np.float32)
     left, top = np.floor(safe).astype(int).T
@@ -98,81 +124,74 @@ def track_colors(
         on_view: progress: views done, views in all.
     """
     assert scene.tracks is not None
-    found = Gathering(scene)
     order = np.argsort(scene.tracks.view_indices, kind="stable")
     bounds = np.searchsorted(scene.tracks.view_indices[order], np.arange(len(scene.views) + 1))
-    for row, index in enumerate(scene.train_indices):
-        pick = order[bounds[index] : bounds[index + 1]]
-        found.add(row, store, scene.tracks.point_indices[pick], scene.tracks.xy[pick])
-        on_view(row + 1, len(scene.train_indices))
-    return found.observations()
+    picks = [order[bounds[i] : bounds[i + 1]] for i in scene.train_indices]
+    points = [scene.tracks.point_indices[pick] for pick in picks]
+    xy = [scene.tracks.xy[pick] for pick in picks]
+    return point_colors(scene, store, points, xy, on_view=on_view)
 
 
-class Gathering:
-    """Observations, collected view by view.
+def point_colors(
+    scene: Scene,
+    store: ImageStore,
+    points: list[Int[np.ndarray, " o"]],
+    xy: list[Float[np.ndarray, "o 2"]],
+    *,
+    uncertainty: float = 1.0,
+    on_view: Callable[[int, int], None] = lambda i, n: None,
+) -> Observations:
+    """Sample points in training views, all at the scale of the coarsest view that is used.
+
+    A surface seen from afar shows less contrast, because a pixel averages more of it; compared
+    pixel for pixel, that looks like a gamma (BUILD_NOTES). So closer views are averaged over the
+    same patch of surface.
 
     Args:
         scene: its training views and points.
+        store: photographs.
+        points: for each training view the points to sample, rows in `scene.points`.
+        xy: for each training view their positions, full resolution.
         uncertainty: of positions, in units of POSITION_DEVIATION.
+        on_view: progress: views done, views in all.
     """
-
-    def __init__(self, scene: Scene, uncertainty: float = 1.0):
-        self._scene, self._uncertainty = scene, uncertainty
-        self._views: list[Int[np.ndarray, " o"]] = []
-        self._points: list[Int[np.ndarray, " o"]] = []
-        self._footprints: list[Float[np.ndarray, " o"]] = []
-        self._samples: list[Samples] = []
-
-    def add(
-        self,
-        row: int,
-        store: ImageStore,
-        points: Int[np.ndarray, " o"],
-        xy: Float[np.ndarray, "o 2"],
-    ) -> None:
-        """Sample points in a training view.
-
-        Args:
-            row: of the view among the training views.
-            store: photographs.
-            points: rows in `scene.points`.
-            xy: their positions, full resolution.
-        """
-        if not len(points):
-            return
-        index = self._scene.train_indices[row]
-        view = self._scene.views[index]
-        ldr, mask = store.get(index, 1)
-        scale = np.array([mask.shape[1] / view.width, mask.shape[0] / view.height])
-        found = sample(ldr, mask, xy * scale)
-        kept = points[found.valid]
-        z = self._scene.points[kept] @ view.viewmat[2, :3] + view.viewmat[2, 3]
-        self._views.append(np.full(len(kept), row))
-        self._points.append(kept)
+    sizes, widths = [], []
+    for index, mine in zip(scene.train_indices, points, strict=True):
+        view = scene.views[index]
+        height, width = store.get(index, 1)[1].shape
+        sizes.append(np.array([width / view.width, height / view.height]))
+        z = scene.points[mine] @ view.viewmat[2, :3] + view.viewmat[2, 3]
         z = np.where(z > 0, z, np.inf)  # a track behind its camera is wrong, not close
-        self._footprints.append(z / np.mean(np.diag(view.K)[:2] * scale))
-        self._samples.append(Samples(*(a[found.valid] for a in found)))
-
-    def observations(self) -> Observations:
-        """Return all but those that are too coarse for their point."""
-        scene = self._scene
-        points = np.concatenate([np.zeros(0, int), *self._points])
-        footprints = np.concatenate([np.zeros(0), *self._footprints])
-        finest = np.full(len(scene.points), np.inf)
-        np.minimum.at(finest, points, footprints)
-        keep = footprints <= COARSEST * finest[points]
-        empty = np.zeros((0, 3), np.float32)
-        spread = np.concatenate([empty, *(s.spread for s in self._samples)])
-        return Observations(
-            views=np.concatenate([np.zeros(0, int), *self._views])[keep],
-            points=points[keep],
-            colors=np.concatenate([empty, *(s.colors for s in self._samples)])[keep],
-            spread=np.float32(self._uncertainty) * spread[keep],
-            view_count=len(scene.train_indices),
-            point_count=len(scene.points),
-            cameras=camera_rows(scene),
-            too_coarse=int((~keep).sum()),
-        )
+        widths.append(z / np.mean(np.diag(view.K)[:2] * sizes[-1]))
+    finest = np.full(len(scene.points), np.inf)
+    for mine, width in zip(points, widths, strict=True):
+        np.minimum.at(finest, mine, width)
+    keep = [w <= COARSEST * finest[mine] for mine, w in zip(points, widths, strict=True)]
+    coarsest = np.zeros(len(scene.points))
+    for mine, width, kept in zip(points, widths, keep, strict=True):
+        np.maximum.at(coarsest, mine[kept], width[kept])
+    views, seen, colors, spreads = [], [], [], []
+    for row, index in enumerate(scene.train_indices):
+        mine = points[row][keep[row]]
+        if len(mine):
+            wider = coarsest[mine] / widths[row][keep[row]]
+            found = sample(*store.get(index, 1), xy[row][keep[row]] * sizes[row], wider)
+            views.append(np.full(int(found.valid.sum()), row))
+            seen.append(mine[found.valid])
+            colors.append(found.colors[found.valid])
+            spreads.append(found.spread[found.valid])
+        on_view(row + 1, len(scene.train_indices))
+    empty = np.zeros((0, 3), np.float32)
+    return Observations(
+        views=np.concatenate([np.zeros(0, int), *views]),
+        points=np.concatenate([np.zeros(0, int), *seen]),
+        colors=np.concatenate([empty, *colors]),
+        spread=np.float32(uncertainty) * np.concatenate([empty, *spreads]),
+        view_count=len(scene.train_indices),
+        point_count=len(scene.points),
+        cameras=camera_rows(scene),
+        too_coarse=int(sum((~kept).sum() for kept in keep)),
+    )
 
 
 def sample_pairs(

@@ -15,10 +15,11 @@ from p2gs_jax.init.correspondence import (
     projected_colors,
     unoccluded,
 )
-from p2gs_jax.init.observations import track_colors
+from p2gs_jax.init.observations import sample, track_colors
 from p2gs_jax.prepare import calibrate_observations
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.synth.sensor import srgb_decode, srgb_encode
 from p2gs_jax.synth.write import write_street
 from p2gs_jax.types import Scene, Tracks, View
 
@@ -104,6 +105,34 @@ def test_a_track_behind_its_camera_is_not_the_closest():
     found = track_colors(seen_from([-1.0, 3.0, 5.0]), Grey())
     assert found.views.tolist() == [1, 2]
     assert found.too_coarse == 1
+
+
+def encoded(linear):
+    return srgb_encode(linear).astype(np.float32)
+
+
+def test_a_surface_has_the_same_colour_from_near_and_from_far():
+    """Near, far (a pixel covers 3x3 of the near ones) and far at a quarter of the exposure."""
+    fine = np.exp(0.5 * np.random.default_rng(0).standard_normal((240, 240, 3))) * 0.1
+    fine = np.minimum(fine, 1.0).astype(np.float32)
+    coarse = fine.reshape(80, 3, 80, 3, 3).mean((1, 3))
+    far_xy = np.stack(np.meshgrid(*[np.arange(10, 70) + 0.5] * 2), -1).reshape(-1, 2)
+    near, far = np.ones((240, 240), np.float32), np.ones((80, 80), np.float32)
+    wide = sample(encoded(fine), near, 3 * far_xy, np.full(len(far_xy), 3.0))
+    narrow = sample(encoded(fine), near, 3 * far_xy)
+    dark = sample(encoded(0.25 * coarse), far, far_xy)
+    expected = 4 * srgb_decode(dark.colors)
+    np.testing.assert_allclose(srgb_decode(wide.colors), expected, rtol=1e-4)
+    gap = np.log(srgb_decode(narrow.colors) / expected)
+    assert np.std(gap) > 0.1
+    assert np.std(np.log(expected)) < 0.5 * np.std(np.log(srgb_decode(narrow.colors)))
+
+
+def test_wide_patches_keep_away_from_the_border():
+    image, mask = np.full((20, 20, 3), 0.5, np.float32), np.ones((20, 20), np.float32)
+    xy = np.array([[3.5, 10.0], [10.0, 10.0]])
+    assert sample(image, mask, xy).valid.tolist() == [True, True]
+    assert sample(image, mask, xy, np.full(2, 4.0)).valid.tolist() == [False, True]
 
 
 def test_what_was_left_out_is_said(street, tmp_path):
