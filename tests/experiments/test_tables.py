@@ -1,0 +1,118 @@
+"""The tables of experiments/: what their cells say, without fitting anything."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "experiments"))
+
+import table1_reconstruction
+import table2_novel_views
+import table3_iso_robustness
+import table4_ablation
+import towns
+import what_a_scene_needs
+
+from p2gs_jax.config import preset
+
+
+def metrics(level: float, **extra):
+    """Return a metrics.json whose PSNRs are `level`, novel ones a decibel lower."""
+    here, there = {"psnr": level, "ssim": 0.9}, {"psnr": level - 1, "ssim": 0.8}
+    return {
+        "train": {**here, "averaged": here},
+        "test": {"averaged": there, "exposure_fitted": there},
+        "reference": {"scale_aligned": {**here, "train": here, "test": there}},
+        "consistency": {
+            k: dict.fromkeys(table1_reconstruction.STEADINESS, 0.1)
+            for k in ("averaged", "photographs")
+        },
+        "counts": {"gaussians": 1000},
+        "seconds": {"optimisation": 3.0},
+        "ev": 0.004,
+        **extra,
+    }
+
+
+def runs_of(wanted, level=lambda name, std, town: 20.0):
+    keys = [(n, s, t) for s, names in wanted.items() for n in names for t in (0, 1)]
+    found = {key: metrics(level(*key)) for key in keys}
+    return towns.Runs(found, dict.fromkeys(found, Path("run")), ())
+
+
+def test_means_are_over_towns_and_missing_values_are_not_invented():
+    runs = runs_of({4.0: ["a"]}, lambda name, std, town: 20.0 + 2 * town)
+    assert runs.mean("a", 4.0, "train", "psnr") == 21.0
+    assert towns.number(runs.mean("a", 4.0, "train", "lpips"), 3) == "n/a"
+    assert towns.number(runs.mean("b", 4.0, "train", "psnr"), 2) == "n/a"
+
+
+def test_losses_between_spreads_of_iso():
+    loss = {0.0: 0.0, 2.0: 1.5, 4.0: 4.0}
+    runs = runs_of(table3_iso_robustness.wanted(), lambda name, std, town: 25.0 - loss[std])
+    for row in table3_iso_robustness.deltas(runs):
+        assert row[1:7] == ["-2.50"] * 4 + ["-4.00"] * 2
+    printed = {row[0]: row[7] for row in table3_iso_robustness.deltas(runs)}
+    assert printed["P2GS as printed"] == "-0.85 / -0.95"  # as the paper's table has it
+
+
+def test_every_table_has_a_cell_for_every_column():
+    wanted = table3_iso_robustness.wanted()
+    runs = runs_of(wanted)
+    rows = table3_iso_robustness.rows(runs)
+    assert len(rows) == sum(map(len, wanted.values()))
+    assert {len(row) for row in rows} == {len(table3_iso_robustness.HEADER)}
+    rows = table1_reconstruction.rows(runs, {"3DGS": 12.0})
+    assert {len(row) for row in rows} == {len(table1_reconstruction.HEADER)}
+    assert {len(row) for row in table2_novel_views.rows(runs)} == {11}
+    ablations = runs_of({4.0: table4_ablation.variants()})
+    rows = table4_ablation.rows(ablations)
+    assert {len(row) for row in rows} == {len(table4_ablation.COLUMNS) + 2}
+
+
+def test_every_variant_differs_from_all_others():
+    for variants in (
+        table4_ablation.variants(),
+        {k: v for k, v in towns.methods().items()},
+    ):
+        assert len(set(variants.values())) == len(variants)
+
+
+def test_ladders_vary_one_thing_at_a_time():
+    o = towns.Options(Path("."), towns.QUICK, 1, None, "")
+    configs = what_a_scene_needs.variants(o)
+    assert configs["model: chosen"] == preset("robust")
+    assert configs["SH degree 1"].render.sh_degree == 1
+    assert configs[what_a_scene_needs.AUTO].densify.max_gaussians == "auto"
+    assert len({c for n, c in configs.items() if n.startswith("model")}) == 7
+
+
+def test_the_budget_is_the_same_for_all():
+    o = towns.Options(Path("."), towns.QUICK, 1, "w.npz", "")
+    for cfg in towns.methods().values():
+        under = towns.budgeted(cfg, o)
+        assert under.train.steps == towns.QUICK.steps
+        assert under.densify.max_gaussians == towns.QUICK.gaussians
+        assert under.evaluation.lpips_weights == "w.npz"
+
+
+def test_a_table_says_where_it_comes_from(tmp_path):
+    o = towns.Options(tmp_path, towns.QUICK, 1, None, "python experiments/x.py --quick")
+    runs = towns.Runs({("a", 4.0, 0): metrics(20.0)}, {("a", 4.0, 0): Path("r")}, ("b: no light",))
+    towns.write(o, "x", "| t |\n", runs, 0.0)
+    text = (tmp_path / o.protocol.name / "x.md").read_text()
+    assert "python experiments/x.py --quick" in text
+    assert "b: no light" in text
+    saved = json.loads((tmp_path / o.protocol.name / "x.json").read_text())
+    assert saved["stamp"]["protocol"]["steps"] == towns.QUICK.steps
+    assert saved["rows"][0]["train"]["psnr"] == 20.0
+
+
+@pytest.mark.parametrize("argv", [["--steps", "many"], ["--towns"]])
+def test_wrong_options_end_with_two(argv, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["x", *argv])
+    with pytest.raises(SystemExit) as stop:
+        towns.options("x", "x")
+    assert stop.value.code == 2
