@@ -186,6 +186,7 @@ def finish(
     truth: Reference | None,
     counts: dict,
     seconds: dict,
+    growth: dict | None = None,
     true_ev: np.ndarray | None = None,
 ) -> dict:
     """Evaluate, export and return what `metrics.json` holds.
@@ -199,6 +200,7 @@ def finish(
         truth: photographs under one common exposure, or None.
         counts: numbers for `metrics.json`.
         seconds: times for `metrics.json`.
+        growth: the history of automatic growth for `metrics.json`, or None.
         true_ev: true exposures of the training views for the plot, or None.
     """
     begin = time.monotonic()
@@ -253,6 +255,8 @@ def finish(
     steps = max(int(counts.get("steps", 0)), 1)
     metrics["seconds_per_step"] = seconds.get("optimisation", 0.0) / steps
     metrics["notes"] = prepared.notes
+    if growth is not None:
+        metrics["growth"] = growth
     write_json(run_dir / "metrics.json", metrics)
     return metrics
 
