@@ -11,7 +11,7 @@ import re
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Union, get_args
+from typing import Annotated, Any, Literal, Union, get_args
 
 # Quiet the native libraries before they load; our own messages say what matters.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
@@ -43,6 +43,22 @@ def parse_duration(text: str) -> float:
     return total
 
 
+def parse_gaussians(text: str) -> int | Literal["auto"]:
+    """Return what `--gaussians` says: a whole number from 1 on, or `auto`.
+
+    Raises:
+        UserError: it is neither.
+    """
+    if text == "auto":
+        return "auto"
+    if re.fullmatch(r"\d+", text) is None or int(text) < 1:
+        raise UserError(
+            f"--gaussians {text!r} is no number of Gaussians.",
+            fix="write a whole number from 1 on, or auto",
+        )
+    return int(text)
+
+
 @dataclass(frozen=True)
 class Fit:
     """Fit a linear HDR radiance field, exposures and gammas to photographs."""
@@ -58,6 +74,9 @@ class Fit:
     """Wall-clock limit for the whole run, such as 5m; replaces --steps."""
     max_width: int | None = None
     """Shrink images to at most this many pixels across."""
+    gaussians: str | None = None
+    """Upper bound on the Gaussians: a whole number, or auto (grow while held-out training views
+    gain by it)."""
     seed: int | None = None
     """Seeds every random choice."""
     test_every: int | None = None
@@ -266,10 +285,14 @@ def resolve(args: Fit) -> configs.FitConfig:
         train = dataclasses.replace(train, budget_s=parse_duration(args.budget))
     if args.lpips_weights is not None:
         evaluation = dataclasses.replace(evaluation, lpips_weights=args.lpips_weights)
+    densify = cfg.densify
+    if args.gaussians is not None:
+        most = parse_gaussians(args.gaussians)
+        densify = dataclasses.replace(densify, max_gaussians=most)
     _check(data.max_width is None or data.max_width >= 16, "--max-width must be at least 16")
     _check(data.test_every >= 0, "--test-every must be 0 or more")
     _check(train.steps >= 1, "--steps must be at least 1")
-    cfg = dataclasses.replace(cfg, data=data, train=train, evaluation=evaluation)
+    cfg = dataclasses.replace(cfg, data=data, train=train, evaluation=evaluation, densify=densify)
     return _known(cfg, args)
 
 

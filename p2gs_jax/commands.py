@@ -279,7 +279,8 @@ def _kept_metrics(path: Path) -> dict:
         old = json.loads(path.read_text())
     except (OSError, ValueError):
         return {}
-    return {k: old[k] for k in ("counts", "seconds", "seconds_per_step", "notes") if k in old}
+    kept = ("counts", "seconds", "seconds_per_step", "notes", "growth")
+    return {k: old[k] for k in kept if k in old}
 
 
 def demo_command(

@@ -234,8 +234,9 @@ class DensifyConfig:
     method: Literal["mcmc", "adaptive"] | None = "mcmc"
     """`mcmc` relocates within a budget, `adaptive` is the 3DGS schedule (paper), None keeps the
     seeds."""
-    max_gaussians: int | None = None
-    """Upper bound on the population; None chooses from the seeds and the pixels."""
+    max_gaussians: int | Literal["auto"] | None = None
+    """Upper bound on the population; None chooses from the seeds and the pixels, `auto` (mcmc only)
+    stops growing where held-out training views gain no more by it."""
     start: float = 1.0 / 60.0
     """First densification (3DGS: step 500)."""
     stop: float = 0.5

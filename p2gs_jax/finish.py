@@ -188,6 +188,7 @@ def finish(
     lpips_weights: LpipsWeights | None,
     counts: dict,
     seconds: dict,
+    growth: dict | None = None,
     true_ev: np.ndarray | None = None,
 ) -> dict:
     """Evaluate, export and return what `metrics.json` holds.
@@ -202,6 +203,7 @@ def finish(
         lpips_weights: for LPIPS, or None to leave it out.
         counts: numbers for `metrics.json`.
         seconds: times for `metrics.json`.
+        growth: the history of automatic growth for `metrics.json`, or None.
         true_ev: true exposures of the training views for the plot, or None.
     """
     begin = time.monotonic()
@@ -257,6 +259,8 @@ def finish(
     steps = max(int(counts.get("steps", 0)), 1)
     metrics["seconds_per_step"] = seconds.get("optimisation", 0.0) / steps
     metrics["notes"] = prepared.notes
+    if growth is not None:
+        metrics["growth"] = growth
     write_json(run_dir / "metrics.json", metrics)
     return metrics
 

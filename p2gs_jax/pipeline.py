@@ -25,7 +25,9 @@ from p2gs_jax.photometry.selection import Selection
 from p2gs_jax.prepare import Prepared, load, prepare
 from p2gs_jax.progress import Reporter, Silent
 from p2gs_jax.scene.images import size_at
+from p2gs_jax.train.growth import check_method
 from p2gs_jax.train.loop import Trainer, TrainResult
+from p2gs_jax.train.validation import pick_validation
 from p2gs_jax.train.views import TrainingViews
 from p2gs_jax.types import Params, Scene
 
@@ -62,6 +64,8 @@ def optimise(
         run_dir,
         on_log=reporter.log,
         on_message=reporter.message,
+        cameras=[prepared.scene.views[i].camera for i in prepared.scene.train_indices],
+        own_exposures=prepared.selection is not None,
     )
     alive = jnp.ones(prepared.params.gaussians.capacity, bool)
     return trainer.run(prepared.params, alive, resume=resume, reserve_s=spent_s + reserve_s)
@@ -121,6 +125,7 @@ def fit(
     reporter = reporter or Silent()
     scene_dir, run_dir = Path(scene_dir), Path(run_dir)
     begin = time.monotonic()
+    check_method(cfg.densify)
     check_run_dir(run_dir, resume, cfg)
     # What judging needs is read first: a wrong file should not cost a fit.
     path = cfg.evaluation.lpips_weights
@@ -129,6 +134,8 @@ def fit(
     scene = load(scene_dir, run_dir, cfg, reporter)
     if lpips_weights is not None:
         lpips_weights.require_sizes(scene.views, cfg.data.max_width)
+    if cfg.densify.max_gaussians == "auto":
+        pick_validation([scene.views[i].camera for i in scene.train_indices])
     truth = load_reference(reference, scene, cfg) if reference is not None else None
     write_json(
         run_dir / "config.json",
@@ -169,6 +176,7 @@ def fit(
             "refused_densifications": result.host.refused,
             "tile_lists_grown": result.host.overflows,
         },
+        growth=result.growth,
         seconds={
             "total_until_evaluation": time.monotonic() - begin,
             "optimisation": result.host.elapsed_s,

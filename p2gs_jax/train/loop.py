@@ -8,12 +8,13 @@ the same path as an uninterrupted one.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -31,7 +32,8 @@ from p2gs_jax.losses.relative_exposure import ColorPairs
 from p2gs_jax.losses.total import OBSERVED_FORMS, SECOND_RENDER_FORMS, Partner
 from p2gs_jax.render import required_capacity
 from p2gs_jax.render.host import capacity_bucket
-from p2gs_jax.train import schedule
+from p2gs_jax.train import growth, schedule
+from p2gs_jax.train.growth import Growth, Look, Stage
 from p2gs_jax.train.optimizer import make_optimizer, zero_moments, zero_opacity_moments
 from p2gs_jax.train.schedule import Pace
 from p2gs_jax.train.state import (
@@ -44,6 +46,7 @@ from p2gs_jax.train.state import (
     replace_gaussians,
 )
 from p2gs_jax.train.step import Controls, StepReport, finite_names, make_step
+from p2gs_jax.train.validation import make_judge, pick_validation
 from p2gs_jax.train.views import TrainingViews
 from p2gs_jax.types import Params
 
@@ -70,6 +73,7 @@ class HostState:
         overflows: tile lists grown.
         capacities: tile-list capacity for every "WxH".
         step_s: running estimate of the seconds a step takes at this level.
+        growth: how far automatic growth has come.
     """
 
     step: int = 0
@@ -82,6 +86,12 @@ class HostState:
     overflows: int = 0
     capacities: dict[str, int] = field(default_factory=dict)
     step_s: float = 0.0
+    growth: Growth = field(default_factory=Growth)
+
+    @classmethod
+    def from_dict(cls, values: dict) -> HostState:
+        """Return what a checkpoint holds; those of older versions know nothing of growth."""
+        return cls(**{**values, "growth": Growth.from_dict(values.get("growth", {}))})
 
 
 @dataclass(frozen=True)
@@ -102,11 +112,29 @@ class LogRecord:
 
 @dataclass(frozen=True)
 class TrainResult:
-    """The end of a run."""
+    """The end of a run.
+
+    Attributes:
+        state: parameters and population.
+        host: counters.
+        max_gaussians: bound on the population.
+        growth: the history of automatic growth, as JSON values; None where it was not asked for.
+    """
 
     state: FitState
     host: HostState
     max_gaussians: int
+    growth: dict | None = None
+
+
+@dataclass
+class _Trial:
+    """A stage of growth under way, and how it ended without growth."""
+
+    stage: Stage
+    ungrown: FitState
+    score: float
+    done: int = 0
 
 
 def default_max_gaussians(seeds: int, width: int, height: int) -> int:
@@ -125,6 +153,8 @@ class Trainer:
         run_dir: where `log.jsonl` and `checkpoints/` go.
         on_log: called with every log record.
         on_message: called with everything the user must know.
+        cameras: the physical camera of every training view, for automatic growth; None: one.
+        own_exposures: the views' exposures come from tracks, so automatic growth may judge by them.
     """
 
     def __init__(
@@ -136,6 +166,8 @@ class Trainer:
         run_dir: Path,
         on_log: Callable[[LogRecord], None] = lambda record: None,
         on_message: Callable[[str], None] = lambda text: None,
+        cameras: Sequence[str] | None = None,
+        own_exposures: bool = False,
     ):
         self.cfg, self.views, self.extent, self.pairs = cfg, views, extent, pairs
         self.run_dir, self.on_log, self.on_message = run_dir, on_log, on_message
@@ -154,6 +186,13 @@ class Trainer:
         self._propose = jax.jit(functools.partial(adaptive.propose, cfg=cfg.densify))
         self._relocate = jax.jit(functools.partial(mcmc.relocate_and_grow, cfg=cfg.densify))
         self._zero_moments = jax.jit(zero_moments)
+        self._trial: _Trial | None = None
+        self.auto = cfg.densify.max_gaussians == "auto"
+        if self.auto:
+            growth.check_method(cfg.densify)
+            self.validation = pick_validation(cameras or ["0"] * len(views))
+            self.growth_window = growth.window(cfg.densify, self.levels)
+            self.judge = make_judge(views, self.validation, cfg, own_exposures=own_exposures)
 
     # -------------------------------------------------------------- starting and resuming
 
@@ -165,7 +204,7 @@ class Trainer:
         if found is None:
             return None
         state = jax.tree.map(jnp.asarray, found[0])
-        host = HostState(**found[1]["host"])
+        host = HostState.from_dict(found[1]["host"])
         self.checkpoints.discard_after(host.step)
         kept = [line for line in read_jsonl(self.log_path) if line["step"] <= host.step]
         write_text(self.log_path, "".join(json.dumps(line) + "\n" for line in kept))
@@ -197,14 +236,9 @@ class Trainer:
         """
         train = self.cfg.train
         seeds = int(np.sum(np.asarray(alive)))
-        limit = self.cfg.densify.max_gaussians
-        if limit is None and self.cfg.densify.method == "mcmc":
-            limit = default_max_gaussians(seeds, self.width, self.height)
-        if self.cfg.densify.method == "mcmc":
-            assert limit is not None
-            limit = max(limit, seeds)
+        limit = self._limit(seeds)
         state = initial_state(params, alive, self.optimizer)
-        if self.cfg.densify.method == "mcmc":
+        if self.cfg.densify.method == "mcmc" and not self.auto:
             state = grow_state(state, max(limit or 0, seeds))
         pace = Pace.from_config(train, reserve_s)
         host = HostState(pace=pace.per_step)
@@ -213,6 +247,8 @@ class Trainer:
             pace = dataclasses.replace(pace, per_step=host.pace)
         elif self.log_path.exists():
             self.log_path.unlink()
+        if self.auto and host.growth.limit is None:
+            self.views.leave_out(self.validation)
 
         session_start = time.monotonic()
         before = host.elapsed_s
@@ -235,11 +271,24 @@ class Trainer:
                             f"The budget ended the run at {host.progress:.0%} of its schedule."
                         )
                     break
-            if time.monotonic() - last_save > train.checkpoint_every_s:
+            # A checkpoint holds one population: none is written while two compete.
+            due = time.monotonic() - last_save > train.checkpoint_every_s
+            if due and self._trial is None:
                 self._save(state, host)
                 last_save = time.monotonic()
         self._save(state, host)
-        return TrainResult(state, host, limit or state.params.gaussians.capacity)
+        summary = growth.summary(host.growth, self.validation) if self.auto else None
+        return TrainResult(state, host, limit or state.params.gaussians.capacity, summary)
+
+    def _limit(self, seeds: int) -> int | None:
+        """Return the bound on the population; None: there is none."""
+        d = self.cfg.densify
+        default = default_max_gaussians(seeds, self.width, self.height)
+        if d.max_gaussians == "auto":
+            return growth.upper_bound(seeds, default)
+        if d.method != "mcmc":
+            return d.max_gaussians
+        return max(default if d.max_gaussians is None else d.max_gaussians, seeds)
 
     def _burst(
         self, state: FitState, host: HostState
@@ -365,31 +414,123 @@ class Trainer:
 
     def _maybe_densify(self, state: FitState, host: HostState, limit: int | None) -> FitState:
         d = self.cfg.densify
+        if self.auto and host.progress >= self.growth_window[1]:
+            if self._trial is not None:
+                state = self._decide(state, host)
+            self._end_growth(state, host)
         if d.method is None or not d.start <= host.progress < d.stop:
             return state
-        interval = max(d.every, d.min_every_steps * host.pace)
-        if host.progress - host.densified_at < interval:
+        if host.progress - host.densified_at < self._interval(host):
             return state
+        if self.auto:
+            state, wanted = self._auto_target(state, host, limit or 0)
+        elif d.method == "mcmc":
+            wanted = self._target(state, host, limit)
+        else:
+            wanted = None
         host.densified_at = host.progress
-        key = jax.random.fold_in(jax.random.key(self.cfg.train.seed + 1), host.step)
-        if d.method == "mcmc":
-            return self._relocate_step(key, state, host, limit)
-        return self._adaptive_step(key, state, host, limit)
+        if wanted is None:
+            return self._adaptive_step(state, host, limit)
+        return self._relocate_step(state, host, wanted)
 
-    def _relocate_step(self, key, state: FitState, host: HostState, limit) -> FitState:
+    def _interval(self, host: HostState) -> float:
+        d = self.cfg.densify
+        return max(d.every, d.min_every_steps * host.pace)
+
+    def _key(self, host: HostState):
+        return jax.random.fold_in(jax.random.key(self.cfg.train.seed + 1), host.step)
+
+    def _target(self, state: FitState, host: HostState, limit: int | None) -> int:
+        """Return the population after the next relocation."""
         alive = int(jnp.sum(state.population.alive))
         room = max((limit or alive) / max(alive, 1), 1.0)
         # A short run has few events: grow so that the limit is reached at the last of them.
-        d = self.cfg.densify
-        events = (d.stop - host.progress) / max(d.every, d.min_every_steps * host.pace)
-        factor = max(d.growth, room ** (1 / max(events, 1.0)))
-        births = min(math.ceil(alive * factor), limit or alive) - alive
+        events = (self.cfg.densify.stop - host.progress) / self._interval(host)
+        factor = max(self.cfg.densify.growth, room ** (1 / max(events, 1.0)))
+        return min(math.ceil(alive * factor), limit or alive)
+
+    def _relocate_step(self, state: FitState, host: HostState, wanted: int) -> FitState:
+        births = max(wanted - int(jnp.sum(state.population.alive)), 0)
         outcome = self._relocate(
-            key, state.params.gaussians, state.population, jnp.int32(max(births, 0))
+            self._key(host), state.params.gaussians, state.population, jnp.int32(births)
         )
         return self._settle(state, outcome, host)
 
-    def _adaptive_step(self, key, state: FitState, host: HostState, limit) -> FitState:
+    # -------------------------------------------------------------- automatic growth
+
+    def _auto_target(self, state: FitState, host: HostState, bound: int) -> tuple[FitState, int]:
+        """Return the state with room for the next population, and that population; 0: as it is.
+
+        After a stage it is decided which population goes on. The next begins an interval later, so
+        that a checkpoint can be written in between.
+        """
+        if host.growth.limit is not None or host.progress < self.growth_window[0]:
+            return state, 0
+        if self._trial is None:
+            self._trial = self._begin_stage(state, host, bound)
+        elif self._trial.done == self._trial.stage.events:
+            state = self._decide(state, host)
+            if host.growth.stalled:
+                self._end_growth(state, host)
+            return state, 0
+        if self._trial is None:
+            self._end_growth(state, host)
+            return state, 0
+        self._trial.done += 1
+        state = grow_state(state, self._trial.ungrown.params.gaussians.capacity)
+        return state, self._trial.stage.target(self._trial.done)
+
+    def _begin_stage(self, state: FitState, host: HostState, bound: int) -> _Trial | None:
+        """Run a stage without growth, and return its end; None: there is no room for a stage."""
+        alive = int(jnp.sum(state.population.alive))
+        left = (self.growth_window[1] - host.progress) / host.pace
+        # The host looks after every burst only.
+        burst = min(self.cfg.train.log_every, MAX_BURST)
+        interval = math.ceil(self._interval(host) / host.pace / burst - 1e-6) * burst
+        stage = growth.plan_stage(alive, bound, left, interval)
+        if stage is None:
+            return None
+        # Both runs of the stage have the same slots, and so the same random draws.
+        needed = stage.target(stage.events)
+        state = grow_state(state, bucket_for(needed, state.params.gaussians.capacity, bound))
+        state = jax.tree.map(jnp.copy, state)  # steps give their input away
+        host = copy.deepcopy(host)
+        for _ in range(stage.events):
+            host.densified_at = host.progress
+            state = self._relocate_step(state, host, 0)
+            while host.progress - host.densified_at < self._interval(host):
+                state, _ = self._burst(state, host)
+        score = self.judge(state.params, state.population.alive)
+        return _Trial(stage, state, score)
+
+    def _decide(self, grown: FitState, host: HostState) -> FitState:
+        """Return the population that goes on: the grown one if it is worth it."""
+        trial, self._trial = self._trial, None
+        assert trial is not None
+        look = Look(
+            int(jnp.sum(grown.population.alive)),
+            self.judge(grown.params, grown.population.alive),
+            trial.stage.before,
+            trial.score,
+            round(host.progress, 6),
+        )
+        host.growth.looks.append(look)
+        if look.kept:
+            return grown
+        # Under a time budget the two runs may differ by a few steps.
+        return dataclasses.replace(trial.ungrown, step=grown.step)
+
+    def _end_growth(self, state: FitState, host: HostState) -> None:
+        """Keep the population from here on, and fit the held-out views as well."""
+        if host.growth.limit is not None:
+            return
+        host.growth.limit = int(jnp.sum(state.population.alive))
+        self.views.leave_out(())
+        self.on_message(growth.describe(host.growth, len(self.validation)))
+
+    # -------------------------------------------------------------- densification
+
+    def _adaptive_step(self, state: FitState, host: HostState, limit) -> FitState:
         d = self.cfg.densify
         gaussians, population = state.params.gaussians, state.population
         prune_large = host.reset_at > 0
@@ -404,7 +545,9 @@ class Trainer:
             proposal = jax.tree.map(
                 lambda a: jnp.concatenate([a, jnp.zeros(extra, bool)]) if a.ndim else a, proposal
             )
-        outcome = self._densify_adaptive(key, state.params.gaussians, state.population, proposal)
+        outcome = self._densify_adaptive(
+            self._key(host), state.params.gaussians, state.population, proposal
+        )
         state = self._settle(state, outcome, host)
         if host.progress - host.reset_at >= max(d.reset_every, d.min_reset_steps * host.pace):
             host.reset_at = host.progress

@@ -34,29 +34,42 @@ class TrainingViews:
         self.rows = tuple(rows)
         self.seed = seed
         self.overlaps = overlaps
+        self._without: tuple[int, ...] = ()
         self._orders: dict[int, np.ndarray] = {}
 
     def __len__(self) -> int:
         return len(self.rows)
 
+    def leave_out(self, without: Sequence[int]) -> None:
+        """Take some views out of the order of steps from here on, or all back in.
+
+        Args:
+            without: which, as rows in `Photometry`; none takes all back in.
+        """
+        self._without, self._orders = tuple(without), {}
+
     def index_at(self, step: int) -> int:
         """Return the row in `Photometry` of the view of a step; every epoch is a permutation."""
-        epoch, position = divmod(step, len(self.rows))
+        epoch, position = divmod(step, len(self.rows) - len(self._without))
         if epoch not in self._orders:
             order = np.random.default_rng((self.seed, epoch)).permutation(len(self.rows))
-            self._orders = {epoch: order}
+            self._orders = {epoch: order[~np.isin(order, self._without)]}
         return int(self._orders[epoch][position])
 
     def partner_at(self, step: int) -> int:
         """Return a second view, different from that of the step where there are two.
 
-        Drawn from those that overlap it, where it is known which do.
+        Drawn from those that overlap it, where it is known which do; never one that is left out.
         """
         rng, index = np.random.default_rng((self.seed, 1, step)), self.index_at(step)
-        if self.overlaps is not None and len(self.overlaps[index]):
-            return int(rng.choice(self.overlaps[index]))
-        count = len(self.rows)
-        return (index + int(rng.integers(1, max(count, 2)))) % count
+        if self.overlaps is not None:
+            overlapping = self.overlaps[index]
+            overlapping = overlapping[~np.isin(overlapping, self._without)]
+            if len(overlapping):
+                return int(rng.choice(overlapping))
+        kept = np.setdiff1d(np.arange(len(self.rows)), self._without)
+        place = int(np.searchsorted(kept, index)) + int(rng.integers(1, max(len(kept), 2)))
+        return int(kept[place % len(kept)])
 
     def prefetch(self, index: int, shrink: int) -> None:
         """Begin decoding a view in the background."""
