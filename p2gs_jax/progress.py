@@ -10,7 +10,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from p2gs_jax.train.loop import LogRecord
+from p2gs_jax.train.host import LogRecord
 
 
 class Reporter(Protocol):

@@ -15,7 +15,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import jax
@@ -33,7 +33,8 @@ from p2gs_jax.losses.total import OBSERVED_FORMS, SECOND_RENDER_FORMS, Partner
 from p2gs_jax.render import required_capacity
 from p2gs_jax.render.host import capacity_bucket
 from p2gs_jax.train import growth, schedule
-from p2gs_jax.train.growth import Growth, Look, Stage
+from p2gs_jax.train.growth import Look, Stage
+from p2gs_jax.train.host import HostState, LogRecord
 from p2gs_jax.train.optimizer import make_optimizer, zero_moments, zero_opacity_moments
 from p2gs_jax.train.schedule import Pace
 from p2gs_jax.train.state import (
@@ -56,58 +57,6 @@ CAPACITY_SAMPLES = 6
 PAIRS_PER_STEP = 4096
 MAX_BURST = 50
 NEARLY_DONE = 0.99
-
-
-@dataclass
-class HostState:
-    """What the host remembers between bursts; saved with every checkpoint.
-
-    Attributes:
-        step: steps completed.
-        progress: fraction of the run completed.
-        pace: progress per step.
-        elapsed_s: seconds of earlier sessions and of this one.
-        densified_at: progress of the last densification.
-        reset_at: progress of the last opacity reset.
-        refused: densification requests that found no slot, summed.
-        overflows: tile lists grown.
-        capacities: tile-list capacity for every "WxH".
-        step_s: running estimate of the seconds a step takes at this level.
-        growth: how far automatic growth has come.
-    """
-
-    step: int = 0
-    progress: float = 0.0
-    pace: float = 0.0
-    elapsed_s: float = 0.0
-    densified_at: float = 0.0
-    reset_at: float = 0.0
-    refused: int = 0
-    overflows: int = 0
-    capacities: dict[str, int] = field(default_factory=dict)
-    step_s: float = 0.0
-    growth: Growth = field(default_factory=Growth)
-
-    @classmethod
-    def from_dict(cls, values: dict) -> HostState:
-        """Return what a checkpoint holds; those of older versions know nothing of growth."""
-        return cls(**{**values, "growth": Growth.from_dict(values.get("growth", {}))})
-
-
-@dataclass(frozen=True)
-class LogRecord:
-    """One line of `log.jsonl`, and what the live display shows."""
-
-    step: int
-    progress: float
-    loss: float
-    psnr: float
-    gaussians: int
-    shrink: int
-    entries: int
-    seconds: float
-    step_seconds: float
-    terms: dict[str, float]
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.sweep import with_fields
 from p2gs_jax.train import growth, loop
 from p2gs_jax.train.growth import Growth, Look
-from p2gs_jax.train.loop import HostState
+from p2gs_jax.train.host import HostState
 from p2gs_jax.train.validation import pick_validation
 from p2gs_jax.train.views import TrainingViews
 

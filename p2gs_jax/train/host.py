@@ -1,0 +1,59 @@
+"""What the host knows of a run between bursts, and what it says about it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from p2gs_jax.train.growth import Growth
+
+
+@dataclass
+class HostState:
+    """What the host remembers between bursts; saved with every checkpoint.
+
+    Attributes:
+        step: steps completed.
+        progress: fraction of the run completed.
+        pace: progress per step.
+        elapsed_s: seconds of earlier sessions and of this one.
+        densified_at: progress of the last densification.
+        reset_at: progress of the last opacity reset.
+        refused: densification requests that found no slot, summed.
+        overflows: tile lists grown.
+        capacities: tile-list capacity for every "WxH".
+        step_s: running estimate of the seconds a step takes at this level.
+        growth: how far automatic growth has come.
+    """
+
+    step: int = 0
+    progress: float = 0.0
+    pace: float = 0.0
+    elapsed_s: float = 0.0
+    densified_at: float = 0.0
+    reset_at: float = 0.0
+    refused: int = 0
+    overflows: int = 0
+    capacities: dict[str, int] = field(default_factory=dict)
+    step_s: float = 0.0
+    growth: Growth = field(default_factory=Growth)
+
+    @classmethod
+    def from_dict(cls, values: dict) -> HostState:
+        """Return what a checkpoint holds; those of older versions know nothing of growth."""
+        return cls(**{**values, "growth": Growth.from_dict(values.get("growth", {}))})
+
+
+@dataclass(frozen=True)
+class LogRecord:
+    """One line of `log.jsonl`, and what the live display shows."""
+
+    step: int
+    progress: float
+    loss: float
+    psnr: float
+    gaussians: int
+    shrink: int
+    entries: int
+    seconds: float
+    step_seconds: float
+    terms: dict[str, float]
