@@ -146,7 +146,7 @@ class Eval:
     reference: Path | None = None
     """Photographs of the same views under one common exposure."""
     lpips_weights: str | None = None
-    """Weights of LPIPS (.npz, docs/files.md; default: the run's)."""
+    """Weights of LPIPS (.npz, docs/files.md; none leaves it out; default: the run's)."""
 
 
 @dataclass(frozen=True)

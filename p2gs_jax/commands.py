@@ -243,11 +243,12 @@ def eval_command(run_dir: Path, reference: Path | None, lpips_weights: str | Non
     Args:
         run_dir: the run folder.
         reference: replaces the run's.
-        lpips_weights: replaces the run's.
+        lpips_weights: replaces the run's; `none` leaves LPIPS out.
     """
     run = load_run(run_dir)
     lpips_weights = lpips_weights or run.cfg.evaluation.lpips_weights
-    weights = None if lpips_weights is None else read_lpips_weights(lpips_weights)
+    left_out = lpips_weights in (None, "none")
+    weights = None if left_out else read_lpips_weights(lpips_weights)
     if weights is not None:
         weights.require_sizes(run.scene.views, run.cfg.data.max_width)
     folder = reference or run.reference

@@ -35,6 +35,8 @@ def test_a_run_is_judged_with_it_and_again_with_another(tmp_path, capsys):
     alex.unlink()
     assert run("eval", out) == 2
     assert str(alex) in capsys.readouterr().err
+    assert run("eval", out, "--lpips-weights", "none") == 0
+    assert "lpips" not in json.loads((out / "metrics.json").read_text())["train"]
     other = write_weights(tmp_path / "other.npz", made_arrays("alex", seed=1))
     assert run("eval", out, "--lpips-weights", other) == 0
     again = json.loads((out / "metrics.json").read_text())
