@@ -67,7 +67,7 @@ def draw(run: Run, index: int, out: Path) -> dict:
             axis.imshow(shown)
             axis.set(xticks=[], yticks=[])
             axis.set_title(f"{stops:+.0f} EV, gamma {gamma:g}", fontsize=9)
-    figure.savefig(out, dpi=110)
+    figure.savefig(out, dpi=72)
     plt.close(figure)
     return {"view": run.scene.views[index].name, "renderings": rows}
 

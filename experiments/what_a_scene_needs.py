@@ -20,7 +20,7 @@ from p2gs_jax.config import FitConfig, preset
 from p2gs_jax.photometry.solution import LADDER
 from p2gs_jax.sweep import with_fields
 
-FACTORS = (0.5, 1.0, 1.25, 1.6, 2.5, 4.0, 6.0)
+FACTORS = (0.5, 1.0, 1.6, 2.5, 4.0)
 DEGREES = (0, 1, 2, 3)
 AUTO = "Gaussians: auto"
 
