@@ -59,7 +59,7 @@ def plot(o: Options, runs: Runs) -> None:
     axis.set(yticks=places, xlabel="PSNR of held-out views, dB", xlim=(10, None))
     axis.set_yticklabels(METHODS)
     axis.invert_yaxis()
-    axis.legend(fontsize=8)
+    figure.legend(loc="outside upper center", ncols=3, fontsize=8)
     figure.savefig(o.out / o.protocol.name / "table2_novel_views.png", dpi=120)
     plt.close(figure)
 
