@@ -15,14 +15,14 @@ import json
 import subprocess
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import p2gs_jax
-from p2gs_jax.config import FitConfig, PresetName
+from p2gs_jax.config import FitConfig, PresetName, to_dict
 from p2gs_jax.sweep import sweep
 from p2gs_jax.synth.rig import image_height
 from p2gs_jax.synth.sensor import Sensor
@@ -140,11 +140,19 @@ def methods(names: Sequence[str] | None = None) -> dict[str, FitConfig]:
 
 @dataclass(frozen=True)
 class Runs:
-    """Metrics of finished runs by (method, ISO std, town), and what failed."""
+    """Finished runs by (method, ISO std, town).
+
+    Attributes:
+        metrics: what their metrics.json say, and exposure errors.
+        folders: where they are.
+        failures: those that did not finish, with reasons.
+        configs: what each method was fitted under.
+    """
 
     metrics: dict[tuple[str, float, int], dict[str, Any]]
     folders: dict[tuple[str, float, int], Path]
     failures: tuple[str, ...]
+    configs: dict[str, dict] = field(default_factory=dict)
 
     def mean(self, method: str, std: float, *path: str) -> float:
         """Return the mean over towns of a value of metrics.json; NaN where none has it."""
@@ -160,14 +168,16 @@ def fit_all(o: Options, wanted: Mapping[float, Mapping[str, FitConfig]]) -> Runs
         o: protocol and folder.
         wanted: ISO std -> method -> configuration, before the budget is applied.
     """
-    metrics, folders, failures = {}, {}, []
+    metrics, folders, failures, used = {}, {}, [], {}
     for town in o.protocol.towns:
         for std, configs in wanted.items():
             street = scene(o, town, std)
+            under = {name: budgeted(cfg, o) for name, cfg in configs.items()}
+            used |= {name: to_dict(cfg) for name, cfg in under.items()}
             result = sweep(
                 street,
                 o.out / o.protocol.name / street.name,
-                {name: budgeted(cfg, o) for name, cfg in configs.items()},
+                under,
                 reference=street / "reference",
                 max_parallel=o.max_parallel,
                 report=lambda line, s=street: print(f"{s.name} {line}", flush=True),
@@ -180,7 +190,7 @@ def fit_all(o: Options, wanted: Mapping[float, Mapping[str, FitConfig]]) -> Runs
                 folders[key] = Path(row["run"])
                 found = json.loads((folders[key] / "metrics.json").read_text())
                 metrics[key] = found | {"ev": row.get("ev"), "ev_power": row.get("ev_power")}
-    return Runs(metrics, folders, tuple(failures))
+    return Runs(metrics, folders, tuple(failures), used)
 
 
 def _at(values: Any, path: Sequence[str]) -> float | None:
@@ -232,7 +242,7 @@ def write(
         {"method": m, "iso_std": s, "town": t, "run": str(runs.folders[m, s, t]), **_scalars(v)}
         for (m, s, t), v in runs.metrics.items()
     ]
-    payload = {"stamp": said, "rows": rows, **(extra or {})}
+    payload = {"stamp": said, "rows": rows, "configs": runs.configs, **(extra or {})}
     (folder / f"{name}.json").write_text(json.dumps(payload, indent=1) + "\n")
     p = o.protocol
     budget = "" if p.gaussians is None else f", at most {p.gaussians} Gaussians"
