@@ -41,11 +41,9 @@ def variants(o: Options) -> dict[str, FitConfig]:
         f"model: {m.replace('_', ' ')}": {"photometry.select": False, "photometry.model": m}
         for m in LADDER
     }
-    ladders = counts | degrees | models
-    configs = {name: with_fields(robust, fields) for name, fields in ladders.items()}
-    configs["model: chosen"] = robust
-    configs[AUTO] = with_fields(robust, {"densify.max_gaussians": "auto"})
-    return configs
+    auto = {AUTO: {"densify.max_gaussians": "auto"}}
+    ladders = counts | auto | models | {"model: chosen": {}} | degrees
+    return {name: with_fields(robust, fields) for name, fields in ladders.items()}
 
 
 COLUMNS = (
