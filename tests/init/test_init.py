@@ -12,6 +12,7 @@ from p2gs_jax.init.seeds import gaussians_from_points, scene_extent, subsample
 from p2gs_jax.init.shell import find_shell
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.render import view_radiance
+from p2gs_jax.synth.sensor import srgb_encode
 from p2gs_jax.types import Camera, View
 
 
@@ -26,14 +27,18 @@ def view(x=0.0, width=160, height=90, yaw=0.0):
 
 def test_samples_sit_at_pixel_centres():
     rng = np.random.default_rng(0)
-    ramp = np.repeat(np.linspace(0, 1, 50, dtype=np.float32)[None, :, None], 40, 0)
-    image = np.repeat(ramp, 3, 2)
-    xy = rng.uniform(4, 36, (100, 2))
-    colors, spread, valid = sample(image, np.ones((40, 50), np.float32), xy)
-    assert valid.all()
-    np.testing.assert_allclose(colors[:, 0], (xy[:, 0] - 0.5) / 49, atol=1e-5)
-    # Half a pixel of misplacement on a ramp of 1/49 a pixel.
-    np.testing.assert_allclose(spread[:, 0], 0.5 / 49, rtol=1e-3)
+    # A ramp of light: patches are averaged linearly.
+    ramp = srgb_encode(np.linspace(0.2, 1, 50))[None, :, None]
+    image = np.tile(ramp, (40, 1, 3)).astype(np.float32)
+    xy = rng.uniform(9, 31, (100, 2))
+    light = 0.2 + 0.8 * (xy[:, 0] - 0.5) / 49
+    # Half a pixel of misplacement on a ramp of 0.8/49 a pixel.
+    slope = (srgb_encode(light + 1e-4) - srgb_encode(light - 1e-4)) / 2e-4
+    for wider in (None, np.full(100, 2.0), np.full(100, 4.0)):
+        colors, spread, valid = sample(image, np.ones((40, 50), np.float32), xy, wider)
+        assert valid.all()
+        np.testing.assert_allclose(colors[:, 0], srgb_encode(light), atol=2e-4)
+        np.testing.assert_allclose(spread[:, 0], 0.5 * slope * 0.8 / 49, rtol=5e-3)
 
 
 def test_samples_outside_and_masked_are_invalid():
