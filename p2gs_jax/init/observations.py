@@ -11,7 +11,9 @@ from jaxtyping import Bool, Float, Float32, Int
 from scipy.sparse import csr_array
 
 from p2gs_jax.photometry.observations import Observations
+from p2gs_jax.photometry.srgb import srgb_decode, srgb_encode
 from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.visibility import project_points
 from p2gs_jax.types import Scene
 
 # Averaging a few pixels quiets noise and hides the misplacement of a fraction of a pixel.
@@ -57,27 +59,21 @@ def sample(
     widths = 2 * np.rint((PATCH * factors - 1) / 2).astype(int) + 1
     colors, spread = (np.zeros((len(xy), 3), np.float32) for _ in range(2))
     valid = np.zeros(len(xy), bool)
-    linear = _decode(ldr)
+    linear = srgb_decode(ldr)  # light averages linearly, whatever the exposure
     for width in np.unique(widths).tolist():
         pick = np.flatnonzero(widths == width)
-        smooth = _encode(cv2.blur(linear, (width, width), borderType=cv2.BORDER_REFLECT))
+        smooth = cv2.blur(linear, (width, width), borderType=cv2.BORDER_REFLECT)
         found = _sample_smooth(smooth, mask, xy[pick], width // 2)
         colors[pick], spread[pick], valid[pick] = found
     return Samples(colors, spread, valid)
 
 
-def _decode(ldr: np.ndarray) -> np.ndarray:
-    """Return linear values: light averages linearly, whatever the exposure."""
-    return np.where(ldr <= 0.04045, ldr / 12.92, ((ldr + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
-def _encode(linear: np.ndarray) -> np.ndarray:
-    bright = 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055
-    return np.where(linear <= 0.0031308, 12.92 * linear, bright).astype(np.float32)
-
-
 def _sample_smooth(smooth, mask, xy, margin: int) -> Samples:
-    """Sample an image that is smooth already; `margin` pixels of its border are not used."""
+    """Sample a linear image that is smooth already; `margin` pixels of its border are not used.
+
+    Display values are interpolated. Only the pixels around the samples are encoded: a large
+    photograph has many more.
+    """
     height, width = mask.shape
     position = (xy - 0.5).astype(np.float32)
     inside = (
@@ -87,24 +83,23 @@ def _sample_smooth(smooth, mask, xy, margin: int) -> Samples:
         & (position[:, 1] <= height - 1 - margin)
     )
     safe = np.where(inside[:, None], position, 1.0).astype(np.float32)
-    left, top = np.floor(safe).astype(int).T
-    fx, fy = (safe - np.floor(safe)).T
+    corner = np.floor(safe).astype(int)
+    part = safe - corner.astype(np.float32)
+    share_x, share_y = (np.stack([1 - f, f], 1) for f in part.T)
+    around = np.arange(-1, 3)
+    columns = np.clip(corner[:, :1] + around, 0, width - 1)[:, None, :]
+    rows = np.clip(corner[:, 1:] + around, 0, height - 1)[:, :, None]
 
-    def at(image):
-        f = fx[:, None] if image.ndim == 3 else fx
-        g = fy[:, None] if image.ndim == 3 else fy
-        upper = image[top, left] * (1 - f) + image[top, left + 1] * f
-        lower = image[top + 1, left] * (1 - f) + image[top + 1, left + 1] * f
-        return upper * (1 - g) + lower * g
+    def between(values):
+        """Interpolate values at the four pixels about each position."""
+        return np.einsum("oi,oj,oij...->o...", share_y, share_x, values)
 
-    slope_x = 0.5 * (smooth[:, 2:] - smooth[:, :-2])
-    slope_y = 0.5 * (smooth[2:] - smooth[:-2])
-    steepness = np.zeros_like(smooth)
-    steepness[:, 1:-1] += slope_x**2
-    steepness[1:-1] += slope_y**2
-    spread = POSITION_DEVIATION * np.sqrt(at(steepness))
-    valid = inside & (at(mask) > 0.99)
-    return Samples(at(smooth).astype(np.float32), spread.astype(np.float32), valid)
+    shown = srgb_encode(smooth[rows, columns])
+    slope_x = 0.5 * (shown[:, 1:3, 2:] - shown[:, 1:3, :2])
+    slope_y = 0.5 * (shown[:, 2:, 1:3] - shown[:, :2, 1:3])
+    spread = POSITION_DEVIATION * np.sqrt(between(slope_x**2 + slope_y**2))
+    valid = inside & (between(mask[rows, columns][:, 1:3, 1:3]) > 0.99)
+    return Samples(between(shown[:, 1:3, 1:3]), spread, valid)
 
 
 def camera_rows(scene: Scene) -> Int[np.ndarray, " v"]:
@@ -155,27 +150,26 @@ def point_colors(
         uncertainty: of positions, in units of POSITION_DEVIATION.
         on_view: progress: views done, views in all.
     """
-    sizes, widths = [], []
+    footprints = []
     for index, mine in zip(scene.train_indices, points, strict=True):
-        view = scene.views[index]
-        height, width = store.get(index, 1)[1].shape
-        sizes.append(np.array([width / view.width, height / view.height]))
-        z = scene.points[mine] @ view.viewmat[2, :3] + view.viewmat[2, 3]
-        z = np.where(z > 0, z, np.inf)  # a track behind its camera is wrong, not close
-        widths.append(z / np.mean(np.diag(view.K)[:2] * sizes[-1]))
+        z = project_points(scene.points[mine], scene.views[index])[1]
+        K = store.camera(index)[1]
+        # A track behind its camera is wrong, not close.
+        footprints.append(np.where(z > 0, z, np.inf) / np.mean(np.diag(K)[:2]))
     finest = np.full(len(scene.points), np.inf)
-    for mine, width in zip(points, widths, strict=True):
-        np.minimum.at(finest, mine, width)
-    keep = [w <= COARSEST * finest[mine] for mine, w in zip(points, widths, strict=True)]
+    for mine, footprint in zip(points, footprints, strict=True):
+        np.minimum.at(finest, mine, footprint)
+    keep = [f <= COARSEST * finest[mine] for mine, f in zip(points, footprints, strict=True)]
     coarsest = np.zeros(len(scene.points))
-    for mine, width, kept in zip(points, widths, keep, strict=True):
-        np.maximum.at(coarsest, mine[kept], width[kept])
+    for mine, footprint, kept in zip(points, footprints, keep, strict=True):
+        np.maximum.at(coarsest, mine[kept], footprint[kept])
     views, seen, colors, spreads = [], [], [], []
-    for row, index in enumerate(scene.train_indices):
-        mine = points[row][keep[row]]
+    for row, (index, kept) in enumerate(zip(scene.train_indices, keep, strict=True)):
+        mine = points[row][kept]
         if len(mine):
-            wider = coarsest[mine] / widths[row][keep[row]]
-            found = sample(*store.get(index, 1), xy[row][keep[row]] * sizes[row], wider)
+            view, (_, _, width, height) = scene.views[index], store.camera(index)
+            there = xy[row][kept] * [width / view.width, height / view.height]
+            found = sample(*store.get(index), there, coarsest[mine] / footprints[row][kept])
             views.append(np.full(int(found.valid.sum()), row))
             seen.append(mine[found.valid])
             colors.append(found.colors[found.valid])

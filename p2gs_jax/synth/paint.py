@@ -18,10 +18,10 @@ from p2gs_jax.synth.texture import (
     as_column,
     cell_offset,
     detail,
-    gradient_noise,
     hash1,
     slab,
     smooth,
+    value_noise,
 )
 from p2gs_jax.synth.town import CROSS_STREET, ROAD_HALF_WIDTH, Material, Town
 from p2gs_jax.synth.vehicles import car_body, car_glass, wheel
@@ -37,9 +37,7 @@ def sky(town: Town, view: Float[Array, "3 r"], *, clouds: bool) -> Float[Array, 
     reach = 1.0 / (up + 0.10)
     x = as_column((0.6, 1.4, 3.3)) * (view[0] * reach)
     y = as_column((1.3, 2.6, 5.3)) * (view[1] * reach)
-    octaves = gradient_noise(x, y, jnp.zeros_like(x), tuple(town.seed + 11 + k for k in range(3)))[
-        0
-    ]
+    octaves = value_noise(x, y, jnp.zeros_like(x), tuple(town.seed + 11 + k for k in range(3)))[0]
     shape = 0.50 * octaves[0] + 0.32 * octaves[1] + 0.18 * octaves[2]
     cover = smooth(0.02, 0.42, shape) * smooth(0.0, 0.10, up)
     white = as_column((2.9, 2.75, 2.55)) * (0.62 + 0.38 * smooth(0.1, 0.5, shape))
@@ -80,7 +78,7 @@ def paint(
     )[material]
     waves = jnp.stack([fine_wave, 4.0 * fine_wave, coarse_wave])
     x, y, z = p[:, None] / waves
-    noise = gradient_noise(x, y, z, (town.seed + 1, town.seed + 2, town.seed + 3))
+    noise = value_noise(x, y, z, (town.seed + 1, town.seed + 2, town.seed + 3))
     noise = noise * detail(footprint, waves)
     fine, coarse = 0.7 * noise[:, 0] + 0.55 * noise[:, 1], noise[:, 2]
     point = Point(

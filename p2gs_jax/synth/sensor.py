@@ -13,6 +13,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from p2gs_jax.photometry.srgb import srgb_encode
+
 Curve = Literal["srgb", "power", "filmic"]
 ISO_REFERENCE = 8
 ISO_MINIMUM = 1
@@ -87,18 +89,6 @@ def draw_shots(sensor: Sensor, frames: int, cameras: int, seed: int) -> Shots:
     return Shots(
         iso, iso / ISO_REFERENCE * np.exp2(stops.ravel()), np.repeat(balance, frames, axis=0)
     )
-
-
-def srgb_encode(linear: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    """Return the sRGB encoding (IEC 61966-2-1) of linear values, clipped to [0, 1]."""
-    x = np.clip(linear, 0.0, 1.0)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)
-
-
-def srgb_decode(encoded: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    """Return linear values of sRGB-encoded values in [0, 1]."""
-    y = np.asarray(encoded)
-    return np.where(y <= 0.04045, y / 12.92, ((np.maximum(y, 0.0) + 0.055) / 1.055) ** 2.4)
 
 
 def encode(exposed: Float[np.ndarray, "..."], curve: Curve) -> Float[np.ndarray, "..."]:

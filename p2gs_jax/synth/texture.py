@@ -61,7 +61,7 @@ def hash3(x: Array, y: Array, z: Array, seed: int) -> Array:
     )
 
 
-def gradient_noise(x: Array, y: Array, z: Array, seeds: tuple[int, ...]) -> Array:
+def value_noise(x: Array, y: Array, z: Array, seeds: tuple[int, ...]) -> Array:
     """Return smooth value noise, about [-1, 1], wavelength about 2 cells.
 
     Args:

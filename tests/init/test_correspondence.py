@@ -16,10 +16,10 @@ from p2gs_jax.init.correspondence import (
     unoccluded,
 )
 from p2gs_jax.init.observations import sample, track_colors
+from p2gs_jax.photometry.srgb import srgb_decode, srgb_encode
 from p2gs_jax.prepare import calibrate_observations
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.synth.sensor import srgb_decode, srgb_encode
 from p2gs_jax.synth.write import write_street
 from p2gs_jax.types import Scene, Tracks, View
 
@@ -74,21 +74,26 @@ def test_exposures_without_tracks(street, tmp_path):
     assert exposure_error(np.exp(solved.log_exposures), expected)["ev"] < 0.03
 
 
+GREY_K = np.array([[50.0, 0, 30], [0, 50, 20], [0, 0, 1]], np.float32)
+
+
 class Grey:
     """Photographs of one grey."""
 
-    def get(self, index, shrink):
+    def get(self, index):
         return np.full((40, 60, 3), 0.5, np.float32), np.ones((40, 60), np.float32)
+
+    def camera(self, index):
+        return np.eye(4, dtype=np.float32), GREY_K, 60, 40
 
 
 def seen_from(distances):
     """Return a scene of one point and a view at every distance from it; behind where negative."""
-    K = np.array([[50.0, 0, 30], [0, 50, 20], [0, 0, 1]], np.float32)
     views = []
     for k, distance in enumerate(distances):
         viewmat = np.eye(4, dtype=np.float32)
         viewmat[2, 3] = distance
-        views.append(View(f"{k}.png", Path(f"{k}.png"), "0", viewmat, K, 60, 40))
+        views.append(View(f"{k}.png", Path(f"{k}.png"), "0", viewmat, GREY_K, 60, 40))
     count = len(distances)
     tracks = Tracks(np.arange(count), np.zeros(count, int), np.full((count, 2), 20.0, np.float32))
     points = np.zeros((1, 3), np.float32)

@@ -11,8 +11,8 @@ from p2gs_jax.init.observations import overlapping_views, sample, sample_pairs
 from p2gs_jax.init.seeds import gaussians_from_points, scene_extent, subsample
 from p2gs_jax.init.shell import find_shell
 from p2gs_jax.photometry.observations import Observations
+from p2gs_jax.photometry.srgb import srgb_encode
 from p2gs_jax.render import view_radiance
-from p2gs_jax.synth.sensor import srgb_encode
 from p2gs_jax.types import Camera, View
 
 

@@ -6,8 +6,9 @@ import json
 import numpy as np
 import pytest
 
+from p2gs_jax.photometry.srgb import srgb_decode
 from p2gs_jax.synth.exposures import read_true_exposures
-from p2gs_jax.synth.sensor import Sensor, draw_shots, encode, photograph, srgb_decode, vignette
+from p2gs_jax.synth.sensor import Sensor, draw_shots, encode, photograph, vignette
 from p2gs_jax.synth.town import UNDERPASS, Material, build_town
 from p2gs_jax.synth.write import write_street
 
