@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -39,6 +39,7 @@ def optimise(
     reporter: Reporter,
     *,
     resume: bool,
+    validation: Sequence[int] = (),
     spent_s: float = 0.0,
     reserve_s: float = 0.0,
 ) -> TrainResult:
@@ -50,6 +51,7 @@ def optimise(
         cfg: everything.
         reporter: receives progress.
         resume: continue from the newest checkpoint.
+        validation: training views that automatic growth is judged by.
         spent_s: seconds of the budget that are already gone.
         reserve_s: seconds of the budget to keep for evaluation and files.
     """
@@ -64,7 +66,7 @@ def optimise(
         run_dir,
         on_log=reporter.log,
         on_message=reporter.message,
-        cameras=[prepared.scene.views[i].camera for i in prepared.scene.train_indices],
+        validation=validation,
         own_exposures=prepared.selection is not None,
     )
     alive = jnp.ones(prepared.params.gaussians.capacity, bool)
@@ -134,8 +136,9 @@ def fit(
     scene = load(scene_dir, run_dir, cfg, reporter)
     if lpips_weights is not None:
         lpips_weights.require_sizes(scene.views, cfg.data.max_width)
+    validation: tuple[int, ...] = ()
     if cfg.densify.max_gaussians == "auto":
-        pick_validation([scene.views[i].camera for i in scene.train_indices])
+        validation = pick_validation([scene.views[i].camera for i in scene.train_indices])
     truth = load_reference(reference, scene, cfg) if reference is not None else None
     write_json(
         run_dir / "config.json",
@@ -153,6 +156,7 @@ def fit(
         cfg,
         reporter,
         resume=resume,
+        validation=validation,
         spent_s=time.monotonic() - begin,
         reserve_s=_finish_estimate(scene, cfg, lpips_weights, truth is not None),
     )

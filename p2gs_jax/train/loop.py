@@ -47,7 +47,7 @@ from p2gs_jax.train.state import (
     replace_gaussians,
 )
 from p2gs_jax.train.step import Controls, StepReport, finite_names, make_step
-from p2gs_jax.train.validation import make_judge, pick_validation
+from p2gs_jax.train.validation import make_judge
 from p2gs_jax.train.views import TrainingViews
 from p2gs_jax.types import Params
 
@@ -102,8 +102,8 @@ class Trainer:
         run_dir: where `log.jsonl` and `checkpoints/` go.
         on_log: called with every log record.
         on_message: called with everything the user must know.
-        cameras: the physical camera of every training view, for automatic growth; None: one.
-        own_exposures: the views' exposures come from tracks, so automatic growth may judge by them.
+        validation: training views that automatic growth is judged by.
+        own_exposures: their exposures come from tracks, so they may be judged under these.
     """
 
     def __init__(
@@ -115,7 +115,7 @@ class Trainer:
         run_dir: Path,
         on_log: Callable[[LogRecord], None] = lambda record: None,
         on_message: Callable[[str], None] = lambda text: None,
-        cameras: Sequence[str] | None = None,
+        validation: Sequence[int] = (),
         own_exposures: bool = False,
     ):
         self.cfg, self.views, self.extent, self.pairs = cfg, views, extent, pairs
@@ -138,8 +138,7 @@ class Trainer:
         self._trial: _Trial | None = None
         self.auto = cfg.densify.max_gaussians == "auto"
         if self.auto:
-            growth.check_method(cfg.densify)
-            self.validation = pick_validation(cameras or ["0"] * len(views))
+            self.validation = validation
             self.growth_window = growth.window(cfg.densify, self.levels)
             self.judge = make_judge(views, self.validation, cfg, own_exposures=own_exposures)
 

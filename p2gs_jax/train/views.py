@@ -34,8 +34,8 @@ class TrainingViews:
         self.rows = tuple(rows)
         self.seed = seed
         self.overlaps = overlaps
-        self._without: tuple[int, ...] = ()
         self._orders: dict[int, np.ndarray] = {}
+        self.leave_out(())
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -46,14 +46,15 @@ class TrainingViews:
         Args:
             without: which, as rows in `Photometry`; none takes all back in.
         """
-        self._without, self._orders = tuple(without), {}
+        self._kept = np.setdiff1d(np.arange(len(self.rows)), np.asarray(without, int))
+        self._orders = {}
 
     def index_at(self, step: int) -> int:
         """Return the row in `Photometry` of the view of a step; every epoch is a permutation."""
-        epoch, position = divmod(step, len(self.rows) - len(self._without))
+        epoch, position = divmod(step, len(self._kept))
         if epoch not in self._orders:
             order = np.random.default_rng((self.seed, epoch)).permutation(len(self.rows))
-            self._orders = {epoch: order[~np.isin(order, self._without)]}
+            self._orders = {epoch: order[np.isin(order, self._kept)]}
         return int(self._orders[epoch][position])
 
     def partner_at(self, step: int) -> int:
@@ -64,10 +65,10 @@ class TrainingViews:
         rng, index = np.random.default_rng((self.seed, 1, step)), self.index_at(step)
         if self.overlaps is not None:
             overlapping = self.overlaps[index]
-            overlapping = overlapping[~np.isin(overlapping, self._without)]
+            overlapping = overlapping[np.isin(overlapping, self._kept)]
             if len(overlapping):
                 return int(rng.choice(overlapping))
-        kept = np.setdiff1d(np.arange(len(self.rows)), self._without)
+        kept = self._kept
         place = int(np.searchsorted(kept, index)) + int(rng.integers(1, max(len(kept), 2)))
         return int(kept[place % len(kept)])
 
