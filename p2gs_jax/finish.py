@@ -8,7 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import cv2
-import jax.numpy as jnp
 import numpy as np
 
 from p2gs_jax.config import FitConfig
@@ -23,7 +22,7 @@ from p2gs_jax.export.ply import write_radiance, write_splats
 from p2gs_jax.export.png import write_png
 from p2gs_jax.export.summary import write_summary
 from p2gs_jax.numerics import LN2
-from p2gs_jax.photometry.formation import display, formation
+from p2gs_jax.photometry.look import Look, develop
 from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.prepare import Prepared
 from p2gs_jax.progress import Reporter
@@ -94,17 +93,6 @@ def find_radiance(scene: Scene, store: ImageStore) -> Truth | None:
     return radiance
 
 
-def tone_function(exposure: float, gamma: float, cfg: FitConfig, appearance=None):
-    """Return linear radiance -> display values for one exposure and gamma, in numpy."""
-
-    def tone(linear):
-        e, g = jnp.float32(exposure), jnp.float32(gamma)
-        ldr = formation(jnp.asarray(linear), e, g, cfg.photometry, appearance)
-        return np.asarray(display(ldr))
-
-    return tone
-
-
 def write_models(params: Params, run_dir: Path, cfg: FitConfig) -> None:
     """Write `splats.ply` (display colours) and `radiance.ply` (linear)."""
     mean = mean_parameters(params.photometry)
@@ -112,11 +100,12 @@ def write_models(params: Params, run_dir: Path, cfg: FitConfig) -> None:
     # A bilateral grid depends on the place in the image: splats cannot carry it.
     spatial = cfg.photometry.appearance == "bilateral"
     correction = None if spatial else params.mean_correction
+    look = Look(mean.exposure_geometric, mean.gamma, cfg.photometry, correction)
     write_splats(
         run_dir / "splats.ply",
         params.gaussians,
         alive,
-        tone=tone_function(mean.exposure_geometric, mean.gamma, cfg, correction),
+        tone=lambda linear: develop(linear, look),
         activation=cfg.render.radiance,
     )
     write_radiance(
@@ -302,7 +291,7 @@ def _write_summary(
     cfg: FitConfig,
     true_ev: np.ndarray | None,
 ) -> None:
-    common = tone_function(mean.exposure_geometric, mean.gamma, cfg, params.mean_correction)
+    common = Look(mean.exposure_geometric, mean.gamma, cfg.photometry, params.mean_correction)
     views = [shown[i] for i in picks]
     train = [scene.views[i] for i in scene.train_indices]
     exif = [v.exif_ev for v in train]
@@ -310,7 +299,7 @@ def _write_summary(
         path,
         photographs=[v.photograph for v in views],
         rendered=[v.ldr for v in views],
-        linear_tonemapped=[common(v.linear) for v in views],
+        linear_tonemapped=[develop(v.linear, common) for v in views],
         names=[f"{scene.views[v.index].name} ({scene.views[v.index].split})" for v in views],
         exposures_ev=np.log2(np.asarray(params.photometry.exposures)),
         cameras=[v.camera for v in train],

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool
 
 from p2gs_jax.config import FitConfig, PhotometryConfig, from_dict
 from p2gs_jax.errors import UserError
+from p2gs_jax.evaluate.evaluate import MeanParameters, mean_parameters
 from p2gs_jax.export.photometry_json import PhotometryFile, read_photometry
 from p2gs_jax.export.ply import read_ply
 from p2gs_jax.finish import APPEARANCE
 from p2gs_jax.photometry.appearance import identity
+from p2gs_jax.photometry.look import Look
 from p2gs_jax.scene import load_scene
 from p2gs_jax.types import GAMMA_SRGB, Params, Photometry, Scene
 
@@ -30,6 +32,8 @@ class Run:
         cfg: how it was made.
         scene: what it was fitted to.
         reference: photographs under one common exposure, or None.
+        photometry: `photometry.json`, with what `params` does not hold: standard errors, EXIF,
+            exposures fitted to held-out photographs.
     """
 
     folder: Path
@@ -37,6 +41,48 @@ class Run:
     cfg: FitConfig
     scene: Scene
     reference: Path | None
+    photometry: PhotometryFile
+
+    @property
+    def alive(self) -> Bool[Array, " n"]:
+        """All Gaussians: a finished run keeps no empty slots."""
+        return jnp.ones(self.params.gaussians.capacity, bool)
+
+    @property
+    def mean(self) -> MeanParameters:
+        """Exposure and gamma of a view that has none of its own."""
+        return mean_parameters(self.params.photometry)
+
+    def own_look(self, index: int) -> Look:
+        """Return how a view was taken; a held-out view's exposure is that fitted to its photograph.
+
+        Args:
+            index: row in `scene.views`.
+        """
+        if index in self.scene.train_indices:
+            row = self.scene.train_indices.index(index)
+            p = self.params.photometry
+            e, g = float(p.exposures[row]), float(p.gammas[row])
+            return Look(e, g, self.cfg.photometry, self.params.correction(row))
+        name = self.scene.views[index].name
+        fitted = {v["image"]: v["exposure_fitted"] for v in self.photometry["views"]}.get(name)
+        if fitted is None:
+            return self.common_look()
+        return replace(self.common_look(), exposure=fitted)
+
+    def common_look(self, exposure_ev: float = 0.0) -> Look:
+        """Return one look for all views.
+
+        Args:
+            exposure_ev: stops from the geometric mean of the training views' exposures.
+        """
+        mean = self.mean
+        return Look(
+            mean.exposure_geometric * 2**exposure_ev,
+            mean.gamma,
+            self.cfg.photometry,
+            self.params.mean_correction,
+        )
 
 
 def resolved(cfg: PhotometryConfig, saved: PhotometryFile) -> PhotometryConfig:
@@ -48,7 +94,7 @@ def resolved(cfg: PhotometryConfig, saved: PhotometryFile) -> PhotometryConfig:
     curve, model = saved["curve"], saved["model"]
     try:
         spline = curve.get("spline")
-        return dataclasses.replace(
+        return replace(
             cfg,
             select=False,
             model=model,  # pyright: ignore[reportArgumentType]
@@ -89,7 +135,7 @@ def load_run(folder: Path) -> Run:
     scene = load_scene(Path(saved["scene"]), cfg.data, folder / "cache", lambda text: None)
     gaussians = read_ply(folder / "radiance.ply")
     photometry_file = read_photometry(folder / "photometry.json")
-    cfg = dataclasses.replace(cfg, photometry=resolved(cfg.photometry, photometry_file))
+    cfg = replace(cfg, photometry=resolved(cfg.photometry, photometry_file))
     views = {v["image"]: v for v in photometry_file["views"]}
     train = [views.get(scene.views[i].name) for i in scene.train_indices]
     if any(v is None or v["exposure"] is None for v in train):
@@ -114,6 +160,7 @@ def load_run(folder: Path) -> Run:
         cfg,
         scene,
         None if reference is None else Path(reference),
+        photometry_file,
     )
 
 

@@ -6,9 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from p2gs_jax.cli import main, parse_duration
+from p2gs_jax.cli import main
 from p2gs_jax.config import preset, to_dict
 from p2gs_jax.errors import UserError
+from p2gs_jax.options.parse import parse_duration
 from p2gs_jax.pipeline import check_run_dir
 
 

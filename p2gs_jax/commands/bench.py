@@ -1,0 +1,35 @@
+"""`p2gs-jax bench`."""
+
+from __future__ import annotations
+
+from p2gs_jax.bench import run as benches
+from p2gs_jax.errors import UserError
+from p2gs_jax.options.experiments import Bench
+from p2gs_jax.progress import TerminalReporter
+
+
+def run(options: Bench) -> int:
+    """Run benches, print their tables; 1 where something is worse than the baseline allows."""
+    parts, baseline, write_baseline = options.parts, options.baseline, options.write_baseline
+    for name in parts:
+        if name not in benches.PARTS:
+            raise UserError(
+                f"there is no bench {name!r}.", fix=f"choose {', '.join(benches.PARTS)}"
+            )
+    chosen: tuple[benches.Part, ...] = tuple(p for p in benches.PARTS if not parts or p in parts)
+    if (baseline or write_baseline) and "speed_error" not in chosen:
+        raise UserError("a baseline concerns speed_error.", fix="name that part as well")
+    with TerminalReporter() as reporter:
+        text, complaints = benches.run(
+            chosen,
+            out=options.out,
+            quick=options.quick,
+            baseline=baseline,
+            write_baseline=write_baseline,
+            on_progress=reporter.stage,
+        )
+    print(text)
+    print(f"Results: {options.out}")
+    for complaint in complaints:
+        print(f"WORSE than {baseline}: {complaint}")
+    return 1 if complaints else 0

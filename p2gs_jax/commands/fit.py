@@ -1,0 +1,24 @@
+"""`p2gs-jax fit`."""
+
+from __future__ import annotations
+
+from p2gs_jax.commands.console import print_metrics
+from p2gs_jax.options.fit import Fit, resolve_fit
+from p2gs_jax.pipeline import fit
+from p2gs_jax.progress import TerminalReporter
+
+
+def run(options: Fit) -> int:
+    """Fit a scene; print where the results are and how good they are."""
+    o = options
+    with TerminalReporter() as reporter:
+        result = fit(
+            o.scene,
+            o.out,
+            resolve_fit(o),
+            reference=o.reference,
+            resume=o.resume,
+            reporter=reporter,
+        )
+    print_metrics(result.metrics, o.out)
+    return 0

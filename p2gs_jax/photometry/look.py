@@ -1,0 +1,67 @@
+"""From radiance to a picture: an exposure, a gamma, a tone curve, and what else a view does."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Float32
+
+from p2gs_jax.config import PhotometryConfig
+from p2gs_jax.photometry.formation import display, formation
+
+Curve = Literal["power", "srgb", "spline", "linear"]
+CURVES: tuple[Curve, ...] = get_args(Curve)
+
+
+@dataclass(frozen=True)
+class Look:
+    """How radiance is shown.
+
+    Attributes:
+        exposure: e > 0, in the run's gauge.
+        gamma: > 0.
+        formation: base curve, pivot, clamping, kind of correction.
+        correction: of display values (photometry/appearance.py), or None.
+    """
+
+    exposure: float
+    gamma: float
+    formation: PhotometryConfig
+    correction: Float[Array, "..."] | None = None
+
+    def with_curve(self, curve: Curve) -> Look:
+        """Return the look under another base curve; corrections belong to the old one and go.
+
+        Raises:
+            ValueError: `spline` where the run has none.
+        """
+        if curve == self.formation.curve:
+            return self
+        if curve == "spline" and self.formation.spline is None:
+            raise ValueError("the run has no spline")
+        return replace(self, formation=replace(self.formation, curve=curve), correction=None)
+
+
+def develop(
+    linear: Float[Array, "... 3"] | Float[np.ndarray, "... 3"], look: Look
+) -> Float32[np.ndarray, "... 3"]:
+    """Return display values in [0, 1] of linear radiance.
+
+    Exposure, gamma and correction are traced: changing them compiles nothing.
+
+    Args:
+        linear: radiance; an image where there is a correction.
+        look: how to show it.
+    """
+    e, g = jnp.float32(look.exposure), jnp.float32(look.gamma)
+    return np.asarray(_develop(jnp.asarray(linear), e, g, look.correction, look.formation))
+
+
+@functools.partial(jax.jit, static_argnames="cfg")
+def _develop(linear, exposure, gamma, correction, cfg: PhotometryConfig):
+    return display(formation(linear, exposure, gamma, cfg, correction))
