@@ -26,3 +26,22 @@ def shared_data():
         return folder
 
     return find
+
+
+@pytest.fixture(scope="session")
+def finished_run(tmp_path_factory) -> Path:
+    """Return the folder of a small finished `robust` run; copy it before writing to it."""
+    from tiny_scene import make_scene
+
+    from p2gs_jax.cli import main
+
+    root = tmp_path_factory.mktemp("finished")
+    argv = [
+        *("fit", str(make_scene(root / "scene")), "--out", str(root / "run")),
+        *("--steps", "60", "--train.coarse-to-fine", "--test-every", "3"),
+        *("--densify.max-gaussians", "400", "--render.sh-degree", "1", "--init.shell", "off"),
+    ]
+    with pytest.raises(SystemExit) as stop:
+        main(argv)
+    assert stop.value.code == 0
+    return root / "run"

@@ -1,0 +1,100 @@
+"""Pictures of what a display cannot show: luminance in stops, clipping, depth.
+
+All colour maps rise evenly in lightness, so that they read without colour as well.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import matplotlib
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+# Weights of BT.709 primaries in luminance (the linear radiance's primaries).
+BT709 = (0.2126, 0.7152, 0.0722)
+STOPS = (-6.0, 6.0)
+STOPS_MAP, DEPTH_MAP = "viridis", "cividis"
+OVER, UNDER = (1.0, 0.15, 0.15), (0.15, 0.35, 1.0)
+STRIPE = 6
+
+
+class Clipping(NamedTuple):
+    """Where an image leaves the range of a display."""
+
+    over: Bool[np.ndarray, "h w"]
+    under: Bool[np.ndarray, "h w"]
+
+
+def luminance(linear: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "..."]:
+    """Return the luminance of linear BT.709 radiance."""
+    return np.asarray(linear) @ np.asarray(BT709, np.float32)
+
+
+def stops(
+    linear: Float[np.ndarray, "... 3"], middle: float, floor: float = 1e-12
+) -> Float[np.ndarray, "..."]:
+    """Return luminance in stops above `middle`, a luminance > 0."""
+    return np.log2(np.maximum(luminance(linear), floor) / middle)
+
+
+def false_color(
+    linear: Float[np.ndarray, "h w 3"], middle: float, limits: tuple[float, float] = STOPS
+) -> Float32[np.ndarray, "h w 3"]:
+    """Return luminance as colour, one step of the map for each whole stop.
+
+    Args:
+        linear: radiance.
+        middle: luminance shown as 0 stops, in the units of `linear`.
+        limits: stops at the ends of the map; beyond them it stays at its ends.
+    """
+    low, high = limits
+    whole = np.clip(np.floor(stops(linear, middle)), low, high - 1)
+    return _mapped((whole + 0.5 - low) / (high - low), STOPS_MAP)
+
+
+def clipping(ldr: Float[np.ndarray, "h w 3"]) -> Clipping:
+    """Return where any channel is at the top, and where all are at the bottom, of 8 bits."""
+    codes = np.rint(np.clip(ldr, 0, 1) * 255)
+    return Clipping(np.any(codes >= 255, axis=-1), np.all(codes <= 0, axis=-1))
+
+
+def clipping_overlay(ldr: Float[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
+    """Return the picture with overexposed pixels striped red one way, black ones blue the other."""
+    over, under = clipping(ldr)
+    rows, columns = np.indices(over.shape)
+    rising = (rows + columns) // STRIPE % 2 == 0
+    falling = (rows - columns) // STRIPE % 2 == 0
+    out = np.array(np.clip(ldr, 0, 1), np.float32)
+    out[over & rising] = OVER
+    out[under & falling] = UNDER
+    return out
+
+
+def depth_color(
+    depth: Float[np.ndarray, "h w"],
+    alpha: Float[np.ndarray, "h w"],
+    limits: tuple[float, float] | None = None,
+) -> Float32[np.ndarray, "h w 3"]:
+    """Return expected depth as colour, near bright, evenly in 1 / depth; black where there is none.
+
+    Args:
+        depth: alpha-weighted depth, scene units.
+        alpha: opacity.
+        limits: nearest and farthest depth; None takes the 1st and 99th percentile.
+    """
+    there = alpha > 0.5
+    inverse = np.where(there, alpha / np.maximum(depth, 1e-9), 0)
+    if limits is not None:
+        high, low = 1 / limits[0], 1 / limits[1]
+    elif there.any():
+        low, high = np.percentile(inverse[there], (1, 99))
+    else:
+        low, high = 0.0, 1.0
+    scaled = (inverse - low) / max(high - low, 1e-12)
+    return np.where(there[..., None], _mapped(scaled, DEPTH_MAP), 0).astype(np.float32)
+
+
+def _mapped(values: Float[np.ndarray, "h w"], name: str) -> Float32[np.ndarray, "h w 3"]:
+    table = matplotlib.colormaps[name](np.linspace(0, 1, 256))[:, :3].astype(np.float32)
+    return table[np.rint(np.clip(values, 0, 1) * 255).astype(int)]
