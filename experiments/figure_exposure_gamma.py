@@ -94,7 +94,7 @@ def main() -> None:
     names = [v.name for v in run.scene.views]
     held_out = run.scene.test_indices or run.scene.train_indices
     index = held_out[0] if own.view is None else names.index(own.view)
-    out = o.out / o.protocol.name / "figure_exposure_gamma.png"
+    out = o.folder / "figure_exposure_gamma.png"
     out.parent.mkdir(parents=True, exist_ok=True)
     measured = draw(run, index, out)
     payload = {"stamp": stamp(o, time.monotonic() - begin), "run": str(folder), **measured}

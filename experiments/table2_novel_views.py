@@ -11,13 +11,24 @@ from __future__ import annotations
 
 import time
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
-from towns import METHODS, NOT_BUILT, WIDE, Options, Runs, fit_all, methods, number, options, write
-from towns import table as markdown
+from matplotlib.figure import Figure
+from towns import (
+    ISO8,
+    METHODS,
+    NOT_BUILT,
+    WIDE,
+    Column,
+    Options,
+    Runs,
+    fit_all,
+    methods,
+    options,
+    save_plot,
+    table,
+    titles,
+    write,
+)
 
 # Table 2 of the paper (Waymo): SSIM, PSNR, LPIPS.
 PAPER = {
@@ -29,28 +40,23 @@ PAPER = {
 PROTOCOLS = {
     "mean": ("test", "averaged"),
     "fitted": ("test", "exposure_fitted"),
-    "ISO 8": ("reference", "scale_aligned", "test"),
+    "ISO 8": (*ISO8, "test"),
 }
-SCORES = (("ssim", 3), ("psnr", 2), ("lpips", 3))
+COLUMNS: tuple[Column, ...] = tuple(
+    (f"{label} {score}", (*path, score.lower()), digits)
+    for label, path in PROTOCOLS.items()
+    for score, digits in (("SSIM", 3), ("PSNR", 2), ("LPIPS", 3))
+)
+HEADER = ("method", *titles(COLUMNS), "paper (Waymo): SSIM / PSNR / LPIPS")
 
 
 def rows(runs: Runs) -> list[list[str]]:
-    return [
-        [
-            name,
-            *(
-                number(runs.mean(name, WIDE, *path, score), digits)
-                for path in PROTOCOLS.values()
-                for score, digits in SCORES
-            ),
-            PAPER.get(name, ""),
-        ]
-        for name in METHODS
-    ]
+    return [[name, *runs.cells(name, WIDE, COLUMNS), PAPER.get(name, "")] for name in METHODS]
 
 
 def plot(o: Options, runs: Runs) -> None:
-    figure, axis = plt.subplots(figsize=(8, 3.6), layout="constrained")
+    figure = Figure(figsize=(8, 3.6), layout="constrained")
+    axis = figure.subplots()
     places = np.arange(len(METHODS))
     for k, (label, path) in enumerate(PROTOCOLS.items()):
         values = [runs.mean(name, WIDE, *path, "psnr") for name in METHODS]
@@ -60,18 +66,15 @@ def plot(o: Options, runs: Runs) -> None:
     axis.set_yticklabels(METHODS)
     axis.invert_yaxis()
     figure.legend(loc="outside upper center", ncols=3, fontsize=8)
-    figure.savefig(o.out / o.protocol.name / "table2_novel_views.png", dpi=120)
-    plt.close(figure)
+    save_plot(o, "table2_novel_views", figure)
 
 
 def main() -> None:
     o = options(__doc__, "table2_novel_views")
     begin = time.monotonic()
     runs = fit_all(o, {WIDE: methods()})
-    names = {"ssim": "SSIM", "psnr": "PSNR", "lpips": "LPIPS"}
-    header = ("method", *(f"{p} {names[s]}" for p in PROTOCOLS for s, _ in SCORES))
-    text = markdown((*header, "paper (Waymo): SSIM / PSNR / LPIPS"), rows(runs))
-    write(o, "table2_novel_views", text + "\n" + NOT_BUILT + "\n", runs, begin)
+    text = table(HEADER, rows(runs)) + "\n" + NOT_BUILT + "\n"
+    write(o, "table2_novel_views", text, runs, begin)
     plot(o, runs)
 
 

@@ -11,25 +11,28 @@ paper does not have (one scale per run is fitted, since radiance has none of its
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
+from matplotlib.figure import Figure
 from towns import (
     CONSTANT,
+    EV_ERROR,
+    ISO8,
     METHODS,
     NARROW,
     NOT_BUILT,
     STD_NAMES,
     WIDE,
+    Column,
     Options,
     Runs,
     fit_all,
     methods,
     number,
     options,
+    save_plot,
     table,
+    titles,
     write,
 )
 
@@ -41,7 +44,28 @@ PAPER = {
     "3DGS + curve (as Luminance-GS)": {NARROW: (17.36, 16.99), WIDE: (11.43, 14.82)},
     "P2GS as printed": {NARROW: (23.76, 22.72), WIDE: (22.91, 21.77)},
 }
-ISO8 = ("reference", "scale_aligned")
+COLUMNS: tuple[Column, ...] = (
+    ("SSIM", ("train", "averaged", "ssim"), 3),
+    ("PSNR", ("train", "averaged", "psnr"), 2),
+    ("LPIPS", ("train", "averaged", "lpips"), 3),
+    ("novel SSIM", ("test", "averaged", "ssim"), 3),
+    ("novel PSNR", ("test", "averaged", "psnr"), 2),
+    ("novel LPIPS", ("test", "averaged", "lpips"), 3),
+    ("ISO 8 PSNR", (*ISO8, "train", "psnr"), 2),
+    ("ISO 8 novel PSNR", (*ISO8, "test", "psnr"), 2),
+    ("ISO 8 novel SSIM", (*ISO8, "test", "ssim"), 3),
+)
+HEADER = ("method", "trained on", *titles(COLUMNS), EV_ERROR[0], "paper (CARLA): PSNR / novel")
+# Title, ISO std before and after, where metrics.json has the PSNR.
+CHANGES = (
+    ("std 2 to 4", NARROW, WIDE, ("train", "averaged", "psnr")),
+    ("novel", NARROW, WIDE, ("test", "averaged", "psnr")),
+    ("std 2 to 4, ISO 8", NARROW, WIDE, (*ISO8, "train", "psnr")),
+    ("novel, ISO 8", NARROW, WIDE, (*ISO8, "test", "psnr")),
+    ("const to std 4, ISO 8", CONSTANT, WIDE, (*ISO8, "train", "psnr")),
+    ("novel, ISO 8", CONSTANT, WIDE, (*ISO8, "test", "psnr")),
+)
+CHANGE_HEADER = ("change of PSNR", *(c[0] for c in CHANGES), "paper: std 2 to 4 / novel")
 
 
 def wanted():
@@ -50,80 +74,42 @@ def wanted():
 
 
 def rows(runs: Runs) -> list[list[str]]:
-    out = []
-    for name in METHODS:
-        for std in (CONSTANT, NARROW, WIDE):
-            if (name, std) not in {(m, s) for m, s, _ in runs.metrics}:
-                continue
-
-            def cell(*path: str, digits: int = 2, name=name, std=std) -> str:
-                return number(runs.mean(name, std, *path), digits)
-
-            printed = PAPER.get(name, {}).get(std)
-            out.append(
-                [
-                    name,
-                    STD_NAMES[std],
-                    cell("train", "averaged", "ssim", digits=3),
-                    cell("train", "averaged", "psnr"),
-                    cell("train", "averaged", "lpips", digits=3),
-                    cell("test", "averaged", "ssim", digits=3),
-                    cell("test", "averaged", "psnr"),
-                    cell("test", "averaged", "lpips", digits=3),
-                    cell(*ISO8, "train", "psnr"),
-                    cell(*ISO8, "test", "psnr"),
-                    cell(*ISO8, "test", "ssim", digits=3),
-                    cell("ev", digits=4) if std and name[0] in "Pr" else "",
-                    "" if printed is None else f"{printed[0]:.2f} / {printed[1]:.2f}",
-                ]
-            )
-    return out
-
-
-HEADER = (
-    "method",
-    "trained on",
-    "SSIM",
-    "PSNR",
-    "LPIPS",
-    "novel SSIM",
-    "novel PSNR",
-    "novel LPIPS",
-    "ISO 8 PSNR",
-    "ISO 8 novel PSNR",
-    "ISO 8 novel SSIM",
-    "EV error",
-    "paper (CARLA): PSNR / novel",
-)
+    fitted = {(method, std) for method, std, _ in runs.metrics}
+    return [
+        [
+            name,
+            STD_NAMES[std],
+            *runs.cells(name, std, COLUMNS),
+            runs.ev_error(name, std),
+            _pair(PAPER.get(name, {}).get(std, ())),
+        ]
+        for name in METHODS
+        for std in (CONSTANT, NARROW, WIDE)
+        if (name, std) in fitted
+    ]
 
 
 def deltas(runs: Runs) -> list[list[str]]:
     out = []
     for name in MAIN:
-
-        def change(a: float, b: float, *path: str, name=name) -> str:
-            return number(runs.mean(name, b, *path) - runs.mean(name, a, *path), 2)
-
+        changes = [
+            runs.mean(name, after, *path) - runs.mean(name, before, *path)
+            for _, before, after, path in CHANGES
+        ]
         printed = PAPER.get(name)
-        out.append(
-            [
-                name,
-                change(NARROW, WIDE, "train", "averaged", "psnr"),
-                change(NARROW, WIDE, "test", "averaged", "psnr"),
-                change(NARROW, WIDE, *ISO8, "train", "psnr"),
-                change(NARROW, WIDE, *ISO8, "test", "psnr"),
-                change(CONSTANT, WIDE, *ISO8, "train", "psnr"),
-                change(CONSTANT, WIDE, *ISO8, "test", "psnr"),
-                ""
-                if printed is None
-                else " / ".join(f"{printed[WIDE][k] - printed[NARROW][k]:.2f}" for k in (0, 1)),
-            ]
-        )
+        pairs = () if printed is None else zip(printed[WIDE], printed[NARROW], strict=True)
+        losses = _pair(wide - narrow for wide, narrow in pairs)
+        out.append([name, *(number(change, 2) for change in changes), losses])
     return out
 
 
+def _pair(values: Iterable[float]) -> str:
+    return " / ".join(f"{v:.2f}" for v in values)
+
+
 def plot(o: Options, runs: Runs) -> None:
-    figure, axes = plt.subplots(1, 2, figsize=(9, 3.4), sharex=True, layout="constrained")
+    figure = Figure(figsize=(9, 3.4), layout="constrained")
+    axes = figure.subplots(1, 2, sharex=True)
     stds = (CONSTANT, NARROW, WIDE)
     for axis, path, title in (
         (axes[0], ("test", "averaged", "psnr"), "novel views, photographs, mean parameters"),
@@ -134,27 +120,14 @@ def plot(o: Options, runs: Runs) -> None:
         axis.set(title=title, xlabel="ISO standard deviation", ylabel="PSNR, dB", xticks=stds)
         axis.grid(alpha=0.3)
     axes[0].legend(fontsize=7)
-    figure.savefig(o.out / o.protocol.name / "table3_iso_robustness.png", dpi=120)
-    plt.close(figure)
+    save_plot(o, "table3_iso_robustness", figure)
 
 
 def main() -> None:
     o = options(__doc__, "table3_iso_robustness")
     begin = time.monotonic()
     runs = fit_all(o, wanted())
-    change = table(
-        (
-            "change of PSNR",
-            "std 2 to 4",
-            "novel",
-            "std 2 to 4, ISO 8",
-            "novel, ISO 8",
-            "const to std 4, ISO 8",
-            "novel, ISO 8",
-            "paper: std 2 to 4 / novel",
-        ),
-        deltas(runs),
-    )
+    change = table(CHANGE_HEADER, deltas(runs))
     text = table(HEADER, rows(runs)) + "\n" + change + "\n" + NOT_BUILT + "\n"
     write(o, "table3_iso_robustness", text, runs, begin)
     plot(o, runs)

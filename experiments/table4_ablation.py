@@ -10,12 +10,22 @@ from __future__ import annotations
 
 import time
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
-from towns import WIDE, Options, Runs, fit_all, number, options, table, write
+from matplotlib.figure import Figure
+from towns import (
+    EV_ERROR,
+    ISO8,
+    WIDE,
+    Column,
+    Options,
+    Runs,
+    fit_all,
+    options,
+    save_plot,
+    table,
+    titles,
+    write,
+)
 
 from p2gs_jax.config import FitConfig, preset
 from p2gs_jax.prepare import without_tracks
@@ -82,35 +92,29 @@ def variants() -> dict[str, FitConfig]:
     }
 
 
-COLUMNS = (
-    ("EV error", ("ev",), 4),
+COLUMNS: tuple[Column, ...] = (
+    EV_ERROR,
     ("radiance, stops", ("radiance", "stops_rms"), 3),
     ("own PSNR", ("train", "psnr"), 2),
     ("mean SSIM", ("train", "averaged", "ssim"), 3),
     ("mean PSNR", ("train", "averaged", "psnr"), 2),
     ("mean LPIPS", ("train", "averaged", "lpips"), 3),
-    ("ISO 8 PSNR", ("reference", "scale_aligned", "train", "psnr"), 2),
-    ("ISO 8 novel PSNR", ("reference", "scale_aligned", "test", "psnr"), 2),
-    ("ISO 8 novel SSIM", ("reference", "scale_aligned", "test", "ssim"), 3),
+    ("ISO 8 PSNR", (*ISO8, "train", "psnr"), 2),
+    ("ISO 8 novel PSNR", (*ISO8, "test", "psnr"), 2),
+    ("ISO 8 novel SSIM", (*ISO8, "test", "ssim"), 3),
 )
+HEADER = ("variant", *titles(COLUMNS), "paper (Waymo): PSNR")
 
 
 def rows(runs: Runs) -> list[list[str]]:
-    return [
-        [
-            name,
-            *(number(runs.mean(name, WIDE, *path), digits) for _, path, digits in COLUMNS),
-            PAPER.get(name, ""),
-        ]
-        for name in variants()
-    ]
+    return [[name, *runs.cells(name, WIDE, COLUMNS), PAPER.get(name, "")] for name in variants()]
 
 
 def plot(o: Options, runs: Runs) -> None:
     names = list(variants())
-    path = ("reference", "scale_aligned", "test", "psnr")
-    values = [runs.mean(name, WIDE, *path) for name in names]
-    figure, axis = plt.subplots(figsize=(8, 5), layout="constrained")
+    values = [runs.mean(name, WIDE, *ISO8, "test", "psnr") for name in names]
+    figure = Figure(figsize=(8, 5), layout="constrained")
+    axis = figure.subplots()
     colors = ["tab:green" if n.startswith("robust") else "tab:blue" for n in names]
     bars = axis.barh(np.arange(len(names)), values, color=colors)
     axis.bar_label(bars, fmt="%.2f", fontsize=7, padding=2)
@@ -118,16 +122,14 @@ def plot(o: Options, runs: Runs) -> None:
     axis.set_yticklabels(names, fontsize=7)
     axis.set_xlim(left=min(values) - 2)
     axis.invert_yaxis()
-    figure.savefig(o.out / o.protocol.name / "table4_ablation.png", dpi=120)
-    plt.close(figure)
+    save_plot(o, "table4_ablation", figure)
 
 
 def main() -> None:
     o = options(__doc__, "table4_ablation")
     begin = time.monotonic()
     runs = fit_all(o, {WIDE: variants()})
-    header = ("variant", *(c for c, _, _ in COLUMNS), "paper (Waymo): PSNR")
-    write(o, "table4_ablation", table(header, rows(runs)), runs, begin)
+    write(o, "table4_ablation", table(HEADER, rows(runs)), runs, begin)
     plot(o, runs)
 
 

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 import p2gs_jax
 from p2gs_jax.config import FitConfig, PresetName, to_dict
@@ -44,9 +45,14 @@ class Protocol:
     gaussians: int | None = 10_000
 
     @property
+    def data(self) -> str:
+        """Folder of its towns."""
+        return f"{self.width}x{image_height(self.width)}_{self.frames}x3"
+
+    @property
     def name(self) -> str:
-        """Folder of its data and runs."""
-        return f"{self.width}x{image_height(self.width)}_{self.frames}x3_{self.steps}"
+        """Folder of its runs and tables."""
+        return f"{self.data}_{self.steps}"
 
 
 FULL = Protocol()
@@ -63,9 +69,16 @@ METHODS: dict[str, PresetName] = {
     "P2GS, appendix weights": "paper_appendix",
     "robust (ours)": "robust",
 }
+WITH_EXPOSURES = frozenset({"P2GS as printed", "P2GS, appendix weights", "robust (ours)"})
 NOT_BUILT = """Not built here: Difix3D needs its diffusion weights; PVG, StreetGS, OmniRe and
 DeSIRE-GS are dynamic systems (these towns stand still). Luminance-GS itself learns curves per view
 with a network; the row here is its idea, a monotone curve per view, under our renderer."""
+
+# A column of a table: its title, where metrics.json has its value, digits shown.
+Column = tuple[str, tuple[str, ...], int]
+# Where metrics.json has the scores against photographs at one common exposure.
+ISO8 = ("reference", "scale_aligned")
+EV_ERROR: Column = ("EV error", ("ev",), 4)
 
 
 @dataclass(frozen=True)
@@ -77,6 +90,11 @@ class Options:
     max_parallel: int
     lpips_weights: str | None
     command: str
+
+    @property
+    def folder(self) -> Path:
+        """Where the protocol's runs and tables are."""
+        return self.out / self.protocol.name
 
 
 def options(description: str | None, name: str) -> Options:
@@ -106,8 +124,7 @@ def options(description: str | None, name: str) -> Options:
 def scene(o: Options, town: int, std: float) -> Path:
     """Return a town's folder; it is made where it does not exist."""
     p = o.protocol
-    data = f"{p.width}x{image_height(p.width)}_{p.frames}x3"
-    path = o.out / "towns" / data / f"town_{town}_iso{std:g}"
+    path = o.out / "towns" / p.data / f"town_{town}_iso{std:g}"
     if not path.exists():
         p2gs_jax.write_street(
             path,
@@ -160,6 +177,15 @@ class Runs:
         values = [v for v in found if v is not None]
         return float(np.mean(values)) if values else float("nan")
 
+    def cells(self, method: str, std: float, columns: Sequence[Column]) -> list[str]:
+        """Return a method's means in these columns."""
+        return [number(self.mean(method, std, *path), digits) for _, path, digits in columns]
+
+    def ev_error(self, method: str, std: float) -> str:
+        """Return the cell of EV_ERROR; empty without exposures or without a spread of ISO."""
+        known = std != CONSTANT and method in WITH_EXPOSURES
+        return self.cells(method, std, [EV_ERROR])[0] if known else ""
+
 
 def fit_all(o: Options, wanted: Mapping[float, Mapping[str, FitConfig]]) -> Runs:
     """Fit every method of every ISO std to every town; finished fits are kept.
@@ -176,7 +202,7 @@ def fit_all(o: Options, wanted: Mapping[float, Mapping[str, FitConfig]]) -> Runs
             used |= {name: to_dict(cfg) for name, cfg in under.items()}
             result = sweep(
                 street,
-                o.out / o.protocol.name / street.name,
+                o.folder / street.name,
                 under,
                 reference=street / "reference",
                 max_parallel=o.max_parallel,
@@ -202,6 +228,11 @@ def _at(values: Any, path: Sequence[str]) -> float | None:
 def number(value: float, digits: int) -> str:
     """Return a cell; n/a where there is no value."""
     return "n/a" if not np.isfinite(value) else f"{value:.{digits}f}"
+
+
+def titles(columns: Sequence[Column]) -> tuple[str, ...]:
+    """Return what the header says of these columns."""
+    return tuple(title for title, _, _ in columns)
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -236,14 +267,13 @@ def write(
     said = stamp(o, time.monotonic() - begin)
     if runs.failures:
         markdown += "\nNot finished:\n\n" + "".join(f"- {line}\n" for line in runs.failures)
-    folder = o.out / o.protocol.name
-    folder.mkdir(parents=True, exist_ok=True)
+    o.folder.mkdir(parents=True, exist_ok=True)
     rows = [
         {"method": m, "iso_std": s, "town": t, "run": str(runs.folders[m, s, t]), **_scalars(v)}
         for (m, s, t), v in runs.metrics.items()
     ]
     payload = {"stamp": said, "rows": rows, "configs": runs.configs, **(extra or {})}
-    (folder / f"{name}.json").write_text(json.dumps(payload, indent=1) + "\n")
+    (o.folder / f"{name}.json").write_text(json.dumps(payload, indent=1) + "\n")
     p = o.protocol
     budget = "" if p.gaussians is None else f", at most {p.gaussians} Gaussians"
     foot = (
@@ -251,8 +281,13 @@ def write(
         f"{p.width}x{image_height(p.width)} each, {p.steps} steps{budget}. "
         f"`{said['command']}`, {said['date']}, commit {said['commit']}.\n"
     )
-    (folder / f"{name}.md").write_text(markdown + foot)
+    (o.folder / f"{name}.md").write_text(markdown + foot)
     print(markdown + foot)
+
+
+def save_plot(o: Options, name: str, figure: Figure) -> None:
+    """Write a table's plot beside it."""
+    figure.savefig(o.folder / f"{name}.png", dpi=120)
 
 
 def _scalars(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -10,11 +10,21 @@ from __future__ import annotations
 import dataclasses
 import time
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-from towns import WIDE, Options, Runs, fit_all, number, options, table, write
+from matplotlib.figure import Figure
+from towns import (
+    EV_ERROR,
+    ISO8,
+    WIDE,
+    Column,
+    Options,
+    Runs,
+    fit_all,
+    options,
+    save_plot,
+    table,
+    titles,
+    write,
+)
 
 from p2gs_jax.config import FitConfig, preset
 from p2gs_jax.photometry.solution import LADDER
@@ -28,13 +38,9 @@ AUTO = "Gaussians: auto"
 def variants(o: Options) -> dict[str, FitConfig]:
     """Return the three ladders, each about robust as it is."""
     robust = preset("robust")
-    seeds = o.protocol.points
     counts = {
-        f"Gaussians: {int(f * seeds)}": {
-            "densify.max_gaussians": int(f * seeds),
-            "init.max_seeds": min(int(f * seeds), 200_000),
-        }
-        for f in FACTORS
+        f"Gaussians: {n}": {"densify.max_gaussians": n, "init.max_seeds": n}
+        for n in (int(f * o.protocol.points) for f in FACTORS)
     }
     degrees = {f"SH degree {d}": {"render.sh_degree": d} for d in DEGREES}
     models = {
@@ -46,27 +52,26 @@ def variants(o: Options) -> dict[str, FitConfig]:
     return {name: with_fields(robust, fields) for name, fields in ladders.items()}
 
 
-COLUMNS = (
+COLUMNS: tuple[Column, ...] = (
     ("Gaussians", ("counts", "gaussians"), 0),
     ("seconds", ("seconds", "optimisation"), 0),
     ("own PSNR", ("train", "psnr"), 2),
     ("novel PSNR, exposure fitted", ("test", "exposure_fitted", "psnr"), 2),
-    ("ISO 8 PSNR", ("reference", "scale_aligned", "train", "psnr"), 2),
-    ("ISO 8 novel PSNR", ("reference", "scale_aligned", "test", "psnr"), 2),
+    ("ISO 8 PSNR", (*ISO8, "train", "psnr"), 2),
+    ("ISO 8 novel PSNR", (*ISO8, "test", "psnr"), 2),
     ("radiance, stops", ("radiance", "stops_rms"), 3),
-    ("EV error", ("ev",), 4),
+    EV_ERROR,
 )
+HEADER = ("", *titles(COLUMNS))
 
 
 def rows(runs: Runs, names: list[str]) -> list[list[str]]:
-    return [
-        [name, *(number(runs.mean(name, WIDE, *path), digits) for _, path, digits in COLUMNS)]
-        for name in names
-    ]
+    return [[name, *runs.cells(name, WIDE, COLUMNS)] for name in names]
 
 
 def plot(o: Options, runs: Runs, names: list[str]) -> None:
-    figure, axis = plt.subplots(figsize=(5.5, 3.6), layout="constrained")
+    figure = Figure(figsize=(5.5, 3.6), layout="constrained")
+    axis = figure.subplots()
     ladder = [n for n in names if n.startswith("Gaussians") and n != AUTO]
     for path, label in (
         (("train", "psnr"), "training views"),
@@ -85,8 +90,7 @@ def plot(o: Options, runs: Runs, names: list[str]) -> None:
     axis.set(xscale="log", xlabel="Gaussians", ylabel="PSNR, dB")
     axis.grid(alpha=0.3)
     axis.legend(fontsize=8)
-    figure.savefig(o.out / o.protocol.name / "what_a_scene_needs.png", dpi=120)
-    plt.close(figure)
+    save_plot(o, "what_a_scene_needs", figure)
 
 
 def main() -> None:
@@ -97,10 +101,9 @@ def main() -> None:
     configs = variants(o)
     runs = fit_all(o, {WIDE: configs})
     names = list(configs)
-    header = ("", *(c for c, _, _ in COLUMNS))
     parts = ("Gaussians", "SH", "model")
     text = "\n".join(
-        table(header, rows(runs, [n for n in names if n.startswith(part)])) for part in parts
+        table(HEADER, rows(runs, [n for n in names if n.startswith(part)])) for part in parts
     )
     write(o, "what_a_scene_needs", text, runs, begin)
     plot(o, runs, names)

@@ -49,6 +49,17 @@ def test_means_are_over_towns_and_missing_values_are_not_invented():
     assert towns.number(runs.mean("b", 4.0, "train", "psnr"), 2) == "n/a"
 
 
+def test_cells_are_means_of_their_own_method_and_iso():
+    robust, plain = "robust (ours)", "3DGS"
+    runs = runs_of({0.0: [robust], 4.0: [robust, plain]}, lambda name, std, town: 20.0 + std + town)
+    columns = (("PSNR", ("train", "psnr"), 2), ("LPIPS", ("train", "lpips"), 3), towns.EV_ERROR)
+    assert runs.cells(robust, 4.0, columns) == ["24.50", "n/a", "0.0040"]
+    assert runs.cells(robust, 0.0, columns[:1]) == ["20.50"]
+    assert towns.titles(columns) == ("PSNR", "LPIPS", "EV error")
+    assert runs.ev_error(robust, 4.0) == "0.0040"
+    assert runs.ev_error(robust, 0.0) == runs.ev_error(plain, 4.0) == ""
+
+
 def test_losses_between_spreads_of_iso():
     loss = {0.0: 0.0, 2.0: 1.5, 4.0: 4.0}
     runs = runs_of(table3_iso_robustness.wanted(), lambda name, std, town: 25.0 - loss[std])
