@@ -57,8 +57,9 @@ class DataConfig:
 class RenderConfig:
     """Projection, tiling and compositing."""
 
-    implementation: Literal["reference", "xla"] | None = None
-    """Rasterizer; None picks the fastest that runs here."""
+    implementation: Literal["reference", "xla", "pallas"] | None = None
+    """Rasterizer; None picks the fastest that runs here: `pallas` on NVIDIA GPUs from Ampere on,
+    `xla` elsewhere. `pallas` on a CPU is interpreted: for tests."""
     binning: Literal["counting", "sorting"] | None = None
     """How tiles get their lists; None counts on CPUs and sorts elsewhere (ours: BUILD_NOTES)."""
     sh_degree: int = 3
@@ -78,6 +79,9 @@ class RenderConfig:
     alpha_cutoff: float = 1.0 / 255.0
     """Contributions below this opacity are skipped (3DGS: 1/255). The error in a pixel is at most
     the cutoff times the sum of the skipped radiances."""
+    deterministic: bool = False
+    """Sum gradients in a fixed order, so that runs repeat bit for bit on GPUs as well (`pallas`;
+    on CPUs they always do)."""
     cutoff_rule: Literal["opacity", "radiance"] = "opacity"
     """`radiance` lowers the cutoff of every splat brighter than the view's geometric mean by the
     same factor, down to 1e-7, so that no skipped contribution exceeds the cutoff times that mean,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -12,12 +13,16 @@ from p2gs_jax.render.binning import bin_tiles, count_entries
 from p2gs_jax.render.cutoff import with_cutoffs
 from p2gs_jax.render.project import project, view_radiance
 from p2gs_jax.render.rasterize_reference import rasterize_reference
-from p2gs_jax.render.rasterize_xla import rasterize_xla
+from p2gs_jax.render.rasterize_tiles import TileImplementation, rasterize_tiles
 from p2gs_jax.types import Camera, Gaussians, Render, Splats2D, TileList
+
+# The oldest NVIDIA GPUs that Pallas supports through Triton.
+AMPERE = 8.0
 
 __all__ = [
     "bin_tiles",
     "count_entries",
+    "fastest_here",
     "project",
     "rasterize",
     "render_linear",
@@ -34,7 +39,7 @@ def rasterize(
     height: int,
     cfg: RenderConfig,
     *,
-    implementation: Literal["reference", "xla"] | None = None,
+    implementation: Literal["reference"] | TileImplementation | None = None,
     with_depth: bool = True,
 ) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"], Float[Array, "h w"] | None]:
     """Composite splats into linear radiance, alpha and alpha-weighted depth.
@@ -46,22 +51,33 @@ def rasterize(
         width: image width, pixels.
         height: image height, pixels.
         cfg: tile, chunk, cutoff, termination.
-        implementation: `reference` (dense, any precision), `xla` (lane queue), or None for the
-            fastest that runs here.
+        implementation: `reference` (dense, any precision), `xla` (lane queue), `pallas` (a GPU
+            block per tile), or None for the fastest that runs here.
         with_depth: render depth too; without it, None in its place and about 5 % less work.
 
     Raises:
-        ValueError: no such implementation, or `xla` without a tile list.
+        ValueError: no such implementation, or one of tiles without a tile list.
     """
-    name = implementation or "xla"
+    name = implementation or fastest_here()
     if name == "reference":
         linear, alpha, depth = rasterize_reference(splats, radiance, width, height, cfg)
         return linear, alpha, depth if with_depth else None
-    if name != "xla":
-        raise ValueError(f"there is no rasterizer {name!r}; choose 'reference' or 'xla'")
+    if name not in ("xla", "pallas"):
+        raise ValueError(f"there is no rasterizer {name!r}; choose 'reference', 'xla' or 'pallas'")
     if tiles is None:
-        raise ValueError("the xla rasterizer needs a tile list: pass bin_tiles(...)")
-    return rasterize_xla(splats, radiance, tiles, width, height, cfg, with_depth)
+        raise ValueError(f"the {name} rasterizer needs a tile list: pass bin_tiles(...)")
+    return rasterize_tiles(splats, radiance, tiles, width, height, cfg, name, with_depth)
+
+
+def fastest_here() -> TileImplementation:
+    """Return the rasterizer of the default backend: `pallas` on NVIDIA GPUs that Triton knows.
+
+    Asked while tracing, so that a program holds one of them.
+    """
+    if jax.default_backend() != "gpu":
+        return "xla"
+    capability = getattr(jax.devices()[0], "compute_capability", None)
+    return "pallas" if capability is not None and float(capability) >= AMPERE else "xla"
 
 
 def render_linear(

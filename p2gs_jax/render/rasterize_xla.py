@@ -4,11 +4,8 @@ B lanes each own one tile. Every iteration a lane composites the next C entries 
 its list ends, or all its pixels are opaque, it writes its tile and takes the next one, longest
 lists first. Work wasted on padding is bounded by C per tile, whatever the spread of list lengths.
 
-Rows. A Gaussian is a row of floats: mean x, y; conic factor a11, a12, a22; log opacity; three
-radiances; depth if asked for; its own log cutoff if they differ. Factor, opacity and cutoff are
-pre-scaled so that the exponent per pixel is e = row - (u^2 + v^2) and alpha = exp(2^s e), with s
-chosen so that a polynomial on [-0.7, 0] and s squarings reach the cutoff. Row N is a dummy that
-absorbs padding.
+The exponential is a polynomial on [-0.7, 0], squared as often as it takes to reach the cutoff
+(`exponent_scale`); rows are what tile_rows.py says.
 
 Backward. The same queue, front to back. With R the gradient-weighted light still to come,
 q = w (radiance . g) and R -= q after each entry, the gradient to the exponent of one entry is
@@ -21,66 +18,24 @@ from __future__ import annotations
 import functools
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
-from p2gs_jax.config import RenderConfig
-from p2gs_jax.render.binning.boxes import bits_for, grid_size
+from p2gs_jax.render.binning.boxes import bits_for
 from p2gs_jax.render.binning.sorting import sort_payloads
-from p2gs_jax.render.cutoff import SMALLEST_CUTOFF
+from p2gs_jax.render.tile_rows import DARKEST, GEOMETRY, Plan, geometry_gradient
 from p2gs_jax.render.xla_cpu import materialize
-from p2gs_jax.types import Splats2D, TileList
 
-DUMMY_LOG_OPACITY = -100.0
 # The backward pass spends more on bookkeeping an iteration and wants more pixels in flight.
 BACKWARD_LANE_FACTOR = 2
 PREFIX_GROUP = 8
-GEOMETRY = 6  # columns of a row before its channels
-# Pixels darker than this, relative to the brightest splat, are held to its absolute error.
-DARKEST = 1e-4
 
 
-class _Plan(NamedTuple):
-    """Static shape of one compositing run."""
-
-    across: int
-    down: int
-    tile_x: int
-    tile_y: int
-    lanes: int
-    chunk: int
-    gaussians: int
-    channels: int
-    log_cutoff: float
-    own_cutoffs: bool
-    alpha_max: float
-    stop_error: float | None
-    exp_degree: int | None
-
-    @property
-    def tile_count(self) -> int:
-        return self.across * self.down
-
-    @property
-    def pixels(self) -> int:
-        return self.tile_x * self.tile_y
-
-    @property
-    def squarings(self) -> int:
-        return max(3, int(np.ceil(np.log2(-self.log_cutoff / 0.7))))
-
-    @property
-    def exponent_scale(self) -> float:
-        return float(2**self.squarings)
-
-    def local_pixels(self) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
-        """Return pixel-centre offsets from the tile centre."""
-        x = jnp.tile(jnp.arange(self.tile_x) - (self.tile_x - 1) / 2, self.tile_y)
-        y = jnp.repeat(jnp.arange(self.tile_y) - (self.tile_y - 1) / 2, self.tile_x)
-        return x.astype(jnp.float32), y.astype(jnp.float32)
+def exponent_scale(smallest_cutoff: float) -> float:
+    """Return 2^s with s such that [-0.7, 0] times it reaches the log of the cutoff."""
+    return float(2 ** max(3, int(np.ceil(np.log2(-np.log(smallest_cutoff) / 0.7)))))
 
 
 @functools.cache
@@ -90,33 +45,16 @@ def _exp_coefficients(degree: int) -> tuple[float, ...]:
     return tuple(float(c) for c in fit.convert(kind=np.polynomial.Polynomial).coef)
 
 
-def _scaled_exp(x: Array, plan: _Plan) -> Array:
-    """Return exp(2^squarings x) for x in [-0.7, 0]; other values are masked by callers."""
+def _scaled_exp(x: Array, plan: Plan) -> Array:
+    """Return exp(exponent_scale x) for x in [-0.7, 0]; other values are masked by callers."""
     if plan.exp_degree is None:
         return jnp.exp(plan.exponent_scale * x)
     *rest, p = _exp_coefficients(plan.exp_degree)
     for c in reversed(rest):
         p = c + x * p
-    for _ in range(plan.squarings):
+    for _ in range(int(np.log2(plan.exponent_scale))):
         p = p * p
     return jnp.asarray(p)
-
-
-def _pack_rows(splats: Splats2D, radiance: Float[Array, "n 3"], plan: _Plan):
-    factor = float(np.sqrt(0.5 / plan.exponent_scale))
-    columns = [
-        splats.means2d,
-        splats.conic_factor * factor,
-        splats.log_opacities[:, None] / plan.exponent_scale,
-        radiance,
-    ]
-    if plan.channels == 4:
-        columns.append(splats.depths[:, None])
-    if plan.own_cutoffs:
-        columns.append(splats.log_cutoffs[:, None] / plan.exponent_scale)
-    rows = jnp.where(splats.visible[:, None], jnp.concatenate(columns, axis=1), 0.0)
-    dummy = jnp.zeros((1, rows.shape[1]), rows.dtype).at[0, GEOMETRY - 1].set(DUMMY_LOG_OPACITY)
-    return jnp.concatenate([rows, dummy])
 
 
 class _Entries(NamedTuple):
@@ -131,7 +69,7 @@ class _Entries(NamedTuple):
     alpha: Array  # [B C P]
 
 
-def _gather(rows, ids_list, tile, position, end, local, plan: _Plan, always) -> _Entries:
+def _gather(rows, ids_list, tile, position, end, local, plan: Plan, always) -> _Entries:
     local_x, local_y = local
     entry = position[:, None] + jnp.arange(plan.chunk)
     ids = materialize(
@@ -165,7 +103,7 @@ class _Queue(NamedTuple):
     lane: Array  # [B]
 
     @classmethod
-    def build(cls, starts, ends, plan: _Plan):
+    def build(cls, starts, ends, plan: Plan):
         count, lanes = plan.tile_count, plan.lanes
         lane = jnp.arange(lanes, dtype=jnp.int32)
         bits = bits_for(count)
@@ -180,7 +118,7 @@ class _Queue(NamedTuple):
             lane,
         )
 
-    def advance(self, next_tile, tile, position, done, plan: _Plan):
+    def advance(self, next_tile, tile, position, done, plan: Plan):
         """Hand finished lanes their next tiles; return (next_tile, tile, position)."""
         finished = done.astype(jnp.int32)
         total = jnp.cumsum(finished)
@@ -191,11 +129,11 @@ class _Queue(NamedTuple):
         return next_tile + total[-1], new, jnp.where(done, self.starts[new], position)
 
 
-def _padded(ids_list, plan: _Plan):
+def _padded(ids_list, plan: Plan):
     return jnp.concatenate([ids_list, jnp.full((plan.chunk,), plan.gaussians, jnp.int32)])
 
 
-def _forward(rows, ids_list, offsets, plan: _Plan):
+def forward(rows, ids_list, offsets, plan: Plan):
     """Return the channels of the image and the transmittance, [T P] each, and the stops [T]."""
     count, lanes, pixels = plan.tile_count, plan.lanes, plan.pixels
     local = plan.local_pixels()
@@ -260,7 +198,7 @@ def _prefixes(first, values, step, group: int):
     return jnp.stack(states, 1)
 
 
-def _backward(rows, ids_list, offsets, stops, image, v_image, plan: _Plan):
+def backward(rows, ids_list, offsets, stops, image, v_image, plan: Plan):
     """Return the gradient of the rows from those of the channels and transmittance."""
     plan = plan._replace(lanes=plan.lanes * BACKWARD_LANE_FACTOR)
     count, lanes, pixels, chunk = plan.tile_count, plan.lanes, plan.pixels, plan.chunk
@@ -331,24 +269,13 @@ def _backward(rows, ids_list, offsets, stops, image, v_image, plan: _Plan):
             transmittance = transmittance * (1 - alpha[:, j])
 
         moments = (v_exponent.reshape(lanes * chunk, pixels) @ features).reshape(lanes, chunk, 8)
-        m1, mx, my, mxx, mxy, myy = (moments[..., i] for i in range(6))
-        a11, a12, a22 = (row[..., i] for i in (2, 3, 4))
-        u0, v0, dx0, dy0 = entries.u0, entries.v0, entries.dx0, entries.dy0
-        # Moments of u and v themselves, and of u and v times the offsets.
-        mu, mv = u0 * m1 + a11 * mx + a12 * my, v0 * m1 + a22 * my
-        mux = u0 * mx + a11 * mxx + a12 * mxy
-        muy = u0 * my + a11 * mxy + a12 * myy
-        mvy = v0 * my + a22 * myy
-        scale = plan.exponent_scale
-        v_geometry = scale * jnp.stack(
-            [
-                2 * a11 * mu,
-                2 * (a12 * mu + a22 * mv),
-                -2 * (mux + dx0 * mu),
-                -2 * (muy + dy0 * mu),
-                -2 * (mvy + dy0 * mv),
-                m1,
-            ],
+        v_geometry = jnp.stack(
+            geometry_gradient(
+                [moments[..., i] for i in range(6)],
+                [row[..., i] for i in (2, 3, 4)],
+                (entries.u0, entries.v0, entries.dx0, entries.dy0),
+                plan.exponent_scale,
+            ),
             -1,
         )
         v_color = jnp.einsum("bcp,bkp->bck", w, v_out)
@@ -373,77 +300,3 @@ def _backward(rows, ids_list, offsets, stops, image, v_image, plan: _Plan):
     v_rows = lax.while_loop(lambda s: jnp.any(s[1] < count), body, state)[6]
     # A splat's own cutoff has no gradient.
     return jnp.pad(v_rows, ((0, 0), (0, rows.shape[1] - v_rows.shape[1])))
-
-
-@functools.partial(jax.custom_vjp, nondiff_argnums=(3,))
-def _composite(rows, ids_list, offsets, plan: _Plan):
-    return _forward(rows, ids_list, offsets, plan)[0]
-
-
-def _composite_fwd(rows, ids_list, offsets, plan: _Plan):
-    image, stops = _forward(rows, ids_list, offsets, plan)
-    return image, (rows, ids_list, offsets, stops, image)
-
-
-def _composite_bwd(plan: _Plan, residuals, v_image):
-    rows, ids_list, offsets, stops, image = residuals
-    return _backward(rows, ids_list, offsets, stops, image, v_image, plan), None, None
-
-
-_composite.defvjp(_composite_fwd, _composite_bwd)
-
-
-def _untile(channel, plan: _Plan):
-    """Return a channel [T P] as an image."""
-    grid = channel.reshape(plan.down, plan.across, plan.tile_y, plan.tile_x)
-    return grid.transpose(0, 2, 1, 3).reshape(plan.down * plan.tile_y, plan.across * plan.tile_x)
-
-
-def rasterize_xla(
-    splats: Splats2D,
-    radiance: Float[Array, "n 3"],
-    tiles: TileList,
-    width: int,
-    height: int,
-    cfg: RenderConfig,
-    with_depth: bool = True,
-) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"], Float[Array, "h w"] | None]:
-    """Composite splats tile by tile.
-
-    Args:
-        splats: projected Gaussians.
-        radiance: linear HDR radiance of each, >= 0.
-        tiles: the tile list of this view; must not have overflowed.
-        width: image width, pixels.
-        height: image height, pixels.
-        cfg: tile, chunk, lanes, cutoff, termination.
-        with_depth: composite depth too.
-
-    Returns:
-        Linear radiance (black background), alpha, and alpha-weighted depth or None.
-    """
-    tile_x, tile_y = cfg.tile
-    across, down = grid_size(width, height, cfg.tile)
-    smallest = cfg.alpha_cutoff
-    if cfg.cutoff_rule == "radiance":
-        smallest = min(smallest, SMALLEST_CUTOFF)
-    plan = _Plan(
-        across=across,
-        down=down,
-        tile_x=tile_x,
-        tile_y=tile_y,
-        lanes=max(1, min(cfg.pixels_in_flight // (tile_x * tile_y), across * down)),
-        chunk=cfg.chunk,
-        gaussians=splats.depths.shape[0],
-        channels=4 if with_depth else 3,
-        log_cutoff=float(np.log(smallest)),
-        own_cutoffs=cfg.cutoff_rule == "radiance",
-        alpha_max=cfg.alpha_max,
-        stop_error=cfg.stop_error,
-        exp_degree=cfg.exp_degree,
-    )
-    rows = _pack_rows(splats, radiance, plan)
-    tiled: tuple[Array, ...] = _composite(rows, tiles.gaussian_ids, tiles.offsets, plan)
-    *channels, transmittance = (_untile(a, plan)[:height, :width] for a in tiled)
-    depth = channels[3] if with_depth else None
-    return jnp.stack(channels[:3], -1), 1 - transmittance, depth

@@ -17,6 +17,7 @@ IMPLEMENTATIONS = {
     "reference, float32": dataclasses.replace(BASE, implementation="reference"),
     "xla, counting": dataclasses.replace(BASE, implementation="xla", binning="counting"),
     "xla, sorting": dataclasses.replace(BASE, implementation="xla", binning="sorting"),
+    "pallas, interpreted": dataclasses.replace(BASE, implementation="pallas", binning="sorting"),
 }
 
 

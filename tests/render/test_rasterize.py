@@ -15,6 +15,8 @@ from p2gs_jax.types import Gaussians
 
 CFG = RenderConfig(pixels_in_flight=2048)
 ORACLE = dataclasses.replace(CFG, implementation="reference")
+# On a CPU the GPU kernels are interpreted.
+IMPLEMENTATIONS = ("xla", "pallas")
 CAPACITY = 40_000
 FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
 
@@ -51,11 +53,12 @@ def oracle():
         return jax.tree.map(np.asarray, r), jax.tree.map(np.asarray, v), weights
 
 
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 @pytest.mark.parametrize("tile", [(16, 8), (16, 16), (8, 8)])
 @pytest.mark.parametrize("stop", [1e-4, None])
-def test_values_and_gradients_match_oracle(oracle, tile, stop):
+def test_values_and_gradients_match_oracle(oracle, tile, stop, implementation):
     expected, v_expected, weights = oracle
-    cfg = dataclasses.replace(CFG, tile=tile, stop_error=stop)
+    cfg = dataclasses.replace(CFG, tile=tile, stop_error=stop, implementation=implementation)
     g, cam = street()
     r = render(g, cam, cfg)
     assert not bool(r.overflow)
@@ -223,14 +226,15 @@ def test_hard_cases_stay_finite(case, g):
         assert not any(np.any(leaf) for leaf in jax.tree.leaves(v))
 
 
-def test_needle_matches_oracle():
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+def test_needle_matches_oracle(implementation):
     """A needle 10^5 times longer than wide: the determinant must not cancel."""
     g = one(log_scale=-8.0)
     g = dataclasses.replace(
         g, log_scales=jnp.array([[3.0, -8.5, -8.5]]), quats=jnp.array([[0.9, 0.1, 0.3, 0.2]])
     )
     cam = camera(60, 40, 50.0)
-    fast = render(g, cam).linear
+    fast = render(g, cam, dataclasses.replace(CFG, implementation=implementation)).linear
     with jax.enable_x64(True):
         exact = render(cast(g, jnp.float64), cast(cam, jnp.float64), ORACLE).linear
     np.testing.assert_allclose(fast, exact, atol=2e-4)

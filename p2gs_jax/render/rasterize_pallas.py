@@ -1,0 +1,277 @@
+"""Tile compositing for NVIDIA GPUs through Pallas and Triton, forward and backward.
+
+One block of threads owns one tile and walks its list front to back; a thread owns a few pixels and
+keeps their transmittance and channels in registers. Rows are read by all threads of a block from
+one address, a broadcast, `UNROLL` of them ahead of their use. Blocks are started longest lists
+first, so that no long one is left alone at the end.
+
+Backward. As on the CPU (rasterize_xla.py): the same walk, front to back; the light still to come
+is what the image holds less what has passed, so that nothing is divided by transmittance. Six
+moments and the channels are summed over the tile and added to the Gaussian's gradient atomically,
+or, where runs must repeat bit for bit, written per entry and summed per Gaussian in the order of
+the list.
+
+On a CPU the kernels are interpreted, so that the shared tests run on them. What was and was not
+measured: BUILD_NOTES, "The GPU kernel".
+"""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.experimental import pallas as pl
+from jax.experimental.pallas import triton as plt
+
+from p2gs_jax.render.binning.boxes import bits_for
+from p2gs_jax.render.binning.sorting import sort_payloads
+from p2gs_jax.render.tile_rows import DARKEST, GEOMETRY, Plan, geometry_gradient
+
+# Entries whose rows are loaded together; the stop rule is looked at once for each such group.
+UNROLL = 4
+# Pixels per thread: sums over a tile cost a shuffle per halving of the threads, and nothing
+# within a thread. One warp per 128 pixels also needs no shared memory to sum.
+PIXELS_PER_THREAD = 4
+# Gradient columns, padded to what one vectorised atomic addition of a block takes.
+COLUMNS = 16
+# Gaussians that one block of the ordered sum owns.
+SUMMED = 32
+
+
+def exponent_scale(smallest_cutoff: float) -> float:
+    """Return ln 2: alpha = 2^e, the exponential that the hardware has."""
+    del smallest_cutoff
+    return float(np.log(2.0))
+
+
+def _interpreted() -> bool:
+    return jax.default_backend() != "gpu"
+
+
+def _parameters(pixels: int) -> plt.CompilerParams:
+    return plt.CompilerParams(num_warps=max(1, pixels // (32 * PIXELS_PER_THREAD)), num_stages=1)
+
+
+def _check(plan: Plan) -> None:
+    if plan.pixels & (plan.pixels - 1):
+        raise ValueError(
+            f"the pallas rasterizer needs tiles with a power of two of pixels, not "
+            f"{plan.tile_x}x{plan.tile_y}: set RenderConfig.tile to (16, 8) or (16, 16)"
+        )
+
+
+def _longest_first(starts, ends, plan: Plan):
+    """Return the tiles, longest lists first."""
+    bits = bits_for(plan.tile_count)
+    limit = 2 ** (32 - bits) - 1
+    length = jnp.minimum(ends - starts, limit).astype(jnp.uint32)
+    tiles = jnp.arange(plan.tile_count, dtype=jnp.uint32)
+    return sort_payloads((jnp.uint32(limit) - length) << bits | tiles, bits)
+
+
+class _Tile:
+    """The pixels of one tile, and what an entry's row says about them."""
+
+    def __init__(self, tile, plan: Plan):
+        self.plan = plan
+        self.center_x = (tile % plan.across).astype(jnp.float32) * plan.tile_x + plan.tile_x / 2
+        self.center_y = (tile // plan.across).astype(jnp.float32) * plan.tile_y + plan.tile_y / 2
+        pixel = lax.broadcasted_iota(jnp.int32, (plan.pixels,), 0)
+        self.x = (pixel % plan.tile_x).astype(jnp.float32) - (plan.tile_x - 1) / 2
+        self.y = (pixel // plan.tile_x).astype(jnp.float32) - (plan.tile_y - 1) / 2
+
+    def load(self, rows_ref, ids_ref, position, end) -> list[list]:
+        """Return id and row of the next `UNROLL` entries, the dummy's beyond the end."""
+        ids = [
+            jnp.where(
+                position + c < end, ids_ref[jnp.minimum(position + c, end - 1)], self.plan.gaussians
+            )
+            for c in range(UNROLL)
+        ]
+        return [[i, *(rows_ref[i, k] for k in range(rows_ref.shape[1]))] for i in ids]
+
+    def center(self, row):
+        """Return u, v, x and y offsets from the mean, at the tile's centre."""
+        mean_x, mean_y, a11, a12, a22 = row[:5]
+        dx, dy = self.center_x - mean_x, self.center_y - mean_y
+        return a11 * dx + a12 * dy, a22 * dy, dx, dy
+
+    def alpha(self, row, center):
+        """Return the opacities of one entry over the pixels."""
+        plan = self.plan
+        a11, a12, a22, log_opacity = row[2:GEOMETRY]
+        u = center[0] + a11 * self.x + a12 * self.y
+        v = center[1] + a22 * self.y
+        exponent = log_opacity - (u * u + v * v)
+        cutoff = row[-1] if plan.own_cutoffs else plan.log_cutoff / plan.exponent_scale
+        alpha = jnp.minimum(jnp.exp2(exponent), plan.alpha_max)
+        return jnp.where(exponent > cutoff, alpha, 0.0)
+
+
+def _forward_kernel(rows, ids, offsets, order, brightest, *outputs, plan: Plan):
+    *image, stops = outputs
+    tile = order[pl.program_id(0)]
+    pixels = _Tile(tile, plan)
+    end = offsets[tile + 1]
+    brightest = brightest[0]
+
+    def body(state):
+        position, _, transmittance, *channels = state
+        for _, *row in pixels.load(rows, ids, position, end):
+            weight = pixels.alpha(row, pixels.center(row)) * transmittance
+            channels = [a + weight * row[GEOMETRY + k] for k, a in enumerate(channels)]
+            transmittance = transmittance - weight
+        position = jnp.minimum(position + UNROLL, end)
+        done = position >= end
+        if plan.stop_error is not None:
+            so_far = functools.reduce(jnp.maximum, channels[:3]) / brightest
+            hidden = transmittance - plan.stop_error * jnp.maximum(so_far, DARKEST)
+            done = done | (jnp.max(hidden) <= 0)
+        return position, done, transmittance, *channels
+
+    start = offsets[tile]
+    blank = jnp.zeros(plan.pixels, jnp.float32)
+    state = (start, start >= end, blank + 1.0, *(blank,) * plan.channels)
+    position, _, *sums = lax.while_loop(lambda s: jnp.logical_not(s[1]), body, state)
+    transmittance, *channels = sums
+    for target, value in zip(image, (*channels, transmittance), strict=True):
+        target[tile, :] = value
+    stops[tile] = position
+
+
+def forward(rows, ids, offsets, plan: Plan):
+    """Return the channels of the image and the transmittance, [T P] each, and the stops [T]."""
+    _check(plan)
+    shape = jax.ShapeDtypeStruct((plan.tile_count, plan.pixels), jnp.float32)
+    radiance = rows[:, GEOMETRY : GEOMETRY + 3]
+    *image, stops = pl.pallas_call(
+        functools.partial(_forward_kernel, plan=plan),
+        out_shape=(
+            *(shape,) * (plan.channels + 1),
+            jax.ShapeDtypeStruct((plan.tile_count,), jnp.int32),
+        ),
+        grid=(plan.tile_count,),
+        compiler_params=_parameters(plan.pixels),
+        interpret=_interpreted(),
+        name="composite_tiles",
+    )(
+        rows,
+        ids,
+        offsets,
+        _longest_first(offsets[:-1], offsets[1:], plan),
+        jnp.maximum(jnp.max(radiance), 1e-30)[None],
+    )
+    return tuple(image), stops
+
+
+def _backward_kernel(rows, ids, offsets, stops, order, *arrays, plan: Plan):
+    """Walk a tile; `arrays` are the image, its gradient, the blank output and the output."""
+    channels = plan.channels
+    image, v_image = arrays[: channels + 1], arrays[channels + 1 : 2 * channels + 2]
+    target = arrays[-1]
+    tile = order[pl.program_id(0)]
+    pixels = _Tile(tile, plan)
+    start, end = offsets[tile], stops[tile]
+    v_out = [v[tile, :] for v in v_image]
+    light = sum(a[tile, :] * v for a, v in zip(image, v_out, strict=True))
+    column = lax.broadcasted_iota(jnp.int32, (COLUMNS,), 0)
+    x, y = pixels.x, pixels.y
+
+    def body(state):
+        position, transmittance, remaining = state
+        for c, (gaussian, *row) in enumerate(pixels.load(rows, ids, position, end)):
+            center = pixels.center(row)
+            alpha = pixels.alpha(row, center)
+            weight = alpha * transmittance
+            q = weight * sum(row[GEOMETRY + k] * v_out[k] for k in range(channels))
+            remaining = remaining - q
+            transmittance = transmittance - weight
+            v = jnp.where(alpha < plan.alpha_max, q - remaining * (alpha / (1 - alpha)), 0.0)
+            vx, vy = v * x, v * y
+            moments = [jnp.sum(m) for m in (v, vx, vy, vx * x, vx * y, vy * y)]
+            gradient = (
+                *geometry_gradient(moments, row[2:5], center, plan.exponent_scale),
+                *(jnp.sum(weight * v_out[k]) for k in range(channels)),
+            )
+            values = jnp.zeros(COLUMNS, jnp.float32)
+            for k, value in enumerate(gradient):
+                values = jnp.where(column == k, value, values)
+            if plan.deterministic:
+                # Entries beyond the end write to the place behind the list.
+                place = jnp.where(position + c < end, position + c, target.shape[0] - 1)
+                target[place, :] = values
+            else:
+                plt.atomic_add(target, (gaussian, slice(None)), values)
+        return jnp.minimum(position + UNROLL, end), transmittance, remaining
+
+    state = (start, jnp.ones(plan.pixels, jnp.float32), light)
+    lax.while_loop(lambda s: s[0] < end, body, state)
+
+
+def _sum_kernel(entries, places, runs, target):
+    """Sum the gradients of `SUMMED` Gaussians, each over its run of places in list order."""
+    first = pl.program_id(0) * SUMMED
+
+    def gaussian(g, _):
+        def body(state):
+            position, total = state
+            return position + 1, total + entries[places[position], :]
+
+        begin, end = runs[first + g], runs[first + g + 1]
+        blank = jnp.zeros(COLUMNS, jnp.float32)
+        target[first + g, :] = lax.while_loop(lambda s: s[0] < end, body, (begin, blank))[1]
+        return 0
+
+    lax.fori_loop(0, SUMMED, gaussian, 0)
+
+
+def _in_order(entries, ids, count: int):
+    """Return the sums of `entries` by Gaussian, always added in the order of the list."""
+    places = jnp.argsort(ids, stable=True).astype(jnp.int32)
+    blocks = -(-count // SUMMED)
+    edges = jnp.arange(blocks * SUMMED + 1, dtype=ids.dtype)
+    runs = jnp.searchsorted(ids[places], edges, method="sort").astype(jnp.int32)
+    return pl.pallas_call(
+        _sum_kernel,
+        out_shape=jax.ShapeDtypeStruct((blocks * SUMMED, COLUMNS), jnp.float32),
+        grid=(blocks,),
+        compiler_params=plt.CompilerParams(num_warps=1, num_stages=1),
+        interpret=_interpreted(),
+        name="sum_gradients_in_order",
+    )(entries, places, runs)[:count]
+
+
+def backward(rows, ids, offsets, stops, image, v_image, plan: Plan):
+    """Return the gradient of the rows from those of the channels and transmittance."""
+    _check(plan)
+    capacity, count = ids.shape[0], rows.shape[0]
+    shape = (capacity + 1 if plan.deterministic else count, COLUMNS)
+    blank = jnp.zeros(shape, jnp.float32)
+    operands = (
+        rows,
+        ids,
+        offsets,
+        stops,
+        _longest_first(offsets[:-1], stops, plan),
+        *image,
+        *v_image,
+        blank,
+    )
+    v_rows = pl.pallas_call(
+        functools.partial(_backward_kernel, plan=plan),
+        out_shape=jax.ShapeDtypeStruct(shape, jnp.float32),
+        grid=(plan.tile_count,),
+        input_output_aliases={len(operands) - 1: 0},
+        compiler_params=_parameters(plan.pixels),
+        interpret=_interpreted(),
+        name="composite_tiles_gradient",
+    )(*operands)
+    if plan.deterministic:
+        v_rows = _in_order(v_rows[:capacity], ids, count)
+    used = GEOMETRY + plan.channels
+    # The dummy has no gradient, nor a splat's own cutoff.
+    v_rows = v_rows[:, :used].at[-1].set(0.0)
+    return jnp.pad(v_rows, ((0, 0), (0, rows.shape[1] - used)))

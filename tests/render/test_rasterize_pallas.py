@@ -1,0 +1,100 @@
+"""What only the GPU kernels promise. Values and gradients: the shared tests beside this file."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import camera, street
+
+from p2gs_jax.config import RenderConfig
+from p2gs_jax.render import fastest_here, rasterize_pallas, render_linear
+
+CFG = RenderConfig(implementation="pallas", binning="sorting")
+CAPACITY = 8000
+
+
+def scene():
+    return street(n=200, width=40, height=32)
+
+
+def loss(g, cam, cfg):
+    r = render_linear(g, jnp.ones(g.capacity, bool), cam, cfg, CAPACITY)
+    return jnp.sum(r.linear**2) + jnp.sum(r.alpha) + 0.01 * jnp.sum(r.depth)
+
+
+def gradient(cfg, g, cam):
+    return jax.jit(jax.grad(lambda g: loss(g, cam, cfg)))(g)
+
+
+def largest_gap(a, b):
+    gaps = jax.tree.map(lambda x, y: jnp.linalg.norm(x - y) / jnp.linalg.norm(x), a, b)
+    return max(float(x) for x in jax.tree.leaves(gaps))
+
+
+def test_the_ordered_sum_is_the_atomic_one():
+    g, cam = scene()
+    atomic = gradient(CFG, g, cam)
+    ordered = gradient(dataclasses.replace(CFG, deterministic=True), g, cam)
+    assert largest_gap(atomic, ordered) < 1e-6
+
+
+def test_the_ordered_sum_counts_every_entry():
+    rng = np.random.default_rng(0)
+    entries = rng.normal(size=(500, rasterize_pallas.COLUMNS)).astype(np.float32)
+    ids = rng.integers(0, 70, 500).astype(np.int32)
+    ids[ids == 13] = 14
+    expected = np.zeros((71, rasterize_pallas.COLUMNS))
+    np.add.at(expected, ids, entries)
+    summed = rasterize_pallas._in_order(jnp.asarray(entries), jnp.asarray(ids), 71)
+    np.testing.assert_allclose(summed, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_views_batch(deterministic):
+    """A batch of cameras by vmap is one launch, and the sum of its views."""
+    g, cam = street(n=60, width=24, height=16)
+    cfg = dataclasses.replace(CFG, deterministic=deterministic)
+    viewmats = jnp.stack([jnp.eye(4).at[0, 3].set(0.3 * i) for i in range(3)])
+
+    def view(g, viewmat):
+        return loss(g, dataclasses.replace(cam, viewmat=viewmat), cfg)
+
+    batch = jax.value_and_grad(lambda g: jnp.sum(jax.vmap(view, (None, 0))(g, viewmats)))
+    single = jax.value_and_grad(lambda g: sum(view(g, v) for v in viewmats))
+    (a, v_a), (b, v_b) = jax.jit(batch)(g), jax.jit(single)(g)
+    assert float(a) == pytest.approx(float(b), rel=1e-5)
+    assert largest_gap(v_a, v_b) < 1e-5
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_the_kernels_lower_to_triton(monkeypatch, deterministic):
+    """Without a GPU the program for one can still be lowered: forward, backward, ordered sum."""
+    monkeypatch.setattr(rasterize_pallas, "_interpreted", lambda: False)
+    g, cam = scene()
+    cfg = dataclasses.replace(CFG, deterministic=deterministic)
+    traced = jax.jit(jax.grad(lambda g: loss(g, cam, cfg))).trace(g)
+    text = traced.lower(lowering_platforms=("cuda",)).as_text()
+    assert text.count("__gpu$xla.gpu.triton") == 2 + deterministic
+
+
+def test_what_runs_here_is_chosen(monkeypatch):
+    assert fastest_here() == ("pallas" if jax.default_backend() == "gpu" else "xla")
+
+    class Device:
+        compute_capability = "9.0"
+
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(jax, "devices", lambda: [Device()])
+    assert fastest_here() == "pallas"
+    Device.compute_capability = "7.5"
+    assert fastest_here() == "xla"
+    del Device.compute_capability
+    assert fastest_here() == "xla"
+
+
+def test_tiles_of_other_sizes_are_refused():
+    cfg = dataclasses.replace(CFG, tile=(12, 8))
+    with pytest.raises(ValueError, match="power of two"):
+        loss(street(n=3)[0], camera(), cfg)
