@@ -57,27 +57,36 @@ METRICS = {
 ACCURACY = ("max_abs", "relative", "psnr", "gradient")
 
 
+def image_errors(
+    linear: Float[np.ndarray, "h w 3"], exact: Float[np.ndarray, "h w 3"]
+) -> dict[str, float]:
+    """Return the accuracy metrics of a render.
+
+    `max_abs` is in linear radiance exposed so that the truth's mean is 0.18; `relative` is the
+    largest error of a pixel over its brightest channel; `psnr` is of the sRGB encoding of the
+    exposed image.
+    """
+    exposure = 0.18 / max(float(exact.mean()), 1e-30)
+    error = np.abs(linear - exact)
+    brightest = exact.max(-1)
+    brightest = np.maximum(brightest, DARKEST * brightest.max())
+    mse = np.mean((srgb_encode(linear * exposure) - srgb_encode(exact * exposure)) ** 2)
+    return {
+        "max_abs": float(error.max() * exposure),
+        "relative": float((error.max(-1) / brightest).max()),
+        "psnr": float(-10 * np.log10(max(mse, 1e-30))),
+    }
+
+
 def errors(
     linear: Float[np.ndarray, "h w 3"], gradient: Gaussians, truth: Truth
 ) -> dict[str, float]:
     """Return the accuracy metrics of a render and its gradient.
 
-    `max_abs` is in linear radiance exposed so that the truth's mean is 0.18; `relative` is the
-    largest error of a pixel over its brightest channel; `psnr` is of the sRGB encoding of the
-    exposed image; `gradient` is the relative L2 error of the worst parameter group.
+    `gradient` is the relative L2 error of the worst parameter group; the others: `image_errors`.
     """
-    exposure = 0.18 / max(float(truth.linear.mean()), 1e-30)
-    error = np.abs(linear - truth.linear)
-    brightest = truth.linear.max(-1)
-    brightest = np.maximum(brightest, DARKEST * brightest.max())
-    mse = np.mean((srgb_encode(linear * exposure) - srgb_encode(truth.linear * exposure)) ** 2)
     groups = []
     for name in FIELDS:
         a, b = np.asarray(getattr(gradient, name), np.float64), getattr(truth.gradient, name)
         groups.append(np.linalg.norm(a - b) / max(np.linalg.norm(b), 1e-30))
-    return {
-        "max_abs": float(error.max() * exposure),
-        "relative": float((error.max(-1) / brightest).max()),
-        "psnr": float(-10 * np.log10(max(mse, 1e-30))),
-        "gradient": float(max(groups)),
-    }
+    return {**image_errors(linear, truth.linear), "gradient": float(max(groups))}

@@ -18,6 +18,7 @@ from matplotlib.ticker import FormatStrFormatter, NullFormatter
 
 from p2gs_jax.bench.growth import Curve
 from p2gs_jax.bench.hard_cases import CASES, Gap
+from p2gs_jax.bench.implementations import Timing, Work
 from p2gs_jax.bench.memory import Footprint
 from p2gs_jax.bench.metrics import ACCURACY, METRICS
 from p2gs_jax.bench.speed_error import DEFAULT, Point, front
@@ -247,6 +248,40 @@ def memory_table(sizes: list[Footprint]) -> str:
     ]
     header = ["scene", "entries", "JAX alone MB", "compiling", "forward", "fwd+bwd"]
     return markdown([*header, "of it buffers", "ms fwd / fwd+bwd"], rows)
+
+
+def implementations_table(timings: list[Timing]) -> str:
+    """Return times, memory and errors of every rasterizer, and ratios to gsplat where it ran."""
+    rival = {t.scene: t.both for t in timings if t.implementation == "gsplat"}
+    rows = [
+        [
+            t.scene,
+            t.implementation,
+            f"{t.forward:.2f}",
+            f"{t.both:.2f}",
+            f"{t.both / rival[t.scene]:.2f}" if t.scene in rival else "n/a",
+            f"{t.megabytes:.0f}",
+            *(_number(k, t.error[k]) if k in t.error else "n/a" for k in ACCURACY),
+        ]
+        for t in timings
+    ]
+    header = ["scene", "rasterizer", "fwd ms", "fwd+bwd ms", "of gsplat's", "MB"]
+    return markdown([*header, *(METRICS[k].title for k in ACCURACY)], rows)
+
+
+def work_table(works: list[Work]) -> str:
+    """Return what each view asks of the device."""
+    rows = [
+        [
+            w.scene,
+            f"{w.entries / 1e3:.0f}k",
+            f"{w.pairs / 1e6:.0f}M",
+            *(f"{v:.2f}" for v in (*w.gigaflops, *w.gigabytes)),
+        ]
+        for w in works
+    ]
+    header = ["scene", "entries", "pairs", "GFLOP fwd", "fwd+bwd", "GB fwd", "fwd+bwd"]
+    return markdown(header, rows)
 
 
 def step_table(costs: dict[str, StepCost]) -> str:

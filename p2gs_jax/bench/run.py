@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
-from p2gs_jax.bench import gate, growth, hard_cases, memory, report, speed_error
+from p2gs_jax.bench import gate, growth, hard_cases, implementations, memory, report, speed_error
 from p2gs_jax.bench.scenes import BenchScene, street
 from p2gs_jax.bench.step import measure_step
 from p2gs_jax.config import preset
 from p2gs_jax.export.atomic import write_json, write_text
 
-Part = Literal["speed_error", "growth", "memory", "step", "hard_cases"]
-PARTS: tuple[Part, ...] = ("speed_error", "growth", "memory", "step", "hard_cases")
+Part = Literal["speed_error", "growth", "memory", "step", "hard_cases", "implementations"]
+PARTS: tuple[Part, ...] = get_args(Part)
 Progress = Callable[[str, int, int], None]
 
 
@@ -105,6 +105,13 @@ def run(
             gaps[case.name] = hard_cases.gap(case, hard_cases.CONFIG)
         section("Hard cases: float32 against float64", report.hard_case_table(gaps))
         data["hard_cases"] = {k: g._asdict() for k, g in gaps.items()}
+    if "implementations" in parts:
+        timings, works = implementations.measure(quick=quick, on_progress=on_progress)
+        counted = "Work of compositing tile by tile, counted:"
+        tables = report.implementations_table(timings), counted, report.work_table(works)
+        section("Rasterizers on this device", *tables)
+        data["implementations"] = [t._asdict() for t in timings]
+        data["work"] = [w._asdict() for w in works]
     text = "\n\n".join(sections) + "\n"
     write_text(out / "bench.md", text)
     write_json(out / "bench.json", data)

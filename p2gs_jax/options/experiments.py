@@ -75,7 +75,7 @@ class Bench:
     """Measure the renderer on this machine: speed against error, growth, memory, hard cases."""
 
     parts: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """speed_error, growth, memory, step, hard_cases; none named runs all."""
+    """speed_error, growth, memory, step, hard_cases, implementations; none named runs all."""
     out: Path = Path("runs/bench")
     """Folder for tables, JSON and plots."""
     quick: bool = False
