@@ -24,7 +24,6 @@ from p2gs_jax.bench.speed_error import DEFAULT, programs
 from p2gs_jax.bench.timing import interleaved
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render import view_radiance
-from p2gs_jax.types import Camera
 
 SIZES = (100_000, 1_000_000, 3_000_000)
 PIXELS = (1920, 1080)
@@ -83,23 +82,17 @@ def work_of(scene: BenchScene, entries: int, cfg: RenderConfig) -> Work:
     return Work(scene.name, entries, pairs, flops, (forward / 1e9, both / 1e9))
 
 
-def _window(camera: Camera, size: tuple[int, int]) -> tuple[Camera, tuple[slice, slice]]:
-    """Return a camera for the middle of the image, and where that is."""
-    width, height = min(size[0], camera.width), min(size[1], camera.height)
-    x, y = (camera.width - width) // 2, (camera.height - height) // 2
-    K = camera.K.at[0, 2].add(-x).at[1, 2].add(-y)
-    where = slice(y, y + height), slice(x, x + width)
-    return dataclasses.replace(camera, K=K, width=width, height=height), where
-
-
 def _truth(scene: BenchScene, cfg: RenderConfig) -> tuple[Truth, np.ndarray, tuple[slice, slice]]:
-    """Return float64 image and gradient of the window, weights over the whole image, and where."""
-    camera, where = _window(scene.camera, WINDOW)
-    shape = (camera.height, camera.width, 3)
-    part = np.random.default_rng(0).normal(size=shape).astype(np.float32) / np.prod(shape[:2])
-    weights = np.zeros((scene.camera.height, scene.camera.width, 3), np.float32)
-    weights[where] = part
-    return truth(scene.gaussians, camera, cfg, part), weights, where
+    """Return float64 image and gradient of a window, weights over the whole image, and where."""
+    width, height = scene.camera.width, scene.camera.height
+    rows = slice(height // 2, min(height // 2 + WINDOW[1], height))
+    columns = slice(width // 2, min(width // 2 + WINDOW[0], width))
+    weights = np.zeros((height, width, 3), np.float32)
+    part = weights[rows, columns]
+    part[:] = np.random.default_rng(0).normal(size=part.shape) / part[..., 0].size
+    window = rows, columns
+    exact = truth(scene.gaussians, scene.camera, cfg, weights, window)
+    return Truth(exact.linear[window], exact.gradient), weights, window
 
 
 def gsplat_jobs(

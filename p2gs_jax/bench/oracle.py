@@ -49,6 +49,7 @@ def truth(
     camera: Camera,
     cfg: RenderConfig,
     cotangent: Float[np.ndarray, "h w 3"],
+    window: tuple[slice, slice] | None = None,
 ) -> Truth:
     """Return image and gradient in float64 under the cutoffs of `cfg`, without a stop rule.
 
@@ -57,13 +58,18 @@ def truth(
         camera: the view.
         cfg: cutoffs and limits; see `untruncated`.
         cotangent: weight of each value in the objective whose gradient is taken.
+        window: rows and columns to compute, for images too large; the rest stays black, and its
+            weights must be zero. None computes all.
     """
     with jax.enable_x64(True):
         scene, view = jax.tree.map(lambda a: jnp.asarray(a, jnp.float64), (gaussians, camera))
         (leaves, radiance), pull, splats = jax.vjp(
             lambda g: _prepared(g, view, cfg), scene, has_aux=True
         )
-        linear, v_leaves, v_radiance = _blocks(splats, leaves, radiance, camera, cfg, cotangent)
+        rows, columns = window or (slice(0, camera.height), slice(0, camera.width))
+        linear, v_leaves, v_radiance = _blocks(
+            splats, leaves, radiance, camera, cfg, cotangent, rows, columns
+        )
         (gradient,) = pull((v_leaves, v_radiance))
         return Truth(linear, jax.tree.map(np.asarray, gradient))
 
@@ -90,7 +96,7 @@ def _block(splats: Splats2D, leaves, radiance, origin, v, cfg: RenderConfig):
     return linear, pull(v)
 
 
-def _blocks(splats, leaves, radiance, camera, cfg, cotangent):
+def _blocks(splats, leaves, radiance, camera, cfg, cotangent, rows: slice, columns: slice):
     means, cov = np.asarray(splats.means2d), np.asarray(splats.cov_diagonal)
     room = np.asarray(splats.log_opacities) - np.asarray(splats.log_cutoffs)
     shown = np.asarray(splats.visible) & (room > 0)
@@ -99,9 +105,9 @@ def _blocks(splats, leaves, radiance, camera, cfg, cotangent):
     width, height = camera.width, camera.height
     linear = np.zeros((height, width, 3))
     totals = [np.zeros(a.shape) for a in (*leaves, radiance)]
-    for y in range(0, height, BLOCK[1]):
+    for y in range(rows.start, rows.stop, BLOCK[1]):
         in_row = shown & (high[:, 1] > y) & (low[:, 1] < y + BLOCK[1])
-        for x in range(0, width, BLOCK[0]):
+        for x in range(columns.start, columns.stop, BLOCK[0]):
             chosen = np.flatnonzero(in_row & (high[:, 0] > x) & (low[:, 0] < x + BLOCK[0]))
             if not len(chosen):
                 continue
