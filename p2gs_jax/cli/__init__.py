@@ -19,7 +19,8 @@ import tyro
 from p2gs_jax.errors import UserError
 from p2gs_jax.options.experiments import Bench, Demo, Sweep, Synth
 from p2gs_jax.options.fit import Calibrate, Fit, named_preset
-from p2gs_jax.options.results import Eval, Render
+from p2gs_jax.options.render import Render
+from p2gs_jax.options.results import Eval
 
 # A name is both the subcommand and the module of `p2gs_jax.commands` that runs it.
 COMMANDS: dict[str, type] = {

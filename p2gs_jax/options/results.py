@@ -1,4 +1,4 @@
-"""`render` and `eval`: what can be asked of a finished run."""
+"""`eval`: what can be asked of a finished run besides pictures."""
 
 from __future__ import annotations
 
@@ -7,22 +7,6 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-
-
-@dataclass(frozen=True)
-class Render:
-    """Render views of a finished run at any exposure and gamma."""
-
-    run: Annotated[Path, tyro.conf.Positional]
-    """Run folder."""
-    out: Path | None = None
-    """Where to write (default: RUN/renders/all)."""
-    split: str = "all"
-    """Which views: all, train or test."""
-    exposure_ev: float | None = None
-    """Exposure in stops relative to the mean; default: each view's own."""
-    gamma: float | None = None
-    """Gamma; default: each view's own."""
 
 
 @dataclass(frozen=True)

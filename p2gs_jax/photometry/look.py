@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Float32
 
 from p2gs_jax.config import PhotometryConfig
-from p2gs_jax.photometry.formation import display, formation
+from p2gs_jax.photometry.formation import display, formation, inverse_tone_map
 
 Curve = Literal["power", "srgb", "spline", "linear"]
 CURVES: tuple[Curve, ...] = get_args(Curve)
@@ -65,3 +65,24 @@ def develop(
 @functools.partial(jax.jit, static_argnames="cfg")
 def _develop(linear, exposure, gamma, correction, cfg: PhotometryConfig):
     return display(formation(linear, exposure, gamma, cfg, correction))
+
+
+def undevelop(
+    ldr: Float[Array, "... 3"] | Float[np.ndarray, "... 3"], look: Look
+) -> Float32[np.ndarray, "... 3"]:
+    """Return the linear radiance that a photograph shows: the inverse of `develop`.
+
+    Saturated values count as the radiance at which they saturate, values below half a code as that;
+    corrections of display values are not undone.
+
+    Args:
+        ldr: display values.
+        look: how it was taken.
+    """
+    e, g = jnp.float32(look.exposure), jnp.float32(look.gamma)
+    return np.asarray(_undevelop(jnp.asarray(ldr), e, g, look.formation))
+
+
+@functools.partial(jax.jit, static_argnames="cfg")
+def _undevelop(ldr, exposure, gamma, cfg: PhotometryConfig):
+    return inverse_tone_map(ldr, gamma, cfg) / exposure

@@ -1,0 +1,103 @@
+"""A smooth ride through given poses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
+
+from p2gs_jax.errors import UserError
+from p2gs_jax.paths.geometry import Poses, angles, inverse, rigid
+from p2gs_jax.paths.shots import Shot, common_lens
+
+# Frames from one pose to the next where nobody says how many.
+FRAMES_BETWEEN = 8
+# A camera that stands still takes this part of the mean time between two poses.
+SHORTEST = 0.1
+
+
+class PosePath:
+    """Poses over time, through every given one; velocity and acceleration are continuous.
+
+    Positions follow a natural cubic spline, rotations scipy's `RotationSpline`. The time between
+    two poses is the square root of how far apart they are (centripetal), so that splines neither
+    loop nor overshoot where distances differ; equal distances take equal times.
+
+    Attributes:
+        times: of the given poses, from 0; 1 is the mean of their differences.
+    """
+
+    def __init__(self, poses: Poses):
+        """Fit the splines.
+
+        Args:
+            poses: camera-to-world, at least two.
+        """
+        self.times = _times(poses)
+        self._positions = CubicSpline(self.times, poses[:, :3, 3], bc_type="natural")
+        self._rotations = RotationSpline(self.times, Rotation.from_matrix(poses[:, :3, :3]))
+
+    def __call__(self, times: Float[np.ndarray, " n"]) -> Poses:
+        """Return camera-to-world matrices at times."""
+        return rigid(self._rotations(times).as_matrix(), self._positions(times))
+
+    def evenly(self, frames: int) -> Float[np.ndarray, " n"]:
+        """Return `frames` equally spaced times from the first pose to the last."""
+        return np.linspace(0.0, self.times[-1], frames)
+
+
+def _times(poses: Poses) -> Float[np.ndarray, " n"]:
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    turns = angles(poses[1:, :3, :3], poses[:-1, :3, :3])
+    apart = steps / max(steps.mean(), 1e-12) + turns
+    gaps = np.sqrt(apart)
+    gaps = np.maximum(gaps / max(gaps.mean(), 1e-12), SHORTEST)
+    return np.concatenate([[0.0], np.cumsum(gaps / gaps.mean())])
+
+
+def frame_count(knots: int, frames: int | None) -> int:
+    """Return how many frames a ride through `knots` poses has."""
+    return FRAMES_BETWEEN * (knots - 1) + 1 if frames is None else frames
+
+
+def drive(knots: Sequence[Shot], frames: int | None = None) -> list[Shot]:
+    """Return a smooth path through shots, with their commonest lens.
+
+    Exposures (in stops) and gammas (their logarithms) are interpolated linearly where all shots
+    have them.
+
+    Args:
+        knots: in the order of the ride.
+        frames: how many shots; None takes `FRAMES_BETWEEN` from one knot to the next.
+
+    Raises:
+        UserError: there are less than two knots.
+    """
+    if len(knots) < 2:
+        raise UserError(
+            f"A drive needs at least two views of a camera; here there are {len(knots)}.",
+            fix="choose another --camera or --split, or --path orbit",
+        )
+    path = PosePath(inverse(np.stack([s.viewmat for s in knots])))
+    times = path.evenly(frame_count(len(knots), frames))
+    evs = _interpolated(path.times, [s.exposure_ev for s in knots], times)
+    logs = [None if s.gamma is None else float(np.log(s.gamma)) for s in knots]
+    gammas = [
+        None if g is None else float(np.exp(g)) for g in _interpolated(path.times, logs, times)
+    ]
+    K, width, height = common_lens(knots)
+    return [
+        replace(Shot(f"{k:05d}", viewmat, K, width, height), exposure_ev=evs[k], gamma=gammas[k])
+        for k, viewmat in enumerate(inverse(path(times)))
+    ]
+
+
+def _interpolated(at, values: list[float | None], times) -> list[float | None]:
+    known = [v for v in values if v is not None]
+    if len(known) < len(values):
+        return [None] * len(times)
+    return np.interp(times, at, known).tolist()

@@ -1,0 +1,173 @@
+"""A circle around what the cameras look at, or part of one where they did not go around it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from p2gs_jax.paths.geometry import inverse, look_at, up_direction
+from p2gs_jax.paths.shots import Shot, common_lens
+
+FRAMES = 120
+# Optical axes meet where they spread at least this much (sine squared) ...
+LEAST_SPREAD = 0.01
+# ... and the point is before most cameras, within this angle from their axes (median).
+MOST_IN_FRONT, WIDEST = 0.9, np.deg2rad(25)
+# A full circle needs cameras all around, with no larger gap than this.
+LARGEST_GAP = np.deg2rad(100)
+LEAST_SWAY = np.deg2rad(10)
+HIGHEST = np.deg2rad(85)
+
+
+@dataclass(frozen=True)
+class Orbit:
+    """A circle, or an arc to go back and forth on.
+
+    Attributes:
+        focus: its centre seen from above, and what is looked at.
+        up: unit vector.
+        forward: horizontal unit vector, azimuth 0 as seen from the focus.
+        radius: distance from the focus, scene units.
+        elevation: of the camera above the focus, radians.
+        middle: azimuth of the middle of the arc, radians.
+        sway: half the arc, radians; pi for a circle.
+        met: whether the optical axes meet in the focus; otherwise it lies before one camera.
+    """
+
+    focus: Float[np.ndarray, " 3"]
+    up: Float[np.ndarray, " 3"]
+    forward: Float[np.ndarray, " 3"]
+    radius: float
+    elevation: float
+    middle: float
+    sway: float
+    met: bool
+
+    def describe(self) -> str:
+        """Return in a sentence what the camera does, and why."""
+        degrees = f"{np.rad2deg(self.sway):.0f} degrees to either side"
+        if not self.met:
+            return (
+                "The cameras look at no common point, as on a vehicle: the orbit sways "
+                f"{degrees} of the middle view, about the median depth before it."
+            )
+        if self.sway < np.pi:
+            return f"No camera went all around: the orbit sways {degrees}, as far as they did."
+        return "A full circle around the point where the optical axes meet."
+
+    def center(self, azimuth: float) -> Float[np.ndarray, " 3"]:
+        """Return where the camera is at an azimuth."""
+        side = np.cross(self.up, self.forward)
+        level = np.cos(azimuth) * self.forward + np.sin(azimuth) * side
+        direction = np.cos(self.elevation) * level + np.sin(self.elevation) * self.up
+        return self.focus + self.radius * direction
+
+
+def orbit(circle: Orbit, shots: Sequence[Shot], frames: int | None = None) -> list[Shot]:
+    """Return a path that ends where it begins, with the shots' commonest lens.
+
+    Args:
+        circle: from `find_orbit`.
+        shots: whose lens it takes.
+        frames: how many; None takes `FRAMES`.
+    """
+    count = FRAMES if frames is None else frames
+    turn = 2 * np.pi * np.arange(count) / count
+    swing = turn if circle.sway >= np.pi else circle.sway * np.sin(turn)
+    K, width, height = common_lens(shots)
+    return [
+        Shot(f"{k:05d}", look_at(circle.center(a), circle.focus, circle.up), K, width, height)
+        for k, a in enumerate(circle.middle + swing)
+    ]
+
+
+def find_orbit(
+    shots: Sequence[Shot], own: Sequence[Shot], points: Float[np.ndarray, "p 3"]
+) -> Orbit:
+    """Return an orbit that suits how a scene was taken.
+
+    Where the optical axes meet before the cameras, it is around that point at the cameras' median
+    distance and elevation: all around if the cameras are, else over the azimuths that they cover.
+    Where the axes do not meet, as on a vehicle, it sways about the median depth before the middle
+    one of `own`.
+
+    Args:
+        shots: all views.
+        own: those of one camera, in order.
+        points: of the scene, for that depth; may be empty.
+    """
+    viewmats = np.stack([s.viewmat for s in shots])
+    up = up_direction(viewmats)
+    centers, axes = inverse(viewmats)[:, :3, 3], viewmats[:, 2, :3]
+    focus = meeting_point(centers, axes)
+    if focus is None:
+        middle = own[len(own) // 2]
+        distance = _median_depth(middle, points, centers)
+        center = inverse(middle.viewmat)[:3, 3]
+        return _around(center + distance * middle.viewmat[2, :3], center[None], up, met=False)
+    return _around(focus, centers, up, met=True)
+
+
+def meeting_point(
+    centers: Float[np.ndarray, "n 3"], axes: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, " 3"] | None:
+    """Return the point nearest to all optical axes, or None where they do not meet before it.
+
+    Args:
+        centers: of the cameras.
+        axes: unit vectors, forward.
+    """
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    A = across.mean(0)
+    if np.linalg.eigvalsh(A)[0] < LEAST_SPREAD:
+        return None
+    focus = np.linalg.solve(A, np.einsum("nij,nj->i", across, centers) / len(centers))
+    towards = focus - centers
+    distances = np.linalg.norm(towards, axis=1)
+    cosines = np.sum(towards * axes, 1) / np.maximum(distances, 1e-12)
+    if np.mean(cosines > 0) < MOST_IN_FRONT or np.median(cosines) < np.cos(WIDEST):
+        return None
+    return focus
+
+
+def _around(focus, centers, up, *, met: bool) -> Orbit:
+    """Return the orbit that goes where cameras are."""
+    away = centers - focus
+    distances = np.linalg.norm(away, axis=1)
+    heights = np.arcsin(np.clip(away @ up / np.maximum(distances, 1e-12), -1, 1))
+    level = away - (away @ up)[:, None] * up
+    forward = level[np.argmax(np.linalg.norm(level, axis=1))]
+    if np.linalg.norm(forward) < 1e-9 * max(float(distances.max()), 1e-12):
+        forward = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    forward = forward / np.linalg.norm(forward)
+    azimuths = np.sort(np.arctan2(level @ np.cross(up, forward), level @ forward))
+    gaps = np.diff(np.append(azimuths, azimuths[0] + 2 * np.pi))
+    widest = int(np.argmax(gaps))
+    arc = 2 * np.pi - gaps[widest]
+    begin = azimuths[(widest + 1) % len(azimuths)]
+    sway = np.pi if gaps[widest] < LARGEST_GAP else max(arc / 2, LEAST_SWAY)
+    return Orbit(
+        focus=focus,
+        up=up,
+        forward=forward,
+        radius=float(np.median(distances)),
+        elevation=float(np.clip(np.median(heights), -HIGHEST, HIGHEST)),
+        middle=float(begin + arc / 2),
+        sway=float(sway),
+        met=met,
+    )
+
+
+def _median_depth(shot: Shot, points, centers) -> float:
+    """Return the median depth of the points in a shot; without any, the cameras' spread."""
+    local = points @ shot.viewmat[:3, :3].T + shot.viewmat[:3, 3]
+    local = local[local[:, 2] > 1e-6]
+    xy = local[:, :2] / local[:, 2:] * shot.K[[0, 1], [0, 1]] + shot.K[:2, 2]
+    inside = np.all((xy >= 0) & (xy <= (shot.width, shot.height)), axis=1)
+    if inside.any():
+        return float(np.median(local[inside, 2]))
+    spread = float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
+    return spread if spread > 0 else 1.0

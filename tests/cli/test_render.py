@@ -1,0 +1,250 @@
+"""`render` from end to end, on a small run and on a rig that photographed its field."""
+
+import json
+import shutil
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from p2gs_jax.cli import main
+from p2gs_jax.export.exr import read_exr
+from p2gs_jax.paths import Shot, covering, find_rig, view_shots
+from p2gs_jax.photometry.look import Look, develop
+from p2gs_jax.pictures import Studio
+from p2gs_jax.run_folder import load_run
+
+SIZE = (96, 72)
+YAWS = {"left": -22.0, "right": 22.0}
+STOPS = {("left", 0): 0.0, ("left", 1): -2.5, ("right", 0): 0.0, ("right", 1): 0.5}
+
+
+def run(capsys, *argv):
+    with pytest.raises(SystemExit) as stop:
+        main(["render", *(str(a) for a in argv)])
+    out = capsys.readouterr()
+    assert "Traceback" not in out.err + out.out
+    return stop.value.code, out.err + out.out
+
+
+def picture(path):
+    image = cv2.imread(str(path))
+    assert image is not None, path
+    return image[..., ::-1] / 255.0
+
+
+def video(path):
+    with av.open(str(path)) as container:
+        return [f.to_ndarray(format="rgb24") / 255.0 for f in container.decode(video=0)]
+
+
+@pytest.fixture(scope="module")
+def own_run(finished_run, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("render") / "run"
+    shutil.copytree(finished_run, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def rig_run(finished_run, tmp_path_factory) -> Path:
+    """Return a run whose photographs are its own field, taken by a rig at known exposures."""
+    root = tmp_path_factory.mktemp("rig")
+    shutil.copytree(finished_run, root / "run")
+    studio = Studio(load_run(finished_run))
+    K = np.array([[70.0, 0, SIZE[0] / 2], [0, 70.0, SIZE[1] / 2], [0, 0, 1]])
+    model = root / "scene" / "sparse" / "0"
+    model.mkdir(parents=True)
+    lines, views = [], []
+    for number, ((camera, step), ev) in enumerate(STOPS.items(), 1):
+        half = np.deg2rad(YAWS[camera]) / 2
+        viewmat = np.eye(4)
+        turn = np.cos(2 * half), np.sin(2 * half)
+        viewmat[0, [0, 2]], viewmat[2, [0, 2]] = (turn[0], -turn[1]), (turn[1], turn[0])
+        viewmat[:3, 3] = -viewmat[:3, :3] @ [0.3 * step, 0, 0]
+        linear, _, _ = studio.linear(Shot("", viewmat, K, *SIZE))
+        look = Look(2.0**ev, 2.2, studio.run.cfg.photometry)
+        name = f"{camera}/{step:03d}.png"
+        path = root / "scene" / "images" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(path), np.rint(develop(linear, look) * 255)[..., ::-1])
+        # A turn by yaw to the right is one of the world to the left about y (down).
+        q, t = (np.cos(half), 0, -np.sin(half), 0), viewmat[:3, 3]
+        lines += [" ".join(map(str, (number, *q, *t, 1, name))), "1.0 1.0 1"]
+        train = step == 1
+        views.append(
+            {
+                "image": name,
+                "camera": camera,
+                "exposure": 2.0**ev if train else None,
+                "exposure_ev": ev if train else None,
+                "gamma": 2.2 if train else None,
+                "exif_ev": None,
+                "split": "train" if train else "test",
+                "exposure_fitted": None if train else 2.0**ev,
+            }
+        )
+    (model / "images.txt").write_text("\n".join(lines) + "\n")
+    cx, cy = SIZE[0] / 2, SIZE[1] / 2
+    (model / "cameras.txt").write_text(f"1 PINHOLE {SIZE[0]} {SIZE[1]} 70 70 {cx} {cy}\n")
+    (model / "points3D.txt").write_text("1 0 0 4 128 128 128 0.5 1 0 2 0\n")
+    for name, key, value in (
+        ("config.json", "scene", str(root / "scene")),
+        ("photometry.json", "views", views),
+    ):
+        data = json.loads((root / "run" / name).read_text())
+        data[key] = value
+        (root / "run" / name).write_text(json.dumps(data))
+    return root / "run"
+
+
+def test_views_come_with_their_photographs_and_a_file_of_their_cameras(capsys, own_run, tmp_path):
+    code, text = run(capsys, own_run, "--out", tmp_path / "all", "--split", "test")
+    assert code == 0
+    assert "2 frames" in text
+    for name in ("0", "3"):
+        for kind in ("exr", "render.png", "photograph.png"):
+            assert (tmp_path / "all" / f"{name}.{kind}").is_file()
+    cameras = json.loads((tmp_path / "all" / "cameras.json").read_text())
+    assert [c["name"] for c in cameras] == ["0", "3"]
+
+
+def test_a_file_of_cameras_renders_what_the_views_rendered(capsys, own_run, tmp_path):
+    run(capsys, own_run, "--out", tmp_path / "a", "--exposure-ev", "0", "--gamma", "2.2")
+    cameras = tmp_path / "a" / "cameras.json"
+    data = json.loads(cameras.read_text())[:2]
+    data[1].update(exposure_ev=1.0, name="far/brighter")
+    cameras.write_text(json.dumps(data))
+    code, _ = run(capsys, own_run, "--path", cameras, "--out", tmp_path / "b", "--gamma", "2.2")
+    assert code == 0
+    first = picture(tmp_path / "a" / "0.render.png")
+    np.testing.assert_allclose(picture(tmp_path / "b" / "0.png"), first, atol=1 / 255)
+    second = picture(tmp_path / "a" / "1.render.png")
+    assert picture(tmp_path / "b" / "far" / "brighter.png").mean() > second.mean() + 0.05
+    _, dark = read_exr(tmp_path / "b" / "0.exr")
+    _, bright = read_exr(tmp_path / "b" / "far" / "brighter.exr")
+    ratio = bright["p2gsExposure"] / dark["p2gsExposure"]
+    assert ratio == pytest.approx(2, rel=1e-5)
+
+
+def test_one_stop_doubles_the_linear_picture_and_leaves_the_radiance(capsys, own_run, tmp_path):
+    for ev in ("-3", "-2"):
+        argv = ("--path", "drive", "--frames", "2", "--curve", "linear", "--gamma", "2.2")
+        code, _ = run(capsys, own_run, *argv, "--exposure-ev", ev, "--out", tmp_path / ev)
+        assert code == 0
+    dark, bright = (picture(tmp_path / ev / "00001.png") for ev in ("-3", "-2"))
+    assert dark.mean() > 0.01
+    assert bright.max() < 1
+    assert bright.mean() == pytest.approx(2 * dark.mean(), rel=0.02)
+    linear = [read_exr(tmp_path / ev / "00001.exr")[0] for ev in ("-3", "-2")]
+    np.testing.assert_array_equal(*linear)
+
+
+def test_a_drive_becomes_a_video(capsys, own_run, tmp_path):
+    out = tmp_path / "new" / "drive.mp4"
+    code, _ = run(
+        capsys, own_run, "--path", "drive", "--frames", 7, "--out", out, "--fps", 12, "--width", 80
+    )
+    assert code == 0
+    assert [p.name for p in out.parent.iterdir()] == ["drive.mp4"]
+    frames = video(out)
+    assert len(frames) == 7
+    assert frames[0].shape == (70, 80, 3)  # 71.4 pixels high, cut to an even number
+    assert np.abs(frames[0] - frames[-1]).mean() > 0.01
+
+
+def test_a_drive_can_be_exposed_as_photographed(capsys, own_run, tmp_path):
+    fitted = load_run(own_run)
+    argv = ("--path", "drive", "--frames", "6", "--split", "all")
+    code, _ = run(capsys, own_run, *argv, "--exposure-ev", "own", "--out", tmp_path)
+    assert code == 0
+    first, last = (json.loads((tmp_path / "cameras.json").read_text())[k] for k in (0, -1))
+    for entry, index in ((first, 0), (last, 5)):
+        look = fitted.own_look(index)
+        ev = np.log2(look.exposure / fitted.mean.exposure_geometric)
+        assert entry["exposure_ev"] == pytest.approx(ev, abs=1e-6)
+        assert entry["gamma"] == pytest.approx(look.gamma, rel=1e-6)
+
+
+def test_an_orbit_says_what_it_does(capsys, own_run, tmp_path):
+    code, text = run(capsys, own_run, "--path", "orbit", "--frames", "3", "--out", tmp_path)
+    assert code == 0
+    assert "orbit sways" in " ".join(text.split())
+    assert len(list(tmp_path.glob("*.png"))) == 3
+
+
+def rows_of(fitted, image):
+    """Return the three images of a comparison, and where the cameras meet."""
+    views = fitted.scene.views
+    rig = find_rig(view_shots(views), views)
+    cylinder = covering(rig.mounts.values(), np.eye(4))
+    line = (image.shape[0] - 3 * cylinder.height) // 4
+    tops = [line, 3 * line + cylinder.height, 4 * line + 2 * cylinder.height]
+    return [image[t : t + cylinder.height] for t in tops]
+
+
+def test_a_panorama_shows_seams_as_taken_and_none_at_one_exposure(capsys, rig_run, tmp_path):
+    code, _ = run(capsys, rig_run, "--panorama", "--out", tmp_path, "--split", "train")
+    assert code == 0
+    assert [p.name for p in tmp_path.glob("*.png")] == ["001.png"]
+    taken, same, field = rows_of(load_run(rig_run), picture(tmp_path / "001.png"))
+    half, edge = taken.shape[1] // 2, taken.shape[1] // 20
+    left, right = slice(edge, half - 2), slice(half + 2, -edge)
+    ratio = [(taken / np.maximum(field, 1e-3))[:, side].mean() for side in (left, right)]
+    assert ratio[1] > 1.5 * ratio[0]
+    for side in (left, right):
+        there = (same[:, side] > 0.1) & (same[:, side] < 0.9) & (taken[:, side] < 0.97)
+        assert there.mean() > 0.3
+        assert np.abs(same - field)[:, side][there].mean() < 0.03
+
+
+def test_a_wide_drive(capsys, rig_run, tmp_path):
+    out = tmp_path / "wide.mp4"
+    code, _ = run(capsys, rig_run, "--path", "drive", "--panorama", "--frames", 3, "--out", out)
+    assert code == 0
+    frames = video(out)
+    assert len(frames) == 3
+    assert frames[0].shape[1] > 1.3 * SIZE[0]
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        (("--path", "spiral"), "--path"),
+        (("--path", "nowhere.json"), "nowhere.json"),
+        (("--curve", "spline"), "spline"),
+        (("--curve", "film"), "film"),
+        (("--gamma", "0"), "--gamma"),
+        (("--gamma", "nan"), "--gamma"),
+        (("--exposure-ev", "5000"), "--exposure-ev"),
+        (("--exposure-ev", "nan"), "--exposure-ev"),
+        (("--exposure-ev", "own", "--path", "orbit"), "own"),
+        (("--panorama",), "one camera"),
+        (("--panorama", "--path", "orbit"), "--panorama"),
+        (("--camera", "front"), "'front'"),
+        (("--frames", "9"), "--frames"),
+        (("--frames", "1", "--path", "drive"), "--frames"),
+        (("--width", "3"), "--width"),
+        (("--fps", "24"), "--fps"),
+        (("--out", "film.mov"), "film.mov"),
+        (("--split", "best"), "--split"),
+    ],
+)
+def test_senseless_requests_end_with_one_message(capsys, own_run, argv, words):
+    before = sorted(own_run.rglob("*"))
+    code, text = run(capsys, own_run, *argv)
+    assert code == 2
+    assert words in " ".join(text.split())
+    assert sorted(own_run.rglob("*")) == before
+
+
+def test_a_folder_in_place_of_a_video_is_kept(capsys, own_run, tmp_path):
+    (tmp_path / "v.mp4").mkdir()
+    code, text = run(capsys, own_run, "--out", tmp_path / "v.mp4")
+    assert code == 2
+    assert "is a folder" in text
+    (tmp_path / "notes").write_text("mine")
+    code, text = run(capsys, own_run, "--out", tmp_path / "notes")
+    assert code == 2
+    assert (tmp_path / "notes").read_text() == "mine"

@@ -1,0 +1,131 @@
+import json
+
+import numpy as np
+import pytest
+from cameras import shot, turned
+
+from p2gs_jax.errors import UserError
+from p2gs_jax.paths import read_cameras, write_cameras
+from p2gs_jax.paths.geometry import inverse
+
+GOOD = {
+    "viewmat": np.eye(4).tolist(),
+    "K": [[50, 0, 32], [0, 50, 24], [0, 0, 1]],
+    "width": 64,
+    "height": 48,
+}
+
+
+def save(path, value):
+    path.write_text(json.dumps(value))
+    return path
+
+
+def test_what_is_written_is_read_again(tmp_path):
+    shots = [
+        shot(turned(20, (1, 2, 3), pitch=5), "a/first"),
+        shot(turned(), "second", exposure_ev=-1.5, gamma=1.8, view=3),
+    ]
+    write_cameras(tmp_path / "cameras.json", shots)
+    back = read_cameras(tmp_path / "cameras.json")
+    for before, after in zip(shots, back, strict=True):
+        np.testing.assert_allclose(after.viewmat, before.viewmat, atol=1e-12)
+        np.testing.assert_array_equal(after.K, before.K)
+        for field in ("name", "width", "height", "exposure_ev", "gamma"):
+            assert getattr(after, field) == getattr(before, field)
+    assert back[1].view is None
+
+
+def test_names_are_numbers_where_there_are_none(tmp_path):
+    shots = read_cameras(save(tmp_path / "c.json", [GOOD, GOOD]))
+    assert [s.name for s in shots] == ["00000", "00001"]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"viewmat": None}, "viewmat"),
+        ({"viewmat": [[1, 2], [3, 4]]}, "viewmat"),
+        ({"viewmat": (2 * np.eye(4)).tolist()}, "viewmat"),
+        ({"viewmat": np.diag([1.0, 1, -1, 1]).tolist()}, "viewmat"),
+        ({"K": [[0, 0, 1], [0, 50, 1], [0, 0, 1]]}, "K"),
+        ({"K": [[50, 3, 32], [0, 50, 24], [0, 0, 1]]}, "skew"),
+        ({"width": 0}, "width"),
+        ({"width": 64.5}, "width"),
+        ({"width": True}, "width"),
+        ({"height": "48"}, "height"),
+        ({"height": 1e300}, "height"),
+        ({"gamma": 0}, "gamma"),
+        ({"exposure_ev": "bright"}, "exposure_ev"),
+        ({"exposure_ev": 5000}, "exposure_ev"),
+        ({"name": "../../etc"}, "name"),
+        ({"name": "/a"}, "name"),
+        ({"name": 3}, "name"),
+        ({"exposure": 2}, "unknown field 'exposure'"),
+    ],
+)
+def test_errors_name_the_entry_and_the_field(tmp_path, change, words):
+    path = save(tmp_path / "c.json", [GOOD, {k: v for k, v in {**GOOD, **change}.items()}])
+    with pytest.raises(UserError) as error:
+        read_cameras(path)
+    assert "camera 1" in str(error.value)
+    assert words in str(error.value)
+    assert str(path) in str(error.value)
+
+
+@pytest.mark.parametrize("key", ["viewmat", "K", "width", "height"])
+def test_a_missing_field_is_named(tmp_path, key):
+    entry = {k: v for k, v in GOOD.items() if k != key}
+    with pytest.raises(UserError, match=key):
+        read_cameras(save(tmp_path / "c.json", [entry]))
+
+
+@pytest.mark.parametrize("content", ["", "{", "3", "[]", "{}", "[3]", '{"camera_path": 3}'])
+def test_other_files_are_refused(tmp_path, content):
+    (tmp_path / "c.json").write_text(content)
+    with pytest.raises(UserError, match=r"c\.json"):
+        read_cameras(tmp_path / "c.json")
+
+
+def test_a_missing_file_and_equal_names_are_refused(tmp_path):
+    with pytest.raises(UserError, match=r"nowhere\.json"):
+        read_cameras(tmp_path / "nowhere.json")
+    twice = [{**GOOD, "name": "x"}, GOOD, {**GOOD, "name": "x"}]
+    with pytest.raises(UserError, match="0 and 2"):
+        read_cameras(save(tmp_path / "c.json", twice))
+
+
+def nerfstudio(**change):
+    pose = inverse(turned(30, (1, 2, 3))) @ np.diag([1.0, -1, -1, 1])
+    entry = {"camera_to_world": pose.ravel().tolist(), "fov": 60, "aspect": 1.5}
+    data = {
+        "camera_type": "perspective",
+        "render_height": 100,
+        "render_width": 150,
+        "camera_path": [entry, {**entry, **change.pop("second", {})}],
+        "fps": 24,
+    }
+    return {**data, **change}
+
+
+def test_a_nerfstudio_path_is_read(tmp_path):
+    shots = read_cameras(save(tmp_path / "camera_path.json", nerfstudio()))
+    assert len(shots) == 2
+    np.testing.assert_allclose(shots[0].viewmat, turned(30, (1, 2, 3)), atol=1e-12)
+    f = 50 / np.tan(np.deg2rad(30))
+    np.testing.assert_allclose(shots[0].K, [[f, 0, 75], [0, f, 50], [0, 0, 1]])
+    assert (shots[0].width, shots[0].height) == (150, 100)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"camera_type": "equirectangular"}, "equirectangular"),
+        ({"render_width": None}, "render_width"),
+        ({"second": {"fov": 0}}, "camera 1 has no fov"),
+        ({"second": {"camera_to_world": [1, 2]}}, "camera 1 has a camera_to_world"),
+    ],
+)
+def test_errors_of_a_nerfstudio_path(tmp_path, change, words):
+    with pytest.raises(UserError, match=words):
+        read_cameras(save(tmp_path / "p.json", nerfstudio(**change)))
