@@ -210,7 +210,7 @@ class OptimizerConfig:
     scales: float = 2e-2
     """Logarithms (3DGS: 5e-3 over 30k steps; ours: for runs of a few thousand)."""
     quats: float = 1e-3
-    """(3DGS: 1e-3)."""
+    """Quaternions (3DGS: 1e-3)."""
     exposures: float = 1e-3
     """Raw exposures (ours: PHOTOMETRY section 4; ten times this where no tracks gave a start)."""
     gammas: float = 1e-4

@@ -30,7 +30,9 @@ def make_scene(root, views=6, points=150, size=(112, 100), seed=0):
                 observations[p].append((v + 1, len(found)))
                 found.append(f"{uv[p, 0]:.4f} {uv[p, 1]:.4f} {p + 1}")
         encoded = np.clip(image, 0, 1) ** (1 / 2.2)
-        cv2.imwrite(str(root / "images" / f"{v}.png"), np.rint(encoded * 255).astype(np.uint8)[..., ::-1])
+        cv2.imwrite(
+            str(root / "images" / f"{v}.png"), np.rint(encoded * 255).astype(np.uint8)[..., ::-1]
+        )
         lines += [f"{v + 1} 1 0 0 0 {t[0]} {t[1]} {t[2]} 1 {v}.png", " ".join(found)]
     (model / "images.txt").write_text("\n".join(lines) + "\n")
     (model / "cameras.txt").write_text(

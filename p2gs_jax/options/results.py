@@ -11,7 +11,11 @@ import tyro
 
 @dataclass(frozen=True)
 class Render:
-    """Render views of a finished run at any exposure and gamma."""
+    """Render views of a finished run at any exposure and gamma.
+
+    p2gs-jax render runs/castle
+    p2gs-jax render runs/castle --exposure-ev 1 --gamma 2.2 --out brighter
+    """
 
     run: Annotated[Path, tyro.conf.Positional]
     """Run folder."""
@@ -27,7 +31,10 @@ class Render:
 
 @dataclass(frozen=True)
 class Eval:
-    """Judge a finished run again, against its photographs or a reference."""
+    """Judge a finished run again, also against a reference.
+
+    p2gs-jax eval runs/castle --reference castle/iso8
+    """
 
     run: Annotated[Path, tyro.conf.Positional]
     """Run folder."""

@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from p2gs_jax.photometry.observations import Observations
-from p2gs_jax.synth.sensor import READ_NOISE, SHOT_NOISE, Curve, encode
+from p2gs_jax.synth.sensor import READ_NOISE, SHOT_NOISE, encode
+from p2gs_jax.synth.settings import Curve
 
 Exposures = Literal["constant", "iso2", "iso4", "cameras", "auto"]
 YAWS = (0.0, -44.2, 44.8)

@@ -151,7 +151,7 @@ def test_durations():
 
 
 def test_every_configuration_field_is_an_option(capsys):
-    code, text = run(capsys, "fit", "--help")
+    code, text = run(capsys, "fit", "--help-all")
     assert code == 0
     for option in ("--loss.dssim-weight", "--densify.method", "--render.tile", "--train.log-every"):
         assert option in text
