@@ -13,7 +13,7 @@ from p2gs_jax.errors import UserError
 
 # Quiet the native libraries before they load; our own messages say what matters.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
-os.environ.setdefault("GLOG_minloglevel", "2")
+os.environ.setdefault("GLOG_minloglevel", "3")
 
 # What must answer even where JAX cannot be imported, and at once where it can.
 WITHOUT_JAX = ("doctor", "completion")

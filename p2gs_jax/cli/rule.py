@@ -23,6 +23,8 @@ from tyro.constructors import (
     MISSING,
     MISSING_NONPROP,
     ConstructorRegistry,
+    PrimitiveConstructorSpec,
+    PrimitiveTypeInfo,
     StructConstructorSpec,
     StructFieldSpec,
     StructTypeInfo,
@@ -50,7 +52,35 @@ def registry(brief: bool) -> ConstructorRegistry:
             return _configuration(info, brief)
         return StructConstructorSpec(kind, tuple(_fields(kind, info.default)))
 
+    rules.primitive_rule(_number_rule)
     return rules
+
+
+def _number_rule(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+    """Return how a number, or a number or None, is read: with complaints in plain words."""
+    kinds = set(get_args(info.type)) if _is_union(info.type) else {info.type}
+    optional = NoneType in kinds
+    kinds -= {NoneType}
+    if kinds not in ({int}, {float}):
+        return None
+    (kind,) = kinds
+
+    def read(words: list[str]) -> int | float | None:
+        if optional and words[0] == "None":
+            return None
+        try:
+            return kind(words[0])
+        except ValueError:
+            what = "whole number" if kind is int else "number"
+            raise ValueError(f"{words[0]!r} is no {what}") from None
+
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=PLACEHOLDERS[kind],
+        instance_from_str=read,
+        is_instance=lambda value: isinstance(value, kind | (NoneType if optional else kind)),
+        str_from_instance=lambda value: [str(value)],
+    )
 
 
 def _configuration(info: StructTypeInfo, brief: bool) -> StructConstructorSpec:
@@ -108,7 +138,7 @@ def _looks(kind: type, name: str, hint: Any, default: Any) -> tuple[Any, ...]:
 def _placeholder(plain: Any, none_counts: bool) -> str | None:
     """Return what stands for a value of a type, or None where tyro shall decide."""
     origin, args = get_origin(plain), get_args(plain)
-    if origin in (Union, UnionType):
+    if _is_union(plain):
         parts = [_placeholder(a, none_counts) or "" for a in args if a is not NoneType]
         choices = ",".join(p.strip("{}") for p in parts if p.startswith("{"))
         others = [p for p in parts if not p.startswith("{")]
@@ -132,6 +162,10 @@ def _default_shown(default: str, *, none_counts: bool) -> str:
     return f"(default: {default})"
 
 
+def _is_union(hint: Any) -> bool:
+    return get_origin(hint) in (Union, UnionType)
+
+
 def _plain(hint: Any) -> Any:
     return get_args(hint)[0] if get_origin(hint) is Annotated else hint
 
@@ -142,7 +176,8 @@ def _extras(hint: Any) -> tuple[Any, ...]:
 
 def _text(kind: type, name: str) -> str | None:
     """Return the string below a field as one paragraph."""
-    text = _field_docs(kind).get(name)
+    found = (_field_docs(k).get(name) for k in kind.__mro__ if dataclasses.is_dataclass(k))
+    text = next((t for t in found if t is not None), None)
     return None if text is None else " ".join(text.split())
 
 

@@ -8,9 +8,12 @@ import platform
 import sys
 import textwrap
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from p2gs_jax.doctor import cache, features, libraries, machine, render
-from p2gs_jax.options.setup import Doctor
+
+if TYPE_CHECKING:  # options need tyro, which may be what is broken
+    from p2gs_jax.options.setup import Doctor
 
 
 def run(options: Doctor) -> int:

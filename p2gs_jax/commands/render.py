@@ -26,7 +26,7 @@ def run(options: Render) -> int:
     if split not in ("all", "train", "test"):
         raise UserError(f"--split {split!r} is unknown.", fix="choose all, train or test")
     if gamma is not None and gamma <= 0:
-        raise UserError("--gamma must be positive.")
+        raise UserError(f"--gamma {gamma} is not positive.", fix="2.2 is the usual one")
     fitted = load_run(options.run)
     folder = options.out or options.run / "renders" / "all"
     store = ImageStore(fitted.scene.views, fitted.cfg.data)

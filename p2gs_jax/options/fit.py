@@ -163,6 +163,7 @@ def _known(cfg: configs.FitConfig, args: Fit | Calibrate) -> configs.FitConfig:
     check(
         args.known_deviation_ev is None or p.known is not None,
         "--known-deviation-ev says nothing without --known-exposures",
+        fix="add --known-exposures FILE, or exif",
     )
     return dataclasses.replace(cfg, photometry=p)
 
