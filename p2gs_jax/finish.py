@@ -166,7 +166,7 @@ def photometry_model(params: Params, cfg: FitConfig) -> tuple[str, dict, str]:
     gauge = (
         "mean log exposure over the training views is 0; radiance is relative to it"
         if params.photometry.parameterization == "log"
-        else "soft: the mean exposure is pulled towards 1 (paper, eq. 9)"
+        else "soft: the mean exposure is pulled towards 1 (paper, eq. 10)"
     )
     p = cfg.photometry
     curve = {"name": p.curve, "pivot": p.pivot, "spline": p.spline}

@@ -1,4 +1,4 @@
-"""One fit from a scene folder to a run folder: the data flow of ARCHITECTURE.md, top to bottom."""
+"""One fit from a scene folder to a run folder: the data flow, top to bottom."""
 
 from __future__ import annotations
 

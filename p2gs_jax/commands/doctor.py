@@ -48,7 +48,11 @@ def examine() -> dict:
         "compile_cache": dataclasses.asdict(kept),
         "self_test": dataclasses.asdict(test),
         "libraries": [dataclasses.asdict(x) for x in tried],
-        "optional": {name: libraries.installed(name) for name in features.OPTIONAL},
+        "optional": {
+            name: libraries.installed(name)
+            for name in features.OPTIONAL
+            if name not in {x.name for x in tried}
+        },
         "features": [dataclasses.asdict(f) for f in features.look(tried, devices.backend)],
         "healthy": test.ok and devices.trouble is None and not any(x.trouble for x in tried),
     }
@@ -77,7 +81,7 @@ def as_text(found: dict) -> str:
     lines += ["", "Feature".ljust(width) + "works"]
     for f in found["features"]:
         lines.append(
-            _row(f"  {f['name']}", f"{'yes' if f['ready'] else 'NO '}   {f['remark']}", width)
+            _row(f"  {f['name']}", f"{'yes' if f['ready'] else 'no '}   {f['remark']}", width)
         )
     if found["healthy"]:
         verdict = "All that a fit needs is there."

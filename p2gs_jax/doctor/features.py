@@ -11,20 +11,13 @@ from pathlib import Path
 from p2gs_jax.doctor.libraries import Library
 
 # Distributions that only some features need.
-OPTIONAL = ("viser", "av", "playwright")
+OPTIONAL = ("viser", "av", "gsply", "playwright")
 BROWSERS = (
     "chromium",
     "chromium-browser",
     "google-chrome",
     "google-chrome-stable",
     "chrome",
-    "msedge",
-)
-PLACES = (
-    "/Applications/Google Chrome.app/Contents/MacOS/Google Chrome",
-    "/Applications/Chromium.app/Contents/MacOS/Chromium",
-    "C:/Program Files/Google/Chrome/Application/chrome.exe",
-    "C:/Program Files (x86)/Microsoft/Edge/Application/msedge.exe",
 )
 
 
@@ -58,7 +51,8 @@ def look(libraries: Sequence[Library], backend: str | None) -> list[Feature]:
         _optional("photographs without poses", "pycolmap", "pip install pycolmap", broken),
         _optional("view", "viser", "pip install 'p2gs-jax[viewer]'", broken),
         _browser(),
-        _optional("videos (render --path, report)", "av", "pip install av", broken),
+        _optional("videos (render --out x.mp4)", "av", "pip install av", broken),
+        _optional("export to .spz", "gsply", "pip install 'p2gs-jax[spz]'", broken),
         _gpu(backend),
         Feature("LPIPS", True, "with --lpips-weights FILE (docs/files.md tells how to write one)"),
     ]
@@ -66,8 +60,7 @@ def look(libraries: Sequence[Library], backend: str | None) -> list[Feature]:
 
 def find_browser() -> str | None:
     """Return the path of a Chromium or Chrome, or None."""
-    found = (shutil.which(name) for name in BROWSERS)
-    return next((p for p in found if p), next((p for p in PLACES if Path(p).is_file()), None))
+    return next(filter(None, map(shutil.which, BROWSERS)), None)
 
 
 def _optional(name: str, module: str, fix: str, broken: Sequence[str]) -> Feature:

@@ -6,30 +6,16 @@ import importlib
 import importlib.metadata
 from dataclasses import dataclass
 
-# Distributions and what they are imported as: the dependencies of pyproject.toml.
-NEEDED = {
-    "jax": "jax",
-    "jaxlib": "jaxlib",
-    "optax": "optax",
-    "optimistix": "optimistix",
-    "equinox": "equinox",
-    "jaxtyping": "jaxtyping",
-    "numpy": "numpy",
-    "scipy": "scipy",
-    "OpenEXR": "OpenEXR",
+# What is imported under another name than it is installed under; pip may write names in lower case.
+MODULES = {
     "colour-science": "colour",
+    "openexr": "OpenEXR",
     "opencv-contrib-python-headless": "cv2",
-    "pycolmap": "pycolmap",
-    "chex": "chex",
-    "tyro": "tyro",
-    "platformdirs": "platformdirs",
-    "filelock": "filelock",
-    "rich": "rich",
     "orbax-checkpoint": "orbax.checkpoint",
-    "plyfile": "plyfile",
     "pillow": "PIL",
-    "matplotlib": "matplotlib",
 }
+# Tried where pip knows nothing of p2gs-jax: a copy that was never installed.
+CORE = ("jax", "optax", "optimistix", "equinox", "jaxtyping", "numpy", "tyro", "rich", "pycolmap")
 
 
 @dataclass(frozen=True)
@@ -47,18 +33,14 @@ class Library:
     trouble: str | None
 
 
-def look(needed: dict[str, str] = NEEDED) -> list[Library]:
-    """Try to import every library; never raises.
-
-    Args:
-        needed: modules by distribution.
-    """
-    wanted = _requirements()
-    return [_try(name, module, wanted.get(name.lower())) for name, module in needed.items()]
+def look() -> list[Library]:
+    """Try to import everything that p2gs-jax depends on; never raises."""
+    wanted = requirements()
+    return [_try(name, wanted[name]) for name in sorted(wanted, key=str.lower)]
 
 
-def _try(name: str, module: str, wanted) -> Library:
-    version = installed(name)
+def _try(name: str, wanted) -> Library:
+    version, module = installed(name), module_of(name)
     try:
         loaded = importlib.import_module(module)
     except Exception as error:  # whatever a broken library raises
@@ -70,6 +52,11 @@ def _try(name: str, module: str, wanted) -> Library:
     return Library(name, version, None)
 
 
+def module_of(name: str) -> str:
+    """Return what a distribution is imported as."""
+    return MODULES.get(name.lower(), name)
+
+
 def installed(name: str) -> str | None:
     """Return the version of a distribution, or None where it is not installed."""
     try:
@@ -78,13 +65,13 @@ def installed(name: str) -> str | None:
         return None
 
 
-def _requirements() -> dict:
-    """Return version ranges by distribution, in lower case; empty where they cannot be told."""
+def requirements() -> dict:
+    """Return ranges of versions by distribution; None where the range cannot be told."""
     try:
         from packaging.requirements import Requirement
 
         lines = importlib.metadata.requires("p2gs-jax") or []
-        found = (Requirement(line) for line in lines)
-        return {r.name.lower(): r.specifier for r in found if r.marker is None}
-    except Exception:  # a hint only
-        return {}
+        needed = [r for r in map(Requirement, lines) if r.marker is None]
+        return {r.name: r.specifier for r in needed} | {"jaxlib": None}
+    except Exception:  # p2gs-jax is not installed, or packaging is not
+        return dict.fromkeys((*CORE, "jaxlib"))

@@ -13,7 +13,7 @@ absorbs padding.
 Backward. The same queue, front to back. With R the gradient-weighted light still to come,
 q = w (radiance . g) and R -= q after each entry, the gradient to the exponent of one entry is
 q - R alpha / (1 - alpha): no division by transmittance. The geometry gradients follow in closed
-form from six moments of it over the tile. Source and measurements: KERNEL.md.
+form from six moments of it over the tile. Source and measurements: docs/kernel.md.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 What a photometric adjustment sees of a drive, with every quantity known: three cameras, frames one
 unit apart, facades, road and sky, 4-6 stops of contrast plus a bright sky, 8-bit photographs with
-photon noise, texture and outliers (our own proxy; PHOTOMETRY section 3 describes the like).
+photon noise, texture and outliers (our own proxy; docs/photometry.md, 3 describes the like).
 """
 
 from __future__ import annotations
