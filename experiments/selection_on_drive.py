@@ -20,7 +20,8 @@ import numpy as np
 
 import p2gs_jax
 from p2gs_jax.photometry.selection import Selection, select
-from p2gs_jax.synth.drive import Curve, Exposures, make_drive, make_exposures, observe
+from p2gs_jax.synth.drive import Exposures, make_drive, make_exposures, observe
+from p2gs_jax.synth.settings import Curve
 
 CAMERA_GAMMAS, GAMMA_SPREAD = (2.0, 2.2, 2.45), 0.15
 BLACK, SATURATION, PIVOT = 4 / 255, 250 / 255, 0.18

@@ -4,11 +4,11 @@ The public interface. Everything else may change between releases.
 """
 
 from importlib import import_module
+from importlib.metadata import version
 from typing import TYPE_CHECKING
 
 from p2gs_jax.config import FitConfig, preset
 from p2gs_jax.errors import DivergenceError, UserError
-from p2gs_jax.types import Camera, Gaussians, Params, Photometry, Render, Scene
 
 if TYPE_CHECKING:
     from p2gs_jax.calibration import calibrate
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from p2gs_jax.run_folder import load_run
     from p2gs_jax.static_stack import calibrate_stack
     from p2gs_jax.synth.write import write_street
+    from p2gs_jax.types import Camera, Gaussians, Params, Photometry, Render, Scene
 
 __all__ = [
     "Camera",
@@ -52,10 +53,15 @@ _LAZY = {
     "render_linear": "p2gs_jax.render",
     "write_street": "p2gs_jax.synth.write",
 }
+_LAZY |= dict.fromkeys(
+    ("Camera", "Gaussians", "Params", "Photometry", "Render", "Scene"), "p2gs_jax.types"
+)
 
 
 def __getattr__(name: str):
-    """Import what is heavy only when it is used."""
+    """Import what is heavy only when it is used: even the records need JAX, `--help` does not."""
+    if name == "__version__":
+        return version("p2gs-jax")
     if name not in _LAZY:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(_LAZY[name]), name)

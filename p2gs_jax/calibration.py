@@ -23,7 +23,7 @@ from p2gs_jax.prepare import calibrate_observations
 from p2gs_jax.progress import Reporter, Silent
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.scene.known_exposures import stated_ev
+from p2gs_jax.scene.known_exposures import check_source, stated_ev
 from p2gs_jax.types import Scene
 
 WEAK_GAMMA = 0.1
@@ -93,6 +93,8 @@ def calibrate(
     reporter = reporter or Silent()
     out = Path(out)
     begin = time.monotonic()
+    check_source(cfg.photometry.known)
+    check_source(compare_with)
     reporter.stage("Reading the scene")
     scene = load_scene(Path(scene_dir), cfg.data, out / "cache", reporter.message)
     store = ImageStore(scene.views, cfg.data)

@@ -26,6 +26,13 @@ def machine() -> str:
     return f"jax-{jax.__version__}-{platform.machine()}-{key}"
 
 
+def cache_folder() -> Path | None:
+    """Return where JAX keeps compiled programs, or None where it keeps none."""
+    values = jax.config.values
+    folder = values["jax_compilation_cache_dir"]
+    return Path(folder) if folder and values["jax_enable_compilation_cache"] else None
+
+
 def use_compile_cache() -> None:
     """Let JAX keep compiled programs in the user's cache folder.
 

@@ -71,11 +71,11 @@ class RenderConfig:
     blur: float = 0.3
     """Variance added to the 2D covariance, pixels^2 (3DGS: 0.3)."""
     tile: tuple[int, int] = (16, 8)
-    """Tile width and height in pixels (ours: KERNEL.md)."""
+    """Tile width and height in pixels (ours: docs/kernel.md)."""
     chunk: int = 16
-    """List entries a lane composites per iteration (ours: KERNEL.md)."""
+    """List entries a lane composites per iteration (ours: docs/kernel.md)."""
     pixels_in_flight: int = 32768
-    """Pixels composited at once: lanes times tile size (ours: KERNEL.md)."""
+    """Pixels composited at once: lanes times tile size (ours: docs/kernel.md)."""
     alpha_cutoff: float = 1.0 / 255.0
     """Contributions below this opacity are skipped (3DGS: 1/255). The error in a pixel is at most
     the cutoff times the sum of the skipped radiances."""
@@ -105,7 +105,7 @@ class PhotometryConfig:
 
     select: bool = True
     """Choose `model` and `curve` on held-out track observations; where there are none, or with
-    --photometry.no-select, they are used as given (ours: PHOTOMETRY section 5)."""
+    --photometry.no-select, they are used as given (ours: docs/photometry.md, 5)."""
     model: PhotometricModel = "view_exposure_gamma"
     """What varies between views; what does not vary is not learned."""
     curve: Literal["power", "srgb", "spline", "linear"] = "srgb"
@@ -119,7 +119,7 @@ class PhotometryConfig:
     """Standard deviation of the known exposures, stops; 0 keeps them as they are."""
     pivot: float = 0.18
     """Linear value that a change of gamma leaves alone: y = OETF(x0 (eL/x0)^(2.2/gamma))
-    (ours: mid-grey beats white 2.5-5x in EV, PHOTOMETRY section 3; the paper's is 1)."""
+    (ours: mid-grey beats white 2.5-5x in EV, docs/photometry.md, 3; the paper's is 1)."""
     clamp: bool = False
     """Clamp the exposed radiance to [1e-6, 10] and the result to [0, 1] as the paper does (paper,
     Tone-mapping estimation); unclamped predictions meet a censored loss instead (ours)."""
@@ -135,12 +135,12 @@ class PhotometryConfig:
     exposure compensation), a bilateral grid of them, or a curve (photometry/appearance.py)."""
     freeze_until: float = 0.6
     """Fraction of the run during which exposure and gamma stay at their start, where that start
-    comes from tracks (ours: PHOTOMETRY section 4)."""
+    comes from tracks (ours: docs/photometry.md, 4)."""
 
 
 @dataclass(frozen=True)
 class RelativeExposureConfig:
-    """The relative-exposure loss L_exp (paper, eq. 8) and its readings (PHOTOMETRY section 3)."""
+    """The relative-exposure loss L_exp (paper, eq. 9) and its readings (docs/photometry.md, 3)."""
 
     weight: float | None = None
     """lambda_exp (paper: 0.01 in the main text, 0.1 in the appendix); None leaves it out."""
@@ -156,7 +156,7 @@ class RelativeExposureConfig:
 
 @dataclass(frozen=True)
 class RegularizerConfig:
-    """What fixes the gauges (paper, eq. 9; PHOTOMETRY section 4). None leaves a term out."""
+    """What fixes the gauges (paper, eq. 10; docs/photometry.md, 4). None leaves a term out."""
 
     exposure_scale: float | None = None
     """lambda_escale E[(e - 1)^2] (paper: 0.01)."""
@@ -178,16 +178,16 @@ class RegularizerConfig:
 
 @dataclass(frozen=True)
 class LossConfig:
-    """The composed loss (paper, eq. 5)."""
+    """The composed loss (paper, eq. 7)."""
 
     dssim_weight: float | None = 0.2
     """lambda_dssim (paper, Photometric reconstruction: 0.2)."""
     censored: bool = True
     """Where the photograph is saturated, penalise only predictions below the threshold (ours)."""
     saturation: float = 250.0 / 255.0
-    """Photographed values from here on count as saturated (ours: PHOTOMETRY section 3)."""
+    """Photographed values from here on count as saturated (ours: docs/photometry.md, 3)."""
     black: float = 4.0 / 255.0
-    """Photographed values up to here carry no exposure information (PHOTOMETRY section 3)."""
+    """Photographed values up to here carry no exposure information (docs/photometry.md, 3)."""
     quantization: float | None = None
     """Half the interval that a stored value stands for (0.5 / 255 for 8 bits): predictions within
     it are right and get no gradient. None compares with the stored value (ours: BUILD_NOTES)."""
@@ -214,9 +214,9 @@ class OptimizerConfig:
     scales: float = 2e-2
     """Logarithms (3DGS: 5e-3 over 30k steps; ours: for runs of a few thousand)."""
     quats: float = 1e-3
-    """(3DGS: 1e-3)."""
+    """Quaternions (3DGS: 1e-3)."""
     exposures: float = 1e-3
-    """Raw exposures (ours: PHOTOMETRY section 4; ten times this where no tracks gave a start)."""
+    """Raw exposures (ours: docs/photometry.md, 4; ten times this where no tracks gave a start)."""
     gammas: float = 1e-4
     """Raw gammas (ours: likewise)."""
     appearance: float = 1e-2

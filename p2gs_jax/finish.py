@@ -37,6 +37,18 @@ APPEARANCE = "appearance.npy"
 Reference = Callable[[int], np.ndarray | None]
 
 
+def check_reference(folder: str | Path | None) -> None:
+    """Complain about a folder that is none, before there are any views; None is fine.
+
+    Raises:
+        UserError: there is no such folder.
+    """
+    if folder is not None and not Path(folder).is_dir():
+        raise UserError(
+            f"{folder} is not a folder.", fix="give --reference a folder of photographs"
+        )
+
+
 def load_reference(folder: str | Path, scene: Scene, cfg: FitConfig) -> Reference:
     """Return a function from a view's row to its photograph under the common exposure.
 
@@ -49,10 +61,7 @@ def load_reference(folder: str | Path, scene: Scene, cfg: FitConfig) -> Referenc
         UserError: the folder does not exist or holds no photograph of any view.
     """
     folder = Path(folder)
-    if not folder.is_dir():
-        raise UserError(
-            f"{folder} is not a folder.", fix="give --reference a folder of photographs"
-        )
+    check_reference(folder)
     rows = {}
     for row, view in enumerate(scene.views):
         named = [folder / view.name, *sorted(folder.glob(str(Path(view.name).with_suffix(".*"))))]
@@ -157,7 +166,7 @@ def photometry_model(params: Params, cfg: FitConfig) -> tuple[str, dict, str]:
     gauge = (
         "mean log exposure over the training views is 0; radiance is relative to it"
         if params.photometry.parameterization == "log"
-        else "soft: the mean exposure is pulled towards 1 (paper, eq. 9)"
+        else "soft: the mean exposure is pulled towards 1 (paper, eq. 10)"
     )
     p = cfg.photometry
     curve = {"name": p.curve, "pivot": p.pivot, "spline": p.spline}

@@ -1,4 +1,4 @@
-"""One fit from a scene folder to a run folder: the data flow of ARCHITECTURE.md, top to bottom."""
+"""One fit from a scene folder to a run folder: the data flow, top to bottom."""
 
 from __future__ import annotations
 
@@ -19,12 +19,13 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.lpips import LpipsWeights
 from p2gs_jax.evaluate.lpips_weights import read_lpips_weights
 from p2gs_jax.export.atomic import plain, write_json
-from p2gs_jax.finish import finish, load_reference
+from p2gs_jax.finish import check_reference, finish, load_reference
 from p2gs_jax.photometry.gauge import recentre
 from p2gs_jax.photometry.selection import Selection
 from p2gs_jax.prepare import Prepared, load, prepare
 from p2gs_jax.progress import Reporter, Silent
 from p2gs_jax.scene.images import size_at
+from p2gs_jax.scene.known_exposures import check_source
 from p2gs_jax.train.growth import check_method
 from p2gs_jax.train.loop import Trainer, TrainResult
 from p2gs_jax.train.validation import pick_validation
@@ -129,7 +130,9 @@ def fit(
     begin = time.monotonic()
     check_method(cfg.densify)
     check_run_dir(run_dir, resume, cfg)
-    # What judging needs is read first: a wrong file should not cost a fit.
+    # What is needed later is looked at first: a wrong file should not cost a fit.
+    check_source(cfg.photometry.known)
+    check_reference(reference)
     path = cfg.evaluation.lpips_weights
     lpips_weights = None if path is None else read_lpips_weights(path)
     run_dir.mkdir(parents=True, exist_ok=True)

@@ -228,7 +228,7 @@ def with_correspondence(cfg: FitConfig, tracks: Observations | None) -> FitConfi
 def without_tracks(cfg: FitConfig) -> FitConfig:
     """Return the configuration for exposures that must be learned from nothing.
 
-    They move from the first step, ten times as fast (PHOTOMETRY section 4).
+    They move from the first step, ten times as fast (docs/photometry.md, 4).
     """
     o = cfg.optimizer
     return dataclasses.replace(

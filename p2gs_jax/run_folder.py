@@ -132,7 +132,7 @@ def load_run(folder: Path) -> Run:
         raise UserError(
             f"{config_path} cannot be read: {error}.", fix="fit again with this version"
         ) from error
-    scene = load_scene(Path(saved["scene"]), cfg.data, folder / "cache", lambda text: None)
+    scene = _load_scene(Path(saved["scene"]), cfg, folder)
     gaussians = read_ply(folder / "radiance.ply")
     photometry_file = read_photometry(folder / "photometry.json")
     cfg = replace(cfg, photometry=resolved(cfg.photometry, photometry_file))
@@ -162,6 +162,15 @@ def load_run(folder: Path) -> Run:
         None if reference is None else Path(reference),
         photometry_file,
     )
+
+
+def _load_scene(path: Path, cfg: FitConfig, folder: Path) -> Scene:
+    if not path.exists():
+        raise UserError(
+            f"the scene of this run, {path}, is not there.",
+            fix=f"put it back, or correct `scene` in {folder / 'config.json'}",
+        )
+    return load_scene(path, cfg.data, folder / "cache", lambda text: None)
 
 
 def _appearance(folder: Path, cfg: FitConfig, views: int):

@@ -122,7 +122,10 @@ def read_stack(folder: Path) -> Stack:
     inner = folder / "images" if (folder / "images").is_dir() else folder
     files = sorted(p for p in inner.iterdir() if p.suffix.lower() in SUFFIXES)
     if len(files) < 2:
-        raise UserError(f"{inner} holds {len(files)} photograph(s); a stack needs two.")
+        raise UserError(
+            f"{inner} holds {len(files)} photograph(s); a stack needs two.",
+            fix="name a folder of photographs from one viewpoint at several exposures",
+        )
     images = []
     for path in files:
         image = cv2.imread(str(path), cv2.IMREAD_COLOR)

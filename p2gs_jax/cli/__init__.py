@@ -1,4 +1,4 @@
-"""The command line: `p2gs-jax fit | calibrate | render | eval | demo | synth | sweep | bench`.
+"""The command line: `p2gs-jax COMMAND ...`; `p2gs-jax --help` lists the commands.
 
 Every configuration field is an option. Bad input ends with one message and exit code 2.
 """
@@ -8,84 +8,80 @@ from __future__ import annotations
 import os
 import sys
 from importlib import import_module
-from typing import Annotated, Any, Union
+
+from p2gs_jax.errors import UserError
 
 # Quiet the native libraries before they load; our own messages say what matters.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
-os.environ.setdefault("GLOG_minloglevel", "2")
+os.environ.setdefault("GLOG_minloglevel", "3")
 
-import tyro
-
-from p2gs_jax.errors import UserError
-from p2gs_jax.options.experiments import Bench, Demo, Sweep, Synth
-from p2gs_jax.options.fit import Calibrate, Fit, named_preset
-from p2gs_jax.options.render import Render
-from p2gs_jax.options.results import Eval
-
-# A name is both the subcommand and the module of `p2gs_jax.commands` that runs it.
-COMMANDS: dict[str, type] = {
-    "fit": Fit,
-    "calibrate": Calibrate,
-    "render": Render,
-    "eval": Eval,
-    "demo": Demo,
-    "synth": Synth,
-    "sweep": Sweep,
-    "bench": Bench,
-}
-WITH_PRESET = ("fit", "calibrate")
-
-
-def _preset_name(argv: list[str]) -> str:
-    """Return what `--preset` names: its values become the defaults of all options."""
-    name = "robust"
-    for i, arg in enumerate(argv):
-        if arg == "--preset" and i + 1 < len(argv):
-            name = argv[i + 1]
-        elif arg.startswith("--preset="):
-            name = arg.split("=", 1)[1]
-    return name
-
-
-def _subcommands(argv: list[str]) -> Any:
-    """Return the union of all option classes that tyro parses."""
-    cfg = named_preset(_preset_name(argv))
-    members = []
-    for name, kind in COMMANDS.items():
-        defaults = {"default": kind(tyro.MISSING, tyro.MISSING, cfg)} if name in WITH_PRESET else {}
-        members.append(Annotated[kind, tyro.conf.subcommand(name, **defaults)])
-    return Union[tuple(members)]  # noqa: UP007 (built at run time)
+# What must answer even where JAX cannot be imported, and at once where it can.
+WITHOUT_JAX = ("doctor", "completion")
 
 
 def _run(argv: list[str]) -> int:
-    options = tyro.cli(
-        _subcommands(argv),
-        prog="p2gs-jax",
-        description="Photometrically consistent Gaussian splatting in JAX.",
-        args=argv,
-    )
-    name = next(name for name, kind in COMMANDS.items() if isinstance(options, kind))
-    # Imported here so that --help answers at once.
-    from p2gs_jax.compile_cache import use_compile_cache
+    from p2gs_jax.cli.parser import parse
 
-    use_compile_cache()
+    name, options = parse(argv)
+    if name == "completion":
+        from p2gs_jax.cli.completion import script
+
+        print(script(options.shell), end="")
+        return 0
+    # Imported here so that --help answers at once.
+    if name not in WITHOUT_JAX:
+        from p2gs_jax.compile_cache import use_compile_cache
+
+        use_compile_cache()
     return import_module(f"p2gs_jax.commands.{name}").run(options)
 
 
 def main(argv: list[str] | None = None) -> None:
     """Run the command line and exit.
 
-    Codes: 0 done, 1 worse than a baseline, 2 bad input, 130 interrupted.
+    Codes: 0 done, 1 worse than a baseline or something needed is broken, 2 bad input, 130
+    interrupted.
     """
+    argv = sys.argv[1:] if argv is None else argv
+    command = argv[0] if argv else ""
     try:
-        code = _run(sys.argv[1:] if argv is None else argv)
+        code = _run(argv)
     except UserError as error:
-        print(f"p2gs-jax: error: {error}", file=sys.stderr)
-        code = 2
+        code = _complain(error)
+    except ImportError as error:
+        code = _missing(error, argv)
+    except OSError as error:
+        code = _from_the_system(error)
     except KeyboardInterrupt:
-        print("p2gs-jax: interrupted; --resume continues from the last checkpoint", file=sys.stderr)
+        resume = "; --resume continues from the last checkpoint" if command == "fit" else ""
+        print(f"p2gs-jax: interrupted{resume}", file=sys.stderr)
         code = 130
-    except BrokenPipeError:  # what reads our output has seen enough, as head does
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        code = 0
     sys.exit(code)
+
+
+def _complain(error: UserError) -> int:
+    print(f"p2gs-jax: error: {error}", file=sys.stderr)
+    return 2
+
+
+def _missing(error: ImportError, argv: list[str]) -> int:
+    """Say which library is broken; `doctor` says it itself, even where it is the parser's."""
+    if (error.name or "").split(".")[0] == "p2gs_jax":
+        raise error
+    if argv[:1] == ["doctor"]:
+        from p2gs_jax.commands.doctor import diagnose
+
+        return diagnose(as_json="--json" in argv)
+    fix = "`p2gs-jax doctor` says what is missing for what"
+    return _complain(UserError(f"a library cannot be imported: {error}.", fix=fix))
+
+
+def _from_the_system(error: OSError) -> int:
+    """Say what the system refused; a broken pipe only means that our reader has seen enough."""
+    if isinstance(error, BrokenPipeError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    where = f"{error.filename}: " if error.filename else ""
+    reason = error.strerror or str(error)
+    fix = "check that the path exists, may be read or written, and that the disk has room"
+    return _complain(UserError(f"{where}{reason}.", fix=fix))

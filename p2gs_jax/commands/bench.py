@@ -19,6 +19,8 @@ def run(options: Bench) -> int:
     chosen: tuple[benches.Part, ...] = tuple(p for p in benches.PARTS if not parts or p in parts)
     if (baseline or write_baseline) and "speed_error" not in chosen:
         raise UserError("a baseline concerns speed_error.", fix="name that part as well")
+    if baseline is not None and not baseline.is_file():
+        raise UserError(f"there is no file {baseline}.", fix="make one with --write-baseline FILE")
     with TerminalReporter() as reporter:
         text, complaints = benches.run(
             chosen,

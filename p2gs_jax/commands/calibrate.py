@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from rich.box import SIMPLE
 from rich.table import Table
 
 from p2gs_jax.calibration import WEAK_GAMMA, Calibration, calibrate
@@ -80,31 +81,12 @@ def _run_static(folder: Path, out: Path, cfg: FitConfig, compare_with: str | Non
 
 def _print_calibration(result: Calibration) -> None:
     """Print exposures and gammas with their standard errors, and what to make of them."""
-    console, s = stdout(), result.selection.solution
-    table = Table(title="Exposures in stops from their mean", title_justify="left")
-    table.add_column("view")
-    table.add_column("camera")
-    for name in ("exposure", "EXIF or file", "gap", "gamma", "residual EV"):
-        table.add_column(name, justify="right")
-    stated = result.stated_ev
-    for i, view in enumerate(result.scene.views):
-        error = s.exposure_errors[i] / LN2
-        known = bool(np.isfinite(error))
-        weak = " (weakly identified)" if s.gamma_errors[i] > WEAK_GAMMA else ""
-        given = np.isfinite(stated[i])
-        table.add_row(
-            view.name,
-            view.camera,
-            f"{s.exposures_ev[i]:+.2f} +- {error:.2f}" if known else "unknown",
-            f"{stated[i]:+.2f}" if given else "",
-            f"{result.agreement.gap_ev[i]:+.2f}" + (" !" if result.agreement.disagrees[i] else "")
-            if given and known
-            else "",
-            f"{s.gammas[i]:.2f} +- {s.gamma_errors[i]:.2f}{weak}"
-            if known and s.gamma_errors[i] > 0
-            else f"{s.gammas[i]:.2f}",
-            f"{s.view_residual_ev[i]:.2f}" if known else "",
-        )
+    console, s, columns = stdout(), result.selection.solution, _columns(result)
+    table = Table(title="Exposures in stops from their mean", title_justify="left", box=SIMPLE)
+    for name in columns:
+        table.add_column(name, justify="left" if name in ("view", "camera") else "right")
+    for row in zip(*columns.values(), strict=True):
+        table.add_row(*row)
     console.print(table)
     for message in result.messages:
         console.print(message)
@@ -113,3 +95,32 @@ def _print_calibration(result: Calibration) -> None:
         f"residual {s.residual_ev:.2f} EV; {result.seconds['reading']:.1f} s reading, "
         f"{result.seconds['adjustment']:.1f} s adjusting."
     )
+
+
+def _columns(result: Calibration) -> dict[str, list[str]]:
+    """Return the table's columns by title, without those that would say nothing."""
+    s, views = result.selection.solution, result.scene.views
+    errors, stated = s.exposure_errors / LN2, result.stated_ev
+    known, given = np.isfinite(errors), np.isfinite(stated)
+    rows = range(len(views))
+    columns = {"view": [v.name for v in views]}
+    if len({v.camera for v in views}) > 1:
+        columns["camera"] = [v.camera for v in views]
+    columns["exposure"] = [
+        f"{s.exposures_ev[i]:+.2f} +- {errors[i]:.2f}" if known[i] else "unknown" for i in rows
+    ]
+    if given.any():
+        gaps, wrong = result.agreement.gap_ev, result.agreement.disagrees
+        columns["stated"] = [f"{stated[i]:+.2f}" if given[i] else "" for i in rows]
+        columns["gap"] = [
+            f"{gaps[i]:+.2f}{' !' if wrong[i] else ''}" if given[i] and known[i] else ""
+            for i in rows
+        ]
+    columns["gamma"] = [
+        f"{s.gammas[i]:.2f}"
+        + (f" +- {s.gamma_errors[i]:.2f}" if known[i] and s.gamma_errors[i] > 0 else "")
+        + (" (weak)" if known[i] and s.gamma_errors[i] > WEAK_GAMMA else "")
+        for i in rows
+    ]
+    columns["residual"] = [f"{s.view_residual_ev[i]:.2f}" if known[i] else "" for i in rows]
+    return columns

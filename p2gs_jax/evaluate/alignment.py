@@ -1,4 +1,4 @@
-"""Removing the gauges before scoring: scale, and scale with power (PHOTOMETRY section 2)."""
+"""Removing the gauges before scoring: scale, and scale with power (docs/photometry.md, 2)."""
 
 from __future__ import annotations
 

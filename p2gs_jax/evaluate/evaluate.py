@@ -1,6 +1,6 @@
 """Judging a finished fit: every view, every protocol, with names that say what was compared.
 
-Protocols (PHOTOMETRY section 6): `per_view` renders a training view with its own exposure and
+Protocols (docs/photometry.md, 6): `per_view` renders a training view with its own exposure and
 gamma; `averaged` uses the mean parameters over the training views (paper, Rendering for
 evaluation); `exposure_fitted` solves one scalar exposure from the photograph, because a held-out
 view has none of its own; against reference photographs of one common exposure, `scale_aligned`
@@ -35,7 +35,7 @@ class MeanParameters:
     """Parameters of a view that has none of its own.
 
     Attributes:
-        exposure: arithmetic mean over the training views (paper, eq. 7).
+        exposure: arithmetic mean over the training views (paper, eq. 6).
         exposure_geometric: geometric mean, which the gauges leave in place.
         gamma: arithmetic mean.
     """

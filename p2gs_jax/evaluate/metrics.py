@@ -1,4 +1,4 @@
-"""Image and HDR metrics (paper, appendix Metrics; PHOTOMETRY section 6)."""
+"""Image and HDR metrics (paper, appendix Metrics; docs/photometry.md, 6)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recovered radiance against HDR truth: stops, PU21, colour (PHOTOMETRY section 6)."""
+"""Recovered radiance against HDR truth: stops, PU21, colour (docs/photometry.md, 6)."""
 
 from __future__ import annotations
 

@@ -113,5 +113,8 @@ def read_jsonl(path: Path) -> list[dict]:
                 records.append(json.loads(line.decode()))
         except ValueError as error:
             if number < len(lines):
-                raise UserError(f"{path}, line {number}, is not JSON: {error}") from error
+                raise UserError(
+                    f"{path}, line {number}, is not JSON: {error}.",
+                    fix="remove that line, or the file: it is a log",
+                ) from error
     return records

@@ -80,4 +80,7 @@ def read_exr(path: Path) -> tuple[Float32[np.ndarray, "h w 3"], dict]:
             linear = np.stack([channels[c].pixels for c in "RGB"], -1).astype(np.float32)
             return linear, dict(file.header())
     except (RuntimeError, KeyError, OSError, ValueError) as error:
-        raise UserError(f"{path} is no readable RGB OpenEXR file: {error}") from error
+        raise UserError(
+            f"{path} is no readable RGB OpenEXR file: {error}.",
+            fix="copy or render it again, or remove it",
+        ) from error

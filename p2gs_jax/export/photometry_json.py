@@ -131,6 +131,9 @@ def write_solution(
     )
 
 
+AGAIN = "restore it from a copy, or run `p2gs-jax fit ... --resume` or `calibrate` again"
+
+
 def read_photometry(path: Path) -> PhotometryFile:
     """Read the file.
 
@@ -140,9 +143,9 @@ def read_photometry(path: Path) -> PhotometryFile:
     try:
         data = json.loads(Path(path).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise UserError(f"{path} cannot be read: {error}") from error
+        raise UserError(f"{path} cannot be read: {error}.", fix=AGAIN) from error
     if problem := _problem(data):
-        raise UserError(f"{path} is incomplete: {problem}")
+        raise UserError(f"{path} is incomplete: {problem}.", fix=AGAIN)
     return data
 
 

@@ -154,7 +154,10 @@ def read_ply(path: Path) -> Gaussians:
         coefficients = 1 + sum(n.startswith("f_rest_") for n in names) // 3
         columns = np.stack([vertex[n] for n in field_names(coefficients)], 1).astype(np.float32)
     except (OSError, PlyParseError, KeyError, ValueError) as error:
-        raise UserError(f"{path} is no PLY of Gaussians: {error}") from error
+        raise UserError(
+            f"{path} is no PLY of Gaussians: {error}.",
+            fix="restore it from a copy, or write it again with `p2gs-jax fit ... --resume`",
+        ) from error
     rest = columns[:, 9 : 9 + 3 * (coefficients - 1)].reshape(len(columns), 3, coefficients - 1)
     sh = np.concatenate([columns[:, None, 6:9], rest.transpose(0, 2, 1)], 1)
     tail = columns[:, 9 + 3 * (coefficients - 1) :]

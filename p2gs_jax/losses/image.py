@@ -1,4 +1,4 @@
-"""Photometric reconstruction: L1 and D-SSIM, masked and censored (paper, eq. 6).
+"""Photometric reconstruction: L1 and D-SSIM, masked and censored (paper, eq. 8).
 
 SSIM is memory-bound. Its blurs are eleven shifted adds per axis, one colour channel at a time so
 that its maps stay in cache, and its gradient is written out: three more blurs, done while the
@@ -130,7 +130,7 @@ def photometric_loss(
     mask: Float[Array, "h w"],
     cfg: LossConfig,
 ) -> dict[str, Float[Array, ""]]:
-    """Return the weighted terms `l1` and `dssim` (paper, eq. 6).
+    """Return the weighted terms `l1` and `dssim` (paper, eq. 8).
 
     Args:
         ldr: prediction, display-encoded, may exceed 1.

@@ -20,8 +20,8 @@ def photometry_regularizers(
 ) -> dict[str, Float[Array, ""]]:
     """Return the weighted terms on exposures and gammas.
 
-    The paper's three (eq. 9) resolve: global scale; spread (which also shrinks true spread, see
-    PHOTOMETRY section 3); tone. Ours resolve: the scale gauge alone; the power gauge.
+    The paper's three (eq. 10) resolve: global scale; spread (which also shrinks true spread, see
+    docs/photometry.md, 3); tone. Ours resolve: the scale gauge alone; the power gauge.
     """
     e, gamma = photometry.exposures, photometry.gammas
     terms = {}
@@ -43,7 +43,7 @@ def photometry_regularizers(
 def closed_form_scale(exposures: Float[Array, " v"], scale: float, spread: float):
     """Return the global factor c that minimises the paper's L_reg over e -> c e.
 
-    c = ls m / (ls (m^2 + v) + lv v) with mean m and variance v (PHOTOMETRY section 3).
+    c = ls m / (ls (m^2 + v) + lv v) with mean m and variance v (docs/photometry.md, 3).
     """
     m, v = jnp.mean(exposures), variance(exposures)
     return scale * m / (scale * (m * m + v) + spread * v)

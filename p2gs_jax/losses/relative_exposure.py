@@ -1,4 +1,4 @@
-"""Relative exposure consistency: L_exp and its readings (paper, eq. 8; PHOTOMETRY section 3).
+"""Relative exposure consistency: L_exp and its readings (paper, eq. 9; docs/photometry.md, 3).
 
 Printed: L_exp = (1/M) sum |alpha_ij L_i - L_j|_1 with alpha_ij = e_j / e_i and L free of exposure.
 At the truth L_i = L_j for the same surface, so the printed formula is zero only where all

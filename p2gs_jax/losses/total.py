@@ -1,4 +1,4 @@
-"""The composed loss (paper, eq. 5): one differentiable function of the one parameter pytree."""
+"""The composed loss (paper, eq. 7): one differentiable function of the one parameter pytree."""
 
 from __future__ import annotations
 

@@ -8,21 +8,26 @@ from typing import Annotated
 
 import tyro
 
-from p2gs_jax.synth.sensor import Sensor
-from p2gs_jax.synth.town import Layout
+from p2gs_jax.synth.settings import Layout, Sensor
 
 
 @dataclass(frozen=True)
 class Demo:
-    """Make a small street with known exposures, fit it, and compare."""
+    """Make a small street with known exposures, fit it, and compare.
+
+    Takes four minutes on two cores; open its summary.png first.
+
+        p2gs-jax demo
+        p2gs-jax demo --out runs/paper --preset paper --budget 5m
+    """
 
     out: Path = Path("runs/demo")
     """Folder for the street and the run."""
-    preset: str = "robust"
+    preset: Annotated[str, tyro.conf.arg(metavar="NAME")] = "robust"
     """A preset of `fit`: robust, paper, paper_appendix, 3dgs, 3dgs_gain, 3dgs_affine,
     3dgs_bilateral or 3dgs_curve."""
-    budget: str = "150s"
-    """Wall-clock limit of the fit."""
+    budget: Annotated[str, tyro.conf.arg(metavar="TIME")] = "150s"
+    """Wall-clock limit of the fit: 90s, 20m or 1h30m."""
     frames: int = 10
     """Frames per camera."""
     width: int = 320
@@ -35,8 +40,13 @@ class Demo:
 
 @dataclass(frozen=True)
 class Synth:
-    """Make a data set by the paper's protocol: a drive through a town by three cameras and a
-    LiDAR, with linear HDR truth."""
+    """Make a data set by the paper's protocol, with linear HDR truth.
+
+    A drive through a procedural town by three cameras and a LiDAR (docs/scenes.md).
+
+        p2gs-jax synth town --seed 1
+        p2gs-jax synth constant --sensor.iso-std 0 --frames 20 --width 240
+    """
 
     out: Annotated[Path, tyro.conf.Positional]
     """Folder to create."""
@@ -60,7 +70,13 @@ class Synth:
 
 @dataclass(frozen=True)
 class Sweep:
-    """Fit a scene under many configurations and seeds, into one table; run again to continue."""
+    """Fit a scene under many configurations and seeds, into one table.
+
+    Run it again to continue: finished runs are kept.
+
+        p2gs-jax sweep sweep.toml
+        p2gs-jax sweep sweep.toml --out runs/sweep --max-parallel 2
+    """
 
     file: Annotated[Path, tyro.conf.Positional]
     """TOML file; docs/sweeps.md says what it may contain."""
@@ -72,9 +88,15 @@ class Sweep:
 
 @dataclass(frozen=True)
 class Bench:
-    """Measure the renderer on this machine: speed against error, growth, memory, hard cases."""
+    """Measure the renderer: speed, error, growth, memory, hard cases.
 
-    parts: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    p2gs-jax bench --quick
+    p2gs-jax bench speed_error memory --out runs/bench
+    """
+
+    parts: Annotated[
+        tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[PART ...]")
+    ] = ()
     """speed_error, growth, memory, step, hard_cases, implementations; none named runs all."""
     out: Path = Path("runs/bench")
     """Folder for tables, JSON and plots."""

@@ -16,66 +16,95 @@ from p2gs_jax.options.parse import check, parse_duration, parse_gaussians
 PRESETS: tuple[configs.PresetName, ...] = get_args(configs.PresetName)
 
 
+Preset = Annotated[configs.PresetName, tyro.conf.arg(metavar="NAME")]
+Duration = Annotated[str | None, tyro.conf.arg(metavar="TIME")]
+Count = Annotated[str | None, tyro.conf.arg(metavar="N|auto")]
+Exposures = Annotated[str | None, tyro.conf.arg(metavar="FILE|exif")]
+Weights = Annotated[str | None, tyro.conf.arg(metavar="FILE")]
+Folder = Annotated[Path, tyro.conf.arg(metavar="DIR")]
+Deviation = Annotated[float | None, tyro.conf.arg(metavar="STOPS")]
+
+
 @dataclass(frozen=True)
 class Fit:
-    """Fit a linear HDR radiance field, exposures and gammas to photographs."""
+    """Fit linear HDR radiance, exposures and gammas to photographs.
+
+    Writes a run folder; open its summary.png first. An interrupted run goes on with --resume.
+
+        p2gs-jax fit castle --out runs/castle --max-width 960 --budget 20m
+        p2gs-jax fit castle --out runs/castle --resume
+        p2gs-jax fit castle --out runs/paper --preset paper --steps 7000
+    """
 
     scene: Annotated[Path, tyro.conf.Positional]
-    """COLMAP model, transforms.json, or a folder of photographs."""
-    out: Path
+    """COLMAP model, transforms.json, a rig, or a folder of photographs (docs/scenes.md)."""
+    out: Folder
     """Run folder to create."""
     config: Annotated[configs.FitConfig, tyro.conf.arg(name="")]
-    steps: int | None = None
-    """Optimisation steps (default: the preset's)."""
-    budget: str | None = None
-    """Wall-clock limit for the whole run, such as 5m; replaces --steps."""
+    budget: Duration = None
+    """Wall-clock limit for the whole run: 90s, 20m or 1h30m; replaces --steps."""
     max_width: int | None = None
-    """Shrink images to at most this many pixels across."""
-    gaussians: str | None = None
+    """Shrink images to at most this many pixels across; default: as they are."""
+    resume: bool = False
+    """Continue an interrupted run; give the options it was started with."""
+    preset: Preset = "robust"
+    """Where all values start: robust; the method as printed, paper or paper_appendix; baselines
+    3dgs, 3dgs_gain, 3dgs_affine, 3dgs_bilateral or 3dgs_curve."""
+    steps: int | None = None
+    """Optimisation steps, one view each; default: the preset's (robust 2000, paper 30000)."""
+    gaussians: Count = None
     """Upper bound on the Gaussians: a whole number, or auto (grow while held-out training views
-    gain by it)."""
-    seed: int | None = None
-    """Seeds every random choice."""
+    gain by it); default: from the seeds and the pixels."""
     test_every: int | None = None
-    """Hold out every n-th view of each camera; 0 holds out none."""
-    images: str | None = None
+    """Hold out every n-th view of each camera, to judge by; 0 holds out none; default: 8."""
+    images: Annotated[str | None, tyro.conf.arg(metavar="DIR")] = None
     """Image folder, where it is not images/ beside the model."""
     allow_missing: bool = False
     """Skip frames whose image is missing."""
-    reference: Path | None = None
-    """Photographs of the same views under one common exposure, to judge against."""
-    known_exposures: str | None = None
+    known_exposures: Exposures = None
     """Exposures to keep: a CSV file (image, exposure or ev), or exif."""
-    known_deviation_ev: float | None = None
-    """Treat them as uncertain by this many stops instead of keeping them."""
-    lpips_weights: str | None = None
+    known_deviation_ev: Deviation = None
+    """Treat known exposures as uncertain by this many stops instead of keeping them."""
+    reference: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Photographs of the same views under one common exposure, to judge against."""
+    lpips_weights: Weights = None
     """Weights of LPIPS (.npz, docs/files.md): judge with it as well."""
-    resume: bool = False
-    """Continue an interrupted run."""
+    seed: int | None = None
+    """Seeds every random choice; default: 0."""
 
 
 @dataclass(frozen=True)
 class Calibrate:
-    """Exposures, gammas and tone curve alone, with error bars, in seconds: no splatting."""
+    """Solve exposures, gammas and tone curve alone, in seconds.
+
+    From the colours of shared points, without splatting, and with standard errors. Prints a table
+    and writes photometry.json; open calibration.png first.
+
+        p2gs-jax calibrate castle --out photometry
+        p2gs-jax calibrate castle --out photometry --known-exposures exif
+        p2gs-jax calibrate stack --out photometry --static
+    """
 
     scene: Annotated[Path, tyro.conf.Positional]
-    """COLMAP model, transforms.json, a folder of photographs, or a finished run (correspondences
-    then go through its rendered depth)."""
-    out: Path
+    """COLMAP model, transforms.json, a rig, a folder of photographs (docs/scenes.md), or a
+    finished run (correspondences then go through its rendered depth)."""
+    out: Folder
     """Folder for photometry.json and calibration.png."""
     config: Annotated[configs.FitConfig, tyro.conf.arg(name="")]
-    known_exposures: str | None = None
-    """Exposures to keep: a CSV file (image, exposure or ev), or exif."""
-    known_deviation_ev: float | None = None
-    """Treat them as uncertain by this many stops instead of keeping them."""
-    compare_with: str | None = None
-    """Stated exposures to compare with: exif or a CSV file (default: EXIF)."""
-    static: bool = False
-    """A folder of photographs from one fixed viewpoint at several exposures."""
     max_width: int | None = None
-    """Shrink images to at most this many pixels across."""
-    images: str | None = None
+    """Shrink images to at most this many pixels across; default: as they are."""
+    known_exposures: Exposures = None
+    """Exposures to keep: a CSV file (image, exposure or ev), or exif."""
+    known_deviation_ev: Deviation = None
+    """Treat known exposures as uncertain by this many stops instead of keeping them."""
+    compare_with: Exposures = None
+    """Stated exposures to compare with; default: EXIF."""
+    static: bool = False
+    """The folder holds photographs from one fixed viewpoint at several exposures."""
+    images: Annotated[str | None, tyro.conf.arg(metavar="DIR")] = None
     """Image folder, where it is not images/ beside the model."""
+    preset: Preset = "robust"
+    """Where all values start; see `fit`."""
 
 
 def resolve_calibration(args: Calibrate) -> configs.FitConfig:
@@ -134,6 +163,7 @@ def _known(cfg: configs.FitConfig, args: Fit | Calibrate) -> configs.FitConfig:
     check(
         args.known_deviation_ev is None or p.known is not None,
         "--known-deviation-ev says nothing without --known-exposures",
+        fix="add --known-exposures FILE, or exif",
     )
     return dataclasses.replace(cfg, photometry=p)
 

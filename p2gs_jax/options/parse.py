@@ -40,11 +40,11 @@ def parse_gaussians(text: str) -> int | Literal["auto"]:
     return int(text)
 
 
-def check(condition: bool, text: str) -> None:
+def check(condition: bool, text: str, *, fix: str | None = None) -> None:
     """Complain unless the condition holds.
 
     Raises:
         UserError: it does not.
     """
     if not condition:
-        raise UserError(text + ".")
+        raise UserError(text + ".", fix=fix)

@@ -11,7 +11,12 @@ import tyro
 
 @dataclass(frozen=True)
 class Render:
-    """Render a finished run: its views or a camera path, at any exposure, gamma and tone curve."""
+    """Render views or a camera path of a run at any exposure.
+
+    p2gs-jax render runs/street --exposure-ev 1 --gamma 2.2 --out brighter
+    p2gs-jax render runs/street --path drive --out drive.mp4
+    p2gs-jax render runs/street --panorama --split test --width 1400 --out wide
+    """
 
     run: Annotated[Path, tyro.conf.Positional]
     """Run folder."""

@@ -11,7 +11,10 @@ import tyro
 
 @dataclass(frozen=True)
 class Eval:
-    """Judge a finished run again, against its photographs or a reference."""
+    """Judge a finished run again, also against a reference.
+
+    p2gs-jax eval runs/castle --reference castle/iso8
+    """
 
     run: Annotated[Path, tyro.conf.Positional]
     """Run folder."""

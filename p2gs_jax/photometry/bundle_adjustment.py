@@ -6,7 +6,7 @@ log exposure, l the log radiance of a point and channel, a = 2.2 / gamma, and F 
 eliminated exactly (variable projection), what remains is the Schur complement over the views: its
 entries are sums over pairs of observations of a point, so cost and memory grow with those pairs,
 never with points times views. Outliers are weighted away: a few L1 rounds, then Geman-McClure
-(PHOTOMETRY section 4: 0 / 10 / 30 % outliers give .005 / .005 / .006 EV). One round is a map from
+(docs/photometry.md, 4: 0 / 10 / 30 % outliers give .005 / .005 / .006 EV). One round is a map from
 parameters to parameters; optimistix iterates it to its fixed point.
 """
 

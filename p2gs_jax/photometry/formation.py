@@ -1,6 +1,6 @@
 """The image formation model: radiance, times exposure, through a tone curve (paper, Sec. 3.3).
 
-Paper: y = clamp(clamp(eL, 1e-6, 10)^(1/gamma), 0, 1). Robust (PHOTOMETRY section 4):
+Paper: y = clamp(clamp(eL, 1e-6, 10)^(1/gamma), 0, 1). Robust (docs/photometry.md, 4):
 y = OETF(x0 (eL/x0)^(2.2/gamma)) with a pivot x0 at mid-grey that a change of gamma leaves alone,
 continued above 1 so that over-bright predictions keep a gradient.
 """
@@ -71,7 +71,7 @@ def eotf(encoded: Float[Array, "..."], curve: str) -> Float[Array, "..."]:
 
 
 def expose(linear: Float[Array, "..."], exposure: Float[Array, ""]) -> Float[Array, "..."]:
-    """Return e L (paper, eq. 5 of Exposure modeling)."""
+    """Return e L (paper, eq. 4)."""
     return exposure * linear
 
 

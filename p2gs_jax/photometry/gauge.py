@@ -12,7 +12,7 @@ from p2gs_jax.types import Params
 
 
 def recentre(params: Params, activation: RadianceKind) -> Params:
-    """Return the same photographs with mean log exposure 0 (PHOTOMETRY section 2, scale).
+    """Return the same photographs with mean log exposure 0 (docs/photometry.md, 2, scale).
 
     Args:
         params: the fit.

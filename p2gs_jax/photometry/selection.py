@@ -2,10 +2,10 @@
 
 Criterion: expected log predictive density of held-out observations in display units, so that
 models under different curves can be compared. The simplest model within max(2 standard errors,
-0.01 nat) of the best is taken; the best itself over-selects (PHOTOMETRY section 5). So is one whose
-predictions nobody could tell from the best's: sharp, noise-free images otherwise earn a gamma per
-view for differences of a hundredth of a stop (BUILD_NOTES). Curve and model are chosen together: a
-wrong curve fixed first drives every criterion to a gamma per view.
+0.01 nat) of the best is taken; the best itself over-selects (docs/photometry.md, 5). So is one
+whose predictions nobody could tell from the best's: sharp, noise-free images otherwise earn a gamma
+per view for differences of a hundredth of a stop (BUILD_NOTES). Curve and model are chosen
+together: a wrong curve fixed first drives every criterion to a gamma per view.
 """
 
 from __future__ import annotations

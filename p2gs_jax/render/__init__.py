@@ -91,7 +91,7 @@ def render_linear(
     means2d_probe: Float[Array, "n 2"] | None = None,
     with_depth: bool = True,
 ) -> Render:
-    """Render linear HDR radiance of one view (paper, eq. 4).
+    """Render linear HDR radiance of one view (paper, eq. 3).
 
     Args:
         gaussians: the scene.

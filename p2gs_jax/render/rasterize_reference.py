@@ -21,7 +21,7 @@ def rasterize_reference(
     height: int,
     cfg: RenderConfig,
 ) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"], Float[Array, "h w"]]:
-    """Composite splats front to back, without a stop rule (paper, eq. 4).
+    """Composite splats front to back, without a stop rule (paper, eq. 3).
 
     Memory is O(N H W): tests only.
 

@@ -10,7 +10,7 @@ The exponential is a polynomial on [-0.7, 0], squared as often as it takes to re
 Backward. The same queue, front to back. With R the gradient-weighted light still to come,
 q = w (radiance . g) and R -= q after each entry, the gradient to the exponent of one entry is
 q - R alpha / (1 - alpha): no division by transmittance. The geometry gradients follow in closed
-form from six moments of it over the tile. Source and measurements: KERNEL.md.
+form from six moments of it over the tile. Source and measurements: docs/kernel.md.
 """
 
 from __future__ import annotations

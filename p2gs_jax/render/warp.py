@@ -87,7 +87,7 @@ def warp(
     other_depth: Float[Array, "h2 w2"],
     other_camera: Camera,
 ) -> Warp:
-    """Return where the pixels of one view lie in another (PHOTOMETRY section 3, w(u)).
+    """Return where the pixels of one view lie in another (docs/photometry.md, 3, w(u)).
 
     Args:
         depth: of this view, 0 where it shows no surface.

@@ -62,7 +62,7 @@ def materialize(always: Bool[Array, ""], compute):
     """Force the arrays that `compute()` returns into memory.
 
     XLA's CPU backend fuses through `optimization_barrier` and then recomputes the whole chain in
-    each consumer (1155 against 421 CPU ms, KERNEL.md); a conditional survives.
+    each consumer (1155 against 421 CPU ms, docs/kernel.md); a conditional survives.
 
     Args:
         always: true, but computed from data, so that XLA cannot know: `opaque_true`.

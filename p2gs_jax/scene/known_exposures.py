@@ -50,6 +50,19 @@ def read_known_exposures(source: str, views: list[View]) -> Float[np.ndarray, " 
     return values
 
 
+def check_source(source: str | None) -> None:
+    """Complain about a source that cannot be used, before there are any views.
+
+    Args:
+        source: see `read_known_exposures`; None is fine.
+
+    Raises:
+        UserError: the file cannot be used.
+    """
+    if source not in (None, "exif"):
+        _read(Path(source))
+
+
 def stated_ev(source: str | None, views: list[View]) -> Float[np.ndarray, " v"]:
     """Return stated exposures in stops, up to a constant; NaN where nothing is stated.
 
@@ -73,7 +86,11 @@ def _read(path: Path) -> dict[str, float]:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path} cannot be read: {error}.") from error
+        reason = getattr(error, "strerror", None) or error
+        raise UserError(
+            f"{path} cannot be read: {reason}.",
+            fix="name a CSV file with the columns image and ev, or say exif",
+        ) from error
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     reader = csv.DictReader(lines)
     names = [n.strip() for n in reader.fieldnames or []]

@@ -38,7 +38,10 @@ def _replaced(record: Any, path: Sequence[str], value: Any, whole: str) -> Any:
     current = getattr(record, path[0])
     if len(path) > 1:
         if not dataclasses.is_dataclass(current):
-            raise UserError(f"the configuration field {whole!r} goes too deep.")
+            raise UserError(
+                f"the configuration field {whole!r} goes too deep.",
+                fix=f"{path[0]!r} is a value itself: leave out what follows it",
+            )
         value = _replaced(current, path[1:], value, whole)
     else:
         hint = typing.get_type_hints(type(record))[path[0]]
@@ -47,7 +50,7 @@ def _replaced(record: Any, path: Sequence[str], value: Any, whole: str) -> Any:
         if isinstance(value, int) and not isinstance(value, bool) and not _fits(value, hint):
             value = float(value)
         if not _fits(value, hint):
-            raise UserError(f"{whole} = {value!r} is not one of its values: {_shown(hint)}.")
+            raise UserError(f"{whole} = {value!r} does not fit.", fix=f"it takes {_shown(hint)}")
     return dataclasses.replace(record, **{path[0]: value})
 
 

@@ -76,9 +76,12 @@ def sweep(
     """
     scene, out = Path(scene), Path(out)
     if not configs or not seeds:
-        raise UserError("a sweep needs at least one configuration and one seed.")
+        raise UserError(
+            "a sweep needs at least one configuration and one seed.",
+            fix="see docs/sweeps.md for an example",
+        )
     if max_parallel < 1:
-        raise UserError("max_parallel must be at least 1.")
+        raise UserError(f"max_parallel is {max_parallel}.", fix="let at least 1 run at a time")
     folders = [slug(name) for name in configs]
     if len(set(folders)) < len(folders):
         twice = sorted({f for f in folders if folders.count(f) > 1})

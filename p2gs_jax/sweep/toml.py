@@ -27,9 +27,9 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
-from p2gs_jax.config import FitConfig, preset
+from p2gs_jax.config import FitConfig, PresetName, preset
 from p2gs_jax.errors import UserError
 from p2gs_jax.sweep.fields import product, with_fields
 
@@ -57,9 +57,14 @@ def read_sweep(path: Path) -> SweepFile:
     try:
         data = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
-        raise UserError(f"{path} cannot be read: {error.strerror}") from error
+        raise UserError(
+            f"{path} cannot be read: {error.strerror}.",
+            fix="name a TOML file; docs/sweeps.md shows one",
+        ) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UserError(f"{path} is no TOML: {error}") from error
+        raise UserError(
+            f"{path} is no TOML: {error}.", fix="mend that line; docs/sweeps.md shows an example"
+        ) from error
     unknown = [key for key in data if key not in KEYS]
     if unknown:
         raise UserError(f"{path}: unknown key {unknown[0]!r}.", fix=f"known: {', '.join(KEYS)}")
@@ -67,9 +72,9 @@ def read_sweep(path: Path) -> SweepFile:
         raise UserError(f"{path} names no scene.", fix='add scene = "FOLDER"')
     seeds, parallel = data.get("seeds", [0]), data.get("max_parallel", 1)
     if not isinstance(seeds, list) or not all(type(s) is int for s in seeds):
-        raise UserError(f"{path}: seeds must be a list of whole numbers.")
+        raise UserError(f"{path}: seeds = {seeds!r}.", fix="write whole numbers, as in [0, 1, 2]")
     if type(parallel) is not int:
-        raise UserError(f"{path}: max_parallel must be a whole number.")
+        raise UserError(f"{path}: max_parallel = {parallel!r}.", fix="write a whole number")
     folder = Path(path).parent
     common = _nulls(data.get("set", {}))
     base = with_fields(_preset(data.get("preset", "robust"), path), common)
@@ -80,7 +85,9 @@ def read_sweep(path: Path) -> SweepFile:
         fields = dict(_nulls(case))
         name = str(fields.pop("name", f"case {number}"))
         if name in configs:
-            raise UserError(f"{path}: two configurations are called {name!r}.")
+            raise UserError(
+                f"{path}: two configurations are called {name!r}.", fix="give each case its name"
+            )
         start = fields.pop("preset", data.get("preset", "robust"))
         configs[name] = with_fields(with_fields(_preset(start, path), common), fields)
     reference = data.get("reference")
@@ -98,7 +105,8 @@ def _preset(name: Any, path: Path) -> FitConfig:
     try:
         return preset(name)
     except KeyError:
-        raise UserError(f"{path}: there is no preset {name!r}.") from None
+        names = ", ".join(get_args(PresetName))
+        raise UserError(f"{path}: there is no preset {name!r}.", fix=f"choose {names}") from None
 
 
 def _null(value: Any) -> Any:

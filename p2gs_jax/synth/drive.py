@@ -2,7 +2,7 @@
 
 What a photometric adjustment sees of a drive, with every quantity known: three cameras, frames one
 unit apart, facades, road and sky, 4-6 stops of contrast plus a bright sky, 8-bit photographs with
-photon noise, texture and outliers (our own proxy; PHOTOMETRY section 3 describes the like).
+photon noise, texture and outliers (our own proxy; docs/photometry.md, 3 describes the like).
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from p2gs_jax.photometry.observations import Observations
-from p2gs_jax.synth.sensor import READ_NOISE, SHOT_NOISE, Curve, encode
+from p2gs_jax.synth.sensor import READ_NOISE, SHOT_NOISE, encode
+from p2gs_jax.synth.settings import Curve
 
 Exposures = Literal["constant", "iso2", "iso4", "cameras", "auto"]
 YAWS = (0.0, -44.2, 44.8)

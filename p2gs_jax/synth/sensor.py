@@ -7,40 +7,19 @@ Exposure is ISO / 8 times the gains: ISO-Const photographs (ISO 8) show the trut
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from p2gs_jax.photometry.srgb import srgb_encode
+from p2gs_jax.synth.settings import Curve, Sensor
 
-Curve = Literal["srgb", "power", "filmic"]
 ISO_REFERENCE = 8
 ISO_MINIMUM = 1
 # Variances of photon noise per unit of exposed radiance, and of read noise.
 SHOT_NOISE, READ_NOISE = 2e-4, 1e-6
 DRIFT_PERIODS = 1.3
-
-
-@dataclass(frozen=True)
-class Sensor:
-    """What the cameras do to the light. The defaults are the paper's ISO-Var(4)."""
-
-    iso_std: float = 4.0
-    """Spread of the ISO about 8 (paper: 2 and 4); 0 is ISO-Const."""
-    curve: Curve = "srgb"
-    """Response; `filmic` bends it into an S before sRGB."""
-    camera_gain_ev: float = 0.0
-    """Standard deviation of a fixed gain per camera, stops."""
-    drift_ev: float = 0.0
-    """Amplitude of a slow automatic exposure, each camera at its own phase, stops."""
-    vignetting: float = 0.0
-    """Share of the light lost in the corners."""
-    white_balance_ev: float = 0.0
-    """Standard deviation of red and blue gains per camera, stops."""
-    noise: float = 0.0
-    """Standard deviation of photon and read noise, 1 = a small sensor in daylight."""
 
 
 class Shots(NamedTuple):

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float32, Int32
 
+from p2gs_jax.synth.settings import Layout
+
 Vec3 = tuple[float, float, float]
-Layout = Literal["street", "town"]
 
 ROAD_HALF_WIDTH = 5.6
 KERB_HEIGHT = 0.14

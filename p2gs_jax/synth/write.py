@@ -35,8 +35,9 @@ from p2gs_jax.synth.kitti_files import write_calibration, write_poses, write_sca
 from p2gs_jax.synth.lidar import Lidar, Scanner
 from p2gs_jax.synth.rig import MOUNTS, camera_viewmat, drive, intrinsics
 from p2gs_jax.synth.seed_points import observe_seeds, sample_seeds
-from p2gs_jax.synth.sensor import ISO_REFERENCE, Sensor, draw_shots, photograph
-from p2gs_jax.synth.town import Layout, Town, build_town
+from p2gs_jax.synth.sensor import ISO_REFERENCE, draw_shots, photograph
+from p2gs_jax.synth.settings import Layout, Sensor
+from p2gs_jax.synth.town import Town, build_town
 from p2gs_jax.synth.tracer import Tracer
 
 FORMAT = "p2gs-jax street, version 2"

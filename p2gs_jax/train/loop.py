@@ -216,7 +216,8 @@ class Trainer:
                 if host.elapsed_s > (pace.deadline_s or math.inf):
                     if host.progress < NEARLY_DONE:
                         self.on_message(
-                            f"The budget ended the run at {host.progress:.0%} of its schedule."
+                            f"The budget ended the run at {host.progress:.0%} of its schedule: fit "
+                            "again with a longer --budget; what was compiled now is kept."
                         )
                     break
             # A checkpoint holds one population: none is written while two compete.

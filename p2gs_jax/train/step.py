@@ -71,7 +71,7 @@ def _first_nonfinite(aux: LossAux, grads: Params) -> tuple[Array, Array]:
 
 
 def _recentered(photometry: Photometry, cfg: FitConfig) -> Photometry:
-    """Project the scale gauge: mean log e = 0 exactly (PHOTOMETRY section 4)."""
+    """Project the scale gauge: mean log e = 0 exactly (docs/photometry.md, 4)."""
     if photometry.parameterization != "log":
         return photometry
     if cfg.loss.regularizers.log_exposure_mean is None:

@@ -1,6 +1,7 @@
 """Wrong input: one message that says what to do, exit code 2, never a traceback."""
 
 import json
+import shutil
 
 import cv2
 import numpy as np
@@ -87,9 +88,83 @@ def test_senseless_options(capsys, tmp_path, option):
     assert option[0] in text or "preset" in text
 
 
-def test_unknown_option(capsys, tmp_path):
-    code, _ = run(capsys, "fit", tmp_path, "--out", tmp_path / "run", "--speed", "9")
+# What was written, and a word of the way on.
+WRONG = [
+    ("", "p2gs-jax COMMAND --help"),
+    ("fitt castle", "did you mean fit?"),
+    ("xyzzy", "`p2gs-jax --help` lists all commands"),
+    ("--preset paper fit castle", "p2gs-jax COMMAND OPTIONS"),
+    ("fit", "SCENE"),
+    ("fit castle", "--out DIR"),
+    ("fit castle --out run --bugdet 5m", "--budget TIME"),
+    ("fit castle --out run --rendr.tile 8 8", "--render.tile N N"),
+    ("fit castle --out run --steps many", "'many' is no whole number"),
+    ("fit castle --out run --max-width 3.5", "'3.5' is no whole number"),
+    ("fit castle --out run --render.near close", "'close' is no number"),
+    ("fit castle --out run --render.tile 16", "Expected 2 values"),
+    ("fit castle --out run --densify.method mcmcc", "'adaptive'"),
+    ("fit castle --out run --gaussians few", "a whole number from 1 on, or auto"),
+    ("fit castle --out run --preset bset", "choose paper, paper_appendix, robust"),
+    ("fit castle --out run --preset", "--preset"),
+    ("fit castle --out run --known-deviation-ev 0.1", "add --known-exposures FILE"),
+    ("fit castle --out run --known-exposures none.csv", "none.csv cannot be read"),
+    ("fit castle --out run --reference nowhere", "give --reference a folder"),
+    ("fit castle --out run --lpips-weights none.npz", "docs/files.md"),
+    ("fit castle --out file.txt", "name a folder with --out"),
+    ("fit castle --out file.txt/run", "check that the path exists"),
+    ("fit file.txt --out run", "name the folder of the scene"),
+    ("fit nowhere --out run", "check the path of the scene"),
+    ("fit junk --out run", "copy or export that photograph again"),
+    ("calibrate castle --out run --compare-with none.csv", "none.csv cannot be read"),
+    ("calibrate nowhere --out run --static", "name the folder of the photographs"),
+    ("calibrate castle --out run --static", "several exposures"),
+    ("render castle", "p2gs-jax fit --out"),
+    ("render", "RUN"),
+    ("demo --budget 0", "write 90s, 5m or 1h30m"),
+    ("demo --frames 0", "at least 1 frame"),
+    ("synth file.txt", "name another folder"),
+    ("synth new --layout village", "'street', 'town'"),
+    ("sweep none.toml", "docs/sweeps.md"),
+    ("sweep file.txt", "is no TOML"),
+    ("bench sped", "choose speed_error"),
+    ("bench speed_error --baseline none.json", "--write-baseline FILE"),
+    ("doctor --jsn", "--json"),
+    ("completion ksh", "'bash', 'zsh'"),
+]
+
+
+@pytest.mark.parametrize(("words", "way_on"), WRONG)
+def test_wrong_words_are_answered_with_a_way_on(capsys, tmp_path, monkeypatch, words, way_on):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "100")
+    images(tmp_path / "castle", 1)
+    (tmp_path / "file.txt").write_text("a: [letter]")
+    (tmp_path / "junk").mkdir()
+    for name in ("a.jpg", "b.jpg"):
+        (tmp_path / "junk" / name).write_text("not a photograph")
+    code, text = run(capsys, *words.split())
     assert code == 2
+    assert way_on in text
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("name", ["radiance.ply", "photometry.json"])
+def test_a_damaged_run_is_named(capsys, tmp_path, finished_run, name):
+    copy = shutil.copytree(finished_run, tmp_path / "run")
+    (copy / name).write_bytes((copy / name).read_bytes()[:500])
+    code, text = run(capsys, "render", copy)
+    assert code == 2
+    assert name in text
+    assert "restore it from a copy" in text
+
+
+def test_a_run_whose_scene_moved(capsys, tmp_path, finished_run):
+    copy = shutil.copytree(finished_run, tmp_path / "run")
+    saved = json.loads((copy / "config.json").read_text())
+    (copy / "config.json").write_text(json.dumps(saved | {"scene": str(tmp_path / "gone")}))
+    code, text = run(capsys, "render", copy)
+    assert code == 2
+    assert "correct `scene`" in text
 
 
 @pytest.mark.parametrize("command", ["render", "eval"])
@@ -151,7 +226,7 @@ def test_durations():
 
 
 def test_every_configuration_field_is_an_option(capsys):
-    code, text = run(capsys, "fit", "--help")
+    code, text = run(capsys, "fit", "--help-all")
     assert code == 0
     for option in ("--loss.dssim-weight", "--densify.method", "--render.tile", "--train.log-every"):
         assert option in text

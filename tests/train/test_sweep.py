@@ -37,11 +37,11 @@ def test_fields_are_replaced_by_their_dotted_names():
     [
         ("loss.wieght", 1.0, "no configuration field"),
         ("train.steps.more", 1, "too deep"),
-        ("train.steps", 1.5, "not one of its values"),
-        ("train.steps", True, "not one of its values"),
+        ("train.steps", 1.5, "does not fit"),
+        ("train.steps", True, "does not fit"),
         ("photometry.curve", "cubic", "'srgb'"),
-        ("loss", 1.0, "not one of its values"),
-        ("photometry.select", 1, "not one of its values"),
+        ("loss", 1.0, "does not fit"),
+        ("photometry.select", 1, "does not fit"),
     ],
 )
 def test_wrong_fields_and_values_are_named(field, value, text):
@@ -129,7 +129,7 @@ preset = "paper"
         ("scene = ", "no TOML"),
         ("sceen = 'x'", "unknown key 'sceen'"),
         ("seeds = [1]", "names no scene"),
-        ("scene = 'x'\nseeds = 3", "list of whole numbers"),
+        ("scene = 'x'\nseeds = 3", "write whole numbers"),
         ("scene = 'x'\npreset = 'best'", "no preset 'best'"),
         ("scene = 'x'\n[grid]\n'train.stepz' = [1]", "no configuration field"),
     ],

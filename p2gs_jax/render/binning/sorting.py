@@ -1,7 +1,7 @@
 """Binning by sorts: what a GPU wants, and the fallback wherever loops are not compiled.
 
 Integer work throughout. Single-operand uint32 sorts of packed keys are about five times as fast
-per element on XLA's CPU backend as comparator or multi-operand sorts (KERNEL.md).
+per element on XLA's CPU backend as comparator or multi-operand sorts (docs/kernel.md).
 """
 
 from __future__ import annotations

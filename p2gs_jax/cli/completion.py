@@ -1,0 +1,41 @@
+"""Completion scripts for shells, made by tyro from the parser of all commands."""
+
+from __future__ import annotations
+
+import tyro
+
+from p2gs_jax.cli import wording
+from p2gs_jax.cli.parser import every_command
+from p2gs_jax.cli.rule import registry
+from p2gs_jax.options.setup import Shell
+
+# tyro offers no path where an option could stand: shells shall look for one themselves.
+BASH_PATHS = """
+_p2gs_jax() {
+  _tyro_p2gs_jax "$@"
+  [[ -n "${COMPREPLY[*]}" ]] || COMPREPLY=()
+}
+complete -o default -F _p2gs_jax p2gs-jax
+"""
+FISH_PATHS = """
+complete --command p2gs-jax --force-files --condition \\
+  "test (count (commandline -opc)) -gt 1; and not string match -q -- '-*' (commandline -ct)"
+"""
+ZSH_CALL = '_tyro_p2gs_jax "$@"'
+
+
+def script(shell: Shell) -> str:
+    """Return the script that a shell reads to complete commands, options and their values."""
+    text = wording.captured(
+        lambda: tyro.cli(
+            every_command(),
+            prog="p2gs-jax",
+            args=["--tyro-print-completion", shell],
+            registry=registry(brief=False),
+        )
+    )
+    if shell == "bash":
+        return text + BASH_PATHS
+    if shell == "zsh":
+        return text.rstrip().removesuffix(ZSH_CALL) + f"{ZSH_CALL} || _files\n"
+    return text + FISH_PATHS

@@ -1,0 +1,198 @@
+"""How tyro reads our option classes: one paragraph of help an option, and short placeholders.
+
+tyro takes the text of an option from the string below its field. What it would print beside that
+(names of types, `(default: None)`, line ends of the source) is replaced here.
+"""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import functools
+import inspect
+import textwrap
+from collections.abc import Iterator
+from contextlib import suppress
+from itertools import pairwise
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import tyro
+from tyro.constructors import (
+    MISSING,
+    MISSING_NONPROP,
+    ConstructorRegistry,
+    PrimitiveConstructorSpec,
+    PrimitiveTypeInfo,
+    StructConstructorSpec,
+    StructFieldSpec,
+    StructTypeInfo,
+)
+
+from p2gs_jax.config import FitConfig
+
+PLACEHOLDERS = {int: "N", float: "X", str: "TEXT", Path: "PATH"}
+
+
+def registry(brief: bool) -> ConstructorRegistry:
+    """Return the rule by which tyro reads our option classes.
+
+    Args:
+        brief: leave out the configuration's groups of options.
+    """
+    rules = ConstructorRegistry()
+
+    @rules.struct_rule
+    def options(info: StructTypeInfo) -> StructConstructorSpec | None:
+        kind = info.type
+        if not dataclasses.is_dataclass(kind) or not kind.__module__.startswith("p2gs_jax."):
+            return None
+        if kind is FitConfig:
+            return _configuration(info, brief)
+        return StructConstructorSpec(kind, tuple(_fields(kind, info.default)))
+
+    rules.primitive_rule(_number_rule)
+    return rules
+
+
+def _number_rule(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+    """Return how a number, or a number or None, is read: with complaints in plain words."""
+    kinds = set(get_args(info.type)) if _is_union(info.type) else {info.type}
+    optional = NoneType in kinds
+    kinds -= {NoneType}
+    if kinds not in ({int}, {float}):
+        return None
+    (kind,) = kinds
+
+    def read(words: list[str]) -> int | float | None:
+        if optional and words[0] == "None":
+            return None
+        try:
+            return kind(words[0])
+        except ValueError:
+            what = "whole number" if kind is int else "number"
+            raise ValueError(f"{words[0]!r} is no {what}") from None
+
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=PLACEHOLDERS[kind],
+        instance_from_str=read,
+        is_instance=lambda value: isinstance(value, kind | (NoneType if optional else kind)),
+        str_from_instance=lambda value: [str(value)],
+    )
+
+
+def _configuration(info: StructTypeInfo, brief: bool) -> StructConstructorSpec:
+    """Return the configuration's groups; which preset it started from is the command's option."""
+    default = info.default if isinstance(info.default, FitConfig) else FitConfig()
+    if brief:
+        return StructConstructorSpec(lambda: default, ())
+    return StructConstructorSpec(
+        functools.partial(FitConfig, preset=default.preset),
+        tuple(f for f in _fields(FitConfig, default) if f.name != "preset"),
+    )
+
+
+def _fields(kind: type, default: Any) -> Iterator[StructFieldSpec]:
+    hints = get_type_hints(kind, include_extras=True)
+    for field in dataclasses.fields(kind):
+        hint = hints[field.name]
+        value = _default(field, default)
+        yield StructFieldSpec(
+            name=field.name,
+            # What a field says of itself comes last, and wins.
+            type=Annotated[(_plain(hint), *_looks(kind, field.name, hint, value), *_extras(hint))],  # type: ignore
+            default=value,
+            helptext=functools.partial(_text, kind, field.name),
+        )
+
+
+def _default(field: dataclasses.Field, parent: Any) -> Any:
+    if parent is MISSING:
+        return MISSING
+    if parent is not MISSING_NONPROP and hasattr(parent, field.name):
+        return getattr(parent, field.name)
+    if field.default is not dataclasses.MISSING:
+        return field.default
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return MISSING_NONPROP
+
+
+def _looks(kind: type, name: str, hint: Any, default: Any) -> tuple[Any, ...]:
+    """Return how an option shows itself, unless its field says otherwise.
+
+    In the configuration None is a value like others, in a command's own options it means that
+    nothing was said; and there a switch that is off can only be turned on.
+    """
+    plain, none_counts = _plain(hint), kind.__module__ == FitConfig.__module__
+    if plain is bool and not none_counts and not default:
+        return tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")
+    positional = tyro.conf.Positional in _extras(hint)
+    shown = name.upper() if positional else _placeholder(plain, none_counts)
+    hint_of = functools.partial(_default_shown, none_counts=none_counts)
+    return (tyro.conf.arg(metavar=shown, help_behavior_hint=hint_of),)
+
+
+def _placeholder(plain: Any, none_counts: bool) -> str | None:
+    """Return what stands for a value of a type, or None where tyro shall decide."""
+    origin, args = get_origin(plain), get_args(plain)
+    if _is_union(plain):
+        parts = [_placeholder(a, none_counts) or "" for a in args if a is not NoneType]
+        choices = ",".join(p.strip("{}") for p in parts if p.startswith("{"))
+        others = [p for p in parts if not p.startswith("{")]
+        if NoneType in args and none_counts:
+            choices, others = (f"{choices},None", others) if choices else ("", [*others, "None"])
+        return "|".join([*([f"{{{choices}}}"] if choices else []), *others])
+    if origin is Literal:
+        return "{" + ",".join(map(str, args)) + "}"
+    if origin is tuple:
+        shown = [_placeholder(a, none_counts) or "" for a in args if a is not Ellipsis]
+        return f"[{shown[0]} ...]" if Ellipsis in args else " ".join(shown)
+    return PLACEHOLDERS.get(plain)
+
+
+def _default_shown(default: str, *, none_counts: bool) -> str:
+    """Return what follows an option's text: its default, where there is one to name."""
+    if not default or (default == "None" and not none_counts):
+        return ""
+    with suppress(ValueError):
+        default = f"{float(default):.4g}" if "." in default else default
+    return f"(default: {default})"
+
+
+def _is_union(hint: Any) -> bool:
+    return get_origin(hint) in (Union, UnionType)
+
+
+def _plain(hint: Any) -> Any:
+    return get_args(hint)[0] if get_origin(hint) is Annotated else hint
+
+
+def _extras(hint: Any) -> tuple[Any, ...]:
+    return get_args(hint)[1:] if get_origin(hint) is Annotated else ()
+
+
+def _text(kind: type, name: str) -> str | None:
+    """Return the string below a field as one paragraph."""
+    found = (_field_docs(k).get(name) for k in kind.__mro__ if dataclasses.is_dataclass(k))
+    text = next((t for t in found if t is not None), None)
+    return None if text is None else " ".join(text.split())
+
+
+@functools.cache
+def _field_docs(kind: type) -> dict[str, str]:
+    try:
+        tree = ast.parse(textwrap.dedent(inspect.getsource(kind)))
+    except (OSError, SyntaxError):
+        return {}
+    body = tree.body[0].body if isinstance(tree.body[0], ast.ClassDef) else []
+    return {
+        field.target.id: str(text.value.value)
+        for field, text in pairwise(body)
+        if isinstance(field, ast.AnnAssign)
+        and isinstance(field.target, ast.Name)
+        and isinstance(text, ast.Expr)
+        and isinstance(text.value, ast.Constant)
+    }

@@ -1,0 +1,1 @@
+"""What works on this machine: nothing here is imported before it is tried."""

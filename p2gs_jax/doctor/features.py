@@ -1,0 +1,86 @@
+"""What works as it is, and what to install for what does not."""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from p2gs_jax.doctor.libraries import Library
+
+# Distributions that only some features need.
+OPTIONAL = ("viser", "av", "gsply", "playwright")
+BROWSERS = (
+    "chromium",
+    "chromium-browser",
+    "google-chrome",
+    "google-chrome-stable",
+    "chrome",
+)
+
+
+@dataclass(frozen=True)
+class Feature:
+    """Something a person may want to do.
+
+    Attributes:
+        name: what.
+        ready: whether it works here.
+        remark: with what it works, or what to do about it.
+    """
+
+    name: str
+    ready: bool
+    remark: str
+
+
+def look(libraries: Sequence[Library], backend: str | None) -> list[Feature]:
+    """Return all features.
+
+    Args:
+        libraries: what was tried.
+        backend: of JAX; None where it does not work.
+    """
+    broken = [x.name for x in libraries if x.trouble is not None]
+    core = [x for x in broken if x != "pycolmap"]
+    again = f"pip install --force-reinstall {' '.join(core)}"
+    return [
+        Feature("fit, calibrate, render, eval", not core, again if core else "core libraries"),
+        _optional("photographs without poses", "pycolmap", "pip install pycolmap", broken),
+        _optional("view", "viser", "pip install 'p2gs-jax[viewer]'", broken),
+        _browser(),
+        _optional("videos (render --out x.mp4)", "av", "pip install av", broken),
+        _optional("export to .spz", "gsply", "pip install 'p2gs-jax[spz]'", broken),
+        _gpu(backend),
+        Feature("LPIPS", True, "with --lpips-weights FILE (docs/files.md tells how to write one)"),
+    ]
+
+
+def find_browser() -> str | None:
+    """Return the path of a Chromium or Chrome, or None."""
+    return next(filter(None, map(shutil.which, BROWSERS)), None)
+
+
+def _optional(name: str, module: str, fix: str, broken: Sequence[str]) -> Feature:
+    ready = module not in broken and importlib.util.find_spec(module) is not None
+    return Feature(name, ready, module if ready else fix)
+
+
+def _browser() -> Feature:
+    found = find_browser()
+    return Feature(
+        "report --pdf", found is not None, found or "install Chromium or Chrome, on the PATH"
+    )
+
+
+def _gpu(backend: str | None) -> Feature:
+    name = "NVIDIA GPU"
+    if backend in ("gpu", "cuda"):
+        return Feature(name, True, "JAX uses it")
+    if shutil.which("nvidia-smi") or Path("/proc/driver/nvidia/version").is_file():
+        return Feature(
+            name, False, "there is one that JAX does not use: pip install 'p2gs-jax[cuda]'"
+        )
+    return Feature(name, False, "none found; everything runs on the CPU")

@@ -1,0 +1,29 @@
+"""What a data set can be asked for, apart from what makes it: `--help` needs no numpy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+Curve = Literal["srgb", "power", "filmic"]
+Layout = Literal["street", "town"]
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """What the cameras do to the light. The defaults are the paper's ISO-Var(4)."""
+
+    iso_std: float = 4.0
+    """Spread of the ISO about 8 (paper: 2 and 4); 0 is ISO-Const."""
+    curve: Curve = "srgb"
+    """Response; `filmic` bends it into an S before sRGB."""
+    camera_gain_ev: float = 0.0
+    """Standard deviation of a fixed gain per camera, stops."""
+    drift_ev: float = 0.0
+    """Amplitude of a slow automatic exposure, each camera at its own phase, stops."""
+    vignetting: float = 0.0
+    """Share of the light lost in the corners."""
+    white_balance_ev: float = 0.0
+    """Standard deviation of red and blue gains per camera, stops."""
+    noise: float = 0.0
+    """Standard deviation of photon and read noise, 1 = a small sensor in daylight."""

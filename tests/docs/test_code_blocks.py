@@ -1,0 +1,193 @@
+"""What the documentation shows works: Python runs, commands are parsed, files are read.
+
+`pages.py` says what a page can say about the test of a block. While pages are tested, the preset
+`robust` is quick (`quick_presets`), so that Python runs as it stands; in the folder where it runs
+lie `scene` and `street`, a tiny scene, and `RUN`, a finished run of it.
+"""
+
+import dataclasses
+import json
+import re
+import shutil
+import sys
+import tomllib
+
+import pytest
+from pages import LANGUAGES, PAGES, ROOT, Block, blocks, commands, prose
+from tiny_scene import make_scene
+
+from p2gs_jax import config
+from p2gs_jax.cli import main
+from p2gs_jax.cli.parser import COMMANDS, parse
+from p2gs_jax.options.fit import Calibrate, Fit, resolve_calibration, resolve_fit
+from p2gs_jax.sweep.toml import read_sweep
+
+BLOCKS = [block for page in PAGES for block in blocks(page)]
+
+
+def of(*languages):
+    return [b for b in BLOCKS if b.language in languages]
+
+
+def named(found):
+    return pytest.mark.parametrize("block", found, ids=[b.name for b in found])
+
+
+def skip_if_said(block: Block) -> None:
+    if block.skip is not None:
+        pytest.skip(block.skip)
+
+
+@pytest.fixture
+def quick_presets(monkeypatch):
+    """Let `robust` take a few steps at one resolution, with few Gaussians."""
+    slow = config.FitConfig()
+    quick = dataclasses.replace(
+        slow,
+        data=dataclasses.replace(slow.data, test_every=3),
+        render=dataclasses.replace(slow.render, sh_degree=1),
+        densify=dataclasses.replace(slow.densify, max_gaussians=400),
+        init=dataclasses.replace(slow.init, shell="off"),
+        train=dataclasses.replace(slow.train, steps=10, coarse_to_fine=()),
+    )
+    monkeypatch.setattr(config, "_robust", lambda: quick)
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch, finished_run):
+    """Go to a folder with a scene and a finished run."""
+    make_scene(tmp_path / "scene")
+    make_scene(tmp_path / "street")
+    shutil.copytree(finished_run, tmp_path / "RUN")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_every_block_has_a_language_that_is_tested():
+    assert len(of("python")) >= 3
+    assert len(of("sh")) >= 5
+    for block in BLOCKS:
+        assert block.language in LANGUAGES, f"{block.name}: choose one of {LANGUAGES}"
+
+
+PYTHON_PAGES = sorted({b.page for b in of("python")})
+
+
+@pytest.mark.parametrize("page", PYTHON_PAGES, ids=[p.name for p in PYTHON_PAGES])
+def test_python_runs(page, place, quick_presets):
+    """Blocks of a page follow each other in one namespace."""
+    namespace = {"__name__": "__main__"}
+    ran = 0
+    for block in blocks(page):
+        if block.language == "python" and block.skip is None:
+            padded = "\n" * (block.line - 1) + block.code  # so that tracebacks name the page's line
+            exec(compile(padded, block.page, "exec"), namespace)
+            ran += 1
+    if not ran:
+        pytest.skip("no block of this page can run here")
+
+
+@named(of("sh"))
+def test_commands_are_right(block, tmp_path, monkeypatch):
+    """Every word is understood; nothing is run."""
+    skip_if_said(block)
+    monkeypatch.chdir(tmp_path)
+    for words in commands(block.code):
+        check_command(words, block.name)
+
+
+def check_command(words, where):
+    program, argv = words[0], words[1:]
+    if program == "p2gs-jax":
+        check_ours(argv, f"{where}: {' '.join(words)}")
+    elif program == "python":
+        script = ROOT / argv[0]
+        assert script.is_file(), f"{where}: there is no {argv[0]}"
+    elif program == "pip":
+        extras = re.findall(r"\[([\w,]+)\]", " ".join(argv))
+        project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+        for extra in ",".join(extras).split(",") if extras else []:
+            assert extra in project["optional-dependencies"], f"{where}: no extra {extra!r}"
+    else:
+        assert program in ("pytest", "cd", "mkdir", "git"), f"{where}: what is {program!r}?"
+
+
+def check_ours(argv, where):
+    if len(argv) == 1 and argv[0] in COMMANDS:  # the command as such is spoken of
+        return
+    try:
+        name, options = parse(argv)
+    except SystemExit as stop:
+        if stop.code:
+            pytest.fail(f"{where}: this is not understood")
+        return
+    assert name in COMMANDS
+    if isinstance(options, Fit):
+        resolve_fit(options)
+    if isinstance(options, Calibrate):
+        resolve_calibration(options)
+
+
+RUN = [b for b in of("sh") if b.run]
+
+
+@named(RUN)
+def test_cheap_commands_run(block, place, quick_presets):
+    for words in commands(block.code):
+        with pytest.raises(SystemExit) as stop:
+            main(words[1:])
+        assert stop.value.code == 0, words
+
+
+@named(of("toml"))
+def test_sweep_files_are_read(block, tmp_path):
+    skip_if_said(block)
+    path = tmp_path / "sweep.toml"
+    path.write_text(block.code)
+    assert read_sweep(path).configs
+
+
+@named(of("json"))
+def test_json_is_json(block):
+    skip_if_said(block)
+    json.loads(block.code)
+
+
+@pytest.fixture(scope="module")
+def options(request):
+    """Return every option of every command."""
+    capture = request.getfixturevalue("capture_help")
+    return {option for name in COMMANDS for option in re.findall(r"--[\w.-]+", capture(name))}
+
+
+@pytest.fixture(scope="module")
+def capture_help():
+    import contextlib
+    import io
+
+    def run(name):
+        out = io.StringIO()
+        with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
+            parse([name, "--help-all"])
+        return out.getvalue()
+
+    return run
+
+
+# Options of other programs that pages mention.
+OTHERS = {"--help", "--help-all", "--version"}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=[str(p.relative_to(ROOT)) for p in PAGES])
+def test_options_in_the_text_exist(page, options):
+    for span in re.findall(r"`([^`\n]+)`", prose(page)):
+        if span.startswith("p2gs-jax "):
+            check_ours(span.split()[1:] if "..." not in span else ["--help"], f"{page}: {span}")
+        for option in re.findall(r"(?<!\S)--[a-z][\w.-]*", span):
+            known = option.replace("*", "") in options | OTHERS
+            group = option.endswith(".") and any(o.startswith(option) for o in options)
+            assert known or group, f"{page.name} speaks of {option}, which does not exist"
+
+
+if sys.platform == "win32":
+    pytestmark = pytest.mark.skip("paths in the pages are written with /")

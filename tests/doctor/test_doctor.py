@@ -1,0 +1,176 @@
+"""The doctor tells what is there, and survives what is not."""
+
+import importlib.metadata
+import json
+import tomllib
+from importlib.util import find_spec
+from pathlib import Path
+
+import jax.numpy as jnp
+import pytest
+from packaging.requirements import Requirement
+
+from p2gs_jax.commands import doctor
+from p2gs_jax.doctor import cache, features, libraries, machine, render
+
+PROJECT = Path(__file__).resolve().parents[2] / "pyproject.toml"
+
+
+def library(name, trouble=None):
+    return libraries.Library(name, "1.0", trouble)
+
+
+def test_everything_here_is_well(capsys):
+    assert doctor.diagnose(as_json=True) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["healthy"]
+    assert found["self_test"]["ok"]
+    assert found["self_test"]["difference"] < 1e-4
+    assert found["devices"]["backend"]
+    assert found["machine"]["cores"] >= 1
+    assert found["machine"]["memory"] > found["machine"]["available"] > 0
+    assert {x["name"]: x["version"] for x in found["libraries"]}["jax"][0].isdigit()
+    text = doctor.as_text(found)
+    assert "All that a fit needs is there." in text
+    assert "BROKEN" not in text
+
+
+def test_every_dependency_can_be_tried():
+    """A dependency whose module is called otherwise must be in MODULES."""
+    project = tomllib.loads(PROJECT.read_text())["project"]
+    for name in [Requirement(line).name for line in project["dependencies"]]:
+        assert find_spec(libraries.module_of(name)) is not None, name
+
+
+def test_without_metadata_the_core_is_tried(monkeypatch):
+    def unknown(name):
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(libraries.importlib.metadata, "requires", unknown)
+    assert {"jax", "jaxlib", "numpy"} <= set(libraries.requirements())
+
+
+def test_a_broken_library_is_said_and_costs_the_exit_code(capsys, monkeypatch, tmp_path):
+    (tmp_path / "broken_splats.py").write_text("raise OSError('libsplat.so: no such file')")
+    monkeypatch.syspath_prepend(tmp_path)
+    wanted = dict.fromkeys(["numpy", "broken_splats", "absent_splats"])
+    monkeypatch.setattr(libraries, "requirements", lambda: wanted)
+    assert doctor.diagnose(as_json=False) == 1
+    text = " ".join(capsys.readouterr().out.split())
+    assert "libsplat.so: no such file" in text
+    assert "No module named 'absent_splats'" in text
+    assert "'absent_splats' 'broken_splats'" in text
+    assert "no pip install --force-reinstall" in text
+
+
+def test_an_old_library_is_said(monkeypatch):
+    wanted = {"numpy": Requirement("numpy>=999").specifier}
+    monkeypatch.setattr(libraries, "requirements", lambda: wanted)
+    (found,) = libraries.look()
+    assert found.trouble == "too old: numpy>=999 is needed"
+
+
+def test_a_wrong_image_fails_the_self_test(monkeypatch):
+    import p2gs_jax.render as rendering
+
+    true = rendering.render_linear
+
+    def wrong(gaussians, alive, camera, cfg, capacity):
+        scale = 1.0 if cfg.implementation == "reference" else 1.01
+        result = true(gaussians, alive, camera, cfg, capacity)
+        return result.__class__(
+            scale * result.linear, result.alpha, result.depth, *(jnp.int32(0), False, False)
+        )
+
+    monkeypatch.setattr(rendering, "render_linear", wrong)
+    found = render.self_test()
+    assert not found.ok
+    assert "image" in found.remark
+
+
+def test_a_renderer_that_raises_fails_the_self_test(monkeypatch):
+    import p2gs_jax.render as rendering
+
+    def broken(*args):
+        raise RuntimeError("XLA said no")
+
+    monkeypatch.setattr(rendering, "render_linear", broken)
+    assert "XLA said no" in render.self_test().remark
+
+
+def test_features_say_what_to_install(monkeypatch):
+    monkeypatch.setattr(features.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(features.shutil, "which", lambda name: None)
+    found = {f.name: f for f in features.look([library("jax")], "cpu")}
+    assert found["fit, calibrate, render, eval"].ready
+    assert not found["view"].ready
+    assert "p2gs-jax[viewer]" in found["view"].remark
+    assert "Chromium" in found["report --pdf"].remark
+    assert not found["videos (render --out x.mp4)"].ready
+
+
+def test_pycolmap_is_only_for_photographs_without_poses():
+    found = {f.name: f for f in features.look([library("pycolmap", "no"), library("jax")], "cpu")}
+    assert found["fit, calibrate, render, eval"].ready
+    assert not found["photographs without poses"].ready
+
+
+def test_a_gpu_that_jax_does_not_use(monkeypatch):
+    monkeypatch.setattr(features.shutil, "which", lambda name: f"/usr/bin/{name}")
+    remark = {f.name: f.remark for f in features.look([], "cpu")}["NVIDIA GPU"]
+    assert "p2gs-jax[cuda]" in remark
+    assert {f.name: f.ready for f in features.look([], "gpu")}["NVIDIA GPU"]
+
+
+@pytest.fixture
+def container(monkeypatch, tmp_path):
+    monkeypatch.setattr(machine, "CGROUP", tmp_path)
+    monkeypatch.setattr(machine, "MEMINFO", tmp_path / "meminfo")
+    monkeypatch.setattr(machine.sys, "platform", "linux")
+    lines = "MemTotal:  8000000 kB\nMemAvailable:  6000000 kB\nHugePages_Total:  0\n"
+    (tmp_path / "meminfo").write_text(lines)
+    return tmp_path
+
+
+def test_memory_of_the_system(container):
+    assert machine.memory() == (8_000_000 * 1024, 6_000_000 * 1024)
+
+
+def test_memory_of_a_container(container):
+    (container / "memory.max").write_text("1000000000\n")
+    (container / "memory.current").write_text("400000000\n")
+    assert machine.memory() == (1_000_000_000, 600_000_000)
+    (container / "memory.max").write_text("max\n")
+    assert machine.memory() == (8_000_000 * 1024, 6_000_000 * 1024)
+
+
+def test_memory_without_proc(container, monkeypatch):
+    (container / "meminfo").unlink()
+    monkeypatch.setattr(machine, "_pages", {"SC_PHYS_PAGES": 5}.get)
+    assert machine.memory() == (5, None)
+
+
+def test_windows_without_its_library(container, monkeypatch):
+    monkeypatch.setattr(machine.sys, "platform", "win32")
+    assert machine.memory() == (None, None)
+
+
+def test_cores_of_a_container(container):
+    free = machine.cores()
+    (container / "cpu.max").write_text("100000 100000\n")
+    assert machine.cores() == 1
+    (container / "cpu.max").write_text("max 100000\n")
+    assert machine.cores() == free
+
+
+def test_an_unwritable_cache_is_said(monkeypatch, tmp_path):
+    import p2gs_jax.compile_cache as compile_cache
+
+    monkeypatch.setattr(compile_cache, "use_compile_cache", lambda: None)
+    monkeypatch.setattr(compile_cache, "cache_folder", lambda: tmp_path)
+    (tmp_path / "program").write_bytes(b"x" * 2_000_000)
+    assert cache.look().remark.startswith("2 MB of at most")
+    monkeypatch.setattr(cache.os, "access", lambda folder, mode: False)
+    assert "JAX_COMPILATION_CACHE_DIR" in cache.look().remark
+    monkeypatch.setattr(compile_cache, "cache_folder", lambda: None)
+    assert "nothing is kept" in cache.look().remark
