@@ -18,7 +18,7 @@ from tiny_scene import make_scene
 
 from p2gs_jax import config
 from p2gs_jax.cli import main
-from p2gs_jax.cli.parser import COMMANDS, parse
+from p2gs_jax.cli.parser import COMMANDS, GROUPS, parse
 from p2gs_jax.options.fit import Calibrate, Fit, resolve_calibration, resolve_fit
 from p2gs_jax.sweep.toml import read_sweep
 
@@ -115,6 +115,8 @@ def check_command(words, where):
 def check_ours(argv, where):
     if len(argv) == 1 and argv[0] in COMMANDS:  # the command as such is spoken of
         return
+    if argv[0] in PLANNED:
+        return
     try:
         name, options = parse(argv)
     except SystemExit as stop:
@@ -174,6 +176,8 @@ def capture_help():
     return run
 
 
+# Commands that the overview has a place for, and that are not there yet.
+PLANNED = {name for group in GROUPS.values() for name in group} - set(COMMANDS)
 # Options of other programs that pages mention.
 OTHERS = {"--help", "--help-all", "--version"}
 
@@ -181,8 +185,8 @@ OTHERS = {"--help", "--help-all", "--version"}
 @pytest.mark.parametrize("page", PAGES, ids=[str(p.relative_to(ROOT)) for p in PAGES])
 def test_options_in_the_text_exist(page, options):
     for span in re.findall(r"`([^`\n]+)`", prose(page)):
-        if span.startswith("p2gs-jax "):
-            check_ours(span.split()[1:] if "..." not in span else ["--help"], f"{page}: {span}")
+        if span.startswith("p2gs-jax ") and "..." not in span and "COMMAND" not in span:
+            check_command(span.split(), page.name)
         for option in re.findall(r"(?<!\S)--[a-z][\w.-]*", span):
             known = option.replace("*", "") in options | OTHERS
             group = option.endswith(".") and any(o.startswith(option) for o in options)

@@ -1,0 +1,70 @@
+"""Pages that list things list all of them, and nothing else."""
+
+import importlib
+import json
+import re
+
+from pages import ROOT
+
+DOCS = ROOT / "docs"
+
+
+def files_page() -> str:
+    return (DOCS / "files.md").read_text(encoding="utf-8")
+
+
+def test_files_page_knows_what_a_run_folder_holds(finished_run):
+    for path in finished_run.iterdir():
+        assert f"`{path.name}" in files_page(), "docs/files.md does not speak of it"
+
+
+def test_files_page_knows_the_keys(finished_run):
+    metrics = json.loads((finished_run / "metrics.json").read_text())
+    photometry = json.loads((finished_run / "photometry.json").read_text())
+    keys = set(metrics) | set(metrics["train"]) | set(metrics["test"]) | set(photometry)
+    keys |= {key for view in photometry["views"] for key in view}
+    keys |= set(metrics["consistency"]) | set(metrics["consistency"]["averaged"])
+    missing = keys - set(re.findall(r"\w+", files_page()))
+    assert not missing, "docs/files.md does not speak of them"
+
+
+REFERENCE = re.compile(r"`([a-z][\w/]*)\.py:(\w+(?:\.\w+)?)`")
+FIELD = re.compile(r"`((?:data|render|photometry|loss|optimizer|densify|init|train)\.[\w.]+)`")
+
+
+def test_the_paper_map_names_functions_that_exist():
+    text = (DOCS / "paper_to_code.md").read_text(encoding="utf-8")
+    found = REFERENCE.findall(text)
+    assert len(found) > 30
+    for path, name in found:
+        found_in = importlib.import_module(f"p2gs_jax.{path.replace('/', '.')}")
+        for part in name.split("."):
+            assert hasattr(found_in, part), f"{path}.py has no {name}"
+            found_in = getattr(found_in, part)
+
+
+def test_the_paper_map_names_fields_that_exist():
+    from p2gs_jax import FitConfig
+
+    found = FIELD.findall((DOCS / "paper_to_code.md").read_text(encoding="utf-8"))
+    assert len(found) > 10
+    for name in found:
+        value = FitConfig()
+        for part in name.split("."):
+            assert hasattr(value, part), f"there is no field {name}"
+            value = getattr(value, part)
+
+
+def test_the_paper_map_has_every_equation():
+    text = (DOCS / "paper_to_code.md").read_text(encoding="utf-8")
+    rows = {int(n) for n in re.findall(r"^\| \((\d+)\)", text, flags=re.M)}
+    assert rows == set(range(1, 20))
+
+
+def test_drawings_are_what_their_script_draws(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(DOCS / "images"))
+    draw = importlib.import_module("draw")
+    for name, drawing in (("kernel", draw.kernel()), ("axes", draw.axes())):
+        drawing.save(tmp_path / name)
+        drawn, kept = (tmp_path / name).read_text(), (DOCS / "images" / f"{name}.svg").read_text()
+        assert drawn == kept, "run `python docs/images/draw.py`"
