@@ -1,4 +1,4 @@
-"""The command line: `p2gs-jax fit | calibrate | render | eval | demo | synth | sweep | bench`.
+"""The command line: `p2gs-jax fit | calibrate | render | eval | report | compare | demo | ...`.
 
 Every configuration field is an option. Bad input ends with one message and exit code 2.
 """
@@ -19,6 +19,7 @@ import tyro
 from p2gs_jax.errors import UserError
 from p2gs_jax.options.experiments import Bench, Demo, Sweep, Synth
 from p2gs_jax.options.fit import Calibrate, Fit, named_preset
+from p2gs_jax.options.pages import Compare, Report
 from p2gs_jax.options.results import Eval, Render
 
 # A name is both the subcommand and the module of `p2gs_jax.commands` that runs it.
@@ -27,6 +28,8 @@ COMMANDS: dict[str, type] = {
     "calibrate": Calibrate,
     "render": Render,
     "eval": Eval,
+    "report": Report,
+    "compare": Compare,
     "demo": Demo,
     "synth": Synth,
     "sweep": Sweep,
