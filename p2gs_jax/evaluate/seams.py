@@ -96,17 +96,19 @@ def neighbours(scene: Scene, most: int) -> list[tuple[int, int]]:
         for b in range(a + 1, len(train))
         if moments[a] == moments[b] and cameras[a] != cameras[b] and shared[a, b] >= FEWEST_SHARED
     ]
-    pairs = together
-    if not pairs:
-        # Among equals, the nearest in the order of names.
-        order = np.arange(len(train))
-        near = shared - np.abs(order[:, None] - order) / (len(train) + 1)
-        np.fill_diagonal(near, -np.inf)
-        best = near.argmax(1) if len(train) > 1 else []
-        closest = {(min(a, int(b)), max(a, int(b))) for a, b in enumerate(best)}
-        pairs = sorted(p for p in closest if shared[p] >= FEWEST_SHARED)
+    pairs = together or _closest(shared)
     picks = np.unique(np.linspace(0, len(pairs) - 1, min(most, len(pairs))).round().astype(int))
     return [(train[pairs[k][0]], train[pairs[k][1]]) for k in picks]
+
+
+def _closest(shared: np.ndarray) -> list[tuple[int, int]]:
+    """Return every view with the one it shares most with; among equals, the nearest in order."""
+    order = np.arange(len(shared))
+    near = shared - np.abs(order[:, None] - order) / (len(shared) + 1)
+    np.fill_diagonal(near, -np.inf)
+    best = near.argmax(1).tolist() if len(shared) > 1 else []
+    pairs = {(min(a, b), max(a, b)) for a, b in enumerate(best)}
+    return sorted(p for p in pairs if shared[p] >= FEWEST_SHARED)
 
 
 def _shared_points(scene: Scene) -> np.ndarray:

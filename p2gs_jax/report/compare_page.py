@@ -7,7 +7,6 @@ from pathlib import Path
 
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.atomic import write_text
-from p2gs_jax.report.charts import against_chart
 from p2gs_jax.report.compare import (
     Comparison,
     Row,
@@ -16,8 +15,19 @@ from p2gs_jax.report.compare import (
     psnr_of,
     to_markdown,
 )
-from p2gs_jax.report.page import Section, figure, listed, made_by, page, paragraph, row, text
+from p2gs_jax.report.page import (
+    Section,
+    figure,
+    listed,
+    made_by,
+    page,
+    paragraph,
+    row,
+    text,
+    write_page,
+)
 from p2gs_jax.report.pictures import jpeg
+from p2gs_jax.report.run_charts import against_chart
 from p2gs_jax.report.strips import read_png, spread
 
 MOST_VIEWS = 4
@@ -32,13 +42,12 @@ def write_comparison(found: Comparison, out: Path) -> tuple[Path, Path]:
 
     Returns:
         Page and Markdown.
+
+    Raises:
+        UserError: the page cannot be written.
     """
     table = out.with_suffix(".md")
-    if table == out:
-        raise UserError(
-            f"{out} would be both the page and its tables.", fix="name a page ending in .html"
-        )
-    write_text(out, comparison_page(found))
+    write_page(out, comparison_page(found))
     write_text(table, to_markdown(found))
     return out, table
 

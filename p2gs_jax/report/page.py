@@ -7,6 +7,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from p2gs_jax.errors import UserError
+from p2gs_jax.export.atomic import write_text
 
 # Nothing is fetched, whatever the page came to hold.
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
@@ -67,6 +71,23 @@ def page(title: str, head: str, sections: Sequence[Section], foot: str) -> str:
 </body>
 </html>
 """
+
+
+def write_page(path: Path, html_text: str) -> None:
+    """Write a page.
+
+    Raises:
+        UserError: there is no writing there, or its name is no page's.
+    """
+    if path.suffix.lower() not in (".html", ".htm") or path.is_dir():
+        raise UserError(f"{path} is no name of a page.", fix="name a file that ends in .html")
+    try:
+        write_text(path, html_text)
+    except OSError as error:
+        raise UserError(
+            f"{path} cannot be written: {error.strerror or error}.",
+            fix="name another place with --out",
+        ) from error
 
 
 def made_by(command: str) -> str:

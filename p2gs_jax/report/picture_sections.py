@@ -8,7 +8,6 @@ import numpy as np
 
 from p2gs_jax.export.false_color import STOPS
 from p2gs_jax.report import words
-from p2gs_jax.report.charts import seams_chart
 from p2gs_jax.report.from_scene import FromScene
 from p2gs_jax.report.page import Section, figure, folded, paragraph, row, table, text
 from p2gs_jax.report.pictures import (
@@ -21,6 +20,7 @@ from p2gs_jax.report.pictures import (
     stop_picture,
     stop_shares,
 )
+from p2gs_jax.report.run_charts import seams_chart
 from p2gs_jax.report.run_files import RunFiles
 from p2gs_jax.report.strips import Strip
 

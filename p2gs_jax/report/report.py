@@ -4,12 +4,20 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from p2gs_jax.export.atomic import write_text
 from p2gs_jax.progress import Reporter, Silent
 from p2gs_jax.report import words
 from p2gs_jax.report.cautions import Caution, cautions
 from p2gs_jax.report.from_scene import FromScene, ask_scene
-from p2gs_jax.report.page import Section, key_numbers, listed, made_by, page, paragraph, text
+from p2gs_jax.report.page import (
+    Section,
+    key_numbers,
+    listed,
+    made_by,
+    page,
+    paragraph,
+    text,
+    write_page,
+)
 from p2gs_jax.report.photometry_sections import camera_sections
 from p2gs_jax.report.picture_sections import hdr_section, seam_section, strip_section
 from p2gs_jax.report.run_files import RunFiles, read_run
@@ -43,7 +51,7 @@ def write_report(
         The page.
 
     Raises:
-        UserError: it is no run folder.
+        UserError: it is no run folder, or the page cannot be written.
     """
     reporter = reporter or Silent()
     folder = Path(folder)
@@ -51,7 +59,7 @@ def write_report(
     scene = ask_scene(run, reporter, render=render)
     reporter.stage("Drawing")
     path = folder / "report.html" if out is None else Path(out)
-    write_text(path, report_page(run, scene))
+    write_page(path, report_page(run, scene))
     return path
 
 

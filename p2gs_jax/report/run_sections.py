@@ -10,8 +10,8 @@ import numpy as np
 
 from p2gs_jax.config import preset, to_dict
 from p2gs_jax.report import words
-from p2gs_jax.report.charts import Training, training_chart
 from p2gs_jax.report.page import Section, figure, folded, paragraph, table, text
+from p2gs_jax.report.run_charts import Training, training_chart
 from p2gs_jax.report.run_files import RunFiles, number_at, part_at
 
 MOST_TERMS = 3

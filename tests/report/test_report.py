@@ -271,6 +271,16 @@ def test_gammas_are_drawn_where_they_are_modelled(run):
     assert "Gamma was not modelled" in words_of(report_page(files, FromScene()))
 
 
+@pytest.mark.parametrize("name", ["page.pdf", "page", "folder.html", "file/page.html"])
+def test_where_no_page_can_be_written(run, tmp_path, capsys, name):
+    (tmp_path / "folder.html").mkdir()
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SystemExit) as stop:
+        main(["report", str(run), "--no-render", "--out", str(tmp_path / name)])
+    assert stop.value.code == 2
+    assert name in capsys.readouterr().err
+
+
 def test_not_a_run_folder(capsys, tmp_path):
     with pytest.raises(SystemExit) as stop:
         main(["report", str(tmp_path)])
