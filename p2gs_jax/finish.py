@@ -134,7 +134,8 @@ def photometry_views(
         params: the fit.
         scene: its views.
         fitted: exposures solved for held-out views.
-        solution: what the fit started from; its standard errors are passed on.
+        solution: what the fit started from; it, its standard errors and its number of observations
+            are passed on.
     """
     exposures = np.asarray(params.photometry.exposures)
     gammas = np.asarray(params.photometry.gammas)
@@ -158,6 +159,8 @@ def photometry_views(
         if k is not None and solution is not None and np.isfinite(solution.exposure_errors[k]):
             out[-1]["exposure_ev_error"] = float(solution.exposure_errors[k] / LN2)
             out[-1]["gamma_error"] = float(solution.gamma_errors[k])
+            out[-1]["exposure_ev_start"] = float(solution.exposures_ev[k])
+            out[-1]["observations"] = int(solution.observations_per_view[k])
     return out
 
 

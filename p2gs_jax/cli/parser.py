@@ -13,6 +13,7 @@ from p2gs_jax.cli.rule import registry
 from p2gs_jax.errors import UserError
 from p2gs_jax.options.experiments import Bench, Demo, Sweep, Synth
 from p2gs_jax.options.fit import Calibrate, Fit, named_preset
+from p2gs_jax.options.pages import Compare, Report
 from p2gs_jax.options.render import Render
 from p2gs_jax.options.results import Eval
 from p2gs_jax.options.setup import Completion, Doctor
@@ -23,6 +24,8 @@ COMMANDS: dict[str, type] = {
     "calibrate": Calibrate,
     "render": Render,
     "eval": Eval,
+    "report": Report,
+    "compare": Compare,
     "demo": Demo,
     "synth": Synth,
     "sweep": Sweep,

@@ -16,7 +16,7 @@ from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.types import View
 
 # Absent from files of runs without a bundle adjustment.
-OPTIONAL = frozenset({"exposure_ev_error", "gamma_error"})
+OPTIONAL = frozenset({"exposure_ev_error", "gamma_error", "exposure_ev_start", "observations"})
 
 
 class ViewPhotometry(TypedDict):
@@ -33,6 +33,8 @@ class ViewPhotometry(TypedDict):
         exposure_fitted: for a held-out view, the scalar solved from its photograph.
         exposure_ev_error: standard error of `exposure_ev` from the bundle adjustment, or null.
         gamma_error: standard error of `gamma`, or null.
+        exposure_ev_start: `exposure_ev` before the first step, where a bundle adjustment gave it.
+        observations: usable observations of shared points that it had in this view.
     """
 
     image: str
@@ -45,6 +47,8 @@ class ViewPhotometry(TypedDict):
     exposure_fitted: float | None
     exposure_ev_error: NotRequired[float | None]
     gamma_error: NotRequired[float | None]
+    exposure_ev_start: NotRequired[float | None]
+    observations: NotRequired[int | None]
 
 
 class PhotometryFile(TypedDict):

@@ -1,0 +1,197 @@
+"""What only the scene can tell: seams, clipped photographs, true exposures, views to look at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from p2gs_jax.errors import UserError
+from p2gs_jax.evaluate.metrics import psnr
+from p2gs_jax.evaluate.seam_picture import Halves, halves
+from p2gs_jax.evaluate.seams import Photographed, Seam, measure, neighbours
+from p2gs_jax.photometry.look import develop
+from p2gs_jax.progress import Reporter
+from p2gs_jax.render.host import make_renderer
+from p2gs_jax.render.warp import surface_depth
+from p2gs_jax.report.run_files import RunFiles
+from p2gs_jax.report.strips import Strip, spread
+from p2gs_jax.run_folder import Run, load_run
+from p2gs_jax.scene.device import camera_of
+from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.synth.exposures import read_true_exposures
+
+MOST_PAIRS, MOST_CLIPPED, MOST_RENDERED = 12, 24, 3
+# Seams are measured on images of at most this many pixels across.
+SEAM_WIDTH = 960
+# A picture of a seam should show some of it: pairs with less than this share of the median overlap
+# are not chosen for it.
+LEAST_OVERLAP = 0.5
+
+
+@dataclass(frozen=True)
+class SeamPair:
+    """A seam between two views.
+
+    Attributes:
+        first: name of one view.
+        second: name of the other.
+        seam: between them.
+    """
+
+    first: str
+    second: str
+    seam: Seam
+
+
+@dataclass(frozen=True)
+class FromScene:
+    """What the scene told.
+
+    Attributes:
+        true_exposures: by view, where the scene carries them.
+        seams: pairs in the order of the views.
+        tried_pairs: pairs that were compared, with or without enough in common.
+        shown: the pair of the picture.
+        picture: the widest seam to look at, or None.
+        clipped: share of clipped pixels by view, for a sample of the training views.
+        strips: rendered training views, where the folder has no held-out ones.
+        missing: sentences on what could not be found out.
+    """
+
+    true_exposures: dict[str, float] = field(default_factory=dict)
+    seams: tuple[SeamPair, ...] = ()
+    tried_pairs: int = 0
+    shown: SeamPair | None = None
+    picture: Halves | None = None
+    clipped: dict[str, float] = field(default_factory=dict)
+    strips: tuple[Strip, ...] = ()
+    missing: tuple[str, ...] = ()
+
+
+def ask_scene(files: RunFiles, reporter: Reporter, *, render: bool = True) -> FromScene:
+    """Load the scene and render what the page needs; a scene that has gone is said, not fatal.
+
+    Args:
+        files: the run folder.
+        reporter: receives progress.
+        render: False leaves the scene alone, but for its true exposures.
+    """
+    truth: dict[str, float] = {}
+    missing: list[str] = []
+    try:
+        truth = read_true_exposures(files.scene)
+    except (OSError, KeyError, ValueError) as error:
+        missing.append(f"The scene's true exposures cannot be read ({error!r}).")
+    if not render:
+        missing.append("Seams were not measured: the page was made without rendering.")
+        return FromScene(true_exposures=truth, missing=tuple(missing))
+    reporter.stage("Reading the scene")
+    try:
+        run = load_run(files.folder)
+        return _rendered(run, files, reporter, truth, missing)
+    except UserError as error:
+        missing.append(f"Seams were not measured, and nothing was rendered: {error.message}")
+        return FromScene(true_exposures=truth, missing=tuple(missing))
+
+
+def _rendered(
+    run: Run, files: RunFiles, reporter: Reporter, truth: dict[str, float], missing: list[str]
+) -> FromScene:
+    store = ImageStore(run.scene.views, run.cfg.data)
+    render = make_renderer(run.cfg.render)
+
+    def render_camera(camera):
+        return render(run.params.gaussians, run.alive, camera)
+
+    pairs: list[SeamPair] = []
+    tried: list[tuple[int, int]] = []
+    shown, picture = None, None
+    if run.cfg.photometry.appearance is not None:
+        missing.append(
+            "Seams were not measured: this preset learns corrections of display values, which "
+            "cannot be undone in a photograph."
+        )
+    else:
+        tried = neighbours(run.scene, MOST_PAIRS)
+        photographed = _Photographs(run, store, render_camera)
+        found: dict[tuple[int, int], Seam] = {}
+        for done, (i, j) in enumerate(tried):
+            reporter.stage("Measuring seams", done, len(tried))
+            seam = measure(photographed(i), photographed(j), run.common_look(), run.cfg.loss)
+            if seam is not None:
+                found[i, j] = seam
+        names = [v.name for v in run.scene.views]
+        pairs = [SeamPair(names[i], names[j], seam) for (i, j), seam in found.items()]
+        widest = _widest(found)
+        if widest is not None:
+            i, j = widest
+            shown = SeamPair(names[i], names[j], found[widest])
+            picture = halves(photographed(i), photographed(j), run.common_look(), render_camera)
+    strips: list[Strip] = []
+    if not files.held_out:
+        for index in spread(run.scene.train_indices, MOST_RENDERED):
+            reporter.stage("Rendering views", len(strips), MOST_RENDERED)
+            strips.append(_strip(run, store, render_camera, index))
+    reporter.stage("Looking for clipped pixels")
+    return FromScene(
+        truth,
+        tuple(pairs),
+        len(tried),
+        shown,
+        picture,
+        _clipped(run, store),
+        tuple(strips),
+        tuple(missing),
+    )
+
+
+class _Photographs:
+    """Photographs with depth, each rendered once."""
+
+    def __init__(self, run: Run, store: ImageStore, render):
+        self.run, self.store, self.render = run, store, render
+        self.known: dict[int, Photographed] = {}
+
+    def __call__(self, index: int) -> Photographed:
+        if index not in self.known:
+            shrink = max(1.0, self.store.camera(index)[2] / SEAM_WIDTH)
+            camera = camera_of(self.store, index, shrink)
+            depth = np.asarray(surface_depth(self.render(camera)))
+            ldr, mask = self.store.get(index, shrink)
+            look = self.run.own_look(index)
+            self.known[index] = Photographed(ldr, mask, camera, depth, look)
+        return self.known[index]
+
+
+def _widest(found: dict[tuple[int, int], Seam]) -> tuple[int, int] | None:
+    """Return the pair with the widest seam among those that have a good part in common."""
+    if not found:
+        return None
+    enough = LEAST_OVERLAP * float(np.median([s.pixels for s in found.values()]))
+    good = {k: s for k, s in found.items() if s.pixels >= enough}
+    return max(good, key=lambda k: good[k].before_ev)
+
+
+def _strip(run: Run, store: ImageStore, render, index: int) -> Strip:
+    photograph, mask = store.get(index)
+    linear = np.asarray(render(camera_of(store, index)).linear)
+    shown = develop(linear, run.own_look(index))
+    score = float(psnr(shown, photograph, mask))
+    view = run.scene.views[index]
+    return Strip(view.name, view.split, photograph, shown, linear, score)
+
+
+def _clipped(run: Run, store: ImageStore) -> dict[str, float]:
+    """Return which share of a training photograph is clipped in some channel."""
+    out = {}
+    for index in spread(run.scene.train_indices, MOST_CLIPPED):
+        ldr, mask = store.get(index)
+        clipped = np.any(ldr >= run.cfg.loss.saturation, axis=-1) & (mask > 0)
+        out[run.scene.views[index].name] = float(clipped.sum() / max(float(mask.sum()), 1.0))
+    return out
+
+
+def true_stops(names: list[str], truth: dict[str, float]) -> np.ndarray:
+    """Return true exposures in stops, NaN where unknown."""
+    return np.array([np.log2(truth[n]) if truth.get(n, 0) > 0 else np.nan for n in names])

@@ -1,0 +1,201 @@
+"""What a run folder holds, read without its scene; what is missing is named, not fatal."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from p2gs_jax.config import FitConfig, from_dict
+from p2gs_jax.errors import UserError
+from p2gs_jax.export.atomic import read_jsonl
+from p2gs_jax.export.photometry_json import PhotometryFile, ViewPhotometry, read_photometry
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Files of a held-out view.
+
+    Attributes:
+        name: of the view, as `metrics.json` knows it; without suffix where it does not.
+        photograph: PNG.
+        render: PNG, under the exposure fitted to the photograph.
+        exr: linear radiance, or None.
+    """
+
+    name: str
+    photograph: Path
+    render: Path
+    exr: Path | None
+
+
+@dataclass(frozen=True)
+class RunFiles:
+    """A run folder.
+
+    Attributes:
+        folder: where it lies.
+        scene: the scene that it was fitted to, as the run was told.
+        options: `config.json`, nested values.
+        cfg: the same as this version reads it, or None where it cannot.
+        metrics: `metrics.json`; empty where there is none.
+        photometry: `photometry.json`, or None.
+        log: lines of `log.jsonl`.
+        held_out: held-out views in `renders/`, by name.
+        missing: sentences on what could not be read.
+    """
+
+    folder: Path
+    scene: Path
+    options: dict[str, Any]
+    cfg: FitConfig | None
+    metrics: dict[str, Any]
+    photometry: PhotometryFile | None
+    log: list[dict[str, Any]]
+    held_out: tuple[HeldOut, ...]
+    missing: tuple[str, ...]
+
+    @property
+    def preset(self) -> str:
+        """The preset that the options started from."""
+        return str(self.options.get("preset", "unknown"))
+
+    @property
+    def views(self) -> list[ViewPhotometry]:
+        """Views of `photometry.json`."""
+        return [] if self.photometry is None else self.photometry["views"]
+
+    @property
+    def train(self) -> list[ViewPhotometry]:
+        """Training views."""
+        return [v for v in self.views if v["split"] == "train"]
+
+    @property
+    def cameras(self) -> list[str]:
+        """Physical cameras, in the order of their first views."""
+        return list(dict.fromkeys(v["camera"] for v in self.views))
+
+    def number(self, *path: str) -> float | None:
+        """Return a number of `metrics.json`, or None where it is missing or no number."""
+        return number_at(self.metrics, *path)
+
+    def part(self, *path: str) -> dict[str, Any]:
+        """Return a part of `metrics.json`; empty where it is missing or has no parts."""
+        return part_at(self.metrics, *path)
+
+    def option(self, *path: str) -> Any:
+        """Return a value of the configuration, or None where it is missing."""
+        return part_at(self.options, *path[:-1]).get(path[-1])
+
+
+def part_at(values: Any, *path: str) -> dict[str, Any]:
+    """Return the mapping at a path of nested mappings, or an empty one."""
+    for key in path:
+        values = values.get(key) if isinstance(values, Mapping) else None
+    return dict(values) if isinstance(values, Mapping) else {}
+
+
+def number_at(values: Any, *path: str) -> float | None:
+    """Return the number at a path of nested mappings, or None."""
+    for key in path:
+        values = values.get(key) if isinstance(values, Mapping) else None
+    if isinstance(values, bool) or not isinstance(values, int | float):
+        return None
+    return float(values)
+
+
+def read_run(folder: Path) -> RunFiles:
+    """Read everything that a run folder holds.
+
+    Raises:
+        UserError: it is no run folder.
+    """
+    path = folder / "config.json"
+    if not path.is_file():
+        raise UserError(
+            f"{folder} is not a run folder: {path.name} is missing.",
+            fix="name the folder that was given to `p2gs-jax fit --out`",
+        )
+    missing: list[str] = []
+    saved = _read_object(path, "the configuration", missing)
+    options = saved.get("fit")
+    options = options if isinstance(options, dict) else {}
+    cfg = None
+    try:
+        cfg = from_dict(options) if options else None
+    except (TypeError, ValueError) as error:
+        missing.append(f"config.json is of another version of this program ({error}).")
+    metrics = _read_object(folder / "metrics.json", "the scores", missing)
+    photometry = None
+    try:
+        photometry = read_photometry(folder / "photometry.json")
+    except UserError as error:
+        there = (folder / "photometry.json").exists()
+        why = error.message if there else "photometry.json is missing"
+        missing.append(f"The exposures are not shown: {why}.".replace("..", "."))
+    log = read_log(folder / "log.jsonl", missing)
+    names = [v["image"] for v in photometry["views"]] if photometry is not None else []
+    return RunFiles(
+        folder,
+        Path(str(saved.get("scene", ""))),
+        options,
+        cfg,
+        metrics,
+        photometry,
+        log,
+        find_held_out(folder / "renders", names),
+        tuple(missing),
+    )
+
+
+def read_log(path: Path, missing: list[str]) -> list[dict[str, Any]]:
+    """Return the lines of the log that hold a step; `missing` receives why there are none."""
+    try:
+        records = read_jsonl(path)
+    except (UserError, OSError) as error:
+        missing.append(f"The training curves are not shown: {error}")
+        return []
+    kept = [r for r in records if isinstance(r, dict) and number_at(r, "step") is not None]
+    if not kept:
+        missing.append("The training curves are not shown: log.jsonl is missing or empty.")
+    return kept
+
+
+def find_held_out(folder: Path, names: list[str]) -> tuple[HeldOut, ...]:
+    """Return the held-out views that `fit` wrote.
+
+    Args:
+        folder: `renders/` of a run.
+        names: of all views; `renders/` has them without their suffix.
+    """
+    whole = {str(Path(name).with_suffix("")): name for name in names}
+    out = []
+    for render in sorted(folder.rglob("*.render.png")):
+        stem = render.name.removesuffix(".render.png")
+        photograph = render.with_name(f"{stem}.photograph.png")
+        short = (render.parent.relative_to(folder) / stem).as_posix()
+        # What `p2gs-jax render` wrote into renders/all is not a held-out view.
+        if not photograph.is_file() or (whole and short not in whole):
+            continue
+        exr = render.with_name(f"{stem}.exr")
+        name = whole.get(short, short)
+        out.append(HeldOut(name, photograph, render, exr if exr.is_file() else None))
+    return tuple(out)
+
+
+def _read_object(path: Path, what: str, missing: list[str]) -> dict[str, Any]:
+    """Return a JSON object; `missing` receives why there is none."""
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        missing.append(f"{path.name} is missing: {what} cannot be shown. The run is not finished.")
+        return {}
+    except (OSError, ValueError) as error:
+        missing.append(f"{path.name} cannot be read: {what} cannot be shown ({error}).")
+        return {}
+    if not isinstance(value, dict):
+        missing.append(f"{path.name} holds no object: {what} cannot be shown.")
+        return {}
+    return value

@@ -1,0 +1,91 @@
+"""Views to look at: a photograph, what the fit makes of it, and its radiance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float32
+
+from p2gs_jax.errors import UserError
+from p2gs_jax.export.exr import read_exr
+from p2gs_jax.report.run_files import HeldOut, RunFiles, number_at
+
+
+@dataclass(frozen=True)
+class Strip:
+    """One view.
+
+    Attributes:
+        name: of the view.
+        split: train or test.
+        photograph: display values.
+        render: under the view's own exposure, or that fitted to its photograph.
+        linear: radiance, or None.
+        psnr: of the two, dB, or None where nothing tells.
+    """
+
+    name: str
+    split: str
+    photograph: Float32[np.ndarray, "h w 3"]
+    render: Float32[np.ndarray, "h w 3"]
+    linear: Float32[np.ndarray, "h w 3"] | None
+    psnr: float | None
+
+
+def held_out_strips(run: RunFiles, most: int, problems: list[str]) -> list[Strip]:
+    """Return held-out views from files, from the worst to the best: evenly over all of them.
+
+    Args:
+        run: the folder.
+        most: views at most.
+        problems: receives what could not be read.
+    """
+    scores = run.part("test", "exposure_fitted", "per_view")
+    ranked = sorted(run.held_out, key=lambda h: (_psnr(scores, h), h.name))
+    out = []
+    for files in spread(ranked, most):
+        try:
+            out.append(
+                Strip(
+                    files.name,
+                    "test",
+                    read_png(files.photograph),
+                    read_png(files.render),
+                    None if files.exr is None else read_exr(files.exr)[0],
+                    number_at(scores, files.name, "psnr"),
+                )
+            )
+        except UserError as error:
+            problems.append(f"{files.name} is not shown: {error.message}.")
+    return out
+
+
+def _psnr(scores: dict, files: HeldOut) -> float:
+    value = number_at(scores, files.name, "psnr")
+    return float("inf") if value is None else value
+
+
+def spread(items: Sequence, most: int) -> list:
+    """Return at most so many items, the first, the last and evenly between."""
+    if len(items) <= most:
+        return list(items)
+    return [items[i] for i in np.linspace(0, len(items) - 1, most).round().astype(int)]
+
+
+def read_png(path: Path) -> Float32[np.ndarray, "h w 3"]:
+    """Return display values of a PNG or JPEG.
+
+    Raises:
+        UserError: it cannot be read.
+    """
+    try:
+        raw = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR)
+    except (OSError, cv2.error):
+        raw = None
+    if raw is None:
+        raise UserError(f"{path} cannot be read")
+    return raw[..., ::-1].astype(np.float32) / 255
