@@ -39,7 +39,7 @@ def bash(tmp_path_factory):
 
 
 def test_commands_are_completed(bash):
-    assert bash("try p2gs-jax re") == ["1", "render"]
+    assert bash("try p2gs-jax re") == ["2", "render", "report"]
     assert bash("try p2gs-jax cal") == ["1", "calibrate"]
 
 
