@@ -1,6 +1,7 @@
 """Shared fixtures; real data is used where it lies beside the checkout and skipped elsewhere."""
 
 import os
+import shutil
 import tempfile
 from pathlib import Path
 
@@ -45,3 +46,21 @@ def finished_run(tmp_path_factory) -> Path:
         main(argv)
     assert stop.value.code == 0
     return root / "run"
+
+
+CHROMIUM = ("chromium", "chromium-browser", "google-chrome")
+
+
+@pytest.fixture(scope="session")
+def browser():
+    """Return a headless Chromium (playwright's `Browser`), skipping where there is none."""
+    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    path = next(filter(None, map(shutil.which, CHROMIUM)), None)
+    if path is None:
+        pytest.skip(f"no browser: none of {', '.join(CHROMIUM)} is on the PATH")
+    # The viewer draws with WebGL, which without a GPU needs the software rasterizer.
+    args = ["--no-sandbox", "--enable-unsafe-swiftshader"]
+    with sync_api.sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=path, args=args)
+        yield chromium
+        chromium.close()
