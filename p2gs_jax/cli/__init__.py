@@ -1,4 +1,4 @@
-"""The command line: `p2gs-jax fit | calibrate | render | eval | demo | synth | sweep | bench`.
+"""The command line: `p2gs-jax fit | calibrate | render | eval | view | demo | synth | ...`.
 
 Every configuration field is an option. Bad input ends with one message and exit code 2.
 """
@@ -20,6 +20,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.options.experiments import Bench, Demo, Sweep, Synth
 from p2gs_jax.options.fit import Calibrate, Fit, named_preset
 from p2gs_jax.options.results import Eval, Render
+from p2gs_jax.options.view import View
 
 # A name is both the subcommand and the module of `p2gs_jax.commands` that runs it.
 COMMANDS: dict[str, type] = {
@@ -27,6 +28,7 @@ COMMANDS: dict[str, type] = {
     "calibrate": Calibrate,
     "render": Render,
     "eval": Eval,
+    "view": View,
     "demo": Demo,
     "synth": Synth,
     "sweep": Sweep,
