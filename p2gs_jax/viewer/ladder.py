@@ -16,6 +16,8 @@ WIDTHS = (320, 480, 720, 1080, 1620, 2430)
 # Shapes lie this many to a factor of two, so that no pixel is more than 9 % out of square.
 SHAPES_PER_OCTAVE = 4
 ALIGN = 8
+# A rung of more than this share of all pixels saves too little.
+FULL_FROM = 0.6
 # Frames of a moving camera should take this long, milliseconds.
 TARGET_MS = 75.0
 # A larger rung must be expected within this share of the target, and a rung is left beyond that.
@@ -37,7 +39,7 @@ def ladder(full: Size) -> tuple[Size, ...]:
     for nominal in WIDTHS:
         area = nominal * nominal / 1.6
         size = _aligned(math.sqrt(area * aspect)), _aligned(math.sqrt(area / aspect))
-        if area < 0.75 * full[0] * full[1]:
+        if area < FULL_FROM * full[0] * full[1]:
             rungs.append(size)
     return (*rungs, full)
 

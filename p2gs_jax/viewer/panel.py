@@ -15,7 +15,7 @@ from p2gs_jax.viewer.settings import ChosenCurve, Settings
 from p2gs_jax.viewer.shade import Mode
 
 MODES: dict[str, Mode] = {
-    "photograph": "display",
+    "picture": "display",
     "stops (false colour)": "stops",
     "clipping": "clipping",
     "depth": "depth",
@@ -50,8 +50,8 @@ class Actions(Protocol):
         """Set the vertical field of view."""
         ...
 
-    def show_cameras(self, visible: bool, size: float) -> None:
-        """Show or hide the photographs' cameras."""
+    def show_cameras(self, visible: bool, scale: float) -> None:
+        """Show or hide the photographs' cameras, times their usual size."""
         ...
 
     def set_place(self, camera: str, place: float) -> None:
@@ -78,7 +78,6 @@ class Facts:
         most_ev: largest distance of an exposure from the mean, stops.
         gammas: all that occur.
         curve: of the run.
-        camera_size: of the frusta, viewer units.
         camera_legend: what their colours mean.
     """
 
@@ -88,7 +87,6 @@ class Facts:
     most_ev: float
     gammas: Sequence[float]
     curve: str
-    camera_size: float
     camera_legend: str
 
 
@@ -138,7 +136,7 @@ class Panel:
             "Exposure",
             -reach,
             reach,
-            0.01,
+            0.05,
             0.0,
             hint="Stops (EV) from the mean exposure of the training photographs.",
             marks=tuple(
@@ -192,10 +190,7 @@ class Panel:
         self._cameras = gui.add_checkbox(
             "Cameras", False, hint="Where photographs were taken; click one to go there."
         )
-        size = facts.camera_size
-        self._size = gui.add_slider(
-            "Size", size / 10, size * 4, size / 20, size, visible=False, marks=()
-        )
+        self._size = gui.add_slider("Size", 0.2, 8.0, 0.1, 1.0, visible=False, marks=())
         self._camera_legend = gui.add_html(facts.camera_legend, visible=False)
 
         def choose(name: str) -> None:

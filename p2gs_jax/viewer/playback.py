@@ -90,6 +90,8 @@ class Player:
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop playing; return at once."""
+        """Stop playing, and wait until nothing moves any more."""
         self._stop.set()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join()
         self._thread = None

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from p2gs_jax.config import RenderConfig
+from p2gs_jax.errors import UserError
 from p2gs_jax.render import render_linear
 from p2gs_jax.render.host import capacity_bucket
 from p2gs_jax.render.xla_cpu import compiler_options
@@ -68,6 +69,7 @@ class Programs:
         self._took_ms: dict[Size, float] = {}
         self._wanted: list[Size] = []
         self._now: Size | None = None
+        self._compiled = 0
         self._changed = threading.Condition()
         self._one_frame = threading.Lock()
         self._stopping = False
@@ -79,6 +81,12 @@ class Programs:
         """Sizes that render at once."""
         with self._changed:
             return frozenset(self._programs)
+
+    @property
+    def compiled(self) -> int:
+        """How many programs have been compiled so far."""
+        with self._changed:
+            return self._compiled
 
     @property
     def compiling(self) -> Size | None:
@@ -102,7 +110,7 @@ class Programs:
     def render(self, camera: Camera) -> Render | None:
         """Return a view, or None where its size is not compiled or its tile lists overflow.
 
-        After an overflow a program with longer lists is wanted.
+        After an overflow the size is not ready until a program with longer lists is compiled.
         """
         size = (camera.width, camera.height)
         with self._changed:
@@ -116,26 +124,40 @@ class Programs:
             self._most[size] = max(self._most.get(size, 0), needed)
             if not bool(result.overflow):
                 return result
-            if needed <= MOST_ENTRIES:
+            if needed <= MOST_ENTRIES and self._programs.get(size) is program:
+                del self._programs[size]
                 self._wanted = [size, *(s for s in self._wanted if s != size)]
                 self._changed.notify_all()
         return None
 
     def render_now(self, camera: Camera) -> Render:
-        """Return a view of any size, compiling and growing as long as it takes."""
+        """Return a view of any size, compiling and growing as long as it takes.
+
+        Raises:
+            UserError: it would need more memory than is reasonable.
+        """
         size = (camera.width, camera.height)
         while True:
             result = self.render(camera)
             if result is not None:
                 return result
+            if self._most.get(size, 0) > MOST_ENTRIES:
+                raise UserError(
+                    f"{size[0]} x {size[1]} pixels from here need too much memory.",
+                    fix="move away from what is close, or choose a smaller width",
+                )
             self._compile(size)
 
     def stop(self) -> None:
-        """Stop compiling, as soon as what is being compiled is done."""
+        """Stop compiling, and wait until what is being compiled is done.
+
+        An interpreter that ends while JAX works in another thread aborts.
+        """
         with self._changed:
             self._stopping = True
             self._wanted.clear()
             self._changed.notify_all()
+        self._worker.join()
 
     def _work(self) -> None:
         while True:
@@ -155,6 +177,8 @@ class Programs:
         """Compile a size with tile lists that hold what it is known to need, and try it."""
         while True:
             with self._changed:
+                if self._stopping:
+                    return
                 capacity = capacity_bucket(self._expected(size), MARGIN)
                 old = self._programs.get(size)
             if old is not None and old.capacity >= capacity:
@@ -169,6 +193,7 @@ class Programs:
                 if most <= capacity:
                     self._programs[size] = _Program(capacity, run)
                     self._took_ms[size] = fastest
+                    self._compiled += 1
                     return
 
     def _expected(self, size: Size) -> int:

@@ -80,11 +80,14 @@ class Screen:
         self.with_depth = False
         self._changed = threading.Condition()
         self._moved, self._retouched = True, False
-        self._settled: Size | None = None
+        # What was shown at rest: the size hoped for, and the programs there were then.
+        self._settled: tuple[Size | None, int] | None = None
         self._last_change = 0.0
         self._stopping = False
         self._took_ms: dict[Size, float] = {}
+        self._last_ms = 0.0
         self._splats: viser.GaussianSplatHandle | None = None
+        self._colored: Settings | None = None
         self._thread = threading.Thread(target=self._work, name="draw", daemon=True)
 
     def start(self) -> None:
@@ -94,12 +97,13 @@ class Screen:
         self._thread.start()
 
     def stop(self) -> None:
-        """Draw no more."""
+        """Draw no more, and wait for the frame that is being drawn."""
         with self._changed:
             self._stopping = True
             self._changed.notify_all()
         if self._programs_changed in self._studio.listeners:
             self._studio.listeners.remove(self._programs_changed)
+        self._thread.join()
 
     def moved(self) -> None:
         """The camera is somewhere else: render anew."""
@@ -140,24 +144,28 @@ class Screen:
         with self._changed:
             while not self._stopping:
                 wait = None
-                ready = self._studio.programs.ready
-                if self._moved and (ready or self._panel.settings().splats):
+                splats = self._panel.settings().splats
+                if self._moved and (splats or self._studio.programs.ready):
                     self._moved = self._retouched = False
                     return "move"
                 if self._retouched and not self._moved:
                     self._retouched = False
                     return "look"
-                if not self._moved and (self._settled is None or self._better(ready)):
+                if not self._moved and (self._settled is None or not (splats or self._sharp())):
                     wait = self._last_change + REST_S - time.monotonic()
                     if wait <= 0:
                         return "rest"
                 self._changed.wait(wait)
         return None
 
-    def _better(self, ready: frozenset[Size]) -> bool:
-        """Whether a sharper picture than the one at rest has become possible."""
-        best = self._best(seen_by(self._client), ready)
-        return best is not None and best != self._settled
+    def _sharp(self) -> bool:
+        """Whether the picture at rest is the best there can be with the programs there are."""
+        programs, frame = self._studio.programs, self.darkroom.frame
+        best = self._best(seen_by(self._client), programs.ready)
+        if self._settled is None or best != self._settled[0]:
+            return False
+        as_hoped = frame is not None and frame.size == best
+        return as_hoped or self._settled[1] == programs.compiled
 
     def _best(self, seen: Seen, ready: frozenset[Size]) -> Size | None:
         return choose(self._rungs(seen), ready, {}, target_ms=np.inf)
@@ -170,15 +178,15 @@ class Screen:
     def _do(self, job: Job) -> None:
         settings = self._panel.settings()
         if settings.splats:
-            self._draw_splats(settings, recolor=job != "move")
+            self._draw_splats(settings)
             with self._changed:
-                self._settled = self._settled or (0, 0)
+                self._settled = None if self._moved or self._retouched else (None, 0)
             return
         self._hide_splats()
         begin = time.perf_counter()
         seen = seen_by(self._client)
         programs = self._studio.programs
-        ready = programs.ready
+        compiled, ready = programs.compiled, programs.ready
         size = None
         if job == "move":
             expected = programs.took_ms | self._took_ms
@@ -197,11 +205,12 @@ class Screen:
         milliseconds = 1e3 * (time.perf_counter() - begin)
         with self._changed:
             if job == "rest" and not self._moved and not self._retouched:
-                self._settled = size
+                self._settled = (size, compiled)
         if job == "move" and size is not None:
             before = self._took_ms.get(size, milliseconds)
             self._took_ms[size] = before + NEWEST * (milliseconds - before)
-        self._say_status(milliseconds)
+        self._last_ms = milliseconds
+        self._say_status()
 
     def _render(self, seen: Seen, size: Size | None, ready: frozenset[Size]) -> None:
         """Render the largest size up to `size` whose tile lists hold the view."""
@@ -243,10 +252,13 @@ class Screen:
 
     # ------------------------------------------------------------------ the browser's splats
 
-    def _draw_splats(self, settings: Settings, *, recolor: bool) -> None:
-        splats, handle = self._studio.splats(), self._splats
-        if handle is not None and handle.visible and not recolor:
+    def _draw_splats(self, settings: Settings) -> None:
+        if settings == self._colored:
             return
+        handle = self._splats
+        if handle is None:
+            self._panel.set_status(note("preparing splats ..."))
+        splats = self._studio.splats()
         begin = time.monotonic()
         colors = splat_colors(splats, look_of(self._studio.run, settings), settings)
         if handle is None:
@@ -256,6 +268,7 @@ class Screen:
         else:
             handle.rgbs = colors
             handle.visible = True
+        self._colored = settings
         self._client.scene.set_background_image(BLACK, "png")
         self._panel.set_legend(stops_legend() if settings.mode == "stops" else None)
         self._panel.set_status(note(f"{len(colors):,} splats, drawn by the browser"))
@@ -263,20 +276,20 @@ class Screen:
         time.sleep(max(0.0, pause))
 
     def _hide_splats(self) -> None:
-        if self._splats is not None and self._splats.visible:
+        if self._splats is not None and self._colored is not None:
             self._splats.visible = False
+            self._colored = None
 
     # ------------------------------------------------------------------ saying what goes on
 
-    def _say_status(self, milliseconds: float | None = None) -> None:
+    def _say_status(self) -> None:
         if self._panel.settings().splats:
             return
         frame, busy = self.darkroom.frame, self._studio.programs.compiling
         parts = []
         if frame is not None:
             parts.append(f"{frame.size[0]} x {frame.size[1]}")
-            if milliseconds is not None:
-                parts.append(f"{milliseconds:.0f} ms")
+            parts.append(f"{self._last_ms:.0f} ms")
         if busy is not None:
             parts.append(f"compiling {busy[0]} x {busy[1]} ...")
         self._panel.set_status(note(" &middot; ".join(parts) or "starting ..."))

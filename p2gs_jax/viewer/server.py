@@ -8,6 +8,7 @@ import os
 import socket
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -63,33 +64,43 @@ def open_viewer(run: Run, *, host: str, port: int, max_width: int) -> Iterator[s
         UserError: one cannot listen there.
     """
     check_address(host, port)
+    # A browser that goes while a picture is on its way is nothing to warn of.
+    warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
     studio = Studio(run, max_width)
     with contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(
             host=host, port=port, label=f"p2gs-jax: {run.folder.name}", verbose=False
         )
+    sessions: dict[int, Session] = {}
     try:
         if port not in (0, server.get_port()):
             raise UserError(f"port {port} was taken just now.", fix="choose another with --port")
-        _furnish(server, studio)
+        _furnish(server, studio, sessions)
         studio.programs.want(order_of_compilation(ladder(full_size(LIKELY_CANVAS, max_width))))
         shown = "localhost" if host in ("0.0.0.0", "::", "") else host
         yield f"http://{f'[{shown}]' if ':' in shown else shown}:{server.get_port()}"
     finally:
+        for session in tuple(sessions.values()):
+            session.stop()
         studio.programs.stop()
         with contextlib.redirect_stdout(io.StringIO()):
             server.stop()
         studio.store.close()
 
 
-def _furnish(server: viser.ViserServer, studio: Studio) -> None:
-    """Set the look of the page, where cameras begin, and what happens when a browser comes."""
+def _furnish(server: viser.ViserServer, studio: Studio, sessions: dict[int, Session]) -> None:
+    """Set the look of the page, where cameras begin, and what happens when a browser comes.
+
+    Args:
+        server: the server.
+        studio: what it shows.
+        sessions: those of the browsers that are here, by their ids; kept up to date.
+    """
     server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
     server.scene.set_up_direction(studio.stage.up)
     start = studio.pose(studio.first_view, LIKELY_CANVAS[0] / LIKELY_CANVAS[1])
     camera = server.initial_camera
     camera.position, camera.look_at, camera.fov = start.position, start.look_at, start.fov
-    sessions: dict[int, Session] = {}
     lock = threading.Lock()
 
     @server.on_client_connect
@@ -116,8 +127,11 @@ def serve(run: Run, *, host: str, port: int, max_width: int, say: Callable[[str]
         max_width: widest picture to render, pixels.
         say: prints a line.
     """
-    with open_viewer(run, host=host, port=port, max_width=max_width) as address:
-        say(f"{run.params.gaussians.capacity} Gaussians at {address} (Ctrl-C ends)")
-        with contextlib.suppress(KeyboardInterrupt):
+    viewer = open_viewer(run, host=host, port=port, max_width=max_width)
+    with contextlib.suppress(KeyboardInterrupt), viewer as address:
+        try:
+            say(f"{run.params.gaussians.capacity} Gaussians at {address} (Ctrl-C ends)")
             while True:
                 time.sleep(3600)
+        finally:
+            say("Ending, once what is being compiled is done.")

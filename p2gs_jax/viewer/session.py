@@ -20,6 +20,9 @@ from p2gs_jax.viewer.screen import Screen, seen_by
 from p2gs_jax.viewer.settings import common_settings, look_of, settings_of_view
 from p2gs_jax.viewer.studio import Studio
 
+# How often the slider follows while playing, seconds.
+SLIDER_S = 0.25
+
 
 class Session:
     """One browser's panel, camera, frusta and screen."""
@@ -35,6 +38,7 @@ class Session:
         self._panel = Panel(client.gui, studio.facts, self)
         self._screen = Screen(client, studio, self._panel)
         self._player = Player(self._play_to)
+        self._shown_at = 0.0
         self._stopping = threading.Event()
         self._thumbnails: threading.Thread | None = None
         self._frusta = Frusta(
@@ -42,7 +46,7 @@ class Session:
             studio.run.scene.views,
             studio.camera_colors,
             studio.stage,
-            studio.facts.camera_size,
+            studio.camera_size,
             self.go_to,
         )
         client.camera.on_update(self._camera_moved)
@@ -76,12 +80,12 @@ class Session:
         self._screen.retouched()
 
     def mode_changed(self) -> None:
-        """Show something else; a split goes where there is a photograph."""
+        """Show something else; a split goes to the nearest photograph and takes its look."""
         if self._panel.settings().mode == "split":
             camera = self._screen.camera(seen_by(self._client), (64, 64))
             room = self._studio.darkroom()
-            if room.view_at(camera) is None:
-                self.go_to(room.nearest_view(camera))
+            here = room.view_at(camera)
+            self.go_to(room.nearest_view(camera) if here is None else here)
         self._screen.moved()
 
     def take_look_of(self, index: int | None) -> None:
@@ -108,9 +112,9 @@ class Session:
         """Set the vertical field of view."""
         self._client.camera.fov = float(np.deg2rad(degrees))
 
-    def show_cameras(self, visible: bool, size: float) -> None:
-        """Show or hide the photographs' cameras; their pictures follow."""
-        self._frusta.resize(size)
+    def show_cameras(self, visible: bool, scale: float) -> None:
+        """Show or hide the photographs' cameras, times their usual size; their pictures follow."""
+        self._frusta.resize(scale * self._studio.camera_size)
         self._frusta.show(visible)
         self._screen.with_depth = visible
         if visible and self._thumbnails is None:
@@ -136,7 +140,7 @@ class Session:
     def set_place(self, camera: str, place: float) -> None:
         """Move along the drive of a camera."""
         pose, nearest = self._studio.pose_along(camera, place, seen_by(self._client).aspect)
-        if self._panel.own_exposures:
+        if self._panel.own_exposures and self._panel.settings().taken_as != nearest:
             self.take_look_of(nearest)
         self._move(pose)
 
@@ -150,7 +154,9 @@ class Session:
         self._player.play(0.0 if place >= last else place, last, lambda: self._panel.speed)
 
     def _play_to(self, place: float) -> None:
-        self._panel.put_place(place)
+        if time.monotonic() > self._shown_at + SLIDER_S:
+            self._shown_at = time.monotonic()
+            self._panel.put_place(place)
         self.set_place(self._panel.drive[0], place)
 
     # ------------------------------------------------------------------ files

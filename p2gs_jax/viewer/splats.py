@@ -7,7 +7,9 @@ kernel's picture; it knows no spherical harmonics, so colours are those seen fro
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
@@ -72,7 +74,7 @@ def browser_splats(
         (np.asarray(gaussians.means)[rows] * unit).astype(np.float32),
         (axes @ axes.transpose(0, 2, 1)).astype(np.float32),
         (1 / (1 + np.exp(-logits)))[:, None].astype(np.float32),
-        np.asarray(view_radiance(gaussians, there, cfg))[rows],
+        np.asarray(jax.jit(partial(view_radiance, cfg=cfg))(gaussians, there))[rows],
     )
 
 

@@ -145,9 +145,13 @@ class Studio:
             most_ev=max(map(abs, evs.values())),
             gammas=[float(g) for g in np.asarray(run.params.photometry.gammas)],
             curve=run.cfg.photometry.curve,
-            camera_size=typical_size(views, self.stage),
             camera_legend=exposure_legend(min(evs.values()), max(evs.values())),
         )
+
+    @cached_property
+    def camera_size(self) -> float:
+        """Usual size of the views' cameras, viewer units."""
+        return typical_size(self.run.scene.views, self.stage)
 
     @cached_property
     def camera_colors(self) -> UInt8[np.ndarray, "v 3"]:
