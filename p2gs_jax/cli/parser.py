@@ -17,6 +17,7 @@ from p2gs_jax.options.pages import Compare, Report
 from p2gs_jax.options.render import Render
 from p2gs_jax.options.results import Eval
 from p2gs_jax.options.setup import Completion, Doctor
+from p2gs_jax.options.view import View
 
 # A name is both the subcommand and the module of `p2gs_jax.commands` that runs it.
 COMMANDS: dict[str, type] = {
@@ -24,6 +25,7 @@ COMMANDS: dict[str, type] = {
     "calibrate": Calibrate,
     "render": Render,
     "eval": Eval,
+    "view": View,
     "report": Report,
     "compare": Compare,
     "demo": Demo,

@@ -1,0 +1,332 @@
+"""The controls, and what they are set to."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol, get_args
+
+import viser
+
+from p2gs_jax.viewer.legend import note
+from p2gs_jax.viewer.save import SAVED_WIDTHS
+from p2gs_jax.viewer.settings import ChosenCurve, Settings
+from p2gs_jax.viewer.shade import Mode
+
+MODES: dict[str, Mode] = {
+    "picture": "display",
+    "stops (false colour)": "stops",
+    "clipping": "clipping",
+    "depth": "depth",
+    "split: photo | render": "split",
+}
+MEAN = "mean of all"
+NOWHERE = "choose ..."
+KERNEL, SPLATS = "our kernel", "browser splats"
+KEYS = "Drag to orbit, right-drag to pan, scroll to approach; W A S D Q E fly, arrows turn."
+
+
+class Actions(Protocol):
+    """What controls do beyond changing the look."""
+
+    def look_changed(self) -> None:
+        """Develop anew."""
+        ...
+
+    def take_look_of(self, index: int | None) -> None:
+        """Take the exposure, gamma and correction of a view, or the mean."""
+        ...
+
+    def mode_changed(self) -> None:
+        """Show something else."""
+        ...
+
+    def go_to(self, index: int) -> None:
+        """Move to where a view was taken, and take its look."""
+        ...
+
+    def set_fov(self, degrees: float) -> None:
+        """Set the vertical field of view."""
+        ...
+
+    def show_cameras(self, visible: bool, scale: float) -> None:
+        """Show or hide the photographs' cameras, times their usual size."""
+        ...
+
+    def set_place(self, camera: str, place: float) -> None:
+        """Move along the drive of a camera."""
+        ...
+
+    def play(self, playing: bool) -> None:
+        """Begin or stop playing along the drive."""
+        ...
+
+    def save(self, kind: str, width: int) -> None:
+        """Send the view as a file."""
+        ...
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What the controls must know of a run.
+
+    Attributes:
+        names: of all views.
+        cameras: physical cameras and how many views each has.
+        start: settings to begin with.
+        most_ev: largest distance of an exposure from the mean, stops.
+        gammas: all that occur.
+        curve: of the run.
+        camera_legend: what their colours mean.
+    """
+
+    names: Sequence[str]
+    cameras: dict[str, int]
+    start: Settings
+    most_ev: float
+    gammas: Sequence[float]
+    curve: str
+    camera_legend: str
+
+
+class Panel:
+    """The controls of one browser."""
+
+    def __init__(self, gui: viser.GuiApi, facts: Facts, actions: Actions):
+        """Add them.
+
+        Args:
+            gui: of the client.
+            facts: of the run.
+            actions: what they do.
+        """
+        self._gui, self._facts, self._actions = gui, facts, actions
+        self._taken_as: int | None = facts.start.taken_as
+        self._status = gui.add_html(note("starting ..."))
+        with gui.add_folder("Picture"):
+            self._add_picture()
+        with gui.add_folder("Camera"):
+            self._add_camera()
+        with gui.add_folder("Drive", expand_by_default=False):
+            self._add_drive()
+        with gui.add_folder("Save", expand_by_default=False):
+            self._add_save()
+        self.put(facts.start)
+
+    def _add_picture(self) -> None:
+        gui, facts, actions = self._gui, self._facts, self._actions
+        self._mode = gui.add_dropdown(
+            "Show",
+            list(MODES),
+            hint="The split needs a camera that stands where a photograph was taken.",
+        )
+        self._legend = gui.add_html("", visible=False)
+        self._split = gui.add_slider(
+            "Split",
+            0.0,
+            1.0,
+            0.01,
+            0.5,
+            visible=False,
+            hint="Share of the photograph, from the left.",
+        )
+        reach = float(max(8, math.ceil(facts.most_ev) + 2))
+        self._exposure = gui.add_slider(
+            "Exposure",
+            -reach,
+            reach,
+            0.05,
+            0.0,
+            hint="Stops (EV) from the mean exposure of the training photographs.",
+            marks=tuple(
+                (float(ev), f"{ev:+d}" if ev else "0") for ev in (-round(reach), 0, round(reach))
+            ),
+        )
+        low = min(1.0, math.floor(10 * min(facts.gammas)) / 10)
+        high = max(4.0, math.ceil(10 * max(facts.gammas)) / 10)
+        self._gamma = gui.add_slider(
+            "Gamma",
+            low,
+            high,
+            0.01,
+            2.2,
+            hint="2.2 is the curve itself; middle grey stays where it is.",
+            marks=((low, f"{low:g}"), (2.2, "2.2"), (high, f"{high:g}")),
+        )
+        self._curves: dict[str, ChosenCurve] = {f"run's ({facts.curve})": "run"}
+        self._curves |= {c: c for c in get_args(ChosenCurve) if c not in ("run", facts.curve)}
+        self._curve = gui.add_dropdown(
+            "Curve", list(self._curves), hint="The tone curve from exposed light to display values."
+        )
+        self._look_of = gui.add_dropdown(
+            "Look of",
+            [MEAN, *facts.names],
+            hint="Takes exposure, gamma, curve and correction of a photograph.",
+        )
+        self._drawn_by = gui.add_dropdown(
+            "Drawn by",
+            [KERNEL, SPLATS],
+            hint="Browser splats move at any speed, but mix display values instead of light.",
+        )
+        for handle in (self._exposure, self._gamma, self._curve, self._split):
+            self._when_chosen(handle, lambda _: actions.look_changed())
+        for handle in (self._mode, self._drawn_by):
+            self._when_chosen(handle, lambda _: actions.mode_changed())
+        self._when_chosen(self._look_of, lambda name: actions.take_look_of(self._index(name)))
+
+    def _add_camera(self) -> None:
+        gui, facts, actions = self._gui, self._facts, self._actions
+        gui.add_html(note(KEYS))
+        self._go_to = gui.add_dropdown(
+            "Go to",
+            [NOWHERE, *facts.names],
+            hint="Stands where a photograph was taken, and takes its look.",
+        )
+        steps = gui.add_button_group("", ["previous", "next"])
+        self._fov = gui.add_slider(
+            "Field", 5.0, 150.0, 0.5, 60.0, hint="Vertical field of view, degrees.", marks=()
+        )
+        self._cameras = gui.add_checkbox(
+            "Cameras", False, hint="Where photographs were taken; click one to go there."
+        )
+        self._size = gui.add_slider("Size", 0.2, 8.0, 0.1, 1.0, visible=False, marks=())
+        self._camera_legend = gui.add_html(facts.camera_legend, visible=False)
+
+        def choose(name: str) -> None:
+            if (index := self._index(name)) is not None:
+                actions.go_to(index)
+
+        def step(name: str) -> None:
+            now = self._index(self._go_to.value)
+            by = 1 if name == "next" else -1
+            count = len(facts.names)
+            actions.go_to((0 if by > 0 else count - 1) if now is None else (now + by) % count)
+
+        def show(_: object) -> None:
+            self._size.visible = self._camera_legend.visible = self._cameras.value
+            actions.show_cameras(self._cameras.value, self._size.value)
+
+        self._when_chosen(self._go_to, choose)
+        steps.on_click(lambda event: step(event.target.value))
+        self._when_chosen(self._fov, actions.set_fov)
+        for handle in (self._cameras, self._size):
+            self._when_chosen(handle, show)
+
+    def _add_drive(self) -> None:
+        gui, facts, actions = self._gui, self._facts, self._actions
+        names = list(facts.cameras)
+        self._drive = gui.add_dropdown("Along", names, visible=len(names) > 1)
+        last = max(facts.cameras[names[0]] - 1, 1)
+        self._place = gui.add_slider(
+            "Frame", 0.0, float(last), 0.01, 0.0, marks=((0.0, "0"), (float(last), str(last)))
+        )
+        self._speed = gui.add_slider(
+            "Speed", 0.2, 30.0, 0.1, 2.0, hint="Photographs per second.", marks=()
+        )
+        self._own = gui.add_checkbox(
+            "As taken", False, hint="With the exposure of every photograph, instead of one for all."
+        )
+        self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY)
+        self._playing = False
+
+        def choose(name: str) -> None:
+            end = max(facts.cameras[name] - 1, 1)
+            self._place.value = 0.0
+            self._place.max = float(end)
+            actions.set_place(name, 0.0)
+
+        def toggle(_: object) -> None:
+            self.set_playing(not self._playing)
+            actions.play(self._playing)
+
+        self._when_chosen(self._drive, choose)
+        self._when_chosen(self._place, lambda at: actions.set_place(self._drive.value, at))
+        self._play.on_click(toggle)
+
+    def _add_save(self) -> None:
+        gui, actions = self._gui, self._actions
+        width = gui.add_dropdown(
+            "Width", [str(w) for w in SAVED_WIDTHS], initial_value="1920", hint="Pixels across."
+        )
+        png = gui.add_button("PNG, as shown", icon=viser.Icon.PHOTO_DOWN)
+        exr = gui.add_button("EXR, linear light", icon=viser.Icon.FILE_DOWNLOAD)
+        png.on_click(lambda _: actions.save("png", int(width.value)))
+        exr.on_click(lambda _: actions.save("exr", int(width.value)))
+
+    @staticmethod
+    def _when_chosen(handle, act: Callable) -> None:
+        """Act on what a person does, not on what `put` does."""
+
+        def on_update(event: viser.GuiEvent) -> None:
+            if event.client_id is not None:
+                act(event.target.value)
+
+        handle.on_update(on_update)
+
+    def _index(self, name: str) -> int | None:
+        return self._facts.names.index(name) if name in self._facts.names else None
+
+    def settings(self) -> Settings:
+        """Return what is chosen now."""
+        return Settings(
+            gamma=self._gamma.value,
+            exposure_ev=self._exposure.value,
+            curve=self._curves[self._curve.value],
+            taken_as=self._taken_as,
+            mode=MODES[self._mode.value],
+            split=self._split.value,
+            splats=self._drawn_by.value == SPLATS,
+        )
+
+    def put(self, settings: Settings) -> None:
+        """Show a look on the controls; the mode stays."""
+        self._taken_as = settings.taken_as
+        self._exposure.value = settings.exposure_ev
+        self._gamma.value = settings.gamma
+        names = {value: name for name, value in self._curves.items()}
+        self._curve.value = names.get(settings.curve, names["run"])
+        index = settings.taken_as
+        self._look_of.value = MEAN if index is None else self._facts.names[index]
+
+    def put_view(self, index: int, degrees: float) -> None:
+        """Show on the controls where the camera went."""
+        self._go_to.value = self._facts.names[index]
+        self._fov.value = degrees
+
+    def put_place(self, place: float) -> None:
+        """Show how far along the drive the camera is."""
+        self._place.value = min(place, self._place.max)
+
+    @property
+    def drive(self) -> tuple[str, float]:
+        """The camera to play along, and the place on it."""
+        return self._drive.value, self._place.value
+
+    @property
+    def speed(self) -> float:
+        """Photographs per second."""
+        return self._speed.value
+
+    @property
+    def own_exposures(self) -> bool:
+        """Whether to play with the exposure of every photograph."""
+        return self._own.value
+
+    def set_playing(self, playing: bool) -> None:
+        """Show whether it plays."""
+        self._playing = playing
+        self._play.label = "Pause" if playing else "Play"
+        self._play.icon = viser.Icon.PLAYER_PAUSE if playing else viser.Icon.PLAYER_PLAY
+
+    def set_status(self, html: str) -> None:
+        """Say what goes on."""
+        if self._status.content != html:
+            self._status.content = html
+
+    def set_legend(self, html: str | None) -> None:
+        """Say what the colours of the picture mean."""
+        self._split.visible = MODES[self._mode.value] == "split"
+        if html is not None and self._legend.content != html:
+            self._legend.content = html
+        self._legend.visible = html is not None

@@ -1,0 +1,220 @@
+"""The renderer compiled ahead for a few sizes, in the background, so that no frame ever waits.
+
+`render/host.py` compiles when it must; here a frame whose tile lists overflow is left to a smaller
+size while a program with longer lists is compiled.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from p2gs_jax.config import RenderConfig
+from p2gs_jax.errors import UserError
+from p2gs_jax.render import render_linear
+from p2gs_jax.render.host import capacity_bucket
+from p2gs_jax.render.xla_cpu import compiler_options
+from p2gs_jax.types import Camera, Gaussians, Render
+from p2gs_jax.viewer.ladder import Size
+
+# Room for views that need more than those probed.
+MARGIN = 1.5
+# Entries of the longest tile lists worth having; a camera inside a splat may ask for any number.
+MOST_ENTRIES = 2**26
+PROBES = 4
+
+
+@dataclass(frozen=True)
+class _Program:
+    capacity: int
+    run: Callable[[Gaussians, Bool[Array, " n"], Camera], Render]
+
+
+class Programs:
+    """Renders views of the sizes that are compiled; compiles others in a thread of its own.
+
+    All methods may be called from any thread; one frame is rendered at a time.
+    """
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        alive: Bool[Array, " n"],
+        cfg: RenderConfig,
+        probes: Sequence[Callable[[Size], Camera]],
+        on_change: Callable[[], None] = lambda: None,
+    ):
+        """Prepare; nothing is compiled yet.
+
+        Args:
+            gaussians: the scene.
+            alive: slots in use.
+            cfg: rendering options.
+            probes: functions from a size to a typical camera, which new programs are tried on.
+            on_change: called when something was compiled, or is about to be.
+        """
+        self._scene = (gaussians, alive)
+        self._cfg = cfg
+        self._probes = probes[:PROBES]
+        self._on_change = on_change
+        self._programs: dict[Size, _Program] = {}
+        self._most: dict[Size, int] = {}
+        self._took_ms: dict[Size, float] = {}
+        self._wanted: list[Size] = []
+        self._now: Size | None = None
+        self._compiled = 0
+        self._changed = threading.Condition()
+        self._one_frame = threading.Lock()
+        self._stopping = False
+        self._worker = threading.Thread(target=self._work, name="compile", daemon=True)
+        self._worker.start()
+
+    @property
+    def ready(self) -> frozenset[Size]:
+        """Sizes that render at once."""
+        with self._changed:
+            return frozenset(self._programs)
+
+    @property
+    def compiled(self) -> int:
+        """How many programs have been compiled so far."""
+        with self._changed:
+            return self._compiled
+
+    @property
+    def compiling(self) -> Size | None:
+        """What is being compiled, or None."""
+        with self._changed:
+            return self._now
+
+    @property
+    def took_ms(self) -> dict[Size, float]:
+        """How long the last probes of every size took."""
+        with self._changed:
+            return dict(self._took_ms)
+
+    def want(self, sizes: Sequence[Size]) -> None:
+        """Compile these next, in this order, and then what was wanted before."""
+        with self._changed:
+            new = [s for s in sizes if s not in self._programs]
+            self._wanted = list(dict.fromkeys((*new, *self._wanted)))
+            self._changed.notify_all()
+
+    def render(self, camera: Camera) -> Render | None:
+        """Return a view, or None where its size is not compiled or its tile lists overflow.
+
+        After an overflow the size is not ready until a program with longer lists is compiled.
+        """
+        size = (camera.width, camera.height)
+        with self._changed:
+            program = self._programs.get(size)
+        if program is None:
+            return None
+        with self._one_frame:
+            result = program.run(*self._scene, camera)
+            needed = int(result.count)
+        with self._changed:
+            self._most[size] = max(self._most.get(size, 0), needed)
+            if not bool(result.overflow):
+                return result
+            if needed <= MOST_ENTRIES and self._programs.get(size) is program:
+                del self._programs[size]
+                self._wanted = [size, *(s for s in self._wanted if s != size)]
+                self._changed.notify_all()
+        return None
+
+    def render_now(self, camera: Camera) -> Render:
+        """Return a view of any size, compiling and growing as long as it takes.
+
+        Raises:
+            UserError: it would need more memory than is reasonable.
+        """
+        size = (camera.width, camera.height)
+        while True:
+            result = self.render(camera)
+            if result is not None:
+                return result
+            if self._most.get(size, 0) > MOST_ENTRIES:
+                raise UserError(
+                    f"{size[0]} x {size[1]} pixels from here need too much memory.",
+                    fix="move away from what is close, or choose a smaller width",
+                )
+            self._compile(size)
+
+    def stop(self) -> None:
+        """Stop compiling, and wait until what is being compiled is done.
+
+        An interpreter that ends while JAX works in another thread aborts.
+        """
+        with self._changed:
+            self._stopping = True
+            self._wanted.clear()
+            self._changed.notify_all()
+        self._worker.join()
+
+    def _work(self) -> None:
+        while True:
+            with self._changed:
+                while not self._wanted and not self._stopping:
+                    self._changed.wait()
+                if self._stopping:
+                    return
+                size = self._now = self._wanted.pop(0)
+            self._on_change()
+            self._compile(size)
+            with self._changed:
+                self._now = None
+            self._on_change()
+
+    def _compile(self, size: Size) -> None:
+        """Compile a size with tile lists that hold what it is known to need, and try it."""
+        while True:
+            with self._changed:
+                if self._stopping:
+                    return
+                capacity = capacity_bucket(self._expected(size), MARGIN)
+                old = self._programs.get(size)
+            if old is not None and old.capacity >= capacity:
+                return
+            camera = self._probes[0](size)
+            draw = partial(render_linear, cfg=self._cfg, capacity=capacity)
+            jitted = jax.jit(draw, compiler_options=compiler_options())
+            run = jitted.lower(*self._scene, camera).compile()
+            most, fastest = self._try(run, size)
+            with self._changed:
+                self._most[size] = max(self._most.get(size, 0), most)
+                if most <= capacity:
+                    self._programs[size] = _Program(capacity, run)
+                    self._took_ms[size] = fastest
+                    self._compiled += 1
+                    return
+
+    def _expected(self, size: Size) -> int:
+        """Return how many entries a size may need; lists never grow faster than the area."""
+        if size in self._most:
+            return self._most[size]
+        if not self._most:
+            return 2 * self._scene[0].capacity
+        area = size[0] * size[1]
+        near = min(self._most, key=lambda other: abs(other[0] * other[1] - area))
+        return int(self._most[near] * max(1.0, area / (near[0] * near[1])))
+
+    def _try(self, run, size: Size) -> tuple[int, float]:
+        """Return the entries that typical views need, and how long the fastest of them took."""
+        most, fastest = 0, float("inf")
+        for probe in self._probes:
+            camera = probe(size)
+            with self._one_frame:
+                begin = time.perf_counter()
+                result = run(*self._scene, camera)
+                jnp.asarray(result.linear).block_until_ready()
+                fastest = min(fastest, 1e3 * (time.perf_counter() - begin))
+            most = max(most, int(result.count))
+        return most, fastest

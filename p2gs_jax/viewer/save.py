@@ -1,0 +1,50 @@
+"""The view on the screen as a file to keep: PNG as it is shown, EXR with its light."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32
+
+from p2gs_jax.export.exr import write_exr
+from p2gs_jax.export.png import write_png
+from p2gs_jax.photometry.look import Look
+from p2gs_jax.viewer.shade import Frame
+
+SAVED_WIDTHS = (960, 1280, 1920, 2560, 3840)
+
+
+def saved_size(width: int, aspect: float) -> tuple[int, int]:
+    """Return a size with square pixels.
+
+    Args:
+        width: pixels.
+        aspect: width / height of the canvas.
+    """
+    return width, max(1, round(width / aspect))
+
+
+def png_bytes(ldr: Float32[np.ndarray, "h w 3"]) -> bytes:
+    """Return display values as a PNG file."""
+    with tempfile.TemporaryDirectory(prefix="p2gs-view-") as folder:
+        path = Path(folder) / "view.png"
+        write_png(path, ldr)
+        return path.read_bytes()
+
+
+def exr_bytes(frame: Frame, look: Look) -> bytes:
+    """Return a frame as an EXR file, with depth, opacity, the look and the camera in it."""
+    with tempfile.TemporaryDirectory(prefix="p2gs-view-") as folder:
+        path = Path(folder) / "view.exr"
+        write_exr(
+            path,
+            np.asarray(frame.linear),
+            depth=frame.depth,
+            alpha=frame.alpha,
+            exposure=look.exposure,
+            gamma=look.gamma,
+            camera=frame.camera,
+        )
+        return path.read_bytes()

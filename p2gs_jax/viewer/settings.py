@@ -1,0 +1,79 @@
+"""What a person has chosen about the picture, and the look that follows from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from p2gs_jax.photometry.look import Look
+from p2gs_jax.run_folder import Run
+from p2gs_jax.viewer.shade import Mode
+
+ChosenCurve = Literal["run", "srgb", "power", "linear"]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The look and the mode.
+
+    Attributes:
+        gamma: > 0.
+        exposure_ev: stops from the geometric mean of the training exposures.
+        curve: `run` is what the fit chose.
+        taken_as: row in `scene.views` of the view whose correction applies, or None for the mean.
+        mode: what is shown.
+        split: share of the photograph in `split`.
+        splats: whether the browser draws, instead of our kernel.
+    """
+
+    gamma: float
+    exposure_ev: float = 0.0
+    curve: ChosenCurve = "run"
+    taken_as: int | None = None
+    mode: Mode = "display"
+    split: float = 0.5
+    splats: bool = False
+
+
+def common_settings(run: Run, before: Settings | None = None) -> Settings:
+    """Return the look of no view in particular: mean exposure and gamma.
+
+    Args:
+        run: whose means.
+        before: what does not belong to the look is kept from it.
+    """
+    gamma = run.mean.gamma
+    if before is None:
+        return Settings(gamma)
+    return replace(before, gamma=gamma, exposure_ev=0.0, curve="run", taken_as=None)
+
+
+def settings_of_view(run: Run, index: int, before: Settings) -> Settings:
+    """Return the settings under which a view looks like its photograph.
+
+    Args:
+        run: with the view.
+        index: row in `scene.views`.
+        before: what does not belong to the look is kept from it.
+    """
+    own = run.own_look(index)
+    ev = float(np.log2(own.exposure / run.mean.exposure_geometric))
+    return replace(before, gamma=own.gamma, exposure_ev=ev, curve="run", taken_as=index)
+
+
+def look_of(run: Run, settings: Settings) -> Look:
+    """Return how the settings show radiance; corrections hold under the run's curve only."""
+    look = run.common_look(settings.exposure_ev)
+    if settings.taken_as is not None:
+        look = replace(look, correction=run.own_look(settings.taken_as).correction)
+    look = replace(look, gamma=settings.gamma)
+    return look if settings.curve == "run" else look.with_curve(settings.curve)
+
+
+def exposures_ev(run: Run) -> dict[int, float]:
+    """Return stops from the geometric mean of every training view, by row in `scene.views`."""
+    values = np.log2(np.asarray(run.params.photometry.exposures, float))
+    values = values - np.log2(run.mean.exposure_geometric)
+    return dict(zip(run.scene.train_indices, values.tolist(), strict=True))

@@ -1,0 +1,179 @@
+"""What the picture shows: the photograph, its luminance in stops, what clips, how far things are.
+
+A frame is rendered once and shaded as often as the look changes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+from jaxtyping import Array, Bool, Float, Float32, UInt8
+
+from p2gs_jax.export.false_color import clipping_overlay, depth_color, false_color
+from p2gs_jax.photometry.look import Look, develop
+from p2gs_jax.types import Camera
+
+Mode = Literal["display", "stops", "clipping", "depth", "split"]
+# Exposed radiance shown as 0 stops.
+MIDDLE_GREY = 0.18
+# Shares of the nearest and farthest pixels that the depth colours leave out, percent.
+DEPTH_TAILS = (1.0, 99.0)
+LINE = 1.0
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A rendered view, from which every mode is made.
+
+    Attributes:
+        linear: radiance.
+        alpha: opacity.
+        depth: alpha-weighted depth, scene units.
+        camera: which rendered it.
+    """
+
+    linear: Float[Array, "h w 3"]
+    alpha: Float[np.ndarray, "h w"]
+    depth: Float[np.ndarray, "h w"]
+    camera: Camera
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height, pixels."""
+        return self.camera.width, self.camera.height
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """A photograph as the frame's camera would have taken it from the same place.
+
+    Attributes:
+        ldr: display values.
+        inside: where the photograph reaches.
+    """
+
+    ldr: Float32[np.ndarray, "h w 3"]
+    inside: Bool[np.ndarray, "h w"]
+
+
+def shade(
+    frame: Frame,
+    mode: Mode,
+    look: Look,
+    *,
+    depth_limits: tuple[float, float] | None = None,
+    photograph: Photograph | None = None,
+    split: float = 0.5,
+) -> Float32[np.ndarray, "h w 3"]:
+    """Return display values of a frame.
+
+    Args:
+        frame: what was rendered.
+        mode: `stops` counts from middle grey at the exposure of the look; `split` without a
+            photograph is `display`.
+        look: how radiance is shown.
+        depth_limits: nearest and farthest depth of the colours, scene units; None takes the
+            frame's own.
+        photograph: for `split`.
+        split: share of the width that the photograph takes, from the left.
+    """
+    if mode == "stops":
+        return false_color(np.asarray(frame.linear), MIDDLE_GREY / look.exposure)
+    if mode == "depth":
+        return depth_color(frame.depth, frame.alpha, depth_limits or limits_of_depth(frame))
+    ldr = develop(frame.linear, look)
+    if mode == "clipping":
+        return clipping_overlay(ldr)
+    if mode == "split" and photograph is not None:
+        return compare(photograph, ldr, split)
+    return ldr
+
+
+def compare(
+    photograph: Photograph, ldr: Float32[np.ndarray, "h w 3"], split: float
+) -> Float32[np.ndarray, "h w 3"]:
+    """Return the photograph left of a white line and the render right of it and around it.
+
+    Args:
+        photograph: in the frame's pixels.
+        ldr: display values of the frame.
+        split: where the line is, as a share of the photograph's width from its left edge.
+    """
+    out = np.array(ldr)
+    columns = np.flatnonzero(photograph.inside.any(0))
+    if not len(columns):
+        return out
+    first, last = int(columns[0]), int(columns[-1]) + 1
+    line = first + round(split * (last - first))
+    left = photograph.inside.copy()
+    left[:, line:] = False
+    out[left] = photograph.ldr[left]
+    if first < line < last:
+        out[:, max(line - 1, 0) : line + 1] = LINE
+    return out
+
+
+def limits_of_depth(frame: Frame) -> tuple[float, float]:
+    """Return the depths between which almost all of a frame lies, scene units; nearest first."""
+    alpha, depth = frame.alpha[::4, ::4], frame.depth[::4, ::4]
+    there = alpha > 0.5
+    if not there.any():
+        return 1.0, 2.0
+    near, far = np.percentile(depth[there] / alpha[there], DEPTH_TAILS)
+    return max(float(near), 1e-6), max(float(far), 1.001 * float(near), 2e-6)
+
+
+def as_seen_by(
+    ldr: Float32[np.ndarray, "h w 3"],
+    mask: Float32[np.ndarray, "h w"],
+    taken_by: Camera,
+    frame: Camera,
+) -> Photograph:
+    """Return a photograph resampled into the pixels of another camera at the same place.
+
+    Cameras that share a centre see the same rays, so a homography carries one image into the
+    other, whatever their directions and lenses.
+
+    Args:
+        ldr: display values.
+        mask: 1 = use.
+        taken_by: its camera.
+        frame: whose pixels.
+    """
+    rotation = (
+        np.asarray(taken_by.viewmat, float)[:3, :3] @ np.asarray(frame.viewmat, float)[:3, :3].T
+    )
+    K, k = np.asarray(taken_by.K, float), np.asarray(frame.K, float)
+    # OpenCV's first pixel centre is at 0, ours at 0.5.
+    half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])
+    pull = np.linalg.inv(half) @ K @ rotation @ np.linalg.inv(k) @ half
+    size = (frame.width, frame.height)
+    how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    shrink = _minification(pull, size)
+    if shrink > 1.0:
+        small = (max(1, round(taken_by.width / shrink)), max(1, round(taken_by.height / shrink)))
+        ldr = cv2.resize(ldr, small, interpolation=cv2.INTER_AREA)
+        mask = cv2.resize(mask, small, interpolation=cv2.INTER_AREA)
+        scale = np.diag([small[0] / taken_by.width, small[1] / taken_by.height, 1.0])
+        pull = np.linalg.inv(half) @ scale @ half @ pull
+    pixels = cv2.warpPerspective(ldr, pull, size, flags=how, borderMode=cv2.BORDER_REPLICATE)
+    inside = cv2.warpPerspective(mask, pull, size, flags=how) > 0.5
+    x, y = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
+    behind = pull[2, 0] * x + pull[2, 1] * y + pull[2, 2] <= 0
+    return Photograph(pixels.astype(np.float32), inside & ~behind)
+
+
+def _minification(pull: Float[np.ndarray, "3 3"], size: tuple[int, int]) -> float:
+    """Return how many photograph pixels a frame pixel spans at the middle of the frame."""
+    middle = np.array([size[0] / 2, size[1] / 2, 1.0])
+    steps = (middle + np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])) @ pull.T
+    at = steps[:, :2] / np.where(np.abs(steps[:, 2:]) < 1e-9, 1e-9, steps[:, 2:])
+    return float(min(np.hypot(*(at[1] - at[0])), np.hypot(*(at[2] - at[0]))))
+
+
+def codes(ldr: Float[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Return display values in [0, 1] as 8-bit codes, rounded."""
+    return cv2.convertScaleAbs(ldr, alpha=255.0)

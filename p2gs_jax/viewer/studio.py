@@ -1,0 +1,194 @@
+"""What all browsers share: the run, its photographs, the compiled programs."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from p2gs_jax.errors import UserError
+from p2gs_jax.run_folder import Run
+from p2gs_jax.scene.images import ImageStore, size_at
+from p2gs_jax.types import Camera
+from p2gs_jax.viewer.darkroom import Darkroom
+from p2gs_jax.viewer.frames import (
+    TYPICAL_DISTANCE,
+    Pose,
+    Stage,
+    camera_of_browser,
+    center,
+    distance_seen,
+    fov_that_holds,
+    make_stage,
+    pose_of,
+)
+from p2gs_jax.viewer.frusta import THUMBNAIL_WIDTH, typical_size
+from p2gs_jax.viewer.ladder import Size
+from p2gs_jax.viewer.legend import exposure_colors, exposure_legend
+from p2gs_jax.viewer.panel import Facts
+from p2gs_jax.viewer.playback import frames_of, pose_between
+from p2gs_jax.viewer.programs import PROBES, Programs
+from p2gs_jax.viewer.settings import common_settings, exposures_ev
+from p2gs_jax.viewer.splats import BrowserSplats, browser_splats
+
+
+@dataclass
+class Studio:
+    """A run, ready to be looked at from several browsers.
+
+    Attributes:
+        run: the run.
+        max_width: widest picture to render, pixels.
+        store: its photographs.
+        stage: how the scene stands in the viewer.
+    """
+
+    run: Run
+    max_width: int
+    store: ImageStore = field(init=False)
+    stage: Stage = field(init=False)
+    programs: Programs = field(init=False)
+    listeners: list[Callable[[], None]] = field(init=False, default_factory=list)
+    _lock: threading.Lock = field(init=False, default_factory=threading.Lock)
+    _thumbnails: dict[int, UInt8[np.ndarray, "h w 3"]] = field(init=False, default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Find the ground and the size of things; compile nothing yet."""
+        run = self.run
+        self.store = ImageStore(run.scene.views, run.cfg.data)
+        self._points = run.scene.points
+        if not len(self._points):
+            self._points = np.asarray(run.params.gaussians.means)
+        self.stage = make_stage(run.scene, self._points)
+        rows = np.unique(np.linspace(0, len(run.scene.views) - 1, PROBES).round().astype(int))
+        self.programs = Programs(
+            run.params.gaussians,
+            run.alive,
+            run.cfg.render,
+            [self._probe(int(row)) for row in rows],
+            self._tell,
+        )
+
+    def _tell(self) -> None:
+        for listener in tuple(self.listeners):
+            listener()
+
+    def _probe(self, index: int) -> Callable[[Size], Camera]:
+        def camera(size: Size) -> Camera:
+            aspect = size[0] / size[1]
+            pose = self.pose(index, aspect)
+            return camera_of_browser(pose.wxyz, pose.position, pose.fov, aspect, size, self.stage)
+
+        return camera
+
+    @property
+    def typical(self) -> float:
+        """How far away things typically are, scene units."""
+        return TYPICAL_DISTANCE / self.stage.unit
+
+    @property
+    def first_view(self) -> int:
+        """Where a browser begins: the first training view."""
+        return self.run.scene.train_indices[0]
+
+    def pose(self, index: int, aspect: float) -> Pose:
+        """Return the browser's camera for a view.
+
+        Args:
+            index: row in `scene.views`.
+            aspect: width / height of the canvas, which shows the whole photograph.
+        """
+        view = self.run.scene.views[index]
+        fov = fov_that_holds(view.K, view.width, view.height, aspect)
+        distance = distance_seen(view.viewmat, self._points)
+        return pose_of(view.viewmat, self.stage, distance=distance, fov=fov)
+
+    def pose_along(self, camera: str, place: float, aspect: float) -> tuple[Pose, int]:
+        """Return the browser's camera on a drive, and the row of the view nearest to it.
+
+        Args:
+            camera: physical camera whose recorded poses are followed.
+            place: in its frames.
+            aspect: width / height of the canvas.
+        """
+        frames, views = self.frames(camera), self.run.scene.views
+        nearest = frames[int(np.clip(round(place), 0, len(frames) - 1))]
+        viewmat = pose_between([views[i].viewmat for i in frames], place)
+        fov = self.pose(nearest, aspect).fov
+        distance = distance_seen(views[nearest].viewmat, self._points)
+        return pose_of(viewmat, self.stage, distance=distance, fov=fov), nearest
+
+    def darkroom(self) -> Darkroom:
+        """Return a darkroom of one's own."""
+        return Darkroom(self.run, self.store, self.programs, self.typical)
+
+    def frames(self, camera: str) -> tuple[int, ...]:
+        """Return the rows of a physical camera's views."""
+        return frames_of(self.run.scene, camera)
+
+    @cached_property
+    def facts(self) -> Facts:
+        """What the panel must know."""
+        run = self.run
+        views = run.scene.views
+        evs = exposures_ev(run)
+        cameras = dict.fromkeys(view.camera for view in views)
+        return Facts(
+            names=[view.name for view in views],
+            cameras={name: len(self.frames(name)) for name in cameras},
+            start=common_settings(run),
+            most_ev=max(map(abs, evs.values())),
+            gammas=[float(g) for g in np.asarray(run.params.photometry.gammas)],
+            curve=run.cfg.photometry.curve,
+            camera_legend=exposure_legend(min(evs.values()), max(evs.values())),
+        )
+
+    @cached_property
+    def camera_size(self) -> float:
+        """Usual size of the views' cameras, viewer units."""
+        return typical_size(self.run.scene.views, self.stage)
+
+    @cached_property
+    def camera_colors(self) -> UInt8[np.ndarray, "v 3"]:
+        """Colours of the views' cameras."""
+        evs = exposures_ev(self.run)
+        return exposure_colors([evs.get(i) for i in range(len(self.run.scene.views))])
+
+    def thumbnail(self, index: int) -> UInt8[np.ndarray, "h w 3"] | None:
+        """Return a small picture of a photograph, or None where it cannot be read."""
+        with self._lock:
+            kept = self._thumbnails.get(index)
+        if kept is not None:
+            return kept
+        view, limit = self.run.scene.views[index], self.run.cfg.data.max_width
+        try:
+            width, _ = size_at(view, limit)
+            ldr, _ = self.store.get(index, max(1.0, width / THUMBNAIL_WIDTH))
+        except UserError:
+            return None
+        small = cv2.convertScaleAbs(ldr, alpha=255.0)
+        with self._lock:
+            self._thumbnails[index] = small
+        return small
+
+    def splats(self) -> BrowserSplats:
+        """Return the scene as the browser's splats, in the colours seen from amid the cameras."""
+        with self._lock:
+            return self._splats
+
+    @cached_property
+    def _splats(self) -> BrowserSplats:
+        run = self.run
+        middle = np.mean([center(view.viewmat) for view in run.scene.views], axis=0)
+        return browser_splats(
+            run.params.gaussians,
+            np.asarray(run.alive),
+            run.cfg.render,
+            seen_from=middle,
+            unit=self.stage.unit,
+        )

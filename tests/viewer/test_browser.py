@@ -1,0 +1,178 @@
+"""The viewer in a real browser: it shows pictures, and a slider does what it claims."""
+
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from p2gs_jax.run_folder import load_run
+
+pytest.importorskip("viser", reason="the extra `viewer` is not installed")
+
+SIZE = {"width": 900, "height": 640}
+PATIENCE_S = 120
+# viser's splats are drawn with corners in two dimensions, which three.js remarks on once.
+VISERS_OWN = "computeBoundingSphere(): Computed radius is NaN"
+
+
+@pytest.fixture(scope="module")
+def address(finished_run):
+    from p2gs_jax.viewer.server import open_viewer
+
+    with open_viewer(load_run(finished_run), host="127.0.0.1", port=0, max_width=640) as url:
+        yield url
+
+
+@pytest.fixture
+def page(browser, address):
+    """Return the viewer's page with its first picture at rest; nothing may go wrong in it."""
+    page = browser.new_page(viewport=SIZE, accept_downloads=True)
+    page.set_default_timeout(1e3 * PATIENCE_S)
+    wrong = []
+    page.on("console", lambda m: wrong.append(m.text) if m.type == "error" else None)
+    page.on("pageerror", lambda error: wrong.append(str(error)))
+    page.goto(address)
+    at_rest(page)
+    yield page
+    page.close()
+    assert [text for text in wrong if VISERS_OWN not in text] == []
+
+
+def at_rest(page):
+    """Wait until the panel says that the canvas was rendered at full size, and nothing compiles."""
+    page.wait_for_function(
+        "/640 x \\d+/.test(document.body.innerText) && !/compiling/.test(document.body.innerText)"
+    )
+
+
+def control(page, label):
+    """Return what stands beside a label."""
+    return page.locator(f"xpath=//label[text()='{label}']/ancestor::div[1]/following-sibling::div")
+
+
+def choose(page, label, option):
+    box = page.get_by_label(label, exact=True)
+    box.click()
+    page.get_by_role("option", name=option, exact=True).click()
+
+
+def enter(page, label, number):
+    field = control(page, label).locator("input[inputmode=decimal]")
+    field.fill(str(number))
+    field.press("Enter")
+
+
+def picture(page):
+    """Return the lower left part of the canvas, which no panel covers."""
+    clip = {"x": 0, "y": 250, "width": 520, "height": 380}
+    data = np.frombuffer(page.screenshot(clip=clip), np.uint8)
+    return cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1].astype(float) / 255
+
+
+def until(page, holds):
+    """Return the picture as soon as something holds for it twice in a row."""
+    end, before = time.monotonic() + PATIENCE_S, False
+    while True:
+        shown = picture(page)
+        now = bool(holds(shown))
+        if (now and before) or time.monotonic() > end:
+            assert now
+            return shown
+        before = now
+        page.wait_for_timeout(300)
+
+
+def brightening(dark, light):
+    """Return the median factor between two pictures of linear values, where neither clips."""
+    inside = (dark > 30 / 255) & (dark < 110 / 255) & (light < 250 / 255)
+    assert inside.mean() > 0.02
+    return float(np.median(light[inside] / dark[inside]))
+
+
+def alike(a, b):
+    return float(np.corrcoef(a.ravel(), b.ravel())[0, 1])
+
+
+def test_one_stop_on_the_slider_doubles_the_brightness(page, tmp_path):
+    choose(page, "Curve", "linear")
+    enter(page, "Gamma", 2.2)
+    enter(page, "Exposure", 0.5)
+    page.wait_for_timeout(500)
+    before = until(page, lambda shown: 0.02 < shown.mean() < 0.9)
+    page.wait_for_timeout(1500)
+    before = picture(page)
+    enter(page, "Exposure", 1.5)
+    after = until(page, lambda shown: abs(brightening(before, shown) / 2 - 1) < 0.02)
+    path = tmp_path / "viewer.png"
+    page.screenshot(path=str(path))
+    assert path.stat().st_size > 10_000
+    assert after.mean() > before.mean()
+
+
+def test_every_mode_shows_something_else(page):
+    shown = [picture(page)]
+    for mode in ("stops (false colour)", "clipping", "depth", "split: photo | render"):
+        choose(page, "Show", mode)
+        shown.append(until(page, lambda now: all(np.abs(now - s).mean() > 2e-4 for s in shown)))
+    assert page.get_by_text("depth, scene units").count() == 0
+    assert page.locator("label", has_text="Split").count() == 1
+
+
+def test_going_to_a_photograph_takes_its_look_and_place(page):
+    before = picture(page)
+    choose(page, "Go to", "5.png")
+    until(page, lambda now: np.abs(now - before).mean() > 0.01)
+    assert page.get_by_label("Look of", exact=True).input_value() == "5.png"
+
+
+def test_the_keys_fly_and_the_picture_follows(page):
+    before = picture(page)
+    page.mouse.click(300, 500)
+    page.keyboard.down("KeyD")
+    page.wait_for_timeout(400)
+    page.keyboard.up("KeyD")
+    until(page, lambda now: np.abs(now - before).mean() > 0.005)
+
+
+def test_playing_moves_along_the_drive_until_it_is_paused(page):
+    page.get_by_text("Drive", exact=True).click()
+    before = picture(page)
+    page.get_by_role("button", name="Play").click()
+    until(page, lambda now: np.abs(now - before).mean() > 0.005)
+    page.get_by_role("button", name="Pause").click()
+    page.wait_for_timeout(1000)
+    still = picture(page)
+    until(page, lambda now: np.abs(now - still).mean() < 0.01)
+    assert page.get_by_role("button", name="Play").count() == 1
+
+
+def test_cameras_appear_with_their_pictures(page):
+    choose(page, "Go to", "1.png")
+    page.wait_for_timeout(1000)
+    before = picture(page)
+    page.get_by_label("Cameras", exact=True).check()
+    page.get_by_text("exposure, EV from the mean").wait_for()
+    page.mouse.move(300, 500)
+    page.mouse.wheel(0, 400)
+    until(page, lambda now: np.abs(now - before).mean() > 0.01)
+
+
+def test_saved_files_arrive(page):
+    page.get_by_text("Save", exact=True).click()
+    choose(page, "Width", "960")
+    for button, start in (("PNG, as shown", b"\x89PNG"), ("EXR, linear light", b"v/1\x01")):
+        with page.expect_download() as download:
+            page.get_by_role("button", name=button).click()
+        with open(download.value.path(), "rb") as file:
+            assert file.read(4) == start
+
+
+def test_browser_splats_look_like_the_kernel(page):
+    kernel = picture(page)
+    choose(page, "Drawn by", "browser splats")
+    page.get_by_text("drawn by the browser").wait_for()
+    # Display values mix differently from light, but things are where they were.
+    until(page, lambda now: np.any(now != kernel) and alike(now, kernel) > 0.85)
+    choose(page, "Drawn by", "our kernel")
+    until(page, lambda now: np.abs(now - kernel).mean() < 0.01)

@@ -1,0 +1,149 @@
+"""One frame, many pictures: modes, and a photograph that lines up with the render."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from p2gs_jax.config import PhotometryConfig
+from p2gs_jax.export.false_color import OVER, clipping_overlay, depth_color, false_color
+from p2gs_jax.photometry.look import Look, develop
+from p2gs_jax.types import Camera
+from p2gs_jax.viewer.shade import (
+    MIDDLE_GREY,
+    Frame,
+    Photograph,
+    as_seen_by,
+    codes,
+    compare,
+    limits_of_depth,
+    shade,
+)
+
+LOOK = Look(2.0, 2.2, PhotometryConfig())
+
+
+def camera(width=40, height=24, focal=50.0, rotation=(0, 0, 0), K=None):
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = Rotation.from_euler("xyz", rotation).as_matrix()
+    viewmat[:3, 3] = viewmat[:3, :3] @ [1.0, 2.0, 3.0]
+    if K is None:
+        K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    return Camera(jnp.asarray(viewmat), jnp.asarray(K), width, height)
+
+
+def frame(seed=0):
+    rng = np.random.default_rng(seed)
+    linear = np.exp2(rng.uniform(-8, 3, (24, 40, 3))).astype(np.float32)
+    alpha = rng.uniform(0, 1, (24, 40)).astype(np.float32)
+    depth = alpha * rng.uniform(2, 9, (24, 40)).astype(np.float32)
+    return Frame(jnp.asarray(linear), alpha, depth, camera())
+
+
+def test_every_mode_shows_what_it_says():
+    f = frame()
+    linear = np.asarray(f.linear)
+    shown = develop(linear, LOOK)
+    np.testing.assert_array_equal(shade(f, "display", LOOK), shown)
+    np.testing.assert_array_equal(shade(f, "clipping", LOOK), clipping_overlay(shown))
+    limits = (2.0, 9.0)
+    np.testing.assert_array_equal(
+        shade(f, "depth", LOOK, depth_limits=limits), depth_color(f.depth, f.alpha, limits)
+    )
+    np.testing.assert_array_equal(
+        shade(f, "stops", LOOK), false_color(linear, MIDDLE_GREY / LOOK.exposure)
+    )
+    assert np.any(np.all(np.isclose(shade(f, "clipping", LOOK), OVER), axis=-1))
+
+
+def test_stops_count_from_middle_grey_at_the_exposure():
+    grey = jnp.full((4, 4, 3), 1.01 * MIDDLE_GREY / LOOK.exposure)
+    f = Frame(grey, np.ones((4, 4)), np.ones((4, 4)), camera(4, 4))
+    one_up = Look(2 * LOOK.exposure, LOOK.gamma, LOOK.formation)
+    twice = Frame(2 * grey, f.alpha, f.depth, f.camera)
+    np.testing.assert_array_equal(shade(f, "stops", one_up), shade(twice, "stops", LOOK))
+    assert np.any(shade(f, "stops", LOOK) != shade(f, "stops", one_up))
+
+
+def test_the_limits_of_depth_hold_almost_everything():
+    f = frame()
+    near, far = limits_of_depth(f)
+    assert 2 <= near < 3
+    assert 8 < far <= 9
+    nothing = Frame(f.linear, 0 * f.alpha, 0 * f.depth, f.camera)
+    near, far = limits_of_depth(nothing)
+    assert 0 < near < far
+
+
+def test_split_without_a_photograph_is_the_picture():
+    np.testing.assert_array_equal(shade(frame(), "split", LOOK), develop(frame().linear, LOOK))
+
+
+def test_photograph_left_render_right():
+    inside = np.zeros((24, 40), bool)
+    inside[4:20, 10:30] = True
+    photo = Photograph(np.full((24, 40, 3), 0.25, np.float32), inside)
+    out = compare(photo, np.full((24, 40, 3), 0.75, np.float32), 0.5)
+    assert np.all(out[4:20, 10:19] == 0.25)
+    assert np.all(out[:, 21:] == 0.75)
+    assert np.all(out[:, :10] == 0.75)
+    assert np.all(out[:4, :19] == 0.75)
+    assert np.all(out[:, 19:21] == 1)
+    whole = compare(photo, np.full((24, 40, 3), 0.75, np.float32), 1.0)
+    assert np.all(whole[inside] == 0.25)
+    none = compare(photo, np.full((24, 40, 3), 0.75, np.float32), 0.0)
+    assert np.all(none == 0.75)
+
+
+def test_a_photograph_in_its_own_camera_stays_as_it_is():
+    ldr = np.random.default_rng(0).uniform(0, 1, (24, 40, 3)).astype(np.float32)
+    seen = as_seen_by(ldr, np.ones((24, 40), np.float32), camera(), camera())
+    np.testing.assert_allclose(seen.ldr, ldr, atol=1e-4)
+    assert seen.inside[1:-1, 1:-1].all()
+
+
+@pytest.mark.parametrize("size", [(120, 90), (33, 21)])
+def test_a_photograph_lines_up_with_a_turned_camera(size):
+    # The photograph shows where each of its pixels looks; so must every pixel of the frame.
+    taken = camera(400, 300, K=np.array([[300.0, 0, 190], [0, 320, 160], [0, 0, 1]]))
+    other = camera(*size, focal=1.2 * size[0], rotation=(0.1, -0.15, 0.05))
+
+    def directions(c):
+        y, x = np.mgrid[: c.height, : c.width] + 0.5
+        rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(np.asarray(c.K, float)).T
+        rays = rays @ np.asarray(c.viewmat, float)[:3, :3]
+        return rays / rays[..., 2:]
+
+    ldr = (0.5 + 0.4 * directions(taken)).astype(np.float32)
+    seen = as_seen_by(ldr, np.ones((300, 400), np.float32), taken, other)
+    expected = 0.5 + 0.4 * directions(other)
+    np.testing.assert_allclose(seen.ldr[seen.inside], expected[seen.inside], atol=2e-3)
+    local = directions(other) @ np.asarray(taken.viewmat, float)[:3, :3].T
+    at = local @ np.asarray(taken.K, float).T
+    at = at[..., :2] / at[..., 2:]
+    within = np.all((at > 4) & (at < np.array([396, 296])), axis=-1)
+    outside = np.any((at < -4) | (at > np.array([404, 304])), axis=-1)
+    assert seen.inside[within].all()
+    assert not seen.inside[outside].any()
+    assert within.any()
+
+
+def test_nothing_is_seen_behind_oneself():
+    back = camera(rotation=(0, np.pi, 0))
+    seen = as_seen_by(np.ones((24, 40, 3), np.float32), np.ones((24, 40)), camera(), back)
+    assert not seen.inside.any()
+
+
+def test_masked_pixels_are_not_shown():
+    mask = np.ones((24, 40), np.float32)
+    mask[:, :20] = 0
+    seen = as_seen_by(np.ones((24, 40, 3), np.float32), mask, camera(), camera())
+    assert not seen.inside[:, :19].any()
+    assert seen.inside[2:-2, 21:-2].all()
+
+
+def test_codes_are_rounded_and_kept_in_range():
+    np.testing.assert_array_equal(
+        codes(np.array([[[0.0, 1.4 / 255, 1.6 / 255], [1.0, 1.2, 0.5]]], np.float32))[0],
+        [[0, 1, 2], [255, 255, 128]],
+    )
