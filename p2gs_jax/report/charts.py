@@ -33,8 +33,8 @@ from p2gs_jax.report.svg import (
 # Margins, CSS pixels: left for numbers, right for the names of curves.
 LEFT, NARROW_LEFT, RIGHT, NARROW_RIGHT = 58, 40, 74, 56
 LABEL_GAP = 15.0
-# Marks of more views than this would touch each other.
-CROWDED = 60
+# CSS pixels a view needs for its marks at their full size; below half of it they are dots.
+ROOM = 11.0
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ def panels_chart(
             if band is not None:
                 axes.axhline(band, color=MUTED, linewidth=0.8)
             for s in panel.series:
-                _plot(axes, s)
+                _plot(axes, s, across / max(float(np.ptp(places)), 1.0))
             axes.xaxis.set_major_locator(MaxNLocator(8 if wide else 5, integer=True))
             axes.yaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
             set_title(axes, panel.title)
@@ -153,11 +153,20 @@ def _reach(s: Series) -> tuple[float, float]:
     return float((s.y - error)[known].min()), float((s.y + error)[known].max())
 
 
-def _plot(axes: Axes, s: Series) -> None:
+def _plot(axes: Axes, s: Series, room: float) -> None:
+    """Draw a series.
+
+    Args:
+        axes: where.
+        s: what.
+        room: CSS pixels from one view to the next.
+    """
     known = np.isfinite(s.y)
     look = s.style.keywords
-    if len(s.x) > CROWDED:
-        look |= {"markersize": 0.45 * s.style.size, "linewidth": 1.0}
+    crowded = room < ROOM
+    if crowded:
+        size = s.style.size * (0.5 if room > ROOM / 2 else 0.32)
+        look |= {"markersize": size, "markeredgewidth": 0.8, "linewidth": 1.0}
     # Lines break where a value is missing.
     axes.plot(s.x, s.y, **look)
     if s.error is not None and np.isfinite(s.error).any():
@@ -167,8 +176,8 @@ def _plot(axes: Axes, s: Series) -> None:
             yerr=np.nan_to_num(s.error[known]),
             fmt="none",
             ecolor=s.style.color,
-            elinewidth=1.3,
-            capsize=0 if len(s.x) > CROWDED else 3,
+            elinewidth=0.8 if crowded else 1.3,
+            capsize=0 if crowded else 3,
             zorder=s.style.order,
         )
 

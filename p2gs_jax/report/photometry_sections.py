@@ -204,7 +204,7 @@ def gamma_section(run: RunFiles) -> Section:
         x = np.arange(1, len(rows) + 1, dtype=float)
         gammas = _column(v["gamma"] for v in rows)
         errors = 2 * _column(v.get("gamma_error") for v in rows)
-        panels.append(Panel(title, (Series("gamma", x, gammas, RECOVERED, errors),)))
+        panels.append(Panel(title, (Series("", x, gammas, RECOVERED, errors),)))
     chart = panels_chart(
         panels,
         y_label="gamma",
@@ -240,12 +240,12 @@ def response_section(run: RunFiles) -> Section:
     curves.append(Curve("this run", own, y, FIRST, "-", 5.0, 0.45))
     curves.append(Curve("sRGB", standard, y, INK, (0, (4, 4))))
     same = np.abs(own - standard)[y > 0.05].max()
-    said = "How exposed radiance becomes a value in the photograph. " + (
-        "The curve of this run is sRGB's."
-        if same < 0.01
-        else f"Broad: this run; dashed: sRGB. They are at most {same:.2f} stops apart above the "
-        "darkest twentieth."
-    )
+    said = "How exposed radiance becomes a value in the photograph. "
+    if same < 0.01:
+        said += "The curve of this run is sRGB's."
+    else:
+        said += "Broad: this run; dashed: sRGB. They are at most "
+        said += f"{same:.2f} stops apart at values above 0.05."
     if high - low > 0.02:
         said += " Dash-dotted and dotted: the smallest and the largest gamma of a view."
     chart = response_chart(curves, label="Tone curve of this run against sRGB")

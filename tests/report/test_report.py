@@ -242,6 +242,45 @@ def test_truth_exif_and_errors_are_drawn(run):
     assert "EXIF disagrees with the pixels" in text
 
 
+def test_error_bars_are_those_of_the_views(run):
+    def marks(error):
+        files = read_run(run)
+        for view in files.train:
+            view["exposure_ev_error"] = error
+        section = re.search(r'id="exposures".*?</section>', report_page(files, FromScene()), re.S)
+        return section[0].count("<use"), words_of(section[0])
+
+    with_errors, said = marks(0.04)
+    without, nothing = marks(None)
+    assert with_errors == without + 2 * 2 * 4
+    assert "two standard errors, at most ±0.08 stops" in said
+    assert "no error bars" in nothing
+
+
+def test_changes_of_resolution_and_freezing_are_marked(run):
+    files = read_run(run)
+    files.log[:] = [
+        {
+            **files.log[0],
+            "step": 10 * i,
+            "progress": i / 100,
+            "shrink": 4 if i < 25 else 2 if i < 50 else 1,
+        }
+        for i in range(1, 101)
+    ]
+    said = words_of(report_page(files, FromScene()))
+    for mark in ("images at 1/2 from step 250", "full-size images from step 500"):
+        assert mark in said
+    assert "exposures move from step 600" in said
+
+
+def test_automatic_growth_is_told(run):
+    files = read_run(run)
+    look = {"gaussians": 500, "psnr": 21.5, "before": 400, "without": 21.25, "progress": 0.2}
+    files.metrics["growth"] = {"looks": [{**look, "gain": 0.25, "kept": True}]}
+    assert "400 → 500 21.25 21.50 0.25 kept" in words_of(report_page(files, FromScene()))
+
+
 def test_two_cameras_get_a_panel_each_and_many_share_one(run):
     files = read_run(run)
     for i, view in enumerate(files.views):
