@@ -73,14 +73,23 @@ def page(title: str, head: str, sections: Sequence[Section], foot: str) -> str:
 """
 
 
+def check_place(path: Path) -> None:
+    """Refuse a name that is no page's, before there is work to lose.
+
+    Raises:
+        UserError: it is a folder, or does not end in .html.
+    """
+    if path.suffix.lower() not in (".html", ".htm") or path.is_dir():
+        raise UserError(f"{path} is no name of a page.", fix="name a file that ends in .html")
+
+
 def write_page(path: Path, html_text: str) -> None:
     """Write a page.
 
     Raises:
         UserError: there is no writing there, or its name is no page's.
     """
-    if path.suffix.lower() not in (".html", ".htm") or path.is_dir():
-        raise UserError(f"{path} is no name of a page.", fix="name a file that ends in .html")
+    check_place(path)
     try:
         write_text(path, html_text)
     except OSError as error:

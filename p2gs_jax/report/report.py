@@ -10,6 +10,7 @@ from p2gs_jax.report.cautions import Caution, cautions
 from p2gs_jax.report.from_scene import FromScene, ask_scene
 from p2gs_jax.report.page import (
     Section,
+    check_place,
     key_numbers,
     listed,
     made_by,
@@ -56,9 +57,10 @@ def write_report(
     reporter = reporter or Silent()
     folder = Path(folder)
     run = read_run(folder)
+    path = folder / "report.html" if out is None else Path(out)
+    check_place(path)
     scene = ask_scene(run, reporter, render=render)
     reporter.stage("Drawing")
-    path = folder / "report.html" if out is None else Path(out)
     write_page(path, report_page(run, scene))
     return path
 
