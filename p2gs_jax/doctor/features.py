@@ -12,13 +12,6 @@ from p2gs_jax.doctor.libraries import Library
 
 # Distributions that only some features need.
 OPTIONAL = ("viser", "av", "gsply", "playwright")
-BROWSERS = (
-    "chromium",
-    "chromium-browser",
-    "google-chrome",
-    "google-chrome-stable",
-    "chrome",
-)
 
 
 @dataclass(frozen=True)
@@ -52,15 +45,10 @@ def look(libraries: Sequence[Library], backend: str | None) -> list[Feature]:
         _optional("view", "viser", "pip install 'p2gs-jax[viewer]'", broken),
         _browser(),
         _optional("videos (render --out x.mp4)", "av", "pip install av", broken),
-        _optional("export to .spz", "gsply", "pip install 'p2gs-jax[spz]'", broken),
+        _optional("export to .spz", "gsply", "pip install gsply", broken),
         _gpu(backend),
         Feature("LPIPS", True, "with --lpips-weights FILE (docs/files.md tells how to write one)"),
     ]
-
-
-def find_browser() -> str | None:
-    """Return the path of a Chromium or Chrome, or None."""
-    return next(filter(None, map(shutil.which, BROWSERS)), None)
 
 
 def _optional(name: str, module: str, fix: str, broken: Sequence[str]) -> Feature:
@@ -69,10 +57,12 @@ def _optional(name: str, module: str, fix: str, broken: Sequence[str]) -> Featur
 
 
 def _browser() -> Feature:
-    found = find_browser()
-    return Feature(
-        "report --pdf", found is not None, found or "install Chromium or Chrome, on the PATH"
-    )
+    try:
+        from p2gs_jax.report.pdf import find_browser
+
+        return Feature("report --pdf", True, find_browser())
+    except Exception:  # there is none, or a library is broken, which is said elsewhere
+        return Feature("report --pdf", False, "install Chromium or Chrome")
 
 
 def _gpu(backend: str | None) -> Feature:

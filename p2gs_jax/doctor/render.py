@@ -54,10 +54,14 @@ def look() -> Devices:
 
         backend = jax.default_backend()
         names = [f"{d.device_kind}{_memory(d)}" for d in jax.devices()]
+        from p2gs_jax.render import fastest_here
+
+        rasterizer = fastest_here()
     except Exception as error:  # whatever a broken JAX raises
         return Devices(None, [], None, None, f"{type(error).__name__}: {error}")
-    # As `render.rasterize` and `render.binning` choose where the configuration says None.
-    return Devices(backend, names, "xla", "counting" if backend == "cpu" else "sorting", None)
+    # As `render.binning` chooses where the configuration says None.
+    binning = "counting" if backend == "cpu" else "sorting"
+    return Devices(backend, names, rasterizer, binning, None)
 
 
 def self_test() -> SelfTest:

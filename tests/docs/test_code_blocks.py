@@ -2,7 +2,7 @@
 
 `pages.py` says what a page can say about the test of a block. While pages are tested, the preset
 `robust` is quick (`quick_presets`), so that Python runs as it stands; in the folder where it runs
-lie `scene` and `street`, a tiny scene, and `RUN`, a finished run of it.
+lie `scene` and `street`, a tiny scene, and `RUN` and `runs/street`, a finished run of it.
 """
 
 import dataclasses
@@ -58,7 +58,8 @@ def place(tmp_path, monkeypatch, finished_run):
     """Go to a folder with a scene and a finished run."""
     make_scene(tmp_path / "scene")
     make_scene(tmp_path / "street")
-    shutil.copytree(finished_run, tmp_path / "RUN")
+    for name in ("RUN", "runs/street"):
+        shutil.copytree(finished_run, tmp_path / name)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
