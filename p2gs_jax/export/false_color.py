@@ -55,14 +55,16 @@ def false_color(
 
 def clipping(ldr: Float[np.ndarray, "h w 3"]) -> Clipping:
     """Return where any channel is at the top, and where all are at the bottom, of 8 bits."""
-    codes = np.rint(np.clip(ldr, 0, 1) * 255)
-    return Clipping(np.any(codes >= 255, axis=-1), np.all(codes <= 0, axis=-1))
+    # One channel at a time: reductions over an axis of three are 20 times slower.
+    r, g, b = (255 * ldr[..., channel] for channel in range(3))
+    over = (r > 254.5) | (g > 254.5) | (b > 254.5)
+    return Clipping(over, (r <= 0.5) & (g <= 0.5) & (b <= 0.5))
 
 
 def clipping_overlay(ldr: Float[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
     """Return the picture with overexposed pixels striped red one way, black ones blue the other."""
     over, under = clipping(ldr)
-    rows, columns = np.indices(over.shape)
+    rows, columns = np.ogrid[: over.shape[0], : over.shape[1]]
     rising = (rows + columns) // STRIPE % 2 == 0
     falling = (rows - columns) // STRIPE % 2 == 0
     out = np.array(np.clip(ldr, 0, 1), np.float32)

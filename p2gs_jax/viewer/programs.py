@@ -6,8 +6,10 @@ size while a program with longer lists is compiled.
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
+import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -18,7 +20,7 @@ from jaxtyping import Array, Bool
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.errors import UserError
-from p2gs_jax.render import render_linear
+from p2gs_jax.render import render_linear, required_capacity
 from p2gs_jax.render.host import capacity_bucket
 from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.types import Camera, Gaussians, Render
@@ -73,6 +75,8 @@ class Programs:
         self._changed = threading.Condition()
         self._one_frame = threading.Lock()
         self._stopping = False
+        self.failure: str | None = None
+        """What went wrong last, or None."""
         self._worker = threading.Thread(target=self._work, name="compile", daemon=True)
         self._worker.start()
 
@@ -168,13 +172,21 @@ class Programs:
                     return
                 size = self._now = self._wanted.pop(0)
             self._on_change()
-            self._compile(size)
+            try:
+                self._compile(size)
+            except Exception as error:  # such as too little memory: other sizes may still do
+                traceback.print_exc(file=sys.stderr)
+                self.failure = f"{size[0]} x {size[1]} cannot be compiled: {error}"
             with self._changed:
                 self._now = None
             self._on_change()
 
     def _compile(self, size: Size) -> None:
         """Compile a size with tile lists that hold what it is known to need, and try it."""
+        with self._changed:
+            first = not self._most
+        if first:
+            self._count(size)
         while True:
             with self._changed:
                 if self._stopping:
@@ -196,12 +208,17 @@ class Programs:
                     self._compiled += 1
                     return
 
+    def _count(self, size: Size) -> None:
+        """Count what typical views need: cheaper than to compile twice."""
+        count = jax.jit(partial(required_capacity, cfg=self._cfg))
+        most = max(int(count(*self._scene, probe(size))) for probe in self._probes)
+        with self._changed:
+            self._most[size] = most
+
     def _expected(self, size: Size) -> int:
         """Return how many entries a size may need; lists never grow faster than the area."""
         if size in self._most:
             return self._most[size]
-        if not self._most:
-            return 2 * self._scene[0].capacity
         area = size[0] * size[1]
         near = min(self._most, key=lambda other: abs(other[0] * other[1] - area))
         return int(self._most[near] * max(1.0, area / (near[0] * near[1])))

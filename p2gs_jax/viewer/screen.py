@@ -7,6 +7,7 @@ canvas is rendered pixel for pixel and travels as PNG.
 
 from __future__ import annotations
 
+import html
 import sys
 import threading
 import time
@@ -292,6 +293,8 @@ class Screen:
             parts.append(f"{self._last_ms:.0f} ms")
         if busy is not None:
             parts.append(f"compiling {busy[0]} x {busy[1]} ...")
+        if self._studio.programs.failure is not None:
+            parts.append(html.escape(self._studio.programs.failure[:200]))
         self._panel.set_status(note(" &middot; ".join(parts) or "starting ..."))
 
     def _complain(self, text: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import signal
 import socket
 import threading
 import time
@@ -118,7 +119,9 @@ def _furnish(server: viser.ViserServer, studio: Studio, sessions: dict[int, Sess
 
 
 def serve(run: Run, *, host: str, port: int, max_width: int, say: Callable[[str], None]) -> None:
-    """Serve a run until Ctrl-C.
+    """Serve a run until Ctrl-C or SIGTERM; a second one ends the process at once.
+
+    For the main thread.
 
     Args:
         run: what to show.
@@ -126,12 +129,24 @@ def serve(run: Run, *, host: str, port: int, max_width: int, say: Callable[[str]
         port: likewise.
         max_width: widest picture to render, pixels.
         say: prints a line.
+
+    Raises:
+        UserError: one cannot listen there.
     """
-    viewer = open_viewer(run, host=host, port=port, max_width=max_width)
-    with contextlib.suppress(KeyboardInterrupt), viewer as address:
-        try:
+    asked: list[int] = []
+
+    def end(number: int, frame: object) -> None:
+        if asked:
+            os._exit(128 + number)
+        asked.append(number)
+
+    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        with open_viewer(run, host=host, port=port, max_width=max_width) as address:
             say(f"{run.params.gaussians.capacity} Gaussians at {address} (Ctrl-C ends)")
-            while True:
-                time.sleep(3600)
-        finally:
+            while not asked:
+                time.sleep(0.1)
             say("Ending, once what is being compiled is done.")
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
