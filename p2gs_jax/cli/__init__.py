@@ -1,4 +1,4 @@
-"""The command line: `p2gs-jax fit | calibrate | render | eval | demo | synth | sweep | bench`.
+"""The command line: `p2gs-jax SUBCOMMAND`; COMMANDS lists them.
 
 Every configuration field is an option. Bad input ends with one message and exit code 2.
 """
@@ -18,6 +18,7 @@ import tyro
 
 from p2gs_jax.errors import UserError
 from p2gs_jax.options.experiments import Bench, Demo, Sweep, Synth
+from p2gs_jax.options.export import Export
 from p2gs_jax.options.fit import Calibrate, Fit, named_preset
 from p2gs_jax.options.results import Eval, Render
 
@@ -27,6 +28,7 @@ COMMANDS: dict[str, type] = {
     "calibrate": Calibrate,
     "render": Render,
     "eval": Eval,
+    "export": Export,
     "demo": Demo,
     "synth": Synth,
     "sweep": Sweep,
