@@ -16,9 +16,10 @@ from p2gs_jax.evaluate.evaluate import MeanParameters, ViewResult, evaluate, mea
 from p2gs_jax.evaluate.lpips import LpipsWeights
 from p2gs_jax.evaluate.radiance import Truth
 from p2gs_jax.export.atomic import write_array, write_json
+from p2gs_jax.export.bake import bake, look_comments, look_of_splats
 from p2gs_jax.export.exr import read_exr, write_exr
 from p2gs_jax.export.photometry_json import ViewPhotometry, write_photometry
-from p2gs_jax.export.ply import write_radiance, write_splats
+from p2gs_jax.export.ply import write_ply, write_radiance
 from p2gs_jax.export.png import write_png
 from p2gs_jax.export.summary import write_summary
 from p2gs_jax.numerics import LN2
@@ -27,6 +28,7 @@ from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.prepare import Prepared
 from p2gs_jax.progress import Reporter
 from p2gs_jax.render.host import make_renderer
+from p2gs_jax.render.spherical_harmonics import MAX_DEGREE
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Params, Scene
@@ -106,17 +108,10 @@ def write_models(params: Params, run_dir: Path, cfg: FitConfig) -> None:
     """Write `splats.ply` (display colours) and `radiance.ply` (linear)."""
     mean = mean_parameters(params.photometry)
     alive = np.ones(params.gaussians.capacity, bool)
-    # A bilateral grid depends on the place in the image: splats cannot carry it.
-    spatial = cfg.photometry.appearance == "bilateral"
-    correction = None if spatial else params.mean_correction
-    look = Look(mean.exposure_geometric, mean.gamma, cfg.photometry, correction)
-    write_splats(
-        run_dir / "splats.ply",
-        params.gaussians,
-        alive,
-        tone=lambda linear: develop(linear, look),
-        activation=cfg.render.radiance,
-    )
+    look = Look(mean.exposure_geometric, mean.gamma, cfg.photometry, params.mean_correction)
+    look = look_of_splats(look)
+    shown = bake(params.gaussians, look, cfg.render.radiance, MAX_DEGREE)
+    write_ply(run_dir / "splats.ply", shown, look_comments(look))
     write_radiance(
         run_dir / "radiance.ply", params.gaussians, alive, activation=cfg.render.radiance
     )

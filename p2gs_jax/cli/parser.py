@@ -12,6 +12,7 @@ from p2gs_jax.cli import wording
 from p2gs_jax.cli.rule import registry
 from p2gs_jax.errors import UserError
 from p2gs_jax.options.experiments import Bench, Demo, Sweep, Synth
+from p2gs_jax.options.export import Export
 from p2gs_jax.options.fit import Calibrate, Fit, named_preset
 from p2gs_jax.options.pages import Compare, Report
 from p2gs_jax.options.render import Render
@@ -25,6 +26,7 @@ COMMANDS: dict[str, type] = {
     "calibrate": Calibrate,
     "render": Render,
     "eval": Eval,
+    "export": Export,
     "view": View,
     "report": Report,
     "compare": Compare,

@@ -45,7 +45,7 @@ def look(libraries: Sequence[Library], backend: str | None) -> list[Feature]:
         _optional("view", "viser", "pip install 'p2gs-jax[viewer]'", broken),
         _browser(),
         _optional("videos (render --out x.mp4)", "av", "pip install av", broken),
-        _optional("export to .spz", "gsply", "pip install gsply", broken),
+        _optional("export to .spz", "gsply", "pip install 'p2gs-jax[spz]'", broken),
         _gpu(backend),
         Feature("LPIPS", True, "with --lpips-weights FILE (docs/files.md tells how to write one)"),
     ]

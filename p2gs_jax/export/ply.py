@@ -1,29 +1,24 @@
 """Gaussians as PLY in the field order of the reference implementation (Inria).
 
-`splats.ply` carries display colours, so common viewers show it as it should look; `radiance.ply`
+Common viewers show files with display colours (export/bake.py) as they should look; `radiance.ply`
 carries the linear pre-activation coefficients, untouched.
 """
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.atomic import atomic_write
-from p2gs_jax.photometry.radiance import RadianceKind, radiance_activation
-from p2gs_jax.render.spherical_harmonics import basis, degree_of
+from p2gs_jax.photometry.radiance import RadianceKind
 from p2gs_jax.types import Gaussians
-
-DIRECTIONS = 64
-CHUNK = 65536
 
 
 def field_names(coefficients: int) -> list[str]:
@@ -43,7 +38,15 @@ def _live(gaussians: Gaussians, alive: Bool[np.ndarray, " n"]) -> Gaussians:
     return jax.tree.map(lambda a: a[rows], gaussians)
 
 
-def _write(path: Path, g: Gaussians, comments: list[str]) -> int:
+def write_ply(path: Path, gaussians: Gaussians, comments: Sequence[str]) -> int:
+    """Write all Gaussians as they are; return how many.
+
+    Args:
+        path: the file.
+        gaussians: what to write.
+        comments: header lines; a PLY header is ASCII, other characters are escaped.
+    """
+    g = gaussians
     count, coefficients = g.sh.shape[:2]
     # All coefficients of red, then green, then blue.
     rest = np.asarray(g.sh[:, 1:]).transpose(0, 2, 1).reshape(count, 3 * (coefficients - 1))
@@ -61,81 +64,18 @@ def _write(path: Path, g: Gaussians, comments: list[str]) -> int:
     ).astype("<f4")
     names = field_names(coefficients)
     table = np.ascontiguousarray(columns).view([(n, "<f4") for n in names]).reshape(count)
-    data = PlyData([PlyElement.describe(table, "vertex")], byte_order="<", comments=comments)
+    lines = [c.encode("unicode_escape").decode() for c in comments]
+    data = PlyData([PlyElement.describe(table, "vertex")], byte_order="<", comments=lines)
     with atomic_write(path) as temporary:
         data.write(str(temporary))
     return count
-
-
-def display_sh(
-    sh: Float[np.ndarray, "n k 3"],
-    tone: Callable[[np.ndarray], np.ndarray],
-    activation: RadianceKind,
-) -> Float[np.ndarray, "n k 3"]:
-    """Return coefficients whose value + 1/2 is the display colour, least squares over directions.
-
-    Exact for degree 0. The tone curve of a mixture is not the mixture of tone curves, so a
-    composited image still differs from the true render; the linear file does not.
-    """
-    directions = _sphere(DIRECTIONS)
-    degree = degree_of(sh.shape[1])
-    table = np.stack([np.asarray(b) for b in basis(tuple(jnp.asarray(directions).T), degree)], 1)
-    inverse = np.linalg.pinv(table)
-    out = np.empty_like(sh)
-    for start in range(0, len(sh), CHUNK):
-        part = sh[start : start + CHUNK]
-        values = np.einsum("dk,nkc->ndc", table, part, optimize=True).astype(np.float32)
-        colors = tone(np.asarray(radiance_activation(jnp.asarray(values), activation)))
-        shown = np.clip(colors, 0, 1) - 0.5
-        out[start : start + CHUNK] = np.einsum("kd,ndc->nkc", inverse, shown, optimize=True)
-    return out
-
-
-def _sphere(count: int) -> Float[np.ndarray, "n 3"]:
-    i = np.arange(count) + 0.5
-    z = 1 - 2 * i / count
-    azimuth = np.pi * (1 + 5**0.5) * i
-    r = np.sqrt(1 - z * z)
-    return np.stack([r * np.cos(azimuth), r * np.sin(azimuth), z], -1).astype(np.float32)
-
-
-def write_splats(
-    path: Path,
-    gaussians: Gaussians,
-    alive: Bool[np.ndarray, " n"],
-    *,
-    tone: Callable[[np.ndarray], np.ndarray],
-    activation: RadianceKind,
-    exposure: float = 1.0,
-    gamma: float | None = None,
-) -> int:
-    """Write live Gaussians with display colours; return how many.
-
-    Args:
-        path: the file.
-        gaussians: linear radiance.
-        alive: which to write.
-        tone: exposed radiance -> display values, clamped to [0, 1] here.
-        activation: of the spherical harmonics.
-        exposure: multiplies the radiance before `tone`; leave it at 1 where `tone` exposes.
-        gamma: what `tone` uses, recorded in a comment.
-    """
-    g = _live(gaussians, alive)
-    sh = display_sh(np.asarray(g.sh), lambda linear: tone(exposure * linear), activation)
-    shown = dataclasses.replace(g, sh=jnp.asarray(sh))
-    comments = ["p2gs-jax: display colours, tone-mapped"]
-    if exposure != 1.0:
-        comments.append(f"p2gs-jax: exposure {exposure:.6g}")
-    if gamma is not None:
-        comments.append(f"p2gs-jax: gamma {gamma:.6g}")
-    return _write(path, shown, comments)
 
 
 def write_radiance(
     path: Path, gaussians: Gaussians, alive: Bool[np.ndarray, " n"], *, activation: RadianceKind
 ) -> int:
     """Write live Gaussians with their linear coefficients; return how many."""
-    return _write(
+    return write_ply(
         path,
         _live(gaussians, alive),
         ["p2gs-jax: linear HDR radiance", f"p2gs-jax: radiance activation {activation}"],

@@ -3,15 +3,47 @@
 from __future__ import annotations
 
 import math
+import re
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
 
 from PIL import ExifTags, Image
 
-_EXPOSURE_TIME, _F_NUMBER = 0x829A, 0x829D
+_EXPOSURE_TIME, _F_NUMBER, _TAKEN = 0x829A, 0x829D, 0x9003
 # PhotographicSensitivity is 16 bits: 65535 there means "see the others".
 _SENSITIVITIES = (0x8827, 0x8833, 0x8832, 0x8831)
 _DEFAULT_ISO = 100.0
+
+
+@dataclass(frozen=True)
+class Shot:
+    """How a photograph was taken, as far as its EXIF says.
+
+    Attributes:
+        time: exposure time, seconds.
+        aperture: f-number.
+        iso: sensitivity.
+        taken: local date and time, `YYYY:MM:DD hh:mm:ss`.
+    """
+
+    time: float | None = None
+    aperture: float | None = None
+    iso: float | None = None
+    taken: str | None = None
+
+
+def read_shot(path: Path) -> Shot:
+    """Return what the EXIF of any image says; broken or absent EXIF says nothing."""
+    tags = _exif_tags(path)
+    isos = (_positive(tags.get(tag)) for tag in _SENSITIVITIES)
+    taken = str(tags.get(_TAKEN, "")).strip("\0 ")
+    return Shot(
+        time=_positive(tags.get(_EXPOSURE_TIME)),
+        aperture=_positive(tags.get(_F_NUMBER)),
+        iso=next((value for value in isos if value not in (None, 65535.0)), None),
+        taken=taken if re.fullmatch(r"\d{4}:\d\d:\d\d \d\d:\d\d:\d\d", taken) else None,
+    )
 
 
 def read_exif_ev(path: Path) -> float | None:
@@ -23,13 +55,10 @@ def read_exif_ev(path: Path) -> float | None:
     Args:
         path: any image; broken or absent EXIF gives None, never an error.
     """
-    tags = _exif_tags(path)
-    time, aperture = _positive(tags.get(_EXPOSURE_TIME)), _positive(tags.get(_F_NUMBER))
-    if time is None or aperture is None:
+    shot = read_shot(path)
+    if shot.time is None or shot.aperture is None:
         return None
-    isos = (_positive(tags.get(tag)) for tag in _SENSITIVITIES)
-    iso = next((value for value in isos if value not in (None, 65535.0)), None) or _DEFAULT_ISO
-    return math.log2(time * iso / aperture**2)
+    return math.log2(shot.time * (shot.iso or _DEFAULT_ISO) / shot.aperture**2)
 
 
 def read_exif_camera(path: Path) -> str:

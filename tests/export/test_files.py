@@ -10,13 +10,13 @@ import pytest
 from plyfile import PlyData
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.export.atomic import append_jsonl, atomic_write, read_jsonl, write_json
+from p2gs_jax.export.atomic import append_jsonl, atomic_folder, atomic_write, read_jsonl, write_json
 from p2gs_jax.export.exr import read_exr, write_exr
 from p2gs_jax.export.photometry_json import read_photometry, write_photometry
-from p2gs_jax.export.ply import display_sh, field_names, read_ply, write_radiance, write_splats
+from p2gs_jax.export.ply import field_names, read_ply, write_ply, write_radiance
 from p2gs_jax.export.png import side_by_side, write_png
 from p2gs_jax.export.summary import _curves, _shorten, write_summary
-from p2gs_jax.types import Camera, Gaussians
+from p2gs_jax.types import Gaussians
 
 
 def gaussians(n=50, degree=3, seed=0):
@@ -38,6 +38,25 @@ def test_atomic_write_leaves_the_old_file_on_failure(tmp_path):
         fail()
     assert '"x": 1' in path.read_text()
     assert os.listdir(tmp_path) == ["a.json"]
+
+
+def test_atomic_folder_replaces_the_old_one_only_when_whole(tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "old").write_text("old")
+
+    def fail():
+        with atomic_folder(tmp_path / "out") as folder:
+            (folder / "new").write_text("half")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail()
+    assert os.listdir(tmp_path) == ["out"]
+    assert os.listdir(tmp_path / "out") == ["old"]
+    with atomic_folder(tmp_path / "out") as folder:
+        (folder / "new").write_text("whole")
+    assert os.listdir(tmp_path) == ["out"]
+    assert os.listdir(tmp_path / "out") == ["new"]
 
 
 def test_json_has_no_nan(tmp_path):
@@ -108,74 +127,22 @@ def test_ply_field_order_is_the_reference_one(tmp_path):
     assert any("linear" in c for c in ply.comments)
 
 
-def tone(x):
-    return np.clip(x, 0, 1) ** (1 / 2.2)
-
-
-def test_display_colours_are_exact_for_degree_0_and_close_for_3(tmp_path):
-    g = gaussians(degree=0)
-    shown = display_sh(np.asarray(g.sh), tone, "exp")
-    expected = tone(np.exp(0.28209479 * np.asarray(g.sh[:, 0])))
-    np.testing.assert_allclose(0.28209479 * shown[:, 0] + 0.5, expected, atol=1e-5)
-    mild = np.asarray(gaussians(degree=3).sh) * 0.1
-    mild[:, 0] -= 3
-    shown = display_sh(mild, tone, "exp")
-    d = np.array([0.36, 0.48, 0.8])
-    from p2gs_jax.render.spherical_harmonics import basis
-
-    table = np.array([float(b[0]) for b in basis(tuple(jnp.asarray(d[:, None], jnp.float32)), 3)])
-    expected = tone(np.exp(np.einsum("k,nkc->nc", table, mild)))
-    found = np.einsum("k,nkc->nc", table, shown) + 0.5
-    assert np.abs(found - expected).max() < 0.03
-    write_splats(tmp_path / "s.ply", g, np.ones(50, bool), tone=tone, activation="exp")
-    assert "display" in PlyData.read(str(tmp_path / "s.ply")).comments[0]
-
-
-def test_display_colours_are_clamped_and_exposed(tmp_path):
-    g = gaussians(degree=0)
-    shown = display_sh(np.asarray(g.sh), lambda x: 9 * x - 1, "linear")
-    colors = 0.28209479 * shown[:, 0] + 0.5
-    assert colors.min() > -1e-6
-    assert colors.max() < 1 + 1e-6
-    path = tmp_path / "s.ply"
-    write_splats(
-        path, g, np.ones(50, bool), tone=tone, activation="softplus", exposure=0.5, gamma=2.2
-    )
-    expected = tone(0.5 * np.log1p(np.exp(0.28209479 * np.asarray(g.sh[:, 0]))))
-    np.testing.assert_allclose(0.28209479 * read_ply(path).sh[:, 0] + 0.5, expected, atol=1e-5)
-    assert "p2gs-jax: exposure 0.5" in PlyData.read(str(path)).comments
+def test_ply_comments_may_name_any_file(tmp_path):
+    write_ply(tmp_path / "a.ply", gaussians(), ["worst: Straße/夜\n1.jpg"])
+    assert PlyData.read(str(tmp_path / "a.ply")).comments == [r"worst: Stra\xdfe/\u591c\n1.jpg"]
+    np.testing.assert_array_equal(read_ply(tmp_path / "a.ply").sh, gaussians().sh)
 
 
 def test_nobody_alive(tmp_path):
     dead = np.zeros(50, bool)
     assert write_radiance(tmp_path / "r.ply", gaussians(), dead, activation="exp") == 0
     assert read_ply(tmp_path / "r.ply").sh.shape == (0, 16, 3)
-    assert write_splats(tmp_path / "s.ply", gaussians(), dead, tone=tone, activation="exp") == 0
 
 
 def test_not_a_ply(tmp_path):
     (tmp_path / "x.ply").write_text("hello")
     with pytest.raises(UserError, match=r"x\.ply"):
         read_ply(tmp_path / "x.ply")
-
-
-def test_exr_holds_radiance_exposure_and_camera(tmp_path):
-    rng = np.random.default_rng(0)
-    linear = np.exp2(rng.uniform(-10, 6, (7, 9, 3))).astype(np.float32)
-    cam = Camera(jnp.eye(4).at[0, 3].set(2.5), jnp.eye(3), 9, 7)
-    depth = np.full((7, 9), 4.0, np.float32)
-    alpha = np.full((7, 9), 0.5, np.float32)
-    write_exr(
-        tmp_path / "a.exr", linear, depth=depth, alpha=alpha, exposure=2.0, gamma=2.2, camera=cam
-    )
-    back, header = read_exr(tmp_path / "a.exr")
-    np.testing.assert_allclose(back, linear, rtol=1e-3)
-    assert header["p2gsExposure"] == 2.0
-    assert header["p2gsExposureEV"] == 1.0
-    assert header["worldToCamera"][0, 3] == 2.5
-    assert header["chromaticities"][0] == pytest.approx(0.64)
-    with OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True) as file:
-        np.testing.assert_allclose(file.channels()["Z"].pixels, 8.0)
 
 
 def test_exr_never_overflows_half(tmp_path):

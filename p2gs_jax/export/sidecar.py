@@ -1,0 +1,159 @@
+"""`linear.json`: all that a foreign program needs to render `linear.ply` as we do.
+
+docs/exports.md describes the fields; a change of their meaning raises VERSION.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.export.exr import BT709
+from p2gs_jax.export.photometry_json import PhotometryFile, ViewPhotometry
+from p2gs_jax.photometry.formation import EXPOSED_CEILING, EXPOSED_FLOOR
+from p2gs_jax.photometry.look import Look, develop
+from p2gs_jax.photometry.radiance import LOG_RADIANCE_LIMIT
+from p2gs_jax.render.spherical_harmonics import C0, C1, C2, C3, degree_of
+from p2gs_jax.scene import ImageStore
+from p2gs_jax.types import GAMMA_SRGB, Gaussians, Scene
+
+FORMAT, VERSION = "p2gs-jax linear Gaussians", 1
+CORRECTIONS = "linear.appearance.npy"
+ACTIVATIONS = {
+    "exp": f"L = exp(clip(s, -{LOG_RADIANCE_LIMIT:g}, {LOG_RADIANCE_LIMIT:g}))",
+    "softplus": "L = log(1 + exp(s))",
+    "linear": "L = max(0, s + 1/2)",
+}
+# The basis of render/spherical_harmonics.py, in order; d = (x, y, z) is the direction.
+BASIS = (
+    f"{C0}",
+    f"-{C1} * y",
+    f"{C1} * z",
+    f"-{C1} * x",
+    f"{C2[0]} * x * y",
+    f"-{C2[0]} * y * z",
+    f"{C2[1]} * (2 * z * z - x * x - y * y)",
+    f"-{C2[0]} * x * z",
+    f"{C2[2]} * (x * x - y * y)",
+    f"-{C3[0]} * y * (3 * x * x - y * y)",
+    f"{C3[1]} * x * y * z",
+    f"-{C3[2]} * y * (4 * z * z - x * x - y * y)",
+    f"{C3[3]} * z * (2 * z * z - 3 * x * x - 3 * y * y)",
+    f"-{C3[2]} * x * (4 * z * z - x * x - y * y)",
+    f"{C3[4]} * z * (x * x - y * y)",
+    f"-{C3[0]} * x * (x * x - 3 * y * y)",
+)
+# Stops about 1 at which the tone curve is tabulated.
+DARKEST_EV, BRIGHTEST_EV, SAMPLES = -14.0, 4.0, 433
+
+
+def linear_sidecar(
+    gaussians: Gaussians,
+    cfg: FitConfig,
+    scene: Scene,
+    store: ImageStore,
+    photometry: PhotometryFile,
+) -> dict[str, Any]:
+    """Return the content of the file.
+
+    Args:
+        gaussians: those of the PLY.
+        cfg: how they were fitted, with the chosen model and curve.
+        scene: the views.
+        store: their cameras at the size of the fit.
+        photometry: exposures and gammas.
+    """
+    count, coefficients = gaussians.sh.shape[:2]
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "ply": "linear.ply",
+        "gaussians": count,
+        "fields": {
+            "mean": "x, y, z: centre, scene units",
+            "opacity": "opacity: peak opacity is 1 / (1 + exp(-opacity))",
+            "scale": "scale_0..2: standard deviations along the rotated axes are exp(scale), "
+            "scene units",
+            "rotation": "rot_0..3: quaternion w, x, y, z, not normalised, from the Gaussian's "
+            "axes to the world's",
+            "normals": "nx, ny, nz: 0, unused",
+            "spherical_harmonics": "coefficient 0 of channel c is f_dc_c; coefficient k > 0 is "
+            "f_rest_(c (K - 1) + k - 1); K is `coefficients`",
+        },
+        "spherical_harmonics": {
+            "degree": degree_of(coefficients),
+            "coefficients": coefficients,
+            "direction": "unit vector (x, y, z) from the camera to the Gaussian's centre, world "
+            "axes",
+            "basis": list(BASIS[:coefficients]),
+        },
+        "radiance": {
+            "activation": cfg.render.radiance,
+            "formula": ACTIVATIONS[cfg.render.radiance]
+            + " of the sum s of coefficients times basis, by channel",
+            "color_space": "linear light, primaries and white of BT.709 (the photographs' sRGB)",
+            "chromaticities": list(BT709),
+            "unit": "relative; multiplied by a view's exposure it is what its tone curve takes",
+        },
+        "rendering": {
+            "compositing": "front to back, by alpha, in linear light, over black",
+            "blur_px2": cfg.render.blur,
+            "alpha_cutoff": cfg.render.alpha_cutoff,
+            "alpha_max": cfg.render.alpha_max,
+            "near": cfg.render.near,
+        },
+        "world": {
+            "axes": f"right-handed, those of the scene as it was read ({scene.format})",
+            "unit": "scene units: metres where the source is metric",
+            "viewmat": "world to camera, for column vectors; camera axes x right, y down, "
+            "z forward",
+            "K": "pixels; the first pixel covers [0, 1]",
+        },
+        "gauge": photometry["gauge"],
+        "tone": _tone(cfg, photometry),
+        "mean": photometry["mean"],
+        "views": _views(scene, store, {v["image"]: v for v in photometry["views"]}),
+    }
+
+
+def _tone(cfg: FitConfig, photometry: PhotometryFile) -> dict[str, Any]:
+    exposed = np.exp2(np.linspace(DARKEST_EV, BRIGHTEST_EV, SAMPLES)).astype(np.float32)
+    base = develop(exposed, Look(1.0, GAMMA_SRGB, cfg.photometry))
+    kind = cfg.photometry.appearance
+    limits = [EXPOSED_FLOOR, EXPOSED_CEILING if cfg.photometry.clamp else None]
+    return {
+        "formula": f"display = base(pivot * (e * L / pivot) ** ({GAMMA_SRGB} / gamma)); e * L is "
+        "first clipped to exposed_limits; base is the curve, tabulated",
+        "model": photometry["model"],
+        "curve": photometry["curve"]["name"],
+        "pivot": cfg.photometry.pivot,
+        "exposed_limits": limits,
+        "base": {"linear": exposed, "display": base},
+        "correction": None if kind is None else {"kind": kind, "file": CORRECTIONS},
+    }
+
+
+def _views(
+    scene: Scene, store: ImageStore, photometry: Mapping[str, ViewPhotometry]
+) -> list[dict[str, Any]]:
+    keys = ("exposure", "exposure_ev", "exposure_ev_error", "gamma", "exposure_fitted")
+    out = []
+    for index, view in enumerate(scene.views):
+        viewmat, K, width, height = store.camera(index)
+        row = photometry.get(view.name, {})
+        out.append(
+            {
+                "image": view.name,
+                "camera": view.camera,
+                "split": view.split,
+                **{key: row.get(key) for key in keys},
+                "width": width,
+                "height": height,
+                "K": K,
+                "viewmat": viewmat,
+            }
+        )
+    return out

@@ -1,0 +1,308 @@
+"""`p2gs-jax export` on a finished run, and what it says to wrong input."""
+
+import json
+import shutil
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from plyfile import PlyData
+from scipy.spatial.transform import Rotation
+
+from p2gs_jax.cli import main
+from p2gs_jax.config import DataConfig
+from p2gs_jax.export.exr import read_exr
+from p2gs_jax.export.ply import read_ply
+from p2gs_jax.export.splat_file import read_splat
+from p2gs_jax.render.host import make_renderer
+from p2gs_jax.run_folder import load_run
+from p2gs_jax.scene import load_scene
+from p2gs_jax.scene.device import camera_of
+from p2gs_jax.scene.images import ImageStore
+
+C0 = 0.28209479177387814
+STEPS = ("--bake-steps", "12")
+
+
+def run(capsys, *argv):
+    with pytest.raises(SystemExit) as stop:
+        main([str(a) for a in argv])
+    out = capsys.readouterr()
+    assert "Traceback" not in out.err + out.out
+    return stop.value.code, out.err + out.out
+
+
+@pytest.fixture(scope="module")
+def exported(finished_run, tmp_path_factory):
+    """Return a run and a folder with every format that needs no extra package."""
+    out = tmp_path_factory.mktemp("exports")
+    formats = ("linear-ply", "display-ply", "splat", "colmap", "exr")
+    argv = ["export", str(finished_run), "--format", *formats, "--out", str(out), *STEPS]
+    with pytest.raises(SystemExit) as stop:
+        main(argv)
+    assert stop.value.code == 0
+    return load_run(finished_run), out
+
+
+def test_the_linear_ply_is_the_run_bit_for_bit(exported):
+    fitted, out = exported
+    back = read_ply(out / "linear.ply")
+    for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(fitted.params.gaussians, name))
+    said = json.loads((out / "linear.json").read_text())
+    assert said["gaussians"] == fitted.params.gaussians.capacity
+    assert said["radiance"]["activation"] == fitted.cfg.render.radiance
+    e = {v["image"]: v["exposure"] for v in said["views"]}
+    train = [fitted.scene.views[i].name for i in fitted.scene.train_indices]
+    np.testing.assert_allclose([e[n] for n in train], fitted.params.photometry.exposures, rtol=1e-6)
+    assert said["mean"]["gamma"] == pytest.approx(fitted.mean.gamma)
+
+
+def as_viewers_do(path):
+    """Read a display PLY as viser's example does: centres, colours, opacities, covariances."""
+    v = PlyData.read(str(path))["vertex"]
+
+    def columns(*names):
+        return np.stack([v[n] for n in names], -1)
+
+    rotation = Rotation.from_quat(columns("rot_1", "rot_2", "rot_3", "rot_0")).as_matrix()
+    scales = np.exp(columns("scale_0", "scale_1", "scale_2"))
+    return {
+        "centers": columns("x", "y", "z"),
+        "rgbs": 0.5 + C0 * columns("f_dc_0", "f_dc_1", "f_dc_2"),
+        "opacities": 1 / (1 + np.exp(-v["opacity"][:, None])),
+        "covariances": np.einsum("nij,nj,nkj->nik", rotation, scales**2, rotation),
+    }
+
+
+def test_the_display_ply_reads_as_any_3dgs_file(exported):
+    fitted, out = exported
+    shown, g = as_viewers_do(out / "display.ply"), fitted.params.gaussians
+    assert len(shown["centers"]) == g.capacity
+    np.testing.assert_array_equal(shown["centers"], g.means)
+    assert shown["rgbs"].min() >= -1e-6, "viewers with 8-bit colours can hold them"
+    assert shown["rgbs"].max() <= 1 + 1e-6
+    determinants = np.linalg.det(shown["covariances"].astype(float))
+    np.testing.assert_allclose(
+        determinants, np.exp(2 * np.asarray(g.log_scales, float).sum(1)), rtol=1e-3
+    )
+
+
+def test_viser_opens_the_display_ply(exported):
+    viser = pytest.importorskip("viser", reason="the extra `viewer` is not installed")
+    _, out = exported
+    shown = as_viewers_do(out / "display.ply")
+    server = viser.ViserServer(port=0, verbose=False)
+    try:
+        handle = server.scene.add_gaussian_splats("/splats", **shown)
+        # Eight words a Gaussian: centre, one unused, six halves of covariance, RGBA bytes.
+        buffer = handle._impl.props.buffer
+        assert buffer.shape == (len(shown["centers"]), 8)
+        np.testing.assert_array_equal(buffer[:, :3].copy().view(np.float32), shown["centers"])
+        rgba = buffer[:, 7:].copy().view(np.uint8)
+        expected = np.clip(np.concatenate([shown["rgbs"], shown["opacities"]], 1), 0, 1)
+        assert np.abs(rgba / 255 - expected).max() < 1.01 / 255
+    finally:
+        server.stop()
+
+
+def test_the_baking_error_is_written_and_true(exported):
+    fitted, out = exported
+    said = json.loads((out / "display.ply.json").read_text())
+    comments = PlyData.read(str(out / "display.ply")).comments
+    for split, rows in (("train", fitted.scene.train_indices), ("test", fitted.scene.test_indices)):
+        error = said["baking_error"][split]
+        assert error["views"] == len(rows)
+        assert any(f"median {error['psnr_median']:.2f} dB" in c for c in comments)
+    # One view judged here, with nothing from export/bake.py.
+    from dataclasses import replace
+
+    from p2gs_jax.photometry.look import develop
+
+    index = fitted.scene.train_indices[1]
+    camera = camera_of(ImageStore(fitted.scene.views, fitted.cfg.data), index)
+    linear = make_renderer(fitted.cfg.render)(fitted.params.gaussians, fitted.alive, camera).linear
+    viewer = make_renderer(replace(fitted.cfg.render, radiance="linear"))
+    shown = np.clip(viewer(read_ply(out / "display.ply"), fitted.alive, camera).linear, 0, 1)
+    difference = 255 * (shown - develop(linear, fitted.common_look()))
+    found = said["baking_error"]["train"]["per_view"][fitted.scene.views[index].name]
+    assert found["mean_codes"] == pytest.approx(np.abs(difference).mean(), abs=0.5)
+    assert found["psnr"] == pytest.approx(
+        -20 * np.log10(np.sqrt((difference**2).mean()) / 255), abs=0.1
+    )
+
+
+def test_the_splat_file_was_measured_as_it_is(exported):
+    fitted, out = exported
+    back = read_splat(out / "display.splat")
+    assert back.capacity == fitted.params.gaussians.capacity
+    said = json.loads((out / "display.splat.json").read_text())
+    assert said["file"] == "display.splat"
+    assert 10 < said["baking_error"]["train"]["psnr_median"] < 60
+
+
+def test_the_colmap_folder_is_the_scene_and_can_be_calibrated(exported, capsys, tmp_path):
+    fitted, out = exported
+    after = load_scene(out / "colmap", DataConfig(test_every=3))
+    assert [v.name for v in after.views] == [v.name for v in fitted.scene.views]
+    assert [v.split for v in after.views] == [v.split for v in fitted.scene.views]
+    for a, b in zip(after.views, fitted.scene.views, strict=True):
+        np.testing.assert_allclose(a.viewmat, b.viewmat, atol=1e-6)
+        np.testing.assert_allclose(a.K, b.K, rtol=1e-6)
+    known = out / "colmap" / "exposures.csv"
+    code, text = run(
+        capsys, "calibrate", out / "colmap", "--out", tmp_path / "c", "--known-exposures", known
+    )
+    assert code == 0, text
+    found = json.loads((tmp_path / "c" / "photometry.json").read_text())["views"]
+    e = {v["image"]: v["exposure"] for v in found}
+    for v in fitted.photometry["views"]:
+        wanted = v["exposure"] if v["split"] == "train" else v["exposure_fitted"]
+        assert e[v["image"]] == pytest.approx(wanted, rel=1e-5)
+
+
+def test_exr_renders_carry_each_views_own_exposure(exported):
+    fitted, out = exported
+    store = ImageStore(fitted.scene.views, fitted.cfg.data)
+    render = make_renderer(fitted.cfg.render)
+    for index, view in enumerate(fitted.scene.views):
+        linear, header = read_exr((out / "exr" / view.name).with_suffix(".exr"))
+        assert header["p2gsExposure"] == pytest.approx(fitted.own_look(index).exposure, rel=1e-6)
+        expected = render(fitted.params.gaussians, fitted.alive, camera_of(store, index)).linear
+        np.testing.assert_allclose(linear, expected, rtol=1e-3, atol=1e-4)
+    assert len({read_exr(p)[1]["p2gsExposure"] for p in (out / "exr").iterdir()}) > 3
+
+
+def test_a_look_changes_the_display_colours(finished_run, capsys, tmp_path):
+    def base(name, *options):
+        argv = ("export", finished_run, "--format", "display-ply", "--out", tmp_path / name)
+        code, text = run(capsys, *argv, "--bake-steps", "0", *options)
+        assert code == 0, text
+        said = json.loads((tmp_path / name / "display.ply.json").read_text())
+        return 0.5 + C0 * np.asarray(read_ply(tmp_path / name / "display.ply").sh[:, 0]), said
+
+    plain, said = base("plain")
+    assert said["exposure_ev_from_mean"] == pytest.approx(0, abs=1e-6)
+    dark, said = base("dark", "--exposure-ev", "-2")
+    assert said["exposure_ev_from_mean"] == pytest.approx(-2, abs=1e-5)
+    assert dark.mean() < plain.mean() - 0.05
+    linear, said = base("linear", "--curve", "linear", "--gamma", "2.2")
+    assert (said["curve"], said["gamma"]) == ("linear", 2.2)
+    assert linear.mean() < plain.mean() - 0.05
+
+
+def test_spz_holds_the_display_colours(finished_run, capsys, tmp_path):
+    pytest.importorskip("gsply", reason="the extra `spz` is not installed")
+    argv = ("export", finished_run, "--format", "display-ply", "spz", "--out", tmp_path)
+    code, text = run(capsys, *argv, "--bake-steps", "5")
+    assert code == 0, text
+    from p2gs_jax.export.spz_file import read_spz
+
+    ply, spz = read_ply(tmp_path / "display.ply"), read_spz(tmp_path / "display.spz")
+    np.testing.assert_allclose(spz.means, ply.means, atol=1e-3)
+    np.testing.assert_allclose(spz.sh[:, 0], ply.sh[:, 0], atol=0.02)
+    scores = [
+        json.loads((tmp_path / f"display.{f}.json").read_text())["baking_error"]["train"]
+        for f in ("ply", "spz")
+    ]
+    assert scores[1]["psnr_median"] == pytest.approx(scores[0]["psnr_median"], abs=1.5)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--format", "obj"), "obj"),
+        ((), "format"),
+        (("--format",), "format"),
+        (("--format", "splat", "--exposure-ev", "nan"), "--exposure-ev"),
+        (("--format", "splat", "--exposure-ev", "bright"), "exposure-ev"),
+        (("--format", "splat", "--exposure-ev", "99"), "--exposure-ev"),
+        (("--format", "splat", "--gamma", "0"), "--gamma"),
+        (("--format", "splat", "--gamma", "inf"), "--gamma"),
+        (("--format", "splat", "--bake-steps", "-1"), "--bake-steps"),
+        (("--format", "splat", "--curve", "spline"), "no spline"),
+        (("--format", "splat", "--curve", "wavy"), "wavy"),
+        (("--format", "exr", "colmap", "--gamma", "2"), "--gamma says nothing"),
+    ],
+)
+def test_senseless_options(finished_run, capsys, tmp_path, options, said):
+    code, text = run(capsys, "export", finished_run, *options, "--out", tmp_path / "out")
+    assert code == 2
+    assert said in text
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_is_there_is_replaced_only_when_asked(finished_run, capsys, tmp_path):
+    (tmp_path / "linear.json").write_text("mine")
+    argv = ("export", finished_run, "--format", "linear-ply", "--out", tmp_path)
+    code, text = run(capsys, *argv)
+    assert code == 2
+    assert "linear.json exists" in text
+    assert "--overwrite" in text
+    assert (tmp_path / "linear.json").read_text() == "mine"
+    assert not (tmp_path / "linear.ply").exists()
+    code, _ = run(capsys, *argv, "--overwrite")
+    assert code == 0
+    assert json.loads((tmp_path / "linear.json").read_text())["version"] == 1
+
+
+def test_exports_lie_in_the_run_unless_told_otherwise(finished_run, capsys, tmp_path):
+    copied = tmp_path / "run"
+    shutil.copytree(finished_run, copied)
+    code, text = run(capsys, "export", copied, "--format", "linear-ply", "linear-ply")
+    assert code == 0, text
+    assert sorted(p.name for p in (copied / "exports").iterdir()) == ["linear.json", "linear.ply"]
+    code, text = run(capsys, "export", copied, "--format", "exr", "--out", copied / "config.json")
+    assert code == 2
+    assert "is a file" in text
+
+
+def test_no_run_and_an_unfinished_one(capsys, tmp_path):
+    code, text = run(capsys, "export", tmp_path, "--format", "exr")
+    assert code == 2
+    assert "config.json" in text
+    (tmp_path / "config.json").write_text("{}")
+    code, text = run(capsys, "export", tmp_path, "--format", "exr")
+    assert code == 2
+    assert "--resume" in text
+
+
+def test_names_that_lead_outside_are_refused(finished_run, capsys, tmp_path, monkeypatch):
+    from dataclasses import replace
+
+    from p2gs_jax.commands import export
+
+    def outside(folder):
+        fitted = load_run(folder)
+        views = (replace(fitted.scene.views[0], name="../0.png"), *fitted.scene.views[1:])
+        return replace(fitted, scene=replace(fitted.scene, views=views))
+
+    monkeypatch.setattr(export, "load_run", outside)
+    for name in ("exr", "colmap"):
+        code, text = run(capsys, "export", finished_run, "--format", name, "--out", tmp_path / name)
+        assert code == 2
+        assert "../0.png" in text
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_corrections_travel_with_the_linear_ply(finished_run, capsys, tmp_path, monkeypatch):
+    from dataclasses import replace
+
+    from p2gs_jax.commands import export
+
+    def corrected(folder):
+        fitted = load_run(folder)
+        appearance = jnp.full((len(fitted.scene.train_indices), 3, 4), 0.1)
+        photometry = replace(fitted.cfg.photometry, appearance="affine")
+        return replace(
+            fitted,
+            params=replace(fitted.params, appearance=appearance),
+            cfg=replace(fitted.cfg, photometry=photometry),
+        )
+
+    monkeypatch.setattr(export, "load_run", corrected)
+    code, text = run(capsys, "export", finished_run, "--format", "linear-ply", "--out", tmp_path)
+    assert code == 0, text
+    said = json.loads((tmp_path / "linear.json").read_text())
+    kept = np.load(tmp_path / said["tone"]["correction"]["file"])
+    np.testing.assert_allclose(kept, 0.1)
