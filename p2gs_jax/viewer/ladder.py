@@ -16,6 +16,8 @@ WIDTHS = (320, 480, 720, 1080, 1620, 2430)
 # Shapes lie this many to a factor of two, so that no pixel is more than 9 % out of square.
 SHAPES_PER_OCTAVE = 4
 ALIGN = 8
+# Weight of the newest frame in what is expected of its size, and what each takes off the others'.
+NEWEST, FORGET = 0.3, 0.01
 # A rung of more than this share of all pixels saves too little.
 FULL_FROM = 0.6
 # Frames of a moving camera should take this long, milliseconds.
@@ -72,10 +74,32 @@ def choose(
         return min(ready, key=lambda size: abs(_area(size) - _area(rungs[0])), default=None)
     best = usable[0]
     for rung in usable:
-        limit = CLIMB if current is None or _area(rung) > _area(current) else FALL
-        if expected_ms(rung, took_ms) <= limit * target_ms:
+        higher = current is None or _area(rung) > _area(current)
+        if expected_ms(rung, took_ms) <= (CLIMB if higher else FALL) * target_ms:
             best = rung
+            if higher and current is not None:
+                break  # one step at a time: what is expected of higher ones may be out of date
     return best
+
+
+class Pace:
+    """How long frames of every size take, learned while they are shown."""
+
+    def __init__(self):
+        """Nothing is known yet."""
+        self.ms: dict[Size, float] = {}
+
+    def begin(self, known: Mapping[Size, float]) -> None:
+        """Take what was measured elsewhere, for sizes of which nothing is known."""
+        self.ms = dict(known) | self.ms
+
+    def took(self, size: Size, milliseconds: float) -> None:
+        """Learn from a frame; larger sizes become worth another try little by little."""
+        before = self.ms.get(size, milliseconds)
+        self.ms[size] = before + NEWEST * (milliseconds - before)
+        for other in self.ms:
+            if _area(other) > _area(size):
+                self.ms[other] *= 1 - FORGET
 
 
 def expected_ms(size: Size, took_ms: Mapping[Size, float]) -> float:

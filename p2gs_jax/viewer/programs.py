@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from functools import partial
 
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from p2gs_jax.config import RenderConfig
@@ -52,6 +51,7 @@ class Programs:
         cfg: RenderConfig,
         probes: Sequence[Callable[[Size], Camera]],
         on_change: Callable[[], None] = lambda: None,
+        warm_up: Callable[[Render], object] = lambda result: None,
     ):
         """Prepare; nothing is compiled yet.
 
@@ -61,11 +61,12 @@ class Programs:
             cfg: rendering options.
             probes: functions from a size to a typical camera, which new programs are tried on.
             on_change: called when something was compiled, or is about to be.
+            warm_up: called with a render of every new size, to compile what follows on it.
         """
         self._scene = (gaussians, alive)
         self._cfg = cfg
         self._probes = probes[:PROBES]
-        self._on_change = on_change
+        self._on_change, self._warm_up = on_change, warm_up
         self._programs: dict[Size, _Program] = {}
         self._most: dict[Size, int] = {}
         self._took_ms: dict[Size, float] = {}
@@ -226,12 +227,12 @@ class Programs:
     def _try(self, run, size: Size) -> tuple[int, float]:
         """Return the entries that typical views need, and how long the fastest of them took."""
         most, fastest = 0, float("inf")
-        for probe in self._probes:
-            camera = probe(size)
+        for camera in [probe(size) for probe in self._probes]:
             with self._one_frame:
                 begin = time.perf_counter()
                 result = run(*self._scene, camera)
-                jnp.asarray(result.linear).block_until_ready()
+                jax.block_until_ready(result)
                 fastest = min(fastest, 1e3 * (time.perf_counter() - begin))
             most = max(most, int(result.count))
+            self._warm_up(result)
         return most, fastest

@@ -21,7 +21,7 @@ from jaxtyping import Float, Float32
 from p2gs_jax.errors import UserError
 from p2gs_jax.types import Camera
 from p2gs_jax.viewer.frames import camera_of_browser
-from p2gs_jax.viewer.ladder import Size, choose, full_size, ladder, order_of_compilation
+from p2gs_jax.viewer.ladder import Pace, Size, choose, full_size, ladder, order_of_compilation
 from p2gs_jax.viewer.legend import clipping_legend, depth_legend, note, stops_legend
 from p2gs_jax.viewer.panel import Panel
 from p2gs_jax.viewer.settings import Settings, look_of
@@ -30,12 +30,10 @@ from p2gs_jax.viewer.splats import splat_colors
 from p2gs_jax.viewer.studio import Studio
 
 # A camera or a slider that has not moved for this long is at rest, seconds.
-REST_S = 0.2
+REST_S = 0.3
 JPEG_QUALITY = 85
 # Depth that hides frusta behind things travels this coarsely and this far, viewer units.
 DEPTH_WIDTH, DEPTH_STEP, FARTHEST = 480, 256e-5, 167.0
-# Weight of the last frame in what a size is expected to take.
-NEWEST = 0.3
 # Colours of a million splats are sent at most this often, seconds.
 SPLATS_S = 1.0
 BLACK = np.zeros((1, 1, 3), np.uint8)
@@ -85,7 +83,9 @@ class Screen:
         self._settled: tuple[Size | None, int] | None = None
         self._last_change = 0.0
         self._stopping = False
-        self._took_ms: dict[Size, float] = {}
+        self._pace = Pace()
+        self._stale = False  # whether the frame is of a camera that has moved on since
+        self._moving_size: Size | None = None
         self._last_ms = 0.0
         self._splats: viser.GaussianSplatHandle | None = None
         self._colored: Settings | None = None
@@ -165,7 +165,7 @@ class Screen:
         best = self._best(seen_by(self._client), programs.ready)
         if self._settled is None or best != self._settled[0]:
             return False
-        as_hoped = frame is not None and frame.size == best
+        as_hoped = not self._stale and frame is not None and frame.size == best
         return as_hoped or self._settled[1] == programs.compiled
 
     def _best(self, seen: Seen, ready: frozenset[Size]) -> Size | None:
@@ -190,14 +190,14 @@ class Screen:
         compiled, ready = programs.compiled, programs.ready
         size = None
         if job == "move":
-            expected = programs.took_ms | self._took_ms
-            frame = self.darkroom.frame
-            size = choose(self._rungs(seen), ready, expected, None if frame is None else frame.size)
+            self._pace.begin(programs.took_ms)
+            size = choose(self._rungs(seen), ready, self._pace.ms, self._moving_size)
+            self._moving_size = size
             self._render(seen, size, ready)
         elif job == "rest":
             programs.want(order_of_compilation(self._rungs(seen)))
             size = self._best(seen, ready)
-            if self.darkroom.frame is None or self.darkroom.frame.size != size:
+            if self._stale or self.darkroom.frame is None or self.darkroom.frame.size != size:
                 self._render(seen, size, ready)
             self.darkroom.set_depth_limits()
         if self.darkroom.frame is None:
@@ -208,18 +208,20 @@ class Screen:
             if job == "rest" and not self._moved and not self._retouched:
                 self._settled = (size, compiled)
         if job == "move" and size is not None:
-            before = self._took_ms.get(size, milliseconds)
-            self._took_ms[size] = before + NEWEST * (milliseconds - before)
-        self._last_ms = milliseconds
+            self._pace.took(size, milliseconds)
+        if job != "look":
+            self._last_ms = milliseconds
         self._say_status()
 
     def _render(self, seen: Seen, size: Size | None, ready: frozenset[Size]) -> None:
         """Render the largest size up to `size` whose tile lists hold the view."""
+        self._stale = True
         if size is None:
             return
         smaller = sorted((s for s in ready if s[0] * s[1] < size[0] * size[1]), reverse=True)
         for candidate in (size, *smaller):
             if self.darkroom.render(self.camera(seen, candidate)):
+                self._stale = False
                 return
 
     def camera(self, seen: Seen, size: Size) -> Camera:

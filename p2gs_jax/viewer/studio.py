@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from p2gs_jax.errors import UserError
+from p2gs_jax.photometry.look import develop
 from p2gs_jax.run_folder import Run
 from p2gs_jax.scene.images import ImageStore, size_at
 from p2gs_jax.types import Camera
@@ -72,6 +73,7 @@ class Studio:
             run.cfg.render,
             [self._probe(int(row)) for row in rows],
             self._tell,
+            lambda result: develop(result.linear, run.common_look()),
         )
 
     def _tell(self) -> None:

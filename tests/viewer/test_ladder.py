@@ -6,6 +6,7 @@ from p2gs_jax.viewer.ladder import (
     CLIMB,
     FALL,
     TARGET_MS,
+    Pace,
     choose,
     expected_ms,
     full_size,
@@ -55,6 +56,31 @@ def test_a_rung_is_kept_until_another_is_clearly_better():
     took = {RUNGS[0]: 10.0, RUNGS[1]: 20.0, RUNGS[2]: between}
     assert choose(RUNGS, RUNGS, took, current=RUNGS[2]) == RUNGS[2]
     assert choose(RUNGS, RUNGS, took, current=RUNGS[1]) == RUNGS[1]
+
+
+def test_climbing_goes_step_by_step():
+    fast = {rung: 1.0 for rung in RUNGS}
+    assert choose(RUNGS, RUNGS, fast, current=RUNGS[0]) == RUNGS[1]
+    assert choose(RUNGS, RUNGS, fast, current=RUNGS[1]) == RUNGS[2]
+    assert choose(RUNGS, RUNGS, {rung: 900.0 for rung in RUNGS}, current=RUNGS[2]) == RUNGS[0]
+
+
+def test_a_rung_that_was_slow_once_is_tried_again():
+    pace = Pace()
+    pace.begin({RUNGS[0]: 10.0, RUNGS[1]: 200.0})
+    assert choose(RUNGS[:2], RUNGS, pace.ms, current=RUNGS[0]) == RUNGS[0]
+    for _ in range(200):
+        pace.took(RUNGS[0], 10.0)
+    assert choose(RUNGS[:2], RUNGS, pace.ms, current=RUNGS[0]) == RUNGS[1]
+
+
+def test_the_pace_follows_what_frames_take():
+    pace = Pace()
+    pace.begin({RUNGS[0]: 10.0})
+    for _ in range(20):
+        pace.took(RUNGS[0], 50.0)
+    pace.begin({RUNGS[0]: 10.0})  # known better by now
+    np.testing.assert_allclose(pace.ms[RUNGS[0]], 50, rtol=0.01)
 
 
 def test_what_is_not_compiled_is_not_chosen():
