@@ -77,9 +77,15 @@ def _fits(value: Any, hint: Any) -> bool:
 
 
 def _shown(hint: Any) -> str:
-    if typing.get_origin(hint) is typing.Literal:
-        return ", ".join(repr(a) for a in typing.get_args(hint))
-    return getattr(hint, "__name__", str(hint))
+    """Return what a field takes, in words."""
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if origin is typing.Literal:
+        return ", ".join(repr(a) for a in args)
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join(_shown(a) for a in args)
+    if hint is type(None):
+        return '"none"'
+    return hint.__name__ if isinstance(hint, type) and not args else str(hint)
 
 
 def grid(base: FitConfig, **axes: Sequence[Any]) -> dict[str, FitConfig]:
