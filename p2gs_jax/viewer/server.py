@@ -98,6 +98,8 @@ def _furnish(server: viser.ViserServer, studio: Studio, sessions: dict[int, Sess
         sessions: those of the browsers that are here, by their ids; kept up to date.
     """
     server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+    # No button asks for it, but any page may: publishing a run through viser's relay.
+    server.request_share_url = lambda verbose=True: None
     server.scene.set_up_direction(studio.stage.up)
     start = studio.pose(studio.first_view, LIKELY_CANVAS[0] / LIKELY_CANVAS[1])
     camera = server.initial_camera

@@ -40,15 +40,8 @@ class Session:
         self._player = Player(self._play_to)
         self._shown_at = 0.0
         self._stopping = threading.Event()
-        self._thumbnails: threading.Thread | None = None
-        self._frusta = Frusta(
-            client,
-            studio.run.scene.views,
-            studio.camera_colors,
-            studio.stage,
-            studio.camera_size,
-            self.go_to,
-        )
+        self._frusta: Frusta | None = None
+        self._one_at_a_time = threading.Lock()
         client.camera.on_update(self._camera_moved)
         pose = studio.pose(studio.first_view, seen_by(client).aspect)
         self._panel.put_view(studio.first_view, float(np.rad2deg(pose.fov)))
@@ -62,7 +55,8 @@ class Session:
         self._screen.stop()
 
     def _camera_moved(self, camera: viser.CameraHandle) -> None:
-        self._frusta.keep_clear(camera.position)
+        if self._frusta is not None:
+            self._frusta.keep_clear(camera.position)
         self._screen.moved()
 
     def _move(self, pose: Pose) -> None:
@@ -114,15 +108,23 @@ class Session:
 
     def show_cameras(self, visible: bool, scale: float) -> None:
         """Show or hide the photographs' cameras, times their usual size; their pictures follow."""
-        self._frusta.resize(scale * self._studio.camera_size)
-        self._frusta.show(visible)
+        with self._one_at_a_time:
+            frusta = self._frusta or self._add_frusta()
+            frusta.resize(scale * self._studio.camera_size)
+            frusta.show(visible)
         self._screen.with_depth = visible
-        if visible and self._thumbnails is None:
-            self._thumbnails = threading.Thread(target=self._add_thumbnails, daemon=True)
-            self._thumbnails.start()
         self._screen.retouched()
 
-    def _add_thumbnails(self) -> None:
+    def _add_frusta(self) -> Frusta:
+        studio, views = self._studio, self._run.scene.views
+        size, colors = studio.camera_size, studio.camera_colors
+        frusta = Frusta(self._client, views, colors, studio.stage, size, self.go_to)
+        frusta.keep_clear(self._client.camera.position)
+        threading.Thread(target=self._add_thumbnails, args=[frusta], daemon=True).start()
+        self._frusta = frusta
+        return frusta
+
+    def _add_thumbnails(self, frusta: Frusta) -> None:
         missing = 0
         for index in range(len(self._run.scene.views)):
             if self._stopping.is_set():
@@ -131,7 +133,7 @@ class Session:
             if image is None:
                 missing += 1
             else:
-                self._frusta.set_thumbnail(index, image)
+                frusta.set_thumbnail(index, image)
         if missing:
             self._client.add_notification("Photographs", f"{missing} could not be read.")
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from functools import cached_property
 
 import cv2
@@ -20,7 +19,6 @@ from p2gs_jax.viewer.darkroom import Darkroom
 from p2gs_jax.viewer.frames import (
     TYPICAL_DISTANCE,
     Pose,
-    Stage,
     camera_of_browser,
     center,
     distance_seen,
@@ -38,7 +36,6 @@ from p2gs_jax.viewer.settings import common_settings, exposures_ev
 from p2gs_jax.viewer.splats import BrowserSplats, browser_splats
 
 
-@dataclass
 class Studio:
     """A run, ready to be looked at from several browsers.
 
@@ -47,20 +44,22 @@ class Studio:
         max_width: widest picture to render, pixels.
         store: its photographs.
         stage: how the scene stands in the viewer.
+        programs: render it.
+        listeners: called when programs were compiled, or are about to be.
     """
 
-    run: Run
-    max_width: int
-    store: ImageStore = field(init=False)
-    stage: Stage = field(init=False)
-    programs: Programs = field(init=False)
-    listeners: list[Callable[[], None]] = field(init=False, default_factory=list)
-    _lock: threading.Lock = field(init=False, default_factory=threading.Lock)
-    _thumbnails: dict[int, UInt8[np.ndarray, "h w 3"]] = field(init=False, default_factory=dict)
+    def __init__(self, run: Run, max_width: int):
+        """Find the ground and the size of things; compile nothing yet.
 
-    def __post_init__(self) -> None:
-        """Find the ground and the size of things; compile nothing yet."""
-        run = self.run
+        Args:
+            run: what is looked at.
+            max_width: widest picture to render, pixels.
+        """
+        self.run, self.max_width = run, max_width
+        self.listeners: list[Callable[[], None]] = []
+        self._lock = threading.Lock()
+        self._thumbnails: dict[int, UInt8[np.ndarray, "h w 3"]] = {}
+        self._distances: dict[int, float] = {}
         self.store = ImageStore(run.scene.views, run.cfg.data)
         self._points = run.scene.points
         if not len(self._points):
@@ -107,8 +106,7 @@ class Studio:
         """
         view = self.run.scene.views[index]
         fov = fov_that_holds(view.K, view.width, view.height, aspect)
-        distance = distance_seen(view.viewmat, self._points)
-        return pose_of(view.viewmat, self.stage, distance=distance, fov=fov)
+        return pose_of(view.viewmat, self.stage, distance=self._distance(index), fov=fov)
 
     def pose_along(self, camera: str, place: float, aspect: float) -> tuple[Pose, int]:
         """Return the browser's camera on a drive, and the row of the view nearest to it.
@@ -122,8 +120,15 @@ class Studio:
         nearest = frames[int(np.clip(round(place), 0, len(frames) - 1))]
         viewmat = pose_between([views[i].viewmat for i in frames], place)
         fov = self.pose(nearest, aspect).fov
-        distance = distance_seen(views[nearest].viewmat, self._points)
+        distance = self._distance(nearest)
         return pose_of(viewmat, self.stage, distance=distance, fov=fov), nearest
+
+    def _distance(self, index: int) -> float:
+        """Return how far away things typically are from a view, scene units."""
+        if index not in self._distances:
+            viewmat = self.run.scene.views[index].viewmat
+            self._distances[index] = distance_seen(viewmat, self._points)
+        return self._distances[index]
 
     def darkroom(self) -> Darkroom:
         """Return a darkroom of one's own."""

@@ -40,10 +40,23 @@ def page(browser, address):
 
 
 def at_rest(page):
-    """Wait until the panel says that the canvas was rendered at full size, and nothing compiles."""
+    """Wait until the canvas was rendered at full size, nothing compiles and nothing changes."""
     page.wait_for_function(
         "/640 x \\d+/.test(document.body.innerText) && !/compiling/.test(document.body.innerText)"
     )
+    return steady(page)
+
+
+def steady(page):
+    """Return the picture as soon as it has stayed the same for a second."""
+    end, before = time.monotonic() + PATIENCE_S, picture(page)
+    while True:
+        page.wait_for_timeout(1000)
+        now = picture(page)
+        if np.array_equal(now, before):
+            return now
+        assert time.monotonic() < end
+        before = now
 
 
 def control(page, label):
@@ -98,10 +111,7 @@ def test_one_stop_on_the_slider_doubles_the_brightness(page, tmp_path):
     choose(page, "Curve", "linear")
     enter(page, "Gamma", 2.2)
     enter(page, "Exposure", 0.5)
-    page.wait_for_timeout(500)
-    before = until(page, lambda shown: 0.02 < shown.mean() < 0.9)
-    page.wait_for_timeout(1500)
-    before = picture(page)
+    before = steady(page)
     enter(page, "Exposure", 1.5)
     after = until(page, lambda shown: abs(brightening(before, shown) / 2 - 1) < 0.02)
     path = tmp_path / "viewer.png"
@@ -141,16 +151,13 @@ def test_playing_moves_along_the_drive_until_it_is_paused(page):
     page.get_by_role("button", name="Play").click()
     until(page, lambda now: np.abs(now - before).mean() > 0.005)
     page.get_by_role("button", name="Pause").click()
-    page.wait_for_timeout(1000)
-    still = picture(page)
-    until(page, lambda now: np.abs(now - still).mean() < 0.01)
+    steady(page)
     assert page.get_by_role("button", name="Play").count() == 1
 
 
 def test_cameras_appear_with_their_pictures(page):
     choose(page, "Go to", "1.png")
-    page.wait_for_timeout(1000)
-    before = picture(page)
+    before = steady(page)
     page.get_by_label("Cameras", exact=True).check()
     page.get_by_text("exposure, EV from the mean").wait_for()
     page.mouse.move(300, 500)

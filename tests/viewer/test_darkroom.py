@@ -83,6 +83,18 @@ def test_a_view_looks_as_the_run_says(room, run):
         np.testing.assert_allclose(darkroom.develop(settings), expected, atol=1e-5)
 
 
+def test_exposures_count_from_the_mean_whatever_the_gauge(run):
+    old = run.params.photometry
+    shifted = replace(old, raw_exposures=old.raw_exposures + 1.3)
+    other = replace(run, params=replace(run.params, photometry=shifted))
+    index = run.scene.train_indices[1]
+    settings = settings_of_view(other, index, common_settings(other))
+    np.testing.assert_allclose(
+        look_of(other, settings).exposure, other.own_look(index).exposure, rtol=1e-5
+    )
+    np.testing.assert_allclose(settings.exposure_ev, exposures_ev(run)[index], atol=1e-5)
+
+
 def test_looks_keep_what_does_not_belong_to_them(run):
     before = Settings(gamma=3.0, exposure_ev=2.0, curve="linear", mode="stops", split=0.2)
     common = common_settings(run, before)
