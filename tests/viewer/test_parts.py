@@ -161,5 +161,5 @@ def test_a_saved_exr_can_be_read_back(tmp_path):
     back, header = read_exr(tmp_path / "a.exr")
     np.testing.assert_allclose(back, linear, rtol=1e-3)
     assert header["p2gsExposureEV"] == pytest.approx(2.0)
-    at = center(np.asarray(header["worldToCamera"]).reshape(4, 4))
+    at = center(np.asarray(header["p2gsViewmat"]).reshape(4, 4))
     np.testing.assert_allclose(at, [1, 2, 3], atol=1e-5)
