@@ -219,6 +219,7 @@ def observe_stack(stack: Stack, xy, shifts) -> Observations:
         frames,
         points,
         np.zeros(frames, int),
+        names=tuple(stack.names),
     )
 
 

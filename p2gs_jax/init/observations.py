@@ -185,6 +185,7 @@ def point_colors(
         point_count=len(scene.points),
         cameras=camera_rows(scene),
         too_coarse=int(sum((~kept).sum() for kept in keep)),
+        names=tuple(scene.views[i].name for i in scene.train_indices),
     )
 
 

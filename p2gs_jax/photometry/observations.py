@@ -30,6 +30,7 @@ class Observations:
         point_count: number of points.
         cameras: physical camera of each view, 0, 1, ...
         too_coarse: observations of these points that were left out for their scale.
+        names: what people call the views; their rows if empty.
     """
 
     views: Int[np.ndarray, " o"]
@@ -40,6 +41,7 @@ class Observations:
     point_count: int
     cameras: Int[np.ndarray, " v"]
     too_coarse: int = 0
+    names: tuple[str, ...] = ()
 
     def decoded(self, response: Response):
         """Return log exposed radiance, its stated standard deviation and dz/dy, each (O, 3)."""

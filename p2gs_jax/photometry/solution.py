@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -365,7 +366,7 @@ def describe(
         view_balance_ev=balance,
         outliers=float(ignored.mean()) if ignored.size else 0.0,
         rounds=int(fit.rounds),
-        warnings=_warnings(per_view, component, active, balance),
+        warnings=_warnings(per_view, component, active, balance, o.names),
     )
 
 
@@ -423,13 +424,13 @@ def _point_radiance(problem: Problem, fit: Fit, shift) -> Float[np.ndarray, "p 3
     return np.where(weight > 0, level, np.nan)
 
 
-def _warnings(per_view, component, active, balance) -> tuple[str, ...]:
+def _warnings(per_view, component, active, balance, names) -> tuple[str, ...]:
     out = []
     few = np.flatnonzero(per_view < MIN_OBSERVATIONS)
     if len(few):
         out.append(
             f"{len(few)} training view(s) have fewer than {MIN_OBSERVATIONS} usable track "
-            f"observations; their exposures are uncertain (rows {_listed(few)})."
+            f"observations; their exposures are uncertain ({_listed(few, names)})."
         )
     groups = len(set(component[active].tolist()))
     if groups > 1:
@@ -447,14 +448,14 @@ def _warnings(per_view, component, active, balance) -> tuple[str, ...]:
         )
         out.append(
             f"White balance changes: {len(tinted)} training view(s) are tinted against the others "
-            f"(rows {_listed(tinted)}; row {worst} by {channels} EV). An exposure here is one "
-            "number for all channels."
+            f"({_listed(tinted, names)}; most of all {_listed([worst], names)}, by {channels} EV). "
+            "An exposure here is one number for all channels."
         )
     return tuple(out)
 
 
-def _listed(rows: np.ndarray) -> str:
-    head = ", ".join(str(r) for r in rows[:8])
+def _listed(rows: Sequence[int], names: Sequence[str]) -> str:
+    head = ", ".join(names[r] if names else f"row {r}" for r in rows[:8])
     return head + (", ..." if len(rows) > 8 else "")
 
 

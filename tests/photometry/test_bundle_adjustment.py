@@ -138,10 +138,11 @@ def test_a_view_without_information_keeps_one_and_is_said(level):
     o = observe(DRIVE, ISO4)
     colors = o.colors.copy()
     colors[o.views == 4] = level
-    s = adjust(dataclasses.replace(o, colors=colors))
+    names = tuple(f"view_{i}.jpg" for i in range(o.view_count))
+    s = adjust(dataclasses.replace(o, colors=colors, names=names))
     assert s.log_exposures[4] == 0
     assert np.isinf(s.exposure_errors[4])
-    assert any("rows 4" in w for w in s.warnings)
+    assert any("(view_4.jpg)" in w for w in s.warnings)
     rest = np.arange(o.view_count) != 4
     assert exposure_error(np.exp(s.log_exposures[rest]), ISO4[rest])["ev"] < 0.01
 
@@ -219,6 +220,6 @@ def test_a_white_balance_that_changes_is_measured_and_said():
     np.testing.assert_allclose(s.view_balance_ev[7], [0.3, 0.0, -0.3], atol=0.03)
     others = np.delete(s.view_balance_ev, 7, 0)
     assert np.nanmax(np.abs(others)) < 0.05
-    assert any("White balance changes: 1 training view" in w and "rows 7" in w for w in s.warnings)
+    assert any("White balance changes: 1 training view" in w and "(row 7;" in w for w in s.warnings)
     plain = fit_model(make_problem(observe(DRIVE, truth), **LIMITS), "view_exposure")
     assert not any("White balance" in w for w in plain.warnings)
