@@ -18,7 +18,7 @@ def test_a_run_gives_its_exposures_again(tmp_path):
     cfg = p2gs_jax.preset("robust")
     cfg = dataclasses.replace(
         cfg,
-        train=dataclasses.replace(cfg.train, steps=80),
+        train=dataclasses.replace(cfg.train, steps=80, coarse_to_fine=()),
         data=dataclasses.replace(cfg.data, test_every=0),
     )
     result = p2gs_jax.fit(street.root, tmp_path / "run", cfg)

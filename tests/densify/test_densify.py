@@ -34,10 +34,11 @@ def made(n=8, seed=0, opacity=0.6):
     )
 
 
+@jax.jit
 def image(g, alive):
     K = jnp.array([[40.0, 0, 20], [0, 40.0, 16], [0, 0, 1]])
     cam = Camera(jnp.eye(4), K, 40, 32)
-    return np.asarray(render_linear(g, alive, cam, RenderConfig(), 8192).linear)
+    return render_linear(g, alive, cam, RenderConfig(), 8192).linear
 
 
 def test_growing_changes_no_pixel():

@@ -1,6 +1,7 @@
 """Photographs compared through rendered depth: right colours, nothing hidden, nothing dropped."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -110,18 +111,12 @@ def test_an_overflow_in_the_other_view_is_not_silent():
             loss=dataclasses.replace(base.loss, relative_exposure=relative),
         )
         partner = Partner(jnp.int32(1), camera=back, batch=other)
+        loss = jax.jit(
+            functools.partial(total_loss, cfg=cfg, active_degree=jnp.int32(0), extent=1.0),
+            static_argnames="capacity",
+        )
         for capacity, fits in ((4, False), (4096, True)):
-            _, aux = total_loss(
-                params,
-                None,
-                population,
-                batch,
-                partner,
-                cfg,
-                capacity=capacity,
-                active_degree=jnp.int32(0),
-                extent=1.0,
-            )
+            _, aux = loss(params, None, population, batch, partner, capacity=capacity)
             assert int(aux.render.count) == 0
             assert int(aux.entries) > 4
             assert bool(aux.overflow) is not fits

@@ -39,7 +39,7 @@ def weights_for(cam, seed=0):
 def scalar(g, cam, cfg, weights, capacity=CAPACITY):
     r = render_linear(g, alive_of(g), cam, cfg, capacity)
     a, b, c = (jnp.asarray(w, r.linear.dtype) for w in weights)
-    return jnp.sum(r.linear * a) + jnp.sum(r.alpha * b) + jnp.sum(r.depth * c)
+    return jnp.sum(r.linear * a) + jnp.sum(r.alpha * b) + jnp.sum(r.depth * c), r
 
 
 @pytest.fixture(scope="module")
@@ -48,26 +48,23 @@ def oracle():
     with jax.enable_x64(True):
         g, cam = street(dtype=np.float64)
         weights = weights_for(cam)
-        r = render(g, cam, ORACLE)
-        v = jax.jit(jax.grad(lambda g: scalar(g, cam, ORACLE, weights)))(g)
+        v, r = jax.jit(jax.grad(lambda g: scalar(g, cam, ORACLE, weights), has_aux=True))(g)
         return jax.tree.map(np.asarray, r), jax.tree.map(np.asarray, v), weights
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
-@pytest.mark.parametrize("tile", [(16, 8), (16, 16), (8, 8)])
-@pytest.mark.parametrize("stop", [1e-4, None])
+@pytest.mark.parametrize(("tile", "stop"), [((16, 8), 1e-4), ((16, 16), None), ((8, 8), None)])
 def test_values_and_gradients_match_oracle(oracle, tile, stop, implementation):
     expected, v_expected, weights = oracle
     cfg = dataclasses.replace(CFG, tile=tile, stop_error=stop, implementation=implementation)
     g, cam = street()
-    r = render(g, cam, cfg)
+    v, r = jax.jit(jax.grad(lambda g: scalar(g, cam, cfg, weights), has_aux=True))(g)
     assert not bool(r.overflow)
     # The stop rule hides at most its transmittance times the largest value behind it.
     brightest = float(view_radiance(g, cam, cfg).max())
     for name, largest in (("linear", brightest), ("alpha", 1.0), ("depth", 150.0)):
         a, b = np.asarray(getattr(r, name)), getattr(expected, name)
         assert np.abs(a - b).max() <= 2e-5 * np.abs(b).max() + (stop or 0) * largest, name
-    v = jax.jit(jax.grad(lambda g: scalar(g, cam, cfg, weights)))(g)
     for name in FIELDS:
         a, b = np.asarray(getattr(v, name)), getattr(v_expected, name)
         error = np.linalg.norm(a - b) / np.linalg.norm(b)
@@ -80,8 +77,8 @@ def test_oracle_gradient_matches_finite_differences():
         # Above a vanishing cutoff the image is smooth, so central differences are meaningful.
         cfg = dataclasses.replace(ORACLE, alpha_cutoff=1e-12, blur=0.3)
         weights = weights_for(cam)
-        f = jax.jit(lambda g: scalar(g, cam, cfg, weights))
-        v = jax.jit(jax.grad(lambda g: scalar(g, cam, cfg, weights)))(g)
+        f = jax.jit(lambda g: scalar(g, cam, cfg, weights)[0])
+        v = jax.jit(jax.grad(lambda g: scalar(g, cam, cfg, weights)[0]))(g)
         rng = np.random.default_rng(1)
         for name in FIELDS:
             direction = jnp.asarray(rng.normal(size=getattr(g, name).shape))
@@ -171,7 +168,7 @@ def test_dead_gaussians_are_invisible_and_get_no_gradient():
 
 def test_capacity_is_exact_and_overflow_is_said():
     g, cam = street(n=300)
-    need = int(required_capacity(g, alive_of(g), cam, CFG))
+    need = int(jax.jit(lambda g: required_capacity(g, alive_of(g), cam, CFG))(g))
     fits, short = (render(g, cam, CFG, c) for c in (need, need - 1))
     assert int(fits.count) == need
     assert not bool(fits.overflow)
@@ -187,43 +184,6 @@ def one(mean=(0, 0, 4), log_scale=-1.0, logit=2.0, sh=0.0, quat=(1, 0, 0, 0), n=
         opacity_logits=jnp.full((n,), logit, jnp.float32),
         sh=jnp.full((n, 1, 3), sh, jnp.float32),
     )
-
-
-@pytest.mark.parametrize(
-    ("case", "g"),
-    [
-        ("behind", one(mean=(0, 0, -3))),
-        ("on the near plane", one(mean=(0, 0, 0.05))),
-        ("just before it", one(mean=(0.2, 0, 0.0501))),
-        ("far outside", one(mean=(1e4, 0, 1))),
-        ("zero quaternion", one(quat=(0, 0, 0, 0))),
-        ("huge quaternion", one(quat=(1e15, 2e15, 0, 0))),
-        ("tiny", one(log_scale=-16.0)),
-        ("covers everything", one(log_scale=7.0)),
-        ("transparent", one(logit=-80.0)),
-        ("opaque", one(logit=40.0)),
-        ("black", one(sh=-80.0)),
-        ("very bright", one(sh=40.0)),
-        ("identical twins", one(n=7)),
-        ("a thousand in one place", one(n=1000, logit=-2.0)),
-    ],
-)
-def test_hard_cases_stay_finite(case, g):
-    cam = camera(37, 21, 30.0)
-
-    def f(g):
-        r = render_linear(g, alive_of(g), cam, CFG, 20_000)
-        return jnp.sum(r.linear) + jnp.sum(r.alpha) + jnp.sum(r.depth), r
-
-    v, r = jax.jit(jax.grad(f, has_aux=True))(g)
-    assert not bool(r.overflow)
-    for leaf in jax.tree.leaves((v, r.linear, r.alpha, r.depth)):
-        assert np.all(np.isfinite(leaf)), case
-    assert float(r.alpha.min()) >= 0
-    assert float(r.alpha.max()) <= 1
-    if case in ("behind", "far outside", "transparent"):
-        assert float(r.alpha.max()) == 0
-        assert not any(np.any(leaf) for leaf in jax.tree.leaves(v))
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
@@ -260,8 +220,13 @@ def test_depth_order_decides_who_is_in_front():
 def test_tile_lists_match_brute_force():
     """Every splat that reaches a pixel centre of a tile is listed there, in depth order."""
     g, cam = street(n=300)
-    splats = project(g, alive_of(g), cam, CFG)
-    tiles = bin_tiles(splats, cam.width, cam.height, CAPACITY, CFG)
+
+    @jax.jit
+    def lists(g):
+        splats = project(g, alive_of(g), cam, CFG)
+        return splats, bin_tiles(splats, cam.width, cam.height, CAPACITY, CFG)
+
+    splats, tiles = lists(g)
     ids, offsets = np.asarray(tiles.gaussian_ids), np.asarray(tiles.offsets)
     m, f = np.asarray(splats.means2d, np.float64), np.asarray(splats.conic_factor, np.float64)
     x, y = np.meshgrid(np.arange(cam.width) + 0.5, np.arange(cam.height) + 0.5)

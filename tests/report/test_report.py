@@ -168,7 +168,7 @@ def test_a_scene_that_has_moved_is_said(run, tmp_path):
     edit(moved / "config.json", lambda c: c.update(scene=str(tmp_path / "gone")))
     text = write_report(moved).read_text()
     assert headings(text) == HEADINGS
-    assert f"{tmp_path / 'gone'} does not exist" in words_of(text)
+    assert f"{tmp_path / 'gone'}, is not there" in words_of(text)
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,7 @@ SMALL = with_fields(
     {
         "train.steps": 100,
         "train.log_every": 5,
+        "train.coarse_to_fine": [],
         "densify.min_every_steps": 5,
         "densify.max_gaussians": "auto",
         "render.sh_degree": 0,

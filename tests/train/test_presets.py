@@ -16,7 +16,7 @@ def small(cfg, steps=40):
     return dataclasses.replace(
         cfg,
         render=dataclasses.replace(cfg.render, sh_degree=1),
-        train=dataclasses.replace(cfg.train, steps=steps),
+        train=dataclasses.replace(cfg.train, steps=steps, coarse_to_fine=()),
         densify=dataclasses.replace(cfg.densify, min_every_steps=10, max_gaussians=400),
     )
 

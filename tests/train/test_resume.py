@@ -24,6 +24,8 @@ def command(scene, run, *extra):
             "0",
             "--densify.max-gaussians",
             "400",
+            "--train.coarse-to-fine",
+            "0.4",
         ),
         *("--densify.min-every-steps", "10", "--render.sh-degree", "1", *extra),
     ]

@@ -11,7 +11,15 @@ from p2gs_jax.sweep import grid, read_sweep, sweep, with_fields
 from p2gs_jax.sweep.rows import to_markdown
 
 BASE = p2gs_jax.preset("robust")
-SMALL = with_fields(BASE, {"train.steps": 12, "densify.max_gaussians": 300, "render.sh_degree": 0})
+SMALL = with_fields(
+    BASE,
+    {
+        "train.steps": 12,
+        "train.coarse_to_fine": [],
+        "densify.max_gaussians": 300,
+        "render.sh_degree": 0,
+    },
+)
 
 
 def test_fields_are_replaced_by_their_dotted_names():
@@ -60,10 +68,7 @@ def test_a_sweep_keeps_what_is_done_and_names_what_failed(tmp_path):
     scene = make_scene(tmp_path / "scene")
     configs = {
         "good": SMALL,
-        "empty": with_fields(
-            p2gs_jax.preset("paper"),
-            {"train.steps": 60, "densify.prune_opacity": 0.99, "densify.min_every_steps": 5},
-        ),
+        "bad": with_fields(p2gs_jax.preset("paper"), {"photometry.known": "exif"}),
     }
     said = []
     result = sweep(scene, tmp_path / "out", configs, seeds=[0, 1], report=said.append)
@@ -71,17 +76,17 @@ def test_a_sweep_keeps_what_is_done_and_names_what_failed(tmp_path):
     assert status == {
         ("good", 0): "done",
         ("good", 1): "done",
-        ("empty", 0): "failed",
-        ("empty", 1): "failed",
+        ("bad", 0): "failed",
+        ("bad", 1): "failed",
     }
     good = result.rows[0]
     assert good["steps"] == 12
     assert good["train_psnr"] > 5
-    assert "every Gaussian" in result.rows[2]["reason"]
+    assert "starts exposures at random" in result.rows[2]["reason"]
     assert json.loads((tmp_path / "out" / "sweep.json").read_text()) == result.rows
     table = (tmp_path / "out" / "sweep.md").read_text()
     assert "| good | 2 of 2 |" in table
-    assert "empty, seed 0: failed" in table
+    assert "bad, seed 0: failed" in table
     stamp = (tmp_path / "out" / "good" / "seed_0" / "metrics.json").stat().st_mtime_ns
     again = sweep(scene, tmp_path / "out", {"good": SMALL}, seeds=[0, 1], report=said.append)
     assert [r["status"] for r in again.rows] == ["done", "done"]
