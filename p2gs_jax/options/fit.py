@@ -20,7 +20,7 @@ Preset = Annotated[configs.PresetName, tyro.conf.arg(metavar="NAME")]
 Duration = Annotated[str | None, tyro.conf.arg(metavar="TIME")]
 Count = Annotated[str | None, tyro.conf.arg(metavar="N|auto")]
 Exposures = Annotated[str | None, tyro.conf.arg(metavar="FILE|exif")]
-Weights = Annotated[str | None, tyro.conf.arg(metavar="FILE")]
+Weights = Annotated[str | None, tyro.conf.arg(metavar="alex|vgg|FILE")]
 Folder = Annotated[Path, tyro.conf.arg(metavar="DIR")]
 Deviation = Annotated[float | None, tyro.conf.arg(metavar="STOPS")]
 
@@ -68,7 +68,7 @@ class Fit:
     reference: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Photographs of the same views under one common exposure, to judge against."""
     lpips_weights: Weights = None
-    """Weights of LPIPS (.npz, docs/files.md): judge with it as well."""
+    """Judge with LPIPS too: alex or vgg (pip install 'p2gs-jax[lpips]'), or a .npz of weights."""
     seed: int | None = None
     """Seeds every random choice; default: 0."""
 

