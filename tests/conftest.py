@@ -11,7 +11,7 @@ import pytest
 # session compiles everything once.
 _COMPILED = tempfile.TemporaryDirectory(prefix="p2gs-compiled-")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", _COMPILED.name)
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 

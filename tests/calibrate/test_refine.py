@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+import pytest
 
 import p2gs_jax
 from p2gs_jax.evaluate.alignment import exposure_error
@@ -11,6 +12,7 @@ from p2gs_jax.refine import calibrate_run
 from p2gs_jax.synth.write import write_street
 
 
+@pytest.mark.slow
 def test_a_run_gives_its_exposures_again(tmp_path):
     street = write_street(
         tmp_path / "street", frames=4, width=160, height=112, points=6000, iso_std=4.0, seed=1
@@ -31,3 +33,16 @@ def test_a_run_gives_its_exposures_again(tmp_path):
     assert exposure_error(found, known)["ev"] < 0.05
     saved = read_photometry(tmp_path / "out" / "photometry.json")
     assert len(saved["views"]) == len(known)
+
+
+def test_what_a_small_run_can_say_is_written(finished_run, tmp_path):
+    run = p2gs_jax.load_run(finished_run)
+    found = calibrate_run(finished_run, tmp_path / "out", run.cfg.photometry)
+    saved = read_photometry(tmp_path / "out" / "photometry.json")["views"]
+    names = [run.scene.views[i].name for i in run.scene.train_indices]
+    assert [v["image"] for v in saved] == names
+    assert all(v["exposure"] > 0 for v in saved)
+    assert (tmp_path / "out" / "calibration.png").is_file()
+    # Flat dots give depth nearly nowhere: views without an observation are named.
+    assert found.observations < 100
+    assert any("usable track observations" in m and names[0] in m for m in found.messages)

@@ -29,7 +29,13 @@ def oracle(name: str):
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
-@pytest.mark.parametrize("case", CASES, ids=lambda c: c.name)
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(c, id=c.name, marks=pytest.mark.slow if c.name.startswith("10^5") else ())
+        for c in CASES
+    ],
+)
 def test_hard_case(case: HardCase, implementation: str):
     cfg = IMPLEMENTATIONS[implementation]
     if case.view is not VIEW and implementation not in OF_ALL_SIZES:

@@ -145,6 +145,7 @@ def test_growth_goes_on_while_it_gains(monkeypatch, tmp_path, scene):
     assert "with its time or room" in said[0]
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_grows_like_one_that_was_not(monkeypatch, tmp_path, scene):
     cfg = with_fields(SMALL, {"train.checkpoint_every_s": 0.0})
     whole, _ = fit(monkeypatch, scene, tmp_path / "whole", population, cfg)

@@ -54,16 +54,10 @@ def test_opacity_resets_empty_the_scene_and_it_grows_back(tmp_path):
     assert max(np.diff(losses)) > 0.01  # the reset
 
 
-READINGS = [
-    *(
-        pytest.param(f, "depth", marks=[] if f == "observed_ldr" else pytest.mark.slow)
-        for f in FORMS
-    ),
-    pytest.param("observed_ldr", None, marks=pytest.mark.slow),
-]
-
-
-@pytest.mark.parametrize(("form", "correspondence"), READINGS)
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("form", "correspondence"), [*((f, "depth") for f in FORMS), ("observed_ldr", None)]
+)
 def test_every_reading_runs(tmp_path, form, correspondence):
     cfg = small(p2gs_jax.preset("robust"))
     relative = dataclasses.replace(
