@@ -134,6 +134,7 @@ def test_growth_ends_where_it_gains_nothing(monkeypatch, tmp_path, scene, taken)
     assert all(min(steps[row]) < end for row in set(range(12)) - held_out)
 
 
+@pytest.mark.slow
 def test_growth_goes_on_while_it_gains(monkeypatch, tmp_path, scene):
     result, said = fit(monkeypatch, scene, tmp_path / "run", population)
     looks = result.metrics["growth"]["looks"]
