@@ -454,7 +454,7 @@ def _warnings(per_view, component, active, balance, names) -> tuple[str, ...]:
     return tuple(out)
 
 
-def _listed(rows: Sequence[int], names: Sequence[str]) -> str:
+def _listed(rows: Sequence[int] | Int[np.ndarray, " n"], names: Sequence[str]) -> str:
     head = ", ".join(names[r] if names else f"row {r}" for r in rows[:8])
     return head + (", ..." if len(rows) > 8 else "")
 
