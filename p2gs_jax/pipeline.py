@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from p2gs_jax.config import FitConfig
+from p2gs_jax.config import from_dict as config_from_dict
 from p2gs_jax.config import to_dict as config_to_dict
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.lpips import LpipsWeights
@@ -222,7 +223,8 @@ def _finish_estimate(
 def check_run_dir(run_dir: Path, resume: bool, cfg: FitConfig) -> None:
     """Refuse to overwrite a run, and to continue one under other options.
 
-    Options of the evaluation may differ: they do not change the fit.
+    Options of the evaluation may differ: they do not change the fit. An option that the run's own
+    version did not have counts as its default.
 
     Raises:
         UserError: the folder holds a run and `resume` is not set, is not a folder, or holds a run
@@ -239,7 +241,7 @@ def check_run_dir(run_dir: Path, resume: bool, cfg: FitConfig) -> None:
             fix="add --resume to continue it, or name another folder with --out",
         )
     try:
-        saved = dict(json.loads(path.read_text())["fit"])
+        saved = plain(config_to_dict(config_from_dict(json.loads(path.read_text())["fit"])))
     except (ValueError, KeyError, TypeError) as error:
         raise UserError(
             f"{path} cannot be read ({error}).", fix="start again in another folder"

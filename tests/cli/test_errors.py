@@ -215,6 +215,26 @@ def test_resuming_under_another_evaluation_is_allowed(tmp_path):
     assert "evaluation" not in str(error.value)
 
 
+def test_a_run_of_an_older_version_goes_on(tmp_path):
+    cfg = to_dict(preset("paper"))
+    del cfg["render"]["deterministic"]
+    del cfg["densify"]["method"]
+
+    def write():
+        (tmp_path / "config.json").write_text(json.dumps({"scene": "s", "fit": cfg}))
+
+    write()
+    with pytest.raises(UserError, match=r"densify.method was mcmc, now adaptive\."):
+        check_run_dir(tmp_path, True, preset("paper"))
+    cfg["densify"]["method"] = "adaptive"
+    write()
+    check_run_dir(tmp_path, True, preset("paper"))
+    cfg["render"]["colour"] = True
+    write()
+    with pytest.raises(UserError, match=r"unknown field\(s\) in RenderConfig: colour"):
+        check_run_dir(tmp_path, True, preset("paper"))
+
+
 def test_durations():
     assert parse_duration("90") == parse_duration("90s") == 90
     assert parse_duration("5m") == 300
