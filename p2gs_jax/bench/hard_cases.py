@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -16,6 +15,7 @@ import numpy as np
 from p2gs_jax.bench.metrics import FIELDS
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render import project, render_linear, view_radiance
+from p2gs_jax.render.binning.boxes import grid_size
 from p2gs_jax.render.spherical_harmonics import C0
 from p2gs_jax.types import Camera, Gaussians, Splats2D
 
@@ -249,10 +249,10 @@ def _padded(gaussians: Gaussians):
 
 def _evaluate(gaussians: Gaussians, view: Camera, cfg: RenderConfig):
     padded, alive = _padded(gaussians)
-    tiles = math.ceil(view.width / cfg.tile[0]) * math.ceil(view.height / cfg.tile[1])
+    across, down = grid_size(view.width, view.height, cfg.tile)
     weights = tuple(jnp.asarray(w, gaussians.means.dtype) for w in _weights(view))
     gradient, result = _value_and_gradient(
-        padded, alive, view, weights, cfg, tiles * padded.capacity
+        padded, alive, view, weights, cfg, across * down * padded.capacity
     )
     gradient = jax.tree.map(lambda a: np.asarray(a[: gaussians.capacity]), gradient)
     return jax.tree.map(np.asarray, result), gradient

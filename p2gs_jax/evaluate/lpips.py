@@ -90,6 +90,11 @@ class Network:
         return size
 
 
+def lin_name(block: int) -> str:
+    """Return what the weights file calls the weights of channels after a block."""
+    return f"lin{block}.model.1.weight"
+
+
 # Layers and their places as in torchvision, by which the weights are named.
 ALEXNET = Network(
     "AlexNet",

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.evaluate.lpips import ALEXNET, VGG16, Network
+from p2gs_jax.evaluate.lpips import ALEXNET, VGG16, Network, lin_name
 
 # What users write: the network, the package's file and its name for the network.
 PACKAGED: dict[str, tuple[Network, str, str]] = {
@@ -55,17 +55,17 @@ def packaged_file(name: str) -> Path:
     return path
 
 
-def packaged_arrays(name: str) -> dict[str, Float[np.ndarray, "..."]]:
+def packaged_arrays(name: str, path: Path) -> dict[str, Float[np.ndarray, "..."]]:
     """Return a network's arrays, named and shaped as in the authors' PyTorch module.
 
     Args:
         name: a key of `PACKAGED`.
+        path: from `packaged_file`.
 
     Raises:
-        UserError: the package is missing or damaged.
+        UserError: the file is damaged.
     """
     network, _, module = PACKAGED[name]
-    path = packaged_file(name)
     try:
         with path.open("rb") as file:
             tree = _Arrays(file).load()
@@ -76,7 +76,7 @@ def packaged_arrays(name: str) -> dict[str, Float[np.ndarray, "..."]]:
             arrays[f"{c.name}.bias"] = np.asarray(layer["bias"])
         for k in range(len(network.blocks)):
             kernel = np.asarray(tree[f"NetLinLayer_{k}"]["Conv_0"]["kernel"])
-            arrays[f"lin{k}.model.1.weight"] = kernel.transpose(3, 2, 0, 1)
+            arrays[lin_name(k)] = kernel.transpose(3, 2, 0, 1)
     except (OSError, EOFError, pickle.UnpicklingError, KeyError, TypeError, ValueError) as error:
         raise UserError(
             f"{path} does not hold the weights of LPIPS: {error!r}.",

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.evaluate.lpips import ALEXNET, VGG16, LpipsWeights, Network
+from p2gs_jax.evaluate.lpips import ALEXNET, VGG16, LpipsWeights, Network, lin_name
 from p2gs_jax.evaluate.lpips_package import PACKAGED, packaged_arrays, packaged_file
 
 # Mean and deviation of ImageNet's colours, for values in [-1, 1] (the authors' code, version 0.1).
@@ -32,8 +32,8 @@ def read_lpips_weights(path: str | Path) -> LpipsWeights:
             package is not installed.
     """
     if str(path) in PACKAGED:
-        arrays = packaged_arrays(str(path))
-        path = packaged_file(str(path))
+        name, path = str(path), packaged_file(str(path))
+        arrays = packaged_arrays(name, path)
     else:
         path = Path(path)
         arrays = _read(path)
@@ -56,7 +56,8 @@ def read_lpips_weights(path: str | Path) -> LpipsWeights:
         {n: jnp.asarray(arrays[f"{n}.weight"].transpose(2, 3, 1, 0), jnp.float32) for n in names},
         {n: jnp.asarray(arrays[f"{n}.bias"], jnp.float32) for n in names},
         tuple(
-            jnp.asarray(arrays[_lin(k)].ravel(), jnp.float32) for k in range(len(network.blocks))
+            jnp.asarray(arrays[lin_name(k)].ravel(), jnp.float32)
+            for k in range(len(network.blocks))
         ),
         jnp.asarray(arrays.get("scaling_layer.shift", np.array(SHIFT)).ravel(), jnp.float32),
         jnp.asarray(arrays.get("scaling_layer.scale", np.array(SCALE)).ravel(), jnp.float32),
@@ -83,12 +84,8 @@ def _read(path: Path) -> dict[str, np.ndarray]:
     # Newer releases of the package name them twice.
     for k in range(len(ALEXNET.blocks)):
         if f"lins.{k}.model.1.weight" in arrays:
-            arrays.setdefault(_lin(k), arrays[f"lins.{k}.model.1.weight"])
+            arrays.setdefault(lin_name(k), arrays[f"lins.{k}.model.1.weight"])
     return arrays
-
-
-def _lin(block: int) -> str:
-    return f"lin{block}.model.1.weight"
 
 
 def _shapes(network: Network) -> dict[str, tuple[int, ...]]:
@@ -97,7 +94,7 @@ def _shapes(network: Network) -> dict[str, tuple[int, ...]]:
     for c in network.convolutions:
         shapes[f"{c.name}.weight"] = (c.outputs, c.inputs, c.kernel, c.kernel)
         shapes[f"{c.name}.bias"] = (c.outputs,)
-    return shapes | {_lin(k): (1, c, 1, 1) for k, c in enumerate(network.channels)}
+    return shapes | {lin_name(k): (1, c, 1, 1) for k, c in enumerate(network.channels)}
 
 
 def _check(

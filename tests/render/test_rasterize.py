@@ -53,7 +53,9 @@ def oracle():
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
-@pytest.mark.parametrize(("tile", "stop"), [((16, 8), 1e-4), ((16, 16), None), ((8, 8), None)])
+@pytest.mark.parametrize(
+    ("tile", "stop"), [((16, 8), 1e-4), ((16, 8), None), ((16, 16), None), ((8, 8), None)]
+)
 def test_values_and_gradients_match_oracle(oracle, tile, stop, implementation):
     expected, v_expected, weights = oracle
     cfg = dataclasses.replace(CFG, tile=tile, stop_error=stop, implementation=implementation)
@@ -184,6 +186,56 @@ def one(mean=(0, 0, 4), log_scale=-1.0, logit=2.0, sh=0.0, quat=(1, 0, 0, 0), n=
         opacity_logits=jnp.full((n,), logit, jnp.float32),
         sh=jnp.full((n, 1, 3), sh, jnp.float32),
     )
+
+
+MOST = 1000
+
+
+def padded(g):
+    """Return the scene with room for `MOST`, so that all share one program."""
+    return jax.tree.map(
+        lambda a: jnp.concatenate([a, jnp.zeros((MOST - len(a), *a.shape[1:]), a.dtype)]), g
+    )
+
+
+@jax.jit
+def pull_of_everything(g, alive):
+    def f(g):
+        r = render_linear(g, alive, camera(37, 21, 30.0), CFG, 20_000)
+        return jnp.sum(r.linear) + jnp.sum(r.alpha) + jnp.sum(r.depth), r
+
+    return jax.grad(f, has_aux=True)(g)
+
+
+@pytest.mark.parametrize(
+    ("case", "g"),
+    [
+        ("behind", one(mean=(0, 0, -3))),
+        ("on the near plane", one(mean=(0, 0, 0.05))),
+        ("just before it", one(mean=(0.2, 0, 0.0501))),
+        ("far outside", one(mean=(1e4, 0, 1))),
+        ("zero quaternion", one(quat=(0, 0, 0, 0))),
+        ("huge quaternion", one(quat=(1e15, 2e15, 0, 0))),
+        ("tiny", one(log_scale=-16.0)),
+        ("covers everything", one(log_scale=7.0)),
+        ("transparent", one(logit=-80.0)),
+        ("opaque", one(logit=40.0)),
+        ("black", one(sh=-80.0)),
+        ("very bright", one(sh=40.0)),
+        ("identical twins", one(n=7)),
+        ("a thousand in one place", one(n=1000, logit=-2.0)),
+    ],
+)
+def test_hard_cases_stay_finite(case, g):
+    v, r = pull_of_everything(padded(g), jnp.arange(MOST) < g.capacity)
+    assert not bool(r.overflow)
+    for leaf in jax.tree.leaves((v, r.linear, r.alpha, r.depth)):
+        assert np.all(np.isfinite(leaf)), case
+    assert float(r.alpha.min()) >= 0
+    assert float(r.alpha.max()) <= 1
+    if case in ("behind", "far outside", "transparent"):
+        assert float(r.alpha.max()) == 0
+        assert not any(np.any(leaf) for leaf in jax.tree.leaves(v))
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)

@@ -71,25 +71,30 @@ def test_a_sweep_keeps_what_is_done_and_names_what_failed(tmp_path):
         "bad": with_fields(p2gs_jax.preset("paper"), {"photometry.known": "exif"}),
     }
     said = []
-    result = sweep(scene, tmp_path / "out", configs, seeds=[3], report=said.append)
+    result = sweep(scene, tmp_path / "out", configs, seeds=[0, 1], report=said.append)
     status = {(r["name"], r["seed"]): r["status"] for r in result.rows}
-    assert status == {("good", 3): "done", ("bad", 3): "failed"}
+    assert status == {
+        ("good", 0): "done",
+        ("good", 1): "done",
+        ("bad", 0): "failed",
+        ("bad", 1): "failed",
+    }
     good = result.rows[0]
     assert good["steps"] == 12
     assert good["train_psnr"] > 5
-    assert "starts exposures at random" in result.rows[1]["reason"]
+    assert "starts exposures at random" in result.rows[2]["reason"]
     assert json.loads((tmp_path / "out" / "sweep.json").read_text()) == result.rows
     table = (tmp_path / "out" / "sweep.md").read_text()
-    assert "| good | 1 of 1 |" in table
-    assert "bad, seed 3: failed" in table
-    stamp = (tmp_path / "out" / "good" / "seed_3" / "metrics.json").stat().st_mtime_ns
-    again = sweep(scene, tmp_path / "out", {"good": SMALL}, seeds=[3], report=said.append)
-    assert [r["status"] for r in again.rows] == ["done"]
+    assert "| good | 2 of 2 |" in table
+    assert "bad, seed 0: failed" in table
+    stamp = (tmp_path / "out" / "good" / "seed_0" / "metrics.json").stat().st_mtime_ns
+    again = sweep(scene, tmp_path / "out", {"good": SMALL}, seeds=[0, 1], report=said.append)
+    assert [r["status"] for r in again.rows] == ["done", "done"]
     assert said[-1].endswith("kept")
-    assert (tmp_path / "out" / "good" / "seed_3" / "metrics.json").stat().st_mtime_ns == stamp
+    assert (tmp_path / "out" / "good" / "seed_0" / "metrics.json").stat().st_mtime_ns == stamp
     other = {"good": with_fields(SMALL, {"train.steps": 13})}
     with pytest.raises(p2gs_jax.UserError, match="other options"):
-        sweep(scene, tmp_path / "out", other, seeds=[3])
+        sweep(scene, tmp_path / "out", other)
     twins = {"a b": SMALL, "a_b": SMALL}
     with pytest.raises(p2gs_jax.UserError, match="share the folder"):
         sweep(scene, tmp_path / "out", twins)
