@@ -164,7 +164,7 @@ def forward(rows, ids, offsets, plan: Plan):
         _longest_first(offsets[:-1], offsets[1:], plan),
         jnp.maximum(jnp.max(radiance), 1e-30)[None],
     )
-    return tuple(image), stops
+    return tuple(image), (offsets, stops)
 
 
 def _backward_kernel(rows, ids, offsets, stops, order, *arrays, plan: Plan):
@@ -244,8 +244,9 @@ def _in_order(entries, ids, count: int):
     )(entries, places, runs)[:count]
 
 
-def backward(rows, ids, offsets, stops, image, v_image, plan: Plan):
+def backward(rows, ids, residuals, image, v_image, plan: Plan):
     """Return the gradient of the rows from those of the channels and transmittance."""
+    offsets, stops = residuals
     _check(plan)
     capacity, count = ids.shape[0], rows.shape[0]
     shape = (capacity + 1 if plan.deterministic else count, COLUMNS)

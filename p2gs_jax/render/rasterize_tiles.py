@@ -2,8 +2,8 @@
 
 An implementation is a module with a pair of functions and its exponent's unit:
 `forward(rows, ids, offsets, plan)` gives the channels of the image and the transmittance, [T P]
-each, and where each tile stopped in the list, [T];
-`backward(rows, ids, offsets, stops, image, v_image, plan)` gives the gradient of the rows.
+each, and what its own backward needs;
+`backward(rows, ids, residuals, image, v_image, plan)` gives the gradient of the rows.
 """
 
 from __future__ import annotations
@@ -23,6 +23,9 @@ from p2gs_jax.render.cutoff import SMALLEST_CUTOFF
 from p2gs_jax.render.tile_rows import Plan, pack_rows
 from p2gs_jax.types import Splats2D, TileList
 
+# Lanes for every tile of an image too small to fill them.
+MOST_LANES = 8
+
 TileImplementation = Literal["xla", "pallas"]
 
 
@@ -37,13 +40,13 @@ def _composite(rows, ids, offsets, plan: Plan, name: TileImplementation):
 
 
 def _composite_fwd(rows, ids, offsets, plan: Plan, name: TileImplementation):
-    image, stops = _module(name).forward(rows, ids, offsets, plan)
-    return image, (rows, ids, offsets, stops, image)
+    image, own = _module(name).forward(rows, ids, offsets, plan)
+    return image, (rows, ids, own, image)
 
 
 def _composite_bwd(plan: Plan, name: TileImplementation, residuals, v_image):
-    rows, ids, offsets, stops, image = residuals
-    return _module(name).backward(rows, ids, offsets, stops, image, v_image, plan), None, None
+    rows, ids, own, image = residuals
+    return _module(name).backward(rows, ids, own, image, v_image, plan), None, None
 
 
 _composite.defvjp(_composite_fwd, _composite_bwd)
@@ -90,7 +93,7 @@ def rasterize_tiles(
         down=down,
         tile_x=tile_x,
         tile_y=tile_y,
-        lanes=max(1, min(cfg.pixels_in_flight // (tile_x * tile_y), across * down)),
+        lanes=max(1, min(cfg.pixels_in_flight // (tile_x * tile_y), MOST_LANES * across * down)),
         chunk=cfg.chunk,
         gaussians=splats.depths.shape[0],
         channels=4 if with_depth else 3,

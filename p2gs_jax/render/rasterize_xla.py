@@ -1,13 +1,16 @@
 """The lane queue: tile compositing in plain XLA, forward and backward, with no per-tile cap.
 
-B lanes each own one tile. Every iteration a lane composites the next C entries of its list; when
-its list ends, or all its pixels are opaque, it writes its tile and takes the next one, longest
-lists first. Work wasted on padding is bounded by C per tile, whatever the spread of list lengths.
+B lanes each own one segment of a tile's list. Every iteration a lane composites the next C entries
+of its segment; when that ends, or all its pixels are opaque, it writes the result and takes the
+next segment, longest first. Long lists are cut so that no segment is longer than a fraction of a
+lane's fair share (segments.py): all lanes are busy to the end, however few tiles there are and
+however uneven their lists. Compositing is associative, so the segments of a tile are composited
+independently and merged. Work wasted on padding is bounded by C per tile.
 
 The exponential is a polynomial on [-0.7, 0], squared as often as it takes to reach the cutoff
 (`exponent_scale`); rows are what tile_rows.py says.
 
-Backward. The same queue, front to back. With R the gradient-weighted light still to come,
+Backward. The same segments, front to back, each from the transmittance and light before it. With R the gradient-weighted light still to come,
 q = w (radiance . g) and R -= q after each entry, the gradient to the exponent of one entry is
 q - R alpha / (1 - alpha): no division by transmittance. The geometry gradients follow in closed
 form from six moments of it over the tile. Source and measurements: docs/kernel.md.
@@ -25,6 +28,7 @@ from jaxtyping import Array
 
 from p2gs_jax.render.binning.boxes import bits_for
 from p2gs_jax.render.binning.sorting import sort_payloads
+from p2gs_jax.render.segments import Segments, cut, merge
 from p2gs_jax.render.tile_rows import DARKEST, GEOMETRY, Plan, geometry_gradient
 from p2gs_jax.render.xla_cpu import materialize
 
@@ -69,7 +73,7 @@ class _Entries(NamedTuple):
     alpha: Array  # [B C P]
 
 
-def _gather(rows, ids_list, tile, position, end, local, plan: Plan, always) -> _Entries:
+def _gather(rows, ids_list, center, position, end, local, plan: Plan, always) -> _Entries:
     local_x, local_y = local
     entry = position[:, None] + jnp.arange(plan.chunk)
     ids = materialize(
@@ -79,9 +83,7 @@ def _gather(rows, ids_list, tile, position, end, local, plan: Plan, always) -> _
         ),
     )
     row = rows.at[ids].get(mode="promise_in_bounds")
-    center_x = ((tile % plan.across) * plan.tile_x).astype(jnp.float32) + plan.tile_x / 2
-    center_y = ((tile // plan.across) * plan.tile_y).astype(jnp.float32) + plan.tile_y / 2
-    dx0, dy0 = center_x[:, None] - row[..., 0], center_y[:, None] - row[..., 1]
+    dx0, dy0 = center[:, 0, None] - row[..., 0], center[:, 1, None] - row[..., 1]
     a11, a12, a22, log_opacity = (row[..., i] for i in range(2, 6))
     u0, v0 = a11 * dx0 + a12 * dy0, a22 * dy0
     u = u0[..., None] + a11[..., None] * local_x + a12[..., None] * local_y
@@ -95,38 +97,61 @@ def _gather(rows, ids_list, tile, position, end, local, plan: Plan, always) -> _
 
 
 class _Queue(NamedTuple):
-    """Tiles in the order in which lanes take them, then one parking place per lane."""
+    """Segments in the order in which lanes take them, then one parking place per lane.
 
-    order: Array  # [T + B]
-    starts: Array  # [T + B + 1]
+    S slots hold segments; those from S on are parking places, empty.
+    """
+
+    order: Array  # [S + B]
+    work: Array  # how many slots hold entries
+    starts: Array  # [S + B]
     ends: Array
+    centers: Array  # [S + B 2], middle of the tile, pixels
     lane: Array  # [B]
 
     @classmethod
-    def build(cls, starts, ends, plan: Plan):
-        count, lanes = plan.tile_count, plan.lanes
+    def build(cls, segments: Segments, ends, plan: Plan):
+        """Queue the segments; `ends` is where each is composited to, at most its own end."""
+        count, lanes = segments.starts.shape[0], plan.lanes
         lane = jnp.arange(lanes, dtype=jnp.int32)
         bits = bits_for(count)
         limit = 2 ** (32 - bits) - 1
-        length = jnp.minimum(ends - starts, limit).astype(jnp.uint32)
-        key = (jnp.uint32(limit) - length) << bits | jnp.arange(count, dtype=jnp.uint32)
-        parked = jnp.zeros(lanes + 1, jnp.int32)
+        lengths = ends - segments.starts
+        key = jnp.uint32(limit) - jnp.minimum(lengths, limit).astype(jnp.uint32)
+        key = key << bits | jnp.arange(count, dtype=jnp.uint32)
+        parked = jnp.zeros(lanes, jnp.int32)
+        tiles = jnp.concatenate([segments.tiles, parked])
+        column, line = tiles % plan.across, tiles // plan.across
+        centers = jnp.stack(
+            [column * plan.tile_x + plan.tile_x / 2, line * plan.tile_y + plan.tile_y / 2], -1
+        )
         return cls(
             jnp.concatenate([sort_payloads(key, bits), count + lane]),
-            jnp.concatenate([starts, parked]),
+            jnp.sum(lengths > 0, dtype=jnp.int32),
+            jnp.concatenate([segments.starts, parked]),
             jnp.concatenate([ends, parked]),
+            centers.astype(jnp.float32),
             lane,
         )
 
-    def advance(self, next_tile, tile, position, done, plan: Plan):
-        """Hand finished lanes their next tiles; return (next_tile, tile, position)."""
+    @property
+    def slots(self) -> int:
+        """Number of slots."""
+        return self.starts.shape[0] - self.lane.shape[0]
+
+    def first(self):
+        """Return the slots that lanes begin with."""
+        lane = self.lane
+        return jnp.where(lane < self.work, self.order[: lane.shape[0]], self.slots + lane)
+
+    def advance(self, turn, slot, position, done):
+        """Hand finished lanes their next slots; return (turn, slot, position)."""
         finished = done.astype(jnp.int32)
         total = jnp.cumsum(finished)
-        turn = next_tile + total - 1
-        last = plan.tile_count + plan.lanes - 1
-        new = jnp.where(done, self.order[jnp.minimum(turn, last)], tile)
-        new = jnp.where(done & (turn >= plan.tile_count), plan.tile_count + self.lane, new)
-        return next_tile + total[-1], new, jnp.where(done, self.starts[new], position)
+        mine = turn + total - 1
+        new = jnp.where(done, self.order[jnp.minimum(mine, self.slots - 1)], slot)
+        new = jnp.where(done & (mine >= self.work), self.slots + self.lane, new)
+        return turn + total[-1], new, jnp.where(done, self.starts[new], position)
 
 
 def _padded(ids_list, plan: Plan):
@@ -134,19 +159,31 @@ def _padded(ids_list, plan: Plan):
 
 
 def forward(rows, ids_list, offsets, plan: Plan):
-    """Return the channels of the image and the transmittance, [T P] each, and the stops [T]."""
-    count, lanes, pixels = plan.tile_count, plan.lanes, plan.pixels
+    """Return the channels of the image and the transmittance, [T P] each, and what backward needs.
+
+    That is the segments, where each stopped in the list [S], and the channels and transmittance
+    before every segment but the first of its tile.
+    """
+    segments = cut(offsets, plan)
+    queue = _Queue.build(segments, segments.ends, plan)
+    slots, lanes, pixels = queue.slots, plan.lanes, plan.pixels
     local = plan.local_pixels()
     ids_list = _padded(ids_list, plan)
-    queue = _Queue.build(offsets[:-1], offsets[1:], plan)
-    tile = queue.order[:lanes]
+    slot = queue.first()
     radiance = rows[:, GEOMETRY : GEOMETRY + 3]
     brightest = jnp.maximum(jnp.max(radiance), 1e-30)
 
+    def opaque(channels, transmittance):
+        """Return whether what lies behind can be left out (RenderConfig.stop_error)."""
+        so_far = functools.reduce(jnp.maximum, channels[:3]) / brightest
+        hidden = transmittance - plan.stop_error * jnp.maximum(so_far, DARKEST)
+        return jnp.max(hidden, -1) <= 0
+
     def body(state):
-        next_tile, tile, position, fresh, sums, image, stops = state
-        end = queue.ends[tile]
-        entries = _gather(rows, ids_list, tile, position, end, local, plan, next_tile > 0)
+        turn, slot, position, fresh, sums, image, stops = state
+        end = queue.ends[slot]
+        center = queue.centers[slot]
+        entries = _gather(rows, ids_list, center, position, end, local, plan, turn > 0)
         transmittance = jnp.where(fresh[:, None], 1.0, sums[-1])
         channels = [jnp.where(fresh[:, None], 0.0, a) for a in sums[:-1]]
         for c in range(plan.chunk):
@@ -159,32 +196,36 @@ def forward(rows, ids_list, offsets, plan: Plan):
         position = jnp.minimum(position + plan.chunk, end)
         done = position >= end
         if plan.stop_error is not None:
-            so_far = functools.reduce(jnp.maximum, channels[:3]) / brightest
-            hidden = transmittance - plan.stop_error * jnp.maximum(so_far, DARKEST)
-            done = done | (jnp.max(hidden, -1) <= 0)
-        target = jnp.where(done, tile, count + lanes)
+            done = done | opaque(channels, transmittance)
+        target = jnp.where(done, slot, slots + lanes)
         image = tuple(
             a.at[target].set(b, mode="drop", unique_indices=True)
             for a, b in zip(image, sums, strict=True)
         )
         stops = stops.at[target].set(position, mode="drop", unique_indices=True)
-        next_tile, tile, position = queue.advance(next_tile, tile, position, done, plan)
-        return next_tile, tile, position, done, sums, image, stops
+        turn, slot, position = queue.advance(turn, slot, position, done)
+        return turn, slot, position, done, sums, image, stops
 
     state = (
         jnp.int32(lanes),
-        tile,
-        queue.starts[tile],
+        slot,
+        queue.starts[slot],
         jnp.ones(lanes, bool),
         tuple(jnp.zeros((lanes, pixels), jnp.float32) for _ in range(plan.channels + 1)),
         tuple(
-            jnp.full((count + lanes, pixels), float(k == plan.channels), jnp.float32)
+            jnp.full((slots + lanes, pixels), float(k == plan.channels), jnp.float32)
             for k in range(plan.channels + 1)
         ),
-        jnp.zeros(count + lanes, jnp.int32),
+        jnp.concatenate([segments.starts, jnp.zeros(lanes, jnp.int32)]),
     )
-    state = lax.while_loop(lambda s: jnp.any(s[1] < count), body, state)
-    return tuple(a[:count] for a in state[5]), state[6][:count]
+    state = lax.while_loop(lambda s: jnp.any(s[1] < slots), body, state)
+    composited, stops = tuple(a[:slots] for a in state[5]), state[6][:slots]
+    image, before = merge(composited, segments, plan)
+    if plan.stop_error is not None:
+        hidden = opaque(before[:-1], before[-1])
+        starts = segments.starts[plan.tile_count :]
+        stops = stops.at[plan.tile_count :].set(jnp.where(hidden, starts, stops[plan.tile_count :]))
+    return image, (segments, stops, before)
 
 
 def _prefixes(first, values, step, group: int):
@@ -198,13 +239,14 @@ def _prefixes(first, values, step, group: int):
     return jnp.stack(states, 1)
 
 
-def backward(rows, ids_list, offsets, stops, image, v_image, plan: Plan):
+def backward(rows, ids_list, residuals, image, v_image, plan: Plan):
     """Return the gradient of the rows from those of the channels and transmittance."""
+    segments, stops, before = residuals
     plan = plan._replace(lanes=plan.lanes * BACKWARD_LANE_FACTOR)
-    count, lanes, pixels, chunk = plan.tile_count, plan.lanes, plan.pixels, plan.chunk
+    lanes, pixels, chunk = plan.lanes, plan.pixels, plan.chunk
     local_x, local_y = plan.local_pixels()
     ids_list = _padded(ids_list, plan)
-    queue = _Queue.build(offsets[:-1], stops, plan)
+    queue = _Queue.build(segments, stops, plan)
     one = jnp.ones(pixels)
     zero = jnp.zeros(pixels)
     # Eight columns, two of them zero, multiply faster than six.
@@ -212,26 +254,32 @@ def backward(rows, ids_list, offsets, stops, image, v_image, plan: Plan):
         [one, local_x, local_y, local_x**2, local_x * local_y, local_y**2, zero, zero], 1
     )
 
-    def pad(a):
-        return jnp.concatenate([a, jnp.zeros((lanes, *a.shape[1:]), a.dtype)])
-
-    light = pad(sum(a * v for a, v in zip(image, v_image, strict=True)))
-    v_channels = pad(jnp.stack(v_image[:-1], 1))
-    tile = queue.order[:lanes]
+    # Parking places need no values: nothing of theirs is kept.
+    tiles = jnp.concatenate([segments.tiles, jnp.zeros(lanes, jnp.int32)])
+    light = sum(a * v for a, v in zip(image, v_image, strict=True))
+    v_channels = jnp.stack(v_image[:-1], 1)
+    # The light still to come and the transmittance where each segment begins.
+    behind = segments.tiles[plan.tile_count :]
+    light = jnp.concatenate(
+        [light, light[behind] - sum(b * v[behind] for b, v in zip(before, v_image[:-1]))]
+    )
+    ahead = before[-1]
+    slot = queue.first()
     group = PREFIX_GROUP if chunk % PREFIX_GROUP == 0 else 1
     within = jnp.arange(group)[:, None]
 
     def body(state):
-        next_tile, tile, position, fresh, transmittance, remaining, v_rows = state
-        always = next_tile > 0
-        end = queue.ends[tile]
-        entries = _gather(rows, ids_list, tile, position, end, (local_x, local_y), plan, always)
+        turn, slot, position, fresh, transmittance, remaining, v_rows = state
+        always = turn > 0
+        end = queue.ends[slot]
+        center = queue.centers[slot]
+        entries = _gather(rows, ids_list, center, position, end, (local_x, local_y), plan, always)
         alpha, row = entries.alpha, entries.rows
-        v_out = v_channels.at[tile].get(mode="promise_in_bounds")
-        transmittance = jnp.where(fresh[:, None], 1.0, transmittance)
-        remaining = jnp.where(
-            fresh[:, None], light.at[tile].get(mode="promise_in_bounds"), remaining
-        )
+        v_out = v_channels.at[tiles[slot]].get(mode="promise_in_bounds")
+        extra = slot - plan.tile_count
+        start = jnp.where(extra[:, None] < 0, 1.0, ahead.at[extra].get(mode="clip"))
+        transmittance = jnp.where(fresh[:, None], start, transmittance)
+        remaining = jnp.where(fresh[:, None], light.at[slot].get(mode="clip"), remaining)
 
         # Transmittance before each entry in two levels: across groups, then within.
         grouped = alpha.reshape(lanes, -1, group, pixels)
@@ -284,19 +332,19 @@ def backward(rows, ids_list, offsets, stops, image, v_image, plan: Plan):
         )
         position = jnp.minimum(position + chunk, end)
         done = position >= end
-        next_tile, tile, position = queue.advance(next_tile, tile, position, done, plan)
-        return next_tile, tile, position, done, transmittance, remaining, v_rows
+        turn, slot, position = queue.advance(turn, slot, position, done)
+        return turn, slot, position, done, transmittance, remaining, v_rows
 
     blank = jnp.zeros((lanes, pixels), jnp.float32)
     state = (
         jnp.int32(lanes),
-        tile,
-        queue.starts[tile],
+        slot,
+        queue.starts[slot],
         jnp.ones(lanes, bool),
         blank,
         blank,
         jnp.zeros((rows.shape[0], GEOMETRY + plan.channels), jnp.float32),
     )
-    v_rows = lax.while_loop(lambda s: jnp.any(s[1] < count), body, state)[6]
+    v_rows = lax.while_loop(lambda s: jnp.any(s[1] < queue.slots), body, state)[6]
     # A splat's own cutoff has no gradient.
     return jnp.pad(v_rows, ((0, 0), (0, rows.shape[1] - v_rows.shape[1])))

@@ -4,6 +4,8 @@ A radix sort of the depths; then, from front to back, splats are expanded into t
 they touch and rows into tiles; then a counting sort by tile. Between the two expansions the
 columns that an ellipse covers in a row of tiles are solved in closed form, for all rows at once,
 so that no bounding box is ever expanded and the list holds exactly what is composited.
+
+Time follows what a view needs, not the capacity of its list: rooms may be generous.
 """
 
 from __future__ import annotations
@@ -26,6 +28,8 @@ WRITES = 8
 MOST_ENTRIES = 2**30
 # Keeps splats that rounding alone would put below the cutoff.
 REACH_MARGIN = 1e-4
+# Rows of tiles solved at once.
+ROWS = 8192
 
 
 def _at(a, i):
@@ -43,17 +47,28 @@ def _starts(keys, bound: int):
 
 
 @compiled_loop
-def _place(keys, values, starts, used):
-    """Return values[:used] in stable order of their keys; `starts` says where each key begins."""
+def _histogram(keys, blank, used):
+    """Return how often every value occurs among keys[:used], added to `blank`."""
+
+    def body(i, counts):
+        key = _at(keys, i)
+        return _put(counts, _at(counts, key) + 1, key)
+
+    return lax.fori_loop(0, used, body, blank)
+
+
+@compiled_loop
+def _place(keys, rows, values, starts, used):
+    """Return values[rows[:used]] in stable order of their keys; `starts`: where each key begins."""
 
     def body(i, state):
         cursor, out = state
         key = _at(keys, i)
         # Reading the cursor back after its update spares XLA a copy of the whole array.
         cursor = _put(cursor, _at(cursor, key) + 1, key)
-        return cursor, _put(out, _at(values, i), _at(cursor, key) - 1)
+        return cursor, _put(out, _at(values, _at(rows, i)), _at(cursor, key) - 1)
 
-    return lax.fori_loop(0, used, body, (starts, jnp.zeros_like(values)))[1]
+    return lax.fori_loop(0, used, body, (starts, jnp.zeros_like(keys)))[1]
 
 
 @compiled_loop
@@ -208,16 +223,46 @@ def bin_tiles(
     visible = jnp.sum(box.visible, dtype=jnp.int32)
     row_count, row, owner = _expand(first, rows, visible, capacity)
 
-    ids = order[owner]
-    ellipses = _Ellipses(*(a[ids] for a in _ellipses(splats, box)))
-    first, lengths = _span(ellipses, row, width, cfg.tile)
     used_rows = jnp.minimum(row_count, capacity)
+    ids, first, lengths = _solve_rows(
+        row, owner, order, _ellipses(splats, box), used_rows, width, cfg.tile
+    )
     entries, tiles, row_of = _expand(row * across + first, lengths, used_rows, capacity)
-
     used = jnp.minimum(entries, capacity)
-    tiles = jnp.where(jnp.arange(capacity + WRITES) < used, tiles, tile_count)
-    starts, counts = _starts(tiles, tile_count)
-    offsets = jnp.concatenate([starts, (starts[-1:] + counts[-1:])])
-    listed = _place(tiles, ids[row_of], starts, used)[:capacity]
+    # One value more than there are tiles: XLA dissolves the counting of a single one and aborts.
+    counts = _histogram(tiles, jnp.zeros(tile_count + 1, jnp.int32), used)
+    ends = jnp.cumsum(counts)
+    offsets = jnp.concatenate([jnp.zeros(1, jnp.int32), ends[:tile_count]])
+    listed = _place(tiles, row_of, ids, ends - counts, used)[:capacity]
     count = jnp.maximum(row_count, entries)
     return TileList(listed, offsets, count, count > capacity)
+
+
+def _solve_rows(row, owner, order, ellipses: _Ellipses, used, width: int, tile: tuple[int, int]):
+    """Return (Gaussian, first tile column, number of tiles) of every row of tiles, block by block.
+
+    Args:
+        row: rows of tiles that splats touch.
+        owner: whose they are, as places in `order`.
+        order: splats from front to back.
+        ellipses: of all splats.
+        used: how many rows there are.
+        width: image width, pixels.
+        tile: tile size, pixels.
+    """
+    size = min(ROWS, row.shape[0])
+    table = jnp.stack(ellipses, -1)
+
+    def body(k, state):
+        here = (k * size,)
+        ids = order[lax.dynamic_slice(owner, here, (size,))]
+        block = table.at[ids].get(mode="promise_in_bounds")
+        mine = _Ellipses(*(block[:, i] for i in range(len(_Ellipses._fields))))
+        first, lengths = _span(mine, lax.dynamic_slice(row, here, (size,)), width, tile)
+        return tuple(
+            lax.dynamic_update_slice(a, b, here)
+            for a, b in zip(state, (ids, first, lengths), strict=True)
+        )
+
+    blank = jnp.zeros(row.shape[0], jnp.int32)
+    return lax.fori_loop(0, -(-used // size), body, (blank, blank, blank))
