@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import cv2
+import jax
 import numpy as np
 
 from p2gs_jax.config import FitConfig
@@ -31,7 +32,7 @@ from p2gs_jax.render.host import make_renderer
 from p2gs_jax.render.spherical_harmonics import MAX_DEGREE
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.types import Params, Scene
+from p2gs_jax.types import Params, Photometry, Scene
 
 SUMMARY_VIEWS = 4
 APPEARANCE = "appearance.npy"
@@ -132,8 +133,8 @@ def photometry_views(
         solution: what the fit started from; it, its standard errors and its number of observations
             are passed on.
     """
-    exposures = np.asarray(params.photometry.exposures)
-    gammas = np.asarray(params.photometry.gammas)
+    taken: Photometry = jax.tree.map(np.asarray, params.photometry)
+    exposures, gammas = taken.exposures, taken.gammas
     rows = {index: k for k, index in enumerate(scene.train_indices)}
     out: list[ViewPhotometry] = []
     for index, view in enumerate(scene.views):
@@ -308,7 +309,7 @@ def _write_summary(
         rendered=[v.ldr for v in views],
         linear_tonemapped=[develop(v.linear, common) for v in views],
         names=[f"{scene.views[v.index].name} ({scene.views[v.index].split})" for v in views],
-        exposures_ev=np.log2(np.asarray(params.photometry.exposures)),
+        exposures_ev=np.log2(jax.tree.map(np.asarray, params.photometry).exposures),
         cameras=[v.camera for v in train],
         true_ev=true_ev,
         exif_ev=None

@@ -4,16 +4,33 @@ from __future__ import annotations
 
 import math
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 LN2 = math.log(2.0)
 
 
+def namespace(*values):
+    """Return numpy where all values are on the host, jax.numpy where any is a device's or traced.
+
+    The same lines then serve inside compiled programs and beside them: on the host, each operation
+    of JAX would be a program of its own, compiled for every new shape.
+    """
+    return jnp if any(isinstance(value, jax.Array) for value in values) else np
+
+
+def on_device(values: Float[np.ndarray, "..."], dtype=np.float32) -> Array:
+    """Return host values on the device; unlike `jnp.asarray`, this compiles nothing."""
+    return jax.device_put(np.asarray(values, dtype))
+
+
 def safe_log(x: Float[Array, "..."], floor: float) -> Float[Array, "..."]:
     """Return log(max(x, floor)); the gradient is zero at and below the floor, NaN stays NaN."""
+    xp = namespace(x)
     below = x <= floor
-    return jnp.where(below, jnp.log(floor), jnp.log(jnp.where(below, 1.0, x)))
+    return xp.where(below, math.log(floor), xp.log(xp.where(below, 1.0, x)))
 
 
 def safe_div(a: Float[Array, "..."], b: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -26,4 +43,4 @@ def positive_pow(
     x: Float[Array, "..."], p: Float[Array, "..."] | float, floor: float
 ) -> Float[Array, "..."]:
     """Return max(x, floor)^p through exp(p log x); the gradient to x is zero below the floor."""
-    return jnp.exp(p * safe_log(x, floor))
+    return namespace(x, p).exp(p * safe_log(x, floor))
