@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +13,7 @@ import cv2
 import jax
 import numpy as np
 
+from p2gs_jax.clock import Stopwatch
 from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.evaluate import MeanParameters, ViewResult, evaluate, mean_parameters
@@ -203,7 +206,8 @@ def finish(
         growth: the history of automatic growth for `metrics.json`, or None.
         true_ev: true exposures of the training views for the plot, or None.
     """
-    begin = time.monotonic()
+    watch = Stopwatch()
+    _import_ahead("matplotlib.figure")
     scene, store = prepared.scene, prepared.store
     mean = mean_parameters(params.photometry)
     fitted: dict[int, float] = {}
@@ -215,24 +219,29 @@ def finish(
         view = scene.views[result.index]
         if view.split == "test":
             fitted[result.index] = result.exposure
-            write_view(folder, view.name, result, store)
+            with watch("files"):
+                write_view(folder, view.name, result, store)
         if result.index in picks:
             shown[result.index] = result
 
-    metrics = evaluate(
-        params,
-        np.ones(params.gaussians.capacity, bool),
-        scene,
-        store,
-        make_renderer(cfg.render),
-        cfg,
-        reference=truth,
-        radiance=find_radiance(scene, store),
-        lpips_weights=lpips_weights,
-        on_view=on_view,
-        on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
-    )
+    with watch("evaluation"):
+        metrics = evaluate(
+            params,
+            np.ones(params.gaussians.capacity, bool),
+            scene,
+            store,
+            make_renderer(cfg.render),
+            cfg,
+            reference=truth,
+            radiance=find_radiance(scene, store),
+            lpips_weights=lpips_weights,
+            on_view=on_view,
+            on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
+        )
+    # Views are written while they are judged.
+    watch.add("evaluation", -watch.seconds.get("files", 0.0))
     reporter.stage("Writing files")
+    begin = time.perf_counter()
     write_models(params, run_dir, cfg)
     model, curve, gauge = photometry_model(params, cfg)
     write_photometry(
@@ -251,8 +260,13 @@ def finish(
     if params.appearance is not None:
         write_array(run_dir / APPEARANCE, np.asarray(params.appearance))
     _write_summary(run_dir / "summary.png", shown, picks, params, scene, mean, cfg, true_ev)
+    watch.add("files", time.perf_counter() - begin)
     metrics["counts"] = counts
-    metrics["seconds"] = {**seconds, "evaluation_and_files": time.monotonic() - begin}
+    metrics["seconds"] = {
+        **seconds,
+        **watch.seconds,
+        "evaluation_and_files": watch.seconds["evaluation"] + watch.seconds["files"],
+    }
     steps = max(int(counts.get("steps", 0)), 1)
     metrics["seconds_per_step"] = seconds.get("optimisation", 0.0) / steps
     metrics["notes"] = prepared.notes
@@ -260,6 +274,11 @@ def finish(
         metrics["growth"] = growth
     write_json(run_dir / "metrics.json", metrics)
     return metrics
+
+
+def _import_ahead(module: str) -> None:
+    """Import what is needed later in a thread: while programs compile, Python has time for it."""
+    threading.Thread(target=importlib.import_module, args=(module,), daemon=True).start()
 
 
 def write_view(folder: Path, name: str, result: ViewResult, store: ImageStore) -> None:

@@ -264,7 +264,8 @@ def _assemble(rows: Rows, theta: Theta, local: _Local, gammas: bool):
     side = np.concatenate([h_bc - s_bc, h_ac - s_ac])
     g_c = -_at_knots(rows, w * residual, one, 1)[0]
     v_log, h_log = _log_slopes(rows, local)
-    corner = h_cc.toarray() + h_log - through.T @ through
+    # Not `through.T @ through`: BLAS wakes threads for it, and waits for busy cores.
+    corner = h_cc.toarray() + h_log - np.einsum("rk,rl->kl", through, through)
     normal = np.block([[normal, side], [side.T, corner]])
     return normal, np.concatenate([right, g_c + v_log])
 
@@ -341,16 +342,16 @@ def _known(system: System, prior, gauge, theta: Theta, normal, right):
     return normal, right
 
 
-def _solve(normal, right, basis):
+def _solve(normal, right, basis: sp.csr_array):
     """Return the step in (b, a, c) along the free directions."""
-    reduced, side = basis.T @ normal @ basis, basis.T @ right
+    reduced, side = basis.T @ (basis.T @ normal).T, basis.T @ right
     diagonal = np.diagonal(reduced)
     free = diagonal > 1e-30
     scale = 1 / np.sqrt(diagonal[free])
     balanced = reduced[np.ix_(free, free)] * scale[:, None] * scale
     balanced[np.diag_indices_from(balanced)] += DAMPING
     step = scale * np.linalg.solve(balanced, scale * side[free])
-    return basis[:, free] @ step
+    return basis[:, np.flatnonzero(free)] @ step
 
 
 def _round(rows: Rows, known, basis, theta: Theta, weight, gm: bool, gammas: bool):
@@ -391,7 +392,7 @@ def solve(rows: Rows, system: System, start: Theta, tolerance: float, gammas: bo
         tolerance: largest change of a parameter in a round that counts as none.
         gammas: whether any gamma is free; without, a quarter of the work.
     """
-    basis = system.basis[:, np.abs(system.basis).sum(0) > 0]
+    basis = sp.csr_array(system.basis[:, np.abs(system.basis).sum(0) > 0])
     gauge = system.anchors.T @ system.anchors
     known = functools.partial(_known, system, prior_matrix(system), gauge)
     # Weighted by the noise alone at first.
