@@ -90,11 +90,11 @@ def _listen() -> None:
     monitoring.register_event_listener(_on_event)
 
 
-def _on_duration(event: str, duration: float, **_) -> None:
+def _on_duration(event: str, duration_secs: float, **_) -> None:
     if event == _COMPILED:
         with _lock:
             _sums[0] += 1
-            _sums[1] += duration
+            _sums[1] += duration_secs
 
 
 def _on_event(event: str, **_) -> None:

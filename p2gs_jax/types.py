@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Float32, Int, UInt8
 Split = Literal["train", "test"]
 
 
-def _namespace(values):
+def _namespace(values) -> Any:
     """Return numpy for host arrays, which are computed with before and after a fit; else JAX."""
     return np if isinstance(values, np.ndarray) else jnp
 

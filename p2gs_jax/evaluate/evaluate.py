@@ -147,7 +147,8 @@ def evaluate(
     # What is small is computed on the host; what is large goes to the device once.
     small = jax.tree.map(np.asarray, replace(params, gaussians=None))
     exposures, gammas = small.photometry.exposures, small.photometry.gammas
-    gaussians, alive = jax.device_put((params.gaussians, alive))
+    gaussians = jax.device_put(params.gaussians)
+    living = jax.device_put(np.asarray(alive))
     score = functools.partial(_score, lpips_weights)
     own, averaged = _Collector(), _Collector()
     test_averaged, test_fitted = _Collector(), _Collector()
@@ -169,7 +170,7 @@ def evaluate(
     # In the order of their names, so that the frames of a camera follow each other.
     for index, view in enumerate(scene.views):
         photograph, mask = store.get(index, 1)
-        result = render(gaussians, alive, camera_of(store, index))
+        result = render(gaussians, living, camera_of(store, index))
         linear = result.linear
         ldr_mean = shown(linear, mean.exposure, mean.gamma)
         if view.split == "train":

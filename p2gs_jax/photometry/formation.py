@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from p2gs_jax.config import PhotometryConfig
-from p2gs_jax.numerics import namespace, positive_pow, safe_log
+from p2gs_jax.numerics import Scalar, Values, namespace, positive_pow, safe_log
 from p2gs_jax.photometry.appearance import corrected
 from p2gs_jax.photometry.response import DARKEST, Response, log_exposed
 from p2gs_jax.types import GAMMA_SRGB
@@ -36,7 +36,7 @@ def _spline_table(cfg: PhotometryConfig) -> tuple[float, float, np.ndarray]:
     return float(grid[0]), float(grid[1] - grid[0]), np.interp(grid, z, y)
 
 
-def _spline_encode(log_linear: Float[Array, "..."], cfg: PhotometryConfig):
+def _spline_encode(log_linear: Values, cfg: PhotometryConfig) -> Values:
     """Encode through the table; linear in x below it, linear in log x above it."""
     xp = namespace(log_linear)
     first, step, table = _spline_table(cfg)
@@ -50,7 +50,7 @@ def _spline_encode(log_linear: Float[Array, "..."], cfg: PhotometryConfig):
     return xp.where(dark, below, inside)
 
 
-def oetf(linear: Float[Array, "..."], curve: str) -> Float[Array, "..."]:
+def oetf(linear: Values, curve: str) -> Values:
     """Encode linear values with the base curve; values above 1 continue it."""
     if curve == "linear":
         return linear
@@ -62,7 +62,7 @@ def oetf(linear: Float[Array, "..."], curve: str) -> Float[Array, "..."]:
     return xp.where(toe, 12.92 * linear, high)
 
 
-def eotf(encoded: Float[Array, "..."], curve: str) -> Float[Array, "..."]:
+def eotf(encoded: Values, curve: str) -> Values:
     """Decode: the inverse of `oetf` on [0, inf)."""
     if curve == "linear":
         return encoded
@@ -79,9 +79,7 @@ def expose(linear: Float[Array, "..."], exposure: Float[Array, ""]) -> Float[Arr
     return exposure * linear
 
 
-def tone_map(
-    exposed: Float[Array, "..."], gamma: Float[Array, ""], cfg: PhotometryConfig
-) -> Float[Array, "..."]:
+def tone_map(exposed: Values, gamma: Scalar, cfg: PhotometryConfig) -> Values:
     """Return the display-encoded image of exposed radiance.
 
     Args:
@@ -112,9 +110,7 @@ def tone_map(
     return xp.clip(y, 0.0, 1.0) if cfg.clamp else y
 
 
-def inverse_tone_map(
-    ldr: Float[Array, "..."], gamma: Float[Array, ""], cfg: PhotometryConfig
-) -> Float[Array, "..."]:
+def inverse_tone_map(ldr: Values, gamma: Scalar, cfg: PhotometryConfig) -> Values:
     """Return the exposed radiance e L of display values; values below half a code count as that."""
     xp = namespace(ldr, gamma)
     y = xp.maximum(ldr, LDR_FLOOR)
@@ -153,6 +149,6 @@ def formation(
     return corrected(ldr, appearance, cfg.appearance)
 
 
-def display(ldr: Float[Array, "..."]) -> Float[Array, "..."]:
+def display(ldr: Values) -> Values:
     """Clamp to what a display or an 8-bit file can hold."""
     return namespace(ldr).clip(ldr, 0.0, 1.0)

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from typing import Literal
 
-from jaxtyping import Array, Float
-
-from p2gs_jax.numerics import namespace
+from p2gs_jax.numerics import Values, namespace
 
 RadianceKind = Literal["exp", "softplus", "linear"]
 LOG_RADIANCE_LIMIT = 30.0
 
 
-def radiance_activation(value: Float[Array, "..."], kind: RadianceKind) -> Float[Array, "..."]:
+def radiance_activation(value: Values, kind: RadianceKind) -> Values:
     """Return radiance >= 0.
 
     Args:
@@ -28,7 +26,7 @@ def radiance_activation(value: Float[Array, "..."], kind: RadianceKind) -> Float
     return xp.maximum(value + 0.5, 0.0)
 
 
-def radiance_preactivation(radiance: Float[Array, "..."], kind: RadianceKind):
+def radiance_preactivation(radiance: Values, kind: RadianceKind) -> Values:
     """Return the value whose activation is `radiance` > 0."""
     xp = namespace(radiance)
     if kind == "exp":
