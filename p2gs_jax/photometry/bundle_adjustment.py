@@ -209,8 +209,10 @@ def _pair_sums(rows: Rows, factors: Float[np.ndarray, "o f x"]) -> Float[np.ndar
     parts = [factors[rows.order, :, x].astype(np.float32) for x in range(count)]
     seen_by = rows.views[rows.order]
     sums = np.zeros((count, count, views * views))
-    for start in range(0, len(rows.first), CHUNK):
-        first, second = (p[start : start + CHUNK] for p in (rows.first, rows.second))
+    # Not fewer at once than half of the entries they are added to.
+    chunk = max(CHUNK, views * views // 2)
+    for start in range(0, len(rows.first), chunk):
+        first, second = (p[start : start + chunk] for p in (rows.first, rows.second))
         at = seen_by[first] * views + seen_by[second]
         # A product of an observation with itself is counted twice below.
         half = np.where(first == second, np.float32(0.5), np.float32(1.0))

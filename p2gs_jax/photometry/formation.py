@@ -9,6 +9,8 @@ All functions compute with numpy on host arrays and with JAX on others (`numeric
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -90,7 +92,8 @@ def tone_map(exposed: Values, gamma: Scalar, cfg: PhotometryConfig) -> Values:
     xp = namespace(exposed, gamma)
     if cfg.clamp:
         exposed = xp.minimum(exposed, EXPOSED_CEILING)
-    log_x = safe_log(exposed, EXPOSED_FLOOR)
+    log_x: Any = safe_log(exposed, EXPOSED_FLOOR)
+    y: Any
     if cfg.curve == "power" and cfg.pivot == 1.0:
         y = xp.exp(log_x / gamma)
     else:
