@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import cv2
+import jax
 import numpy as np
 
+from p2gs_jax.clock import Stopwatch
 from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.evaluate import MeanParameters, ViewResult, evaluate, mean_parameters
@@ -31,7 +35,7 @@ from p2gs_jax.render.host import make_renderer
 from p2gs_jax.render.spherical_harmonics import MAX_DEGREE
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.types import Params, Scene
+from p2gs_jax.types import Params, Photometry, Scene
 
 SUMMARY_VIEWS = 4
 APPEARANCE = "appearance.npy"
@@ -132,8 +136,8 @@ def photometry_views(
         solution: what the fit started from; it, its standard errors and its number of observations
             are passed on.
     """
-    exposures = np.asarray(params.photometry.exposures)
-    gammas = np.asarray(params.photometry.gammas)
+    taken: Photometry = jax.tree.map(np.asarray, params.photometry)
+    exposures, gammas = taken.exposures, taken.gammas
     rows = {index: k for k, index in enumerate(scene.train_indices)}
     out: list[ViewPhotometry] = []
     for index, view in enumerate(scene.views):
@@ -202,7 +206,8 @@ def finish(
         growth: the history of automatic growth for `metrics.json`, or None.
         true_ev: true exposures of the training views for the plot, or None.
     """
-    begin = time.monotonic()
+    watch = Stopwatch()
+    _import_ahead("matplotlib.figure")
     scene, store = prepared.scene, prepared.store
     mean = mean_parameters(params.photometry)
     fitted: dict[int, float] = {}
@@ -214,24 +219,29 @@ def finish(
         view = scene.views[result.index]
         if view.split == "test":
             fitted[result.index] = result.exposure
-            write_view(folder, view.name, result, store)
+            with watch("files"):
+                write_view(folder, view.name, result, store)
         if result.index in picks:
             shown[result.index] = result
 
-    metrics = evaluate(
-        params,
-        np.ones(params.gaussians.capacity, bool),
-        scene,
-        store,
-        make_renderer(cfg.render),
-        cfg,
-        reference=truth,
-        radiance=find_radiance(scene, store),
-        lpips_weights=lpips_weights,
-        on_view=on_view,
-        on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
-    )
+    with watch("evaluation"):
+        metrics = evaluate(
+            params,
+            np.ones(params.gaussians.capacity, bool),
+            scene,
+            store,
+            make_renderer(cfg.render),
+            cfg,
+            reference=truth,
+            radiance=find_radiance(scene, store),
+            lpips_weights=lpips_weights,
+            on_view=on_view,
+            on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
+        )
+    # Views are written while they are judged.
+    watch.add("evaluation", -watch.seconds.get("files", 0.0))
     reporter.stage("Writing files")
+    begin = time.perf_counter()
     write_models(params, run_dir, cfg)
     model, curve, gauge = photometry_model(params, cfg)
     write_photometry(
@@ -250,8 +260,13 @@ def finish(
     if params.appearance is not None:
         write_array(run_dir / APPEARANCE, np.asarray(params.appearance))
     _write_summary(run_dir / "summary.png", shown, picks, params, scene, mean, cfg, true_ev)
+    watch.add("files", time.perf_counter() - begin)
     metrics["counts"] = counts
-    metrics["seconds"] = {**seconds, "evaluation_and_files": time.monotonic() - begin}
+    metrics["seconds"] = {
+        **seconds,
+        **watch.seconds,
+        "evaluation_and_files": watch.seconds["evaluation"] + watch.seconds["files"],
+    }
     steps = max(int(counts.get("steps", 0)), 1)
     metrics["seconds_per_step"] = seconds.get("optimisation", 0.0) / steps
     metrics["notes"] = prepared.notes
@@ -259,6 +274,11 @@ def finish(
         metrics["growth"] = growth
     write_json(run_dir / "metrics.json", metrics)
     return metrics
+
+
+def _import_ahead(module: str) -> None:
+    """Import what is needed later in a thread: while programs compile, Python has time for it."""
+    threading.Thread(target=importlib.import_module, args=(module,), daemon=True).start()
 
 
 def write_view(folder: Path, name: str, result: ViewResult, store: ImageStore) -> None:
@@ -308,7 +328,7 @@ def _write_summary(
         rendered=[v.ldr for v in views],
         linear_tonemapped=[develop(v.linear, common) for v in views],
         names=[f"{scene.views[v.index].name} ({scene.views[v.index].split})" for v in views],
-        exposures_ev=np.log2(np.asarray(params.photometry.exposures)),
+        exposures_ev=np.log2(jax.tree.map(np.asarray, params.photometry).exposures),
         cameras=[v.camera for v in train],
         true_ev=true_ev,
         exif_ev=None

@@ -3,17 +3,40 @@
 from __future__ import annotations
 
 import math
+from typing import Any, TypeVar
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+from numpy.typing import ArrayLike, DTypeLike
 
 LN2 = math.log(2.0)
 
+# Arrays that come back as what they were given: on the host or on a device.
+Values = TypeVar("Values", Array, np.ndarray)
+Scalar = Array | np.ndarray | np.floating | float
 
-def safe_log(x: Float[Array, "..."], floor: float) -> Float[Array, "..."]:
+
+def namespace(*values) -> Any:
+    """Return numpy where all values are on the host, jax.numpy where any is a device's or traced.
+
+    The same lines then serve inside compiled programs and beside them: on the host, each operation
+    of JAX would be a program of its own, compiled for every new shape.
+    """
+    return jnp if any(isinstance(value, jax.Array) for value in values) else np
+
+
+def on_device(values: ArrayLike, dtype: DTypeLike = np.float32) -> Array:
+    """Return host values on the device; unlike `jnp.asarray`, this compiles nothing."""
+    return jax.device_put(np.asarray(values, dtype))
+
+
+def safe_log(x: Values, floor: float) -> Values:
     """Return log(max(x, floor)); the gradient is zero at and below the floor, NaN stays NaN."""
+    xp = namespace(x)
     below = x <= floor
-    return jnp.where(below, jnp.log(floor), jnp.log(jnp.where(below, 1.0, x)))
+    return xp.where(below, math.log(floor), xp.log(xp.where(below, 1.0, x)))
 
 
 def safe_div(a: Float[Array, "..."], b: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -22,8 +45,6 @@ def safe_div(a: Float[Array, "..."], b: Float[Array, "..."]) -> Float[Array, "..
     return jnp.where(nonzero, a / jnp.where(nonzero, b, 1.0), 0.0)
 
 
-def positive_pow(
-    x: Float[Array, "..."], p: Float[Array, "..."] | float, floor: float
-) -> Float[Array, "..."]:
+def positive_pow(x: Values, p: Scalar, floor: float) -> Values:
     """Return max(x, floor)^p through exp(p log x); the gradient to x is zero below the floor."""
-    return jnp.exp(p * safe_log(x, floor))
+    return namespace(x, p).exp(p * safe_log(x, floor))

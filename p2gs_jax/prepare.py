@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
 from p2gs_jax.config import FitConfig
@@ -17,6 +17,7 @@ from p2gs_jax.init.seeds import gaussians_from_points, merge, scene_extent, subs
 from p2gs_jax.init.shell import Shell, find_shell
 from p2gs_jax.losses.relative_exposure import ColorPairs
 from p2gs_jax.losses.total import OBSERVED_FORMS
+from p2gs_jax.numerics import on_device
 from p2gs_jax.photometry.appearance import identity
 from p2gs_jax.photometry.formation import inverse_tone_map
 from p2gs_jax.photometry.observations import Observations
@@ -252,9 +253,7 @@ def _photometry(start: PhotometricSolution | None, count: int, cfg: FitConfig) -
         exposures, gammas = log_exposures, np.log(gammas / GAMMA_SRGB)
     else:
         exposures = np.exp(log_exposures)
-    return Photometry(
-        jnp.asarray(exposures, jnp.float32), jnp.asarray(gammas, jnp.float32), p.parameterization
-    )
+    return Photometry(on_device(exposures), on_device(gammas), p.parameterization)
 
 
 def _appearance(count: int, cfg: FitConfig):
@@ -263,9 +262,7 @@ def _appearance(count: int, cfg: FitConfig):
 
 
 def _linearize(colors: np.ndarray, cfg: FitConfig, gamma: float = GAMMA_SRGB) -> np.ndarray:
-    return np.asarray(
-        inverse_tone_map(jnp.asarray(colors, jnp.float32), jnp.float32(gamma), cfg.photometry)
-    )
+    return inverse_tone_map(np.asarray(colors, np.float32), np.float32(gamma), cfg.photometry)
 
 
 def _seed_radiance(scene: Scene, start: PhotometricSolution | None, cfg: FitConfig) -> np.ndarray:
@@ -281,7 +278,8 @@ def _shell_gaussians(
     shell: Shell, scene: Scene, store: ImageStore, photometry: Photometry, views, cfg: FitConfig
 ) -> Gaussians:
     """Colour the shell by what the photographs show in its directions."""
-    exposures = np.asarray(photometry.exposures)
+    taken: Photometry = jax.tree.map(np.asarray, photometry)
+    exposures, gammas = taken.exposures, taken.gammas
     total = np.zeros((len(shell.points), 3))
     weight = np.zeros(len(shell.points))
     for row, index in enumerate(scene.train_indices):
@@ -292,7 +290,7 @@ def _shell_gaussians(
         view = scene.views[index]
         scale = [mask.shape[1] / view.width, mask.shape[0] / view.height]
         colors, _, valid = sample(ldr, mask, shell.xy[seen, row] * scale)
-        linear = _linearize(colors[valid], cfg, float(photometry.gammas[row]))
+        linear = _linearize(colors[valid], cfg, float(gammas[row]))
         total[seen[valid]] += linear / exposures[row]
         weight[seen[valid]] += 1
     seen = weight > 0
@@ -332,9 +330,9 @@ def _pairs(tracks: Observations | None, cfg: FitConfig) -> ColorPairs | None:
         )
     first, second = sample_pairs(tracks, PAIR_POOL, cfg.train.seed)
     return ColorPairs(
-        jnp.asarray(tracks.colors[first]),
-        jnp.asarray(tracks.colors[second]),
-        jnp.asarray(tracks.views[first], jnp.int32),
-        jnp.asarray(tracks.views[second], jnp.int32),
-        jnp.ones(len(first)),
+        on_device(tracks.colors[first]),
+        on_device(tracks.colors[second]),
+        on_device(tracks.views[first], np.int32),
+        on_device(tracks.views[second], np.int32),
+        on_device(np.ones(len(first))),
     )

@@ -6,7 +6,6 @@ import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
@@ -16,6 +15,7 @@ from p2gs_jax.evaluate.evaluate import MeanParameters, mean_parameters
 from p2gs_jax.export.photometry_json import PhotometryFile, read_photometry
 from p2gs_jax.export.ply import read_ply
 from p2gs_jax.finish import APPEARANCE
+from p2gs_jax.numerics import on_device
 from p2gs_jax.photometry.appearance import identity
 from p2gs_jax.photometry.look import Look
 from p2gs_jax.scene import load_scene
@@ -46,7 +46,7 @@ class Run:
     @property
     def alive(self) -> Bool[Array, " n"]:
         """All Gaussians: a finished run keeps no empty slots."""
-        return jnp.ones(self.params.gaussians.capacity, bool)
+        return on_device(np.ones(self.params.gaussians.capacity), bool)
 
     @property
     def mean(self) -> MeanParameters:
@@ -149,8 +149,8 @@ def load_run(folder: Path) -> Run:
     if cfg.photometry.parameterization == "log":
         exposures, gammas = np.log(exposures), np.log(gammas / GAMMA_SRGB)
     photometry = Photometry(
-        jnp.asarray(exposures, jnp.float32),
-        jnp.asarray(gammas, jnp.float32),
+        on_device(exposures),
+        on_device(gammas),
         cfg.photometry.parameterization,
     )
     reference = saved.get("reference")
@@ -186,4 +186,4 @@ def _appearance(folder: Path, cfg: FitConfig, views: int):
         ) from error
     if corrections.shape != identity(cfg.photometry.appearance, views).shape:
         raise UserError(f"{path} does not belong to this run.", fix="fit again")
-    return jnp.asarray(corrections)
+    return on_device(corrections)

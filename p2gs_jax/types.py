@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -19,6 +19,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, Int, UInt8
 
 Split = Literal["train", "test"]
+
+
+def _namespace(values) -> Any:
+    """Return numpy for host arrays, which are computed with before and after a fit; else JAX."""
+    return np if isinstance(values, np.ndarray) else jnp
+
+
 GAMMA_SRGB = 2.2
 # Weights of red, green and blue in the luminance of display values (BT.601).
 LUMINANCE = (0.299, 0.587, 0.114)
@@ -63,16 +70,18 @@ class Photometry(eqx.Module):
     @property
     def exposures(self) -> Float[Array, " v"]:
         """Exposures e > 0, dimensionless."""
+        xp = _namespace(self.raw_exposures)
         if self.parameterization == "log":
-            return jnp.exp(self.raw_exposures)
-        return jnp.maximum(self.raw_exposures, 1e-3)
+            return xp.exp(self.raw_exposures)
+        return xp.maximum(self.raw_exposures, 1e-3)
 
     @property
     def gammas(self) -> Float[Array, " v"]:
         """Gammas > 0."""
+        xp = _namespace(self.raw_gammas)
         if self.parameterization == "log":
-            return GAMMA_SRGB * jnp.exp(self.raw_gammas)
-        return jnp.maximum(self.raw_gammas, 1e-3)
+            return GAMMA_SRGB * xp.exp(self.raw_gammas)
+        return xp.maximum(self.raw_gammas, 1e-3)
 
 
 class Params(eqx.Module):
@@ -90,7 +99,7 @@ class Params(eqx.Module):
     @property
     def mean_correction(self) -> Float[Array, "..."] | None:
         """The mean over the training views, for views that have none of their own, or None."""
-        return None if self.appearance is None else jnp.mean(self.appearance, axis=0)
+        return None if self.appearance is None else self.appearance.mean(axis=0)
 
 
 class Camera(eqx.Module):

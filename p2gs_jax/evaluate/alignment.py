@@ -88,11 +88,19 @@ def fit_exposure(
     width = 2 * SEARCH_STOPS / (SEARCH_STEPS - 1)
     ratio = (5**0.5 - 1) / 2
 
-    def narrow(_, bounds):
-        low, high = bounds
-        a, b = high - ratio * (high - low), low + ratio * (high - low)
-        left = error(a) < error(b)
-        return jnp.where(left, low, a), jnp.where(left, b, high)
+    def narrow(_, state):
+        low, high, inner, errors = state
+        left = errors[0] < errors[1]
+        low, high = jnp.where(left, low, inner[0]), jnp.where(left, inner[1], high)
+        # One of the inner points stays one: only the other is new.
+        new = jnp.where(left, high - ratio * (high - low), low + ratio * (high - low))
+        found = error(new)
+        inner = jnp.where(left, jnp.stack([new, inner[0]]), jnp.stack([inner[1], new]))
+        errors = jnp.where(left, jnp.stack([found, errors[0]]), jnp.stack([errors[1], found]))
+        return low, high, inner, errors
 
-    low, high = lax.fori_loop(0, GOLDEN_STEPS, narrow, (best - width, best + width))
+    low, high = best - width, best + width
+    inner = jnp.stack([high - ratio * (high - low), low + ratio * (high - low)])
+    state = (low, high, inner, lax.map(error, inner))
+    low, high, _, _ = lax.fori_loop(0, GOLDEN_STEPS, narrow, state)
     return jnp.exp2((low + high) / 2)

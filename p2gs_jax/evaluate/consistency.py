@@ -74,7 +74,7 @@ class VideoScores:
             ldr: the frame, display values.
             exposure: its exposure.
         """
-        linear = np.asarray(eotf(jnp.asarray(ldr), "srgb"), np.float64)
+        linear = eotf(np.asarray(ldr), "srgb").astype(np.float64)
         if camera in self._last and self._last[camera][0].shape == linear.shape:
             before, e = self._last[camera]
             self._printed.append(_rms(before * e - linear * exposure))

@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Bool, Float32
 
@@ -23,7 +23,8 @@ from p2gs_jax.evaluate.consistency import VideoScores
 from p2gs_jax.evaluate.lpips import LpipsWeights, lpips
 from p2gs_jax.evaluate.metrics import psnr, ssim
 from p2gs_jax.evaluate.radiance import RadianceScores, Truth
-from p2gs_jax.photometry.formation import display, formation, inverse_tone_map
+from p2gs_jax.photometry.formation import inverse_tone_map
+from p2gs_jax.photometry.look import Look, develop
 from p2gs_jax.render.host import RenderView
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
@@ -47,11 +48,12 @@ class MeanParameters:
 
 def mean_parameters(photometry: Photometry) -> MeanParameters:
     """Return the means over the training views."""
-    e = np.asarray(photometry.exposures, np.float64)
+    taken: Photometry = jax.tree.map(np.asarray, photometry)
+    e = taken.exposures.astype(np.float64)
     return MeanParameters(
         float(e.mean()),
         float(np.exp(np.log(e).mean())),
-        float(np.asarray(photometry.gammas, np.float64).mean()),
+        float(taken.gammas.astype(np.float64).mean()),
     )
 
 
@@ -142,19 +144,21 @@ def evaluate(
         UserError: an image is too small for LPIPS.
     """
     mean = mean_parameters(params.photometry)
-    exposures = np.asarray(params.photometry.exposures)
-    gammas = np.asarray(params.photometry.gammas)
+    # What is small is computed on the host; what is large goes to the device once.
+    small = jax.tree.map(np.asarray, replace(params, gaussians=None))
+    exposures, gammas = small.photometry.exposures, small.photometry.gammas
+    gaussians = jax.device_put(params.gaussians)
+    living = jax.device_put(np.asarray(alive))
     score = functools.partial(_score, lpips_weights)
     own, averaged = _Collector(), _Collector()
     test_averaged, test_fitted = _Collector(), _Collector()
     scores = RadianceScores()
     reference_views: list[tuple[int, np.ndarray, np.ndarray, np.ndarray]] = []
 
-    mean_correction = params.mean_correction
+    mean_correction = small.mean_correction
 
     def shown(linear, exposure, gamma, correction=mean_correction):
-        e, g = jnp.float32(exposure), jnp.float32(gamma)
-        return np.asarray(display(formation(linear, e, g, cfg.photometry, correction)))
+        return develop(linear, Look(exposure, gamma, cfg.photometry, correction))
 
     def fitted(linear, photograph, mask) -> float:
         """Solve the exposure of a view that has none of its own."""
@@ -166,13 +170,13 @@ def evaluate(
     # In the order of their names, so that the frames of a camera follow each other.
     for index, view in enumerate(scene.views):
         photograph, mask = store.get(index, 1)
-        result = render(params.gaussians, jnp.asarray(alive), camera_of(store, index))
+        result = render(gaussians, living, camera_of(store, index))
         linear = result.linear
         ldr_mean = shown(linear, mean.exposure, mean.gamma)
         if view.split == "train":
             row = row_of[index]
             e, g = float(exposures[row]), float(gammas[row])
-            ldr = shown(linear, e, g, params.correction(row))
+            ldr = shown(linear, e, g, small.correction(row))
             own.add(view.name, score(ldr, photograph, mask))
             averaged.add(view.name, score(ldr_mean, photograph, mask))
         else:
@@ -210,7 +214,7 @@ def evaluate(
     metrics["train"]["per_view"] = metrics["train"].pop("per_view", {})
     metrics["consistency"] = {name: video.summary() for name, video in videos.items()}
     if scores.views:
-        gamma, saturated = jnp.float32(mean.gamma), jnp.float32(cfg.loss.saturation)
+        gamma, saturated = np.float32(mean.gamma), np.array(cfg.loss.saturation, np.float32)
         exposed = float(inverse_tone_map(saturated, gamma, cfg.photometry))
         metrics["radiance"] = scores.summary(exposed / float(np.median(exposures)))
     if reference_views:
@@ -235,7 +239,7 @@ def _against_reference(views, scene: Scene, mean: MeanParameters, shown, fitted,
         fitted: (linear, photograph, mask) -> the exposure that fits best.
         score: (display image, photograph, mask) -> scores by name.
     """
-    scales = [fitted(jnp.asarray(linear), truth, mask) for _, linear, truth, mask in views]
+    scales = [fitted(linear, truth, mask) for _, linear, truth, mask in views]
     common = float(np.exp(np.median(np.log(scales))))
     protocols = {
         "averaged": mean.exposure,
@@ -247,7 +251,7 @@ def _against_reference(views, scene: Scene, mean: MeanParameters, shown, fitted,
         parts = {"all": _Collector(), "train": _Collector(), "test": _Collector()}
         for index, linear, truth, mask in views:
             view = scene.views[index]
-            ldr = shown(jnp.asarray(linear), exposure, mean.gamma)
+            ldr = shown(linear, exposure, mean.gamma)
             row = score(ldr, truth, mask)
             for part in ("all", view.split):
                 parts[part].add(view.name, row)

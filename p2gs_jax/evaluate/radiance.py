@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -50,10 +49,10 @@ def pu21_psnr(linear, truth, mask: Bool[np.ndarray, "h w"], white: float) -> flo
 def pu21_ssim(linear, truth, mask: Bool[np.ndarray, "h w"], white: float) -> float:
     """Return SSIM of PU21-encoded radiance; see `pu21_psnr`."""
     a, b = (
-        jnp.asarray(pu21_encode(x / white * WHITE_NITS) / PU21_PEAK, jnp.float32)
+        (pu21_encode(x / white * WHITE_NITS) / PU21_PEAK).astype(np.float32)
         for x in (linear, truth)
     )
-    return float(ssim(a, b, jnp.asarray(mask, jnp.float32)))
+    return float(ssim(a, b, np.asarray(mask, np.float32)))
 
 
 def delta_e_itp(linear, truth, mask: Bool[np.ndarray, "h w"], white: float) -> float:

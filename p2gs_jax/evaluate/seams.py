@@ -167,8 +167,7 @@ def measure(
 
 def decoded(ldr: Float[np.ndarray, "... 3"], look: Look) -> Float32[np.ndarray, "... 3"]:
     """Return the exposed radiance e L of a photograph."""
-    gamma = jnp.float32(look.gamma)
-    return np.asarray(inverse_tone_map(jnp.asarray(ldr, jnp.float32), gamma, look.formation))
+    return inverse_tone_map(np.asarray(ldr, np.float32), np.float32(look.gamma), look.formation)
 
 
 def _informative(ldr: Float[np.ndarray, "h w 3"], cfg: LossConfig) -> Bool[np.ndarray, "h w"]:

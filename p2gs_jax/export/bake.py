@@ -21,6 +21,7 @@ import optax
 from jaxtyping import Array, Float, UInt8
 
 from p2gs_jax.config import RenderConfig
+from p2gs_jax.numerics import on_device
 from p2gs_jax.photometry.look import Look, develop
 from p2gs_jax.photometry.radiance import RadianceKind, radiance_activation
 from p2gs_jax.render import render_linear, required_capacity
@@ -30,7 +31,8 @@ from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.types import Camera, Gaussians, Render
 
 DIRECTIONS = 64
-CHUNK = 65536
+# Gaussians at once: the last ones are filled up, so that their number compiles nothing.
+CHUNK = 8192
 # Adam's rates per step for colours of degree 0, of the others, and for opacity logits; they decay
 # to a tenth. Measured on two runs (BUILD_NOTES, "Display PLY").
 COLOR_RATE, BANDS_RATE, OPACITY_RATE, DECAY = 0.05, 0.0025, 0.3, 0.1
@@ -113,7 +115,7 @@ def bake(gaussians: Gaussians, look: Look, activation: RadianceKind, degree: int
     sh = np.asarray(gaussians.sh)
     degree = min(degree, degree_of(sh.shape[1]))
     shown = display_sh(sh, lambda linear: develop(linear, look), activation, degree)
-    return replace(gaussians, sh=jnp.asarray(shown))
+    return replace(gaussians, sh=on_device(shown))
 
 
 def display_sh(
@@ -133,18 +135,22 @@ def display_sh(
         degree: of the result; None keeps the radiance's.
     """
     directions = _sphere(DIRECTIONS)
-    axes = tuple(jnp.asarray(directions).T)
-    table = np.stack([np.asarray(b) for b in basis(axes, degree_of(sh.shape[1]))], 1)
+    axes = tuple(directions.T)
+    table = np.stack(_basis(axes, degree_of(sh.shape[1])), 1)
     kept = table if degree is None else table[:, : coefficient_count(degree)]
     inverse = np.linalg.pinv(kept)
     out = np.empty((len(sh), kept.shape[1], 3), np.float32)
     for start in range(0, len(sh), CHUNK):
         part = sh[start : start + CHUNK]
-        values = np.einsum("dk,nkc->ndc", table, part, optimize=True).astype(np.float32)
-        colors = tone(np.asarray(radiance_activation(jnp.asarray(values), activation)))
+        values = np.zeros((CHUNK, DIRECTIONS, 3), np.float32)
+        values[: len(part)] = np.einsum("dk,nkc->ndc", table, part, optimize=True)
+        colors = tone(np.asarray(radiance_activation(values, activation)))[: len(part)]
         shown = np.clip(colors, 0, 1) - 0.5
         out[start : start + CHUNK] = np.einsum("kd,ndc->nkc", inverse, shown, optimize=True)
     return out
+
+
+_basis = jax.jit(basis, static_argnums=1)
 
 
 def _sphere(count: int) -> Float[np.ndarray, "n 3"]:
@@ -290,4 +296,4 @@ def summary(errors: Sequence[ViewError]) -> dict | None:
 
 
 def _all(gaussians: Gaussians) -> Array:
-    return jnp.ones(gaussians.capacity, bool)
+    return on_device(np.ones(gaussians.capacity), bool)

@@ -4,14 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Float
-from matplotlib.ticker import MaxNLocator
 
 from p2gs_jax.export.atomic import atomic_write
 from p2gs_jax.numerics import LN2
@@ -41,13 +35,16 @@ def write_calibration_plot(
         stated_ev: EXIF or a file, stops, laid over the recovered ones; NaN where unknown.
         pivot: linear value that gammas leave alone.
     """
+    # Imported here: it takes as long to load as a small scene to read.
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
+
     s = solution
     seen = np.isfinite(s.exposure_errors)
     exposures_ev = np.where(seen, s.exposures_ev, np.nan)
     errors_ev = np.where(seen, s.exposure_errors / LN2, np.nan)
-    figure, (top, middle, right) = plt.subplots(
-        1, 3, figsize=(13, 4), width_ratios=(2.2, 1.1, 1.1), layout="constrained"
-    )
+    figure = Figure(figsize=(13, 4), layout="constrained")
+    top, middle, right = figure.subplots(1, 3, width_ratios=(2.2, 1.1, 1.1))
     names = list(dict.fromkeys(cameras))
     groups = [np.array([c == name for c in cameras]) for name in names]
     for i, (name, mine) in enumerate(zip(names, groups, strict=True)):
@@ -95,4 +92,3 @@ def write_calibration_plot(
     right.legend(fontsize=7)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=110, format="png")
-    plt.close(figure)

@@ -10,13 +10,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.atomic import atomic_write
+from p2gs_jax.numerics import on_device
 from p2gs_jax.photometry.radiance import RadianceKind
 from p2gs_jax.types import Gaussians
 
@@ -35,7 +35,7 @@ def field_names(coefficients: int) -> list[str]:
 
 def _live(gaussians: Gaussians, alive: Bool[np.ndarray, " n"]) -> Gaussians:
     rows = np.flatnonzero(np.asarray(alive))
-    return jax.tree.map(lambda a: a[rows], gaussians)
+    return jax.tree.map(lambda a: np.asarray(a)[rows], gaussians)
 
 
 def write_ply(path: Path, gaussians: Gaussians, comments: Sequence[str]) -> int:
@@ -46,17 +46,17 @@ def write_ply(path: Path, gaussians: Gaussians, comments: Sequence[str]) -> int:
         gaussians: what to write.
         comments: header lines; a PLY header is ASCII, other characters are escaped.
     """
-    g = gaussians
+    g = jax.tree.map(np.asarray, gaussians)
     count, coefficients = g.sh.shape[:2]
     # All coefficients of red, then green, then blue.
-    rest = np.asarray(g.sh[:, 1:]).transpose(0, 2, 1).reshape(count, 3 * (coefficients - 1))
+    rest = g.sh[:, 1:].transpose(0, 2, 1).reshape(count, 3 * (coefficients - 1))
     columns = np.concatenate(
         [
             g.means,
             np.zeros((count, 3), np.float32),
             g.sh[:, 0],
             rest,
-            np.asarray(g.opacity_logits)[:, None],
+            g.opacity_logits[:, None],
             g.log_scales,
             g.quats,
         ],
@@ -102,9 +102,9 @@ def read_ply(path: Path) -> Gaussians:
     sh = np.concatenate([columns[:, None, 6:9], rest.transpose(0, 2, 1)], 1)
     tail = columns[:, 9 + 3 * (coefficients - 1) :]
     return Gaussians(
-        means=jnp.asarray(columns[:, :3]),
-        quats=jnp.asarray(tail[:, 4:8]),
-        log_scales=jnp.asarray(tail[:, 1:4]),
-        opacity_logits=jnp.asarray(tail[:, 0]),
-        sh=jnp.asarray(sh),
+        means=on_device(columns[:, :3]),
+        quats=on_device(tail[:, 4:8]),
+        log_scales=on_device(tail[:, 1:4]),
+        opacity_logits=on_device(tail[:, 0]),
+        sh=on_device(sh),
     )

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from p2gs_jax.config import FitConfig
+from p2gs_jax.numerics import on_device
 from p2gs_jax.photometry.radiance import radiance_preactivation
 from p2gs_jax.render.spherical_harmonics import C0, coefficient_count
 from p2gs_jax.types import Gaussians, View
@@ -82,24 +82,22 @@ def gaussians_from_points(
     if scales is None:
         scales = neighbour_scales(points, views)
     start = cfg.init.opacity if opacity is None else opacity
-    dc = np.asarray(
-        radiance_preactivation(
-            jnp.asarray(np.maximum(radiance, MIN_RADIANCE), jnp.float32), cfg.render.radiance
-        )
+    dc = radiance_preactivation(
+        np.maximum(radiance, MIN_RADIANCE).astype(np.float32), cfg.render.radiance
     )
     sh = np.zeros((count, coefficient_count(cfg.render.sh_degree), 3), np.float32)
     sh[:, 0] = dc / C0
     quats = np.zeros((count, 4), np.float32)
     quats[:, 0] = 1.0
     return Gaussians(
-        means=jnp.asarray(points, jnp.float32),
-        quats=jnp.asarray(quats),
-        log_scales=jnp.asarray(np.repeat(np.log(scales)[:, None], 3, 1), jnp.float32),
-        opacity_logits=jnp.full((count,), float(np.log(start / (1 - start))), jnp.float32),
-        sh=jnp.asarray(sh),
+        means=on_device(points),
+        quats=on_device(quats),
+        log_scales=on_device(np.repeat(np.log(scales)[:, None], 3, 1)),
+        opacity_logits=on_device(np.full(count, np.log(start / (1 - start)))),
+        sh=on_device(sh),
     )
 
 
 def merge(a: Gaussians, b: Gaussians) -> Gaussians:
     """Return both sets of Gaussians, `a` first."""
-    return jax.tree.map(lambda x, y: jnp.concatenate([x, y]), a, b)
+    return jax.tree.map(lambda x, y: on_device(np.concatenate([x, y])), a, b)

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from p2gs_jax.config import Appearance
+from p2gs_jax.numerics import on_device
 from p2gs_jax.types import LUMINANCE
 
 # Luminance levels, rows and columns of a bilateral grid, as its authors use.
@@ -23,7 +24,7 @@ CURVE_KNOTS = 16
 def identity(kind: Appearance, views: int) -> Float[Array, "v ..."]:
     """Return parameters that change nothing."""
     shapes = {"affine": (3, 4), "bilateral": (12, *GRID), "curve": (CURVE_KNOTS,)}
-    return jnp.zeros((views, *shapes[kind]))
+    return on_device(np.zeros((views, *shapes[kind])))
 
 
 def corrected(

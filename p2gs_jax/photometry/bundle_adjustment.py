@@ -7,7 +7,11 @@ eliminated exactly (variable projection), what remains is the Schur complement o
 entries are sums over pairs of observations of a point, so cost and memory grow with those pairs,
 never with points times views. Outliers are weighted away: a few L1 rounds, then Geman-McClure
 (docs/photometry.md, 4: 0 / 10 / 30 % outliers give .005 / .005 / .006 EV). One round is a map from
-parameters to parameters; optimistix iterates it to its fixed point.
+parameters to parameters, repeated until nothing moves.
+
+On the host, in numpy: derivatives are written out anyway, a round takes milliseconds, and four
+programs for the models, curves and sizes of one scene took longer to compile than to solve
+(BUILD_NOTES, "Compile less").
 """
 
 from __future__ import annotations
@@ -15,12 +19,9 @@ from __future__ import annotations
 import functools
 from typing import NamedTuple
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
-from jaxtyping import Array, Float
+import scipy.sparse as sp
+from jaxtyping import Float
 
 from p2gs_jax.photometry.observations import Rows
 from p2gs_jax.photometry.response import FLOOR, FREE, KNOTS, SMALLEST_SLOPE
@@ -32,12 +33,13 @@ A_RANGE = (0.3, 3.0)
 # Anchors and damping relative to the mean diagonal of the normal matrix.
 ANCHOR, DAMPING = 10.0, 1e-8
 EMPTY = 1e-9
-# Rows whose pairs are formed at once: their blocks stay in the cache.
-CHUNK = 128
+# Pairs whose products are formed at once: they stay in the cache.
+CHUNK = 1 << 15
 MEDIAN_ROWS = 4096
+_FREE = np.array(FREE)
 
 
-class Theta(eqx.Module):
+class Theta(NamedTuple):
     """What is solved for.
 
     Attributes:
@@ -46,12 +48,12 @@ class Theta(eqx.Module):
         c: response spline at its free knots; empty where the response is given.
     """
 
-    b: Float[Array, " v"]
-    a: Float[Array, " v"]
-    c: Float[Array, " k"]
+    b: Float[np.ndarray, " v"]
+    a: Float[np.ndarray, " v"]
+    c: Float[np.ndarray, " k"]
 
 
-class System(eqx.Module):
+class System(NamedTuple):
     """Which directions are free, and what is known besides the photographs.
 
     Attributes:
@@ -64,13 +66,13 @@ class System(eqx.Module):
         bend: matrix whose quadratic form keeps the spline smooth, (k, k).
     """
 
-    basis: Float[Array, "d q"]
-    anchors: Float[Array, "g 2v"]
-    targets: Float[Array, " g"]
-    log_exposure: Float[Array, " v"]
-    log_exposure_precision: Float[Array, " v"]
-    a_precision: Float[Array, " v"]
-    bend: Float[Array, "k k"]
+    basis: Float[np.ndarray, "d q"]
+    anchors: Float[np.ndarray, "g 2v"]
+    targets: Float[np.ndarray, " g"]
+    log_exposure: Float[np.ndarray, " v"]
+    log_exposure_precision: Float[np.ndarray, " v"]
+    a_precision: Float[np.ndarray, " v"]
+    bend: Float[np.ndarray, "k k"]
 
 
 class Fit(NamedTuple):
@@ -90,75 +92,78 @@ class Fit(NamedTuple):
     """
 
     theta: Theta
-    radiance: Float[Array, "r 3"]
-    precision: Float[Array, "r 3"]
-    residual: Float[Array, "r m 3"]
-    weight: Float[Array, "r m 3"]
-    scale: Float[Array, ""]
-    normal: Float[Array, "d d"]
-    scores: Float[Array, "d d"]
-    curvature: Float[Array, ""]
-    rounds: Float[Array, ""]
+    radiance: Float[np.ndarray, "r 3"]
+    precision: Float[np.ndarray, "r 3"]
+    residual: Float[np.ndarray, "o 3"]
+    weight: Float[np.ndarray, "o 3"]
+    scale: float
+    normal: Float[np.ndarray, "d d"]
+    scores: Float[np.ndarray, "d d"]
+    curvature: float
+    rounds: int
 
 
 class _Local(NamedTuple):
     """Everything per observation at given parameters."""
 
-    weight: Float[Array, "r m 3"]
-    sigma: Float[Array, "r m 3"]
-    slope: Float[Array, "r m 3"]
-    residual: Float[Array, "r m 3"]
-    radiance: Float[Array, "r 3"]
-    precision: Float[Array, "r 3"]
-    scale: Float[Array, ""]
-    curvature: Float[Array, ""]
+    weight: Float[np.ndarray, "o 3"]
+    sigma: Float[np.ndarray, "o 3"]
+    slope: Float[np.ndarray, "o 3"]
+    residual: Float[np.ndarray, "o 3"]
+    radiance: Float[np.ndarray, "r 3"]
+    precision: Float[np.ndarray, "r 3"]
+    scale: float
+    curvature: float
 
 
-def masked_median(values: Float[Array, "..."], used: Float[Array, "..."]) -> Float[Array, ""]:
-    """Return the median of non-negative values where `used` > 0, to 1e-6 relative, by bisection.
-
-    Sorting a million values costs more than a round of the adjustment; of more rows than
-    MEDIAN_ROWS, every n-th is looked at.
-    """
-    step = max(1, values.shape[0] // MEDIAN_ROWS)
-    values, used = values[::step], used[::step]
-    half = 0.5 * jnp.sum(used > 0)
-    logs = jnp.where(used > 0, jnp.log(values + 1e-12), jnp.inf)
-
-    def narrow(_, bounds):
-        low, high = bounds
-        middle = 0.5 * (low + high)
-        below = jnp.sum(logs < middle) < half
-        return jnp.where(below, middle, low), jnp.where(below, high, middle)
-
-    low, high = jax.lax.fori_loop(0, 30, narrow, (jnp.float64(-14.0), jnp.float64(14.0)))
-    return jnp.exp(0.5 * (low + high))
+def _median(rows: Rows, values: Float[np.ndarray, "o 3"]) -> float:
+    """Return the median of used values; of more rows than MEDIAN_ROWS, of every n-th row."""
+    used = rows.weight > 0
+    step = max(1, rows.count // MEDIAN_ROWS)
+    if step > 1:
+        used = used & (rows.row % step == 0)[:, None]
+    picked = values[used]
+    if not picked.size:
+        return 0.0
+    middle = (picked.size + 1) // 2 - 1
+    return float(np.partition(picked, middle)[middle])
 
 
-def _bent(rows: Rows, c: Float[Array, " k"]):
+def _bent(rows: Rows, c: Float[np.ndarray, " k"]):
     """Return z, its standard deviation and dz/dy under the spline."""
-    full = jnp.zeros(len(KNOTS)).at[np.array(FREE)].set(c)
+    full = np.zeros(len(KNOTS))
+    full[_FREE] = c
     z = rows.z + (1 - rows.fraction) * full[rows.knot] + rows.fraction * full[rows.knot + 1]
-    steeper = (jnp.diff(full) / np.diff(KNOTS))[rows.knot]
-    slope = jnp.maximum(rows.slope + steeper, SMALLEST_SLOPE * rows.slope)
-    of_pixel = jnp.maximum(rows.sigma**2 - FLOOR**2, 0) * (slope / rows.slope) ** 2
-    return z, jnp.sqrt(of_pixel + FLOOR**2), slope
+    steeper = (np.diff(full) / np.diff(KNOTS))[rows.knot]
+    slope = np.maximum(rows.slope + steeper, SMALLEST_SLOPE * rows.slope)
+    of_pixel = np.maximum(rows.sigma**2 - FLOOR**2, 0) * (slope / rows.slope) ** 2
+    return z, np.sqrt(of_pixel + FLOOR**2), slope
 
 
-def _hats(rows: Rows) -> Float[Array, "r m 3 k"]:
-    """Return the spline's basis at every observation, free knots only."""
-    knots = jnp.asarray(np.array(FREE))
-    left = (rows.knot[..., None] == knots) * (1 - rows.fraction)[..., None]
-    return left + (rows.knot[..., None] + 1 == knots) * rows.fraction[..., None]
+def _at_knots(rows: Rows, values: Float[np.ndarray, "o 3"], index, size: int):
+    """Return sums of values times the spline's basis: (size, free knots).
+
+    Args:
+        rows: for the knots; of its basis functions two are not zero at a value.
+        values: what is summed.
+        index: where each value belongs, broadcast to the shape of `values`.
+        size: number of those places.
+    """
+    at = (np.broadcast_to(index, values.shape) * len(KNOTS) + rows.knot).ravel()
+    length = size * len(KNOTS)
+    right = values * rows.fraction
+    sums = np.bincount(at, (values - right).ravel(), length)
+    sums += np.bincount(at + 1, right.ravel(), length + 1)[:length]
+    return sums.reshape(size, len(KNOTS))[:, _FREE]
 
 
-def _radiance(rows: Rows, theta: Theta, z, weight):
-    a, b = theta.a[rows.views][..., None], theta.b[rows.views][..., None]
-    precision = jnp.sum(weight * a**2, 1)
-    return jnp.sum(weight * a * (z - b), 1) / (precision + EMPTY), precision
+def _radiance(rows: Rows, a, b, z, weight):
+    """Return the log radiance of each row and its precision; a and b per observation."""
+    precision = rows.by_row @ (weight * a**2)
+    return rows.by_row @ (weight * a * (z - b)) / (precision + EMPTY), precision
 
 
-def _local(rows: Rows, theta: Theta, weight, gm) -> _Local:
+def _local(rows: Rows, theta: Theta, weight, gm: bool) -> _Local:
     """Return residuals and the weights they imply.
 
     Args:
@@ -170,103 +175,117 @@ def _local(rows: Rows, theta: Theta, weight, gm) -> _Local:
     z, sigma, slope = rows.z, rows.sigma, rows.slope
     if theta.c.size:
         z, sigma, slope = _bent(rows, theta.c)
-    radiance, _ = _radiance(rows, theta, z, weight)
-    a, b = theta.a[rows.views][..., None], theta.b[rows.views][..., None]
-    residual = z - b - a * radiance[:, None]
-    u = residual / sigma
-    scale = jnp.maximum(1.4826 * masked_median(jnp.abs(u), rows.weight), SMALLEST_SCALE)
-    l1 = 1 / jnp.maximum(jnp.abs(u) / scale, 0.5)
+    a, b = theta.a[rows.views][:, None], theta.b[rows.views][:, None]
+    radiance, _ = _radiance(rows, a, b, z, weight)
+    u = (z - b - a * radiance[rows.row]) / sigma
+    scale = max(1.4826 * _median(rows, np.abs(u)), SMALLEST_SCALE)
     # One weight for the whole observation: an outlier is wrong in all channels.
-    channels = jnp.maximum(jnp.sum(rows.weight, -1), 1)
-    square = jnp.sum(u**2 * rows.weight, -1) / channels / (GEMAN_MCCLURE * scale) ** 2
-    robust = (1 / (1 + square) ** 2)[..., None]
-    weight = rows.weight / sigma**2 * jnp.where(gm, robust, l1)
-    radiance, precision = _radiance(rows, theta, z, weight)
-    used = jnp.sum(rows.weight, -1) > 0
-    bent = jnp.where(used, (1 - 3 * square) / (1 + square) ** 3, 0)
-    curvature = jnp.sum(bent) / jnp.maximum(jnp.sum(jnp.where(used, robust[..., 0], 0)), 1e-9)
-    residual = z - b - a * radiance[:, None]
-    return _Local(weight, sigma, slope, residual, radiance, precision, scale, curvature)
+    used = rows.weight.sum(1)
+    square = (u**2 * rows.weight).sum(1) / np.maximum(used, 1) / (GEMAN_MCCLURE * scale) ** 2
+    robust = 1 / (1 + square) ** 2
+    factor = robust[:, None] if gm else 1 / np.maximum(np.abs(u) / scale, 0.5)
+    weight = rows.weight / sigma**2 * factor
+    radiance, precision = _radiance(rows, a, b, z, weight)
+    seen = used > 0
+    bent = ((1 - 3 * square) / (1 + square) ** 3)[seen].sum()
+    curvature = bent / max(robust[seen].sum(), 1e-9)
+    residual = z - b - a * radiance[rows.row]
+    return _Local(weight, sigma, slope, residual, radiance, precision, scale, float(curvature))
 
 
-def _pair_sums(rows: Rows, factors: Float[Array, "r m f x"], views: int) -> Float[Array, "d d"]:
+def _pair_sums(rows: Rows, factors: Float[np.ndarray, "o f x"]) -> Float[np.ndarray, "d d"]:
     """Return sum over rows of the outer products of per-view vectors, as a (2 V, 2 V) matrix.
 
-    Chunk by chunk, each pair of slots once, in float32: the matrix decides how fast the iteration
-    converges and how large the standard errors are, never where it ends.
+    Each pair of observations once, in float32: the matrix decides how fast the iteration converges
+    and how large the standard errors are, never where it ends.
 
     Args:
-        rows: for the views of each slot.
-        factors: f vectors per row; entry (m, f, x) belongs to the view of slot m, parameter x.
-            x = 1 leaves the second parameter's part zero.
-        views: V.
+        rows: for the pairs.
+        factors: f vectors per row; entry (o, f, x) belongs to the view of observation o, parameter
+            x. One parameter leaves the second's part zero.
     """
-    slots, x = factors.shape[1], factors.shape[-1]
-    first, second = np.triu_indices(slots)
-    half = jnp.asarray(np.where(first == second, 0.5, 1.0), jnp.float32)
-
-    def chunk(total, part):
-        f, v = part
-        blocks = jnp.einsum("rpfx,rpfy->rpxy", f[:, first], f[:, second]) * half[:, None, None]
-        at = v[:, first] * views + v[:, second]
-        return total.at[at.reshape(-1)].add(blocks.reshape(-1, x * x)), None
-
-    parts = (
-        factors.astype(jnp.float32).reshape(-1, CHUNK, *factors.shape[1:]),
-        rows.views.reshape(-1, CHUNK, slots),
-    )
-    sums, _ = jax.lax.scan(chunk, jnp.zeros((views * views, x * x), jnp.float32), parts)
-    sums = sums.astype(jnp.float64).reshape(views, views, x, x)
-    sums = sums.transpose(2, 0, 3, 1).reshape(x * views, x * views)
-    sums = sums + sums.T
-    return jnp.pad(sums, (0, (2 - x) * views))
+    views, count = rows.view_count, factors.shape[-1]
+    # In the order of the rows: the two of a pair then lie close together.
+    parts = [factors[rows.order, :, x].astype(np.float32) for x in range(count)]
+    seen_by = rows.views[rows.order]
+    sums = np.zeros((count, count, views * views))
+    # Not fewer at once than half of the entries they are added to.
+    chunk = max(CHUNK, views * views // 2)
+    for start in range(0, len(rows.first), chunk):
+        first, second = (p[start : start + chunk] for p in (rows.first, rows.second))
+        at = seen_by[first] * views + seen_by[second]
+        # A product of an observation with itself is counted twice below.
+        half = np.where(first == second, np.float32(0.5), np.float32(1.0))
+        right = [np.take(p, second, 0) for p in parts]
+        for x, part in enumerate(parts):
+            left = np.take(part, first, 0) * half[:, None]
+            for y in range(count):
+                products = np.einsum("pf,pf->p", left, right[y])
+                sums[x, y] += np.bincount(at, products, views * views)
+    matrix = sums.reshape(count, count, views, views).transpose(0, 2, 1, 3)
+    matrix = matrix.reshape(count * views, count * views)
+    return np.pad(matrix + matrix.T, (0, (2 - count) * views))
 
 
 def _assemble(rows: Rows, theta: Theta, local: _Local, gammas: bool):
     """Return the reduced normal matrix and right side over (b, a, c); a's part only if wanted."""
-    views = theta.b.shape[0]
+    views = rows.view_count
     w, residual = local.weight, local.residual
-    level = local.radiance[:, None]
+    level = local.radiance[rows.row]
+    powers = [np.ones_like(level), level, level**2]
 
     def per_view(values):
-        return jax.ops.segment_sum(values.reshape(-1), rows.views.reshape(-1), views)
+        # Of nothing at all, numpy counts in integers.
+        return np.bincount(rows.views, values.sum(1), views).astype(np.float64)
 
-    h_bb, h_ba, h_aa = (per_view(jnp.sum(w * level**k, -1)) for k in range(3))
-    g_b, g_a = (per_view(jnp.sum(w * residual * level**k, -1)) for k in range(2))
-    coupling = w * theta.a[rows.views][..., None] / jnp.sqrt(local.precision + EMPTY)[:, None]
-    factors = jnp.stack([coupling, coupling * level][: 1 + gammas], -1)
+    h_bb, h_ba, h_aa = (per_view(w * p) for p in powers)
+    g_b, g_a = (per_view(w * residual * p) for p in powers[:2])
+    root = np.sqrt(local.precision + EMPTY)[rows.row]
+    coupling = w * theta.a[rows.views][:, None] / root
+    factors = np.stack([coupling, coupling * level][: 1 + gammas], -1)
     if not gammas:
-        h_ba, h_aa, g_a = (jnp.zeros(views) for _ in range(3))
-    diagonal = jnp.block([[jnp.diag(h_bb), jnp.diag(h_ba)], [jnp.diag(h_ba), jnp.diag(h_aa)]])
-    normal = diagonal - _pair_sums(rows, factors, views)
-    right = jnp.concatenate([g_b, g_a])
+        h_ba, h_aa, g_a = (np.zeros(views) for _ in range(3))
+    normal = np.block([[np.diag(h_bb), np.diag(h_ba)], [np.diag(h_ba), np.diag(h_aa)]])
+    normal -= _pair_sums(rows, factors)
+    right = np.concatenate([g_b, g_a])
     if not theta.c.size:
         return normal, right
     # The spline moves z itself: d residual / dc is +hat where d residual / db is -1.
+    at_view, one = rows.views[:, None], np.zeros((1, 1), int)
     hats = _hats(rows)
-    h_cc = jnp.einsum("rmc,rmck,rmcl->kl", w, hats, hats)
-    moved = w[..., None] * hats
-    h_bc, h_ac = (
-        -jax.ops.segment_sum(
-            jnp.sum(moved * level[..., None] ** k, 2).reshape(-1, theta.c.size),
-            rows.views.reshape(-1),
-            views,
-        )
-        for k in range(2)
-    )
-    through = -jnp.einsum("rmc,rmck->rck", coupling, hats)
-    s_cc = jnp.einsum("rck,rcl->kl", through, through)
-    s_vc = jnp.einsum("rmcx,rck->rmxk", factors, through)
+    h_cc = hats.T @ hats.multiply(w.reshape(-1, 1)).tocsr()
+    h_bc, h_ac = (-_at_knots(rows, w * p, at_view, views) for p in powers[:2])
+    at_channel = 3 * rows.row[:, None] + np.arange(3)
+    through = -_at_knots(rows, coupling, at_channel, 3 * rows.count)
     s_bc, s_ac = (
-        jax.ops.segment_sum(s_vc[:, :, k].reshape(-1, theta.c.size), rows.views.reshape(-1), views)
-        for k in range(2)
+        _by_view(rows, factors[..., x], at_channel, 3 * rows.count) @ through
+        if x <= gammas
+        else np.zeros((views, theta.c.size))
+        for x in range(2)
     )
-    side = jnp.concatenate([h_bc - s_bc, h_ac - s_ac])
-    g_c = -jnp.einsum("rmc,rmck->k", w * residual, hats)
+    side = np.concatenate([h_bc - s_bc, h_ac - s_ac])
+    g_c = -_at_knots(rows, w * residual, one, 1)[0]
     v_log, h_log = _log_slopes(rows, local)
-    g_c, h_cc = g_c + v_log, h_cc + h_log
-    normal = jnp.block([[normal, side], [side.T, h_cc - s_cc]])
-    return normal, jnp.concatenate([right, g_c])
+    # Not `through.T @ through`: BLAS wakes threads for it, and waits for busy cores.
+    corner = h_cc.toarray() + h_log - np.einsum("rk,rl->kl", through, through)
+    normal = np.block([[normal, side], [side.T, corner]])
+    return normal, np.concatenate([right, g_c + v_log])
+
+
+def _hats(rows: Rows) -> sp.csr_array:
+    """Return the spline's basis at every observed value, free knots only: (3 o, k)."""
+    count = rows.knot.size
+    knot, fraction = rows.knot.ravel(), rows.fraction.ravel()
+    values = np.stack([1 - fraction, fraction], 1).ravel()
+    columns = np.stack([knot, knot + 1], 1).ravel()
+    shape = (count, len(KNOTS))
+    return sp.csr_array((values, columns, 2 * np.arange(count + 1)), shape=shape)[:, _FREE]
+
+
+def _by_view(rows: Rows, values, at, size: int) -> sp.csr_array:
+    """Return the (views, size) matrix that holds values at their views and places."""
+    views = np.broadcast_to(rows.views.reshape(-1, *[1] * (values.ndim - 1)), values.shape)
+    return sp.csr_array((values.ravel(), (views.ravel(), at.ravel())), (rows.view_count, size))
 
 
 def _log_slopes(rows: Rows, local: _Local):
@@ -275,70 +294,77 @@ def _log_slopes(rows: Rows, local: _Local):
     A density over photographed values carries the slope of the transform. Without it, a curve that
     is flat nearly everywhere and jumps once explains everything: the residuals vanish with it.
     """
-    intervals = len(KNOTS) - 1
     share = local.weight * local.sigma**2 * local.scale**2
-
-    def per_interval(values):
-        return jax.ops.segment_sum(values.reshape(-1), rows.knot.reshape(-1), intervals)
-
-    steps = np.diff(np.eye(len(KNOTS)), axis=0)[:, list(FREE)] / np.diff(KNOTS)[:, None]
-    first, second = (per_interval(share / local.slope**k) for k in (1, 2))
+    steps = np.diff(np.eye(len(KNOTS)), axis=0)[:, _FREE] / np.diff(KNOTS)[:, None]
+    first, second = (
+        np.bincount(rows.knot.ravel(), (share / local.slope**k).ravel(), len(KNOTS) - 1)
+        for k in (1, 2)
+    )
     return steps.T @ first, steps.T @ (second[:, None] * steps)
 
 
-def prior_matrix(system: System) -> Float[Array, "2v 2v"]:
+def prior_matrix(system: System) -> Float[np.ndarray, "2v 2v"]:
     """Return the normal matrix of the priors: of h by b = a h (residual b - a mu), and of a."""
     tau, mu = system.log_exposure_precision, system.log_exposure
-    cross = jnp.diag(-tau * mu)
-    of_a = jnp.diag(tau * mu**2 + system.a_precision)
-    return jnp.block([[jnp.diag(tau), cross], [cross, of_a]])
+    cross = np.diag(-tau * mu)
+    of_a = np.diag(tau * mu**2 + system.a_precision)
+    return np.block([[np.diag(tau), cross], [cross, of_a]])
 
 
-def gauge_strength(normal: Float[Array, "d d"], views: int) -> Float[Array, ""]:
+def gauge_strength(normal: Float[np.ndarray, "d d"], views: int) -> float:
     """Return how hard the anchors hold, on the scale of the exposures' information."""
-    return ANCHOR * (jnp.mean(jnp.diagonal(normal)[:views]) + EMPTY)
+    return ANCHOR * float(np.mean(np.diagonal(normal)[:views]) + EMPTY)
 
 
-def _known(system: System, theta: Theta, normal, right):
-    """Add priors and gauges to the normal equations."""
-    views = theta.b.shape[0]
-    both, part = jnp.concatenate([theta.b, theta.a]), slice(0, 2 * views)
-    prior = prior_matrix(system)
-    normal = normal.at[part, part].add(prior)
-    right = right.at[part].add(-prior @ both)
-    right = right.at[views : 2 * views].add(system.a_precision)
+def _known(system: System, prior, gauge, theta: Theta, normal, right):
+    """Add priors and gauges to the normal equations.
+
+    Args:
+        system: priors and gauges.
+        prior: from `prior_matrix`.
+        gauge: normal matrix of the anchors.
+        theta: parameters.
+        normal: changed in place.
+        right: changed in place.
+    """
+    views = len(theta.b)
+    both, part = np.concatenate([theta.b, theta.a]), slice(0, 2 * views)
+    normal[part, part] += prior
+    right[part] -= prior @ both
+    right[views : 2 * views] += system.a_precision
     strength = gauge_strength(normal, views)
     pulled = system.targets - system.anchors @ both
-    normal = normal.at[part, part].add(strength * system.anchors.T @ system.anchors)
-    right = right.at[part].add(strength * system.anchors.T @ pulled)
+    normal[part, part] += strength * gauge
+    right[part] += strength * (pulled @ system.anchors)
     if theta.c.size:
-        stiffness = jnp.mean(jnp.diagonal(normal)[2 * views :])
-        normal = normal.at[2 * views :, 2 * views :].add(stiffness * system.bend)
-        right = right.at[2 * views :].add(-stiffness * system.bend @ theta.c)
+        rest = slice(2 * views, None)
+        stiffness = np.mean(np.diagonal(normal)[rest])
+        normal[rest, rest] += stiffness * system.bend
+        right[rest] -= stiffness * system.bend @ theta.c
     return normal, right
 
 
-def _solve(normal, right, basis):
+def _solve(normal, right, basis: sp.csr_array):
     """Return the step in (b, a, c) along the free directions."""
-    reduced = basis.T @ normal @ basis
-    scale = jax.lax.rsqrt(jnp.maximum(jnp.diagonal(reduced), 1e-30))
-    free = jnp.diagonal(reduced) > 1e-30
-    balanced = reduced * scale[:, None] * scale[None]
-    balanced = jnp.where(free[:, None] & free[None], balanced, 0)
-    balanced = balanced + jnp.diag(jnp.where(free, DAMPING, 1.0))
-    factor = jax.scipy.linalg.cho_factor(balanced)
-    step = jax.scipy.linalg.cho_solve(factor, jnp.where(free, scale * (basis.T @ right), 0))
-    return basis @ (scale * step)
+    reduced, side = basis.T @ (basis.T @ normal).T, basis.T @ right
+    diagonal = np.diagonal(reduced)
+    free = diagonal > 1e-30
+    scale = 1 / np.sqrt(diagonal[free])
+    balanced = reduced[np.ix_(free, free)] * scale[:, None] * scale
+    balanced[np.diag_indices_from(balanced)] += DAMPING
+    step = scale * np.linalg.solve(balanced, scale * side[free])
+    return basis[:, np.flatnonzero(free)] @ step
 
 
-def _round(rows: Rows, system: System, theta: Theta, weight, gm, gammas: bool):
+def _round(rows: Rows, known, basis, theta: Theta, weight, gm: bool, gammas: bool):
+    """Return the parameters after one step, and the weights it was computed with."""
     local = _local(rows, theta, weight, gm)
-    normal, right = _known(system, theta, *_assemble(rows, theta, local, gammas))
-    step = _solve(normal, right, system.basis)
-    v = theta.b.shape[0]
+    normal, right = known(theta, *_assemble(rows, theta, local, gammas))
+    step = _solve(normal, right, basis)
+    v = len(theta.b)
     moved = Theta(
         theta.b + step[:v],
-        jnp.clip(theta.a + step[v : 2 * v], *A_RANGE),
+        np.clip(theta.a + step[v : 2 * v], *A_RANGE),
         theta.c + step[2 * v :],
     )
     return moved, local.weight
@@ -346,29 +372,19 @@ def _round(rows: Rows, system: System, theta: Theta, weight, gm, gammas: bool):
 
 def _scores(rows: Rows, theta: Theta, local: _Local, gammas: bool):
     """Return the sum of outer products of row scores over (b, a, c)."""
-    views = theta.b.shape[0]
     g = local.weight * local.residual
-    factors = jnp.stack([jnp.sum(g, -1), jnp.sum(g * local.radiance[:, None], -1)], -1)
-    scores = _pair_sums(rows, factors[:, :, None, : 1 + gammas], views)
+    factors = np.stack([g.sum(1), (g * local.radiance[rows.row]).sum(1)][: 1 + gammas], -1)
+    scores = _pair_sums(rows, factors[:, None, :])
     if not theta.c.size:
         return scores
-    s_c = -jnp.einsum("rmc,rmck->rk", g, _hats(rows))
-    cross = jnp.einsum("rmx,rk->rmxk", factors, s_c)
-    side = jnp.concatenate(
-        [
-            jax.ops.segment_sum(
-                cross[:, :, x].reshape(-1, theta.c.size), rows.views.reshape(-1), views
-            )
-            for x in range(2)
-        ]
-    )
-    return jnp.block([[scores, side], [side.T, s_c.T @ s_c]])
+    s_c = -_at_knots(rows, g, rows.row[:, None], rows.count)
+    side = [_by_view(rows, factors[:, x], rows.row, rows.count) @ s_c for x in range(1 + gammas)]
+    side += [np.zeros_like(side[0])] * (1 - gammas)
+    side = np.concatenate(side)
+    return np.block([[scores, side], [side.T, s_c.T @ s_c]])
 
 
-@functools.partial(jax.jit, static_argnames="gammas")
-def solve(
-    rows: Rows, system: System, start: Theta, tolerance: Float[Array, ""], gammas: bool
-) -> Fit:
+def solve(rows: Rows, system: System, start: Theta, tolerance: float, gammas: bool) -> Fit:
     """Adjust exposures, gammas and response to observations (float64).
 
     Args:
@@ -378,25 +394,18 @@ def solve(
         tolerance: largest change of a parameter in a round that counts as none.
         gammas: whether any gamma is free; without, a quarter of the work.
     """
+    basis = sp.csr_array(system.basis[:, np.abs(system.basis).sum(0) > 0])
+    gauge = system.anchors.T @ system.anchors
+    known = functools.partial(_known, system, prior_matrix(system), gauge)
     # Weighted by the noise alone at first.
-    weight = rows.weight / rows.sigma**2
-
-    def one_round(state, _):
-        theta, weight, rounds = state
-        theta, weight = _round(rows, system, theta, weight, rounds >= L1_ROUNDS, gammas)
-        return theta, weight, jnp.minimum(rounds + 1, L1_ROUNDS + 1.0)
-
-    found = optx.fixed_point(
-        one_round,
-        # The norm receives changes over `atol`; dividing by the tolerance keeps it a traced value.
-        optx.FixedPointIteration(
-            rtol=0.0, atol=1.0, norm=lambda state: _largest_step(state) / tolerance
-        ),
-        (start, weight, jnp.float64(0)),
-        max_steps=MOST_ROUNDS,
-        throw=False,
-    )
-    theta, weight, _ = found.value
+    theta, weight, rounds = start, rows.weight / rows.sigma**2, 0
+    for rounds in range(1, MOST_ROUNDS + 1):
+        before = theta
+        theta, weight = _round(rows, known, basis, theta, weight, rounds > L1_ROUNDS, gammas)
+        moved = max(np.abs(x - y).max(initial=0.0) for x, y in zip(theta, before, strict=True))
+        # At least one round after the first of Geman-McClure.
+        if rounds > L1_ROUNDS + 1 and moved < tolerance:
+            break
     local = _local(rows, theta, weight, True)
     normal, _ = _assemble(rows, theta, local, gammas)
     return Fit(
@@ -408,12 +417,6 @@ def solve(
         local.scale,
         normal,
         _scores(rows, theta, local, gammas),
-        jnp.maximum(local.curvature, 0.1),
-        found.stats["num_steps"].astype(jnp.float64),
+        max(local.curvature, 0.1),
+        rounds,
     )
-
-
-def _largest_step(state) -> Float[Array, ""]:
-    """Return the largest change of a parameter; weights follow, and the L1 rounds are counted."""
-    theta, _, rounds = state
-    return jnp.max(jnp.abs(jnp.concatenate([theta.b, theta.a, theta.c, rounds[None]])))

@@ -3,16 +3,19 @@
 Paper: y = clamp(clamp(eL, 1e-6, 10)^(1/gamma), 0, 1). Robust (docs/photometry.md, 4):
 y = OETF(x0 (eL/x0)^(2.2/gamma)) with a pivot x0 at mid-grey that a change of gamma leaves alone,
 continued above 1 so that over-bright predictions keep a gradient.
+
+All functions compute with numpy on host arrays and with JAX on others (`numerics.namespace`).
 """
 
 from __future__ import annotations
 
-import jax.numpy as jnp
+from typing import Any
+
 import numpy as np
 from jaxtyping import Array, Float
 
 from p2gs_jax.config import PhotometryConfig
-from p2gs_jax.numerics import positive_pow, safe_log
+from p2gs_jax.numerics import Scalar, Values, namespace, positive_pow, safe_log
 from p2gs_jax.photometry.appearance import corrected
 from p2gs_jax.photometry.response import DARKEST, Response, log_exposed
 from p2gs_jax.types import GAMMA_SRGB
@@ -35,39 +38,42 @@ def _spline_table(cfg: PhotometryConfig) -> tuple[float, float, np.ndarray]:
     return float(grid[0]), float(grid[1] - grid[0]), np.interp(grid, z, y)
 
 
-def _spline_encode(log_linear: Float[Array, "..."], cfg: PhotometryConfig):
+def _spline_encode(log_linear: Values, cfg: PhotometryConfig) -> Values:
     """Encode through the table; linear in x below it, linear in log x above it."""
+    xp = namespace(log_linear)
     first, step, table = _spline_table(cfg)
     place = (log_linear - first) / step
-    left = jnp.clip(jnp.floor(place), 0, SPLINE_TABLE - 2).astype(jnp.int32)
-    values = jnp.asarray(table, log_linear.dtype)
+    left = xp.clip(xp.floor(place), 0, SPLINE_TABLE - 2).astype(np.int32)
+    values = xp.asarray(table, log_linear.dtype)
     # Above the table the last segment goes on, so that over-bright predictions keep a gradient.
     inside = values[left] + (place - left) * (values[left + 1] - values[left])
     dark = place < 0
-    below = table[0] * jnp.exp(jnp.where(dark, log_linear - first, 0.0))
-    return jnp.where(dark, below, inside)
+    below = float(table[0]) * xp.exp(xp.where(dark, log_linear - first, 0.0))
+    return xp.where(dark, below, inside)
 
 
-def oetf(linear: Float[Array, "..."], curve: str) -> Float[Array, "..."]:
+def oetf(linear: Values, curve: str) -> Values:
     """Encode linear values with the base curve; values above 1 continue it."""
     if curve == "linear":
         return linear
     if curve == "power":
         return positive_pow(linear, 1.0 / GAMMA_SRGB, EXPOSED_FLOOR)
+    xp = namespace(linear)
     toe = linear <= SRGB_LINEAR_END
-    high = 1.055 * positive_pow(jnp.where(toe, 1.0, linear), 1.0 / 2.4, EXPOSED_FLOOR) - 0.055
-    return jnp.where(toe, 12.92 * linear, high)
+    high = 1.055 * positive_pow(xp.where(toe, 1.0, linear), 1.0 / 2.4, EXPOSED_FLOOR) - 0.055
+    return xp.where(toe, 12.92 * linear, high)
 
 
-def eotf(encoded: Float[Array, "..."], curve: str) -> Float[Array, "..."]:
+def eotf(encoded: Values, curve: str) -> Values:
     """Decode: the inverse of `oetf` on [0, inf)."""
     if curve == "linear":
         return encoded
     if curve == "power":
         return positive_pow(encoded, GAMMA_SRGB, 1e-3)
+    xp = namespace(encoded)
     toe = encoded <= SRGB_ENCODED_END
-    base = (jnp.where(toe, 1.0, encoded) + 0.055) / 1.055
-    return jnp.where(toe, encoded / 12.92, positive_pow(base, 2.4, 1e-3))
+    base = (xp.where(toe, 1.0, encoded) + 0.055) / 1.055
+    return xp.where(toe, encoded / 12.92, positive_pow(base, 2.4, 1e-3))
 
 
 def expose(linear: Float[Array, "..."], exposure: Float[Array, ""]) -> Float[Array, "..."]:
@@ -75,9 +81,7 @@ def expose(linear: Float[Array, "..."], exposure: Float[Array, ""]) -> Float[Arr
     return exposure * linear
 
 
-def tone_map(
-    exposed: Float[Array, "..."], gamma: Float[Array, ""], cfg: PhotometryConfig
-) -> Float[Array, "..."]:
+def tone_map(exposed: Values, gamma: Scalar, cfg: PhotometryConfig) -> Values:
     """Return the display-encoded image of exposed radiance.
 
     Args:
@@ -85,43 +89,45 @@ def tone_map(
         gamma: > 0; dT/dgamma = -(ln x / gamma^2) x^(1/gamma) in the paper's form.
         cfg: base curve, pivot, clamping.
     """
+    xp = namespace(exposed, gamma)
     if cfg.clamp:
-        exposed = jnp.minimum(exposed, EXPOSED_CEILING)
-    log_x = safe_log(exposed, EXPOSED_FLOOR)
+        exposed = xp.minimum(exposed, EXPOSED_CEILING)
+    log_x: Any = safe_log(exposed, EXPOSED_FLOOR)
+    y: Any
     if cfg.curve == "power" and cfg.pivot == 1.0:
-        y = jnp.exp(log_x / gamma)
+        y = xp.exp(log_x / gamma)
     else:
         log_pivot = float(np.log(cfg.pivot))
         log_linear = log_pivot + (log_x - log_pivot) * (GAMMA_SRGB / gamma)
         if cfg.curve == "power":
-            y = jnp.exp(log_linear / GAMMA_SRGB)
+            y = xp.exp(log_linear / GAMMA_SRGB)
         elif cfg.curve == "linear":
-            y = jnp.exp(log_linear)
+            y = xp.exp(log_linear)
         elif cfg.curve == "spline":
             y = _spline_encode(log_linear, cfg)
         else:
             toe = log_linear <= float(np.log(SRGB_LINEAR_END))
-            low = 12.92 * jnp.exp(jnp.where(toe, log_linear, 0.0))
-            high = 1.055 * jnp.exp(jnp.where(toe, 0.0, log_linear) / 2.4) - 0.055
-            y = jnp.where(toe, low, high)
-    return jnp.clip(y, 0.0, 1.0) if cfg.clamp else y
+            low = 12.92 * xp.exp(xp.where(toe, log_linear, 0.0))
+            high = 1.055 * xp.exp(xp.where(toe, 0.0, log_linear) / 2.4) - 0.055
+            y = xp.where(toe, low, high)
+    return xp.clip(y, 0.0, 1.0) if cfg.clamp else y
 
 
-def inverse_tone_map(
-    ldr: Float[Array, "..."], gamma: Float[Array, ""], cfg: PhotometryConfig
-) -> Float[Array, "..."]:
+def inverse_tone_map(ldr: Values, gamma: Scalar, cfg: PhotometryConfig) -> Values:
     """Return the exposed radiance e L of display values; values below half a code count as that."""
-    y = jnp.maximum(ldr, LDR_FLOOR)
+    xp = namespace(ldr, gamma)
+    y = xp.maximum(ldr, LDR_FLOOR)
     if cfg.curve == "power" and cfg.pivot == 1.0:
-        return jnp.exp(gamma * jnp.log(y))
+        return xp.exp(gamma * xp.log(y))
     if cfg.curve == "spline":
         first, step, table = _spline_table(cfg)
         logs = first + step * np.arange(SPLINE_TABLE)
-        log_linear = jnp.interp(y, jnp.asarray(table, y.dtype), jnp.asarray(logs, y.dtype))
+        # numpy's interp computes and returns double precision.
+        log_linear = xp.interp(y, table.astype(y.dtype), logs.astype(y.dtype)).astype(y.dtype)
     else:
-        log_linear = jnp.log(eotf(y, cfg.curve))
+        log_linear = xp.log(eotf(y, cfg.curve))
     log_pivot = float(np.log(cfg.pivot))
-    return jnp.exp(log_pivot + (log_linear - log_pivot) * (gamma / GAMMA_SRGB))
+    return xp.exp(log_pivot + (log_linear - log_pivot) * (gamma / GAMMA_SRGB))
 
 
 def formation(
@@ -146,6 +152,6 @@ def formation(
     return corrected(ldr, appearance, cfg.appearance)
 
 
-def display(ldr: Float[Array, "..."]) -> Float[Array, "..."]:
+def display(ldr: Values) -> Values:
     """Clamp to what a display or an 8-bit file can hold."""
-    return jnp.clip(ldr, 0.0, 1.0)
+    return namespace(ldr).clip(ldr, 0.0, 1.0)

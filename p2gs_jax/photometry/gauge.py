@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 
-import jax.numpy as jnp
+import jax
+import numpy as np
 
 from p2gs_jax.photometry.radiance import RadianceKind
 from p2gs_jax.render.spherical_harmonics import C0
@@ -21,20 +22,23 @@ def recentre(params: Params, activation: RadianceKind) -> Params:
     """
     if activation == "softplus":
         return params
-    photometry, sh = params.photometry, params.gaussians.sh
-    log_scale = jnp.mean(jnp.log(photometry.exposures))
-    factor = jnp.exp(log_scale)
+    # On the host: once a fit, and every operation would be a program of its own.
+    photometry = jax.tree.map(np.asarray, params.photometry)
+    sh = np.array(params.gaussians.sh)
+    log_scale = np.mean(np.log(photometry.exposures))
+    factor = np.exp(log_scale)
     if activation == "exp":
-        sh = sh.at[:, 0].add(log_scale / C0)
+        sh[:, 0] += log_scale / C0
     else:
         # radiance = value + 1/2: the half must grow with the rest.
-        sh = (sh * factor).at[:, 0].add((factor - 1) * 0.5 / C0)
+        sh *= factor
+        sh[:, 0] += (factor - 1) * 0.5 / C0
     if photometry.parameterization == "log":
         raw = photometry.raw_exposures - log_scale
     else:
         raw = photometry.raw_exposures / factor
     return dataclasses.replace(
         params,
-        gaussians=dataclasses.replace(params.gaussians, sh=sh),
-        photometry=dataclasses.replace(photometry, raw_exposures=raw),
+        gaussians=dataclasses.replace(params.gaussians, sh=jax.device_put(sh)),
+        photometry=jax.device_put(dataclasses.replace(photometry, raw_exposures=raw)),
     )

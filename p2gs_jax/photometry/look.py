@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float32
 
@@ -58,8 +57,8 @@ def develop(
         linear: radiance; an image where there is a correction.
         look: how to show it.
     """
-    e, g = jnp.float32(look.exposure), jnp.float32(look.gamma)
-    return np.asarray(_develop(jnp.asarray(linear), e, g, look.correction, look.formation))
+    e, g = np.float32(look.exposure), np.float32(look.gamma)
+    return np.asarray(_develop(linear, e, g, look.correction, look.formation))
 
 
 @functools.partial(jax.jit, static_argnames="cfg")
@@ -79,8 +78,8 @@ def undevelop(
         ldr: display values.
         look: how it was taken.
     """
-    e, g = jnp.float32(look.exposure), jnp.float32(look.gamma)
-    return np.asarray(_undevelop(jnp.asarray(ldr), e, g, look.formation))
+    e, g = np.float32(look.exposure), np.float32(look.gamma)
+    return np.asarray(_undevelop(ldr, e, g, look.formation))
 
 
 @functools.partial(jax.jit, static_argnames="cfg")

@@ -1,20 +1,17 @@
-"""Colours of the same surface points in several views, padded for the bundle adjustment."""
+"""Colours of the same surface points in several views, in rows for the bundle adjustment."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 from scipy.sparse.csgraph import connected_components
 
 from p2gs_jax.photometry.response import Response, deviation, hat, log_exposed
 
 LONGEST_ROW = 16
-ROW_BUCKET = 512
 
 
 @dataclass(frozen=True)
@@ -66,33 +63,61 @@ class Observations:
         return connected_components(incidence @ incidence.T, directed=False)[1]
 
 
-class Rows(eqx.Module):
-    """Observations padded to rows of one point each: R rows of M slots.
-
-    Tracks longer than M are split into interleaved rows with a radiance of their own each, which
-    loses a few degrees of freedom and keeps every shape static.
+@dataclass(frozen=True)
+class Rows:
+    """Observations by row: one point each, or a part of a point that many views saw.
 
     Attributes:
-        views: row of the view, 0 in empty slots.
+        views: row of the view.
+        row: which row an observation belongs to.
         z: log exposed radiance under the base curve, relative to the pivot.
         sigma: its standard deviation.
-        weight: 1 used, 0 masked, held out or empty.
+        weight: 1 used, 0 masked or held out.
         knot: left spline knot.
         fraction: of the way to the next knot.
         slope: dz/dy under the base curve.
+        by_row: sums observations over their rows.
+        order: observations sorted by row.
+        first: of every pair of observations in a row, themselves included, the first one: its place
+            in `order`.
+        second: likewise the other.
+        count: number of rows.
+        view_count: number of views.
     """
 
-    views: Int[Array, "r m"]
-    z: Float[Array, "r m 3"]
-    sigma: Float[Array, "r m 3"]
-    weight: Float[Array, "r m 3"]
-    knot: Int[Array, "r m 3"]
-    fraction: Float[Array, "r m 3"]
-    slope: Float[Array, "r m 3"]
+    views: Int[np.ndarray, " o"]
+    row: Int[np.ndarray, " o"]
+    z: Float[np.ndarray, "o 3"]
+    sigma: Float[np.ndarray, "o 3"]
+    weight: Float[np.ndarray, "o 3"]
+    knot: Int[np.ndarray, "o 3"]
+    fraction: Float[np.ndarray, "o 3"]
+    slope: Float[np.ndarray, "o 3"]
+    by_row: sp.csr_array
+    order: Int[np.ndarray, " o"]
+    first: Int[np.ndarray, " pairs"]
+    second: Int[np.ndarray, " pairs"]
+    count: int
+    view_count: int
 
 
 class Layout:
-    """Where each observation lies in `Rows`."""
+    """Which row each observation belongs to.
+
+    Tracks longer than `slots` are split into interleaved rows with a radiance of their own each,
+    which loses a few degrees of freedom and bounds the number of pairs.
+
+    Attributes:
+        slots: longest row.
+        row: of each observation.
+        rows: their number.
+        point_of_row: the point of each row.
+        by_row: sums observations over their rows.
+        order: observations sorted by row.
+        first: of every pair of observations in a row, themselves included, the first one: its place
+            in `order`.
+        second: likewise the other.
+    """
 
     def __init__(self, observations: Observations):
         points = np.asarray(observations.points)
@@ -106,21 +131,25 @@ class Layout:
         starts = np.concatenate([[0], np.cumsum(lengths)])
         rank = np.empty(len(points), int)
         rank[order] = np.arange(len(points)) - starts[points[order]]
-        parts = np.maximum(split[points], 1)
-        self.row = first[points] + rank % parts
-        self.slot = rank // parts
-        self.rows = int(-(-max(first[-1], 1) // ROW_BUCKET) * ROW_BUCKET)
+        self.row = first[points] + rank % np.maximum(split[points], 1)
+        self.rows = int(first[-1])
         self.point_of_row = np.repeat(np.arange(observations.point_count), split)
+        count = len(points)
+        self.by_row = sp.csr_array(
+            (np.ones(count), (self.row, np.arange(count))), shape=(self.rows, count)
+        )
+        self.order = np.argsort(self.row, kind="stable")
+        self.first, self.second = _pairs(self.row[self.order])
 
-    def place(self, values: np.ndarray, fill: float = 0) -> np.ndarray:
-        """Return values of observations at their slots."""
-        out = np.full((self.rows, self.slots, *values.shape[1:]), fill, values.dtype)
-        out[self.row, self.slot] = values
-        return out
 
-    def take(self, values) -> np.ndarray:
-        """Return values of slots in the order of the observations."""
-        return np.asarray(values)[self.row, self.slot]
+def _pairs(row: Int[np.ndarray, " o"]):
+    """Return every pair of equal entries of a sorted array once, each with itself included."""
+    here = np.arange(len(row))
+    # Every entry with itself and those behind it that equal it.
+    behind = np.searchsorted(row, row, side="right") - here
+    first = np.repeat(here, behind)
+    offset = np.arange(len(first)) - np.repeat(np.cumsum(behind) - behind, behind)
+    return first, first + offset
 
 
 def make_rows(
@@ -130,7 +159,7 @@ def make_rows(
     response: Response,
     log_pivot: float,
 ) -> Rows:
-    """Return padded rows under one response.
+    """Return rows under one response.
 
     Args:
         observations: the colours.
@@ -142,11 +171,18 @@ def make_rows(
     z, sigma, slope = observations.decoded(response)
     knot, fraction = hat(np.asarray(observations.colors, np.float64))
     return Rows(
-        views=jnp.asarray(layout.place(observations.views.astype(np.int32))),
-        z=jnp.asarray(layout.place(z - log_pivot)),
-        sigma=jnp.asarray(layout.place(sigma, 1.0)),
-        weight=jnp.asarray(layout.place(np.asarray(weight, np.float64))),
-        knot=jnp.asarray(layout.place(knot.astype(np.int32))),
-        fraction=jnp.asarray(layout.place(fraction)),
-        slope=jnp.asarray(layout.place(slope, 1.0)),
+        views=np.asarray(observations.views),
+        row=layout.row,
+        z=z - log_pivot,
+        sigma=sigma,
+        weight=np.asarray(weight, np.float64),
+        knot=knot,
+        fraction=fraction,
+        slope=slope,
+        by_row=layout.by_row,
+        order=layout.order,
+        first=layout.first,
+        second=layout.second,
+        count=layout.rows,
+        view_count=observations.view_count,
     )

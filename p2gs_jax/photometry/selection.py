@@ -132,7 +132,7 @@ def _judged(
     """
     o, layout = problem.observations, problem.layout
     sigma, slope = (a[held] for a in o.decoded(response)[1:])
-    residual = layout.take(fit.residual)[held]
+    residual = fit.residual[held]
     precision = fit.precision[layout.row[held]]
     known = (problem.usable[held] > 0) & (precision > 1e-3)
     a = fit.theta.a[o.views[held]][:, None]

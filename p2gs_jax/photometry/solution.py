@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -221,13 +219,13 @@ def make_system(problem: Problem, model: Model, spline: bool) -> System:
     between = 0.5 * (gaps[1:] + gaps[:-1])
     second = second * (BEND_SPACING**1.5 / np.sqrt(between))[:, None]
     return System(
-        basis=jnp.asarray(basis),
-        anchors=jnp.asarray(anchors),
-        targets=jnp.asarray(targets),
-        log_exposure=jnp.asarray(log_exposure),
-        log_exposure_precision=jnp.asarray(precision),
-        a_precision=jnp.full(views, 1 / A_PRIOR**2 if model.gamma else 0.0),
-        bend=jnp.asarray(BEND * second.T @ second)[:knots, :knots],
+        basis=basis,
+        anchors=anchors,
+        targets=targets,
+        log_exposure=log_exposure,
+        log_exposure_precision=precision,
+        a_precision=np.full(views, 1 / A_PRIOR**2 if model.gamma else 0.0),
+        bend=(BEND * second.T @ second)[:knots, :knots],
     )
 
 
@@ -250,15 +248,12 @@ def solve_model(
         spline: solve for a spline over the response's base as well.
         tolerance: change of a parameter, log units, at which the rounds end.
     """
-    with jax.enable_x64(True):
-        weight = problem.usable if use is None else problem.usable * use[:, None]
-        rows = make_rows(problem.observations, problem.layout, weight, response, problem.log_pivot)
-        system = make_system(problem, LADDER[name], spline)
-        views = problem.observations.view_count
-        start = Theta(system.log_exposure, jnp.ones(views), jnp.zeros(len(FREE) if spline else 0))
-        gammas = LADDER[name].gamma is not None
-        fit = solve(rows, system, start, jnp.float64(tolerance), gammas)
-        return jax.tree.map(np.asarray, fit), jax.tree.map(np.asarray, system)
+    weight = problem.usable if use is None else problem.usable * use[:, None]
+    rows = make_rows(problem.observations, problem.layout, weight, response, problem.log_pivot)
+    system = make_system(problem, LADDER[name], spline)
+    views = problem.observations.view_count
+    start = Theta(system.log_exposure, np.ones(views), np.zeros(len(FREE) if spline else 0))
+    return solve(rows, system, start, tolerance, LADDER[name].gamma is not None), system
 
 
 def covariance(fit: Fit, system: System) -> Float[np.ndarray, "d d"]:
@@ -269,15 +264,14 @@ def covariance(fit: Fit, system: System) -> Float[np.ndarray, "d d"]:
     """
     both = slice(0, 2 * len(fit.theta.b))
     bread, meat = fit.normal * fit.curvature, fit.scores.copy()
-    with jax.enable_x64(True):
-        prior = np.asarray(prior_matrix(system))
-        bread[both, both] += prior
-        strength = float(gauge_strength(jnp.asarray(bread), len(fit.theta.b)))
+    prior = prior_matrix(system)
+    bread[both, both] += prior
+    strength = gauge_strength(bread, len(fit.theta.b))
     # A prior is itself an observation with variance 1 / precision: it is its own meat.
     meat[both, both] += prior
     bread[both, both] += strength * system.anchors.T @ system.anchors
     free = np.abs(system.basis).sum(0) > 0
-    g = np.asarray(system.basis)[:, free]
+    g = system.basis[:, free]
     if not g.size:
         return np.zeros_like(bread)
     inverse = np.linalg.pinv(g.T @ bread @ g, hermitian=True)
@@ -347,10 +341,10 @@ def describe(
     h = np.where(active, h - shift, 0.0)
 
     used = problem.usable > 0
-    residual = problem.layout.take(fit.residual) / a[o.views][:, None]
+    residual = fit.residual / a[o.views][:, None]
     view_residual, balance = _per_view_ev(o.views, residual, used, o.view_count)
     ideal = 1 / o.decoded(response)[1] ** 2
-    ignored = (problem.layout.take(fit.weight) / ideal)[used] < 0.25
+    ignored = (fit.weight / ideal)[used] < 0.25
     return PhotometricSolution(
         model=name,
         response=response,
@@ -365,7 +359,7 @@ def describe(
         view_residual_ev=view_residual,
         view_balance_ev=balance,
         outliers=float(ignored.mean()) if ignored.size else 0.0,
-        rounds=int(fit.rounds),
+        rounds=fit.rounds,
         warnings=_warnings(per_view, component, active, balance, o.names),
     )
 
@@ -410,8 +404,7 @@ def _centering(a, h, component, active, free_scale):
 def _point_radiance(problem: Problem, fit: Fit, shift) -> Float[np.ndarray, "p 3"]:
     """Combine the rows of each point; the gauge shift of its views goes the other way."""
     o, layout = problem.observations, problem.layout
-    rows = len(layout.point_of_row)
-    precision, level = fit.precision[:rows], fit.radiance[:rows]
+    precision, level = fit.precision, fit.radiance
     total = np.zeros((o.point_count, 3))
     weight = np.zeros((o.point_count, 3))
     np.add.at(total, layout.point_of_row, precision * level)

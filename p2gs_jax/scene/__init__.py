@@ -14,9 +14,7 @@ from p2gs_jax.scene.files import list_images
 from p2gs_jax.scene.images import ImageStore, camera_at, size_at
 from p2gs_jax.scene.rig import is_rig, load_rig
 from p2gs_jax.scene.split import assign_split
-from p2gs_jax.scene.structure_from_motion import load_images
 from p2gs_jax.scene.transforms import load_transforms
-from p2gs_jax.scene.triangulate import triangulate
 from p2gs_jax.types import Scene, View
 
 __all__ = ["ImageStore", "camera_at", "load_scene", "size_at"]
@@ -52,6 +50,9 @@ def load_scene(
         raise UserError(f"{root} does not exist", fix="check the path of the scene")
     scene = _read(root, cfg, work_dir, report)
     if len(scene.points) == 0:
+        # Imported here as below: scenes with points do not need COLMAP.
+        from p2gs_jax.scene.triangulate import triangulate
+
         scene = triangulate(scene, work_dir, report)
     views, mask_notes = _attach_masks(scene.views)
     views = tuple(
@@ -91,6 +92,8 @@ def _read(
         # Subfolders of the root itself may hold anything: masks, or the results of other runs.
         paths = list_images(folder, recursive=folder != root)
         if paths:
+            from p2gs_jax.scene.structure_from_motion import load_images
+
             return load_images(root, folder, paths, cfg, work_dir, report)
     looked = ", ".join(str(folder) for folder in folders)
     raise UserError(

@@ -91,7 +91,7 @@ def test_the_fixed_point_minimises_the_robust_loss():
         channels = jnp.maximum(rows.weight.sum(-1), 1)
 
         def loss(b):
-            level = fit.radiance[:, None] * fit.theta.a[rows.views][..., None]
+            level = fit.radiance[rows.row] * fit.theta.a[rows.views][..., None]
             u = (rows.z - b[rows.views][..., None] - level) / rows.sigma
             square = jnp.sum(u**2 * rows.weight, -1) / channels / bound
             return jnp.sum(0.5 * bound * channels * square / (1 + square))

@@ -1,0 +1,103 @@
+"""Where the time goes: named seconds, and what the compiler took of them."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from jax import monitoring
+
+_COMPILED = "/jax/core/compile/backend_compile_duration"
+_READ_BACK = "/jax/compilation_cache/cache_hits"
+
+
+class Stopwatch:
+    """Seconds by name; the same name adds up.
+
+    Threads may share one. Seconds are wall time: parts that overlap are both counted in full.
+
+    Attributes:
+        seconds: wall seconds by name, in the order in which the names were first used.
+    """
+
+    def __init__(self):
+        self.seconds: dict[str, float] = {}
+        self._lock = threading.Lock()
+
+    @contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        """Add the seconds of a `with` block to a name, also where the block raises."""
+        begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.add(name, time.perf_counter() - begin)
+
+    def add(self, name: str, seconds: float) -> None:
+        """Add seconds that were measured elsewhere."""
+        with self._lock:
+            self.seconds[name] = self.seconds.get(name, 0.0) + seconds
+
+
+class CompileCounter:
+    """What XLA compiled since this counter was made, in all threads of the process.
+
+    JAX offers listeners but no counter. One listener adds everything up for the whole process, and
+    counters are differences: none needs an end, and threads cannot miss one.
+    """
+
+    def __init__(self):
+        _listen()
+        self._begin = _totals()
+
+    @property
+    def programs(self) -> int:
+        """Programs compiled, or read back from the cache on disk."""
+        return int(_totals()[0] - self._begin[0])
+
+    @property
+    def read_back(self) -> int:
+        """How many of `programs` came from the cache on disk."""
+        return int(_totals()[2] - self._begin[2])
+
+    @property
+    def seconds(self) -> float:
+        """Seconds that threads spent in the compiler or reading the cache, summed over threads."""
+        return _totals()[1] - self._begin[1]
+
+
+_lock = threading.Lock()
+_sums = [0.0, 0.0, 0.0]
+_listening = False
+
+
+def _totals() -> tuple[float, float, float]:
+    """Return (programs, seconds, programs read back) since listening began."""
+    with _lock:
+        programs, seconds, read_back = _sums
+    return programs, seconds, read_back
+
+
+def _listen() -> None:
+    global _listening
+    with _lock:
+        if _listening:
+            return
+        _listening = True
+    monitoring.register_event_duration_secs_listener(_on_duration)
+    monitoring.register_event_listener(_on_event)
+
+
+def _on_duration(event: str, duration_secs: float, **_) -> None:
+    if event == _COMPILED:
+        with _lock:
+            _sums[0] += 1
+            _sums[1] += duration_secs
+
+
+def _on_event(event: str, **_) -> None:
+    if event == _READ_BACK:
+        with _lock:
+            _sums[2] += 1
