@@ -16,6 +16,7 @@ its users.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import datetime
 import hashlib
 import itertools
@@ -29,7 +30,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -239,12 +240,15 @@ def plan(
     temperatures: Sequence[Temperature],
     budgets: Sequence[int],
 ) -> list[Job]:
-    """Return all jobs; the versions take turns, and cold runs come before warm ones."""
+    """Return all jobs; the versions take turns, and cold runs come before warm ones.
+
+    The longest budget comes first: its cold run leaves what the warm ones need.
+    """
     order: list[Temperature] = [t for t in ("cold", "warm") if t in temperatures]
     return [
         Job(scene, v, temperature, budget)
         for scene in found
-        for budget in sorted(budgets)
+        for budget in sorted(budgets, reverse=True)
         for temperature in order
         for v in versions
     ]
@@ -389,23 +393,41 @@ def execute(job: Job, cache: Path, work: Path) -> dict[str, Any]:
         return row
 
 
+@contextlib.contextmanager
+def emptied(cache: Path) -> Iterator[Path]:
+    """Yield an empty folder at `cache`; what it held before comes back beside what it then holds.
+
+    The folder keeps its place because JAX's keys contain it: moved programs are not found.
+    """
+    aside = cache.with_name(f"{cache.name}.aside")
+    if cache.is_dir() and not aside.is_dir():
+        cache.rename(aside)
+    shutil.rmtree(cache, ignore_errors=True)
+    cache.mkdir(parents=True)
+    try:
+        yield cache
+    finally:
+        if aside.is_dir():
+            shutil.copytree(aside, cache, dirs_exist_ok=True)
+            shutil.rmtree(aside)
+
+
 def run(job: Job, work: Path, say: Callable[[str], None]) -> dict[str, Any]:
     """Run a job with the cache that its temperature asks for.
 
     What a cold run compiled is kept for the warm ones; where nothing is kept yet, a warm run is
     preceded by one that does not count.
     """
-    kept = work / "caches" / job.version.code / job.scene.name
-    if job.temperature == "warm":
-        if not kept.is_dir():
-            say("  first a run that does not count")
-            with atomic_folder(kept) as folder:
-                execute(job, folder, work)
-        return execute(job, kept, work)
-    with tempfile.TemporaryDirectory(dir=work) as temporary:
-        row = execute(job, Path(temporary), work)
-        shutil.copytree(temporary, kept, dirs_exist_ok=True)
-        return row
+    v = job.version
+    cache = work / "caches" / f"{v.label}-{v.code}" / job.scene.name.replace(", ", "_")
+    if job.temperature == "cold":
+        with emptied(cache):
+            return execute(job, cache, work)
+    if not cache.is_dir():
+        say("  first a run that does not count")
+        with emptied(cache):
+            execute(job, cache, work)
+    return execute(job, cache, work)
 
 
 # ------------------------------------------------------------------ what is made of the rows
@@ -596,7 +618,8 @@ def main() -> None:
         write_rows(out, stamp, rows)
         say(f"  {rows[-1]['wall_s']:.1f} s, novel {_cell(rows[-1]['test_psnr'], 2)} dB")
     # Rows of other code stay in the file; tables and plot are of these two versions.
-    shown = [row for row in (row_of(job, rows) for job in jobs) if row is not None]
+    in_order = sorted(jobs, key=lambda j: (SCENES.index(j.scene.name.split(",")[0]), j.budget))
+    shown = [row for row in (row_of(job, rows) for job in in_order) if row is not None]
     print(table(shown))
     for line in speedups(shown):
         print(f"- {line}")

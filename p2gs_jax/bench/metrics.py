@@ -53,6 +53,7 @@ METRICS = {
     "gradient": Metric("gradient rel. L2", "lower", 1.25),
     "forward": Metric("forward / reference", "lower", 2.0),
     "both": Metric("forward + backward / reference", "lower", 2.0),
+    "step": Metric("training step / reference", "lower", 2.0),
 }
 ACCURACY = ("max_abs", "relative", "psnr", "gradient")
 

@@ -32,7 +32,7 @@ def test_versions_take_turns_and_cold_runs_come_first():
     assert len(jobs) == 16
     assert [j.version.label for j in jobs[:4]] == [t2q.THIS, t2q.AGAINST] * 2
     assert [j.temperature for j in jobs[:4]] == ["cold", "cold", "warm", "warm"]
-    assert [j.budget for j in jobs[:8]] == [60] * 4 + [120] * 4
+    assert [j.budget for j in jobs[:8]] == [120] * 4 + [60] * 4
 
 
 def test_finished_rows_are_kept_and_other_code_is_measured_anew(tmp_path):
@@ -72,13 +72,13 @@ def test_when_a_curve_reaches_a_level():
 
 
 def test_speedups_compare_with_the_best_of_the_other():
-    ours = t2q.plan([TOWN], [NEW], ["warm"], [60, 120])
+    ours = t2q.plan([TOWN], [NEW], ["warm"], [120, 60])
     theirs = t2q.plan([TOWN], [OLD], ["warm"], [60, 120])
-    rows = [row(j, j.budget, v) for j, v in zip(ours, (21.0, 23.0), strict=True)]
-    rows += [row(j, j.budget, v) for j, v in zip(theirs, (20.0, 21.0), strict=True)]
+    rows = [row(j, j.budget, v) for j, v in zip(ours, (23.0, 21.0), strict=True)]
+    rows += [row(j, j.budget, v) for j, v in zip(theirs, (21.0, 20.0), strict=True)]
     (said,) = t2q.speedups(rows)
     assert "at most 60 s here: 2.00 times" in said
-    rows = [row(j, j.budget, v) for j, v in zip(ours, (19.0, 19.5), strict=True)] + rows[2:]
+    rows = [row(j, j.budget, v) for j, v in zip(ours, (19.5, 19.0), strict=True)] + rows[2:]
     assert "not reached here (best 19.50 dB)" in t2q.speedups(rows)[0]
     assert len(t2q.plot(rows).axes) == 1
 
@@ -141,3 +141,17 @@ def test_absent_scenes_are_skipped_with_a_message(tmp_path, capsys):
     found = t2q.scenes(["nerf_fox", "sofa"], tmp_path, tmp_path / "none", None, quick=False)
     assert found == []
     assert capsys.readouterr().err.count("is skipped") == 2
+
+
+def test_a_cold_run_starts_empty_and_leaves_its_programs_where_they_are_found(tmp_path):
+    cache = tmp_path / "caches" / "town"
+    for name in ("first", "second"):
+        with t2q.emptied(cache) as folder:
+            assert folder == cache
+            assert list(folder.iterdir()) == []
+            (folder / name).write_text("")
+    assert {f.name for f in cache.iterdir()} == {"first", "second"}
+    with pytest.raises(RuntimeError), t2q.emptied(cache):
+        raise RuntimeError("a fit failed")
+    assert {f.name for f in cache.iterdir()} == {"first", "second"}
+    assert [f.name for f in cache.parent.iterdir()] == ["town"]
