@@ -51,6 +51,7 @@ BUDGETS = (60, 120, 240, 480)
 QUICK_BUDGET = 30
 MIXTURE_SEED, MIXTURE_GROUPS, MIXTURE_REFERENCE = 7, ("low", "high", "over_exp"), "high"
 THIS, AGAINST = "this", "against"
+TICKS = (15, 20, 30, 45, 60, 90, 120, 180, 240, 360, 480, 720, 960)
 COLORS = {THIS: "#0072B2", AGAINST: "#D55E00"}
 COMPILED = re.compile(r"Finished XLA compilation of \S+ in ([\d.]+) sec")
 
@@ -539,8 +540,10 @@ def plot(rows: Sequence[Mapping[str, Any]]) -> Figure:
         times = sorted({r["budget"] for r in rows if r["scene"] == name})
         walls = [r["wall_s"] for r in rows if r["scene"] == name]
         axis.set(xscale="log", title=name, xlabel="wall seconds of the whole command")
-        axis.set_xlim(0.8 * min([*times, *walls]), 1.25 * max([*times, *walls]))
-        axis.set_xticks(times, [str(t) for t in times])
+        low, high = 0.8 * min([*times, *walls]), 1.25 * max([*times, *walls])
+        axis.set_xlim(low, high)
+        ticks = [t for t in TICKS if low <= t <= high] or times
+        axis.set_xticks(ticks, [str(t) for t in ticks])
         axis.minorticks_off()
         axis.grid(alpha=0.3)
     figure.axes[0].set_ylabel("PSNR of held-out views, dB")

@@ -26,6 +26,7 @@ from p2gs_jax.bench.speed_error import DEFAULT, Point, front
 from p2gs_jax.bench.step import StepCost
 from p2gs_jax.export.atomic import atomic_write
 
+LEVEL_ACCURACY = ("relative", "relative_99", "gradient", "gradient_99")
 MARKERS = "osD^vPXhp*<>"
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#555555")
 
@@ -302,7 +303,7 @@ def levels_table(levels: list[Level]) -> str:
         lists, ms = level.lists, level.milliseconds
         low, middle, high = lists.quantiles
         numerics = (
-            _number(k, level.numerics[k]) if k in level.numerics else "" for k in ACCURACY[1:]
+            _number(k, level.numerics[k]) if k in level.numerics else "" for k in LEVEL_ACCURACY
         )
         rows.append(
             [
@@ -318,7 +319,7 @@ def levels_table(levels: list[Level]) -> str:
             ]
         )
     header = ["scene", "pixels", "Gaussians", "entries", "a tile", "5 / 50 / 95 %", "longest"]
-    header += ["fwd ms", "fwd+bwd ms", "step ms", *(METRICS[k].title for k in ACCURACY[1:])]
+    header += ["fwd ms", "fwd+bwd ms", "step ms", *(METRICS[k].title for k in LEVEL_ACCURACY)]
     return markdown(header, rows)
 
 
