@@ -10,8 +10,10 @@ from p2gs_jax.bench.speed_error import Point
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.atomic import write_json
 
+Rows = dict[str, dict[str, float]]
 
-def values(points: list[Point]) -> dict[str, dict[str, float]]:
+
+def values(points: list[Point]) -> Rows:
     """Return per variant what the gate compares.
 
     The total error shows what the rules leave out; `numerics ...` shows the implementation alone.
@@ -24,13 +26,18 @@ def values(points: list[Point]) -> dict[str, dict[str, float]]:
     return rows
 
 
-def write_baseline(path: Path, points: list[Point]) -> None:
-    """Write the baseline that `check` reads."""
-    write_json(path, values(points))
+def write_baseline(path: Path, rows: Rows) -> None:
+    """Write the baseline that `check` reads; rows of the file that were not measured stay."""
+    known = json.loads(path.read_text()) if path.is_file() else {}
+    write_json(path, known | rows)
 
 
-def check(path: Path, points: list[Point]) -> list[str]:
+def check(path: Path, rows: Rows) -> list[str]:
     """Return one sentence for each value that is worse than the baseline allows.
+
+    Args:
+        path: the baseline.
+        rows: variant or scene -> metric -> value.
 
     Raises:
         UserError: the baseline is missing, damaged, or lacks a variant or metric.
@@ -42,7 +49,7 @@ def check(path: Path, points: list[Point]) -> list[str]:
             f"{path} is no baseline: {error}", fix="write one with --write-baseline"
         ) from error
     complaints = []
-    for name, row in values(points).items():
+    for name, row in rows.items():
         for metric, value in row.items():
             known = baseline.get(name, {}).get(metric)
             if not isinstance(known, int | float):

@@ -19,12 +19,14 @@ from matplotlib.ticker import FormatStrFormatter, NullFormatter
 from p2gs_jax.bench.growth import Curve
 from p2gs_jax.bench.hard_cases import CASES, Gap
 from p2gs_jax.bench.implementations import Timing, Work
+from p2gs_jax.bench.levels import Level
 from p2gs_jax.bench.memory import Footprint
 from p2gs_jax.bench.metrics import ACCURACY, METRICS
 from p2gs_jax.bench.speed_error import DEFAULT, Point, front
 from p2gs_jax.bench.step import StepCost
 from p2gs_jax.export.atomic import atomic_write
 
+LEVEL_ACCURACY = ("relative", "relative_99", "gradient", "gradient_99")
 MARKERS = "osD^vPXhp*<>"
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#555555")
 
@@ -292,6 +294,33 @@ def step_table(costs: dict[str, StepCost]) -> str:
         for scene, c in costs.items()
     ]
     return markdown(["scene", *names, "whole step", "programs"], rows)
+
+
+def levels_table(levels: list[Level]) -> str:
+    """Return what every level of a fit asks of the renderer, and what it takes."""
+    rows = []
+    for level in levels:
+        lists, ms = level.lists, level.milliseconds
+        low, middle, high = lists.quantiles
+        numerics = (
+            _number(k, level.numerics[k]) if k in level.numerics else "" for k in LEVEL_ACCURACY
+        )
+        rows.append(
+            [
+                level.scene,
+                "{}x{}".format(*level.size),
+                f"{level.gaussians / 1e3:.0f}k",
+                f"{lists.entries / 1e3:.0f}k",
+                f"{lists.entries / lists.tiles:.0f}",
+                f"{low:.0f} / {middle:.0f} / {high:.0f}",
+                str(lists.longest),
+                *(f"{ms[k]:.1f}" if k in ms else "" for k in ("forward", "both", "step")),
+                *numerics,
+            ]
+        )
+    header = ["scene", "pixels", "Gaussians", "entries", "a tile", "5 / 50 / 95 %", "longest"]
+    header += ["fwd ms", "fwd+bwd ms", "step ms", *(METRICS[k].title for k in LEVEL_ACCURACY)]
+    return markdown(header, rows)
 
 
 def hard_case_table(gaps: dict[str, Gap]) -> str:

@@ -2,18 +2,30 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import Literal, get_args
 
-from p2gs_jax.bench import gate, growth, hard_cases, implementations, memory, report, speed_error
+from p2gs_jax.bench import (
+    gate,
+    growth,
+    hard_cases,
+    implementations,
+    levels,
+    memory,
+    report,
+    speed_error,
+)
 from p2gs_jax.bench.scenes import BenchScene, street
 from p2gs_jax.bench.step import measure_step
-from p2gs_jax.config import preset
+from p2gs_jax.config import RenderConfig, preset
 from p2gs_jax.export.atomic import write_json, write_text
 
-Part = Literal["speed_error", "growth", "memory", "step", "hard_cases", "implementations"]
+Part = Literal["speed_error", "levels", "growth", "memory", "step", "hard_cases", "implementations"]
 PARTS: tuple[Part, ...] = get_args(Part)
+# What a baseline holds.
+GATED: tuple[Part, ...] = ("speed_error", "levels")
 Progress = Callable[[str, int, int], None]
 
 
@@ -31,6 +43,7 @@ def run(
     quick: bool = False,
     baseline: Path | None = None,
     write_baseline: Path | None = None,
+    render: RenderConfig | None = None,
     on_progress: Progress = lambda stage, done, count: None,
 ) -> tuple[str, list[str]]:
     """Run benches and write `bench.md`, `bench.json` and plots under `out`.
@@ -39,8 +52,9 @@ def run(
         parts: which.
         out: folder.
         quick: fewer and smaller.
-        baseline: compare `speed_error` with it.
-        write_baseline: write what `speed_error` measured there.
+        baseline: compare `speed_error` and `levels` with it.
+        write_baseline: write what these measured there.
+        render: options of the renderer for `levels`; default `RenderConfig()`.
         on_progress: called with (stage, done, count).
 
     Returns:
@@ -49,6 +63,7 @@ def run(
     sections: list[str] = []
     data: dict = {"stamp": report.stamp(), "quick": quick}
     complaints: list[str] = []
+    gated: gate.Rows = {}
 
     def section(title: str, *texts: str) -> None:
         sections.append("\n\n".join([f"## {title}", *texts]))
@@ -62,10 +77,23 @@ def run(
         section(f"Speed against error: {title}", report.speed_error_table(points))
         report.speed_error_plot(out / "speed_error.png", points, title)
         data["speed_error"] = [p._replace(variant=p.variant.name)._asdict() for p in points]  # pyright: ignore[reportArgumentType]
-        if write_baseline:
-            gate.write_baseline(write_baseline, points)
-        if baseline:
-            complaints = gate.check(baseline, points)
+        gated |= gate.values(points)
+    if "levels" in parts:
+        cfg = dataclasses.replace(preset("robust"), render=render or RenderConfig())
+        found = levels.measure(
+            levels.QUICK if quick else levels.SCENES,
+            cfg,
+            steps=levels.QUICK_STEPS if quick else None,
+            repeats=5 if quick else 7,
+            on_progress=on_progress,
+        )
+        section("Levels of a fit: rendering and the whole step", report.levels_table(found))
+        data["levels"] = [level._replace(lists=level.lists._asdict())._asdict() for level in found]  # pyright: ignore[reportArgumentType]
+        gated |= levels.gate_rows(found)
+    if write_baseline:
+        gate.write_baseline(write_baseline, gated)
+    if baseline:
+        complaints = gate.check(baseline, gated)
     if "growth" in parts:
         curves = growth.measure(quick=quick, on_progress=on_progress)
         per = report.memory_coefficients(curves)

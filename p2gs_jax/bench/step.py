@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
 import jax
@@ -45,6 +46,45 @@ class StepCost(NamedTuple):
         return sum(self.parts[k] for k in ("loss", "optimizer", "transfer", "densify (a step)"))
 
 
+class WholeStep(NamedTuple):
+    """The jitted step as training runs it, on one view.
+
+    Attributes:
+        run: takes a step, from where the last one ended, and returns its loss.
+        compilations: returns how many programs the step has become.
+        fault: returns the kind of the first fault; after one, steps do nothing.
+    """
+
+    run: Callable[[], Any]
+    compilations: Callable[[], int]
+    fault: Callable[[], int]
+
+
+def whole_step(scene: BenchScene, cfg: FitConfig, batch: Batch, capacity: int) -> WholeStep:
+    """Return the step of a fit of `scene`.
+
+    Args:
+        scene: what to fit.
+        cfg: as for a fit.
+        batch: the view.
+        capacity: of the tile lists.
+    """
+    alive = jnp.ones(scene.gaussians.capacity, bool)
+    params = Params(scene.gaussians, Photometry(jnp.zeros(4), jnp.zeros(4)))
+    optimizer = make_optimizer(cfg)
+    # The step donates its state: the scene keeps its own copy.
+    holder = [jax.tree.map(jnp.copy, initial_state(params, alive, optimizer))]
+    controls = Controls(jnp.float32(0.5), jnp.int32(cfg.render.sh_degree))
+    partner = Partner(jnp.int32(0))
+    step = make_step(cfg, optimizer, 1.0)
+
+    def run():
+        holder[0], report = step(holder[0], batch, partner, controls, capacity=capacity)
+        return report.loss
+
+    return WholeStep(run, cast(Any, step)._cache_size, lambda: int(holder[0].fault.kind))
+
+
 def measure_step(scene: BenchScene, cfg: FitConfig, repeats: int = 7) -> StepCost:
     """Time a full step and its parts on one view.
 
@@ -65,7 +105,6 @@ def measure_step(scene: BenchScene, cfg: FitConfig, repeats: int = 7) -> StepCos
     photograph = rng.integers(0, 256, (*shape, 3), np.uint8)
     ldr, mask = jnp.asarray(photograph / np.float32(255)), jnp.ones(shape)
     batch = Batch(camera, ldr, mask, jnp.int32(0))
-    controls = Controls(jnp.float32(0.5), jnp.int32(cfg.render.sh_degree))
 
     def jit(f):
         return jax.jit(f, compiler_options=compiler_options())
@@ -129,17 +168,9 @@ def measure_step(scene: BenchScene, cfg: FitConfig, repeats: int = 7) -> StepCos
         "densify (a step)": lambda: relocate(gaussians),
         "transfer": lambda: jax.device_put(photograph).astype(jnp.float32) / 255,
     }
-    step = make_step(cfg, optimizer, 1.0)
-    partner = Partner(jnp.int32(0))
-    # The step donates its state: the parts above keep their own copy of it.
-    holder = [jax.tree.map(jnp.copy, state)]
-
-    def whole():
-        holder[0], report = step(holder[0], batch, partner, controls, capacity=capacity)
-        return report.loss
-
-    jobs["whole"] = whole
+    step = whole_step(scene, cfg, batch, capacity)
+    jobs["whole"] = step.run
     times = interleaved(jobs, repeats)
     whole_ms = times.pop("whole")
     times["densify (a step)"] /= cfg.densify.min_every_steps
-    return StepCost(times, whole_ms, cast(Any, step)._cache_size())
+    return StepCost(times, whole_ms, step.compilations())

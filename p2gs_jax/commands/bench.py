@@ -17,8 +17,9 @@ def run(options: Bench) -> int:
                 f"there is no bench {name!r}.", fix=f"choose {', '.join(benches.PARTS)}"
             )
     chosen: tuple[benches.Part, ...] = tuple(p for p in benches.PARTS if not parts or p in parts)
-    if (baseline or write_baseline) and "speed_error" not in chosen:
-        raise UserError("a baseline concerns speed_error.", fix="name that part as well")
+    if (baseline or write_baseline) and not set(benches.GATED) & set(chosen):
+        gated = " and ".join(benches.GATED)
+        raise UserError(f"a baseline concerns {gated}.", fix="name one of these parts as well")
     if baseline is not None and not baseline.is_file():
         raise UserError(f"there is no file {baseline}.", fix="make one with --write-baseline FILE")
     with TerminalReporter() as reporter:
@@ -28,6 +29,7 @@ def run(options: Bench) -> int:
             quick=options.quick,
             baseline=baseline,
             write_baseline=write_baseline,
+            render=options.render,
             on_progress=reporter.stage,
         )
     print(text)

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from p2gs_jax.config import RenderConfig
 from p2gs_jax.synth.settings import Layout, Sensor
 
 
@@ -92,17 +93,21 @@ class Bench:
 
     p2gs-jax bench --quick
     p2gs-jax bench speed_error memory --out runs/bench
+    p2gs-jax bench levels --render.chunk 32
     """
 
     parts: Annotated[
         tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[PART ...]")
     ] = ()
-    """speed_error, growth, memory, step, hard_cases, implementations; none named runs all."""
+    """speed_error, levels, growth, memory, step, hard_cases, implementations; none named runs
+    all."""
     out: Path = Path("runs/bench")
     """Folder for tables, JSON and plots."""
     quick: bool = False
     """Fewer and smaller: two minutes instead of half an hour."""
     baseline: Path | None = None
-    """Compare speed_error with this file; exit code 1 where it is worse."""
+    """Compare speed_error and levels with this file; exit code 1 where they are worse."""
     write_baseline: Path | None = None
-    """Write what speed_error measured, for a later --baseline."""
+    """Write what speed_error and levels measured, for a later --baseline."""
+    render: RenderConfig = field(default_factory=RenderConfig)
+    """Options of the renderer, for levels."""
