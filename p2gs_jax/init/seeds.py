@@ -65,23 +65,28 @@ def gaussians_from_points(
     views: list[View],
     cfg: FitConfig,
     *,
-    scales: Float[np.ndarray, " p"] | None = None,
-    opacity: float | None = None,
+    scales: Float[np.ndarray, "p #3"] | Float[np.ndarray, " p"] | None = None,
+    opacity: Float[np.ndarray, " p"] | float | None = None,
+    quats: Float[np.ndarray, "p 4"] | None = None,
 ) -> Gaussians:
-    """Return one isotropic Gaussian per point.
+    """Return one Gaussian per point.
 
     Args:
         points: scene units.
         radiance: linear radiance in the gauge of the exposures.
         views: training views, for the distance that bounds the scales.
         cfg: activation, degree, opacity.
-        scales: standard deviations; None takes the mean distance to three neighbours (3DGS).
+        scales: standard deviations, of each axis or of all; None takes the mean distance to three
+            neighbours (3DGS).
         opacity: initial opacity; None takes the configured one.
+        quats: orientations, w x y z; None: none.
     """
     count = len(points)
     if scales is None:
         scales = neighbour_scales(points, views)
-    start = cfg.init.opacity if opacity is None else opacity
+    scales = np.asarray(scales)
+    axes = np.broadcast_to(scales if scales.ndim == 2 else scales[:, None], (count, 3))
+    start = np.broadcast_to(cfg.init.opacity if opacity is None else opacity, (count,))
     dc = np.asarray(
         radiance_preactivation(
             jnp.asarray(np.maximum(radiance, MIN_RADIANCE), jnp.float32), cfg.render.radiance
@@ -89,17 +94,17 @@ def gaussians_from_points(
     )
     sh = np.zeros((count, coefficient_count(cfg.render.sh_degree), 3), np.float32)
     sh[:, 0] = dc / C0
-    quats = np.zeros((count, 4), np.float32)
-    quats[:, 0] = 1.0
+    if quats is None:
+        quats = np.tile(np.eye(1, 4), (count, 1))
     return Gaussians(
         means=jnp.asarray(points, jnp.float32),
-        quats=jnp.asarray(quats),
-        log_scales=jnp.asarray(np.repeat(np.log(scales)[:, None], 3, 1), jnp.float32),
-        opacity_logits=jnp.full((count,), float(np.log(start / (1 - start))), jnp.float32),
+        quats=jnp.asarray(quats, jnp.float32),
+        log_scales=jnp.asarray(np.log(axes), jnp.float32),
+        opacity_logits=jnp.asarray(np.log(start / (1 - start)), jnp.float32),
         sh=jnp.asarray(sh),
     )
 
 
 def merge(a: Gaussians, b: Gaussians) -> Gaussians:
     """Return both sets of Gaussians, `a` first."""
-    return jax.tree.map(lambda x, y: jnp.concatenate([x, y]), a, b)
+    return jax.tree.map(lambda x, y: jnp.asarray(np.concatenate([x, y])), a, b)
