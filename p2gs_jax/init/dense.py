@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.init.brightness import Frames, Tones
-from p2gs_jax.init.flow import CHECKS, DepthMap, depth_map, guide, pixel_centers
+from p2gs_jax.init.flow import CHECKS, DepthMap, Flows, depth_map, pixel_centers
 from p2gs_jax.init.pairs import neighbours, visibility
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Scene
@@ -29,7 +29,7 @@ from p2gs_jax.types import Scene
 FEWEST_VIEWS = 3
 # More views than this are not needed for seeds; they are taken evenly.
 MOST_VIEWS = 64
-NEIGHBOURS = 4
+NEIGHBOURS = 5
 # Longest side of the photographs that are matched, pixels.
 MATCH_SIDE = 640
 WORKERS = 2
@@ -138,10 +138,11 @@ def dense_seeds(
     near = neighbours(scene, seen, match.log_exposures, NEIGHBOURS)
     wanted = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MOST_VIEWS)).round())
     wanted = [int(r) for r in wanted if len(near[int(r)]) >= 2]
+    flows = Flows(frames, scene.points, seen)
     found: list[Candidates] = []
 
     def one(row: int) -> Candidates:
-        return _candidates(row, near[row], frames, color, scene.points, seen, cfg.train.seed)
+        return _candidates(row, near[row], flows, color, cfg.train.seed)
 
     with ThreadPoolExecutor(WORKERS, thread_name_prefix="dense") as pool:
         for done, candidates in enumerate(pool.map(one, wanted)):
@@ -157,17 +158,16 @@ def _none() -> DenseSeeds:
     return DenseSeeds(empty, empty, empty, np.zeros((0, 4), np.float32))
 
 
-def _candidates(row, near, frames: Frames, color: Tones, points, seen, seed: int) -> Candidates:
-    frame, others = frames[row], [frames[j] for j in near]
-    guides = [guide(f, points[seen[r]]) for f, r in zip([frame, *others], [row, *near], strict=True)]
-    depth = depth_map(frame, others, guides)
+def _candidates(row: int, near, flows: Flows, color: Tones, seed: int) -> Candidates:
+    frame, depth = flows.frames[row], depth_map(flows, row, near)
     shown = frame.ldr.mean(2)
     steep = np.hypot(*np.gradient(shown)).astype(np.float32)
-    texture = _blur(steep)
+    texture = cv2.blur(steep, (9, 9))
     # One pixel of every cell, steep ones first: their matches are the surest.
     rng = np.random.default_rng((seed, 23, row))
     y, x = np.nonzero(depth.valid)
     key = rng.random(len(x)) ** (1 / (0.1 + steep[y, x] / max(float(steep.mean()), 1e-6)))
+    key += depth.flat[y, x]
     pick = _winners(x // FINEST_CELL + (y // FINEST_CELL) * (shown.shape[1] + 1), key)
     y, x = y[pick], x[pick]
     centers = pixel_centers(*shown.shape)[y, x]
@@ -181,9 +181,6 @@ def _candidates(row, near, frames: Frames, color: Tones, points, seen, seed: int
         depth.counts,
     )
 
-
-def _blur(image):
-    return cv2.blur(image, (9, 9))
 
 
 def _winners(cell: Int[np.ndarray, " c"], key: Float[np.ndarray, " c"]) -> Int[np.ndarray, " w"]:
@@ -270,7 +267,10 @@ def _draw(found, frames: Frames, existing, tree, cell: float, plain: float):
         first = int(fine.max(initial=0)) + 1
         place = np.where(rich, fine, first + coarse)
         # Candidates are in the order of their cells, so that a fixed stride is a fair draw.
-        key = np.modf(np.arange(len(xy)) * 0.6180339887)[0] + candidates.texture / max(plain, 1e-9)
+        key = np.modf(np.arange(len(xy)) * 0.6180339887)[0]
+        # Texture first, but where surfaces are not flat wrong depths are ten times as frequent.
+        key += np.minimum(candidates.texture / max(plain, 1e-9), 2) / 2
+        key += (candidates.normals**2).sum(1) > 0.5
         pick = _winners(place, key)
         spacing = np.where(rich[pick], cell, 2 * cell)
         # What other views and existing seeds show here already.

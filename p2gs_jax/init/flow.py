@@ -8,7 +8,9 @@ linear equations (a - q a_z) + r (b - q b_z) = 0.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
@@ -16,15 +18,15 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from scipy.spatial import KDTree
 
-from p2gs_jax.init.brightness import Frame, alike
+from p2gs_jax.init.brightness import Frame, Frames, alike
 
 # Pixels, at the size that is matched.
 FORWARD_BACKWARD = 1.0
-EPIPOLAR = 1.0
+EPIPOLAR = 0.7
 # Matches are uncertain by this much, pixels.
 DEVIATION = 0.5
 # Largest relative error of a depth that this may cause in one pair, and in all together.
-PAIR_ERROR, FUSED_ERROR = 0.10, 0.04
+PAIR_ERROR, FUSED_ERROR = 0.10, 0.025
 # Two pairs agree within this many standard deviations, and never farther apart than this share.
 SIGMAS, APART = 2.0, 0.05
 # Largest difference of the 8-bit values at both ends of a match, after a small blur.
@@ -32,9 +34,13 @@ COLOUR = 24.0
 # Window of the plane fit, pixels, and what of it must have a depth.
 WINDOW, SUPPORT = 9, 0.4
 # Inverse depths of a flat patch leave its plane by less than this share.
-FLAT = 0.015
+FLAT = 0.01
 # The start of the flow is interpolated from this many points, on a grid this coarse.
 GUIDES, GUIDE_CELL = 6, 16
+# DIS at full resolution: half the depth error of its preset `medium`, which ends at half of it.
+PATCH, STRIDE, DESCENTS = 8, 4, 16
+# Flows kept: those back serve the neighbours' own depth.
+KEPT_FLOWS = 128
 
 CHECKS = ("unusable", "forward-backward", "epipolar", "parallax", "colour", "third view", "alone")
 
@@ -117,6 +123,10 @@ def _flow(first, second, start) -> Float32[np.ndarray, "h w 2"]:
         return cv2.copyMakeBorder(image, 0, down, 0, right, cv2.BORDER_REPLICATE)
 
     matcher = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    matcher.setFinestScale(0)
+    matcher.setPatchSize(PATCH)
+    matcher.setPatchStride(STRIDE)
+    matcher.setGradientDescentIterations(DESCENTS)
     start = np.ascontiguousarray(padded(start), np.float32)
     return matcher.calc(padded(first), padded(second), start)[:height, :width]
 
@@ -141,13 +151,47 @@ class _Pair(NamedTuple):
     refused: list[np.ndarray]
 
 
-def _match(a: Frame, b: Frame, guide_a, guide_b) -> _Pair:
-    """Return inverse depth of `a` from its flow to `b`."""
+@dataclass(frozen=True)
+class Flows:
+    """Flows between training views, computed when asked for; from any thread.
+
+    Attributes:
+        frames: the views.
+        points: that start the flow, scene units.
+        seen: which training view sees which.
+    """
+
+    frames: Frames
+    points: Float[np.ndarray, "p 3"]
+    seen: Bool[np.ndarray, "v p"]
+    _kept: tuple = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self):
+        """Keep the last flows, and what starts them."""
+        kept = lru_cache(KEPT_FLOWS)(self._guide), lru_cache(KEPT_FLOWS)(self._flow)
+        object.__setattr__(self, "_kept", kept)
+
+    def between(self, i: int, j: int) -> Float32[np.ndarray, "h w 2"]:
+        """Return the flow from a training view to another."""
+        return self._kept[1](i, j)
+
+    def _guide(self, i: int):
+        return guide(self.frames[i], self.points[self.seen[i]])
+
+    def _flow(self, i: int, j: int):
+        a, b = self.frames[i], self.frames[j]
+        # In one order, so that there and back see the same pictures.
+        first, second = alike(a, b) if i < j else alike(b, a)[::-1]
+        here = pixel_centers(*a.luminance.shape)
+        return _flow(first, second, _start(_geometry(a, b), self._kept[0](i), here))
+
+
+def _match(flows: Flows, i: int, j: int) -> _Pair:
+    """Return inverse depth of a view from its flow to another."""
+    a, b = flows.frames[i], flows.frames[j]
     first, second = alike(a, b)
-    here, there = (pixel_centers(*f.luminance.shape) for f in (a, b))
-    to_b, to_a = _geometry(a, b), _geometry(b, a)
-    forward = _flow(first, second, _start(to_b, guide_a, here))
-    backward = _flow(second, first, _start(to_a, guide_b, there))
+    here, to_b = pixel_centers(*a.luminance.shape), _geometry(a, b)
+    forward, backward = flows.between(i, j), flows.between(j, i)
     match = here + forward
     height, width = second.shape
     inside = (match > 0.5).all(2) & (match[..., 0] < width - 0.5) & (match[..., 1] < height - 0.5)
@@ -174,15 +218,15 @@ def _match(a: Frame, b: Frame, guide_a, guide_b) -> _Pair:
     return _Pair(inverse, precision, refused)
 
 
-def depth_map(frame: Frame, others: list[Frame], guides: list[np.ndarray]) -> DepthMap:
+def depth_map(flows: Flows, row: int, near: Sequence[int]) -> DepthMap:
     """Return the depth of a view, where at least two of its neighbours agree on it.
 
     Args:
-        frame: the view.
-        others: neighbours.
-        guides: rough inverse depth of the view, then of each neighbour.
+        flows: between the views.
+        row: the view.
+        near: its neighbours.
     """
-    pairs = [_match(frame, o, guides[0], g) for o, g in zip(others, guides[1:], strict=True)]
+    pairs = [_match(flows, row, int(j)) for j in near]
     inverse = np.stack([p.inverse for p in pairs])
     precision = np.stack([p.precision for p in pairs])
     fused, agreeing, total = _fuse(inverse, precision)
