@@ -16,6 +16,8 @@ NARROW, WIDE, FADE = 4.0, 12.0, 8.0
 EXPOSURE_FADE = 1.5
 FEWEST_SHARED = 5
 MOST_POINTS = 20_000
+# Fewer points in a view are too far apart to say what hides what.
+FEWEST_HIDING = 1000
 
 
 def visibility(scene: Scene, seed: int) -> Bool[np.ndarray, "v p"]:
@@ -30,7 +32,10 @@ def visibility(scene: Scene, seed: int) -> Bool[np.ndarray, "v p"]:
         return seen
     for row, index in enumerate(rows):
         view = scene.views[index]
-        seen[row] = unoccluded(*project_points(scene.points, view), view.width, view.height)
+        xy, z = project_points(scene.points, view)
+        seen[row] = (z > 1e-6) & (xy >= 0).all(1) & (xy < [view.width, view.height]).all(1)
+        if seen[row].sum() >= FEWEST_HIDING:
+            seen[row] = unoccluded(xy, z, view.width, view.height)
     if len(scene.points) > MOST_POINTS:
         rng = np.random.default_rng((seed, 19))
         seen[:, rng.permutation(len(scene.points))[MOST_POINTS:]] = False
