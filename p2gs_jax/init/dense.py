@@ -1,9 +1,9 @@
 """Dense starts: seeds from depth maps of the photographs, where points are too few.
 
-After EDGS (arXiv 2504.13204), which triangulates dense matches instead of growing splats; the depth
-maps are those of `init/flow.py`. Of all pixels with a depth so many are drawn as the bound allows,
-evenly: an image is cut into cells, a cell gives one seed, flat and plain neighbourhoods fewer, and a
-cell that shows a seed already gives none.
+After EDGS (arXiv 2504.13204), which triangulates dense matches instead of growing splats; the
+depth maps are those of `init/flow.py`. Of all pixels with a depth so many are drawn as the bound
+allows, evenly: an image is cut into cells, a cell gives one seed, where there is little texture
+four cells together give one, and a cell that shows a seed already gives none.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from p2gs_jax.types import Scene
 # A depth that two neighbours must agree on needs at least three views.
 FEWEST_VIEWS = 3
 # More views than this are not needed for seeds; they are taken evenly.
-MOST_VIEWS = 64
+MOST_VIEWS = 40
 NEIGHBOURS = 5
 # Longest side of the photographs that are matched, pixels.
 MATCH_SIDE = 640
@@ -182,7 +182,6 @@ def _candidates(row: int, near, flows: Flows, color: Tones, seed: int) -> Candid
     )
 
 
-
 def _winners(cell: Int[np.ndarray, " c"], key: Float[np.ndarray, " c"]) -> Int[np.ndarray, " w"]:
     """Return which has the largest key in each cell."""
     order = np.argsort(-key, kind="stable")
@@ -200,7 +199,11 @@ def _normals(depth: DepthMap, K, y, x) -> Float32[np.ndarray, "c 3"]:
 
 
 def choose(
-    found: list[Candidates], frames: Frames, existing: Float[np.ndarray, "p 3"], limit: int, seed: int
+    found: list[Candidates],
+    frames: Frames,
+    existing: Float[np.ndarray, "p 3"],
+    limit: int,
+    seed: int,
 ) -> DenseSeeds:
     """Draw seeds evenly from the candidates of all views, as many as the bound allows.
 
@@ -216,21 +219,19 @@ def choose(
     found = [found[k] for k in order]
     plain = float(np.quantile(np.concatenate([c.texture for c in found]), PLAIN))
     tree = KDTree(existing) if len(existing) else None
-    cell, best = float(FINEST_CELL), None
+    cell, drawn, refused = float(FINEST_CELL), [], 0
     for _ in range(ATTEMPTS):
         drawn, refused = _draw(found, frames, existing, tree, cell, plain)
-        count = sum(len(d[0]) for d in drawn)
-        if count <= limit or best is None or count < sum(len(d[0]) for d in best[0]):
-            best = drawn, refused
-        if (1 - SLACK) * limit <= count <= (1 + SLACK) * limit or (
-            count < limit and cell == FINEST_CELL
-        ):
-            best = drawn, refused
+        count = sum(len(pick) for pick, _ in drawn)
+        # A few too many are left out at random below.
+        few = count < (1 - SLACK) * limit and cell > FINEST_CELL
+        if not few and count <= (1 + SLACK) * limit:
             break
         cell = max(cell * float(np.sqrt(max(count, 1) / limit)), float(FINEST_CELL))
-    drawn, refused = best
     parts = [_seeds(c, frames, *d) for c, d in zip(found, drawn, strict=True)]
-    points, radiance, scales, quats = (np.concatenate(p).astype(np.float32) for p in zip(*parts))
+    points, radiance, scales, quats = (
+        np.concatenate(p).astype(np.float32) for p in zip(*parts, strict=True)
+    )
     keep = np.sort(rng.permutation(len(points))[:limit])
     counts = np.sum([c.counts for c in found], axis=0)
     return DenseSeeds(
@@ -324,5 +325,7 @@ def _seeds(candidates: Candidates, frames: Frames, pick, spacing):
     if not len(pick):
         quats = np.zeros((0, 4))
     across = np.where(flat, THICKNESS / SPREAD, 1.0)
-    scales = size[:, None] * np.stack([np.where(flat, 1 / facing, 1), np.ones_like(size), across], 1)
+    scales = size[:, None] * np.stack(
+        [np.where(flat, 1 / facing, 1), np.ones_like(size), across], 1
+    )
     return _world(candidates, frames, pick), candidates.radiance[pick], scales, quats

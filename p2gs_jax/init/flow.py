@@ -1,9 +1,9 @@
 """Depth of one photograph from optical flow to its neighbours, each pixel checked four times.
 
 EDGS (arXiv 2504.13204) triangulates matches of a learned matcher; here DIS flow (Kroeger et al.
-2016, OpenCV) between photographs brought to one exposure, under known poses. A pixel's inverse depth
-r is what puts it nearest to its match: with x(r) = (a + r b) / (a_z + r b_z) the match q gives the
-linear equations (a - q a_z) + r (b - q b_z) = 0.
+2016, OpenCV) between photographs brought to one exposure, under known poses. A pixel's inverse
+depth r is what puts it nearest to its match: with x(r) = (a + r b) / (a_z + r b_z) the match q
+gives the linear equations (a - q a_z) + r (b - q b_z) = 0.
 """
 
 from __future__ import annotations
@@ -106,8 +106,9 @@ def guide(frame: Frame, points: Float[np.ndarray, "p 3"]) -> Float32[np.ndarray,
     down, across = -(-height // GUIDE_CELL), -(-width // GUIDE_CELL)
     grid = pixel_centers(down, across).reshape(-1, 2) * [width / across, height / down]
     nearest = min(GUIDES, len(local))
-    distance, which = KDTree(xy).query(grid, k=[*range(1, nearest + 1)])
-    weight = 1 / (np.asarray(distance) ** 2 + GUIDE_CELL**2)
+    found = KDTree(xy).query(grid, k=nearest)
+    distance, which = (np.asarray(f).reshape(len(grid), nearest) for f in found)
+    weight = 1 / (distance**2 + GUIDE_CELL**2)
     coarse = (weight / local[which, 2]).sum(1) / weight.sum(1)
     coarse = coarse.reshape(down, across).astype(np.float32)
     return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
@@ -122,7 +123,7 @@ def _flow(first, second, start) -> Float32[np.ndarray, "h w 2"]:
         down, right = tall - image.shape[0], wide - image.shape[1]
         return cv2.copyMakeBorder(image, 0, down, 0, right, cv2.BORDER_REPLICATE)
 
-    matcher = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    matcher = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     matcher.setFinestScale(0)
     matcher.setPatchSize(PATCH)
     matcher.setPatchStride(STRIDE)
@@ -237,7 +238,8 @@ def depth_map(flows: Flows, row: int, near: Sequence[int]) -> DepthMap:
     smooth, slope, flat, support = plane_fit(fused, third)
     valid = third & (support > SUPPORT)
     # A pixel is refused by the check that its luckiest neighbour failed.
-    last = np.max([sum(i * r for i, r in enumerate(p.refused)) for p in pairs], axis=0)
+    rank = np.arange(5)[:, None, None]
+    last = np.max([(rank * np.stack(p.refused)).sum(0) for p in pairs], axis=0)
     refused = [int((~matched & (last == i)).sum()) for i in range(5)]
     refused += [int((matched & ~third).sum()), int((third & ~valid).sum())]
     counts = np.array([matched.size, *refused, int(valid.sum())])

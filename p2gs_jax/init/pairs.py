@@ -1,4 +1,4 @@
-"""Which photographs to match with which: views of the same points, from places not too far apart."""
+"""Which photographs to match: views of the same points, from places not too far apart."""
 
 from __future__ import annotations
 

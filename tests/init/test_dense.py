@@ -33,12 +33,12 @@ def texture(seed, size=512):
 
 def look_up(image, x, y):
     """Return the texture at scene coordinates, 40 texels a unit."""
-    at = [((v * 40 + 256) % 511).astype(np.float32) for v in (x, y)]
-    return cv2.remap(image, *at, cv2.INTER_LINEAR)
+    right, down = (((v * 40 + 256) % 511).astype(np.float32) for v in (x, y))
+    return cv2.remap(image, right, down, cv2.INTER_LINEAR)
 
 
 def render(center, square, tilt, paint):
-    """Return linear radiance and depth of a back plane z = BACK + tilt x, and a square before it."""
+    """Return radiance and depth of a plane z = BACK + tilt x, and of a square before it."""
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     ray = np.stack([(x - WIDTH / 2) / FOCAL, (y - HEIGHT / 2) / FOCAL], -1)
     z = (BACK + tilt * center[0] - center[2]) / (1 - tilt * ray[..., 0])
@@ -135,7 +135,8 @@ def test_wrong_matches_are_refused(tmp_path):
 
 def test_exposures_do_not_matter_once_they_are_solved(tmp_path):
     even, mixed = tmp_path / "even", tmp_path / "mixed"
-    even.mkdir(), mixed.mkdir()
+    even.mkdir()
+    mixed.mkdir()
     same = World(even)
     other = World(mixed, exposures=[1.0, 0.5, 2.0, 0.5, 2.0])
     a, b = same.depth()[0], other.depth()[0]
