@@ -114,6 +114,11 @@ def guide(frame: Frame, points: Float[np.ndarray, "p 3"]) -> Float32[np.ndarray,
     return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
 
 
+def _squared(v):
+    """Return squared lengths; a sum over an axis of two is slow."""
+    return v[..., 0] ** 2 + v[..., 1] ** 2
+
+
 def _flow(first, second, start) -> Float32[np.ndarray, "h w 2"]:
     """Return the flow from one image to the other, which may be of another size."""
     height, width = first.shape
@@ -195,18 +200,20 @@ def _match(flows: Flows, i: int, j: int) -> _Pair:
     forward, backward = flows.between(i, j), flows.between(j, i)
     match = here + forward
     height, width = second.shape
-    inside = (match > 0.5).all(2) & (match[..., 0] < width - 0.5) & (match[..., 1] < height - 0.5)
+    x, y = match[..., 0], match[..., 1]
+    inside = (x > 0.5) & (y > 0.5) & (x < width - 0.5) & (y < height - 0.5)
     usable = a.usable & inside & (_sampled(b.usable.astype(np.float32), match) > 0.99)
     back = _sampled(backward, match)
-    returns = ((forward + back) ** 2).sum(2) < FORWARD_BACKWARD**2
+    returns = _squared(forward + back) < FORWARD_BACKWARD**2
     u = to_b.b[:2] - match * to_b.b[2]
     v = to_b.a[..., :2] - match * to_b.a[..., 2:]
-    square = (u**2).sum(2)
-    inverse = -(u * v).sum(2) / np.maximum(square, 1e-20)
+    square = _squared(u)
+    dot = u[..., 0] * v[..., 0] + u[..., 1] * v[..., 1]
+    inverse = -dot / np.maximum(square, 1e-20)
     predicted, z = to_b.project(inverse)
     ahead = (inverse > 0) & (z > 1e-6)
     with np.errstate(invalid="ignore"):
-        on_line = ahead & (((predicted - match) ** 2).sum(2) < EPIPOLAR**2)
+        on_line = ahead & (_squared(predicted - match) < EPIPOLAR**2)
     sensitivity = np.sqrt(square) / np.maximum(z, 1e-6)
     apart = ahead & (sensitivity * inverse > DEVIATION / PAIR_ERROR)
     blurred = [cv2.blur(i, (3, 3)).astype(np.float32) for i in (first, second)]
