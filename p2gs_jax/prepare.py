@@ -13,7 +13,7 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.init.brightness import Tones, rough_tones
 from p2gs_jax.init.correspondence import has_tracks, surface_colors
-from p2gs_jax.init.dense import FEWEST_VIEWS, DenseSeeds, dense_seeds
+from p2gs_jax.init.dense import FEWEST_VIEWS, MOST_VIEWS, DenseSeeds, dense_seeds
 from p2gs_jax.init.observations import COARSEST, overlapping_views, sample, sample_pairs
 from p2gs_jax.init.seeds import (
     gaussians_from_points,
@@ -46,6 +46,8 @@ SHELL_SHRINK = 4
 SHELL_OPACITY = 0.5
 # Seeds may take this share of the bound on the population; the rest grows where it is needed.
 DENSE_SHARE = 0.6
+# Of a time budget at most this share goes into them, if two idle cores need so long for a view.
+DENSE_TIME, DENSE_SECONDS, FEWEST_DENSE_VIEWS = 0.25, 0.6, 8
 # Scenes with this share of the bound in seeds need no more.
 ENOUGH_SEEDS = 0.5
 
@@ -240,6 +242,10 @@ def _dense(
     """Find dense seeds, with radiances in the gauge of the exposures that the fit starts from."""
     _, _, width, height = store.camera(scene.train_indices[0])
     raw, gammas = np.asarray(photometry.raw_exposures), np.asarray(photometry.raw_gammas)
+    most_views, budget = MOST_VIEWS, cfg.train.budget_s
+    if budget is not None:
+        affordable = int(DENSE_TIME * budget / DENSE_SECONDS)
+        most_views = min(most_views, max(affordable, FEWEST_DENSE_VIEWS))
     if photometry.parameterization == "log":
         log_exposures, gammas = raw, GAMMA_SRGB * np.exp(gammas)
     else:
@@ -252,6 +258,7 @@ def _dense(
         cfg,
         existing=points,
         limit=dense_limit(cfg, len(points), width, height),
+        most_views=most_views,
         on_view=lambda i, n: reporter.stage("Matching photographs", i, n),
     )
 

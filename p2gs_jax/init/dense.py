@@ -113,6 +113,7 @@ def dense_seeds(
     *,
     existing: Float[np.ndarray, "p 3"],
     limit: int,
+    most_views: int = MOST_VIEWS,
     on_view: Callable[[int, int], None] = lambda i, n: None,
 ) -> DenseSeeds:
     """Return seeds from the depths of the training views; the same for the same seed.
@@ -128,6 +129,7 @@ def dense_seeds(
         cfg: seed of the choices; black and saturation.
         existing: seeds that keep their place.
         limit: most seeds to return.
+        most_views: that give seeds, taken evenly; their neighbours may be any.
         on_view: progress: views done, views in all.
     """
     rows = scene.train_indices
@@ -136,7 +138,7 @@ def dense_seeds(
     frames = Frames(scene, store, match, MATCH_SIDE, cfg.loss.black, cfg.loss.saturation)
     seen = visibility(scene, cfg.train.seed)
     near = neighbours(scene, seen, match.log_exposures, NEIGHBOURS)
-    wanted = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MOST_VIEWS)).round())
+    wanted = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), most_views)).round())
     wanted = [int(r) for r in wanted if len(near[int(r)]) >= 2]
     flows = Flows(frames, scene.points, seen)
     found: list[Candidates] = []
