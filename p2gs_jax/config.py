@@ -281,6 +281,13 @@ class InitConfig:
     """Directions on the whole sphere from which the shell is drawn."""
     shell_radius: float = 30.0
     """Its distance, in scene extents."""
+    dense: Literal["auto", "on", "off"] = "auto"
+    """Seeds from optical flow between photographs (after EDGS, arXiv 2504.13204): `auto` where the
+    seeds are fewer than half of the bound on the population (ours: BUILD_NOTES)."""
+    dense_points: int | None = None
+    """Most of them; None leaves 40 % of the bound on the population to grow into."""
+    dense_opacity: float = 0.5
+    """Initial peak opacity of these seeds (ours: BUILD_NOTES)."""
 
 
 @dataclass(frozen=True)
@@ -374,7 +381,7 @@ def _paper(exposure_weight: float, name: PresetName) -> FitConfig:
             photometry_final=1.0,
         ),
         densify=DensifyConfig(method="adaptive"),
-        init=InitConfig(shell="off"),
+        init=InitConfig(shell="off", dense="off"),
         train=TrainConfig(steps=30_000, coarse_to_fine=()),
     )
 

@@ -11,9 +11,17 @@ import numpy as np
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
+from p2gs_jax.init.brightness import Tones, rough_tones
 from p2gs_jax.init.correspondence import has_tracks, surface_colors
+from p2gs_jax.init.dense import FEWEST_VIEWS, MOST_VIEWS, DenseSeeds, dense_seeds
 from p2gs_jax.init.observations import COARSEST, overlapping_views, sample, sample_pairs
-from p2gs_jax.init.seeds import gaussians_from_points, merge, scene_extent, subsample
+from p2gs_jax.init.seeds import (
+    gaussians_from_points,
+    merge,
+    neighbour_scales,
+    scene_extent,
+    subsample,
+)
 from p2gs_jax.init.shell import Shell, find_shell
 from p2gs_jax.losses.relative_exposure import ColorPairs
 from p2gs_jax.losses.total import OBSERVED_FORMS
@@ -28,6 +36,7 @@ from p2gs_jax.progress import Reporter
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.scene.known_exposures import read_known_exposures
+from p2gs_jax.train.loop import default_max_gaussians
 from p2gs_jax.types import GAMMA_SRGB, Gaussians, Params, Photometry, Scene
 
 PAIR_POOL = 200_000
@@ -36,6 +45,12 @@ FEWEST_SHARED = 30
 # Shell colours come from small images: a direction covers many pixels.
 SHELL_SHRINK = 4
 SHELL_OPACITY = 0.5
+# Seeds may take this share of the bound on the population; the rest grows where it is needed.
+DENSE_SHARE = 0.6
+# Of a time budget at most this share goes into them, if two idle cores need so long for a view.
+DENSE_TIME, DENSE_SECONDS, FEWEST_DENSE_VIEWS = 0.25, 0.6, 8
+# Scenes with this share of the bound in seeds need no more.
+ENOUGH_SEEDS = 0.5
 
 
 @dataclass
@@ -105,7 +120,8 @@ def prepare(scene: Scene, cfg: FitConfig, reporter: Reporter) -> Prepared:
             "it.",
             fix="add --photometry.start random, or use a preset whose name begins with 3dgs",
         )
-    if has_tracks(scene) or cfg.photometry.start == "tracks":
+    dense = wants_dense(scene, store, cfg)
+    if has_tracks(scene) or cfg.photometry.start == "tracks" or dense:
         if not has_tracks(scene):
             notes.append("No tracks: seed points are projected into the views instead.")
         tracks = surface_colors(
@@ -132,8 +148,20 @@ def prepare(scene: Scene, cfg: FitConfig, reporter: Reporter) -> Prepared:
         )
     points = scene.points[keep]
     radiance = _seed_radiance(scene, start, cfg)[keep]
-    gaussians = gaussians_from_points(points, radiance, views, cfg)
-    shell = find_shell(views, scene.points, extent, cfg.init)
+    covering = scene.points
+    if dense:
+        match = (
+            rough_tones(tracks, len(views))
+            if start is None
+            else Tones.of(start.log_exposures, start.gammas, cfg.photometry)
+        )
+        added = _dense(scene, store, match, points, photometry, cfg, reporter)
+        gaussians = _seed_gaussians(points, radiance, added, views, cfg)
+        covering = np.concatenate([covering, added.points])
+        notes.append(added.note())
+    else:
+        gaussians = gaussians_from_points(points, radiance, views, cfg)
+    shell = find_shell(views, covering, extent, cfg.init)
     if shell is not None:
         gaussians = merge(gaussians, _shell_gaussians(shell, scene, store, photometry, views, cfg))
         notes.append(
@@ -152,6 +180,113 @@ def prepare(scene: Scene, cfg: FitConfig, reporter: Reporter) -> Prepared:
         _overlaps(tracks, cfg),
         cfg,
         notes,
+    )
+
+
+def seed_bound(cfg: FitConfig, seeds: int, width: int, height: int) -> int:
+    """Return the bound on the population that the seeds are measured by.
+
+    Args:
+        cfg: the bound, if it is given.
+        seeds: points of the scene.
+        width: of the training photographs, pixels.
+        height: likewise.
+    """
+    given = cfg.densify.max_gaussians
+    return given if isinstance(given, int) else default_max_gaussians(seeds, width, height)
+
+
+def dense_limit(cfg: FitConfig, seeds: int, width: int, height: int) -> int:
+    """Return how many dense seeds a fit may start from.
+
+    Args:
+        cfg: the bound on the population and `init.dense_points`.
+        seeds: that are there already.
+        width: of the training photographs, pixels.
+        height: likewise.
+    """
+    bound = seed_bound(cfg, seeds, width, height)
+    room = bound - seeds
+    wanted = cfg.init.dense_points
+    if wanted is None:
+        wanted = int(DENSE_SHARE * bound) - seeds
+    elif not isinstance(cfg.densify.max_gaussians, int):
+        room = wanted
+    return max(0, min(wanted, room))
+
+
+def wants_dense(scene: Scene, store: ImageStore, cfg: FitConfig) -> bool:
+    """Return whether the scene gets dense seeds.
+
+    The baselines that splat display values get them as well: a comparison with them is about
+    photometry, so all start from the same surfaces.
+    """
+    if cfg.init.dense == "off" or len(scene.train_indices) < FEWEST_VIEWS:
+        return False
+    _, _, width, height = store.camera(scene.train_indices[0])
+    seeds = min(len(scene.points), cfg.init.max_seeds)
+    if dense_limit(cfg, seeds, width, height) == 0:
+        return False
+    bound = seed_bound(cfg, seeds, width, height)
+    return cfg.init.dense == "on" or seeds < ENOUGH_SEEDS * bound
+
+
+def _dense(
+    scene: Scene,
+    store: ImageStore,
+    match: Tones,
+    points: np.ndarray,
+    photometry: Photometry,
+    cfg: FitConfig,
+    reporter: Reporter,
+) -> DenseSeeds:
+    """Find dense seeds, with radiances in the gauge of the exposures that the fit starts from."""
+    _, _, width, height = store.camera(scene.train_indices[0])
+    raw, gammas = np.asarray(photometry.raw_exposures), np.asarray(photometry.raw_gammas)
+    most_views, budget = MOST_VIEWS, cfg.train.budget_s
+    if budget is not None:
+        affordable = int(DENSE_TIME * budget / DENSE_SECONDS)
+        most_views = min(most_views, max(affordable, FEWEST_DENSE_VIEWS))
+    if photometry.parameterization == "log":
+        log_exposures, gammas = raw, GAMMA_SRGB * np.exp(gammas)
+    else:
+        log_exposures = np.log(raw)
+    return dense_seeds(
+        scene,
+        store,
+        match,
+        Tones.of(log_exposures, gammas, cfg.photometry),
+        cfg,
+        existing=points,
+        limit=dense_limit(cfg, len(points), width, height),
+        most_views=most_views,
+        on_view=lambda i, n: reporter.stage("Matching photographs", i, n),
+    )
+
+
+def _seed_gaussians(
+    points: np.ndarray, radiance: np.ndarray, dense: DenseSeeds, views, cfg: FitConfig
+) -> Gaussians:
+    """Return Gaussians of the scene's points and of dense seeds, the former first.
+
+    A point that has dense seeds around it is as small as they are near.
+    """
+    everything = np.concatenate([points, dense.points])
+    count = len(points)
+    scales = np.repeat(neighbour_scales(everything, views)[:, None], 3, 1)
+    scales[count:] = dense.scales
+    opacity = np.full(len(everything), cfg.init.opacity)
+    opacity[count:] = cfg.init.dense_opacity
+    quats = np.tile(np.eye(1, 4), (len(everything), 1))
+    quats[count:] = dense.quats
+    return gaussians_from_points(
+        everything,
+        np.concatenate([radiance, dense.radiance]),
+        views,
+        cfg,
+        scales=scales,
+        opacity=opacity,
+        quats=quats,
     )
 
 

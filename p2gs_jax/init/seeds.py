@@ -65,35 +65,40 @@ def gaussians_from_points(
     views: list[View],
     cfg: FitConfig,
     *,
-    scales: Float[np.ndarray, " p"] | None = None,
-    opacity: float | None = None,
+    scales: Float[np.ndarray, "p #3"] | Float[np.ndarray, " p"] | None = None,
+    opacity: Float[np.ndarray, " p"] | float | None = None,
+    quats: Float[np.ndarray, "p 4"] | None = None,
 ) -> Gaussians:
-    """Return one isotropic Gaussian per point.
+    """Return one Gaussian per point.
 
     Args:
         points: scene units.
         radiance: linear radiance in the gauge of the exposures.
         views: training views, for the distance that bounds the scales.
         cfg: activation, degree, opacity.
-        scales: standard deviations; None takes the mean distance to three neighbours (3DGS).
+        scales: standard deviations, of each axis or of all; None takes the mean distance to three
+            neighbours (3DGS).
         opacity: initial opacity; None takes the configured one.
+        quats: orientations, w x y z; None: none.
     """
     count = len(points)
     if scales is None:
         scales = neighbour_scales(points, views)
-    start = cfg.init.opacity if opacity is None else opacity
+    scales = np.asarray(scales)
+    axes = np.broadcast_to(scales if scales.ndim == 2 else scales[:, None], (count, 3))
+    start = np.broadcast_to(cfg.init.opacity if opacity is None else opacity, (count,))
     dc = radiance_preactivation(
         np.maximum(radiance, MIN_RADIANCE).astype(np.float32), cfg.render.radiance
     )
     sh = np.zeros((count, coefficient_count(cfg.render.sh_degree), 3), np.float32)
     sh[:, 0] = dc / C0
-    quats = np.zeros((count, 4), np.float32)
-    quats[:, 0] = 1.0
+    if quats is None:
+        quats = np.tile(np.eye(1, 4), (count, 1))
     return Gaussians(
         means=on_device(points),
         quats=on_device(quats),
-        log_scales=on_device(np.repeat(np.log(scales)[:, None], 3, 1)),
-        opacity_logits=on_device(np.full(count, np.log(start / (1 - start)))),
+        log_scales=on_device(np.log(axes)),
+        opacity_logits=on_device(np.log(start / (1 - start))),
         sh=on_device(sh),
     )
 
