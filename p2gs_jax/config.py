@@ -229,6 +229,10 @@ class OptimizerConfig:
     """All other rates decay exponentially to this fraction (3DGS: no decay)."""
     eps: float = 1e-15
     """Adam's epsilon (3DGS: 1e-15)."""
+    visible_only: bool = True
+    """Update only what a view may show; all other Gaussians and their moments rest (as gsplat's
+    selective Adam; ours: BUILD_NOTES, "Every second counts"). Off: every Gaussian in every step,
+    by momentum where it is not seen (3DGS)."""
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from p2gs_jax.config import FitConfig
@@ -71,7 +70,7 @@ def optimise(
         validation=validation,
         own_exposures=prepared.selection is not None,
     )
-    alive = jnp.ones(prepared.params.gaussians.capacity, bool)
+    alive = np.ones(prepared.params.gaussians.capacity, bool)
     return trainer.run(prepared.params, alive, resume=resume, reserve_s=spent_s + reserve_s)
 
 
@@ -79,7 +78,8 @@ def compact(result: TrainResult) -> Params:
     """Return the parameters with only the live Gaussians, in slot order."""
     alive = np.flatnonzero(np.asarray(result.state.population.alive))
     params = result.state.params
-    return dataclasses.replace(params, gaussians=jax.tree.map(lambda a: a[alive], params.gaussians))
+    gaussians = jax.tree.map(lambda a: jax.device_put(np.asarray(a)[alive]), params.gaussians)
+    return dataclasses.replace(params, gaussians=gaussians)
 
 
 @dataclass(frozen=True)

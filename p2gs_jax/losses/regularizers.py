@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from p2gs_jax.config import RegularizerConfig
+from p2gs_jax.config import FitConfig, RegularizerConfig
 from p2gs_jax.densify.population import opacities
 from p2gs_jax.types import GAMMA_SRGB, Gaussians, Photometry
 
@@ -49,14 +49,49 @@ def closed_form_scale(exposures: Float[Array, " v"], scale: float, spread: float
     return scale * m / (scale * (m * m + v) + spread * v)
 
 
-def opacity_regularizer(gaussians: Gaussians, alive: Bool[Array, " n"]) -> Float[Array, ""]:
-    """Return the mean opacity of live Gaussians (3DGS-MCMC)."""
-    return jnp.sum(jnp.where(alive, opacities(gaussians), 0.0)) / jnp.maximum(jnp.sum(alive), 1)
+def opacity_regularizer(
+    gaussians: Gaussians, alive: Bool[Array, " n"], count: Float[Array, ""]
+) -> Float[Array, ""]:
+    """Return the mean opacity of live Gaussians (3DGS-MCMC).
+
+    Args:
+        gaussians: all that count, or some of them for their share of the mean.
+        alive: slots in use.
+        count: how many the mean is over.
+    """
+    return jnp.sum(jnp.where(alive, opacities(gaussians), 0.0)) / count
 
 
 def scale_regularizer(
-    gaussians: Gaussians, alive: Bool[Array, " n"], extent: float
+    gaussians: Gaussians, alive: Bool[Array, " n"], extent: float, count: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """Return the mean scale of live Gaussians in scene extents (3DGS-MCMC)."""
+    """Return the mean scale of live Gaussians in scene extents (3DGS-MCMC); see above."""
     scales = jnp.where(alive[:, None], jnp.exp(gaussians.log_scales), 0.0)
-    return jnp.sum(scales) / (3 * extent * jnp.maximum(jnp.sum(alive), 1))
+    return jnp.sum(scales) / (3 * extent * count)
+
+
+def population_terms(
+    gaussians: Gaussians,
+    alive: Bool[Array, " n"],
+    cfg: FitConfig,
+    extent: float,
+    count: Float[Array, ""] | None = None,
+) -> dict[str, Float[Array, ""]]:
+    """Return the weighted terms on the Gaussians themselves, as MCMC wants them.
+
+    Args:
+        gaussians: all that count, or some of them for their share.
+        alive: slots in use.
+        cfg: weights; a weight of None keeps its term out of the trace.
+        extent: scene extent, scene units.
+        count: how many the means are over; None: the live ones given.
+    """
+    if cfg.densify.method != "mcmc":
+        return {}
+    reg, terms = cfg.loss.regularizers, {}
+    over = jnp.maximum(jnp.sum(alive) if count is None else count, 1).astype(jnp.float32)
+    if reg.opacity is not None:
+        terms["opacity"] = reg.opacity * opacity_regularizer(gaussians, alive, over)
+    if reg.scale is not None:
+        terms["scale"] = reg.scale * scale_regularizer(gaussians, alive, extent, over)
+    return terms

@@ -7,16 +7,13 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.losses.image import photometric_loss
-from p2gs_jax.losses.regularizers import (
-    opacity_regularizer,
-    photometry_regularizers,
-    scale_regularizer,
-)
+from p2gs_jax.losses.regularizers import photometry_regularizers, population_terms
 from p2gs_jax.losses.relative_exposure import (
     ColorPairs,
     ExposurePairs,
@@ -24,9 +21,10 @@ from p2gs_jax.losses.relative_exposure import (
 )
 from p2gs_jax.photometry.appearance import roughness
 from p2gs_jax.photometry.formation import formation
-from p2gs_jax.render import render_linear
+from p2gs_jax.render import render_splats
+from p2gs_jax.render.blocks import Shown, splat
 from p2gs_jax.render.warp import sample_bilinear, surface_depth, warp
-from p2gs_jax.types import Batch, Camera, Gaussians, Params, Population, Render
+from p2gs_jax.types import Batch, Camera, Params, Photometry, Render
 
 # The readings of L_exp that compare renders from two poses.
 SECOND_RENDER_FORMS = ("literal_pixels", "exposed")
@@ -70,6 +68,13 @@ class LossAux(NamedTuple):
     overflow: Bool[Array, ""]
 
 
+def decoded(batch: Batch) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"]]:
+    """Return a photograph in [0, 1] and its mask as floats; they may travel as 8 bits."""
+    ldr = batch.ldr.astype(jnp.float32)
+    scale = float(np.iinfo(batch.ldr.dtype).max) if batch.ldr.dtype.kind == "u" else 1.0
+    return ldr / scale, batch.mask.astype(jnp.float32)
+
+
 def depth_pairs(render: Render, batch: Batch, other: Render, other_batch: Batch) -> ColorPairs:
     """Return the photographed colours of every pixel and of where depth finds it in another view.
 
@@ -80,13 +85,14 @@ def depth_pairs(render: Render, batch: Batch, other: Render, other_batch: Batch)
         other_batch: its photograph.
     """
     there = warp(surface_depth(render), batch.camera, surface_depth(other), other_batch.camera)
-    both = jnp.concatenate([other_batch.ldr, other_batch.mask[..., None]], -1)
+    (ldr, mask), (other_ldr, other_mask) = decoded(batch), decoded(other_batch)
+    both = jnp.concatenate([other_ldr, other_mask[..., None]], -1)
     seen = sample_bilinear(both, there.xy)
-    valid = there.seen & (batch.mask > 0) & (seen[..., 3] > ALL_UNMASKED)
-    count = batch.mask.size
+    valid = there.seen & (mask > 0) & (seen[..., 3] > ALL_UNMASKED)
+    count = mask.size
     return lax.stop_gradient(
         ColorPairs(
-            batch.ldr.reshape(-1, 3),
+            ldr.reshape(-1, 3),
             seen[..., :3].reshape(-1, 3),
             jnp.full(count, batch.view_index),
             jnp.full(count, other_batch.view_index),
@@ -95,24 +101,97 @@ def depth_pairs(render: Render, batch: Batch, other: Render, other_batch: Batch)
     )
 
 
+def partner_cameras(partner: Partner, cfg: FitConfig) -> tuple[Camera, ...]:
+    """Return the camera of the second render that the loss needs, if it needs one."""
+    relative = cfg.loss.relative_exposure
+    if relative.weight is None:
+        return ()
+    if relative.form in SECOND_RENDER_FORMS and partner.camera is not None:
+        return (partner.camera,)
+    if relative.form in OBSERVED_FORMS and partner.batch is not None:
+        return (partner.batch.camera,)
+    return ()
+
+
+def image_loss(
+    shown: tuple[Shown, ...],
+    photometry: Photometry,
+    appearance: Float[Array, "v ..."] | None,
+    batch: Batch,
+    partner: Partner,
+    cfg: FitConfig,
+    capacity: int,
+) -> tuple[Float[Array, ""], LossAux]:
+    """Return the loss of one view and its terms, but for those on the Gaussians themselves.
+
+    Args:
+        shown: splats and radiance in the view and in each of `partner_cameras`.
+        photometry: exposures and gammas.
+        appearance: corrections of display values, or None.
+        batch: the photograph.
+        partner: the second view of the relative-exposure loss.
+        cfg: weights; a weight of None keeps its term out of the trace.
+        capacity: tile-list entries.
+    """
+    relative = cfg.loss.relative_exposure
+    through_depth = relative.form in OBSERVED_FORMS and partner.batch is not None
+    through_depth = through_depth and relative.weight is not None
+    cameras = (batch.camera, *partner_cameras(partner, cfg))
+    renders = []
+    for (splats, radiance), camera in zip(shown, cameras, strict=True):
+        if renders and through_depth:
+            splats, radiance = lax.stop_gradient((splats, radiance))
+        renders.append(
+            render_splats(splats, radiance, camera, cfg.render, capacity, with_depth=through_depth)
+        )
+    render, *others = renders
+    entries, overflow = render.count, render.overflow
+    exposures, gammas = photometry.exposures, photometry.gammas
+    i, j = batch.view_index, partner.view_index
+    correction = None if appearance is None else appearance[i]
+    photograph, mask = decoded(batch)
+    ldr = formation(render.linear, exposures[i], gammas[i], cfg.photometry, correction)
+    terms = dict(photometric_loss(ldr, photograph, mask, cfg.loss))
+
+    if relative.weight is not None:
+        other, pairs = next(iter(others), None), partner.pairs
+        if other is not None:
+            entries = jnp.maximum(entries, other.count)
+            overflow = overflow | other.overflow
+        if through_depth and other is not None and partner.batch is not None:
+            pairs = depth_pairs(render, batch, other, partner.batch)
+        linear_j = None if other is None else other.linear
+        terms["relative_exposure"] = relative.weight * relative_exposure_loss(
+            ExposurePairs(render.linear, linear_j, i, j, exposures, gammas, pairs),
+            cfg.loss,
+            cfg.photometry,
+        )
+    terms |= photometry_regularizers(photometry, cfg.loss.regularizers)
+    smoothness = cfg.loss.regularizers.appearance
+    if cfg.photometry.appearance == "bilateral" and smoothness is not None:
+        assert appearance is not None
+        terms["appearance"] = smoothness * roughness(appearance, "bilateral")
+    return jax.tree.reduce(jnp.add, terms), LossAux(terms, render, ldr, entries, overflow)
+
+
 def total_loss(
     params: Params,
-    means2d_probe: Float[Array, "n 2"] | None,
-    population: Population,
+    alive: Bool[Array, " n"],
     batch: Batch,
     partner: Partner,
     cfg: FitConfig,
     *,
     capacity: int,
-    active_degree: Int[Array, ""],
+    active_degree: Int[Array, ""] | int,
     extent: float,
 ) -> tuple[Float[Array, ""], LossAux]:
-    """Return the loss of one view and its terms.
+    """Return the loss of one view and its terms, as one function of the parameters.
+
+    The step computes the same in blocks (train/step.py).
 
     Args:
         params: Gaussians and photometry.
-        means2d_probe: zeros whose gradient is the screen-space statistic, or None.
-        population: who is alive.
+        alive: slots in use.
         batch: the photograph.
         partner: the second view of the relative-exposure loss.
         cfg: weights; a weight of None keeps its term out of the trace.
@@ -120,58 +199,11 @@ def total_loss(
         active_degree: spherical-harmonics degree in use.
         extent: scene extent, scene units.
     """
-    relative = cfg.loss.relative_exposure
-    reads = None if relative.weight is None else relative.form
-    through_depth = reads in OBSERVED_FORMS and partner.batch is not None
-
-    def rendered(gaussians: Gaussians, camera: Camera, probe=None) -> Render:
-        return render_linear(
-            gaussians,
-            population.alive,
-            camera,
-            cfg.render,
-            capacity,
-            active_degree=active_degree,
-            means2d_probe=probe,
-            with_depth=through_depth,
-        )
-
-    render = rendered(params.gaussians, batch.camera, means2d_probe)
-    entries, overflow = render.count, render.overflow
-    exposures, gammas = params.photometry.exposures, params.photometry.gammas
-    i, j = batch.view_index, partner.view_index
-    correction = params.correction(i)
-    ldr = formation(render.linear, exposures[i], gammas[i], cfg.photometry, correction)
-    terms = dict(photometric_loss(ldr, batch.ldr, batch.mask, cfg.loss))
-
-    if relative.weight is not None:
-        other, pairs = None, partner.pairs
-        if reads in SECOND_RENDER_FORMS and partner.camera is not None:
-            other = rendered(params.gaussians, partner.camera)
-        elif through_depth:
-            assert partner.batch is not None
-            other = rendered(lax.stop_gradient(params.gaussians), partner.batch.camera)
-            pairs = depth_pairs(render, batch, other, partner.batch)
-        if other is not None:
-            entries = jnp.maximum(entries, other.count)
-            overflow = overflow | other.overflow
-        linear_j = None if other is None else other.linear
-        terms["relative_exposure"] = relative.weight * relative_exposure_loss(
-            ExposurePairs(render.linear, linear_j, i, j, exposures, gammas, pairs),
-            cfg.loss,
-            cfg.photometry,
-        )
-    terms |= photometry_regularizers(params.photometry, cfg.loss.regularizers)
-    smoothness = cfg.loss.regularizers.appearance
-    if cfg.photometry.appearance == "bilateral" and smoothness is not None:
-        assert params.appearance is not None
-        terms["appearance"] = smoothness * roughness(params.appearance, "bilateral")
-    if cfg.densify.method == "mcmc":
-        reg = cfg.loss.regularizers
-        if reg.opacity is not None:
-            terms["opacity"] = reg.opacity * opacity_regularizer(params.gaussians, population.alive)
-        if reg.scale is not None:
-            terms["scale"] = reg.scale * scale_regularizer(
-                params.gaussians, population.alive, extent
-            )
-    return jax.tree.reduce(jnp.add, terms), LossAux(terms, render, ldr, entries, overflow)
+    cameras = (batch.camera, *partner_cameras(partner, cfg))
+    shown = splat(params.gaussians, alive, cameras, cfg.render, active_degree)
+    loss, aux = image_loss(
+        shown, params.photometry, params.appearance, batch, partner, cfg, capacity
+    )
+    own = population_terms(params.gaussians, alive, cfg, extent)
+    total = jax.tree.reduce(jnp.add, own, loss)
+    return total, aux._replace(terms=aux.terms | own)

@@ -26,6 +26,7 @@ __all__ = [
     "project",
     "rasterize",
     "render_linear",
+    "render_splats",
     "required_capacity",
     "view_radiance",
 ]
@@ -88,7 +89,6 @@ def render_linear(
     capacity: int,
     *,
     active_degree: Int[Array, ""] | int | None = None,
-    means2d_probe: Float[Array, "n 2"] | None = None,
     with_depth: bool = True,
 ) -> Render:
     """Render linear HDR radiance of one view (paper, eq. 3).
@@ -100,7 +100,6 @@ def render_linear(
         cfg: rendering options.
         capacity: tile-list entries; see `required_capacity`.
         active_degree: highest spherical-harmonics degree in use, None for all.
-        means2d_probe: see `project`.
         with_depth: see `rasterize`.
 
     Returns:
@@ -108,8 +107,30 @@ def render_linear(
     """
     if gaussians.capacity == 0:
         return _nothing(camera, with_depth)
-    splats = project(gaussians, alive, camera, cfg, means2d_probe)
+    splats = project(gaussians, alive, camera, cfg)
     radiance = view_radiance(gaussians, camera, cfg, active_degree)
+    return render_splats(splats, radiance, camera, cfg, capacity, with_depth=with_depth)
+
+
+def render_splats(
+    splats: Splats2D,
+    radiance: Float[Array, "n 3"],
+    camera: Camera,
+    cfg: RenderConfig,
+    capacity: int,
+    *,
+    with_depth: bool = True,
+) -> Render:
+    """Render Gaussians that are projected already (see `render_linear`).
+
+    Args:
+        splats: the view's.
+        radiance: of each towards the camera.
+        camera: the view; its size counts.
+        cfg: rendering options.
+        capacity: tile-list entries.
+        with_depth: see `rasterize`.
+    """
     splats = with_cutoffs(splats, radiance, cfg)
     if cfg.implementation == "reference":
         tiles, count = None, jnp.int32(0)

@@ -46,7 +46,6 @@ def project(
     alive: Bool[Array, " n"],
     camera: Camera,
     cfg: RenderConfig,
-    means2d_probe: Float[Array, "n 2"] | None = None,
 ) -> Splats2D:
     """Project Gaussians into a view.
 
@@ -58,8 +57,6 @@ def project(
         alive: slots in use; the others become invisible.
         camera: the view.
         cfg: near plane and blur.
-        means2d_probe: zeros added to the projected centres in units of half the image; its
-            gradient is the screen-space statistic that densification wants.
 
     Returns:
         The splats; those that are not alive, not in front of the near plane or not finite are
@@ -98,9 +95,6 @@ def project(
     c_xx, c_yy = s_xx + cfg.blur, s_yy + cfg.blur
 
     mean_x, mean_y = fx * x * inverse_z + cx, fy * y * inverse_z + cy
-    if means2d_probe is not None:
-        mean_x = mean_x + means2d_probe[:, 0] * (camera.width / 2)
-        mean_y = mean_y + means2d_probe[:, 1] * (camera.height / 2)
     finite = jnp.isfinite(det) & jnp.isfinite(mean_x) & jnp.isfinite(mean_y) & (det > 0)
     visible = visible & finite
     a11 = jnp.sqrt(c_yy / det)

@@ -10,10 +10,11 @@ independently and merged. Work wasted on padding is bounded by C per tile.
 The exponential is a polynomial on [-0.7, 0], squared as often as it takes to reach the cutoff
 (`exponent_scale`); rows are what tile_rows.py says.
 
-Backward. The same segments, front to back, each from the transmittance and light before it. With R the gradient-weighted light still to come,
-q = w (radiance . g) and R -= q after each entry, the gradient to the exponent of one entry is
-q - R alpha / (1 - alpha): no division by transmittance. The geometry gradients follow in closed
-form from six moments of it over the tile. Source and measurements: docs/kernel.md.
+Backward. The same segments, front to back, each from the transmittance and light before it. With
+R the gradient-weighted light still to come, q = w (radiance . g) and R -= q after each entry, the
+gradient to the exponent of one entry is q - R alpha / (1 - alpha): no division by transmittance.
+The geometry gradients follow in closed form from six moments of it over the tile. Source and
+measurements: docs/kernel.md.
 """
 
 from __future__ import annotations
@@ -261,7 +262,11 @@ def backward(rows, ids_list, residuals, image, v_image, plan: Plan):
     # The light still to come and the transmittance where each segment begins.
     behind = segments.tiles[plan.tile_count :]
     light = jnp.concatenate(
-        [light, light[behind] - sum(b * v[behind] for b, v in zip(before, v_image[:-1]))]
+        [
+            light,
+            light[behind]
+            - sum(b * v[behind] for b, v in zip(before[:-1], v_image[:-1], strict=True)),
+        ]
     )
     ahead = before[-1]
     slot = queue.first()

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
+from p2gs_jax.render.capacity import Room
 from p2gs_jax.train.growth import Growth
 
 
@@ -20,8 +21,10 @@ class HostState:
         reset_at: progress of the last opacity reset.
         refused: densification requests that found no slot, summed.
         overflows: tile lists grown.
-        capacities: tile-list capacity for every "WxH".
-        step_s: running estimate of the seconds a step takes at this level.
+        rooms: room of a view for every "WxH".
+        shrink: factor by which images are shrunk at the present level.
+        step_s: running estimate of the seconds a step takes at this level, compiling apart; 0:
+            none was timed yet.
         growth: how far automatic growth has come.
     """
 
@@ -33,14 +36,19 @@ class HostState:
     reset_at: float = 0.0
     refused: int = 0
     overflows: int = 0
-    capacities: dict[str, int] = field(default_factory=dict)
+    rooms: dict[str, Room] = field(default_factory=dict)
+    shrink: int = 0
     step_s: float = 0.0
     growth: Growth = field(default_factory=Growth)
 
     @classmethod
     def from_dict(cls, values: dict) -> HostState:
         """Return what a checkpoint holds; those of older versions know nothing of growth."""
-        return cls(**{**values, "growth": Growth.from_dict(values.get("growth", {}))})
+        known = {f.name for f in fields(cls)}
+        values = {k: v for k, v in values.items() if k in known}
+        rooms = {size: Room(*room) for size, room in values.get("rooms", {}).items()}
+        growth = Growth.from_dict(values.get("growth", {}))
+        return cls(**{**values, "rooms": rooms, "growth": growth})
 
 
 @dataclass(frozen=True)

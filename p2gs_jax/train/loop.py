@@ -22,6 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from p2gs_jax.clock import Stopwatch
 from p2gs_jax.config import FitConfig
 from p2gs_jax.densify import adaptive, mcmc
 from p2gs_jax.densify.population import bucket_for
@@ -30,12 +31,13 @@ from p2gs_jax.export.atomic import append_jsonl, read_jsonl, write_text
 from p2gs_jax.export.checkpoint import CheckpointStore
 from p2gs_jax.losses.relative_exposure import ColorPairs
 from p2gs_jax.losses.total import OBSERVED_FORMS, SECOND_RENDER_FORMS, Partner
-from p2gs_jax.render import required_capacity
-from p2gs_jax.render.host import capacity_bucket
+from p2gs_jax.render.capacity import Room
 from p2gs_jax.train import growth, schedule
 from p2gs_jax.train.growth import Look, Stage
 from p2gs_jax.train.host import HostState, LogRecord
 from p2gs_jax.train.optimizer import make_optimizer, zero_moments, zero_opacity_moments
+from p2gs_jax.train.programs import Key, StepPrograms
+from p2gs_jax.train.room import room_for
 from p2gs_jax.train.schedule import Pace
 from p2gs_jax.train.state import (
     FAULT_NONFINITE,
@@ -51,9 +53,6 @@ from p2gs_jax.train.validation import make_judge
 from p2gs_jax.train.views import TrainingViews
 from p2gs_jax.types import Params
 
-# A fresh tile list leaves this much room above the largest view sampled.
-CAPACITY_MARGIN = 1.3
-CAPACITY_SAMPLES = 6
 PAIRS_PER_STEP = 4096
 MAX_BURST = 50
 NEARLY_DONE = 0.99
@@ -68,12 +67,15 @@ class TrainResult:
         host: counters.
         max_gaussians: bound on the population.
         growth: the history of automatic growth, as JSON values; None where it was not asked for.
+        seconds: of this session, by name: compiling (waited for), steps, densification,
+            checkpoints.
     """
 
     state: FitState
     host: HostState
     max_gaussians: int
     growth: dict | None = None
+    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
 
 
 @dataclass
@@ -121,7 +123,12 @@ class Trainer:
         self.cfg, self.views, self.extent, self.pairs = cfg, views, extent, pairs
         self.run_dir, self.on_log, self.on_message = run_dir, on_log, on_message
         self.optimizer = make_optimizer(cfg)
-        self.step_fn = make_step(cfg, self.optimizer, extent)
+        self.programs = StepPrograms(make_step(cfg, self.optimizer, extent))
+        self._rng = jax.jit(
+            lambda step: jax.random.fold_in(jax.random.key(cfg.train.seed + 1), step)
+        )
+        self._alive = jax.jit(jnp.sum)
+        self.clock = Stopwatch()
         self.checkpoints = CheckpointStore(run_dir / "checkpoints")
         self.log_path = run_dir / "log.jsonl"
         sizes = [views.camera(i, 1) for i in range(len(views))]
@@ -130,7 +137,6 @@ class Trainer:
             cfg.train, min(c.width for c in sizes), min(c.height for c in sizes)
         )
         self.sh_degree = cfg.render.sh_degree
-        self._count = jax.jit(lambda g, alive, cam: required_capacity(g, alive, cam, cfg.render))
         self._densify_adaptive = jax.jit(adaptive.apply)
         self._propose = jax.jit(functools.partial(adaptive.propose, cfg=cfg.densify))
         self._relocate = jax.jit(functools.partial(mcmc.relocate_and_grow, cfg=cfg.densify))
@@ -182,12 +188,19 @@ class Trainer:
         Raises:
             DivergenceError: a loss term or gradient is not finite.
         """
+        try:
+            return self._run(params, alive, resume, reserve_s)
+        finally:
+            self.programs.close()
+
+    def _run(self, params: Params, alive, resume: bool, reserve_s: float) -> TrainResult:
         train = self.cfg.train
         seeds = int(np.sum(np.asarray(alive)))
         limit = self._limit(seeds)
-        state = initial_state(params, alive, self.optimizer)
+        slots = seeds
         if self.cfg.densify.method == "mcmc" and not self.auto:
-            state = grow_state(state, max(limit or 0, seeds))
+            slots = max(limit or 0, seeds)
+        state = initial_state(params, alive, self.optimizer, slots)
         pace = Pace.from_config(train, reserve_s)
         host = HostState(pace=pace.per_step)
         if resume and (restored := self._restore(state)) is not None:
@@ -201,13 +214,15 @@ class Trainer:
         session_start = time.monotonic()
         before = host.elapsed_s
         last_save = session_start
+        self._make_room(state, host, limit)
         while host.progress < 1.0 - 0.5 * host.pace:
+            shrink = schedule.shrink_at(host.progress, self.levels)
             state, reports = self._burst(state, host)
             host.elapsed_s = before + time.monotonic() - session_start
-            shrink = schedule.shrink_at(host.progress, self.levels)
             if reports:
                 self._log(reports, state, host, shrink)
-                state = self._maybe_densify(state, host, limit)
+                with self.clock("densification"):
+                    state = self._maybe_densify(state, host, limit)
             if pace.deadline_s is not None:
                 if host.step_s > 0:
                     pace = dataclasses.replace(pace, per_step=host.pace)
@@ -223,11 +238,18 @@ class Trainer:
             # A checkpoint holds one population: none is written while two compete.
             due = time.monotonic() - last_save > train.checkpoint_every_s
             if due and self._trial is None:
-                self._save(state, host)
+                with self.clock("checkpoints"):
+                    self._save(state, host)
                 last_save = time.monotonic()
-        self._save(state, host)
+        with self.clock("checkpoints"):
+            self._save(state, host)
         summary = growth.summary(host.growth, self.validation) if self.auto else None
-        return TrainResult(state, host, limit or state.params.gaussians.capacity, summary)
+        most = limit or state.params.gaussians.capacity
+        return TrainResult(state, host, most, summary, self._seconds())
+
+    def _seconds(self) -> dict[str, float]:
+        """Return where the time went, by name."""
+        return {"compiling": self.programs.waited_s, **self.clock.seconds}
 
     def _limit(self, seeds: int) -> int | None:
         """Return the bound on the population; None: there is none."""
@@ -244,16 +266,18 @@ class Trainer:
     ) -> tuple[FitState, list[tuple[int, float, StepReport]]]:
         """Dispatch steps up to the next point where the host must look, then look.
 
-        On overflow the steps that the device refused are taken back and the tile list grows.
+        Where a view finds no room, the steps that the device refused are taken back and the room
+        grows.
         """
         shrink = schedule.shrink_at(host.progress, self.levels)
+        if shrink != host.shrink:
+            host.shrink, host.step_s = shrink, 0.0
         length = self.cfg.train.log_every - host.step % self.cfg.train.log_every
         length = max(1, min(length, MAX_BURST))
         reports: list[tuple[int, float, StepReport]] = []
         progress = host.progress
-        begin = time.monotonic()
-        compiled = False
-        keys = []
+        begin, waited = time.monotonic(), self.programs.waited_s
+        sizes = []
         for k in range(length):
             if progress >= 1.0 - 0.5 * host.pace:
                 break
@@ -263,57 +287,94 @@ class Trainer:
             index = self.views.index_at(step)
             self.views.prefetch(self.views.index_at(step + 1), shrink)
             batch = self.views.batch(index, shrink)
-            key = f"{batch.camera.width}x{batch.camera.height}"
-            if key not in host.capacities:
-                host.capacities[key] = self._fresh_capacity(state, shrink, key)
-                compiled = True
-            keys.append(key)
-            controls = Controls(
-                jnp.float32(progress),
-                jnp.int32(schedule.sh_degree_at(progress, self.cfg.train, self.sh_degree)),
+            size = (batch.camera.width, batch.camera.height)
+            sizes.append(size)
+            arguments = (
+                state,
+                batch,
+                self._partner(step, shrink),
+                Controls(
+                    np.float32(progress),
+                    np.int32(schedule.sh_degree_at(progress, self.cfg.train, self.sh_degree)),
+                ),
             )
-            state, report = self.step_fn(
-                state, batch, self._partner(step, shrink), controls, capacity=host.capacities[key]
+            key = Key(
+                size, state.params.gaussians.capacity, self._room(host, size), self._degree(shrink)
             )
+            state, report = self.programs.get(key, *arguments)(*arguments)
             reports.append((step, progress, report))
             progress = progress + host.pace
         kind = int(state.fault.kind)
         done = int(state.step) - host.step
+        seconds = time.monotonic() - begin - (self.programs.waited_s - waited)
+        self.clock.add("steps", seconds)
         if kind == FAULT_NONFINITE:
             self._diverged(state, host.step + done, reports[done][2])
         if kind == FAULT_OVERFLOW:
-            key = keys[done]
-            host.capacities[key] = capacity_bucket(int(state.fault.needed), 1.1)
+            room = self._room(host, sizes[done])
+            grown = room.grown(int(state.fault.needed), int(state.fault.visible))
+            host.rooms[_name(sizes[done])] = grown
             host.overflows += 1
             state = dataclasses.replace(state, fault=Fault.none())
-            compiled = True
-        if not compiled and done:
-            self._time(host, (time.monotonic() - begin) / done)
+        elif done:
+            per_step = seconds / done
+            known = host.step_s > 0
+            host.step_s = 0.7 * host.step_s + 0.3 * per_step if known else per_step
         reports = reports[:done]
         host.step += done
         for _ in range(done):
             host.progress += host.pace
         return state, reports
 
-    @staticmethod
-    def _time(host: HostState, seconds: float) -> None:
-        host.step_s = seconds if host.step_s == 0 else 0.7 * host.step_s + 0.3 * seconds
+    # -------------------------------------------------------------- room and programs
 
-    def _fresh_capacity(self, state: FitState, shrink: int, key: str) -> int:
-        """Return a tile-list capacity for a new image size, from a sample of its views."""
-        picks = np.linspace(0, len(self.views) - 1, CAPACITY_SAMPLES).round().astype(int)
-        cameras = [self.views.camera(int(i), shrink) for i in sorted(set(picks))]
-        same = [c for c in cameras if f"{c.width}x{c.height}" == key] or cameras[:1]
-        needed = max(
-            int(self._count(state.params.gaussians, state.population.alive, c)) for c in same
-        )
-        return capacity_bucket(needed, CAPACITY_MARGIN)
+    def _room(self, host: HostState, size: tuple[int, int]) -> Room:
+        return host.rooms[_name(size)]
+
+    def _degree(self, shrink: int) -> int:
+        """Return the highest spherical-harmonics degree that a level of the schedule uses."""
+        end = next((end for end, factor in self.levels if factor == shrink), 1.0)
+        return schedule.sh_degree_at(end, self.cfg.train, self.sh_degree)
+
+    def _make_room(self, state: FitState, host: HostState, limit: int | None) -> None:
+        """Estimate the room of every image size to come, and begin to compile its step."""
+        gaussians = jax.tree.map(np.asarray, state.params.gaussians)
+        alive = np.asarray(state.population.alive)
+        most = max(limit or 0, state.params.gaussians.capacity)
+        if not self.cfg.optimizer.visible_only:
+            most = max(most, len(alive))
+        for end, shrink in self.levels:
+            if end <= host.progress:
+                continue
+            cameras: dict[tuple[int, int], list[int]] = {}
+            for index in range(len(self.views)):
+                camera = self.views.host_camera(index, shrink)
+                cameras.setdefault((camera.width, camera.height), []).append(index)
+            for size, indices in cameras.items():
+                if _name(size) not in host.rooms:
+                    taken = [self.views.host_camera(i, shrink) for i in indices]
+                    host.rooms[_name(size)] = room_for(
+                        gaussians, alive, taken, most, self.cfg.render
+                    )
+            if self.auto or self.cfg.densify.method == "adaptive" or len(cameras) > 1:
+                continue  # the population's slots, or the sizes, are not known beforehand
+            (size,) = cameras
+            degree = self._degree(shrink)
+            key = Key(size, state.params.gaussians.capacity, host.rooms[_name(size)], degree)
+            step = host.step
+            self.programs.expect(
+                key,
+                state,
+                self.views.batch(self.views.index_at(step), shrink),
+                self._partner(step, shrink),
+                Controls(np.float32(0), np.int32(0)),
+            )
 
     def _partner(self, step: int, shrink: int) -> Partner:
         """Return the second view of the relative-exposure loss, as much of it as is needed."""
         relative = self.cfg.loss.relative_exposure
         if relative.weight is None:
-            return Partner(jnp.int32(0))
+            return Partner(np.int32(0))
         other = self.views.partner_at(step)
         camera, batch, pairs = None, None, None
         if relative.form in SECOND_RENDER_FORMS:
@@ -324,8 +385,8 @@ class Trainer:
             count = self.pairs.views_i.shape[0]
             rng = np.random.default_rng((self.cfg.train.seed, 2, step))
             pick = rng.integers(0, count, min(PAIRS_PER_STEP, count))
-            pairs = jax.tree.map(lambda a: a[pick], self.pairs)
-        return Partner(jnp.int32(other), camera, batch, pairs)
+            pairs = jax.tree.map(lambda a: np.asarray(a)[pick], self.pairs)
+        return Partner(np.int32(other), camera, batch, pairs)
 
     def _diverged(self, state: FitState, step: int, report: StepReport) -> None:
         names = finite_names(report.terms)
@@ -351,7 +412,7 @@ class Trainer:
             progress=round(host.progress, 6),
             loss=_mean(r.loss for _, _, r in reports),
             psnr=_mean(r.psnr for _, _, r in reports),
-            gaussians=int(jnp.sum(state.population.alive)),
+            gaussians=self._count(state),
             shrink=shrink,
             entries=int(last.entries),
             seconds=round(host.elapsed_s, 3),
@@ -387,11 +448,11 @@ class Trainer:
         return max(d.every, d.min_every_steps * host.pace)
 
     def _key(self, host: HostState):
-        return jax.random.fold_in(jax.random.key(self.cfg.train.seed + 1), host.step)
+        return self._rng(np.int32(host.step))
 
     def _target(self, state: FitState, host: HostState, limit: int | None) -> int:
         """Return the population after the next relocation."""
-        alive = int(jnp.sum(state.population.alive))
+        alive = self._count(state)
         room = max((limit or alive) / max(alive, 1), 1.0)
         # A short run has few events: grow so that the limit is reached at the last of them.
         events = (self.cfg.densify.stop - host.progress) / self._interval(host)
@@ -399,9 +460,9 @@ class Trainer:
         return min(math.ceil(alive * factor), limit or alive)
 
     def _relocate_step(self, state: FitState, host: HostState, wanted: int) -> FitState:
-        births = max(wanted - int(jnp.sum(state.population.alive)), 0)
+        births = max(wanted - self._count(state), 0)
         outcome = self._relocate(
-            self._key(host), state.params.gaussians, state.population, jnp.int32(births)
+            self._key(host), state.params.gaussians, state.population, np.int32(births)
         )
         return self._settle(state, outcome, host)
 
@@ -431,7 +492,7 @@ class Trainer:
 
     def _begin_stage(self, state: FitState, host: HostState, bound: int) -> _Trial | None:
         """Run a stage without growth, and return its end; None: there is no room for a stage."""
-        alive = int(jnp.sum(state.population.alive))
+        alive = self._count(state)
         left = (self.growth_window[1] - host.progress) / host.pace
         # The host looks after every burst only.
         burst = min(self.cfg.train.log_every, MAX_BURST)
@@ -457,7 +518,7 @@ class Trainer:
         trial, self._trial = self._trial, None
         assert trial is not None
         look = Look(
-            int(jnp.sum(grown.population.alive)),
+            self._count(grown),
             self.judge(grown.params, grown.population.alive),
             trial.stage.before,
             trial.score,
@@ -473,7 +534,7 @@ class Trainer:
         """Keep the population from here on, and fit the held-out views as well."""
         if host.growth.limit is not None:
             return
-        host.growth.limit = int(jnp.sum(state.population.alive))
+        host.growth.limit = self._count(state)
         self.views.leave_out(())
         self.on_message(growth.describe(host.growth, len(self.validation)))
 
@@ -508,6 +569,9 @@ class Trainer:
             )
         return state
 
+    def _count(self, state: FitState) -> int:
+        return int(self._alive(state.population.alive))
+
     def _settle(self, state: FitState, outcome, host: HostState) -> FitState:
         refused = int(outcome.refused)
         if refused > 0:
@@ -517,13 +581,17 @@ class Trainer:
                     "reached; raise --densify.max-gaussians to let them. Counted from here on."
                 )
             host.refused += refused
-        if not bool(jnp.any(outcome.population.alive)):
+        if int(self._alive(outcome.population.alive)) == 0:
             raise UserError(
                 f"Step {host.step}: densification removed every Gaussian.",
                 fix="lower --densify.prune-opacity or raise --densify.prune-scale",
             )
         opt_state = self._zero_moments(state.opt_state, outcome.reset_moments)
         return replace_gaussians(state, outcome.gaussians, outcome.population, opt_state)
+
+
+def _name(size: tuple[int, int]) -> str:
+    return f"{size[0]}x{size[1]}"
 
 
 def _mean(values) -> float:

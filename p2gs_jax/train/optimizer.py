@@ -1,18 +1,81 @@
-"""Adam with a learning rate per group, as one optax chain over the single parameter pytree."""
+"""Adam with a learning rate per group over the single parameter pytree.
+
+A step sees some Gaussians only: the moments of all others rest, and so do their parameters. Each
+Gaussian counts its own updates, so its bias correction is that of an Adam that has run as often as
+it was seen. Everything else has one count.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.photometry.solution import LADDER
 from p2gs_jax.types import Gaussians, Params, Photometry
+
+B1, B2 = 0.9, 0.999
+
+
+class AdamState(NamedTuple):
+    """Moments, and how often they were updated.
+
+    Attributes:
+        count: updates; one number, or one per row of the parameters.
+        mu: first moments.
+        nu: second moments.
+    """
+
+    count: Int[Array, "..."]
+    mu: Any
+    nu: Any
+
+
+class OptState(NamedTuple):
+    """The optimiser's state.
+
+    Attributes:
+        gaussians: of the Gaussians, updates counted one by one.
+        rest: of photometry and appearance.
+    """
+
+    gaussians: tuple[AdamState, optax.EmptyState]
+    rest: tuple[AdamState, optax.EmptyState]
+
+
+def scale_by_adam(eps: float, *, by_row: bool) -> optax.GradientTransformation:
+    """Return Adam (Kingma and Ba 2015).
+
+    Args:
+        eps: added to the root of the second moment.
+        by_row: count updates of every row, which the first axes of all parameters share.
+    """
+
+    def init(params) -> AdamState:
+        rows = jax.tree.leaves(params)[0].shape[:1] if by_row else ()
+        zeros = (jax.tree.map(jnp.zeros_like, params) for _ in range(2))
+        return AdamState(jnp.zeros(rows, jnp.int32), *zeros)
+
+    def update(updates, state: AdamState, params=None):
+        del params
+        count = state.count + 1
+        mu = jax.tree.map(lambda m, g: B1 * m + (1 - B1) * g, state.mu, updates)
+        nu = jax.tree.map(lambda v, g: B2 * v + (1 - B2) * g * g, state.nu, updates)
+        first = 1 / (1 - B1 ** count.astype(jnp.float32))
+        second = 1 / (1 - B2 ** count.astype(jnp.float32))
+
+        def scaled(m, v):
+            shape = count.shape + (1,) * (m.ndim - count.ndim) if by_row else ()
+            return first.reshape(shape) * m / (jnp.sqrt(second.reshape(shape) * v) + eps)
+
+        return jax.tree.map(scaled, mu, nu), AdamState(count, mu, nu)
+
+    return optax.GradientTransformation(init, update)  # pyright: ignore[reportArgumentType]
 
 
 def scale_by_rates() -> optax.GradientTransformationExtraArgs:
@@ -20,15 +83,39 @@ def scale_by_rates() -> optax.GradientTransformationExtraArgs:
 
     def update(updates, state, params=None, **extra: Any):
         del params
-        rates: Params = extra["rates"]
+        rates = extra["rates"]
         return jax.tree.map(lambda u, r: -r * u, updates, rates), state
 
     return optax.GradientTransformationExtraArgs(lambda params: optax.EmptyState(), update)
 
 
-def make_optimizer(cfg: FitConfig) -> optax.GradientTransformationExtraArgs:
+class Optimizer(NamedTuple):
+    """Two optax chains over the parameters.
+
+    Attributes:
+        gaussians: for any rows of the Gaussians.
+        rest: for (photometry, appearance).
+    """
+
+    gaussians: optax.GradientTransformationExtraArgs
+    rest: optax.GradientTransformationExtraArgs
+
+    def init(self, params: Params) -> OptState:
+        """Return the state before the first step."""
+        # optax annotates trees as nests of containers and does not know our records.
+        return OptState(
+            self.gaussians.init(params.gaussians),  # pyright: ignore[reportArgumentType]
+            self.rest.init((params.photometry, params.appearance)),  # pyright: ignore
+        )
+
+
+def make_optimizer(cfg: FitConfig) -> Optimizer:
     """Return Adam followed by the group rates."""
-    return optax.chain(optax.scale_by_adam(eps=cfg.optimizer.eps), scale_by_rates())
+    eps = cfg.optimizer.eps
+    return Optimizer(
+        optax.chain(scale_by_adam(eps, by_row=True), scale_by_rates()),
+        optax.chain(scale_by_adam(eps, by_row=False), scale_by_rates()),
+    )
 
 
 def means_rate(progress: Array, extent: float, cfg: FitConfig) -> Float[Array, ""]:
@@ -50,7 +137,9 @@ def photometry_gate(progress: Array, cfg: FitConfig) -> Float[Array, ""]:
     return jnp.where(along >= 0, rate, 0.0)
 
 
-def learning_rates(progress: Array, extent: float, like: Params, cfg: FitConfig) -> Params:
+def learning_rates(
+    progress: Array, extent: float, like: Params, cfg: FitConfig, bands: int
+) -> Params:
     """Return the rate of every parameter, shaped to broadcast against `like`.
 
     Args:
@@ -58,10 +147,10 @@ def learning_rates(progress: Array, extent: float, like: Params, cfg: FitConfig)
         extent: scene extent, scene units.
         like: the parameters, for their structure.
         cfg: rates and schedules.
+        bands: spherical-harmonics coefficients in use.
     """
     o = cfg.optimizer
     decay = o.final**progress
-    bands = like.gaussians.sh.shape[1]
     sh = jnp.full((bands, 1), o.sh_rest).at[0].set(o.sh_dc) * decay
     gate = photometry_gate(progress, cfg)
     varies = LADDER[cfg.photometry.model]
@@ -84,17 +173,25 @@ def learning_rates(progress: Array, extent: float, like: Params, cfg: FitConfig)
     )
 
 
-def map_moments(opt_state, change):
-    """Apply `change` (Gaussians -> Gaussians) to both Adam moments of the Gaussians."""
-    adam = opt_state[0]
-
-    def moved(moment: Params) -> Params:
-        return dataclasses.replace(moment, gaussians=change(moment.gaussians))
-
-    return (adam._replace(mu=moved(adam.mu), nu=moved(adam.nu)), *opt_state[1:])
+def _changed(opt_state: OptState, change, count) -> OptState:
+    adam, *others = opt_state.gaussians
+    moments = AdamState(count, change(adam.mu), change(adam.nu))
+    return opt_state._replace(gaussians=(moments, *others))
 
 
-def zero_moments(opt_state, where: Bool[Array, " n"]):
+def grow_moments(opt_state: OptState, empty: Gaussians) -> OptState:
+    """Append zero moments for new slots, as many as `empty` has."""
+    count = opt_state.gaussians[0].count
+    more = jnp.zeros(empty.means.shape[0], count.dtype)
+    zeros = jax.tree.map(jnp.zeros_like, empty)
+    return _changed(
+        opt_state,
+        lambda m: jax.tree.map(lambda a, b: jnp.concatenate([a, b]), m, zeros),
+        jnp.concatenate([count, more]),
+    )
+
+
+def zero_moments(opt_state: OptState, where: Bool[Array, " n"]) -> OptState:
     """Forget the moments of the given slots."""
 
     def zero(moment: Gaussians) -> Gaussians:
@@ -102,12 +199,13 @@ def zero_moments(opt_state, where: Bool[Array, " n"]):
             lambda a: jnp.where(where.reshape((-1,) + (1,) * (a.ndim - 1)), 0.0, a), moment
         )
 
-    return map_moments(opt_state, zero)
+    return _changed(opt_state, zero, jnp.where(where, 0, opt_state.gaussians[0].count))
 
 
-def zero_opacity_moments(opt_state):
+def zero_opacity_moments(opt_state: OptState) -> OptState:
     """Forget the opacity moments of all slots (3DGS, at an opacity reset)."""
-    return map_moments(
+    return _changed(
         opt_state,
         lambda m: dataclasses.replace(m, opacity_logits=jnp.zeros_like(m.opacity_logits)),
+        opt_state.gaussians[0].count,
     )

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, cast
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optax
 from jaxtyping import Array, Int
 
 from p2gs_jax.densify.population import empty_gaussians, fresh_population, grow
-from p2gs_jax.train.optimizer import map_moments
+from p2gs_jax.train.optimizer import Optimizer, OptState, grow_moments
 from p2gs_jax.types import Gaussians, Params, Population
 
 FAULT_NONE, FAULT_OVERFLOW, FAULT_NONFINITE = 0, 1, 2
@@ -22,19 +20,21 @@ class Fault(eqx.Module):
     """Why the state stopped advancing; sticky, so the host need not look after every step.
 
     Attributes:
-        kind: 0 none, 1 tile list overflow, 2 something is not finite.
+        kind: 0 none, 1 a view needs more room, 2 something is not finite.
         needed: entries that the tile list needed.
+        visible: Gaussians that the view showed.
         term: index into the names of loss terms and gradients that was not finite.
     """
 
     kind: Int[Array, ""]
     needed: Int[Array, ""]
+    visible: Int[Array, ""]
     term: Int[Array, ""]
 
     @classmethod
     def none(cls) -> Fault:
         """Return the state of health."""
-        return cls(*(jnp.int32(0) for _ in range(3)))
+        return cls(*(jnp.int32(0) for _ in range(4)))
 
 
 class FitState(eqx.Module):
@@ -49,23 +49,35 @@ class FitState(eqx.Module):
     """
 
     params: Params
-    opt_state: optax.OptState
+    opt_state: OptState
     population: Population
     step: Int[Array, ""]
     fault: Fault
 
 
-def initial_state(
-    params: Params, alive: Array, optimizer: optax.GradientTransformation
-) -> FitState:
-    """Return the state before the first step."""
-    return FitState(
-        params,
-        optimizer.init(cast(Any, params)),
-        fresh_population(alive),
-        jnp.int32(0),
-        Fault.none(),
-    )
+def initial_state(params: Params, alive: Array, optimizer: Optimizer, slots: int = 0) -> FitState:
+    """Return the state before the first step.
+
+    Args:
+        params: the start.
+        alive: which Gaussians exist.
+        optimizer: from `make_optimizer`.
+        slots: room of the population, at least what `params` holds.
+    """
+
+    @jax.jit
+    def build(params, alive):
+        state = FitState(
+            params,
+            optimizer.init(params),
+            fresh_population(alive),
+            jnp.int32(0),
+            Fault.none(),
+        )
+        return grow_state(state, slots)
+
+    # The step gives its state away: the caller keeps its parameters.
+    return jax.tree.map(jnp.asarray, build(params, alive))
 
 
 def grow_state(state: FitState, capacity: int) -> FitState:
@@ -75,17 +87,16 @@ def grow_state(state: FitState, capacity: int) -> FitState:
     if extra <= 0:
         return state
     empty = empty_gaussians(extra, gaussians)
-    zeros = jax.tree.map(jnp.zeros_like, empty)
     return dataclasses.replace(
         state,
         params=dataclasses.replace(state.params, gaussians=grow(gaussians, empty)),
-        opt_state=map_moments(state.opt_state, lambda m: grow(m, zeros)),
+        opt_state=grow_moments(state.opt_state, empty),
         population=grow(state.population, fresh_population(jnp.zeros(extra, bool))),
     )
 
 
 def replace_gaussians(
-    state: FitState, gaussians: Gaussians, population: Population, opt_state: optax.OptState
+    state: FitState, gaussians: Gaussians, population: Population, opt_state: OptState
 ) -> FitState:
     """Return the state with another population."""
     return dataclasses.replace(

@@ -11,14 +11,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jax import lax
 from jaxtyping import Array, Float, Int
 
 from p2gs_jax.config import FitConfig
-from p2gs_jax.densify.mcmc import exploration_noise
-from p2gs_jax.losses.total import LossAux, Partner, total_loss
+from p2gs_jax.losses.regularizers import population_terms
+from p2gs_jax.losses.total import LossAux, Partner, decoded, image_loss, partner_cameras
+from p2gs_jax.render.blocks import splat, splat_listed, whole_blocks
+from p2gs_jax.render.capacity import Room
+from p2gs_jax.render.spherical_harmonics import coefficient_count
+from p2gs_jax.render.visible import compact, in_view
 from p2gs_jax.render.xla_cpu import compiler_options
-from p2gs_jax.train.optimizer import learning_rates, means_rate
+from p2gs_jax.train.optimizer import Optimizer, OptState, learning_rates, means_rate
 from p2gs_jax.train.state import (
     FAULT_NONE,
     FAULT_NONFINITE,
@@ -26,7 +29,8 @@ from p2gs_jax.train.state import (
     Fault,
     FitState,
 )
-from p2gs_jax.types import Batch, Gaussians, Params, Photometry, Population
+from p2gs_jax.train.update import update_listed
+from p2gs_jax.types import Batch, Camera, Gaussians, Params, Photometry, Population
 
 
 class Controls(eqx.Module):
@@ -48,6 +52,7 @@ class StepReport(NamedTuple):
     terms: dict[str, Float[Array, ""]]
     psnr: Float[Array, ""]
     entries: Int[Array, ""]
+    visible: Int[Array, ""]
 
 
 Step = Callable[..., tuple[FitState, StepReport]]
@@ -64,12 +69,6 @@ def finite_names(terms: dict) -> tuple[str, ...]:
     return (*(f"loss term {k}" for k in terms), *GRADIENT_NAMES)
 
 
-def _first_nonfinite(aux: LossAux, grads: Params) -> tuple[Array, Array]:
-    values = [*aux.terms.values(), *jax.tree.leaves(grads)]
-    finite = jnp.stack([jnp.isfinite(jnp.sum(v)) for v in values])
-    return ~jnp.all(finite), jnp.argmin(finite).astype(jnp.int32)
-
-
 def _recentered(photometry: Photometry, cfg: FitConfig) -> Photometry:
     """Project the scale gauge: mean log e = 0 exactly (docs/photometry.md, 4)."""
     if photometry.parameterization != "log":
@@ -80,89 +79,159 @@ def _recentered(photometry: Photometry, cfg: FitConfig) -> Photometry:
     return dataclasses.replace(photometry, raw_exposures=raw - jnp.mean(raw))
 
 
-def _observed(population: Population, v_probe: Array, aux: LossAux, state: FitState) -> Population:
-    """Add this view to the densification statistics."""
-    seen = aux.render.visible & (jnp.sum(jnp.abs(v_probe), -1) > 0)
+def _observed(population: Population, ids, v_means2d: Array, aux: LossAux, camera: Camera):
+    """Add this view to the densification statistics of what it shows.
+
+    Gradients are in units of half the image, as 3DGS has them.
+    """
+    gradient = v_means2d * jnp.array([camera.width / 2, camera.height / 2])
+    seen = aux.render.visible & (jnp.sum(jnp.abs(gradient), -1) > 0)
+
+    def added(a, b):
+        return a.at[ids].add(b, mode="drop", unique_indices=True)
+
     return dataclasses.replace(
         population,
-        grad2d_sum=population.grad2d_sum + jnp.linalg.norm(v_probe, axis=-1),
-        seen_count=population.seen_count + seen,
+        grad2d_sum=added(population.grad2d_sum, jnp.linalg.norm(gradient, axis=-1)),
+        seen_count=added(population.seen_count, seen.astype(jnp.float32)),
     )
 
 
-def make_step(cfg: FitConfig, optimizer: optax.GradientTransformationExtraArgs, extent: float):
-    """Return the jitted step `(state, batch, partner, controls, capacity=...) -> (state, report)`.
+def make_step(cfg: FitConfig, optimizer: Optimizer, extent: float):
+    """Return the jitted step `(state, batch, partner, controls, room=..., degree=...)`.
 
-    A step that would overflow the tile list or is not finite changes nothing but `state.fault`,
-    and so do all steps after it, until the host has dealt with it. Randomness follows from the
-    seed and the step number alone.
+    It gives the next state and a report. A step that finds no room or whose loss is not finite
+    changes nothing but `state.fault`, and so do all steps after it, until the host has dealt with
+    it; where only the gradient of some Gaussians is not finite, these keep their place. Randomness
+    follows from the seed and the step number alone.
+
+    The loss is that of `total_loss`. What is done per Gaussian is done in blocks, for those that
+    the view may show; the others rest (`OptimizerConfig.visible_only`).
 
     Args:
         cfg: everything.
         optimizer: from `make_optimizer`.
         extent: scene extent, scene units.
     """
-    wants_probe = cfg.densify.method == "adaptive"
+    mcmc = cfg.densify.method == "mcmc"
 
     @functools.partial(
         jax.jit,
-        static_argnames="capacity",
+        static_argnames=("room", "degree"),
         donate_argnums=0,
         compiler_options=compiler_options(),
     )
     def step(
-        state: FitState, batch: Batch, partner: Partner, controls: Controls, *, capacity: int
+        state: FitState,
+        batch: Batch,
+        partner: Partner,
+        controls: Controls,
+        *,
+        room: Room,
+        degree: int,
     ) -> tuple[FitState, StepReport]:
-        n = state.params.gaussians.capacity
-        probe = jnp.zeros((n, 2)) if wants_probe else None
-        loss_and_gradient = jax.value_and_grad(total_loss, argnums=(0, 1), has_aux=True)
-        (loss, aux), (grads, v_probe) = loss_and_gradient(
-            state.params,
-            probe,
-            state.population,
-            batch,
-            partner,
-            cfg,
-            capacity=capacity,
-            active_degree=controls.active_degree,
-            extent=extent,
+        gaussians, population = state.params.gaussians, state.population
+        alive = population.alive
+        n, bands = gaussians.capacity, coefficient_count(degree)
+        cameras = (batch.camera, *partner_cameras(partner, cfg))
+        if cfg.optimizer.visible_only:
+            may = functools.reduce(
+                jnp.logical_or, (in_view(gaussians, alive, c, cfg.render) for c in cameras)
+            )
+            ids, count = compact(may, whole_blocks(min(room.visible, n)))
+        else:
+            index = jnp.arange(whole_blocks(n), dtype=jnp.int32)
+            ids, count = jnp.minimum(index, n), jnp.int32(n)
+        shown = splat_listed(
+            gaussians, alive, ids, count, cameras, cfg.render, controls.active_degree, bands
         )
-        broken, term = _first_nonfinite(aux, grads)
-        kind = jnp.where(
-            aux.overflow, FAULT_OVERFLOW, jnp.where(broken, FAULT_NONFINITE, FAULT_NONE)
-        ).astype(jnp.int32)
-        fault = Fault(kind, aux.entries, term)
+        photometry, appearance = state.params.photometry, state.params.appearance
+        (loss, aux), (v_shown, *v_rest) = jax.value_and_grad(
+            image_loss, argnums=(0, 1, 2), has_aux=True, allow_int=True
+        )(shown, photometry, appearance, batch, partner, cfg, room.entries)
 
-        def advance(state: FitState) -> FitState:
-            rates = learning_rates(controls.progress, extent, state.params, cfg)
-            # optax annotates trees as nests of containers and does not know our records.
-            updates, opt_state = optimizer.update(
-                cast(Any, grads), state.opt_state, cast(Any, state.params), rates=rates
-            )
-            params = cast(Params, optax.apply_updates(cast(Any, state.params), updates))
-            gaussians, population = params.gaussians, state.population
-            if cfg.densify.method == "mcmc":
-                key = jax.random.fold_in(jax.random.key(cfg.train.seed), state.step)
-                rate = cfg.densify.noise * means_rate(controls.progress, extent, cfg)
-                noise = exploration_noise(key, gaussians, population.alive, rate)
-                gaussians = dataclasses.replace(gaussians, means=gaussians.means + noise)
-            if wants_probe:
-                population = _observed(population, v_probe, aux, state)
-            params = Params(gaussians, _recentered(params.photometry, cfg), params.appearance)
-            return FitState(params, opt_state, population, state.step + 1, state.fault)
+        fits = ~aux.overflow & (count <= ids.shape[0])
+        values = [*aux.terms.values(), *jax.tree.leaves(v_rest)]
+        finite = jnp.stack([jnp.all(jnp.isfinite(v)) for v in values])
+        first = state.fault.kind == FAULT_NONE
+        healthy = first & fits & jnp.all(finite)
 
-        def stay(state: FitState) -> FitState:
-            first = state.fault.kind == FAULT_NONE
-            return dataclasses.replace(
-                state, fault=jax.tree.map(lambda a, b: jnp.where(first, a, b), fault, state.fault)
-            )
+        rates = learning_rates(controls.progress, extent, state.params, cfg, bands)
+        listed = jnp.sum(alive.at[ids].get(mode="fill", fill_value=False))
+        updated = update_listed(
+            gaussians,
+            state.opt_state.gaussians[0],
+            alive,
+            ids,
+            count,
+            healthy,
+            bands=bands,
+            seen=lambda block, on: _differentiable(
+                splat(block, on, cameras, cfg.render, controls.active_degree)
+            ),
+            v_seen=_differentiable(v_shown),
+            own=lambda block, on: population_terms(block, on, cfg, extent, listed),
+            optimizer=optimizer.gaussians,
+            rates=rates.gaussians,
+            key=jax.random.fold_in(jax.random.key(cfg.train.seed), state.step),
+            noise_rate=cfg.densify.noise * means_rate(controls.progress, extent, cfg)
+            if mcmc
+            else None,
+        )
+        # optax annotates trees as nests of containers and does not know our records.
+        rest = (photometry, appearance)
+        updates, rest_moments = optimizer.rest.update(
+            cast(Any, tuple(v_rest)),
+            state.opt_state.rest,
+            cast(Any, rest),
+            rates=(rates.photometry, rates.appearance),
+        )
+        moved_photometry, moved_appearance = cast(
+            Any, optax.apply_updates(cast(Any, rest), cast(Any, updates))
+        )
+        if not mcmc:
+            where = jnp.where(healthy, ids, n)
+            v_means2d = v_shown[0][0].means2d
+            population = _observed(population, where, v_means2d, aux, batch.camera)
 
-        healthy = (kind == FAULT_NONE) & (state.fault.kind == FAULT_NONE)
-        state = lax.cond(healthy, advance, stay, state)
-        mask = batch.mask[..., None]
-        squared = mask * (jnp.clip(aux.ldr, 0, 1) - batch.ldr) ** 2
-        mse = jnp.sum(squared) / jnp.maximum(3 * jnp.sum(batch.mask), 1)
+        terms = aux.terms | updated.value
+        all_finite = jnp.concatenate([finite[: len(aux.terms)], _ones(len(updated.value))])
+        all_finite = jnp.concatenate([all_finite, updated.finite, finite[len(aux.terms) :]])
+        broken = FAULT_NONFINITE * ~jnp.all(all_finite)
+        kind = jnp.where(fits, broken, FAULT_OVERFLOW).astype(jnp.int32)
+        term = jnp.argmin(all_finite).astype(jnp.int32)
+        fault = jax.tree.map(
+            lambda a, b: jnp.where(first, a, b), Fault(kind, aux.entries, count, term), state.fault
+        )
+        rest, rest_moments = jax.tree.map(
+            lambda a, b: jnp.where(healthy, b, a),
+            (rest, state.opt_state.rest),
+            ((_recentered(moved_photometry, cfg), moved_appearance), rest_moments),
+        )
+        advanced = fault.kind == FAULT_NONE
+        state = FitState(
+            Params(updated.gaussians, *rest),
+            OptState((updated.moments, optax.EmptyState()), rest_moments),
+            population,
+            state.step + advanced,
+            fault,
+        )
+        photograph, mask = decoded(batch)
+        squared = mask[..., None] * (jnp.clip(aux.ldr, 0, 1) - photograph) ** 2
+        mse = jnp.sum(squared) / jnp.maximum(3 * jnp.sum(mask), 1)
         psnr = -10 * jnp.log10(jnp.maximum(mse, 1e-10))
-        return state, StepReport(loss, aux.terms, psnr, aux.entries)
+        loss = jax.tree.reduce(jnp.add, updated.value, loss)
+        return state, StepReport(loss, terms, psnr, aux.entries, count)
 
     return step
+
+
+def _differentiable(shown):
+    """Return what the image is made of, without flags and what only bins."""
+    return tuple(
+        (s.means2d, s.conic_factor, s.log_opacities, s.depths, radiance) for s, radiance in shown
+    )
+
+
+def _ones(count: int):
+    return jnp.ones(count, bool)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
-from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.train.room import HostCamera
 from p2gs_jax.types import Batch, Camera
 
 
@@ -76,13 +75,15 @@ class TrainingViews:
         """Begin decoding a view in the background."""
         self.store.prefetch(self.rows[index], shrink)
 
+    def host_camera(self, index: int, shrink: int) -> HostCamera:
+        """Return the camera of a training view at a level, on the host."""
+        return HostCamera(*self.store.camera(self.rows[index], shrink))
+
     def camera(self, index: int, shrink: int) -> Camera:
         """Return the camera of a training view at a level."""
-        return camera_of(self.store, self.rows[index], shrink)
+        return Camera(*self.host_camera(index, shrink))
 
     def batch(self, index: int, shrink: int) -> Batch:
-        """Return a training view on the device."""
+        """Return a training view, on the host: a compiled step takes it from there."""
         ldr, mask = self.store.get(self.rows[index], shrink)
-        return Batch(
-            self.camera(index, shrink), jnp.asarray(ldr), jnp.asarray(mask), jnp.int32(index)
-        )
+        return Batch(self.camera(index, shrink), ldr, mask, np.int32(index))

@@ -1,0 +1,132 @@
+"""Projection and radiance of what a view shows, block by block.
+
+The list of what a view shows has a static length and a dynamic count. A loop over blocks costs what
+the count costs, and keeps what it computes in a core's cache: gathering 48 spherical-harmonics
+coefficients of 57k Gaussians at once took as long as projecting them (BUILD_NOTES, "Every second
+counts").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from p2gs_jax.config import RenderConfig
+from p2gs_jax.render.project import project, view_radiance
+from p2gs_jax.types import Camera, Gaussians, Splats2D
+
+BLOCK = 4096
+
+Shown = tuple[Splats2D, Float[Array, "v 3"]]
+
+
+def whole_blocks(room: int) -> int:
+    """Return the length of a list that has room for so many and ends with a block."""
+    return -(-max(room, 1) // BLOCK) * BLOCK
+
+
+def take_rows(gaussians: Gaussians, ids: Int[Array, " v"], bands: int) -> Gaussians:
+    """Return some Gaussians, with their first spherical-harmonics coefficients only.
+
+    Args:
+        gaussians: parameters or moments.
+        ids: which; those out of bounds give the last one.
+        bands: how many coefficients.
+    """
+
+    def rows(a):
+        return a.at[ids].get(mode="clip")
+
+    return Gaussians(
+        means=rows(gaussians.means),
+        quats=rows(gaussians.quats),
+        log_scales=rows(gaussians.log_scales),
+        opacity_logits=rows(gaussians.opacity_logits),
+        sh=gaussians.sh.at[ids, :bands].get(mode="clip"),
+    )
+
+
+def put_rows(gaussians: Gaussians, ids: Int[Array, " v"], new: Gaussians) -> Gaussians:
+    """Return Gaussians with some rows replaced; the inverse of `take_rows`.
+
+    Args:
+        gaussians: parameters or moments.
+        ids: where, each once; those out of bounds go nowhere.
+        new: from `take_rows`, changed.
+    """
+
+    def rows(a, b):
+        return a.at[ids].set(b, mode="drop", unique_indices=True)
+
+    bands = new.sh.shape[1]
+    return Gaussians(
+        means=rows(gaussians.means, new.means),
+        quats=rows(gaussians.quats, new.quats),
+        log_scales=rows(gaussians.log_scales, new.log_scales),
+        opacity_logits=rows(gaussians.opacity_logits, new.opacity_logits),
+        sh=gaussians.sh.at[ids, :bands].set(new.sh, mode="drop", unique_indices=True),
+    )
+
+
+def slice_of(tree, block: Int[Array, ""] | int):
+    """Return one block of every array of a tree."""
+    return jax.tree.map(lambda a: lax.dynamic_slice_in_dim(a, block * BLOCK, BLOCK), tree)
+
+
+def splat(
+    gaussians: Gaussians,
+    alive: Bool[Array, " v"],
+    cameras: Sequence[Camera],
+    cfg: RenderConfig,
+    active_degree: Int[Array, ""] | int | None = None,
+) -> tuple[Shown, ...]:
+    """Return the splats and the radiance of Gaussians in each of some views."""
+    return tuple(
+        (project(gaussians, alive, c, cfg), view_radiance(gaussians, c, cfg, active_degree))
+        for c in cameras
+    )
+
+
+def splat_listed(
+    gaussians: Gaussians,
+    alive: Bool[Array, " n"],
+    ids: Int[Array, " v"],
+    count: Int[Array, ""],
+    cameras: Sequence[Camera],
+    cfg: RenderConfig,
+    active_degree: Int[Array, ""] | int,
+    bands: int,
+) -> tuple[Shown, ...]:
+    """Return the splats and the radiance of the listed Gaussians in each of some views.
+
+    Args:
+        gaussians: the scene.
+        alive: slots in use.
+        ids: from `compact`, whole blocks.
+        count: how many are listed.
+        cameras: the views.
+        cfg: rendering options.
+        active_degree: spherical-harmonics degree in use.
+        bands: coefficients that are looked at.
+    """
+
+    def block(k):
+        here = slice_of(ids, k)
+        shown = alive.at[here].get(mode="fill", fill_value=False)
+        return splat(take_rows(gaussians, here, bands), shown, cameras, cfg, active_degree)
+
+    def body(k, out):
+        return jax.tree.map(
+            lambda a, b: lax.dynamic_update_slice_in_dim(a, b, k * BLOCK, 0), out, block(k)
+        )
+
+    length = ids.shape[0]
+    blank = jax.tree.map(
+        lambda s: jnp.zeros((length, *s.shape[1:]), s.dtype), jax.eval_shape(block, jnp.int32(0))
+    )
+    used = jnp.minimum(count, length)
+    return lax.fori_loop(0, -(-used // BLOCK), body, blank)

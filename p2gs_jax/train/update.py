@@ -1,0 +1,129 @@
+"""The Gaussians' side of a step: gradients, Adam and noise of what a view shows, block by block.
+
+Each block is read, differentiated, updated and written once, while it lies in the cache; nothing of
+the size of the population is ever made.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple, cast
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from p2gs_jax.densify.mcmc import exploration_noise
+from p2gs_jax.render.blocks import BLOCK, put_rows, slice_of, take_rows
+from p2gs_jax.train.optimizer import AdamState
+from p2gs_jax.types import Gaussians
+
+
+class Updated(NamedTuple):
+    """Gaussians and their optimiser after a step.
+
+    Attributes:
+        gaussians: with the listed ones moved.
+        moments: likewise.
+        value: of the loss that belongs to the Gaussians, summed over the blocks.
+        finite: whether the gradient of each field is finite, in the order of `Gaussians`.
+    """
+
+    gaussians: Gaussians
+    moments: AdamState
+    value: Any
+    finite: Bool[Array, " 5"]
+
+
+def update_listed(
+    gaussians: Gaussians,
+    moments: AdamState,
+    alive: Bool[Array, " n"],
+    ids: Int[Array, " v"],
+    count: Int[Array, ""],
+    healthy: Bool[Array, ""],
+    *,
+    bands: int,
+    seen: Callable,
+    v_seen: Any,
+    own: Callable,
+    optimizer: optax.GradientTransformationExtraArgs,
+    rates: Gaussians,
+    key: Array,
+    noise_rate: Float[Array, ""] | None,
+) -> Updated:
+    """Move the listed Gaussians by one step.
+
+    Args:
+        gaussians: the scene.
+        moments: Adam's, of all of them.
+        alive: slots in use.
+        ids: from `compact`, whole blocks.
+        count: how many are listed.
+        healthy: otherwise nothing is written.
+        bands: spherical-harmonics coefficients that are looked at and moved.
+        seen: (Gaussians, alive) of a block -> what the image is made of, per Gaussian.
+        v_seen: gradient of the loss to that, for the whole list.
+        own: (Gaussians, alive) of a block -> the block's share of the loss terms on the Gaussians
+            themselves, as a dictionary.
+        optimizer: from `make_optimizer`, for the Gaussians.
+        rates: learning rates.
+        key: for the noise.
+        noise_rate: scale of the noise on the means, or None for none.
+    """
+    n = gaussians.capacity
+
+    def body(k, state: Updated) -> Updated:
+        here = slice_of(ids, k)
+        shown = alive.at[here].get(mode="fill", fill_value=False)
+        old = take_rows(state.gaussians, here, bands)
+
+        def objective(block):
+            terms = own(block, shown)
+            total = jax.tree.reduce(jnp.add, terms, jnp.float32(0))
+            return (seen(block, shown), total), terms
+
+        _, pull, terms = jax.vjp(objective, old, has_aux=True)
+        (grads,) = pull((slice_of(v_seen, k), jnp.float32(1)))
+        finite = jnp.stack([jnp.all(jnp.isfinite(g)) for g in jax.tree.leaves(grads)])
+        adam = AdamState(
+            state.moments.count.at[here].get(mode="clip"),
+            take_rows(state.moments.mu, here, bands),
+            take_rows(state.moments.nu, here, bands),
+        )
+        # optax annotates trees as nests of containers and does not know our records.
+        updates, (new, *_) = optimizer.update(
+            cast(Any, grads), (adam, optax.EmptyState()), cast(Any, old), rates=rates
+        )
+        moved = cast(Gaussians, optax.apply_updates(cast(Any, old), cast(Any, updates)))
+        if noise_rate is not None:
+            noise = exploration_noise(jax.random.fold_in(key, k), moved, shown, noise_rate)
+            moved = dataclasses.replace(moved, means=moved.means + noise)
+        where = jnp.where(healthy & jnp.all(finite), here, n)
+        return Updated(
+            put_rows(state.gaussians, where, moved),
+            AdamState(
+                state.moments.count.at[where].set(new.count, mode="drop", unique_indices=True),
+                put_rows(state.moments.mu, where, new.mu),
+                put_rows(state.moments.nu, where, new.nu),
+            ),
+            jax.tree.map(jnp.add, state.value, terms),
+            state.finite & finite,
+        )
+
+    values = jax.eval_shape(
+        own,
+        jax.eval_shape(lambda: take_rows(gaussians, ids[:BLOCK], bands)),
+        jax.ShapeDtypeStruct((BLOCK,), bool),
+    )
+    start = Updated(
+        gaussians,
+        moments,
+        jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), values),
+        jnp.ones(len(jax.tree.leaves(gaussians)), bool),
+    )
+    used = jnp.minimum(count, ids.shape[0])
+    return lax.fori_loop(0, -(-used // BLOCK), body, start)
