@@ -13,7 +13,7 @@ import cv2
 import jax
 import numpy as np
 
-from p2gs_jax.clock import Stopwatch
+from p2gs_jax.clock import CompileCounter, Stopwatch
 from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.evaluate import MeanParameters, ViewResult, evaluate, mean_parameters
@@ -188,6 +188,7 @@ def finish(
     lpips_weights: LpipsWeights | None,
     counts: dict,
     seconds: dict,
+    compiler: CompileCounter,
     growth: dict | None = None,
     true_ev: np.ndarray | None = None,
 ) -> dict:
@@ -203,6 +204,7 @@ def finish(
         lpips_weights: for LPIPS, or None to leave it out.
         counts: numbers for `metrics.json`.
         seconds: times for `metrics.json`.
+        compiler: counts what was compiled for this fit.
         growth: the history of automatic growth for `metrics.json`, or None.
         true_ev: true exposures of the training views for the plot, or None.
     """
@@ -261,11 +263,12 @@ def finish(
         write_array(run_dir / APPEARANCE, np.asarray(params.appearance))
     _write_summary(run_dir / "summary.png", shown, picks, params, scene, mean, cfg, true_ev)
     watch.add("files", time.perf_counter() - begin)
-    metrics["counts"] = counts
+    metrics["counts"] = {**counts, "programs": compiler.programs}
     metrics["seconds"] = {
         **seconds,
         **watch.seconds,
         "evaluation_and_files": watch.seconds["evaluation"] + watch.seconds["files"],
+        "compiler_in_all_threads": compiler.seconds,
     }
     steps = max(int(counts.get("steps", 0)), 1)
     metrics["seconds_per_step"] = seconds.get("optimisation", 0.0) / steps

@@ -12,6 +12,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from p2gs_jax.clock import CompileCounter, Stopwatch
 from p2gs_jax.config import FitConfig
 from p2gs_jax.config import from_dict as config_from_dict
 from p2gs_jax.config import to_dict as config_to_dict
@@ -110,6 +111,7 @@ def fit(
     resume: bool = False,
     reporter: Reporter | None = None,
     true_exposures: Mapping[str, float] | None = None,
+    spent_s: float = 0.0,
 ) -> FitResult:
     """Fit a scene and write a run folder.
 
@@ -121,6 +123,7 @@ def fit(
         resume: continue after an interruption.
         reporter: receives progress.
         true_exposures: image name -> true exposure, where it is known, for the plot.
+        spent_s: seconds of the budget that were gone before the call.
 
     Raises:
         UserError: something the user can mend.
@@ -128,7 +131,8 @@ def fit(
     cfg = cfg or FitConfig()
     reporter = reporter or Silent()
     scene_dir, run_dir = Path(scene_dir), Path(run_dir)
-    begin = time.monotonic()
+    begin = time.monotonic() - spent_s
+    clock, compiler = Stopwatch(), CompileCounter()
     check_method(cfg.densify)
     check_run_dir(run_dir, resume, cfg)
     # What is needed later is looked at first: a wrong file should not cost a fit.
@@ -137,7 +141,11 @@ def fit(
     path = cfg.evaluation.lpips_weights
     lpips_weights = None if path is None else read_lpips_weights(path)
     run_dir.mkdir(parents=True, exist_ok=True)
+    reading = time.monotonic()
     scene = load(scene_dir, run_dir, cfg, reporter)
+    # Without a model, nearly all of it is finding and matching features.
+    found = scene.format in ("images", "transforms")
+    clock.add("structure_from_motion" if found else "reading", time.monotonic() - reading)
     if lpips_weights is not None:
         lpips_weights.require_sizes(scene.views, cfg.data.max_width)
     validation: tuple[int, ...] = ()
@@ -152,7 +160,7 @@ def fit(
             "fit": config_to_dict(cfg),
         },
     )
-    prepared = prepare(scene, cfg, reporter)
+    prepared = prepare(scene, cfg, reporter, clock)
     cfg = prepared.cfg
     result = optimise(
         prepared,
@@ -186,9 +194,13 @@ def fit(
         },
         growth=result.growth,
         seconds={
+            **({"starting": spent_s} if spent_s else {}),
+            **clock.seconds,
+            **result.seconds,
             "total_until_evaluation": time.monotonic() - begin,
             "optimisation": result.host.elapsed_s,
         },
+        compiler=compiler,
         true_ev=None
         if true_exposures is None
         else np.log2([true_exposures[scene.views[i].name] for i in scene.train_indices]),

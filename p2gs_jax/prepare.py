@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import jax
 import numpy as np
 
+from p2gs_jax.clock import Stopwatch
 from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.init.brightness import Tones, rough_tones
@@ -101,8 +103,19 @@ def load(scene_dir: Path, run_dir: Path, cfg: FitConfig, reporter: Reporter) -> 
     return scene
 
 
-def prepare(scene: Scene, cfg: FitConfig, reporter: Reporter) -> Prepared:
-    """Start exposures, radiances and Gaussians from what the scene offers."""
+def prepare(
+    scene: Scene, cfg: FitConfig, reporter: Reporter, clock: Stopwatch | None = None
+) -> Prepared:
+    """Start exposures, radiances and Gaussians from what the scene offers.
+
+    Args:
+        scene: from `load`.
+        cfg: everything.
+        reporter: receives progress.
+        clock: receives the seconds of `photometry` and `seeds`.
+    """
+    clock = clock or Stopwatch()
+    begin = time.monotonic()
     store = ImageStore(scene.views, cfg.data)
     views = [scene.views[i] for i in scene.train_indices]
     notes = list(scene.notes)
@@ -141,6 +154,8 @@ def prepare(scene: Scene, cfg: FitConfig, reporter: Reporter) -> Prepared:
     cfg = with_correspondence(cfg, tracks)
     start = None if selection is None else selection.solution
     photometry = _photometry(start, len(views), cfg)
+    solved = time.monotonic()
+    clock.add("photometry", solved - begin)
     keep = subsample(len(scene.points), cfg.init.max_seeds, cfg.train.seed)
     if len(keep) < len(scene.points):
         notes.append(
@@ -170,6 +185,7 @@ def prepare(scene: Scene, cfg: FitConfig, reporter: Reporter) -> Prepared:
         )
     for note in notes:
         reporter.message(note)
+    clock.add("seeds", time.monotonic() - solved)
     return Prepared(
         scene,
         store,

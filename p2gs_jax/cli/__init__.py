@@ -31,8 +31,10 @@ def _run(argv: list[str]) -> int:
     # Imported here so that --help answers at once.
     if name not in WITHOUT_JAX:
         from p2gs_jax.compile_cache import use_compile_cache
+        from p2gs_jax.runtime import tune_process
 
         use_compile_cache()
+        tune_process()
     return import_module(f"p2gs_jax.commands.{name}").run(options)
 
 

@@ -7,6 +7,21 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+# Parts of a fit, as metrics.json has them under "seconds", and what they are called in print.
+PARTS = {
+    "starting": "starting",
+    "reading": "reading",
+    "structure_from_motion": "structure from motion",
+    "photometry": "photometry",
+    "seeds": "seeds",
+    "compiling": "waiting for the compiler",
+    "steps": "steps",
+    "densification": "densification",
+    "checkpoints": "checkpoints",
+    "evaluation": "evaluation",
+    "files": "files",
+}
+
 
 def stdout() -> Console:
     """Return where results go; progress and messages go to stderr."""
@@ -46,4 +61,9 @@ def print_metrics(metrics: dict, out: Path) -> None:
             f"{counts['gaussians']} Gaussians, {counts['steps']} steps, "
             f"{1e3 * metrics['seconds_per_step']:.0f} ms a step."
         )
+    seconds = {k: v for k, v in metrics.get("seconds", {}).items() if k in PARTS and v >= 0.5}
+    if seconds:
+        spent = ", ".join(f"{PARTS[k]} {v:.0f}" for k, v in seconds.items())
+        programs = f" ({counts['programs']} programs)" if "programs" in counts else ""
+        console.print(f"Seconds: {spent}{programs}.")
     console.print(f"Results: {out} (open {out / 'summary.png'} first)")

@@ -12,6 +12,7 @@ from p2gs_jax.config import from_dict
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.atomic import write_json
 from p2gs_jax.pipeline import fit
+from p2gs_jax.runtime import tune_process
 
 REASON = "failure.json"
 
@@ -24,6 +25,7 @@ def main(job_path: Path) -> int:
     job = json.loads(job_path.read_text(encoding="utf-8"))
     run = Path(job["run"])
     use_compile_cache()
+    tune_process()
     try:
         fit(
             job["scene"],
