@@ -170,10 +170,11 @@ class RegularizerConfig:
     """(mean gamma - 2.2)^2 + Var gamma, the power gauge (ours)."""
     appearance: float | None = 10.0
     """Roughness of bilateral grids (bilateral-guided radiance fields: 10)."""
-    opacity: float | None = 0.01
-    """Mean opacity (3DGS-MCMC: 0.01); empties splats so that relocation can reuse them."""
-    scale: float | None = 0.01
-    """Mean scale in units of the scene extent (3DGS-MCMC: 0.01)."""
+    opacity: float | None = None
+    """Mean opacity (3DGS-MCMC: 0.01, which empties splats so that relocation can reuse them; ours:
+    at our populations it empties the scene within some thousand steps, BUILD_NOTES)."""
+    scale: float | None = None
+    """Mean scale in units of the scene extent (3DGS-MCMC: 0.01; ours: likewise)."""
 
 
 @dataclass(frozen=True)
@@ -243,8 +244,9 @@ class DensifyConfig:
     """`mcmc` relocates within a budget, `adaptive` is the 3DGS schedule (paper), None keeps the
     seeds."""
     max_gaussians: int | Literal["auto"] | None = None
-    """Upper bound on the population; None chooses from the seeds and the pixels, `auto` (mcmc only)
-    stops growing where held-out training views gain no more by it."""
+    """Upper bound on the population, seeds included; None chooses from the pixels, the length of
+    the run and the seeds (densify/population.py), `auto` (mcmc only) stops growing where held-out
+    training views gain no more by it."""
     start: float = 1.0 / 60.0
     """First densification (3DGS: step 500)."""
     stop: float = 0.5

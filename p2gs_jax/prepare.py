@@ -12,6 +12,7 @@ import numpy as np
 
 from p2gs_jax.clock import Stopwatch
 from p2gs_jax.config import FitConfig
+from p2gs_jax.densify.population import default_max_gaussians
 from p2gs_jax.errors import UserError
 from p2gs_jax.init.brightness import Tones, rough_tones
 from p2gs_jax.init.correspondence import has_tracks, surface_colors
@@ -38,7 +39,6 @@ from p2gs_jax.progress import Reporter
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.scene.known_exposures import read_known_exposures
-from p2gs_jax.train.loop import default_max_gaussians
 from p2gs_jax.types import GAMMA_SRGB, Gaussians, Params, Photometry, Scene
 
 PAIR_POOL = 200_000
@@ -156,11 +156,12 @@ def prepare(
     photometry = _photometry(start, len(views), cfg)
     solved = time.monotonic()
     clock.add("photometry", solved - begin)
-    keep = subsample(len(scene.points), cfg.init.max_seeds, cfg.train.seed)
+    bound = cfg.densify.max_gaussians
+    most = min(cfg.init.max_seeds, bound) if isinstance(bound, int) else cfg.init.max_seeds
+    keep = subsample(len(scene.points), most, cfg.train.seed)
     if len(keep) < len(scene.points):
-        notes.append(
-            f"{len(scene.points)} seed points were thinned to {len(keep)} (--init.max-seeds)."
-        )
+        option = "--gaussians" if most == bound else "--init.max-seeds"
+        notes.append(f"{len(scene.points)} seed points were thinned to {len(keep)} ({option}).")
     points = scene.points[keep]
     radiance = _seed_radiance(scene, start, cfg)[keep]
     covering = scene.points
@@ -183,6 +184,10 @@ def prepare(
             f"{shell.empty_fraction:.0%} of the images look past every seed point: a far shell "
             f"of {len(shell.points)} Gaussians was added (--init.shell off leaves it out)."
         )
+    if isinstance(bound, int) and gaussians.capacity > bound:
+        kept = subsample(gaussians.capacity, bound, cfg.train.seed)
+        notes.append(f"{gaussians.capacity} Gaussians were thinned to {bound} (--gaussians).")
+        gaussians = jax.tree.map(lambda a: on_device(np.asarray(a)[kept]), gaussians)
     for note in notes:
         reporter.message(note)
     clock.add("seeds", time.monotonic() - solved)
@@ -209,7 +214,9 @@ def seed_bound(cfg: FitConfig, seeds: int, width: int, height: int) -> int:
         height: likewise.
     """
     given = cfg.densify.max_gaussians
-    return given if isinstance(given, int) else default_max_gaussians(seeds, width, height)
+    if isinstance(given, int):
+        return given
+    return default_max_gaussians(seeds, width, height, cfg.train)
 
 
 def dense_limit(cfg: FitConfig, seeds: int, width: int, height: int) -> int:

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from p2gs_jax.config import TrainConfig
 from p2gs_jax.types import Gaussians, Population
 
 # Logit of an opacity that no cutoff lets through: what empty slots hold.
@@ -44,6 +45,38 @@ def empty_gaussians(count: int, like: Gaussians) -> Gaussians:
         quats=shape.quats.at[:, 0].set(1.0),
         opacity_logits=jnp.full((count,), EMPTY_LOGIT, like.opacity_logits.dtype),
     )
+
+
+# A step costs about this many seconds a pixel (ours; two cores of 2025).
+STEP_SECONDS_PER_PIXEL = 5e-7
+# Gaussians a pixel of a view: rising with the length of a run up to the second (ours: BUILD_NOTES).
+SMALLEST_SHARE, LARGEST_SHARE, STEPS_PER_SHARE = 0.1, 0.5, 8000
+MOST_BY_DEFAULT = 400_000
+
+
+def default_share(steps: float) -> float:
+    """Return how many Gaussians a pixel of a view a run of so many steps can fit."""
+    return min(max(steps / STEPS_PER_SHARE, SMALLEST_SHARE), LARGEST_SHARE)
+
+
+def default_max_gaussians(seeds: int, width: int, height: int, train: TrainConfig) -> int:
+    """Return the population limit where none is configured.
+
+    A long run can fit more Gaussians than a short one. The limit is never below the seeds and a
+    quarter.
+
+    Args:
+        seeds: points of the scene.
+        width: of the training photographs, pixels.
+        height: likewise.
+        train: steps or budget.
+    """
+    pixels = width * height
+    steps = train.steps
+    if train.budget_s is not None:
+        steps = train.budget_s / (STEP_SECONDS_PER_PIXEL * pixels)
+    wanted = min(int(default_share(steps) * pixels), MOST_BY_DEFAULT)
+    return max(int(1.25 * seeds), wanted, 1000)
 
 
 def bucket_for(needed: int, current: int, limit: int | None) -> int:

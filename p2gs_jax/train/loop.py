@@ -25,7 +25,7 @@ import numpy as np
 from p2gs_jax.clock import Stopwatch
 from p2gs_jax.config import FitConfig
 from p2gs_jax.densify import adaptive, mcmc
-from p2gs_jax.densify.population import bucket_for
+from p2gs_jax.densify.population import bucket_for, default_max_gaussians, default_share
 from p2gs_jax.errors import DivergenceError, UserError
 from p2gs_jax.export.atomic import append_jsonl, read_jsonl, write_text
 from p2gs_jax.export.checkpoint import CheckpointStore
@@ -56,6 +56,8 @@ from p2gs_jax.types import Params
 PAIRS_PER_STEP = 4096
 MAX_BURST = 50
 NEARLY_DONE = 0.99
+# Steps at full size cost about twice the present ones, at a coarse level.
+FULL_SIZE_COST = 2.0
 
 
 @dataclass(frozen=True)
@@ -86,11 +88,6 @@ class _Trial:
     ungrown: FitState
     score: float
     done: int = 0
-
-
-def default_max_gaussians(seeds: int, width: int, height: int) -> int:
-    """Return the population limit where none is configured: one per ten pixels, or the seeds."""
-    return max(int(1.25 * seeds), min(width * height // 10, 400_000), 1000)
 
 
 class Trainer:
@@ -254,7 +251,7 @@ class Trainer:
     def _limit(self, seeds: int) -> int | None:
         """Return the bound on the population; None: there is none."""
         d = self.cfg.densify
-        default = default_max_gaussians(seeds, self.width, self.height)
+        default = default_max_gaussians(seeds, self.width, self.height, self.cfg.train)
         if d.max_gaussians == "auto":
             return growth.upper_bound(seeds, default)
         if d.method != "mcmc":
@@ -453,11 +450,26 @@ class Trainer:
     def _target(self, state: FitState, host: HostState, limit: int | None) -> int:
         """Return the population after the next relocation."""
         alive = self._count(state)
+        limit = self._affordable(alive, host, limit)
         room = max((limit or alive) / max(alive, 1), 1.0)
         # A short run has few events: grow so that the limit is reached at the last of them.
         events = (self.cfg.densify.stop - host.progress) / self._interval(host)
         factor = max(self.cfg.densify.growth, room ** (1 / max(events, 1.0)))
         return min(math.ceil(alive * factor), limit or alive)
+
+    def _affordable(self, alive: int, host: HostState, limit: int | None) -> int | None:
+        """Return the bound on the population that the pace of this machine allows.
+
+        Where the bound was chosen for a time budget, it was chosen for an unloaded machine.
+        """
+        chosen = self.cfg.densify.max_gaussians is None and self.cfg.train.budget_s is not None
+        if not chosen or limit is None or host.step_s <= 0:
+            return limit
+        left = (1.0 - host.progress) / host.pace
+        later = any(end > host.progress and factor < host.shrink for end, factor in self.levels)
+        steps = host.step + (left / FULL_SIZE_COST if later else left)
+        share = default_share(steps)
+        return max(alive, min(limit, int(share * self.width * self.height)))
 
     def _relocate_step(self, state: FitState, host: HostState, wanted: int) -> FitState:
         births = max(wanted - self._count(state), 0)
