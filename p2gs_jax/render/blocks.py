@@ -72,9 +72,17 @@ def put_rows(gaussians: Gaussians, ids: Int[Array, " v"], new: Gaussians) -> Gau
     )
 
 
-def slice_of(tree, block: Int[Array, ""] | int):
+def block_size(length: int) -> int:
+    """Return how many rows of a list are handled at once: all where there is no cache to fit.
+
+    Asked while tracing, so that a program holds one of them.
+    """
+    return min(BLOCK, length) if jax.default_backend() == "cpu" else length
+
+
+def slice_of(tree, block: Int[Array, ""] | int, size: int):
     """Return one block of every array of a tree."""
-    return jax.tree.map(lambda a: lax.dynamic_slice_in_dim(a, block * BLOCK, BLOCK), tree)
+    return jax.tree.map(lambda a: lax.dynamic_slice_in_dim(a, block * size, size), tree)
 
 
 def splat(
@@ -114,19 +122,21 @@ def splat_listed(
         bands: coefficients that are looked at.
     """
 
+    length = ids.shape[0]
+    size = block_size(length)
+
     def block(k):
-        here = slice_of(ids, k)
+        here = slice_of(ids, k, size)
         shown = alive.at[here].get(mode="fill", fill_value=False)
         return splat(take_rows(gaussians, here, bands), shown, cameras, cfg, active_degree)
 
     def body(k, out):
         return jax.tree.map(
-            lambda a, b: lax.dynamic_update_slice_in_dim(a, b, k * BLOCK, 0), out, block(k)
+            lambda a, b: lax.dynamic_update_slice_in_dim(a, b, k * size, 0), out, block(k)
         )
 
-    length = ids.shape[0]
     blank = jax.tree.map(
         lambda s: jnp.zeros((length, *s.shape[1:]), s.dtype), jax.eval_shape(block, jnp.int32(0))
     )
     used = jnp.minimum(count, length)
-    return lax.fori_loop(0, -(-used // BLOCK), body, blank)
+    return lax.fori_loop(0, -(-used // size), body, blank)

@@ -17,7 +17,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from p2gs_jax.densify.mcmc import exploration_noise
-from p2gs_jax.render.blocks import BLOCK, put_rows, slice_of, take_rows
+from p2gs_jax.render.blocks import block_size, put_rows, slice_of, take_rows
 from p2gs_jax.train.optimizer import AdamState
 from p2gs_jax.types import Gaussians
 
@@ -74,10 +74,10 @@ def update_listed(
         key: for the noise.
         noise_rate: scale of the noise on the means, or None for none.
     """
-    n = gaussians.capacity
+    n, size = gaussians.capacity, block_size(ids.shape[0])
 
     def body(k, state: Updated) -> Updated:
-        here = slice_of(ids, k)
+        here = slice_of(ids, k, size)
         shown = alive.at[here].get(mode="fill", fill_value=False)
         old = take_rows(state.gaussians, here, bands)
 
@@ -87,7 +87,7 @@ def update_listed(
             return (seen(block, shown), total), terms
 
         _, pull, terms = jax.vjp(objective, old, has_aux=True)
-        (grads,) = pull((slice_of(v_seen, k), jnp.float32(1)))
+        (grads,) = pull((slice_of(v_seen, k, size), jnp.float32(1)))
         finite = jnp.stack([jnp.all(jnp.isfinite(g)) for g in jax.tree.leaves(grads)])
         adam = AdamState(
             state.moments.count.at[here].get(mode="clip"),
@@ -116,8 +116,8 @@ def update_listed(
 
     values = jax.eval_shape(
         own,
-        jax.eval_shape(lambda: take_rows(gaussians, ids[:BLOCK], bands)),
-        jax.ShapeDtypeStruct((BLOCK,), bool),
+        jax.eval_shape(lambda: take_rows(gaussians, ids[:size], bands)),
+        jax.ShapeDtypeStruct((size,), bool),
     )
     start = Updated(
         gaussians,
@@ -126,4 +126,4 @@ def update_listed(
         jnp.ones(len(jax.tree.leaves(gaussians)), bool),
     )
     used = jnp.minimum(count, ids.shape[0])
-    return lax.fori_loop(0, -(-used // BLOCK), body, start)
+    return lax.fori_loop(0, -(-used // size), body, start)
