@@ -42,7 +42,10 @@ def _blur(maps: Float[Array, "m h w"], always: Bool[Array, ""]) -> Float[Array, 
 
 
 def _ssim_terms(x: Float[Array, "h w"], y: Float[Array, "h w"], always: Bool[Array, ""]):
-    mx, my, mxx, myy, mxy = _blur(jnp.stack([x, y, x * x, y * y, x * y]), always)
+    # In memory: each of the maps made from them would blur all five anew (10.1 against 6.8 ms).
+    mx, my, mxx, myy, mxy = materialize(
+        always, lambda: _blur(jnp.stack([x, y, x * x, y * y, x * y]), always)
+    )
     a1, a2 = 2 * mx * my + C1, 2 * (mxy - mx * my) + C2
     b1, b2 = mx * mx + my * my + C1, mxx - mx * mx + myy - my * my + C2
     return mx, my, a1, a2, b1, b2
