@@ -24,7 +24,7 @@ from p2gs_jax.bench.scenes import STREETS, garden
 from p2gs_jax.bench.timing import interleaved
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render import bin_tiles, count_entries, project, rasterize
-from p2gs_jax.render.host import capacity_bucket
+from p2gs_jax.render.capacity import bucket
 from p2gs_jax.render.spherical_harmonics import C0
 from p2gs_jax.render.xla_cpu import compiler_options
 
@@ -74,14 +74,14 @@ def main() -> None:
                 other.project(p, *view, w, h), w, h, *cfg.tile, 1024
             )[2]
         )(p)
-        theirs_capacity = capacity_bucket(int(theirs_need))
+        theirs_capacity = bucket(int(theirs_need))
 
         def ours_splats(p, g=g, camera=camera):
             scene = type(g)(p["means"], p["quats"], p["log_scales"], p["opac"], g.sh)
             return project(scene, jnp.ones(scene.capacity, bool), camera, cfg)
 
         need = jax.jit(lambda p, w=w, h=h: count_entries(ours_splats(p), w, h, cfg))(p)
-        capacity = capacity_bucket(int(need))
+        capacity = bucket(int(need))
 
         def ours(p, w=w, h=h, capacity=capacity, splats=ours_splats):
             s = splats(p)

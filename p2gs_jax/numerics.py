@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import jax
@@ -13,6 +14,7 @@ from numpy.typing import ArrayLike, DTypeLike
 
 LN2 = math.log(2.0)
 
+Record = TypeVar("Record")
 # Arrays that come back as what they were given: on the host or on a device.
 Values = TypeVar("Values", Array, np.ndarray)
 Scalar = Array | np.ndarray | np.floating | float
@@ -48,3 +50,11 @@ def safe_div(a: Float[Array, "..."], b: Float[Array, "..."]) -> Float[Array, "..
 def positive_pow(x: Values, p: Scalar, floor: float) -> Values:
     """Return max(x, floor)^p through exp(p log x); the gradient to x is zero below the floor."""
     return namespace(x, p).exp(p * safe_log(x, floor))
+
+
+def on_host(record: Callable[..., Record], *values: Any) -> Record:
+    """Return a device record made of host arrays, which a compiled program takes as they are.
+
+    Its annotations say `Array`, as most of its life is on a device.
+    """
+    return record(*values)

@@ -15,7 +15,7 @@ from p2gs_jax.bench.speed_error import DEFAULT, cotangent, programs
 from p2gs_jax.bench.timing import interleaved
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render import render_linear, required_capacity
-from p2gs_jax.render.host import capacity_bucket
+from p2gs_jax.render.capacity import bucket
 from p2gs_jax.render.xla_cpu import compiler_options
 
 PIXELS, COUNT, RADIUS = (960, 650), 100_000, 3.0
@@ -140,7 +140,7 @@ def _views(quick: bool, repeats: int) -> Curve:
     scene = street(20_000, 640, 360, radius=4.0)
     cfg = RenderConfig()
     alive = jnp.ones(scene.gaussians.capacity, bool)
-    capacity = capacity_bucket(int(required_capacity(scene.gaussians, alive, scene.camera, cfg)), 2)
+    capacity = bucket(int(required_capacity(scene.gaussians, alive, scene.camera, cfg)), 2)
     weights = jnp.asarray(cotangent(scene))
     jobs: dict[str, Callable[[], Any]] = {}
     facts = []

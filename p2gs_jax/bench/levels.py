@@ -28,7 +28,7 @@ from p2gs_jax.bench.step import whole_step
 from p2gs_jax.bench.timing import interleaved
 from p2gs_jax.config import FitConfig, preset
 from p2gs_jax.render import bin_tiles, project, required_capacity
-from p2gs_jax.render.host import capacity_bucket
+from p2gs_jax.render.capacity import bucket
 from p2gs_jax.types import Batch
 
 SCENES: dict[str, Callable[[], BenchScene]] = {
@@ -67,7 +67,7 @@ def lists(scene: BenchScene, cfg: FitConfig) -> Lists:
     """Return how long the tile lists of a scene are."""
     g, camera = scene.gaussians, scene.camera
     alive = jnp.ones(g.capacity, bool)
-    capacity = capacity_bucket(int(required_capacity(g, alive, camera, cfg.render)))
+    capacity = bucket(int(required_capacity(g, alive, camera, cfg.render)))
     splats = project(g, alive, camera, cfg.render)
     tiles = bin_tiles(splats, camera.width, camera.height, capacity, cfg.render)
     lengths = np.diff(np.asarray(tiles.offsets))
@@ -152,7 +152,7 @@ def measure(
         linear, step = np.asarray(linear, np.float64), None
         if steps is None or name in steps:
             # Stepping moves the Gaussians a little.
-            step = whole_step(scene, cfg, photograph(linear, scene), capacity_bucket(need, 1.2))
+            step = whole_step(scene, cfg, photograph(linear, scene), bucket(need, 1.2))
             jobs["step"] = step.run
         times = interleaved(jobs, repeats)
         if step is not None and step.fault():

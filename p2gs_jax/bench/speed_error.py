@@ -16,7 +16,7 @@ from p2gs_jax.bench.scenes import BenchScene
 from p2gs_jax.bench.timing import interleaved
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render import render_linear, required_capacity
-from p2gs_jax.render.host import capacity_bucket
+from p2gs_jax.render.capacity import bucket
 from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.types import Gaussians
 
@@ -174,7 +174,7 @@ def programs(scene: BenchScene, variant: Variant, base: RenderConfig, weights: n
     gaussians = jax.tree.map(lambda a: a[kept], scene.gaussians)
     alive = jnp.ones(gaussians.capacity, bool)
     need = int(required_capacity(stored(gaussians, variant.storage), alive, scene.camera, cfg))
-    capacity = capacity_bucket(need)
+    capacity = bucket(need)
 
     def linear(g):
         g = stored(g, variant.storage)

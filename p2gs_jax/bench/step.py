@@ -19,7 +19,8 @@ from p2gs_jax.losses.image import photometric_loss
 from p2gs_jax.losses.total import Partner
 from p2gs_jax.photometry.formation import formation
 from p2gs_jax.render import bin_tiles, project, rasterize, required_capacity, view_radiance
-from p2gs_jax.render.host import capacity_bucket
+from p2gs_jax.render.blocks import whole_blocks
+from p2gs_jax.render.capacity import Room, bucket
 from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.train.optimizer import learning_rates, make_optimizer
 from p2gs_jax.train.state import initial_state
@@ -31,7 +32,8 @@ class StepCost(NamedTuple):
     """Medians of one run, milliseconds; forward and backward together.
 
     Attributes:
-        parts: name of the part to its time; `rasterizer` includes binning.
+        parts: name of the part to its time, over all Gaussians at once; `rasterizer` includes
+            binning.
         whole: the jitted step as training runs it.
         compilations: programs that the step was compiled into while its capacity stayed.
     """
@@ -60,14 +62,14 @@ class WholeStep(NamedTuple):
     fault: Callable[[], int]
 
 
-def whole_step(scene: BenchScene, cfg: FitConfig, batch: Batch, capacity: int) -> WholeStep:
+def whole_step(scene: BenchScene, cfg: FitConfig, batch: Batch, entries: int) -> WholeStep:
     """Return the step of a fit of `scene`.
 
     Args:
         scene: what to fit.
         cfg: as for a fit.
         batch: the view.
-        capacity: of the tile lists.
+        entries: room in the tile lists.
     """
     alive = jnp.ones(scene.gaussians.capacity, bool)
     params = Params(scene.gaussians, Photometry(jnp.zeros(4), jnp.zeros(4)))
@@ -77,9 +79,10 @@ def whole_step(scene: BenchScene, cfg: FitConfig, batch: Batch, capacity: int) -
     controls = Controls(jnp.float32(0.5), jnp.int32(cfg.render.sh_degree))
     partner = Partner(jnp.int32(0))
     step = make_step(cfg, optimizer, 1.0)
+    room, degree = Room(entries, whole_blocks(scene.gaussians.capacity)), cfg.render.sh_degree
 
     def run():
-        holder[0], report = step(holder[0], batch, partner, controls, capacity=capacity)
+        holder[0], report = step(holder[0], batch, partner, controls, room=room, degree=degree)
         return report.loss
 
     return WholeStep(run, cast(Any, step)._cache_size, lambda: int(holder[0].fault.kind))
@@ -95,7 +98,7 @@ def measure_step(scene: BenchScene, cfg: FitConfig, repeats: int = 7) -> StepCos
     """
     gaussians, camera = scene.gaussians, scene.camera
     alive = jnp.ones(gaussians.capacity, bool)
-    capacity = capacity_bucket(int(required_capacity(gaussians, alive, camera, cfg.render)), 1.1)
+    capacity = bucket(int(required_capacity(gaussians, alive, camera, cfg.render)), 1.1)
     params = Params(gaussians, Photometry(jnp.zeros(4), jnp.zeros(4)))
     optimizer = make_optimizer(cfg)
     state = initial_state(params, alive, optimizer)
@@ -140,10 +143,12 @@ def measure_step(scene: BenchScene, cfg: FitConfig, repeats: int = 7) -> StepCos
         y = formation(linear, jnp.float32(0.5), jnp.float32(2.2), cfg.photometry)
         return sum(photometric_loss(y, ldr, mask, cfg.loss).values())
 
-    def update(params, opt_state, grads):
-        rates = learning_rates(jnp.float32(0.5), 1.0, params, cfg)
-        updates, opt_state = optimizer.update(grads, opt_state, params, rates=rates)
-        return optax.apply_updates(cast(Any, params), updates), opt_state
+    def update(params, moments, grads):
+        bands = params.gaussians.sh.shape[1]
+        rates = learning_rates(jnp.float32(0.5), 1.0, params, cfg, bands).gaussians
+        rows = cast(Any, params.gaussians)
+        updates, moments = optimizer.gaussians.update(cast(Any, grads), moments, rows, rates=rates)
+        return optax.apply_updates(rows, updates), moments
 
     v_splats = jax.tree.map(jnp.ones_like, differentiable)
 
@@ -164,7 +169,7 @@ def measure_step(scene: BenchScene, cfg: FitConfig, repeats: int = 7) -> StepCos
         "radiance (SH)": lambda: radiance_both(radiance, gaussians),
         "rasterizer": lambda: raster_both(v_linear, differentiable, radiance),
         "loss": lambda: loss_both(linear),
-        "optimizer": lambda: apply(params, state.opt_state, params),
+        "optimizer": lambda: apply(params, state.opt_state.gaussians, params.gaussians),
         "densify (a step)": lambda: relocate(gaussians),
         "transfer": lambda: jax.device_put(photograph).astype(jnp.float32) / 255,
     }

@@ -15,7 +15,7 @@ MODULES = {
     "pillow": "PIL",
 }
 # Tried where pip knows nothing of p2gs-jax: a copy that was never installed.
-CORE = ("jax", "optax", "equinox", "jaxtyping", "numpy", "tyro", "rich", "pycolmap")
+CORE = ("jax", "optax", "optimistix", "equinox", "jaxtyping", "numpy", "tyro", "rich", "pycolmap")
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,8 @@ from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.photometry.formation import display, formation
 
 SEARCH_STOPS, SEARCH_STEPS, GOLDEN_STEPS = 5.0, 41, 30
+# Of the logarithm of the exposure, stops, and of the error.
+TOLERANCE = 1e-6
 
 
 class ExposureError(TypedDict):
@@ -77,30 +79,25 @@ def fit_exposure(
     A coarse search over +-5 stops around 1 followed by golden sections: the error of a clipped
     image has flat stretches where Newton's method stalls.
     """
+    # Imported late: of what evaluates, little searches.
+    import optimistix
 
     def error(log2_exposure):
         exposure = jnp.exp2(log2_exposure)
         ldr = display(formation(linear, exposure, jnp.asarray(gamma), cfg, appearance))
-        return jnp.sum(mask[..., None] * (ldr - photograph) ** 2)
+        return jnp.sum(mask[..., None] * (ldr - photograph) ** 2) / jnp.maximum(jnp.sum(mask), 1)
 
     grid = jnp.linspace(-SEARCH_STOPS, SEARCH_STOPS, SEARCH_STEPS)
     best = grid[jnp.argmin(lax.map(error, grid))]
     width = 2 * SEARCH_STOPS / (SEARCH_STEPS - 1)
-    ratio = (5**0.5 - 1) / 2
-
-    def narrow(_, state):
-        low, high, inner, errors = state
-        left = errors[0] < errors[1]
-        low, high = jnp.where(left, low, inner[0]), jnp.where(left, inner[1], high)
-        # One of the inner points stays one: only the other is new.
-        new = jnp.where(left, high - ratio * (high - low), low + ratio * (high - low))
-        found = error(new)
-        inner = jnp.where(left, jnp.stack([new, inner[0]]), jnp.stack([inner[1], new]))
-        errors = jnp.where(left, jnp.stack([found, errors[0]]), jnp.stack([errors[1], found]))
-        return low, high, inner, errors
-
-    low, high = best - width, best + width
-    inner = jnp.stack([high - ratio * (high - low), low + ratio * (high - low)])
-    state = (low, high, inner, lax.map(error, inner))
-    low, high, _, _ = lax.fori_loop(0, GOLDEN_STEPS, narrow, state)
-    return jnp.exp2((low + high) / 2)
+    # The bracket begins at zero: optimistix 0.1.0 places the first inner point as if all did.
+    low = best - width
+    found = optimistix.minimise(
+        lambda above, _: error(low + above),
+        optimistix.GoldenSearch(rtol=TOLERANCE, atol=TOLERANCE),
+        jnp.float32(width),
+        options={"lower": 0.0, "upper": 2 * width},
+        max_steps=GOLDEN_STEPS,
+        throw=False,
+    )
+    return jnp.exp2(low + found.value)

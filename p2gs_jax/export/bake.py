@@ -25,7 +25,8 @@ from p2gs_jax.numerics import on_device
 from p2gs_jax.photometry.look import Look, develop
 from p2gs_jax.photometry.radiance import RadianceKind, radiance_activation
 from p2gs_jax.render import render_linear, required_capacity
-from p2gs_jax.render.host import RenderView, capacity_bucket, make_renderer
+from p2gs_jax.render.capacity import bucket
+from p2gs_jax.render.host import RenderView, make_renderer
 from p2gs_jax.render.spherical_harmonics import C0, basis, coefficient_count, degree_of
 from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.types import Camera, Gaussians, Render
@@ -202,7 +203,7 @@ def refine(
         return gaussians
     cfg, optimizer = viewer_config(cfg), optax.scale_by_adam(eps=1e-15)
     fitting = jax.jit(lambda g, camera: required_capacity(g, _all(g), camera, cfg))
-    capacity = capacity_bucket(max(int(fitting(gaussians, t.camera)) for t in targets), 1.2)
+    capacity = bucket(max(int(fitting(gaussians, t.camera)) for t in targets), 1.2)
     bands = jnp.full((gaussians.sh.shape[1], 1), BANDS_RATE).at[0].set(COLOR_RATE)
     rates = _Moving(bands, jnp.asarray(OPACITY_RATE))
 
@@ -237,7 +238,7 @@ def refine(
             )
             if not bool(overflow):
                 break
-            capacity = capacity_bucket(int(count), 1.1)
+            capacity = bucket(int(count), 1.1)
         moving, state = moved, after
         on_step(done + 1, steps)
     return replace(gaussians, **moving._asdict())

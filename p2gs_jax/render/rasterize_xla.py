@@ -177,7 +177,7 @@ def forward(rows, ids_list, offsets, plan: Plan):
     def opaque(channels, transmittance):
         """Return whether what lies behind can be left out (RenderConfig.stop_error)."""
         so_far = functools.reduce(jnp.maximum, channels[:3]) / brightest
-        hidden = transmittance - plan.stop_error * jnp.maximum(so_far, DARKEST)
+        hidden = transmittance - (plan.stop_error or 0.0) * jnp.maximum(so_far, DARKEST)
         return jnp.max(hidden, -1) <= 0
 
     def body(state):
@@ -257,7 +257,7 @@ def backward(rows, ids_list, residuals, image, v_image, plan: Plan):
 
     # Parking places need no values: nothing of theirs is kept.
     tiles = jnp.concatenate([segments.tiles, jnp.zeros(lanes, jnp.int32)])
-    light = sum(a * v for a, v in zip(image, v_image, strict=True))
+    light = functools.reduce(jnp.add, (a * v for a, v in zip(image, v_image, strict=True)))
     v_channels = jnp.stack(v_image[:-1], 1)
     # The light still to come and the transmittance where each segment begins.
     behind = segments.tiles[plan.tile_count :]

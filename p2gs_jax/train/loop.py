@@ -31,6 +31,7 @@ from p2gs_jax.export.atomic import append_jsonl, read_jsonl, write_text
 from p2gs_jax.export.checkpoint import CheckpointStore
 from p2gs_jax.losses.relative_exposure import ColorPairs
 from p2gs_jax.losses.total import OBSERVED_FORMS, SECOND_RENDER_FORMS, Partner
+from p2gs_jax.numerics import on_host
 from p2gs_jax.render.capacity import Room
 from p2gs_jax.train import growth, schedule
 from p2gs_jax.train.growth import Look, Stage
@@ -290,7 +291,8 @@ class Trainer:
                 state,
                 batch,
                 self._partner(step, shrink),
-                Controls(
+                on_host(
+                    Controls,
                     np.float32(progress),
                     np.int32(schedule.sh_degree_at(progress, self.cfg.train, self.sh_degree)),
                 ),
@@ -364,14 +366,14 @@ class Trainer:
                 state,
                 self.views.batch(self.views.index_at(step), shrink),
                 self._partner(step, shrink),
-                Controls(np.float32(0), np.int32(0)),
+                on_host(Controls, np.float32(0), np.int32(0)),
             )
 
     def _partner(self, step: int, shrink: int) -> Partner:
         """Return the second view of the relative-exposure loss, as much of it as is needed."""
         relative = self.cfg.loss.relative_exposure
         if relative.weight is None:
-            return Partner(np.int32(0))
+            return on_host(Partner, np.int32(0))
         other = self.views.partner_at(step)
         camera, batch, pairs = None, None, None
         if relative.form in SECOND_RENDER_FORMS:
@@ -383,7 +385,7 @@ class Trainer:
             rng = np.random.default_rng((self.cfg.train.seed, 2, step))
             pick = rng.integers(0, count, min(PAIRS_PER_STEP, count))
             pairs = jax.tree.map(lambda a: np.asarray(a)[pick], self.pairs)
-        return Partner(np.int32(other), camera, batch, pairs)
+        return on_host(Partner, np.int32(other), camera, batch, pairs)
 
     def _diverged(self, state: FitState, step: int, report: StepReport) -> None:
         names = finite_names(report.terms)

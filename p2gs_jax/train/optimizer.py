@@ -26,12 +26,12 @@ class AdamState(NamedTuple):
     """Moments, and how often they were updated.
 
     Attributes:
-        count: updates; one number, or one per row of the parameters.
+        counts: updates; one number, or one per row of the parameters.
         mu: first moments.
         nu: second moments.
     """
 
-    count: Int[Array, "..."]
+    counts: Int[Array, "..."]
     mu: Any
     nu: Any
 
@@ -63,17 +63,17 @@ def scale_by_adam(eps: float, *, by_row: bool) -> optax.GradientTransformation:
 
     def update(updates, state: AdamState, params=None):
         del params
-        count = state.count + 1
+        counts = state.counts + 1
         mu = jax.tree.map(lambda m, g: B1 * m + (1 - B1) * g, state.mu, updates)
         nu = jax.tree.map(lambda v, g: B2 * v + (1 - B2) * g * g, state.nu, updates)
-        first = 1 / (1 - B1 ** count.astype(jnp.float32))
-        second = 1 / (1 - B2 ** count.astype(jnp.float32))
+        first = 1 / (1 - B1 ** counts.astype(jnp.float32))
+        second = 1 / (1 - B2 ** counts.astype(jnp.float32))
 
         def scaled(m, v):
-            shape = count.shape + (1,) * (m.ndim - count.ndim) if by_row else ()
+            shape = counts.shape + (1,) * (m.ndim - counts.ndim) if by_row else ()
             return first.reshape(shape) * m / (jnp.sqrt(second.reshape(shape) * v) + eps)
 
-        return jax.tree.map(scaled, mu, nu), AdamState(count, mu, nu)
+        return jax.tree.map(scaled, mu, nu), AdamState(counts, mu, nu)
 
     return optax.GradientTransformation(init, update)  # pyright: ignore[reportArgumentType]
 
@@ -173,21 +173,21 @@ def learning_rates(
     )
 
 
-def _changed(opt_state: OptState, change, count) -> OptState:
+def _changed(opt_state: OptState, change, counts) -> OptState:
     adam, *others = opt_state.gaussians
-    moments = AdamState(count, change(adam.mu), change(adam.nu))
+    moments = AdamState(counts, change(adam.mu), change(adam.nu))
     return opt_state._replace(gaussians=(moments, *others))
 
 
 def grow_moments(opt_state: OptState, empty: Gaussians) -> OptState:
     """Append zero moments for new slots, as many as `empty` has."""
-    count = opt_state.gaussians[0].count
-    more = jnp.zeros(empty.means.shape[0], count.dtype)
+    counts = opt_state.gaussians[0].counts
+    more = jnp.zeros(empty.means.shape[0], counts.dtype)
     zeros = jax.tree.map(jnp.zeros_like, empty)
     return _changed(
         opt_state,
         lambda m: jax.tree.map(lambda a, b: jnp.concatenate([a, b]), m, zeros),
-        jnp.concatenate([count, more]),
+        jnp.concatenate([counts, more]),
     )
 
 
@@ -199,7 +199,7 @@ def zero_moments(opt_state: OptState, where: Bool[Array, " n"]) -> OptState:
             lambda a: jnp.where(where.reshape((-1,) + (1,) * (a.ndim - 1)), 0.0, a), moment
         )
 
-    return _changed(opt_state, zero, jnp.where(where, 0, opt_state.gaussians[0].count))
+    return _changed(opt_state, zero, jnp.where(where, 0, opt_state.gaussians[0].counts))
 
 
 def zero_opacity_moments(opt_state: OptState) -> OptState:
@@ -207,5 +207,5 @@ def zero_opacity_moments(opt_state: OptState) -> OptState:
     return _changed(
         opt_state,
         lambda m: dataclasses.replace(m, opacity_logits=jnp.zeros_like(m.opacity_logits)),
-        opt_state.gaussians[0].count,
+        opt_state.gaussians[0].counts,
     )

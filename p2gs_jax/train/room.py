@@ -68,7 +68,7 @@ class HostGaussians(NamedTuple):
             ]
         ).transpose(2, 0, 1)
         scales = np.exp(np.clip(gaussians.log_scales[kept], *LOG_SCALE_RANGE))
-        return cls(gaussians.means[kept], rotation * scales[:, None], reach[kept])
+        return cls(np.asarray(gaussians.means)[kept], rotation * scales[:, None], reach[kept])
 
 
 def count_view(gaussians: HostGaussians, camera: HostCamera, cfg: RenderConfig) -> tuple[int, int]:

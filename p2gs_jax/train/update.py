@@ -90,14 +90,15 @@ def update_listed(
         (grads,) = pull((slice_of(v_seen, k, size), jnp.float32(1)))
         finite = jnp.stack([jnp.all(jnp.isfinite(g)) for g in jax.tree.leaves(grads)])
         adam = AdamState(
-            state.moments.count.at[here].get(mode="clip"),
+            state.moments.counts.at[here].get(mode="clip"),
             take_rows(state.moments.mu, here, bands),
             take_rows(state.moments.nu, here, bands),
         )
         # optax annotates trees as nests of containers and does not know our records.
-        updates, (new, *_) = optimizer.update(
+        updates, moved_state = optimizer.update(
             cast(Any, grads), (adam, optax.EmptyState()), cast(Any, old), rates=rates
         )
+        new = cast(Any, moved_state)[0]
         moved = cast(Gaussians, optax.apply_updates(cast(Any, old), cast(Any, updates)))
         if noise_rate is not None:
             noise = exploration_noise(jax.random.fold_in(key, k), moved, shown, noise_rate)
@@ -106,7 +107,7 @@ def update_listed(
         return Updated(
             put_rows(state.gaussians, where, moved),
             AdamState(
-                state.moments.count.at[where].set(new.count, mode="drop", unique_indices=True),
+                state.moments.counts.at[where].set(new.counts, mode="drop", unique_indices=True),
                 put_rows(state.moments.mu, where, new.mu),
                 put_rows(state.moments.nu, where, new.nu),
             ),

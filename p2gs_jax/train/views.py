@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Int
 
+from p2gs_jax.numerics import on_host
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.train.room import HostCamera
 from p2gs_jax.types import Batch, Camera
@@ -81,9 +82,9 @@ class TrainingViews:
 
     def camera(self, index: int, shrink: int) -> Camera:
         """Return the camera of a training view at a level."""
-        return Camera(*self.host_camera(index, shrink))
+        return on_host(Camera, *self.host_camera(index, shrink))
 
     def batch(self, index: int, shrink: int) -> Batch:
         """Return a training view, on the host: a compiled step takes it from there."""
         ldr, mask = self.store.get(self.rows[index], shrink)
-        return Batch(self.camera(index, shrink), ldr, mask, np.int32(index))
+        return on_host(Batch, self.camera(index, shrink), ldr, mask, np.int32(index))

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.render import render_linear, required_capacity
-from p2gs_jax.render.host import capacity_bucket
+from p2gs_jax.render.capacity import bucket
 from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.types import Camera, Gaussians, Render
 from p2gs_jax.viewer.ladder import Size
@@ -192,7 +192,7 @@ class Programs:
             with self._changed:
                 if self._stopping:
                     return
-                capacity = capacity_bucket(self._expected(size), MARGIN)
+                capacity = bucket(self._expected(size), MARGIN)
                 old = self._programs.get(size)
             if old is not None and old.capacity >= capacity:
                 return

@@ -49,12 +49,16 @@ def test_a_fit_without_its_steps_compiles_few_programs(scene, tmp_path):
         truth=None,
         lpips_weights=None,
         counts={},
+        compiler=counter,
         seconds={"reading": 1.0},
     )
     # Counting tiles, rendering, developing (images; colours of splats), fitting an exposure, PSNR,
     # SSIM, and the basis of spherical harmonics.
     assert counter.programs <= 8
     seconds = metrics["seconds"]
+    compiling = seconds.pop("compiler_in_all_threads")
+    assert compiling == counter.seconds > 0
+    assert metrics["counts"]["programs"] == counter.programs
     assert list(seconds) == ["reading", "files", "evaluation", "evaluation_and_files"]
     assert min(seconds.values()) > 0
 

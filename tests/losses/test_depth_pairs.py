@@ -14,7 +14,7 @@ from p2gs_jax.config import FitConfig, LossConfig, PhotometryConfig, RelativeExp
 from p2gs_jax.losses import relative_exposure as rel
 from p2gs_jax.losses.total import Partner, depth_pairs, total_loss
 from p2gs_jax.photometry.formation import formation
-from p2gs_jax.types import Batch, Camera, Gaussians, Params, Photometry, Population, Render
+from p2gs_jax.types import Batch, Camera, Gaussians, Params, Photometry, Render
 
 WIDTH, HEIGHT, FOCAL, DEPTH = 48, 32, 40.0, 5.0
 PHOTOMETRY = PhotometryConfig()
@@ -96,8 +96,7 @@ def test_an_overflow_in_the_other_view_is_not_silent():
         jnp.zeros((count, 1, 3)),
     )
     params = Params(gaussians, Photometry(jnp.zeros(2), jnp.zeros(2)))
-    zeros = jnp.zeros(count)
-    population = Population(jnp.ones(count, bool), zeros, zeros, zeros)
+    alive = jnp.ones(count, bool)
     _, batch = wall(0.0, 1.0, 0)
     turned = np.diag([-1.0, 1, -1, 1]).astype(np.float32)
     back = dataclasses.replace(batch.camera, viewmat=jnp.asarray(turned))
@@ -116,7 +115,7 @@ def test_an_overflow_in_the_other_view_is_not_silent():
             static_argnames="capacity",
         )
         for capacity, fits in ((4, False), (4096, True)):
-            _, aux = loss(params, None, population, batch, partner, capacity=capacity)
+            _, aux = loss(params, alive, batch, partner, capacity=capacity)
             assert int(aux.render.count) == 0
             assert int(aux.entries) > 4
             assert bool(aux.overflow) is not fits

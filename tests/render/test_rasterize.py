@@ -121,20 +121,6 @@ def test_garden_statistics_match_oracle(shared_data):
     assert psnr > 95, psnr
 
 
-def test_probe_gradient_is_screen_space_gradient():
-    g, cam = street(n=300)
-    weights = weights_for(cam)
-
-    def f(probe):
-        r = render_linear(g, alive_of(g), cam, CFG, CAPACITY, means2d_probe=probe)
-        return jnp.sum(r.linear * jnp.asarray(weights[0], jnp.float32))
-
-    probe = jnp.zeros((300, 2))
-    v = jax.jit(jax.grad(f))(probe)
-    assert jnp.all(jnp.isfinite(v))
-    assert float(jnp.abs(v).max()) > 0
-
-
 @pytest.mark.parametrize("value", [(16, 16), (32, 4)])
 def test_tile_size_does_not_change_the_image(value):
     g, cam = street(n=300)

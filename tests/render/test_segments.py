@@ -1,0 +1,104 @@
+"""Segments cover every list once and in order, and merge to what one pass would composite."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from p2gs_jax.render.segments import SEGMENTS_PER_LANE, cut, merge
+from p2gs_jax.render.tile_rows import Plan
+
+TILES, LANES, CHUNK, PIXELS = 6, 4, 2, 3
+UNUSED = dict.fromkeys(Plan._fields)
+PLAN = Plan(
+    **UNUSED | {"across": TILES, "down": 1, "lanes": LANES, "chunk": CHUNK}  # type: ignore[arg-type]
+)
+MOST = SEGMENTS_PER_LANE * LANES
+LENGTHS = st.lists(
+    st.one_of(st.just(0), st.integers(0, 9), st.integers(0, 400)), min_size=TILES, max_size=TILES
+)
+GIANT = [0, 0, 4000, 0, 1, 0]
+
+cut_here = jax.jit(lambda offsets: cut(offsets, PLAN))
+merge_here = jax.jit(lambda composited, segments: merge(composited, segments, PLAN))
+
+
+def offsets_of(lengths):
+    return np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
+
+
+def check_cut(lengths):
+    offsets = offsets_of(lengths)
+    tiles, starts, ends, extra = jax.tree.map(np.asarray, cut_here(jnp.asarray(offsets)))
+    assert len(tiles) == TILES + MOST
+    assert extra <= MOST
+    used = np.arange(TILES + MOST) < TILES + extra
+    assert (starts[~used] == ends[~used]).all()
+    np.testing.assert_array_equal(tiles[:TILES], np.arange(TILES))
+    assert (np.diff(tiles[TILES:][: int(extra)]) >= 0).all()
+    for t in range(TILES):
+        mine = np.flatnonzero(used & (tiles == t))
+        assert mine[0] == t
+        assert starts[mine[0]] == offsets[t]
+        assert ends[mine[-1]] == offsets[t + 1]
+        np.testing.assert_array_equal(starts[mine[1:]], ends[mine[:-1]])
+        assert (ends[mine[1:]] > starts[mine[1:]]).all()
+    longest = max(-(-n // CHUNK) for n in lengths)
+    assert (ends - starts).max() <= max(1, -(-sum(-(-n // CHUNK) for n in lengths) // MOST)) * CHUNK
+    assert (ends - starts).max() <= longest * CHUNK
+
+
+@settings(max_examples=100, deadline=None)
+@given(LENGTHS)
+def test_every_list_is_covered_once_and_in_order(lengths):
+    check_cut(lengths)
+
+
+def test_nothing_and_one_giant_list():
+    check_cut([0] * TILES)
+    check_cut(GIANT)
+    check_cut(GIANT[::-1])
+
+
+def composite(colors, alphas):
+    """Return the colour and the transmittance of entries from front to back."""
+    color, transmittance = np.zeros(PIXELS), np.ones(PIXELS)
+    for c, a in zip(colors, alphas, strict=True):
+        color, transmittance = color + transmittance * a * c, transmittance * (1 - a)
+    return color, transmittance
+
+
+def check_merge(lengths, seed):
+    rng = np.random.default_rng(seed)
+    offsets = offsets_of(lengths)
+    total = int(offsets[-1])
+    colors = rng.uniform(0, 4, (total, PIXELS))
+    alphas = rng.uniform(0, 0.1, (total, PIXELS)) * (rng.random((total, 1)) < 0.5)
+    segments = cut_here(jnp.asarray(offsets))
+    parts = [
+        composite(colors[a:b], alphas[a:b])
+        for a, b in zip(np.asarray(segments.starts), np.asarray(segments.ends), strict=True)
+    ]
+    stacked = tuple(jnp.asarray(np.stack(p), jnp.float32) for p in zip(*parts, strict=True))
+    image, before = merge_here(stacked, segments)
+    for t in range(TILES):
+        whole = composite(*(a[offsets[t] : offsets[t + 1]] for a in (colors, alphas)))
+        for got, expected in zip(image, whole, strict=True):
+            np.testing.assert_allclose(np.asarray(got)[t], expected, rtol=1e-5, atol=1e-6)
+    tiles, starts = np.asarray(segments.tiles), np.asarray(segments.starts)
+    for k in range(int(segments.extra)):
+        t, start = tiles[TILES + k], starts[TILES + k]
+        front = composite(*(a[offsets[t] : start] for a in (colors, alphas)))
+        for got, expected in zip(before, front, strict=True):
+            np.testing.assert_allclose(np.asarray(got)[k], expected, rtol=1e-5, atol=1e-6)
+
+
+@settings(max_examples=25, deadline=None)
+@given(LENGTHS, st.integers(0, 100))
+def test_merging_is_compositing(lengths, seed):
+    check_merge(lengths, seed)
+
+
+def test_merging_one_giant_list():
+    check_merge(GIANT, 0)

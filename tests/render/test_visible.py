@@ -1,0 +1,123 @@
+"""What a view may show is listed whole, and the host counts no less than it needs."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from p2gs_jax.config import RenderConfig
+from p2gs_jax.render import bin_tiles, project, required_capacity, view_radiance
+from p2gs_jax.render.cutoff import with_cutoffs
+from p2gs_jax.render.visible import compact, in_view
+from p2gs_jax.train.room import HostCamera, HostGaussians, count_view
+from p2gs_jax.types import Camera, Gaussians
+
+COUNT, WIDTH, HEIGHT = 300, 80, 56
+# Every tile of every Gaussian.
+CAPACITY = COUNT * 5 * 7
+RULES = ("opacity", "radiance")
+
+
+def scene(seed: int, spread: float, size: float, shape: float, near: float) -> Gaussians:
+    """Gaussians all around the camera: far and near, round and elongated, opaque and not."""
+    rng = np.random.default_rng(seed)
+    means = spread * rng.normal(size=(COUNT, 3))
+    means[: COUNT // 4, 2] = near * rng.uniform(0.5, 2, COUNT // 4)
+    return Gaussians(
+        *(
+            jnp.asarray(a, jnp.float32)
+            for a in (
+                means,
+                rng.normal(size=(COUNT, 4)),
+                size + shape * rng.normal(size=(COUNT, 3)),
+                rng.normal(0, 4, COUNT),
+                rng.normal(0, 2, (COUNT, 1, 3)),
+            )
+        )
+    )
+
+
+def view(seed: int, focal: float) -> Camera:
+    q, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = q * np.linalg.det(q)
+    K = np.array([[focal, 0, 0.3 * WIDTH], [0, 1.2 * focal, 0.6 * HEIGHT], [0, 0, 1]])
+    return Camera(
+        jnp.asarray(viewmat, jnp.float32), jnp.asarray(K, jnp.float32), width=WIDTH, height=HEIGHT
+    )
+
+
+@functools.partial(jax.jit, static_argnames="cfg")
+def seen_and_listed(gaussians, alive, camera, cfg):
+    splats = project(gaussians, alive, camera, cfg)
+    splats = with_cutoffs(splats, view_radiance(gaussians, camera, cfg), cfg)
+    tiles = bin_tiles(splats, camera.width, camera.height, CAPACITY, cfg)
+    used = jnp.arange(CAPACITY) < tiles.offsets[-1]
+    ids = jnp.where(used, tiles.gaussian_ids, COUNT)
+    listed = jnp.zeros(COUNT, bool).at[ids].set(True, mode="drop")
+    seen = in_view(gaussians, alive, camera, cfg)
+    return seen, listed, required_capacity(gaussians, alive, camera, cfg)
+
+
+@pytest.mark.parametrize("rule", RULES)
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 1000),
+    spread=st.sampled_from([0.5, 4.0, 40.0]),
+    size=st.floats(-6, 3),
+    shape=st.sampled_from([0.0, 0.5, 3.0]),
+    near=st.sampled_from([0.05, 0.2, 2.0]),
+    focal=st.sampled_from([10.0, 60.0, 400.0]),
+)
+def test_all_that_is_listed_is_in_view_and_counted(rule, seed, spread, size, shape, near, focal):
+    cfg = RenderConfig(sh_degree=0, cutoff_rule=rule)
+    gaussians, camera = scene(seed, spread, size, shape, near), view(seed, focal)
+    alive = jnp.arange(COUNT) % 7 != 3
+    seen, listed, need = jax.tree.map(np.asarray, seen_and_listed(gaussians, alive, camera, cfg))
+    assert not (listed & ~seen).any()
+    assert not seen[~np.asarray(alive)].any()
+    host = HostGaussians.of(jax.tree.map(np.asarray, gaussians), np.asarray(alive), cfg)
+    at = HostCamera(np.asarray(camera.viewmat), np.asarray(camera.K), WIDTH, HEIGHT)
+    entries, visible = count_view(host, at, cfg)
+    # Both are bounds up to rounding at the edges of tiles and of the image.
+    assert entries >= need - 2
+    assert visible >= listed.sum()
+    assert abs(visible - seen.sum()) <= 2
+
+
+def test_few_that_are_not_listed_are_in_view():
+    cfg = RenderConfig(sh_degree=0)
+    shares = []
+    for seed in range(8):
+        alive = jnp.ones(COUNT, bool)
+        seen, listed, _ = seen_and_listed(
+            scene(seed, 4.0, -3.0, 0.3, 2.0), alive, view(seed, 60.0), cfg
+        )
+        shares.append((float(seen.sum()), float(listed.sum())))
+    seen, listed = np.sum(shares, axis=0)
+    assert listed <= seen <= 1.3 * listed
+
+
+@pytest.mark.parametrize("room", [1, 50, 400])
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_compact_lists_the_flags(room, share):
+    flags = np.random.default_rng(0).random(COUNT) < share
+    ids, count = jax.jit(compact, static_argnums=1)(jnp.asarray(flags), room)
+    expected = np.flatnonzero(flags)
+    assert int(count) == len(expected)
+    padded = np.full(max(room, len(expected)), COUNT)
+    padded[: len(expected)] = expected
+    np.testing.assert_array_equal(ids, padded[:room])
+
+
+def test_a_dark_or_dead_gaussian_is_not_in_view():
+    cfg = RenderConfig(sh_degree=0)
+    gaussians, camera = scene(0, 1.0, 0.0, 0.0, 2.0), view(0, 60.0)
+    dark = dataclasses.replace(gaussians, opacity_logits=jnp.full(COUNT, -8.0))
+    assert not np.any(in_view(dark, jnp.ones(COUNT, bool), camera, cfg))
+    assert not np.any(in_view(gaussians, jnp.zeros(COUNT, bool), camera, cfg))

@@ -1,0 +1,268 @@
+"""One step in blocks is one Adam update of `total_loss`; what cannot be taken changes nothing."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from tiny_scene import make_scene
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.losses.total import Partner, image_loss, total_loss
+from p2gs_jax.pipeline import fit
+from p2gs_jax.render.blocks import BLOCK, splat
+from p2gs_jax.render.capacity import Room
+from p2gs_jax.render.visible import in_view
+from p2gs_jax.train import step as step_module
+from p2gs_jax.train.optimizer import B1, B2, learning_rates, make_optimizer
+from p2gs_jax.train.state import FAULT_NONE, FAULT_NONFINITE, FAULT_OVERFLOW, initial_state
+from p2gs_jax.train.step import Controls, finite_names, make_step
+from p2gs_jax.types import Batch, Camera, Gaussians, Params, Photometry
+
+COUNT, HIDDEN = 6000, 600
+WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
+EXTENT, DEGREE, PROGRESS = 2.0, 1, 0.3
+FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
+
+
+def config(visible_only: bool) -> FitConfig:
+    base = FitConfig()
+    return dataclasses.replace(
+        base,
+        render=dataclasses.replace(base.render, sh_degree=DEGREE, pixels_in_flight=2048),
+        densify=dataclasses.replace(base.densify, method=None),
+        # With an epsilon of about the gradient's size, updates are as smooth as the gradient.
+        optimizer=dataclasses.replace(base.optimizer, visible_only=visible_only, eps=1e-5),
+    )
+
+
+def start() -> Params:
+    """More Gaussians in view than fit into a block, and some behind the camera."""
+    rng = np.random.default_rng(0)
+    z = rng.uniform(3, 8, COUNT)
+    xy = rng.uniform(-0.5, 0.5, (COUNT, 2)) * z[:, None] * [WIDTH / FOCAL, HEIGHT / FOCAL]
+    means = np.concatenate([xy, z[:, None]], 1)
+    means[rng.permutation(COUNT)[:HIDDEN], 2] *= -1
+    values = (
+        means,
+        rng.normal(size=(COUNT, 4)),
+        rng.normal(-3, 0.4, (COUNT, 3)),
+        rng.normal(0, 1, COUNT),
+        rng.normal(0, 0.3, (COUNT, (DEGREE + 1) ** 2, 3)) - [[[1.0], *[[0.0]] * 3]],
+    )
+    gaussians = Gaussians(*(jnp.asarray(a, jnp.float32) for a in values))
+    return Params(gaussians, Photometry(jnp.array([0.1, -0.1]), jnp.array([0.02, 0.0])))
+
+
+def photograph() -> Batch:
+    K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]], np.float32)
+    camera = Camera(jnp.eye(4), jnp.asarray(K), WIDTH, HEIGHT)
+    ldr = np.random.default_rng(1).uniform(0, 1, (HEIGHT, WIDTH, 3)).astype(np.float32)
+    return Batch(camera, jnp.asarray(ldr), jnp.ones((HEIGHT, WIDTH)), jnp.int32(1))
+
+
+@pytest.fixture(scope="module")
+def made():
+    """Return one step of each kind from the same start, and the gradient it should follow."""
+    params, batch, partner = start(), photograph(), Partner(jnp.int32(0))
+    # A tenth of the slots are empty.
+    alive = jnp.arange(COUNT) % 10 != 0
+    controls = Controls(jnp.float32(PROGRESS), jnp.int32(DEGREE))
+    cfg = config(True)
+
+    def steps(cfg):
+        optimizer = make_optimizer(cfg)
+        run = make_step(cfg, optimizer, EXTENT)
+
+        def step(room, params=params, alive=alive):
+            state = initial_state(params, alive, optimizer)
+            return run(state, batch, partner, controls, room=room, degree=DEGREE)
+
+        return step
+
+    def objective(params, probe):
+        shown = splat(params.gaussians, alive, (batch.camera,), cfg.render, DEGREE)
+        ((splats, radiance),) = shown
+        splats = dataclasses.replace(splats, means2d=splats.means2d + probe)
+        loss, _ = image_loss(
+            ((splats, radiance),), params.photometry, None, batch, partner, cfg, 2**16
+        )
+        whole, _ = total_loss(
+            params, alive, batch, partner, cfg, capacity=2**16, active_degree=DEGREE, extent=EXTENT
+        )
+        return whole + loss, (whole, loss)
+
+    # Both losses are the same here: their sum has twice the gradient.
+    (_, (whole, loss)), (grads, probe) = jax.jit(
+        jax.value_and_grad(objective, argnums=(0, 1), has_aux=True)
+    )(params, jnp.zeros((COUNT, 2)))
+    assert float(whole) == pytest.approx(float(loss), rel=1e-6)
+    seen = np.asarray(in_view(params.gaussians, alive, batch.camera, cfg.render))
+    selective = steps(cfg)
+    tight = Room(64, BLOCK)
+    refused = selective(tight)
+    fault = refused[0].fault
+    room = tight.grown(int(fault.needed), int(fault.visible))
+    return SimpleNamespace(
+        params=params,
+        alive=np.asarray(alive),
+        seen=seen,
+        cfg=cfg,
+        gradient=jax.tree.map(lambda g: np.asarray(g) / 2, grads),
+        probe=np.asarray(probe),
+        loss=float(whole),
+        tight=tight,
+        refused=refused,
+        room=room,
+        selective=selective,
+        after=selective(room),
+        everyone=steps(config(False))(room),
+    )
+
+
+def rows_of(tree, name, rows):
+    return np.asarray(getattr(tree, name))[rows]
+
+
+@pytest.mark.parametrize("which", ["after", "everyone"])
+def test_one_step_is_an_adam_update_of_the_gradient_of_the_total_loss(made, which):
+    state, report = getattr(made, which)
+    assert int(state.fault.kind) == FAULT_NONE
+    assert int(state.step) == 1
+    assert float(report.loss) == pytest.approx(made.loss, rel=1e-6)
+    assert int(report.visible) == (made.seen.sum() if which == "after" else COUNT)
+    rates = learning_rates(jnp.float32(PROGRESS), EXTENT, made.params, made.cfg, (DEGREE + 1) ** 2)
+    adam = optax.scale_by_adam(B1, B2, made.cfg.optimizer.eps)
+    updates, _ = adam.update(made.gradient, adam.init(made.params))
+    moments = state.opt_state.gaussians[0]
+    for name in FIELDS:
+        g = rows_of(made.gradient.gaussians, name, made.seen)
+        mu = rows_of(moments.mu, name, made.seen) / (1 - B1)
+        nu = rows_of(moments.nu, name, made.seen) / (1 - B2)
+        assert np.linalg.norm(mu - g) <= 1e-5 * np.linalg.norm(g), name
+        assert np.linalg.norm(np.sqrt(nu) - np.abs(g)) <= 1e-4 * np.linalg.norm(g), name
+        rate = np.asarray(getattr(rates.gaussians, name))
+        old = rows_of(made.params.gaussians, name, made.seen)
+        new = rows_of(state.params.gaussians, name, made.seen)
+        expected = old - rate * rows_of(updates.gaussians, name, made.seen)
+        np.testing.assert_allclose(new, expected, rtol=1e-6, atol=2e-3 * rate.max())
+        moved = np.abs(new - old).max()
+        assert moved > 0.5 * rate.max(), name
+    got, v = state.opt_state.rest[0].mu[0], made.gradient.photometry
+    for name in ("raw_exposures", "raw_gammas"):
+        np.testing.assert_allclose(
+            getattr(got, name) / (1 - B1), getattr(v, name), rtol=1e-4, atol=1e-8
+        )
+
+
+def test_blocks_and_the_whole_population_agree(made):
+    a, b = made.after[0].params.gaussians, made.everyone[0].params.gaussians
+    for name in FIELDS:
+        old = rows_of(made.params.gaussians, name, made.seen)
+        moved = rows_of(b, name, made.seen) - old
+        apart = rows_of(a, name, made.seen) - rows_of(b, name, made.seen)
+        assert np.linalg.norm(apart) <= 1e-3 * np.linalg.norm(moved), name
+
+
+def test_out_of_view_nothing_is_touched(made):
+    state, _ = made.after
+    hidden = ~made.seen
+    assert hidden.sum() > HIDDEN / 2
+    moments = state.opt_state.gaussians[0]
+    for name in FIELDS:
+        before = rows_of(made.params.gaussians, name, hidden)
+        assert rows_of(state.params.gaussians, name, hidden).tobytes() == before.tobytes(), name
+        assert not rows_of(moments.mu, name, hidden).any(), name
+        assert not rows_of(moments.nu, name, hidden).any(), name
+    np.testing.assert_array_equal(moments.counts, made.seen.astype(np.int32))
+
+
+def test_the_statistic_is_the_screen_space_gradient(made):
+    state, _ = made.after
+    norm = np.linalg.norm(made.probe * [WIDTH / 2, HEIGHT / 2], axis=1)
+    assert norm.max() > 0
+    got = np.asarray(state.population.grad2d_sum)
+    assert np.linalg.norm(got - norm) <= 1e-5 * np.linalg.norm(norm)
+    np.testing.assert_array_equal(state.population.seen_count, norm > 0)
+
+
+def same(a, b):
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        assert np.asarray(x).tobytes() == np.asarray(y).tobytes()
+
+
+def test_a_view_without_room_changes_nothing_but_the_fault(made):
+    state, report = made.refused
+    fresh = initial_state(made.params, jnp.asarray(made.alive), make_optimizer(made.cfg))
+    same(dataclasses.replace(state, fault=fresh.fault), fresh)
+    assert int(state.fault.kind) == FAULT_OVERFLOW
+    assert int(state.fault.visible) == made.seen.sum() > made.tight.visible
+    assert int(state.fault.needed) > made.tight.entries
+    assert int(report.visible) == made.seen.sum()
+    assert made.room.fits(int(state.fault.needed), int(state.fault.visible))
+    grown = made.after[1]
+    assert made.room.fits(int(grown.entries), int(grown.visible))
+    # Only what did not fit grows.
+    assert made.room.grown(10**6, 1).visible == made.room.visible
+    assert made.room.grown(1, 10**6).entries == made.room.entries
+
+
+def broken(made, field, value):
+    """Return a step after one visible value was replaced."""
+    row = np.flatnonzero(made.seen)[-1]
+    gaussians = made.params.gaussians
+    array = getattr(gaussians, field)
+    changed = dataclasses.replace(gaussians, **{field: array.at[row].set(value)})
+    params = dataclasses.replace(made.params, gaussians=changed)
+    state, report = made.selective(made.room, params)
+    return params, state, finite_names(report.terms)[int(state.fault.term)]
+
+
+def test_a_radiance_that_is_no_number_is_named(made):
+    params, state, name = broken(made, "sh", jnp.nan)
+    assert int(state.fault.kind) == FAULT_NONFINITE
+    assert name.startswith("loss term")
+    fresh = initial_state(params, jnp.asarray(made.alive), make_optimizer(made.cfg))
+    same(dataclasses.replace(state, fault=fresh.fault), fresh)
+
+
+def test_a_gradient_that_is_no_number_is_named(made):
+    _, state, name = broken(made, "quats", jnp.nan)
+    assert int(state.fault.kind) == FAULT_NONFINITE
+    assert name.startswith("gradient of")
+    assert int(state.step) == 0
+
+
+def test_the_first_term_that_is_no_number_is_named(made):
+    """The exposure of another view than the step's: only the mean over all views knows it."""
+    photometry = Photometry(jnp.array([jnp.nan, -0.1]), made.params.photometry.raw_gammas)
+    params = dataclasses.replace(made.params, photometry=photometry)
+    state, report = made.selective(made.room, params)
+    assert int(state.fault.kind) == FAULT_NONFINITE
+    assert finite_names(report.terms)[int(state.fault.term)] == "loss term log_exposure_mean"
+
+
+def test_a_short_fit_traces_its_step_once_per_image_size(tmp_path, monkeypatch):
+    scene = make_scene(tmp_path / "scene", size=(200, 192))
+    base = FitConfig()
+    cfg = dataclasses.replace(
+        base,
+        render=dataclasses.replace(base.render, sh_degree=0),
+        densify=dataclasses.replace(base.densify, max_gaussians=400, min_every_steps=5),
+        init=dataclasses.replace(base.init, dense="off", shell="off"),
+        train=dataclasses.replace(base.train, steps=30, coarse_to_fine=(0.5,)),
+    )
+    sizes = []
+
+    def counted(shown, photometry, appearance, batch, *others):
+        sizes.append((batch.camera.width, batch.camera.height))
+        return image_loss(shown, photometry, appearance, batch, *others)
+
+    chex.clear_trace_counter()
+    monkeypatch.setattr(step_module, "image_loss", chex.assert_max_traces(counted, n=2))
+    fit(scene, tmp_path / "run", cfg)
+    assert len(sizes) == len(set(sizes)) == 2
