@@ -220,9 +220,10 @@ class CheckpointStore:
             return
         name = differing[0]
         raise UserError(
-            f"The checkpoint {self.folder / str(step)} belongs to another configuration: "
+            f"The checkpoint {self.folder / str(step)} belongs to another version or configuration: "
             f"{name} is {held.get(name, 'absent')}, not {wanted.get(name, 'absent')}.",
-            fix="resume with the configuration of the run, or start again without --resume",
+            fix="resume with the version and the configuration of the run, or start again without "
+            "--resume",
         )
 
     def _broken(self, step: int, error: Exception) -> UserError:
