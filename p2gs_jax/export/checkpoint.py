@@ -219,9 +219,10 @@ class CheckpointStore:
         if not differing:
             return
         name = differing[0]
+        found, expected = held.get(name, "absent"), wanted.get(name, "absent")
         raise UserError(
-            f"The checkpoint {self.folder / str(step)} belongs to another version or configuration: "
-            f"{name} is {held.get(name, 'absent')}, not {wanted.get(name, 'absent')}.",
+            f"The checkpoint {self.folder / str(step)} belongs to another version or "
+            f"configuration: {name} is {found}, not {expected}.",
             fix="resume with the version and the configuration of the run, or start again without "
             "--resume",
         )
