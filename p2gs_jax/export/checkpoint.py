@@ -219,10 +219,12 @@ class CheckpointStore:
         if not differing:
             return
         name = differing[0]
+        found, expected = held.get(name, "absent"), wanted.get(name, "absent")
         raise UserError(
-            f"The checkpoint {self.folder / str(step)} belongs to another configuration: "
-            f"{name} is {held.get(name, 'absent')}, not {wanted.get(name, 'absent')}.",
-            fix="resume with the configuration of the run, or start again without --resume",
+            f"The checkpoint {self.folder / str(step)} belongs to another version or "
+            f"configuration: {name} is {found}, not {expected}.",
+            fix="resume with the version and the configuration of the run, or start again without "
+            "--resume",
         )
 
     def _broken(self, step: int, error: Exception) -> UserError:

@@ -1,5 +1,6 @@
 """Checkpoints return bit for bit, and no kill or broken file takes the last good one away."""
 
+import dataclasses
 import random
 import subprocess
 import sys
@@ -102,7 +103,7 @@ def test_unusual_leaves_and_values(tmp_path):
 def test_another_structure_is_refused(tmp_path, like, message):
     store = CheckpointStore(tmp_path / "c")
     store.save(1, {"x": jnp.zeros(4), "y": jnp.zeros(2)}, {})
-    with pytest.raises(UserError, match=f"another configuration.*{message}"):
+    with pytest.raises(UserError, match=f"another version or configuration.*{message}"):
         store.restore(1, like)
 
 
@@ -110,6 +111,18 @@ def flip(path):
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 4
     path.write_bytes(content)
+
+
+def test_a_checkpoint_of_another_optimiser_ends_in_advice(tmp_path):
+    """Earlier versions counted updates once for all Gaussians, in another structure."""
+    now = state(20)
+    moments = now.opt_state.gaussians[0]
+    earlier = {"mu": moments.mu, "nu": moments.nu, "count": jnp.int32(7)}
+    store = CheckpointStore(tmp_path / "c")
+    store.save(7, dataclasses.replace(now, opt_state=earlier), {"gaussian_capacity": 20})
+    with pytest.raises(UserError, match="another version or configuration") as caught:
+        CheckpointStore(tmp_path / "c").restore_latest(lambda meta: now)
+    assert "without --resume" in caught.value.fix
 
 
 DAMAGES = {
