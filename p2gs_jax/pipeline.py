@@ -72,7 +72,7 @@ def optimise(
         own_exposures=prepared.selection is not None,
     )
     alive = np.ones(prepared.params.gaussians.capacity, bool)
-    return trainer.run(prepared.params, alive, resume=resume, reserve_s=spent_s + reserve_s)
+    return trainer.run(prepared.params, alive, resume=resume, spent_s=spent_s, finish_s=reserve_s)
 
 
 def compact(result: TrainResult) -> Params:
@@ -225,7 +225,7 @@ def _finish_estimate(
     for view in scene.views:
         width, height = size_at(view, cfg.data.max_width)
         pixels += width * height
-    per_pixel = 1.2e-6
+    per_pixel = 1.8e-6 if reference else 1.2e-6
     if lpips_weights is not None:
         # Under two protocols, and three more against a reference.
         per_pixel += (5 if reference else 2) * lpips_weights.network.seconds_per_pixel

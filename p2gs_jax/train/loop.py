@@ -25,7 +25,12 @@ import numpy as np
 from p2gs_jax.clock import Stopwatch
 from p2gs_jax.config import FitConfig
 from p2gs_jax.densify import adaptive, mcmc
-from p2gs_jax.densify.population import bucket_for, default_max_gaussians, default_share
+from p2gs_jax.densify.population import (
+    STEP_SECONDS_PER_PIXEL,
+    bucket_for,
+    default_max_gaussians,
+    default_share,
+)
 from p2gs_jax.errors import DivergenceError, UserError
 from p2gs_jax.export.atomic import append_jsonl, read_jsonl, write_text
 from p2gs_jax.export.checkpoint import CheckpointStore
@@ -173,7 +178,13 @@ class Trainer:
     # -------------------------------------------------------------- the run
 
     def run(
-        self, params: Params, alive, *, resume: bool = False, reserve_s: float = 0.0
+        self,
+        params: Params,
+        alive,
+        *,
+        resume: bool = False,
+        spent_s: float = 0.0,
+        finish_s: float = 0.0,
     ) -> TrainResult:
         """Optimise until the run is complete.
 
@@ -181,17 +192,20 @@ class Trainer:
             params: initial parameters.
             alive: which Gaussians exist.
             resume: continue from the newest checkpoint, if there is one.
-            reserve_s: seconds of a time budget to leave for what follows.
+            spent_s: seconds of a time budget that are gone.
+            finish_s: seconds of it to leave for what follows, on an unloaded machine.
 
         Raises:
             DivergenceError: a loss term or gradient is not finite.
         """
         try:
-            return self._run(params, alive, resume, reserve_s)
+            return self._run(params, alive, resume, spent_s, finish_s)
         finally:
             self.programs.close()
 
-    def _run(self, params: Params, alive, resume: bool, reserve_s: float) -> TrainResult:
+    def _run(
+        self, params: Params, alive, resume: bool, spent_s: float, finish_s: float
+    ) -> TrainResult:
         train = self.cfg.train
         seeds = int(np.sum(np.asarray(alive)))
         limit = self._limit(seeds)
@@ -199,7 +213,7 @@ class Trainer:
         if self.cfg.densify.method == "mcmc" and not self.auto:
             slots = max(limit or 0, seeds)
         state = initial_state(params, alive, self.optimizer, slots)
-        pace = Pace.from_config(train, reserve_s)
+        pace = Pace.from_config(train, spent_s + finish_s)
         host = HostState(pace=pace.per_step)
         if resume and (restored := self._restore(state)) is not None:
             state, host = restored
@@ -222,11 +236,13 @@ class Trainer:
                 with self.clock("densification"):
                     state = self._maybe_densify(state, host, limit)
             if pace.deadline_s is not None:
+                # As if so much had passed already: what follows is as slow as the steps are.
+                now = host.elapsed_s + finish_s * (self._slowness(host) - 1)
                 if host.step_s > 0:
                     pace = dataclasses.replace(pace, per_step=host.pace)
-                    pace = pace.replan(host.progress, host.elapsed_s, host.step_s)
+                    pace = pace.replan(host.progress, now, host.step_s)
                     host.pace = pace.per_step
-                if host.elapsed_s > (pace.deadline_s or math.inf):
+                if now > (pace.deadline_s or math.inf):
                     if host.progress < NEARLY_DONE:
                         self.on_message(
                             f"The budget ended the run at {host.progress:.0%} of its schedule: fit "
@@ -244,6 +260,13 @@ class Trainer:
         summary = growth.summary(host.growth, self.validation) if self.auto else None
         most = limit or state.params.gaussians.capacity
         return TrainResult(state, host, most, summary, self._seconds())
+
+    def _slowness(self, host: HostState) -> float:
+        """Return how many times slower than expected full-size steps are, from 1 to 3."""
+        if host.shrink != 1 or host.step_s <= 0:
+            return 1.0
+        expected = STEP_SECONDS_PER_PIXEL * self.width * self.height
+        return min(max(host.step_s / expected, 1.0), 3.0)
 
     def _seconds(self) -> dict[str, float]:
         """Return where the time went, by name."""
