@@ -21,9 +21,10 @@ from p2gs_jax.types import Gaussians
 
 # Of the first of these many views, evenly spread.
 SAMPLED_VIEWS = 32
-# Entries: splats widen before they settle; visible: views between the sampled ones.
-ENTRIES_MARGIN, VISIBLE_MARGIN = 1.4, 1.1
-ENTRIES_PER_GAUSSIAN = 4
+# Entries: splats widen before they settle, and share their places as they grow in number; visible:
+# views between the sampled ones.
+ENTRIES_MARGIN, VISIBLE_MARGIN = 1.5, 1.1
+ENTRIES_PER_GAUSSIAN, FEWEST_ENTRIES = 4, 16_384
 
 
 class HostCamera(NamedTuple):
@@ -127,9 +128,10 @@ def room_for(
     live = HostGaussians.of(gaussians, alive, cfg)
     counts = [count_view(live, cameras[i], cfg) for i in picks]
     entries, visible = (max(c[k] for c in counts) for k in (0, 1))
-    growth = max(limit, 1) / max(int(alive.sum()), 1)
-    wanted = int(visible * VISIBLE_MARGIN * max(growth, 1.0))
+    growth = max(max(limit, 1) / max(int(alive.sum()), 1), 1.0)
+    wanted = int(visible * VISIBLE_MARGIN * growth)
+    lists = int(ENTRIES_MARGIN * entries * growth**0.5)
     return Room(
-        bucket(max(int(ENTRIES_MARGIN * entries), ENTRIES_PER_GAUSSIAN * wanted)),
+        bucket(max(lists, ENTRIES_PER_GAUSSIAN * wanted, FEWEST_ENTRIES)),
         min(whole_blocks(wanted), whole_blocks(max(limit, len(alive)))),
     )
