@@ -77,8 +77,8 @@ def variants() -> dict[str, FitConfig]:
         ),
         "robust, not censored": of(robust, loss__censored=False),
         "robust, no D-SSIM": of(robust, loss__dssim_weight=None),
-        "robust, no opacity and scale regularisers": of(
-            robust, loss__regularizers__opacity=None, loss__regularizers__scale=None
+        "robust, with opacity and scale regularisers": of(
+            robust, loss__regularizers__opacity=0.01, loss__regularizers__scale=0.01
         ),
         PRINTED: paper,
         "printed, no L_exp": of(paper, loss__relative_exposure__weight=None),
