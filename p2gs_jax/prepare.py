@@ -204,7 +204,7 @@ def prepare(
     )
 
 
-def seed_bound(cfg: FitConfig, seeds: int, width: int, height: int) -> int:
+def seed_bound(cfg: FitConfig, seeds: int, width: int, height: int, views: int) -> int:
     """Return the bound on the population that the seeds are measured by.
 
     Args:
@@ -212,14 +212,15 @@ def seed_bound(cfg: FitConfig, seeds: int, width: int, height: int) -> int:
         seeds: points of the scene.
         width: of the training photographs, pixels.
         height: likewise.
+        views: training views.
     """
     given = cfg.densify.max_gaussians
     if isinstance(given, int):
         return given
-    return default_max_gaussians(seeds, width, height, cfg.train)
+    return default_max_gaussians(seeds, width, height, views, cfg.train)
 
 
-def dense_limit(cfg: FitConfig, seeds: int, width: int, height: int) -> int:
+def dense_limit(cfg: FitConfig, seeds: int, width: int, height: int, views: int) -> int:
     """Return how many dense seeds a fit may start from.
 
     Args:
@@ -227,8 +228,9 @@ def dense_limit(cfg: FitConfig, seeds: int, width: int, height: int) -> int:
         seeds: that are there already.
         width: of the training photographs, pixels.
         height: likewise.
+        views: training views.
     """
-    bound = seed_bound(cfg, seeds, width, height)
+    bound = seed_bound(cfg, seeds, width, height, views)
     room = bound - seeds
     wanted = cfg.init.dense_points
     if wanted is None:
@@ -248,9 +250,10 @@ def wants_dense(scene: Scene, store: ImageStore, cfg: FitConfig) -> bool:
         return False
     _, _, width, height = store.camera(scene.train_indices[0])
     seeds = min(len(scene.points), cfg.init.max_seeds)
-    if dense_limit(cfg, seeds, width, height) == 0:
+    views = len(scene.train_indices)
+    if dense_limit(cfg, seeds, width, height, views) == 0:
         return False
-    bound = seed_bound(cfg, seeds, width, height)
+    bound = seed_bound(cfg, seeds, width, height, views)
     return cfg.init.dense == "on" or seeds < ENOUGH_SEEDS * bound
 
 
@@ -281,7 +284,7 @@ def _dense(
         Tones.of(log_exposures, gammas, cfg.photometry),
         cfg,
         existing=points,
-        limit=dense_limit(cfg, len(points), width, height),
+        limit=dense_limit(cfg, len(points), width, height, len(scene.train_indices)),
         most_views=most_views,
         on_view=lambda i, n: reporter.stage("Matching photographs", i, n),
     )

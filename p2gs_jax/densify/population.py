@@ -51,15 +51,20 @@ def empty_gaussians(count: int, like: Gaussians) -> Gaussians:
 STEP_SECONDS_PER_PIXEL = 5e-7
 # Gaussians a pixel of a view: rising with the length of a run up to the second (ours: BUILD_NOTES).
 SMALLEST_SHARE, LARGEST_SHARE, STEPS_PER_SHARE = 0.1, 0.5, 8000
+# Few views cannot tell more Gaussians apart: at 28 of them twice as many gained nothing.
+VIEWS_PER_SHARE = 200
 MOST_BY_DEFAULT = 400_000
 
 
-def default_share(steps: float) -> float:
-    """Return how many Gaussians a pixel of a view a run of so many steps can fit."""
-    return min(max(steps / STEPS_PER_SHARE, SMALLEST_SHARE), LARGEST_SHARE)
+def default_share(steps: float, views: int) -> float:
+    """Return how many Gaussians a pixel of a view so many steps and training views can fit."""
+    most = min(steps / STEPS_PER_SHARE, views / VIEWS_PER_SHARE, LARGEST_SHARE)
+    return max(most, SMALLEST_SHARE)
 
 
-def default_max_gaussians(seeds: int, width: int, height: int, train: TrainConfig) -> int:
+def default_max_gaussians(
+    seeds: int, width: int, height: int, views: int, train: TrainConfig
+) -> int:
     """Return the population limit where none is configured.
 
     A long run can fit more Gaussians than a short one. The limit is never below the seeds and a
@@ -69,13 +74,14 @@ def default_max_gaussians(seeds: int, width: int, height: int, train: TrainConfi
         seeds: points of the scene.
         width: of the training photographs, pixels.
         height: likewise.
+        views: training views.
         train: steps or budget.
     """
     pixels = width * height
     steps = train.steps
     if train.budget_s is not None:
         steps = train.budget_s / (STEP_SECONDS_PER_PIXEL * pixels)
-    wanted = min(int(default_share(steps) * pixels), MOST_BY_DEFAULT)
+    wanted = min(int(default_share(steps, views) * pixels), MOST_BY_DEFAULT)
     return max(int(1.25 * seeds), wanted, 1000)
 
 

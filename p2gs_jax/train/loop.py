@@ -275,7 +275,9 @@ class Trainer:
     def _limit(self, seeds: int) -> int | None:
         """Return the bound on the population; None: there is none."""
         d = self.cfg.densify
-        default = default_max_gaussians(seeds, self.width, self.height, self.cfg.train)
+        default = default_max_gaussians(
+            seeds, self.width, self.height, len(self.views), self.cfg.train
+        )
         if d.max_gaussians == "auto":
             return growth.upper_bound(seeds, default)
         if d.method != "mcmc":
@@ -493,7 +495,7 @@ class Trainer:
         left = (1.0 - host.progress) / host.pace
         later = any(end > host.progress and factor < host.shrink for end, factor in self.levels)
         steps = host.step + (left / FULL_SIZE_COST if later else left)
-        share = default_share(steps)
+        share = default_share(steps, len(self.views))
         return max(alive, min(limit, int(share * self.width * self.height)))
 
     def _relocate_step(self, state: FitState, host: HostState, wanted: int) -> FitState:
