@@ -41,7 +41,6 @@ def finished_run(tmp_path_factory) -> Path:
         *("fit", str(make_scene(root / "scene")), "--out", str(root / "run")),
         *("--steps", "60", "--train.coarse-to-fine", "--test-every", "3"),
         *("--densify.max-gaussians", "400", "--render.sh-degree", "1", "--init.shell", "off"),
-        *("--init.dense", "off"),
     ]
     with pytest.raises(SystemExit) as stop:
         main(argv)

@@ -43,6 +43,5 @@ def test_what_a_small_run_can_say_is_written(finished_run, tmp_path):
     assert [v["image"] for v in saved] == names
     assert all(v["exposure"] is None or v["exposure"] > 0 for v in saved)
     assert (tmp_path / "out" / "calibration.png").is_file()
-    # Flat dots give depth nearly nowhere: views without an observation are named.
-    assert found.observations < 100
-    assert any("usable track observations" in m and names[0] in m for m in found.messages)
+    # Dense seeds lie on the surfaces: even a short run has depth to warp through.
+    assert found.observations > 1000
