@@ -385,6 +385,7 @@ def _paper(exposure_weight: float, name: PresetName) -> FitConfig:
             exposures=1e-3,
             gammas=1e-3,
             photometry_final=1.0,
+            visible_only=False,
         ),
         densify=DensifyConfig(method="adaptive"),
         init=InitConfig(shell="off", dense="off"),
