@@ -16,7 +16,7 @@ from typing import Any, Literal
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Float32, Int, UInt8
+from jaxtyping import Array, Bool, Float, Float32, Int, UInt, UInt8
 
 Split = Literal["train", "test"]
 
@@ -201,14 +201,14 @@ class Batch(eqx.Module):
 
     Attributes:
         camera: its camera, at the resolution of `ldr`.
-        ldr: the photograph, display-encoded, [0, 1].
+        ldr: the photograph, display-encoded: in [0, 1], or integers of which the largest is 1.
         mask: 1 = use, 0 = ignore.
         view_index: its row in `Photometry`.
     """
 
     camera: Camera
-    ldr: Float[Array, "h w 3"]
-    mask: Float[Array, "h w"]
+    ldr: Float[Array, "h w 3"] | UInt[Array, "h w 3"]
+    mask: Float[Array, "h w"] | Bool[Array, "h w"]
     view_index: Int[Array, ""]
 
 

@@ -69,7 +69,7 @@ class LossAux(NamedTuple):
 
 
 def decoded(batch: Batch) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"]]:
-    """Return a photograph in [0, 1] and its mask as floats; they may travel as 8 bits."""
+    """Return a photograph in [0, 1] and its mask as floats; they travel as they are stored."""
     ldr = batch.ldr.astype(jnp.float32)
     scale = float(np.iinfo(batch.ldr.dtype).max) if batch.ldr.dtype.kind == "u" else 1.0
     return ldr / scale, batch.mask.astype(jnp.float32)

@@ -31,10 +31,6 @@ class Room(NamedTuple):
     entries: int
     visible: int
 
-    def fits(self, entries: int, visible: int) -> bool:
-        """Return whether a view that needs this much has room."""
-        return entries <= self.entries and visible <= self.visible
-
     def grown(self, entries: int, visible: int) -> Room:
         """Return room for a view that did not fit, with some to spare."""
         return Room(

@@ -15,6 +15,13 @@ from p2gs_jax.types import Splats2D
 SMALLEST_CUTOFF = 1e-7
 
 
+def smallest_cutoff(cfg: RenderConfig) -> float:
+    """Return the lowest cutoff that any splat may have."""
+    if cfg.cutoff_rule == "opacity":
+        return cfg.alpha_cutoff
+    return min(SMALLEST_CUTOFF, cfg.alpha_cutoff)
+
+
 def log_cutoffs(
     splats: Splats2D, radiance: Float[Array, "n 3"], cfg: RenderConfig
 ) -> Float[Array, " n"]:
@@ -28,7 +35,7 @@ def log_cutoffs(
     shown = splats.visible
     mean = jnp.sum(jnp.where(shown, log_l, 0)) / jnp.maximum(jnp.sum(shown), 1)
     lowered = float(np.log(cfg.alpha_cutoff)) - jnp.maximum(log_l - mean, 0)
-    return jnp.maximum(lowered, float(np.log(min(SMALLEST_CUTOFF, cfg.alpha_cutoff))))
+    return jnp.maximum(lowered, float(np.log(smallest_cutoff(cfg))))
 
 
 def with_cutoffs(splats: Splats2D, radiance: Float[Array, "n 3"], cfg: RenderConfig) -> Splats2D:

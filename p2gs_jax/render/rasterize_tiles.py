@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render.binning.boxes import grid_size
-from p2gs_jax.render.cutoff import SMALLEST_CUTOFF
+from p2gs_jax.render.cutoff import smallest_cutoff
 from p2gs_jax.render.tile_rows import Plan, pack_rows
 from p2gs_jax.types import Splats2D, TileList
 
@@ -85,9 +85,7 @@ def rasterize_tiles(
     """
     tile_x, tile_y = cfg.tile
     across, down = grid_size(width, height, cfg.tile)
-    smallest = cfg.alpha_cutoff
-    if cfg.cutoff_rule == "radiance":
-        smallest = min(smallest, SMALLEST_CUTOFF)
+    smallest = smallest_cutoff(cfg)
     plan = Plan(
         across=across,
         down=down,

@@ -6,16 +6,16 @@ One view of a drive sees a fifth of the population. Everything that is done per 
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Int
 
 from p2gs_jax.config import RenderConfig
-from p2gs_jax.render.cutoff import SMALLEST_CUTOFF
+from p2gs_jax.numerics import namespace
+from p2gs_jax.render.cutoff import smallest_cutoff
 from p2gs_jax.render.project import LOG_SCALE_RANGE, TANGENT_LIMIT
-from p2gs_jax.render.xla_cpu import columns, compiled_loop
+from p2gs_jax.render.xla_cpu import compiled_loop
 from p2gs_jax.types import Camera, Gaussians
 
 # Pixels of slack for rounding.
@@ -29,26 +29,29 @@ def in_view(
 
     The projected covariance is bounded by that of a ball as wide as the widest axis: along x its
     deviation is at most s f / z sqrt(1 + t^2), t being the tangent at which `project` evaluates.
+
+    Args:
+        gaussians: the scene; on the host if everything is, and then so is the answer.
+        alive: slots in use.
+        camera: the view.
+        cfg: near plane, blur and cutoffs.
     """
+    xp = namespace(gaussians.means, camera.viewmat)
     R, t = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
-    means = columns(gaussians.means)
-    x, y, z = (sum(means[k] * R[i, k] for k in range(3)) + t[i] for i in range(3))
-    smallest = cfg.alpha_cutoff
-    if cfg.cutoff_rule == "radiance":
-        smallest = min(smallest, SMALLEST_CUTOFF)
-    reach = -jax.nn.softplus(-gaussians.opacity_logits) - float(np.log(smallest))
+    x, y, z = (sum(gaussians.means[:, k] * R[i, k] for k in range(3)) + t[i] for i in range(3))
+    reach = -xp.logaddexp(0.0, -gaussians.opacity_logits) - float(np.log(smallest_cutoff(cfg)))
     seen = alive & (z > cfg.near) & (reach > 0)
-    inverse_z = 1 / jnp.where(z > cfg.near, z, 1.0)
-    widest = jnp.exp(jnp.clip(jnp.max(gaussians.log_scales, -1), *LOG_SCALE_RANGE))
+    inverse_z = 1 / xp.where(z > cfg.near, z, 1.0)
+    widest = xp.exp(xp.clip(xp.max(gaussians.log_scales, -1), *LOG_SCALE_RANGE))
     sizes = ((x, camera.width, 0), (y, camera.height, 1))
     for along, size, axis in sizes:
         f, c = camera.K[axis, axis], camera.K[axis, 2]
         tangent = along * inverse_z
         limit = TANGENT_LIMIT * size / (2 * f)
-        slant = jnp.clip(tangent, -limit, limit)
+        slant = xp.clip(tangent, -limit, limit)
         deviation2 = (widest * f * inverse_z) ** 2 * (1 + slant * slant) + cfg.blur
-        radius = jnp.sqrt(2 * jnp.maximum(reach, 0) * deviation2) + SLACK
-        # Written so that what is not finite stays out of sight only where `project` hides it too.
+        radius = xp.sqrt(2 * xp.maximum(reach, 0) * deviation2) + SLACK
+        # Comparisons with NaN are false: what is not finite counts as seen, and `project` hides it.
         at = f * tangent + c
         seen = seen & ~((at + radius < 0) | (at - radius > size))
     return seen

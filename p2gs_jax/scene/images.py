@@ -11,7 +11,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, UInt
 from PIL import Image
 
 from p2gs_jax.config import DataConfig
@@ -23,6 +23,7 @@ from p2gs_jax.types import View
 _FULL = 0.999  # a pixel is valid only where all of its sources are
 _ALPHA_VALID = 0.5
 _MAX_PREFETCHED = 4
+_RESAMPLED_MAX = 65535
 
 
 def size_at(view: View, max_width: int | None, shrink: float = 1.0) -> tuple[int, int]:
@@ -52,22 +53,17 @@ def camera_at(
 
 @dataclass(frozen=True)
 class _Entry:
-    """A photograph as it is cached: as integers where nothing but decoding was needed."""
+    """A photograph as it is cached: as decoded, or as 16 bits where it was resampled."""
 
-    pixels: np.ndarray
+    pixels: np.ndarray  # unsigned integers; the largest is 1.0
     valid: np.ndarray  # bool
-    scale: float  # what 1.0 is in `pixels`
 
     @property
     def nbytes(self) -> int:
         return self.pixels.nbytes + self.valid.nbytes
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray]:
-        if self.pixels.dtype == np.float32:
-            ldr = self.pixels  # shared with the cache and therefore read-only
-        else:
-            ldr = self.pixels.astype(np.float32) / np.float32(self.scale)
-        return ldr, self.valid.astype(np.float32)
+        return _floats(self.pixels), self.valid.astype(np.float32)
 
 
 class ImageStore:
@@ -110,12 +106,22 @@ class ImageStore:
             shrink: factor >= 1 below the full size.
 
         Returns:
-            Display-encoded colours in [0, 1], possibly read-only, and the mask: 1 = use, 0 =
-            ignore (masked, transparent, or outside the photograph after undistortion).
+            Display-encoded colours in [0, 1], and the mask: 1 = use, 0 = ignore (masked,
+            transparent, or outside the photograph after undistortion).
 
         Raises:
             UserError: the file or its mask is missing, broken or of another size than the model's.
         """
+        return self._entry(index, shrink).arrays()
+
+    def stored(
+        self, index: int, shrink: float = 1.0
+    ) -> tuple[UInt[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
+        """Return what `get` does as it is kept, read-only: integers, of which the largest is 1."""
+        entry = self._entry(index, shrink)
+        return entry.pixels, entry.valid
+
+    def _entry(self, index: int, shrink: float) -> _Entry:
         key = self._key(index, shrink)
         with self._lock:
             entry = self._cache.get(key)
@@ -124,7 +130,7 @@ class ImageStore:
                 self._cache.move_to_end(key)
         if entry is None:
             entry = self._load(key) if pending is None else pending.result()
-        return entry.arrays()
+        return entry
 
     def camera(
         self, index: int, shrink: float = 1.0
@@ -188,10 +194,9 @@ def _prepare(view: View, width: int, height: int) -> _Entry:
         )
     if view.mask_path is not None:
         valid &= _decode_mask(view)
-    scale = float(np.iinfo(pixels.dtype).max)
     shrunk = (width, height) != (view.width, view.height)
     if view.distortion is not None or shrunk:
-        ldr = pixels.astype(np.float32) / np.float32(scale)
+        ldr = _floats(pixels)
         if view.distortion is not None:
             maps = undistortion_maps(view.K, view.distortion, view.width, view.height)
             ldr = cv2.remap(ldr, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -202,9 +207,13 @@ def _prepare(view: View, width: int, height: int) -> _Entry:
             valid = _resample_valid(
                 valid, lambda v: cv2.resize(v, size, interpolation=cv2.INTER_AREA)
             )
-        pixels, scale = ldr, 1.0
-    pixels.flags.writeable = False
-    return _Entry(pixels, valid, scale)
+        pixels = np.rint(ldr * np.float32(_RESAMPLED_MAX)).astype(np.uint16)
+    pixels.flags.writeable = valid.flags.writeable = False
+    return _Entry(pixels, valid)
+
+
+def _floats(pixels: UInt[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
+    return pixels.astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
 
 
 def _resample_valid(

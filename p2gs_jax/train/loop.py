@@ -57,7 +57,7 @@ from p2gs_jax.train.state import (
 from p2gs_jax.train.step import Controls, StepReport, finite_names, make_step
 from p2gs_jax.train.validation import make_judge
 from p2gs_jax.train.views import TrainingViews
-from p2gs_jax.types import Params
+from p2gs_jax.types import Batch, Camera, Params
 
 PAIRS_PER_STEP = 4096
 MAX_BURST = 50
@@ -322,9 +322,7 @@ class Trainer:
                     np.int32(schedule.sh_degree_at(progress, self.cfg.train, self.sh_degree)),
                 ),
             )
-            key = Key(
-                size, state.params.gaussians.capacity, self._room(host, size), self._degree(shrink)
-            )
+            key = self._program(state, batch, host, shrink)
             state, report = self.programs.get(key, *arguments)(*arguments)
             reports.append((step, progress, report))
             progress = progress + host.pace
@@ -355,6 +353,11 @@ class Trainer:
     def _room(self, host: HostState, size: tuple[int, int]) -> Room:
         return host.rooms[_name(size)]
 
+    def _program(self, state: FitState, batch: Batch, host: HostState, shrink: int) -> Key:
+        size = (batch.camera.width, batch.camera.height)
+        room, degree = self._room(host, size), self._degree(shrink)
+        return Key(size, state.params.gaussians.capacity, room, degree, str(batch.ldr.dtype))
+
     def _degree(self, shrink: int) -> int:
         """Return the highest spherical-harmonics degree that a level of the schedule uses."""
         end = next((end for end, factor in self.levels if factor == shrink), 1.0)
@@ -365,31 +368,26 @@ class Trainer:
         gaussians = jax.tree.map(np.asarray, state.params.gaussians)
         alive = np.asarray(state.population.alive)
         most = max(limit or 0, state.params.gaussians.capacity)
-        if not self.cfg.optimizer.visible_only:
-            most = max(most, len(alive))
         for end, shrink in self.levels:
             if end <= host.progress:
                 continue
-            cameras: dict[tuple[int, int], list[int]] = {}
+            cameras: dict[tuple[int, int], list[Camera]] = {}
             for index in range(len(self.views)):
-                camera = self.views.host_camera(index, shrink)
-                cameras.setdefault((camera.width, camera.height), []).append(index)
-            for size, indices in cameras.items():
+                camera = self.views.camera(index, shrink)
+                cameras.setdefault((camera.width, camera.height), []).append(camera)
+            for size, taken in cameras.items():
                 if _name(size) not in host.rooms:
-                    taken = [self.views.host_camera(i, shrink) for i in indices]
                     host.rooms[_name(size)] = room_for(
                         gaussians, alive, taken, most, self.cfg.render
                     )
             if self.auto or self.cfg.densify.method == "adaptive" or len(cameras) > 1:
                 continue  # the population's slots, or the sizes, are not known beforehand
-            (size,) = cameras
-            degree = self._degree(shrink)
-            key = Key(size, state.params.gaussians.capacity, host.rooms[_name(size)], degree)
             step = host.step
+            batch = self.views.batch(self.views.index_at(step), shrink)
             self.programs.expect(
-                key,
+                self._program(state, batch, host, shrink),
                 state,
-                self.views.batch(self.views.index_at(step), shrink),
+                batch,
                 self._partner(step, shrink),
                 on_host(Controls, np.float32(0), np.int32(0)),
             )

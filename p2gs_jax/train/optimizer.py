@@ -16,6 +16,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int
 
 from p2gs_jax.config import FitConfig
+from p2gs_jax.densify.population import grow
 from p2gs_jax.photometry.solution import LADDER
 from p2gs_jax.types import Gaussians, Params, Photometry
 
@@ -181,14 +182,10 @@ def _changed(opt_state: OptState, change, counts) -> OptState:
 
 def grow_moments(opt_state: OptState, empty: Gaussians) -> OptState:
     """Append zero moments for new slots, as many as `empty` has."""
-    counts = opt_state.gaussians[0].counts
-    more = jnp.zeros(empty.means.shape[0], counts.dtype)
+    adam, *others = opt_state.gaussians
     zeros = jax.tree.map(jnp.zeros_like, empty)
-    return _changed(
-        opt_state,
-        lambda m: jax.tree.map(lambda a, b: jnp.concatenate([a, b]), m, zeros),
-        jnp.concatenate([counts, more]),
-    )
+    none = AdamState(jnp.zeros(empty.capacity, adam.counts.dtype), zeros, zeros)
+    return opt_state._replace(gaussians=(grow(adam, none), *others))
 
 
 def zero_moments(opt_state: OptState, where: Bool[Array, " n"]) -> OptState:

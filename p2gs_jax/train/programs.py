@@ -23,12 +23,14 @@ class Key(NamedTuple):
         slots: room of the population.
         room: of a view.
         degree: highest spherical-harmonics degree in use.
+        pixels: type of the photographs as they are stored.
     """
 
     size: tuple[int, int]
     slots: int
     room: Room
     degree: int
+    pixels: str
 
 
 class StepPrograms:
@@ -46,11 +48,6 @@ class StepPrograms:
         self._made: dict[Key, Future] = {}
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="compile")
         self.waited_s = 0.0
-
-    @property
-    def count(self) -> int:
-        """Programs compiled or under way."""
-        return len(self._made)
 
     def expect(self, key: Key, *arguments: Any) -> None:
         """Begin to compile a step in the background.

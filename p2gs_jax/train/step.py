@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.losses.regularizers import population_terms
@@ -77,6 +77,14 @@ def _recentered(photometry: Photometry, cfg: FitConfig) -> Photometry:
         return photometry
     raw = photometry.raw_exposures
     return dataclasses.replace(photometry, raw_exposures=raw - jnp.mean(raw))
+
+
+def _rest_updated(optimizer: Optimizer, moments, rest, grads, rates, cfg: FitConfig):
+    """Return photometry and appearance after a step, and their moments."""
+    # optax annotates trees as nests of containers and does not know our records.
+    updates, moments = optimizer.rest.update(grads, moments, rest, rates=rates)
+    photometry, appearance = cast(Any, optax.apply_updates(rest, updates))
+    return (_recentered(photometry, cfg), appearance), moments
 
 
 def _observed(population: Population, ids, v_means2d: Array, aux: LossAux, camera: Camera):
@@ -151,10 +159,8 @@ def make_step(cfg: FitConfig, optimizer: Optimizer, extent: float):
         )(shown, photometry, appearance, batch, partner, cfg, room.entries)
 
         fits = ~aux.overflow & (count <= ids.shape[0])
-        values = [*aux.terms.values(), *jax.tree.leaves(v_rest)]
-        finite = jnp.stack([jnp.all(jnp.isfinite(v)) for v in values])
         first = state.fault.kind == FAULT_NONE
-        healthy = first & fits & jnp.all(finite)
+        healthy = first & fits & jnp.all(_finite((aux.terms, v_rest)))
 
         rates = learning_rates(controls.progress, extent, state.params, cfg, bands)
         listed = jnp.sum(alive.at[ids].get(mode="fill", fill_value=False))
@@ -178,35 +184,32 @@ def make_step(cfg: FitConfig, optimizer: Optimizer, extent: float):
             if mcmc
             else None,
         )
-        # optax annotates trees as nests of containers and does not know our records.
-        rest = (photometry, appearance)
-        updates, rest_moments = optimizer.rest.update(
-            cast(Any, tuple(v_rest)),
+        rest, rest_moments = _rest_updated(
+            optimizer,
             state.opt_state.rest,
-            cast(Any, rest),
-            rates=(rates.photometry, rates.appearance),
-        )
-        moved_photometry, moved_appearance = cast(
-            Any, optax.apply_updates(cast(Any, rest), cast(Any, updates))
+            (photometry, appearance),
+            tuple(v_rest),
+            (rates.photometry, rates.appearance),
+            cfg,
         )
         if not mcmc:
             where = jnp.where(healthy, ids, n)
             v_means2d = v_shown[0][0].means2d
             population = _observed(population, where, v_means2d, aux, batch.camera)
 
+        # In the order of `finite_names`.
         terms = aux.terms | updated.value
-        all_finite = jnp.concatenate([finite[: len(aux.terms)], _ones(len(updated.value))])
-        all_finite = jnp.concatenate([all_finite, updated.finite, finite[len(aux.terms) :]])
-        broken = FAULT_NONFINITE * ~jnp.all(all_finite)
+        checked = jnp.concatenate([_finite(terms), updated.finite, _finite(v_rest)])
+        broken = FAULT_NONFINITE * ~jnp.all(checked)
         kind = jnp.where(fits, broken, FAULT_OVERFLOW).astype(jnp.int32)
-        term = jnp.argmin(all_finite).astype(jnp.int32)
+        term = jnp.argmin(checked).astype(jnp.int32)
         fault = jax.tree.map(
             lambda a, b: jnp.where(first, a, b), Fault(kind, aux.entries, count, term), state.fault
         )
         rest, rest_moments = jax.tree.map(
-            lambda a, b: jnp.where(healthy, b, a),
-            (rest, state.opt_state.rest),
-            ((_recentered(moved_photometry, cfg), moved_appearance), rest_moments),
+            lambda new, old: jnp.where(healthy, new, old),
+            (rest, rest_moments),
+            ((photometry, appearance), state.opt_state.rest),
         )
         advanced = fault.kind == FAULT_NONE
         state = FitState(
@@ -233,5 +236,6 @@ def _differentiable(shown):
     )
 
 
-def _ones(count: int):
-    return jnp.ones(count, bool)
+def _finite(values) -> Bool[Array, " k"]:
+    """Return whether each array of a tree is finite."""
+    return jnp.stack([jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(values)])

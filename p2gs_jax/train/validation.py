@@ -84,18 +84,16 @@ def make_judge(
         correction = params.mean_correction
         scores = []
         for row in rows:
-            batch = views.batch(row, 1)
-            linear = render(params.gaussians, alive, batch.camera).linear
+            photograph, mask = views.store.get(views.rows[row])
+            linear = render(params.gaussians, alive, views.camera(row, 1)).linear
             if own_exposures:
                 gamma = params.photometry.gammas[row]
                 exposure = params.photometry.exposures[row]
             else:
                 gamma = mean_gamma
-                exposure = fit_exposure(
-                    linear, batch.ldr, batch.mask, gamma, cfg.photometry, correction
-                )
+                exposure = fit_exposure(linear, photograph, mask, gamma, cfg.photometry, correction)
             ldr = display(formation(linear, exposure, gamma, cfg.photometry, correction))
-            scores.append(float(psnr(ldr, batch.ldr, batch.mask)))
+            scores.append(float(psnr(ldr, photograph, mask)))
         return float(np.mean(scores))
 
     return judge

@@ -9,7 +9,6 @@ from jaxtyping import Int
 
 from p2gs_jax.numerics import on_host
 from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.train.room import HostCamera
 from p2gs_jax.types import Batch, Camera
 
 
@@ -76,15 +75,11 @@ class TrainingViews:
         """Begin decoding a view in the background."""
         self.store.prefetch(self.rows[index], shrink)
 
-    def host_camera(self, index: int, shrink: int) -> HostCamera:
-        """Return the camera of a training view at a level, on the host."""
-        return HostCamera(*self.store.camera(self.rows[index], shrink))
-
     def camera(self, index: int, shrink: int) -> Camera:
-        """Return the camera of a training view at a level."""
-        return on_host(Camera, *self.host_camera(index, shrink))
+        """Return the camera of a training view at a level, on the host."""
+        return on_host(Camera, *self.store.camera(self.rows[index], shrink))
 
     def batch(self, index: int, shrink: int) -> Batch:
         """Return a training view, on the host: a compiled step takes it from there."""
-        ldr, mask = self.store.get(self.rows[index], shrink)
+        ldr, mask = self.store.stored(self.rows[index], shrink)
         return on_host(Batch, self.camera(index, shrink), ldr, mask, np.int32(index))

@@ -14,7 +14,7 @@ from p2gs_jax.config import RenderConfig
 from p2gs_jax.render import bin_tiles, project, required_capacity, view_radiance
 from p2gs_jax.render.cutoff import with_cutoffs
 from p2gs_jax.render.visible import compact, in_view
-from p2gs_jax.train.room import HostCamera, HostGaussians, count_view
+from p2gs_jax.train.room import count_view
 from p2gs_jax.types import Camera, Gaussians
 
 COUNT, WIDTH, HEIGHT = 300, 80, 56
@@ -81,9 +81,8 @@ def test_all_that_is_listed_is_in_view_and_counted(rule, seed, spread, size, sha
     seen, listed, need = jax.tree.map(np.asarray, seen_and_listed(gaussians, alive, camera, cfg))
     assert not (listed & ~seen).any()
     assert not seen[~np.asarray(alive)].any()
-    host = HostGaussians.of(jax.tree.map(np.asarray, gaussians), np.asarray(alive), cfg)
-    at = HostCamera(np.asarray(camera.viewmat), np.asarray(camera.K), WIDTH, HEIGHT)
-    entries, visible = count_view(host, at, cfg)
+    host, at = jax.tree.map(np.asarray, (gaussians, camera))
+    entries, visible = count_view(host, np.asarray(alive), at, cfg)
     # Both are bounds up to rounding at the edges of tiles and of the image.
     assert entries >= need - 2
     assert visible >= listed.sum()
