@@ -18,9 +18,12 @@ MAX_FEATURES = 4096
 EXHAUSTIVE_LIMIT = 60
 """Up to this many images every pair is matched."""
 _OVERLAP = 10
-_NEIGHBOURS = 20
-# With known poses (nerf_fox, 50 views): the nearest 20 give 574 pairs in 16 s and 11,936 points,
-# all 1,225 pairs take 57 s and give 12,146; same reprojection error (2 shared CPU cores).
+# With known poses (nerf_fox, 50 views of 540x960, processor time): the nearest 20 give 574 pairs in
+# 71 s and 11,961 points, the nearest 10 292 pairs in 53 s and 12,017 points.
+_NEIGHBOURS = 10
+# Photographs this long are not enlarged before features are sought where poses are known (nerf_fox:
+# 53 s and 12,017 points become 15 s and 5,449); exposures and dense seeds need no more of them.
+_LONG_ENOUGH = 800
 _EXHAUSTIVE_LIMIT_BY_POSE = _NEIGHBOURS + 5
 
 Pair = tuple[str, str]
@@ -32,7 +35,12 @@ def quiet_colmap() -> None:
 
 
 def extract(
-    database: Path, image_folder: Path, names: Sequence[str], *, mode: pycolmap.CameraMode
+    database: Path,
+    image_folder: Path,
+    names: Sequence[str],
+    *,
+    mode: pycolmap.CameraMode,
+    longest_side: int = 0,
 ) -> None:
     """Detect SIFT features on the CPU and store them.
 
@@ -41,6 +49,7 @@ def extract(
         image_folder: what `names` are relative to.
         names: images to read.
         mode: how the images share cameras.
+        longest_side: of the images, pixels, where fewer features are enough.
 
     Raises:
         UserError: COLMAP gave up.
@@ -48,6 +57,8 @@ def extract(
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size = MAX_IMAGE_SIZE
     options.sift.max_num_features = MAX_FEATURES
+    if longest_side >= _LONG_ENOUGH:
+        options.sift.first_octave = 0
     try:
         pycolmap.extract_features(
             database,
@@ -114,7 +125,7 @@ def pairs_by_name(names: Sequence[str]) -> list[Pair] | None:
 def pairs_by_pose(names: Sequence[str], viewmats: Float[np.ndarray, "v 4 4"]) -> list[Pair] | None:
     """Return the pairs to match where poses are known; None means all.
 
-    Each image meets the 20 nearest cameras that look less than 75 degrees another way.
+    Each image meets the 10 nearest cameras that look less than 75 degrees another way.
 
     Args:
         names: of the images.

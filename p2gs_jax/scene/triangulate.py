@@ -69,7 +69,13 @@ def _build(folder: Path, views: Sequence[View], report: Callable[[str], None]) -
     database = folder / "database.db"
     report(f"no seed points: detecting features in {len(views)} images")
     # Intrinsics are held fixed, so it does not matter that every image has its own camera.
-    extract(database, image_folder, names, mode=pycolmap.CameraMode.PER_IMAGE)
+    extract(
+        database,
+        image_folder,
+        names,
+        mode=pycolmap.CameraMode.PER_IMAGE,
+        longest_side=max(max(view.width, view.height) for view in views),
+    )
     prior = _set_cameras(database, views)
     pairs = pairs_by_pose(names, np.stack([view.viewmat for view in views]))
     n = len(views) * (len(views) - 1) // 2 if pairs is None else len(pairs)
