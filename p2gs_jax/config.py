@@ -271,6 +271,9 @@ class DensifyConfig:
     """Factor by which MCMC grows the population each time (3DGS-MCMC)."""
     noise: float = 5e5
     """Scale of the MCMC noise on the means, times their learning rate (3DGS-MCMC)."""
+    spread: float = 0.5
+    """How far apart MCMC puts Gaussians that come to share a place, in standard deviations; 0: not
+    at all (3DGS-MCMC; ours: they would stay twins, BUILD_NOTES)."""
 
 
 @dataclass(frozen=True)

@@ -58,14 +58,16 @@ def relocate_and_grow(
 ) -> Outcome:
     """Move transparent Gaussians onto opaque ones and add `births` new ones there.
 
-    Targets are drawn in proportion to opacity; everyone in one place shares its look.
+    Targets are drawn in proportion to opacity; everyone in one place shares its look, and they are
+    moved apart by `cfg.spread` of their extent: Gaussians in exactly one place have the same
+    gradients, and at opacities that no noise reaches they never part (BUILD_NOTES, "Twins").
 
     Args:
         key: randomness.
         gaussians: the scene.
         population: who is alive.
         births: new Gaussians wanted; those without a free slot are counted in `refused`.
-        cfg: opacity threshold.
+        cfg: opacity threshold, spread.
     """
     n = population.alive.shape[0]
     dead = transparent(gaussians, population, cfg)
@@ -93,9 +95,39 @@ def relocate_and_grow(
     )
     source = jnp.where(movers, jnp.minimum(target, n - 1), jnp.arange(n))
     gaussians = jax.tree.map(lambda a: a[source], gaussians)
+    # Whoever stays gives way to the other side, so that the centre of the place stays.
+    raw = jax.random.normal(jax.random.fold_in(key, 1), (n, 3))
+    away = jnp.where(movers[:, None], raw, 0.0)
+    pushed = jnp.zeros((n, 3)).at[target].add(away, mode="drop")
+    away = away - jnp.where(shared, 1 / jnp.maximum(arrivals, 1), 0.0)[:, None] * pushed
+    gaussians = _apart(gaussians, away, (movers | shared) & (cfg.spread > 0), cfg.spread)
     refused = births - jnp.sum(newborn)
     return Outcome(
         gaussians, fresh_population(population.alive | (newborn & movers)), movers | shared, refused
+    )
+
+
+def _apart(
+    gaussians: Gaussians, away: Float[Array, "n 3"], where: Bool[Array, " n"], spread: float
+) -> Gaussians:
+    """Move Gaussians within their own extent, and shrink them by what that adds to the place.
+
+    Args:
+        gaussians: the scene.
+        away: directions in units of the principal axes, variance 1.
+        where: whom.
+        spread: deviation of the moves over that of the Gaussian, below 1.
+    """
+    R, scales = rotation_matrices(gaussians.quats), jnp.exp(gaussians.log_scales)
+    local = [spread * away[:, j] * scales[:, j] for j in range(3)]
+    moved = jnp.stack([sum(R[i][j] * local[j] for j in range(3)) for i in range(3)], -1)
+    on = where[:, None]
+    return dataclasses.replace(
+        gaussians,
+        means=jnp.where(on, gaussians.means + moved, gaussians.means),
+        log_scales=jnp.where(
+            on, gaussians.log_scales + 0.5 * float(np.log1p(-(spread**2))), gaussians.log_scales
+        ),
     )
 
 

@@ -1,6 +1,7 @@
 """Populations grow, shrink and move without changing what nobody asked to change."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -141,11 +142,42 @@ def test_relocation_moves_the_transparent_and_adds_births():
     assert int(out.refused) == 0
     live = np.asarray(out.population.alive)
     assert float(opacities(out.gaussians)[live].min()) > CFG.prune_opacity
+    # Each lies within a few deviations of one that was healthy.
     healthy = np.asarray(g.means[3:])
+    widest = float(np.exp(g.log_scales).max())
     for i in np.flatnonzero(live):
-        assert np.any(np.all(np.isclose(healthy, np.asarray(out.gaussians.means[i])), axis=1))
+        distance = np.linalg.norm(healthy - np.asarray(out.gaussians.means[i]), axis=1)
+        assert distance.min() < 3 * widest
     more = mcmc.relocate_and_grow(jax.random.key(1), grown, p, jnp.int32(9), CFG)
     assert int(more.refused) == 3
+
+
+def test_two_that_share_a_place_part_about_its_centre_and_keep_its_extent():
+    g = dataclasses.replace(
+        made(1),
+        quats=jnp.full((1, 4), 0.5),  # x -> y -> z -> x
+        log_scales=jnp.log(jnp.array([[0.5, 0.1, 0.02]])),
+    )
+    grown, p = grow(g, empty_gaussians(1, g)), fresh_population(jnp.arange(2) < 1)
+
+    @functools.partial(jax.jit, static_argnums=1)
+    def births(keys, spread):
+        cfg = dataclasses.replace(CFG, spread=spread)
+
+        def born(key):
+            return mcmc.relocate_and_grow(key, grown, p, jnp.int32(1), cfg).gaussians
+
+        return jax.vmap(born)(keys)
+
+    keys = jax.random.split(jax.random.key(0), 2000)
+    together, apart = (jax.tree.map(np.asarray, births(keys, s)) for s in (0.0, 0.5))
+    assert not np.ptp(together.means, axis=1).any()
+    centre = np.asarray(g.means)
+    np.testing.assert_allclose(apart.means.mean(1), np.tile(centre, (2000, 1)), atol=1e-5)
+    variance = ((apart.means - centre) ** 2).mean((0, 1))[[1, 2, 0]]
+    whole = np.exp(2 * together.log_scales[0, 0])
+    np.testing.assert_allclose(np.exp(2 * apart.log_scales[0, 0]), 0.75 * whole, rtol=1e-4)
+    np.testing.assert_allclose(variance, 0.25 * whole, rtol=0.1)
 
 
 def test_relocation_with_nobody_healthy_changes_nothing():
