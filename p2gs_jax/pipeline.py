@@ -65,6 +65,7 @@ def optimise(
         views,
         prepared.extent,
         prepared.pairs,
+        prepared.coverage,
         run_dir,
         on_log=reporter.log,
         on_message=reporter.message,

@@ -12,7 +12,7 @@ import numpy as np
 
 from p2gs_jax.clock import Stopwatch
 from p2gs_jax.config import FitConfig
-from p2gs_jax.densify.population import default_max_gaussians
+from p2gs_jax.densify.population import Coverage, default_max_gaussians
 from p2gs_jax.errors import UserError
 from p2gs_jax.init.brightness import Tones, rough_tones
 from p2gs_jax.init.correspondence import has_tracks, surface_colors
@@ -39,6 +39,7 @@ from p2gs_jax.progress import Reporter
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.scene.known_exposures import read_known_exposures
+from p2gs_jax.scene.visibility import shown_share
 from p2gs_jax.types import GAMMA_SRGB, Gaussians, Params, Photometry, Scene
 
 PAIR_POOL = 200_000
@@ -67,6 +68,7 @@ class Prepared:
         selection: photometric model, exposures and their errors from the tracks, or None.
         pairs: corresponding observations, or None.
         overlaps: for every training view the ones that show the same surfaces, or None.
+        coverage: how much of the scene the views show.
         cfg: the configuration, adapted to what the scene offers.
         notes: what the user should know.
     """
@@ -78,6 +80,7 @@ class Prepared:
     selection: Selection | None
     pairs: ColorPairs | None
     overlaps: list[np.ndarray] | None
+    coverage: Coverage
     cfg: FitConfig
     notes: list[str] = field(default_factory=list)
 
@@ -133,7 +136,8 @@ def prepare(
             "it.",
             fix="add --photometry.start random, or use a preset whose name begins with 3dgs",
         )
-    dense = wants_dense(scene, store, cfg)
+    coverage = coverage_of(scene, store)
+    dense = wants_dense(scene, coverage, cfg)
     if has_tracks(scene) or cfg.photometry.start == "tracks" or dense:
         if not has_tracks(scene):
             notes.append("No tracks: seed points are projected into the views instead.")
@@ -171,7 +175,7 @@ def prepare(
             if start is None
             else Tones.of(start.log_exposures, start.gammas, cfg.photometry)
         )
-        added = _dense(scene, store, match, points, photometry, cfg, reporter)
+        added = _dense(scene, store, match, points, photometry, coverage, cfg, reporter)
         gaussians = _seed_gaussians(points, radiance, added, views, cfg)
         covering = np.concatenate([covering, added.points])
         notes.append(added.note())
@@ -199,38 +203,42 @@ def prepare(
         selection,
         _pairs(tracks, cfg),
         _overlaps(tracks, cfg),
+        coverage,
         cfg,
         notes,
     )
 
 
-def seed_bound(cfg: FitConfig, seeds: int, width: int, height: int, views: int) -> int:
+def coverage_of(scene: Scene, store: ImageStore) -> Coverage:
+    """Return how much of a scene its training views show; the largest counts."""
+    sizes = [store.camera(i)[2:] for i in scene.train_indices]
+    views = [scene.views[i] for i in scene.train_indices]
+    return Coverage(max(w * h for w, h in sizes), shown_share(scene.points, views))
+
+
+def seed_bound(cfg: FitConfig, seeds: int, coverage: Coverage) -> int:
     """Return the bound on the population that the seeds are measured by.
 
     Args:
         cfg: the bound, if it is given.
         seeds: points of the scene.
-        width: of the training photographs, pixels.
-        height: likewise.
-        views: training views.
+        coverage: by the training photographs.
     """
     given = cfg.densify.max_gaussians
     if isinstance(given, int):
         return given
-    return default_max_gaussians(seeds, width, height, views, cfg.train)
+    return default_max_gaussians(seeds, coverage, cfg.train)
 
 
-def dense_limit(cfg: FitConfig, seeds: int, width: int, height: int, views: int) -> int:
+def dense_limit(cfg: FitConfig, seeds: int, coverage: Coverage) -> int:
     """Return how many dense seeds a fit may start from.
 
     Args:
         cfg: the bound on the population and `init.dense_points`.
         seeds: that are there already.
-        width: of the training photographs, pixels.
-        height: likewise.
-        views: training views.
+        coverage: by the training photographs.
     """
-    bound = seed_bound(cfg, seeds, width, height, views)
+    bound = seed_bound(cfg, seeds, coverage)
     room = bound - seeds
     wanted = cfg.init.dense_points
     if wanted is None:
@@ -240,7 +248,7 @@ def dense_limit(cfg: FitConfig, seeds: int, width: int, height: int, views: int)
     return max(0, min(wanted, room))
 
 
-def wants_dense(scene: Scene, store: ImageStore, cfg: FitConfig) -> bool:
+def wants_dense(scene: Scene, coverage: Coverage, cfg: FitConfig) -> bool:
     """Return whether the scene gets dense seeds.
 
     The baselines that splat display values get them as well: a comparison with them is about
@@ -248,12 +256,10 @@ def wants_dense(scene: Scene, store: ImageStore, cfg: FitConfig) -> bool:
     """
     if cfg.init.dense == "off" or len(scene.train_indices) < FEWEST_VIEWS:
         return False
-    _, _, width, height = store.camera(scene.train_indices[0])
     seeds = min(len(scene.points), cfg.init.max_seeds)
-    views = len(scene.train_indices)
-    if dense_limit(cfg, seeds, width, height, views) == 0:
+    if dense_limit(cfg, seeds, coverage) == 0:
         return False
-    bound = seed_bound(cfg, seeds, width, height, views)
+    bound = seed_bound(cfg, seeds, coverage)
     return cfg.init.dense == "on" or seeds < ENOUGH_SEEDS * bound
 
 
@@ -263,11 +269,11 @@ def _dense(
     match: Tones,
     points: np.ndarray,
     photometry: Photometry,
+    coverage: Coverage,
     cfg: FitConfig,
     reporter: Reporter,
 ) -> DenseSeeds:
     """Find dense seeds, with radiances in the gauge of the exposures that the fit starts from."""
-    _, _, width, height = store.camera(scene.train_indices[0])
     raw, gammas = np.asarray(photometry.raw_exposures), np.asarray(photometry.raw_gammas)
     most_views, budget = MOST_VIEWS, cfg.train.budget_s
     if budget is not None:
@@ -284,7 +290,7 @@ def _dense(
         Tones.of(log_exposures, gammas, cfg.photometry),
         cfg,
         existing=points,
-        limit=dense_limit(cfg, len(points), width, height, len(scene.train_indices)),
+        limit=dense_limit(cfg, len(points), coverage),
         most_views=most_views,
         on_view=lambda i, n: reporter.stage("Matching photographs", i, n),
     )

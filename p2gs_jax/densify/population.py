@@ -49,39 +49,44 @@ def empty_gaussians(count: int, like: Gaussians) -> Gaussians:
 
 # A step costs about this many seconds a pixel (ours; two cores of 2025).
 STEP_SECONDS_PER_PIXEL = 5e-7
-# Gaussians a pixel of a view: rising with the length of a run up to the second (ours: BUILD_NOTES).
-SMALLEST_SHARE, LARGEST_SHARE, STEPS_PER_SHARE = 0.1, 0.5, 8000
-# Few views cannot tell more Gaussians apart: at 28 of them twice as many gained nothing.
-VIEWS_PER_SHARE = 200
+# Gaussians a pixel of a view that it shows: rising with the steps of a run from the first to the
+# second (ours: BUILD_NOTES, "Population").
+SMALLEST_SHARE, LARGEST_SHARE, STEPS_PER_SHARE = 0.1, 0.3, 15_000
 MOST_BY_DEFAULT = 400_000
 
 
-def default_share(steps: float, views: int) -> float:
-    """Return how many Gaussians a pixel of a view so many steps and training views can fit."""
-    most = min(steps / STEPS_PER_SHARE, views / VIEWS_PER_SHARE, LARGEST_SHARE)
-    return max(most, SMALLEST_SHARE)
+class Coverage(NamedTuple):
+    """How much of a scene its views show.
+
+    Attributes:
+        pixels: of one view.
+        shown: share of the scene that a view shows on average.
+    """
+
+    pixels: int
+    shown: float
+
+    def gaussians(self, steps: float) -> int:
+        """Return how many Gaussians so many steps can fit."""
+        share = min(max(steps / STEPS_PER_SHARE, SMALLEST_SHARE), LARGEST_SHARE)
+        return int(share * self.pixels / self.shown)
 
 
-def default_max_gaussians(
-    seeds: int, width: int, height: int, views: int, train: TrainConfig
-) -> int:
+def default_max_gaussians(seeds: int, coverage: Coverage, train: TrainConfig) -> int:
     """Return the population limit where none is configured.
 
-    A long run can fit more Gaussians than a short one. The limit is never below the seeds and a
-    quarter.
+    A long run can fit more Gaussians than a short one, and a scene of which a view shows little
+    needs more. The limit is never below the seeds and a quarter.
 
     Args:
         seeds: points of the scene.
-        width: of the training photographs, pixels.
-        height: likewise.
-        views: training views.
+        coverage: by the training photographs.
         train: steps or budget.
     """
-    pixels = width * height
     steps = train.steps
     if train.budget_s is not None:
-        steps = train.budget_s / (STEP_SECONDS_PER_PIXEL * pixels)
-    wanted = min(int(default_share(steps, views) * pixels), MOST_BY_DEFAULT)
+        steps = train.budget_s / (STEP_SECONDS_PER_PIXEL * coverage.pixels)
+    wanted = min(coverage.gaussians(steps), MOST_BY_DEFAULT)
     return max(int(1.25 * seeds), wanted, 1000)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import minimum_filter
@@ -12,6 +14,8 @@ from p2gs_jax.types import View
 SPACINGS = 1.5
 # ... and nearer by more than this share of its depth.
 DEPTH_MARGIN = 0.05
+# Evenly taken where there are more.
+SHARE_VIEWS, SHARE_POINTS = 32, 20_000
 
 
 def project_points(
@@ -23,6 +27,24 @@ def project_points(
     ahead = np.where(z > 1e-6, z, 1.0)
     focal, center = view.K[[0, 1], [0, 1]], view.K[[0, 1], [2, 2]]
     return local[:, :2] / ahead[:, None] * focal + center, z
+
+
+def shown_share(points: Float[np.ndarray, "p 3"], views: Sequence[View]) -> float:
+    """Return the share of the points that lies in a view's frustum, on average; 1 without points.
+
+    Not below 1 / views: together the views show all that matters.
+    """
+    if not len(points):
+        return 1.0
+    picked = np.linspace(0, len(views) - 1, min(SHARE_VIEWS, len(views))).round().astype(int)
+    sample = points[:: max(1, len(points) // SHARE_POINTS)]
+    shares = []
+    for view in (views[i] for i in picked):
+        xy, z = project_points(sample, view)
+        shares.append(
+            np.mean((z > 1e-6) & (xy >= 0).all(1) & (xy < [view.width, view.height]).all(1))
+        )
+    return float(max(np.mean(shares), 1 / len(views)))
 
 
 def unoccluded(

@@ -27,9 +27,9 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.densify import adaptive, mcmc
 from p2gs_jax.densify.population import (
     STEP_SECONDS_PER_PIXEL,
+    Coverage,
     bucket_for,
     default_max_gaussians,
-    default_share,
 )
 from p2gs_jax.errors import DivergenceError, UserError
 from p2gs_jax.export.atomic import append_jsonl, read_jsonl, write_text
@@ -104,6 +104,7 @@ class Trainer:
         views: the training views.
         extent: scene extent, scene units.
         pairs: corresponding observations, for the relative-exposure readings that need them.
+        coverage: how much of the scene the views show.
         run_dir: where `log.jsonl` and `checkpoints/` go.
         on_log: called with every log record.
         on_message: called with everything the user must know.
@@ -117,6 +118,7 @@ class Trainer:
         views: TrainingViews,
         extent: float,
         pairs: ColorPairs | None,
+        coverage: Coverage,
         run_dir: Path,
         on_log: Callable[[LogRecord], None] = lambda record: None,
         on_message: Callable[[str], None] = lambda text: None,
@@ -124,6 +126,7 @@ class Trainer:
         own_exposures: bool = False,
     ):
         self.cfg, self.views, self.extent, self.pairs = cfg, views, extent, pairs
+        self.coverage = coverage
         self.run_dir, self.on_log, self.on_message = run_dir, on_log, on_message
         self.optimizer = make_optimizer(cfg)
         self.programs = StepPrograms(make_step(cfg, self.optimizer, extent))
@@ -135,7 +138,6 @@ class Trainer:
         self.checkpoints = CheckpointStore(run_dir / "checkpoints")
         self.log_path = run_dir / "log.jsonl"
         sizes = [views.camera(i, 1) for i in range(len(views))]
-        self.width, self.height = max((c.width, c.height) for c in sizes)
         self.levels = schedule.levels(
             cfg.train, min(c.width for c in sizes), min(c.height for c in sizes)
         )
@@ -265,7 +267,7 @@ class Trainer:
         """Return how many times slower than expected full-size steps are, from 1 to 3."""
         if host.shrink != 1 or host.step_s <= 0:
             return 1.0
-        expected = STEP_SECONDS_PER_PIXEL * self.width * self.height
+        expected = STEP_SECONDS_PER_PIXEL * self.coverage.pixels
         return min(max(host.step_s / expected, 1.0), 3.0)
 
     def _seconds(self) -> dict[str, float]:
@@ -275,9 +277,7 @@ class Trainer:
     def _limit(self, seeds: int) -> int | None:
         """Return the bound on the population; None: there is none."""
         d = self.cfg.densify
-        default = default_max_gaussians(
-            seeds, self.width, self.height, len(self.views), self.cfg.train
-        )
+        default = default_max_gaussians(seeds, self.coverage, self.cfg.train)
         if d.max_gaussians == "auto":
             return growth.upper_bound(seeds, default)
         if d.method != "mcmc":
@@ -493,8 +493,7 @@ class Trainer:
         left = (1.0 - host.progress) / host.pace
         later = any(end > host.progress and factor < host.shrink for end, factor in self.levels)
         steps = host.step + (left / FULL_SIZE_COST if later else left)
-        share = default_share(steps, len(self.views))
-        return max(alive, min(limit, int(share * self.width * self.height)))
+        return max(alive, min(limit, self.coverage.gaussians(steps)))
 
     def _relocate_step(self, state: FitState, host: HostState, wanted: int) -> FitState:
         births = max(wanted - self._count(state), 0)

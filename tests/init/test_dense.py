@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import DataConfig, DensifyConfig, FitConfig, InitConfig, preset
+from p2gs_jax.densify.population import Coverage
 from p2gs_jax.init.brightness import Frames, Tones, alike, rough_tones
 from p2gs_jax.init.dense import MATCH_SIDE, dense_seeds
 from p2gs_jax.init.flow import CHECKS, Flows, depth_map
 from p2gs_jax.init.pairs import neighbours, visibility
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.srgb import srgb_encode
-from p2gs_jax.prepare import dense_limit, wants_dense
+from p2gs_jax.prepare import coverage_of, dense_limit, wants_dense
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Scene, View
 
@@ -247,19 +248,21 @@ def with_seeds(cfg, **changes):
 def test_dense_seeds_leave_room_to_grow():
     cfg = FitConfig()
     bounded = dataclasses.replace(cfg, densify=DensifyConfig(max_gaussians=1000))
-    assert dense_limit(bounded, 100, 640, 480, 40) == 500
-    assert dense_limit(bounded, 2000, 640, 480, 40) == 0
-    assert dense_limit(with_seeds(bounded, dense_points=5000), 100, 640, 480, 40) == 900
-    assert dense_limit(with_seeds(cfg, dense_points=50_000), 100, 640, 480, 40) == 50_000
-    assert 0 < dense_limit(cfg, 100, 640, 480, 40) < 640 * 480 / 2
+    whole = Coverage(640 * 480, 1.0)
+    assert dense_limit(bounded, 100, whole) == 500
+    assert dense_limit(bounded, 2000, whole) == 0
+    assert dense_limit(with_seeds(bounded, dense_points=5000), 100, whole) == 900
+    assert dense_limit(with_seeds(cfg, dense_points=50_000), 100, whole) == 50_000
+    # Of a scene of which a view shows a quarter there is four times as much.
+    assert 0 < 4 * (dense_limit(cfg, 0, whole) + 1) <= dense_limit(cfg, 0, Coverage(307_200, 0.25))
 
 
 def test_dense_starts_where_seeds_are_few(plane):
-    scene, store = plane.scene, plane.store
-    assert wants_dense(scene, store, FitConfig())
-    assert wants_dense(scene, store, preset("3dgs"))
-    assert not wants_dense(scene, store, preset("paper"))
-    assert not wants_dense(scene, store, with_seeds(FitConfig(), dense="off"))
+    scene, coverage = plane.scene, coverage_of(plane.scene, plane.store)
+    assert wants_dense(scene, coverage, FitConfig())
+    assert wants_dense(scene, coverage, preset("3dgs"))
+    assert not wants_dense(scene, coverage, preset("paper"))
+    assert not wants_dense(scene, coverage, with_seeds(FitConfig(), dense="off"))
     lidar = dataclasses.replace(scene, points=np.repeat(scene.points, 200, 0))
-    assert not wants_dense(lidar, store, FitConfig())
+    assert not wants_dense(lidar, coverage, FitConfig())
     assert InitConfig().dense == "auto"
