@@ -202,19 +202,21 @@ class LossConfig:
 class OptimizerConfig:
     """Adam and its learning rates; all rates are per step."""
 
-    means: float = 4e-4
-    """Times the scene extent (3DGS: 1.6e-4 over 30k steps; ours: for runs of a few thousand)."""
-    means_final: float = 4e-6
+    means: float = 1.6e-3
+    """Times the scene extent (3DGS: 1.6e-4 over 30k steps, in all of which every Gaussian moves;
+    ours, these and all below: a few thousand, and a Gaussian moves only in those that show it:
+    BUILD_NOTES, "Rates")."""
+    means_final: float = 1.6e-5
     """Reached at the end, exponentially (3DGS: 1.6e-6)."""
-    sh_dc: float = 2e-2
-    """Degree 0 (3DGS: 2.5e-3 for LDR colours; ours: 8 times that for log radiance)."""
-    sh_rest: float = 1e-3
-    """Degrees 1-3 (3DGS: 2.5e-3 / 20; ours: 8 times that)."""
-    opacities: float = 5e-2
+    sh_dc: float = 8e-2
+    """Degree 0 (3DGS: 2.5e-3 for LDR colours; log radiance takes 8 times that)."""
+    sh_rest: float = 4e-3
+    """Degrees 1-3 (3DGS: 2.5e-3 / 20)."""
+    opacities: float = 2e-1
     """Logits (3DGS: 5e-2)."""
-    scales: float = 2e-2
-    """Logarithms (3DGS: 5e-3 over 30k steps; ours: for runs of a few thousand)."""
-    quats: float = 1e-3
+    scales: float = 8e-2
+    """Logarithms (3DGS: 5e-3)."""
+    quats: float = 4e-3
     """Quaternions (3DGS: 1e-3)."""
     exposures: float = 1e-3
     """Raw exposures (ours: docs/photometry.md, 4; ten times this where no tracks gave a start)."""
@@ -226,8 +228,8 @@ class OptimizerConfig:
     """They decay exponentially to this fraction (3DGS: 0.1)."""
     photometry_final: float = 0.01
     """Exposure and gamma rates decay exponentially to this fraction (ours)."""
-    final: float = 1.0
-    """All other rates decay exponentially to this fraction (3DGS: no decay)."""
+    final: float = 0.1
+    """All other rates decay exponentially to this fraction (3DGS: no decay; ours: BUILD_NOTES)."""
     eps: float = 1e-15
     """Adam's epsilon (3DGS: 1e-15)."""
     visible_only: bool = True
@@ -385,6 +387,9 @@ def _paper(exposure_weight: float, name: PresetName) -> FitConfig:
             scales=5e-3,
             sh_dc=2.5e-3,
             sh_rest=1.25e-4,
+            opacities=5e-2,
+            quats=1e-3,
+            final=1.0,
             exposures=1e-3,
             gammas=1e-3,
             photometry_final=1.0,
@@ -424,7 +429,7 @@ def _ldr(
         ),
         loss=dataclasses.replace(robust.loss, censored=False),
         optimizer=dataclasses.replace(
-            robust.optimizer, sh_dc=5e-3, sh_rest=2.5e-4, exposures=1e-2, appearance=rate
+            robust.optimizer, sh_dc=2e-2, sh_rest=1e-3, exposures=1e-2, appearance=rate
         ),
     )
 
