@@ -72,8 +72,8 @@ def variants() -> dict[str, FitConfig]:
         "robust, linear radiance": of(
             robust,
             render__radiance="linear",
-            optimizer__sh_dc=5e-3,
-            optimizer__sh_rest=2.5e-4,
+            optimizer__sh_dc=2e-2,
+            optimizer__sh_rest=1e-3,
         ),
         "robust, not censored": of(robust, loss__censored=False),
         "robust, no D-SSIM": of(robust, loss__dssim_weight=None),

@@ -15,6 +15,8 @@ from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.photometry.formation import display, formation
 
 SEARCH_STOPS, SEARCH_STEPS, GOLDEN_STEPS = 5.0, 41, 30
+# The coarse search looks at one pixel in so many each way.
+SEARCH_STRIDE = 3
 # Of the logarithm of the exposure, stops, and of the error.
 TOLERANCE = 1e-6
 
@@ -82,13 +84,14 @@ def fit_exposure(
     # Imported late: of what evaluates, little searches.
     import optimistix
 
-    def error(log2_exposure):
+    def error(log2_exposure, stride=1):
         exposure = jnp.exp2(log2_exposure)
         ldr = display(formation(linear, exposure, jnp.asarray(gamma), cfg, appearance))
-        return jnp.sum(mask[..., None] * (ldr - photograph) ** 2) / jnp.maximum(jnp.sum(mask), 1)
+        squared = mask[..., None] * (ldr - photograph) ** 2
+        return jnp.sum(squared[::stride, ::stride]) / jnp.maximum(jnp.sum(mask), 1)
 
     grid = jnp.linspace(-SEARCH_STOPS, SEARCH_STOPS, SEARCH_STEPS)
-    best = grid[jnp.argmin(lax.map(error, grid))]
+    best = grid[jnp.argmin(lax.map(functools.partial(error, stride=SEARCH_STRIDE), grid))]
     width = 2 * SEARCH_STOPS / (SEARCH_STEPS - 1)
     # The bracket begins at zero: optimistix 0.1.0 places the first inner point as if all did.
     low = best - width
