@@ -367,7 +367,7 @@ class Trainer:
         """Estimate the room of every image size to come, and begin to compile its step."""
         gaussians = jax.tree.map(np.asarray, state.params.gaussians)
         alive = np.asarray(state.population.alive)
-        most = max(limit or 0, state.params.gaussians.capacity)
+        most, ahead = max(limit or 0, state.params.gaussians.capacity), False
         for end, shrink in self.levels:
             if end <= host.progress:
                 continue
@@ -391,6 +391,11 @@ class Trainer:
                 self._partner(step, shrink),
                 on_host(Controls, np.float32(0), np.int32(0)),
             )
+            if not ahead and self.cfg.densify.method == "mcmc":
+                ahead = True  # wanted soon after the first step
+                self._relocate = self.programs.ahead(
+                    self._relocate, self._key(host), gaussians, state.population, np.int32(0)
+                )
 
     def _partner(self, step: int, shrink: int) -> Partner:
         """Return the second view of the relative-exposure loss, as much of it as is needed."""

@@ -40,7 +40,7 @@ class StepPrograms:
         step: from `make_step`.
 
     Attributes:
-        waited_s: seconds for which a step was waited for.
+        waited_s: seconds for which a program was waited for.
     """
 
     def __init__(self, step):
@@ -56,20 +56,32 @@ class StepPrograms:
             key: what for.
             arguments: of the step, or their shapes.
         """
-        if key in self._made:
-            return
+        if key not in self._made:
+            static = {"room": key.room, "degree": key.degree}
+            self._made[key] = self._submit(self._step, arguments, static)
+
+    def ahead(self, program, *arguments: Any):
+        """Begin to compile another program in the background, and return it.
+
+        Args:
+            program: a jitted function, called with arguments of these shapes from here on.
+            arguments: its arguments, or their shapes.
+        """
+        future = self._submit(program, arguments, {})
+        return lambda *given: self._wait(future)(*given)
+
+    def _submit(self, program, arguments, static: dict[str, Any]) -> Future:
         shapes = jax.tree.map(
             lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype, weak_type=False), arguments
         )
-        self._made[key] = self._worker.submit(self._compile, key, shapes)
-
-    def _compile(self, key: Key, shapes):
-        return self._step.lower(*shapes, room=key.room, degree=key.degree).compile()
+        return self._worker.submit(lambda: program.lower(*shapes, **static).compile())
 
     def get(self, key: Key, *arguments: Any):
         """Return a compiled step, `(state, batch, partner, controls) -> (state, report)`."""
         self.expect(key, *arguments)
-        future = self._made[key]
+        return self._wait(self._made[key])
+
+    def _wait(self, future: Future):
         if future.done():
             return future.result()
         begin = time.monotonic()
