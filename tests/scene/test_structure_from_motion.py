@@ -113,5 +113,5 @@ def test_pairs_by_pose_prefer_neighbours_that_look_the_same_way():
     pairs = pairs_by_pose(names, viewmats)
     assert ("010", "011") in pairs
     assert not any("050" in pair for pair in pairs)
-    assert max(abs(int(a) - int(b)) for a, b in pairs) <= 21
-    assert pairs_by_pose(names[:25], viewmats[:25]) is None
+    assert max(abs(int(a) - int(b)) for a, b in pairs) <= 11
+    assert pairs_by_pose(names[:15], viewmats[:15]) is None
