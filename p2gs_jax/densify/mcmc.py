@@ -96,11 +96,10 @@ def relocate_and_grow(
     source = jnp.where(movers, jnp.minimum(target, n - 1), jnp.arange(n))
     gaussians = jax.tree.map(lambda a: a[source], gaussians)
     # Whoever stays gives way to the other side, so that the centre of the place stays.
-    raw = jax.random.normal(jax.random.fold_in(key, 1), (n, 3))
-    away = jnp.where(movers[:, None], raw, 0.0)
+    away = jax.random.normal(jax.random.fold_in(key, 1), (n, 3)) * movers[:, None]
     pushed = jnp.zeros((n, 3)).at[target].add(away, mode="drop")
-    away = away - jnp.where(shared, 1 / jnp.maximum(arrivals, 1), 0.0)[:, None] * pushed
-    gaussians = _apart(gaussians, away, (movers | shared) & (cfg.spread > 0), cfg.spread)
+    away = away - pushed / jnp.maximum(arrivals, 1)[:, None]
+    gaussians = _apart(gaussians, away, movers | shared, cfg.spread)
     refused = births - jnp.sum(newborn)
     return Outcome(
         gaussians, fresh_population(population.alive | (newborn & movers)), movers | shared, refused
@@ -114,21 +113,22 @@ def _apart(
 
     Args:
         gaussians: the scene.
-        away: directions in units of the principal axes, variance 1.
+        away: directions in units of the principal axes, variance 1; zero for all others.
         where: whom.
         spread: deviation of the moves over that of the Gaussian, below 1.
     """
-    R, scales = rotation_matrices(gaussians.quats), jnp.exp(gaussians.log_scales)
-    local = [spread * away[:, j] * scales[:, j] for j in range(3)]
-    moved = jnp.stack([sum(R[i][j] * local[j] for j in range(3)) for i in range(3)], -1)
-    on = where[:, None]
+    scales = jnp.exp(gaussians.log_scales)
+    moved = _turned(rotation_matrices(gaussians.quats), spread * away * scales)
     return dataclasses.replace(
         gaussians,
-        means=jnp.where(on, gaussians.means + moved, gaussians.means),
-        log_scales=jnp.where(
-            on, gaussians.log_scales + 0.5 * float(np.log1p(-(spread**2))), gaussians.log_scales
-        ),
+        means=gaussians.means + moved,
+        log_scales=gaussians.log_scales + 0.5 * float(np.log1p(-(spread**2))) * where[:, None],
     )
+
+
+def _turned(R, local: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    """Return vectors along the principal axes in world coordinates; R from `rotation_matrices`."""
+    return jnp.stack([sum(R[i][j] * local[:, j] for j in range(3)) for i in range(3)], -1)
 
 
 def exploration_noise(
@@ -152,4 +152,4 @@ def exploration_noise(
     variance = jnp.exp(2 * gaussians.log_scales)
     raw = jax.random.normal(key, gaussians.means.shape) * (gate * alive * rate)[:, None]
     local = [sum(R[i][j] * raw[:, i] for i in range(3)) * variance[:, j] for j in range(3)]
-    return jnp.stack([sum(R[i][j] * local[j] for j in range(3)) for i in range(3)], -1)
+    return _turned(R, jnp.stack(local, -1))

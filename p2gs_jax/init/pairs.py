@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from p2gs_jax.init.seeds import camera_centers
-from p2gs_jax.scene.visibility import project_points, unoccluded
+from p2gs_jax.scene.visibility import in_frame, project_points, unoccluded
 from p2gs_jax.types import Scene
 
 # Angles under which a pair sees its points, degrees: below the first the depth is uncertain, above
@@ -33,7 +33,7 @@ def visibility(scene: Scene, seed: int) -> Bool[np.ndarray, "v p"]:
     for row, index in enumerate(rows):
         view = scene.views[index]
         xy, z = project_points(scene.points, view)
-        seen[row] = (z > 1e-6) & (xy >= 0).all(1) & (xy < [view.width, view.height]).all(1)
+        seen[row] = in_frame(xy, z, view.width, view.height)
         if seen[row].sum() >= FEWEST_HIDING:
             seen[row] = unoccluded(xy, z, view.width, view.height)
     if len(scene.points) > MOST_POINTS:

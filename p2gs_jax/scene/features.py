@@ -21,9 +21,6 @@ _OVERLAP = 10
 # With known poses (nerf_fox, 50 views of 540x960, processor time): the nearest 20 give 574 pairs in
 # 71 s and 11,961 points, the nearest 10 292 pairs in 53 s and 12,017 points.
 _NEIGHBOURS = 10
-# Photographs this long are not enlarged before features are sought where poses are known (nerf_fox:
-# 53 s and 12,017 points become 15 s and 5,449); exposures and dense seeds need no more of them.
-_LONG_ENOUGH = 800
 _EXHAUSTIVE_LIMIT_BY_POSE = _NEIGHBOURS + 5
 
 Pair = tuple[str, str]
@@ -40,7 +37,7 @@ def extract(
     names: Sequence[str],
     *,
     mode: pycolmap.CameraMode,
-    longest_side: int = 0,
+    enlarge: bool = True,
 ) -> None:
     """Detect SIFT features on the CPU and store them.
 
@@ -49,7 +46,7 @@ def extract(
         image_folder: what `names` are relative to.
         names: images to read.
         mode: how the images share cameras.
-        longest_side: of the images, pixels, where fewer features are enough.
+        enlarge: look for features in images of twice the size as well.
 
     Raises:
         UserError: COLMAP gave up.
@@ -57,7 +54,7 @@ def extract(
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size = MAX_IMAGE_SIZE
     options.sift.max_num_features = MAX_FEATURES
-    if longest_side >= _LONG_ENOUGH:
+    if not enlarge:
         options.sift.first_octave = 0
     try:
         pycolmap.extract_features(

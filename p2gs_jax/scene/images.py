@@ -23,7 +23,6 @@ from p2gs_jax.types import View
 _FULL = 0.999  # a pixel is valid only where all of its sources are
 _ALPHA_VALID = 0.5
 _MAX_PREFETCHED = 4
-_RESAMPLED_MAX = 65535
 
 
 def size_at(view: View, max_width: int | None, shrink: float = 1.0) -> tuple[int, int]:
@@ -207,7 +206,7 @@ def _prepare(view: View, width: int, height: int) -> _Entry:
             valid = _resample_valid(
                 valid, lambda v: cv2.resize(v, size, interpolation=cv2.INTER_AREA)
             )
-        pixels = np.rint(ldr * np.float32(_RESAMPLED_MAX)).astype(np.uint16)
+        pixels = np.rint(ldr * np.float32(np.iinfo(np.uint16).max)).astype(np.uint16)
     pixels.flags.writeable = valid.flags.writeable = False
     return _Entry(pixels, valid)
 

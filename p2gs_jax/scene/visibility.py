@@ -29,6 +29,13 @@ def project_points(
     return local[:, :2] / ahead[:, None] * focal + center, z
 
 
+def in_frame(
+    xy: Float[np.ndarray, "p 2"], z: Float[np.ndarray, " p"], width: int, height: int
+) -> Bool[np.ndarray, " p"]:
+    """Return which projected points lie in front of the camera and within its image."""
+    return (z > 1e-6) & (xy >= 0).all(1) & (xy < [width, height]).all(1)
+
+
 def shown_share(points: Float[np.ndarray, "p 3"], views: Sequence[View]) -> float:
     """Return the share of the points that lies in a view's frustum, on average; 1 without points.
 
@@ -41,9 +48,7 @@ def shown_share(points: Float[np.ndarray, "p 3"], views: Sequence[View]) -> floa
     shares = []
     for view in (views[i] for i in picked):
         xy, z = project_points(sample, view)
-        shares.append(
-            np.mean((z > 1e-6) & (xy >= 0).all(1) & (xy < [view.width, view.height]).all(1))
-        )
+        shares.append(np.mean(in_frame(xy, z, view.width, view.height)))
     return float(max(np.mean(shares), 1 / len(views)))
 
 
@@ -55,7 +60,7 @@ def unoccluded(
     A coarse depth buffer of the points themselves, its cells as wide as their spacing; sparse
     foregrounds let some background through, which the robust loss has to bear.
     """
-    inside = (z > 1e-6) & (xy >= 0).all(1) & (xy[:, 0] < width) & (xy[:, 1] < height)
+    inside = in_frame(xy, z, width, height)
     count = int(inside.sum())
     if count == 0:
         return inside

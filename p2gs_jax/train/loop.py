@@ -312,17 +312,18 @@ class Trainer:
             batch = self.views.batch(index, shrink)
             size = (batch.camera.width, batch.camera.height)
             sizes.append(size)
+            partner = self._partner(step, shrink)
             arguments = (
                 state,
                 batch,
-                self._partner(step, shrink),
+                partner,
                 on_host(
                     Controls,
                     np.float32(progress),
                     np.int32(schedule.sh_degree_at(progress, self.cfg.train, self.sh_degree)),
                 ),
             )
-            key = self._program(state, batch, host, shrink)
+            key = self._program(state, batch, partner, host, shrink)
             state, report = self.programs.get(key, *arguments)(*arguments)
             reports.append((step, progress, report))
             progress = progress + host.pace
@@ -353,10 +354,13 @@ class Trainer:
     def _room(self, host: HostState, size: tuple[int, int]) -> Room:
         return host.rooms[_name(size)]
 
-    def _program(self, state: FitState, batch: Batch, host: HostState, shrink: int) -> Key:
+    def _program(
+        self, state: FitState, batch: Batch, partner: Partner, host: HostState, shrink: int
+    ) -> Key:
         size = (batch.camera.width, batch.camera.height)
         room, degree = self._room(host, size), self._degree(shrink)
-        return Key(size, state.params.gaussians.capacity, room, degree, str(batch.ldr.dtype))
+        pixels = tuple(str(b.ldr.dtype) for b in (batch, partner.batch) if b is not None)
+        return Key(size, state.params.gaussians.capacity, room, degree, pixels)
 
     def _degree(self, shrink: int) -> int:
         """Return the highest spherical-harmonics degree that a level of the schedule uses."""
@@ -384,11 +388,12 @@ class Trainer:
                 continue  # the population's slots, or the sizes, are not known beforehand
             step = host.step
             batch = self.views.batch(self.views.index_at(step), shrink)
+            partner = self._partner(step, shrink)
             self.programs.expect(
-                self._program(state, batch, host, shrink),
+                self._program(state, batch, partner, host, shrink),
                 state,
                 batch,
-                self._partner(step, shrink),
+                partner,
                 on_host(Controls, np.float32(0), np.int32(0)),
             )
             if not ahead and self.cfg.densify.method == "mcmc":

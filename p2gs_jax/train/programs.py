@@ -23,14 +23,14 @@ class Key(NamedTuple):
         slots: room of the population.
         room: of a view.
         degree: highest spherical-harmonics degree in use.
-        pixels: type of the photographs as they are stored.
+        pixels: types of the view's and the partner's photographs as they are stored.
     """
 
     size: tuple[int, int]
     slots: int
     room: Room
     degree: int
-    pixels: str
+    pixels: tuple[str, ...]
 
 
 class StepPrograms:

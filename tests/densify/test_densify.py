@@ -142,10 +142,13 @@ def test_relocation_moves_the_transparent_and_adds_births():
     assert int(out.refused) == 0
     live = np.asarray(out.population.alive)
     assert float(opacities(out.gaussians)[live].min()) > CFG.prune_opacity
-    # Each lies within a few deviations of one that was healthy.
+    together = dataclasses.replace(CFG, spread=0.0)
+    same = mcmc.relocate_and_grow(jax.random.key(1), grown, p, jnp.int32(4), together)
     healthy = np.asarray(g.means[3:])
     widest = float(np.exp(g.log_scales).max())
     for i in np.flatnonzero(live):
+        assert np.any(np.all(np.isclose(healthy, np.asarray(same.gaussians.means[i])), axis=1))
+        # Moved apart, each still lies within a few deviations of one that was healthy.
         distance = np.linalg.norm(healthy - np.asarray(out.gaussians.means[i]), axis=1)
         assert distance.min() < 3 * widest
     more = mcmc.relocate_and_grow(jax.random.key(1), grown, p, jnp.int32(9), CFG)

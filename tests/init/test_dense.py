@@ -253,6 +253,7 @@ def test_dense_seeds_leave_room_to_grow():
     assert dense_limit(bounded, 2000, whole) == 0
     assert dense_limit(with_seeds(bounded, dense_points=5000), 100, whole) == 900
     assert dense_limit(with_seeds(cfg, dense_points=50_000), 100, whole) == 50_000
+    assert 0 < dense_limit(cfg, 100, whole) < 640 * 480 / 10
     # Of a scene of which a view shows a quarter there is four times as much.
     part = Coverage(640 * 480, 0.25)
     assert dense_limit(cfg, 0, part) == 4 * dense_limit(cfg, 0, whole) > 0

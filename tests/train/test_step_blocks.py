@@ -203,6 +203,8 @@ def test_a_view_without_room_changes_nothing_but_the_fault(made):
     assert int(state.fault.visible) == made.seen.sum() > made.tight.visible
     assert int(state.fault.needed) > made.tight.entries
     assert int(report.visible) == made.seen.sum()
+    assert int(state.fault.needed) <= made.room.entries
+    assert int(state.fault.visible) <= made.room.visible
     grown = made.after[1]
     assert int(grown.entries) <= made.room.entries
     assert int(grown.visible) <= made.room.visible
