@@ -206,13 +206,15 @@ def _pair_sums(rows: Rows, factors: Float[np.ndarray, "o f x"]) -> Float[np.ndar
     """
     views, count = rows.view_count, factors.shape[-1]
     # In the order of the rows: the two of a pair then lie close together.
-    parts = [factors[rows.order, :, x].astype(np.float32) for x in range(count)]
-    seen_by = rows.views[rows.order]
+    order = rows.layout.order
+    parts = [factors[order, :, x].astype(np.float32) for x in range(count)]
+    seen_by = rows.views[order]
     sums = np.zeros((count, count, views * views))
     # Not fewer at once than half of the entries they are added to.
     chunk = max(CHUNK, views * views // 2)
-    for start in range(0, len(rows.first), chunk):
-        first, second = (p[start : start + chunk] for p in (rows.first, rows.second))
+    pairs = rows.layout.pairs
+    for start in range(0, len(pairs[0]), chunk):
+        first, second = (p[start : start + chunk] for p in pairs)
         at = seen_by[first] * views + seen_by[second]
         # A product of an observation with itself is counted twice below.
         half = np.where(first == second, np.float32(0.5), np.float32(1.0))
@@ -419,4 +421,23 @@ def solve(rows: Rows, system: System, start: Theta, tolerance: float, gammas: bo
         _scores(rows, theta, local, gammas),
         max(local.curvature, 0.1),
         rounds,
+    )
+
+
+def complete(fit: Fit, rows: Rows) -> Fit:
+    """Return the solution of some observations with radiances and residuals of all of them.
+
+    Args:
+        fit: from `solve`, on some of the observations; its parameters and errors stay.
+        rows: all observations.
+    """
+    weight = rows.weight / rows.sigma**2
+    for gm in (False, False, True, True):
+        local = _local(rows, fit.theta, weight, gm)
+        weight = local.weight
+    return fit._replace(
+        radiance=local.radiance,
+        precision=local.precision,
+        residual=local.residual,
+        weight=local.weight,
     )

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import functools
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import connected_components
 
 from p2gs_jax.photometry.response import Response, deviation, hat, log_exposed
@@ -62,6 +63,29 @@ class Observations:
         )
         return connected_components(incidence @ incidence.T, directed=False)[1]
 
+    def picked(self, pick: Bool[np.ndarray, " o"]) -> Observations:
+        """Return some of them."""
+        taken = {k: getattr(self, k)[pick] for k in ("views", "points", "colors", "spread")}
+        return replace(self, **taken)
+
+    def thinned(self, per_view: int, seed: int) -> Bool[np.ndarray, " o"]:
+        """Return which to keep so that every view has enough and their number grows with the views.
+
+        Points are put in a random order; those are kept, in all their views, that come first in
+        some view.
+
+        Args:
+            per_view: how many points of a view come first.
+            seed: of the order.
+        """
+        place = np.random.default_rng((seed, 19)).permutation(self.point_count)[self.points]
+        order = np.lexsort((place, self.views))
+        seen_by = self.views[order]
+        rank = np.arange(len(order)) - np.searchsorted(seen_by, seen_by)
+        kept = np.zeros(self.point_count, bool)
+        kept[self.points[order[rank < per_view]]] = True
+        return kept[self.points]
+
 
 @dataclass(frozen=True)
 class Rows:
@@ -77,10 +101,7 @@ class Rows:
         fraction: of the way to the next knot.
         slope: dz/dy under the base curve.
         by_row: sums observations over their rows.
-        order: observations sorted by row.
-        first: of every pair of observations in a row, themselves included, the first one: its place
-            in `order`.
-        second: likewise the other.
+        layout: the same observations in the order of their rows, and the pairs of them.
         count: number of rows.
         view_count: number of views.
     """
@@ -94,9 +115,7 @@ class Rows:
     fraction: Float[np.ndarray, "o 3"]
     slope: Float[np.ndarray, "o 3"]
     by_row: sp.csr_array
-    order: Int[np.ndarray, " o"]
-    first: Int[np.ndarray, " pairs"]
-    second: Int[np.ndarray, " pairs"]
+    layout: Layout
     count: int
     view_count: int
 
@@ -114,9 +133,6 @@ class Layout:
         point_of_row: the point of each row.
         by_row: sums observations over their rows.
         order: observations sorted by row.
-        first: of every pair of observations in a row, themselves included, the first one: its place
-            in `order`.
-        second: likewise the other.
     """
 
     def __init__(self, observations: Observations):
@@ -139,7 +155,11 @@ class Layout:
             (np.ones(count), (self.row, np.arange(count))), shape=(self.rows, count)
         )
         self.order = np.argsort(self.row, kind="stable")
-        self.first, self.second = _pairs(self.row[self.order])
+
+    @functools.cached_property
+    def pairs(self) -> tuple[Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"]]:
+        """Every pair of observations in a row once, themselves included: places in `order`."""
+        return _pairs(self.row[self.order])
 
 
 def _pairs(row: Int[np.ndarray, " o"]):
@@ -180,9 +200,7 @@ def make_rows(
         fraction=fraction,
         slope=slope,
         by_row=layout.by_row,
-        order=layout.order,
-        first=layout.first,
-        second=layout.second,
+        layout=layout,
         count=layout.rows,
         view_count=observations.view_count,
     )

@@ -10,7 +10,6 @@ together: a wrong curve fixed first drives every criterion to a gamma per view.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -174,12 +173,7 @@ def _subset(observations: Observations, seed: int, most: int) -> Observations:
     kept = order[np.cumsum(lengths) <= most]
     chosen = np.zeros(o.point_count, bool)
     chosen[kept] = True
-    return _picked(o, chosen[o.points])
-
-
-def _picked(o: Observations, pick: np.ndarray) -> Observations:
-    taken = {k: getattr(o, k)[pick] for k in ("views", "points", "colors", "spread")}
-    return dataclasses.replace(o, **taken)
+    return o.picked(chosen[o.points])
 
 
 def _spline(problem: Problem, spread: float, notes: list[str]) -> Response | None:
@@ -239,7 +233,7 @@ def select(
 
     for base in BASES:
         solve_all(Response(base))
-    training = _subset(_picked(o, ~held), seed, SPLINE_OBSERVATIONS)
+    training = _subset(o.picked(~held), seed, SPLINE_OBSERVATIONS)
     spread = float(np.std(fits["view_exposure", Response("srgb")].theta.b))
     spline = _spline(make(training), spread, notes)
     if spline is not None:

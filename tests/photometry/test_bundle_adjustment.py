@@ -46,6 +46,26 @@ def test_exposures_are_recovered(outliers, limit):
     assert np.median(np.abs(stops - np.median(stops))) < 0.05
 
 
+def test_a_part_of_the_observations_tells_exposures_and_all_points_get_a_radiance(monkeypatch):
+    o = observe(DRIVE, ISO4, outliers=0.1)
+    whole = adjust(o)
+    few = 100
+    monkeypatch.setattr(solution, "PER_VIEW", few)
+    kept = o.thinned(few, 0)
+    assert 0.1 < kept.mean() < 0.9
+    seen = np.bincount(o.views, minlength=o.view_count)
+    assert (np.bincount(o.views[kept], minlength=o.view_count) >= np.minimum(seen, few)).all()
+    assert not set(o.points[kept]) & set(o.points[~kept])
+    part = adjust(o)
+    assert ev(part, ISO4) < 0.02
+    assert (part.exposure_errors >= whole.exposure_errors).all()
+    np.testing.assert_array_equal(part.observations_per_view, whole.observations_per_view)
+    difference = part.point_log_radiance - whole.point_log_radiance
+    assert (np.isfinite(difference) == np.isfinite(whole.point_log_radiance)).all()
+    assert np.nanquantile(np.abs(difference), 0.9) < 0.03
+    assert abs(part.residual_ev - whole.residual_ev) < 0.002
+
+
 def test_saturation_must_be_masked():
     """Without the mask the error grows several times (PHOTOMETRY section 4: .006 to .042)."""
     o = observe(DRIVE, ISO4)
