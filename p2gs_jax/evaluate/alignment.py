@@ -17,8 +17,8 @@ from p2gs_jax.photometry.formation import display, formation
 SEARCH_STOPS, SEARCH_STEPS, GOLDEN_STEPS = 5.0, 41, 30
 # The coarse search looks at one pixel in so many each way.
 SEARCH_STRIDE = 3
-# Of the logarithm of the exposure, stops, and of the error.
-TOLERANCE = 1e-6
+# Stops: so much changes a display value by 1e-4, and 40 dB by 1e-3 dB.
+TOLERANCE = 5e-4
 
 
 class ExposureError(TypedDict):

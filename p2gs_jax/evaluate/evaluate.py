@@ -12,6 +12,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -20,6 +21,7 @@ from jaxtyping import Bool, Float32
 from p2gs_jax.config import FitConfig
 from p2gs_jax.evaluate.alignment import fit_exposure
 from p2gs_jax.evaluate.consistency import VideoScores
+from p2gs_jax.evaluate.in_order import in_order
 from p2gs_jax.evaluate.lpips import LpipsWeights, lpips
 from p2gs_jax.evaluate.metrics import psnr, ssim
 from p2gs_jax.evaluate.radiance import RadianceScores, Truth
@@ -90,6 +92,28 @@ def _score(lpips_weights: LpipsWeights | None, ldr, target, mask) -> dict[str, f
     return row
 
 
+class _Judged(NamedTuple):
+    """A view with its scores, and what it is compared with once all are known.
+
+    Attributes:
+        result: the view.
+        ldr_averaged: display image with the mean parameters.
+        mask: which pixels count.
+        scores: of `result.ldr`.
+        scores_averaged: of `ldr_averaged`.
+        radiance: true linear radiance, or None.
+        reference: photograph under the common exposure, or None.
+    """
+
+    result: ViewResult
+    ldr_averaged: Float32[np.ndarray, "h w 3"]
+    mask: Float32[np.ndarray, "h w"]
+    scores: dict[str, float]
+    scores_averaged: dict[str, float]
+    radiance: np.ndarray | None
+    reference: np.ndarray | None
+
+
 class _Collector:
     """Per-view scores and their means."""
 
@@ -150,11 +174,6 @@ def evaluate(
     gaussians = jax.device_put(params.gaussians)
     living = jax.device_put(np.asarray(alive))
     score = functools.partial(_score, lpips_weights)
-    own, averaged = _Collector(), _Collector()
-    test_averaged, test_fitted = _Collector(), _Collector()
-    scores = RadianceScores()
-    reference_views: list[tuple[int, np.ndarray, np.ndarray, np.ndarray]] = []
-
     mean_correction = small.mean_correction
 
     def shown(linear, exposure, gamma, correction=mean_correction):
@@ -165,46 +184,53 @@ def evaluate(
         tone = cfg.photometry
         return float(fit_exposure(linear, photograph, mask, mean.gamma, tone, mean_correction))
 
-    videos = {name: VideoScores() for name in ("per_view", "averaged", "photographs")}
     row_of = {index: row for row, index in enumerate(scene.train_indices)}
-    # In the order of their names, so that the frames of a camera follow each other.
-    for index, view in enumerate(scene.views):
+
+    def judged(index: int) -> _Judged:
         photograph, mask = store.get(index, 1)
         result = render(gaussians, living, camera_of(store, index))
-        linear = result.linear
+        linear = np.asarray(result.linear)
         ldr_mean = shown(linear, mean.exposure, mean.gamma)
-        if view.split == "train":
+        if scene.views[index].split == "train":
             row = row_of[index]
             e, g = float(exposures[row]), float(gammas[row])
             ldr = shown(linear, e, g, small.correction(row))
-            own.add(view.name, score(ldr, photograph, mask))
-            averaged.add(view.name, score(ldr_mean, photograph, mask))
+            extra = {}
         else:
             e, g = fitted(linear, photograph, mask), mean.gamma
             ldr = shown(linear, e, g)
-            test_averaged.add(view.name, score(ldr_mean, photograph, mask))
-            test_fitted.add(view.name, {**score(ldr, photograph, mask), "exposure": e})
-        hdr = None if radiance is None else radiance(index)
-        if hdr is not None:
-            scores.add(view.name, view.split, np.asarray(linear), hdr, mask)
-        truth = None if reference is None else _lookup(reference, index)
-        if truth is not None:
-            reference_views.append((index, np.asarray(linear), truth, mask))
-        on_view(
-            ViewResult(
-                index,
-                np.asarray(linear),
-                np.asarray(result.alpha),
-                np.asarray(result.depth),
-                ldr,
-                photograph,
-                e,
-                g,
-            )
+            extra = {"exposure": e}
+        depth, alpha = np.asarray(result.depth), np.asarray(result.alpha)
+        return _Judged(
+            ViewResult(index, linear, alpha, depth, ldr, photograph, e, g),
+            ldr_mean,
+            mask,
+            {**score(ldr, photograph, mask), **extra},
+            score(ldr_mean, photograph, mask),
+            None if radiance is None else radiance(index),
+            None if reference is None else _lookup(reference, index),
         )
-        videos["per_view"].add(view.camera, ldr, e)
-        videos["averaged"].add(view.camera, ldr_mean, mean.exposure)
-        videos["photographs"].add(view.camera, photograph, e)
+
+    own, averaged = _Collector(), _Collector()
+    test_averaged, test_fitted = _Collector(), _Collector()
+    scores = RadianceScores()
+    reference_views: list[tuple[int, np.ndarray, np.ndarray, np.ndarray]] = []
+    videos = {name: VideoScores() for name in ("per_view", "averaged", "photographs")}
+    # In the order of their names, so that the frames of a camera follow each other.
+    for found in in_order(judged, range(len(scene.views))):
+        result = found.result
+        index, view = result.index, scene.views[result.index]
+        training = view.split == "train"
+        (own if training else test_fitted).add(view.name, found.scores)
+        (averaged if training else test_averaged).add(view.name, found.scores_averaged)
+        if found.radiance is not None:
+            scores.add(view.name, view.split, result.linear, found.radiance, found.mask)
+        if found.reference is not None:
+            reference_views.append((index, result.linear, found.reference, found.mask))
+        on_view(result)
+        videos["per_view"].add(view.camera, result.ldr, result.exposure)
+        videos["averaged"].add(view.camera, found.ldr_averaged, mean.exposure)
+        videos["photographs"].add(view.camera, result.photograph, result.exposure)
         on_progress(index + 1, len(scene.views))
 
     metrics = {
@@ -239,26 +265,33 @@ def _against_reference(views, scene: Scene, mean: MeanParameters, shown, fitted,
         fitted: (linear, photograph, mask) -> the exposure that fits best.
         score: (display image, photograph, mask) -> scores by name.
     """
-    scales = [fitted(linear, truth, mask) for _, linear, truth, mask in views]
+    scales = list(in_order(lambda view: fitted(*view[1:]), views))
     common = float(np.exp(np.median(np.log(scales))))
     protocols = {
         "averaged": mean.exposure,
         "geometric": mean.exposure_geometric,
         "scale_aligned": common,
     }
+
+    def judged(view):
+        _, linear, truth, mask = view
+        return {
+            name: score(shown(linear, exposure, mean.gamma), truth, mask)
+            for name, exposure in protocols.items()
+        }
+
+    parts = {name: {part: _Collector() for part in ("all", "train", "test")} for name in protocols}
+    for (index, *_), rows in zip(views, in_order(judged, views), strict=True):
+        view = scene.views[index]
+        for name, row in rows.items():
+            for part in ("all", view.split):
+                parts[name][part].add(view.name, row)
     out = {}
     for name, exposure in protocols.items():
-        parts = {"all": _Collector(), "train": _Collector(), "test": _Collector()}
-        for index, linear, truth, mask in views:
-            view = scene.views[index]
-            ldr = shown(linear, exposure, mean.gamma)
-            row = score(ldr, truth, mask)
-            for part in ("all", view.split):
-                parts[part].add(view.name, row)
         out[name] = {
-            **parts["all"].summary(),
+            **parts[name]["all"].summary(),
             "exposure": exposure,
-            "train": parts["train"].summary(),
-            "test": parts["test"].summary(),
+            "train": parts[name]["train"].summary(),
+            "test": parts[name]["test"].summary(),
         }
     return out

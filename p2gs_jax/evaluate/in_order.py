@@ -1,0 +1,39 @@
+"""Views judged side by side, their results in order."""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TypeVar
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+# More would hold too many rendered images at once.
+MOST_WORKERS = 4
+
+
+def in_order(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+    """Yield what a function returns for every item, in their order, computed in threads.
+
+    Numpy, JAX and image files leave the interpreter to other threads. The first item is computed
+    alone: it compiles what all need. At most twice as many results as threads are waiting.
+    """
+    workers = min(os.cpu_count() or 1, MOST_WORKERS)
+    rest = iter(items)
+    for first in rest:
+        yield function(first)
+        break
+    waiting: deque[Future[Result]] = deque()
+    with ThreadPoolExecutor(workers, thread_name_prefix="evaluate") as pool:
+        try:
+            for item in rest:
+                waiting.append(pool.submit(function, item))
+                if len(waiting) > workers:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
