@@ -118,6 +118,22 @@ class Camera(eqx.Module):
     height: int = eqx.field(static=True)
 
 
+class Frustum(eqx.Module):
+    """A camera whose image size is data: what is done per Gaussian is compiled once for all sizes.
+
+    Attributes:
+        viewmat: world-to-camera, OpenCV axes.
+        K: intrinsics in pixels, pixel centres at +0.5.
+        width: pixels.
+        height: pixels.
+    """
+
+    viewmat: Float[Array, "4 4"]
+    K: Float[Array, "3 3"]
+    width: Float[Array, ""]
+    height: Float[Array, ""]
+
+
 class Splats2D(eqx.Module):
     """Gaussians projected into one view.
 

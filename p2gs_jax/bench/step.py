@@ -85,7 +85,7 @@ def whole_step(scene: BenchScene, cfg: FitConfig, batch: Batch, entries: int) ->
         holder[0], report = step(holder[0], batch, partner, controls, room=room, degree=degree)
         return report.loss
 
-    return WholeStep(run, cast(Any, step)._cache_size, lambda: int(holder[0].fault.kind))
+    return WholeStep(run, step.compilations, lambda: int(holder[0].fault.kind))
 
 
 def measure_step(scene: BenchScene, cfg: FitConfig, repeats: int = 7) -> StepCost:

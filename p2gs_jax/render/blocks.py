@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render.project import project, view_radiance
-from p2gs_jax.types import Camera, Gaussians, Splats2D
+from p2gs_jax.types import Camera, Frustum, Gaussians, Splats2D
 
 BLOCK = 4096
 
@@ -88,7 +88,7 @@ def slice_of(tree, block: Int[Array, ""] | int, size: int):
 def splat(
     gaussians: Gaussians,
     alive: Bool[Array, " v"],
-    cameras: Sequence[Camera],
+    cameras: Sequence[Camera | Frustum],
     cfg: RenderConfig,
     active_degree: Int[Array, ""] | int | None = None,
 ) -> tuple[Shown, ...]:
@@ -104,7 +104,7 @@ def splat_listed(
     alive: Bool[Array, " n"],
     ids: Int[Array, " v"],
     count: Int[Array, ""],
-    cameras: Sequence[Camera],
+    cameras: Sequence[Camera | Frustum],
     cfg: RenderConfig,
     active_degree: Int[Array, ""] | int,
     bands: int,

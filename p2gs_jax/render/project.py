@@ -13,7 +13,7 @@ from p2gs_jax.config import RenderConfig
 from p2gs_jax.photometry.radiance import radiance_activation
 from p2gs_jax.render import spherical_harmonics
 from p2gs_jax.render.xla_cpu import columns
-from p2gs_jax.types import Camera, Gaussians, Splats2D
+from p2gs_jax.types import Camera, Frustum, Gaussians, Splats2D
 
 INVISIBLE_LOG_OPACITY = -100.0
 # Outside this range float32 products of scales and focal lengths leave the normal numbers.
@@ -44,7 +44,7 @@ def rotation_matrices(quats: Float[Array, "n 4"]) -> list[list[Float[Array, " n"
 def project(
     gaussians: Gaussians,
     alive: Bool[Array, " n"],
-    camera: Camera,
+    camera: Camera | Frustum,
     cfg: RenderConfig,
 ) -> Splats2D:
     """Project Gaussians into a view.
@@ -114,7 +114,7 @@ def project(
 
 def view_radiance(
     gaussians: Gaussians,
-    camera: Camera,
+    camera: Camera | Frustum,
     cfg: RenderConfig,
     active_degree: Int[Array, ""] | int | None = None,
 ) -> Float[Array, "n 3"]:

@@ -16,14 +16,14 @@ from p2gs_jax.numerics import namespace
 from p2gs_jax.render.cutoff import smallest_cutoff
 from p2gs_jax.render.project import LOG_SCALE_RANGE, TANGENT_LIMIT
 from p2gs_jax.render.xla_cpu import compiled_loop
-from p2gs_jax.types import Camera, Gaussians
+from p2gs_jax.types import Camera, Frustum, Gaussians
 
 # Pixels of slack for rounding.
 SLACK = 1.0
 
 
 def in_view(
-    gaussians: Gaussians, alive: Bool[Array, " n"], camera: Camera, cfg: RenderConfig
+    gaussians: Gaussians, alive: Bool[Array, " n"], camera: Camera | Frustum, cfg: RenderConfig
 ) -> Bool[Array, " n"]:
     """Return which Gaussians may reach a pixel: all that do, and few that do not.
 

@@ -337,6 +337,7 @@ class Trainer:
             room = self._room(host, sizes[done])
             grown = room.grown(int(state.fault.needed), int(state.fault.visible))
             host.rooms[_name(sizes[done])] = grown
+            self._share_visible(host)
             host.overflows += 1
             state = dataclasses.replace(state, fault=Fault.none())
         elif done:
@@ -353,6 +354,11 @@ class Trainer:
 
     def _room(self, host: HostState, size: tuple[int, int]) -> Room:
         return host.rooms[_name(size)]
+
+    def _share_visible(self, host: HostState) -> None:
+        """Give all image sizes the same room for Gaussians: what is done per Gaussian is shared."""
+        most = max((room.visible for room in host.rooms.values()), default=0)
+        host.rooms = {name: room._replace(visible=most) for name, room in host.rooms.items()}
 
     def _program(
         self, state: FitState, batch: Batch, partner: Partner, host: HostState, shrink: int
@@ -371,7 +377,8 @@ class Trainer:
         """Estimate the room of every image size to come, and begin to compile its step."""
         gaussians = jax.tree.map(np.asarray, state.params.gaussians)
         alive = np.asarray(state.population.alive)
-        most, ahead = max(limit or 0, state.params.gaussians.capacity), False
+        most = max(limit or 0, state.params.gaussians.capacity)
+        sizes: dict[int, int] = {}
         for end, shrink in self.levels:
             if end <= host.progress:
                 continue
@@ -384,9 +391,14 @@ class Trainer:
                     host.rooms[_name(size)] = room_for(
                         gaussians, alive, taken, most, self.cfg.render
                     )
-            if self.auto or self.cfg.densify.method == "adaptive" or len(cameras) > 1:
-                continue  # the population's slots, or the sizes, are not known beforehand
-            step = host.step
+            sizes[shrink] = len(cameras)
+        self._share_visible(host)
+        if self.auto or self.cfg.densify.method == "adaptive":
+            return  # the population's slots are not known beforehand
+        ahead, step = False, host.step
+        for shrink, count in sizes.items():
+            if count > 1:
+                continue  # which size comes first is not known
             batch = self.views.batch(self.views.index_at(step), shrink)
             partner = self._partner(step, shrink)
             self.programs.expect(

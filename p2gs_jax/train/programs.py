@@ -1,4 +1,4 @@
-"""Compiled steps: one per image size and run, compiled ahead of their turn in the background.
+"""Compiled steps, compiled ahead of their turn in the background.
 
 XLA holds no lock of Python's while it compiles, so the program of the next level is made while the
 present one runs. Seconds that a run waits for the compiler are counted, and never as pace.
@@ -6,6 +6,7 @@ present one runs. Seconds that a run waits for the compiler are counted, and nev
 
 from __future__ import annotations
 
+import functools
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, NamedTuple
@@ -13,6 +14,10 @@ from typing import Any, NamedTuple
 import jax
 
 from p2gs_jax.render.capacity import Room
+from p2gs_jax.train.step import Step
+
+# The first step waits for two programs of about equal size.
+WORKERS = 2
 
 
 class Key(NamedTuple):
@@ -37,16 +42,16 @@ class StepPrograms:
     """The compiled steps of a run.
 
     Args:
-        step: from `make_step`.
+        step: from `make_step`; levels and populations share those of its programs that they can.
 
     Attributes:
         waited_s: seconds for which a program was waited for.
     """
 
-    def __init__(self, step):
+    def __init__(self, step: Step):
         self._step = step
-        self._made: dict[Key, Future] = {}
-        self._worker = ThreadPoolExecutor(1, thread_name_prefix="compile")
+        self._made: dict[tuple, Future] = {}
+        self._worker = ThreadPoolExecutor(WORKERS, thread_name_prefix="compile")
         self.waited_s = 0.0
 
     def expect(self, key: Key, *arguments: Any) -> None:
@@ -56,9 +61,28 @@ class StepPrograms:
             key: what for.
             arguments: of the step, or their shapes.
         """
-        if key not in self._made:
-            static = {"room": key.room, "degree": key.degree}
-            self._made[key] = self._submit(self._step, arguments, static)
+        self._parts(key, arguments)
+
+    def _parts(self, key: Key, arguments) -> list[Future]:
+        """Return the programs of a step in their order, those yet unknown on their way."""
+        rows = min(key.room.visible, key.slots)
+        of_gaussians = (key.slots, rows, key.degree)
+        keys = [
+            ("show", *of_gaussians),
+            ("differentiate", key.size, key.room.entries, rows, key.pixels),
+            ("advance", *of_gaussians),
+        ]
+        # The longest first.
+        for name in (keys[1], keys[0], keys[2]):
+            if name not in self._made:
+                state, batch, partner, controls = _shapes(arguments)
+                lowered = functools.partial(
+                    self._step.lowered, name[0], state, batch, partner, controls
+                )
+                self._made[name] = self._worker.submit(
+                    lambda lowered=lowered: lowered(room=key.room, degree=key.degree).compile()
+                )
+        return [self._made[name] for name in keys]
 
     def ahead(self, program, *arguments: Any):
         """Begin to compile another program in the background, and return it.
@@ -67,19 +91,12 @@ class StepPrograms:
             program: a jitted function, called with arguments of these shapes from here on.
             arguments: its arguments, or their shapes.
         """
-        future = self._submit(program, arguments, {})
+        future = self._worker.submit(lambda: program.lower(*_shapes(arguments)).compile())
         return lambda *given: self._wait(future)(*given)
-
-    def _submit(self, program, arguments, static: dict[str, Any]) -> Future:
-        shapes = jax.tree.map(
-            lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype, weak_type=False), arguments
-        )
-        return self._worker.submit(lambda: program.lower(*shapes, **static).compile())
 
     def get(self, key: Key, *arguments: Any):
         """Return a compiled step, `(state, batch, partner, controls) -> (state, report)`."""
-        self.expect(key, *arguments)
-        return self._wait(self._made[key])
+        return self._step.chained(*(self._wait(part) for part in self._parts(key, arguments)))
 
     def _wait(self, future: Future):
         if future.done():
@@ -93,3 +110,9 @@ class StepPrograms:
     def close(self) -> None:
         """Forget programs whose compilation has not begun."""
         self._worker.shutdown(wait=False, cancel_futures=True)
+
+
+def _shapes(arguments):
+    return jax.tree.map(
+        lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype, weak_type=False), arguments
+    )
