@@ -232,6 +232,11 @@ class OptimizerConfig:
     """All other rates decay exponentially to this fraction (3DGS: no decay; ours: BUILD_NOTES)."""
     eps: float = 1e-15
     """Adam's epsilon (3DGS: 1e-15)."""
+    b1: float = 0.6
+    """Share of the old mean in Adam's mean of a Gaussian's gradients (3DGS: 0.9; ours: BUILD_NOTES,
+    "Momentum"; exposures, gammas and corrections keep 0.9)."""
+    b2: float = 0.999
+    """Likewise of their squares (3DGS: 0.999; the rest keeps that)."""
     visible_only: bool = True
     """Update only what a view may show; all other Gaussians and their moments rest (as gsplat's
     selective Adam; ours: BUILD_NOTES, "Every second counts"). Off: every Gaussian in every step,
@@ -282,8 +287,8 @@ class DensifyConfig:
 class InitConfig:
     """From seed points to Gaussians."""
 
-    opacity: float = 0.1
-    """Initial peak opacity (3DGS: 0.1)."""
+    opacity: float = 0.5
+    """Initial peak opacity (3DGS: 0.1; ours: BUILD_NOTES, "Momentum")."""
     max_seeds: int = 200_000
     """Seed points kept, sampled evenly; the rest is reported."""
     shell: Literal["auto", "on", "off"] = "auto"
@@ -393,10 +398,12 @@ def _paper(exposure_weight: float, name: PresetName) -> FitConfig:
             exposures=1e-3,
             gammas=1e-3,
             photometry_final=1.0,
+            b1=0.9,
+            b2=0.999,
             visible_only=False,
         ),
         densify=DensifyConfig(method="adaptive"),
-        init=InitConfig(shell="off", dense="off"),
+        init=InitConfig(opacity=0.1, shell="off", dense="off"),
         train=TrainConfig(steps=30_000, coarse_to_fine=()),
     )
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -34,7 +36,7 @@ from p2gs_jax.photometry.formation import inverse_tone_map
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import Response
 from p2gs_jax.photometry.selection import Selection, select
-from p2gs_jax.photometry.solution import KnownExposures, PhotometricSolution
+from p2gs_jax.photometry.solution import KnownExposures, ModelName, PhotometricSolution
 from p2gs_jax.progress import Reporter
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.images import ImageStore
@@ -85,6 +87,26 @@ class Prepared:
     notes: list[str] = field(default_factory=list)
 
 
+class Expected(NamedTuple):
+    """What is known of a fit before its exposures: enough to compile for.
+
+    Attributes:
+        store: photographs.
+        params: of the right shapes; the Gaussians are the scene's points, without colours.
+        extent: scene extent, scene units.
+        coverage: how much of the scene the views show.
+        cfg: the configuration that most fits end up with.
+        images: its tone curve is chosen.
+    """
+
+    store: ImageStore
+    params: Params
+    extent: float
+    coverage: Coverage
+    cfg: FitConfig
+    images: bool
+
+
 def load(scene_dir: Path, run_dir: Path, cfg: FitConfig, reporter: Reporter) -> Scene:
     """Read a scene of any known format and check that there is something to fit.
 
@@ -107,7 +129,11 @@ def load(scene_dir: Path, run_dir: Path, cfg: FitConfig, reporter: Reporter) -> 
 
 
 def prepare(
-    scene: Scene, cfg: FitConfig, reporter: Reporter, clock: Stopwatch | None = None
+    scene: Scene,
+    cfg: FitConfig,
+    reporter: Reporter,
+    clock: Stopwatch | None = None,
+    on_expected: Callable[[Expected], None] = lambda expected: None,
 ) -> Prepared:
     """Start exposures, radiances and Gaussians from what the scene offers.
 
@@ -116,6 +142,7 @@ def prepare(
         cfg: everything.
         reporter: receives progress.
         clock: receives the seconds of `photometry` and `seeds`.
+        on_expected: receives what can be told before the exposures are solved, where that is much.
     """
     clock = clock or Stopwatch()
     begin = time.monotonic()
@@ -138,6 +165,26 @@ def prepare(
         )
     coverage = coverage_of(scene, store)
     dense = wants_dense(scene, coverage, cfg)
+    bound = cfg.densify.max_gaussians
+    most = min(cfg.init.max_seeds, bound) if isinstance(bound, int) else cfg.init.max_seeds
+    keep = subsample(len(scene.points), most, cfg.train.seed)
+    points = scene.points[keep]
+    expected: Expected | None = None
+    likely = _likely(cfg, has_tracks(scene) or dense)
+    if likely is not None:
+        params = Params(
+            gaussians_from_points(points, np.zeros_like(points), views, cfg),
+            _photometry(None, len(views), cfg),
+            _appearance(len(views), cfg),
+        )
+        expected = Expected(store, params, extent, coverage, likely, not cfg.photometry.select)
+        on_expected(expected)
+
+    def chosen(model: ModelName, response: Response) -> None:
+        if expected is not None:
+            known = with_choice(expected.cfg, model, response)
+            on_expected(expected._replace(cfg=known, images=True))
+
     if has_tracks(scene) or cfg.photometry.start == "tracks" or dense:
         if not has_tracks(scene):
             notes.append("No tracks: seed points are projected into the views instead.")
@@ -147,7 +194,7 @@ def prepare(
     if cfg.photometry.start == "tracks":
         if tracks is not None and len(tracks.points):
             reporter.stage("Photometric bundle adjustment")
-            selection = calibrate_observations(tracks, scene, cfg)
+            selection = calibrate_observations(tracks, scene, cfg, on_chosen=chosen)
             notes += [*selection.reasons, *selection.solution.warnings]
             cfg = with_selection(cfg, selection)
         else:
@@ -160,13 +207,9 @@ def prepare(
     photometry = _photometry(start, len(views), cfg)
     solved = time.monotonic()
     clock.add("photometry", solved - begin)
-    bound = cfg.densify.max_gaussians
-    most = min(cfg.init.max_seeds, bound) if isinstance(bound, int) else cfg.init.max_seeds
-    keep = subsample(len(scene.points), most, cfg.train.seed)
     if len(keep) < len(scene.points):
         option = "--gaussians" if most == bound else "--init.max-seeds"
         notes.append(f"{len(scene.points)} seed points were thinned to {len(keep)} ({option}).")
-    points = scene.points[keep]
     radiance = _seed_radiance(scene, start, cfg)[keep]
     covering = scene.points
     if dense:
@@ -323,7 +366,11 @@ def _seed_gaussians(
 
 
 def calibrate_observations(
-    observations: Observations, scene: Scene, cfg: FitConfig, seed: int | None = None
+    observations: Observations,
+    scene: Scene,
+    cfg: FitConfig,
+    seed: int | None = None,
+    on_chosen: Callable[[ModelName, Response], None] = lambda model, response: None,
 ) -> Selection:
     """Choose the photometric model and solve it.
 
@@ -332,6 +379,7 @@ def calibrate_observations(
         scene: for known exposures.
         cfg: options; with `photometry.select` off the given model and curve are solved.
         seed: which observations are held out; default the run's.
+        on_chosen: receives model and curve before they are solved on all observations.
 
     Raises:
         UserError: the known exposures cannot be read.
@@ -350,6 +398,7 @@ def calibrate_observations(
         known=known,
         seed=cfg.train.seed if seed is None else seed,
         fixed=None if p.select else (p.model, given),
+        on_chosen=on_chosen,
     )
     coarse = observations.too_coarse
     if not coarse:
@@ -361,17 +410,21 @@ def calibrate_observations(
     return dataclasses.replace(selection, reasons=(said, *selection.reasons))
 
 
+def with_choice(cfg: FitConfig, model: ModelName, response: Response) -> FitConfig:
+    """Return the configuration under a model and a curve."""
+    chosen = dataclasses.replace(
+        cfg.photometry, model=model, curve=response.curve, spline=response.spline
+    )
+    return dataclasses.replace(cfg, photometry=chosen)
+
+
 def with_selection(cfg: FitConfig, selection: Selection) -> FitConfig:
     """Return the configuration under the chosen model and curve.
 
     Known exposures that are to be kept are not learned, and no regulariser pulls at their mean.
     """
-    solution, p = selection.solution, cfg.photometry
-    response = solution.response
-    chosen = dataclasses.replace(
-        p, model=solution.model, curve=response.curve, spline=response.spline
-    )
-    cfg = dataclasses.replace(cfg, photometry=chosen)
+    p = cfg.photometry
+    cfg = with_choice(cfg, selection.solution.model, selection.solution.response)
     if p.known is None:
         return cfg
     regularizers = dataclasses.replace(cfg.loss.regularizers, log_exposure_mean=None)
@@ -391,6 +444,26 @@ def with_correspondence(cfg: FitConfig, tracks: Observations | None) -> FitConfi
     found = tracks is not None and len(tracks.points) > 0
     relative = dataclasses.replace(relative, correspondence="tracks" if found else "depth")
     return dataclasses.replace(cfg, loss=dataclasses.replace(cfg.loss, relative_exposure=relative))
+
+
+def _likely(cfg: FitConfig, matched: bool) -> FitConfig | None:
+    """Return the configuration that a fit probably has once exposures are solved; None: who knows.
+
+    Args:
+        cfg: before.
+        matched: colours of shared points will be there.
+    """
+    p, d, relative = cfg.photometry, cfg.densify, cfg.loss.relative_exposure
+    slots_known = d.method != "adaptive" and d.max_gaussians != "auto"
+    if p.known is not None or relative.weight is not None or not slots_known:
+        return None
+    if p.start == "tracks" and p.select:
+        p = dataclasses.replace(p, model="view_exposure")
+    if relative.correspondence is None:
+        found = matched or p.start == "tracks"
+        relative = dataclasses.replace(relative, correspondence="tracks" if found else "depth")
+    loss = dataclasses.replace(cfg.loss, relative_exposure=relative)
+    return dataclasses.replace(cfg, photometry=p, loss=loss)
 
 
 def without_tracks(cfg: FitConfig) -> FitConfig:

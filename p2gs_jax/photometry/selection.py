@@ -11,6 +11,7 @@ together: a wrong curve fixed first drives every criterion to a gamma per view.
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -205,6 +206,7 @@ def select(
     known: KnownExposures | None = None,
     seed: int = 0,
     fixed: tuple[ModelName, Response] | None = None,
+    on_chosen: Callable[[ModelName, Response], None] = lambda model, response: None,
 ) -> Selection:
     """Choose model and curve on held-out observations and solve the choice on all of them.
 
@@ -216,6 +218,7 @@ def select(
         known: exposures known beforehand; used in the final solution only.
         seed: which observations are held out.
         fixed: solve this model under this curve instead of choosing.
+        on_chosen: receives the choice before it is solved on all observations.
     """
     make = functools.partial(make_problem, black=black, saturation=saturation, pivot=pivot)
     if fixed is not None:
@@ -251,6 +254,7 @@ def select(
         codes = _largest_difference(judged[best].errors, found.errors, o.views[where], views)
         candidates.append(Candidate(model, curve, count, mean[model, curve], behind, error, codes))
     chosen = choose(candidates)
+    on_chosen(chosen.model, chosen.response)
     candidates.sort(key=lambda c: -c.density)
     solution = fit_model(make(observations, known=known), chosen.model, chosen.response)
     return Selection(solution, tuple(candidates), (*notes, *_reasons(chosen, candidates)))

@@ -31,6 +31,10 @@ class Room(NamedTuple):
     entries: int
     visible: int
 
+    def holds(self, other: Room) -> bool:
+        """Return whether what fits the other fits this."""
+        return self.entries >= other.entries and self.visible >= other.visible
+
     def grown(self, entries: int, visible: int) -> Room:
         """Return room for a view that did not fit, with some to spare."""
         return Room(

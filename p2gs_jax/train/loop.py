@@ -57,7 +57,7 @@ from p2gs_jax.train.state import (
 from p2gs_jax.train.step import Controls, StepReport, finite_names, make_step
 from p2gs_jax.train.validation import make_judge
 from p2gs_jax.train.views import TrainingViews
-from p2gs_jax.types import Batch, Camera, Params
+from p2gs_jax.types import Batch, Camera, Gaussians, Params
 
 PAIRS_PER_STEP = 4096
 MAX_BURST = 50
@@ -106,6 +106,7 @@ class Trainer:
         pairs: corresponding observations, for the relative-exposure readings that need them.
         coverage: how much of the scene the views show.
         run_dir: where `log.jsonl` and `checkpoints/` go.
+        programs: compiled steps, some of them perhaps begun.
         on_log: called with every log record.
         on_message: called with everything the user must know.
         validation: training views that automatic growth is judged by.
@@ -120,6 +121,7 @@ class Trainer:
         pairs: ColorPairs | None,
         coverage: Coverage,
         run_dir: Path,
+        programs: StepPrograms,
         on_log: Callable[[LogRecord], None] = lambda record: None,
         on_message: Callable[[str], None] = lambda text: None,
         validation: Sequence[int] = (),
@@ -129,7 +131,8 @@ class Trainer:
         self.coverage = coverage
         self.run_dir, self.on_log, self.on_message = run_dir, on_log, on_message
         self.optimizer = make_optimizer(cfg)
-        self.programs = StepPrograms(make_step(cfg, self.optimizer, extent))
+        self.step = make_step(cfg, self.optimizer, extent)
+        self.programs = programs
         self._rng = jax.jit(
             lambda step: jax.random.fold_in(jax.random.key(cfg.train.seed + 1), step)
         )
@@ -200,20 +203,8 @@ class Trainer:
         Raises:
             DivergenceError: a loss term or gradient is not finite.
         """
-        try:
-            return self._run(params, alive, resume, spent_s, finish_s)
-        finally:
-            self.programs.close()
-
-    def _run(
-        self, params: Params, alive, resume: bool, spent_s: float, finish_s: float
-    ) -> TrainResult:
         train = self.cfg.train
-        seeds = int(np.sum(np.asarray(alive)))
-        limit = self._limit(seeds)
-        slots = seeds
-        if self.cfg.densify.method == "mcmc" and not self.auto:
-            slots = max(limit or 0, seeds)
+        limit, slots = self._slots(int(np.sum(np.asarray(alive))))
         state = initial_state(params, alive, self.optimizer, slots)
         pace = Pace.from_config(train, spent_s + finish_s)
         host = HostState(pace=pace.per_step)
@@ -228,7 +219,8 @@ class Trainer:
         session_start = time.monotonic()
         before = host.elapsed_s
         last_save = session_start
-        self._make_room(state, host, limit)
+        self._make_room(state.params.gaussians, state.population.alive, host, limit)
+        self._expect(state, host)
         while host.progress < 1.0 - 0.5 * host.pace:
             shrink = schedule.shrink_at(host.progress, self.levels)
             state, reports = self._burst(state, host)
@@ -273,6 +265,27 @@ class Trainer:
     def _seconds(self) -> dict[str, float]:
         """Return where the time went, by name."""
         return {"compiling": self.programs.waited_s, **self.clock.seconds}
+
+    def expect(self, params: Params, images: bool) -> None:
+        """Begin to compile the steps of a run before its colours and exposures are known.
+
+        Args:
+            params: as the run will have them, as far as they are known.
+            images: the tone curve is known.
+        """
+        seeds = params.gaussians.capacity
+        limit, slots = self._slots(seeds)
+        alive, host = np.ones(seeds, bool), HostState()
+        self._make_room(params.gaussians, alive, host, limit)
+        self.programs.rooms = dict(host.rooms)
+        start = functools.partial(initial_state, optimizer=self.optimizer, slots=slots)
+        self._expect(jax.eval_shape(start, params, alive), host, images)
+
+    def _slots(self, seeds: int) -> tuple[int | None, int]:
+        """Return the bound on the population, or None, and room for it to begin with."""
+        limit = self._limit(seeds)
+        known = self.cfg.densify.method == "mcmc" and not self.auto
+        return limit, max(limit or 0, seeds) if known else seeds
 
     def _limit(self, seeds: int) -> int | None:
         """Return the bound on the population; None: there is none."""
@@ -324,7 +337,7 @@ class Trainer:
                 ),
             )
             key = self._program(state, batch, partner, host, shrink)
-            state, report = self.programs.get(key, *arguments)(*arguments)
+            state, report = self.programs.get(self.step, key, *arguments)(*arguments)
             reports.append((step, progress, report))
             progress = progress + host.pace
         kind = int(state.fault.kind)
@@ -373,45 +386,52 @@ class Trainer:
         end = next((end for end, factor in self.levels if factor == shrink), 1.0)
         return schedule.sh_degree_at(end, self.cfg.train, self.sh_degree)
 
-    def _make_room(self, state: FitState, host: HostState, limit: int | None) -> None:
-        """Estimate the room of every image size to come, and begin to compile its step."""
-        gaussians = jax.tree.map(np.asarray, state.params.gaussians)
-        alive = np.asarray(state.population.alive)
-        most = max(limit or 0, state.params.gaussians.capacity)
-        sizes: dict[int, int] = {}
+    def _make_room(self, gaussians: Gaussians, alive, host: HostState, limit: int | None) -> None:
+        """Estimate the room of every image size to come."""
+        gaussians, alive = jax.tree.map(np.asarray, gaussians), np.asarray(alive)
+        most = max(limit or 0, gaussians.capacity)
         for end, shrink in self.levels:
             if end <= host.progress:
                 continue
-            cameras: dict[tuple[int, int], list[Camera]] = {}
-            for index in range(len(self.views)):
-                camera = self.views.camera(index, shrink)
-                cameras.setdefault((camera.width, camera.height), []).append(camera)
-            for size, taken in cameras.items():
-                if _name(size) not in host.rooms:
-                    host.rooms[_name(size)] = room_for(
-                        gaussians, alive, taken, most, self.cfg.render
-                    )
-            sizes[shrink] = len(cameras)
+            for size, cameras in self._sizes(shrink).items():
+                name = _name(size)
+                if name in host.rooms:
+                    continue
+                room = room_for(gaussians, alive, cameras, most, self.cfg.render)
+                begun = self.programs.rooms.get(name, room)
+                host.rooms[name] = begun if begun.holds(room) else room
         self._share_visible(host)
+
+    def _sizes(self, shrink: int) -> dict[tuple[int, int], list[Camera]]:
+        """Return the cameras of a level by the size of their images."""
+        cameras: dict[tuple[int, int], list[Camera]] = {}
+        for index in range(len(self.views)):
+            camera = self.views.camera(index, shrink)
+            cameras.setdefault((camera.width, camera.height), []).append(camera)
+        return cameras
+
+    def _expect(self, state: FitState, host: HostState, images: bool = True) -> None:
+        """Begin to compile what is known of the steps to come, given a state or its shapes."""
         if self.auto or self.cfg.densify.method == "adaptive":
             return  # the population's slots are not known beforehand
         ahead, step = False, host.step
-        for shrink, count in sizes.items():
-            if count > 1:
-                continue  # which size comes first is not known
+        for end, shrink in self.levels:
+            if end <= host.progress or len(self._sizes(shrink)) > 1:
+                continue  # over, or it is not known which size comes first
             batch = self.views.batch(self.views.index_at(step), shrink)
             partner = self._partner(step, shrink)
-            self.programs.expect(
-                self._program(state, batch, partner, host, shrink),
-                state,
-                batch,
-                partner,
-                on_host(Controls, np.float32(0), np.int32(0)),
-            )
+            key = self._program(state, batch, partner, host, shrink)
+            controls = on_host(Controls, np.float32(0), np.int32(0))
+            self.programs.expect(self.step, key, state, batch, partner, controls, images=images)
             if not ahead and self.cfg.densify.method == "mcmc":
                 ahead = True  # wanted soon after the first step
                 self._relocate = self.programs.ahead(
-                    self._relocate, self._key(host), gaussians, state.population, np.int32(0)
+                    ("relocate", self.cfg.densify, key.slots),
+                    self._relocate,
+                    jax.eval_shape(self._rng, np.int32(0)),
+                    state.params.gaussians,
+                    state.population,
+                    np.int32(0),
                 )
 
     def _partner(self, step: int, shrink: int) -> Partner:

@@ -20,6 +20,7 @@ from p2gs_jax.densify.population import grow
 from p2gs_jax.photometry.solution import LADDER
 from p2gs_jax.types import Gaussians, Params, Photometry
 
+# For exposures, gammas and corrections (Kingma and Ba).
 B1, B2 = 0.9, 0.999
 
 
@@ -49,10 +50,14 @@ class OptState(NamedTuple):
     rest: tuple[AdamState, optax.EmptyState]
 
 
-def scale_by_adam(eps: float, *, by_row: bool) -> optax.GradientTransformation:
+def scale_by_adam(
+    b1: float, b2: float, eps: float, *, by_row: bool
+) -> optax.GradientTransformation:
     """Return Adam (Kingma and Ba 2015).
 
     Args:
+        b1: share of the old mean of the gradients.
+        b2: share of the old mean of their squares.
         eps: added to the root of the second moment.
         by_row: count updates of every row, which the first axes of all parameters share.
     """
@@ -65,10 +70,10 @@ def scale_by_adam(eps: float, *, by_row: bool) -> optax.GradientTransformation:
     def update(updates, state: AdamState, params=None):
         del params
         counts = state.counts + 1
-        mu = jax.tree.map(lambda m, g: B1 * m + (1 - B1) * g, state.mu, updates)
-        nu = jax.tree.map(lambda v, g: B2 * v + (1 - B2) * g * g, state.nu, updates)
-        first = 1 / (1 - B1 ** counts.astype(jnp.float32))
-        second = 1 / (1 - B2 ** counts.astype(jnp.float32))
+        mu = jax.tree.map(lambda m, g: b1 * m + (1 - b1) * g, state.mu, updates)
+        nu = jax.tree.map(lambda v, g: b2 * v + (1 - b2) * g * g, state.nu, updates)
+        first = 1 / (1 - b1 ** counts.astype(jnp.float32))
+        second = 1 / (1 - b2 ** counts.astype(jnp.float32))
 
         def scaled(m, v):
             shape = counts.shape + (1,) * (m.ndim - counts.ndim) if by_row else ()
@@ -112,10 +117,10 @@ class Optimizer(NamedTuple):
 
 def make_optimizer(cfg: FitConfig) -> Optimizer:
     """Return Adam followed by the group rates."""
-    eps = cfg.optimizer.eps
+    o = cfg.optimizer
     return Optimizer(
-        optax.chain(scale_by_adam(eps, by_row=True), scale_by_rates()),
-        optax.chain(scale_by_adam(eps, by_row=False), scale_by_rates()),
+        optax.chain(scale_by_adam(o.b1, o.b2, o.eps, by_row=True), scale_by_rates()),
+        optax.chain(scale_by_adam(B1, B2, o.eps, by_row=False), scale_by_rates()),
     )
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import time
+from collections.abc import Hashable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -39,64 +40,71 @@ class Key(NamedTuple):
 
 
 class StepPrograms:
-    """The compiled steps of a run.
+    """The compiled steps of a fit.
 
-    Args:
-        step: from `make_step`; levels and populations share those of its programs that they can.
+    Levels and populations share those of the three programs of a step that they can, and so do a
+    step that was made before the exposures were known and the one that was made after.
 
     Attributes:
+        rooms: of the image sizes, by name, for which programs were begun before the start.
         waited_s: seconds for which a program was waited for.
     """
 
-    def __init__(self, step: Step):
-        self._step = step
-        self._made: dict[tuple, Future] = {}
+    def __init__(self):
+        self.rooms: dict[str, Room] = {}
+        self._made: dict[Hashable, Future] = {}
         self._worker = ThreadPoolExecutor(WORKERS, thread_name_prefix="compile")
         self.waited_s = 0.0
 
-    def expect(self, key: Key, *arguments: Any) -> None:
+    def expect(self, step: Step, key: Key, *arguments: Any, images: bool = True) -> None:
         """Begin to compile a step in the background.
 
         Args:
+            step: from `make_step`.
             key: what for.
             arguments: of the step, or their shapes.
+            images: the program between as well, which knows the tone curve.
         """
-        self._parts(key, arguments)
+        self._parts(step, key, arguments, images)
 
-    def _parts(self, key: Key, arguments) -> list[Future]:
+    def _parts(self, step: Step, key: Key, arguments, images: bool = True) -> list[Future]:
         """Return the programs of a step in their order, those yet unknown on their way."""
         rows = min(key.room.visible, key.slots)
         of_gaussians = (key.slots, rows, key.degree)
-        keys = [
-            ("show", *of_gaussians),
-            ("differentiate", key.size, key.room.entries, rows, key.pixels),
-            ("advance", *of_gaussians),
-        ]
+        shapes = {
+            "show": of_gaussians,
+            "differentiate": (key.size, key.room.entries, rows, key.pixels),
+            "advance": of_gaussians,
+        }
+        keys = {name: (name, step.options(name), shape) for name, shape in shapes.items()}
         # The longest first.
-        for name in (keys[1], keys[0], keys[2]):
-            if name not in self._made:
-                state, batch, partner, controls = _shapes(arguments)
-                lowered = functools.partial(
-                    self._step.lowered, name[0], state, batch, partner, controls
-                )
-                self._made[name] = self._worker.submit(
+        wanted = ("differentiate", "show", "advance") if images else ("advance", "show")
+        for name in wanted:
+            if keys[name] not in self._made:
+                lowered = functools.partial(step.lowered, name, *_shapes(arguments))
+                self._made[keys[name]] = self._worker.submit(
                     lambda lowered=lowered: lowered(room=key.room, degree=key.degree).compile()
                 )
-        return [self._made[name] for name in keys]
+        return [self._made[keys[name]] for name in shapes if name in wanted]
 
-    def ahead(self, program, *arguments: Any):
+    def ahead(self, key: Hashable, program, *arguments: Any):
         """Begin to compile another program in the background, and return it.
 
         Args:
+            key: tells it from others.
             program: a jitted function, called with arguments of these shapes from here on.
             arguments: its arguments, or their shapes.
         """
-        future = self._worker.submit(lambda: program.lower(*_shapes(arguments)).compile())
+        if key not in self._made:
+            self._made[key] = self._worker.submit(
+                lambda: program.lower(*_shapes(arguments)).compile()
+            )
+        future = self._made[key]
         return lambda *given: self._wait(future)(*given)
 
-    def get(self, key: Key, *arguments: Any):
+    def get(self, step: Step, key: Key, *arguments: Any):
         """Return a compiled step, `(state, batch, partner, controls) -> (state, report)`."""
-        return self._step.chained(*(self._wait(part) for part in self._parts(key, arguments)))
+        return step.chained(*(self._wait(part) for part in self._parts(step, key, arguments)))
 
     def _wait(self, future: Future):
         if future.done():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Hashable
 from typing import Any, NamedTuple, cast
 
 import equinox as eqx
@@ -157,12 +158,14 @@ class Step:
         differentiate: (shown, photometry, appearance, batch, partner, room=) -> ImageGradient.
         advance: (state, ids, count, gradient, frusta, controls, degree=) -> (state, report).
         cfg: everything.
+        extent: scene extent, scene units.
     """
 
     show: Any
     differentiate: Any
     advance: Any
     cfg: FitConfig
+    extent: float
 
     def __call__(
         self,
@@ -200,6 +203,19 @@ class Step:
             return advance(state, listed.ids, listed.visible, gradient, frusta, controls)
 
         return step
+
+    def options(self, name: str) -> Hashable:
+        """Return what one of the three programs, by its name, takes from the configuration.
+
+        Neither knows the curve but `differentiate`; that does not know which exposures move.
+        """
+        cfg, p = self.cfg, self.cfg.photometry
+        if name == "show":
+            return cfg.render, cfg.optimizer.visible_only
+        if name == "differentiate":
+            return cfg.render, cfg.loss, dataclasses.replace(p, model="constant")
+        rates = (cfg.optimizer, p.model, p.start, p.freeze_until, self.extent)
+        return cfg.render, cfg.loss, cfg.densify, cfg.train.seed, rates
 
     def lowered(
         self, name: str, state: FitState, batch, partner, controls, *, room: Room, degree: int
@@ -372,7 +388,7 @@ def make_step(cfg: FitConfig, optimizer: Optimizer, extent: float) -> Step:
         loss = jax.tree.reduce(jnp.add, updated.value, gradient.loss)
         return state, StepReport(loss, terms, gradient.psnr, gradient.entries, count)
 
-    return Step(show, differentiate, advance, cfg)
+    return Step(show, differentiate, advance, cfg, extent)
 
 
 def _differentiable(shown):

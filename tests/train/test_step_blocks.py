@@ -18,7 +18,7 @@ from p2gs_jax.render.blocks import BLOCK, splat
 from p2gs_jax.render.capacity import Room
 from p2gs_jax.render.visible import in_view
 from p2gs_jax.train import step as step_module
-from p2gs_jax.train.optimizer import B1, B2, learning_rates, make_optimizer
+from p2gs_jax.train.optimizer import B1, learning_rates, make_optimizer
 from p2gs_jax.train.state import FAULT_NONE, FAULT_NONFINITE, FAULT_OVERFLOW, initial_state
 from p2gs_jax.train.step import Controls, finite_names, make_step
 from p2gs_jax.types import Batch, Camera, Gaussians, Params, Photometry
@@ -136,13 +136,14 @@ def test_one_step_is_an_adam_update_of_the_gradient_of_the_total_loss(made, whic
     assert float(report.loss) == pytest.approx(made.loss, rel=1e-6)
     assert int(report.visible) == (made.seen.sum() if which == "after" else COUNT)
     rates = learning_rates(jnp.float32(PROGRESS), EXTENT, made.params, made.cfg, (DEGREE + 1) ** 2)
-    adam = optax.scale_by_adam(B1, B2, made.cfg.optimizer.eps)
+    o = made.cfg.optimizer
+    adam = optax.scale_by_adam(o.b1, o.b2, o.eps)
     updates, _ = adam.update(made.gradient, adam.init(made.params))
     moments = state.opt_state.gaussians[0]
     for name in FIELDS:
         g = rows_of(made.gradient.gaussians, name, made.seen)
-        mu = rows_of(moments.mu, name, made.seen) / (1 - B1)
-        nu = rows_of(moments.nu, name, made.seen) / (1 - B2)
+        mu = rows_of(moments.mu, name, made.seen) / (1 - o.b1)
+        nu = rows_of(moments.nu, name, made.seen) / (1 - o.b2)
         assert np.linalg.norm(mu - g) <= 1e-5 * np.linalg.norm(g), name
         assert np.linalg.norm(np.sqrt(nu) - np.abs(g)) <= 1e-4 * np.linalg.norm(g), name
         rate = np.asarray(getattr(rates.gaussians, name))
@@ -265,6 +266,8 @@ def test_a_short_fit_traces_its_step_once_per_image_size(tmp_path, monkeypatch):
         return image_loss(shown, photometry, appearance, batch, *others)
 
     chex.clear_trace_counter()
-    monkeypatch.setattr(step_module, "image_loss", chex.assert_max_traces(counted, n=2))
+    # Once more before the exposures are known, for the shapes that the last program of a step takes.
+    monkeypatch.setattr(step_module, "image_loss", chex.assert_max_traces(counted, n=3))
     fit(scene, tmp_path / "run", cfg)
-    assert len(sizes) == len(set(sizes)) == 2
+    assert len(set(sizes)) == 2
+    assert len(sizes) <= 3
