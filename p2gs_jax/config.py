@@ -287,7 +287,7 @@ class DensifyConfig:
 class InitConfig:
     """From seed points to Gaussians."""
 
-    opacity: float = 0.5
+    opacity: float = 0.3
     """Initial peak opacity (3DGS: 0.1; ours: BUILD_NOTES, "Momentum")."""
     max_seeds: int = 200_000
     """Seed points kept, sampled evenly; the rest is reported."""

@@ -266,7 +266,7 @@ def test_a_short_fit_traces_its_step_once_per_image_size(tmp_path, monkeypatch):
         return image_loss(shown, photometry, appearance, batch, *others)
 
     chex.clear_trace_counter()
-    # Once more before the exposures are known, for the shapes that the last program of a step takes.
+    # Once more before exposures are known, for the shapes that the last program of a step takes.
     monkeypatch.setattr(step_module, "image_loss", chex.assert_max_traces(counted, n=3))
     fit(scene, tmp_path / "run", cfg)
     assert len(set(sizes)) == 2
