@@ -171,9 +171,19 @@ def prepare(
     points = scene.points[keep]
     expected: Expected | None = None
     likely = _likely(cfg, has_tracks(scene) or dense)
+    # Dense seeds cover some of what the points do not.
+    shell = None if dense else find_shell(views, scene.points, extent, cfg.init)
     if likely is not None:
+        black = gaussians_from_points(points, np.zeros_like(points), views, cfg)
+        if shell is not None:
+            black = merge(
+                black,
+                gaussians_from_points(
+                    shell.points, np.zeros_like(shell.points), views, cfg, scales=shell.scales
+                ),
+            )
         params = Params(
-            gaussians_from_points(points, np.zeros_like(points), views, cfg),
+            black,
             _photometry(None, len(views), cfg),
             _appearance(len(views), cfg),
         )
@@ -211,7 +221,6 @@ def prepare(
         option = "--gaussians" if most == bound else "--init.max-seeds"
         notes.append(f"{len(scene.points)} seed points were thinned to {len(keep)} ({option}).")
     radiance = _seed_radiance(scene, start, cfg)[keep]
-    covering = scene.points
     if dense:
         match = (
             rough_tones(tracks, len(views))
@@ -220,11 +229,11 @@ def prepare(
         )
         added = _dense(scene, store, match, points, photometry, coverage, cfg, reporter)
         gaussians = _seed_gaussians(points, radiance, added, views, cfg)
-        covering = np.concatenate([covering, added.points])
+        covering = np.concatenate([scene.points, added.points])
+        shell = find_shell(views, covering, extent, cfg.init)
         notes.append(added.note())
     else:
         gaussians = gaussians_from_points(points, radiance, views, cfg)
-    shell = find_shell(views, covering, extent, cfg.init)
     if shell is not None:
         gaussians = merge(gaussians, _shell_gaussians(shell, scene, store, photometry, views, cfg))
         notes.append(
@@ -454,7 +463,7 @@ def _likely(cfg: FitConfig, matched: bool) -> FitConfig | None:
         matched: colours of shared points will be there.
     """
     p, d, relative = cfg.photometry, cfg.densify, cfg.loss.relative_exposure
-    slots_known = d.method != "adaptive" and d.max_gaussians != "auto"
+    slots_known = d.method == "mcmc" and d.max_gaussians != "auto"
     if p.known is not None or relative.weight is not None or not slots_known:
         return None
     if p.start == "tracks" and p.select:
