@@ -1,0 +1,107 @@
+"""Which steps share a program, and what waiting for one is counted as."""
+
+import dataclasses
+import threading
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.render.capacity import Room
+from p2gs_jax.train.optimizer import make_optimizer
+from p2gs_jax.train.programs import Key, StepPrograms
+from p2gs_jax.train.step import make_step
+
+COARSE = Key((120, 80), 500, Room(4096, 4096), 3, ("uint16",))
+FULL = COARSE._replace(size=(240, 160), room=Room(8192, 4096), pixels=("uint8",))
+SHAPES = tuple(np.zeros(k) for k in range(1, 5))
+
+
+class Traced:
+    """Stands for a step: counts what is compiled, and computes nothing."""
+
+    def __init__(self, cfg: FitConfig):
+        real = make_step(cfg, make_optimizer(cfg), 1.0)
+        self.options, self.made, self.gate = real.options, [], threading.Event()
+        self.gate.set()
+
+    def lowered(self, name, *arguments, room, degree):
+        def compile():
+            self.gate.wait(10)
+            self.made.append(name)
+            return name
+
+        return SimpleNamespace(compile=compile)
+
+    def chained(self, *programs):
+        return programs
+
+
+@pytest.fixture
+def programs():
+    made = StepPrograms()
+    yield made
+    made.close()
+
+
+def under(curve="srgb", model="view_exposure", **optimizer):
+    cfg = FitConfig()
+    return dataclasses.replace(
+        cfg,
+        photometry=dataclasses.replace(cfg.photometry, curve=curve, model=model),
+        optimizer=dataclasses.replace(cfg.optimizer, **optimizer),
+    )
+
+
+def test_levels_share_what_is_done_per_gaussian(programs):
+    step = Traced(under())
+    for key in (COARSE, FULL, COARSE):
+        assert programs.get(step, key, *SHAPES) == ("show", "differentiate", "advance")
+    assert sorted(step.made) == ["advance", "differentiate", "differentiate", "show"]
+
+
+def test_a_larger_population_keeps_the_program_of_the_image(programs):
+    step = Traced(under())
+    for slots in (5000, 9000):
+        programs.get(step, COARSE._replace(slots=slots), *SHAPES)
+    assert sorted(step.made) == ["advance", "advance", "differentiate", "show", "show"]
+
+
+@pytest.mark.parametrize(
+    ("change", "again"),
+    [
+        ({"curve": "power"}, ["differentiate"]),
+        ({"model": "view_exposure_gamma"}, ["advance"]),
+        ({"scales": 0.5}, ["advance"]),
+        ({}, []),
+    ],
+)
+def test_what_was_begun_before_exposures_were_known_is_used_where_it_fits(programs, change, again):
+    early, step = Traced(under()), Traced(under(**change))
+    programs.expect(early, COARSE, *SHAPES)
+    programs.get(step, COARSE, *SHAPES)
+    assert sorted(step.made) == again
+
+
+def test_without_a_curve_only_programs_of_gaussians_begin(programs):
+    step = Traced(under())
+    programs.expect(step, COARSE, *SHAPES, images=False)
+    while len(step.made) < 2:
+        time.sleep(0.01)
+    assert sorted(step.made) == ["advance", "show"]
+    programs.get(step, COARSE, *SHAPES)
+    assert step.made[2:] == ["differentiate"]
+
+
+def test_only_waiting_is_counted(programs):
+    step = Traced(under())
+    programs.get(step, COARSE, *SHAPES)
+    before = programs.waited_s
+    programs.get(step, COARSE, *SHAPES)
+    assert programs.waited_s == before
+    step.gate.clear()
+    threading.Timer(0.05, step.gate.set).start()
+    programs.get(step, FULL, *SHAPES)
+    assert programs.waited_s > before
