@@ -202,21 +202,21 @@ class LossConfig:
 class OptimizerConfig:
     """Adam and its learning rates; all rates are per step."""
 
-    means: float = 1.6e-3
+    means: float = 2.4e-3
     """Times the scene extent (3DGS: 1.6e-4 over 30k steps, in all of which every Gaussian moves;
     ours, these and all below: a few thousand, and a Gaussian moves only in those that show it:
     BUILD_NOTES, "Rates")."""
-    means_final: float = 1.6e-5
+    means_final: float = 2.4e-5
     """Reached at the end, exponentially (3DGS: 1.6e-6)."""
-    sh_dc: float = 8e-2
+    sh_dc: float = 1.2e-1
     """Degree 0 (3DGS: 2.5e-3 for LDR colours; log radiance takes 8 times that)."""
-    sh_rest: float = 4e-3
+    sh_rest: float = 6e-3
     """Degrees 1-3 (3DGS: 2.5e-3 / 20)."""
-    opacities: float = 2e-1
+    opacities: float = 3e-1
     """Logits (3DGS: 5e-2)."""
-    scales: float = 8e-2
+    scales: float = 1.2e-1
     """Logarithms (3DGS: 5e-3)."""
-    quats: float = 4e-3
+    quats: float = 6e-3
     """Quaternions (3DGS: 1e-3)."""
     exposures: float = 1e-3
     """Raw exposures (ours: docs/photometry.md, 4; ten times this where no tracks gave a start)."""
