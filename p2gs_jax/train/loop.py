@@ -62,6 +62,7 @@ from p2gs_jax.types import Batch, Camera, Gaussians, Params
 PAIRS_PER_STEP = 4096
 MAX_BURST = 50
 NEARLY_DONE = 0.99
+SLOTS = 1024
 # Steps at full size cost about twice the present ones, at a coarse level.
 FULL_SIZE_COST = 2.0
 
@@ -284,8 +285,10 @@ class Trainer:
     def _slots(self, seeds: int) -> tuple[int | None, int]:
         """Return the bound on the population, or None, and room for it to begin with."""
         limit = self._limit(seeds)
-        known = self.cfg.densify.method == "mcmc" and not self.auto
-        return limit, max(limit or 0, seeds) if known else seeds
+        if self.cfg.densify.method != "mcmc" or self.auto:
+            return limit, seeds
+        # Rounded: a seed more or less, known late, should not be another program.
+        return limit, -(-max(limit or 0, seeds) // SLOTS) * SLOTS
 
     def _limit(self, seeds: int) -> int | None:
         """Return the bound on the population; None: there is none."""
