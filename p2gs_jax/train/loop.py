@@ -220,7 +220,8 @@ class Trainer:
         session_start = time.monotonic()
         before = host.elapsed_s
         last_save = session_start
-        self._make_room(state.params.gaussians, state.population.alive, host, limit)
+        most = max(limit or 0, slots)
+        self._make_room(state.params.gaussians, state.population.alive, host, most)
         self._expect(state, host)
         while host.progress < 1.0 - 0.5 * host.pace:
             shrink = schedule.shrink_at(host.progress, self.levels)
@@ -277,7 +278,7 @@ class Trainer:
         seeds = params.gaussians.capacity
         limit, slots = self._slots(seeds)
         alive, host = np.ones(seeds, bool), HostState()
-        self._make_room(params.gaussians, alive, host, limit)
+        self._make_room(params.gaussians, alive, host, max(limit or 0, slots))
         self.programs.rooms = dict(host.rooms)
         start = functools.partial(initial_state, optimizer=self.optimizer, slots=slots)
         self._expect(jax.eval_shape(start, params, alive), host, images)
@@ -389,10 +390,9 @@ class Trainer:
         end = next((end for end, factor in self.levels if factor == shrink), 1.0)
         return schedule.sh_degree_at(end, self.cfg.train, self.sh_degree)
 
-    def _make_room(self, gaussians: Gaussians, alive, host: HostState, limit: int | None) -> None:
-        """Estimate the room of every image size to come."""
+    def _make_room(self, gaussians: Gaussians, alive, host: HostState, most: int) -> None:
+        """Estimate the room of every image size to come, for a population of at most so many."""
         gaussians, alive = jax.tree.map(np.asarray, gaussians), np.asarray(alive)
-        most = max(limit or 0, gaussians.capacity)
         for end, shrink in self.levels:
             if end <= host.progress:
                 continue
