@@ -16,7 +16,7 @@ from p2gs_jax.synth.settings import Layout, Sensor
 class Demo:
     """Make a small street with known exposures, fit it, and compare.
 
-    Takes four minutes on two cores; open its summary.png first.
+    Takes three minutes on two cores; open its summary.png first.
 
         p2gs-jax demo
         p2gs-jax demo --out runs/paper --preset paper --budget 5m
@@ -27,7 +27,7 @@ class Demo:
     preset: Annotated[str, tyro.conf.arg(metavar="NAME")] = "robust"
     """A preset of `fit`: robust, paper, paper_appendix, 3dgs, 3dgs_gain, 3dgs_affine,
     3dgs_bilateral or 3dgs_curve."""
-    budget: Annotated[str, tyro.conf.arg(metavar="TIME")] = "150s"
+    budget: Annotated[str, tyro.conf.arg(metavar="TIME")] = "125s"
     """Wall-clock limit of the fit: 90s, 20m or 1h30m."""
     frames: int = 10
     """Frames per camera."""
