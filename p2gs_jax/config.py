@@ -418,7 +418,7 @@ def _ldr(
     """Return 3DGS in display values under the schedule, renderer and budget of `robust`.
 
     Exposures start at 1; without `gain` they stay there. Rates of the colours: the best of three
-    (BUILD_NOTES, "LDR splatting"), raised with those of `robust` (BUILD_NOTES, "Rates").
+    (BUILD_NOTES, "LDR splatting"), times four, unmeasured (BUILD_NOTES, "Rates").
     """
     robust = _robust()
     return dataclasses.replace(

@@ -82,7 +82,7 @@ def optimise(
 
 
 def _begin(programs: StepPrograms, known: Expected, scene: Scene, run_dir: Path) -> None:
-    """Begin to compile steps while the exposures are solved: that leaves a core idle."""
+    """Begin to compile steps while the exposures are solved, mostly on one core."""
     views = TrainingViews(known.store, scene.train_indices, known.cfg.train.seed)
     trainer = Trainer(known.cfg, views, known.extent, None, known.coverage, run_dir, programs)
     trainer.expect(known.params, known.images)

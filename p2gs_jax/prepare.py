@@ -212,7 +212,7 @@ def prepare(
                 "No point is seen twice: exposures start at 1 and are learned from the first step."
             )
             cfg = without_tracks(cfg)
-    cfg = with_correspondence(cfg, tracks)
+    cfg = with_correspondence(cfg, tracks is not None and len(tracks.points) > 0)
     start = None if selection is None else selection.solution
     photometry = _photometry(start, len(views), cfg)
     solved = time.monotonic()
@@ -445,12 +445,16 @@ def with_selection(cfg: FitConfig, selection: Selection) -> FitConfig:
     )
 
 
-def with_correspondence(cfg: FitConfig, tracks: Observations | None) -> FitConfig:
-    """Return the configuration with a way to compare photographs that the scene allows."""
+def with_correspondence(cfg: FitConfig, found: bool) -> FitConfig:
+    """Return the configuration with a way to compare photographs that the scene allows.
+
+    Args:
+        cfg: before; a way that is given stays.
+        found: there are colours of shared points.
+    """
     relative = cfg.loss.relative_exposure
     if relative.correspondence is not None:
         return cfg
-    found = tracks is not None and len(tracks.points) > 0
     relative = dataclasses.replace(relative, correspondence="tracks" if found else "depth")
     return dataclasses.replace(cfg, loss=dataclasses.replace(cfg.loss, relative_exposure=relative))
 
@@ -462,17 +466,13 @@ def _likely(cfg: FitConfig, matched: bool) -> FitConfig | None:
         cfg: before.
         matched: colours of shared points will be there.
     """
-    p, d, relative = cfg.photometry, cfg.densify, cfg.loss.relative_exposure
+    p, d = cfg.photometry, cfg.densify
     slots_known = d.method == "mcmc" and d.max_gaussians != "auto"
-    if p.known is not None or relative.weight is not None or not slots_known:
+    if p.known is not None or cfg.loss.relative_exposure.weight is not None or not slots_known:
         return None
     if p.start == "tracks" and p.select:
-        p = dataclasses.replace(p, model="view_exposure")
-    if relative.correspondence is None:
-        found = matched or p.start == "tracks"
-        relative = dataclasses.replace(relative, correspondence="tracks" if found else "depth")
-    loss = dataclasses.replace(cfg.loss, relative_exposure=relative)
-    return dataclasses.replace(cfg, photometry=p, loss=loss)
+        cfg = dataclasses.replace(cfg, photometry=dataclasses.replace(p, model="view_exposure"))
+    return with_correspondence(cfg, matched or p.start == "tracks")
 
 
 def without_tracks(cfg: FitConfig) -> FitConfig:

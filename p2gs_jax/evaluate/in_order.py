@@ -19,7 +19,7 @@ def in_order(function: Callable[[Item], Result], items: Iterable[Item]) -> Itera
     """Yield what a function returns for every item, in their order, computed in threads.
 
     Numpy, JAX and image files leave the interpreter to other threads. The first item is computed
-    alone: it compiles what all need. At most twice as many results as threads are waiting.
+    alone: it compiles what all need. At most one result more than there are threads is held.
     """
     workers = min(os.cpu_count() or 1, MOST_WORKERS)
     rest = iter(items)

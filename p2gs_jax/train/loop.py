@@ -277,7 +277,7 @@ class Trainer:
         """
         seeds = params.gaussians.capacity
         limit, slots = self._slots(seeds)
-        alive, host = np.ones(seeds, bool), HostState()
+        alive, host = np.ones(seeds, bool), HostState(rooms=dict(self.programs.rooms))
         self._make_room(params.gaussians, alive, host, max(limit or 0, slots))
         self.programs.rooms = dict(host.rooms)
         start = functools.partial(initial_state, optimizer=self.optimizer, slots=slots)

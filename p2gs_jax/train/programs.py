@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -53,6 +53,7 @@ class StepPrograms:
     def __init__(self):
         self.rooms: dict[str, Room] = {}
         self._made: dict[Hashable, Future] = {}
+        self._ready: dict[tuple[Step, Key], Callable] = {}
         self._worker = ThreadPoolExecutor(WORKERS, thread_name_prefix="compile")
         self.waited_s = 0.0
 
@@ -104,7 +105,10 @@ class StepPrograms:
 
     def get(self, step: Step, key: Key, *arguments: Any):
         """Return a compiled step, `(state, batch, partner, controls) -> (state, report)`."""
-        return step.chained(*(self._wait(part) for part in self._parts(step, key, arguments)))
+        if (step, key) not in self._ready:
+            parts = self._parts(step, key, arguments)
+            self._ready[step, key] = step.chained(*(self._wait(part) for part in parts))
+        return self._ready[step, key]
 
     def _wait(self, future: Future):
         if future.done():

@@ -145,7 +145,7 @@ class ImageGradient(NamedTuple):
     psnr: Float[Array, ""]
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Step:
     """One optimisation step as three programs, one after the other.
 
