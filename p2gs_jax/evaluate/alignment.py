@@ -15,6 +15,7 @@ from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.photometry.formation import display, formation
 
 SEARCH_STOPS, SEARCH_STEPS, GOLDEN_STEPS = 5.0, 41, 30
+REFINE_STEPS = 30
 # The coarse search looks at one pixel in so many each way.
 SEARCH_STRIDE = 3
 # Stops: so much changes a display value by 1e-4, and 40 dB by 1e-3 dB.
@@ -104,3 +105,37 @@ def fit_exposure(
         throw=False,
     )
     return jnp.exp2(low + found.value)
+
+
+@functools.partial(jax.jit, static_argnames="cfg")
+def fit_exposure_and_gamma(
+    linear: Float[Array, "h w 3"],
+    photograph: Float[Array, "h w 3"],
+    mask: Float[Array, "h w"],
+    exposure: Float[Array, ""] | float,
+    gamma: Float[Array, ""] | float,
+    cfg: PhotometryConfig,
+    appearance: Float[Array, "..."] | None = None,
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return (exposure, gamma) with which a render fits a photograph best, in squared LDR error.
+
+    Levenberg-Marquardt on their logarithms from the given ones, which `fit_exposure` found.
+    """
+    # Imported late: of what evaluates, little searches.
+    import optimistix
+
+    weight = jnp.sqrt(mask / jnp.maximum(jnp.sum(mask), 1))[..., None]
+
+    def residuals(logs, _):
+        ldr = display(formation(linear, jnp.exp(logs[0]), jnp.exp(logs[1]), cfg, appearance))
+        return weight * (ldr - photograph)
+
+    found = optimistix.least_squares(
+        residuals,
+        optimistix.LevenbergMarquardt(rtol=TOLERANCE, atol=TOLERANCE),
+        jnp.log(jnp.stack([jnp.float32(exposure), jnp.float32(gamma)])),
+        options={"jac": "fwd"},
+        max_steps=REFINE_STEPS,
+        throw=False,
+    )
+    return jnp.exp(found.value[0]), jnp.exp(found.value[1])

@@ -3,8 +3,9 @@
 Protocols (docs/photometry.md, 6): `per_view` renders a training view with its own exposure and
 gamma; `averaged` uses the mean parameters over the training views (paper, Rendering for
 evaluation); `exposure_fitted` solves one scalar exposure from the photograph, because a held-out
-view has none of its own; against reference photographs of one common exposure, `scale_aligned`
-solves one scalar for all of them.
+view has none of its own; `exposure_and_gamma_fitted` solves both, where the model gives every view
+a gamma too; against reference photographs of one common exposure, `scale_aligned` solves one
+scalar for all of them.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from p2gs_jax.config import FitConfig
-from p2gs_jax.evaluate.alignment import fit_exposure
+from p2gs_jax.evaluate.alignment import fit_exposure, fit_exposure_and_gamma
 from p2gs_jax.evaluate.consistency import VideoScores
 from p2gs_jax.evaluate.in_order import in_order
 from p2gs_jax.evaluate.lpips import LpipsWeights, lpips
@@ -27,6 +28,7 @@ from p2gs_jax.evaluate.metrics import psnr, ssim
 from p2gs_jax.evaluate.radiance import RadianceScores, Truth
 from p2gs_jax.photometry.formation import inverse_tone_map
 from p2gs_jax.photometry.look import Look, develop
+from p2gs_jax.photometry.solution import LADDER
 from p2gs_jax.render.host import RenderView
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
@@ -101,6 +103,7 @@ class _Judged(NamedTuple):
         mask: which pixels count.
         scores: of `result.ldr`.
         scores_averaged: of `ldr_averaged`.
+        scores_both: of a held-out view with exposure and gamma fitted, or None.
         radiance: true linear radiance, or None.
         reference: photograph under the common exposure, or None.
     """
@@ -110,6 +113,7 @@ class _Judged(NamedTuple):
     mask: Float32[np.ndarray, "h w"]
     scores: dict[str, float]
     scores_averaged: dict[str, float]
+    scores_both: dict[str, float] | None
     radiance: np.ndarray | None
     reference: np.ndarray | None
 
@@ -179,10 +183,20 @@ def evaluate(
     def shown(linear, exposure, gamma, correction=mean_correction):
         return develop(linear, Look(exposure, gamma, cfg.photometry, correction))
 
+    tone = cfg.photometry
+
     def fitted(linear, photograph, mask) -> float:
         """Solve the exposure of a view that has none of its own."""
-        tone = cfg.photometry
         return float(fit_exposure(linear, photograph, mask, mean.gamma, tone, mean_correction))
+
+    def with_both(linear, photograph, mask, exposure) -> dict[str, float] | None:
+        """Score a held-out view with its exposure and gamma solved, where each view has both."""
+        if LADDER[tone.model].gamma != "view":
+            return None
+        start = (exposure, mean.gamma)
+        both = fit_exposure_and_gamma(linear, photograph, mask, *start, tone, mean_correction)
+        e, g = map(float, both)
+        return {**score(shown(linear, e, g), photograph, mask), "exposure": e, "gamma": g}
 
     row_of = {index: row for row, index in enumerate(scene.train_indices)}
 
@@ -195,11 +209,11 @@ def evaluate(
             row = row_of[index]
             e, g = float(exposures[row]), float(gammas[row])
             ldr = shown(linear, e, g, small.correction(row))
-            extra = {}
+            extra, both = {}, None
         else:
             e, g = fitted(linear, photograph, mask), mean.gamma
             ldr = shown(linear, e, g)
-            extra = {"exposure": e}
+            extra, both = {"exposure": e}, with_both(linear, photograph, mask, e)
         depth, alpha = np.asarray(result.depth), np.asarray(result.alpha)
         return _Judged(
             ViewResult(index, linear, alpha, depth, ldr, photograph, e, g),
@@ -207,12 +221,13 @@ def evaluate(
             mask,
             {**score(ldr, photograph, mask), **extra},
             score(ldr_mean, photograph, mask),
+            both,
             None if radiance is None else radiance(index),
             None if reference is None else _lookup(reference, index),
         )
 
     own, averaged = _Collector(), _Collector()
-    test_averaged, test_fitted = _Collector(), _Collector()
+    test_averaged, test_fitted, test_both = _Collector(), _Collector(), _Collector()
     scores = RadianceScores()
     reference_views: list[tuple[int, np.ndarray, np.ndarray, np.ndarray]] = []
     videos = {name: VideoScores() for name in ("per_view", "averaged", "photographs")}
@@ -223,6 +238,8 @@ def evaluate(
         training = view.split == "train"
         (own if training else test_fitted).add(view.name, found.scores)
         (averaged if training else test_averaged).add(view.name, found.scores_averaged)
+        if found.scores_both is not None:
+            test_both.add(view.name, found.scores_both)
         if found.radiance is not None:
             scores.add(view.name, view.split, result.linear, found.radiance, found.mask)
         if found.reference is not None:
@@ -237,6 +254,8 @@ def evaluate(
         "train": {**own.summary(), "averaged": averaged.summary()},
         "test": {"averaged": test_averaged.summary(), "exposure_fitted": test_fitted.summary()},
     }
+    if test_both.rows:
+        metrics["test"]["exposure_and_gamma_fitted"] = test_both.summary()
     metrics["train"]["per_view"] = metrics["train"].pop("per_view", {})
     metrics["consistency"] = {name: video.summary() for name, video in videos.items()}
     if scores.views:

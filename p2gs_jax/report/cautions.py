@@ -116,22 +116,29 @@ def _without_exposure(run: RunFiles) -> Caution | None:
     )
 
 
+def _fitted(run: RunFiles) -> str:
+    """Return the protocol that leaves least of a held-out view's own camera in its score."""
+    both = "exposure_and_gamma_fitted"
+    return both if run.part("test", both) else "exposure_fitted"
+
+
 def _generalisation(run: RunFiles) -> Caution | None:
     train = run.number("train", "psnr")
-    held_out = run.number("test", "exposure_fitted", "psnr")
+    held_out = run.number("test", _fitted(run), "psnr")
     if train is None or held_out is None or train - held_out < WIDE_GAP:
         return None
+    solved = _fitted(run).removesuffix("_fitted").replace("_", " ")
     return Caution(
         "New views are worse than training views",
         f"Training photographs are met at {train:.1f} dB, held-out ones at {held_out:.1f} dB, even "
-        "with an exposure fitted to each. Either the held-out views look where few others do, or "
+        f"with {solved} fitted to each. Either the held-out views look where few others do, or "
         "there are too few photographs for this many Gaussians: add photographs, or try "
         "--gaussians auto.",
     )
 
 
 def _outlier(run: RunFiles) -> Caution | None:
-    per_view = run.part("test", "exposure_fitted", "per_view")
+    per_view = run.part("test", _fitted(run), "per_view")
     scores = {n: s for n, v in per_view.items() if (s := number_at(v, "psnr")) is not None}
     if len(scores) < 3:
         return None

@@ -70,6 +70,12 @@ NUMBERS: tuple[tuple[str, tuple[str, ...], int, Better], ...] = (
     ("held-out PSNR, fitted exposure, dB", ("test", "exposure_fitted", "psnr"), 2, "high"),
     ("held-out SSIM, fitted exposure", ("test", "exposure_fitted", "ssim"), 4, "high"),
     ("held-out LPIPS, fitted exposure", ("test", "exposure_fitted", "lpips"), 4, "low"),
+    (
+        "held-out PSNR, fitted exposure and gamma, dB",
+        ("test", "exposure_and_gamma_fitted", "psnr"),
+        2,
+        "high",
+    ),
     ("reference PSNR, one scale, dB", ("reference", "scale_aligned", "psnr"), 2, "high"),
     (
         "reference PSNR, held out, one scale, dB",

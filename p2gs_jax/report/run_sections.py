@@ -20,6 +20,11 @@ PROTOCOLS = (
     ("training", "mean exposure and gamma", ("train", "averaged")),
     ("held out", "mean exposure and gamma", ("test", "averaged")),
     ("held out", "exposure fitted to each photograph", ("test", "exposure_fitted")),
+    (
+        "held out",
+        "exposure and gamma fitted to each photograph",
+        ("test", "exposure_and_gamma_fitted"),
+    ),
     ("all", "reference photographs, mean exposure", ("reference", "averaged")),
     ("all", "reference photographs, geometric mean exposure", ("reference", "geometric")),
     ("all", "reference photographs, one scale for all", ("reference", "scale_aligned")),

@@ -23,6 +23,7 @@ COLUMNS: tuple[tuple[str, tuple[str, ...], int], ...] = (
     ("test_psnr_averaged", ("test", "averaged", "psnr"), 2),
     ("test_lpips_averaged", ("test", "averaged", "lpips"), 4),
     ("test_psnr_fitted", ("test", "exposure_fitted", "psnr"), 2),
+    ("test_psnr_both_fitted", ("test", "exposure_and_gamma_fitted", "psnr"), 2),
     ("reference_psnr_averaged", ("reference", "averaged", "psnr"), 2),
     ("reference_psnr", ("reference", "scale_aligned", "psnr"), 2),
     ("reference_lpips", ("reference", "scale_aligned", "lpips"), 4),

@@ -5,7 +5,12 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import PhotometryConfig
-from p2gs_jax.evaluate.alignment import align_scale, exposure_error, fit_exposure
+from p2gs_jax.evaluate.alignment import (
+    align_scale,
+    exposure_error,
+    fit_exposure,
+    fit_exposure_and_gamma,
+)
 from p2gs_jax.evaluate.metrics import hdr_error_stops, psnr
 from p2gs_jax.photometry.formation import display, formation
 
@@ -34,6 +39,20 @@ def test_fit_exposure_finds_the_exposure(true, curve):
     photo = display(formation(linear, jnp.float32(true), jnp.float32(2.2), cfg))
     found = fit_exposure(linear, photo, jnp.ones((20, 30)), 2.2, cfg)
     assert float(found) == pytest.approx(true, rel=2e-3)
+
+
+@pytest.mark.parametrize(("true", "gamma"), [(0.3, 1.7), (1.0, 3.1), (4.0, 2.4)])
+def test_exposure_and_gamma_are_found_together(true, gamma):
+    cfg = PhotometryConfig()
+    rng = np.random.default_rng(0)
+    linear = jnp.asarray(np.exp2(rng.normal(-3, 2, (20, 30, 3))), jnp.float32)
+    photo = display(formation(linear, jnp.float32(true), jnp.float32(gamma), cfg))
+    mask = jnp.ones((20, 30)).at[:4].set(0.0)
+    photo = photo.at[:4].set(1.0)
+    start = fit_exposure(linear, photo, mask, 2.2, cfg)
+    found = fit_exposure_and_gamma(linear, photo, mask, start, 2.2, cfg)
+    assert float(found[0]) == pytest.approx(true, rel=5e-3)
+    assert float(found[1]) == pytest.approx(gamma, rel=5e-3)
 
 
 def test_fit_exposure_ignores_masked_pixels():

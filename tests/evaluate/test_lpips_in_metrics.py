@@ -70,10 +70,11 @@ def test_every_comparison_gets_it_where_there_are_weights(weights, tmp_path, cap
         (metrics["train"]["averaged"], 2),
         (metrics["test"]["averaged"], 1),
         (metrics["test"]["exposure_fitted"], 1),
+        (metrics["test"]["exposure_and_gamma_fitted"], 1),
     ]
     for part in metrics["reference"].values():
         parts += [(part, 3), (part["train"], 2), (part["test"], 1)]
-    assert len(parts) == 13
+    assert len(parts) == 14
     for part, views in parts:
         rows = [row["lpips"] for row in part["per_view"].values()]
         assert len(rows) == views
@@ -103,7 +104,7 @@ def test_nothing_is_said_without_weights(tmp_path, capsys):
     print_metrics(metrics, tmp_path)
     printed = capsys.readouterr().out
     rows = [line for line in printed.splitlines() if "training" in line or "held out" in line]
-    assert len(rows) == 7
+    assert len(rows) == 8
     assert all("n/a" in line for line in rows)
 
 
