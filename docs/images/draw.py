@@ -137,20 +137,35 @@ def draw_list(d: Drawing, x: float, y: float) -> None:
     d.line(at, y - 4, at, y + 22, INK, 1.6)
 
 
-# Chunks of 16 entries in the list of each tile, and after how many all its pixels are opaque.
-LISTS = {"t5": 9, "t2": 8, "t7": 6, "t1": 5, "t9": 5, "t3": 4, "t8": 3, "t4": 2, "t6": 2, "t0": 1}
-OPAQUE = {"t2": 5, "t9": 3}
+# Chunks of 16 entries in the segments of each tile's list, and after how many of a segment's all
+# pixels are opaque.
+LISTS = {
+    "t5": (4, 4, 1),
+    "t2": (4, 4),
+    "t7": (4, 2),
+    "t1": (4, 1),
+    "t9": (4,),
+    "t3": (4,),
+    "t8": (3,),
+    "t4": (2,),
+    "t6": (2,),
+    "t0": (1,),
+}
+OPAQUE = {"t2": (1, 2), "t9": (0, 3)}
 LANES = 3
 
 
-def schedule() -> list[list[tuple[str, int, int]]]:
-    """Return (tile, start, length) by lane: whoever is free takes the next longest list."""
-    lanes: list[list[tuple[str, int, int]]] = [[] for _ in range(LANES)]
+def schedule() -> list[list[tuple[str, str, int, int]]]:
+    """Return (tile, name, start, length) by lane: whoever is free takes the next longest."""
+    lanes: list[list[tuple[str, str, int, int]]] = [[] for _ in range(LANES)]
     free = [0] * LANES
-    for tile, chunks in LISTS.items():
+    parts = [(tile, k, n) for tile, chunks in LISTS.items() for k, n in enumerate(chunks)]
+    for tile, k, chunks in sorted(parts, key=lambda part: -part[2]):
         lane = free.index(min(free))
-        length = OPAQUE.get(tile, chunks)
-        lanes[lane].append((tile, free[lane], length))
+        cut, end = OPAQUE.get(tile, (None, 0))
+        length = end if cut == k else chunks
+        name = tile + "abc"[k] if len(LISTS[tile]) > 1 else tile
+        lanes[lane].append((tile, name, free[lane], length))
         free[lane] += length
     return lanes
 
@@ -160,13 +175,13 @@ def draw_lanes(d: Drawing, x: float, y: float) -> None:
     for lane, tiles in enumerate(schedule()):
         top = y + lane * (height + 8)
         d.text(x - 10, top + 18, f"lane {lane}", anchor="end")
-        for tile, start, length in tiles:
+        for tile, name, start, length in tiles:
             color = COLORS[list(LISTS).index(tile) % len(COLORS)]
             for k in range(length):
                 d.rect(x + (start + k) * step, top, step, height, color, PAPER, 0.35)
             d.rect(x + start * step, top, length * step, height)
-            d.text(x + (start + length / 2) * step, top + 18, tile, 13, "middle")
-            if tile in OPAQUE:
+            d.text(x + (start + length / 2) * step, top + 18, name, 12, "middle")
+            if tile in OPAQUE and name == tile + "abc"[OPAQUE[tile][0]] * (len(LISTS[tile]) > 1):
                 end = x + (start + length) * step
                 d.line(end, top - 4, end, top + height + 4, COLORS[1], 3)
     end = y + LANES * (height + 8)
@@ -216,16 +231,19 @@ def kernel() -> Drawing:
         24,
         312,
         [
-            "256 lanes run side by side in one while_loop, each on a tile of its own. An iteration",
-            "composites the next 16 entries (one cell). A lane whose list ends, or whose",
-            "pixels are all opaque (orange bar), writes its tile and takes the longest list left.",
+            "256 lanes run side by side in one while_loop, each on a segment: a tile's list,",
+            "or a part of a long one. An iteration composites the next 16 entries (one cell).",
+            "A lane whose segment ends, or is opaque all over (orange bar), takes the longest.",
         ],
     )
     draw_lanes(d, 84, 372)
     d.lines(
         24,
         506,
-        ["Waste is bounded by one cell a tile, however", "uneven the lists are."],
+        [
+            "Parts of a list (t5a, t5b, t5c) are merged front to back afterwards:",
+            "no lane waits for a long list, however uneven the lists are.",
+        ],
     )
 
     d.text(600, 290, "4  One iteration of a lane", 16, bold=True)

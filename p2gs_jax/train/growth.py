@@ -101,11 +101,17 @@ class Growth:
 
 
 def check_method(cfg: DensifyConfig) -> None:
-    """Refuse automatic growth where it cannot be steered.
+    """Refuse automatic growth where it cannot be steered, and moves that no shrinking makes up for.
 
     Raises:
-        UserError: `max_gaussians` is `auto` and the method is not `mcmc`.
+        UserError: `max_gaussians` is `auto` and the method is not `mcmc`, or `spread` is not in
+            [0, 1).
     """
+    if not 0 <= cfg.spread < 1:
+        raise UserError(
+            f"--densify.spread {cfg.spread:g} is not between 0 and 1 (1 excluded).",
+            fix="give a share of a Gaussian's own extent, for example 0.5",
+        )
     if cfg.max_gaussians == "auto" and cfg.method != "mcmc":
         raise UserError(
             f"--gaussians auto steers the growth of --densify.method mcmc, not of {cfg.method}.",
