@@ -55,12 +55,14 @@ def relocate_and_grow(
     population: Population,
     births: Int[Array, ""],
     cfg: DensifyConfig,
+    demand: Float[Array, " n"] | None = None,
 ) -> Outcome:
     """Move transparent Gaussians onto opaque ones and add `births` new ones there.
 
-    Targets are drawn in proportion to opacity; everyone in one place shares its look, and they are
-    moved apart by `cfg.spread` of their extent: Gaussians in exactly one place have the same
-    gradients, and at opacities that no noise reaches they never part (BUILD_NOTES, "Twins").
+    Targets are drawn in proportion to opacity times demand. Everyone in one place shares its look,
+    and they are moved apart by `cfg.spread` of their extent: Gaussians in exactly one place have
+    the same gradients, and at opacities that no noise reaches they never part (BUILD_NOTES,
+    "Twins").
 
     Args:
         key: randomness.
@@ -68,6 +70,7 @@ def relocate_and_grow(
         population: who is alive.
         births: new Gaussians wanted; those without a free slot are counted in `refused`.
         cfg: opacity threshold, spread.
+        demand: where more Gaussians are needed (`train/demand.py`); None: alike everywhere.
     """
     n = population.alive.shape[0]
     dead = transparent(gaussians, population, cfg)
@@ -75,8 +78,10 @@ def relocate_and_grow(
     # Births go to the first `births` empty slots.
     order = jnp.cumsum(~population.alive) - 1
     newborn = ~population.alive & (order < births)
-    movers = (dead | newborn) & jnp.any(healthy)
     weights = jnp.where(healthy, opacities(gaussians), 0.0)
+    if demand is not None:
+        weights = weights * demand
+    movers = (dead | newborn) & jnp.any(weights > 0)
     cumulative = jnp.cumsum(weights)
     draws = jax.random.uniform(key, (n,)) * cumulative[-1]
     target = jnp.clip(jnp.searchsorted(cumulative, draws, side="right"), 0, n - 1)

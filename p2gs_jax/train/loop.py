@@ -39,6 +39,7 @@ from p2gs_jax.losses.total import OBSERVED_FORMS, SECOND_RENDER_FORMS, Partner
 from p2gs_jax.numerics import on_host
 from p2gs_jax.render.capacity import Room
 from p2gs_jax.train import growth, schedule
+from p2gs_jax.train.demand import demand
 from p2gs_jax.train.growth import Look, Stage
 from p2gs_jax.train.host import HostState, LogRecord
 from p2gs_jax.train.optimizer import make_optimizer, zero_moments, zero_opacity_moments
@@ -148,7 +149,7 @@ class Trainer:
         self.sh_degree = cfg.render.sh_degree
         self._densify_adaptive = jax.jit(adaptive.apply)
         self._propose = jax.jit(functools.partial(adaptive.propose, cfg=cfg.densify))
-        self._relocate = jax.jit(functools.partial(mcmc.relocate_and_grow, cfg=cfg.densify))
+        self._relocate = jax.jit(functools.partial(_relocate, cfg=cfg))
         self._zero_moments = jax.jit(zero_moments)
         self._trial: _Trial | None = None
         self.auto = cfg.densify.max_gaussians == "auto"
@@ -429,11 +430,12 @@ class Trainer:
             if not ahead and self.cfg.densify.method == "mcmc":
                 ahead = True  # wanted soon after the first step
                 self._relocate = self.programs.ahead(
-                    ("relocate", self.cfg.densify, key.slots),
+                    ("relocate", self.cfg.densify, self.cfg.optimizer.b2, key.slots),
                     self._relocate,
                     jax.eval_shape(self._rng, np.int32(0)),
                     state.params.gaussians,
                     state.population,
+                    state.opt_state.gaussians[0],
                     np.int32(0),
                 )
 
@@ -543,7 +545,11 @@ class Trainer:
     def _relocate_step(self, state: FitState, host: HostState, wanted: int) -> FitState:
         births = max(wanted - self._count(state), 0)
         outcome = self._relocate(
-            self._key(host), state.params.gaussians, state.population, np.int32(births)
+            self._key(host),
+            state.params.gaussians,
+            state.population,
+            state.opt_state.gaussians[0],
+            np.int32(births),
         )
         return self._settle(state, outcome, host)
 
@@ -669,6 +675,12 @@ class Trainer:
             )
         opt_state = self._zero_moments(state.opt_state, outcome.reset_moments)
         return replace_gaussians(state, outcome.gaussians, outcome.population, opt_state)
+
+
+def _relocate(key, gaussians, population, moments, births, *, cfg: FitConfig):
+    """Relocate and grow towards where the loss pulls most."""
+    asked = demand(gaussians, moments, cfg.optimizer.b2)
+    return mcmc.relocate_and_grow(key, gaussians, population, births, cfg.densify, asked)
 
 
 def _name(size: tuple[int, int]) -> str:

@@ -104,6 +104,7 @@ WRONG = [
     ("fit castle --out run --render.tile 16", "Expected 2 values"),
     ("fit castle --out run --densify.method mcmcc", "'adaptive'"),
     ("fit castle --out run --gaussians few", "a whole number from 1 on, or auto"),
+    ("fit castle --out run --densify.spread 1", "for example 0.5"),
     ("fit castle --out run --preset bset", "choose paper, paper_appendix, robust"),
     ("fit castle --out run --preset", "--preset"),
     ("fit castle --out run --known-deviation-ev 0.1", "add --known-exposures FILE"),

@@ -19,6 +19,8 @@ from p2gs_jax.densify.population import (
     place,
 )
 from p2gs_jax.render import render_linear
+from p2gs_jax.train.demand import demand
+from p2gs_jax.train.optimizer import AdamState
 from p2gs_jax.types import Camera, Gaussians
 
 CFG = DensifyConfig()
@@ -181,6 +183,31 @@ def test_two_that_share_a_place_part_about_its_centre_and_keep_its_extent():
     whole = np.exp(2 * together.log_scales[0, 0])
     np.testing.assert_allclose(np.exp(2 * apart.log_scales[0, 0]), 0.75 * whole, rtol=1e-4)
     np.testing.assert_allclose(variance, 0.25 * whole, rtol=0.1)
+
+
+def test_births_go_where_they_are_needed():
+    g = made(10)
+    grown, p = grow(g, empty_gaussians(6, g)), fresh_population(jnp.arange(16) < 10)
+    needed = jnp.zeros(16).at[7].set(1.0)
+    together = dataclasses.replace(CFG, spread=0.0)
+    out = mcmc.relocate_and_grow(jax.random.key(0), grown, p, jnp.int32(4), together, needed)
+    assert int(out.population.alive.sum()) == 14
+    np.testing.assert_array_equal(out.gaussians.means[10:14], np.tile(g.means[7], (4, 1)))
+    # Where nothing is needed yet, nobody is born; those without a place are not put anywhere.
+    none = mcmc.relocate_and_grow(jax.random.key(0), grown, p, jnp.int32(4), together, 0 * needed)
+    assert int(none.population.alive.sum()) == 10
+    np.testing.assert_array_equal(none.gaussians.means, grown.means)
+
+
+def test_demand_is_the_mean_pull_on_what_was_seen():
+    scales = jnp.array([[1.0, 2.0, 1.0], [4.0, 1.0, 1.0], [1.0, 1.0, 1.0]])
+    g = dataclasses.replace(made(3), log_scales=jnp.log(scales))
+    moments = AdamState(jnp.array([1, 3, 0]), g, jax.tree.map(jnp.zeros_like, g))
+    b2, pulls = 0.9, (3.0, 5.0, 5.0)
+    nu = [pulls[0] ** 2 * (1 - b2), pulls[1] ** 2 * (1 - b2**3), pulls[2] ** 2]
+    means = jnp.zeros((3, 3)).at[:, 0].set(jnp.array(nu))
+    moments = moments._replace(nu=dataclasses.replace(moments.nu, means=means))
+    np.testing.assert_allclose(demand(g, moments, b2), [3 * 2, 5 * 4, 0], rtol=1e-5)
 
 
 def test_relocation_with_nobody_healthy_changes_nothing():
