@@ -7,8 +7,11 @@ al. 2023; "ours" is measured, see BUILD_NOTES.md. A weight or option set to None
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, get_args
+
+from p2gs_jax.errors import UserError
 
 Appearance = Literal["affine", "bilateral", "curve"]
 PresetName = Literal[
@@ -450,9 +453,9 @@ def preset(name: PresetName) -> FitConfig:
             correction per view `3dgs_affine`, `3dgs_bilateral`, `3dgs_curve`.
 
     Raises:
-        KeyError: there is no such preset.
+        UserError: there is no such preset.
     """
-    return {
+    known: dict[str, Callable[[], FitConfig]] = {
         "robust": _robust,
         "paper": lambda: _paper(0.01, "paper"),
         "paper_appendix": lambda: _paper(0.1, "paper_appendix"),
@@ -461,7 +464,28 @@ def preset(name: PresetName) -> FitConfig:
         "3dgs_affine": lambda: _ldr("3dgs_affine", appearance="affine"),
         "3dgs_bilateral": lambda: _ldr("3dgs_bilateral", appearance="bilateral", rate=2e-3),
         "3dgs_curve": lambda: _ldr("3dgs_curve", appearance="curve"),
-    }[name]()
+    }
+    if name not in known:
+        raise UserError(
+            f"there is no preset {name!r}.", fix=f"choose {', '.join(get_args(PresetName))}"
+        )
+    return known[name]()
+
+
+def require_config(cfg: FitConfig | None) -> FitConfig:
+    """Return a configuration as it was given; None takes `robust`.
+
+    Raises:
+        UserError: it is something else, such as the name of a preset.
+    """
+    if cfg is None:
+        return FitConfig()
+    if not isinstance(cfg, FitConfig):
+        raise UserError(
+            f"{cfg!r} is no configuration.",
+            fix='give a FitConfig, for example p2gs_jax.preset("robust")',
+        )
+    return cfg
 
 
 def to_dict(config: FitConfig) -> dict:

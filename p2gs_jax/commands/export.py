@@ -58,12 +58,14 @@ def run(options: Export) -> int:
     formats = tuple(dict.fromkeys(options.format))
     if "spz" in formats:
         require_gsply()
-    fitted = load_run(options.run)
+    fitted = load_run(options.run, options.scene)
     look = _look(fitted, options)
     folder = options.out or options.run / "exports"
     _check_places(folder, formats, options.overwrite)
     _check_names(fitted, formats)
-    store = ImageStore(fitted.scene.views, fitted.cfg.data)
+    if "colmap" in formats:
+        fitted.require_photographs()
+    store = fitted.store
     with TerminalReporter() as reporter:
         display = None
         if set(formats) & set(DISPLAY):

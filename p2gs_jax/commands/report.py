@@ -16,7 +16,13 @@ def run(options: Report) -> int:
     # Looked for first: a missing browser should not cost the page's rendering.
     browser = find_browser() if options.pdf else None
     with TerminalReporter() as reporter:
-        page = write_report(options.run, options.out, render=options.render, reporter=reporter)
+        page = write_report(
+            options.run,
+            options.out,
+            scene=options.scene,
+            render=options.render,
+            reporter=reporter,
+        )
         paths = [page]
         if browser is not None:
             reporter.stage("Printing")

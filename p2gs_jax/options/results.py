@@ -8,6 +8,8 @@ from typing import Annotated
 
 import tyro
 
+from p2gs_jax.options.scene import SceneFolder
+
 
 @dataclass(frozen=True)
 class Eval:
@@ -18,6 +20,8 @@ class Eval:
 
     run: Annotated[Path, tyro.conf.Positional]
     """Run folder."""
+    scene: SceneFolder = None
+    """Where the run's scene lies now, if it is not where it was."""
     reference: Path | None = None
     """Photographs of the same views under one common exposure."""
     lpips_weights: str | None = None
