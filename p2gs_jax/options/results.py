@@ -13,7 +13,7 @@ from p2gs_jax.options.scene import SceneFolder
 
 @dataclass(frozen=True)
 class Eval:
-    """Judge a finished run again, also against a reference.
+    """Evaluate a finished run again, also against a reference.
 
     p2gs-jax eval runs/castle --reference castle/iso8
     """
@@ -25,4 +25,4 @@ class Eval:
     reference: Path | None = None
     """Photographs of the same views under one common exposure."""
     lpips_weights: str | None = None
-    """Judge with LPIPS: alex, vgg, a .npz of weights, or none (default: as the run was)."""
+    """Evaluate with LPIPS: alex, vgg, a .npz of weights, or none (default: as the run was)."""

@@ -47,6 +47,7 @@ class RunFiles:
         log: lines of `log.jsonl`.
         held_out: held-out views in `renders/`, by name.
         missing: sentences on what could not be read.
+        broken: names of files that are there and say nothing that can be read.
     """
 
     folder: Path
@@ -59,6 +60,7 @@ class RunFiles:
     log: list[dict[str, Any]]
     held_out: tuple[HeldOut, ...]
     missing: tuple[str, ...]
+    broken: tuple[str, ...]
 
     @property
     def preset(self) -> str:
@@ -144,6 +146,9 @@ def read_run(folder: Path, scene: Path | None = None) -> RunFiles:
         missing.append(f"The exposures are not shown: {why}.".replace("..", "."))
     log = read_log(folder / "log.jsonl", missing)
     names = [v["image"] for v in photometry["views"]] if photometry is not None else []
+    read = {path.name: saved, "metrics.json": metrics, "log.jsonl": log}
+    read["photometry.json"] = photometry
+    broken = [n for n, found in read.items() if not found and (folder / n).exists()]
     return RunFiles(
         folder,
         scene or find(saved, "scene", folder) or Path(),
@@ -155,6 +160,7 @@ def read_run(folder: Path, scene: Path | None = None) -> RunFiles:
         log,
         find_held_out(folder / "renders", names),
         tuple(missing),
+        tuple(broken),
     )
 
 

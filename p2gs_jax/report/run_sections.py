@@ -158,7 +158,7 @@ def _growth(run: RunFiles) -> str:
     return (
         "<h3>Automatic growth</h3>"
         + table(names, rows, numbers=(0, 1, 2, 3))
-        + paragraph("Judged on training views that were left out meanwhile.", "note")
+        + paragraph("Evaluated on training views that were left out meanwhile.", "note")
     )
 
 
