@@ -11,13 +11,17 @@ from p2gs_jax.config import FitConfig, preset
 from p2gs_jax.errors import DivergenceError, UserError
 
 if TYPE_CHECKING:
+    from p2gs_jax import sweep
     from p2gs_jax.calibration import calibrate
     from p2gs_jax.evaluate.alignment import exposure_error
+    from p2gs_jax.paths.pinhole import make_camera
+    from p2gs_jax.photometry.look import Look, develop
     from p2gs_jax.pipeline import fit
     from p2gs_jax.refine import calibrate_run
-    from p2gs_jax.render import render_linear
-    from p2gs_jax.run_folder import load_run
+    from p2gs_jax.render import render_linear, required_capacity
+    from p2gs_jax.run_folder import Run, load_run
     from p2gs_jax.static_stack import calibrate_stack
+    from p2gs_jax.sweep.fields import with_fields
     from p2gs_jax.synth.write import write_street
     from p2gs_jax.types import Camera, Gaussians, Params, Photometry, Render, Scene
 
@@ -26,31 +30,44 @@ __all__ = [
     "DivergenceError",
     "FitConfig",
     "Gaussians",
+    "Look",
     "Params",
     "Photometry",
     "Render",
+    "Run",
     "Scene",
     "UserError",
     "calibrate",
     "calibrate_run",
     "calibrate_stack",
+    "develop",
     "exposure_error",
     "fit",
     "load_run",
+    "make_camera",
     "preset",
     "render_linear",
+    "required_capacity",
+    "sweep",
+    "with_fields",
     "write_street",
 ]
 
 
 _LAZY = {
+    "Look": "p2gs_jax.photometry.look",
+    "Run": "p2gs_jax.run_folder",
     "calibrate": "p2gs_jax.calibration",
     "calibrate_run": "p2gs_jax.refine",
     "calibrate_stack": "p2gs_jax.static_stack",
+    "develop": "p2gs_jax.photometry.look",
     "exposure_error": "p2gs_jax.evaluate.alignment",
     "fit": "p2gs_jax.pipeline",
     "load_run": "p2gs_jax.run_folder",
+    "make_camera": "p2gs_jax.paths.pinhole",
     "render_linear": "p2gs_jax.render",
+    "required_capacity": "p2gs_jax.render",
+    "with_fields": "p2gs_jax.sweep.fields",
     "write_street": "p2gs_jax.synth.write",
 }
 _LAZY |= dict.fromkeys(
@@ -62,6 +79,13 @@ def __getattr__(name: str):
     """Import what is heavy only when it is used: even the records need JAX, `--help` does not."""
     if name == "__version__":
         return version("p2gs-jax")
+    if name == "sweep":
+        return import_module("p2gs_jax.sweep")
     if name not in _LAZY:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(_LAZY[name]), name)
+
+
+def __dir__() -> list[str]:
+    """List what is imported lazily too, for completion."""
+    return sorted({*globals(), *__all__, "__version__"})

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from p2gs_jax.config import FitConfig
+from p2gs_jax.config import FitConfig, require_config
 from p2gs_jax.errors import UserError
-from p2gs_jax.export.atomic import write_json
+from p2gs_jax.export.atomic import no_empty_folders, write_json
 from p2gs_jax.export.calibration_plot import write_calibration_plot
 from p2gs_jax.export.photometry_json import write_solution
 from p2gs_jax.init.correspondence import has_tracks, surface_colors
@@ -88,7 +88,7 @@ def calibrate(
     Raises:
         UserError: something the user can mend.
     """
-    cfg = cfg or FitConfig()
+    cfg = require_config(cfg)
     cfg = dataclasses.replace(cfg, data=dataclasses.replace(cfg.data, test_every=0))
     reporter = reporter or Silent()
     out = Path(out)
@@ -96,18 +96,19 @@ def calibrate(
     check_source(cfg.photometry.known)
     check_source(compare_with)
     reporter.stage("Reading the scene")
-    scene = load_scene(Path(scene_dir), cfg.data, out / "cache", reporter.message)
-    store = ImageStore(scene.views, cfg.data)
-    if not (has_tracks(scene) or len(scene.points)):
-        raise UserError(
-            f"{scene_dir} has neither tracks nor points: which pixels show the same surface is "
-            "not known.",
-            fix="give a COLMAP model with its images.bin, or the photographs alone",
+    with no_empty_folders(out):
+        scene = load_scene(Path(scene_dir), cfg.data, out / "cache", reporter.message)
+        store = ImageStore(scene.views, cfg.data)
+        if not (has_tracks(scene) or len(scene.points)):
+            raise UserError(
+                f"{scene_dir} has neither tracks nor points: which pixels show the same surface is "
+                "not known.",
+                fix="give a COLMAP model with its images.bin, or the photographs alone",
+            )
+        observations = surface_colors(
+            scene, store, cfg.train.seed, lambda i, n: reporter.stage("Sampling colours", i, n)
         )
-    observations = surface_colors(
-        scene, store, cfg.train.seed, lambda i, n: reporter.stage("Sampling colours", i, n)
-    )
-    sampled = time.monotonic()
+        sampled = time.monotonic()
     reporter.stage("Photometric bundle adjustment")
     selection = calibrate_observations(observations, scene, cfg)
     solved = time.monotonic()

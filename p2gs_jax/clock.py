@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
 from jax import monitoring
@@ -39,6 +39,47 @@ class Stopwatch:
         """Add seconds that were measured elsewhere."""
         with self._lock:
             self.seconds[name] = self.seconds.get(name, 0.0) + seconds
+
+
+# Sums and views of the others in the `seconds` of metrics.json: no parts of a run.
+NO_PARTS = (
+    "total_until_evaluation",
+    "optimisation",
+    "evaluation_and_files",
+    "compiler_in_all_threads",
+)
+# What a budget may be exceeded by before that is said: a share, and seconds.
+LATE = (1.1, 2.0)
+MOST_NAMED = 4
+
+
+def whole_run(seconds: Mapping[str, float]) -> float | None:
+    """Return how long a run took from start to end, or None where it does not say.
+
+    Args:
+        seconds: of `metrics.json`.
+    """
+    parts = [seconds.get(k) for k in ("total_until_evaluation", "evaluation_and_files")]
+    known = [p for p in parts if isinstance(p, int | float) and not isinstance(p, bool)]
+    return float(sum(known)) if known else None
+
+
+def over_budget(budget_s: float | None, seconds: Mapping[str, float]) -> str | None:
+    """Return by how much a run exceeded its budget and where the seconds went; None if it did not.
+
+    Args:
+        budget_s: for the whole run, or None.
+        seconds: of `metrics.json`.
+    """
+    total = whole_run(seconds)
+    if budget_s is None or total is None or total <= LATE[0] * budget_s + LATE[1]:
+        return None
+    parts = sorted(((v, k) for k, v in seconds.items() if k not in NO_PARTS), reverse=True)
+    named = ", ".join(f"{k.replace('_', ' ')} {v:.0f}" for v, k in parts[:MOST_NAMED] if v >= 0.5)
+    return (
+        f"The budget of {budget_s:.0f} s was exceeded: the run took {total:.0f} s ({named}). Only "
+        "steps are cut short; what comes before and after them takes its time."
+    )
 
 
 class CompileCounter:

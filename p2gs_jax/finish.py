@@ -13,7 +13,7 @@ import cv2
 import jax
 import numpy as np
 
-from p2gs_jax.clock import CompileCounter, Stopwatch
+from p2gs_jax.clock import CompileCounter, Stopwatch, over_budget
 from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.evaluate import MeanParameters, ViewResult, evaluate, mean_parameters
@@ -270,6 +270,10 @@ def finish(
         "evaluation_and_files": watch.seconds["evaluation"] + watch.seconds["files"],
         "compiler_in_all_threads": compiler.seconds,
     }
+    late = over_budget(cfg.train.budget_s, metrics["seconds"])
+    if late is not None:
+        prepared.notes.append(late)
+        reporter.message(late)
     steps = max(int(counts.get("steps", 0)), 1)
     metrics["seconds_per_step"] = seconds.get("optimisation", 0.0) / steps
     metrics["notes"] = prepared.notes

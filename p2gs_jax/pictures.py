@@ -73,7 +73,7 @@ def shot_frames(
     studio: Studio,
     shots: Sequence[Shot],
     look_of: Callable[[Shot], Look],
-    store: ImageStore | None = None,
+    photograph: Callable[[int], Float32[np.ndarray, "h w 3"] | None] | None = None,
 ) -> Iterator[Frame]:
     """Yield a frame for every shot.
 
@@ -81,13 +81,13 @@ def shot_frames(
         studio: renders.
         shots: what to render.
         look_of: how to develop each.
-        store: photographs that go with those that were taken, or None.
+        photograph: returns what goes beside the render of a view, or None; by default nothing.
     """
     for shot in shots:
         linear, alpha, depth = studio.linear(shot)
         look = look_of(shot)
         ldr = studio.develop(linear, look)
-        taken = None if store is None or shot.view is None else store.get(shot.view)[0]
+        taken = None if photograph is None or shot.view is None else photograph(shot.view)
         how = (look.exposure, look.gamma)
         yield Frame(shot.name, linear, alpha, ldr, *how, depth, shot.camera(), taken)
 

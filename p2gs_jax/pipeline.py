@@ -14,13 +14,15 @@ import jax
 import numpy as np
 
 from p2gs_jax.clock import CompileCounter, Stopwatch
-from p2gs_jax.config import FitConfig
+from p2gs_jax.config import FitConfig, require_config
 from p2gs_jax.config import from_dict as config_from_dict
 from p2gs_jax.config import to_dict as config_to_dict
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.lpips import LpipsWeights
 from p2gs_jax.evaluate.lpips_weights import read_lpips_weights
-from p2gs_jax.export.atomic import plain, write_json
+from p2gs_jax.export.atomic import no_empty_folders, plain, write_json
+from p2gs_jax.export.places import remembered
+from p2gs_jax.export.scene_file import write_scene
 from p2gs_jax.finish import check_reference, finish, load_reference
 from p2gs_jax.photometry.gauge import recentre
 from p2gs_jax.photometry.selection import Selection
@@ -64,6 +66,11 @@ def optimise(
     views = TrainingViews(
         prepared.store, prepared.scene.train_indices, cfg.train.seed, prepared.overlaps
     )
+
+    def say(text: str) -> None:
+        prepared.notes.append(text)
+        reporter.message(text)
+
     trainer = Trainer(
         cfg,
         views,
@@ -73,7 +80,7 @@ def optimise(
         run_dir,
         programs,
         on_log=reporter.log,
-        on_message=reporter.message,
+        on_message=say,
         validation=validation,
         own_exposures=prepared.selection is not None,
     )
@@ -141,7 +148,7 @@ def fit(
     Raises:
         UserError: something the user can mend.
     """
-    cfg = cfg or FitConfig()
+    cfg = require_config(cfg)
     reporter = reporter or Silent()
     scene_dir, run_dir = Path(scene_dir), Path(run_dir)
     begin = time.monotonic() - spent_s
@@ -153,26 +160,27 @@ def fit(
     check_reference(reference)
     path = cfg.evaluation.lpips_weights
     lpips_weights = None if path is None else read_lpips_weights(path)
-    run_dir.mkdir(parents=True, exist_ok=True)
-    reading = time.monotonic()
-    scene = load(scene_dir, run_dir, cfg, reporter)
-    # Without a model, nearly all of it is finding and matching features.
-    found = scene.format in ("images", "transforms")
-    clock.add("structure_from_motion" if found else "reading", time.monotonic() - reading)
-    if lpips_weights is not None:
-        lpips_weights.require_sizes(scene.views, cfg.data.max_width)
-    validation: tuple[int, ...] = ()
-    if cfg.densify.max_gaussians == "auto":
-        validation = pick_validation([scene.views[i].camera for i in scene.train_indices])
-    truth = load_reference(reference, scene, cfg) if reference is not None else None
-    write_json(
-        run_dir / "config.json",
-        {
-            "scene": str(scene_dir),
-            "reference": None if reference is None else str(reference),
-            "fit": config_to_dict(cfg),
-        },
-    )
+    with no_empty_folders(run_dir):
+        reading = time.monotonic()
+        scene = load(scene_dir, run_dir, cfg, reporter)
+        # Without a model, nearly all of it is finding and matching features.
+        found = scene.format in ("images", "transforms")
+        clock.add("structure_from_motion" if found else "reading", time.monotonic() - reading)
+        if lpips_weights is not None:
+            lpips_weights.require_sizes(scene.views, cfg.data.max_width)
+        validation: tuple[int, ...] = ()
+        if cfg.densify.max_gaussians == "auto":
+            validation = pick_validation([scene.views[i].camera for i in scene.train_indices])
+        truth = load_reference(reference, scene, cfg) if reference is not None else None
+        write_json(
+            run_dir / "config.json",
+            {
+                **remembered("scene", scene_dir, run_dir),
+                **remembered("reference", None if reference is None else Path(reference), run_dir),
+                "fit": config_to_dict(cfg),
+            },
+        )
+        write_scene(run_dir, scene)
     programs = StepPrograms()
     with contextlib.closing(programs):
         prepared = prepare(
@@ -273,6 +281,11 @@ def check_run_dir(run_dir: Path, resume: bool, cfg: FitConfig) -> None:
         )
     try:
         saved = plain(config_to_dict(config_from_dict(json.loads(path.read_text())["fit"])))
+    except json.JSONDecodeError as error:
+        raise UserError(
+            f"{path} cannot be read ({error}).",
+            fix="remove it and repeat the options the run was begun with: --resume then goes on",
+        ) from error
     except (ValueError, KeyError, TypeError) as error:
         raise UserError(
             f"{path} cannot be read ({error}).", fix="start again in another folder"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from typing import Protocol
 
 from rich.console import Console
@@ -11,6 +12,9 @@ from rich.table import Table
 from rich.text import Text
 
 from p2gs_jax.train.host import LogRecord
+
+# Seconds between lines of progress where there is no terminal.
+EVERY_S = 15.0
 
 
 class Reporter(Protocol):
@@ -50,7 +54,7 @@ def clock(seconds: float) -> str:
 
 
 class TerminalReporter:
-    """Messages as lines; progress as one live line in a terminal and not at all elsewhere.
+    """Messages as lines; progress as one live line in a terminal, elsewhere as a line now and then.
 
     Use as a context manager.
     """
@@ -58,6 +62,7 @@ class TerminalReporter:
     def __init__(self, console: Console | None = None):
         self.console = console or Console(file=sys.stderr, highlight=False)
         self.live: Live | None = None
+        self._said_at = time.monotonic()
 
     def __enter__(self) -> TerminalReporter:
         if self.console.is_terminal:
@@ -75,15 +80,27 @@ class TerminalReporter:
 
     def stage(self, name: str, done: int = 0, total: int = 0) -> None:
         """Show a stage and how far it is."""
+        text = f"{name} {done}/{total}" if total else f"{name} ..."
         if self.live is not None:
-            text = f"{name} {done}/{total}" if total else f"{name} ..."
             self.live.update(Text(text))
+        else:
+            self._now_and_then(text)
+
+    def _now_and_then(self, text: str) -> None:
+        """Print a line for those who watch a log, unless the last one is recent."""
+        if time.monotonic() - self._said_at >= EVERY_S:
+            self._said_at = time.monotonic()
+            self.console.print(Text(text), soft_wrap=True)
 
     def log(self, record: LogRecord) -> None:
         """Show loss, PSNR, Gaussians, views per second and the time left."""
-        if self.live is None:
-            return
         left = record.seconds * (1 - record.progress) / max(record.progress, 1e-3)
+        if self.live is None:
+            self._now_and_then(
+                f"{record.progress:.0%}, step {record.step}, PSNR {record.psnr:.2f} dB, "
+                f"{record.gaussians} Gaussians, {clock(left)} left"
+            )
+            return
         rate = 1 / record.step_seconds if record.step_seconds else 0.0
         bar = "█" * int(24 * record.progress)
         table = Table.grid(padding=(0, 2))

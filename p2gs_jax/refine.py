@@ -40,6 +40,7 @@ def rendered_observations(run: Run, seed: int = 0, reporter: Reporter | None = N
         Observations of the warped points; hidden ones are left out by their depth.
     """
     reporter = reporter or Silent()
+    run.require_photographs(run.scene.train_indices)
     scene, rng = run.scene, np.random.default_rng((seed, 19))
     store = ImageStore(scene.views, run.cfg.data)
     render = make_renderer(run.cfg.render)
@@ -67,10 +68,11 @@ def rendered_observations(run: Run, seed: int = 0, reporter: Reporter | None = N
 
 
 def calibrate_run(
-    run_dir: Path,
-    out: Path,
-    photometry: PhotometryConfig,
+    run_dir: str | Path,
+    out: str | Path,
+    photometry: PhotometryConfig | None = None,
     *,
+    scene: str | Path | None = None,
     compare_with: str | None = None,
     reporter: Reporter | None = None,
 ) -> Calibration:
@@ -79,7 +81,9 @@ def calibrate_run(
     Args:
         run_dir: the run folder; it is not changed.
         out: folder for the results.
-        photometry: what to choose from and what is known; the run's own choice is not used.
+        photometry: what to choose from and what is known, by default as `robust`; the run's own
+            choice is not used.
+        scene: see `load_run`.
         compare_with: see `calibrate`.
         reporter: receives progress.
 
@@ -87,14 +91,17 @@ def calibrate_run(
         UserError: see `load_run` and `refine_photometry`.
     """
     begin = time.monotonic()
-    run = load_run(run_dir)
+    run = load_run(run_dir, scene)
+    photometry = photometry or PhotometryConfig()
     run = dataclasses.replace(run, cfg=dataclasses.replace(run.cfg, photometry=photometry))
     selection, observations = refine_photometry(run, reporter)
     training = tuple(run.scene.views[i] for i in run.scene.train_indices)
-    scene = dataclasses.replace(run.scene, views=training)
+    trained_on = dataclasses.replace(run.scene, views=training)
     seconds = {"reading": 0.0, "adjustment": time.monotonic() - begin}
     count = len(observations.views)
-    return conclude(scene, selection, count, seconds, out, run.cfg, compare_with=compare_with)
+    return conclude(
+        trained_on, selection, count, seconds, Path(out), run.cfg, compare_with=compare_with
+    )
 
 
 def refine_photometry(run: Run, reporter: Reporter | None = None) -> tuple[Selection, Observations]:

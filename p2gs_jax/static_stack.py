@@ -257,7 +257,7 @@ def unexplained(problem: Problem, residual, xy, size, signal) -> tuple[float, fl
 
 
 def calibrate_stack(
-    folder: Path,
+    folder: str | Path,
     *,
     known: str | None = None,
     known_deviation_ev: float = 0.0,
@@ -279,7 +279,7 @@ def calibrate_stack(
     Raises:
         UserError: see `read_stack` and `read_known_exposures`.
     """
-    stack = read_stack(folder)
+    stack = read_stack(Path(folder))
     views = [_view(path) for path in stack.files]
     given = None
     if known is not None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
+
 import tyro
 
 from p2gs_jax.cli import wording
 from p2gs_jax.cli.parser import every_command
 from p2gs_jax.cli.rule import registry
+from p2gs_jax.options.render import PATHS
 from p2gs_jax.options.setup import Shell
 
 # tyro offers no path where an option could stand: shells shall look for one themselves.
@@ -21,6 +24,9 @@ FISH_PATHS = """
 complete --command p2gs-jax --force-files --condition \\
   "test (count (commandline -opc)) -gt 1; and not string match -q -- '-*' (commandline -ct)"
 """
+# `--path` takes a word or a file; tyro takes every word for a path. Shells look for files where no
+# word fits.
+PATH_OPTION = re.compile(r"('flags': \['--path'\].*?'type': )'path'(, 'cascade': \w+, 'nargs': 1)")
 ZSH_CALL = '_tyro_p2gs_jax "$@"'
 
 
@@ -34,6 +40,7 @@ def script(shell: Shell) -> str:
             registry=registry(brief=False),
         )
     )
+    text = PATH_OPTION.sub(rf"\1'choice'\2, 'choices': {list(PATHS)}", text)
     if shell == "bash":
         return text + BASH_PATHS
     if shell == "zsh":

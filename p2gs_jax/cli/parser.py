@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 import sys
 from typing import Annotated, Any, Union
@@ -10,6 +11,7 @@ import tyro
 
 from p2gs_jax.cli import wording
 from p2gs_jax.cli.rule import registry
+from p2gs_jax.cli.synonyms import check_words
 from p2gs_jax.errors import UserError
 from p2gs_jax.options.experiments import Bench, Demo, Sweep, Synth
 from p2gs_jax.options.export import Export
@@ -86,6 +88,7 @@ def every_command() -> Any:
 
 
 def _options(name: str, argv: list[str]) -> Any:
+    check_words(name, argv, _own_options(name))
     wants_all = HELP_ALL in argv
     argv = ["--help" if a == HELP_ALL else a for a in argv]
     brief = not wants_all and any(a in HELP for a in argv)
@@ -104,6 +107,12 @@ def _options(name: str, argv: list[str]) -> Any:
         return answer()
     text = wording.captured(answer)
     _leave(wording.with_prose(text, COMMANDS[name], brief and name in WITH_PRESET, name), 0)
+
+
+def _own_options(name: str) -> set[str]:
+    """Return a command's options as they are written, without those of the configuration."""
+    fields = dataclasses.fields(COMMANDS[name])
+    return {f"--{field.name.replace('_', '-')}" for field in fields}
 
 
 def _defaults(name: str, argv: list[str]) -> Any:

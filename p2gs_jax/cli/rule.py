@@ -57,28 +57,38 @@ def registry(brief: bool) -> ConstructorRegistry:
 
 
 def _number_rule(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-    """Return how a number, or a number or None, is read: with complaints in plain words."""
+    """Return how a number is read, or a number, a few words or None: complaints in plain words."""
     kinds = set(get_args(info.type)) if _is_union(info.type) else {info.type}
     optional = NoneType in kinds
     kinds -= {NoneType}
-    if kinds not in ({int}, {float}):
+    known = {word for k in kinds if get_origin(k) is Literal for word in get_args(k)}
+    kinds = {k for k in kinds if get_origin(k) is not Literal}
+    if kinds not in ({int}, {float}) or not all(isinstance(word, str) for word in known):
         return None
     (kind,) = kinds
 
-    def read(words: list[str]) -> int | float | None:
+    def read(words: list[str]) -> int | float | str | None:
         if optional and words[0] == "None":
             return None
+        if words[0] in known:
+            return words[0]
         try:
             return kind(words[0])
         except ValueError:
             what = "whole number" if kind is int else "number"
-            raise ValueError(f"{words[0]!r} is no {what}") from None
+            other = f", and not {' or '.join(sorted(known))}" if known else ""
+            raise ValueError(f"{words[0]!r} is no {what}{other}") from None
+
+    def fits(value: Any) -> bool:
+        if isinstance(value, str):
+            return value in known
+        return value is None if not isinstance(value, kind) else not isinstance(value, bool)
 
     return PrimitiveConstructorSpec(
         nargs=1,
-        metavar=PLACEHOLDERS[kind],
+        metavar="|".join([*sorted(known), PLACEHOLDERS[kind]]),
         instance_from_str=read,
-        is_instance=lambda value: isinstance(value, kind | (NoneType if optional else kind)),
+        is_instance=fits,
         str_from_instance=lambda value: [str(value)],
     )
 

@@ -18,7 +18,8 @@ def run(options: Compare) -> int:
     console = stdout()
     for remark in found.remarks:
         console.print(Text(remark))
-    console.print(_table("Scores (* best)", found.labels, found.scores))
+    marked = any(row.best for row in found.scores)
+    console.print(_table(f"Scores{' (* best)' if marked else ''}", found.labels, found.scores))
     if found.options:
         console.print(_table("Options that differ", found.labels, found.options))
     for label, x, y in found.exposures:

@@ -16,12 +16,12 @@ from p2gs_jax.options.results import Eval
 from p2gs_jax.progress import TerminalReporter
 from p2gs_jax.render.host import make_renderer
 from p2gs_jax.run_folder import load_run
-from p2gs_jax.scene.images import ImageStore
 
 
 def run(options: Eval) -> int:
     """Judge a run again and rewrite its metrics; options replace what the run was judged by."""
-    fitted = load_run(options.run)
+    fitted = load_run(options.run, options.scene)
+    fitted.require_photographs()
     lpips_weights = options.lpips_weights or fitted.cfg.evaluation.lpips_weights
     left_out = lpips_weights in (None, "none")
     weights = None if left_out else read_lpips_weights(lpips_weights)
@@ -29,7 +29,7 @@ def run(options: Eval) -> int:
         weights.require_sizes(fitted.scene.views, fitted.cfg.data.max_width)
     folder = options.reference or fitted.reference
     truth = None if folder is None else load_reference(folder, fitted.scene, fitted.cfg)
-    store = ImageStore(fitted.scene.views, fitted.cfg.data)
+    store = fitted.store
     with TerminalReporter() as reporter:
         metrics = evaluate(
             fitted.params,

@@ -58,12 +58,14 @@ def run(options: Export) -> int:
     formats = tuple(dict.fromkeys(options.format))
     if "spz" in formats:
         require_gsply()
-    fitted = load_run(options.run)
+    fitted = load_run(options.run, options.scene)
     look = _look(fitted, options)
     folder = options.out or options.run / "exports"
     _check_places(folder, formats, options.overwrite)
     _check_names(fitted, formats)
-    store = ImageStore(fitted.scene.views, fitted.cfg.data)
+    if "colmap" in formats:
+        fitted.require_photographs()
+    store = fitted.store
     with TerminalReporter() as reporter:
         display = None
         if set(formats) & set(DISPLAY):
@@ -286,7 +288,7 @@ def _sentences(error: dict) -> list[str]:
             said.append(
                 f"baking error over {s['views']} {name} views: median {s['psnr_median']:.2f} dB, "
                 f"worst {s['psnr_worst']:.2f} dB ({s['worst_view']}), mean {s['mean_codes']:.2f} "
-                f"and largest {s['max_codes']:.0f} of 255 codes; median "
+                f"and largest {s['max_codes']:.0f} 8-bit levels; median "
                 f"{s['psnr_on_white_median']:.2f} dB over white"
             )
     return said

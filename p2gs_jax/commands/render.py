@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float32
 
+from p2gs_jax.clock import CompileCounter
 from p2gs_jax.commands.console import stdout
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.frames import Frame, open_frames
-from p2gs_jax.options.render import Render
+from p2gs_jax.options.render import PATHS, Render
 from p2gs_jax.paths import (
     PosePath,
     Shot,
@@ -39,9 +41,7 @@ from p2gs_jax.pictures import (
 )
 from p2gs_jax.progress import TerminalReporter
 from p2gs_jax.run_folder import Run, load_run
-from p2gs_jax.scene.images import ImageStore
 
-PATHS = ("views", "drive", "orbit")
 FPS = 24.0
 CAMERAS = "cameras.json"
 OTHER_FILES = (".mov", ".avi", ".mkv", ".webm", ".gif", ".png", ".jpg", ".exr", ".json")
@@ -68,19 +68,26 @@ class Job:
 
 def run(options: Render) -> int:
     """Render a run along a path, into a folder or a video."""
+    begin = time.monotonic()
+    compiler = CompileCounter()
     _check(options)
+    out = options.out or options.run / "renders" / _default_name(options)
+    _check_place(out, options.overwrite)
     given = read_cameras(Path(options.path)) if options.path not in PATHS else None
-    fitted = load_run(options.run)
+    fitted = load_run(options.run, options.scene)
     if options.curve == "spline" and fitted.cfg.photometry.spline is None:
         raise UserError(
             f"--curve spline: {options.run} has none; its curve is {fitted.cfg.photometry.curve}.",
             fix="choose run, srgb, power or linear",
         )
-    out = options.out or options.run / "renders" / _default_name(options)
     studio = Studio(fitted)
-    job = _panoramas(options, studio) if options.panorama else _shots(options, studio, given)
-    begin = time.monotonic()
     with TerminalReporter() as reporter:
+        job = (
+            _panoramas(options, studio)
+            if options.panorama
+            else _shots(options, studio, given, reporter.message)
+        )
+        reading = time.monotonic() - begin
         for note in job.notes:
             reporter.message(note)
         reporter.stage("Rendering", 0, job.count)
@@ -92,12 +99,33 @@ def run(options: Render) -> int:
             write_cameras(out / CAMERAS, job.shots)
     what = "frame" if job.count == 1 else "frames"
     console = stdout()
-    console.print(f"{job.count} {what} in {time.monotonic() - begin:.1f} s: {out}")
+    console.print(f"{job.count} {what}: {out}", soft_wrap=True)
+    console.print(_spent(time.monotonic() - begin, reading, compiler.seconds))
     console.print(
         f"A frame takes {_median_ms(studio.render_seconds)} to render and "
         f"{_median_ms(studio.develop_seconds)} to expose and encode, whatever exposure and gamma."
     )
     return 0
+
+
+def _spent(total: float, reading: float, compiling: float) -> str:
+    """Return in words where the seconds of a command went."""
+    frames = max(total - reading - compiling, 0.0)
+    kept = " (kept: the next time is faster)" if compiling >= 1.0 else ""
+    return (
+        f"{total:.1f} s: {reading:.1f} reading the run, {compiling:.1f} compiling{kept}, "
+        f"{frames:.1f} rendering and writing."
+    )
+
+
+def _check_place(out: Path, overwrite: bool) -> None:
+    """Refuse to write over what is there, unless that was asked for."""
+    there = out.is_file() or (out.is_dir() and any(out.iterdir()))
+    if there and not overwrite:
+        what = f"{out} exists already" if out.is_file() else f"{out} holds files already"
+        raise UserError(
+            f"{what}.", fix="add --overwrite to replace them, or choose another place with --out"
+        )
 
 
 def _median_ms(seconds: list[float]) -> str:
@@ -192,9 +220,11 @@ def _chosen(options: Render, fitted: Run) -> list[Shot]:
     return chosen
 
 
-def _shots(options: Render, studio: Studio, given: list[Shot] | None) -> Job:
+def _shots(
+    options: Render, studio: Studio, given: list[Shot] | None, say: Callable[[str], None]
+) -> Job:
     """Return the job of rendering pinhole cameras."""
-    fitted, notes, store = studio.run, [], None
+    fitted, notes, photograph = studio.run, [], None
     if given is not None:
         shots = given
     else:
@@ -202,7 +232,7 @@ def _shots(options: Render, studio: Studio, given: list[Shot] | None) -> Job:
         chosen = _chosen(options, fitted)
         if options.path == "views":
             shots = chosen if options.camera is None else of_camera(chosen, views, options.camera)
-            store = ImageStore(views, fitted.cfg.data)
+            photograph = _Photographs(fitted, say)
         else:
             own = of_camera(chosen, views, options.camera)
             if options.path == "drive":
@@ -214,8 +244,24 @@ def _shots(options: Render, studio: Studio, given: list[Shot] | None) -> Job:
     if options.width is not None:
         shots = [shot.resized(options.width) for shot in shots]
     size = (max(s.width for s in shots), max(s.height for s in shots))
-    frames = shot_frames(studio, shots, lambda shot: _look(fitted, options, shot), store)
+    frames = shot_frames(studio, shots, lambda shot: _look(fitted, options, shot), photograph)
     return Job(frames, len(shots), size, shots, notes)
+
+
+class _Photographs:
+    """Photographs that go beside their renders, as far as they are there."""
+
+    def __init__(self, fitted: Run, say: Callable[[str], None]):
+        self._fitted, self._say, self._silent = fitted, say, False
+
+    def __call__(self, index: int) -> Float32[np.ndarray, "h w 3"] | None:
+        try:
+            return self._fitted.photograph(index)
+        except UserError as error:
+            if not self._silent:
+                self._say(f"Views without their photographs are NAME.png alone: {error.message}.")
+            self._silent = True
+            return None
 
 
 def _recorded(shots: list[Shot], options: Render, fitted: Run) -> list[Shot]:
@@ -262,6 +308,7 @@ def _panoramas(options: Render, studio: Studio) -> Job:
         notes.append(f"{alone} views have no other camera's at their time: they are left out.")
     if fitted.params.appearance is not None:
         notes.append("Corrections of display values that this run learned stay in the photographs.")
-    store = ImageStore(views, fitted.cfg.data)
-    frames = comparison_frames(studio, rig, steps, cylinder, look, store)
+    taken = [shot.view for step in steps for shot in step.shots.values() if shot.view is not None]
+    fitted.require_photographs(taken)
+    frames = comparison_frames(studio, rig, steps, cylinder, look, fitted.store)
     return Job(frames, len(steps), comparison_size(cylinder), (), notes)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+from rich.table import Table
 from rich.text import Text
 
 from p2gs_jax.commands.console import stdout
 from p2gs_jax.options.experiments import Sweep
 from p2gs_jax.sweep import read_sweep, sweep
+from p2gs_jax.sweep.rows import brief, failures
 
 
 def run(options: Sweep) -> int:
@@ -22,6 +26,23 @@ def run(options: Sweep) -> int:
         max_parallel=options.max_parallel or wanted.max_parallel,
         report=lambda line: console.print(Text(line)),
     )
-    print(result.to_markdown())
-    console.print(Text(f"Results: {result.out} (sweep.json, sweep.md)"))
+    console.print(_table(result.rows))
+    for line in failures(result.rows):
+        console.print(Text(f"Not finished: {line}"))
+    console.print(
+        Text(
+            "Means over seeds; seconds of whole runs; held-out views with the exposure fitted to "
+            f"each. Every column, and what it means: {result.out / 'sweep.md'} (and sweep.json)."
+        )
+    )
     return 0 if all(row["status"] == "done" for row in result.rows) else 1
+
+
+def _table(rows: list[dict[str, Any]]) -> Table:
+    headings, lines = brief(rows)
+    table = Table()
+    for heading in headings:
+        table.add_column(heading, justify="left" if heading == "configuration" else "right")
+    for line in lines:
+        table.add_row(*(Text(cell) for cell in line))
+    return table

@@ -22,7 +22,7 @@ def run(options: View) -> int:
         ) from None
     check(options.max_width >= 64, "--max-width must be at least 64")
     check_address(options.host, options.port)
-    fitted = load_run(options.run)
+    fitted = load_run(options.run, options.scene)
     serve(
         fitted,
         host=options.host,

@@ -60,6 +60,28 @@ def atomic_folder(path: Path) -> Iterator[Path]:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
+@contextlib.contextmanager
+def no_empty_folders(path: Path) -> Iterator[None]:
+    """Create a folder for a `with` block; where that fails, what is empty of it goes again.
+
+    Args:
+        path: the folder. It, and those above it, are removed only if they were not there before.
+    """
+    new = [folder for folder in (path, *path.parents) if not folder.exists()]
+    path.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    except BaseException:
+        if new:
+            for folder, _, _ in os.walk(path, topdown=False):
+                with contextlib.suppress(OSError):
+                    os.rmdir(folder)
+            for folder in new[1:]:
+                with contextlib.suppress(OSError):
+                    folder.rmdir()
+        raise
+
+
 def plain(value: Any) -> Any:
     """Return `value` as JSON types, numpy's and jax's included; NaN and infinities become null."""
     if isinstance(value, dict):

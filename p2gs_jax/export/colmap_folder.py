@@ -111,6 +111,8 @@ def _write_model(folder: Path, scene: Scene, store: ImageStore) -> None:
             tracks[point].add_element(index + 1, slot)
     for xyz, track, color in zip(scene.points, tracks, scene.point_colors, strict=True):
         model.add_point3D(xyz.astype(np.float64), track, color)
+    # Mean distance of a point's projections from its observations: what COLMAP itself writes.
+    model.update_point_3d_errors()
     folder.mkdir(parents=True)
     model.write_binary(str(folder))
 

@@ -11,6 +11,7 @@ import tyro
 
 from p2gs_jax.errors import UserError
 from p2gs_jax.options.parse import check
+from p2gs_jax.options.scene import SceneFolder
 
 Format = Literal["linear-ply", "display-ply", "splat", "spz", "colmap", "exr"]
 FORMATS: tuple[Format, ...] = get_args(Format)
@@ -43,6 +44,8 @@ class Export:
     bake_steps: int | None = None
     """Display colours: steps that bring a viewer's pictures closer to the true ones; 0 takes every
     Gaussian by itself (default: 240, or one for every training view if that is more)."""
+    scene: SceneFolder = None
+    """Where the run's scene lies now, if it is not where it was."""
     overwrite: bool = False
     """Replace what an earlier export wrote."""
 

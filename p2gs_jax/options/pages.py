@@ -8,6 +8,8 @@ from typing import Annotated
 
 import tyro
 
+from p2gs_jax.options.scene import SceneFolder
+
 
 @dataclass(frozen=True)
 class Report:
@@ -23,6 +25,8 @@ class Report:
     """The page (default: RUN/report.html)."""
     pdf: bool = False
     """Print the page as a PDF as well, beside it (needs a Chromium or Chrome)."""
+    scene: SceneFolder = None
+    """Where the run's scene lies now, if it is not where it was."""
     render: bool = True
     """Load the scene and render for the seams; without, only what the run folder holds."""
 

@@ -8,6 +8,10 @@ from typing import Annotated, Literal
 
 import tyro
 
+from p2gs_jax.options.scene import SceneFolder
+
+PATHS = ("views", "drive", "orbit")
+
 
 @dataclass(frozen=True)
 class Render:
@@ -46,3 +50,7 @@ class Render:
     """Image width, pixels; the height follows (default: as the photographs)."""
     fps: float | None = None
     """Frames per second of a video (default: 24)."""
+    scene: SceneFolder = None
+    """Where the run's scene lies now, if it is not where it was."""
+    overwrite: bool = False
+    """Replace what an earlier render wrote."""

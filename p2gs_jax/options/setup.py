@@ -24,6 +24,8 @@ class Doctor:
 
     json: bool = False
     """Print JSON, to attach to a report of a problem."""
+    skip_self_test: bool = False
+    """Render nothing: the self-test waits for the compiler, up to half a minute."""
 
 
 @dataclass(frozen=True)

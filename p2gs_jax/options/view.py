@@ -8,6 +8,8 @@ from typing import Annotated
 
 import tyro
 
+from p2gs_jax.options.scene import SceneFolder
+
 
 @dataclass(frozen=True)
 class View:
@@ -18,6 +20,8 @@ class View:
 
     run: Annotated[Path, tyro.conf.Positional]
     """Run folder."""
+    scene: SceneFolder = None
+    """Where the run's scene lies now, if it is not where it was."""
     port: int = 8080
     """Port to listen on; 0 takes any free one."""
     host: str = "127.0.0.1"

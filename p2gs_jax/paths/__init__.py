@@ -5,6 +5,7 @@ from p2gs_jax.paths.drive import PosePath, drive
 from p2gs_jax.paths.files import read_cameras, write_cameras
 from p2gs_jax.paths.orbit import Orbit, find_orbit, orbit
 from p2gs_jax.paths.panorama import Wide, render_wide, slices, stitch
+from p2gs_jax.paths.pinhole import make_camera
 from p2gs_jax.paths.rig import Rig, Step, find_rig
 from p2gs_jax.paths.shots import Shot, of_camera, view_shots
 
@@ -20,6 +21,7 @@ __all__ = [
     "drive",
     "find_orbit",
     "find_rig",
+    "make_camera",
     "of_camera",
     "orbit",
     "read_cameras",

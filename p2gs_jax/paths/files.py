@@ -18,13 +18,11 @@ from jaxtyping import Float
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.atomic import write_json
 from p2gs_jax.paths.geometry import inverse
+from p2gs_jax.paths.pinhole import LARGEST, as_matrix, checked_lens, orthonormal
 from p2gs_jax.paths.shots import Shot
 
 FIELDS = ("name", "viewmat", "K", "width", "height", "exposure_ev", "gamma")
-LARGEST = 16384  # pixels
 MOST_STOPS = 60.0
-# Rotations written with few digits are accepted and made orthonormal again.
-TOLERANCE = 0.01
 _FIX = "correct the file; docs/rendering.md has the format"
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -85,14 +83,10 @@ def _entry(values: dict, index: int) -> Shot:
     if unknown:
         raise ValueError(f"has an unknown field {unknown[0]!r} (known are {', '.join(FIELDS)})")
     viewmat = _matrix(values, "viewmat", 4)
-    K = _matrix(values, "K", 3)
-    if K[0, 0] <= 0 or K[1, 1] <= 0 or not np.array_equal(K[2], [0, 0, 1]):
-        raise ValueError("has a K with no positive focal lengths, or a last row other than 0 0 1")
-    if K[0, 1] != 0 or K[1, 0] != 0:
-        raise ValueError("has a K with skew, which the renderer does not know")
+    K = checked_lens(_matrix(values, "K", 3))
     return Shot(
         _name(values, index),
-        _orthonormal(viewmat, "viewmat"),
+        orthonormal(viewmat, "viewmat"),
         K,
         _pixels(values, "width"),
         _pixels(values, "height"),
@@ -117,7 +111,7 @@ def _nerfstudio(path: Path, data: dict):
         raise UserError(f"{path} {error}.", fix=_FIX) from None
 
     def entry(values: dict, index: int) -> Shot:
-        c2w = _orthonormal(_matrix(values, "camera_to_world", 4) @ _OPENGL, "camera_to_world")
+        c2w = orthonormal(_matrix(values, "camera_to_world", 4) @ _OPENGL, "camera_to_world")
         fov = _number(values, "fov", 0.1, 179.0)
         f = 0.5 * height / math.tan(0.5 * math.radians(fov))
         K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]])
@@ -129,26 +123,7 @@ def _nerfstudio(path: Path, data: dict):
 def _matrix(values: dict, key: str, size: int) -> Float[np.ndarray, "n n"]:
     if key not in values:
         raise ValueError(f"has no {key}")
-    try:
-        out = np.array(values[key], np.float64)
-    except (TypeError, ValueError):
-        out = np.zeros(0)
-    if out.shape == (size * size,):
-        out = out.reshape(size, size)
-    if out.shape != (size, size) or not np.isfinite(out).all():
-        raise ValueError(f"has a {key} that is no {size}x{size} matrix of finite numbers")
-    return out
-
-
-def _orthonormal(matrix: Float[np.ndarray, "4 4"], key: str) -> Float[np.ndarray, "4 4"]:
-    u, sizes, vt = np.linalg.svd(matrix[:3, :3])
-    turned = u @ vt
-    straight = np.abs(sizes - 1).max() <= TOLERANCE and np.linalg.det(turned) > 0
-    if not straight or not np.allclose(matrix[3], [0, 0, 0, 1], atol=TOLERANCE):
-        raise ValueError(f"has a {key} that is no rotation and translation")
-    out = np.eye(4)
-    out[:3, :3], out[:3, 3] = turned, matrix[:3, 3]
-    return out
+    return as_matrix(values[key], key, size)
 
 
 def _pixels(values: dict, key: str) -> int:

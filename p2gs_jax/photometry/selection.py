@@ -305,20 +305,21 @@ def _reasons(chosen: Candidate, candidates: list[Candidate]) -> list[str]:
     if simpler:
         c = max(simpler, key=lambda c: c.density)
         out.append(
-            f"Simpler ({WORDS[c.model]}, {c.response.name}) predicts held-out colours worse by "
-            f"{c.density_gap(chosen):.3f} nat an observation."
+            f"Simpler ({WORDS[c.model]}, {c.response.name}) predicts held-out colours worse: "
+            f"log-likelihood lower by {c.density_gap(chosen):.3f} per observation (0.01 is little, "
+            "1 a lot)."
         )
     richer = [c for c in candidates if c.parameters > chosen.parameters]
     if richer:
         c = max(richer, key=lambda c: c.density)
         out.append(
             f"Richer ({WORDS[c.model]}, {c.response.name}) would gain "
-            f"{-c.density_gap(chosen):.3f} nat for {c.parameters - chosen.parameters} more "
-            "parameters."
+            f"{-c.density_gap(chosen):.3f} of held-out log-likelihood per observation for "
+            f"{c.parameters - chosen.parameters} more parameters."
         )
     if not _likely(chosen):
         out.append(
             f"What predicts best ({WORDS[candidates[0].model]}, {candidates[0].response.name}) "
-            f"differs by at most {chosen.codes:.1f} of 255 codes in any view."
+            f"differs by at most {chosen.codes:.1f} 8-bit levels in any view."
         )
     return out

@@ -85,8 +85,8 @@ NUMBERS: tuple[tuple[str, tuple[str, ...], int, Better], ...] = (
     ),
     ("radiance error, median, stops", ("radiance", "stops_median"), 3, "low"),
     ("radiance error, RMS, stops", ("radiance", "stops_rms"), 3, "low"),
-    ("HIS of the renders", ("consistency", "per_view", "his"), 3, None),
-    ("HIS of the photographs", ("consistency", "photographs", "his"), 3, None),
+    ("HDR inconsistency (HIS) of the renders", ("consistency", "per_view", "his"), 3, None),
+    ("HDR inconsistency (HIS) of the photographs", ("consistency", "photographs", "his"), 3, None),
 )
 
 
@@ -171,7 +171,7 @@ def _scores(runs: Sequence[RunFiles], same: bool) -> list[Row]:
             rows.append(_row(name, values, digits, better if same else None))
     seconds = [words.seconds_of(run) for run in runs]
     if any(s is not None for s in seconds):
-        rows.insert(6, _row("seconds", seconds, 0, None))
+        rows.insert(6, _row("seconds, whole run", seconds, 0, None))
     errors = [_true_error(run) for run in runs]
     if any(e is not None for e in errors):
         rows.append(_row("exposure error, RMS, stops", errors, 4, "low" if same else None))

@@ -88,7 +88,8 @@ def ask_scene(files: RunFiles, reporter: Reporter, *, render: bool = True) -> Fr
         return FromScene(true_exposures=truth, missing=tuple(missing))
     reporter.stage("Reading the scene")
     try:
-        run = load_run(files.folder)
+        run = load_run(files.folder, files.given)
+        run.require_photographs()
         return _rendered(run, files, reporter, truth, missing)
     except UserError as error:
         missing.append(f"Seams were not measured, and nothing was rendered: {error.message}")

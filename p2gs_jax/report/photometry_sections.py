@@ -48,9 +48,9 @@ def model_section(run: RunFiles) -> Section:
     body += listed(words.reasons(run))
     if words.reasons(run):
         body += paragraph(
-            "Models and curves compete on colours of shared surface points that were held out. A "
-            "nat is the natural unit of log probability: 0.01 nat an observation is little, 1 is a "
-            "lot. The simplest model that predicts about as well as the best one is taken.",
+            "Models and curves compete on colours of shared surface points that were held out, by "
+            "their log-likelihood: 0.01 per observation is little, 1 is a lot. The simplest model "
+            "that predicts about as well as the best one is taken.",
             "note",
         )
     body += paragraph(f"Scale: {run.photometry['gauge']}.", "note")

@@ -72,7 +72,7 @@ def seam_section(scene: FromScene) -> Section:
         for p in scene.seams
     ]
     heads = ["pair", "before, stops", "after, stops", "step after, stops"]
-    heads += ["before, 8-bit codes", "after, 8-bit codes", "pixels"]
+    heads += ["before, 8-bit levels", "after, 8-bit levels", "pixels"]
     body += folded("Every pair in numbers", table(heads, numbers, numbers=range(1, 7), tall=True))
     return Section("seams", title, body)
 
@@ -94,11 +94,11 @@ def _seam_picture(scene: FromScene) -> str:
     cells = [
         (
             jpeg(scene.picture.before, f"{left} beside {right}, as taken", LARGE),
-            f"As taken: {seam.before_ev:.2f} stops, {seam.before_codes:.0f} of 255 codes apart",
+            f"As taken: {seam.before_ev:.2f} stops, {seam.before_codes:.0f} 8-bit levels apart",
         ),
         (
             jpeg(scene.picture.after, f"{left} beside {right}, developed alike", LARGE),
-            f"Developed alike: {seam.after_ev:.2f} stops, {seam.after_codes:.1f} codes apart",
+            f"Developed alike: {seam.after_ev:.2f} stops, {seam.after_codes:.1f} levels apart",
         ),
     ]
     said = (
@@ -132,7 +132,7 @@ def strip_section(strips: Sequence[Strip], total: int) -> Section:
         said = "No held-out view could be shown, so these are photographs that the fit knew. "
     said += (
         "Difference: in luminance; grey where both agree, lighter where the render is too bright, "
-        f"darker where it is too dark, white and black from {128 / GAIN * 2:.0f} of 255 codes on."
+        f"darker where it is too dark, white and black from {128 / GAIN * 2:.0f} of 255 on."
     )
     body = paragraph(said)
     for s in strips:

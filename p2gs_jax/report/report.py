@@ -37,6 +37,7 @@ def write_report(
     folder: str | Path,
     out: str | Path | None = None,
     *,
+    scene: str | Path | None = None,
     render: bool = True,
     reporter: Reporter | None = None,
 ) -> Path:
@@ -45,6 +46,7 @@ def write_report(
     Args:
         folder: the run folder.
         out: the page; None takes `report.html` in the folder.
+        scene: where the run's scene lies now; None looks where it was.
         render: load the scene and render for the seams; False uses only what the folder holds.
         reporter: receives progress.
 
@@ -56,12 +58,12 @@ def write_report(
     """
     reporter = reporter or Silent()
     folder = Path(folder)
-    run = read_run(folder)
+    run = read_run(folder, None if scene is None else Path(scene))
     path = folder / "report.html" if out is None else Path(out)
     check_place(path)
-    scene = ask_scene(run, reporter, render=render)
+    told = ask_scene(run, reporter, render=render)
     reporter.stage("Drawing")
-    write_page(path, report_page(run, scene))
+    write_page(path, report_page(run, told))
     return path
 
 

@@ -12,6 +12,7 @@ from p2gs_jax.config import FitConfig, from_dict
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.atomic import read_jsonl
 from p2gs_jax.export.photometry_json import PhotometryFile, ViewPhotometry, read_photometry
+from p2gs_jax.export.places import find
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,8 @@ class RunFiles:
 
     Attributes:
         folder: where it lies.
-        scene: the scene that it was fitted to, as the run was told.
+        scene: the scene that it was fitted to: where it lies, or lay.
+        given: what the caller says about that, or None.
         options: `config.json`, nested values.
         cfg: the same as this version reads it, or None where it cannot.
         metrics: `metrics.json`; empty where there is none.
@@ -45,10 +47,12 @@ class RunFiles:
         log: lines of `log.jsonl`.
         held_out: held-out views in `renders/`, by name.
         missing: sentences on what could not be read.
+        broken: names of files that are there and say nothing that can be read.
     """
 
     folder: Path
     scene: Path
+    given: Path | None
     options: dict[str, Any]
     cfg: FitConfig | None
     metrics: dict[str, Any]
@@ -56,6 +60,7 @@ class RunFiles:
     log: list[dict[str, Any]]
     held_out: tuple[HeldOut, ...]
     missing: tuple[str, ...]
+    broken: tuple[str, ...]
 
     @property
     def preset(self) -> str:
@@ -106,8 +111,12 @@ def number_at(values: Any, *path: str) -> float | None:
     return float(values)
 
 
-def read_run(folder: Path) -> RunFiles:
+def read_run(folder: Path, scene: Path | None = None) -> RunFiles:
     """Read everything that a run folder holds.
+
+    Args:
+        folder: the run.
+        scene: where its scene lies now; None looks where it was.
 
     Raises:
         UserError: it is no run folder.
@@ -137,9 +146,13 @@ def read_run(folder: Path) -> RunFiles:
         missing.append(f"The exposures are not shown: {why}.".replace("..", "."))
     log = read_log(folder / "log.jsonl", missing)
     names = [v["image"] for v in photometry["views"]] if photometry is not None else []
+    read = {path.name: saved, "metrics.json": metrics, "log.jsonl": log}
+    read["photometry.json"] = photometry
+    broken = [n for n, found in read.items() if not found and (folder / n).exists()]
     return RunFiles(
         folder,
-        Path(str(saved.get("scene", ""))),
+        scene or find(saved, "scene", folder) or Path(),
+        scene,
         options,
         cfg,
         metrics,
@@ -147,6 +160,7 @@ def read_run(folder: Path) -> RunFiles:
         log,
         find_held_out(folder / "renders", names),
         tuple(missing),
+        tuple(broken),
     )
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from p2gs_jax.config import preset, to_dict
+from p2gs_jax.errors import UserError
 from p2gs_jax.report import words
 from p2gs_jax.report.page import Section, figure, folded, paragraph, table, text
 from p2gs_jax.report.run_charts import Training, training_chart
@@ -157,7 +158,7 @@ def _growth(run: RunFiles) -> str:
     return (
         "<h3>Automatic growth</h3>"
         + table(names, rows, numbers=(0, 1, 2, 3))
-        + paragraph("Judged on training views that were left out meanwhile.", "note")
+        + paragraph("Evaluated on training views that were left out meanwhile.", "note")
     )
 
 
@@ -220,7 +221,7 @@ def configuration_section(run: RunFiles) -> Section:
     given = flat(run.options)
     try:
         base = flat(to_dict(preset(run.preset)))  # pyright: ignore[reportArgumentType]
-    except KeyError:
+    except UserError:
         base = {}
     differs = [
         [name, option_text(value), option_text(base[name]) if name in base else ""]

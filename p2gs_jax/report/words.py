@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from p2gs_jax.clock import whole_run
 from p2gs_jax.evaluate.alignment import ExposureError, exposure_error
 from p2gs_jax.photometry.agreement import Agreement, compare
 from p2gs_jax.photometry.selection import WORDS
@@ -41,12 +42,7 @@ def duration(seconds: float) -> str:
 
 def seconds_of(run: RunFiles) -> float | None:
     """Return how long the run took, or None where it does not say."""
-    parts = [
-        run.number("seconds", "total_until_evaluation"),
-        run.number("seconds", "evaluation_and_files"),
-    ]
-    known = [p for p in parts if p is not None]
-    return sum(known) if known else None
+    return whole_run(run.part("seconds"))
 
 
 def summary(run: RunFiles, scene: FromScene) -> list[str]:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from p2gs_jax.clock import whole_run
 from p2gs_jax.evaluate.alignment import exposure_error
 from p2gs_jax.synth.exposures import read_true_exposures
 
@@ -16,7 +17,7 @@ from p2gs_jax.synth.exposures import read_true_exposures
 COLUMNS: tuple[tuple[str, tuple[str, ...], int], ...] = (
     ("gaussians", ("counts", "gaussians"), 0),
     ("steps", ("counts", "steps"), 0),
-    ("seconds", ("seconds", "optimisation"), 0),
+    ("seconds", (), 0),
     ("train_psnr", ("train", "psnr"), 2),
     ("train_ssim", ("train", "ssim"), 4),
     ("train_lpips", ("train", "lpips"), 4),
@@ -50,7 +51,9 @@ def read_row(run: Path, scene: Path) -> dict[str, Any]:
             value = value.get(key) if isinstance(value, Mapping) else None
         if path and value is not None:
             row[name] = value
-    return row | _exposures(run, scene)
+    seconds = metrics.get("seconds")
+    total = whole_run(seconds) if isinstance(seconds, Mapping) else None
+    return row | ({} if total is None else {"seconds": total}) | _exposures(run, scene)
 
 
 def _exposures(run: Path, scene: Path) -> dict[str, float]:
@@ -66,6 +69,57 @@ def _exposures(run: Path, scene: Path) -> dict[str, float]:
     return {"ev": error["ev"], "ev_power": error["ev_scale_power"]}
 
 
+# What the columns are, where their names do not say it.
+MEANING = {
+    "seconds": "of the whole run, compilation and evaluation included",
+    "train_": "training views, each under its own exposure and gamma",
+    "test_psnr_averaged": "held-out views under the mean exposure and gamma (as in the paper)",
+    "test_psnr_fitted": "held-out views, exposure fitted to each photograph: the one to trust",
+    "test_psnr_both_fitted": "likewise, exposure and gamma fitted",
+    "reference_psnr": "all views against photographs of one exposure, one scale for all",
+    "reference_psnr_averaged": "likewise under the mean exposure",
+    "reference_test_": "likewise, held-out views only",
+    "radiance_stops": "RMS error of the radiance against HDR truth, stops",
+    "ev": "RMS error of the exposures against the truth, stops, after one scale",
+    "ev_power": "likewise after the best power as well",
+}
+# What fits a terminal: column, heading, digits.
+BRIEF = (
+    ("seconds", "seconds", 0),
+    ("gaussians", "Gaussians", 0),
+    ("train_psnr", "training PSNR dB", 2),
+    ("test_psnr_fitted", "held-out PSNR dB", 2),
+    ("reference_psnr", "reference PSNR dB", 2),
+    ("ev", "exposure error EV", 3),
+)
+
+
+def brief(rows: list[dict[str, Any]]) -> tuple[list[str], list[list[str]]]:
+    """Return headings and cells of the columns that matter most; means over seeds."""
+    shown = [(c, h, d) for c, h, d in BRIEF if any(c in row for row in rows)]
+    lines = []
+    for name in dict.fromkeys(row["name"] for row in rows):
+        mine = [row for row in rows if row["name"] == name]
+        done = [row for row in mine if row["status"] == "done"]
+        cells = [_mean(done, column, digits) for column, _, digits in shown]
+        lines.append([str(name), f"{len(done)} of {len(mine)}", *cells])
+    return ["configuration", "seeds", *(h for _, h, _ in shown)], lines
+
+
+def _mean(rows: list[dict[str, Any]], column: str, digits: int) -> str:
+    values = [row[column] for row in rows if column in row]
+    return f"{np.mean(values):.{digits}f}" if values else "-"
+
+
+def failures(rows: list[dict[str, Any]]) -> list[str]:
+    """Return a line for every run that is not done, with its reason."""
+    return [
+        f"{row['name']}, seed {row['seed']}: {row['status']}: {row.get('reason', '')}"
+        for row in rows
+        if row["status"] != "done"
+    ]
+
+
 def to_markdown(rows: list[dict[str, Any]]) -> str:
     """Return a table: a line per configuration, means over its seeds; failures with reasons."""
     names = list(dict.fromkeys(row["name"] for row in rows))
@@ -74,20 +128,19 @@ def to_markdown(rows: list[dict[str, Any]]) -> str:
         "| configuration | seeds | " + " | ".join(c for c, _ in shown) + " |",
         "|---|---:|" + "---:|" * len(shown),
     ]
-    failures = []
     for name in names:
         mine = [row for row in rows if row["name"] == name]
         done = [row for row in mine if row["status"] == "done"]
-        cells = []
-        for column, digits in shown:
-            values = [row[column] for row in done if column in row]
-            cells.append(f"{np.mean(values):.{digits}f}" if values else "-")
+        cells = [_mean(done, column, digits) for column, digits in shown]
         lines.append(f"| {name} | {len(done)} of {len(mine)} | " + " | ".join(cells) + " |")
-        failures += [
-            f"- {name}, seed {row['seed']}: {row['status']}: {row.get('reason', '')}"
-            for row in mine
-            if row["status"] != "done"
-        ]
-    if failures:
-        lines += ["", "Not finished:", "", *failures]
+    meant = [
+        f"- `{name}{'*' if name.endswith('_') else ''}`: {text}"
+        for name, text in MEANING.items()
+        if any(c == name or (name.endswith("_") and c.startswith(name)) for c, _ in shown)
+    ]
+    if meant:
+        lines += ["", *meant]
+    bad = failures(rows)
+    if bad:
+        lines += ["", "Not finished:", "", *(f"- {line}" for line in bad)]
     return "\n".join(lines) + "\n"

@@ -110,7 +110,8 @@ def sweep(
             _run(job, scene, reference, out / JOBS / f"{slug(job['name'])}_{job['seed']}.json")
         if (job["run"] / "metrics.json").exists():
             row.update(status="done", **read_row(job["run"], scene))
-            said = "kept" if kept else f"{time.monotonic() - begin:.0f} s"
+            took = row.get("seconds", time.monotonic() - begin)
+            said = "kept" if kept else f"{took:.0f} s"
         else:
             row.update(status="failed", reason=_reason(job["run"]))
             said = f"failed: {row['reason']}"

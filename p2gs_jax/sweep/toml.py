@@ -27,9 +27,9 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
-from p2gs_jax.config import FitConfig, PresetName, preset
+from p2gs_jax.config import FitConfig, preset
 from p2gs_jax.errors import UserError
 from p2gs_jax.sweep.fields import product, with_fields
 
@@ -104,9 +104,8 @@ def read_sweep(path: Path) -> SweepFile:
 def _preset(name: Any, path: Path) -> FitConfig:
     try:
         return preset(name)
-    except KeyError:
-        names = ", ".join(get_args(PresetName))
-        raise UserError(f"{path}: there is no preset {name!r}.", fix=f"choose {names}") from None
+    except UserError as error:
+        raise UserError(f"{path}: {error.message}", fix=error.fix) from None
 
 
 def _null(value: Any) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import time
 import traceback
 from pathlib import Path
 
@@ -33,6 +34,8 @@ def main(job_path: Path) -> int:
             from_dict(job["fit"]),
             reference=job["reference"],
             resume=(run / "config.json").exists(),
+            # As for `p2gs-jax fit`: starting the interpreter counts.
+            spent_s=time.process_time(),
         )
     except UserError as error:
         write_json(run / REASON, {"reason": str(error)})

@@ -86,7 +86,7 @@ class StreetTruth:
 
 
 def write_street(
-    out: Path,
+    out: str | Path,
     *,
     frames: int = 10,
     width: int = 320,
@@ -123,10 +123,10 @@ def write_street(
     Raises:
         UserError: a parameter is impossible, or `out` is in the way.
     """
+    out = Path(out)
     sensor = sensor or Sensor(iso_std=iso_std)
     _check(out, frames, width, height, sensor.iso_std, supersample)
     say = report or (lambda line: None)
-    out = Path(out)
     out.parent.mkdir(parents=True, exist_ok=True)
     town = build_town(seed, layout)
     names = tuple(f"{camera}/{f:06d}.png" for camera in sorted(MOUNTS) for f in range(frames))

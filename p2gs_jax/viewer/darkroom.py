@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float32
 
+from p2gs_jax.errors import UserError
 from p2gs_jax.run_folder import Run
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
@@ -24,6 +25,7 @@ class Darkroom:
     Attributes:
         frame: the last frame, or None.
         depth_limits: nearest and farthest depth that the depth colours span, scene units.
+        trouble: why a photograph could not be shown last, or None.
     """
 
     def __init__(self, run: Run, store: ImageStore, programs: Programs, typical: float):
@@ -37,6 +39,7 @@ class Darkroom:
         """
         self.frame: Frame | None = None
         self.depth_limits: tuple[float, float] | None = None
+        self.trouble: str | None = None
         self._run, self._store, self._programs = run, store, programs
         self._centers = np.stack([center(view.viewmat) for view in run.scene.views])
         self._tolerance = SAME_PLACE * typical
@@ -107,7 +110,11 @@ class Darkroom:
             return None
         kept = self._photograph
         if kept is None or kept[0] != index or kept[1] is not camera:
-            ldr, mask = self._store.get(index)
+            try:
+                ldr, mask = self._store.get(index)
+            except UserError as error:
+                self.trouble = error.message
+                return None
             seen = as_seen_by(ldr, mask, camera_of(self._store, index), camera)
             self._photograph = kept = (index, camera, seen)
         return kept[2]

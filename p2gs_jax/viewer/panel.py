@@ -23,7 +23,7 @@ MODES: dict[str, Mode] = {
 }
 MEAN = "mean of all"
 NOWHERE = "choose ..."
-KERNEL, SPLATS = "our kernel", "browser splats"
+FULL, SPLATS = "full (linear light)", "browser splats (fast)"
 KEYS = "Drag to orbit, right-drag to pan, scroll to approach; W A S D Q E fly, arrows turn."
 
 
@@ -43,7 +43,7 @@ class Actions(Protocol):
         ...
 
     def go_to(self, index: int) -> None:
-        """Move to where a view was taken, and take its look."""
+        """Move to where a view was taken, and take its look unless that is locked."""
         ...
 
     def set_fov(self, degrees: float) -> None:
@@ -159,21 +159,21 @@ class Panel:
         self._curve = gui.add_dropdown(
             "Curve", list(self._curves), hint="The tone curve from exposed light to display values."
         )
-        self._look_of = gui.add_dropdown(
-            "Look of",
+        self._match = gui.add_dropdown(
+            "Match photo",
             [MEAN, *facts.names],
-            hint="Takes exposure, gamma, curve and correction of a photograph.",
+            hint="Sets exposure, gamma, curve and correction as a photograph was taken.",
         )
-        self._drawn_by = gui.add_dropdown(
-            "Drawn by",
-            [KERNEL, SPLATS],
+        self._renderer = gui.add_dropdown(
+            "Renderer",
+            [FULL, SPLATS],
             hint="Browser splats move at any speed, but mix display values instead of light.",
         )
         for handle in (self._exposure, self._gamma, self._curve, self._split):
             self._when_chosen(handle, lambda _: actions.look_changed())
-        for handle in (self._mode, self._drawn_by):
+        for handle in (self._mode, self._renderer):
             self._when_chosen(handle, lambda _: actions.mode_changed())
-        self._when_chosen(self._look_of, lambda name: actions.take_look_of(self._index(name)))
+        self._when_chosen(self._match, lambda name: actions.take_look_of(self._index(name)))
 
     def _add_camera(self) -> None:
         gui, facts, actions = self._gui, self._facts, self._actions
@@ -181,16 +181,23 @@ class Panel:
         self._go_to = gui.add_dropdown(
             "Go to",
             [NOWHERE, *facts.names],
-            hint="Stands where a photograph was taken, and takes its look.",
+            hint="Stands where a photograph was taken, and matches its exposure and gamma.",
         )
         steps = gui.add_button_group("", ["previous", "next"])
+        self._locked = gui.add_checkbox(
+            "Lock exposure",
+            False,
+            hint="Go to, previous, next and split leave exposure, gamma and curve as they are.",
+        )
         self._fov = gui.add_slider(
-            "Field", 5.0, 150.0, 0.5, 60.0, hint="Vertical field of view, degrees.", marks=()
+            "FOV", 5.0, 150.0, 0.5, 60.0, hint="Vertical field of view, degrees.", marks=()
         )
         self._cameras = gui.add_checkbox(
             "Cameras", False, hint="Where photographs were taken; click one to go there."
         )
-        self._size = gui.add_slider("Size", 0.2, 8.0, 0.1, 1.0, visible=False, marks=())
+        self._size = gui.add_slider(
+            "Camera size", 0.2, 8.0, 0.1, 1.0, visible=False, hint="Times the usual.", marks=()
+        )
         self._camera_legend = gui.add_html(facts.camera_legend, visible=False)
 
         def choose(name: str) -> None:
@@ -225,7 +232,9 @@ class Panel:
             "Speed", 0.2, 30.0, 0.1, 2.0, hint="Photographs per second.", marks=()
         )
         self._own = gui.add_checkbox(
-            "As taken", False, hint="With the exposure of every photograph, instead of one for all."
+            "Each photo's exposure",
+            False,
+            hint="Plays with the exposure of every photograph, instead of one for all.",
         )
         self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY)
         self._playing = False
@@ -246,13 +255,19 @@ class Panel:
 
     def _add_save(self) -> None:
         gui, actions = self._gui, self._actions
-        width = gui.add_dropdown(
-            "Width", [str(w) for w in SAVED_WIDTHS], initial_value="1920", hint="Pixels across."
+        low, high = SAVED_WIDTHS
+        width = gui.add_number(
+            "Width",
+            1920,
+            min=low,
+            max=high,
+            step=1,
+            hint=f"Pixels across, {low} to {high}; the height follows the window.",
         )
         png = gui.add_button("PNG, as shown", icon=viser.Icon.PHOTO_DOWN)
         exr = gui.add_button("EXR, linear light", icon=viser.Icon.FILE_DOWNLOAD)
-        png.on_click(lambda _: actions.save("png", int(width.value)))
-        exr.on_click(lambda _: actions.save("exr", int(width.value)))
+        png.on_click(lambda _: actions.save("png", round(width.value)))
+        exr.on_click(lambda _: actions.save("exr", round(width.value)))
 
     @staticmethod
     def _when_chosen(handle, act: Callable) -> None:
@@ -276,7 +291,7 @@ class Panel:
             taken_as=self._taken_as,
             mode=MODES[self._mode.value],
             split=self._split.value,
-            splats=self._drawn_by.value == SPLATS,
+            splats=self._renderer.value == SPLATS,
         )
 
     def put(self, settings: Settings) -> None:
@@ -287,7 +302,7 @@ class Panel:
         names = {value: name for name, value in self._curves.items()}
         self._curve.value = names.get(settings.curve, names["run"])
         index = settings.taken_as
-        self._look_of.value = MEAN if index is None else self._facts.names[index]
+        self._match.value = MEAN if index is None else self._facts.names[index]
 
     def put_view(self, index: int, degrees: float) -> None:
         """Show on the controls where the camera went."""
@@ -307,6 +322,11 @@ class Panel:
     def speed(self) -> float:
         """Photographs per second."""
         return self._speed.value
+
+    @property
+    def locked(self) -> bool:
+        """Whether going somewhere leaves the look as it is."""
+        return self._locked.value
 
     @property
     def own_exposures(self) -> bool:

@@ -13,7 +13,8 @@ from p2gs_jax.export.png import write_png
 from p2gs_jax.photometry.look import Look
 from p2gs_jax.viewer.shade import Frame
 
-SAVED_WIDTHS = (960, 1280, 1920, 2560, 3840)
+# Fewest and most pixels across.
+SAVED_WIDTHS = (16, 16384)
 
 
 def saved_size(width: int, aspect: float) -> tuple[int, int]:

@@ -251,6 +251,8 @@ class Screen:
             return depth_legend(*self.darkroom.depth_limits)
         if settings.mode == "split" and not self.darkroom.photographed_from_here:
             return note(NO_PHOTOGRAPH)
+        if settings.mode == "split" and self.darkroom.trouble is not None:
+            return note(html.escape(f"The photograph cannot be shown: {self.darkroom.trouble}"))
         return None
 
     # ------------------------------------------------------------------ the browser's splats

@@ -17,7 +17,13 @@ from p2gs_jax.viewer.panel import Panel
 from p2gs_jax.viewer.playback import Player
 from p2gs_jax.viewer.save import exr_bytes, png_bytes, saved_size
 from p2gs_jax.viewer.screen import Screen, seen_by
-from p2gs_jax.viewer.settings import common_settings, look_of, settings_of_view
+from p2gs_jax.viewer.settings import (
+    Settings,
+    common_settings,
+    look_of,
+    same_look,
+    settings_of_view,
+)
 from p2gs_jax.viewer.studio import Studio
 
 # How often the slider follows while playing, seconds.
@@ -42,6 +48,9 @@ class Session:
         self._stopping = threading.Event()
         self._frusta: Frusta | None = None
         self._one_at_a_time = threading.Lock()
+        # The look before a split took a photograph's, and the one that it took.
+        self._before_split: Settings | None = None
+        self._taken: Settings | None = None
         client.camera.on_update(self._camera_moved)
         pose = studio.pose(studio.first_view, seen_by(client).aspect)
         self._panel.put_view(studio.first_view, float(np.rad2deg(pose.fov)))
@@ -74,12 +83,22 @@ class Session:
         self._screen.retouched()
 
     def mode_changed(self) -> None:
-        """Show something else; a split goes to the nearest photograph and takes its look."""
-        if self._panel.settings().mode == "split":
+        """Show something else; a split goes to the nearest photograph and takes its look.
+
+        The look of before comes back after the split, unless a person has chosen another meanwhile.
+        """
+        before, now = self._before_split, self._panel.settings()
+        if now.mode == "split":
+            if before is None:
+                self._before_split = now
             camera = self._screen.camera(seen_by(self._client), (64, 64))
             room = self._studio.darkroom()
             here = room.view_at(camera)
             self.go_to(room.nearest_view(camera) if here is None else here)
+        elif before is not None:
+            self._before_split = None
+            if self._taken is not None and same_look(now, self._taken):
+                self._panel.put(before)
         self._screen.moved()
 
     def take_look_of(self, index: int | None) -> None:
@@ -94,12 +113,14 @@ class Session:
     # ------------------------------------------------------------------ the camera
 
     def go_to(self, index: int) -> None:
-        """Move to where a view was taken, and take its look."""
+        """Move to where a view was taken, and take its look unless that is locked."""
         self._player.stop()
         self._panel.set_playing(False)
         pose = self._studio.pose(index, seen_by(self._client).aspect)
         self._panel.put_view(index, float(np.rad2deg(pose.fov)))
-        self.take_look_of(index)
+        if not self._panel.locked:
+            self.take_look_of(index)
+            self._taken = self._panel.settings()
         self._move(pose)
 
     def set_fov(self, degrees: float) -> None:

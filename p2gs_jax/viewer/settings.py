@@ -25,7 +25,7 @@ class Settings:
         taken_as: row in `scene.views` of the view whose correction applies, or None for the mean.
         mode: what is shown.
         split: share of the photograph in `split`.
-        splats: whether the browser draws, instead of our kernel.
+        splats: whether the browser draws, instead of the renderer.
     """
 
     gamma: float
@@ -61,6 +61,11 @@ def settings_of_view(run: Run, index: int, before: Settings) -> Settings:
     own = run.own_look(index)
     ev = float(np.log2(own.exposure / run.mean.exposure_geometric))
     return replace(before, gamma=own.gamma, exposure_ev=ev, curve="run", taken_as=index)
+
+
+def same_look(a: Settings, b: Settings) -> bool:
+    """Return whether two settings develop alike, whatever they show."""
+    return replace(a, mode=b.mode, split=b.split, splats=b.splats) == b
 
 
 def look_of(run: Run, settings: Settings) -> Look:

@@ -1,7 +1,7 @@
 """The scene as splats that the browser draws by itself: any speed, display colours only.
 
-The browser composites display values instead of light, so soft edges differ a little from our
-kernel's picture; it knows no spherical harmonics, so colours are those seen from one place.
+The browser composites display values instead of light, so soft edges differ a little from the
+renderer's picture; it knows no spherical harmonics, so colours are those seen from one place.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.look import develop
 from p2gs_jax.run_folder import Run
-from p2gs_jax.scene.images import ImageStore, size_at
+from p2gs_jax.scene.images import size_at
 from p2gs_jax.types import Camera
 from p2gs_jax.viewer.darkroom import Darkroom
 from p2gs_jax.viewer.frames import (
@@ -60,7 +60,7 @@ class Studio:
         self._lock = threading.Lock()
         self._thumbnails: dict[int, UInt8[np.ndarray, "h w 3"]] = {}
         self._distances: dict[int, float] = {}
-        self.store = ImageStore(run.scene.views, run.cfg.data)
+        self.store = run.store
         self._points = run.scene.points
         if not len(self._points):
             self._points = np.asarray(run.params.gaussians.means)

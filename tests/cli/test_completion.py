@@ -50,6 +50,14 @@ def test_options_and_their_values_are_completed(bash):
     assert bash("try p2gs-jax synth town --sensor.curve f") == ["1", "filmic"]
 
 
+def test_a_path_of_cameras_is_a_word_or_a_file(bash):
+    assert bash('try p2gs-jax render RUN --path ""') == ["3", "views", "drive", "orbit"]
+    assert bash("try p2gs-jax render RUN --path dr") == ["1", "drive"]
+    assert bash("try p2gs-jax render RUN --path cameras.j") == ["0"]
+    for shell in ("zsh", "fish"):
+        assert "'choices': ['views', 'drive', 'orbit']" in script(shell)
+
+
 def test_paths_are_left_to_bash(bash):
     assert bash("try p2gs-jax fit cast") == ["0"]
     assert bash("try p2gs-jax fit castle --out ru") == ["0"]

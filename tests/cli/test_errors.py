@@ -10,6 +10,7 @@ import pytest
 from p2gs_jax.cli import main
 from p2gs_jax.config import preset, to_dict
 from p2gs_jax.errors import UserError
+from p2gs_jax.export.atomic import no_empty_folders
 from p2gs_jax.options.parse import parse_duration
 from p2gs_jax.pipeline import check_run_dir
 
@@ -119,6 +120,15 @@ WRONG = [
     ("calibrate castle --out run --compare-with none.csv", "none.csv cannot be read"),
     ("calibrate nowhere --out run --static", "name the folder of the photographs"),
     ("calibrate castle --out run --static", "several exposures"),
+    ("fit castle --out run --iterations 100", "here it is called --steps"),
+    ("fit castle --out run --sh_degree=2", "here it is called --render.sh-degree"),
+    ("fit --source-path castle --out run", "p2gs-jax fit SCENE"),
+    ("render castle --output x", "here it is called --out"),
+    ("render castle --exposure-ev bright", "'bright' is no number, and not own"),
+    (
+        "fit castle --out run --densify.max-gaussians many",
+        "no whole number, and not auto",
+    ),
     ("render castle", "p2gs-jax fit --out"),
     ("render", "RUN"),
     ("demo --budget 0", "write 90s, 5m or 1h30m"),
@@ -146,7 +156,26 @@ def test_wrong_words_are_answered_with_a_way_on(capsys, tmp_path, monkeypatch, w
     code, text = run(capsys, *words.split())
     assert code == 2
     assert way_on in text
-    assert not (tmp_path / "new").exists()
+    for folder in ("new", "run"):
+        assert not (tmp_path / folder).exists(), "a failure leaves no empty folder"
+
+
+def fail_in(path, *files):
+    with no_empty_folders(path):
+        (path / "cache").mkdir()
+        for name in files:
+            (path / name).write_text("what was done")
+        raise RuntimeError
+
+
+def test_folders_that_were_there_before_a_failure_stay(tmp_path):
+    mine, new = tmp_path / "mine", tmp_path / "new" / "run"
+    mine.mkdir()
+    for path, files in ((mine, ()), (mine / "new" / "run", ()), (new, ("log",))):
+        with pytest.raises(RuntimeError):
+            fail_in(path, *files)
+    assert list(mine.rglob("*")) == [mine / "cache"]
+    assert [p.name for p in new.iterdir()] == ["log"]
 
 
 @pytest.mark.parametrize("name", ["radiance.ply", "photometry.json"])
@@ -157,15 +186,26 @@ def test_a_damaged_run_is_named(capsys, tmp_path, finished_run, name):
     assert code == 2
     assert name in text
     assert "restore it from a copy" in text
+    assert "--resume" in text
 
 
-def test_a_run_whose_scene_moved(capsys, tmp_path, finished_run):
+@pytest.mark.parametrize("content", ["half", "object", "newer"])
+def test_a_damaged_configuration_says_what_mends_it(capsys, tmp_path, finished_run, content):
     copy = shutil.copytree(finished_run, tmp_path / "run")
-    saved = json.loads((copy / "config.json").read_text())
-    (copy / "config.json").write_text(json.dumps(saved | {"scene": str(tmp_path / "gone")}))
-    code, text = run(capsys, "render", copy)
+    path = copy / "config.json"
+    saved = json.loads(path.read_text())
+    saved["fit"]["render"]["colour"] = True
+    path.write_text(
+        {"half": path.read_text()[:300], "object": "{}", "newer": json.dumps(saved)}[content]
+    )
+    code, text = run(capsys, "eval", copy)
     assert code == 2
-    assert "correct `scene`" in text
+    assert "config.json" in text
+    assert ("with the version that made it" if content == "newer" else "--resume") in text
+    if content == "half":
+        code, text = run(capsys, "fit", tmp_path, "--out", copy, "--resume")
+        assert code == 2
+        assert "remove it and repeat the options" in text
 
 
 @pytest.mark.parametrize("command", ["render", "eval"])

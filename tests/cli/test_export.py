@@ -272,7 +272,7 @@ def test_names_that_lead_outside_are_refused(finished_run, capsys, tmp_path, mon
 
     from p2gs_jax.commands import export
 
-    def outside(folder):
+    def outside(folder, scene=None):
         fitted = load_run(folder)
         views = (replace(fitted.scene.views[0], name="../0.png"), *fitted.scene.views[1:])
         return replace(fitted, scene=replace(fitted.scene, views=views))
@@ -290,7 +290,7 @@ def test_corrections_travel_with_the_linear_ply(finished_run, capsys, tmp_path, 
 
     from p2gs_jax.commands import export
 
-    def corrected(folder):
+    def corrected(folder, scene=None):
         fitted = load_run(folder)
         appearance = jnp.full((len(fitted.scene.train_indices), 3, 4), 0.1)
         photometry = replace(fitted.cfg.photometry, appearance="affine")

@@ -1,6 +1,7 @@
 """`render` from end to end, on a small run and on a rig that photographed its field."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -96,6 +97,7 @@ def rig_run(finished_run, tmp_path_factory) -> Path:
         data = json.loads((root / "run" / name).read_text())
         data[key] = value
         (root / "run" / name).write_text(json.dumps(data))
+    (root / "run" / "scene.npz").unlink()
     return root / "run"
 
 
@@ -237,6 +239,27 @@ def test_senseless_requests_end_with_one_message(capsys, own_run, argv, words):
     assert code == 2
     assert words in " ".join(text.split())
     assert sorted(own_run.rglob("*")) == before
+
+
+def test_what_is_there_is_replaced_only_when_asked_for(capsys, own_run, tmp_path):
+    for out in (tmp_path / "a", tmp_path / "a.mp4"):
+        argv = (own_run, "--path", "drive", "--frames", "2", "--width", "48", "--out", out)
+        assert run(capsys, *argv)[0] == 0
+        written = [p for p in (out.iterdir() if out.is_dir() else [out])]
+        before = [p.stat().st_mtime_ns for p in written]
+        code, text = run(capsys, *argv)
+        assert code == 2
+        assert "--overwrite" in text
+        assert [p.stat().st_mtime_ns for p in written] == before
+        code, text = run(capsys, *argv, "--overwrite")
+        assert code == 0
+        assert [p.stat().st_mtime_ns for p in written] != before
+        # Where the seconds went adds up.
+        spent = re.search(
+            r"([\d.]+) s: ([\d.]+) reading .*? ([\d.]+) compiling.*? ([\d.]+) ren", text
+        )
+        total, *parts = map(float, spent.groups())
+        assert sum(parts) == pytest.approx(total, abs=0.3)
 
 
 def test_a_folder_in_place_of_a_video_is_kept(capsys, own_run, tmp_path):

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import pytest
 from packaging.requirements import Requirement
 
+from p2gs_jax.cli import main
 from p2gs_jax.commands import doctor
 from p2gs_jax.doctor import cache, features, libraries, machine, render
 
@@ -33,6 +34,17 @@ def test_everything_here_is_well(capsys):
     text = doctor.as_text(found)
     assert "All that a fit needs is there." in text
     assert "BROKEN" not in text
+
+
+def test_the_self_test_can_be_skipped(capsys, monkeypatch):
+    def never():
+        raise AssertionError
+
+    monkeypatch.setattr(render, "self_test", never)
+    with pytest.raises(SystemExit) as stop:
+        main(["doctor", "--skip-self-test"])
+    assert stop.value.code == 0
+    assert "skipped" in capsys.readouterr().out
 
 
 def test_every_dependency_can_be_tried():

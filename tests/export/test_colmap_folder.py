@@ -1,6 +1,7 @@
 """What is exported as COLMAP is the same scene, to us and to pycolmap, with its exposures."""
 
 import csv
+import dataclasses
 
 import numpy as np
 import pycolmap
@@ -103,8 +104,25 @@ def test_pycolmap_reads_the_model(tmp_path):
     assert {c.model.name for c in model.cameras.values()} == {"PINHOLE"}
     assert model.num_points3D() == len(before.points)
     assert model.compute_num_observations() == len(before.tracks.xy)
+    written = {k: p.error for k, p in model.points3D.items()}
     model.update_point_3d_errors()
+    # Observations travel as float32, and are moved a little to be told from zero.
+    assert all(0 < e < 1e-3 for e in written.values())
+    assert written == pytest.approx({k: p.error for k, p in model.points3D.items()}, abs=1e-9)
     assert model.compute_mean_reprojection_error() < 1e-3, "the dots lie where points project"
+
+
+def test_errors_of_points_are_those_of_their_tracks(tmp_path):
+    root = make_scene(tmp_path)
+    scene = load_scene(root, DataConfig())
+    first = scene.tracks.point_indices == 0
+    moved = np.where(first[:, None], scene.tracks.xy + np.float32(0.5), scene.tracks.xy)
+    noisy = dataclasses.replace(scene, tracks=dataclasses.replace(scene.tracks, xy=moved))
+    write_colmap_folder(root / "out", noisy, ImageStore(scene.views, DataConfig()), rows(scene))
+    model = pycolmap.Reconstruction(str(root / "out" / "sparse" / "0"))
+    errors = [p.error for _, p in sorted(model.points3D.items())]
+    assert errors[0] == pytest.approx(0.5 * 2**0.5, abs=1e-3)
+    assert max(errors[1:]) < 1e-3
 
 
 def test_points_without_tracks_are_kept(tmp_path):

@@ -56,4 +56,4 @@ def test_sharp_images_do_not_earn_parameters_for_invisible_differences():
     found = select(seen, **LIMITS)
     assert found.solution.model == "constant"
     assert found.candidates[0].model != "constant"
-    assert any("codes in any view" in r for r in found.reasons)
+    assert any("8-bit levels in any view" in r for r in found.reasons)

@@ -7,6 +7,7 @@ import pytest
 from page_tools import copy_run, edit, look_at
 
 from p2gs_jax.cli import main
+from p2gs_jax.report import compare
 from p2gs_jax.report.compare import compare_runs, to_markdown
 from p2gs_jax.report.compare_page import comparison_page
 
@@ -50,6 +51,17 @@ def test_the_table_holds_every_run_and_marks_the_best(runs):
     assert row(found, "held-out PSNR, fitted exposure, dB").best == {1}
     assert row(found, "training SSIM").best == frozenset()
     assert row(found, "Gaussians").best == frozenset()
+
+
+def test_no_star_is_announced_where_scores_do_not_compare(runs, tmp_path, monkeypatch, capsys):
+    for different in (False, True):
+        if different:
+            monkeypatch.setattr(compare, "_same_scene", lambda first, other: False)
+        with pytest.raises(SystemExit):
+            main(["compare", *map(str, runs), "--out", str(tmp_path / "compare.html")])
+        printed = capsys.readouterr().out
+        assert ("* best" in printed) is not different
+        assert "seconds, whole run" in printed
 
 
 def test_options_that_differ_and_no_others(runs):

@@ -149,7 +149,7 @@ def test_seams_are_shown_with_their_numbers(full_page, run):
     said = words_of(text)
     assert "differ by 1.25 stops as taken, and by 0.07 once" in said
     assert f"Left half: {second}. Right half: {first}." in said
-    assert "As taken: 1.25 stops, 40 of 255 codes apart" in said
+    assert "As taken: 1.25 stops, 40 8-bit levels apart" in said
     shown = pictures(text)
     assert np.median(shown[f"{second} beside {first}, as taken"]) == pytest.approx(64, abs=1)
     assert np.median(shown[f"{second} beside {first}, developed alike"]) == pytest.approx(
@@ -205,6 +205,17 @@ def test_broken_files_do_not_break_the_page(run, tmp_path, name, content):
     (broken / name).write_text(content, encoding="latin-1")
     text = write_report(broken, render=False).read_text()
     assert "What this page lacks" in text or content.startswith('{"train"')
+
+
+def test_broken_files_are_said_by_the_command(run, tmp_path, capsys):
+    broken = copy_run(run, tmp_path / "run")
+    for content, code in (("{", 1), (None, 0)):
+        path = broken / "photometry.json"
+        path.unlink() if content is None else path.write_text(content)
+        with pytest.raises(SystemExit) as stop:
+            main(["report", str(broken), "--no-render"])
+        assert stop.value.code == code
+        assert "photometry.json" in capsys.readouterr().err.replace("\n", "")
 
 
 def test_an_only_config_still_gives_a_page(run, tmp_path):

@@ -7,8 +7,9 @@ from tiny_scene import make_scene
 
 import p2gs_jax
 from p2gs_jax.cli import main
+from p2gs_jax.clock import whole_run
 from p2gs_jax.sweep import grid, read_sweep, sweep, with_fields
-from p2gs_jax.sweep.rows import to_markdown
+from p2gs_jax.sweep.rows import brief, failures, to_markdown
 
 BASE = p2gs_jax.preset("robust")
 SMALL = with_fields(
@@ -57,6 +58,23 @@ def test_wrong_fields_and_values_are_named(field, value, text):
         with_fields(BASE, {field: value})
 
 
+def test_the_printed_table_is_short_and_the_kept_one_says_what_columns_are():
+    row = {"name": "a", "seed": 0, "status": "done", "seconds": 56.2, "gaussians": 300}
+    row |= {"train_psnr": 25.0, "train_lpips": 0.1, "test_psnr_fitted": 21.0, "ev": 0.01}
+    rows = [row, {**row, "seed": 1, "status": "failed", "reason": "no seeds"}]
+    headings, lines = brief(rows)
+    assert headings == [
+        *("configuration", "seeds", "seconds", "Gaussians", "training PSNR dB"),
+        *("held-out PSNR dB", "exposure error EV"),
+    ]
+    assert lines == [["a", "1 of 2", "56", "300", "25.00", "21.00", "0.010"]]
+    assert failures(rows) == ["a, seed 1: failed: no seeds"]
+    text = to_markdown(rows)
+    for column in ("seconds", "train_*", "test_psnr_fitted", "ev"):
+        assert f"- `{column}`: " in text
+    assert "ev_power" not in text
+
+
 def test_a_grid_has_every_combination():
     configs = grid(BASE, loss__relative_exposure__weight=[None, 0.1], render__sh_degree=[0, 1, 3])
     assert len(configs) == 6
@@ -82,6 +100,9 @@ def test_a_sweep_keeps_what_is_done_and_names_what_failed(tmp_path):
     good = result.rows[0]
     assert good["steps"] == 12
     assert good["train_psnr"] > 5
+    metrics = json.loads((tmp_path / "out" / "good" / "seed_0" / "metrics.json").read_text())
+    assert good["seconds"] == whole_run(metrics["seconds"]) > metrics["seconds"]["optimisation"]
+    assert said[0].endswith(f"{good['seconds']:.0f} s")
     assert "starts exposures at random" in result.rows[2]["reason"]
     assert json.loads((tmp_path / "out" / "sweep.json").read_text()) == result.rows
     table = (tmp_path / "out" / "sweep.md").read_text()

@@ -1,0 +1,162 @@
+"""Runs travel: they open from anywhere, without their scene where cameras suffice, or with it."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from tiny_scene import make_scene
+
+from p2gs_jax.cli import main
+from p2gs_jax.config import DataConfig
+from p2gs_jax.errors import UserError
+from p2gs_jax.export.places import candidates, find, remembered
+from p2gs_jax.export.scene_file import SCENE_FILE, read_scene, write_scene
+from p2gs_jax.run_folder import load_run
+from p2gs_jax.scene import load_scene
+
+
+def run(capsys, *argv):
+    with pytest.raises(SystemExit) as stop:
+        main([str(a) for a in argv])
+    out = capsys.readouterr()
+    assert "Traceback" not in out.err + out.out
+    return stop.value.code, " ".join((out.err + out.out).split())
+
+
+@pytest.fixture
+def alone(tmp_path, finished_run):
+    """Return a copy of a run whose scene has gone."""
+    folder = shutil.copytree(finished_run, tmp_path / "elsewhere" / "run")
+    path = folder / "config.json"
+    saved = json.loads(path.read_text())
+    path.write_text(json.dumps(saved | {"scene": str(tmp_path / "gone")}))
+    return folder
+
+
+def test_a_scene_comes_back_from_the_run(tmp_path):
+    (tmp_path / "masks").mkdir()
+    root = make_scene(tmp_path / "scene")
+    shutil.copytree(root / "images", root / "masks")
+    path = root / "sparse" / "0" / "cameras.txt"
+    _, _, *numbers = path.read_text().split()
+    path.write_text(" ".join(["1", "OPENCV", *numbers, "0.08", "0.01", "0.001", "-0.002"]) + "\n")
+    scene = load_scene(root, DataConfig(test_every=3))
+    write_scene(tmp_path, scene)
+    again = read_scene(tmp_path, root)
+    assert (again.root, again.format, again.notes) == (scene.root, scene.format, scene.notes)
+    for a, b in zip(again.views, scene.views, strict=True):
+        np.testing.assert_array_equal(a.viewmat, b.viewmat)
+        np.testing.assert_array_equal(a.K, b.K)
+        for name in ("name", "camera", "width", "height", "distortion", "exif_ev", "split"):
+            assert getattr(a, name) == getattr(b, name)
+        assert a.image_path == b.image_path
+        assert a.mask_path == b.mask_path
+    for name in ("view_indices", "point_indices", "xy"):
+        np.testing.assert_array_equal(getattr(again.tracks, name), getattr(scene.tracks, name))
+    np.testing.assert_array_equal(again.points, scene.points)
+    np.testing.assert_array_equal(again.point_colors, scene.point_colors)
+    moved = read_scene(tmp_path, tmp_path / "new")
+    assert moved.views[0].image_path == tmp_path / "new" / "images" / "0.png"
+
+
+def test_photographs_outside_the_scene_keep_their_place(tmp_path):
+    root = make_scene(tmp_path / "scene")
+    shutil.move(root / "images", tmp_path / "photos")
+    scene = load_scene(root, DataConfig(images="../photos"))
+    write_scene(tmp_path, scene)
+    for place in (root, tmp_path / "new"):
+        assert read_scene(tmp_path, place).views[0].image_path.samefile(tmp_path / "photos/0.png")
+
+
+def test_places_are_remembered_in_two_ways(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("street", "runs/first"):
+        (tmp_path / name).mkdir(parents=True)
+    saved = remembered(
+        "scene", (tmp_path / "street").relative_to(tmp_path), tmp_path / "runs/first"
+    )
+    monkeypatch.chdir("/")
+    assert find(saved, "scene", tmp_path / "runs/first") == tmp_path / "street"
+    shutil.move(tmp_path / "street", tmp_path / "moved" / "street")
+    shutil.move(tmp_path / "runs", tmp_path / "moved" / "runs")
+    assert find(saved, "scene", tmp_path / "moved/runs/first") == tmp_path / "moved" / "street"
+    # As older versions wrote it.
+    old = {"scene": "street", "reference": None}
+    assert find(old, "scene", tmp_path / "moved/runs/first") == tmp_path / "moved" / "street"
+    assert find(old, "reference", tmp_path / "moved/runs/first") is None
+    assert candidates({}, "scene", tmp_path) == []
+
+
+def test_a_run_opens_from_another_directory(tmp_path, monkeypatch, finished_run):
+    monkeypatch.chdir(tmp_path)
+    opened = load_run(str(finished_run))
+    opened.require_photographs()
+    saved = json.loads((finished_run / "config.json").read_text())
+    assert saved["scene_from_run"] == "../scene"
+
+
+def test_a_run_without_its_scene_renders_and_exports(capsys, tmp_path, alone):
+    code, text = run(capsys, "render", alone, "--split", "test", "--out", tmp_path / "r")
+    assert code == 0
+    assert "Views without their photographs are NAME.png alone" in text
+    files = {p.name for p in (tmp_path / "r").iterdir()}
+    assert files == {"0.exr", "0.png", "3.exr", "3.png", "cameras.json"}
+    formats = ("linear-ply", "exr")
+    code, _ = run(capsys, "export", alone, "--format", *formats, "--out", tmp_path / "e")
+    assert code == 0
+    assert len(list((tmp_path / "e" / "exr").iterdir())) == 6
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [("eval",), ("export", "--format", "colmap"), ("calibrate", "--out", "new")],
+)
+def test_what_needs_photographs_says_so(capsys, tmp_path, monkeypatch, alone, argv):
+    monkeypatch.chdir(tmp_path)
+    code, text = run(capsys, argv[0], alone, *argv[1:])
+    assert code == 2
+    assert f"{tmp_path / 'gone'}, is not there" in text
+    assert "--scene" in text
+    assert not (tmp_path / "new").exists()
+
+
+def test_the_scene_can_be_named(capsys, tmp_path, alone, finished_run):
+    scene = finished_run.parent / "scene"
+    argv = ("--split", "test", "--scene", scene, "--out", tmp_path / "r")
+    code, text = run(capsys, "render", alone, *argv)
+    assert code == 0
+    assert (tmp_path / "r" / "0.photograph.png").is_file()
+    code, text = run(capsys, "view", alone, "--scene", tmp_path / "nowhere", "--port", "0")
+    assert code == 2
+    assert "nowhere does not exist" in text
+
+
+def test_a_broken_training_photograph_does_not_keep_held_out_views(
+    capsys, tmp_path, alone, finished_run
+):
+    scene = shutil.copytree(finished_run.parent / "scene", tmp_path / "scene")
+    (scene / "images" / "1.png").write_bytes(b"broken")
+    argv = ("--scene", scene, "--out", tmp_path / "r")
+    code, _ = run(capsys, "render", alone, "--split", "test", *argv)
+    assert code == 0
+    assert (tmp_path / "r" / "0.photograph.png").is_file()
+    code, text = run(capsys, "render", alone, *argv, "--overwrite")
+    assert code == 0
+    assert "cannot decode the image" in text
+    assert (tmp_path / "r" / "2.photograph.png").is_file()
+
+
+def test_an_older_run_reads_its_scene(tmp_path, finished_run, alone):
+    (alone / SCENE_FILE).unlink()
+    opened = load_run(alone, finished_run.parent / "scene")
+    assert len(opened.scene.points) > 0
+    with pytest.raises(UserError, match=r"(?s)looked for .*gone.*kept no cameras.*--scene"):
+        load_run(alone)
+
+
+def test_a_damaged_scene_file_is_named(alone):
+    path = alone / SCENE_FILE
+    path.write_bytes(path.read_bytes()[:300])
+    with pytest.raises(UserError, match=rf"(?s){SCENE_FILE}.*or remove it"):
+        load_run(alone)
