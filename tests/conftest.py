@@ -17,7 +17,7 @@ _COMPILED = tempfile.TemporaryDirectory(prefix="p2gs-compiled-")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", _COMPILED.name)
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 
-# From here on, programs of a finished file are forgotten; those that are wanted again come from disk.
+# From here on, programs of a finished file are forgotten; those wanted again come from disk.
 MOST_MEMORY_GB = 1.2
 
 
