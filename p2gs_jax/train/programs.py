@@ -7,6 +7,7 @@ present one runs. Seconds that a run waits for the compiler are counted, and nev
 from __future__ import annotations
 
 import functools
+import os
 import time
 from collections.abc import Callable, Hashable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -17,8 +18,9 @@ import jax
 from p2gs_jax.render.capacity import Room
 from p2gs_jax.train.step import Step
 
-# The first step waits for two programs of about equal size.
-WORKERS = 2
+# The first step waits for two programs of about equal size; but XLA itself compiles on several
+# cores, and two at once on two cores take three times as long each (ours: BUILD_NOTES).
+WORKERS = 1 if (os.cpu_count() or 1) <= 2 else 2
 
 
 class Key(NamedTuple):
