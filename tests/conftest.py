@@ -1,7 +1,11 @@
 """Shared fixtures; real data is used where it lies beside the checkout and skipped elsewhere."""
 
+import collections
+import gc
 import os
+import resource
 import shutil
+import sys
 import tempfile
 from pathlib import Path
 
@@ -12,6 +16,42 @@ import pytest
 _COMPILED = tempfile.TemporaryDirectory(prefix="p2gs-compiled-")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", _COMPILED.name)
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+
+# From here on, programs of a finished file are forgotten; those wanted again come from disk.
+MOST_MEMORY_GB = 1.2
+
+
+def memory_gb() -> float:
+    """Return the resident memory of this process, GB."""
+    if sys.platform == "linux":
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+        return pages * resource.getpagesize() / 1e9
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e9
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _forget_programs():
+    """Let compiled programs go between files once they have taken much memory."""
+    yield
+    if memory_gb() > MOST_MEMORY_GB:
+        import jax
+
+        jax.clear_caches()
+        gc.collect()
+
+
+def pytest_terminal_summary(terminalreporter):
+    """Say where the time went: seconds of set-up, test and tear-down by folder."""
+    seconds: dict[str, float] = collections.Counter()
+    for reports in terminalreporter.stats.values():
+        for report in reports:
+            if hasattr(report, "duration") and hasattr(report, "nodeid"):
+                seconds[report.nodeid.split("::")[0].rsplit("/", 1)[0]] += report.duration
+    if sum(seconds.values()) > 10:
+        terminalreporter.section("seconds by folder")
+        for folder, spent in sorted(seconds.items(), key=lambda item: -item[1]):
+            terminalreporter.write_line(f"{spent:7.1f}  {folder}")
+
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 

@@ -1,10 +1,13 @@
-"""Draws kernel.svg and axes.svg: `python docs/images/draw.py` writes them beside this file.
+"""Draws this folder's SVG files: `python docs/images/draw.py` writes them beside it.
 
-What can be computed is computed: the tiles that the ellipses reach, the order of the lanes.
+What can be computed is computed: the tiles that the ellipses reach, the order of the lanes, and
+who may import whom (from the contracts in pyproject.toml).
 """
 
 from __future__ import annotations
 
+import ast
+import tomllib
 from html import escape
 from pathlib import Path
 
@@ -374,7 +377,48 @@ def axes() -> Drawing:
     return d
 
 
+# ------------------------------------------------------------------ the package
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def layers() -> list[list[str]]:
+    """Return the packages and modules in the order in which they may import, top to bottom."""
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    (contract,) = [
+        c for c in settings["tool"]["importlinter"]["contracts"] if c["type"] == "layers"
+    ]
+    return [[name.strip() for name in layer.split(":")] for layer in contract["layers"]]
+
+
+def described(name: str) -> str:
+    """Return the first sentence of a package or module."""
+    folder = ROOT / "p2gs_jax" / name
+    head = folder / "__init__.py" if folder.is_dir() else folder.with_suffix(".py")
+    words = ast.get_docstring(ast.parse(head.read_text(encoding="utf-8"))) or ""
+    return words.split("\n\n")[0].replace("\n", " ")
+
+
+def architecture() -> Drawing:
+    rows = layers()
+    count = sum(map(len, rows))
+    d = Drawing(980, 60 + 24 * count + 14 * len(rows), "What the package is made of")
+    d.text(24, 34, "Imports run downwards", 16, bold=True)
+    y = 50.0
+    for k, row in enumerate(rows):
+        height = 24 * len(row) + 4
+        d.rect(24, y, 932, height, COLORS[k % len(COLORS)], "none", 0.12)
+        for i, name in enumerate(row):
+            words = described(name)
+            at = y + 18 + 24 * i
+            d.text(36, at, name, 13, bold=True)
+            d.text(176, at, words if len(words) < 118 else words[:115].rstrip() + " ...", 11.5)
+        y += height + 10
+    return d
+
+
+DRAWINGS = {"kernel": kernel, "axes": axes, "architecture": architecture}
+
 if __name__ == "__main__":
-    here = Path(__file__).parent
-    kernel().save(here / "kernel.svg")
-    axes().save(here / "axes.svg")
+    for name, draw in DRAWINGS.items():
+        draw().save(Path(__file__).parent / f"{name}.svg")

@@ -1,1 +1,1 @@
-""""""
+"""How the population of Gaussians grows and moves."""

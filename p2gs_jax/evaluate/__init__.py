@@ -1,1 +1,1 @@
-""""""
+"""Judging a finished fit: photographs, radiance, seams, steadiness."""

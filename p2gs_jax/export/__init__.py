@@ -1,1 +1,1 @@
-""""""
+"""Files that a run writes and that other programs read."""

@@ -23,10 +23,10 @@ from jaxtyping import Array, Float, UInt8
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.numerics import on_device
 from p2gs_jax.photometry.look import Look, develop
-from p2gs_jax.photometry.radiance import RadianceKind, radiance_activation
 from p2gs_jax.render import render_linear, required_capacity
 from p2gs_jax.render.capacity import bucket
 from p2gs_jax.render.host import RenderView, make_renderer
+from p2gs_jax.render.radiance import RadianceKind, radiance_activation
 from p2gs_jax.render.spherical_harmonics import C0, basis, coefficient_count, degree_of
 from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.types import Camera, Gaussians, Render

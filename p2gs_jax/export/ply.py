@@ -17,7 +17,7 @@ from plyfile import PlyData, PlyElement, PlyParseError
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.atomic import atomic_write
 from p2gs_jax.numerics import on_device
-from p2gs_jax.photometry.radiance import RadianceKind
+from p2gs_jax.render.radiance import RadianceKind
 from p2gs_jax.types import Gaussians
 
 

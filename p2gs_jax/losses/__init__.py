@@ -1,1 +1,1 @@
-""""""
+"""What a step minimises: the photograph, relative exposures, gauges."""

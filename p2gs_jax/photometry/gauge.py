@@ -7,7 +7,7 @@ import dataclasses
 import jax
 import numpy as np
 
-from p2gs_jax.photometry.radiance import RadianceKind
+from p2gs_jax.render.radiance import RadianceKind
 from p2gs_jax.render.spherical_harmonics import C0
 from p2gs_jax.types import Params
 

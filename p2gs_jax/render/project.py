@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from p2gs_jax.config import RenderConfig
-from p2gs_jax.photometry.radiance import radiance_activation
 from p2gs_jax.render import spherical_harmonics
+from p2gs_jax.render.radiance import radiance_activation
 from p2gs_jax.render.xla_cpu import columns
 from p2gs_jax.types import Camera, Frustum, Gaussians, Splats2D
 

@@ -27,9 +27,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from p2gs_jax.render.binning.boxes import bits_for
-from p2gs_jax.render.binning.sorting import sort_payloads
-from p2gs_jax.render.segments import Segments, cut, merge
+from p2gs_jax.render.lane_queue import Queue
+from p2gs_jax.render.segments import cut, merge
 from p2gs_jax.render.tile_rows import DARKEST, GEOMETRY, Plan, geometry_gradient
 from p2gs_jax.render.xla_cpu import materialize
 
@@ -97,64 +96,6 @@ def _gather(rows, ids_list, center, position, end, local, plan: Plan, always) ->
     return _Entries(ids, row, u0, v0, dx0, dy0, alpha)
 
 
-class _Queue(NamedTuple):
-    """Segments in the order in which lanes take them, then one parking place per lane.
-
-    S slots hold segments; those from S on are parking places, empty.
-    """
-
-    order: Array  # [S + B]
-    work: Array  # how many slots hold entries
-    starts: Array  # [S + B]
-    ends: Array
-    centers: Array  # [S + B 2], middle of the tile, pixels
-    lane: Array  # [B]
-
-    @classmethod
-    def build(cls, segments: Segments, ends, plan: Plan):
-        """Queue the segments; `ends` is where each is composited to, at most its own end."""
-        count, lanes = segments.starts.shape[0], plan.lanes
-        lane = jnp.arange(lanes, dtype=jnp.int32)
-        bits = bits_for(count)
-        limit = 2 ** (32 - bits) - 1
-        lengths = ends - segments.starts
-        key = jnp.uint32(limit) - jnp.minimum(lengths, limit).astype(jnp.uint32)
-        key = key << bits | jnp.arange(count, dtype=jnp.uint32)
-        parked = jnp.zeros(lanes, jnp.int32)
-        tiles = jnp.concatenate([segments.tiles, parked])
-        column, line = tiles % plan.across, tiles // plan.across
-        centers = jnp.stack(
-            [column * plan.tile_x + plan.tile_x / 2, line * plan.tile_y + plan.tile_y / 2], -1
-        )
-        return cls(
-            jnp.concatenate([sort_payloads(key, bits), count + lane]),
-            jnp.sum(lengths > 0, dtype=jnp.int32),
-            jnp.concatenate([segments.starts, parked]),
-            jnp.concatenate([ends, parked]),
-            centers.astype(jnp.float32),
-            lane,
-        )
-
-    @property
-    def slots(self) -> int:
-        """Number of slots."""
-        return self.starts.shape[0] - self.lane.shape[0]
-
-    def first(self):
-        """Return the slots that lanes begin with."""
-        lane = self.lane
-        return jnp.where(lane < self.work, self.order[: lane.shape[0]], self.slots + lane)
-
-    def advance(self, turn, slot, position, done):
-        """Hand finished lanes their next slots; return (turn, slot, position)."""
-        finished = done.astype(jnp.int32)
-        total = jnp.cumsum(finished)
-        mine = turn + total - 1
-        new = jnp.where(done, self.order[jnp.minimum(mine, self.slots - 1)], slot)
-        new = jnp.where(done & (mine >= self.work), self.slots + self.lane, new)
-        return turn + total[-1], new, jnp.where(done, self.starts[new], position)
-
-
 def _padded(ids_list, plan: Plan):
     return jnp.concatenate([ids_list, jnp.full((plan.chunk,), plan.gaussians, jnp.int32)])
 
@@ -166,7 +107,7 @@ def forward(rows, ids_list, offsets, plan: Plan):
     before every segment but the first of its tile.
     """
     segments = cut(offsets, plan)
-    queue = _Queue.build(segments, segments.ends, plan)
+    queue = Queue.build(segments, segments.ends, plan)
     slots, lanes, pixels = queue.slots, plan.lanes, plan.pixels
     local = plan.local_pixels()
     ids_list = _padded(ids_list, plan)
@@ -247,7 +188,7 @@ def backward(rows, ids_list, residuals, image, v_image, plan: Plan):
     lanes, pixels, chunk = plan.lanes, plan.pixels, plan.chunk
     local_x, local_y = plan.local_pixels()
     ids_list = _padded(ids_list, plan)
-    queue = _Queue.build(segments, stops, plan)
+    queue = Queue.build(segments, stops, plan)
     one = jnp.ones(pixels)
     zero = jnp.zeros(pixels)
     # Eight columns, two of them zero, multiply faster than six.

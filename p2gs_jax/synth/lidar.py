@@ -14,8 +14,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Float32
 
+from p2gs_jax.synth.intersect import nearest_hit
 from p2gs_jax.synth.town import Town
-from p2gs_jax.synth.tracer import nearest_hit
 
 # Rays are traced sector by sector, against the primitives that the sector can meet.
 _SECTORS = 48

@@ -29,6 +29,7 @@ from jaxtyping import Float32, Float64, Int, UInt8
 from PIL import Image
 
 from p2gs_jax.errors import UserError
+from p2gs_jax.synth.build_town import build_town
 from p2gs_jax.synth.colmap_files import DriveViews, write_colmap
 from p2gs_jax.synth.exposures import write_true_exposures
 from p2gs_jax.synth.kitti_files import write_calibration, write_poses, write_scan
@@ -37,7 +38,7 @@ from p2gs_jax.synth.rig import MOUNTS, camera_viewmat, drive, intrinsics
 from p2gs_jax.synth.seed_points import observe_seeds, sample_seeds
 from p2gs_jax.synth.sensor import ISO_REFERENCE, draw_shots, photograph
 from p2gs_jax.synth.settings import Layout, Sensor
-from p2gs_jax.synth.town import Town, build_town
+from p2gs_jax.synth.town import Town
 from p2gs_jax.synth.tracer import Tracer
 
 FORMAT = "p2gs-jax street, version 2"

@@ -14,8 +14,8 @@ from p2gs_jax.export.atomic import write_json
 from p2gs_jax.export.ply import write_radiance
 from p2gs_jax.export.sidecar import linear_sidecar
 from p2gs_jax.photometry.look import Look, develop
-from p2gs_jax.photometry.radiance import radiance_activation
 from p2gs_jax.photometry.response import FREE, KNOTS
+from p2gs_jax.render.radiance import radiance_activation
 from p2gs_jax.render.spherical_harmonics import evaluate
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Scene, View

@@ -84,3 +84,13 @@ def test_quantisation_aware_loss_is_zero_for_what_rounding_hides():
     aware = LossConfig(quantization=0.5001 / 255)
     assert float(sum(image.photometric_loss(truth, stored, mask, aware).values())) < 1e-6
     assert float(sum(image.photometric_loss(truth, stored, mask, LossConfig()).values())) > 5e-4
+
+
+def test_a_saturated_photograph_says_at_least_this_bright():
+    target = jnp.full((12, 12, 3), 0.99)
+    mask = jnp.ones((12, 12))
+    pull = jax.jit(
+        jax.grad(lambda ldr: sum(image.photometric_loss(ldr, target, mask, LossConfig()).values()))
+    )
+    assert not np.asarray(pull(jnp.full((12, 12, 3), 1.7))).any()
+    assert (np.asarray(pull(jnp.full((12, 12, 3), 0.9))) < 0).all()

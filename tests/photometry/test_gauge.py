@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from p2gs_jax.photometry.gauge import recentre
-from p2gs_jax.photometry.radiance import radiance_activation
+from p2gs_jax.render.radiance import radiance_activation
 from p2gs_jax.types import Gaussians, Params, Photometry
 
 

@@ -10,9 +10,9 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.rig import load_rig
+from p2gs_jax.synth.build_town import build_town
+from p2gs_jax.synth.intersect import nearest_hit
 from p2gs_jax.synth.lidar import Lidar, Scanner
-from p2gs_jax.synth.town import build_town
-from p2gs_jax.synth.tracer import nearest_hit
 from p2gs_jax.synth.write import write_street
 
 RIG = DataConfig(format="rig")

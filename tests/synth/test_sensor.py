@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from p2gs_jax.photometry.srgb import srgb_decode
+from p2gs_jax.synth.build_town import build_town
 from p2gs_jax.synth.exposures import read_true_exposures
 from p2gs_jax.synth.sensor import draw_shots, encode, photograph, vignette
 from p2gs_jax.synth.settings import Sensor
-from p2gs_jax.synth.town import UNDERPASS, Material, build_town
+from p2gs_jax.synth.town import UNDERPASS, Material
 from p2gs_jax.synth.write import write_street
 
 

@@ -14,9 +14,9 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.srgb import srgb_decode, srgb_encode
 from p2gs_jax.scene.colmap import load_colmap
+from p2gs_jax.synth.build_town import build_town
 from p2gs_jax.synth.rig import MOUNTS, camera_viewmat, carla_rotation, image_height, intrinsics
 from p2gs_jax.synth.sensor import draw_iso, photograph
-from p2gs_jax.synth.town import build_town
 from p2gs_jax.synth.write import read_truth, write_street
 
 SIZE = {"frames": 4, "width": 192, "height": 128, "points": 4000, "seed": 3}

@@ -1,0 +1,173 @@
+"""Twenty deliberate faults, each with the test that has to notice it.
+
+`python tests/faults/apply.py [NAME ...]` plants them one by one in a copy of the package.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class Fault(NamedTuple):
+    """A line that is wrong.
+
+    Attributes:
+        name: what the fault does.
+        file: inside p2gs_jax.
+        right: the text, which occurs there once.
+        wrong: what takes its place.
+        caught_by: test to run, as pytest names it, below tests/.
+    """
+
+    name: str
+    file: str
+    right: str
+    wrong: str
+    caught_by: str
+
+
+RASTERIZE = "render/test_rasterize.py"
+ORACLE = f"{RASTERIZE}::test_values_and_gradients_match_oracle"
+
+FAULTS = (
+    Fault(
+        "the covariance loses its slant",
+        "render/project.py",
+        "s_xy = sum(V[0][axis] * V[1][axis] for axis in range(3))",
+        "s_xy = 0.0 * sum(V[0][axis] * V[1][axis] for axis in range(3))",
+        "render/test_project.py",
+    ),
+    Fault(
+        "pixels are blurred twice",
+        "render/project.py",
+        "c_xx, c_yy = s_xx + cfg.blur, s_yy + cfg.blur",
+        "c_xx, c_yy = s_xx + 2 * cfg.blur, s_yy + cfg.blur",
+        "render/test_project.py",
+    ),
+    Fault(
+        "pixel centres lie at integers",
+        "render/rasterize_reference.py",
+        "x = jnp.arange(width) + 0.5",
+        "x = jnp.arange(width) + 0.0",
+        ORACLE,
+    ),
+    Fault(
+        "what lies behind is not attenuated",
+        "render/rasterize_xla.py",
+        "            transmittance = transmittance - weight\n",
+        "",
+        ORACLE,
+    ),
+    Fault(
+        "the backward pass forgets the light behind",
+        "render/rasterize_xla.py",
+        "q_grouped - after * (grouped / (1 - grouped))",
+        "q_grouped",
+        ORACLE,
+    ),
+    Fault(
+        "a segment begins with all the light of its tile",
+        "render/rasterize_xla.py",
+        "            light[behind]\n            - sum(",
+        "            light[behind]\n            - 0 * sum(",
+        ORACLE,
+    ),
+    Fault(
+        "tile lists lose their last entry",
+        "render/rasterize_xla.py",
+        "entry < end[:, None], ids_list",
+        "entry < end[:, None] - 1, ids_list",
+        ORACLE,
+    ),
+    Fault(
+        "one band of the harmonics has the other sign",
+        "render/spherical_harmonics.py",
+        "values += [-C1 * y, C1 * z, -C1 * x]",
+        "values += [-C1 * y, C1 * z, C1 * x]",
+        "render/test_spherical_harmonics.py",
+    ),
+    Fault(
+        "the view list leaves out what touches the left edge",
+        "render/visible.py",
+        "(at + radius < 0)",
+        "(at - radius < 0)",
+        "render/test_visible.py",
+    ),
+    Fault(
+        "a list that is too long is cut in silence",
+        "render/visible.py",
+        "return count + lax.dynamic_slice(seen, (i,), (1,))[0].astype(jnp.int32), ids",
+        "return at + lax.dynamic_slice(seen, (i,), (1,))[0].astype(jnp.int32), ids",
+        "render/test_visible.py",
+    ),
+    Fault(
+        "gamma works the wrong way round",
+        "photometry/formation.py",
+        "log_linear = log_pivot + (log_x - log_pivot) * (GAMMA_SRGB / gamma)",
+        "log_linear = log_pivot + (log_x - log_pivot) * (gamma / GAMMA_SRGB)",
+        "properties/test_pir.py::test_5_inverse",
+    ),
+    Fault(
+        "the pivot is not where a change of gamma leaves values alone",
+        "photometry/formation.py",
+        "log_pivot = float(np.log(cfg.pivot))\n        log_linear",
+        "log_pivot = float(np.log(2 * cfg.pivot))\n        log_linear",
+        "properties/test_pir.py::test_5_inverse",
+    ),
+    Fault(
+        "sRGB without its toe",
+        "photometry/formation.py",
+        "toe = log_linear <= float(np.log(SRGB_LINEAR_END))",
+        "toe = log_linear <= -1e9",
+        "properties/test_pir.py::test_5_inverse",
+    ),
+    Fault(
+        "recentring moves exposures but not radiance",
+        "photometry/gauge.py",
+        "sh[:, 0] += log_scale / C0",
+        "sh[:, 0] += 0.0 * log_scale / C0",
+        "photometry/test_gauge.py",
+    ),
+    Fault(
+        "saturated pixels count as observations of radiance",
+        "photometry/observations.py",
+        "(self.colors > black) & (self.colors < saturation)",
+        "(self.colors > black) & (self.colors < 2 + saturation)",
+        "photometry/test_bundle_adjustment.py::test_saturation_must_be_masked",
+    ),
+    Fault(
+        "an exposure ratio is turned over",
+        "losses/relative_exposure.py",
+        "exposures[pairs.views_j] / exposures[pairs.views_i]",
+        "exposures[pairs.views_i] / exposures[pairs.views_j]",
+        "properties/test_pir.py::test_11_observed_readings",
+    ),
+    Fault(
+        "over-bright predictions of saturated pixels are punished",
+        "losses/image.py",
+        "agrees = (target >= saturation) & (ldr >= saturation)",
+        "agrees = (target >= saturation) & (ldr >= saturation + 1e9)",
+        "losses/test_image.py::test_a_saturated_photograph_says_at_least_this_bright",
+    ),
+    Fault(
+        "SSIM's gradient forgets the covariance",
+        "losses/image.py",
+        "back[0] + 2 * x * back[1] + y * back[2]",
+        "back[0] + 2 * x * back[1]",
+        "losses/test_image.py::test_gradient_matches_autodiff_and_finite_differences",
+    ),
+    Fault(
+        "masked pixels pull",
+        "losses/image.py",
+        'terms = {"l1": (1 - weight) * jnp.sum(absolute * mask[..., None]) / valid}',
+        'terms = {"l1": (1 - weight) * jnp.sum(jnp.abs(ldr - target)) / valid}',
+        "properties/test_pir.py::test_17_masked_pixels_get_zero_gradient",
+    ),
+    Fault(
+        "the printed loss forgets its scale prior",
+        "losses/regularizers.py",
+        "cfg.exposure_scale * jnp.mean((e - 1) ** 2)",
+        "cfg.exposure_scale * jnp.mean((e - 2) ** 2)",
+        "properties/test_pir.py::test_12_closed_form_scale",
+    ),
+)

@@ -1,0 +1,74 @@
+"""Projection against its definition in numpy: the oracle of the rasterizer shares `project`."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import camera, street
+
+from p2gs_jax.config import RenderConfig
+from p2gs_jax.render import project
+
+CFG = RenderConfig()
+
+
+def rotation(quat):
+    w, x, y, z = quat / np.linalg.norm(quat)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def by_definition(g, cam, i):
+    """Return centre, covariance and depth of a splat: J W S W^T J^T + blur (EWA; 3DGS, eq. 5)."""
+    R, t = cam.viewmat[:3, :3], cam.viewmat[:3, 3]
+    x, y, z = R @ g.means[i] + t
+    fx, fy, cx, cy = cam.K[0, 0], cam.K[1, 1], cam.K[0, 2], cam.K[1, 2]
+    J = np.array([[fx / z, 0, -fx * x / z**2], [0, fy / z, -fy * y / z**2]])
+    M = rotation(g.quats[i]) * np.exp(g.log_scales[i])
+    covariance = J @ R @ M @ M.T @ R.T @ J.T + CFG.blur * np.eye(2)
+    return np.array([fx * x / z + cx, fy * y / z + cy]), covariance, z
+
+
+def test_splats_are_the_definition():
+    with jax.enable_x64(True):
+        g, cam = street(dtype=np.float64)
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = rotation(np.array([1, 0.05, -0.1, 0.2]))
+        viewmat[:3, 3] = 0.3, -0.2, 0.5
+        cam = dataclasses.replace(cam, viewmat=jnp.asarray(viewmat))
+        n = g.capacity
+        splats = jax.jit(lambda g: project(g, jnp.ones(n, bool), cam, CFG))(g)
+        splats, g, cam = jax.tree.map(np.asarray, (splats, g, cam))
+    inside = (splats.means2d > 0).all(1) & (splats.means2d < [cam.width, cam.height]).all(1)
+    rows = np.flatnonzero(splats.visible & inside)
+    assert len(rows) > 30
+    for i in rows[:200]:
+        center, covariance, z = by_definition(g, cam, i)
+        np.testing.assert_allclose(splats.means2d[i], center, rtol=1e-9)
+        np.testing.assert_allclose(splats.cov_diagonal[i], np.diag(covariance), rtol=1e-9)
+        a11, a12, a22 = splats.conic_factor[i]
+        factor = np.array([[a11, a12], [0, a22]])
+        np.testing.assert_allclose(factor.T @ factor @ covariance, np.eye(2), atol=1e-7)
+        assert splats.depths[i] == pytest.approx(z)
+        opacity = 1 / (1 + np.exp(-g.opacity_logits[i]))
+        assert np.exp(splats.log_opacities[i]) == pytest.approx(opacity)
+
+
+def test_a_camera_of_another_place_sees_the_scene_move_the_other_way():
+    g, cam = street()
+    moved = dataclasses.replace(cam, viewmat=cam.viewmat.at[0, 3].add(0.1))
+    alive = jnp.ones(g.capacity, bool)
+    first = project(g, alive, camera(), CFG)
+    second = project(g, alive, moved, CFG)
+    both = np.asarray(first.visible & second.visible)
+    shift = np.asarray(second.means2d - first.means2d)[both]
+    expected = 0.1 * float(cam.K[0, 0]) / np.asarray(first.depths)[both]
+    np.testing.assert_allclose(shift[:, 0], expected, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(shift[:, 1], 0, atol=1e-3)
