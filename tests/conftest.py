@@ -53,6 +53,24 @@ def pytest_terminal_summary(terminalreporter):
             terminalreporter.write_line(f"{spent:7.1f}  {folder}")
 
 
+# Programs of tests run once or twice: XLA compiles them with the least effort. With the options of
+# users the renderer is measured by the bench in `.ci/run`.
+EFFORT = {
+    "xla_cpu_use_fusion_emitters": False,
+    "xla_backend_optimization_level": 0,
+    "xla_llvm_disable_expensive_passes": True,
+}
+if "XLA_FLAGS" not in os.environ:
+    os.environ["XLA_FLAGS"] = " ".join(f"--{k}={str(v).lower()}" for k, v in EFFORT.items())
+
+
+def pytest_configure():
+    """Compile what asks for options of its own with the same effort."""
+    from p2gs_jax.render import xla_cpu
+
+    xla_cpu._CPU_OPTIONS = EFFORT
+
+
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
