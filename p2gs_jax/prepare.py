@@ -42,6 +42,7 @@ from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.scene.known_exposures import read_known_exposures
 from p2gs_jax.scene.visibility import shown_share
+from p2gs_jax.streams import Stream, generator
 from p2gs_jax.types import GAMMA_SRGB, Gaussians, Params, Photometry, Scene
 
 PAIR_POOL = 200_000
@@ -241,7 +242,7 @@ def prepare(
             f"of {len(shell.points)} Gaussians was added (--init.shell off leaves it out)."
         )
     if isinstance(bound, int) and gaussians.capacity > bound:
-        kept = subsample(gaussians.capacity, bound, cfg.train.seed)
+        kept = subsample(gaussians.capacity, bound, cfg.train.seed, Stream.SEED_GAUSSIANS)
         notes.append(f"{gaussians.capacity} Gaussians were thinned to {bound} (--gaussians).")
         gaussians = jax.tree.map(lambda a: on_device(np.asarray(a)[kept]), gaussians)
     for note in notes:
@@ -493,7 +494,7 @@ def _photometry(start: PhotometricSolution | None, count: int, cfg: FitConfig) -
     if start is not None:
         log_exposures = np.asarray(start.log_exposures)
     elif p.start == "random":
-        draws = np.random.default_rng((cfg.train.seed, 3)).normal(1.0, p.start_std, count)
+        draws = generator(cfg.train.seed, Stream.START_EXPOSURES).normal(1.0, p.start_std, count)
         log_exposures = np.log(np.maximum(draws, 0.1))
     else:
         log_exposures = np.zeros(count)

@@ -13,6 +13,7 @@ from enum import IntEnum
 import numpy as np
 from jaxtyping import Float32, Int32
 
+from p2gs_jax.streams import SceneStream, generator
 from p2gs_jax.synth.settings import Layout
 
 Vec3 = tuple[float, float, float]
@@ -166,7 +167,9 @@ def build_town(seed: int = 0, layout: Layout = "street") -> Town:
         seed: of everything that is drawn at random.
         layout: `town` adds an underpass, deep in shadow, and draws the place of the sun.
     """
-    build = _Builder(np.random.default_rng([seed, 1]), UNDERPASS if layout == "town" else None)
+    build = _Builder(
+        generator(seed, SceneStream.BUILDINGS), UNDERPASS if layout == "town" else None
+    )
     _pavements(build)
     _houses(build)
     _vista(build)
@@ -180,7 +183,7 @@ def build_town(seed: int = 0, layout: Layout = "street") -> Town:
 
 def _light(seed: int) -> Light:
     """Return a sun at 35 to 55 degrees from a direction that shades one side of the street."""
-    rng = np.random.default_rng([seed, 5])
+    rng = generator(seed, SceneStream.LIGHT)
     azimuth = np.deg2rad(rng.uniform(200.0, 340.0) if rng.random() < 0.5 else rng.uniform(20, 160))
     height = np.deg2rad(rng.uniform(35.0, 55.0))
     flat = np.cos(height)

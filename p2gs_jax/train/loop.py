@@ -38,6 +38,7 @@ from p2gs_jax.losses.relative_exposure import ColorPairs
 from p2gs_jax.losses.total import OBSERVED_FORMS, SECOND_RENDER_FORMS, Partner
 from p2gs_jax.numerics import on_host
 from p2gs_jax.render.capacity import Room
+from p2gs_jax.streams import Stream, densification_key, generator
 from p2gs_jax.train import growth, schedule
 from p2gs_jax.train.demand import demand
 from p2gs_jax.train.growth import Look, Stage
@@ -135,9 +136,7 @@ class Trainer:
         self.optimizer = make_optimizer(cfg)
         self.step = make_step(cfg, self.optimizer, extent)
         self.programs = programs
-        self._rng = jax.jit(
-            lambda step: jax.random.fold_in(jax.random.key(cfg.train.seed + 1), step)
-        )
+        self._rng = jax.jit(functools.partial(densification_key, cfg.train.seed))
         self._alive = jax.jit(jnp.sum)
         self.clock = Stopwatch()
         self.checkpoints = CheckpointStore(run_dir / "checkpoints")
@@ -452,7 +451,7 @@ class Trainer:
             batch = self.views.batch(other, shrink)
         elif relative.form in OBSERVED_FORMS and self.pairs is not None:
             count = self.pairs.views_i.shape[0]
-            rng = np.random.default_rng((self.cfg.train.seed, 2, step))
+            rng = generator(self.cfg.train.seed, Stream.STEP_PAIRS, step)
             pick = rng.integers(0, count, min(PAIRS_PER_STEP, count))
             pairs = jax.tree.map(lambda a: np.asarray(a)[pick], self.pairs)
         return on_host(Partner, np.int32(other), camera, batch, pairs)
