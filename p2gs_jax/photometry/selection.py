@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from p2gs_jax.numerics import LN2
-from p2gs_jax.photometry.bundle_adjustment import Fit
+from p2gs_jax.photometry.bundle_adjustment import MOST_ROUNDS, Fit
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import (
     BASES,
@@ -242,6 +242,11 @@ def select(
     spline = _spline(make(training), spread, notes)
     if spline is not None:
         solve_all(spline)
+    if loose := sum(not f.converged for f in fits.values()):
+        notes.append(
+            f"{loose} of the {len(fits)} models compared had not settled after {MOST_ROUNDS} "
+            "rounds; they are judged as they were then."
+        )
     scale = min(float(f.scale) for f in fits.values())
     where = np.flatnonzero(held)
     judged = {k: _judged(small, f, k[1], where, scale) for k, f in fits.items()}
