@@ -180,6 +180,7 @@ def _write(result: Calibration, out: Path, cfg: FitConfig) -> None:
             "messages": result.messages,
             "observations": result.observations,
             "seconds": result.seconds,
+            "solution": s.state,
             "residual_ev": s.residual_ev,
             "view_residual_ev": s.view_residual_ev,
             "view_balance_ev": s.view_balance_ev,

@@ -277,6 +277,8 @@ def finish(
     steps = max(int(counts.get("steps", 0)), 1)
     metrics["seconds_per_step"] = seconds.get("optimisation", 0.0) / steps
     metrics["notes"] = prepared.notes
+    if prepared.selection is not None:
+        metrics["photometry"] = prepared.selection.solution.state
     if growth is not None:
         metrics["growth"] = growth
     write_json(run_dir / "metrics.json", metrics)

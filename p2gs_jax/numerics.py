@@ -1,4 +1,4 @@
-"""Power, logarithm and division that stay finite, in value and in gradient, over all of float32."""
+"""Power and logarithm that stay finite, in value and in gradient, over all of float32."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 from numpy.typing import ArrayLike, DTypeLike
 
 LN2 = math.log(2.0)
@@ -39,12 +39,6 @@ def safe_log(x: Values, floor: float) -> Values:
     xp = namespace(x)
     below = x <= floor
     return xp.where(below, math.log(floor), xp.log(xp.where(below, 1.0, x)))
-
-
-def safe_div(a: Float[Array, "..."], b: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return a / b, and 0 with zero gradient where b is 0."""
-    nonzero = b != 0
-    return jnp.where(nonzero, a / jnp.where(nonzero, b, 1.0), 0.0)
 
 
 def positive_pow(x: Values, p: Scalar, floor: float) -> Values:

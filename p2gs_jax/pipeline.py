@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,25 +14,23 @@ import numpy as np
 
 from p2gs_jax.clock import CompileCounter, Stopwatch
 from p2gs_jax.config import FitConfig, require_config
-from p2gs_jax.config import from_dict as config_from_dict
 from p2gs_jax.config import to_dict as config_to_dict
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.lpips import LpipsWeights
-from p2gs_jax.evaluate.lpips_weights import read_lpips_weights
-from p2gs_jax.export.atomic import no_empty_folders, plain, write_json
+from p2gs_jax.export.atomic import no_empty_folders, write_json
+from p2gs_jax.export.checkpoint import CheckpointStore
 from p2gs_jax.export.places import remembered
 from p2gs_jax.export.scene_file import write_scene
-from p2gs_jax.finish import check_reference, finish, load_reference
+from p2gs_jax.finish import finish
 from p2gs_jax.photometry.gauge import recentre
 from p2gs_jax.photometry.selection import Selection
+from p2gs_jax.preflight import Paths, check_scene, preflight
 from p2gs_jax.prepare import Expected, Prepared, load, prepare
 from p2gs_jax.progress import Reporter, Silent
 from p2gs_jax.scene.images import size_at
-from p2gs_jax.scene.known_exposures import check_source
-from p2gs_jax.train.growth import check_method
+from p2gs_jax.train import decisions
 from p2gs_jax.train.loop import Trainer, TrainResult
 from p2gs_jax.train.programs import StepPrograms
-from p2gs_jax.train.validation import pick_validation
 from p2gs_jax.train.views import TrainingViews
 from p2gs_jax.types import Params, Scene
 
@@ -83,6 +80,7 @@ def optimise(
         on_message=say,
         validation=validation,
         own_exposures=prepared.selection is not None,
+        reasons=() if prepared.selection is None else prepared.selection.reasons,
     )
     alive = np.ones(prepared.params.gaussians.capacity, bool)
     return trainer.run(prepared.params, alive, resume=resume, spent_s=spent_s, finish_s=reserve_s)
@@ -150,54 +148,45 @@ def fit(
     """
     cfg = require_config(cfg)
     reporter = reporter or Silent()
-    scene_dir, run_dir = Path(scene_dir), Path(run_dir)
+    paths = Paths(Path(scene_dir), Path(run_dir), None if reference is None else Path(reference))
+    scene_dir, run_dir = paths.scene, paths.run
     begin = time.monotonic() - spent_s
     clock, compiler = Stopwatch(), CompileCounter()
-    check_method(cfg.densify)
-    check_run_dir(run_dir, resume, cfg)
-    # What is needed later is looked at first: a wrong file should not cost a fit.
-    check_source(cfg.photometry.known)
-    check_reference(reference)
-    path = cfg.evaluation.lpips_weights
-    lpips_weights = None if path is None else read_lpips_weights(path)
+    lpips_weights = preflight(cfg, paths, resume=resume)
     with no_empty_folders(run_dir):
         reading = time.monotonic()
         scene = load(scene_dir, run_dir, cfg, reporter)
         # Without a model, nearly all of it is finding and matching features.
         found = scene.format in ("images", "transforms")
         clock.add("structure_from_motion" if found else "reading", time.monotonic() - reading)
-        if lpips_weights is not None:
-            lpips_weights.require_sizes(scene.views, cfg.data.max_width)
-        validation: tuple[int, ...] = ()
-        if cfg.densify.max_gaussians == "auto":
-            validation = pick_validation([scene.views[i].camera for i in scene.train_indices])
-        truth = load_reference(reference, scene, cfg) if reference is not None else None
-        write_json(
-            run_dir / "config.json",
-            {
-                **remembered("scene", scene_dir, run_dir),
-                **remembered("reference", None if reference is None else Path(reference), run_dir),
-                "fit": config_to_dict(cfg),
-            },
-        )
-        write_scene(run_dir, scene)
+        views = check_scene(scene, cfg, paths, lpips_weights)
+    truth, given = views.truth, cfg
+    reasons: tuple[str, ...] = ()
+    if resume:
+        cfg, reasons = decisions.kept(cfg, run_dir)
     programs = StepPrograms()
     with contextlib.closing(programs):
         prepared = prepare(
-            scene, cfg, reporter, clock, lambda known: _begin(programs, known, scene, run_dir)
-        )
-        cfg = prepared.cfg
-        result = optimise(
-            prepared,
-            run_dir,
+            scene,
             cfg,
             reporter,
-            programs,
-            resume=resume,
-            validation=validation,
-            spent_s=time.monotonic() - begin,
-            reserve_s=_finish_estimate(scene, cfg, lpips_weights, truth is not None),
+            clock,
+            lambda known: _begin(programs, known, scene, run_dir),
+            reasons=reasons,
         )
+        cfg = prepared.cfg
+        with _lock(paths, given, scene):
+            result = optimise(
+                prepared,
+                run_dir,
+                cfg,
+                reporter,
+                programs,
+                resume=resume,
+                validation=views.validation,
+                spent_s=time.monotonic() - begin,
+                reserve_s=_finish_estimate(scene, cfg, lpips_weights, truth is not None),
+            )
     params = compact(result)
     if cfg.photometry.parameterization == "log" and cfg.photometry.known is None:
         params = recentre(params, cfg.render.radiance)
@@ -234,6 +223,35 @@ def fit(
     return FitResult(params, scene, metrics, run_dir, prepared.selection)
 
 
+@contextlib.contextmanager
+def _lock(paths: Paths, cfg: FitConfig, scene: Scene) -> Iterator[None]:
+    """Make the folder a run's while its steps are taken, and keep it where they left something.
+
+    A run that failed before its first checkpoint leaves nothing to continue or to overwrite.
+
+    Args:
+        paths: of the fit.
+        cfg: as the user gave it.
+        scene: what can be opened again without its photographs.
+    """
+    path = paths.run / "config.json"
+    write_json(
+        path,
+        {
+            **remembered("scene", paths.scene, paths.run),
+            **remembered("reference", paths.reference, paths.run),
+            "fit": config_to_dict(cfg),
+        },
+    )
+    write_scene(paths.run, scene)
+    try:
+        yield
+    except UserError:
+        if CheckpointStore(paths.run / "checkpoints").latest_step() is None:
+            path.unlink(missing_ok=True)
+        raise
+
+
 def _finish_estimate(
     scene: Scene, cfg: FitConfig, lpips_weights: LpipsWeights | None, reference: bool
 ) -> float:
@@ -257,57 +275,3 @@ def _finish_estimate(
         # Under two protocols, and three more against a reference.
         per_pixel += (5 if reference else 2) * lpips_weights.network.seconds_per_pixel
     return min(6.0 + per_view * len(scene.views) + per_pixel * pixels, 0.25 * cfg.train.budget_s)
-
-
-def check_run_dir(run_dir: Path, resume: bool, cfg: FitConfig) -> None:
-    """Refuse to overwrite a run, and to continue one under other options.
-
-    Options of the evaluation may differ: they do not change the fit. An option that the run's own
-    version did not have counts as its default.
-
-    Raises:
-        UserError: the folder holds a run and `resume` is not set, is not a folder, or holds a run
-            that was begun with other options.
-    """
-    if run_dir.exists() and not run_dir.is_dir():
-        raise UserError(f"{run_dir} is a file.", fix="name a folder with --out")
-    path = run_dir / "config.json"
-    if not path.exists():
-        return
-    if not resume:
-        raise UserError(
-            f"{run_dir} already holds a run.",
-            fix="add --resume to continue it, or name another folder with --out",
-        )
-    try:
-        saved = plain(config_to_dict(config_from_dict(json.loads(path.read_text())["fit"])))
-    except json.JSONDecodeError as error:
-        raise UserError(
-            f"{path} cannot be read ({error}).",
-            fix="remove it and repeat the options the run was begun with: --resume then goes on",
-        ) from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise UserError(
-            f"{path} cannot be read ({error}).", fix="start again in another folder"
-        ) from error
-    now = plain(config_to_dict(cfg))
-    for options in (saved, now):
-        options.pop("evaluation", None)
-    other = _differences(saved, now)
-    if other:
-        raise UserError(
-            f"{run_dir} was begun with other options: {'; '.join(other[:6])}.",
-            fix="repeat the options it was begun with, or name another folder with --out",
-        )
-
-
-def _differences(saved: dict, now: dict, prefix: str = "") -> list[str]:
-    """Return "name: then, now" for every value that differs."""
-    out = []
-    for key in sorted(set(saved) | set(now)):
-        a, b = saved.get(key), now.get(key)
-        if isinstance(a, dict) and isinstance(b, dict):
-            out += _differences(a, b, f"{prefix}{key}.")
-        elif a != b:
-            out.append(f"{prefix}{key} was {a}, now {b}")
-    return out

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -42,6 +42,7 @@ from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.scene.known_exposures import read_known_exposures
 from p2gs_jax.scene.visibility import shown_share
+from p2gs_jax.streams import Stream, generator
 from p2gs_jax.types import GAMMA_SRGB, Gaussians, Params, Photometry, Scene
 
 PAIR_POOL = 200_000
@@ -134,6 +135,8 @@ def prepare(
     reporter: Reporter,
     clock: Stopwatch | None = None,
     on_expected: Callable[[Expected], None] = lambda expected: None,
+    *,
+    reasons: Sequence[str] = (),
 ) -> Prepared:
     """Start exposures, radiances and Gaussians from what the scene offers.
 
@@ -143,6 +146,7 @@ def prepare(
         reporter: receives progress.
         clock: receives the seconds of `photometry` and `seeds`.
         on_expected: receives what can be told before the exposures are solved, where that is much.
+        reasons: for model and curve, where they were chosen before and `cfg` has them.
     """
     clock = clock or Stopwatch()
     begin = time.monotonic()
@@ -152,17 +156,6 @@ def prepare(
     extent = scene_extent(views, scene.points)
     tracks: Observations | None = None
     selection: Selection | None = None
-    if cfg.photometry.known is not None and cfg.photometry.start != "tracks":
-        raise UserError(
-            f"the preset {cfg.preset!r} starts exposures at random: known ones would be ignored.",
-            fix="leave out --known-exposures, or add --photometry.start tracks",
-        )
-    if cfg.photometry.curve == "linear" and cfg.photometry.start == "tracks":
-        raise UserError(
-            "the curve 'linear' splats display values; the tracks' bundle adjustment does not know "
-            "it.",
-            fix="add --photometry.start random, or use a preset whose name begins with 3dgs",
-        )
     coverage = coverage_of(scene, store)
     dense = wants_dense(scene, coverage, cfg)
     bound = cfg.densify.max_gaussians
@@ -205,6 +198,8 @@ def prepare(
         if tracks is not None and len(tracks.points):
             reporter.stage("Photometric bundle adjustment")
             selection = calibrate_observations(tracks, scene, cfg, on_chosen=chosen)
+            if reasons:
+                selection = dataclasses.replace(selection, reasons=tuple(reasons))
             notes += [*selection.reasons, *selection.solution.warnings]
             cfg = with_selection(cfg, selection)
         else:
@@ -241,7 +236,7 @@ def prepare(
             f"of {len(shell.points)} Gaussians was added (--init.shell off leaves it out)."
         )
     if isinstance(bound, int) and gaussians.capacity > bound:
-        kept = subsample(gaussians.capacity, bound, cfg.train.seed)
+        kept = subsample(gaussians.capacity, bound, cfg.train.seed, Stream.SEED_GAUSSIANS)
         notes.append(f"{gaussians.capacity} Gaussians were thinned to {bound} (--gaussians).")
         gaussians = jax.tree.map(lambda a: on_device(np.asarray(a)[kept]), gaussians)
     for note in notes:
@@ -493,7 +488,7 @@ def _photometry(start: PhotometricSolution | None, count: int, cfg: FitConfig) -
     if start is not None:
         log_exposures = np.asarray(start.log_exposures)
     elif p.start == "random":
-        draws = np.random.default_rng((cfg.train.seed, 3)).normal(1.0, p.start_std, count)
+        draws = generator(cfg.train.seed, Stream.START_EXPOSURES).normal(1.0, p.start_std, count)
         log_exposures = np.log(np.maximum(draws, 0.1))
     else:
         log_exposures = np.zeros(count)

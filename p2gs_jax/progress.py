@@ -111,6 +111,6 @@ class TerminalReporter:
             f"PSNR {record.psnr:.2f} dB",
             f"{record.gaussians} Gaussians",
             f"{rate:.1f} views/s",
-            f"{clock(left)} left",
+            f"{clock(left)} left" if not record.trial else "trying without growth",
         )
         self.live.update(table)

@@ -22,6 +22,7 @@ from p2gs_jax.render.warp import project_points, surface_depth, unproject, visib
 from p2gs_jax.run_folder import Run, load_run
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.streams import Stream, generator
 
 POINTS, MOST_PER_POINT = 40_000, 8
 # More than `warp.OPAQUE`: a loss averages over a wrong correspondence, a solution is bent by it.
@@ -41,7 +42,7 @@ def rendered_observations(run: Run, seed: int = 0, reporter: Reporter | None = N
     """
     reporter = reporter or Silent()
     run.require_photographs(run.scene.train_indices)
-    scene, rng = run.scene, np.random.default_rng((seed, 19))
+    scene, rng = run.scene, generator(seed, Stream.RENDERED_PIXELS)
     store = ImageStore(scene.views, run.cfg.data)
     render = make_renderer(run.cfg.render)
     alive = jnp.ones(run.params.gaussians.capacity, bool)

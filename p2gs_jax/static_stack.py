@@ -29,6 +29,7 @@ from p2gs_jax.photometry.solution import (
 )
 from p2gs_jax.scene.exif import read_exif_ev
 from p2gs_jax.scene.known_exposures import read_known_exposures, stated_ev
+from p2gs_jax.streams import Stream, generator
 from p2gs_jax.types import View
 
 POINTS, CANDIDATES = 4000, 40_000
@@ -185,7 +186,7 @@ def signal_share(values: UInt8[np.ndarray, "n 3"], black: float) -> float:
 
 def choose_points(stack: Stack, black: float, seed: int) -> Float[np.ndarray, "p 2"]:
     """Return positions, as many in the mid tones of each frame."""
-    rng = np.random.default_rng((seed, 13))
+    rng = generator(seed, Stream.STACK_PIXELS)
     height, width = stack.valid.shape
     x = rng.integers(MARGIN, width - MARGIN, CANDIDATES)
     y = rng.integers(MARGIN, height - MARGIN, CANDIDATES)

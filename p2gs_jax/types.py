@@ -203,13 +203,11 @@ class Population(eqx.Module):
         alive: slots in use.
         grad2d_sum: summed norms of the screen-space mean gradients, in units of half the image.
         seen_count: number of views that contributed to `grad2d_sum`.
-        max_radii: largest projected radius seen, as a fraction of the image's longer side.
     """
 
     alive: Bool[Array, " n"]
     grad2d_sum: Float[Array, " n"]
     seen_count: Float[Array, " n"]
-    max_radii: Float[Array, " n"]
 
 
 class Batch(eqx.Module):

@@ -42,11 +42,6 @@ class StepCost(NamedTuple):
     whole: float
     compilations: int
 
-    @property
-    def beside_rasterizer(self) -> float:
-        """Loss, optimiser, transfer and densification together."""
-        return sum(self.parts[k] for k in ("loss", "optimizer", "transfer", "densify (a step)"))
-
 
 class WholeStep(NamedTuple):
     """The jitted step as training runs it, on one view.

@@ -56,5 +56,5 @@ def _kept_metrics(path: Path) -> dict:
         old = json.loads(path.read_text())
     except (OSError, ValueError):
         return {}
-    kept = ("counts", "seconds", "seconds_per_step", "notes", "growth", "exposures")
+    kept = ("counts", "seconds", "seconds_per_step", "notes", "photometry", "growth", "exposures")
     return {k: old[k] for k in kept if k in old}

@@ -16,9 +16,6 @@ from p2gs_jax.types import Gaussians, Population
 
 SPLIT_SHRINK = 1.6
 RESET_OPACITY = 0.01
-# A splat wider than this fraction of the image is removed after the first reset (3DGS: 20 px of a
-# typical 1000 px image).
-PRUNE_RADIUS = 0.15
 
 
 class Proposal(NamedTuple):
@@ -49,7 +46,7 @@ def propose(
     """
     largest = jnp.exp(jnp.max(gaussians.log_scales, -1))
     prune = opacities(gaussians) < cfg.prune_opacity
-    oversized = (largest > cfg.prune_scale * extent) | (population.max_radii > PRUNE_RADIUS)
+    oversized = largest > cfg.prune_scale * extent
     prune = population.alive & (prune | (prune_large & oversized))
     average = population.grad2d_sum / jnp.maximum(population.seen_count, 1)
     hot = population.alive & ~prune & (average >= cfg.grad_threshold)

@@ -33,8 +33,8 @@ class Outcome(NamedTuple):
 
 def fresh_population(alive: Bool[Array, " n"]) -> Population:
     """Return a population with empty statistics."""
-    # Three arrays, not one three times: the step donates its input and each may be given away once.
-    return Population(alive, *(jnp.zeros(alive.shape, jnp.float32) for _ in range(3)))
+    # Two arrays, not one twice: the step donates its input and each may be given away once.
+    return Population(alive, *(jnp.zeros(alive.shape, jnp.float32) for _ in range(2)))
 
 
 def empty_gaussians(count: int, like: Gaussians) -> Gaussians:

@@ -26,6 +26,7 @@ from p2gs_jax.evaluate.in_order import in_order
 from p2gs_jax.evaluate.lpips import LpipsWeights, lpips
 from p2gs_jax.evaluate.metrics import psnr, ssim
 from p2gs_jax.evaluate.radiance import RadianceScores, Truth
+from p2gs_jax.evaluate.shelf import Kept, Shelf
 from p2gs_jax.photometry.formation import inverse_tone_map
 from p2gs_jax.photometry.look import Look, develop
 from p2gs_jax.photometry.solution import LADDER
@@ -228,45 +229,49 @@ def evaluate(
 
     own, averaged = _Collector(), _Collector()
     test_averaged, test_fitted, test_both = _Collector(), _Collector(), _Collector()
-    scores = RadianceScores()
-    reference_views: list[tuple[int, np.ndarray, np.ndarray, np.ndarray]] = []
     videos = {name: VideoScores() for name in ("per_view", "averaged", "photographs")}
-    # In the order of their names, so that the frames of a camera follow each other.
-    for found in in_order(judged, range(len(scene.views))):
-        result = found.result
-        index, view = result.index, scene.views[result.index]
-        training = view.split == "train"
-        (own if training else test_fitted).add(view.name, found.scores)
-        (averaged if training else test_averaged).add(view.name, found.scores_averaged)
-        if found.scores_both is not None:
-            test_both.add(view.name, found.scores_both)
-        if found.radiance is not None:
-            scores.add(view.name, view.split, result.linear, found.radiance, found.mask)
-        if found.reference is not None:
-            reference_views.append((index, result.linear, found.reference, found.mask))
-        on_view(result)
-        videos["per_view"].add(view.camera, result.ldr, result.exposure)
-        videos["averaged"].add(view.camera, found.ldr_averaged, mean.exposure)
-        videos["photographs"].add(view.camera, result.photograph, result.exposure)
-        on_progress(index + 1, len(scene.views))
+    with Shelf() as shelf:
+        scores = RadianceScores(shelf)
+        reference_views: list[tuple[int, tuple[Kept, ...]]] = []
+        # In the order of their names, so that the frames of a camera follow each other.
+        for found in in_order(judged, range(len(scene.views))):
+            result = found.result
+            index, view = result.index, scene.views[result.index]
+            training = view.split == "train"
+            (own if training else test_fitted).add(view.name, found.scores)
+            (averaged if training else test_averaged).add(view.name, found.scores_averaged)
+            if found.scores_both is not None:
+                test_both.add(view.name, found.scores_both)
+            again = found.radiance is not None or found.reference is not None
+            linear = shelf.put(result.linear) if again else result.linear
+            if found.radiance is not None:
+                scores.add(view.name, view.split, linear, found.radiance, found.mask)
+            if found.reference is not None:
+                images = (linear, found.reference, found.mask)
+                reference_views.append((index, tuple(map(shelf.put, images))))
+            on_view(result)
+            videos["per_view"].add(view.camera, result.ldr, result.exposure)
+            videos["averaged"].add(view.camera, found.ldr_averaged, mean.exposure)
+            videos["photographs"].add(view.camera, result.photograph, result.exposure)
+            on_progress(index + 1, len(scene.views))
 
-    metrics = {
-        "train": {**own.summary(), "averaged": averaged.summary()},
-        "test": {"averaged": test_averaged.summary(), "exposure_fitted": test_fitted.summary()},
-    }
-    if test_both.rows:
-        metrics["test"]["exposure_and_gamma_fitted"] = test_both.summary()
-    metrics["train"]["per_view"] = metrics["train"].pop("per_view", {})
-    metrics["consistency"] = {name: video.summary() for name, video in videos.items()}
-    if scores.views:
-        gamma, saturated = np.float32(mean.gamma), np.array(cfg.loss.saturation, np.float32)
-        exposed = float(inverse_tone_map(saturated, gamma, cfg.photometry))
-        metrics["radiance"] = scores.summary(exposed / float(np.median(exposures)))
-    if reference_views:
-        metrics["reference"] = _against_reference(
-            reference_views, scene, mean, shown, fitted, score
-        )
-    return metrics
+        metrics = {
+            "train": {**own.summary(), "averaged": averaged.summary()},
+            "test": {"averaged": test_averaged.summary(), "exposure_fitted": test_fitted.summary()},
+        }
+        if test_both.rows:
+            metrics["test"]["exposure_and_gamma_fitted"] = test_both.summary()
+        metrics["train"]["per_view"] = metrics["train"].pop("per_view", {})
+        metrics["consistency"] = {name: video.summary() for name, video in videos.items()}
+        if scores.views:
+            gamma, saturated = np.float32(mean.gamma), np.array(cfg.loss.saturation, np.float32)
+            exposed = float(inverse_tone_map(saturated, gamma, cfg.photometry))
+            metrics["radiance"] = scores.summary(exposed / float(np.median(exposures)))
+        if reference_views:
+            metrics["reference"] = _against_reference(
+                reference_views, scene, mean, shown, fitted, score
+            )
+        return metrics
 
 
 def _lookup(reference, index: int):
@@ -277,14 +282,18 @@ def _against_reference(views, scene: Scene, mean: MeanParameters, shown, fitted,
     """Judge all views against photographs of one common exposure.
 
     Args:
-        views: row, linear radiance, reference photograph and mask of each.
+        views: row of each; linear radiance, reference photograph and mask, kept.
         scene: their names and splits.
         mean: exposures to show them at.
         shown: (linear, exposure, gamma) -> display image.
         fitted: (linear, photograph, mask) -> the exposure that fits best.
         score: (display image, photograph, mask) -> scores by name.
     """
-    scales = list(in_order(lambda view: fitted(*view[1:]), views))
+
+    def images(view):
+        return (kept.read() for kept in view[1])
+
+    scales = list(in_order(lambda view: fitted(*images(view)), views))
     common = float(np.exp(np.median(np.log(scales))))
     protocols = {
         "averaged": mean.exposure,
@@ -293,7 +302,7 @@ def _against_reference(views, scene: Scene, mean: MeanParameters, shown, fitted,
     }
 
     def judged(view):
-        _, linear, truth, mask = view
+        linear, truth, mask = images(view)
         return {
             name: score(shown(linear, exposure, mean.gamma), truth, mask)
             for name, exposure in protocols.items()

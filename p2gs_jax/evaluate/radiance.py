@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 
 from p2gs_jax.evaluate.in_order import in_order
 from p2gs_jax.evaluate.metrics import ssim
+from p2gs_jax.evaluate.shelf import Kept, Shelf
 from p2gs_jax.numerics import LN2
 
 Truth = Callable[[int], Float[np.ndarray, "h w 3"] | None]
@@ -82,14 +83,17 @@ class RadianceScores:
     """Collects views, then scores them under one common alignment.
 
     Attributes:
+        shelf: where images wait.
         views: (name, split, recovered, truth, mask) of each view.
     """
 
-    views: list[tuple[str, str, np.ndarray, np.ndarray, np.ndarray]] = field(default_factory=list)
+    shelf: Shelf = field(default_factory=Shelf)
+    views: list[tuple[str, str, Kept, Kept, Kept]] = field(default_factory=list)
 
     def add(self, name: str, split: str, linear, truth, mask) -> None:
-        """Keep one view."""
-        self.views.append((name, split, linear, truth, np.asarray(mask) > 0.5))
+        """Keep one view; its images are arrays, or on the shelf already."""
+        linear, truth = self.shelf.put(linear), self.shelf.put(truth)
+        self.views.append((name, split, linear, truth, self.shelf.put(np.asarray(mask) > 0.5)))
 
     def summary(self, brightest: float) -> dict:
         """Return means over all, training and held-out views.
@@ -111,7 +115,7 @@ class RadianceScores:
         white = brightest * scale
 
         def judged(view) -> dict[str, float]:
-            _, _, linear, truth, mask = view
+            linear, truth, mask = (kept.read() for kept in view[2:])
             keep = mask & (truth.min(-1) > 0) & (linear.max(-1) < brightest)
             a, b = np.log2(np.maximum(linear[keep], 1e-12)), np.log2(truth[keep])
             stops = np.minimum(np.abs(a + shift / LN2 - b), STOPS_CAP)
@@ -146,7 +150,8 @@ class RadianceScores:
 
     def _sample(self, brightest: float) -> np.ndarray:
         parts = []
-        for _, _, linear, truth, mask in self.views:
+        for _, _, *images in self.views:
+            linear, truth, mask = (kept.read() for kept in images)
             keep = mask & (truth.min(-1) > 0) & (linear.min(-1) > 0)
             keep &= linear.max(-1) < brightest
             pick = np.flatnonzero(keep)

@@ -140,6 +140,17 @@ class CheckpointStore:
         """
         return self._read_json(step)["meta"]
 
+    def latest_meta(self) -> dict | None:
+        """Return the plain values of the newest checkpoint whose values can be read, or None."""
+        if not self.folder.is_dir():
+            return None
+        for step in sorted(self._manager().all_steps(), reverse=True):
+            try:
+                return self.read_meta(step)
+            except UserError:
+                continue  # `restore_latest` says so
+        return None
+
     def restore(self, step: int, like: Tree) -> tuple[Tree, dict]:
         """Return the tree of a checkpoint, bit for bit in numpy arrays, and its plain values.
 

@@ -11,6 +11,7 @@ from p2gs_jax.init.observations import point_colors, track_colors
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.scene.visibility import project_points, unoccluded
+from p2gs_jax.streams import Stream, generator
 from p2gs_jax.types import Scene
 
 # Positions come from calibration, not from matching: less certain than tracks by this factor.
@@ -57,7 +58,7 @@ def projected_colors(
         seed: of the choice among points, and among the views of a point.
         on_view: progress: views done, views in all.
     """
-    rng = np.random.default_rng((seed, 17))
+    rng = generator(seed, Stream.SURFACE_COLORS)
     chosen = np.arange(len(scene.points))
     if len(chosen) > MOST_POINTS:
         chosen = np.sort(rng.choice(len(chosen), MOST_POINTS, replace=False))

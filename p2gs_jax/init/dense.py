@@ -23,6 +23,7 @@ from p2gs_jax.init.brightness import Frames, Tones
 from p2gs_jax.init.flow import CHECKS, DepthMap, Flows, depth_map, pixel_centers
 from p2gs_jax.init.pairs import neighbours, visibility
 from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.streams import Stream, generator
 from p2gs_jax.types import Scene
 
 # A depth that two neighbours must agree on needs at least three views.
@@ -166,7 +167,7 @@ def _candidates(row: int, near, flows: Flows, color: Tones, seed: int) -> Candid
     steep = np.hypot(*np.gradient(shown)).astype(np.float32)
     texture = cv2.blur(steep, (9, 9))
     # One pixel of every cell, steep ones first: their matches are the surest.
-    rng = np.random.default_rng((seed, 23, row))
+    rng = generator(seed, Stream.MATCHED_PIXELS, row)
     y, x = np.nonzero(depth.valid)
     key = rng.random(len(x)) ** (1 / (0.1 + steep[y, x] / max(float(steep.mean()), 1e-6)))
     key += depth.flat[y, x]
@@ -216,7 +217,7 @@ def choose(
         limit: most seeds to return.
         seed: of the order of views, and of what is left out.
     """
-    rng = np.random.default_rng((seed, 29))
+    rng = generator(seed, Stream.DENSE_SEEDS)
     order = rng.permutation(len(found))
     found = [found[k] for k in order]
     plain = float(np.quantile(np.concatenate([c.texture for c in found]), PLAIN))

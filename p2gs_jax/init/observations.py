@@ -14,6 +14,7 @@ from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.srgb import srgb_decode, srgb_encode
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.scene.visibility import project_points
+from p2gs_jax.streams import Stream, generator
 from p2gs_jax.types import Scene
 
 # Averaging a few pixels quiets noise and hides the misplacement of a fraction of a pixel.
@@ -199,7 +200,7 @@ def sample_pairs(
     starts, lengths = bounds[:-1][lengths >= 2], lengths[lengths >= 2]
     if not len(starts):
         return np.zeros(0, int), np.zeros(0, int)
-    rng = np.random.default_rng((seed, 11))
+    rng = generator(seed, Stream.COLOR_PAIRS)
     pick = rng.integers(0, len(starts), count)
     first = rng.integers(0, lengths[pick])
     second = (first + rng.integers(1, lengths[pick])) % lengths[pick]

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 
 from p2gs_jax.init.seeds import camera_centers
 from p2gs_jax.scene.visibility import in_frame, project_points, unoccluded
+from p2gs_jax.streams import Stream, generator
 from p2gs_jax.types import Scene
 
 # Angles under which a pair sees its points, degrees: below the first the depth is uncertain, above
@@ -37,7 +38,7 @@ def visibility(scene: Scene, seed: int) -> Bool[np.ndarray, "v p"]:
         if seen[row].sum() >= FEWEST_HIDING:
             seen[row] = unoccluded(xy, z, view.width, view.height)
     if len(scene.points) > MOST_POINTS:
-        rng = np.random.default_rng((seed, 19))
+        rng = generator(seed, Stream.SHARED_POINTS)
         seen[:, rng.permutation(len(scene.points))[MOST_POINTS:]] = False
     return seen
 

@@ -11,6 +11,7 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.numerics import on_device
 from p2gs_jax.render.radiance import radiance_preactivation
 from p2gs_jax.render.spherical_harmonics import C0, coefficient_count
+from p2gs_jax.streams import Stream, generator
 from p2gs_jax.types import Gaussians, View
 
 NEIGHBOURS = 3
@@ -40,11 +41,11 @@ def scene_extent(views: list[View], points: Float[np.ndarray, "p 3"]) -> float:
     return max(radius, 1e-3)
 
 
-def subsample(count: int, limit: int, seed: int) -> np.ndarray:
+def subsample(count: int, limit: int, seed: int, stream: Stream = Stream.SEED_POINTS) -> np.ndarray:
     """Return which seeds to keep, sorted, at most `limit`, drawn evenly."""
     if count <= limit:
         return np.arange(count)
-    return np.sort(np.random.default_rng((seed, 7)).choice(count, limit, replace=False))
+    return np.sort(generator(seed, stream).choice(count, limit, replace=False))
 
 
 def neighbour_scales(

@@ -40,15 +40,6 @@ def photometry_regularizers(
     return terms
 
 
-def closed_form_scale(exposures: Float[Array, " v"], scale: float, spread: float):
-    """Return the global factor c that minimises the paper's L_reg over e -> c e.
-
-    c = ls m / (ls (m^2 + v) + lv v) with mean m and variance v (docs/photometry.md, 3).
-    """
-    m, v = jnp.mean(exposures), variance(exposures)
-    return scale * m / (scale * (m * m + v) + spread * v)
-
-
 def opacity_regularizer(
     gaussians: Gaussians, alive: Bool[Array, " n"], count: Float[Array, ""]
 ) -> Float[Array, ""]:

@@ -129,7 +129,8 @@ def relative_exposure_loss(
     """Return the configured reading, unweighted.
 
     Raises:
-        ValueError: the reading needs a second render or observations that were not given.
+        ValueError: the reading needs a second render or observations that were not given, or
+            renders of one size.
     """
     form = cfg.relative_exposure.form
     e_i, e_j = given.exposures[given.view_i], given.exposures[given.view_j]
@@ -138,6 +139,9 @@ def relative_exposure_loss(
     if form in ("literal_pixels", "exposed"):
         if given.linear_j is None:
             raise ValueError(f"the reading {form!r} needs the render of a second view")
+        if given.linear_j.shape != given.linear_i.shape:
+            sizes = f"{given.linear_i.shape} and {given.linear_j.shape}"
+            raise ValueError(f"the reading {form!r} subtracts renders of one size, not {sizes}")
         if form == "exposed":
             return exposed(given.linear_i, given.linear_j, e_j)
         return literal_pixels(given.linear_i, given.linear_j, e_i, e_j)

@@ -89,6 +89,8 @@ class Fit(NamedTuple):
         scores: sum over rows of the outer products of their scores, for robust standard errors.
         curvature: mean second derivative of the robust loss over its weight (1 for squares).
         rounds: iterations.
+        moved: largest change of a parameter in the last round, log units.
+        converged: that was no more than the tolerance.
     """
 
     theta: Theta
@@ -101,6 +103,8 @@ class Fit(NamedTuple):
     scores: Float[np.ndarray, "d d"]
     curvature: float
     rounds: int
+    moved: float
+    converged: bool
 
 
 class _Local(NamedTuple):
@@ -193,21 +197,25 @@ def _local(rows: Rows, theta: Theta, weight, gm: bool) -> _Local:
     return _Local(weight, sigma, slope, residual, radiance, precision, scale, float(curvature))
 
 
-def _pair_sums(rows: Rows, factors: Float[np.ndarray, "o f x"]) -> Float[np.ndarray, "d d"]:
+def _pair_sums(
+    rows: Rows, factors: Float[np.ndarray, "o f x"], kind: type[np.floating] = np.float64
+) -> Float[np.ndarray, "d d"]:
     """Return sum over rows of the outer products of per-view vectors, as a (2 V, 2 V) matrix.
 
-    Each pair of observations once, in float32: the matrix decides how fast the iteration converges
-    and how large the standard errors are, never where it ends.
+    Each pair of observations once.
 
     Args:
         rows: for the pairs.
         factors: f vectors per row; entry (o, f, x) belongs to the view of observation o, parameter
             x. One parameter leaves the second's part zero.
+        kind: of the products. In the rounds float32: there the matrix decides how fast they
+            converge, never where they end. Standard errors need float64: what joins groups of views
+            by a few dark points is less than the rounding of what joins the views of a group.
     """
     views, count = rows.view_count, factors.shape[-1]
     # In the order of the rows: the two of a pair then lie close together.
     order = rows.layout.order
-    parts = [factors[order, :, x].astype(np.float32) for x in range(count)]
+    parts = [factors[order, :, x].astype(kind) for x in range(count)]
     seen_by = rows.views[order]
     sums = np.zeros((count, count, views * views))
     # Not fewer at once than half of the entries they are added to.
@@ -217,7 +225,7 @@ def _pair_sums(rows: Rows, factors: Float[np.ndarray, "o f x"]) -> Float[np.ndar
         first, second = (p[start : start + chunk] for p in pairs)
         at = seen_by[first] * views + seen_by[second]
         # A product of an observation with itself is counted twice below.
-        half = np.where(first == second, np.float32(0.5), np.float32(1.0))
+        half = np.where(first == second, kind(0.5), kind(1.0))
         right = [np.take(p, second, 0) for p in parts]
         for x, part in enumerate(parts):
             left = np.take(part, first, 0) * half[:, None]
@@ -229,8 +237,22 @@ def _pair_sums(rows: Rows, factors: Float[np.ndarray, "o f x"]) -> Float[np.ndar
     return np.pad(matrix + matrix.T, (0, (2 - count) * views))
 
 
-def _assemble(rows: Rows, theta: Theta, local: _Local, gammas: bool):
-    """Return the reduced normal matrix and right side over (b, a, c); a's part only if wanted."""
+def _assemble(
+    rows: Rows,
+    theta: Theta,
+    local: _Local,
+    gammas: bool,
+    kind: type[np.floating] = np.float64,
+):
+    """Return the reduced normal matrix and right side over (b, a, c); a's part only if wanted.
+
+    Args:
+        rows: observations.
+        theta: parameters.
+        local: residuals and weights at these.
+        gammas: whether a's part is wanted.
+        kind: see `_pair_sums`.
+    """
     views = rows.view_count
     w, residual = local.weight, local.residual
     level = local.radiance[rows.row]
@@ -248,7 +270,7 @@ def _assemble(rows: Rows, theta: Theta, local: _Local, gammas: bool):
     if not gammas:
         h_ba, h_aa, g_a = (np.zeros(views) for _ in range(3))
     normal = np.block([[np.diag(h_bb), np.diag(h_ba)], [np.diag(h_ba), np.diag(h_aa)]])
-    normal -= _pair_sums(rows, factors)
+    normal -= _pair_sums(rows, factors, kind)
     right = np.concatenate([g_b, g_a])
     if not theta.c.size:
         return normal, right
@@ -361,7 +383,7 @@ def _solve(normal, right, basis: sp.csr_array):
 def _round(rows: Rows, known, basis, theta: Theta, weight, gm: bool, gammas: bool):
     """Return the parameters after one step, and the weights it was computed with."""
     local = _local(rows, theta, weight, gm)
-    normal, right = known(theta, *_assemble(rows, theta, local, gammas))
+    normal, right = known(theta, *_assemble(rows, theta, local, gammas, np.float32))
     step = _solve(normal, right, basis)
     v = len(theta.b)
     moved = Theta(
@@ -400,11 +422,12 @@ def solve(rows: Rows, system: System, start: Theta, tolerance: float, gammas: bo
     gauge = system.anchors.T @ system.anchors
     known = functools.partial(_known, system, prior_matrix(system), gauge)
     # Weighted by the noise alone at first.
-    theta, weight, rounds = start, rows.weight / rows.sigma**2, 0
+    theta, weight, rounds, moved = start, rows.weight / rows.sigma**2, 0, np.inf
     for rounds in range(1, MOST_ROUNDS + 1):
         before = theta
         theta, weight = _round(rows, known, basis, theta, weight, rounds > L1_ROUNDS, gammas)
-        moved = max(np.abs(x - y).max(initial=0.0) for x, y in zip(theta, before, strict=True))
+        changes = zip(theta, before, strict=True)
+        moved = float(np.max([np.abs(x - y).max(initial=0.0) for x, y in changes]))
         # At least one round after the first of Geman-McClure.
         if rounds > L1_ROUNDS + 1 and moved < tolerance:
             break
@@ -421,6 +444,8 @@ def solve(rows: Rows, system: System, start: Theta, tolerance: float, gammas: bo
         _scores(rows, theta, local, gammas),
         max(local.curvature, 0.1),
         rounds,
+        moved,
+        moved < tolerance,
     )
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import connected_components
 
 from p2gs_jax.photometry.response import Response, deviation, hat, log_exposed
+from p2gs_jax.streams import Stream, generator
 
 LONGEST_ROW = 16
 
@@ -78,7 +79,7 @@ class Observations:
             per_view: how many points of a view come first.
             seed: of the order.
         """
-        place = np.random.default_rng((seed, 19)).permutation(self.point_count)[self.points]
+        place = generator(seed, Stream.SOLVED_POINTS).permutation(self.point_count)[self.points]
         order = np.lexsort((place, self.views))
         seen_by = self.views[order]
         rank = np.arange(len(order)) - np.searchsorted(seen_by, seen_by)

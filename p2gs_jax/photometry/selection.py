@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from p2gs_jax.numerics import LN2
-from p2gs_jax.photometry.bundle_adjustment import Fit
+from p2gs_jax.photometry.bundle_adjustment import MOST_ROUNDS, Fit
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import (
     BASES,
@@ -37,6 +37,7 @@ from p2gs_jax.photometry.solution import (
     make_problem,
     solve_model,
 )
+from p2gs_jax.streams import Stream, generator
 
 HELD_OUT = 0.2
 STANDARD_ERRORS, SMALLEST_GAIN = 2.0, 0.01
@@ -168,7 +169,7 @@ def _subset(observations: Observations, seed: int, most: int) -> Observations:
     o = observations
     if len(o.points) <= most:
         return o
-    rng = np.random.default_rng((seed, 5))
+    rng = generator(seed, Stream.COMPARED_POINTS)
     order = rng.permutation(o.point_count)
     lengths = np.bincount(o.points, minlength=o.point_count)[order]
     kept = order[np.cumsum(lengths) <= most]
@@ -225,7 +226,7 @@ def select(
         return Selection(fit_model(make(observations, known=known), *fixed), (), ())
     small = make(_subset(observations, seed, MOST_OBSERVATIONS))
     o = small.observations
-    held = np.random.default_rng((seed, 7)).random(len(o.points)) < HELD_OUT
+    held = generator(seed, Stream.HELD_OUT).random(len(o.points)) < HELD_OUT
     use = (~held).astype(np.float64)
     notes: list[str] = []
     fits: dict[tuple[ModelName, Response], Fit] = {}
@@ -241,6 +242,11 @@ def select(
     spline = _spline(make(training), spread, notes)
     if spline is not None:
         solve_all(spline)
+    if loose := sum(not f.converged for f in fits.values()):
+        notes.append(
+            f"{loose} of the {len(fits)} models compared had not settled after {MOST_ROUNDS} "
+            "rounds; they are judged as they were then."
+        )
     scale = min(float(f.scale) for f in fits.values())
     where = np.flatnonzero(held)
     judged = {k: _judged(small, f, k[1], where, scale) for k, f in fits.items()}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -38,6 +38,11 @@ FIXED_EV = 1e-5
 # Smoothness of the spline relative to its mean information.
 BEND, BEND_SPACING = 3e-3, 0.12
 STRETCH, FLATTEST = 1.6, 0.3
+# Relative size of what a difference of equal numbers leaves of them.
+CANCELLED = 1e-6
+# Share of a parameter's information that must be left beside all others'. Rounding leaves less, and
+# so does what keeps points without observations finite (`bundle_adjustment.EMPTY`).
+HELD = 1e-11
 
 
 class Model(NamedTuple):
@@ -85,9 +90,9 @@ class PhotometricSolution:
         response: base curve and spline.
         log_exposures: natural logarithm; mean 0 over each component unless exposures were known.
         exposure_errors: standard errors of `log_exposures` (robust, gauge fixed); inf where
-            unobserved.
+            unobserved or not to be told.
         gammas: per view.
-        gamma_errors: standard errors; 0 where gamma is not modelled.
+        gamma_errors: standard errors; 0 where gamma is not modelled, inf as above.
         observations_per_view: usable observations.
         component: views with equal numbers share a scale; others cannot be compared.
         point_log_radiance: natural logarithm per channel; NaN where unobserved.
@@ -97,6 +102,9 @@ class PhotometricSolution:
             what a scalar exposure leaves of a white balance; NaN where unobserved.
         outliers: share of observations that the robust loss ignores.
         rounds: iterations.
+        moved: largest change of a parameter in the last of them, log units.
+        converged: that was no more than the tolerance.
+        unknown_errors: observed views whose standard errors cannot be told.
         warnings: what the user should know.
     """
 
@@ -114,7 +122,16 @@ class PhotometricSolution:
     view_balance_ev: Float[np.ndarray, "v 3"]
     outliers: float
     rounds: int
+    moved: float
+    converged: bool
+    unknown_errors: int
     warnings: tuple[str, ...]
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """How the solution ended, for `metrics.json` and `calibration.json`."""
+        names = ("rounds", "converged", "unknown_errors")
+        return {"last_change": self.moved, **{k: getattr(self, k) for k in names}}
 
     @property
     def exposures_ev(self) -> Float[np.ndarray, " v"]:
@@ -259,11 +276,17 @@ def solve_model(
     return solve(rows, system, start, tolerance, LADDER[name].gamma is not None), system
 
 
-def covariance(fit: Fit, system: System) -> Float[np.ndarray, "d d"]:
+def covariance(
+    fit: Fit, system: System
+) -> tuple[Float[np.ndarray, "d d"], Float[np.ndarray, "d k"]]:
     """Return the robust covariance of (b, a, c): bread, meat, bread (Huber; White).
 
     Residuals of the three channels of an observation, and of a point, are not independent: the
     meat is summed over points, and counts them once.
+
+    Returns:
+        The covariance, and the free directions that the observations do not hold: the covariance
+        knows nothing of them.
     """
     both = slice(0, 2 * len(fit.theta.b))
     bread, meat = fit.normal * fit.curvature, fit.scores.copy()
@@ -276,9 +299,37 @@ def covariance(fit: Fit, system: System) -> Float[np.ndarray, "d d"]:
     free = np.abs(system.basis).sum(0) > 0
     g = system.basis[:, free]
     if not g.size:
-        return np.zeros_like(bread)
-    inverse = np.linalg.pinv(g.T @ bread @ g, hermitian=True)
-    return g @ inverse @ (g.T @ meat @ g) @ inverse @ g.T
+        return np.zeros_like(bread), np.zeros((len(bread), 0))
+    reduced = g.T @ bread @ g
+    # Exposures that are known say so much more than pixels that only ratios can be compared.
+    diagonal = np.diag(reduced)
+    g = g / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    value, direction = np.linalg.eigh(g.T @ bread @ g)
+    held = value > HELD
+    inverse = (direction[:, held] / value[held]) @ direction[:, held].T
+    unknown = g @ direction[:, ~held]
+    unknown = unknown / np.linalg.norm(unknown, axis=0)
+    return g @ inverse @ (g.T @ meat @ g) @ inverse @ g.T, unknown
+
+
+def deviations(
+    jacobian: Float[np.ndarray, "v d"],
+    cov: Float[np.ndarray, "d d"],
+    unknown: Float[np.ndarray, "d k"],
+) -> Float[np.ndarray, " v"]:
+    """Return standard deviations; inf where nothing is known, or where rounding left less than 0.
+
+    Args:
+        jacobian: of what is asked, by (b, a).
+        cov: covariance of (b, a).
+        unknown: directions in (b, a) that no observation holds.
+    """
+    variance = ((jacobian @ cov) * jacobian).sum(1)
+    # What cancels to zero, such as a model's only exposure in its gauge, ends this near to it.
+    size = np.abs(jacobian)
+    rounding = CANCELLED * ((size @ np.abs(cov)) * size).sum(1)
+    lost = (np.abs(jacobian @ unknown) > CANCELLED).any(1) | (variance < -rounding)
+    return np.where(lost, np.inf, np.sqrt(np.maximum(variance, 0)))
 
 
 def fit_model(
@@ -347,10 +398,14 @@ def describe(
         free_scale = ~np.isin(component, anchored)
         active = active | given
     shift, to_h = _centering(a, h, component, active, free_scale)
-    cov = covariance(fit, system)[: 2 * o.view_count, : 2 * o.view_count]
-    h_errors = np.sqrt(np.maximum(((to_h @ cov) * to_h).sum(1), 0))
+    both = slice(0, 2 * o.view_count)
+    cov, unknown = covariance(fit, system)
+    cov, unknown = cov[both, both], unknown[both]
+    h_errors = deviations(to_h, cov, unknown)
     gamma = GAMMA_SRGB / a
-    a_errors = np.sqrt(np.maximum(np.diag(cov)[o.view_count :], 0))
+    a_errors = deviations(np.eye(2 * o.view_count)[o.view_count :], cov, unknown)
+    lost = active & ~(np.isfinite(h_errors) & np.isfinite(a_errors))
+    known = active & ~lost
     h = np.where(active, h - shift, 0.0)
 
     used = problem.usable > 0
@@ -362,9 +417,9 @@ def describe(
         model=name,
         response=response,
         log_exposures=h,
-        exposure_errors=np.where(active, h_errors, np.inf),
+        exposure_errors=np.where(known, h_errors, np.inf),
         gammas=np.where(active, gamma, GAMMA_SRGB),
-        gamma_errors=np.where(active, gamma / a * a_errors, np.inf),
+        gamma_errors=np.where(known, gamma / a * a_errors, np.inf),
         observations_per_view=per_view,
         component=component,
         point_log_radiance=_point_radiance(problem, fit, shift),
@@ -373,7 +428,13 @@ def describe(
         view_balance_ev=balance,
         outliers=float(ignored.mean()) if ignored.size else 0.0,
         rounds=fit.rounds,
-        warnings=_warnings(per_view, component, active, balance, o.names),
+        moved=fit.moved,
+        converged=fit.converged,
+        unknown_errors=int(lost.sum()),
+        warnings=(
+            *_doubts(fit, np.flatnonzero(lost), o.names),
+            *_warnings(per_view, component, active, balance, o.names),
+        ),
     )
 
 
@@ -428,6 +489,24 @@ def _point_radiance(problem: Problem, fit: Fit, shift) -> Float[np.ndarray, "p 3
     with np.errstate(invalid="ignore", divide="ignore"):
         level = total / weight + moved[:, None] + problem.log_pivot
     return np.where(weight > 0, level, np.nan)
+
+
+def _doubts(fit: Fit, lost: Int[np.ndarray, " n"], names: Sequence[str]) -> list[str]:
+    """Say where the numbers themselves are not to be trusted."""
+    out = []
+    if not fit.converged:
+        out.append(
+            f"The photometric solution had not settled after {fit.rounds} rounds: its last moved "
+            f"an exposure or gamma by {fit.moved:.2g} (log units, settled below {TOLERANCE:g}). "
+            "Exposures may be off by more than their standard errors say: compare them with "
+            "--photometry.no-select and a simpler --photometry.model."
+        )
+    if len(lost):
+        out.append(
+            f"The standard errors of {len(lost)} training view(s) cannot be told: what joins them "
+            f"to the others is lost in rounding ({_listed(lost, names)})."
+        )
+    return out
 
 
 def _warnings(per_view, component, active, balance, names) -> tuple[str, ...]:

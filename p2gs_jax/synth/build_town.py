@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from p2gs_jax.streams import SceneStream, generator
 from p2gs_jax.synth import houses, street_furniture
 from p2gs_jax.synth.settings import Layout
 from p2gs_jax.synth.solids import Builder, pack
@@ -17,7 +18,7 @@ def build_town(seed: int = 0, layout: Layout = "street") -> Town:
         seed: of everything that is drawn at random.
         layout: `town` adds an underpass, deep in shadow, and draws the place of the sun.
     """
-    build = Builder(np.random.default_rng([seed, 1]), UNDERPASS if layout == "town" else None)
+    build = Builder(generator(seed, SceneStream.BUILDINGS), UNDERPASS if layout == "town" else None)
     houses.pavements(build)
     houses.houses(build)
     houses.vista(build)
@@ -31,7 +32,7 @@ def build_town(seed: int = 0, layout: Layout = "street") -> Town:
 
 def _light(seed: int) -> Light:
     """Return a sun at 35 to 55 degrees from a direction that shades one side of the street."""
-    rng = np.random.default_rng([seed, 5])
+    rng = generator(seed, SceneStream.LIGHT)
     azimuth = np.deg2rad(rng.uniform(200.0, 340.0) if rng.random() < 0.5 else rng.uniform(20, 160))
     height = np.deg2rad(rng.uniform(35.0, 55.0))
     flat = np.cos(height)

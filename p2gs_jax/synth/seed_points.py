@@ -7,6 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
+from p2gs_jax.streams import SceneStream, generator
+
 _DEPTH_TOLERANCE = 0.01
 _SEED_RANGE = 90.0  # m: farther points are not triangulated
 
@@ -21,7 +23,7 @@ def sample_seeds(
     seed: int,
 ) -> tuple[Float64[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"]]:
     """Sample first hits at random pixels of the sampled views, with the photographs' colours."""
-    rng = np.random.default_rng([seed, 3])
+    rng = generator(seed, SceneStream.SEED_POINTS)
     rows = np.flatnonzero(sampled)
     xyz, rgb = [], []
     for row in rows.tolist():

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from p2gs_jax.photometry.srgb import srgb_encode
+from p2gs_jax.streams import SceneStream, generator
 from p2gs_jax.synth.settings import Curve, Sensor
 
 ISO_REFERENCE = 8
@@ -44,7 +45,7 @@ def draw_iso(shape: tuple[int, ...], std: float, seed: int) -> Int[np.ndarray, "
         std: standard deviation before rounding (paper: 2 and 4).
         seed: of the draw.
     """
-    noise = np.random.default_rng([seed, 2]).standard_normal(shape)
+    noise = generator(seed, SceneStream.ISO).standard_normal(shape)
     return np.maximum(np.rint(ISO_REFERENCE + std * noise), ISO_MINIMUM).astype(np.int64)
 
 
@@ -58,7 +59,7 @@ def draw_shots(sensor: Sensor, frames: int, cameras: int, seed: int) -> Shots:
         seed: of everything drawn.
     """
     iso = draw_iso((frames, cameras), sensor.iso_std, seed).T.ravel()
-    rng = np.random.default_rng([seed, 4])
+    rng = generator(seed, SceneStream.CAMERAS)
     gain = sensor.camera_gain_ev * rng.standard_normal(cameras)
     tint = sensor.white_balance_ev * rng.standard_normal((cameras, 2))
     phase = 2 * np.pi * rng.random(cameras)

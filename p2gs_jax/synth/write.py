@@ -29,6 +29,7 @@ from jaxtyping import Float32, Float64, Int, UInt8
 from PIL import Image
 
 from p2gs_jax.errors import UserError
+from p2gs_jax.streams import SceneStream, generator
 from p2gs_jax.synth.build_town import build_town
 from p2gs_jax.synth.colmap_files import DriveViews, write_colmap
 from p2gs_jax.synth.exposures import write_true_exposures
@@ -147,7 +148,7 @@ def write_street(
         for row, (linear, depth) in enumerate(
             _render_all(town, viewmats, K, width, height, supersample)
         ):
-            rng = np.random.default_rng([seed, 6, row])
+            rng = generator(seed, SceneStream.PHOTOGRAPH, row)
             shot = photograph(
                 linear, shots.exposures[row], sensor, balance=shots.balance[row], rng=rng
             )

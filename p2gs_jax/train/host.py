@@ -53,7 +53,11 @@ class HostState:
 
 @dataclass(frozen=True)
 class LogRecord:
-    """One line of `log.jsonl`, and what the live display shows."""
+    """One line of `log.jsonl`, and what the live display shows.
+
+    Those of a trial, the run without growth that automatic growth compares with, are lines of
+    `growth.jsonl`.
+    """
 
     step: int
     progress: float
@@ -65,3 +69,4 @@ class LogRecord:
     seconds: float
     step_seconds: float
     terms: dict[str, float]
+    trial: bool = False

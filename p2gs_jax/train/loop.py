@@ -3,7 +3,8 @@
 Within a burst the host only dispatches. After it the host reads the fault flag and the reports,
 densifies, logs, replans the pace and checkpoints. All decisions follow from the seed and the step
 number (and, under a time budget, from paces that the checkpoint remembers), so a resumed run takes
-the same path as an uninterrupted one.
+the same path as an uninterrupted one: bit for bit on a CPU, and on GPUs as far as their sums repeat
+(`RenderConfig.deterministic`).
 """
 
 from __future__ import annotations
@@ -38,7 +39,8 @@ from p2gs_jax.losses.relative_exposure import ColorPairs
 from p2gs_jax.losses.total import OBSERVED_FORMS, SECOND_RENDER_FORMS, Partner
 from p2gs_jax.numerics import on_host
 from p2gs_jax.render.capacity import Room
-from p2gs_jax.train import growth, schedule
+from p2gs_jax.streams import Stream, densification_key, generator
+from p2gs_jax.train import decisions, growth, schedule
 from p2gs_jax.train.demand import demand
 from p2gs_jax.train.growth import Look, Stage
 from p2gs_jax.train.host import HostState, LogRecord
@@ -46,6 +48,7 @@ from p2gs_jax.train.optimizer import make_optimizer, zero_moments, zero_opacity_
 from p2gs_jax.train.programs import Key, StepPrograms
 from p2gs_jax.train.room import room_for
 from p2gs_jax.train.schedule import Pace
+from p2gs_jax.train.session import Session
 from p2gs_jax.train.state import (
     FAULT_NONFINITE,
     FAULT_OVERFLOW,
@@ -88,16 +91,6 @@ class TrainResult:
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
 
 
-@dataclass
-class _Trial:
-    """A stage of growth under way, and how it ended without growth."""
-
-    stage: Stage
-    ungrown: FitState
-    score: float
-    done: int = 0
-
-
 class Trainer:
     """Runs one fit from its initial parameters to its final ones.
 
@@ -107,12 +100,13 @@ class Trainer:
         extent: scene extent, scene units.
         pairs: corresponding observations, for the relative-exposure readings that need them.
         coverage: how much of the scene the views show.
-        run_dir: where `log.jsonl` and `checkpoints/` go.
+        run_dir: where `log.jsonl`, `growth.jsonl` and `checkpoints/` go.
         programs: compiled steps, some of them perhaps begun.
         on_log: called with every log record.
         on_message: called with everything the user must know.
         validation: training views that automatic growth is judged by.
         own_exposures: their exposures come from tracks, so they may be judged under these.
+        reasons: for the photometric model, in words; a resumed run repeats them.
     """
 
     def __init__(
@@ -128,20 +122,22 @@ class Trainer:
         on_message: Callable[[str], None] = lambda text: None,
         validation: Sequence[int] = (),
         own_exposures: bool = False,
+        reasons: Sequence[str] = (),
     ):
         self.cfg, self.views, self.extent, self.pairs = cfg, views, extent, pairs
         self.coverage = coverage
         self.run_dir, self.on_log, self.on_message = run_dir, on_log, on_message
+        self.decided = decisions.recorded(cfg, reasons)
         self.optimizer = make_optimizer(cfg)
         self.step = make_step(cfg, self.optimizer, extent)
         self.programs = programs
-        self._rng = jax.jit(
-            lambda step: jax.random.fold_in(jax.random.key(cfg.train.seed + 1), step)
-        )
+        self._rng = jax.jit(functools.partial(densification_key, cfg.train.seed))
         self._alive = jax.jit(jnp.sum)
         self.clock = Stopwatch()
         self.checkpoints = CheckpointStore(run_dir / "checkpoints")
         self.log_path = run_dir / "log.jsonl"
+        # What automatic growth compares with takes the same steps, so it has a log of its own.
+        self.trial_path = run_dir / "growth.jsonl"
         sizes = [views.camera(i, 1) for i in range(len(views))]
         self.levels = schedule.levels(
             cfg.train, min(c.width for c in sizes), min(c.height for c in sizes)
@@ -151,7 +147,6 @@ class Trainer:
         self._propose = jax.jit(functools.partial(adaptive.propose, cfg=cfg.densify))
         self._relocate = jax.jit(functools.partial(_relocate, cfg=cfg))
         self._zero_moments = jax.jit(zero_moments)
-        self._trial: _Trial | None = None
         self.auto = cfg.densify.max_gaussians == "auto"
         if self.auto:
             self.validation = validation
@@ -167,18 +162,28 @@ class Trainer:
         )
         if found is None:
             return None
+        decisions.check(found[1].get(decisions.KEY), self.cfg, self.checkpoints.folder)
         state = jax.tree.map(jnp.asarray, found[0])
         host = HostState.from_dict(found[1]["host"])
         self.checkpoints.discard_after(host.step)
-        kept = [line for line in read_jsonl(self.log_path) if line["step"] <= host.step]
-        write_text(self.log_path, "".join(json.dumps(line) + "\n" for line in kept))
+        for path in (self.log_path, self.trial_path):
+            if path.exists():
+                kept = [line for line in read_jsonl(path) if line["step"] <= host.step]
+                _write_lines(path, kept)
         self.on_message(f"Resuming after step {host.step} ({host.progress:.0%}).")
+        if not _repeats(self.cfg):
+            self.on_message(
+                "Sums on this device come in no fixed order: the rest of the run is as good as "
+                "without the interruption, but not the same bit for bit "
+                "(--render.deterministic from the start fixes the order of the renderer's)."
+            )
         return state, host
 
     def _save(self, state: FitState, host: HostState) -> None:
         meta = {
             "host": dataclasses.asdict(host),
             "gaussian_capacity": state.params.gaussians.capacity,
+            decisions.KEY: self.decided,
         }
         self.checkpoints.save(host.step, state, meta)
 
@@ -213,57 +218,44 @@ class Trainer:
         if resume and (restored := self._restore(state)) is not None:
             state, host = restored
             pace = dataclasses.replace(pace, per_step=host.pace)
-        elif self.log_path.exists():
-            self.log_path.unlink()
+        else:
+            for path in (self.log_path, self.trial_path):
+                path.unlink(missing_ok=True)
         if self.auto and host.growth.limit is None:
             self.views.leave_out(self.validation)
 
-        session_start = time.monotonic()
-        before = host.elapsed_s
-        last_save = session_start
+        full_step_s = STEP_SECONDS_PER_PIXEL * self.coverage.pixels
+        session = Session(pace, host, finish_s=finish_s, full_step_s=full_step_s)
+        last_save = time.monotonic()
         most = max(limit or 0, slots)
         self._make_room(state.params.gaussians, state.population.alive, host, most)
         self._expect(state, host)
         while host.progress < 1.0 - 0.5 * host.pace:
-            shrink = schedule.shrink_at(host.progress, self.levels)
-            state, reports = self._burst(state, host)
-            host.elapsed_s = before + time.monotonic() - session_start
-            if reports:
-                self._log(reports, state, host, shrink)
+            state, stepped = self._advance(state, host, session)
+            if stepped and self._stage_due(host):
+                state, host = self._grow(state, host, limit or 0, session)
+            if stepped:
                 with self.clock("densification"):
                     state = self._maybe_densify(state, host, limit)
-            if pace.deadline_s is not None:
-                # As if so much had passed already: what follows is as slow as the steps are.
-                now = host.elapsed_s + finish_s * (self._slowness(host) - 1)
-                if host.step_s > 0:
-                    pace = dataclasses.replace(pace, per_step=host.pace)
-                    pace = pace.replan(host.progress, now, host.step_s)
-                    host.pace = pace.per_step
-                if now > (pace.deadline_s or math.inf):
-                    if host.progress < NEARLY_DONE:
-                        self.on_message(
-                            f"The budget ended the run at {host.progress:.0%} of its schedule: fit "
-                            "again with a longer --budget; what was compiled now is kept."
-                        )
-                    break
-            # A checkpoint holds one population: none is written while two compete.
-            due = time.monotonic() - last_save > train.checkpoint_every_s
-            if due and self._trial is None:
+            session.replan(host)
+            if session.over(host):
+                if host.progress < NEARLY_DONE:
+                    self.on_message(
+                        f"The budget ended the run at {host.progress:.0%} of its schedule: fit "
+                        "again with a longer --budget; what was compiled now is kept."
+                    )
+                break
+            if time.monotonic() - last_save > train.checkpoint_every_s:
                 with self.clock("checkpoints"):
                     self._save(state, host)
                 last_save = time.monotonic()
+        if self.auto:
+            self._end_growth(state, host)
         with self.clock("checkpoints"):
             self._save(state, host)
         summary = growth.summary(host.growth, self.validation) if self.auto else None
         most = limit or state.params.gaussians.capacity
         return TrainResult(state, host, most, summary, self._seconds())
-
-    def _slowness(self, host: HostState) -> float:
-        """Return how many times slower than expected full-size steps are, from 1 to 3."""
-        if host.shrink != 1 or host.step_s <= 0:
-            return 1.0
-        expected = STEP_SECONDS_PER_PIXEL * self.coverage.pixels
-        return min(max(host.step_s / expected, 1.0), 3.0)
 
     def _seconds(self) -> dict[str, float]:
         """Return where the time went, by name."""
@@ -301,6 +293,24 @@ class Trainer:
         if d.method != "mcmc":
             return d.max_gaussians
         return max(default if d.max_gaussians is None else d.max_gaussians, seeds)
+
+    def _advance(
+        self, state: FitState, host: HostState, session: Session, *, trial: bool = False
+    ) -> tuple[FitState, bool]:
+        """Take a burst of steps and log it; return the state and whether there were any.
+
+        Args:
+            state: to start from; it is given away.
+            host: counters; changed.
+            session: the clock.
+            trial: the run is one that automatic growth compares with.
+        """
+        shrink = schedule.shrink_at(host.progress, self.levels)
+        state, reports = self._burst(state, host)
+        session.tick(host)
+        if reports:
+            self._log(reports, state, host, shrink, trial)
+        return state, bool(reports)
 
     def _burst(
         self, state: FitState, host: HostState
@@ -452,7 +462,7 @@ class Trainer:
             batch = self.views.batch(other, shrink)
         elif relative.form in OBSERVED_FORMS and self.pairs is not None:
             count = self.pairs.views_i.shape[0]
-            rng = np.random.default_rng((self.cfg.train.seed, 2, step))
+            rng = generator(self.cfg.train.seed, Stream.STEP_PAIRS, step)
             pick = rng.integers(0, count, min(PAIRS_PER_STEP, count))
             pairs = jax.tree.map(lambda a: np.asarray(a)[pick], self.pairs)
         return on_host(Partner, np.int32(other), camera, batch, pairs)
@@ -474,7 +484,7 @@ class Trainer:
 
     # -------------------------------------------------------------- between bursts
 
-    def _log(self, reports, state: FitState, host: HostState, shrink: int) -> None:
+    def _log(self, reports, state: FitState, host: HostState, shrink: int, trial: bool) -> None:
         last = reports[-1][2]
         record = LogRecord(
             step=host.step,
@@ -487,22 +497,23 @@ class Trainer:
             seconds=round(host.elapsed_s, 3),
             step_seconds=round(host.step_s, 5),
             terms={k: _mean(r.terms[k] for _, _, r in reports) for k in last.terms},
+            trial=trial,
         )
-        append_jsonl(self.log_path, dataclasses.asdict(record))
+        line = dataclasses.asdict(record)
+        del line["trial"]
+        append_jsonl(self.trial_path if trial else self.log_path, line)
         self.on_log(record)
 
     def _maybe_densify(self, state: FitState, host: HostState, limit: int | None) -> FitState:
         d = self.cfg.densify
         if self.auto and host.progress >= self.growth_window[1]:
-            if self._trial is not None:
-                state = self._decide(state, host)
             self._end_growth(state, host)
         if d.method is None or not d.start <= host.progress < d.stop:
             return state
         if host.progress - host.densified_at < self._interval(host):
             return state
         if self.auto:
-            state, wanted = self._auto_target(state, host, limit or 0)
+            wanted = 0  # it grows in stages only
         elif d.method == "mcmc":
             wanted = self._target(state, host, limit)
         else:
@@ -555,67 +566,98 @@ class Trainer:
 
     # -------------------------------------------------------------- automatic growth
 
-    def _auto_target(self, state: FitState, host: HostState, bound: int) -> tuple[FitState, int]:
-        """Return the state with room for the next population, and that population; 0: as it is.
+    def _stage_due(self, host: HostState) -> bool:
+        """Return whether automatic growth may try another stage now."""
+        if not self.auto or host.growth.limit is not None:
+            return False
+        first, last = self.growth_window
+        d = self.cfg.densify
+        inside = max(first, d.start) <= host.progress < min(last, d.stop)
+        return inside and host.progress - host.densified_at >= self._interval(host)
 
-        After a stage it is decided which population goes on. The next begins an interval later, so
-        that a checkpoint can be written in between.
+    def _grow(
+        self, state: FitState, host: HostState, bound: int, session: Session
+    ) -> tuple[FitState, HostState]:
+        """Run a stage twice over the same steps, without growth and with it, and return the better.
+
+        What does not grow runs first. Where time ends within the stage, it is the run: it is never
+        behind, and needs no comparison. A checkpoint holds one population: none is written here.
         """
-        if host.growth.limit is not None or host.progress < self.growth_window[0]:
-            return state, 0
-        if self._trial is None:
-            self._trial = self._begin_stage(state, host, bound)
-        elif self._trial.done == self._trial.stage.events:
-            state = self._decide(state, host)
-            if host.growth.stalled:
-                self._end_growth(state, host)
-            return state, 0
-        if self._trial is None:
+        stage = self._next_stage(state, host, bound)
+        if stage is None:
             self._end_growth(state, host)
-            return state, 0
-        self._trial.done += 1
-        state = grow_state(state, self._trial.ungrown.params.gaussians.capacity)
-        return state, self._trial.stage.target(self._trial.done)
+            return state, host
+        begun = host.step
+        # Both runs of the stage have the same slots, and so the same random draws.
+        needed = stage.target(stage.events)
+        state = grow_state(state, bucket_for(needed, state.params.gaussians.capacity, bound))
+        plain = jax.tree.map(jnp.copy, state)  # steps give their input away
+        plain_host = copy.deepcopy(host)
+        plain = self._run_stage(plain, plain_host, stage, session, grows=False)
+        if session.over(plain_host):
+            self._log_trial_as_run(begun)
+            return plain, plain_host
+        # Tile lists that were too short once would be so again.
+        host.rooms, host.overflows = dict(plain_host.rooms), plain_host.overflows
+        with self.clock("densification"):
+            score = self.judge(plain.params, plain.population.alive)
+        grown = self._run_stage(state, host, stage, session, grows=True)
+        if session.over(host):
+            plain_host.elapsed_s = host.elapsed_s
+            self._log_trial_as_run(begun)
+            return plain, plain_host
+        with self.clock("densification"):
+            psnr = self.judge(grown.params, grown.population.alive)
+        progress = round(host.progress, 6)
+        look = Look(self._count(grown), psnr, stage.before, score, progress)
+        host.growth.looks.append(look)
+        # Tile lists that overflow end bursts early: the two may differ by a few steps.
+        kept = grown if look.kept else dataclasses.replace(plain, step=grown.step)
+        if host.growth.stalled:
+            self._end_growth(kept, host)
+        return kept, host
 
-    def _begin_stage(self, state: FitState, host: HostState, bound: int) -> _Trial | None:
-        """Run a stage without growth, and return its end; None: there is no room for a stage."""
-        alive = self._count(state)
+    def _log_trial_as_run(self, begun: int) -> None:
+        """Replace the lines of a stage in the log by those of its trial.
+
+        Args:
+            begun: steps before the stage.
+        """
+        lines = [line for line in read_jsonl(self.log_path) if line["step"] <= begun]
+        lines += [line for line in read_jsonl(self.trial_path) if line["step"] > begun]
+        _write_lines(self.log_path, lines)
+
+    def _next_stage(self, state: FitState, host: HostState, bound: int) -> Stage | None:
+        """Return the next stage, or None where there is no room or time for one."""
         left = (self.growth_window[1] - host.progress) / host.pace
         # The host looks after every burst only.
         burst = min(self.cfg.train.log_every, MAX_BURST)
         interval = math.ceil(self._interval(host) / host.pace / burst - 1e-6) * burst
-        stage = growth.plan_stage(alive, bound, left, interval)
-        if stage is None:
-            return None
-        # Both runs of the stage have the same slots, and so the same random draws.
-        needed = stage.target(stage.events)
-        state = grow_state(state, bucket_for(needed, state.params.gaussians.capacity, bound))
-        state = jax.tree.map(jnp.copy, state)  # steps give their input away
-        host = copy.deepcopy(host)
-        for _ in range(stage.events):
-            host.densified_at = host.progress
-            state = self._relocate_step(state, host, 0)
-            while host.progress - host.densified_at < self._interval(host):
-                state, _ = self._burst(state, host)
-        score = self.judge(state.params, state.population.alive)
-        return _Trial(stage, state, score)
+        return growth.plan_stage(self._count(state), bound, left, interval)
 
-    def _decide(self, grown: FitState, host: HostState) -> FitState:
-        """Return the population that goes on: the grown one if it is worth it."""
-        trial, self._trial = self._trial, None
-        assert trial is not None
-        look = Look(
-            self._count(grown),
-            self.judge(grown.params, grown.population.alive),
-            trial.stage.before,
-            trial.score,
-            round(host.progress, 6),
-        )
-        host.growth.looks.append(look)
-        if look.kept:
-            return grown
-        # Under a time budget the two runs may differ by a few steps.
-        return dataclasses.replace(trial.ungrown, step=grown.step)
+    def _run_stage(
+        self, state: FitState, host: HostState, stage: Stage, session: Session, *, grows: bool
+    ) -> FitState:
+        """Run the densifications of a stage and the steps after each; the pace stays.
+
+        It ends early where the time does, or the window of growth.
+
+        Args:
+            state: to start from; it is given away.
+            host: counters; changed.
+            stage: its densifications.
+            session: the clock.
+            grows: otherwise Gaussians are only relocated.
+        """
+        for done in range(1, stage.events + 1):
+            host.densified_at = host.progress
+            with self.clock("densification"):
+                state = self._relocate_step(state, host, stage.target(done) if grows else 0)
+            while host.progress - host.densified_at < self._interval(host):
+                state, _ = self._advance(state, host, session, trial=not grows)
+                if session.over(host) or host.progress >= self.growth_window[1]:
+                    return state
+        return state
 
     def _end_growth(self, state: FitState, host: HostState) -> None:
         """Keep the population from here on, and fit the held-out views as well."""
@@ -683,8 +725,17 @@ def _relocate(key, gaussians, population, moments, births, *, cfg: FitConfig):
     return mcmc.relocate_and_grow(key, gaussians, population, births, cfg.densify, asked)
 
 
+def _repeats(cfg: FitConfig) -> bool:
+    """Return whether the same steps give the same bits here."""
+    return jax.default_backend() == "cpu" or cfg.render.deterministic
+
+
 def _name(size: tuple[int, int]) -> str:
     return f"{size[0]}x{size[1]}"
+
+
+def _write_lines(path: Path, lines: list[dict]) -> None:
+    write_text(path, "".join(json.dumps(line) + "\n" for line in lines))
 
 
 def _mean(values) -> float:

@@ -16,15 +16,19 @@ MIN_STEPS_LEFT = 8
 MAX_SPEED_UP = 1.5
 
 
+def shrinks(cfg: TrainConfig) -> tuple[int, ...]:
+    """Return the factors by which images are shrunk, level by level; the last is 1."""
+    return tuple(2**k for k in range(len(cfg.coarse_to_fine), -1, -1))
+
+
 def levels(cfg: TrainConfig, width: int, height: int) -> tuple[tuple[float, int], ...]:
     """Return (end of level as a progress, factor by which images are shrunk) in order.
 
     Levels that would make images smaller than 96 pixels across are left out.
     """
-    shrinks = [2 ** (len(cfg.coarse_to_fine) - i) for i in range(len(cfg.coarse_to_fine))]
     kept = [
         (end, shrink)
-        for end, shrink in zip(cfg.coarse_to_fine, shrinks, strict=True)
+        for end, shrink in zip(cfg.coarse_to_fine, shrinks(cfg)[:-1], strict=True)
         if min(width, height) // shrink >= MIN_LEVEL_PIXELS
     ]
     return (*kept, (1.0, 1))

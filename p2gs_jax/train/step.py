@@ -23,6 +23,7 @@ from p2gs_jax.render.capacity import Room
 from p2gs_jax.render.spherical_harmonics import coefficient_count
 from p2gs_jax.render.visible import compact, in_view
 from p2gs_jax.render.xla_cpu import compiler_options
+from p2gs_jax.streams import noise_key
 from p2gs_jax.train.optimizer import Optimizer, OptState, learning_rates, means_rate
 from p2gs_jax.train.state import (
     FAULT_NONE,
@@ -344,7 +345,7 @@ def make_step(cfg: FitConfig, optimizer: Optimizer, extent: float) -> Step:
             own=lambda block, on: population_terms(block, on, cfg, extent, listed),
             optimizer=optimizer.gaussians,
             rates=rates.gaussians,
-            key=jax.random.fold_in(jax.random.key(cfg.train.seed), state.step),
+            key=noise_key(cfg.train.seed, state.step),
             noise_rate=cfg.densify.noise * means_rate(controls.progress, extent, cfg)
             if mcmc
             else None,

@@ -9,6 +9,7 @@ from jaxtyping import Int
 
 from p2gs_jax.numerics import on_host
 from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.streams import Stream, generator, view_order
 from p2gs_jax.types import Batch, Camera
 
 
@@ -52,7 +53,7 @@ class TrainingViews:
         """Return the row in `Photometry` of the view of a step; every epoch is a permutation."""
         epoch, position = divmod(step, len(self._kept))
         if epoch not in self._orders:
-            order = np.random.default_rng((self.seed, epoch)).permutation(len(self.rows))
+            order = view_order(self.seed, epoch, len(self.rows))
             self._orders = {epoch: order[np.isin(order, self._kept)]}
         return int(self._orders[epoch][position])
 
@@ -61,7 +62,7 @@ class TrainingViews:
 
         Drawn from those that overlap it, where it is known which do; never one that is left out.
         """
-        rng, index = np.random.default_rng((self.seed, 1, step)), self.index_at(step)
+        rng, index = generator(self.seed, Stream.PARTNER, step), self.index_at(step)
         if self.overlaps is not None:
             overlapping = self.overlaps[index]
             overlapping = overlapping[np.isin(overlapping, self._kept)]

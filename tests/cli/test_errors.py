@@ -12,7 +12,7 @@ from p2gs_jax.config import preset, to_dict
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.atomic import no_empty_folders
 from p2gs_jax.options.parse import parse_duration
-from p2gs_jax.pipeline import check_run_dir
+from p2gs_jax.preflight import check_run_dir
 
 
 def run(capsys, *argv):

@@ -55,6 +55,8 @@ def test_a_fit_without_its_steps_compiles_few_programs(scene, tmp_path):
     # Counting tiles, rendering, developing (images; colours of splats), fitting an exposure, PSNR,
     # SSIM, and the basis of spherical harmonics.
     assert counter.programs <= 8
+    assert metrics["photometry"]["converged"]
+    assert metrics["photometry"]["unknown_errors"] == 0
     seconds = metrics["seconds"]
     compiling = seconds.pop("compiler_in_all_threads")
     assert compiling == counter.seconds > 0

@@ -14,7 +14,7 @@ from p2gs_jax.export.atomic import append_jsonl, atomic_folder, atomic_write, re
 from p2gs_jax.export.exr import read_exr, write_exr
 from p2gs_jax.export.photometry_json import read_photometry, write_photometry
 from p2gs_jax.export.ply import field_names, read_ply, write_ply, write_radiance
-from p2gs_jax.export.png import side_by_side, write_png
+from p2gs_jax.export.png import write_png
 from p2gs_jax.export.summary import _curves, _shorten, write_summary
 from p2gs_jax.types import Gaussians
 
@@ -202,13 +202,6 @@ def test_png_rounds_and_keeps_the_channel_order(tmp_path):
     write_png(tmp_path / "a.png", ldr)
     back = cv2.imread(str(tmp_path / "a.png"))[..., ::-1]
     np.testing.assert_array_equal(back, [[[255, 128, 0], [255, 0, 0]]])
-
-
-def test_side_by_side():
-    row = side_by_side([np.zeros((2, 3, 3)), np.full((4, 1, 3), 0.5)], gap=2, background=1.0)
-    assert row.shape == (4, 6, 3)
-    np.testing.assert_array_equal(row[0, :, 0], [0, 0, 0, 1, 1, 0.5])
-    np.testing.assert_array_equal(row[3, :, 0], [1, 1, 1, 1, 1, 0.5])
 
 
 @pytest.mark.parametrize("columns", [1, 5])

@@ -268,6 +268,10 @@ def test_a_short_fit_traces_its_step_once_per_image_size(tmp_path, monkeypatch):
     chex.clear_trace_counter()
     # Once more before exposures are known, for the shapes that the last program of a step takes.
     monkeypatch.setattr(step_module, "image_loss", chex.assert_max_traces(counted, n=3))
+    # What is done per Gaussian knows no image size: once before exposures are known, once after.
+    for name in ("splat_listed", "update_listed"):
+        twice = chex.assert_max_traces(getattr(step_module, name), n=2)
+        monkeypatch.setattr(step_module, name, twice)
     fit(scene, tmp_path / "run", cfg)
     assert len(set(sizes)) == 2
     assert len(sizes) <= 3

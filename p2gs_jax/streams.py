@@ -1,0 +1,89 @@
+"""The random streams of fits and synthetic scenes, by name: users of one would be correlated.
+
+Numbers are what they were before they had names, so that seeds mean what they meant; only streams
+that shared one got another (BUILD_NOTES, "Risks of the review").
+
+The order of views is the exception: its stream is the number of the epoch, and epoch 7 therefore
+has the words of `HELD_OUT`. They order views, everything else draws points, pixels or exposures,
+and nothing that is computed depends on both; numbers of its own would make every fit another one.
+Likewise scenes: what they are made with is data to a fit, whatever its seed.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum, unique
+
+import jax
+import numpy as np
+from jaxtyping import Array, Int, PRNGKeyArray
+
+
+@unique
+class Stream(IntEnum):
+    """What a fit draws on the host, beside the order of its views."""
+
+    PARTNER = 1
+    """Second view of a step."""
+    STEP_PAIRS = 2
+    """Track observations that a step compares."""
+    START_EXPOSURES = 3
+    COMPARED_POINTS = 5
+    """Points whose observations choose the photometric model."""
+    HELD_OUT = 7
+    """Observations that judge it."""
+    COLOR_PAIRS = 11
+    """Track observations that steps draw from."""
+    STACK_PIXELS = 13
+    SURFACE_COLORS = 17
+    """Points without tracks, and the views they are sampled in."""
+    SOLVED_POINTS = 19
+    """Points that exposures are solved from."""
+    MATCHED_PIXELS = 23
+    """Pixels of a view that may become dense seeds."""
+    DENSE_SEEDS = 29
+    SEED_POINTS = 31
+    """Points of the scene that start as Gaussians."""
+    SEED_GAUSSIANS = 37
+    """Of these and the shell's, those that are kept."""
+    SHARED_POINTS = 41
+    """Points that tell which views to match."""
+    RENDERED_PIXELS = 43
+    """Pixels of a fit that are looked for in other views."""
+
+
+@unique
+class SceneStream(IntEnum):
+    """What a synthetic scene draws."""
+
+    BUILDINGS = 1
+    ISO = 2
+    SEED_POINTS = 3
+    CAMERAS = 4
+    LIGHT = 5
+    PHOTOGRAPH = 6
+
+
+def generator(seed: int, stream: Stream | SceneStream, *more: int) -> np.random.Generator:
+    """Return a generator at its beginning.
+
+    Args:
+        seed: of the fit, or of the scene.
+        stream: what it is for.
+        more: which step, view or row.
+    """
+    return np.random.default_rng((seed, int(stream), *more))
+
+
+def view_order(seed: int, epoch: int, count: int) -> Int[np.ndarray, " v"]:
+    """Return the order of so many views in an epoch."""
+    return np.random.default_rng((seed, epoch)).permutation(count)
+
+
+def noise_key(seed: int, step: Int[Array, ""]) -> PRNGKeyArray:
+    """Return the key of a step's exploration noise, on the device."""
+    return jax.random.fold_in(jax.random.key(seed), step)
+
+
+def densification_key(seed: int, step: Int[Array, ""]) -> PRNGKeyArray:
+    """Return the key of the densification after a step, on the device."""
+    return jax.random.fold_in(jax.random.key(seed + 1), step)

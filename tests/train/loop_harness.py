@@ -1,0 +1,198 @@
+"""A training loop whose steps cost nothing: a clock that stands still, programs that only count."""
+
+import dataclasses
+import json
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.densify.population import Coverage
+from p2gs_jax.export.atomic import read_jsonl
+from p2gs_jax.numerics import on_host
+from p2gs_jax.sweep import with_fields
+from p2gs_jax.train import loop, session
+from p2gs_jax.train.state import FAULT_NONFINITE, FAULT_OVERFLOW, Fault, FitState
+from p2gs_jax.train.step import StepReport
+from p2gs_jax.types import Batch, Camera, Gaussians, Params, Photometry, Population
+
+VIEWS, SEEDS = 4, 10
+SHORT = with_fields(
+    FitConfig(),
+    {
+        "train.steps": 100,
+        "train.log_every": 5,
+        "train.coarse_to_fine": [],
+        "train.checkpoint_every_s": 1e9,
+        "densify.min_every_steps": 5,
+        "densify.method": None,
+    },
+)
+GROWING = with_fields(SHORT, {"densify.method": "mcmc", "densify.max_gaussians": "auto"})
+
+
+class Views:
+    """Views of one size, without photographs."""
+
+    def __init__(self):
+        self.out = ()
+
+    def __len__(self):
+        return VIEWS
+
+    def leave_out(self, rows):
+        self.out = tuple(rows)
+
+    def index_at(self, step):
+        return step % VIEWS
+
+    def prefetch(self, index, shrink):
+        pass
+
+    def camera(self, index, shrink):
+        K = np.diag([400.0 / shrink, 400.0 / shrink, 1.0]).astype(np.float32)
+        return on_host(Camera, np.eye(4, dtype=np.float32), K, 400 // shrink, 300 // shrink)
+
+    def batch(self, index, shrink):
+        nothing = np.zeros((1, 1, 3), np.uint8), np.ones((1, 1), bool)
+        return on_host(Batch, self.camera(index, shrink), *nothing, np.int32(index))
+
+
+class Programs:
+    """Programs that take `compile_s` to wait for and `step_s(width)` to run, on the given clock."""
+
+    def __init__(self, clock, compile_s=5.0, step_s=lambda width: 0.1):
+        self.clock, self.compile_s, self.step_s = clock, compile_s, step_s
+        self.rooms, self.waited_s = {}, 0.0
+        self.made, self.taken = [], []
+        self.overflows_at, self.breaks_at = None, None
+
+    def expect(self, *arguments, **options):
+        pass
+
+    def ahead(self, key, program, *arguments):
+        return program
+
+    def get(self, step, key, *arguments):
+        if key not in self.made:
+            self.made.append(key)
+            self.clock.now += self.compile_s
+            self.waited_s += self.compile_s
+
+        def run(state, batch, partner, controls):
+            if int(state.fault.kind):
+                return state, REPORT
+            self.clock.now += self.step_s(key.size[0])
+            at = int(state.step)
+            kind = 0
+            if at == self.overflows_at and key.room.entries < 10**6:
+                kind = FAULT_OVERFLOW
+            if at == self.breaks_at:
+                kind = FAULT_NONFINITE
+            if kind:
+                fault = Fault(*map(np.int32, (kind, 10**6, 1, 0)))
+                return dataclasses.replace(state, fault=fault), REPORT
+            self.taken.append((at, key.size[0], float(controls.progress)))
+            return dataclasses.replace(state, step=np.int32(at + 1)), REPORT
+
+        return run
+
+
+REPORT = StepReport(*map(np.float32, (1, 1, 20, 7, 3)))._replace(terms={"l1": np.float32(1)})
+
+
+class Checkpoints:
+    """Checkpoints in memory; their plain values are JSON."""
+
+    folder = "checkpoints"
+
+    def __init__(self):
+        self.saved = {}
+
+    def save(self, step, state, meta):
+        self.saved[step] = jax.tree.map(np.array, state), json.loads(json.dumps(meta))
+
+    def latest_step(self):
+        return max(self.saved, default=None)
+
+    def restore_latest(self, like, on_message):
+        return self.saved[self.latest_step()] if self.saved else None
+
+    def discard_after(self, step):
+        self.saved = {k: v for k, v in self.saved.items() if k <= step}
+
+
+def gaussians(count):
+    shapes = ((3,), (4,), (3,), (), (1, 3))
+    values = [np.zeros((count, *shape), np.float32) for shape in shapes]
+    values[0][:, 2], values[1][:, 0], values[2][:] = 3, 1, -5
+    return on_host(Gaussians, *values)
+
+
+def state_of(count, slots):
+    alive = np.arange(slots) < count
+    zeros = [np.zeros(slots, np.float32) for _ in range(2)]
+    photometry = on_host(Photometry, np.zeros(VIEWS, np.float32), np.zeros(VIEWS, np.float32))
+    return FitState(
+        Params(gaussians(slots), photometry),
+        (),
+        on_host(Population, alive, *zeros),
+        np.int32(0),
+        Fault(*(np.int32(0) for _ in range(4))),
+    )
+
+
+class Harness:
+    """A run folder, a clock, and trainers on them one after the other."""
+
+    def __init__(self, monkeypatch, folder):
+        self.clock = SimpleNamespace(now=0.0)
+        self.folder, self.checkpoints = folder, Checkpoints()
+        self.said, self.records = [], []
+        stopped = SimpleNamespace(monotonic=lambda: self.clock.now)
+        for module in (loop, session):
+            monkeypatch.setattr(module, "time", stopped)
+        monkeypatch.setattr(loop, "CheckpointStore", lambda folder: self.checkpoints)
+        monkeypatch.setattr(loop, "initial_state", lambda p, a, o, slots: state_of(SEEDS, slots))
+        monkeypatch.setattr(loop, "grow_state", self._grown)
+        monkeypatch.setattr(loop.Trainer, "_relocate_step", self._relocated)
+        # Copies that stay on the host compile nothing.
+        monkeypatch.setattr(loop.jnp, "copy", np.copy)
+        monkeypatch.setattr(loop, "make_judge", lambda *a, **k: self.judge)
+        self.judge = lambda params, alive: 20.0
+
+    def _grown(self, state, slots):
+        if slots <= state.params.gaussians.capacity:
+            return state
+        new = state_of(int(state.population.alive.sum()), slots)
+        return dataclasses.replace(new, step=state.step)
+
+    def _relocated(self, state, host, wanted):
+        count = max(int(state.population.alive.sum()), wanted)
+        new = state_of(count, state.params.gaussians.capacity)
+        return dataclasses.replace(new, step=state.step)
+
+    def run(self, cfg=SHORT, *, resume=False, programs=None, pixels=None, **options):
+        """Run to the end; return the result and the programs."""
+        programs = programs or Programs(self.clock)
+        trainer = loop.Trainer(
+            cfg,
+            Views(),
+            1.0,
+            None,
+            Coverage(400 * 300 if pixels is None else pixels, 1.0),
+            self.folder,
+            programs,
+            on_log=self.records.append,
+            on_message=self.said.append,
+            validation=(1,) if cfg.densify.max_gaussians == "auto" else (),
+        )
+        trainer._alive = np.sum
+        result = trainer.run(
+            state_of(SEEDS, SEEDS).params, np.ones(SEEDS, bool), resume=resume, **options
+        )
+        return result, programs
+
+    def log(self, name="log.jsonl"):
+        return read_jsonl(self.folder / name)

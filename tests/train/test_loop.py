@@ -1,0 +1,106 @@
+"""What the host decides between bursts: paces, levels, faults, checkpoints."""
+
+import jax
+import numpy as np
+import pytest
+from loop_harness import SHORT, Harness, Programs
+
+from p2gs_jax.errors import DivergenceError, UserError
+from p2gs_jax.sweep import with_fields
+from p2gs_jax.train import decisions
+
+BUDGET = with_fields(SHORT, {"train.budget_s": 60.0})
+LEVELS = with_fields(SHORT, {"train.coarse_to_fine": [0.33]})
+
+
+@pytest.fixture
+def harness(monkeypatch, tmp_path):
+    return Harness(monkeypatch, tmp_path)
+
+
+def pace_of(lines):
+    return [line["step_seconds"] for line in lines]
+
+
+@pytest.mark.parametrize("cfg", [SHORT, BUDGET])
+def test_compiling_is_never_pace(harness, cfg):
+    """Neither the first program, nor one after an overflow, nor those of a resumed run."""
+    programs = Programs(harness.clock, compile_s=7.0)
+    programs.overflows_at = 23
+    result, _ = harness.run(cfg, programs=programs)
+    assert len(programs.made) == 2
+    assert result.host.overflows == 1
+    assert pace_of(harness.log()) == pytest.approx([0.1] * len(harness.log()))
+    assert result.seconds["compiling"] == 14
+    taken = len(programs.taken)
+    assert result.seconds["steps"] == pytest.approx(0.1 * (taken + 1))
+    if cfg is BUDGET:
+        # Compiling is time all the same.
+        assert 50 < harness.clock.now < 62
+
+
+def test_a_resumed_run_keeps_its_pace(harness):
+    cut = with_fields(SHORT, {"train.checkpoint_every_s": 0.0})
+    programs = Programs(harness.clock, compile_s=7.0)
+    programs.breaks_at = 52
+    with pytest.raises(DivergenceError, match="Step 53"):
+        harness.run(cut, programs=programs)
+    assert harness.checkpoints.latest_step() == 50
+    before = len(harness.log())
+    result, programs = harness.run(cut, resume=True)
+    assert programs.taken[0][0] == 50
+    assert result.host.step == 100
+    assert pace_of(harness.log()[before:]) == pytest.approx([0.1] * 10)
+    assert [line["step"] for line in harness.log()] == list(range(5, 101, 5))
+
+
+def test_a_level_begins_a_new_estimate_of_the_pace_and_the_log_names_the_level_of_its_steps(
+    harness,
+):
+    programs = Programs(harness.clock, step_s={200: 0.1, 400: 0.4}.get)
+    harness.run(LEVELS, programs=programs)
+    lines, last = harness.log(), 0
+    assert {line["shrink"] for line in lines} == {1, 2}
+    for line in lines:
+        widths = {width for step, width, _ in programs.taken if last <= step < line["step"]}
+        assert widths == {400 // line["shrink"]}
+        assert line["step_seconds"] == pytest.approx(0.1 if line["shrink"] == 2 else 0.4)
+        last = line["step"]
+    assert 33 in [line["step"] for line in lines]
+
+
+def test_checkpoints_remember_what_the_scene_decided(harness):
+    harness.run(SHORT)
+    assert harness.run(SHORT, resume=True)[0].host.step == 100
+    other = with_fields(SHORT, {"photometry.curve": "power", "photometry.freeze_until": 0.0})
+    with pytest.raises(UserError) as error:
+        harness.run(other, resume=True)
+    assert "curve was srgb, now power" in error.value.message
+    assert "freeze_until was 0.6, now 0.0" in error.value.message
+    assert "restore the scene" in str(error.value.fix)
+    # Checkpoints of older versions say nothing, and are believed.
+    for _, meta in harness.checkpoints.saved.values():
+        del meta[decisions.KEY]
+    assert harness.run(other, resume=True)[0].host.step == 100
+
+
+@pytest.mark.parametrize(
+    ("backend", "deterministic", "said"),
+    [("cpu", False, False), ("gpu", False, True), ("gpu", True, False)],
+)
+def test_where_sums_do_not_repeat_a_resumed_run_says_so(
+    harness, monkeypatch, backend, deterministic, said
+):
+    cfg = with_fields(SHORT, {"render.deterministic": deterministic})
+    harness.run(cfg)
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    harness.run(cfg, resume=True)
+    assert any("not the same bit for bit" in text for text in harness.said) == said
+
+
+def test_a_run_without_steps_to_take_ends(harness):
+    result, programs = harness.run(with_fields(BUDGET, {"train.budget_s": 1.0}), spent_s=100.0)
+    # A run has at least 5 s, compiling included.
+    assert 0 < len(programs.taken) <= 10
+    assert np.isclose(result.host.elapsed_s, harness.clock.now)
+    assert any("The budget ended the run" in text for text in harness.said)

@@ -1,0 +1,24 @@
+"""A step takes photographs as they are stored, and decodes them itself."""
+
+import chex
+import numpy as np
+from tiny_scene import make_scene
+
+from p2gs_jax.config import DataConfig
+from p2gs_jax.losses.total import decoded
+from p2gs_jax.scene import load_scene
+from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.train.views import TrainingViews
+
+
+def test_photographs_travel_as_integers(tmp_path):
+    scene = load_scene(make_scene(tmp_path / "scene", views=3, points=30), DataConfig())
+    store = ImageStore(scene.views, DataConfig())
+    views = TrainingViews(store, scene.train_indices, 0)
+    for shrink, kind in ((1, np.uint8), (2, np.uint16)):
+        batch = views.batch(0, shrink)
+        assert isinstance(batch.ldr, np.ndarray)
+        assert batch.ldr.dtype == kind
+        assert batch.mask.dtype == bool
+        expected = store.get(scene.train_indices[0], shrink)
+        chex.assert_trees_all_close(decoded(batch), expected, atol=1e-7)
