@@ -6,6 +6,7 @@ libraries are large, and `.ci/run` checks a fresh one. Only `wheel` makes an env
 
 from __future__ import annotations
 
+import shutil
 import sys
 from pathlib import Path
 
@@ -46,9 +47,10 @@ def docs(session: nox.Session) -> None:
 
 @nox.session(venv_backend="venv")
 def wheel(session: nox.Session) -> None:
-    """Build sdist and wheel, check them, and try the wheel outside of the checkout."""
+    """Build sdist and wheel, check them, and try the wheel away from the sources."""
     place = Path(session.create_tmp()).resolve()
     dist = place / "dist"
+    shutil.rmtree(dist, ignore_errors=True)
     session.install("build", "twine")
     session.run("python", "-m", "build", "--outdir", str(dist))
     session.run("twine", "check", "--strict", *map(str, sorted(dist.iterdir())))
