@@ -28,6 +28,38 @@ def test_files_page_knows_the_keys(finished_run):
     assert not missing, "docs/files.md does not speak of them"
 
 
+PATH = re.compile(r"`([\w.-]+(?:/[\w.-]+)+)(?::(\w+(?:\.\w+)?))?`")
+
+
+def test_the_map_for_contributors_names_what_exists():
+    """Every path of CONTRIBUTING.md but those with NAME, and what they are said to hold."""
+    found = PATH.findall((ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8"))
+    assert len(found) > 50
+    for path, name in found:
+        if "NAME" in path or path.startswith("../"):
+            continue
+        assert (ROOT / path).exists(), f"there is no {path}"
+        holder = importlib.import_module(_module(path)) if name else None
+        for part in name.split(".") if name else []:
+            assert hasattr(holder, part), f"{path} has no {name}"
+            holder = getattr(holder, part)
+
+
+def _module(path: str) -> str:
+    return path.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+
+
+def test_the_reference_has_every_public_name():
+    import p2gs_jax
+
+    text = (DOCS / "reference.md").read_text(encoding="utf-8")
+    entries = re.findall(r"^::: ([\w.]+)\.(\w+)$", text, flags=re.M)
+    names = {name for _, name in entries}
+    assert set(p2gs_jax.__all__) <= names
+    for module, name in entries:
+        assert hasattr(importlib.import_module(module), name), f"{module} has no {name}"
+
+
 REFERENCE = re.compile(r"`([a-z][\w/]*)\.py:(\w+(?:\.\w+)?)`")
 FIELD = re.compile(r"`((?:data|render|photometry|loss|optimizer|densify|init|train)\.[\w.]+)`")
 

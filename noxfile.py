@@ -1,0 +1,69 @@
+"""Everyday commands: `nox -s lint`, `nox -s tests`, ... `nox -l` lists them.
+
+They run in the environment that nox was started from (`pip install -e '.[dev,docs]'`): its
+libraries are large, and `.ci/run` checks a fresh one. Only `wheel` makes an environment.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+import nox
+
+nox.options.default_venv_backend = "none"
+nox.options.sessions = ["lint", "tests", "docs"]
+BASELINE = "experiments/bench/baseline.json"
+
+
+@nox.session
+def lint(session: nox.Session) -> None:
+    """Check format, rules, imports and types."""
+    session.run("ruff", "format", "--check", ".")
+    session.run("ruff", "check", ".")
+    session.run("lint-imports")
+    session.run("pyright", "--pythonpath", sys.executable)
+
+
+@nox.session
+def tests(session: nox.Session) -> None:
+    """Run the tests, or those named: nox -s tests -- tests/render -k needle."""
+    # By file, so that the tests of a file share what they compile and fit.
+    session.run("pytest", *(session.posargs or ("-n", "2", "--dist", "loadfile")))
+
+
+@nox.session
+def slow(session: nox.Session) -> None:
+    """Run the longer checks."""
+    session.run("pytest", "-m", "slow", *session.posargs)
+
+
+@nox.session
+def docs(session: nox.Session) -> None:
+    """Build the site; every warning is an error. `nox -s docs -- serve` shows it live."""
+    session.run("mkdocs", *(session.posargs or ("build", "--strict")))
+
+
+@nox.session(venv_backend="venv")
+def wheel(session: nox.Session) -> None:
+    """Build sdist and wheel, check them, and try the wheel away from the sources."""
+    place = Path(session.create_tmp()).resolve()
+    dist = place / "dist"
+    shutil.rmtree(dist, ignore_errors=True)
+    session.install("build", "twine")
+    session.run("python", "-m", "build", "--outdir", str(dist))
+    session.run("twine", "check", "--strict", *map(str, sorted(dist.iterdir())))
+    session.install(str(next(dist.glob("*.whl"))))
+    session.chdir(place)
+    session.run("p2gs-jax", "--help", silent=True)
+    session.run("p2gs-jax", "doctor")
+    session.run("python", "-c", "import p2gs_jax; [getattr(p2gs_jax, n) for n in p2gs_jax.__all__]")
+
+
+@nox.session
+def bench(session: nox.Session) -> None:
+    """Hold the renderer against the baseline, as CI does."""
+    parts = session.posargs or ("speed_error", "levels", "--quick")
+    out = Path(session.create_tmp()).resolve()
+    session.run("p2gs-jax", "bench", *parts, "--out", str(out), "--baseline", BASELINE)
