@@ -29,8 +29,7 @@ def lint(session: nox.Session) -> None:
 @nox.session
 def tests(session: nox.Session) -> None:
     """Run the tests, or those named: nox -s tests -- tests/render -k needle."""
-    # By file, so that the tests of a file share what they compile and fit.
-    session.run("pytest", *(session.posargs or ("-n", "2", "--dist", "loadfile")))
+    session.run("pytest", *session.posargs)
 
 
 @nox.session

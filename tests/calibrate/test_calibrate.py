@@ -152,7 +152,13 @@ def test_stacks_must_fit_together(tmp_path):
         read_stack(tmp_path / "s")
 
 
-@pytest.mark.parametrize("name", ["hdr_living_room", "hdr_memorial", "hdr_taipei_night"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "hdr_living_room",
+        *(pytest.param(n, marks=pytest.mark.slow) for n in ("hdr_memorial", "hdr_taipei_night")),
+    ],
+)
 def test_real_stacks(shared_data, name):
     """Recovered exposure ratios against the listed times on the frames that carry signal."""
     folder = shared_data(name)

@@ -72,9 +72,17 @@ def test_every_block_has_a_language_that_is_tested():
 
 
 PYTHON_PAGES = sorted({b.page for b in of("python")})
+# Whole fits, one after the other.
+LONG_PAGES = ("api.md", "sweeps.md")
 
 
-@pytest.mark.parametrize("page", PYTHON_PAGES, ids=[p.name for p in PYTHON_PAGES])
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(p, id=p.name, marks=pytest.mark.slow if p.name in LONG_PAGES else ())
+        for p in PYTHON_PAGES
+    ],
+)
 def test_python_runs(page, place, quick_presets):
     """Blocks of a page follow each other in one namespace."""
     namespace = {"__name__": "__main__"}

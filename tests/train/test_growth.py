@@ -112,6 +112,7 @@ def test_views_left_out_come_back():
     assert [views.index_at(s) for s in range(30)] == before
 
 
+@pytest.mark.slow
 def test_growth_ends_where_it_gains_nothing(monkeypatch, tmp_path, scene, taken):
     result, said = fit(monkeypatch, scene, tmp_path / "run", lambda params, alive: 20.0)
     record = result.metrics["growth"]
@@ -189,6 +190,7 @@ def test_stages_fill_the_time_and_stay_within_bounds():
     assert growth.window(densify, ((0.25, 4), (0.5, 2), (1.0, 1))) == (0.25, 0.5)
 
 
+@pytest.mark.slow
 def test_the_real_judge_measures_at_full_size(tmp_path, scene):
     result = p2gs_jax.fit(scene, tmp_path / "run", SMALL)
     looks = result.metrics["growth"]["looks"]

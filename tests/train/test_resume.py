@@ -39,7 +39,8 @@ def content(run):
     return timeless, (run / "radiance.ply").read_bytes(), (run / "photometry.json").read_text()
 
 
-@pytest.mark.parametrize("method", ["mcmc", pytest.param("adaptive", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["mcmc", "adaptive"])
 def test_killed_three_times_and_resumed(tmp_path, method):
     scene = make_scene(tmp_path / "scene")
     chosen = ("--densify.method", method)

@@ -82,6 +82,7 @@ def test_a_grid_has_every_combination():
     assert configs["weight None, sh_degree 0"].render.sh_degree == 0
 
 
+@pytest.mark.slow
 def test_a_sweep_keeps_what_is_done_and_names_what_failed(tmp_path):
     scene = make_scene(tmp_path / "scene")
     configs = {
