@@ -90,6 +90,7 @@ class Fit(NamedTuple):
         curvature: mean second derivative of the robust loss over its weight (1 for squares).
         rounds: iterations.
         moved: largest change of a parameter in the last round, log units.
+        left: how far the end is, were the rounds to go on as the last two did; inf if they grew.
         converged: that was no more than the tolerance.
     """
 
@@ -104,6 +105,7 @@ class Fit(NamedTuple):
     curvature: float
     rounds: int
     moved: float
+    left: float
     converged: bool
 
 
@@ -422,9 +424,9 @@ def solve(rows: Rows, system: System, start: Theta, tolerance: float, gammas: bo
     gauge = system.anchors.T @ system.anchors
     known = functools.partial(_known, system, prior_matrix(system), gauge)
     # Weighted by the noise alone at first.
-    theta, weight, rounds, moved = start, rows.weight / rows.sigma**2, 0, np.inf
+    theta, weight, rounds, moved, last = start, rows.weight / rows.sigma**2, 0, np.inf, np.inf
     for rounds in range(1, MOST_ROUNDS + 1):
-        before = theta
+        before, last = theta, moved
         theta, weight = _round(rows, known, basis, theta, weight, rounds > L1_ROUNDS, gammas)
         changes = zip(theta, before, strict=True)
         moved = float(np.max([np.abs(x - y).max(initial=0.0) for x, y in changes]))
@@ -445,6 +447,7 @@ def solve(rows: Rows, system: System, start: Theta, tolerance: float, gammas: bo
         max(local.curvature, 0.1),
         rounds,
         moved,
+        moved**2 / (last - moved) if moved < last else np.inf if moved else 0.0,
         moved < tolerance,
     )
 

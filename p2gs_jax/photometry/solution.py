@@ -40,6 +40,8 @@ BEND, BEND_SPACING = 3e-3, 0.12
 STRETCH, FLATTEST = 1.6, 0.3
 # Relative size of what a difference of equal numbers leaves of them.
 CANCELLED = 1e-6
+# Of a standard error, what does not matter.
+NEGLIGIBLE = 0.1
 # Share of a parameter's information that must be left beside all others'. Rounding leaves less, and
 # so does what keeps points without observations finite (`bundle_adjustment.EMPTY`).
 HELD = 1e-11
@@ -432,7 +434,7 @@ def describe(
         converged=fit.converged,
         unknown_errors=int(lost.sum()),
         warnings=(
-            *_doubts(fit, np.flatnonzero(lost), o.names),
+            *_doubts(fit, h_errors[known], np.flatnonzero(lost), o.names),
             *_warnings(per_view, component, active, balance, o.names),
         ),
     )
@@ -491,16 +493,33 @@ def _point_radiance(problem: Problem, fit: Fit, shift) -> Float[np.ndarray, "p 3
     return np.where(weight > 0, level, np.nan)
 
 
-def _doubts(fit: Fit, lost: Int[np.ndarray, " n"], names: Sequence[str]) -> list[str]:
-    """Say where the numbers themselves are not to be trusted."""
+def _doubts(
+    fit: Fit,
+    errors: Float[np.ndarray, " k"],
+    lost: Int[np.ndarray, " n"],
+    names: Sequence[str],
+) -> list[str]:
+    """Say where the numbers themselves are not to be trusted.
+
+    Args:
+        fit: the solution.
+        errors: standard errors of log exposures, where there are any.
+        lost: views that have none though they were observed.
+        names: of all views.
+    """
     out = []
     if not fit.converged:
-        out.append(
-            f"The photometric solution had not settled after {fit.rounds} rounds: its last moved "
-            f"an exposure or gamma by {fit.moved:.2g} (log units, settled below {TOLERANCE:g}). "
-            "Exposures may be off by more than their standard errors say: compare them with "
-            "--photometry.no-select and a simpler --photometry.model."
-        )
+        said = f"The photometric solution had not settled after {fit.rounds} rounds"
+        said += f" (its last moved a parameter by {fit.moved:.1e}, log units)"
+        typical = float(np.median(errors)) if errors.size else 0.0
+        if fit.left <= NEGLIGIBLE * typical:
+            share = f"{NEGLIGIBLE:.0%} of a typical standard error"
+            out.append(f"{said}; what is left of the way is less than {share}.")
+        else:
+            out.append(
+                f"{said}: exposures may be off by more than their standard errors say. Compare "
+                "them with --photometry.no-select and a simpler --photometry.model."
+            )
     if len(lost):
         out.append(
             f"The standard errors of {len(lost)} training view(s) cannot be told: what joins them "

@@ -89,4 +89,14 @@ def test_an_end_that_is_none_is_said(monkeypatch, rounds):
     assert any("models compared had not settled" in r for r in found.reasons) == (rounds == 3)
     if rounds == 3:
         assert s.state["last_change"] > solution.TOLERANCE
-        assert f"{s.moved:.2g}" in s.warnings[0]
+        assert "more than their standard errors say" in s.warnings[0]
+
+
+def test_an_end_that_is_near_enough_does_not_alarm(monkeypatch):
+    problem = make_problem(observe(DRIVE, ISO2), **LIMITS)
+    settled = fit_model(problem, "view_exposure")
+    monkeypatch.setattr(bundle_adjustment, "MOST_ROUNDS", settled.rounds - 1)
+    s = fit_model(problem, "view_exposure")
+    assert not s.converged
+    assert any("had not settled" in w and "is less than 10%" in w for w in s.warnings)
+    assert np.abs(s.log_exposures - settled.log_exposures).max() < 0.1 * s.exposure_errors.min()
