@@ -45,7 +45,7 @@ def noticed(fault: Fault) -> bool:
     with tempfile.TemporaryDirectory() as folder:
         planted(fault, Path(folder))
         done = subprocess.run(
-            [sys.executable, "-m", "pytest", "-q", "-x", f"tests/{fault.caught_by}"],
+            [sys.executable, "-m", "pytest", "-q", "-x", "-n", "0", f"tests/{fault.caught_by}"],
             cwd=folder,
             env=dict(os.environ, PYTHONPATH=folder),
             capture_output=True,
