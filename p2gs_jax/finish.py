@@ -25,6 +25,7 @@ from p2gs_jax.export.exr import read_exr, write_exr
 from p2gs_jax.export.photometry_json import ViewPhotometry, write_photometry
 from p2gs_jax.export.ply import write_ply, write_radiance
 from p2gs_jax.export.png import write_png
+from p2gs_jax.export.scene_file import write_scene
 from p2gs_jax.export.summary import write_summary
 from p2gs_jax.numerics import LN2
 from p2gs_jax.photometry.look import Look, develop
@@ -244,6 +245,7 @@ def finish(
     watch.add("evaluation", -watch.seconds.get("files", 0.0))
     reporter.stage("Writing files")
     begin = time.perf_counter()
+    write_scene(run_dir, scene)
     write_models(params, run_dir, cfg)
     model, curve, gauge = photometry_model(params, cfg)
     write_photometry(

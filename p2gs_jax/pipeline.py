@@ -20,7 +20,6 @@ from p2gs_jax.evaluate.lpips import LpipsWeights
 from p2gs_jax.export.atomic import no_empty_folders, write_json
 from p2gs_jax.export.checkpoint import CheckpointStore
 from p2gs_jax.export.places import remembered
-from p2gs_jax.export.scene_file import write_scene
 from p2gs_jax.finish import finish
 from p2gs_jax.photometry.gauge import recentre
 from p2gs_jax.photometry.selection import Selection
@@ -175,7 +174,7 @@ def fit(
             reasons=reasons,
         )
         cfg = prepared.cfg
-        with _lock(paths, given, scene):
+        with _lock(paths, given):
             result = optimise(
                 prepared,
                 run_dir,
@@ -224,7 +223,7 @@ def fit(
 
 
 @contextlib.contextmanager
-def _lock(paths: Paths, cfg: FitConfig, scene: Scene) -> Iterator[None]:
+def _lock(paths: Paths, cfg: FitConfig) -> Iterator[None]:
     """Make the folder a run's while its steps are taken, and keep it where they left something.
 
     A run that failed before its first checkpoint leaves nothing to continue or to overwrite.
@@ -232,7 +231,6 @@ def _lock(paths: Paths, cfg: FitConfig, scene: Scene) -> Iterator[None]:
     Args:
         paths: of the fit.
         cfg: as the user gave it.
-        scene: what can be opened again without its photographs.
     """
     path = paths.run / "config.json"
     write_json(
@@ -243,7 +241,6 @@ def _lock(paths: Paths, cfg: FitConfig, scene: Scene) -> Iterator[None]:
             "fit": config_to_dict(cfg),
         },
     )
-    write_scene(paths.run, scene)
     try:
         yield
     except UserError:

@@ -181,10 +181,10 @@ def evaluate(
     score = functools.partial(_score, lpips_weights)
     mean_correction = small.mean_correction
 
-    def shown(linear, exposure, gamma, correction=mean_correction):
-        return develop(linear, Look(exposure, gamma, cfg.photometry, correction))
-
     tone = cfg.photometry
+
+    def shown(linear, exposure, gamma, correction=mean_correction):
+        return develop(linear, Look(exposure, gamma, tone, correction))
 
     def fitted(linear, photograph, mask) -> float:
         """Solve the exposure of a view that has none of its own."""

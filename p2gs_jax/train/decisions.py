@@ -8,13 +8,13 @@ So a resumed run keeps what its checkpoints say.
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
+from p2gs_jax.export.atomic import plain
 from p2gs_jax.export.checkpoint import CheckpointStore
 
 KEY = "decided"
@@ -33,7 +33,7 @@ def decisions(cfg: FitConfig) -> dict[str, Any]:
         "exposure_rate": o.exposures,
         "gamma_rate": o.gammas,
     }
-    return json.loads(json.dumps(values))
+    return plain(values)
 
 
 def recorded(cfg: FitConfig, reasons: Sequence[str]) -> dict[str, Any]:

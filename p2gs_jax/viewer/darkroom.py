@@ -104,6 +104,7 @@ class Darkroom:
 
     def _photograph_here(self) -> Photograph | None:
         assert self.frame is not None
+        self.trouble = None
         camera = self.frame.camera
         index = self.view_at(camera)
         if index is None:

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.look import develop
 from p2gs_jax.render.host import make_renderer
 from p2gs_jax.run_folder import load_run
@@ -145,6 +146,21 @@ def test_the_split_shows_the_photograph_in_its_place(room, run):
     np.testing.assert_array_equal(shown[right], rendered[right])
     # ... and it is about the same thing, so the halves belong together.
     assert np.mean(np.abs(rendered[left] - photo[left])) < 0.15
+
+
+def test_a_broken_photograph_is_said_until_one_can_be_shown(room, run, monkeypatch):
+    darkroom, _, store = room
+
+    def broken(*args):
+        raise UserError("0.png is torn.", fix="mend it")
+
+    split = replace(common_settings(run), mode="split")
+    with monkeypatch.context() as patch:
+        patch.setattr(store, "get", broken)
+        darkroom.develop(split)
+        assert darkroom.trouble == "0.png is torn."
+    darkroom.develop(split)
+    assert darkroom.trouble is None
 
 
 def test_where_no_photograph_was_taken_the_split_is_the_picture(room, run):
