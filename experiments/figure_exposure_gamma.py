@@ -24,9 +24,9 @@ import numpy as np
 from towns import METHODS, WIDE, fit_all, methods, options, stamp
 
 from p2gs_jax.evaluate.evaluate import mean_parameters
-from p2gs_jax.photometry.look import Look, develop
+from p2gs_jax.photometry.display import Look, develop
 from p2gs_jax.render.host import make_renderer
-from p2gs_jax.run_folder import Run, load_run
+from p2gs_jax.run.read import Run, load_run
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
 

@@ -19,7 +19,7 @@ import numpy as np
 
 import p2gs_jax
 from p2gs_jax.config import FitConfig
-from p2gs_jax.prepare import without_tracks
+from p2gs_jax.pipeline.prepare import without_tracks
 from p2gs_jax.sweep.rows import read_row
 
 # Name of the column, column of a sweep's table.

@@ -20,7 +20,7 @@ import numpy as np
 from p2gs_jax.evaluate.alignment import exposure_error
 from p2gs_jax.photometry.response import Response, log_exposed
 from p2gs_jax.photometry.solution import KnownExposures, fit_model, fit_response, make_problem
-from p2gs_jax.static_stack import (
+from p2gs_jax.pipeline.calibrate_stack import (
     PIVOT,
     SATURATED,
     StackResult,

@@ -32,7 +32,7 @@ from towns import (
 )
 
 from p2gs_jax.render.host import make_renderer
-from p2gs_jax.run_folder import load_run
+from p2gs_jax.run.read import load_run
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
 

@@ -28,7 +28,7 @@ from towns import (
 )
 
 from p2gs_jax.config import FitConfig, preset
-from p2gs_jax.prepare import without_tracks
+from p2gs_jax.pipeline.prepare import without_tracks
 from p2gs_jax.sweep import with_fields
 
 # Table 4 of the paper (Waymo): PSNR.

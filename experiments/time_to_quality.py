@@ -38,8 +38,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
+from p2gs_jax.core.atomic import atomic_folder, atomic_write, write_json
 from p2gs_jax.evaluate.alignment import exposure_error
-from p2gs_jax.export.atomic import atomic_folder, atomic_write, write_json
 from p2gs_jax.synth.exposures import read_true_exposures
 from p2gs_jax.synth.rig import image_height
 from p2gs_jax.synth.sensor import Sensor

@@ -12,15 +12,15 @@ from p2gs_jax.errors import DivergenceError, UserError
 
 if TYPE_CHECKING:
     from p2gs_jax import sweep
-    from p2gs_jax.calibration import calibrate
     from p2gs_jax.evaluate.alignment import exposure_error
     from p2gs_jax.paths.pinhole import make_camera
-    from p2gs_jax.photometry.look import Look, develop
-    from p2gs_jax.pipeline import fit
-    from p2gs_jax.refine import calibrate_run
+    from p2gs_jax.photometry.display import Look, develop
+    from p2gs_jax.pipeline.calibrate import calibrate
+    from p2gs_jax.pipeline.calibrate_run import calibrate_run
+    from p2gs_jax.pipeline.calibrate_stack import calibrate_stack
+    from p2gs_jax.pipeline.fit import fit
     from p2gs_jax.render import render_linear, required_capacity
-    from p2gs_jax.run_folder import Run, load_run
-    from p2gs_jax.static_stack import calibrate_stack
+    from p2gs_jax.run.read import Run, load_run
     from p2gs_jax.sweep.fields import with_fields
     from p2gs_jax.synth.write import write_street
     from p2gs_jax.types import Camera, Gaussians, Params, Photometry, Render, Scene
@@ -55,15 +55,15 @@ __all__ = [
 
 
 _LAZY = {
-    "Look": "p2gs_jax.photometry.look",
-    "Run": "p2gs_jax.run_folder",
-    "calibrate": "p2gs_jax.calibration",
-    "calibrate_run": "p2gs_jax.refine",
-    "calibrate_stack": "p2gs_jax.static_stack",
-    "develop": "p2gs_jax.photometry.look",
+    "Look": "p2gs_jax.photometry.display",
+    "Run": "p2gs_jax.run.read",
+    "calibrate": "p2gs_jax.pipeline.calibrate",
+    "calibrate_run": "p2gs_jax.pipeline.calibrate_run",
+    "calibrate_stack": "p2gs_jax.pipeline.calibrate_stack",
+    "develop": "p2gs_jax.photometry.display",
     "exposure_error": "p2gs_jax.evaluate.alignment",
-    "fit": "p2gs_jax.pipeline",
-    "load_run": "p2gs_jax.run_folder",
+    "fit": "p2gs_jax.pipeline.fit",
+    "load_run": "p2gs_jax.run.read",
     "make_camera": "p2gs_jax.paths.pinhole",
     "render_linear": "p2gs_jax.render",
     "required_capacity": "p2gs_jax.render",

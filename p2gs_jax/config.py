@@ -256,7 +256,7 @@ class DensifyConfig:
     seeds."""
     max_gaussians: int | Literal["auto"] | None = None
     """Upper bound on the population, seeds included; None chooses from the pixels, the length of
-    the run and the seeds (densify/population.py), `auto` (mcmc only) stops growing where held-out
+    the run and the seeds (gaussians/population.py), `auto` (mcmc only) stops growing where held-out
     training views gain no more by it."""
     start: float = 1.0 / 60.0
     """First densification (3DGS: step 500)."""

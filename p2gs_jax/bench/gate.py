@@ -7,8 +7,8 @@ from pathlib import Path
 
 from p2gs_jax.bench.metrics import METRICS
 from p2gs_jax.bench.speed_error import Point
+from p2gs_jax.core.atomic import write_json
 from p2gs_jax.errors import UserError
-from p2gs_jax.export.atomic import write_json
 
 Rows = dict[str, dict[str, float]]
 

@@ -24,7 +24,7 @@ from p2gs_jax.bench.memory import Footprint
 from p2gs_jax.bench.metrics import ACCURACY, METRICS
 from p2gs_jax.bench.speed_error import DEFAULT, Point, front
 from p2gs_jax.bench.step import StepCost
-from p2gs_jax.export.atomic import atomic_write
+from p2gs_jax.core.atomic import atomic_write
 
 LEVEL_ACCURACY = ("relative", "relative_99", "gradient", "gradient_99")
 MARKERS = "osD^vPXhp*<>"

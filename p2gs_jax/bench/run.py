@@ -20,7 +20,7 @@ from p2gs_jax.bench import (
 from p2gs_jax.bench.scenes import BenchScene, street
 from p2gs_jax.bench.step import measure_step
 from p2gs_jax.config import RenderConfig, preset
-from p2gs_jax.export.atomic import write_json, write_text
+from p2gs_jax.core.atomic import write_json, write_text
 
 Part = Literal["speed_error", "levels", "growth", "memory", "step", "hard_cases", "implementations"]
 PARTS: tuple[Part, ...] = get_args(Part)

@@ -14,7 +14,7 @@ import optax
 from p2gs_jax.bench.scenes import BenchScene
 from p2gs_jax.bench.timing import interleaved
 from p2gs_jax.config import FitConfig
-from p2gs_jax.densify import mcmc
+from p2gs_jax.gaussians import mcmc
 from p2gs_jax.losses.image import photometric_loss
 from p2gs_jax.losses.total import Partner
 from p2gs_jax.photometry.formation import formation

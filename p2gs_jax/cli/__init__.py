@@ -30,12 +30,12 @@ def _run(argv: list[str]) -> int:
         return 0
     # Imported here so that --help answers at once.
     if name not in WITHOUT_JAX:
-        from p2gs_jax.compile_cache import use_compile_cache
-        from p2gs_jax.runtime import tune_process
+        from p2gs_jax.core.compile_cache import use_compile_cache
+        from p2gs_jax.core.runtime import tune_process
 
         use_compile_cache()
         tune_process()
-    return import_module(f"p2gs_jax.commands.{name}").run(options)
+    return import_module(f"p2gs_jax.cli.commands.{name}").run(options)
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -71,7 +71,7 @@ def _missing(error: ImportError, argv: list[str]) -> int:
     if (error.name or "").split(".")[0] == "p2gs_jax":
         raise error
     if argv[:1] == ["doctor"]:
-        from p2gs_jax.commands.doctor import diagnose
+        from p2gs_jax.cli.commands.doctor import diagnose
 
         return diagnose(as_json="--json" in argv)
     fix = "`p2gs-jax doctor` says what is missing for what"

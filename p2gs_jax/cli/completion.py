@@ -7,10 +7,10 @@ import re
 import tyro
 
 from p2gs_jax.cli import wording
+from p2gs_jax.cli.options.render import PATHS
+from p2gs_jax.cli.options.setup import Shell
 from p2gs_jax.cli.parser import every_command
-from p2gs_jax.cli.rule import registry
-from p2gs_jax.options.render import PATHS
-from p2gs_jax.options.setup import Shell
+from p2gs_jax.cli.tyro_rules import registry
 
 # tyro offers no path where an option could stand: shells shall look for one themselves.
 BASH_PATHS = """

@@ -10,19 +10,19 @@ from typing import Annotated, Any, Union
 import tyro
 
 from p2gs_jax.cli import wording
-from p2gs_jax.cli.rule import registry
+from p2gs_jax.cli.options.experiments import Bench, Demo, Sweep, Synth
+from p2gs_jax.cli.options.export import Export
+from p2gs_jax.cli.options.fit import Calibrate, Fit, named_preset
+from p2gs_jax.cli.options.pages import Compare, Report
+from p2gs_jax.cli.options.render import Render
+from p2gs_jax.cli.options.results import Eval
+from p2gs_jax.cli.options.setup import Completion, Doctor
+from p2gs_jax.cli.options.view import View
 from p2gs_jax.cli.synonyms import check_words
+from p2gs_jax.cli.tyro_rules import registry
 from p2gs_jax.errors import UserError
-from p2gs_jax.options.experiments import Bench, Demo, Sweep, Synth
-from p2gs_jax.options.export import Export
-from p2gs_jax.options.fit import Calibrate, Fit, named_preset
-from p2gs_jax.options.pages import Compare, Report
-from p2gs_jax.options.render import Render
-from p2gs_jax.options.results import Eval
-from p2gs_jax.options.setup import Completion, Doctor
-from p2gs_jax.options.view import View
 
-# A name is both the subcommand and the module of `p2gs_jax.commands` that runs it.
+# A name is both the subcommand and the module of `p2gs_jax.cli.commands` that runs it.
 COMMANDS: dict[str, type] = {
     "fit": Fit,
     "calibrate": Calibrate,

@@ -27,7 +27,7 @@ class Cache:
 def look() -> Cache:
     """Make JAX use the cache, and say how it is; never raises."""
     try:
-        from p2gs_jax.compile_cache import MOST_BYTES, cache_folder, use_compile_cache
+        from p2gs_jax.core.compile_cache import MOST_BYTES, cache_folder, use_compile_cache
 
         use_compile_cache()
         folder = cache_folder()

@@ -27,8 +27,8 @@ from p2gs_jax.evaluate.lpips import LpipsWeights, lpips
 from p2gs_jax.evaluate.metrics import psnr, ssim
 from p2gs_jax.evaluate.radiance import RadianceScores, Truth
 from p2gs_jax.evaluate.shelf import Kept, Shelf
+from p2gs_jax.photometry.display import Look, develop
 from p2gs_jax.photometry.formation import inverse_tone_map
-from p2gs_jax.photometry.look import Look, develop
 from p2gs_jax.photometry.solution import LADDER
 from p2gs_jax.render.host import RenderView
 from p2gs_jax.scene.device import camera_of

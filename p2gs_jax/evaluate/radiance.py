@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool, Float
 
+from p2gs_jax.core.numerics import LN2
 from p2gs_jax.evaluate.in_order import in_order
 from p2gs_jax.evaluate.metrics import ssim
 from p2gs_jax.evaluate.shelf import Kept, Shelf
-from p2gs_jax.numerics import LN2
 
 Truth = Callable[[int], Float[np.ndarray, "h w 3"] | None]
 

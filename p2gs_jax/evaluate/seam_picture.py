@@ -11,7 +11,7 @@ from jaxtyping import Float, Float32
 from scipy.spatial.transform import Rotation
 
 from p2gs_jax.evaluate.seams import Photographed, decoded
-from p2gs_jax.photometry.look import Look, develop
+from p2gs_jax.photometry.display import Look, develop
 from p2gs_jax.render.warp import project_points, sample_bilinear, surface_depth, unproject
 from p2gs_jax.types import Camera, Render
 

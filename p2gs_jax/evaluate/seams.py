@@ -24,8 +24,8 @@ from jaxtyping import Bool, Float, Float32
 from scipy.sparse import csr_array
 
 from p2gs_jax.config import LossConfig
+from p2gs_jax.photometry.display import Look, develop
 from p2gs_jax.photometry.formation import inverse_tone_map
-from p2gs_jax.photometry.look import Look, develop
 from p2gs_jax.render.warp import sample_bilinear, warp
 from p2gs_jax.scene.visibility import project_points, unoccluded
 from p2gs_jax.types import Camera, Scene

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from p2gs_jax.config import FitConfig, RegularizerConfig
-from p2gs_jax.densify.population import opacities
+from p2gs_jax.gaussians.population import opacities
 from p2gs_jax.types import GAMMA_SRGB, Gaussians, Photometry
 
 

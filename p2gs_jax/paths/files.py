@@ -15,8 +15,8 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from jaxtyping import Float
 
+from p2gs_jax.core.atomic import write_json
 from p2gs_jax.errors import UserError
-from p2gs_jax.export.atomic import write_json
 from p2gs_jax.paths.geometry import inverse
 from p2gs_jax.paths.pinhole import LARGEST, as_matrix, checked_lens, orthonormal
 from p2gs_jax.paths.shots import Shot

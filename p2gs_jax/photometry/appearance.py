@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from p2gs_jax.config import Appearance
-from p2gs_jax.numerics import on_device
+from p2gs_jax.core.numerics import on_device
 from p2gs_jax.types import LUMINANCE
 
 # Luminance levels, rows and columns of a bilateral grid, as its authors use.

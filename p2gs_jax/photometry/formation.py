@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from p2gs_jax.config import PhotometryConfig
-from p2gs_jax.numerics import Scalar, Values, namespace, positive_pow, safe_log
+from p2gs_jax.core.numerics import Scalar, Values, namespace, positive_pow, safe_log
 from p2gs_jax.photometry.appearance import corrected
 from p2gs_jax.photometry.response import DARKEST, Response, log_exposed
 from p2gs_jax.types import GAMMA_SRGB

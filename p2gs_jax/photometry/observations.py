@@ -10,8 +10,8 @@ import scipy.sparse as sp
 from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import connected_components
 
+from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.photometry.response import Response, deviation, hat, log_exposed
-from p2gs_jax.streams import Stream, generator
 
 LONGEST_ROW = 16
 

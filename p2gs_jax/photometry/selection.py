@@ -18,7 +18,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from p2gs_jax.numerics import LN2
+from p2gs_jax.core.numerics import LN2
+from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.photometry.bundle_adjustment import MOST_ROUNDS, Fit
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import (
@@ -37,7 +38,6 @@ from p2gs_jax.photometry.solution import (
     make_problem,
     solve_model,
 )
-from p2gs_jax.streams import Stream, generator
 
 HELD_OUT = 0.2
 STANDARD_ERRORS, SMALLEST_GAIN = 2.0, 0.01

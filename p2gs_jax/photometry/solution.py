@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from p2gs_jax.config import PhotometricModel as ModelName
-from p2gs_jax.numerics import LN2
+from p2gs_jax.core.numerics import LN2
 from p2gs_jax.photometry.bundle_adjustment import (
     Fit,
     System,

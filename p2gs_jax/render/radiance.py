@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from p2gs_jax.numerics import Values, namespace
+from p2gs_jax.core.numerics import Values, namespace
 
 RadianceKind = Literal["exp", "softplus", "linear"]
 LOG_RADIANCE_LIMIT = 30.0

@@ -12,7 +12,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Int
 
 from p2gs_jax.config import RenderConfig
-from p2gs_jax.numerics import namespace
+from p2gs_jax.core.numerics import namespace
 from p2gs_jax.render.cutoff import smallest_cutoff
 from p2gs_jax.render.project import LOG_SCALE_RANGE, TANGENT_LIMIT
 from p2gs_jax.render.xla_cpu import compiled_loop

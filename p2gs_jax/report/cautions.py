@@ -7,12 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from p2gs_jax.calibration import WEAK_GAMMA
-from p2gs_jax.export.photometry_json import ViewPhotometry
 from p2gs_jax.photometry.solution import LADDER, MIN_OBSERVATIONS
+from p2gs_jax.pipeline.calibrate import WEAK_GAMMA
 from p2gs_jax.report.from_scene import FromScene
 from p2gs_jax.report.run_files import RunFiles, number_at
 from p2gs_jax.report.words import against_exif, count
+from p2gs_jax.run.photometry_file import ViewPhotometry
 
 # Held-out photographs met so much worse than training ones, dB.
 WIDE_GAP = 4.0

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from p2gs_jax.core.atomic import write_text
 from p2gs_jax.errors import UserError
-from p2gs_jax.export.atomic import write_text
 from p2gs_jax.report.compare import (
     Comparison,
     Row,

@@ -6,17 +6,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from p2gs_jax.core.progress import Reporter
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.metrics import psnr
 from p2gs_jax.evaluate.seam_picture import Halves, halves
 from p2gs_jax.evaluate.seams import Photographed, Seam, measure, neighbours
-from p2gs_jax.photometry.look import develop
-from p2gs_jax.progress import Reporter
+from p2gs_jax.photometry.display import develop
 from p2gs_jax.render.host import make_renderer
 from p2gs_jax.render.warp import surface_depth
 from p2gs_jax.report.run_files import RunFiles
 from p2gs_jax.report.strips import Strip, spread
-from p2gs_jax.run_folder import Run, load_run
+from p2gs_jax.run.read import Run, load_run
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.synth.exposures import read_true_exposures

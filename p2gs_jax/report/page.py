@@ -9,8 +9,8 @@ from importlib import resources
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+from p2gs_jax.core.atomic import write_text
 from p2gs_jax.errors import UserError
-from p2gs_jax.export.atomic import write_text
 
 # Nothing is fetched, whatever the page came to hold.
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"

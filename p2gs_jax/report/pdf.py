@@ -8,8 +8,8 @@ import subprocess
 import tempfile
 from pathlib import Path
 
+from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.errors import UserError
-from p2gs_jax.export.atomic import atomic_write
 
 BROWSERS = (
     *("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome"),

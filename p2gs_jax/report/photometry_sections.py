@@ -10,7 +10,6 @@ import numpy as np
 
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.errors import UserError
-from p2gs_jax.export.photometry_json import ViewPhotometry
 from p2gs_jax.photometry.formation import inverse_tone_map
 from p2gs_jax.photometry.solution import LADDER
 from p2gs_jax.report import words
@@ -29,7 +28,8 @@ from p2gs_jax.report.from_scene import FromScene, true_stops
 from p2gs_jax.report.page import Section, figure, folded, listed, paragraph, table
 from p2gs_jax.report.run_files import RunFiles
 from p2gs_jax.report.svg import FIRST, INK, SECOND
-from p2gs_jax.run_folder import resolved
+from p2gs_jax.run.photometry_file import ViewPhotometry
+from p2gs_jax.run.read import resolved
 from p2gs_jax.types import GAMMA_SRGB
 
 # More cameras than this, or cameras with fewer views than this, share one panel.

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from p2gs_jax.export.false_color import STOPS
+from p2gs_jax.formats.false_color import STOPS
 from p2gs_jax.report import words
 from p2gs_jax.report.from_scene import FromScene
 from p2gs_jax.report.page import Section, figure, folded, paragraph, row, table, text

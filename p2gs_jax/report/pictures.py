@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 
-from p2gs_jax.export.false_color import STOPS, false_color, luminance, stops
+from p2gs_jax.formats.false_color import STOPS, false_color, luminance, stops
 
 # Largest width, pixels: a third of the page on a screen of twice its resolution, and all of it.
 SMALL, LARGE = 560, 900

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from p2gs_jax.progress import Reporter, Silent
+from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.report import words
 from p2gs_jax.report.cautions import Caution, cautions
 from p2gs_jax.report.from_scene import FromScene, ask_scene

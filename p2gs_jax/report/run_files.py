@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from p2gs_jax.config import FitConfig, from_dict
+from p2gs_jax.core.atomic import read_jsonl
 from p2gs_jax.errors import UserError
-from p2gs_jax.export.atomic import read_jsonl
-from p2gs_jax.export.photometry_json import PhotometryFile, ViewPhotometry, read_photometry
-from p2gs_jax.export.places import find
+from p2gs_jax.run.photometry_file import PhotometryFile, ViewPhotometry, read_photometry
+from p2gs_jax.run.places import find
 
 
 @dataclass(frozen=True)

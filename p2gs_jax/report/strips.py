@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.export.exr import read_exr
+from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.report.run_files import HeldOut, RunFiles, number_at
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from p2gs_jax.clock import whole_run
+from p2gs_jax.core.clock import whole_run
 from p2gs_jax.evaluate.alignment import ExposureError, exposure_error
 from p2gs_jax.photometry.agreement import Agreement, compare
 from p2gs_jax.photometry.selection import WORDS

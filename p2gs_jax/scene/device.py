@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from p2gs_jax.numerics import on_device
+from p2gs_jax.core.numerics import on_device
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Camera
 

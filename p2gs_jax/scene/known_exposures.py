@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from p2gs_jax.core.numerics import LN2
 from p2gs_jax.errors import UserError
-from p2gs_jax.numerics import LN2
 from p2gs_jax.types import View
 
 KINDS = ("ev", "exposure", "rel_exposure_ev", "exposure_time_s")

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from p2gs_jax.clock import whole_run
+from p2gs_jax.core.clock import whole_run
 from p2gs_jax.evaluate.alignment import exposure_error
 from p2gs_jax.synth.exposures import read_true_exposures
 

@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from p2gs_jax.config import FitConfig, to_dict
+from p2gs_jax.core.atomic import write_json, write_text
 from p2gs_jax.errors import UserError
-from p2gs_jax.export.atomic import write_json, write_text
-from p2gs_jax.preflight import check_run_dir
+from p2gs_jax.pipeline.preflight import check_run_dir
 from p2gs_jax.sweep.rows import read_row, to_markdown
 from p2gs_jax.sweep.worker import REASON
 

@@ -8,12 +8,12 @@ import time
 import traceback
 from pathlib import Path
 
-from p2gs_jax.compile_cache import use_compile_cache
 from p2gs_jax.config import from_dict
+from p2gs_jax.core.atomic import write_json
+from p2gs_jax.core.compile_cache import use_compile_cache
+from p2gs_jax.core.runtime import tune_process
 from p2gs_jax.errors import UserError
-from p2gs_jax.export.atomic import write_json
-from p2gs_jax.pipeline import fit
-from p2gs_jax.runtime import tune_process
+from p2gs_jax.pipeline.fit import fit
 
 REASON = "failure.json"
 

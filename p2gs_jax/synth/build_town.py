@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from p2gs_jax.streams import SceneStream, generator
+from p2gs_jax.core.streams import SceneStream, generator
 from p2gs_jax.synth import houses, street_furniture
 from p2gs_jax.synth.settings import Layout
 from p2gs_jax.synth.solids import Builder, pack

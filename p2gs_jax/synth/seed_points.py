@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
-from p2gs_jax.streams import SceneStream, generator
+from p2gs_jax.core.streams import SceneStream, generator
 
 _DEPTH_TOLERANCE = 0.01
 _SEED_RANGE = 90.0  # m: farther points are not triangulated

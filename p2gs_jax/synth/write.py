@@ -28,8 +28,8 @@ import OpenEXR
 from jaxtyping import Float32, Float64, Int, UInt8
 from PIL import Image
 
+from p2gs_jax.core.streams import SceneStream, generator
 from p2gs_jax.errors import UserError
-from p2gs_jax.streams import SceneStream, generator
 from p2gs_jax.synth.build_town import build_town
 from p2gs_jax.synth.colmap_files import DriveViews, write_colmap
 from p2gs_jax.synth.exposures import write_true_exposures

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from p2gs_jax.config import FitConfig
+from p2gs_jax.core.atomic import plain
 from p2gs_jax.errors import UserError
-from p2gs_jax.export.atomic import plain
-from p2gs_jax.export.checkpoint import CheckpointStore
+from p2gs_jax.run.checkpoint import CheckpointStore
 
 KEY = "decided"
 

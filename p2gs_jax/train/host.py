@@ -1,4 +1,4 @@
-"""What the host knows of a run between bursts, and what it says about it."""
+"""What the host knows of a run between bursts."""
 
 from __future__ import annotations
 
@@ -49,24 +49,3 @@ class HostState:
         rooms = {size: Room(*room) for size, room in values.get("rooms", {}).items()}
         growth = Growth.from_dict(values.get("growth", {}))
         return cls(**{**values, "rooms": rooms, "growth": growth})
-
-
-@dataclass(frozen=True)
-class LogRecord:
-    """One line of `log.jsonl`, and what the live display shows.
-
-    Those of a trial, the run without growth that automatic growth compares with, are lines of
-    `growth.jsonl`.
-    """
-
-    step: int
-    progress: float
-    loss: float
-    psnr: float
-    gaussians: int
-    shrink: int
-    entries: int
-    seconds: float
-    step_seconds: float
-    terms: dict[str, float]
-    trial: bool = False

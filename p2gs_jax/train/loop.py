@@ -23,27 +23,28 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from p2gs_jax.clock import Stopwatch
 from p2gs_jax.config import FitConfig
-from p2gs_jax.densify import adaptive, mcmc
-from p2gs_jax.densify.population import (
+from p2gs_jax.core.atomic import append_jsonl, read_jsonl, write_text
+from p2gs_jax.core.clock import Stopwatch
+from p2gs_jax.core.numerics import on_host
+from p2gs_jax.core.progress import LogRecord
+from p2gs_jax.core.streams import Stream, densification_key, generator
+from p2gs_jax.errors import DivergenceError, UserError
+from p2gs_jax.gaussians import adaptive, mcmc
+from p2gs_jax.gaussians.population import (
     STEP_SECONDS_PER_PIXEL,
     Coverage,
     bucket_for,
     default_max_gaussians,
 )
-from p2gs_jax.errors import DivergenceError, UserError
-from p2gs_jax.export.atomic import append_jsonl, read_jsonl, write_text
-from p2gs_jax.export.checkpoint import CheckpointStore
 from p2gs_jax.losses.relative_exposure import ColorPairs
 from p2gs_jax.losses.total import OBSERVED_FORMS, SECOND_RENDER_FORMS, Partner
-from p2gs_jax.numerics import on_host
 from p2gs_jax.render.capacity import Room
-from p2gs_jax.streams import Stream, densification_key, generator
+from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.train import decisions, growth, schedule
 from p2gs_jax.train.demand import demand
 from p2gs_jax.train.growth import Look, Stage
-from p2gs_jax.train.host import HostState, LogRecord
+from p2gs_jax.train.host import HostState
 from p2gs_jax.train.optimizer import make_optimizer, zero_moments, zero_opacity_moments
 from p2gs_jax.train.programs import Key, StepPrograms
 from p2gs_jax.train.room import room_for

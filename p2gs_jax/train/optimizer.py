@@ -16,7 +16,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int
 
 from p2gs_jax.config import FitConfig
-from p2gs_jax.densify.population import grow
+from p2gs_jax.gaussians.population import grow
 from p2gs_jax.photometry.solution import LADDER
 from p2gs_jax.types import Gaussians, Params, Photometry
 

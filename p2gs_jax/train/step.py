@@ -15,15 +15,15 @@ import optax
 from jaxtyping import Array, Bool, Float, Int
 
 from p2gs_jax.config import FitConfig
+from p2gs_jax.core.numerics import on_host
+from p2gs_jax.core.streams import noise_key
 from p2gs_jax.losses.regularizers import population_terms
 from p2gs_jax.losses.total import Partner, decoded, image_loss, partner_cameras
-from p2gs_jax.numerics import on_host
 from p2gs_jax.render.blocks import Shown, splat, splat_listed, whole_blocks
 from p2gs_jax.render.capacity import Room
 from p2gs_jax.render.spherical_harmonics import coefficient_count
 from p2gs_jax.render.visible import compact, in_view
 from p2gs_jax.render.xla_cpu import compiler_options
-from p2gs_jax.streams import noise_key
 from p2gs_jax.train.optimizer import Optimizer, OptState, learning_rates, means_rate
 from p2gs_jax.train.state import (
     FAULT_NONE,

@@ -16,7 +16,7 @@ import optax
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from p2gs_jax.densify.mcmc import exploration_noise
+from p2gs_jax.gaussians.mcmc import exploration_noise
 from p2gs_jax.render.blocks import block_size, put_rows, slice_of, take_rows
 from p2gs_jax.train.optimizer import AdamState
 from p2gs_jax.types import Gaussians

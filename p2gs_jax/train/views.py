@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Int
 
-from p2gs_jax.numerics import on_host
+from p2gs_jax.core.numerics import on_host
+from p2gs_jax.core.streams import Stream, generator, view_order
 from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.streams import Stream, generator, view_order
 from p2gs_jax.types import Batch, Camera
 
 

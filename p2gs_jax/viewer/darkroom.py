@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.run_folder import Run
+from p2gs_jax.run.read import Run
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Camera

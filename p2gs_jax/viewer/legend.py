@@ -8,7 +8,7 @@ import matplotlib
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from p2gs_jax.export.false_color import DEPTH_MAP, OVER, STOPS, STOPS_MAP, UNDER, false_color
+from p2gs_jax.formats.false_color import DEPTH_MAP, OVER, STOPS, STOPS_MAP, UNDER, false_color
 
 BOX = "margin:0 0.75em 0.75em;font-size:0.75em;line-height:1.4;opacity:0.9"
 COLORS = 12

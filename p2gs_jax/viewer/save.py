@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from p2gs_jax.export.exr import write_exr
-from p2gs_jax.export.png import write_png
-from p2gs_jax.photometry.look import Look
+from p2gs_jax.formats.exr import write_exr
+from p2gs_jax.formats.png import write_png
+from p2gs_jax.photometry.display import Look
 from p2gs_jax.viewer.shade import Frame
 
 # Fewest and most pixels across.

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 import viser
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.run_folder import Run
+from p2gs_jax.run.read import Run
 from p2gs_jax.viewer.ladder import full_size, ladder, order_of_compilation
 from p2gs_jax.viewer.session import Session
 from p2gs_jax.viewer.studio import Studio

@@ -7,8 +7,8 @@ from typing import Literal
 
 import numpy as np
 
-from p2gs_jax.photometry.look import Look
-from p2gs_jax.run_folder import Run
+from p2gs_jax.photometry.display import Look
+from p2gs_jax.run.read import Run
 from p2gs_jax.viewer.shade import Mode
 
 ChosenCurve = Literal["run", "srgb", "power", "linear"]

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, UInt8
 
-from p2gs_jax.export.false_color import clipping_overlay, depth_color, false_color
-from p2gs_jax.photometry.look import Look, develop
+from p2gs_jax.formats.false_color import clipping_overlay, depth_color, false_color
+from p2gs_jax.photometry.display import Look, develop
 from p2gs_jax.types import Camera
 
 Mode = Literal["display", "stops", "clipping", "depth", "split"]

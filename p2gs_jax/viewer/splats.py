@@ -16,8 +16,8 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from scipy.spatial.transform import Rotation
 
 from p2gs_jax.config import RenderConfig
-from p2gs_jax.export.false_color import false_color
-from p2gs_jax.photometry.look import Look, develop
+from p2gs_jax.formats.false_color import false_color
+from p2gs_jax.photometry.display import Look, develop
 from p2gs_jax.render import view_radiance
 from p2gs_jax.types import Camera, Gaussians
 from p2gs_jax.viewer.settings import Settings

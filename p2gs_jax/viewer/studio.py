@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.photometry.look import develop
-from p2gs_jax.run_folder import Run
+from p2gs_jax.photometry.display import develop
+from p2gs_jax.run.read import Run
 from p2gs_jax.scene.images import size_at
 from p2gs_jax.types import Camera
 from p2gs_jax.viewer.darkroom import Darkroom

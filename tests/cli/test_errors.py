@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from p2gs_jax.cli import main
+from p2gs_jax.cli.options.parse import parse_duration
 from p2gs_jax.config import preset, to_dict
+from p2gs_jax.core.atomic import no_empty_folders
 from p2gs_jax.errors import UserError
-from p2gs_jax.export.atomic import no_empty_folders
-from p2gs_jax.options.parse import parse_duration
-from p2gs_jax.preflight import check_run_dir
+from p2gs_jax.pipeline.preflight import check_run_dir
 
 
 def run(capsys, *argv):

@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from p2gs_jax.cli import main
 from p2gs_jax.config import DataConfig
-from p2gs_jax.export.exr import read_exr
-from p2gs_jax.export.ply import read_ply
-from p2gs_jax.export.splat_file import read_splat
+from p2gs_jax.formats.exr import read_exr
+from p2gs_jax.formats.ply import read_ply
+from p2gs_jax.formats.splat import read_splat
 from p2gs_jax.render.host import make_renderer
-from p2gs_jax.run_folder import load_run
+from p2gs_jax.run.read import load_run
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
@@ -114,10 +114,10 @@ def test_the_baking_error_is_written_and_true(exported):
         error = said["baking_error"][split]
         assert error["views"] == len(rows)
         assert any(f"median {error['psnr_median']:.2f} dB" in c for c in comments)
-    # One view judged here, with nothing from export/bake.py.
+    # One view judged here, with nothing from gaussians/bake.py.
     from dataclasses import replace
 
-    from p2gs_jax.photometry.look import develop
+    from p2gs_jax.photometry.display import develop
 
     index = fitted.scene.train_indices[1]
     camera = camera_of(ImageStore(fitted.scene.views, fitted.cfg.data), index)
@@ -196,7 +196,7 @@ def test_spz_holds_the_display_colours(finished_run, capsys, tmp_path):
     argv = ("export", finished_run, "--format", "display-ply", "spz", "--out", tmp_path)
     code, text = run(capsys, *argv, "--bake-steps", "5")
     assert code == 0, text
-    from p2gs_jax.export.spz_file import read_spz
+    from p2gs_jax.formats.spz import read_spz
 
     ply, spz = read_ply(tmp_path / "display.ply"), read_spz(tmp_path / "display.spz")
     np.testing.assert_allclose(spz.means, ply.means, atol=1e-3)
@@ -270,7 +270,7 @@ def test_no_run_and_an_unfinished_one(capsys, tmp_path):
 def test_names_that_lead_outside_are_refused(finished_run, capsys, tmp_path, monkeypatch):
     from dataclasses import replace
 
-    from p2gs_jax.commands import export
+    from p2gs_jax.cli.commands import export
 
     def outside(folder, scene=None):
         fitted = load_run(folder)
@@ -288,7 +288,7 @@ def test_names_that_lead_outside_are_refused(finished_run, capsys, tmp_path, mon
 def test_corrections_travel_with_the_linear_ply(finished_run, capsys, tmp_path, monkeypatch):
     from dataclasses import replace
 
-    from p2gs_jax.commands import export
+    from p2gs_jax.cli.commands import export
 
     def corrected(folder, scene=None):
         fitted = load_run(folder)

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from p2gs_jax.cli import main
-from p2gs_jax.export.exr import read_exr
+from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.paths import Shot, covering, find_rig, view_shots
-from p2gs_jax.photometry.look import Look, develop
-from p2gs_jax.pictures import Studio
-from p2gs_jax.run_folder import load_run
+from p2gs_jax.paths.pictures import Studio
+from p2gs_jax.photometry.display import Look, develop
+from p2gs_jax.run.read import load_run
 
 SIZE = (96, 72)
 YAWS = {"left": -22.0, "right": 22.0}

@@ -10,9 +10,9 @@ from tiny_scene import make_scene
 from p2gs_jax.cli import main
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
-from p2gs_jax.export.places import candidates, find, remembered
-from p2gs_jax.export.scene_file import SCENE_FILE, read_scene, write_scene
-from p2gs_jax.run_folder import load_run
+from p2gs_jax.run.places import candidates, find, remembered
+from p2gs_jax.run.read import load_run
+from p2gs_jax.run.scene_file import SCENE_FILE, read_scene, write_scene
 from p2gs_jax.scene import load_scene
 
 

@@ -11,7 +11,7 @@ import pytest
 from packaging.requirements import Requirement
 
 from p2gs_jax.cli import main
-from p2gs_jax.commands import doctor
+from p2gs_jax.cli.commands import doctor
 from p2gs_jax.doctor import cache, features, libraries, machine, render
 
 PROJECT = Path(__file__).resolve().parents[2] / "pyproject.toml"
@@ -176,7 +176,7 @@ def test_cores_of_a_container(container):
 
 
 def test_an_unwritable_cache_is_said(monkeypatch, tmp_path):
-    import p2gs_jax.compile_cache as compile_cache
+    import p2gs_jax.core.compile_cache as compile_cache
 
     monkeypatch.setattr(compile_cache, "use_compile_cache", lambda: None)
     monkeypatch.setattr(compile_cache, "cache_folder", lambda: tmp_path)

@@ -9,7 +9,7 @@ import pytest
 from p2gs_jax.config import LossConfig, PhotometryConfig
 from p2gs_jax.evaluate.seam_picture import halfway, halves, redeveloped
 from p2gs_jax.evaluate.seams import Photographed, measure, neighbours
-from p2gs_jax.photometry.look import Look, develop
+from p2gs_jax.photometry.display import Look, develop
 from p2gs_jax.types import Camera, Render, Scene, Tracks, View
 
 SIZE, FOCAL, DEPTH = 64, 60.0, 4.0

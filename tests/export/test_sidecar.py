@@ -10,10 +10,10 @@ from plyfile import PlyData
 from splats import random_splats
 
 from p2gs_jax.config import DataConfig, FitConfig, PhotometryConfig, RenderConfig
-from p2gs_jax.export.atomic import write_json
-from p2gs_jax.export.ply import write_radiance
+from p2gs_jax.core.atomic import write_json
 from p2gs_jax.export.sidecar import linear_sidecar
-from p2gs_jax.photometry.look import Look, develop
+from p2gs_jax.formats.ply import write_radiance
+from p2gs_jax.photometry.display import Look, develop
 from p2gs_jax.photometry.response import FREE, KNOTS
 from p2gs_jax.render.radiance import radiance_activation
 from p2gs_jax.render.spherical_harmonics import evaluate

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import preset
-from p2gs_jax.photometry.look import Look, develop, undevelop
+from p2gs_jax.photometry.display import Look, develop, undevelop
 from p2gs_jax.photometry.response import KNOTS
 
 SRGB = preset("robust").photometry

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import FitConfig, to_dict
-from p2gs_jax.export.atomic import write_json
-from p2gs_jax.export.photometry_json import write_photometry
-from p2gs_jax.export.ply import write_radiance
-from p2gs_jax.progress import Silent
+from p2gs_jax.core.atomic import write_json
+from p2gs_jax.core.progress import Silent
+from p2gs_jax.formats.ply import write_radiance
 from p2gs_jax.report.from_scene import ask_scene
 from p2gs_jax.report.run_files import read_run
+from p2gs_jax.run.photometry_file import write_photometry
 from p2gs_jax.types import Gaussians
 
 WIDTH, HEIGHT, FOCAL, WALL = 96, 64, 80.0, 4.0

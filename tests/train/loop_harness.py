@@ -8,9 +8,9 @@ import jax
 import numpy as np
 
 from p2gs_jax.config import FitConfig
-from p2gs_jax.densify.population import Coverage
-from p2gs_jax.export.atomic import read_jsonl
-from p2gs_jax.numerics import on_host
+from p2gs_jax.core.atomic import read_jsonl
+from p2gs_jax.core.numerics import on_host
+from p2gs_jax.gaussians.population import Coverage
 from p2gs_jax.sweep import with_fields
 from p2gs_jax.train import loop, session
 from p2gs_jax.train.state import FAULT_NONFINITE, FAULT_OVERFLOW, Fault, FitState

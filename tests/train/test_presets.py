@@ -7,7 +7,7 @@ import pytest
 from tiny_scene import make_scene
 
 import p2gs_jax
-from p2gs_jax.export.atomic import read_jsonl
+from p2gs_jax.core.atomic import read_jsonl
 
 FORMS = ("literal_same_pose", "literal_pixels", "exposed", "observed_linear", "observed_ldr")
 

@@ -13,7 +13,7 @@ from tiny_scene import make_scene
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.losses.total import Partner, image_loss, total_loss
-from p2gs_jax.pipeline import fit
+from p2gs_jax.pipeline.fit import fit
 from p2gs_jax.render.blocks import BLOCK, splat
 from p2gs_jax.render.capacity import Room
 from p2gs_jax.render.visible import in_view

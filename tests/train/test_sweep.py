@@ -7,7 +7,7 @@ from tiny_scene import make_scene
 
 import p2gs_jax
 from p2gs_jax.cli import main
-from p2gs_jax.clock import whole_run
+from p2gs_jax.core.clock import whole_run
 from p2gs_jax.sweep import grid, read_sweep, sweep, with_fields
 from p2gs_jax.sweep.rows import brief, failures, to_markdown
 

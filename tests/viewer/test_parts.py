@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from p2gs_jax.config import PhotometryConfig, RenderConfig
-from p2gs_jax.export.exr import read_exr
-from p2gs_jax.export.false_color import luminance
-from p2gs_jax.photometry.look import Look, develop
+from p2gs_jax.formats.exr import read_exr
+from p2gs_jax.formats.false_color import luminance
+from p2gs_jax.photometry.display import Look, develop
 from p2gs_jax.render import view_radiance
 from p2gs_jax.types import Camera, Gaussians, Scene, View
 from p2gs_jax.viewer.frames import center

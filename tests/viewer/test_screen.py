@@ -9,7 +9,7 @@ import pytest
 
 from p2gs_jax.errors import UserError
 from p2gs_jax.render.host import make_renderer
-from p2gs_jax.run_folder import load_run
+from p2gs_jax.run.read import load_run
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.viewer.darkroom import Darkroom
 from p2gs_jax.viewer.frames import Stage

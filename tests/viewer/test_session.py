@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from p2gs_jax.run_folder import load_run
+from p2gs_jax.run.read import load_run
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 

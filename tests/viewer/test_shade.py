@@ -6,8 +6,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from p2gs_jax.config import PhotometryConfig
-from p2gs_jax.export.false_color import OVER, clipping_overlay, depth_color, false_color
-from p2gs_jax.photometry.look import Look, develop
+from p2gs_jax.formats.false_color import OVER, clipping_overlay, depth_color, false_color
+from p2gs_jax.photometry.display import Look, develop
 from p2gs_jax.types import Camera
 from p2gs_jax.viewer.shade import (
     MIDDLE_GREY,

@@ -1,0 +1,126 @@
+"""`p2gs-jax calibrate`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from rich.box import SIMPLE
+from rich.table import Table
+
+from p2gs_jax.cli.commands.console import stdout
+from p2gs_jax.cli.options.fit import Calibrate, resolve_calibration
+from p2gs_jax.config import FitConfig
+from p2gs_jax.core.numerics import LN2
+from p2gs_jax.core.progress import TerminalReporter
+from p2gs_jax.errors import UserError
+from p2gs_jax.pipeline.calibrate import WEAK_GAMMA, Calibration, calibrate
+from p2gs_jax.pipeline.calibrate_run import calibrate_run
+from p2gs_jax.pipeline.calibrate_stack import calibrate_stack, write_stack
+
+
+def run(options: Calibrate) -> int:
+    """Solve the photometry alone; print it as a table."""
+    scene, out, compare_with = options.scene, options.out, options.compare_with
+    cfg = resolve_calibration(options)
+    if options.static:
+        return _run_static(scene, out, cfg, compare_with)
+    is_run = (scene / "config.json").is_file() and (scene / "radiance.ply").is_file()
+    with TerminalReporter() as reporter:
+        if is_run:
+            if cfg.data != FitConfig().data:
+                raise UserError(
+                    f"{scene} is a finished run: it keeps its own image size and folder.",
+                    fix="leave out --max-width, --images and --data options",
+                )
+            result = calibrate_run(
+                scene, out, cfg.photometry, compare_with=compare_with, reporter=reporter
+            )
+        else:
+            result = calibrate(scene, out, cfg, compare_with=compare_with, reporter=reporter)
+    _print_calibration(result)
+    stdout().print(f"Results: {out} (open {out / 'calibration.png'} first)")
+    return 0
+
+
+def _run_static(folder: Path, out: Path, cfg: FitConfig, compare_with: str | None) -> int:
+    if cfg.data != FitConfig().data:
+        raise UserError(
+            "--static reads every photograph of the folder at its own size.",
+            fix="leave out --max-width, --images and --data options",
+        )
+    with TerminalReporter() as reporter:
+        reporter.stage("Solving the stack")
+        result = calibrate_stack(
+            folder,
+            known=cfg.photometry.known,
+            known_deviation_ev=cfg.photometry.known_deviation_ev,
+            compare_with=compare_with,
+        )
+        write_stack(result, out)
+    console, s = stdout(), result.solution
+    table = Table(title="Exposures in stops from their mean", title_justify="left")
+    table.add_column("frame")
+    for name in ("exposure", "stated", "usable points", "signal"):
+        table.add_column(name, justify="right")
+    for i, name in enumerate(result.names):
+        error = s.exposure_errors[i] / LN2
+        table.add_row(
+            name,
+            f"{s.exposures_ev[i]:+.2f} +- {error:.2f}" if np.isfinite(error) else "unknown",
+            f"{result.stated_ev[i]:+.2f}" if np.isfinite(result.stated_ev[i]) else "",
+            str(s.observations_per_view[i]),
+            "yes" if result.signal[i] else "little",
+        )
+    console.print(table)
+    for message in result.messages:
+        console.print(message)
+    console.print(f"Response: {s.response.name}; residual {s.residual_ev:.2f} EV. Results: {out}")
+    return 0
+
+
+def _print_calibration(result: Calibration) -> None:
+    """Print exposures and gammas with their standard errors, and what to make of them."""
+    console, s, columns = stdout(), result.selection.solution, _columns(result)
+    table = Table(title="Exposures in stops from their mean", title_justify="left", box=SIMPLE)
+    for name in columns:
+        table.add_column(name, justify="left" if name in ("view", "camera") else "right")
+    for row in zip(*columns.values(), strict=True):
+        table.add_row(*row)
+    console.print(table)
+    for message in result.messages:
+        console.print(message)
+    console.print(
+        f"{result.observations} observations, {100 * s.outliers:.0f} % ignored as outliers; "
+        f"residual {s.residual_ev:.2f} EV; {result.seconds['reading']:.1f} s reading, "
+        f"{result.seconds['adjustment']:.1f} s adjusting."
+    )
+
+
+def _columns(result: Calibration) -> dict[str, list[str]]:
+    """Return the table's columns by title, without those that would say nothing."""
+    s, views = result.selection.solution, result.scene.views
+    errors, stated = s.exposure_errors / LN2, result.stated_ev
+    known, given = np.isfinite(errors), np.isfinite(stated)
+    rows = range(len(views))
+    columns = {"view": [v.name for v in views]}
+    if len({v.camera for v in views}) > 1:
+        columns["camera"] = [v.camera for v in views]
+    columns["exposure"] = [
+        f"{s.exposures_ev[i]:+.2f} +- {errors[i]:.2f}" if known[i] else "unknown" for i in rows
+    ]
+    if given.any():
+        gaps, wrong = result.agreement.gap_ev, result.agreement.disagrees
+        columns["stated"] = [f"{stated[i]:+.2f}" if given[i] else "" for i in rows]
+        columns["gap"] = [
+            f"{gaps[i]:+.2f}{' !' if wrong[i] else ''}" if given[i] and known[i] else ""
+            for i in rows
+        ]
+    columns["gamma"] = [
+        f"{s.gammas[i]:.2f}"
+        + (f" +- {s.gamma_errors[i]:.2f}" if known[i] and s.gamma_errors[i] > 0 else "")
+        + (" (weak)" if known[i] and s.gamma_errors[i] > WEAK_GAMMA else "")
+        for i in rows
+    ]
+    columns["residual"] = [f"{s.view_residual_ev[i]:.2f}" if known[i] else "" for i in rows]
+    return columns

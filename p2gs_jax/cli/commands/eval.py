@@ -1,0 +1,60 @@
+"""`p2gs-jax eval`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from p2gs_jax.cli.commands.console import print_metrics
+from p2gs_jax.cli.options.results import Eval
+from p2gs_jax.core.atomic import write_json
+from p2gs_jax.core.progress import TerminalReporter
+from p2gs_jax.evaluate.evaluate import evaluate
+from p2gs_jax.evaluate.lpips_weights import read_lpips_weights
+from p2gs_jax.pipeline.finish import find_radiance, load_reference
+from p2gs_jax.render.host import make_renderer
+from p2gs_jax.run.read import load_run
+
+
+def run(options: Eval) -> int:
+    """Judge a run again and rewrite its metrics; options replace what the run was judged by."""
+    fitted = load_run(options.run, options.scene)
+    fitted.require_photographs()
+    lpips_weights = options.lpips_weights or fitted.cfg.evaluation.lpips_weights
+    left_out = lpips_weights in (None, "none")
+    weights = None if left_out else read_lpips_weights(lpips_weights)
+    if weights is not None:
+        weights.require_sizes(fitted.scene.views, fitted.cfg.data.max_width)
+    folder = options.reference or fitted.reference
+    truth = None if folder is None else load_reference(folder, fitted.scene, fitted.cfg)
+    store = fitted.store
+    with TerminalReporter() as reporter:
+        metrics = evaluate(
+            fitted.params,
+            np.asarray(fitted.alive),
+            fitted.scene,
+            store,
+            make_renderer(fitted.cfg.render),
+            fitted.cfg,
+            reference=truth,
+            radiance=find_radiance(fitted.scene, store),
+            lpips_weights=weights,
+            on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
+        )
+    path = options.run / "metrics.json"
+    kept = _kept_metrics(path)
+    write_json(path, {**metrics, **kept})
+    print_metrics({**metrics, **kept}, options.run)
+    return 0
+
+
+def _kept_metrics(path: Path) -> dict:
+    """Return what only the fit itself knows: counts, times, notes."""
+    try:
+        old = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+    kept = ("counts", "seconds", "seconds_per_step", "notes", "photometry", "growth", "exposures")
+    return {k: old[k] for k in kept if k in old}

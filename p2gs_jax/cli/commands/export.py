@@ -1,0 +1,294 @@
+"""`p2gs-jax export`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from p2gs_jax.cli.commands.console import stdout
+from p2gs_jax.cli.options.export import DISPLAY, Export, Format, check_export
+from p2gs_jax.core.atomic import atomic_folder, write_array, write_json
+from p2gs_jax.core.progress import Reporter, TerminalReporter
+from p2gs_jax.errors import UserError
+from p2gs_jax.export.colmap_folder import write_colmap_folder
+from p2gs_jax.export.sidecar import CORRECTIONS, linear_sidecar
+from p2gs_jax.formats.exr import write_exr
+from p2gs_jax.formats.ply import write_ply, write_radiance
+from p2gs_jax.formats.splat import read_splat, write_splat
+from p2gs_jax.formats.spz import read_spz, require_gsply, write_spz
+from p2gs_jax.gaussians.bake import (
+    Target,
+    bake,
+    baking_error,
+    look_comments,
+    look_of_splats,
+    refine,
+    summary,
+    true_target,
+)
+from p2gs_jax.photometry.display import Look
+from p2gs_jax.render.host import make_renderer
+from p2gs_jax.render.spherical_harmonics import MAX_DEGREE
+from p2gs_jax.run.read import Run, load_run
+from p2gs_jax.scene.device import camera_of
+from p2gs_jax.scene.exif import read_shot
+from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.types import Gaussians
+
+STEPS = 240
+# The baking error is measured on at most this many views of each split, evenly spread.
+MEASURED = 60
+PLACES: dict[Format, tuple[str, ...]] = {
+    "linear-ply": ("linear.ply", "linear.json"),
+    "display-ply": ("display.ply", "display.ply.json"),
+    "splat": ("display.splat", "display.splat.json"),
+    "spz": ("display.spz", "display.spz.json"),
+    "colmap": ("colmap",),
+    "exr": ("exr",),
+}
+
+
+def run(options: Export) -> int:
+    """Write every format that was asked for."""
+    check_export(options)
+    formats = tuple(dict.fromkeys(options.format))
+    if "spz" in formats:
+        require_gsply()
+    fitted = load_run(options.run, options.scene)
+    look = _look(fitted, options)
+    folder = options.out or options.run / "exports"
+    _check_places(folder, formats, options.overwrite)
+    _check_names(fitted, formats)
+    if "colmap" in formats:
+        fitted.require_photographs()
+    store = fitted.store
+    with TerminalReporter() as reporter:
+        display = None
+        if set(formats) & set(DISPLAY):
+            display = _Display(fitted, store, look, options.bake_steps, reporter)
+        for name in formats:
+            begin = time.monotonic()
+            if name == "linear-ply":
+                said = _linear_ply(folder, fitted, store)
+            elif name == "colmap":
+                said = _colmap(folder, fitted, store, reporter)
+            elif name == "exr":
+                said = _exr(folder, fitted, store, reporter)
+            else:
+                assert display is not None
+                said = display.write(name, folder)
+            seconds = time.monotonic() - begin
+            stdout().print(f"{folder / PLACES[name][0]}: {said} ({seconds:.1f} s)", soft_wrap=True)
+    return 0
+
+
+def _look(fitted: Run, options: Export) -> Look:
+    """Return the look of display colours.
+
+    Raises:
+        UserError: the run has no such curve.
+    """
+    look = fitted.common_look(options.exposure_ev or 0.0)
+    if options.gamma is not None:
+        look = replace(look, gamma=options.gamma)
+    if options.curve is not None:
+        try:
+            look = look.with_curve(options.curve)
+        except ValueError as error:
+            raise UserError(
+                f"--curve {options.curve}: {error}.",
+                fix=f"leave it out for the run's own ({look.formation.curve})",
+            ) from error
+    return look_of_splats(look)
+
+
+def _check_places(folder: Path, formats: Sequence[Format], overwrite: bool) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise UserError(f"{folder} is a file.", fix="name a folder with --out")
+    places = [folder / place for name in formats for place in PLACES[name]]
+    there = [path for path in places if path.exists()]
+    if there and not overwrite:
+        raise UserError(
+            f"{there[0]} exists already.",
+            fix="add --overwrite to replace it, or name another folder with --out",
+        )
+
+
+def _check_names(fitted: Run, formats: Sequence[Format]) -> None:
+    """Refuse names that would lead files out of the folder they are written to."""
+    if not set(formats) & {"colmap", "exr"}:
+        return
+    for view in fitted.scene.views:
+        name = PurePosixPath(view.name)
+        if name.is_absolute() or ".." in name.parts:
+            raise UserError(
+                f"the view {view.name} lies outside the image folder.",
+                fix="move its photograph into the image folder and fit again",
+            )
+
+
+def _linear_ply(folder: Path, fitted: Run, store: ImageStore) -> str:
+    g = fitted.params.gaussians
+    ply, sidecar = (folder / place for place in PLACES["linear-ply"])
+    activation = fitted.cfg.render.radiance
+    count = write_radiance(ply, g, np.asarray(fitted.alive), activation=activation)
+    content = linear_sidecar(g, fitted.cfg, fitted.scene, store, fitted.photometry)
+    write_json(sidecar, content)
+    if fitted.cfg.photometry.appearance is not None:
+        write_array(folder / CORRECTIONS, np.asarray(fitted.params.appearance))
+    return f"{count} Gaussians of linear radiance; {sidecar.name} says how to read them"
+
+
+def _colmap(folder: Path, fitted: Run, store: ImageStore, reporter: Reporter) -> str:
+    place = folder / PLACES["colmap"][0]
+    write_colmap_folder(
+        place,
+        fitted.scene,
+        store,
+        fitted.photometry["views"],
+        on_view=lambda done, count: reporter.stage("Writing photographs", done, count),
+    )
+    scene = fitted.scene
+    return f"{len(scene.views)} views, {len(scene.points)} points, exposures.csv"
+
+
+def _exr(folder: Path, fitted: Run, store: ImageStore, reporter: Reporter) -> str:
+    render, views = make_renderer(fitted.cfg.render), fitted.scene.views
+    with atomic_folder(folder / PLACES["exr"][0]) as temporary:
+        for index, view in enumerate(views):
+            camera, look = camera_of(store, index), fitted.own_look(index)
+            result = render(fitted.params.gaussians, fitted.alive, camera)
+            write_exr(
+                (temporary / view.name).with_suffix(".exr"),
+                np.asarray(result.linear),
+                depth=np.asarray(result.depth),
+                alpha=np.asarray(result.alpha),
+                exposure=look.exposure,
+                gamma=look.gamma,
+                camera=camera,
+                shot=read_shot(view.image_path),
+            )
+            reporter.stage("Rendering", index + 1, len(views))
+    return f"{len(views)} linear renders"
+
+
+@dataclass(frozen=True)
+class _Writer:
+    """How a format with display colours is written and read back."""
+
+    write: Callable[[Path, Gaussians], int]
+    read: Callable[[Path], Gaussians]
+    degree: int
+
+
+WRITERS = {
+    "splat": _Writer(write_splat, read_splat, 0),
+    "spz": _Writer(write_spz, read_spz, MAX_DEGREE),
+}
+
+
+class _Display:
+    """Display colours at one look, baked once for each degree, and measured."""
+
+    def __init__(
+        self, fitted: Run, store: ImageStore, look: Look, steps: int | None, reporter: Reporter
+    ):
+        self.fitted, self.look, self.reporter = fitted, look, reporter
+        scene = fitted.scene
+        self.steps = max(STEPS, len(scene.train_indices)) if steps is None else steps
+        self.baked: dict[int, Gaussians] = {}
+        render = make_renderer(fitted.cfg.render)
+        self.targets: dict[int, Target] = {}
+        wanted = scene.train_indices if self.steps else _spread(scene.train_indices)
+        rows = [*wanted, *_spread(scene.test_indices)]
+        for done, index in enumerate(rows):
+            self.targets[index] = true_target(
+                scene.views[index].name,
+                fitted.params.gaussians,
+                camera_of(store, index),
+                look,
+                render,
+            )
+            reporter.stage("Rendering true pictures", done + 1, len(rows))
+
+    def write(self, name: Format, folder: Path) -> str:
+        """Write one format and its JSON; return what to say about it."""
+        path, sidecar = (folder / place for place in PLACES[name])
+        begin = time.monotonic()
+        if name == "display-ply":
+            shown = self._bake(MAX_DEGREE)
+            error = self._error(shown)
+            comments = [*look_comments(self.look), *(f"p2gs-jax: {t}" for t in _sentences(error))]
+            write_ply(path, shown, comments)
+        else:
+            writer = WRITERS[name]
+            writer.write(path, self._bake(writer.degree))
+            error = self._error(writer.read(path))
+        write_json(
+            sidecar,
+            {
+                "file": path.name,
+                "gaussians": self.fitted.params.gaussians.capacity,
+                "exposure": self.look.exposure,
+                "exposure_ev_from_mean": float(
+                    np.log2(self.look.exposure / self.fitted.mean.exposure_geometric)
+                ),
+                "gamma": self.look.gamma,
+                "curve": self.look.formation.curve,
+                "bake_steps": self.steps,
+                "seconds": time.monotonic() - begin,
+                "baking_error": error,
+            },
+        )
+        return "; ".join([f"{self.fitted.params.gaussians.capacity} Gaussians", *_sentences(error)])
+
+    def _bake(self, degree: int) -> Gaussians:
+        cfg, g = self.fitted.cfg, self.fitted.params.gaussians
+        if degree not in self.baked:
+            self.reporter.stage("Baking")
+            start = bake(g, self.look, cfg.render.radiance, degree)
+            train = self.fitted.scene.train_indices
+            self.baked[degree] = refine(
+                start,
+                [self.targets[i] for i in train if i in self.targets],
+                cfg.render,
+                steps=self.steps,
+                seed=cfg.train.seed,
+                on_step=lambda done, steps: self.reporter.stage("Baking", done, steps),
+            )
+        return self.baked[degree]
+
+    def _error(self, shown: Gaussians) -> dict:
+        """Return the baking error by split."""
+        self.reporter.stage("Measuring")
+        scene, render = self.fitted.scene, self.fitted.cfg.render
+        splits = {"train": scene.train_indices, "test": scene.test_indices}
+        return {
+            split: summary(baking_error(shown, [self.targets[i] for i in _spread(rows)], render))
+            for split, rows in splits.items()
+        }
+
+
+def _spread(rows: Sequence[int]) -> list[int]:
+    """Return at most MEASURED of the rows, evenly spread."""
+    picks = np.linspace(0, len(rows) - 1, min(len(rows), MEASURED)).round().astype(int)
+    return [rows[i] for i in picks]
+
+
+def _sentences(error: dict) -> list[str]:
+    """Say how far a viewer's pictures are from the true ones."""
+    said = []
+    for split, name in (("train", "training"), ("test", "held-out")):
+        s = error[split]
+        if s is not None:
+            said.append(
+                f"baking error over {s['views']} {name} views: median {s['psnr_median']:.2f} dB, "
+                f"worst {s['psnr_worst']:.2f} dB ({s['worst_view']}), mean {s['mean_codes']:.2f} "
+                f"and largest {s['max_codes']:.0f} 8-bit levels; median "
+                f"{s['psnr_on_white_median']:.2f} dB over white"
+            )
+    return said

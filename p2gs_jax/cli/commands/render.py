@@ -1,0 +1,314 @@
+"""`p2gs-jax render`."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32
+
+from p2gs_jax.cli.commands.console import stdout
+from p2gs_jax.cli.options.render import PATHS, Render
+from p2gs_jax.core.clock import CompileCounter
+from p2gs_jax.core.progress import TerminalReporter
+from p2gs_jax.errors import UserError
+from p2gs_jax.formats.frames import Frame, open_frames
+from p2gs_jax.paths import (
+    PosePath,
+    Shot,
+    covering,
+    drive,
+    find_orbit,
+    find_rig,
+    of_camera,
+    orbit,
+    read_cameras,
+    view_shots,
+    write_cameras,
+)
+from p2gs_jax.paths.drive import frame_count
+from p2gs_jax.paths.files import LARGEST, MOST_STOPS
+from p2gs_jax.paths.pictures import (
+    Studio,
+    comparison_frames,
+    comparison_size,
+    shot_frames,
+    wide_frames,
+)
+from p2gs_jax.photometry.display import Look
+from p2gs_jax.run.read import Run, load_run
+
+FPS = 24.0
+CAMERAS = "cameras.json"
+OTHER_FILES = (".mov", ".avi", ".mkv", ".webm", ".gif", ".png", ".jpg", ".exr", ".json")
+
+
+@dataclass(frozen=True)
+class Job:
+    """What is to be rendered.
+
+    Attributes:
+        frames: made when they are asked for.
+        count: of frames.
+        size: (width, height) of the largest, pixels.
+        shots: cameras that can be kept as a file; none for panoramas.
+        notes: what the user should know.
+    """
+
+    frames: Iterator[Frame]
+    count: int
+    size: tuple[int, int]
+    shots: Sequence[Shot] = ()
+    notes: Sequence[str] = ()
+
+
+def run(options: Render) -> int:
+    """Render a run along a path, into a folder or a video."""
+    begin = time.monotonic()
+    compiler = CompileCounter()
+    _check(options)
+    out = options.out or options.run / "renders" / _default_name(options)
+    _check_place(out, options.overwrite)
+    given = read_cameras(Path(options.path)) if options.path not in PATHS else None
+    fitted = load_run(options.run, options.scene)
+    if options.curve == "spline" and fitted.cfg.photometry.spline is None:
+        raise UserError(
+            f"--curve spline: {options.run} has none; its curve is {fitted.cfg.photometry.curve}.",
+            fix="choose run, srgb, power or linear",
+        )
+    studio = Studio(fitted)
+    with TerminalReporter() as reporter:
+        job = (
+            _panoramas(options, studio)
+            if options.panorama
+            else _shots(options, studio, given, reporter.message)
+        )
+        reading = time.monotonic() - begin
+        for note in job.notes:
+            reporter.message(note)
+        reporter.stage("Rendering", 0, job.count)
+        with open_frames(out, job.size, options.fps or FPS) as write:
+            for done, frame in enumerate(job.frames):
+                write(frame)
+                reporter.stage("Rendering", done + 1, job.count)
+        if job.shots and not _is_video(out):
+            write_cameras(out / CAMERAS, job.shots)
+    what = "frame" if job.count == 1 else "frames"
+    console = stdout()
+    console.print(f"{job.count} {what}: {out}", soft_wrap=True)
+    console.print(_spent(time.monotonic() - begin, reading, compiler.seconds))
+    console.print(
+        f"A frame takes {_median_ms(studio.render_seconds)} to render and "
+        f"{_median_ms(studio.develop_seconds)} to expose and encode, whatever exposure and gamma."
+    )
+    return 0
+
+
+def _spent(total: float, reading: float, compiling: float) -> str:
+    """Return in words where the seconds of a command went."""
+    frames = max(total - reading - compiling, 0.0)
+    kept = " (kept: the next time is faster)" if compiling >= 1.0 else ""
+    return (
+        f"{total:.1f} s: {reading:.1f} reading the run, {compiling:.1f} compiling{kept}, "
+        f"{frames:.1f} rendering and writing."
+    )
+
+
+def _check_place(out: Path, overwrite: bool) -> None:
+    """Refuse to write over what is there, unless that was asked for."""
+    there = out.is_file() or (out.is_dir() and any(out.iterdir()))
+    if there and not overwrite:
+        what = f"{out} exists already" if out.is_file() else f"{out} holds files already"
+        raise UserError(
+            f"{what}.", fix="add --overwrite to replace them, or choose another place with --out"
+        )
+
+
+def _median_ms(seconds: list[float]) -> str:
+    """Return the median; the first waited for the compiler and counts only where it is alone."""
+    return f"{1e3 * float(np.median(seconds[1:] or seconds)):.1f} ms"
+
+
+def _is_video(out: Path) -> bool:
+    return out.suffix.lower() == ".mp4"
+
+
+def _default_name(options: Render) -> str:
+    if options.path == "views":
+        return "panorama" if options.panorama else "all"
+    name = options.path if options.path in PATHS else Path(options.path).stem
+    return f"{name}_panorama" if options.panorama else name
+
+
+def _check(options: Render) -> None:
+    """Complain about options that make no sense, alone or together, before anything is read."""
+    path, ev, out = options.path, options.exposure_ev, options.out
+    if path not in PATHS and not path.lower().endswith(".json"):
+        raise UserError(
+            f"--path {path!r} is unknown.", fix="choose views, drive, orbit or a FILE.json"
+        )
+    if isinstance(ev, float | int) and not abs(ev) <= MOST_STOPS:
+        raise UserError(f"--exposure-ev {ev} is no number of stops.", fix="write 0, 1 or -2.5")
+    if ev == "own" and (path not in ("views", "drive") or options.panorama):
+        raise UserError(
+            "--exposure-ev own is for views and drives, and not for panoramas.",
+            fix="write a number of stops, or leave it out",
+        )
+    if options.gamma is not None and not 0 < options.gamma < math.inf:
+        raise UserError(
+            "--gamma must be positive.",
+            fix="write 2.2 for the tone curve as it is, more for less contrast",
+        )
+    if options.frames is not None and path not in ("drive", "orbit"):
+        raise UserError("--frames is for --path drive and orbit.", fix="leave it out")
+    if options.frames is not None and options.frames < 2:
+        raise UserError("--frames must be 2 or more.")
+    if options.width is not None and not 16 <= options.width <= LARGEST:
+        raise UserError(f"--width must be between 16 and {LARGEST}.")
+    if options.panorama and path not in ("views", "drive"):
+        raise UserError(
+            "--panorama is for --path views and drive.", fix="choose one of them, or leave it out"
+        )
+    if options.camera is not None and (options.panorama or path not in PATHS):
+        raise UserError("--camera is for single cameras of the scene.", fix="leave it out")
+    if options.split != "all" and path not in PATHS:
+        raise UserError("--split is for the scene's own views.", fix="leave it out")
+    if out is not None and out.suffix.lower() in OTHER_FILES:
+        raise UserError(
+            f"--out {out}: {out.suffix} files are not written.", fix="name a folder, or NAME.mp4"
+        )
+    if out is not None and out.exists() and out.is_dir() == _is_video(out):
+        kind = "a folder" if out.is_dir() else "a file"
+        raise UserError(f"--out {out} is {kind}.", fix="choose another name")
+    if options.fps is not None and (out is None or not _is_video(out)):
+        raise UserError("--fps is for videos.", fix="write --out NAME.mp4, or leave it out")
+    if options.fps is not None and not 1 <= options.fps <= 240:
+        raise UserError("--fps must be between 1 and 240.")
+
+
+def _look(fitted: Run, options: Render, shot: Shot | None = None) -> Look:
+    """Return how a shot is developed: as the options say, else as it says, else as it was taken."""
+    if shot is not None and shot.view is not None:
+        look = fitted.own_look(shot.view)
+    else:
+        ev = None if shot is None else shot.exposure_ev
+        look = fitted.common_look(0.0 if ev is None else ev)
+    if isinstance(options.exposure_ev, float | int):
+        look = replace(fitted.common_look(float(options.exposure_ev)), gamma=look.gamma)
+    gamma = options.gamma
+    if gamma is None and shot is not None:
+        gamma = shot.gamma
+    if gamma is not None:
+        look = replace(look, gamma=gamma)
+    return look if options.curve == "run" else look.with_curve(options.curve)
+
+
+def _chosen(options: Render, fitted: Run) -> list[Shot]:
+    """Return shots of the views that `--split` leaves."""
+    shots = view_shots(fitted.scene.views, fitted.cfg.data.max_width)
+    chosen = [
+        shot
+        for shot, view in zip(shots, fitted.scene.views, strict=True)
+        if options.split in ("all", view.split)
+    ]
+    if not chosen:
+        raise UserError(f"--split {options.split}: the scene has no such view.")
+    return chosen
+
+
+def _shots(
+    options: Render, studio: Studio, given: list[Shot] | None, say: Callable[[str], None]
+) -> Job:
+    """Return the job of rendering pinhole cameras."""
+    fitted, notes, photograph = studio.run, [], None
+    if given is not None:
+        shots = given
+    else:
+        views = fitted.scene.views
+        chosen = _chosen(options, fitted)
+        if options.path == "views":
+            shots = chosen if options.camera is None else of_camera(chosen, views, options.camera)
+            photograph = _Photographs(fitted, say)
+        else:
+            own = of_camera(chosen, views, options.camera)
+            if options.path == "drive":
+                shots = drive(_recorded(own, options, fitted), options.frames)
+            else:
+                circle = find_orbit(chosen, own, np.asarray(fitted.scene.points, np.float64))
+                shots = orbit(circle, own, options.frames)
+                notes = [circle.describe()]
+    if options.width is not None:
+        shots = [shot.resized(options.width) for shot in shots]
+    size = (max(s.width for s in shots), max(s.height for s in shots))
+    frames = shot_frames(studio, shots, lambda shot: _look(fitted, options, shot), photograph)
+    return Job(frames, len(shots), size, shots, notes)
+
+
+class _Photographs:
+    """Photographs that go beside their renders, as far as they are there."""
+
+    def __init__(self, fitted: Run, say: Callable[[str], None]):
+        self._fitted, self._say, self._silent = fitted, say, False
+
+    def __call__(self, index: int) -> Float32[np.ndarray, "h w 3"] | None:
+        try:
+            return self._fitted.photograph(index)
+        except UserError as error:
+            if not self._silent:
+                self._say(f"Views without their photographs are NAME.png alone: {error.message}.")
+            self._silent = True
+            return None
+
+
+def _recorded(shots: list[Shot], options: Render, fitted: Run) -> list[Shot]:
+    """Return shots with the exposures and gammas of their photographs where `own` asks for them."""
+    if options.exposure_ev != "own":
+        return shots
+    looks = [fitted.own_look(shot.view) for shot in shots if shot.view is not None]
+    mean = fitted.mean.exposure_geometric
+    return [
+        replace(shot, exposure_ev=math.log2(look.exposure / mean), gamma=look.gamma)
+        for shot, look in zip(shots, looks, strict=True)
+    ]
+
+
+def _panoramas(options: Render, studio: Studio) -> Job:
+    """Return the job of rendering what all cameras of a rig see."""
+    fitted = studio.run
+    views = fitted.scene.views
+    rig = find_rig(view_shots(views, fitted.cfg.data.max_width), views)
+    cylinder = covering(rig.mounts.values(), np.eye(4))
+    if options.width is not None:
+        cylinder = cylinder.resized(options.width)
+    look = _look(fitted, options)
+    if options.path == "drive":
+        if len(rig.steps) < 2:
+            raise UserError(
+                "A drive needs at least two time steps; the rig has one.", fix="use --path views"
+            )
+        path = PosePath(rig.poses)
+        poses = path(path.evenly(frame_count(len(rig.steps), options.frames)))
+        size = (cylinder.width, cylinder.height)
+        return Job(wide_frames(studio, cylinder, poses, look), len(poses), size)
+    allowed = {shot.view for shot in _chosen(options, fitted)}
+    steps = []
+    for step in rig.steps:
+        shots = {c: s for c, s in step.shots.items() if s.view in allowed}
+        if shots:
+            steps.append(replace(step, shots=shots))
+    if not steps:
+        raise UserError(f"--split {options.split}: the rig has no such time step.")
+    notes = []
+    alone = len(views) - sum(len(step.shots) for step in rig.steps)
+    if alone:
+        notes.append(f"{alone} views have no other camera's at their time: they are left out.")
+    if fitted.params.appearance is not None:
+        notes.append("Corrections of display values that this run learned stay in the photographs.")
+    taken = [shot.view for step in steps for shot in step.shots.values() if shot.view is not None]
+    fitted.require_photographs(taken)
+    frames = comparison_frames(studio, rig, steps, cylinder, look, fitted.store)
+    return Job(frames, len(steps), comparison_size(cylinder), (), notes)

@@ -1,0 +1,174 @@
+"""`fit` and `calibrate`: from photographs to a run folder, or to exposures alone."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from p2gs_jax import config as configs
+from p2gs_jax.cli.options.parse import check, parse_duration, parse_gaussians
+
+Preset = Annotated[configs.PresetName, tyro.conf.arg(metavar="NAME")]
+Duration = Annotated[str | None, tyro.conf.arg(metavar="TIME")]
+Count = Annotated[str | None, tyro.conf.arg(metavar="N|auto")]
+Exposures = Annotated[str | None, tyro.conf.arg(metavar="FILE|exif")]
+Weights = Annotated[str | None, tyro.conf.arg(metavar="alex|vgg|FILE")]
+Folder = Annotated[Path, tyro.conf.arg(metavar="DIR")]
+Deviation = Annotated[float | None, tyro.conf.arg(metavar="STOPS")]
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Fit linear HDR radiance, exposures and gammas to photographs.
+
+    Writes a run folder; open its summary.png first. An interrupted run goes on with --resume.
+
+        p2gs-jax fit castle --out runs/castle --max-width 960 --budget 20m
+        p2gs-jax fit castle --out runs/castle --resume
+        p2gs-jax fit castle --out runs/paper --preset paper --steps 7000
+    """
+
+    scene: Annotated[Path, tyro.conf.Positional]
+    """COLMAP model, transforms.json, a rig, or a folder of photographs (docs/scenes.md)."""
+    out: Folder
+    """Run folder to create."""
+    config: Annotated[configs.FitConfig, tyro.conf.arg(name="")]
+    budget: Duration = None
+    """Wall-clock limit for the whole run: 90s, 20m or 1h30m; replaces --steps."""
+    max_width: int | None = None
+    """Shrink images to at most this many pixels across; default: as they are."""
+    resume: bool = False
+    """Continue an interrupted run; give the options it was started with."""
+    preset: Preset = "robust"
+    """Where all values start: robust; the method as printed, paper or paper_appendix; baselines
+    3dgs, 3dgs_gain, 3dgs_affine, 3dgs_bilateral or 3dgs_curve."""
+    steps: int | None = None
+    """Optimisation steps, one view each; default: the preset's (robust 2000, paper 30000)."""
+    gaussians: Count = None
+    """Upper bound on the Gaussians: a whole number, or auto (grow while held-out training views
+    gain by it); default: from the seeds and the pixels."""
+    test_every: int | None = None
+    """Hold out every n-th view of each camera for evaluation; 0 holds out none; default: 8."""
+    images: Annotated[str | None, tyro.conf.arg(metavar="DIR")] = None
+    """Image folder, where it is not images/ beside the model."""
+    allow_missing: bool = False
+    """Skip frames whose image is missing."""
+    known_exposures: Exposures = None
+    """Exposures to keep: a CSV file (image, exposure or ev), or exif."""
+    known_deviation_ev: Deviation = None
+    """Treat known exposures as uncertain by this many stops instead of keeping them."""
+    reference: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Photographs of the same views under one common exposure, for evaluation."""
+    lpips_weights: Weights = None
+    """Evaluate with LPIPS too: alex or vgg (pip install 'p2gs-jax[lpips]'), or a .npz of
+    weights."""
+    seed: int | None = None
+    """Seeds every random choice; default: 0."""
+
+
+@dataclass(frozen=True)
+class Calibrate:
+    """Solve exposures, gammas and tone curve alone, in seconds.
+
+    From the colours of shared points, without splatting, and with standard errors. Prints a table
+    and writes photometry.json; open calibration.png first.
+
+        p2gs-jax calibrate castle --out photometry
+        p2gs-jax calibrate castle --out photometry --known-exposures exif
+        p2gs-jax calibrate stack --out photometry --static
+    """
+
+    scene: Annotated[Path, tyro.conf.Positional]
+    """COLMAP model, transforms.json, a rig, a folder of photographs (docs/scenes.md), or a
+    finished run (correspondences then go through its rendered depth)."""
+    out: Folder
+    """Folder for photometry.json and calibration.png."""
+    config: Annotated[configs.FitConfig, tyro.conf.arg(name="")]
+    max_width: int | None = None
+    """Shrink images to at most this many pixels across; default: as they are."""
+    known_exposures: Exposures = None
+    """Exposures to keep: a CSV file (image, exposure or ev), or exif."""
+    known_deviation_ev: Deviation = None
+    """Treat known exposures as uncertain by this many stops instead of keeping them."""
+    compare_with: Exposures = None
+    """Stated exposures to compare with; default: EXIF."""
+    static: bool = False
+    """The folder holds photographs from one fixed viewpoint at several exposures."""
+    images: Annotated[str | None, tyro.conf.arg(metavar="DIR")] = None
+    """Image folder, where it is not images/ beside the model."""
+    preset: Preset = "robust"
+    """Where all values start; see `fit`."""
+
+
+def resolve_calibration(args: Calibrate) -> configs.FitConfig:
+    """Return the configuration with the short options applied.
+
+    Raises:
+        UserError: a value makes no sense.
+    """
+    data = args.config.data
+    for name in ("max_width", "images"):
+        if getattr(args, name) is not None:
+            data = dataclasses.replace(data, **{name: getattr(args, name)})
+    check(data.max_width is None or data.max_width >= 16, "--max-width must be at least 16")
+    return _known(dataclasses.replace(args.config, data=data), args)
+
+
+def resolve_fit(args: Fit) -> configs.FitConfig:
+    """Return the configuration with the short options applied.
+
+    Raises:
+        UserError: a value makes no sense.
+    """
+    cfg = args.config
+    data, train, evaluation = cfg.data, cfg.train, cfg.evaluation
+    for name in ("max_width", "test_every", "images"):
+        if getattr(args, name) is not None:
+            data = dataclasses.replace(data, **{name: getattr(args, name)})
+    if args.allow_missing:
+        data = dataclasses.replace(data, allow_missing=True)
+    if args.seed is not None:
+        train = dataclasses.replace(train, seed=args.seed)
+    if args.steps is not None:
+        train = dataclasses.replace(train, steps=args.steps)
+    if args.budget is not None:
+        train = dataclasses.replace(train, budget_s=parse_duration(args.budget))
+    if args.lpips_weights is not None:
+        evaluation = dataclasses.replace(evaluation, lpips_weights=args.lpips_weights)
+    densify = cfg.densify
+    if args.gaussians is not None:
+        most = parse_gaussians(args.gaussians)
+        densify = dataclasses.replace(densify, max_gaussians=most)
+    check(data.max_width is None or data.max_width >= 16, "--max-width must be at least 16")
+    check(data.test_every >= 0, "--test-every must be 0 or more")
+    check(train.steps >= 1, "--steps must be at least 1")
+    cfg = dataclasses.replace(cfg, data=data, train=train, evaluation=evaluation, densify=densify)
+    return _known(cfg, args)
+
+
+def _known(cfg: configs.FitConfig, args: Fit | Calibrate) -> configs.FitConfig:
+    p = cfg.photometry
+    if args.known_exposures is not None:
+        p = dataclasses.replace(p, known=args.known_exposures)
+    if args.known_deviation_ev is not None:
+        p = dataclasses.replace(p, known_deviation_ev=args.known_deviation_ev)
+    check(p.known_deviation_ev >= 0, "--known-deviation-ev must be 0 or more")
+    check(
+        args.known_deviation_ev is None or p.known is not None,
+        "--known-deviation-ev says nothing without --known-exposures",
+        fix="add --known-exposures FILE, or exif",
+    )
+    return dataclasses.replace(cfg, photometry=p)
+
+
+def named_preset(name: str) -> configs.FitConfig:
+    """Return a preset.
+
+    Raises:
+        UserError: there is none of that name.
+    """
+    return configs.preset(name)  # pyright: ignore[reportArgumentType]

@@ -1,0 +1,56 @@
+"""`render`: pictures of a finished run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from p2gs_jax.cli.options.scene import SceneFolder
+
+PATHS = ("views", "drive", "orbit")
+
+
+@dataclass(frozen=True)
+class Render:
+    """Render views or a camera path of a run at any exposure.
+
+    p2gs-jax render runs/street --exposure-ev 1 --gamma 2.2 --out brighter
+    p2gs-jax render runs/street --path drive --out drive.mp4
+    p2gs-jax render runs/street --panorama --split test --width 1400 --out wide
+    """
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """Run folder."""
+    path: str = "views"
+    """views: the scene's own. drive: smoothly through the views of one camera. orbit: around what
+    the cameras look at. FILE.json: a list of cameras (docs/rendering.md)."""
+    out: Path | None = None
+    """A folder, for linear EXR and PNG of every frame, or a video, NAME.mp4 (default: a folder
+    in RUN/renders)."""
+    split: Literal["all", "train", "test"] = "all"
+    """Which of the scene's views: held-out ones are test."""
+    camera: str | None = None
+    """Only the views of this camera; drive and orbit default to that with the most views."""
+    panorama: bool = False
+    """One wide image of all cameras of a rig. With views, at every time step: the photographs
+    stitched as taken, the same developed to one exposure, and the field. With drive: the field."""
+    exposure_ev: float | Literal["own"] | None = None
+    """Exposure in stops from the geometric mean of the training exposures; own: as photographed
+    (on a drive interpolated). Default: own for views, 0 for other paths."""
+    gamma: float | None = None
+    """Gamma; default: each view's own, or the training views' mean for other paths."""
+    curve: Literal["run", "srgb", "power", "linear", "spline"] = "run"
+    """Tone curve; run: the one that was fitted."""
+    frames: int | None = None
+    """Frames of a drive (default: 8 from one view to the next) or an orbit (default: 120)."""
+    width: int | None = None
+    """Image width, pixels; the height follows (default: as the photographs)."""
+    fps: float | None = None
+    """Frames per second of a video (default: 24)."""
+    scene: SceneFolder = None
+    """Where the run's scene lies now, if it is not where it was."""
+    overwrite: bool = False
+    """Replace what an earlier render wrote."""

@@ -1,0 +1,28 @@
+"""`eval`: what can be asked of a finished run besides pictures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from p2gs_jax.cli.options.scene import SceneFolder
+
+
+@dataclass(frozen=True)
+class Eval:
+    """Evaluate a finished run again, also against a reference.
+
+    p2gs-jax eval runs/castle --reference castle/iso8
+    """
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """Run folder."""
+    scene: SceneFolder = None
+    """Where the run's scene lies now, if it is not where it was."""
+    reference: Path | None = None
+    """Photographs of the same views under one common exposure."""
+    lpips_weights: str | None = None
+    """Evaluate with LPIPS: alex, vgg, a .npz of weights, or none (default: as the run was)."""

@@ -1,0 +1,1 @@
+"""What every part uses: device arrays, random streams, files, clocks."""

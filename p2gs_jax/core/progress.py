@@ -1,0 +1,136 @@
+"""Where a fit says what it does: a live display in a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass
+from typing import Protocol
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+# Seconds between lines of progress where there is no terminal.
+EVERY_S = 15.0
+
+
+@dataclass(frozen=True)
+class LogRecord:
+    """One line of `log.jsonl`, and what the live display shows.
+
+    Those of a trial, the run without growth that automatic growth compares with, are lines of
+    `growth.jsonl`.
+    """
+
+    step: int
+    progress: float
+    loss: float
+    psnr: float
+    gaussians: int
+    shrink: int
+    entries: int
+    seconds: float
+    step_seconds: float
+    terms: dict[str, float]
+    trial: bool = False
+
+
+class Reporter(Protocol):
+    """What a fit tells its user."""
+
+    def message(self, text: str) -> None:
+        """Say something the user must know."""
+        ...
+
+    def stage(self, name: str, done: int = 0, total: int = 0) -> None:
+        """Begin or advance a stage."""
+        ...
+
+    def log(self, record: LogRecord) -> None:
+        """Show the state of the optimisation."""
+        ...
+
+
+class Silent:
+    """A reporter that says nothing."""
+
+    def message(self, text: str) -> None:
+        """Ignore."""
+
+    def stage(self, name: str, done: int = 0, total: int = 0) -> None:
+        """Ignore."""
+
+    def log(self, record: LogRecord) -> None:
+        """Ignore."""
+
+
+def clock(seconds: float) -> str:
+    """Return m:ss or h:mm:ss."""
+    whole = max(int(seconds), 0)
+    hours, minutes, rest = whole // 3600, whole // 60 % 60, whole % 60
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+class TerminalReporter:
+    """Messages as lines; progress as one live line in a terminal, elsewhere as a line now and then.
+
+    Use as a context manager.
+    """
+
+    def __init__(self, console: Console | None = None):
+        self.console = console or Console(file=sys.stderr, highlight=False)
+        self.live: Live | None = None
+        self._said_at = time.monotonic()
+
+    def __enter__(self) -> TerminalReporter:
+        if self.console.is_terminal:
+            self.live = Live(console=self.console, refresh_per_second=8, transient=True)
+            self.live.start()
+        return self
+
+    def __exit__(self, *exc) -> None:
+        if self.live is not None:
+            self.live.stop()
+
+    def message(self, text: str) -> None:
+        """Print a line that stays."""
+        self.console.print(Text(text))
+
+    def stage(self, name: str, done: int = 0, total: int = 0) -> None:
+        """Show a stage and how far it is."""
+        text = f"{name} {done}/{total}" if total else f"{name} ..."
+        if self.live is not None:
+            self.live.update(Text(text))
+        else:
+            self._now_and_then(text)
+
+    def _now_and_then(self, text: str) -> None:
+        """Print a line for those who watch a log, unless the last one is recent."""
+        if time.monotonic() - self._said_at >= EVERY_S:
+            self._said_at = time.monotonic()
+            self.console.print(Text(text), soft_wrap=True)
+
+    def log(self, record: LogRecord) -> None:
+        """Show loss, PSNR, Gaussians, views per second and the time left."""
+        left = record.seconds * (1 - record.progress) / max(record.progress, 1e-3)
+        if self.live is None:
+            self._now_and_then(
+                f"{record.progress:.0%}, step {record.step}, PSNR {record.psnr:.2f} dB, "
+                f"{record.gaussians} Gaussians, {clock(left)} left"
+            )
+            return
+        rate = 1 / record.step_seconds if record.step_seconds else 0.0
+        bar = "█" * int(24 * record.progress)
+        table = Table.grid(padding=(0, 2))
+        table.add_row(
+            f"{bar:<24} {record.progress:4.0%}",
+            f"step {record.step}",
+            f"loss {record.loss:.4f}",
+            f"PSNR {record.psnr:.2f} dB",
+            f"{record.gaussians} Gaussians",
+            f"{rate:.1f} views/s",
+            f"{clock(left)} left" if not record.trial else "trying without growth",
+        )
+        self.live.update(table)

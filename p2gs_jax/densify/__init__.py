@@ -1,1 +1,0 @@
-"""How the population of Gaussians grows and moves."""

@@ -1,0 +1,136 @@
+"""OpenEXR: linear radiance with the exposure, gamma and camera that belong to it.
+
+Standard attributes follow https://openexr.com/en/latest/StandardAttributes.html: matrices act on
+row vectors, as Imath's; camera space is left-handed with x right, y up and z forward; NDC runs
+from (0, 0) at the upper left of the display window to (1, 1) at its lower right.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+from jaxtyping import Float, Float32
+
+from p2gs_jax.core.atomic import atomic_write
+from p2gs_jax.errors import UserError
+from p2gs_jax.scene.exif import Shot
+from p2gs_jax.types import Camera
+
+BT709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+HALF_MAX = 65504.0
+
+
+def write_exr(
+    path: Path,
+    linear: Float32[np.ndarray, "h w 3"],
+    *,
+    half: bool = True,
+    depth: Float32[np.ndarray, "h w"] | None = None,
+    alpha: Float32[np.ndarray, "h w"] | None = None,
+    exposure: float | None = None,
+    gamma: float | None = None,
+    camera: Camera | None = None,
+    shot: Shot | None = None,
+) -> None:
+    """Write linear radiance, without exposure applied; docs/exports.md lists the header.
+
+    Args:
+        path: the file.
+        linear: radiance.
+        half: 16-bit floats, unless a value would overflow; then 32-bit.
+        depth: alpha-weighted depth, written as expected depth in channel Z.
+        alpha: opacity, channel A.
+        exposure: e that turns it into the photograph's exposed radiance.
+        gamma: its gamma.
+        camera: what saw it.
+        shot: how the photograph of the same view was taken.
+    """
+    linear = np.asarray(linear, np.float32)
+    small = half and bool(np.all(np.abs(linear) <= HALF_MAX))
+    pixel = np.float16 if small else np.float32
+    header: dict = {
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        "chromaticities": BT709,
+        "adoptedNeutral": BT709[6:],
+        "comments": "linear relative radiance; no exposure applied",
+    }
+    if exposure is not None:
+        header["p2gsExposure"] = float(exposure)
+        header["p2gsExposureEV"] = float(np.log2(exposure))
+    if gamma is not None:
+        header["p2gsGamma"] = float(gamma)
+    if camera is not None:
+        header |= camera_attributes(camera)
+    if shot is not None:
+        header |= _shot_attributes(shot)
+    channels = {c: np.ascontiguousarray(linear[..., i].astype(pixel)) for i, c in enumerate("RGB")}
+    if alpha is not None:
+        channels["A"] = np.ascontiguousarray(np.asarray(alpha).astype(pixel))
+    if depth is not None:
+        weight = np.ones_like(depth) if alpha is None else np.maximum(alpha, 1e-6)
+        channels["Z"] = np.ascontiguousarray((depth / weight).astype(np.float32))
+    with atomic_write(path) as temporary, OpenEXR.File(header, channels) as file:
+        file.write(str(temporary))
+
+
+def camera_attributes(camera: Camera) -> dict:
+    """Return the header attributes that describe a camera."""
+    viewmat, K = np.asarray(camera.viewmat, np.float64), np.asarray(camera.K, np.float64)
+    to_y_up = np.diag([1.0, -1.0, 1.0, 1.0])
+    # Half the image less the principal point, over the focal length: camera space at z = 1.
+    right = (camera.width / 2 - K[0, 2]) / K[0, 0]
+    up = (K[1, 2] - camera.height / 2) / K[1, 1]
+    return {
+        "worldToCamera": _for_rows(to_y_up @ viewmat),
+        "worldToNDC": _for_rows(_to_ndc(K, camera.width, camera.height) @ viewmat),
+        "screenWindowWidth": float(camera.width / K[0, 0]),
+        "screenWindowCenter": (float(right), float(up)),
+        "p2gsViewmat": np.ascontiguousarray(viewmat, np.float32),
+        "p2gsIntrinsics": np.ascontiguousarray(K, np.float32),
+    }
+
+
+def _for_rows(matrix: Float[np.ndarray, "4 4"]) -> Float32[np.ndarray, "4 4"]:
+    """Return the matrix for row vectors, laid out as OpenEXR reads it: it ignores strides."""
+    return np.ascontiguousarray(matrix.T, np.float32)
+
+
+def _to_ndc(K: Float[np.ndarray, "3 3"], width: int, height: int) -> Float[np.ndarray, "4 4"]:
+    """Return the projection of column vectors in OpenCV camera space; its third row gives 1 / z."""
+    out = np.zeros((4, 4))
+    out[0, :3] = K[0] / width
+    out[1, :3] = K[1] / height
+    out[2, 3] = 1.0
+    out[3, 2] = 1.0
+    return out
+
+
+def _shot_attributes(shot: Shot) -> dict:
+    named = {
+        "expTime": shot.time,
+        "aperture": shot.aperture,
+        "isoSpeed": shot.iso,
+        "capDate": shot.taken,
+    }
+    return {name: value for name, value in named.items() if value is not None}
+
+
+def read_exr(path: Path) -> tuple[Float32[np.ndarray, "h w 3"], dict]:
+    """Return linear radiance and the header.
+
+    Raises:
+        UserError: the file cannot be read or has no R, G, B.
+    """
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            channels = file.channels()
+            linear = np.stack([channels[c].pixels for c in "RGB"], -1).astype(np.float32)
+            return linear, dict(file.header())
+    except (RuntimeError, KeyError, OSError, ValueError) as error:
+        raise UserError(
+            f"{path} is no readable RGB OpenEXR file: {error}.",
+            fix="copy or render it again, or remove it",
+        ) from error

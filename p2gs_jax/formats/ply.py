@@ -1,0 +1,110 @@
+"""Gaussians as PLY in the field order of the reference implementation (Inria).
+
+Common viewers show files with display colours (gaussians/bake.py) as they should look;
+`radiance.ply` carries the linear pre-activation coefficients, untouched.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax
+import numpy as np
+from jaxtyping import Bool
+from plyfile import PlyData, PlyElement, PlyParseError
+
+from p2gs_jax.core.atomic import atomic_write
+from p2gs_jax.core.numerics import on_device
+from p2gs_jax.errors import UserError
+from p2gs_jax.render.radiance import RadianceKind
+from p2gs_jax.types import Gaussians
+
+
+def field_names(coefficients: int) -> list[str]:
+    """Return the PLY properties in order, for (degree + 1)^2 coefficients."""
+    return [
+        *("x", "y", "z", "nx", "ny", "nz"),
+        *(f"f_dc_{i}" for i in range(3)),
+        *(f"f_rest_{i}" for i in range(3 * (coefficients - 1))),
+        "opacity",
+        *(f"scale_{i}" for i in range(3)),
+        *(f"rot_{i}" for i in range(4)),
+    ]
+
+
+def _live(gaussians: Gaussians, alive: Bool[np.ndarray, " n"]) -> Gaussians:
+    rows = np.flatnonzero(np.asarray(alive))
+    return jax.tree.map(lambda a: np.asarray(a)[rows], gaussians)
+
+
+def write_ply(path: Path, gaussians: Gaussians, comments: Sequence[str]) -> int:
+    """Write all Gaussians as they are; return how many.
+
+    Args:
+        path: the file.
+        gaussians: what to write.
+        comments: header lines; a PLY header is ASCII, other characters are escaped.
+    """
+    g = jax.tree.map(np.asarray, gaussians)
+    count, coefficients = g.sh.shape[:2]
+    # All coefficients of red, then green, then blue.
+    rest = g.sh[:, 1:].transpose(0, 2, 1).reshape(count, 3 * (coefficients - 1))
+    columns = np.concatenate(
+        [
+            g.means,
+            np.zeros((count, 3), np.float32),
+            g.sh[:, 0],
+            rest,
+            g.opacity_logits[:, None],
+            g.log_scales,
+            g.quats,
+        ],
+        axis=1,
+    ).astype("<f4")
+    names = field_names(coefficients)
+    table = np.ascontiguousarray(columns).view([(n, "<f4") for n in names]).reshape(count)
+    lines = [c.encode("unicode_escape").decode() for c in comments]
+    data = PlyData([PlyElement.describe(table, "vertex")], byte_order="<", comments=lines)
+    with atomic_write(path) as temporary:
+        data.write(str(temporary))
+    return count
+
+
+def write_radiance(
+    path: Path, gaussians: Gaussians, alive: Bool[np.ndarray, " n"], *, activation: RadianceKind
+) -> int:
+    """Write live Gaussians with their linear coefficients; return how many."""
+    return write_ply(
+        path,
+        _live(gaussians, alive),
+        ["p2gs-jax: linear HDR radiance", f"p2gs-jax: radiance activation {activation}"],
+    )
+
+
+def read_ply(path: Path) -> Gaussians:
+    """Read Gaussians back, bit for bit.
+
+    Raises:
+        UserError: the file is no such PLY.
+    """
+    try:
+        vertex = PlyData.read(str(path))["vertex"].data
+        names = vertex.dtype.names or ()
+        coefficients = 1 + sum(n.startswith("f_rest_") for n in names) // 3
+        columns = np.stack([vertex[n] for n in field_names(coefficients)], 1).astype(np.float32)
+    except (OSError, PlyParseError, KeyError, ValueError) as error:
+        raise UserError(
+            f"{path} is no PLY of Gaussians: {error}.",
+            fix="restore it from a copy, or write it again with `p2gs-jax fit ... --resume`",
+        ) from error
+    rest = columns[:, 9 : 9 + 3 * (coefficients - 1)].reshape(len(columns), 3, coefficients - 1)
+    sh = np.concatenate([columns[:, None, 6:9], rest.transpose(0, 2, 1)], 1)
+    tail = columns[:, 9 + 3 * (coefficients - 1) :]
+    return Gaussians(
+        means=on_device(columns[:, :3]),
+        quats=on_device(tail[:, 4:8]),
+        log_scales=on_device(tail[:, 1:4]),
+        opacity_logits=on_device(tail[:, 0]),
+        sh=on_device(sh),
+    )

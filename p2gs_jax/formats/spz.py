@@ -1,0 +1,127 @@
+"""SPZ (https://github.com/nianticlabs/spz), some ten times smaller than PLY, through gsply.
+
+SPZ axes are right, up, back; splats from COLMAP's world count as right, down, forward. gsply
+leaves that to its caller, as it does the number of fractional bits of positions, beyond which it
+would clip them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import jax.numpy as jnp
+import numpy as np
+
+from p2gs_jax.core.atomic import atomic_write
+from p2gs_jax.errors import UserError
+from p2gs_jax.render.spherical_harmonics import basis, degree_of
+from p2gs_jax.types import Gaussians
+
+FLIP = (1.0, -1.0, -1.0)
+# Positions are integers of 24 bits with a sign; more than 24 fractional bits are not allowed.
+LARGEST_INTEGER, MOST_FRACTIONAL_BITS = 2**23 - 1, 24
+
+
+def require_gsply() -> ModuleType:
+    """Return the package that writes SPZ.
+
+    Raises:
+        UserError: it is not installed.
+    """
+    try:
+        import gsply
+    except ImportError as error:
+        raise UserError(
+            f"--format spz needs the package gsply, which cannot be imported ({error}).",
+            fix="pip install 'p2gs-jax[spz]', or convert display.ply with another tool "
+            "(docs/exports.md)",
+        ) from error
+    return gsply
+
+
+def write_spz(path: Path, gaussians: Gaussians) -> int:
+    """Write Gaussians with display colours; return how many.
+
+    Raises:
+        UserError: gsply is not installed, or a position does not fit the format.
+    """
+    gsply = require_gsply()
+    from gsply.spz import write_spz as write
+
+    g = _flipped(gaussians)
+    quats = np.asarray(g.quats, np.float32)
+    data = gsply.GSData.from_arrays(
+        means=np.asarray(g.means),
+        scales=np.asarray(g.log_scales),
+        quats=quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12),
+        opacities=np.asarray(g.opacity_logits),
+        sh0=np.asarray(g.sh[:, 0]),
+        shN=np.asarray(g.sh[:, 1:]) if g.sh.shape[1] > 1 else None,
+        format="ply",
+    )
+    with atomic_write(path) as temporary:
+        write(temporary, data, version=3, fractional_bits=fractional_bits(np.asarray(g.means)))
+    return g.capacity
+
+
+def fractional_bits(means: np.ndarray) -> int:
+    """Return the most fractional bits with which every coordinate fits.
+
+    Raises:
+        UserError: a coordinate fits with none.
+    """
+    farthest = max(float(np.abs(means).max(initial=0.0)), 1e-12)
+    bits = int(np.floor(np.log2(LARGEST_INTEGER / farthest)))
+    if bits < 1:
+        raise UserError(
+            f"SPZ holds no position as far as {farthest:.3g} scene units from the origin.",
+            fix="move or shrink the scene, or export display-ply",
+        )
+    return min(bits, MOST_FRACTIONAL_BITS)
+
+
+def read_spz(path: Path) -> Gaussians:
+    """Read Gaussians back, as precisely as the file holds them.
+
+    Raises:
+        UserError: the file is no SPZ, or gsply is not installed.
+    """
+    require_gsply()
+    from gsply.spz import read_spz as read
+
+    try:
+        data = read(path)
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path} is no readable SPZ: {error}") from error
+    sh = np.asarray(data.sh0)[:, None]
+    rest = data.shN
+    if rest is not None and np.size(rest):
+        sh = np.concatenate([sh, np.asarray(rest)], axis=1)
+    g = Gaussians(
+        means=jnp.asarray(data.means),
+        quats=jnp.asarray(data.quats),
+        log_scales=jnp.asarray(data.scales),
+        opacity_logits=jnp.asarray(np.reshape(data.opacities, -1)),
+        sh=jnp.asarray(sh),
+    )
+    return _flipped(g)
+
+
+def _flipped(g: Gaussians) -> Gaussians:
+    """Return the Gaussians turned by 180 degrees about x; twice is nothing."""
+    flip = jnp.asarray(FLIP)
+    direction = np.array([[0.36, 0.48, 0.8]], np.float32)
+    degree = degree_of(g.sh.shape[1])
+    # A half turn about an axis only changes signs of the harmonics.
+    here, there = (
+        np.array([float(b[0]) for b in basis(tuple(jnp.asarray(d).T), degree)])
+        for d in (direction, direction * np.array(FLIP, np.float32))
+    )
+    return replace(
+        g,
+        means=g.means * flip,
+        quats=g.quats * jnp.asarray([1.0, *FLIP]),
+        sh=g.sh * jnp.asarray(np.sign(here * there), g.sh.dtype)[:, None],
+    )

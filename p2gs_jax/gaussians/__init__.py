@@ -1,0 +1,1 @@
+"""The population: where it begins, how it grows, what it is exported as."""

@@ -1,0 +1,103 @@
+"""The 3DGS schedule, as the paper: clone small, split large, prune, reset opacities."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from p2gs_jax.config import DensifyConfig
+from p2gs_jax.gaussians.population import Outcome, fresh_population, opacities, place
+from p2gs_jax.render.project import rotation_matrices
+from p2gs_jax.types import Gaussians, Population
+
+SPLIT_SHRINK = 1.6
+RESET_OPACITY = 0.01
+
+
+class Proposal(NamedTuple):
+    """What one densification wants, before slots are assigned."""
+
+    prune: Bool[Array, " n"]
+    clone: Bool[Array, " n"]
+    split: Bool[Array, " n"]
+    wanted: Int[Array, ""]
+    """Slots that must exist for it: survivors plus children."""
+
+
+def propose(
+    gaussians: Gaussians,
+    population: Population,
+    extent: Float[Array, ""] | float,
+    prune_large: Bool[Array, ""] | bool,
+    cfg: DensifyConfig,
+) -> Proposal:
+    """Decide who is pruned, cloned and split.
+
+    Args:
+        gaussians: the scene.
+        population: statistics since the last densification.
+        extent: scene extent, scene units.
+        prune_large: whether oversized Gaussians go too (3DGS: after the first opacity reset).
+        cfg: thresholds.
+    """
+    largest = jnp.exp(jnp.max(gaussians.log_scales, -1))
+    prune = opacities(gaussians) < cfg.prune_opacity
+    oversized = largest > cfg.prune_scale * extent
+    prune = population.alive & (prune | (prune_large & oversized))
+    average = population.grad2d_sum / jnp.maximum(population.seen_count, 1)
+    hot = population.alive & ~prune & (average >= cfg.grad_threshold)
+    small = largest <= cfg.clone_scale * extent
+    clone, split = hot & small, hot & ~small
+    survivors = jnp.sum(population.alive & ~prune)
+    return Proposal(prune, clone, split, survivors + jnp.sum(hot))
+
+
+def apply(
+    key: PRNGKeyArray, gaussians: Gaussians, population: Population, proposal: Proposal
+) -> Outcome:
+    """Carry out a proposal inside the present capacity.
+
+    A clone is an exact copy; a split replaces the parent by two samples of its own distribution
+    with scales divided by 1.6 (3DGS).
+    """
+    alive = population.alive & ~proposal.prune
+    requests = proposal.clone | proposal.split
+    slot, refused = place(requests, alive)
+    split = proposal.split & (slot < alive.shape[0])
+
+    scales = jnp.exp(gaussians.log_scales)
+    R = rotation_matrices(gaussians.quats)
+
+    def sample(k):
+        local = jax.random.normal(k, gaussians.means.shape) * scales
+        offset = jnp.stack([sum(R[i][j] * local[:, j] for j in range(3)) for i in range(3)], -1)
+        return gaussians.means + offset
+
+    first, second = (sample(k) for k in jax.random.split(key))
+    shrunk = gaussians.log_scales - jnp.log(SPLIT_SHRINK)
+    s = split[:, None]
+    child = dataclasses.replace(
+        gaussians,
+        means=jnp.where(s, second, gaussians.means),
+        log_scales=jnp.where(s, shrunk, gaussians.log_scales),
+    )
+    parent = dataclasses.replace(
+        gaussians,
+        means=jnp.where(s, first, gaussians.means),
+        log_scales=jnp.where(s, shrunk, gaussians.log_scales),
+    )
+    gaussians = jax.tree.map(lambda a, b: a.at[slot].set(b, mode="drop"), parent, child)
+    born = jnp.zeros_like(alive).at[slot].set(True, mode="drop")
+    return Outcome(gaussians, fresh_population(alive | born), born | split, refused)
+
+
+def reset_opacities(gaussians: Gaussians) -> Gaussians:
+    """Lower every opacity to at most 0.01, so that only what is needed grows back (3DGS)."""
+    ceiling = jnp.log(RESET_OPACITY / (1 - RESET_OPACITY))
+    return dataclasses.replace(
+        gaussians, opacity_logits=jnp.minimum(gaussians.opacity_logits, ceiling)
+    )

@@ -1,0 +1,300 @@
+"""Display colours for ordinary 3DGS viewers, and how far their pictures are from the true ones.
+
+A viewer composites display values; the true picture composites light and then applies the tone
+curve. The curve of a mixture is not the mixture of the curves, so colours taken from each Gaussian
+by itself miss by many codes where translucent ones overlap (BUILD_NOTES, "Display PLY"). `refine`
+then moves colours and opacities until a viewer's pictures of given views agree with the true ones;
+places and shapes stay.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, NamedTuple, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float, UInt8
+
+from p2gs_jax.config import RenderConfig
+from p2gs_jax.core.numerics import on_device
+from p2gs_jax.photometry.display import Look, develop
+from p2gs_jax.render import render_linear, required_capacity
+from p2gs_jax.render.capacity import bucket
+from p2gs_jax.render.host import RenderView, make_renderer
+from p2gs_jax.render.radiance import RadianceKind, radiance_activation
+from p2gs_jax.render.spherical_harmonics import C0, basis, coefficient_count, degree_of
+from p2gs_jax.render.xla_cpu import compiler_options
+from p2gs_jax.types import Camera, Gaussians, Render
+
+DIRECTIONS = 64
+# Gaussians at once: the last ones are filled up, so that their number compiles nothing.
+CHUNK = 8192
+# Adam's rates per step for colours of degree 0, of the others, and for opacity logits; they decay
+# to a tenth. Measured on two runs (BUILD_NOTES, "Display PLY").
+COLOR_RATE, BANDS_RATE, OPACITY_RATE, DECAY = 0.05, 0.0025, 0.3, 0.1
+
+
+@dataclass(frozen=True)
+class Target:
+    """A view, and what a viewer should show of it.
+
+    Attributes:
+        name: of the view.
+        camera: its camera.
+        picture: the true picture, 8 bits.
+    """
+
+    name: str
+    camera: Camera
+    picture: UInt8[np.ndarray, "h w 3"]
+
+
+@dataclass(frozen=True)
+class ViewError:
+    """How far a viewer's picture of one view is from the true one.
+
+    Attributes:
+        name: of the view.
+        psnr: dB.
+        mean_codes: mean absolute difference, 8-bit codes.
+        max_codes: largest absolute difference of any channel.
+        psnr_on_white: dB, in a viewer whose background is white instead of black.
+    """
+
+    name: str
+    psnr: float
+    mean_codes: float
+    max_codes: float
+    psnr_on_white: float
+
+
+def true_target(
+    name: str, gaussians: Gaussians, camera: Camera, look: Look, render: RenderView
+) -> Target:
+    """Return what a view truly looks like: light composited, then developed.
+
+    Args:
+        name: of the view.
+        gaussians: linear radiance.
+        camera: the view.
+        look: how to show it.
+        render: of the run, from `make_renderer`.
+    """
+    linear = render(gaussians, _all(gaussians), camera).linear
+    codes = np.rint(255 * develop(linear, look)).astype(np.uint8)
+    return Target(name, camera, codes)
+
+
+def look_of_splats(look: Look) -> Look:
+    """Return the look without what splats cannot carry: a correction by place in the image."""
+    return replace(look, correction=None) if look.formation.appearance == "bilateral" else look
+
+
+def look_comments(look: Look) -> list[str]:
+    """Return the header lines of a PLY with display colours."""
+    return [
+        "p2gs-jax: display colours, tone-mapped",
+        f"p2gs-jax: exposure {look.exposure:.6g}, gamma {look.gamma:.6g}, "
+        f"curve {look.formation.curve}",
+    ]
+
+
+def bake(gaussians: Gaussians, look: Look, activation: RadianceKind, degree: int) -> Gaussians:
+    """Return Gaussians with display colours, each taken by itself.
+
+    Args:
+        gaussians: linear radiance.
+        look: how to show it.
+        activation: of the spherical harmonics.
+        degree: of the display colours; a higher one than the radiance has changes nothing.
+    """
+    sh = np.asarray(gaussians.sh)
+    degree = min(degree, degree_of(sh.shape[1]))
+    shown = display_sh(sh, lambda linear: develop(linear, look), activation, degree)
+    return replace(gaussians, sh=on_device(shown))
+
+
+def display_sh(
+    sh: Float[np.ndarray, "n k 3"],
+    tone: Callable[[np.ndarray], np.ndarray],
+    activation: RadianceKind,
+    degree: int | None = None,
+) -> Float[np.ndarray, "n k2 3"]:
+    """Return coefficients whose value + 1/2 is the display colour, least squares over directions.
+
+    Exact for degree 0.
+
+    Args:
+        sh: coefficients of radiance.
+        tone: radiance -> display values, clamped to [0, 1] here.
+        activation: of the spherical harmonics.
+        degree: of the result; None keeps the radiance's.
+    """
+    directions = _sphere(DIRECTIONS)
+    axes = tuple(directions.T)
+    table = np.stack(_basis(axes, degree_of(sh.shape[1])), 1)
+    kept = table if degree is None else table[:, : coefficient_count(degree)]
+    inverse = np.linalg.pinv(kept)
+    out = np.empty((len(sh), kept.shape[1], 3), np.float32)
+    for start in range(0, len(sh), CHUNK):
+        part = sh[start : start + CHUNK]
+        values = np.zeros((CHUNK, DIRECTIONS, 3), np.float32)
+        values[: len(part)] = np.einsum("dk,nkc->ndc", table, part, optimize=True)
+        colors = tone(np.asarray(radiance_activation(values, activation)))[: len(part)]
+        shown = np.clip(colors, 0, 1) - 0.5
+        out[start : start + CHUNK] = np.einsum("kd,ndc->nkc", inverse, shown, optimize=True)
+    return out
+
+
+_basis = jax.jit(basis, static_argnums=1)
+
+
+def _sphere(count: int) -> Float[np.ndarray, "n 3"]:
+    i = np.arange(count) + 0.5
+    z = 1 - 2 * i / count
+    azimuth = np.pi * (1 + 5**0.5) * i
+    r = np.sqrt(1 - z * z)
+    return np.stack([r * np.cos(azimuth), r * np.sin(azimuth), z], -1).astype(np.float32)
+
+
+def viewer_config(cfg: RenderConfig) -> RenderConfig:
+    """Return how an ordinary 3DGS viewer renders: max(0, sh + 1/2), composited as it is."""
+    return replace(cfg, radiance="linear", cutoff_rule="opacity")
+
+
+class _Moving(NamedTuple):
+    """What `refine` changes."""
+
+    sh: Float[Array, "n k 3"]
+    opacity_logits: Float[Array, " n"]
+
+
+def refine(
+    gaussians: Gaussians,
+    targets: Sequence[Target],
+    cfg: RenderConfig,
+    *,
+    steps: int,
+    seed: int = 0,
+    on_step: Callable[[int, int], None] = lambda done, steps: None,
+) -> Gaussians:
+    """Return Gaussians whose pictures in a viewer are closer to the targets.
+
+    Adam on the mean squared difference, one view a step, in a random order that shows all views
+    before it repeats. Every other step has a background of random colour instead of black: what
+    is dark because it is transparent would be bright in a viewer with a bright background. Base
+    colours stay in [0, 1], so that viewers with 8-bit colours can hold them. A Gaussian that no
+    target shows stays as it is.
+
+    Args:
+        gaussians: from `bake`.
+        targets: what to agree with.
+        cfg: rendering options of the run.
+        steps: 0 returns the Gaussians as they are.
+        seed: of the order.
+        on_step: steps done, steps in all.
+    """
+    if steps == 0 or not targets or gaussians.capacity == 0:
+        return gaussians
+    cfg, optimizer = viewer_config(cfg), optax.scale_by_adam(eps=1e-15)
+    fitting = jax.jit(lambda g, camera: required_capacity(g, _all(g), camera, cfg))
+    capacity = bucket(max(int(fitting(gaussians, t.camera)) for t in targets), 1.2)
+    bands = jnp.full((gaussians.sh.shape[1], 1), BANDS_RATE).at[0].set(COLOR_RATE)
+    rates = _Moving(bands, jnp.asarray(OPACITY_RATE))
+
+    @functools.partial(jax.jit, static_argnames="capacity", compiler_options=compiler_options())
+    def step(moving, state, camera, picture, background, decay, capacity):
+        def loss(moving: _Moving):
+            shown = replace(gaussians, **moving._asdict())
+            result = render_linear(shown, _all(shown), camera, cfg, capacity, with_depth=False)
+            picture_shown = _over(result, background)
+            return jnp.mean((picture_shown - picture / 255.0) ** 2), result
+
+        (_, result), gradient = jax.value_and_grad(loss, has_aux=True)(moving)
+        updates, state = optimizer.update(gradient, state)
+        changes = jax.tree.map(lambda rate, u: -decay * rate * u, rates, updates)
+        moved = cast(_Moving, optax.apply_updates(cast(Any, moving), cast(Any, changes)))
+        limit = 0.5 / C0
+        sh = moved.sh.at[:, 0].set(jnp.clip(moved.sh[:, 0], -limit, limit))
+        return _Moving(sh, moved.opacity_logits), state, result.count, result.overflow
+
+    rng, order = np.random.default_rng(seed), []
+    moving = _Moving(gaussians.sh, gaussians.opacity_logits)
+    state = optimizer.init(cast(Any, moving))
+    for done in range(steps):
+        order = order or list(rng.permutation(len(targets)))
+        target = targets[order.pop()]
+        decay = jnp.float32(DECAY ** (done / steps))
+        picture = jnp.asarray(target.picture)
+        background = jnp.asarray(rng.uniform(size=3) * (done % 2), jnp.float32)
+        while True:
+            moved, after, count, overflow = step(
+                moving, state, target.camera, picture, background, decay, capacity=capacity
+            )
+            if not bool(overflow):
+                break
+            capacity = bucket(int(count), 1.1)
+        moving, state = moved, after
+        on_step(done + 1, steps)
+    return replace(gaussians, **moving._asdict())
+
+
+def baking_error(
+    gaussians: Gaussians, targets: Sequence[Target], cfg: RenderConfig
+) -> list[ViewError]:
+    """Compare a viewer's pictures with the true ones.
+
+    Args:
+        gaussians: display colours, as the file holds them.
+        targets: the true pictures.
+        cfg: rendering options of the run.
+    """
+    render = make_renderer(viewer_config(cfg))
+    return [_difference(t, render(gaussians, _all(gaussians), t.camera)) for t in targets]
+
+
+def _over(render: Render, background: Float[Array, " 3"]) -> Float[Array, "h w 3"]:
+    return render.linear + (1 - render.alpha)[..., None] * background
+
+
+def _difference(target: Target, render: Render) -> ViewError:
+    codes, on_white = (
+        np.abs(
+            255.0 * np.clip(np.asarray(_over(render, jnp.full(3, level))), 0, 1) - target.picture
+        )
+        for level in (0.0, 1.0)
+    )
+    return ViewError(
+        target.name, _psnr(codes), float(codes.mean()), float(codes.max()), _psnr(on_white)
+    )
+
+
+def _psnr(codes: Float[np.ndarray, "h w 3"]) -> float:
+    mse = float(np.mean((codes / 255.0) ** 2, dtype=np.float64))
+    return float(-10 * np.log10(max(mse, 1e-10)))
+
+
+def summary(errors: Sequence[ViewError]) -> dict | None:
+    """Return median and worst of some views as plain values; None where there are none."""
+    if not errors:
+        return None
+    worst = min(errors, key=lambda e: e.psnr)
+    return {
+        "views": len(errors),
+        "psnr_median": float(np.median([e.psnr for e in errors])),
+        "psnr_worst": worst.psnr,
+        "worst_view": worst.name,
+        "mean_codes": float(np.mean([e.mean_codes for e in errors])),
+        "max_codes": max(e.max_codes for e in errors),
+        "psnr_on_white_median": float(np.median([e.psnr_on_white for e in errors])),
+        "per_view": {e.name: {k: v for k, v in asdict(e).items() if k != "name"} for e in errors},
+    }
+
+
+def _all(gaussians: Gaussians) -> Array:
+    return on_device(np.ones(gaussians.capacity), bool)

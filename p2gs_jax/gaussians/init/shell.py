@@ -1,0 +1,133 @@
+"""A far shell of Gaussians, where views look past every seed point: sky, hills, far facades.
+
+Seeds mark surfaces. A pixel with no seed anywhere near it has nothing to grow from except distant
+splats stretched over it, so directions that views look into and no seed explains get a Gaussian
+each, far behind the seeds. Scenes whose views are covered by seeds get none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from p2gs_jax.config import InitConfig
+from p2gs_jax.gaussians.init.seeds import camera_centers
+from p2gs_jax.types import View
+
+# Each view is cut into cells; a cell with a seed in it or beside it counts as covered.
+CELLS_ACROSS = 16
+# A direction belongs to the shell if fewer of the views that look into it see a seed there.
+COVERED_FRACTION = 0.3
+# Less empty image than this is a gap in the seeds, not a sky.
+EMPTY_IMAGE_FRACTION = 0.04
+# How far the shell stands behind the far seeds.
+BEHIND_SEEDS = 2.0
+OVERLAP = 0.7
+
+
+@dataclass(frozen=True)
+class Shell:
+    """Directions to add.
+
+    Attributes:
+        points: positions, scene units.
+        scales: their standard deviations.
+        seen: which training view (row) sees each, and where: [s v] bool.
+        xy: pixel position of each in each view, full resolution.
+        empty_fraction: share of image cells with no seed near.
+    """
+
+    points: Float32[np.ndarray, "s 3"]
+    scales: Float[np.ndarray, " s"]
+    seen: Bool[np.ndarray, "s v"]
+    xy: Float32[np.ndarray, "s v 2"]
+    empty_fraction: float
+
+
+def fibonacci_sphere(count: int) -> Float[np.ndarray, "n 3"]:
+    """Return evenly spread unit vectors."""
+    i = np.arange(count) + 0.5
+    z = 1 - 2 * i / count
+    azimuth = np.pi * (1 + 5**0.5) * i
+    r = np.sqrt(1 - z * z)
+    return np.stack([r * np.cos(azimuth), r * np.sin(azimuth), z], -1)
+
+
+def project_points(view: View, points: Float[np.ndarray, "p 3"]):
+    """Return pixel positions [p 2] and which points are in front and inside the image."""
+    local = points @ view.viewmat[:3, :3].T.astype(np.float64) + view.viewmat[:3, 3]
+    z = np.where(local[:, 2] > 1e-6, local[:, 2], 1.0)
+    xy = local[:, :2] / z[:, None] * [view.K[0, 0], view.K[1, 1]] + view.K[:2, 2]
+    inside = (
+        (local[:, 2] > 1e-6)
+        & (xy[:, 0] >= 0)
+        & (xy[:, 1] >= 0)
+        & (xy[:, 0] < view.width)
+        & (xy[:, 1] < view.height)
+    )
+    return xy, inside
+
+
+def covered_cells(view: View, points: Float[np.ndarray, "p 3"]) -> Bool[np.ndarray, "gy gx"]:
+    """Return which cells of a view hold a seed, or touch one that does."""
+    across = CELLS_ACROSS
+    down = max(1, round(across * view.height / view.width))
+    xy, inside = project_points(view, points)
+    cells = np.zeros((down + 2, across + 2), bool)
+    column = (xy[inside, 0] * across / view.width).astype(int)
+    row = (xy[inside, 1] * down / view.height).astype(int)
+    cells[row + 1, column + 1] = True
+    near = np.zeros_like(cells)
+    for dy in (-1, 0, 1):
+        for dx in (-1, 0, 1):
+            near |= np.roll(cells, (dy, dx), (0, 1))
+    return near[1:-1, 1:-1]
+
+
+def find_shell(
+    views: list[View], points: Float[np.ndarray, "p 3"], extent: float, cfg: InitConfig
+) -> Shell | None:
+    """Return the shell a scene needs, or None.
+
+    Args:
+        views: training views.
+        points: seed points.
+        extent: scene extent, scene units.
+        cfg: how many directions, how far, whether at all.
+    """
+    if cfg.shell == "off":
+        return None
+    middle = camera_centers(views).mean(0)
+    radius = cfg.shell_radius * extent
+    if len(points):
+        far = float(np.quantile(np.linalg.norm(points - middle, axis=1), 0.98))
+        radius = max(min(radius, 10 * far), BEHIND_SEEDS * far)
+    directions = fibonacci_sphere(cfg.shell_count)
+    candidates = middle + radius * directions
+    covered = [covered_cells(v, points) for v in views]
+    empty_fraction = float(np.mean([1 - c.mean() for c in covered]))
+    if cfg.shell == "auto" and empty_fraction < EMPTY_IMAGE_FRACTION:
+        return None
+    seen = np.zeros((len(candidates), len(views)), bool)
+    explained = np.zeros_like(seen)
+    xy = np.zeros((len(candidates), len(views), 2), np.float32)
+    for k, (view, cells) in enumerate(zip(views, covered, strict=True)):
+        position, inside = project_points(view, candidates)
+        xy[:, k], seen[:, k] = position, inside
+        column = (position[inside, 0] * cells.shape[1] / view.width).astype(int)
+        row = (position[inside, 1] * cells.shape[0] / view.height).astype(int)
+        explained[inside, k] = cells[row, column]
+    looked = seen.sum(1)
+    keep = (looked > 0) & (explained.sum(1) < COVERED_FRACTION * looked)
+    if not keep.any():
+        return None
+    spacing = radius * np.sqrt(4 * np.pi / cfg.shell_count)
+    return Shell(
+        candidates[keep].astype(np.float32),
+        np.full(int(keep.sum()), OVERLAP * spacing),
+        (seen & ~explained)[keep],
+        xy[keep],
+        empty_fraction,
+    )

@@ -1,0 +1,160 @@
+"""3DGS as Markov chain Monte Carlo: relocate transparent Gaussians, explore with noise.
+
+Source: Kheradmand et al. 2024. The scale correction for N Gaussians in one place is written there
+as an alternating double sum of binomials; substituting 1/sqrt(k+1) = 2/sqrt(pi) int exp(-(k+1)t^2)
+turns it into (2/sqrt(pi)) int_0^inf 1 - (1 - o exp(-t^2))^N dt, which has no cancellation (ours).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from p2gs_jax.config import DensifyConfig
+from p2gs_jax.gaussians.population import Outcome, fresh_population, logit, opacities
+from p2gs_jax.render.project import rotation_matrices
+from p2gs_jax.types import Gaussians, Population
+
+# Noise falls off above this opacity, with this steepness (Kheradmand et al. 2024).
+NOISE_OPACITY, NOISE_STEEPNESS = 0.005, 100.0
+_NODES = np.linspace(0.0, 4.5, 49, dtype=np.float32)
+_WEIGHTS = np.full(49, _NODES[1], np.float32)
+_WEIGHTS[0] = _WEIGHTS[-1] = _NODES[1] / 2
+
+
+def share(
+    opacity: Float[Array, " n"], copies: Float[Array, " n"]
+) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """Return opacity and scale factor of each of `copies` Gaussians that together look like one.
+
+    Args:
+        opacity: of the one, in (0, 1).
+        copies: how many share its place, >= 1.
+    """
+    new = 1 - jnp.exp(jnp.log1p(-jnp.minimum(opacity, 1 - 1e-6)) / copies)
+    behind = jnp.log1p(-new[:, None] * jnp.exp(-(_NODES**2)))
+    integrand = -jnp.expm1(copies[:, None] * behind)
+    denominator = 2 / np.sqrt(np.pi) * (integrand @ _WEIGHTS)
+    return new, opacity / denominator
+
+
+def transparent(
+    gaussians: Gaussians, population: Population, cfg: DensifyConfig
+) -> Bool[Array, " n"]:
+    """Return which live Gaussians are too transparent to keep their place."""
+    return population.alive & (opacities(gaussians) <= cfg.prune_opacity)
+
+
+def relocate_and_grow(
+    key: PRNGKeyArray,
+    gaussians: Gaussians,
+    population: Population,
+    births: Int[Array, ""],
+    cfg: DensifyConfig,
+    demand: Float[Array, " n"] | None = None,
+) -> Outcome:
+    """Move transparent Gaussians onto opaque ones and add `births` new ones there.
+
+    Targets are drawn in proportion to opacity times demand. Everyone in one place shares its look,
+    and they are moved apart by `cfg.spread` of their extent: Gaussians in exactly one place have
+    the same gradients, and at opacities that no noise reaches they never part (BUILD_NOTES,
+    "Twins").
+
+    Args:
+        key: randomness.
+        gaussians: the scene.
+        population: who is alive.
+        births: new Gaussians wanted; those without a free slot are counted in `refused`.
+        cfg: opacity threshold, spread.
+        demand: where more Gaussians are needed (`train/demand.py`); None: alike everywhere.
+    """
+    n = population.alive.shape[0]
+    dead = transparent(gaussians, population, cfg)
+    healthy = population.alive & ~dead
+    # Births go to the first `births` empty slots.
+    order = jnp.cumsum(~population.alive) - 1
+    newborn = ~population.alive & (order < births)
+    weights = jnp.where(healthy, opacities(gaussians), 0.0)
+    if demand is not None:
+        weights = weights * demand
+    movers = (dead | newborn) & jnp.any(weights > 0)
+    cumulative = jnp.cumsum(weights)
+    draws = jax.random.uniform(key, (n,)) * cumulative[-1]
+    target = jnp.clip(jnp.searchsorted(cumulative, draws, side="right"), 0, n - 1)
+    target = jnp.where(movers, target, n)
+    arrivals = jnp.zeros(n, jnp.float32).at[target].add(1.0, mode="drop")
+    opacity, factor = share(opacities(gaussians), 1 + arrivals)
+    shared = arrivals > 0
+    gaussians = dataclasses.replace(
+        gaussians,
+        opacity_logits=jnp.where(
+            shared, logit(jnp.maximum(opacity, cfg.prune_opacity)), gaussians.opacity_logits
+        ),
+        log_scales=jnp.where(
+            shared[:, None], gaussians.log_scales + jnp.log(factor)[:, None], gaussians.log_scales
+        ),
+    )
+    source = jnp.where(movers, jnp.minimum(target, n - 1), jnp.arange(n))
+    gaussians = jax.tree.map(lambda a: a[source], gaussians)
+    # Whoever stays gives way to the other side, so that the centre of the place stays.
+    away = jax.random.normal(jax.random.fold_in(key, 1), (n, 3)) * movers[:, None]
+    pushed = jnp.zeros((n, 3)).at[target].add(away, mode="drop")
+    away = away - pushed / jnp.maximum(arrivals, 1)[:, None]
+    gaussians = _apart(gaussians, away, movers | shared, cfg.spread)
+    refused = births - jnp.sum(newborn)
+    return Outcome(
+        gaussians, fresh_population(population.alive | (newborn & movers)), movers | shared, refused
+    )
+
+
+def _apart(
+    gaussians: Gaussians, away: Float[Array, "n 3"], where: Bool[Array, " n"], spread: float
+) -> Gaussians:
+    """Move Gaussians within their own extent, and shrink them by what that adds to the place.
+
+    Args:
+        gaussians: the scene.
+        away: directions in units of the principal axes, variance 1; zero for all others.
+        where: whom.
+        spread: deviation of the moves over that of the Gaussian, below 1.
+    """
+    scales = jnp.exp(gaussians.log_scales)
+    moved = _turned(rotation_matrices(gaussians.quats), spread * away * scales)
+    return dataclasses.replace(
+        gaussians,
+        means=gaussians.means + moved,
+        log_scales=gaussians.log_scales + 0.5 * float(np.log1p(-(spread**2))) * where[:, None],
+    )
+
+
+def _turned(R, local: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    """Return vectors along the principal axes in world coordinates; R from `rotation_matrices`."""
+    return jnp.stack([sum(R[i][j] * local[:, j] for j in range(3)) for i in range(3)], -1)
+
+
+def exploration_noise(
+    key: PRNGKeyArray,
+    gaussians: Gaussians,
+    alive: Bool[Array, " n"],
+    rate: Float[Array, ""],
+) -> Float[Array, "n 3"]:
+    """Return the noise to add to the means after a step.
+
+    It has the shape of each Gaussian's covariance and reaches only nearly transparent ones.
+
+    Args:
+        key: randomness.
+        gaussians: the scene.
+        alive: slots in use.
+        rate: noise scale times the learning rate of the means.
+    """
+    gate = jax.nn.sigmoid(NOISE_STEEPNESS * (NOISE_OPACITY - opacities(gaussians)))
+    R = rotation_matrices(gaussians.quats)
+    variance = jnp.exp(2 * gaussians.log_scales)
+    raw = jax.random.normal(key, gaussians.means.shape) * (gate * alive * rate)[:, None]
+    local = [sum(R[i][j] * raw[:, i] for i in range(3)) * variance[:, j] for j in range(3)]
+    return _turned(R, jnp.stack(local, -1))

@@ -1,1 +1,0 @@
-"""From seed points to Gaussians: what a fit starts from."""

@@ -1,0 +1,173 @@
+"""Pictures of a finished run: from shots, wide ones, and ones that compare it with photographs."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from jaxtyping import Float32
+
+from p2gs_jax.formats.frames import Frame
+from p2gs_jax.paths import Cylinder, Rig, Shot, Step, Wide, render_wide, stitch
+from p2gs_jax.paths.captioned_rows import Row, stacked, stacked_size
+from p2gs_jax.paths.cylinder import borders
+from p2gs_jax.paths.geometry import Poses, inverse
+from p2gs_jax.paths.panorama import Layers
+from p2gs_jax.photometry.display import Look, develop, undevelop
+from p2gs_jax.render.host import make_renderer
+from p2gs_jax.run.read import Run
+from p2gs_jax.scene.images import ImageStore
+
+# Where no camera has seen anything.
+NOTHING = 0.92
+# Photographs are placed by the field's depth, smoothed over this part of the width: its noise would
+# fray their edges.
+SMOOTH = 1 / 80
+
+
+class Studio:
+    """Renders a run and develops what it renders, and knows how long either took.
+
+    Attributes:
+        run: the run.
+        render_seconds: of every picture rendered.
+        develop_seconds: of every picture developed.
+    """
+
+    def __init__(self, run: Run):
+        self.run = run
+        self.render_seconds: list[float] = []
+        self.develop_seconds: list[float] = []
+        self._render = make_renderer(run.cfg.render)
+
+    def linear(self, shot: Shot) -> Layers:
+        """Return linear radiance, alpha and alpha-weighted depth of a pinhole camera."""
+        begin = time.perf_counter()
+        layers = self._layers(shot)
+        self.render_seconds.append(time.perf_counter() - begin)
+        return layers
+
+    def wide(self, cylinder: Cylinder) -> Wide:
+        """Return a wide view of the field."""
+        begin = time.perf_counter()
+        wide = render_wide(self._layers, cylinder)
+        self.render_seconds.append(time.perf_counter() - begin)
+        return wide
+
+    def _layers(self, shot: Shot) -> Layers:
+        result = self._render(self.run.params.gaussians, self.run.alive, shot.camera())
+        return np.asarray(result.linear), np.asarray(result.alpha), np.asarray(result.depth)
+
+    def develop(self, linear: Float32[np.ndarray, "h w 3"], look: Look):
+        """Return display values."""
+        begin = time.perf_counter()
+        ldr = develop(linear, look)
+        self.develop_seconds.append(time.perf_counter() - begin)
+        return ldr
+
+
+def shot_frames(
+    studio: Studio,
+    shots: Sequence[Shot],
+    look_of: Callable[[Shot], Look],
+    photograph: Callable[[int], Float32[np.ndarray, "h w 3"] | None] | None = None,
+) -> Iterator[Frame]:
+    """Yield a frame for every shot.
+
+    Args:
+        studio: renders.
+        shots: what to render.
+        look_of: how to develop each.
+        photograph: returns what goes beside the render of a view, or None; by default nothing.
+    """
+    for shot in shots:
+        linear, alpha, depth = studio.linear(shot)
+        look = look_of(shot)
+        ldr = studio.develop(linear, look)
+        taken = None if photograph is None or shot.view is None else photograph(shot.view)
+        how = (look.exposure, look.gamma)
+        yield Frame(shot.name, linear, alpha, ldr, *how, depth, shot.camera(), taken)
+
+
+def wide_frames(studio: Studio, cylinder: Cylinder, poses: Poses, look: Look) -> Iterator[Frame]:
+    """Yield wide views of the field.
+
+    Args:
+        studio: renders.
+        cylinder: the view from a rig: its viewmat is rig-to-camera.
+        poses: rig-to-world.
+        look: how to develop all.
+    """
+    for k, pose in enumerate(poses):
+        wide = studio.wide(_placed(cylinder, pose))
+        ldr = studio.develop(wide.linear, look)
+        yield Frame(f"{k:05d}", wide.linear, wide.alpha, ldr, look.exposure, look.gamma)
+
+
+def comparison_size(cylinder: Cylinder) -> tuple[int, int]:
+    """Return (width, height) of the pictures of `comparison_frames`."""
+    return stacked_size(cylinder.width, [cylinder.height] * 3, captions=1)
+
+
+def comparison_frames(
+    studio: Studio,
+    rig: Rig,
+    steps: Sequence[Step],
+    cylinder: Cylinder,
+    look: Look,
+    store: ImageStore,
+) -> Iterator[Frame]:
+    """Yield three panoramas below each other for every time step.
+
+    Photographs stitched as taken; the same, each taken back to radiance by its own exposure and
+    gamma and developed with one look; the field with that look. Photographs are placed by the
+    field's smoothed depth, and nothing is blended. The frame's `linear` is the field.
+
+    Args:
+        studio: renders.
+        rig: the cameras.
+        steps: of the rig.
+        cylinder: the view from the rig: its viewmat is rig-to-camera.
+        look: the common one.
+        store: the photographs.
+    """
+    names = list(rig.mounts)
+    mean = studio.run.mean.exposure_geometric
+    for step in steps:
+        placed = _placed(cylinder, step.pose)
+        wide = studio.wide(placed)
+        shots = [step.shots[name] for name in names if name in step.shots]
+        rows = [shot.view for shot in shots if shot.view is not None]
+        looks = [studio.run.own_look(row) for row in rows]
+        photographs, masks = zip(*(store.get(row) for row in rows), strict=True)
+        radiance = [undevelop(p, own) for p, own in zip(photographs, looks, strict=True)]
+        near = cv2.GaussianBlur(wide.nearness, (0, 0), SMOOTH * cylinder.width)
+        taken = stitch(photographs, shots, placed, near, masks)
+        same = stitch(radiance, shots, placed, near, masks)
+        seen = taken.source[..., None] >= 0
+        stops = [float(np.log2(own.exposure / mean)) for own in looks]
+        cameras = [name for name in names if name in step.shots]
+        captions = [
+            (f"{cameras[k]} {stops[k]:+.1f} EV".replace("-", "−"), start, end)
+            for k, start, end in borders(taken.source[cylinder.height // 2])
+        ]
+        field = studio.develop(wide.linear, look)
+        picture = stacked(
+            [
+                Row("photographs as taken", np.where(seen, taken.image, NOTHING), captions),
+                Row(
+                    "the same photographs, developed to one exposure",
+                    np.where(seen, develop(same.image, look), NOTHING),
+                ),
+                Row("the radiance field at that exposure", field),
+            ]
+        )
+        how = (look.exposure, look.gamma)
+        yield Frame(step.name, wide.linear, wide.alpha, picture, *how)
+
+
+def _placed(cylinder: Cylinder, pose) -> Cylinder:
+    return replace(cylinder, viewmat=cylinder.viewmat @ inverse(pose))

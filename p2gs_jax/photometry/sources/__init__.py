@@ -1,0 +1,1 @@
+"""Where observations of shared points come from."""

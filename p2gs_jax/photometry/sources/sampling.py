@@ -1,0 +1,222 @@
+"""What the photographs show at tracks and at shell directions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+from scipy.sparse import csr_array
+
+from p2gs_jax.core.streams import Stream, generator
+from p2gs_jax.photometry.observations import Observations
+from p2gs_jax.photometry.srgb import srgb_decode, srgb_encode
+from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.visibility import project_points
+from p2gs_jax.types import Scene
+
+# Averaging a few pixels quiets noise and hides the misplacement of a fraction of a pixel.
+PATCH = 3
+# A track's position is uncertain by this much, in pixels of the sampled image; where the image is
+# steep, so is its colour.
+POSITION_DEVIATION = 0.5
+# Patches are widened to the coarsest view of a point, which is at most this many times coarser than
+# the finest: what is still farther away mixes in neighbours (BUILD_NOTES).
+COARSEST = 4.0
+
+
+class Samples(NamedTuple):
+    """Colours of an image at some positions.
+
+    Attributes:
+        colors: averages over patches, display-encoded.
+        spread: standard deviation of `colors` from uncertain positions: gradient times that.
+        valid: inside the image and its mask.
+    """
+
+    colors: Float32[np.ndarray, "o 3"]
+    spread: Float32[np.ndarray, "o 3"]
+    valid: Bool[np.ndarray, " o"]
+
+
+def sample(
+    ldr: Float32[np.ndarray, "h w 3"],
+    mask: Float32[np.ndarray, "h w"],
+    xy: Float[np.ndarray, "o 2"],
+    wider: Float[np.ndarray, " o"] | None = None,
+) -> Samples:
+    """Sample an image at pixel positions.
+
+    Args:
+        ldr: photograph.
+        mask: 1 = use.
+        xy: positions, pixel centres at +0.5.
+        wider: factors by which the averaged patches are wider than PATCH; None: 1.
+    """
+    factors = np.ones(len(xy)) if wider is None else wider
+    # Odd, so that patches are centred.
+    widths = 2 * np.rint((PATCH * factors - 1) / 2).astype(int) + 1
+    colors, spread = (np.zeros((len(xy), 3), np.float32) for _ in range(2))
+    valid = np.zeros(len(xy), bool)
+    linear = srgb_decode(ldr)  # light averages linearly, whatever the exposure
+    for width in np.unique(widths).tolist():
+        pick = np.flatnonzero(widths == width)
+        smooth = cv2.blur(linear, (width, width), borderType=cv2.BORDER_REFLECT)
+        found = _sample_smooth(smooth, mask, xy[pick], width // 2)
+        colors[pick], spread[pick], valid[pick] = found
+    return Samples(colors, spread, valid)
+
+
+def _sample_smooth(smooth, mask, xy, margin: int) -> Samples:
+    """Sample a linear image that is smooth already; `margin` pixels of its border are not used.
+
+    Display values are interpolated. Only the pixels around the samples are encoded: a large
+    photograph has many more.
+    """
+    height, width = mask.shape
+    position = (xy - 0.5).astype(np.float32)
+    inside = (
+        (position[:, 0] >= margin)
+        & (position[:, 1] >= margin)
+        & (position[:, 0] <= width - 1 - margin)
+        & (position[:, 1] <= height - 1 - margin)
+    )
+    safe = np.where(inside[:, None], position, 1.0).astype(np.float32)
+    corner = np.floor(safe).astype(int)
+    part = safe - corner.astype(np.float32)
+    share_x, share_y = (np.stack([1 - f, f], 1) for f in part.T)
+    around = np.arange(-1, 3)
+    columns = np.clip(corner[:, :1] + around, 0, width - 1)[:, None, :]
+    rows = np.clip(corner[:, 1:] + around, 0, height - 1)[:, :, None]
+
+    def between(values):
+        """Interpolate values at the four pixels about each position."""
+        return np.einsum("oi,oj,oij...->o...", share_y, share_x, values)
+
+    shown = srgb_encode(smooth[rows, columns])
+    slope_x = 0.5 * (shown[:, 1:3, 2:] - shown[:, 1:3, :2])
+    slope_y = 0.5 * (shown[:, 2:, 1:3] - shown[:, :2, 1:3])
+    spread = POSITION_DEVIATION * np.sqrt(between(slope_x**2 + slope_y**2))
+    valid = inside & (between(mask[rows, columns][:, 1:3, 1:3]) > 0.99)
+    return Samples(between(shown[:, 1:3, 1:3]), spread, valid)
+
+
+def camera_rows(scene: Scene) -> Int[np.ndarray, " v"]:
+    """Return the physical camera of each training view as 0, 1, ..."""
+    names = [scene.views[i].camera for i in scene.train_indices]
+    return np.unique(names, return_inverse=True)[1]
+
+
+def track_colors(
+    scene: Scene, store: ImageStore, on_view: Callable[[int, int], None] = lambda i, n: None
+) -> Observations:
+    """Sample every track in every training view.
+
+    Args:
+        scene: with tracks.
+        store: photographs, sampled at their training resolution.
+        on_view: progress: views done, views in all.
+    """
+    assert scene.tracks is not None
+    order = np.argsort(scene.tracks.view_indices, kind="stable")
+    bounds = np.searchsorted(scene.tracks.view_indices[order], np.arange(len(scene.views) + 1))
+    picks = [order[bounds[i] : bounds[i + 1]] for i in scene.train_indices]
+    points = [scene.tracks.point_indices[pick] for pick in picks]
+    xy = [scene.tracks.xy[pick] for pick in picks]
+    return point_colors(scene, store, points, xy, on_view=on_view)
+
+
+def point_colors(
+    scene: Scene,
+    store: ImageStore,
+    points: list[Int[np.ndarray, " o"]],
+    xy: list[Float[np.ndarray, "o 2"]],
+    *,
+    uncertainty: float = 1.0,
+    on_view: Callable[[int, int], None] = lambda i, n: None,
+) -> Observations:
+    """Sample points in training views, all at the scale of the coarsest view that is used.
+
+    A surface seen from afar shows less contrast, because a pixel averages more of it; compared
+    pixel for pixel, that looks like a gamma (BUILD_NOTES). So closer views are averaged over the
+    same patch of surface.
+
+    Args:
+        scene: its training views and points.
+        store: photographs.
+        points: for each training view the points to sample, rows in `scene.points`.
+        xy: for each training view their positions, full resolution.
+        uncertainty: of positions, in units of POSITION_DEVIATION.
+        on_view: progress: views done, views in all.
+    """
+    footprints = []
+    for index, mine in zip(scene.train_indices, points, strict=True):
+        z = project_points(scene.points[mine], scene.views[index])[1]
+        K = store.camera(index)[1]
+        # A track behind its camera is wrong, not close.
+        footprints.append(np.where(z > 0, z, np.inf) / np.mean(np.diag(K)[:2]))
+    finest = np.full(len(scene.points), np.inf)
+    for mine, footprint in zip(points, footprints, strict=True):
+        np.minimum.at(finest, mine, footprint)
+    keep = [f <= COARSEST * finest[mine] for mine, f in zip(points, footprints, strict=True)]
+    coarsest = np.zeros(len(scene.points))
+    for mine, footprint, kept in zip(points, footprints, keep, strict=True):
+        np.maximum.at(coarsest, mine[kept], footprint[kept])
+    views, seen, colors, spreads = [], [], [], []
+    for row, (index, kept) in enumerate(zip(scene.train_indices, keep, strict=True)):
+        mine = points[row][kept]
+        if len(mine):
+            view, (_, _, width, height) = scene.views[index], store.camera(index)
+            there = xy[row][kept] * [width / view.width, height / view.height]
+            found = sample(*store.get(index), there, coarsest[mine] / footprints[row][kept])
+            views.append(np.full(int(found.valid.sum()), row))
+            seen.append(mine[found.valid])
+            colors.append(found.colors[found.valid])
+            spreads.append(found.spread[found.valid])
+        on_view(row + 1, len(scene.train_indices))
+    empty = np.zeros((0, 3), np.float32)
+    return Observations(
+        views=np.concatenate([np.zeros(0, int), *views]),
+        points=np.concatenate([np.zeros(0, int), *seen]),
+        colors=np.concatenate([empty, *colors]),
+        spread=np.float32(uncertainty) * np.concatenate([empty, *spreads]),
+        view_count=len(scene.train_indices),
+        point_count=len(scene.points),
+        cameras=camera_rows(scene),
+        too_coarse=int(sum((~kept).sum() for kept in keep)),
+        names=tuple(scene.views[i].name for i in scene.train_indices),
+    )
+
+
+def sample_pairs(
+    tracks: Observations, count: int, seed: int
+) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
+    """Draw pairs of observations of the same point; rows of `tracks`, in different views."""
+    order = np.argsort(tracks.points, kind="stable")
+    bounds = np.flatnonzero(np.diff(tracks.points[order], prepend=-1, append=-1))
+    lengths = np.diff(bounds)
+    starts, lengths = bounds[:-1][lengths >= 2], lengths[lengths >= 2]
+    if not len(starts):
+        return np.zeros(0, int), np.zeros(0, int)
+    rng = generator(seed, Stream.COLOR_PAIRS)
+    pick = rng.integers(0, len(starts), count)
+    first = rng.integers(0, lengths[pick])
+    second = (first + rng.integers(1, lengths[pick])) % lengths[pick]
+    return order[starts[pick] + first], order[starts[pick] + second]
+
+
+def overlapping_views(tracks: Observations, fewest: int) -> list[Int[np.ndarray, " k"]]:
+    """Return for every view the others that share at least `fewest` points with it.
+
+    A view that shares fewer with all of them keeps the one it shares most with, if any.
+    """
+    ones = np.ones(len(tracks.views), np.float32)
+    shape = (tracks.view_count, tracks.point_count)
+    seen = csr_array((ones, (tracks.views, tracks.points)), shape=shape)
+    seen.data[:] = 1
+    shared = (seen @ seen.T).toarray()
+    np.fill_diagonal(shared, 0)
+    enough = np.minimum(fewest, np.maximum(shared.max(1, initial=0), 1))
+    return [np.flatnonzero(row >= least) for row, least in zip(shared, enough, strict=True)]

@@ -1,0 +1,274 @@
+"""One fit from a scene folder to a run folder: the data flow, top to bottom."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from p2gs_jax.config import FitConfig, require_config
+from p2gs_jax.config import to_dict as config_to_dict
+from p2gs_jax.core.atomic import no_empty_folders, write_json
+from p2gs_jax.core.clock import CompileCounter, Stopwatch
+from p2gs_jax.core.progress import Reporter, Silent
+from p2gs_jax.errors import UserError
+from p2gs_jax.evaluate.lpips import LpipsWeights
+from p2gs_jax.photometry.gauge import recentre
+from p2gs_jax.photometry.selection import Selection
+from p2gs_jax.pipeline.finish import finish
+from p2gs_jax.pipeline.preflight import Paths, check_scene, preflight
+from p2gs_jax.pipeline.prepare import Expected, Prepared, load, prepare
+from p2gs_jax.run.checkpoint import CheckpointStore
+from p2gs_jax.run.places import remembered
+from p2gs_jax.scene.images import size_at
+from p2gs_jax.train import decisions
+from p2gs_jax.train.loop import Trainer, TrainResult
+from p2gs_jax.train.programs import StepPrograms
+from p2gs_jax.train.views import TrainingViews
+from p2gs_jax.types import Params, Scene
+
+
+def optimise(
+    prepared: Prepared,
+    run_dir: Path,
+    cfg: FitConfig,
+    reporter: Reporter,
+    programs: StepPrograms,
+    *,
+    resume: bool,
+    validation: Sequence[int] = (),
+    spent_s: float = 0.0,
+    reserve_s: float = 0.0,
+) -> TrainResult:
+    """Run the optimisation, from the start or from the newest checkpoint.
+
+    Args:
+        prepared: from `prepare`.
+        run_dir: where the log and checkpoints go.
+        cfg: everything.
+        reporter: receives progress.
+        programs: compiled steps, some of them perhaps begun.
+        resume: continue from the newest checkpoint.
+        validation: training views that automatic growth is judged by.
+        spent_s: seconds of the budget that are already gone.
+        reserve_s: seconds of the budget to keep for evaluation and files.
+    """
+    views = TrainingViews(
+        prepared.store, prepared.scene.train_indices, cfg.train.seed, prepared.overlaps
+    )
+
+    def say(text: str) -> None:
+        prepared.notes.append(text)
+        reporter.message(text)
+
+    trainer = Trainer(
+        cfg,
+        views,
+        prepared.extent,
+        prepared.pairs,
+        prepared.coverage,
+        run_dir,
+        programs,
+        on_log=reporter.log,
+        on_message=say,
+        validation=validation,
+        own_exposures=prepared.selection is not None,
+        reasons=() if prepared.selection is None else prepared.selection.reasons,
+    )
+    alive = np.ones(prepared.params.gaussians.capacity, bool)
+    return trainer.run(prepared.params, alive, resume=resume, spent_s=spent_s, finish_s=reserve_s)
+
+
+def _begin(programs: StepPrograms, known: Expected, scene: Scene, run_dir: Path) -> None:
+    """Begin to compile steps while the exposures are solved, mostly on one core."""
+    views = TrainingViews(known.store, scene.train_indices, known.cfg.train.seed)
+    trainer = Trainer(known.cfg, views, known.extent, None, known.coverage, run_dir, programs)
+    trainer.expect(known.params, known.images)
+
+
+def compact(result: TrainResult) -> Params:
+    """Return the parameters with only the live Gaussians, in slot order."""
+    alive = np.flatnonzero(np.asarray(result.state.population.alive))
+    params = result.state.params
+    gaussians = jax.tree.map(lambda a: jax.device_put(np.asarray(a)[alive]), params.gaussians)
+    return dataclasses.replace(params, gaussians=gaussians)
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """What `fit` returns to a program.
+
+    Attributes:
+        params: the fit, live Gaussians only.
+        scene: what it was fitted to.
+        metrics: what `metrics.json` holds.
+        run_dir: the run folder.
+        selection: what the bundle adjustment found, or None.
+    """
+
+    params: Params
+    scene: Scene
+    metrics: dict
+    run_dir: Path
+    selection: Selection | None
+
+
+def fit(
+    scene_dir: str | Path,
+    run_dir: str | Path,
+    cfg: FitConfig | None = None,
+    *,
+    reference: str | Path | None = None,
+    resume: bool = False,
+    reporter: Reporter | None = None,
+    true_exposures: Mapping[str, float] | None = None,
+    spent_s: float = 0.0,
+) -> FitResult:
+    """Fit a scene and write a run folder.
+
+    Args:
+        scene_dir: COLMAP model, transforms.json, or folder of photographs.
+        run_dir: created; its contract is in docs/files.md.
+        cfg: options; None takes the `robust` preset.
+        reference: photographs of the same views under one common exposure.
+        resume: continue after an interruption.
+        reporter: receives progress.
+        true_exposures: image name -> true exposure, where it is known, for the plot.
+        spent_s: seconds of the budget that were gone before the call.
+
+    Raises:
+        UserError: something the user can mend.
+    """
+    cfg = require_config(cfg)
+    reporter = reporter or Silent()
+    paths = Paths(Path(scene_dir), Path(run_dir), None if reference is None else Path(reference))
+    scene_dir, run_dir = paths.scene, paths.run
+    begin = time.monotonic() - spent_s
+    clock, compiler = Stopwatch(), CompileCounter()
+    lpips_weights = preflight(cfg, paths, resume=resume)
+    with no_empty_folders(run_dir):
+        reading = time.monotonic()
+        scene = load(scene_dir, run_dir, cfg, reporter)
+        # Without a model, nearly all of it is finding and matching features.
+        found = scene.format in ("images", "transforms")
+        clock.add("structure_from_motion" if found else "reading", time.monotonic() - reading)
+        views = check_scene(scene, cfg, paths, lpips_weights)
+    truth, given = views.truth, cfg
+    reasons: tuple[str, ...] = ()
+    if resume:
+        cfg, reasons = decisions.kept(cfg, run_dir)
+    programs = StepPrograms()
+    with contextlib.closing(programs):
+        prepared = prepare(
+            scene,
+            cfg,
+            reporter,
+            clock,
+            lambda known: _begin(programs, known, scene, run_dir),
+            reasons=reasons,
+        )
+        cfg = prepared.cfg
+        with _lock(paths, given):
+            result = optimise(
+                prepared,
+                run_dir,
+                cfg,
+                reporter,
+                programs,
+                resume=resume,
+                validation=views.validation,
+                spent_s=time.monotonic() - begin,
+                reserve_s=_finish_estimate(scene, cfg, lpips_weights, truth is not None),
+            )
+    params = compact(result)
+    if cfg.photometry.parameterization == "log" and cfg.photometry.known is None:
+        params = recentre(params, cfg.render.radiance)
+    metrics = finish(
+        params,
+        prepared,
+        run_dir,
+        cfg,
+        reporter,
+        truth=truth,
+        lpips_weights=lpips_weights,
+        counts={
+            "gaussians": params.gaussians.capacity,
+            "seed_points": len(scene.points),
+            "train_views": len(scene.train_indices),
+            "test_views": len(scene.test_indices),
+            "steps": result.host.step,
+            "refused_densifications": result.host.refused,
+            "tile_lists_grown": result.host.overflows,
+        },
+        growth=result.growth,
+        seconds={
+            **({"starting": spent_s} if spent_s else {}),
+            **clock.seconds,
+            **result.seconds,
+            "total_until_evaluation": time.monotonic() - begin,
+            "optimisation": result.host.elapsed_s,
+        },
+        compiler=compiler,
+        true_ev=None
+        if true_exposures is None
+        else np.log2([true_exposures[scene.views[i].name] for i in scene.train_indices]),
+    )
+    return FitResult(params, scene, metrics, run_dir, prepared.selection)
+
+
+@contextlib.contextmanager
+def _lock(paths: Paths, cfg: FitConfig) -> Iterator[None]:
+    """Make the folder a run's while its steps are taken, and keep it where they left something.
+
+    A run that failed before its first checkpoint leaves nothing to continue or to overwrite.
+
+    Args:
+        paths: of the fit.
+        cfg: as the user gave it.
+    """
+    path = paths.run / "config.json"
+    write_json(
+        path,
+        {
+            **remembered("scene", paths.scene, paths.run),
+            **remembered("reference", paths.reference, paths.run),
+            "fit": config_to_dict(cfg),
+        },
+    )
+    try:
+        yield
+    except UserError:
+        if CheckpointStore(paths.run / "checkpoints").latest_step() is None:
+            path.unlink(missing_ok=True)
+        raise
+
+
+def _finish_estimate(
+    scene: Scene, cfg: FitConfig, lpips_weights: LpipsWeights | None, reference: bool
+) -> float:
+    """Return a guess of the seconds that evaluation and files will take.
+
+    Args:
+        scene: its views are judged.
+        cfg: their size, and the budget, of which a quarter at most is kept.
+        lpips_weights: whether LPIPS is computed, and on which network.
+        reference: whether each view is compared with a reference photograph as well.
+    """
+    if cfg.train.budget_s is None:
+        return 0.0
+    pixels = 0
+    for view in scene.views:
+        width, height = size_at(view, cfg.data.max_width)
+        pixels += width * height
+    # Measured (BUILD_NOTES, "Smaller things"): programs, then every view, and every pixel.
+    per_view, per_pixel = (0.13, 0.35e-6) if reference else (0.09, 0.25e-6)
+    if lpips_weights is not None:
+        # Under two protocols, and three more against a reference.
+        per_pixel += (5 if reference else 2) * lpips_weights.network.seconds_per_pixel
+    return min(6.0 + per_view * len(scene.views) + per_pixel * pixels, 0.25 * cfg.train.budget_s)

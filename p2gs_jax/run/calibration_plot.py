@@ -1,0 +1,94 @@
+"""`calibration.png`: exposures with error bars, residuals, and tone curves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from p2gs_jax.core.atomic import atomic_write
+from p2gs_jax.core.numerics import LN2
+from p2gs_jax.photometry.response import Response, log_exposed
+from p2gs_jax.photometry.solution import PhotometricSolution
+from p2gs_jax.types import GAMMA_SRGB
+
+MARKERS = "osD^vPX*"
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
+MOST_CURVES = 12
+
+
+def write_calibration_plot(
+    path: Path,
+    solution: PhotometricSolution,
+    *,
+    cameras: list[str],
+    stated_ev: Float[np.ndarray, " v"],
+    pivot: float,
+) -> None:
+    """Draw what a calibration found.
+
+    Args:
+        path: the PNG.
+        solution: exposures, gammas, response and residuals.
+        cameras: physical camera of each view.
+        stated_ev: EXIF or a file, stops, laid over the recovered ones; NaN where unknown.
+        pivot: linear value that gammas leave alone.
+    """
+    # Imported here: it takes as long to load as a small scene to read.
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
+
+    s = solution
+    seen = np.isfinite(s.exposure_errors)
+    exposures_ev = np.where(seen, s.exposures_ev, np.nan)
+    errors_ev = np.where(seen, s.exposure_errors / LN2, np.nan)
+    figure = Figure(figsize=(13, 4), layout="constrained")
+    top, middle, right = figure.subplots(1, 3, width_ratios=(2.2, 1.1, 1.1))
+    names = list(dict.fromkeys(cameras))
+    groups = [np.array([c == name for c in cameras]) for name in names]
+    for i, (name, mine) in enumerate(zip(names, groups, strict=True)):
+        at = np.flatnonzero(mine)
+        color, marker = COLORS[i % len(COLORS)], MARKERS[i % len(MARKERS)]
+        top.errorbar(
+            at,
+            exposures_ev[mine],
+            yerr=2 * errors_ev[mine],
+            fmt=f"{marker}-",
+            ms=4,
+            lw=0.8,
+            capsize=2,
+            color=color,
+            label=f"camera {name}" if len(names) > 1 else "recovered, 2 standard errors",
+        )
+        middle.plot(at, s.view_residual_ev[mine], marker, ms=4, color=color)
+        if np.isfinite(stated_ev[mine]).any():
+            label = "EXIF or file" if i == 0 else None
+            top.plot(at, stated_ev[mine], "k_", ms=9, mew=1.6, label=label)
+    top.set_title("Exposure", loc="left", fontsize=10)
+    top.set_ylabel("stops from the mean")
+    middle.set_title("Residual of an observation", loc="left", fontsize=10)
+    middle.set_ylabel("stops")
+    middle.set_ylim(bottom=0)
+    for axis in (top, middle):
+        axis.set_xlabel("view")
+        axis.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axis.grid(alpha=0.25)
+    if len(names) <= 12:
+        top.legend(fontsize=7)
+    y = np.linspace(0.02, 1, 300)
+    base = log_exposed(y, s.response)[0] - np.log(pivot)
+    distinct = np.unique(np.round(s.gammas, 3))
+    for gamma in distinct[:: max(1, len(distinct) // MOST_CURVES)]:
+        stops = (base * gamma / GAMMA_SRGB + np.log(pivot)) / LN2
+        right.plot(stops, y, lw=0.9, label=f"gamma {gamma:.2f}")
+    srgb = log_exposed(y, Response())[0] / LN2
+    right.plot(srgb, y, "k--", lw=0.9, label="sRGB")
+    right.set_title(f"Tone curve: {s.response.name}", loc="left", fontsize=10)
+    right.set_xlabel("log2 of the exposed radiance (0: white)")
+    right.set_ylabel("photographed value")
+    right.set_xlim(-9, 1)
+    right.grid(alpha=0.25)
+    right.legend(fontsize=7)
+    with atomic_write(path) as temporary:
+        figure.savefig(temporary, dpi=110, format="png")

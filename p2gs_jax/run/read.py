@@ -1,0 +1,288 @@
+"""Reading a finished run back."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Array, Bool, Float32
+
+from p2gs_jax.config import FitConfig, PhotometryConfig, from_dict
+from p2gs_jax.core.numerics import on_device
+from p2gs_jax.errors import UserError
+from p2gs_jax.evaluate.evaluate import MeanParameters, mean_parameters
+from p2gs_jax.formats.ply import read_ply
+from p2gs_jax.photometry.appearance import identity
+from p2gs_jax.photometry.display import Look
+from p2gs_jax.render.host import RenderView, make_renderer
+from p2gs_jax.run.layout import APPEARANCE
+from p2gs_jax.run.photometry_file import AGAIN, PhotometryFile, read_photometry
+from p2gs_jax.run.places import candidates, find
+from p2gs_jax.run.scene_file import read_scene
+from p2gs_jax.scene import load_scene
+from p2gs_jax.scene.device import camera_of
+from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.types import GAMMA_SRGB, Camera, Params, Photometry, Render, Scene
+
+CONFIG_AGAIN = (
+    "restore it from a copy; or remove it and repeat the `p2gs-jax fit` that made it, with "
+    "--resume, which writes it again and goes on from the last checkpoint"
+)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run.
+
+    Attributes:
+        folder: where it lies.
+        params: the fit.
+        cfg: how it was made.
+        scene: what it was fitted to; its photographs may be gone.
+        reference: photographs under one common exposure, or None.
+        photometry: `photometry.json`, with what `params` does not hold: standard errors, EXIF,
+            exposures fitted to held-out photographs.
+    """
+
+    folder: Path
+    params: Params
+    cfg: FitConfig
+    scene: Scene
+    reference: Path | None
+    photometry: PhotometryFile
+
+    @cached_property
+    def store(self) -> ImageStore:
+        """The photographs, and the cameras at the size of the fit."""
+        return ImageStore(self.scene.views, self.cfg.data)
+
+    @cached_property
+    def _renderer(self) -> RenderView:
+        return make_renderer(self.cfg.render)
+
+    def camera(self, index: int) -> Camera:
+        """Return the camera of a view at the size of the fit.
+
+        Args:
+            index: row in `scene.views`.
+        """
+        return camera_of(self.store, index)
+
+    def render(self, camera: Camera) -> Render:
+        """Return linear radiance, opacity and depth that a camera sees.
+
+        Args:
+            camera: of a view, or one's own (`make_camera`).
+        """
+        return self._renderer(self.params.gaussians, self.alive, camera)
+
+    def photograph(self, index: int) -> Float32[np.ndarray, "h w 3"]:
+        """Return a photograph at the size of the fit, display values.
+
+        Args:
+            index: row in `scene.views`.
+
+        Raises:
+            UserError: it is gone or broken.
+        """
+        return self.store.get(index)[0]
+
+    def require_photographs(self, indices: Sequence[int] | None = None) -> None:
+        """Make sure that photographs are there.
+
+        Args:
+            indices: rows in `scene.views`; None: all.
+
+        Raises:
+            UserError: one is not.
+        """
+        rows = range(len(self.scene.views)) if indices is None else indices
+        gone = [p for p in (self.scene.views[i].image_path for i in rows) if not p.is_file()]
+        if not gone:
+            return
+        what = (
+            f"{gone[0]} is missing" + (f", and {len(gone) - 1} more" if len(gone) > 1 else "")
+            if self.scene.root.exists()
+            else f"the scene of this run, {self.scene.root}, is not there"
+        )
+        raise UserError(
+            f"this needs the photographs of the run: {what}.",
+            fix="put them back, or say where the scene is (--scene of view, render, export, eval "
+            "and report; in Python load_run(folder, scene))",
+        )
+
+    @property
+    def alive(self) -> Bool[Array, " n"]:
+        """All Gaussians: a finished run keeps no empty slots."""
+        return on_device(np.ones(self.params.gaussians.capacity), bool)
+
+    @property
+    def mean(self) -> MeanParameters:
+        """Exposure and gamma of a view that has none of its own."""
+        return mean_parameters(self.params.photometry)
+
+    def own_look(self, index: int) -> Look:
+        """Return how a view was taken; a held-out view's exposure is that fitted to its photograph.
+
+        Args:
+            index: row in `scene.views`.
+        """
+        if index in self.scene.train_indices:
+            row = self.scene.train_indices.index(index)
+            p = self.params.photometry
+            e, g = float(p.exposures[row]), float(p.gammas[row])
+            return Look(e, g, self.cfg.photometry, self.params.correction(row))
+        name = self.scene.views[index].name
+        fitted = {v["image"]: v["exposure_fitted"] for v in self.photometry["views"]}.get(name)
+        if fitted is None:
+            return self.common_look()
+        return replace(self.common_look(), exposure=fitted)
+
+    def common_look(self, exposure_ev: float = 0.0) -> Look:
+        """Return one look for all views.
+
+        Args:
+            exposure_ev: stops from the geometric mean of the training views' exposures.
+        """
+        mean = self.mean
+        return Look(
+            mean.exposure_geometric * 2**exposure_ev,
+            mean.gamma,
+            self.cfg.photometry,
+            self.params.mean_correction,
+        )
+
+
+def resolved(cfg: PhotometryConfig, saved: PhotometryFile) -> PhotometryConfig:
+    """Return the options with the model and curve that the fit chose.
+
+    Raises:
+        UserError: the file names none.
+    """
+    curve, model = saved["curve"], saved["model"]
+    try:
+        spline = curve.get("spline")
+        return replace(
+            cfg,
+            select=False,
+            model=model,  # pyright: ignore[reportArgumentType]
+            curve=curve["name"],
+            spline=None if spline is None else tuple(map(float, spline)),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(f"photometry.json names no tone curve ({error}).", fix=AGAIN) from error
+
+
+def load_run(folder: str | Path, scene: str | Path | None = None) -> Run:
+    """Read parameters, configuration and cameras of a finished run.
+
+    Photographs are read when they are asked for; all else works without them.
+
+    Args:
+        folder: the run folder.
+        scene: where its scene lies now; None looks where it was, also relative to the run.
+
+    Raises:
+        UserError: the folder is no run, is unfinished or damaged; `scene` does not exist; or the
+            run is of an older version, which kept no cameras, and its scene has moved.
+    """
+    folder = Path(folder)
+    config_path = folder / "config.json"
+    if not config_path.is_file():
+        raise UserError(
+            f"{folder} is not a run folder: {config_path.name} is missing.",
+            fix="name the folder that was given to `p2gs-jax fit --out`",
+        )
+    for name in ("radiance.ply", "photometry.json"):
+        if not (folder / name).is_file():
+            raise UserError(
+                f"{folder} is unfinished: {name} is missing.",
+                fix="finish it with `p2gs-jax fit ... --resume`",
+            )
+    saved, cfg = _read_config(config_path)
+    found = _load_scene(saved, None if scene is None else Path(scene), cfg, folder)
+    gaussians = read_ply(folder / "radiance.ply")
+    photometry_file = read_photometry(folder / "photometry.json")
+    cfg = replace(cfg, photometry=resolved(cfg.photometry, photometry_file))
+    views = {v["image"]: v for v in photometry_file["views"]}
+    train = [views.get(found.views[i].name) for i in found.train_indices]
+    if any(v is None or v["exposure"] is None for v in train):
+        raise UserError(
+            f"{folder / 'photometry.json'} does not belong to the scene {found.root}: its "
+            "training views differ.",
+            fix="restore the scene folder as it was during the fit",
+        )
+    exposures = np.array([v["exposure"] for v in train if v is not None])
+    gammas = np.array([v["gamma"] for v in train if v is not None])
+    if cfg.photometry.parameterization == "log":
+        exposures, gammas = np.log(exposures), np.log(gammas / GAMMA_SRGB)
+    photometry = Photometry(
+        on_device(exposures),
+        on_device(gammas),
+        cfg.photometry.parameterization,
+    )
+    return Run(
+        folder,
+        Params(gaussians, photometry, _appearance(folder, cfg, len(train))),
+        cfg,
+        found,
+        find(saved, "reference", folder),
+        photometry_file,
+    )
+
+
+def _read_config(path: Path) -> tuple[dict[str, Any], FitConfig]:
+    """Return `config.json` and the configuration in it."""
+    try:
+        saved = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path} cannot be read: {error}.", fix=CONFIG_AGAIN) from error
+    if not isinstance(saved, dict) or not isinstance(saved.get("fit"), dict):
+        raise UserError(f"{path} is incomplete: it holds no options.", fix=CONFIG_AGAIN)
+    try:
+        return saved, from_dict(saved["fit"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise UserError(
+            f"{path} is of another version of this program: {error}.",
+            fix="open the run with the version that made it, or fit again with this one",
+        ) from error
+
+
+def _load_scene(saved: dict[str, Any], given: Path | None, cfg: FitConfig, folder: Path) -> Scene:
+    if given is not None and not given.exists():
+        raise UserError(
+            f"{given} does not exist.", fix="name the folder of the run's scene with --scene"
+        )
+    root = given or find(saved, "scene", folder)
+    scene = read_scene(folder, root or folder / "scene")
+    if scene is not None:
+        return scene
+    if root is None or not root.exists():
+        looked = ", ".join(map(str, candidates(saved, "scene", folder))) or "nowhere: it names none"
+        raise UserError(
+            f"the scene of this run, {saved.get('scene')}, is not there (looked for {looked}), and "
+            f"this run, of an older version, kept no cameras.",
+            fix="put it back, or name its folder with --scene",
+        )
+    return load_scene(root, cfg.data, folder / "cache", lambda text: None)
+
+
+def _appearance(folder: Path, cfg: FitConfig, views: int):
+    """Return the corrections of display values that the run learned, or None."""
+    if cfg.photometry.appearance is None:
+        return None
+    path = folder / APPEARANCE
+    try:
+        corrections = np.load(path, allow_pickle=False)
+    except (OSError, ValueError) as error:
+        raise UserError(
+            f"{path} cannot be read: {error}.", fix="finish the fit again with --resume"
+        ) from error
+    if corrections.shape != identity(cfg.photometry.appearance, views).shape:
+        raise UserError(f"{path} does not belong to this run.", fix="fit again")
+    return on_device(corrections)

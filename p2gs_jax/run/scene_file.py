@@ -1,0 +1,127 @@
+"""`scene.npz`: the cameras, points and tracks of a fit, so that a run opens without its scene.
+
+Photographs are not in it; where they lie is kept relative to the scene's folder.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from p2gs_jax.core.atomic import atomic_write
+from p2gs_jax.errors import UserError
+from p2gs_jax.types import Distortion, Scene, Tracks, View
+
+SCENE_FILE = "scene.npz"
+
+
+def write_scene(folder: Path, scene: Scene) -> None:
+    """Write what a run must know of its scene.
+
+    Args:
+        folder: the run folder.
+        scene: as it was read.
+    """
+    base = _base(scene.root)
+    said = {
+        "format": scene.format,
+        "notes": scene.notes,
+        "views": [
+            {
+                "name": v.name,
+                "camera": v.camera,
+                "split": v.split,
+                "exif_ev": v.exif_ev,
+                "image": _relative(v.image_path, base),
+                "mask": None if v.mask_path is None else _relative(v.mask_path, base),
+                "distortion": None if v.distortion is None else v.distortion.coefficients,
+            }
+            for v in scene.views
+        ],
+    }
+    arrays = {
+        "viewmats": np.stack([v.viewmat for v in scene.views]),
+        "Ks": np.stack([v.K for v in scene.views]),
+        "sizes": np.array([(v.width, v.height) for v in scene.views], np.int32),
+        "points": scene.points,
+        "point_colors": scene.point_colors,
+    }
+    if scene.tracks is not None:
+        arrays["track_views"] = scene.tracks.view_indices
+        arrays["track_points"] = scene.tracks.point_indices
+        arrays["track_xy"] = scene.tracks.xy
+    with atomic_write(folder / SCENE_FILE) as temporary:
+        np.savez_compressed(temporary, json=np.array(json.dumps(said)), **arrays)
+
+
+def read_scene(folder: Path, root: Path) -> Scene | None:
+    """Return the scene of a run, or None where the run was made before there was such a file.
+
+    Args:
+        folder: the run folder.
+        root: the scene's folder now; it need not exist.
+
+    Raises:
+        UserError: the file is broken.
+    """
+    path = folder / SCENE_FILE
+    if not path.is_file():
+        return None
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            a = dict(file)
+        said = json.loads(str(a["json"]))
+        base = _base(root)
+        views = tuple(
+            View(
+                name=v["name"],
+                image_path=base / v["image"],
+                camera=v["camera"],
+                viewmat=a["viewmats"][i],
+                K=a["Ks"][i],
+                width=int(a["sizes"][i, 0]),
+                height=int(a["sizes"][i, 1]),
+                distortion=None if v["distortion"] is None else Distortion(tuple(v["distortion"])),
+                mask_path=None if v["mask"] is None else base / v["mask"],
+                exif_ev=v["exif_ev"],
+                split=v["split"],
+            )
+            for i, v in enumerate(said["views"])
+        )
+        tracks = None
+        if "track_xy" in a:
+            tracks = Tracks(a["track_views"], a["track_points"], a["track_xy"])
+        return Scene(
+            root=root,
+            format=said["format"],
+            views=views,
+            points=a["points"],
+            point_colors=a["point_colors"],
+            tracks=tracks,
+            notes=tuple(said["notes"]),
+        )
+    except (OSError, ValueError, KeyError, TypeError, IndexError, zipfile.BadZipFile) as error:
+        raise UserError(
+            f"{path} cannot be read: {error}.",
+            fix="restore it from a copy, or remove it: the scene is then read from its own folder",
+        ) from error
+
+
+def _base(root: Path) -> Path:
+    """Return the folder that photographs are named from; a scene may be a transforms.json."""
+    return root.parent if root.suffix.lower() == ".json" else root
+
+
+def _relative(path: Path, base: Path) -> str:
+    """Return a path from the scene's folder where it lies below it, else an absolute one."""
+    for a, b in (
+        (os.path.abspath(path), os.path.abspath(base)),
+        (path.resolve(), base.resolve()),
+    ):
+        if Path(a).is_relative_to(b):
+            return Path(a).relative_to(b).as_posix()
+    return Path(os.path.abspath(path)).as_posix()

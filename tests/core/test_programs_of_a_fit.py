@@ -1,0 +1,72 @@
+"""Few programs: what is small is computed by numpy, what is large by one program per image size."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from tiny_scene import make_scene
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.core.clock import CompileCounter
+from p2gs_jax.core.progress import Silent
+from p2gs_jax.photometry.gauge import recentre
+from p2gs_jax.pipeline.calibrate import calibrate
+from p2gs_jax.pipeline.finish import finish
+from p2gs_jax.pipeline.prepare import load, prepare
+from p2gs_jax.run.read import load_run
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return make_scene(tmp_path_factory.mktemp("programs") / "scene")
+
+
+def test_calibration_compiles_nothing(scene, tmp_path):
+    counter = CompileCounter()
+    calibrate(scene, tmp_path)
+    assert counter.programs == 0
+
+
+def test_a_fit_without_its_steps_compiles_few_programs(scene, tmp_path):
+    cfg = FitConfig()
+    cfg = dataclasses.replace(
+        cfg,
+        data=dataclasses.replace(cfg.data, test_every=3),
+        render=dataclasses.replace(cfg.render, sh_degree=1),
+    )
+    counter = CompileCounter()
+    loaded = load(scene, tmp_path, cfg, Silent())
+    prepared = prepare(loaded, cfg, Silent())
+    assert counter.programs == 0
+    params = recentre(prepared.params, cfg.render.radiance)
+    assert counter.programs == 0
+    metrics = finish(
+        params,
+        prepared,
+        tmp_path,
+        prepared.cfg,
+        Silent(),
+        truth=None,
+        lpips_weights=None,
+        counts={},
+        compiler=counter,
+        seconds={"reading": 1.0},
+    )
+    # Counting tiles, rendering, developing (images; colours of splats), fitting an exposure, PSNR,
+    # SSIM, and the basis of spherical harmonics.
+    assert counter.programs <= 8
+    assert metrics["photometry"]["converged"]
+    assert metrics["photometry"]["unknown_errors"] == 0
+    seconds = metrics["seconds"]
+    compiling = seconds.pop("compiler_in_all_threads")
+    assert compiling == counter.seconds > 0
+    assert metrics["counts"]["programs"] == counter.programs
+    assert list(seconds) == ["reading", "files", "evaluation", "evaluation_and_files"]
+    assert min(seconds.values()) > 0
+
+
+def test_reading_a_run_compiles_nothing(finished_run):
+    counter = CompileCounter()
+    run = load_run(finished_run)
+    assert np.asarray(run.alive).all()
+    assert counter.programs == 0

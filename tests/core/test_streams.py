@@ -1,0 +1,65 @@
+"""Nobody draws from another's stream, and seeds mean what they meant."""
+
+import itertools
+import re
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import p2gs_jax
+from p2gs_jax.core.streams import (
+    SceneStream,
+    Stream,
+    densification_key,
+    generator,
+    noise_key,
+    view_order,
+)
+
+PACKAGE = Path(p2gs_jax.__file__).parent
+# Each draws everything from one stream of its own: toy data, benchmarks, an export's order.
+ALONE = ("core/streams.py", "synth/drive.py", "gaussians/bake.py", "bench/")
+
+
+@pytest.mark.parametrize("streams", [Stream, SceneStream])
+def test_no_two_streams_draw_the_same(streams):
+    drawn = {s: generator(5, s).random(4).tobytes() for s in streams}
+    assert len(set(drawn.values())) == len(streams)
+
+
+def test_every_stream_has_one_user():
+    uses = {}
+    for path in PACKAGE.rglob("*.py"):
+        name = str(path.relative_to(PACKAGE))
+        text = path.read_text(encoding="utf-8")
+        if not name.startswith(ALONE):
+            assert not re.search(r"default_rng|random\.key\(|SeedSequence", text), name
+        if name == "core/streams.py":
+            continue
+        for kind, stream in re.findall(r"\b(Stream|SceneStream)\.([A-Z_]+)", text):
+            uses.setdefault((kind, stream), set()).add(name)
+    named = {("Stream", s.name) for s in Stream} | {("SceneStream", s.name) for s in SceneStream}
+    assert set(uses) == named
+    shared = {s: names for s, names in uses.items() if len(names) > 1}
+    assert not shared
+
+
+def test_seeds_mean_what_they_meant():
+    old = {Stream.PARTNER: 1, Stream.STEP_PAIRS: 2, Stream.START_EXPOSURES: 3, Stream.HELD_OUT: 7}
+    old |= {Stream.COMPARED_POINTS: 5, Stream.COLOR_PAIRS: 11, Stream.SURFACE_COLORS: 17}
+    old |= {Stream.SOLVED_POINTS: 19, SceneStream.ISO: 2, SceneStream.LIGHT: 5}
+    for stream, number in old.items():
+        for more in ((), (4,)):
+            before = np.random.default_rng((9, number, *more)).random(3)
+            np.testing.assert_array_equal(generator(9, stream, *more).random(3), before)
+    np.testing.assert_array_equal(view_order(9, 2, 8), np.random.default_rng((9, 2)).permutation(8))
+
+
+def test_a_step_and_its_densification_have_different_keys():
+    made = [
+        jax.random.key_data(key(seed, step)).tobytes()
+        for key, seed, step in itertools.product((noise_key, densification_key), (3,), (0, 1))
+    ]
+    assert len(set(made)) == 4

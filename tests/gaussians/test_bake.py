@@ -1,0 +1,168 @@
+"""Display colours: exact where they can be, refined where they cannot, measured everywhere."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from splats import SRGB, camera, haze, random_splats
+
+from p2gs_jax.config import PhotometryConfig, RenderConfig
+from p2gs_jax.gaussians.bake import (
+    Target,
+    bake,
+    baking_error,
+    display_sh,
+    look_of_splats,
+    refine,
+    summary,
+    true_target,
+    viewer_config,
+)
+from p2gs_jax.photometry.display import Look, develop
+from p2gs_jax.render.host import make_renderer
+from p2gs_jax.render.spherical_harmonics import C0, basis
+
+CFG = RenderConfig(sh_degree=1)
+
+
+def tone(x):
+    return np.clip(x, 0, 1) ** (1 / 2.2)
+
+
+def test_colours_are_exact_for_degree_0_and_close_for_3():
+    sh = np.asarray(random_splats(degree=0).sh)
+    shown = display_sh(sh, tone, "exp")
+    np.testing.assert_allclose(C0 * shown[:, 0] + 0.5, tone(np.exp(C0 * sh[:, 0])), atol=1e-5)
+    mild = np.asarray(random_splats(degree=3).sh) * 0.1
+    mild[:, 0] -= 3
+    shown = display_sh(mild, tone, "exp")
+    d = np.array([0.36, 0.48, 0.8])
+    table = np.array([float(b[0]) for b in basis(tuple(jnp.asarray(d[:, None], jnp.float32)), 3)])
+    expected = tone(np.exp(np.einsum("k,nkc->nc", table, mild)))
+    assert np.abs(np.einsum("k,nkc->nc", table, shown) + 0.5 - expected).max() < 0.03
+
+
+def test_a_lower_degree_keeps_the_mean_over_directions():
+    sh = np.asarray(random_splats(degree=2).sh) * 0.2
+    low = display_sh(sh, tone, "exp", degree=0)
+    assert low.shape == (50, 1, 3)
+    z, azimuth = np.meshgrid(np.linspace(-0.995, 0.995, 200), np.linspace(0, 6.2832, 100)[:-1])
+    r = np.sqrt(1 - z**2)
+    axes = [jnp.asarray(a.ravel()) for a in (r * np.cos(azimuth), r * np.sin(azimuth), z)]
+    table = np.stack(basis(tuple(axes), 2), 1)
+    mean = tone(np.exp(np.einsum("dk,nkc->ndc", table, sh))).mean(1)
+    np.testing.assert_allclose(C0 * low[:, 0] + 0.5, mean, atol=5e-3)
+
+
+def test_colours_are_clamped():
+    shown = display_sh(np.asarray(random_splats(degree=0).sh), lambda x: 9 * x - 1, "linear")
+    colors = C0 * shown[:, 0] + 0.5
+    assert colors.min() > -1e-6
+    assert colors.max() < 1 + 1e-6
+
+
+def test_a_correction_by_place_in_the_image_is_left_out():
+    grid = Look(1.0, 2.2, PhotometryConfig(appearance="bilateral"), jnp.ones((12, 8, 16, 16)))
+    assert look_of_splats(grid).correction is None
+    matrix = Look(1.0, 2.2, PhotometryConfig(appearance="affine"), jnp.full((3, 4), 0.1))
+    assert look_of_splats(matrix) is matrix
+    g = random_splats(degree=0)
+    shown = bake(g, matrix, "exp", 3).sh
+    plain = develop(np.exp(C0 * np.asarray(g.sh[:, 0])), replace(matrix, correction=None))
+    np.testing.assert_allclose(
+        C0 * shown[:, 0] + 0.5,
+        np.clip(plain + 0.1 * plain.sum(1, keepdims=True) + 0.1, 0, 1),
+        atol=1e-5,
+    )
+
+
+@pytest.fixture(scope="module")
+def targets():
+    render = make_renderer(CFG)
+    views = {f"{x:+.1f}": camera(x) for x in (-0.4, -0.2, 0.0, 0.2, 0.4)}
+    return [true_target(name, haze(), c, SRGB, render) for name, c in views.items()]
+
+
+def test_the_true_picture_is_light_composited_then_developed(targets):
+    linear = make_renderer(CFG)(haze(), jnp.ones(120, bool), camera(0.0)).linear
+    expected = np.rint(255 * develop(linear, SRGB))
+    np.testing.assert_array_equal(targets[2].picture, expected)
+    assert 20 < expected.mean() < 235
+
+
+def test_refining_brings_viewers_closer_to_unseen_views_as_well(targets):
+    seen, unseen = [targets[i] for i in (0, 2, 4)], [targets[i] for i in (1, 3)]
+    plain = bake(haze(), SRGB, "exp", 1)
+    refined = refine(plain, seen, CFG, steps=60)
+    for views in (seen, unseen):
+        before = summary(baking_error(plain, views, CFG))
+        after = summary(baking_error(refined, views, CFG))
+        assert after["psnr_worst"] > before["psnr_worst"] + 3
+        assert after["mean_codes"] < before["mean_codes"]
+    base = 0.5 + C0 * np.asarray(refined.sh[:, 0])
+    assert base.min() >= -1e-6
+    assert base.max() <= 1 + 1e-6
+    for name in ("means", "quats", "log_scales"):
+        np.testing.assert_array_equal(getattr(refined, name), getattr(plain, name))
+    again = refine(plain, seen, CFG, steps=60)
+    np.testing.assert_array_equal(again.sh, refined.sh)
+
+
+def test_what_is_dark_by_transparency_becomes_opaque():
+    """Over black nothing tells a translucent black wall from an opaque one; over white it shows."""
+    wall = jax.tree.map(lambda a: a[-1:], haze())
+    wall = replace(wall, opacity_logits=jnp.zeros(1), sh=wall.sh - 60.0)
+    (target,) = [true_target("wall", wall, camera(), SRGB, make_renderer(CFG))]
+    assert target.picture.max() == 0
+    plain = bake(wall, SRGB, "exp", 1)
+    (before,) = baking_error(plain, [target], CFG)
+    (after,) = baking_error(refine(plain, [target], CFG, steps=40), [target], CFG)
+    assert before.psnr > 60
+    assert after.psnr > 35
+    assert before.psnr_on_white < 8
+    assert after.psnr_on_white > before.psnr_on_white + 8
+
+
+def test_no_steps_and_unseen_gaussians_change_nothing(targets):
+    plain = bake(haze(), SRGB, "exp", 1)
+    assert refine(plain, targets, CFG, steps=0) is plain
+    assert refine(plain, [], CFG, steps=9) is plain
+    behind = replace(plain, means=plain.means.at[0, 2].set(-3.0))
+    moved = refine(behind, targets[:1], CFG, steps=3)
+    np.testing.assert_array_equal(moved.sh[0], behind.sh[0])
+    assert moved.opacity_logits[0] == behind.opacity_logits[0]
+    assert np.abs(np.asarray(moved.opacity_logits - behind.opacity_logits)).max() > 0.1
+
+
+def test_the_error_of_a_known_difference():
+    nothing = replace(bake(haze(), SRGB, "exp", 1), opacity_logits=jnp.full(120, -100.0))
+    picture = np.full((32, 40, 3), 51, np.uint8)
+    (error,) = baking_error(nothing, [Target("grey", camera(), picture)], CFG)
+    assert error.name == "grey"
+    assert error.psnr == pytest.approx(20 * np.log10(5))
+    assert error.mean_codes == error.max_codes == 51
+    assert error.psnr_on_white == pytest.approx(20 * np.log10(5 / 4))
+
+
+def test_a_viewer_is_measured_as_3dgs_renders(targets):
+    """Colours max(0, sh + 1/2), composited as they are."""
+    g = random_splats(1, degree=0)
+    one = replace(
+        g,
+        means=jnp.array([[0.0, 0.0, 2.0]]),
+        log_scales=jnp.full((1, 3), 3.0),
+        opacity_logits=jnp.array([0.0]),
+        sh=jnp.array([[[0.5, 0.0, -2.0]]]) / C0,
+    )
+    linear = make_renderer(viewer_config(CFG))(one, jnp.ones(1, bool), camera()).linear
+    np.testing.assert_allclose(linear[16, 20], [0.5, 0.25, 0.0], atol=1e-3)
+
+
+def test_summary_names_the_worst_view(targets):
+    errors = baking_error(bake(haze(), SRGB, "exp", 1), targets, CFG)
+    s = summary(errors)
+    assert s["worst_view"] == min(errors, key=lambda e: e.psnr).name
+    assert s["views"] == len(s["per_view"]) == 5
+    assert summary([]) is None

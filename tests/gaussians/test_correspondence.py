@@ -1,0 +1,151 @@
+"""Points projected into views: positions, occlusion, and exposures without tracks."""
+
+import csv
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from p2gs_jax.config import preset
+from p2gs_jax.evaluate.alignment import exposure_error
+from p2gs_jax.photometry.sources.sampling import sample, track_colors
+from p2gs_jax.photometry.sources.tracks import (
+    MOST_PER_POINT,
+    project_points,
+    projected_colors,
+    unoccluded,
+)
+from p2gs_jax.photometry.srgb import srgb_decode, srgb_encode
+from p2gs_jax.pipeline.prepare import calibrate_observations
+from p2gs_jax.scene import load_scene
+from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.synth.write import write_street
+from p2gs_jax.types import Scene, Tracks, View
+
+
+def test_a_wall_hides_what_is_behind_it():
+    rng = np.random.default_rng(0)
+    wall = np.concatenate([rng.uniform(20, 60, (600, 2)), np.full((600, 1), 5.0)], 1)
+    far = np.concatenate([rng.uniform(0, 100, (800, 2)), np.full((800, 1), 20.0)], 1)
+    every = np.concatenate([wall, far])
+    visible = unoccluded(every[:, :2], every[:, 2], 100, 100)
+    assert visible[:600].all()
+    inner = np.all((far[:, :2] > 25) & (far[:, :2] < 55), 1)
+    outer = np.any((far[:, :2] < 10) | (far[:, :2] > 70), 1)
+    assert visible[600:][inner].mean() < 0.02
+    assert visible[600:][outer].mean() > 0.98
+
+
+def test_behind_and_outside_are_invisible():
+    xy = np.array([[5.0, 5.0], [5.0, 5.0], [-1.0, 5.0], [5.0, 11.0]])
+    z = np.array([2.0, -2.0, 2.0, 2.0])
+    assert unoccluded(xy, z, 10, 10).tolist() == [True, False, False, False]
+    assert not unoccluded(xy[1:2], z[1:2], 10, 10).any()
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory):
+    root = tmp_path_factory.mktemp("street") / "scene"
+    write_street(root, frames=5, width=192, height=128, points=6000, iso_std=4.0, seed=3)
+    return root
+
+
+def test_positions_are_those_of_the_tracks(street, tmp_path):
+    cfg = preset("robust")
+    scene = load_scene(street, cfg.data, tmp_path, lambda text: None)
+    tracks = scene.tracks
+    mine = tracks.view_indices == 3
+    xy, z = project_points(scene.points[tracks.point_indices[mine]], scene.views[3])
+    assert np.all(z > 0)
+    assert np.median(np.abs(xy - tracks.xy[mine])) < 0.5
+
+
+def test_exposures_without_tracks(street, tmp_path):
+    cfg = preset("robust")
+    scene = load_scene(street, cfg.data, tmp_path, lambda text: None)
+    scene = dataclasses.replace(scene, tracks=None)
+    observations = projected_colors(scene, ImageStore(scene.views, cfg.data))
+    assert np.bincount(observations.points).max() <= MOST_PER_POINT
+    solved = calibrate_observations(observations, scene, cfg).solution
+    with (street / "truth" / "exposures.csv").open(newline="") as file:
+        truth = {r["image"]: float(r["exposure"]) for r in csv.DictReader(file)}
+    expected = np.array([truth[scene.views[i].name] for i in scene.train_indices])
+    assert exposure_error(np.exp(solved.log_exposures), expected)["ev"] < 0.03
+
+
+GREY_K = np.array([[50.0, 0, 30], [0, 50, 20], [0, 0, 1]], np.float32)
+
+
+class Grey:
+    """Photographs of one grey."""
+
+    def get(self, index):
+        return np.full((40, 60, 3), 0.5, np.float32), np.ones((40, 60), np.float32)
+
+    def camera(self, index):
+        return np.eye(4, dtype=np.float32), GREY_K, 60, 40
+
+
+def seen_from(distances):
+    """Return a scene of one point and a view at every distance from it; behind where negative."""
+    views = []
+    for k, distance in enumerate(distances):
+        viewmat = np.eye(4, dtype=np.float32)
+        viewmat[2, 3] = distance
+        views.append(View(f"{k}.png", Path(f"{k}.png"), "0", viewmat, GREY_K, 60, 40))
+    count = len(distances)
+    tracks = Tracks(np.arange(count), np.zeros(count, int), np.full((count, 2), 20.0, np.float32))
+    points = np.zeros((1, 3), np.float32)
+    return Scene(Path("."), "made", tuple(views), points, np.zeros((1, 3), np.uint8), tracks)
+
+
+def test_observations_from_too_far_away_are_left_out_and_counted():
+    found = track_colors(seen_from([2.0, 7.9, 8.1, 30.0]), Grey())
+    assert found.views.tolist() == [0, 1]
+    assert found.too_coarse == 2
+
+
+def test_a_track_behind_its_camera_is_not_the_closest():
+    found = track_colors(seen_from([-1.0, 3.0, 5.0]), Grey())
+    assert found.views.tolist() == [1, 2]
+    assert found.too_coarse == 1
+
+
+def encoded(linear):
+    return srgb_encode(linear).astype(np.float32)
+
+
+def test_a_surface_has_the_same_colour_from_near_and_from_far():
+    """Near, far (a pixel covers 3x3 of the near ones) and far at a quarter of the exposure."""
+    fine = np.exp(0.5 * np.random.default_rng(0).standard_normal((240, 240, 3))) * 0.1
+    fine = np.minimum(fine, 1.0).astype(np.float32)
+    coarse = fine.reshape(80, 3, 80, 3, 3).mean((1, 3))
+    far_xy = np.stack(np.meshgrid(*[np.arange(10, 70) + 0.5] * 2), -1).reshape(-1, 2)
+    near, far = np.ones((240, 240), np.float32), np.ones((80, 80), np.float32)
+    wide = sample(encoded(fine), near, 3 * far_xy, np.full(len(far_xy), 3.0))
+    narrow = sample(encoded(fine), near, 3 * far_xy)
+    dark = sample(encoded(0.25 * coarse), far, far_xy)
+    expected = 4 * srgb_decode(dark.colors)
+    np.testing.assert_allclose(srgb_decode(wide.colors), expected, rtol=1e-4)
+    gap = np.log(srgb_decode(narrow.colors) / expected)
+    assert np.std(gap) > 0.1
+    assert np.std(np.log(expected)) < 0.5 * np.std(np.log(srgb_decode(narrow.colors)))
+
+
+def test_wide_patches_keep_away_from_the_border():
+    image, mask = np.full((20, 20, 3), 0.5, np.float32), np.ones((20, 20), np.float32)
+    xy = np.array([[3.5, 10.0], [10.0, 10.0]])
+    assert sample(image, mask, xy).valid.tolist() == [True, True]
+    assert sample(image, mask, xy, np.full(2, 4.0)).valid.tolist() == [False, True]
+
+
+def test_what_was_left_out_is_said(street, tmp_path):
+    cfg = preset("robust")
+    scene = load_scene(street, cfg.data, tmp_path, lambda text: None)
+    observations = track_colors(scene, ImageStore(scene.views, cfg.data))
+    assert not any(
+        "left out" in r for r in calibrate_observations(observations, scene, cfg).reasons
+    )
+    some = dataclasses.replace(observations, too_coarse=7)
+    assert calibrate_observations(some, scene, cfg).reasons[0].startswith("7 of ")

@@ -1,0 +1,270 @@
+"""Dense starts: depths of textured planes, the checks, and what is drawn from them."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+
+from p2gs_jax.config import DataConfig, DensifyConfig, FitConfig, InitConfig, preset
+from p2gs_jax.gaussians.init.brightness import Frames, Tones, alike, rough_tones
+from p2gs_jax.gaussians.init.dense import MATCH_SIDE, dense_seeds
+from p2gs_jax.gaussians.init.flow import CHECKS, Flows, depth_map
+from p2gs_jax.gaussians.init.pairs import neighbours, visibility
+from p2gs_jax.gaussians.population import Coverage
+from p2gs_jax.photometry.observations import Observations
+from p2gs_jax.photometry.srgb import srgb_encode
+from p2gs_jax.pipeline.prepare import coverage_of, dense_limit, wants_dense
+from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.types import Scene, View
+
+WIDTH, HEIGHT, FOCAL = 192, 144, 180.0
+CENTERS = np.array([[0, 0, 0], [0.4, 0, 0], [-0.4, 0.1, 0], [0.1, 0.4, 0], [0, -0.4, 0.1]])
+BACK, FRONT = 5.0, 4.0
+# The foreground square, scene units.
+SQUARE = 0.8
+
+
+def texture(seed, size=512):
+    noise = np.random.default_rng(seed).random((size, size, 3)).astype(np.float32)
+    smooth = cv2.GaussianBlur(noise, (0, 0), 2.0) + cv2.GaussianBlur(noise, (0, 0), 6.0)
+    smooth = (smooth - smooth.mean()) / smooth.std()
+    return np.clip(0.2 + 0.07 * smooth, 0.01, 1)
+
+
+def look_up(image, x, y):
+    """Return the texture at scene coordinates, 40 texels a unit."""
+    right, down = (((v * 40 + 256) % 511).astype(np.float32) for v in (x, y))
+    return cv2.remap(image, right, down, cv2.INTER_LINEAR)
+
+
+def render(center, square, tilt, paint):
+    """Return radiance and depth of a plane z = BACK + tilt x, and of a square before it."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    ray = np.stack([(x - WIDTH / 2) / FOCAL, (y - HEIGHT / 2) / FOCAL], -1)
+    z = (BACK + tilt * center[0] - center[2]) / (1 - tilt * ray[..., 0])
+    place = center[:2] + ray * z[..., None]
+    image = look_up(paint[0], place[..., 0], place[..., 1])
+    if square:
+        place = center[:2] + ray * (FRONT - center[2])
+        hit = (np.abs(place) < SQUARE).all(-1)
+        image[hit] = look_up(paint[1], place[..., 0], place[..., 1])[hit]
+        z = np.where(hit, FRONT - center[2], z)
+    return image, z
+
+
+class World:
+    """A small scene on disk with its true depths."""
+
+    def __init__(self, path, *, square=False, tilt=0.0, exposures=None, spoil=(), change=None):
+        exposures = np.ones(len(CENTERS)) if exposures is None else np.asarray(exposures)
+        paint, other = (texture(1), texture(2)), (texture(3), texture(4))
+        views, self.depths = [], []
+        K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]], np.float32)
+        for k, center in enumerate(CENTERS):
+            linear, z = render(center, square, tilt, other if k in spoil else paint)
+            if change is not None:
+                linear = change(k, linear)
+            shown = srgb_encode(np.clip(linear * exposures[k], 0, 1).astype(np.float32))
+            name = path / f"{k}.png"
+            cv2.imwrite(str(name), np.rint(255 * shown[..., ::-1]).astype(np.uint8))
+            viewmat = np.eye(4, dtype=np.float32)
+            viewmat[:3, 3] = -center
+            views.append(View(name.name, name, "0", viewmat, K, WIDTH, HEIGHT))
+            self.depths.append(z)
+        x, y = (g.ravel() for g in np.meshgrid(np.linspace(-2, 2, 5), np.linspace(-1.5, 1.5, 4)))
+        points = np.stack([x, y, BACK + tilt * x], 1).astype(np.float32)
+        colors = np.full((len(points), 3), 128, np.uint8)
+        self.scene = Scene(path, "test", tuple(views), points, colors)
+        self.store = ImageStore(views, DataConfig())
+        self.tones = Tones(np.log(exposures), np.full(len(views), 2.2))
+
+    def depth(self, row=0):
+        cfg = FitConfig().loss
+        side, tones = MATCH_SIDE, self.tones
+        frames = Frames(self.scene, self.store, tones, side, cfg.black, cfg.saturation)
+        flows = Flows(frames, self.scene.points, visibility(self.scene, 0))
+        found = depth_map(flows, row, [k for k in range(len(CENTERS)) if k != row])
+        return found, np.abs(1 / np.maximum(found.inverse, 1e-9) / self.depths[row] - 1)
+
+    def seeds(self, limit=100_000, existing=None):
+        existing = np.zeros((0, 3)) if existing is None else existing
+        return dense_seeds(
+            self.scene,
+            self.store,
+            self.tones,
+            self.tones,
+            FitConfig(),
+            existing=existing,
+            limit=limit,
+        )
+
+
+@pytest.fixture(scope="module")
+def plane(tmp_path_factory):
+    return World(tmp_path_factory.mktemp("plane"), tilt=0.5)
+
+
+def test_depths_of_a_slanted_plane_are_right(plane):
+    found, error = plane.depth()
+    assert found.valid.mean() > 0.7
+    assert np.quantile(error[found.valid], 0.95) < 0.01
+    assert found.flat[found.valid].mean() > 0.95
+    assert found.counts[0] == found.counts[1:].sum() == WIDTH * HEIGHT
+
+
+def test_what_one_photograph_hides_from_another_is_refused(tmp_path):
+    world = World(tmp_path, square=True)
+    found, error = world.depth()
+    assert found.valid.mean() > 0.5
+    assert (error[found.valid] > 0.05).mean() < 0.02
+    # Both surfaces are found.
+    front = world.depths[0] < 0.5 * (BACK + FRONT)
+    assert found.valid[front].mean() > 0.5
+    assert found.valid[~front].mean() > 0.4
+
+
+def test_wrong_matches_are_refused(tmp_path):
+    one = World(tmp_path, spoil=(1,))
+    found, error = one.depth()
+    assert found.valid.mean() > 0.5
+    assert np.quantile(error[found.valid], 0.95) < 0.01
+    assert found.agreeing[0][found.valid].mean() < 0.05
+    # A picture of something else is no view of this.
+    assert one.depth(1)[0].valid.mean() < 0.01
+
+
+def test_exposures_do_not_matter_once_they_are_solved(tmp_path):
+    even, mixed = tmp_path / "even", tmp_path / "mixed"
+    even.mkdir()
+    mixed.mkdir()
+    same = World(even)
+    other = World(mixed, exposures=[1.0, 0.5, 2.0, 0.5, 2.0])
+    a, b = same.depth()[0], other.depth()[0]
+    assert b.valid.mean() > 0.9 * a.valid.mean()
+    both = a.valid & b.valid
+    assert np.quantile(np.abs(a.inverse[both] / b.inverse[both] - 1), 0.95) < 0.01
+    # The gauge of the exposures is that of the radiances.
+    for seeds in (same.seeds(), other.seeds()):
+        assert abs(np.median(seeds.radiance) / 0.2 - 1) < 0.1
+    # Unsolved, the photographs are refused by their colours.
+    blind = World(mixed, exposures=[1.0, 0.25, 4.0, 0.25, 4.0])
+    blind.tones = same.tones
+    assert blind.depth()[0].counts[1 + CHECKS.index("colour")] > 0.1 * WIDTH * HEIGHT
+
+
+def test_clipped_pixels_carry_no_seed(tmp_path):
+    def lamp(k, linear):
+        centre = CENTERS[k]
+        y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+        x = centre[0] + (x - WIDTH / 2) / FOCAL * (BACK - centre[2])
+        y = centre[1] + (y - HEIGHT / 2) / FOCAL * (BACK - centre[2])
+        linear[(np.abs(x) < 0.5) & (np.abs(y) < 0.5)] = 3.0
+        return linear
+
+    world = World(tmp_path, change=lamp)
+    points = world.seeds().points
+    in_lamp = (np.abs(points[:, :2]) < 0.5).all(1) & (np.abs(points[:, 2] - BACK) < 0.5)
+    assert len(points) > 200
+    assert not in_lamp.any()
+
+
+def test_the_bound_binds_and_seeds_are_spread(plane):
+    many, few = plane.seeds(), plane.seeds(limit=150)
+    assert len(many.points) > 1000
+    assert 100 <= len(few.points) <= 150
+    on_plane = np.abs(few.points[:, 2] - BACK - 0.5 * few.points[:, 0])
+    assert np.quantile(on_plane, 0.95) < 0.1
+    for low, high in ((-2, -0.7), (-0.7, 0.7), (0.7, 2)):
+        assert ((few.points[:, 0] > low) & (few.points[:, 0] < high)).sum() > 15
+    # Fewer seeds stand for larger patches.
+    assert np.median(few.scales[:, 1]) > 2 * np.median(many.scales[:, 1])
+    assert len(plane.seeds(limit=0).points) == 0
+
+
+def test_seeds_are_the_same_again(plane):
+    a, b = plane.seeds(limit=300), plane.seeds(limit=300)
+    for field in ("points", "radiance", "scales", "quats"):
+        np.testing.assert_array_equal(getattr(a, field), getattr(b, field))
+
+
+def test_seeds_lie_flat_on_their_surface(plane):
+    seeds = plane.seeds(limit=500)
+    w, x, y, z = seeds.quats.T
+    third = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], 1)
+    normal = np.array([-0.5, 0, 1]) / np.hypot(0.5, 1)
+    assert np.quantile(np.abs(third @ normal), 0.1) > 0.99
+    assert np.median(seeds.scales[:, 2] / seeds.scales[:, 1]) < 0.5
+
+
+def test_existing_seeds_have_precedence(plane):
+    x, y = (g.ravel() for g in np.meshgrid(np.linspace(-2.5, 0, 40), np.linspace(-2, 2, 60)))
+    existing = np.stack([x, y, BACK + 0.5 * x], 1)
+    seeds = plane.seeds(limit=400, existing=existing)
+    left = seeds.points[:, 0] < -0.1
+    assert (~left).sum() > 150
+    assert left.sum() < 0.05 * len(left)
+    assert seeds.near_existing > 0
+    # Seeds far behind are seeds of something else.
+    behind = plane.seeds(limit=400, existing=existing * [1, 1, 3])
+    assert (behind.points[:, 0] < -0.1).sum() > 100
+
+
+def test_pairs_see_the_same_from_different_places(plane):
+    scene, even = plane.scene, np.zeros(len(CENTERS))
+    near = neighbours(scene, visibility(scene, 0), even, 2)
+    assert all(len(n) == 2 and k not in n for k, n in enumerate(near))
+    # The first two only differ from the rest in their exposure.
+    apart = np.array([3.0, 3.0, -3.0, -3.0, -3.0])
+    near = neighbours(scene, visibility(scene, 0), apart, 2)
+    assert near[0][0] == 1
+    assert near[1][0] == 0
+
+
+def test_photographs_are_alike_under_one_exposure(tmp_path):
+    world = World(tmp_path, exposures=[1.0, 1.0, 4.0, 1.0, 1.0], change=lambda k, image: image)
+    frames = Frames(world.scene, world.store, world.tones, MATCH_SIDE, 0.02, 0.98)
+    first, second = alike(frames[0], frames[2])
+    assert abs(float(first.mean()) - float(second.mean())) < 6
+    assert first.std() > 20
+
+
+def test_rough_tones_find_the_factors():
+    rng = np.random.default_rng(0)
+    log_exposures = rng.normal(0, 0.4, 8)
+    radiance = rng.uniform(0.1, 0.4, (300, 3))
+    views, points = (g.ravel() for g in np.meshgrid(np.arange(8), np.arange(300)))
+    colors = srgb_encode(np.minimum(radiance[points] * np.exp(log_exposures[views])[:, None], 1))
+    tracks = Observations(views, points, colors, 0 * colors, 8, 300, np.zeros(8, int))
+    found = rough_tones(tracks, 8).log_exposures
+    np.testing.assert_allclose(found, log_exposures - log_exposures.mean(), atol=0.05)
+    assert not rough_tones(None, 8).log_exposures.any()
+
+
+def with_seeds(cfg, **changes):
+    return dataclasses.replace(cfg, init=dataclasses.replace(cfg.init, **changes))
+
+
+def test_dense_seeds_leave_room_to_grow():
+    cfg = FitConfig()
+    bounded = dataclasses.replace(cfg, densify=DensifyConfig(max_gaussians=1000))
+    whole = Coverage(640 * 480, 1.0)
+    assert dense_limit(bounded, 100, whole) == 500
+    assert dense_limit(bounded, 2000, whole) == 0
+    assert dense_limit(with_seeds(bounded, dense_points=5000), 100, whole) == 900
+    assert dense_limit(with_seeds(cfg, dense_points=50_000), 100, whole) == 50_000
+    assert 0 < dense_limit(cfg, 100, whole) < 640 * 480 / 10
+    # Of a scene of which a view shows a quarter there is four times as much.
+    part = Coverage(640 * 480, 0.25)
+    assert dense_limit(cfg, 0, part) == 4 * dense_limit(cfg, 0, whole) > 0
+
+
+def test_dense_starts_where_seeds_are_few(plane):
+    scene, coverage = plane.scene, coverage_of(plane.scene, plane.store)
+    assert wants_dense(scene, coverage, FitConfig())
+    assert wants_dense(scene, coverage, preset("3dgs"))
+    assert not wants_dense(scene, coverage, preset("paper"))
+    assert not wants_dense(scene, coverage, with_seeds(FitConfig(), dense="off"))
+    lidar = dataclasses.replace(scene, points=np.repeat(scene.points, 200, 0))
+    assert not wants_dense(lidar, coverage, FitConfig())
+    assert InitConfig().dense == "auto"

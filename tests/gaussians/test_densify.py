@@ -1,0 +1,234 @@
+"""Populations grow, shrink and move without changing what nobody asked to change."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from p2gs_jax.config import DensifyConfig, RenderConfig
+from p2gs_jax.gaussians import adaptive, mcmc
+from p2gs_jax.gaussians.population import (
+    bucket_for,
+    empty_gaussians,
+    fresh_population,
+    grow,
+    opacities,
+    place,
+)
+from p2gs_jax.render import render_linear
+from p2gs_jax.train.demand import demand
+from p2gs_jax.train.optimizer import AdamState
+from p2gs_jax.types import Camera, Gaussians
+
+CFG = DensifyConfig()
+
+
+def made(n=8, seed=0, opacity=0.6):
+    rng = np.random.default_rng(seed)
+    return Gaussians(
+        means=jnp.asarray(rng.normal(0, 0.5, (n, 3)) + np.array([0, 0, 4]), jnp.float32),
+        quats=jnp.asarray(rng.normal(size=(n, 4)), jnp.float32),
+        log_scales=jnp.full((n, 3), -2.0),
+        opacity_logits=jnp.full((n,), float(np.log(opacity / (1 - opacity)))),
+        sh=jnp.asarray(rng.normal(size=(n, 1, 3)), jnp.float32),
+    )
+
+
+@jax.jit
+def image(g, alive):
+    K = jnp.array([[40.0, 0, 20], [0, 40.0, 16], [0, 0, 1]])
+    cam = Camera(jnp.eye(4), K, 40, 32)
+    return render_linear(g, alive, cam, RenderConfig(), 8192).linear
+
+
+def test_growing_changes_no_pixel():
+    g, alive = made(), jnp.ones(8, bool)
+    bigger = grow(g, empty_gaussians(5, g))
+    assert bigger.capacity == 13
+    alive13 = jnp.concatenate([alive, jnp.zeros(5, bool)])
+    np.testing.assert_allclose(image(bigger, alive13), image(g, alive), rtol=1e-6)
+    assert float(opacities(bigger)[8:].max()) < 1e-6
+
+
+def test_place_fills_empty_slots_in_order_and_counts_the_rest():
+    alive = jnp.array([True, False, True, False, True])
+    requests = jnp.array([True, False, True, False, True])
+    slot, refused = place(requests, alive)
+    assert slot.tolist() == [1, 5, 3, 5, 5]
+    assert int(refused) == 1
+
+
+@pytest.mark.parametrize(
+    ("needed", "current", "limit"), [(10, 20, None), (50, 20, None), (90, 20, 95)]
+)
+def test_bucket_holds_what_is_needed(needed, current, limit):
+    capacity = bucket_for(needed, current, limit)
+    assert capacity >= max(needed, current if needed <= current else 0)
+    assert limit is None or capacity <= limit
+
+
+def hot_population(n, hot):
+    p = fresh_population(jnp.ones(n, bool))
+    return dataclasses.replace(
+        p, grad2d_sum=jnp.where(jnp.asarray(hot), 1.0, 0.0), seen_count=jnp.ones(n)
+    )
+
+
+def test_clone_copies_and_split_replaces():
+    g = made()
+    g = dataclasses.replace(g, log_scales=g.log_scales.at[1].set(-6.0))
+    grown = grow(g, empty_gaussians(4, g))
+    p = hot_population(8, np.arange(8) < 2)
+    p = grow(p, fresh_population(jnp.zeros(4, bool)))
+    proposal = adaptive.propose(grown, p, 1.0, False, CFG)
+    assert proposal.clone.tolist()[:2] == [False, True]
+    assert proposal.split.tolist()[:2] == [True, False]
+    assert int(proposal.wanted) == 10
+    out = adaptive.apply(jax.random.key(0), grown, p, proposal)
+    assert int(out.population.alive.sum()) == 10
+    assert int(out.refused) == 0
+    # Slot 8 took the split's second child, slot 9 the clone.
+    np.testing.assert_array_equal(out.gaussians.means[9], g.means[1])
+    assert out.gaussians.log_scales[0, 0] == pytest.approx(-2.0 - np.log(1.6), abs=1e-6)
+    assert not np.allclose(out.gaussians.means[0], g.means[0])
+    for i in range(2, 8):
+        np.testing.assert_array_equal(out.gaussians.means[i], g.means[i])
+    assert out.reset_moments.tolist() == [True, *[False] * 7, True, True, False, False]
+
+
+def test_transparent_are_pruned_and_full_house_is_counted():
+    g = made()
+    g = dataclasses.replace(g, opacity_logits=g.opacity_logits.at[3].set(-9.0))
+    p = hot_population(8, np.arange(8) < 3)
+    proposal = adaptive.propose(g, p, 1.0, False, CFG)
+    assert proposal.prune.tolist().index(True) == 3
+    out = adaptive.apply(jax.random.key(0), g, p, proposal)
+    assert int(out.refused) == 2  # one slot came free, three asked
+    assert int(out.population.alive.sum()) == 8
+
+
+def test_reset_lowers_only():
+    g = dataclasses.replace(made(), opacity_logits=jnp.linspace(-9.0, 5.0, 8))
+    after = opacities(adaptive.reset_opacities(g))
+    assert float(after.max()) == pytest.approx(0.01, rel=1e-4)
+    np.testing.assert_allclose(after[0], opacities(g)[0])
+
+
+@pytest.mark.parametrize("copies", [1, 2, 5, 51, 400])
+@pytest.mark.parametrize("opacity", [0.01, 0.5, 0.95])
+def test_shares_look_like_the_whole(copies, opacity):
+    """N equal Gaussians composited at their centre, and over their plane, match the one."""
+    new, factor = mcmc.share(jnp.array([opacity]), jnp.array([float(copies)]))
+    together = 1 - (1 - float(new[0])) ** copies
+    assert together == pytest.approx(opacity, rel=2e-3)
+    # The factor is defined by equal integrals over a line through the centre.
+    t = np.linspace(-12, 12, 20001)
+    s = float(factor[0])
+    whole = opacity * np.exp(-(t**2))
+    parts = 1 - (1 - float(new[0]) * np.exp(-((t / s) ** 2))) ** copies
+    assert np.trapezoid(parts, t) == pytest.approx(np.trapezoid(whole, t), rel=5e-3)
+    if copies == 1:
+        assert s == pytest.approx(1.0, abs=1e-3)
+
+
+def test_relocation_moves_the_transparent_and_adds_births():
+    g = made(10)
+    g = dataclasses.replace(g, opacity_logits=g.opacity_logits.at[:3].set(-9.0))
+    grown = grow(g, empty_gaussians(6, g))
+    p = fresh_population(jnp.arange(16) < 10)
+    out = mcmc.relocate_and_grow(jax.random.key(1), grown, p, jnp.int32(4), CFG)
+    assert int(out.population.alive.sum()) == 14
+    assert int(out.refused) == 0
+    live = np.asarray(out.population.alive)
+    assert float(opacities(out.gaussians)[live].min()) > CFG.prune_opacity
+    together = dataclasses.replace(CFG, spread=0.0)
+    same = mcmc.relocate_and_grow(jax.random.key(1), grown, p, jnp.int32(4), together)
+    healthy = np.asarray(g.means[3:])
+    widest = float(np.exp(g.log_scales).max())
+    for i in np.flatnonzero(live):
+        assert np.any(np.all(np.isclose(healthy, np.asarray(same.gaussians.means[i])), axis=1))
+        # Moved apart, each still lies within a few deviations of one that was healthy.
+        distance = np.linalg.norm(healthy - np.asarray(out.gaussians.means[i]), axis=1)
+        assert distance.min() < 3 * widest
+    more = mcmc.relocate_and_grow(jax.random.key(1), grown, p, jnp.int32(9), CFG)
+    assert int(more.refused) == 3
+
+
+def test_two_that_share_a_place_part_about_its_centre_and_keep_its_extent():
+    g = dataclasses.replace(
+        made(1),
+        quats=jnp.full((1, 4), 0.5),  # x -> y -> z -> x
+        log_scales=jnp.log(jnp.array([[0.5, 0.1, 0.02]])),
+    )
+    grown, p = grow(g, empty_gaussians(1, g)), fresh_population(jnp.arange(2) < 1)
+
+    @functools.partial(jax.jit, static_argnums=1)
+    def births(keys, spread):
+        cfg = dataclasses.replace(CFG, spread=spread)
+
+        def born(key):
+            return mcmc.relocate_and_grow(key, grown, p, jnp.int32(1), cfg).gaussians
+
+        return jax.vmap(born)(keys)
+
+    keys = jax.random.split(jax.random.key(0), 2000)
+    together, apart = (jax.tree.map(np.asarray, births(keys, s)) for s in (0.0, 0.5))
+    assert not np.ptp(together.means, axis=1).any()
+    centre = np.asarray(g.means)
+    np.testing.assert_allclose(apart.means.mean(1), np.tile(centre, (2000, 1)), atol=1e-5)
+    variance = ((apart.means - centre) ** 2).mean((0, 1))[[1, 2, 0]]
+    whole = np.exp(2 * together.log_scales[0, 0])
+    np.testing.assert_allclose(np.exp(2 * apart.log_scales[0, 0]), 0.75 * whole, rtol=1e-4)
+    np.testing.assert_allclose(variance, 0.25 * whole, rtol=0.1)
+
+
+def test_births_go_where_they_are_needed():
+    g = made(10)
+    grown, p = grow(g, empty_gaussians(6, g)), fresh_population(jnp.arange(16) < 10)
+    needed = jnp.zeros(16).at[7].set(1.0)
+    together = dataclasses.replace(CFG, spread=0.0)
+    out = mcmc.relocate_and_grow(jax.random.key(0), grown, p, jnp.int32(4), together, needed)
+    assert int(out.population.alive.sum()) == 14
+    np.testing.assert_array_equal(out.gaussians.means[10:14], np.tile(g.means[7], (4, 1)))
+    # Where nothing is needed yet, nobody is born; those without a place are not put anywhere.
+    none = mcmc.relocate_and_grow(jax.random.key(0), grown, p, jnp.int32(4), together, 0 * needed)
+    assert int(none.population.alive.sum()) == 10
+    np.testing.assert_array_equal(none.gaussians.means, grown.means)
+
+
+def test_demand_is_the_mean_pull_on_what_was_seen():
+    scales = jnp.array([[1.0, 2.0, 1.0], [4.0, 1.0, 1.0], [1.0, 1.0, 1.0]])
+    g = dataclasses.replace(made(3), log_scales=jnp.log(scales))
+    moments = AdamState(jnp.array([1, 3, 0]), g, jax.tree.map(jnp.zeros_like, g))
+    b2, pulls = 0.9, (3.0, 5.0, 5.0)
+    nu = [pulls[0] ** 2 * (1 - b2), pulls[1] ** 2 * (1 - b2**3), pulls[2] ** 2]
+    means = jnp.zeros((3, 3)).at[:, 0].set(jnp.array(nu))
+    moments = moments._replace(nu=dataclasses.replace(moments.nu, means=means))
+    np.testing.assert_allclose(demand(g, moments, b2), [3 * 2, 5 * 4, 0], rtol=1e-5)
+
+
+def test_relocation_with_nobody_healthy_changes_nothing():
+    g = made(opacity=0.001)
+    p = fresh_population(jnp.ones(8, bool))
+    out = mcmc.relocate_and_grow(jax.random.key(1), g, p, jnp.int32(0), CFG)
+    np.testing.assert_array_equal(out.gaussians.means, g.means)
+
+
+def test_noise_reaches_only_the_transparent_and_has_their_shape():
+    g = made(2000, opacity=0.001)
+    g = dataclasses.replace(
+        g,
+        quats=jnp.tile(jnp.array([[1.0, 0, 0, 0]]), (2000, 1)),
+        log_scales=jnp.tile(jnp.log(jnp.array([[0.5, 0.1, 0.02]])), (2000, 1)),
+    )
+    alive = jnp.arange(2000) < 1500
+    noise = np.asarray(mcmc.exploration_noise(jax.random.key(0), g, alive, jnp.float32(1.0)))
+    assert not noise[1500:].any()
+    spread = noise[:1500].std(0)
+    np.testing.assert_allclose(spread / spread[0], [1, 0.04, 0.0016], rtol=0.15)
+    solid = dataclasses.replace(g, opacity_logits=jnp.full((2000,), 2.0))
+    quiet = mcmc.exploration_noise(jax.random.key(0), solid, alive, jnp.float32(1.0))
+    assert float(jnp.abs(quiet).max()) < 1e-6

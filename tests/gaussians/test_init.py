@@ -1,0 +1,127 @@
+"""Seeds, samples and the far shell."""
+
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from p2gs_jax.config import FitConfig, InitConfig, preset
+from p2gs_jax.gaussians.init.seeds import gaussians_from_points, scene_extent, subsample
+from p2gs_jax.gaussians.init.shell import find_shell
+from p2gs_jax.photometry.observations import Observations
+from p2gs_jax.photometry.sources.sampling import overlapping_views, sample, sample_pairs
+from p2gs_jax.photometry.srgb import srgb_encode
+from p2gs_jax.render import view_radiance
+from p2gs_jax.types import Camera, View
+
+
+def view(x=0.0, width=160, height=90, yaw=0.0):
+    c, s = np.cos(yaw), np.sin(yaw)
+    viewmat = np.eye(4, dtype=np.float32)
+    viewmat[:3, :3] = [[c, 0, -s], [0, 1, 0], [s, 0, c]]
+    viewmat[:3, 3] = -viewmat[:3, :3] @ [x, 0, 0]
+    K = np.array([[100, 0, 80], [0, 100, 45], [0, 0, 1]], np.float32)
+    return View(f"{x}.png", Path("none"), "0", viewmat, K, width, height)
+
+
+def test_samples_sit_at_pixel_centres():
+    rng = np.random.default_rng(0)
+    # A ramp of light: patches are averaged linearly.
+    ramp = srgb_encode(np.linspace(0.2, 1, 50))[None, :, None]
+    image = np.tile(ramp, (40, 1, 3)).astype(np.float32)
+    xy = rng.uniform(9, 31, (100, 2))
+    light = 0.2 + 0.8 * (xy[:, 0] - 0.5) / 49
+    # Half a pixel of misplacement on a ramp of 0.8/49 a pixel.
+    slope = (srgb_encode(light + 1e-4) - srgb_encode(light - 1e-4)) / 2e-4
+    for wider in (None, np.full(100, 2.0), np.full(100, 4.0)):
+        colors, spread, valid = sample(image, np.ones((40, 50), np.float32), xy, wider)
+        assert valid.all()
+        np.testing.assert_allclose(colors[:, 0], srgb_encode(light), atol=2e-4)
+        np.testing.assert_allclose(spread[:, 0], 0.5 * slope * 0.8 / 49, rtol=5e-3)
+
+
+def test_samples_outside_and_masked_are_invalid():
+    mask = np.ones((40, 50), np.float32)
+    mask[:20] = 0
+    xy = np.array([[-3.0, 30], [25, 10], [25, 30], [60, 30], [25, 20.4]])
+    valid = sample(np.zeros((40, 50, 3), np.float32), mask, xy).valid
+    assert valid.tolist() == [False, False, True, False, False]
+
+
+def observations(views, points):
+    colors = np.zeros((len(views), 3))
+    return Observations(views, points, colors, colors, 20, 50, np.zeros(20, int))
+
+
+def test_pairs_are_two_views_of_one_point():
+    rng = np.random.default_rng(0)
+    tracks = observations(rng.permutation(200) % 20, np.repeat(np.arange(50), 4))
+    i, j = sample_pairs(tracks, 1000, 0)
+    assert np.all(tracks.points[i] == tracks.points[j])
+    assert np.all(i != j)
+    lonely = observations(np.arange(5), np.arange(5))
+    assert len(sample_pairs(lonely, 10, 0)[0]) == 0
+
+
+def street_points(ground_only):
+    rng = np.random.default_rng(0)
+    ground = np.stack([rng.uniform(-30, 30, 4000), np.full(4000, 1.5), rng.uniform(2, 40, 4000)], 1)
+    if ground_only:
+        return ground.astype(np.float32)
+    wall = np.stack([rng.uniform(-60, 60, 6000), rng.uniform(-30, 5, 6000), np.full(6000, 40)], 1)
+    return np.concatenate([ground, wall]).astype(np.float32)
+
+
+def test_shell_only_where_views_look_past_the_seeds():
+    views = [view(x) for x in (0.0, 1.0, 2.0)]
+    points = street_points(ground_only=True)
+    shell = find_shell(views, points, 2.0, InitConfig())
+    assert shell is not None
+    direction = shell.points - [1.0, 0, 0]
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    assert np.all(direction[:, 2] > 0)  # in front of the cameras
+    assert np.quantile(direction[:, 1], 0.95) < 0.05  # y points down: the sky is above
+    assert np.linalg.norm(shell.points, axis=1).min() > np.linalg.norm(points, axis=1).max()
+    assert shell.seen.any(1).all()
+
+
+def test_no_shell_where_seeds_cover_the_views_or_it_is_switched_off():
+    views = [view(x) for x in (0.0, 1.0, 2.0)]
+    assert find_shell(views, street_points(ground_only=False), 2.0, InitConfig()) is None
+    points = street_points(ground_only=True)
+    assert find_shell(views, points, 2.0, InitConfig(shell="off")) is None
+
+
+@pytest.mark.parametrize("name", ["robust", "paper"])
+def test_seeds_carry_their_radiance(name):
+    cfg = preset(name)
+    rng = np.random.default_rng(0)
+    points = rng.normal(0, 1, (100, 3)).astype(np.float32) + np.array([0, 0, 6], np.float32)
+    radiance = np.exp(rng.normal(-1, 1, (100, 3))).astype(np.float32)
+    views = [view(0.0), view(1.0)]
+    g = gaussians_from_points(points, radiance, views, cfg)
+    cam = Camera(jnp.eye(4), jnp.eye(3), 8, 8)
+    np.testing.assert_allclose(view_radiance(g, cam, cfg.render), radiance, rtol=1e-4, atol=1e-5)
+    assert np.all(np.isfinite(g.log_scales))
+
+
+def test_extent_and_subsample():
+    views = [view(x) for x in (0.0, 10.0)]
+    assert scene_extent(views, np.zeros((0, 3), np.float32)) == pytest.approx(5.5)
+    assert scene_extent([view(0.0)], np.full((5, 3), 10, np.float32)) > 0.5
+    kept = subsample(1000, 100, 0)
+    assert len(kept) == 100
+    assert np.all(np.diff(kept) > 0)
+    assert FitConfig() == preset("robust")
+
+
+def test_views_that_share_points_overlap():
+    """Three views in a chain and one that shares a single point with the last."""
+    seen = [(0, p) for p in range(10)] + [(1, p) for p in range(5, 20)]
+    seen += [(2, p) for p in range(15, 30)] + [(3, 29)] + [(4, 99), (0, 0)]
+    views, points = np.array(seen).T
+    colors = np.zeros((len(seen), 3), np.float32)
+    tracks = Observations(views, points, colors, colors, 5, 100, np.zeros(5, int))
+    found = [list(row) for row in overlapping_views(tracks, fewest=3)]
+    assert found == [[1], [0, 2], [1], [2], []]

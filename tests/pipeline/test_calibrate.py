@@ -1,0 +1,176 @@
+"""`p2gs-jax calibrate`: a street with known exposures, real photographs, stacks, wrong input."""
+
+import csv
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from p2gs_jax import calibrate
+from p2gs_jax.cli import main
+from p2gs_jax.config import preset
+from p2gs_jax.errors import UserError
+from p2gs_jax.evaluate.alignment import exposure_error
+from p2gs_jax.pipeline.calibrate_stack import calibrate_stack, read_stack
+from p2gs_jax.run.photometry_file import read_photometry
+from p2gs_jax.synth.write import write_street
+
+
+def run(capsys, *argv):
+    with pytest.raises(SystemExit) as stop:
+        main([str(a) for a in argv])
+    out = capsys.readouterr()
+    assert "Traceback" not in out.err + out.out
+    return stop.value.code, out.err + out.out
+
+
+def read_truth(root):
+    with (root / "truth" / "exposures.csv").open(newline="") as file:
+        return {row["image"]: float(row["exposure"]) for row in csv.DictReader(file)}
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory):
+    root = tmp_path_factory.mktemp("street") / "scene"
+    write_street(root, frames=5, width=192, height=128, points=4000, iso_std=4.0, seed=3)
+    return root
+
+
+def test_street(street, tmp_path):
+    result = calibrate(street, tmp_path / "out", preset("robust"))
+    saved = read_photometry(tmp_path / "out" / "photometry.json")
+    found = {v["image"]: v["exposure"] for v in saved["views"]}
+    truth = read_truth(street)
+    names = sorted(found)
+    error = exposure_error(np.array([found[n] for n in names]), np.array([truth[n] for n in names]))
+    assert error["ev"] < 0.05
+    assert result.selection.solution.model == "view_exposure"
+    assert all(v["exposure_ev_error"] < 0.2 for v in saved["views"])
+    assert (tmp_path / "out" / "calibration.png").stat().st_size > 10_000
+    candidates = json.loads((tmp_path / "out" / "calibration.json").read_text())["candidates"]
+    assert candidates[0]["codes"] == 0
+    assert max(c["codes"] for c in candidates) > 1
+
+
+def test_command_keeps_known_exposures(street, tmp_path, capsys):
+    truth = read_truth(street)
+    path = tmp_path / "known.csv"
+    path.write_text("image,exposure\n" + "\n".join(f"{k},{5 * v}" for k, v in truth.items()))
+    argv = ("calibrate", street, "--out", tmp_path / "out", "--known-exposures", path)
+    code, text = run(capsys, *argv)
+    assert code == 0
+    assert "Chosen:" in text
+    for view in read_photometry(tmp_path / "out" / "photometry.json")["views"]:
+        assert view["exposure"] == pytest.approx(5 * truth[view["image"]], rel=1e-3)
+
+
+def test_fit_refuses_known_exposures_it_would_ignore(street, tmp_path, capsys):
+    path = tmp_path / "known.csv"
+    path.write_text("image,exposure\n" + "\n".join(f"{k},1" for k in read_truth(street)))
+    argv = ("fit", street, "--out", tmp_path / "r", "--preset", "paper", "--known-exposures", path)
+    code, text = run(capsys, *argv)
+    assert code == 2
+    assert "starts exposures at random" in text
+
+
+def test_castle_says_that_exif_and_pixels_disagree(shared_data, tmp_path):
+    root = shared_data("sceaux_castle")
+    result = calibrate(
+        root, tmp_path / "out", preset("robust"), compare_with=str(root / "exposures.csv")
+    )
+    assert result.agreement.correlation > 0.7
+    assert result.agreement.disagrees[[v.name for v in result.scene.views].index("100_7109.jpg")]
+    assert any("disagrees with the pixels" in m for m in result.messages)
+
+
+def test_wrong_input(capsys, tmp_path):
+    code, text = run(capsys, "calibrate", tmp_path / "nowhere", "--out", tmp_path / "o")
+    assert code == 2
+    assert "nowhere" in text
+    code, text = run(
+        capsys, "calibrate", tmp_path, "--out", tmp_path / "o", "--known-deviation-ev", "1"
+    )
+    assert code == 2
+    assert "--known-exposures" in text
+    code, text = run(capsys, "calibrate", tmp_path, "--out", tmp_path / "o", "--static")
+    assert code == 2
+    assert "a stack needs two" in text
+
+
+def stack(folder, times, response=lambda x: x ** (1 / 2.2), seed=0, drift=None):
+    """Write a smooth HDR picture at several exposures."""
+    rng = np.random.default_rng(seed)
+    base = cv2.resize(rng.normal(0, 1, (12, 16, 1)), (320, 240), interpolation=cv2.INTER_CUBIC)
+    log = 1.8 * base[..., None] + 0.2 * np.array([0.3, 0.0, -0.3]) - 1.5
+    fine = cv2.GaussianBlur(rng.normal(0, 1, (240, 320)), (0, 0), 2)
+    linear = np.exp(log + fine[..., None])
+    folder.mkdir(parents=True, exist_ok=True)
+    for i, t in enumerate(times):
+        exposed = linear * t * (1 if drift is None else drift(i, linear))
+        noisy = np.clip(response(exposed), 0, 1) + rng.normal(0, 0.002, linear.shape)
+        cv2.imwrite(str(folder / f"{i:02d}.png"), np.rint(np.clip(noisy, 0, 1) * 255)[..., ::-1])
+
+
+def s_curve(x):
+    return np.where(x > 0, x**0.7 / (x**0.7 + 0.35), 0)
+
+
+@pytest.mark.parametrize("response", [lambda x: x ** (1 / 2.2), s_curve])
+def test_stack_exposures(tmp_path, response):
+    times = 2.0 ** np.arange(3, -4, -1)
+    stack(tmp_path / "s", times, response)
+    result = calibrate_stack(tmp_path / "s")
+    use = result.signal
+    assert use.sum() >= 6
+    error = exposure_error(np.exp(result.solution.log_exposures[use]), times[use])
+    assert error["ev_scale_power"] < 0.05
+    assert result.one_response
+
+
+def test_stack_tone_mapped_by_region_is_recognised(tmp_path):
+    def local(i, linear):
+        # Shadows are lifted, more in some regions, and differently from frame to frame.
+        regions = cv2.resize(
+            np.random.default_rng(i).normal(0, 1, (5, 6)), (320, 240), interpolation=cv2.INTER_CUBIC
+        )
+        return np.exp(0.25 * regions)[..., None]
+
+    stack(tmp_path / "s", 2.0 ** np.arange(3, -4, -1), drift=local)
+    result = calibrate_stack(tmp_path / "s")
+    assert not result.one_response
+    assert any("One response does not explain" in m for m in result.messages)
+
+
+def test_stacks_must_fit_together(tmp_path):
+    stack(tmp_path / "s", [1.0, 2.0])
+    cv2.imwrite(str(tmp_path / "s" / "zz.png"), np.zeros((10, 10, 3), np.uint8))
+    with pytest.raises(UserError, match="a stack has one size"):
+        read_stack(tmp_path / "s")
+    (tmp_path / "s" / "zz.png").write_bytes(b"no image")
+    with pytest.raises(UserError, match="cannot be read"):
+        read_stack(tmp_path / "s")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "hdr_living_room",
+        *(pytest.param(n, marks=pytest.mark.slow) for n in ("hdr_memorial", "hdr_taipei_night")),
+    ],
+)
+def test_real_stacks(shared_data, name):
+    """Recovered exposure ratios against the listed times on the frames that carry signal."""
+    folder = shared_data(name)
+    result = calibrate_stack(folder)
+    with (folder / "exposures.csv").open(newline="") as file:
+        listed = {r["file"]: float(r["exposure_time_s"]) for r in csv.DictReader(file)}
+    times = np.array([listed[n] for n in result.names])
+    use = result.signal
+    error = exposure_error(np.exp(result.solution.log_exposures[use]), times[use])
+    assert error["ev_scale_power"] <= 0.05
+    assert result.one_response
+
+
+def test_the_phone_is_recognised(shared_data):
+    assert not calibrate_stack(shared_data("hdr_iphone_night")).one_response

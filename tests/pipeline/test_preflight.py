@@ -1,0 +1,175 @@
+"""A fit that is refused leaves its folder to the next command, corrected."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from tiny_scene import make_scene
+
+import p2gs_jax
+from p2gs_jax.cli import main
+from p2gs_jax.config import FitConfig
+from p2gs_jax.errors import DivergenceError, UserError
+from p2gs_jax.losses.relative_exposure import ExposurePairs, relative_exposure_loss
+from p2gs_jax.pipeline import fit as pipeline
+from p2gs_jax.pipeline.preflight import Paths, check_run_dir, check_sizes, preflight
+from p2gs_jax.run.checkpoint import CheckpointStore
+from p2gs_jax.sweep import with_fields
+from p2gs_jax.train import decisions
+from p2gs_jax.types import View
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return make_scene(tmp_path_factory.mktemp("preflight") / "scene", views=4, points=60)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--preset", "paper", "--known-exposures", "KNOWN"), "starts exposures at random"),
+        (("--preset", "3dgs", "--photometry.start", "tracks"), "splats display values"),
+        (("--known-exposures", "KNOWN"), "names none of the"),
+        (("--known-exposures", "exif"), "carries exposure time"),
+        (("--gaussians", "auto"), "this scene has"),
+    ],
+)
+def test_a_refused_option_does_not_lock_the_folder(tmp_path, scene, capsys, options, said):
+    known = tmp_path / "known.csv"
+    known.write_text("image,exposure\nelsewhere.png,1\n")
+    run = tmp_path / "run"
+    given = [str(known) if o == "KNOWN" else o for o in options]
+    with pytest.raises(SystemExit) as stop:
+        main(["fit", str(scene), "--out", str(run), *given])
+    assert stop.value.code == 2
+    text = capsys.readouterr().err
+    assert said in text
+    assert "To fix it" in text
+    assert not (run / "config.json").exists()
+    check_run_dir(run, False, FitConfig())
+
+
+def test_options_alone_are_refused_before_the_folder_is_made(tmp_path):
+    wrong = with_fields(p2gs_jax.preset("3dgs"), {"photometry.start": "tracks"})
+    with pytest.raises(UserError, match="splats display values"):
+        p2gs_jax.fit(tmp_path / "no_scene", tmp_path / "run", wrong)
+    paths = Paths(tmp_path / "no_scene", tmp_path / "run", tmp_path / "nowhere")
+    with pytest.raises(UserError, match="is not a folder"):
+        preflight(FitConfig(), paths)
+    assert not (tmp_path / "run").exists()
+    assert preflight(FitConfig(), Paths(tmp_path, tmp_path / "run")) is None
+
+
+@pytest.mark.parametrize("part", ["prepare", "optimise"])
+@pytest.mark.parametrize("checkpoint", [False, True])
+def test_a_folder_is_a_runs_once_there_is_something_to_continue(
+    tmp_path, scene, monkeypatch, part, checkpoint
+):
+    run, states = tmp_path / "run", []
+
+    def fails(*args, **kwargs):
+        states.append((run / "config.json").exists())
+        if checkpoint:
+            CheckpointStore(run / "checkpoints").save(3, {"a": np.zeros(2)}, {})
+        raise DivergenceError("Step 1: no.", fix="lower the learning rates")
+
+    prepared = dataclasses.make_dataclass("Prepared", ["cfg"])(FitConfig())
+    monkeypatch.setattr(pipeline, "prepare", lambda *a, **k: prepared)
+    monkeypatch.setattr(pipeline, part, fails)
+    with pytest.raises(DivergenceError):
+        p2gs_jax.fit(scene, run, FitConfig())
+    assert states == [part == "optimise"]
+    locked = part == "optimise" and checkpoint
+    assert (run / "config.json").exists() == locked
+    if locked:
+        with pytest.raises(UserError, match="already holds a run"):
+            check_run_dir(run, False, FitConfig())
+
+
+def test_a_resumed_run_keeps_the_model_and_curve_of_its_checkpoints(tmp_path, scene, monkeypatch):
+    run = tmp_path / "run"
+    spline = (0.1, *np.random.default_rng(0).normal(size=19).tolist())
+    chosen = {
+        "photometry.model": "view_exposure",
+        "photometry.curve": "spline",
+        "photometry.spline": list(spline),
+    }
+    under = with_fields(FitConfig(), chosen)
+    meta = {decisions.KEY: decisions.recorded(under, ("Chosen: that.",))}
+    CheckpointStore(run / "checkpoints").save(3, {"a": np.zeros(2)}, meta)
+    given = []
+
+    def prepare(scene, cfg, reporter, clock, on_expected, *, reasons):
+        given.append((cfg, reasons))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pipeline, "prepare", prepare)
+    for resume in (True, False):
+        with pytest.raises(KeyboardInterrupt):
+            p2gs_jax.fit(scene, run, FitConfig(), resume=resume)
+    (kept, reasons), (anew, none) = given
+    assert kept.photometry == with_fields(under, {"photometry.select": False}).photometry
+    assert kept.photometry.spline == spline
+    assert reasons == ("Chosen: that.",)
+    assert (anew, none) == (FitConfig(), ())
+    decisions.check(meta[decisions.KEY], kept, run)
+    # What the user fixes, or starts at random, was never chosen.
+    for fixed in ({"photometry.select": False}, {"photometry.start": "random"}):
+        cfg = with_fields(FitConfig(), fixed)
+        assert decisions.kept(cfg, run) == (cfg, ())
+
+
+def test_the_saved_choice_is_solved_and_its_reasons_repeated(tmp_path, scene):
+    from p2gs_jax.core.progress import Silent
+    from p2gs_jax.pipeline.prepare import load, prepare
+
+    cfg = with_fields(FitConfig(), {"init.shell": "off", "init.dense": "off"})
+    loaded = load(scene, tmp_path, cfg, Silent())
+    first = prepare(loaded, cfg, Silent())
+    assert first.selection is not None
+    reasons = first.selection.reasons
+    CheckpointStore(tmp_path / "checkpoints").save(
+        3, {"a": np.zeros(2)}, {decisions.KEY: decisions.recorded(first.cfg, reasons)}
+    )
+    kept, saved = decisions.kept(cfg, tmp_path)
+    again = prepare(loaded, kept, Silent(), reasons=saved)
+    assert again.selection is not None
+    assert again.selection.reasons == reasons
+    assert again.notes == first.notes
+    assert again.selection.candidates == ()
+    decisions.check(decisions.recorded(first.cfg, reasons), again.cfg, tmp_path)
+    solved = (first.selection.solution, again.selection.solution)
+    np.testing.assert_array_equal(*(s.log_exposures for s in solved))
+    np.testing.assert_array_equal(*(s.gammas for s in solved))
+
+
+def views(tmp_path, *sizes):
+    pose, K = np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32)
+    return [View(f"{k}.png", tmp_path, "0", pose, K, *size) for k, size in enumerate(sizes)]
+
+
+@pytest.mark.parametrize("form", ["literal_pixels", "exposed"])
+def test_readings_that_subtract_images_need_one_size(tmp_path, form):
+    cfg = with_fields(FitConfig(), {"loss.relative_exposure.weight": 0.01})
+    subtracting = with_fields(cfg, {"loss.relative_exposure.form": form})
+    unequal = views(tmp_path, (400, 300), (400, 300), (300, 400))
+    with pytest.raises(UserError, match=r"0\.png is 400x300 where 2\.png is 300x400"):
+        check_sizes(unequal, subtracting)
+    # Equal at full size only: halves are rounded up and down.
+    narrow = with_fields(subtracting, {"data.max_width": 201})
+    with pytest.raises(UserError, match="pixel by pixel"):
+        check_sizes(views(tmp_path, (402, 290), (700, 505)), narrow)
+    check_sizes(unequal[:2], subtracting)
+    check_sizes(unequal, cfg)
+    check_sizes(unequal, with_fields(subtracting, {"loss.relative_exposure.weight": None}))
+    nothing = np.zeros((4, 6, 3), np.float32)
+    pairs = ExposurePairs(nothing, nothing[:1], 0, 1, np.ones(2), np.ones(2), None)
+    with pytest.raises(ValueError, match="renders of one size"):
+        relative_exposure_loss(pairs, subtracting.loss, subtracting.photometry)
+
+
+def test_the_config_of_a_run_is_what_the_user_gave(finished_run):
+    saved = json.loads((finished_run / "config.json").read_text())["fit"]
+    assert saved["photometry"]["select"]
+    assert saved["photometry"]["model"] == FitConfig().photometry.model

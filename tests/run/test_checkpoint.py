@@ -1,0 +1,199 @@
+"""Checkpoints return bit for bit, and no kill or broken file takes the last good one away."""
+
+import dataclasses
+import random
+import subprocess
+import sys
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.errors import UserError
+from p2gs_jax.run.checkpoint import CheckpointStore
+from p2gs_jax.train.optimizer import make_optimizer
+from p2gs_jax.train.state import grow_state, initial_state
+from p2gs_jax.types import Gaussians, Params, Photometry
+
+
+def state(capacity, seed=0):
+    rng = np.random.default_rng(seed)
+    shapes = [(capacity, 3), (capacity, 4), (capacity, 3), (capacity,), (capacity, 16, 3)]
+    gaussians = Gaussians(*(jnp.asarray(rng.normal(size=s), jnp.float32) for s in shapes))
+    params = Params(gaussians, Photometry(jnp.zeros(4), jnp.ones(4), "linear"))
+    return initial_state(params, jnp.ones(capacity, bool), make_optimizer(FitConfig()))
+
+
+def assert_same(a, b):
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        assert np.asarray(x).dtype == np.asarray(y).dtype
+        assert np.asarray(x).tobytes() == np.asarray(y).tobytes()
+
+
+def biggest(folder):
+    return max((p for p in folder.rglob("*") if p.is_file()), key=lambda p: p.stat().st_size)
+
+
+def test_exact_and_the_last_two_are_kept(tmp_path):
+    store = CheckpointStore(tmp_path / "c")
+    assert store.latest_step() is None
+    assert store.restore_latest(lambda meta: {}) is None
+    trees = {s: {"a": state(50, s), "n": jnp.int32(s)} for s in (1, 2, 3)}
+    for s, tree in trees.items():
+        store.save(s, tree, {"capacity": 50 + s})
+    store = CheckpointStore(tmp_path / "c")
+    assert store.latest_step() == 3
+    assert store.read_meta(3) == {"capacity": 53}
+    tree, meta = store.restore_latest(lambda meta: trees[3])
+    assert meta == {"capacity": 53}
+    assert_same(tree, trees[3])
+    assert_same(store.restore(2, trees[2])[0], trees[2])
+    with pytest.raises(UserError):
+        store.restore(1, trees[1])
+    store.discard_after(2)
+    assert store.latest_step() == 2
+
+
+def test_a_grown_population_is_rebuilt_from_the_values(tmp_path):
+    grown = grow_state(state(20), 37)
+    store = CheckpointStore(tmp_path / "c")
+    store.save(7, grown, {"capacity": grown.params.gaussians.capacity})
+    found = CheckpointStore(tmp_path / "c").restore_latest(
+        lambda meta: jax.eval_shape(lambda: grow_state(state(20), meta["capacity"]))
+    )
+    assert found is not None
+    assert_same(found[0], grown)
+    assert found[0].params.photometry.parameterization == "linear"
+
+
+def test_unusual_leaves_and_values(tmp_path):
+    tree = {
+        "nan": jnp.array([jnp.nan, -0.0, jnp.inf, 1e-42]),
+        "none": None,
+        "empty": jnp.zeros((0, 3)),
+        "scalar": jnp.int32(7),
+        "bool": jnp.array([True, False]),
+        "bfloat16": jnp.ones((2, 2), jnp.bfloat16),
+        "schedule": optax.ScaleByScheduleState(jnp.int32(3)),
+    }
+    store = CheckpointStore(tmp_path / "c")
+    store.save(0, tree, {"e": np.float64(0.1), "n": jnp.int32(3), "a": np.arange(2), "s": [None]})
+    back, meta = store.restore(0, tree)
+    assert_same(back, tree)
+    assert meta == {"e": 0.1, "n": 3, "a": [0, 1], "s": [None]}
+    with pytest.raises(TypeError, match="PosixPath"):
+        store.save(1, tree, {"path": tmp_path})
+    assert store.latest_step() == 0
+
+
+@pytest.mark.parametrize(
+    ("like", "message"),
+    [
+        ({"x": jnp.zeros(5), "y": jnp.zeros(2)}, "'x'.*4.*5"),
+        ({"x": jnp.zeros(4, jnp.int32), "y": jnp.zeros(2)}, "'x'.*float32.*int32"),
+        ({"x": jnp.zeros(4)}, "'y'.*absent"),
+        ({"x": jnp.zeros(4), "y": jnp.zeros(2), "z": jnp.zeros(1)}, "'z'.*absent"),
+    ],
+)
+def test_another_structure_is_refused(tmp_path, like, message):
+    store = CheckpointStore(tmp_path / "c")
+    store.save(1, {"x": jnp.zeros(4), "y": jnp.zeros(2)}, {})
+    with pytest.raises(UserError, match=f"another version or configuration.*{message}"):
+        store.restore(1, like)
+
+
+def flip(path):
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 4
+    path.write_bytes(content)
+
+
+def test_a_checkpoint_of_another_optimiser_ends_in_advice(tmp_path):
+    """Earlier versions counted updates once for all Gaussians, in another structure."""
+    now = state(20)
+    moments = now.opt_state.gaussians[0]
+    earlier = {"mu": moments.mu, "nu": moments.nu, "count": jnp.int32(7)}
+    store = CheckpointStore(tmp_path / "c")
+    store.save(7, dataclasses.replace(now, opt_state=earlier), {"gaussian_capacity": 20})
+    with pytest.raises(UserError, match="another version or configuration") as caught:
+        CheckpointStore(tmp_path / "c").restore_latest(lambda meta: now)
+    assert "without --resume" in caught.value.fix
+
+
+DAMAGES = {
+    "flipped bit": lambda folder: flip(biggest(folder)),
+    "cut file": lambda folder: biggest(folder).write_bytes(biggest(folder).read_bytes()[:100]),
+    "lost file": lambda folder: biggest(folder).unlink(),
+    "emptied": lambda folder: [p.write_bytes(b"") for p in folder.rglob("*") if p.is_file()],
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES.keys())
+def test_a_broken_newest_falls_back_quietly(tmp_path, damage, capfd):
+    store = CheckpointStore(tmp_path / "c")
+    trees = {s: {"x": jnp.full(5000, float(s)), "y": jnp.full(300, s)} for s in (1, 2)}
+    for s, tree in trees.items():
+        store.save(s, tree, {"s": s})
+    damage(tmp_path / "c" / "2")
+    capfd.readouterr()
+    told = []
+    found = CheckpointStore(tmp_path / "c").restore_latest(lambda m: trees[1], told.append)
+    assert found is not None
+    assert_same(found[0], trees[1])
+    assert found[1] == {"s": 1}
+    assert len(told) == 1
+    assert str(tmp_path / "c" / "2") in told[0]
+    assert capfd.readouterr() == ("", "")
+
+
+def test_nothing_readable_is_said(tmp_path):
+    store = CheckpointStore(tmp_path / "c")
+    tree = {"x": jnp.zeros(1000)}
+    store.save(1, tree, {})
+    flip(biggest(tmp_path / "c" / "1"))
+    told = []
+    with pytest.raises(UserError, match="c/1 cannot be read"):
+        store.restore_latest(lambda meta: tree, told.append)
+    assert told == []
+
+
+CHILD = """
+import sys, numpy as np
+from pathlib import Path
+from p2gs_jax.run.checkpoint import CheckpointStore
+store = CheckpointStore(Path(sys.argv[1]))
+step = (store.latest_step() or 0) + 1
+while True:
+    store.save(step, {"x": np.full(2_000_000, step, np.float32)}, {"step": step})
+    print(step, flush=True)
+    step += 1
+"""
+
+
+def test_killed_at_any_moment_the_last_good_checkpoint_stays(tmp_path):
+    folder, moments = tmp_path / "c", random.Random(0)
+    like = {"x": jax.ShapeDtypeStruct((2_000_000,), np.dtype("float32"))}
+    for _ in range(5):
+        child = subprocess.Popen(
+            [sys.executable, "-c", CHILD, str(folder)], stdout=subprocess.PIPE, text=True
+        )
+        assert child.stdout is not None
+        child.stdout.readline()
+        time.sleep(moments.uniform(0, 0.3))
+        child.kill()
+        written = [int(line) for line in child.stdout.read().split()]
+        child.wait()
+        store = CheckpointStore(folder)
+        told = []
+        found = store.restore_latest(lambda meta: like, told.append)
+        assert found is not None
+        tree, meta = found
+        assert told == []
+        assert meta["step"] == store.latest_step() >= max(written, default=1)
+        assert np.all(tree["x"] == meta["step"])
+    assert not [p.name for p in folder.iterdir() if "tmp" in p.name]

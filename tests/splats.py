@@ -1,0 +1,40 @@
+"""Small sets of Gaussians for the tests of exports."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from p2gs_jax.config import PhotometryConfig
+from p2gs_jax.photometry.display import Look
+from p2gs_jax.types import Camera, Gaussians
+
+SRGB = Look(1.0, 2.2, PhotometryConfig())
+
+
+def random_splats(n=50, degree=3, seed=0):
+    """Return Gaussians whose every parameter is drawn from a normal distribution."""
+    rng = np.random.default_rng(seed)
+    shapes = [(n, 3), (n, 4), (n, 3), (n,), (n, (degree + 1) ** 2, 3)]
+    return Gaussians(*(jnp.asarray(rng.normal(size=s), jnp.float32) for s in shapes))
+
+
+def haze(n=120, degree=1, seed=0):
+    """Return translucent Gaussians of very different radiance along +z; the last is a dark wall."""
+    rng = np.random.default_rng(seed)
+    means = rng.uniform([-1, -1, 2], [1, 1, 4], (n, 3))
+    sh = rng.normal(0, 0.1, (n, (degree + 1) ** 2, 3))
+    sh[:, 0] = rng.normal(-4, 6, (n, 1))
+    log_scales = rng.normal(-1.5, 0.3, (n, 3))
+    means[-1], log_scales[-1], sh[-1, 0] = (0, 0, 6), (2, 2, -3), -12
+    return Gaussians(
+        jnp.asarray(means, jnp.float32),
+        jnp.asarray(rng.normal(size=(n, 4)), jnp.float32).at[-1].set(jnp.array([1.0, 0, 0, 0])),
+        jnp.asarray(log_scales, jnp.float32),
+        jnp.asarray(rng.normal(-1, 1, n), jnp.float32),
+        jnp.asarray(sh, jnp.float32),
+    )
+
+
+def camera(x=0.0, width=40, height=32):
+    """Return a camera that looks along +z from (x, 0, 0)."""
+    K = jnp.array([[30.0, 0, width / 2], [0, 30.0, height / 2], [0, 0, 1]])
+    return Camera(jnp.eye(4).at[0, 3].set(-x), K, width, height)
