@@ -24,7 +24,7 @@ import numpy as np
 from towns import METHODS, WIDE, fit_all, methods, options, stamp
 
 from p2gs_jax.evaluate.evaluate import mean_parameters
-from p2gs_jax.photometry.display import Look, develop
+from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.render.host import make_renderer
 from p2gs_jax.run.read import Run, load_run
 from p2gs_jax.scene.device import camera_of
@@ -57,7 +57,7 @@ def draw(run: Run, index: int, out: Path) -> dict:
     for line, gamma in zip(axes, GAMMAS, strict=True):
         for axis, stops in zip(line, STOPS, strict=True):
             exposure = mean.exposure_geometric * 2**stops
-            shown = develop(linear, Look(exposure, gamma, run.cfg.photometry))
+            shown = develop(linear, DisplayTransform(exposure, gamma, run.cfg.photometry))
             row = {"ev": stops, "gamma": gamma, "mean_display": float(shown.mean())}
             if run.cfg.photometry.curve == "srgb":
                 gap = np.abs(shown - expected(np.asarray(linear), exposure, gamma, run)).max()

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from p2gs_jax import sweep
     from p2gs_jax.evaluate.alignment import exposure_error
     from p2gs_jax.paths.pinhole import make_camera
-    from p2gs_jax.photometry.display import Look, develop
+    from p2gs_jax.photometry.display import DisplayTransform, develop
     from p2gs_jax.pipeline.calibrate import calibrate
     from p2gs_jax.pipeline.calibrate_run import calibrate_run
     from p2gs_jax.pipeline.calibrate_stack import calibrate_stack
@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Camera",
+    "DisplayTransform",
     "DivergenceError",
     "FitConfig",
     "Gaussians",
-    "Look",
     "Params",
     "Photometry",
     "Render",
@@ -55,7 +55,7 @@ __all__ = [
 
 
 _LAZY = {
-    "Look": "p2gs_jax.photometry.display",
+    "DisplayTransform": "p2gs_jax.photometry.display",
     "Run": "p2gs_jax.run.read",
     "calibrate": "p2gs_jax.pipeline.calibrate",
     "calibrate_run": "p2gs_jax.pipeline.calibrate_run",

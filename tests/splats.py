@@ -4,10 +4,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from p2gs_jax.config import PhotometryConfig
-from p2gs_jax.photometry.display import Look
+from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.types import Camera, Gaussians
 
-SRGB = Look(1.0, 2.2, PhotometryConfig())
+SRGB = DisplayTransform(1.0, 2.2, PhotometryConfig())
 
 
 def random_splats(n=50, degree=3, seed=0):

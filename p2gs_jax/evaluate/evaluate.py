@@ -27,7 +27,7 @@ from p2gs_jax.evaluate.lpips import LpipsWeights, lpips
 from p2gs_jax.evaluate.metrics import psnr, ssim
 from p2gs_jax.evaluate.radiance import RadianceScores, Truth
 from p2gs_jax.evaluate.shelf import Kept, Shelf
-from p2gs_jax.photometry.display import Look, develop
+from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import inverse_tone_map
 from p2gs_jax.photometry.solution import LADDER
 from p2gs_jax.render.host import RenderView
@@ -184,7 +184,7 @@ def evaluate(
     tone = cfg.photometry
 
     def shown(linear, exposure, gamma, correction=mean_correction):
-        return develop(linear, Look(exposure, gamma, tone, correction))
+        return develop(linear, DisplayTransform(exposure, gamma, tone, correction))
 
     def fitted(linear, photograph, mask) -> float:
         """Solve the exposure of a view that has none of its own."""

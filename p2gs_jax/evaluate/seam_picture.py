@@ -11,7 +11,7 @@ from jaxtyping import Float, Float32
 from scipy.spatial.transform import Rotation
 
 from p2gs_jax.evaluate.seams import Photographed, decoded
-from p2gs_jax.photometry.display import Look, develop
+from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.render.warp import project_points, sample_bilinear, surface_depth, unproject
 from p2gs_jax.types import Camera, Render
 
@@ -23,9 +23,9 @@ BLANK = 0.5
 
 
 def redeveloped(
-    ldr: Float[np.ndarray, "... 3"], own: Look, common: Look
+    ldr: Float[np.ndarray, "... 3"], own: DisplayTransform, common: DisplayTransform
 ) -> Float32[np.ndarray, "... 3"]:
-    """Return a photograph as it would look had it been taken in the common look.
+    """Return a photograph as it would look had it been taken in the common display transform.
 
     What it saturated stays at the value of its white.
     """
@@ -49,7 +49,7 @@ class Halves(NamedTuple):
 def halves(
     first: Photographed,
     second: Photographed,
-    common: Look,
+    common: DisplayTransform,
     render: Callable[[Camera], Render],
 ) -> Halves:
     """Show half of each photograph as a camera halfway between the two sees it.
@@ -60,7 +60,7 @@ def halves(
     Args:
         first: one photograph.
         second: the other.
-        common: the look of "after".
+        common: the display transform of "after".
         render: of a camera, with depth.
     """
     camera = halfway(first.camera, second.camera)
@@ -75,7 +75,7 @@ def halves(
         size = jnp.array([photograph.camera.width, photograph.camera.height])
         inside = np.asarray((z > 1e-6) & jnp.all((xy >= 0) & (xy < size), axis=-1))
         ldr = np.asarray(sample_bilinear(jnp.asarray(photograph.ldr), xy))
-        alike = redeveloped(ldr, photograph.look, common)
+        alike = redeveloped(ldr, photograph.transform, common)
         reached.append(inside)
         before.append(np.where(inside[..., None], ldr, BLANK))
         after.append(np.where(inside[..., None], alike, BLANK))

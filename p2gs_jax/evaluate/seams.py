@@ -1,4 +1,4 @@
-"""Seams: how far photographs of the same surface are apart, as taken and developed to one look.
+"""Seams: how far photographs of one surface are apart, as taken and under one display transform.
 
 Pixels of one view are found in a neighbouring one through rendered depth, with an occlusion test
 (render/warp.py). Over the pixels that both show, unsaturated and not near black, the seam is the
@@ -7,7 +7,7 @@ median over pixels and channels of the absolute difference, in 8-bit codes and i
 - before: of the photographs as taken. In stops, as if all were taken alike: both are decoded with
   the common gamma, and no exposure is undone.
 - after: of the photographs developed alike: each is decoded with its own gamma, divided by its own
-  exposure, and shown in the common look.
+  exposure, and shown in the common display transform.
 
 The step is what the two still differ by throughout: the median of the signed difference after, in
 stops. What is left beyond it contains the misplacement of pixels on texture, view-dependent shine,
@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float, Float32
 from scipy.sparse import csr_array
 
 from p2gs_jax.config import LossConfig
-from p2gs_jax.photometry.display import Look, develop
+from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import inverse_tone_map
 from p2gs_jax.render.warp import sample_bilinear, warp
 from p2gs_jax.scene.visibility import project_points, unoccluded
@@ -46,14 +46,14 @@ class Photographed(NamedTuple):
         mask: 1 = use.
         camera: at the size of `ldr`.
         depth: from `surface_depth`, 0 where the view shows no surface.
-        look: how it was taken.
+        transform: how it was taken.
     """
 
     ldr: Float32[np.ndarray, "h w 3"]
     mask: Float32[np.ndarray, "h w"]
     camera: Camera
     depth: Float[np.ndarray, "h w"]
-    look: Look
+    transform: DisplayTransform
 
 
 class Seam(NamedTuple):
@@ -133,14 +133,14 @@ def _shared_points(scene: Scene) -> np.ndarray:
 
 
 def measure(
-    first: Photographed, second: Photographed, common: Look, cfg: LossConfig
+    first: Photographed, second: Photographed, common: DisplayTransform, cfg: LossConfig
 ) -> Seam | None:
     """Return the seam between two photographs, or None where they have too little in common.
 
     Args:
         first: in whose pixels the two are compared.
         second: its neighbour.
-        common: the look of "after", and the gamma of "before".
+        common: the display transform of "after", and the gamma of "before".
         cfg: from and up to which values a photograph says something.
     """
     there = warp(jnp.asarray(first.depth), first.camera, jnp.asarray(second.depth), second.camera)
@@ -152,8 +152,8 @@ def measure(
         return None
     a, b = first.ldr[use], np.asarray(ldr)[use]
     plain = [decoded(values, common) for values in (a, b)]
-    own = [decoded(a, first.look), decoded(b, second.look)]
-    radiance = [own[0] / first.look.exposure, own[1] / second.look.exposure]
+    own = [decoded(a, first.transform), decoded(b, second.transform)]
+    radiance = [own[0] / first.transform.exposure, own[1] / second.transform.exposure]
     shown = [develop(linear, common) for linear in radiance]
     return Seam(
         _apart(np.log2(plain[0]), np.log2(plain[1])),
@@ -165,9 +165,13 @@ def measure(
     )
 
 
-def decoded(ldr: Float[np.ndarray, "... 3"], look: Look) -> Float32[np.ndarray, "... 3"]:
+def decoded(
+    ldr: Float[np.ndarray, "... 3"], transform: DisplayTransform
+) -> Float32[np.ndarray, "... 3"]:
     """Return the exposed radiance e L of a photograph."""
-    return inverse_tone_map(np.asarray(ldr, np.float32), np.float32(look.gamma), look.formation)
+    return inverse_tone_map(
+        np.asarray(ldr, np.float32), np.float32(transform.gamma), transform.formation
+    )
 
 
 def _informative(ldr: Float[np.ndarray, "h w 3"], cfg: LossConfig) -> Bool[np.ndarray, "h w"]:

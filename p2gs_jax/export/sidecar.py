@@ -12,7 +12,7 @@ import numpy as np
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.formats.exr import BT709
-from p2gs_jax.photometry.display import Look, develop
+from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import EXPOSED_CEILING, EXPOSED_FLOOR
 from p2gs_jax.render.radiance import LOG_RADIANCE_LIMIT
 from p2gs_jax.render.spherical_harmonics import C0, C1, C2, C3, degree_of
@@ -121,7 +121,7 @@ def linear_sidecar(
 
 def _tone(cfg: FitConfig, photometry: PhotometryFile) -> dict[str, Any]:
     exposed = np.exp2(np.linspace(DARKEST_EV, BRIGHTEST_EV, SAMPLES)).astype(np.float32)
-    base = develop(exposed, Look(1.0, GAMMA_SRGB, cfg.photometry))
+    base = develop(exposed, DisplayTransform(1.0, GAMMA_SRGB, cfg.photometry))
     kind = cfg.photometry.appearance
     limits = [EXPOSED_FLOOR, EXPOSED_CEILING if cfg.photometry.clamp else None]
     return {

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, UInt8
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.numerics import on_device
-from p2gs_jax.photometry.display import Look, develop
+from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.render import render_linear, required_capacity
 from p2gs_jax.render.capacity import bucket
 from p2gs_jax.render.host import RenderView, make_renderer
@@ -74,7 +74,7 @@ class ViewError:
 
 
 def true_target(
-    name: str, gaussians: Gaussians, camera: Camera, look: Look, render: RenderView
+    name: str, gaussians: Gaussians, camera: Camera, transform: DisplayTransform, render: RenderView
 ) -> Target:
     """Return what a view truly looks like: light composited, then developed.
 
@@ -82,40 +82,46 @@ def true_target(
         name: of the view.
         gaussians: linear radiance.
         camera: the view.
-        look: how to show it.
+        transform: how to show it.
         render: of the run, from `make_renderer`.
     """
     linear = render(gaussians, _all(gaussians), camera).linear
-    codes = np.rint(255 * develop(linear, look)).astype(np.uint8)
+    codes = np.rint(255 * develop(linear, transform)).astype(np.uint8)
     return Target(name, camera, codes)
 
 
-def look_of_splats(look: Look) -> Look:
-    """Return the look without what splats cannot carry: a correction by place in the image."""
-    return replace(look, correction=None) if look.formation.appearance == "bilateral" else look
+def display_of_splats(transform: DisplayTransform) -> DisplayTransform:
+    """Return the transform without what splats cannot carry: a correction by image position."""
+    return (
+        replace(transform, correction=None)
+        if transform.formation.appearance == "bilateral"
+        else transform
+    )
 
 
-def look_comments(look: Look) -> list[str]:
+def display_comments(transform: DisplayTransform) -> list[str]:
     """Return the header lines of a PLY with display colours."""
     return [
         "p2gs-jax: display colours, tone-mapped",
-        f"p2gs-jax: exposure {look.exposure:.6g}, gamma {look.gamma:.6g}, "
-        f"curve {look.formation.curve}",
+        f"p2gs-jax: exposure {transform.exposure:.6g}, gamma {transform.gamma:.6g}, "
+        f"curve {transform.formation.curve}",
     ]
 
 
-def bake(gaussians: Gaussians, look: Look, activation: RadianceKind, degree: int) -> Gaussians:
+def bake(
+    gaussians: Gaussians, transform: DisplayTransform, activation: RadianceKind, degree: int
+) -> Gaussians:
     """Return Gaussians with display colours, each taken by itself.
 
     Args:
         gaussians: linear radiance.
-        look: how to show it.
+        transform: how to show it.
         activation: of the spherical harmonics.
         degree: of the display colours; a higher one than the radiance has changes nothing.
     """
     sh = np.asarray(gaussians.sh)
     degree = min(degree, degree_of(sh.shape[1]))
-    shown = display_sh(sh, lambda linear: develop(linear, look), activation, degree)
+    shown = display_sh(sh, lambda linear: develop(linear, transform), activation, degree)
     return replace(gaussians, sh=on_device(shown))
 
 

@@ -16,7 +16,7 @@ from p2gs_jax.paths.captioned_rows import Row, stacked, stacked_size
 from p2gs_jax.paths.cylinder import borders
 from p2gs_jax.paths.geometry import Poses, inverse
 from p2gs_jax.paths.panorama import Layers
-from p2gs_jax.photometry.display import Look, develop, undevelop
+from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
 from p2gs_jax.render.host import make_renderer
 from p2gs_jax.run.read import Run
 from p2gs_jax.scene.images import ImageStore
@@ -61,10 +61,10 @@ class Studio:
         result = self._render(self.run.params.gaussians, self.run.alive, shot.camera())
         return np.asarray(result.linear), np.asarray(result.alpha), np.asarray(result.depth)
 
-    def develop(self, linear: Float32[np.ndarray, "h w 3"], look: Look):
+    def develop(self, linear: Float32[np.ndarray, "h w 3"], transform: DisplayTransform):
         """Return display values."""
         begin = time.perf_counter()
-        ldr = develop(linear, look)
+        ldr = develop(linear, transform)
         self.develop_seconds.append(time.perf_counter() - begin)
         return ldr
 
@@ -72,7 +72,7 @@ class Studio:
 def shot_frames(
     studio: Studio,
     shots: Sequence[Shot],
-    look_of: Callable[[Shot], Look],
+    display_of: Callable[[Shot], DisplayTransform],
     photograph: Callable[[int], Float32[np.ndarray, "h w 3"] | None] | None = None,
 ) -> Iterator[Frame]:
     """Yield a frame for every shot.
@@ -80,31 +80,33 @@ def shot_frames(
     Args:
         studio: renders.
         shots: what to render.
-        look_of: how to develop each.
+        display_of: how to develop each.
         photograph: returns what goes beside the render of a view, or None; by default nothing.
     """
     for shot in shots:
         linear, alpha, depth = studio.linear(shot)
-        look = look_of(shot)
-        ldr = studio.develop(linear, look)
+        transform = display_of(shot)
+        ldr = studio.develop(linear, transform)
         taken = None if photograph is None or shot.view is None else photograph(shot.view)
-        how = (look.exposure, look.gamma)
+        how = (transform.exposure, transform.gamma)
         yield Frame(shot.name, linear, alpha, ldr, *how, depth, shot.camera(), taken)
 
 
-def wide_frames(studio: Studio, cylinder: Cylinder, poses: Poses, look: Look) -> Iterator[Frame]:
+def wide_frames(
+    studio: Studio, cylinder: Cylinder, poses: Poses, transform: DisplayTransform
+) -> Iterator[Frame]:
     """Yield wide views of the field.
 
     Args:
         studio: renders.
         cylinder: the view from a rig: its viewmat is rig-to-camera.
         poses: rig-to-world.
-        look: how to develop all.
+        transform: how to develop all.
     """
     for k, pose in enumerate(poses):
         wide = studio.wide(_placed(cylinder, pose))
-        ldr = studio.develop(wide.linear, look)
-        yield Frame(f"{k:05d}", wide.linear, wide.alpha, ldr, look.exposure, look.gamma)
+        ldr = studio.develop(wide.linear, transform)
+        yield Frame(f"{k:05d}", wide.linear, wide.alpha, ldr, transform.exposure, transform.gamma)
 
 
 def comparison_size(cylinder: Cylinder) -> tuple[int, int]:
@@ -117,21 +119,21 @@ def comparison_frames(
     rig: Rig,
     steps: Sequence[Step],
     cylinder: Cylinder,
-    look: Look,
+    transform: DisplayTransform,
     store: ImageStore,
 ) -> Iterator[Frame]:
     """Yield three panoramas below each other for every time step.
 
     Photographs stitched as taken; the same, each taken back to radiance by its own exposure and
-    gamma and developed with one look; the field with that look. Photographs are placed by the
-    field's smoothed depth, and nothing is blended. The frame's `linear` is the field.
+    gamma and developed with one display transform; the field under the same. Photographs are
+    placed by the field's smoothed depth, and nothing is blended. The frame's `linear` is the field.
 
     Args:
         studio: renders.
         rig: the cameras.
         steps: of the rig.
         cylinder: the view from the rig: its viewmat is rig-to-camera.
-        look: the common one.
+        transform: the common one.
         store: the photographs.
     """
     names = list(rig.mounts)
@@ -141,31 +143,31 @@ def comparison_frames(
         wide = studio.wide(placed)
         shots = [step.shots[name] for name in names if name in step.shots]
         rows = [shot.view for shot in shots if shot.view is not None]
-        looks = [studio.run.own_look(row) for row in rows]
+        transforms = [studio.run.own_display(row) for row in rows]
         photographs, masks = zip(*(store.get(row) for row in rows), strict=True)
-        radiance = [undevelop(p, own) for p, own in zip(photographs, looks, strict=True)]
+        radiance = [undevelop(p, own) for p, own in zip(photographs, transforms, strict=True)]
         near = cv2.GaussianBlur(wide.nearness, (0, 0), SMOOTH * cylinder.width)
         taken = stitch(photographs, shots, placed, near, masks)
         same = stitch(radiance, shots, placed, near, masks)
         seen = taken.source[..., None] >= 0
-        stops = [float(np.log2(own.exposure / mean)) for own in looks]
+        stops = [float(np.log2(own.exposure / mean)) for own in transforms]
         cameras = [name for name in names if name in step.shots]
         captions = [
             (f"{cameras[k]} {stops[k]:+.1f} EV".replace("-", "−"), start, end)
             for k, start, end in borders(taken.source[cylinder.height // 2])
         ]
-        field = studio.develop(wide.linear, look)
+        field = studio.develop(wide.linear, transform)
         picture = stacked(
             [
                 Row("photographs as taken", np.where(seen, taken.image, NOTHING), captions),
                 Row(
                     "the same photographs, developed to one exposure",
-                    np.where(seen, develop(same.image, look), NOTHING),
+                    np.where(seen, develop(same.image, transform), NOTHING),
                 ),
                 Row("the radiance field at that exposure", field),
             ]
         )
-        how = (look.exposure, look.gamma)
+        how = (transform.exposure, transform.gamma)
         yield Frame(step.name, wide.linear, wide.alpha, picture, *how)
 
 

@@ -18,7 +18,7 @@ CURVES: tuple[Curve, ...] = get_args(Curve)
 
 
 @dataclass(frozen=True)
-class Look:
+class DisplayTransform:
     """How radiance is shown.
 
     Attributes:
@@ -33,8 +33,8 @@ class Look:
     formation: PhotometryConfig
     correction: Float[Array, "..."] | None = None
 
-    def with_curve(self, curve: Curve) -> Look:
-        """Return the look under another base curve; corrections belong to the old one and go.
+    def with_curve(self, curve: Curve) -> DisplayTransform:
+        """Return the transform under another base curve; a correction belongs to the old one.
 
         Raises:
             ValueError: `spline` where the run has none.
@@ -47,7 +47,7 @@ class Look:
 
 
 def develop(
-    linear: Float[Array, "... 3"] | Float[np.ndarray, "... 3"], look: Look
+    linear: Float[Array, "... 3"] | Float[np.ndarray, "... 3"], transform: DisplayTransform
 ) -> Float32[np.ndarray, "... 3"]:
     """Return display values in [0, 1] of linear radiance.
 
@@ -55,10 +55,10 @@ def develop(
 
     Args:
         linear: radiance; an image where there is a correction.
-        look: how to show it.
+        transform: how to show it.
     """
-    e, g = np.float32(look.exposure), np.float32(look.gamma)
-    return np.asarray(_develop(linear, e, g, look.correction, look.formation))
+    e, g = np.float32(transform.exposure), np.float32(transform.gamma)
+    return np.asarray(_develop(linear, e, g, transform.correction, transform.formation))
 
 
 @functools.partial(jax.jit, static_argnames="cfg")
@@ -67,7 +67,7 @@ def _develop(linear, exposure, gamma, correction, cfg: PhotometryConfig):
 
 
 def undevelop(
-    ldr: Float[Array, "... 3"] | Float[np.ndarray, "... 3"], look: Look
+    ldr: Float[Array, "... 3"] | Float[np.ndarray, "... 3"], transform: DisplayTransform
 ) -> Float32[np.ndarray, "... 3"]:
     """Return the linear radiance that a photograph shows: the inverse of `develop`.
 
@@ -76,10 +76,10 @@ def undevelop(
 
     Args:
         ldr: display values.
-        look: how it was taken.
+        transform: how it was taken.
     """
-    e, g = np.float32(look.exposure), np.float32(look.gamma)
-    return np.asarray(_undevelop(ldr, e, g, look.formation))
+    e, g = np.float32(transform.exposure), np.float32(transform.gamma)
+    return np.asarray(_undevelop(ldr, e, g, transform.formation))
 
 
 @functools.partial(jax.jit, static_argnames="cfg")

@@ -25,8 +25,8 @@ from p2gs_jax.evaluate.radiance import Truth
 from p2gs_jax.formats.exr import read_exr, write_exr
 from p2gs_jax.formats.ply import write_ply, write_radiance
 from p2gs_jax.formats.png import write_png
-from p2gs_jax.gaussians.bake import bake, look_comments, look_of_splats
-from p2gs_jax.photometry.display import Look, develop
+from p2gs_jax.gaussians.bake import bake, display_comments, display_of_splats
+from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.pipeline.prepare import Prepared
 from p2gs_jax.render.host import make_renderer
@@ -113,10 +113,12 @@ def write_models(params: Params, run_dir: Path, cfg: FitConfig) -> None:
     """Write `splats.ply` (display colours) and `radiance.ply` (linear)."""
     mean = mean_parameters(params.photometry)
     alive = np.ones(params.gaussians.capacity, bool)
-    look = Look(mean.exposure_geometric, mean.gamma, cfg.photometry, params.mean_correction)
-    look = look_of_splats(look)
-    shown = bake(params.gaussians, look, cfg.render.radiance, MAX_DEGREE)
-    write_ply(run_dir / "splats.ply", shown, look_comments(look))
+    transform = DisplayTransform(
+        mean.exposure_geometric, mean.gamma, cfg.photometry, params.mean_correction
+    )
+    transform = display_of_splats(transform)
+    shown = bake(params.gaussians, transform, cfg.render.radiance, MAX_DEGREE)
+    write_ply(run_dir / "splats.ply", shown, display_comments(transform))
     write_radiance(
         run_dir / "radiance.ply", params.gaussians, alive, activation=cfg.render.radiance
     )
@@ -329,7 +331,9 @@ def _write_summary(
     cfg: FitConfig,
     true_ev: np.ndarray | None,
 ) -> None:
-    common = Look(mean.exposure_geometric, mean.gamma, cfg.photometry, params.mean_correction)
+    common = DisplayTransform(
+        mean.exposure_geometric, mean.gamma, cfg.photometry, params.mean_correction
+    )
     views = [shown[i] for i in picks]
     train = [scene.views[i] for i in scene.train_indices]
     exif = [v.exif_ev for v in train]

@@ -119,7 +119,7 @@ def _rendered(
         found: dict[tuple[int, int], Seam] = {}
         for done, (i, j) in enumerate(tried):
             reporter.stage("Measuring seams", done, len(tried))
-            seam = measure(photographed(i), photographed(j), run.common_look(), run.cfg.loss)
+            seam = measure(photographed(i), photographed(j), run.common_display(), run.cfg.loss)
             if seam is not None:
                 found[i, j] = seam
         names = [v.name for v in run.scene.views]
@@ -128,7 +128,7 @@ def _rendered(
         if widest is not None:
             i, j = widest
             shown = SeamPair(names[i], names[j], found[widest])
-            picture = halves(photographed(i), photographed(j), run.common_look(), render_camera)
+            picture = halves(photographed(i), photographed(j), run.common_display(), render_camera)
     strips: list[Strip] = []
     if not files.held_out:
         for index in spread(run.scene.train_indices, MOST_RENDERED):
@@ -160,8 +160,8 @@ class _Photographs:
             camera = camera_of(self.store, index, shrink)
             depth = np.asarray(surface_depth(self.render(camera)))
             ldr, mask = self.store.get(index, shrink)
-            look = self.run.own_look(index)
-            self.known[index] = Photographed(ldr, mask, camera, depth, look)
+            transform = self.run.own_display(index)
+            self.known[index] = Photographed(ldr, mask, camera, depth, transform)
         return self.known[index]
 
 
@@ -177,7 +177,7 @@ def _widest(found: dict[tuple[int, int], Seam]) -> tuple[int, int] | None:
 def _strip(run: Run, store: ImageStore, render, index: int) -> Strip:
     photograph, mask = store.get(index)
     linear = np.asarray(render(camera_of(store, index)).linear)
-    shown = develop(linear, run.own_look(index))
+    shown = develop(linear, run.own_display(index))
     score = float(psnr(shown, photograph, mask))
     view = run.scene.views[index]
     return Strip(view.name, view.split, photograph, shown, linear, score)

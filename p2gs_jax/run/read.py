@@ -18,7 +18,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.evaluate import MeanParameters, mean_parameters
 from p2gs_jax.formats.ply import read_ply
 from p2gs_jax.photometry.appearance import identity
-from p2gs_jax.photometry.display import Look
+from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.render.host import RenderView, make_renderer
 from p2gs_jax.run.layout import APPEARANCE
 from p2gs_jax.run.photometry_file import AGAIN, PhotometryFile, read_photometry
@@ -126,7 +126,7 @@ class Run:
         """Exposure and gamma of a view that has none of its own."""
         return mean_parameters(self.params.photometry)
 
-    def own_look(self, index: int) -> Look:
+    def own_display(self, index: int) -> DisplayTransform:
         """Return how a view was taken; a held-out view's exposure is that fitted to its photograph.
 
         Args:
@@ -136,21 +136,21 @@ class Run:
             row = self.scene.train_indices.index(index)
             p = self.params.photometry
             e, g = float(p.exposures[row]), float(p.gammas[row])
-            return Look(e, g, self.cfg.photometry, self.params.correction(row))
+            return DisplayTransform(e, g, self.cfg.photometry, self.params.correction(row))
         name = self.scene.views[index].name
         fitted = {v["image"]: v["exposure_fitted"] for v in self.photometry["views"]}.get(name)
         if fitted is None:
-            return self.common_look()
-        return replace(self.common_look(), exposure=fitted)
+            return self.common_display()
+        return replace(self.common_display(), exposure=fitted)
 
-    def common_look(self, exposure_ev: float = 0.0) -> Look:
+    def common_display(self, exposure_ev: float = 0.0) -> DisplayTransform:
         """Return one look for all views.
 
         Args:
             exposure_ev: stops from the geometric mean of the training views' exposures.
         """
         mean = self.mean
-        return Look(
+        return DisplayTransform(
             mean.exposure_geometric * 2**exposure_ev,
             mean.gamma,
             self.cfg.photometry,

@@ -28,7 +28,7 @@ EARLIEST, LATEST = 0.15, 0.9
 SEEDS_BOUND, DEFAULT_BOUND, BOUND = 8, 4, 2_000_000
 
 
-class Look(NamedTuple):
+class StageResult(NamedTuple):
     """The end of a stage: the same steps with growth and without.
 
     Attributes:
@@ -85,19 +85,20 @@ class Growth:
         limit: the population at which growth ended, or None while it goes on.
     """
 
-    looks: list[Look] = field(default_factory=list)
+    results: list[StageResult] = field(default_factory=list)
     limit: int | None = None
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Growth:
         """Return what `dataclasses.asdict` and JSON made of it."""
-        return cls([Look(*look) for look in values.get("looks", [])], values.get("limit"))
+        saved = values.get("results", values.get("looks", []))  # as earlier versions named it
+        return cls([StageResult(*stage) for stage in saved], values.get("limit"))
 
     @property
     def stalled(self) -> bool:
         """Whether the last stages gained too little to go on."""
-        last = self.looks[-PATIENCE:]
-        return len(last) == PATIENCE and not any(look.kept for look in last)
+        last = self.results[-PATIENCE:]
+        return len(last) == PATIENCE and not any(result.kept for result in last)
 
 
 def check_method(cfg: DensifyConfig) -> None:
@@ -168,9 +169,9 @@ def plan_stage(
 
 def describe(growth: Growth, views: int) -> str:
     """Return in words where growth ended and why."""
-    if not growth.looks:
+    if not growth.results:
         return f"Growth ended at {growth.limit} Gaussians: there was no time or room to try more."
-    last = growth.looks[-1]
+    last = growth.results[-1]
     what = f"{last.gaussians / last.before:.2f}x of {last.before}"
     why = "" if growth.stalled else " with its time or room"
     return (
@@ -186,5 +187,7 @@ def summary(growth: Growth, validation: Sequence[int]) -> dict[str, Any]:
         growth: at the end of the run.
         validation: rows of the held-out training views.
     """
-    looks = [{**look._asdict(), "gain": look.gain, "kept": look.kept} for look in growth.looks]
-    return {"limit": growth.limit, "held_out": len(validation), "looks": looks}
+    results = [
+        {**stage._asdict(), "gain": stage.gain, "kept": stage.kept} for stage in growth.results
+    ]
+    return {"limit": growth.limit, "held_out": len(validation), "looks": results}

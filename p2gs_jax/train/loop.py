@@ -43,7 +43,7 @@ from p2gs_jax.render.capacity import Room
 from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.train import decisions, growth, schedule
 from p2gs_jax.train.demand import demand
-from p2gs_jax.train.growth import Look, Stage
+from p2gs_jax.train.growth import Stage, StageResult
 from p2gs_jax.train.host import HostState
 from p2gs_jax.train.optimizer import make_optimizer, zero_moments, zero_opacity_moments
 from p2gs_jax.train.programs import Key, StepPrograms
@@ -610,10 +610,10 @@ class Trainer:
         with self.clock("densification"):
             psnr = self.judge(grown.params, grown.population.alive)
         progress = round(host.progress, 6)
-        look = Look(self._count(grown), psnr, stage.before, score, progress)
-        host.growth.looks.append(look)
+        result = StageResult(self._count(grown), psnr, stage.before, score, progress)
+        host.growth.results.append(result)
         # Tile lists that overflow end bursts early: the two may differ by a few steps.
-        kept = grown if look.kept else dataclasses.replace(plain, step=grown.step)
+        kept = grown if result.kept else dataclasses.replace(plain, step=grown.step)
         if host.growth.stalled:
             self._end_growth(kept, host)
         return kept, host

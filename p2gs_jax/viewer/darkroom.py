@@ -1,4 +1,4 @@
-"""The last frame, kept as light: a new look develops it again and renders nothing."""
+"""The last frame, kept as light: a new display transform develops it again and renders nothing."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Camera
 from p2gs_jax.viewer.frames import center
 from p2gs_jax.viewer.programs import Programs
-from p2gs_jax.viewer.settings import Settings, look_of
+from p2gs_jax.viewer.settings import Settings, display_of
 from p2gs_jax.viewer.shade import Frame, Photograph, as_seen_by, limits_of_depth, shade
 
 # A camera this close to a photograph's sees the same rays, in typical distances.
@@ -75,7 +75,7 @@ class Darkroom:
         return shade(
             self.frame,
             settings.mode,
-            look_of(self._run, settings),
+            display_of(self._run, settings),
             depth_limits=self.depth_limits,
             photograph=self._photograph_here() if settings.mode == "split" else None,
             split=settings.split,

@@ -28,13 +28,13 @@ KEYS = "Drag to orbit, right-drag to pan, scroll to approach; W A S D Q E fly, a
 
 
 class Actions(Protocol):
-    """What controls do beyond changing the look."""
+    """What controls do beyond changing the display transform."""
 
-    def look_changed(self) -> None:
+    def display_changed(self) -> None:
         """Develop anew."""
         ...
 
-    def take_look_of(self, index: int | None) -> None:
+    def take_display_of(self, index: int | None) -> None:
         """Take the exposure, gamma and correction of a view, or the mean."""
         ...
 
@@ -43,7 +43,7 @@ class Actions(Protocol):
         ...
 
     def go_to(self, index: int) -> None:
-        """Move to where a view was taken, and take its look unless that is locked."""
+        """Move to where a view was taken, and take its display transform unless that is locked."""
         ...
 
     def set_fov(self, degrees: float) -> None:
@@ -170,10 +170,10 @@ class Panel:
             hint="Browser splats move at any speed, but mix display values instead of light.",
         )
         for handle in (self._exposure, self._gamma, self._curve, self._split):
-            self._when_chosen(handle, lambda _: actions.look_changed())
+            self._when_chosen(handle, lambda _: actions.display_changed())
         for handle in (self._mode, self._renderer):
             self._when_chosen(handle, lambda _: actions.mode_changed())
-        self._when_chosen(self._match, lambda name: actions.take_look_of(self._index(name)))
+        self._when_chosen(self._match, lambda name: actions.take_display_of(self._index(name)))
 
     def _add_camera(self) -> None:
         gui, facts, actions = self._gui, self._facts, self._actions
@@ -295,7 +295,7 @@ class Panel:
         )
 
     def put(self, settings: Settings) -> None:
-        """Show a look on the controls; the mode stays."""
+        """Show a display transform on the controls; the mode stays."""
         self._taken_as = settings.taken_as
         self._exposure.value = settings.exposure_ev
         self._gamma.value = settings.gamma
@@ -325,7 +325,7 @@ class Panel:
 
     @property
     def locked(self) -> bool:
-        """Whether going somewhere leaves the look as it is."""
+        """Whether going somewhere leaves the display transform as it is."""
         return self._locked.value
 
     @property

@@ -10,7 +10,7 @@ from jaxtyping import Float32
 
 from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.formats.png import write_png
-from p2gs_jax.photometry.display import Look
+from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.viewer.shade import Frame
 
 # Fewest and most pixels across.
@@ -35,8 +35,8 @@ def png_bytes(ldr: Float32[np.ndarray, "h w 3"]) -> bytes:
         return path.read_bytes()
 
 
-def exr_bytes(frame: Frame, look: Look) -> bytes:
-    """Return a frame as an EXR file, with depth, opacity, the look and the camera in it."""
+def exr_bytes(frame: Frame, transform: DisplayTransform) -> bytes:
+    """Return a frame as an EXR file with depth, opacity, display transform and camera in it."""
     with tempfile.TemporaryDirectory(prefix="p2gs-view-") as folder:
         path = Path(folder) / "view.exr"
         write_exr(
@@ -44,8 +44,8 @@ def exr_bytes(frame: Frame, look: Look) -> bytes:
             np.asarray(frame.linear),
             depth=frame.depth,
             alpha=frame.alpha,
-            exposure=look.exposure,
-            gamma=look.gamma,
+            exposure=transform.exposure,
+            gamma=transform.gamma,
             camera=frame.camera,
         )
         return path.read_bytes()

@@ -24,7 +24,7 @@ from p2gs_jax.viewer.frames import camera_of_browser
 from p2gs_jax.viewer.ladder import Pace, Size, choose, full_size, ladder, order_of_compilation
 from p2gs_jax.viewer.legend import clipping_legend, depth_legend, note, stops_legend
 from p2gs_jax.viewer.panel import Panel
-from p2gs_jax.viewer.settings import Settings, look_of
+from p2gs_jax.viewer.settings import Settings, display_of
 from p2gs_jax.viewer.shade import Frame, codes
 from p2gs_jax.viewer.splats import splat_colors
 from p2gs_jax.viewer.studio import Studio
@@ -39,7 +39,7 @@ SPLATS_S = 1.0
 BLACK = np.zeros((1, 1, 3), np.uint8)
 NO_PHOTOGRAPH = "No photograph was taken from here: choose one under Camera, Go to."
 
-Job = Literal["move", "look", "rest"]
+Job = Literal["move", "develop", "rest"]
 
 
 class Seen(NamedTuple):
@@ -113,7 +113,7 @@ class Screen:
             self._touch()
 
     def retouched(self) -> None:
-        """The look is another: develop anew."""
+        """The display transform is another: develop anew."""
         with self._changed:
             self._retouched = True
             self._touch()
@@ -151,7 +151,7 @@ class Screen:
                     return "move"
                 if self._retouched and not self._moved:
                     self._retouched = False
-                    return "look"
+                    return "develop"
                 if not self._moved and (self._settled is None or not (splats or self._sharp())):
                     wait = self._last_change + REST_S - time.monotonic()
                     if wait <= 0:
@@ -209,7 +209,7 @@ class Screen:
                 self._settled = (size, compiled)
         if job == "move" and size is not None:
             self._pace.took(size, milliseconds)
-        if job != "look":
+        if job != "develop":
             self._last_ms = milliseconds
         self._say_status()
 
@@ -265,7 +265,7 @@ class Screen:
             self._panel.set_status(note("preparing splats ..."))
         splats = self._studio.splats()
         begin = time.monotonic()
-        colors = splat_colors(splats, look_of(self._studio.run, settings), settings)
+        colors = splat_colors(splats, display_of(self._studio.run, settings), settings)
         if handle is None:
             self._splats = self._client.scene.add_gaussian_splats(
                 "/splats", splats.centers, splats.covariances, colors, splats.opacities

@@ -20,8 +20,8 @@ from p2gs_jax.viewer.screen import Screen, seen_by
 from p2gs_jax.viewer.settings import (
     Settings,
     common_settings,
-    look_of,
-    same_look,
+    display_of,
+    same_display,
     settings_of_view,
 )
 from p2gs_jax.viewer.studio import Studio
@@ -48,7 +48,7 @@ class Session:
         self._stopping = threading.Event()
         self._frusta: Frusta | None = None
         self._one_at_a_time = threading.Lock()
-        # The look before a split took a photograph's, and the one that it took.
+        # The display transform before a split took a photograph's, and the one that it took.
         self._before_split: Settings | None = None
         self._taken: Settings | None = None
         client.camera.on_update(self._camera_moved)
@@ -78,14 +78,14 @@ class Session:
 
     # ------------------------------------------------------------------ the picture
 
-    def look_changed(self) -> None:
+    def display_changed(self) -> None:
         """Develop anew."""
         self._screen.retouched()
 
     def mode_changed(self) -> None:
-        """Show something else; a split goes to the nearest photograph and takes its look.
+        """Show something else; a split goes to the nearest photograph and takes its settings.
 
-        The look of before comes back after the split, unless a person has chosen another meanwhile.
+        Those of before come back after the split, unless a person has chosen others meanwhile.
         """
         before, now = self._before_split, self._panel.settings()
         if now.mode == "split":
@@ -97,11 +97,11 @@ class Session:
             self.go_to(room.nearest_view(camera) if here is None else here)
         elif before is not None:
             self._before_split = None
-            if self._taken is not None and same_look(now, self._taken):
+            if self._taken is not None and same_display(now, self._taken):
                 self._panel.put(before)
         self._screen.moved()
 
-    def take_look_of(self, index: int | None) -> None:
+    def take_display_of(self, index: int | None) -> None:
         """Take the exposure, gamma and correction of a view, or the mean."""
         before = self._panel.settings()
         if index is None:
@@ -113,13 +113,13 @@ class Session:
     # ------------------------------------------------------------------ the camera
 
     def go_to(self, index: int) -> None:
-        """Move to where a view was taken, and take its look unless that is locked."""
+        """Move to where a view was taken, and take its display transform unless that is locked."""
         self._player.stop()
         self._panel.set_playing(False)
         pose = self._studio.pose(index, seen_by(self._client).aspect)
         self._panel.put_view(index, float(np.rad2deg(pose.fov)))
         if not self._panel.locked:
-            self.take_look_of(index)
+            self.take_display_of(index)
             self._taken = self._panel.settings()
         self._move(pose)
 
@@ -164,7 +164,7 @@ class Session:
         """Move along the drive of a camera."""
         pose, nearest = self._studio.pose_along(camera, place, seen_by(self._client).aspect)
         if self._panel.own_exposures and self._panel.settings().taken_as != nearest:
-            self.take_look_of(nearest)
+            self.take_display_of(nearest)
         self._move(pose)
 
     def play(self, playing: bool) -> None:
@@ -194,7 +194,7 @@ class Session:
             room.render(self._screen.camera(seen, size), wait=True)
             if kind == "exr":
                 assert room.frame is not None
-                content = exr_bytes(room.frame, look_of(self._run, settings))
+                content = exr_bytes(room.frame, display_of(self._run, settings))
             else:
                 content = png_bytes(room.develop(settings))
         name = f"{self._run.folder.resolve().name}_{time.strftime('%Y%m%d_%H%M%S')}.{kind}"

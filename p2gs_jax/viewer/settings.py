@@ -1,4 +1,4 @@
-"""What a person has chosen about the picture, and the look that follows from it."""
+"""What a person has chosen about the picture, and the display transform that follows from it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from p2gs_jax.photometry.display import Look
+from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.run.read import Run
 from p2gs_jax.viewer.shade import Mode
 
@@ -16,7 +16,7 @@ ChosenCurve = Literal["run", "srgb", "power", "linear"]
 
 @dataclass(frozen=True)
 class Settings:
-    """The look and the mode.
+    """The display transform and the mode.
 
     Attributes:
         gamma: > 0.
@@ -38,11 +38,11 @@ class Settings:
 
 
 def common_settings(run: Run, before: Settings | None = None) -> Settings:
-    """Return the look of no view in particular: mean exposure and gamma.
+    """Return the display transform of no view in particular: mean exposure and gamma.
 
     Args:
         run: whose means.
-        before: what does not belong to the look is kept from it.
+        before: what does not belong to the display transform is kept from it.
     """
     gamma = run.mean.gamma
     if before is None:
@@ -56,25 +56,25 @@ def settings_of_view(run: Run, index: int, before: Settings) -> Settings:
     Args:
         run: with the view.
         index: row in `scene.views`.
-        before: what does not belong to the look is kept from it.
+        before: what does not belong to the display transform is kept from it.
     """
-    own = run.own_look(index)
+    own = run.own_display(index)
     ev = float(np.log2(own.exposure / run.mean.exposure_geometric))
     return replace(before, gamma=own.gamma, exposure_ev=ev, curve="run", taken_as=index)
 
 
-def same_look(a: Settings, b: Settings) -> bool:
+def same_display(a: Settings, b: Settings) -> bool:
     """Return whether two settings develop alike, whatever they show."""
     return replace(a, mode=b.mode, split=b.split, splats=b.splats) == b
 
 
-def look_of(run: Run, settings: Settings) -> Look:
+def display_of(run: Run, settings: Settings) -> DisplayTransform:
     """Return how the settings show radiance; corrections hold under the run's curve only."""
-    look = run.common_look(settings.exposure_ev)
+    transform = run.common_display(settings.exposure_ev)
     if settings.taken_as is not None:
-        look = replace(look, correction=run.own_look(settings.taken_as).correction)
-    look = replace(look, gamma=settings.gamma)
-    return look if settings.curve == "run" else look.with_curve(settings.curve)
+        transform = replace(transform, correction=run.own_display(settings.taken_as).correction)
+    transform = replace(transform, gamma=settings.gamma)
+    return transform if settings.curve == "run" else transform.with_curve(settings.curve)
 
 
 def exposures_ev(run: Run) -> dict[int, float]:

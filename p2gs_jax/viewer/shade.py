@@ -1,6 +1,6 @@
 """What the picture shows: the photograph, its luminance in stops, what clips, how far things are.
 
-A frame is rendered once and shaded as often as the look changes.
+A frame is rendered once and shaded as often as the display transform changes.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, UInt8
 
 from p2gs_jax.formats.false_color import clipping_overlay, depth_color, false_color
-from p2gs_jax.photometry.display import Look, develop
+from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.types import Camera
 
 Mode = Literal["display", "stops", "clipping", "depth", "split"]
@@ -62,7 +62,7 @@ class Photograph:
 def shade(
     frame: Frame,
     mode: Mode,
-    look: Look,
+    transform: DisplayTransform,
     *,
     depth_limits: tuple[float, float] | None = None,
     photograph: Photograph | None = None,
@@ -72,19 +72,19 @@ def shade(
 
     Args:
         frame: what was rendered.
-        mode: `stops` counts from middle grey at the exposure of the look; `split` without a
-            photograph is `display`.
-        look: how radiance is shown.
+        mode: `stops` counts from middle grey at the exposure of the transform; `split` without
+            a photograph is `display`.
+        transform: how radiance is shown.
         depth_limits: nearest and farthest depth of the colours, scene units; None takes the
             frame's own.
         photograph: for `split`.
         split: share of the width that the photograph takes, from the left.
     """
     if mode == "stops":
-        return false_color(np.asarray(frame.linear), MIDDLE_GREY / look.exposure)
+        return false_color(np.asarray(frame.linear), MIDDLE_GREY / transform.exposure)
     if mode == "depth":
         return depth_color(frame.depth, frame.alpha, depth_limits or limits_of_depth(frame))
-    ldr = develop(frame.linear, look)
+    ldr = develop(frame.linear, transform)
     if mode == "clipping":
         return clipping_overlay(ldr)
     if mode == "split" and photograph is not None:

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.formats.false_color import false_color
-from p2gs_jax.photometry.display import Look, develop
+from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.render import view_radiance
 from p2gs_jax.types import Camera, Gaussians
 from p2gs_jax.viewer.settings import Settings
@@ -78,14 +78,16 @@ def browser_splats(
     )
 
 
-def splat_colors(splats: BrowserSplats, look: Look, settings: Settings) -> UInt8[np.ndarray, "n 3"]:
+def splat_colors(
+    splats: BrowserSplats, transform: DisplayTransform, settings: Settings
+) -> UInt8[np.ndarray, "n 3"]:
     """Return a colour for each splat: in stops where the mode is that, else as displayed.
 
     A correction that depends on the place in the image is left out.
     """
     column = splats.linear[:, None]
     if settings.mode == "stops":
-        return codes(false_color(column, MIDDLE_GREY / look.exposure))[:, 0]
-    if look.formation.appearance == "bilateral":
-        look = replace(look, correction=None)
-    return codes(develop(column, look))[:, 0]
+        return codes(false_color(column, MIDDLE_GREY / transform.exposure))[:, 0]
+    if transform.formation.appearance == "bilateral":
+        transform = replace(transform, correction=None)
+    return codes(develop(column, transform))[:, 0]

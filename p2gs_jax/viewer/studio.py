@@ -72,7 +72,7 @@ class Studio:
             run.cfg.render,
             [self._probe(int(row)) for row in rows],
             self._tell,
-            lambda result: develop(result.linear, run.common_look()),
+            lambda result: develop(result.linear, run.common_display()),
         )
 
     def _tell(self) -> None:

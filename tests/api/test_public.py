@@ -70,9 +70,9 @@ def test_a_camera_of_one_s_own_sees_what_the_view_sees(finished_run):
     np.testing.assert_allclose(own.K, of_view.K)
     assert (own.width, own.height) == (of_view.width, of_view.height)
     linear = run.render(own).linear
-    bright = p2gs_jax.develop(linear, run.common_look(exposure_ev=1.0))
+    bright = p2gs_jax.develop(linear, run.common_display(exposure_ev=1.0))
     assert bright.shape == run.photograph(2).shape
-    assert bright.mean() > p2gs_jax.develop(linear, run.common_look()).mean()
+    assert bright.mean() > p2gs_jax.develop(linear, run.common_display()).mean()
 
 
 @pytest.mark.parametrize(

@@ -124,7 +124,7 @@ def test_the_baking_error_is_written_and_true(exported):
     linear = make_renderer(fitted.cfg.render)(fitted.params.gaussians, fitted.alive, camera).linear
     viewer = make_renderer(replace(fitted.cfg.render, radiance="linear"))
     shown = np.clip(viewer(read_ply(out / "display.ply"), fitted.alive, camera).linear, 0, 1)
-    difference = 255 * (shown - develop(linear, fitted.common_look()))
+    difference = 255 * (shown - develop(linear, fitted.common_display()))
     found = said["baking_error"]["train"]["per_view"][fitted.scene.views[index].name]
     assert found["mean_codes"] == pytest.approx(np.abs(difference).mean(), abs=0.5)
     assert found["psnr"] == pytest.approx(
@@ -167,7 +167,7 @@ def test_exr_renders_carry_each_views_own_exposure(exported):
     render = make_renderer(fitted.cfg.render)
     for index, view in enumerate(fitted.scene.views):
         linear, header = read_exr((out / "exr" / view.name).with_suffix(".exr"))
-        assert header["p2gsExposure"] == pytest.approx(fitted.own_look(index).exposure, rel=1e-6)
+        assert header["p2gsExposure"] == pytest.approx(fitted.own_display(index).exposure, rel=1e-6)
         expected = render(fitted.params.gaussians, fitted.alive, camera_of(store, index)).linear
         np.testing.assert_allclose(linear, expected, rtol=1e-3, atol=1e-4)
     assert len({read_exr(p)[1]["p2gsExposure"] for p in (out / "exr").iterdir()}) > 3

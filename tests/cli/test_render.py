@@ -14,7 +14,7 @@ from p2gs_jax.cli import main
 from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.paths import Shot, covering, find_rig, view_shots
 from p2gs_jax.paths.pictures import Studio
-from p2gs_jax.photometry.display import Look, develop
+from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.run.read import load_run
 
 SIZE = (96, 72)
@@ -65,11 +65,11 @@ def rig_run(finished_run, tmp_path_factory) -> Path:
         viewmat[0, [0, 2]], viewmat[2, [0, 2]] = (turn[0], -turn[1]), (turn[1], turn[0])
         viewmat[:3, 3] = -viewmat[:3, :3] @ [0.3 * step, 0, 0]
         linear, _, _ = studio.linear(Shot("", viewmat, K, *SIZE))
-        look = Look(2.0**ev, 2.2, studio.run.cfg.photometry)
+        transform = DisplayTransform(2.0**ev, 2.2, studio.run.cfg.photometry)
         name = f"{camera}/{step:03d}.png"
         path = root / "scene" / "images" / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(path), np.rint(develop(linear, look) * 255)[..., ::-1])
+        cv2.imwrite(str(path), np.rint(develop(linear, transform) * 255)[..., ::-1])
         # A turn by yaw to the right is one of the world to the left about y (down).
         q, t = (np.cos(half), 0, -np.sin(half), 0), viewmat[:3, 3]
         lines += [" ".join(map(str, (number, *q, *t, 1, name))), "1.0 1.0 1"]
@@ -163,10 +163,10 @@ def test_a_drive_can_be_exposed_as_photographed(capsys, own_run, tmp_path):
     assert code == 0
     first, last = (json.loads((tmp_path / "cameras.json").read_text())[k] for k in (0, -1))
     for entry, index in ((first, 0), (last, 5)):
-        look = fitted.own_look(index)
-        ev = np.log2(look.exposure / fitted.mean.exposure_geometric)
+        transform = fitted.own_display(index)
+        ev = np.log2(transform.exposure / fitted.mean.exposure_geometric)
         assert entry["exposure_ev"] == pytest.approx(ev, abs=1e-6)
-        assert entry["gamma"] == pytest.approx(look.gamma, rel=1e-6)
+        assert entry["gamma"] == pytest.approx(transform.gamma, rel=1e-6)
 
 
 def test_an_orbit_says_what_it_does(capsys, own_run, tmp_path):

@@ -9,12 +9,12 @@ import pytest
 from p2gs_jax.config import LossConfig, PhotometryConfig
 from p2gs_jax.evaluate.seam_picture import halfway, halves, redeveloped
 from p2gs_jax.evaluate.seams import Photographed, measure, neighbours
-from p2gs_jax.photometry.display import Look, develop
+from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.types import Camera, Render, Scene, Tracks, View
 
 SIZE, FOCAL, DEPTH = 64, 60.0, 4.0
 TONE = PhotometryConfig()
-COMMON = Look(1.0, 2.2, TONE)
+COMMON = DisplayTransform(1.0, 2.2, TONE)
 
 
 def camera(x: float) -> Camera:
@@ -32,13 +32,13 @@ def radiance(x: float) -> np.ndarray:
 
 
 def photographed(x: float, exposure: float, gamma: float = 2.2, claimed: float | None = None):
-    ldr = np.rint(255 * develop(radiance(x), Look(exposure, gamma, TONE))) / 255
+    ldr = np.rint(255 * develop(radiance(x), DisplayTransform(exposure, gamma, TONE))) / 255
     return Photographed(
         ldr.astype(np.float32),
         np.ones((SIZE, SIZE), np.float32),
         camera(x),
         np.full((SIZE, SIZE), DEPTH, np.float32),
-        Look(claimed or exposure, gamma, TONE),
+        DisplayTransform(claimed or exposure, gamma, TONE),
     )
 
 
@@ -87,7 +87,7 @@ def test_views_with_nothing_in_common_have_no_seam():
 
 
 def test_a_photograph_developed_in_another_look():
-    own = Look(2.0, 2.2, TONE)
+    own = DisplayTransform(2.0, 2.2, TONE)
     ldr = develop(radiance(0.0), own)
     np.testing.assert_allclose(
         redeveloped(ldr, own, COMMON), develop(radiance(0.0), COMMON), atol=1e-4
@@ -117,12 +117,12 @@ def test_halves_lie_on_the_side_of_their_camera_and_match_when_developed_alike()
     inner = slice(8, -8)
     np.testing.assert_allclose(
         picture.before[inner, edge + 1 : -8],
-        develop(middle, first.look)[inner, edge + 1 : -8],
+        develop(middle, first.transform)[inner, edge + 1 : -8],
         atol=0.02,
     )
     np.testing.assert_allclose(
         picture.before[inner, 8 : edge - 1],
-        develop(middle, second.look)[inner, 8 : edge - 1],
+        develop(middle, second.transform)[inner, 8 : edge - 1],
         atol=0.02,
     )
     np.testing.assert_allclose(

@@ -13,7 +13,7 @@ from p2gs_jax.config import DataConfig, FitConfig, PhotometryConfig, RenderConfi
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.export.sidecar import linear_sidecar
 from p2gs_jax.formats.ply import write_radiance
-from p2gs_jax.photometry.display import Look, develop
+from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.response import FREE, KNOTS
 from p2gs_jax.render.radiance import radiance_activation
 from p2gs_jax.render.spherical_harmonics import evaluate
@@ -95,7 +95,7 @@ def test_the_tone_curve_follows_from_the_table(tmp_path, options, exposure, gamm
         exposed = np.minimum(exposed, tone["exposed_limits"][1])
     linear = tone["pivot"] * (exposed / tone["pivot"]) ** (2.2 / gamma)
     found = np.interp(np.log(linear), np.log(tone["base"]["linear"]), tone["base"]["display"])
-    expected = develop(radiance, Look(exposure, gamma, cfg.photometry))
+    expected = develop(radiance, DisplayTransform(exposure, gamma, cfg.photometry))
     np.testing.assert_allclose(found, expected, atol=0.5 / 255)
 
 

@@ -13,14 +13,14 @@ from p2gs_jax.gaussians.bake import (
     Target,
     bake,
     baking_error,
+    display_of_splats,
     display_sh,
-    look_of_splats,
     refine,
     summary,
     true_target,
     viewer_config,
 )
-from p2gs_jax.photometry.display import Look, develop
+from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.render.host import make_renderer
 from p2gs_jax.render.spherical_harmonics import C0, basis
 
@@ -64,10 +64,14 @@ def test_colours_are_clamped():
 
 
 def test_a_correction_by_place_in_the_image_is_left_out():
-    grid = Look(1.0, 2.2, PhotometryConfig(appearance="bilateral"), jnp.ones((12, 8, 16, 16)))
-    assert look_of_splats(grid).correction is None
-    matrix = Look(1.0, 2.2, PhotometryConfig(appearance="affine"), jnp.full((3, 4), 0.1))
-    assert look_of_splats(matrix) is matrix
+    grid = DisplayTransform(
+        1.0, 2.2, PhotometryConfig(appearance="bilateral"), jnp.ones((12, 8, 16, 16))
+    )
+    assert display_of_splats(grid).correction is None
+    matrix = DisplayTransform(
+        1.0, 2.2, PhotometryConfig(appearance="affine"), jnp.full((3, 4), 0.1)
+    )
+    assert display_of_splats(matrix) is matrix
     g = random_splats(degree=0)
     shown = bake(g, matrix, "exp", 3).sh
     plain = develop(np.exp(C0 * np.asarray(g.sh[:, 0])), replace(matrix, correction=None))

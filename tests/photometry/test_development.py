@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import preset
-from p2gs_jax.photometry.display import Look, develop, undevelop
+from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
 from p2gs_jax.photometry.response import KNOTS
 
 SRGB = preset("robust").photometry
@@ -24,29 +24,31 @@ FORMATIONS = [
 
 @pytest.mark.parametrize("formation", FORMATIONS, ids=lambda f: f"{f.curve}-{f.pivot}")
 def test_what_is_developed_can_be_taken_back(formation):
-    look = Look(2.5, 1.9, formation)
+    transform = DisplayTransform(2.5, 1.9, formation)
     linear = np.linspace(0.02, 0.25, 60, dtype=np.float32).reshape(4, 5, 3)
-    ldr = develop(linear, look)
+    ldr = develop(linear, transform)
     assert ldr.max() < 1
-    np.testing.assert_allclose(undevelop(ldr, look), linear, rtol=2e-3)
+    np.testing.assert_allclose(undevelop(ldr, transform), linear, rtol=2e-3)
 
 
 def test_saturated_values_count_as_where_they_saturate():
-    look = Look(4.0, 2.2, SRGB)
-    np.testing.assert_allclose(undevelop(np.ones((1, 1, 3), np.float32), look), 0.25, rtol=1e-4)
+    transform = DisplayTransform(4.0, 2.2, SRGB)
+    np.testing.assert_allclose(
+        undevelop(np.ones((1, 1, 3), np.float32), transform), 0.25, rtol=1e-4
+    )
 
 
 def test_another_exposure_and_gamma_compile_nothing(caplog):
     linear = np.full((7, 9, 3), 0.1, np.float32)
-    look = Look(1.0, 2.2, SRGB)
+    transform = DisplayTransform(1.0, 2.2, SRGB)
 
-    def compiled(look):
+    def compiled(transform):
         caplog.clear()
         with jax.log_compiles(), caplog.at_level(logging.WARNING):
-            develop(linear, look)
+            develop(linear, transform)
         return sum("ompiling" in record.getMessage() for record in caplog.records)
 
-    compiled(look)
+    compiled(transform)
     for e, gamma in ((3.0, 1.7), (0.01, 2.9)):
-        assert compiled(replace(look, exposure=e, gamma=gamma)) == 0
-    assert compiled(look.with_curve("linear")) > 0  # else this test could not fail
+        assert compiled(replace(transform, exposure=e, gamma=gamma)) == 0
+    assert compiled(transform.with_curve("linear")) > 0  # else this test could not fail

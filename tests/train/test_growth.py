@@ -15,7 +15,7 @@ from p2gs_jax.core.progress import Silent
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.sweep import with_fields
 from p2gs_jax.train import growth, loop
-from p2gs_jax.train.growth import Growth, Look
+from p2gs_jax.train.growth import Growth, StageResult
 from p2gs_jax.train.host import HostState
 from p2gs_jax.train.validation import pick_validation
 from p2gs_jax.train.views import TrainingViews
@@ -116,20 +116,20 @@ def test_views_left_out_come_back():
 def test_growth_ends_where_it_gains_nothing(monkeypatch, tmp_path, scene, taken):
     result, said = fit(monkeypatch, scene, tmp_path / "run", lambda params, alive: 20.0)
     record = result.metrics["growth"]
-    looks, limit = record["looks"], record["limit"]
-    assert len(looks) == growth.PATIENCE
+    results, limit = record["looks"], record["limit"]
+    assert len(results) == growth.PATIENCE
     # What gained nothing was taken back.
-    assert limit == result.params.gaussians.capacity == looks[0]["before"]
-    assert all(look["gaussians"] > 1.2 * look["before"] for look in looks)
-    assert [look["gain"] for look in looks] == [0.0, 0.0]
-    assert not any(look["kept"] for look in looks)
+    assert limit == result.params.gaussians.capacity == results[0]["before"]
+    assert all(stage["gaussians"] > 1.2 * stage["before"] for stage in results)
+    assert [stage["gain"] for stage in results] == [0.0, 0.0]
+    assert not any(stage["kept"] for stage in results)
     assert record == json.loads((tmp_path / "run" / "metrics.json").read_text())["growth"]
     assert len(said) == 1
     assert f"ended at {limit} Gaussians: the last stage" in said[0]
     assert "gained 0.00 dB on 2 held-out training views" in said[0]
     held_out = set(pick_validation(["0"] * 12))
     steps = {row: [s for s, r in taken if r == row] for row in range(12)}
-    end = 100 * looks[-1]["progress"]
+    end = 100 * results[-1]["progress"]
     assert end < 50
     assert all(min(steps[row]) >= end for row in held_out)
     assert all(min(steps[row]) < end for row in set(range(12)) - held_out)
@@ -138,12 +138,14 @@ def test_growth_ends_where_it_gains_nothing(monkeypatch, tmp_path, scene, taken)
 @pytest.mark.slow
 def test_growth_goes_on_while_it_gains(monkeypatch, tmp_path, scene):
     result, said = fit(monkeypatch, scene, tmp_path / "run", population)
-    looks = result.metrics["growth"]["looks"]
-    assert len(looks) >= 2
-    assert all(look["kept"] for look in looks)
-    assert [look["before"] for look in looks[1:]] == [look["gaussians"] for look in looks[:-1]]
-    assert result.params.gaussians.capacity == looks[-1]["gaussians"] > 1.5 * looks[0]["before"]
-    assert looks[-1]["progress"] <= SMALL.densify.stop
+    results = result.metrics["growth"]["looks"]
+    assert len(results) >= 2
+    assert all(stage["kept"] for stage in results)
+    assert [stage["before"] for stage in results[1:]] == [
+        stage["gaussians"] for stage in results[:-1]
+    ]
+    assert result.params.gaussians.capacity == results[-1]["gaussians"] > 1.5 * results[0]["before"]
+    assert results[-1]["progress"] <= SMALL.densify.stop
     assert "with its time or room" in said[0]
 
 
@@ -160,11 +162,11 @@ def test_an_interrupted_run_grows_like_one_that_was_not(monkeypatch, tmp_path, s
 
 
 def test_the_host_remembers_growth_and_old_checkpoints_know_none():
-    looks = [Look(125, 21.0, 100, 20.8, 0.2), Look(150, 21.01, 125, 21.0, 0.3)]
-    host = HostState(step=40, growth=Growth(looks, 125))
+    results = [StageResult(125, 21.0, 100, 20.8, 0.2), StageResult(150, 21.01, 125, 21.0, 0.3)]
+    host = HostState(step=40, growth=Growth(results, 125))
     saved = json.loads(json.dumps(dataclasses.asdict(host)))
     assert HostState.from_dict(saved) == host
-    assert [look.kept for look in HostState.from_dict(saved).growth.looks] == [True, False]
+    assert [stage.kept for stage in HostState.from_dict(saved).growth.results] == [True, False]
     del saved["growth"]
     assert HostState.from_dict(saved) == HostState(step=40)
 
@@ -193,10 +195,10 @@ def test_stages_fill_the_time_and_stay_within_bounds():
 @pytest.mark.slow
 def test_the_real_judge_measures_at_full_size(tmp_path, scene):
     result = p2gs_jax.fit(scene, tmp_path / "run", SMALL)
-    looks = result.metrics["growth"]["looks"]
-    assert len(looks) >= 2
-    assert all(10 < look[key] < 40 for look in looks for key in ("psnr", "without"))
-    assert looks[-1]["without"] > looks[0]["without"]
+    results = result.metrics["growth"]["looks"]
+    assert len(results) >= 2
+    assert all(10 < stage[key] < 40 for stage in results for key in ("psnr", "without"))
+    assert results[-1]["without"] > results[0]["without"]
 
 
 @pytest.mark.parametrize("text", ["0", "-3", "many", "1.5", "1e5"])

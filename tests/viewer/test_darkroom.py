@@ -15,8 +15,8 @@ from p2gs_jax.viewer.darkroom import Darkroom
 from p2gs_jax.viewer.settings import (
     Settings,
     common_settings,
+    display_of,
     exposures_ev,
-    look_of,
     settings_of_view,
 )
 
@@ -80,7 +80,7 @@ def test_a_view_looks_as_the_run_says(room, run):
     darkroom, _, _ = room
     for index in (run.scene.train_indices[0], run.scene.test_indices[0]):
         settings = settings_of_view(run, index, common_settings(run))
-        expected = develop(darkroom.frame.linear, run.own_look(index))
+        expected = develop(darkroom.frame.linear, run.own_display(index))
         np.testing.assert_allclose(darkroom.develop(settings), expected, atol=1e-5)
 
 
@@ -91,7 +91,7 @@ def test_exposures_count_from_the_mean_whatever_the_gauge(run):
     index = run.scene.train_indices[1]
     settings = settings_of_view(other, index, common_settings(other))
     np.testing.assert_allclose(
-        look_of(other, settings).exposure, other.own_look(index).exposure, rtol=1e-5
+        display_of(other, settings).exposure, other.own_display(index).exposure, rtol=1e-5
     )
     np.testing.assert_allclose(settings.exposure_ev, exposures_ev(run)[index], atol=1e-5)
 
@@ -117,11 +117,11 @@ def test_corrections_hold_under_the_curve_they_were_learned_with(run):
     )
     index = run.scene.train_indices[2]
     own = settings_of_view(with_corrections, index, Settings(gamma=2.2))
-    np.testing.assert_array_equal(look_of(with_corrections, own).correction, corrections[2])
-    mean = look_of(with_corrections, replace(own, taken_as=None))
+    np.testing.assert_array_equal(display_of(with_corrections, own).correction, corrections[2])
+    mean = display_of(with_corrections, replace(own, taken_as=None))
     np.testing.assert_allclose(mean.correction, corrections.mean(0), atol=1e-6)
     other = replace(own, curve="linear")
-    assert look_of(with_corrections, other).correction is None
+    assert display_of(with_corrections, other).correction is None
 
 
 def test_photographs_are_found_where_they_were_taken(room, run):

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from p2gs_jax.config import PhotometryConfig, RenderConfig
 from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.formats.false_color import luminance
-from p2gs_jax.photometry.display import Look, develop
+from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.render import view_radiance
 from p2gs_jax.types import Camera, Gaussians, Scene, View
 from p2gs_jax.viewer.frames import center
@@ -105,11 +105,11 @@ def test_splat_colours_are_developed():
     splats = browser_splats(
         splat_scene(), np.ones(5, bool), RenderConfig(), seen_from=np.zeros(3), unit=1.0
     )
-    look, settings = Look(0.5, 2.2, PhotometryConfig()), Settings(gamma=2.2)
-    expected = np.rint(255 * np.asarray(develop(splats.linear, look)))
-    assert np.abs(splat_colors(splats, look, settings).astype(float) - expected).max() <= 1
-    stops = splat_colors(splats, look, Settings(gamma=2.2, mode="stops"))
-    assert np.any(stops != splat_colors(splats, look, settings))
+    transform, settings = DisplayTransform(0.5, 2.2, PhotometryConfig()), Settings(gamma=2.2)
+    expected = np.rint(255 * np.asarray(develop(splats.linear, transform)))
+    assert np.abs(splat_colors(splats, transform, settings).astype(float) - expected).max() <= 1
+    stops = splat_colors(splats, transform, Settings(gamma=2.2, mode="stops"))
+    assert np.any(stops != splat_colors(splats, transform, settings))
 
 
 def test_a_correction_by_place_is_left_out_of_splats():
@@ -117,8 +117,10 @@ def test_a_correction_by_place_is_left_out_of_splats():
         splat_scene(), np.ones(5, bool), RenderConfig(), seen_from=np.zeros(3), unit=1.0
     )
     settings = Settings(gamma=2.2)
-    plain = Look(0.5, 2.2, PhotometryConfig())
-    grid = Look(0.5, 2.2, PhotometryConfig(appearance="bilateral"), np.ones((12, 8, 16, 16)))
+    plain = DisplayTransform(0.5, 2.2, PhotometryConfig())
+    grid = DisplayTransform(
+        0.5, 2.2, PhotometryConfig(appearance="bilateral"), np.ones((12, 8, 16, 16))
+    )
     np.testing.assert_array_equal(
         splat_colors(splats, grid, settings), splat_colors(splats, plain, settings)
     )
@@ -142,8 +144,8 @@ def test_saved_files_hold_what_is_shown():
     linear = np.random.default_rng(0).uniform(0, 9, (6, 8, 3)).astype(np.float32)
     alpha, depth = np.full((6, 8), 0.5, np.float32), np.full((6, 8), 2.0, np.float32)
     camera = Camera(jnp.asarray(viewmat([0, 0.1, 0], [1, 2, 3])), jnp.eye(3), 8, 6)
-    look = Look(4.0, 2.4, PhotometryConfig())
-    path_bytes = exr_bytes(Frame(jnp.asarray(linear), alpha, depth, camera), look)
+    transform = DisplayTransform(4.0, 2.4, PhotometryConfig())
+    path_bytes = exr_bytes(Frame(jnp.asarray(linear), alpha, depth, camera), transform)
     assert path_bytes[:4] == b"\x76\x2f\x31\x01"
     png = cv2.imdecode(np.frombuffer(png_bytes(linear / 9), np.uint8), cv2.IMREAD_COLOR)
     np.testing.assert_array_equal(png[..., ::-1], np.rint(linear / 9 * 255))
@@ -154,9 +156,9 @@ def test_a_saved_exr_can_be_read_back(tmp_path):
     linear = np.random.default_rng(0).uniform(0, 9, (6, 8, 3)).astype(np.float32)
     alpha, depth = np.full((6, 8), 0.5, np.float32), np.full((6, 8), 2.0, np.float32)
     camera = Camera(jnp.asarray(viewmat([0, 0.1, 0], [1, 2, 3])), jnp.eye(3), 8, 6)
-    look = Look(4.0, 2.4, PhotometryConfig())
+    transform = DisplayTransform(4.0, 2.4, PhotometryConfig())
     (tmp_path / "a.exr").write_bytes(
-        exr_bytes(Frame(jnp.asarray(linear), alpha, depth, camera), look)
+        exr_bytes(Frame(jnp.asarray(linear), alpha, depth, camera), transform)
     )
     back, header = read_exr(tmp_path / "a.exr")
     np.testing.assert_allclose(back, linear, rtol=1e-3)

@@ -1,4 +1,4 @@
-"""What one browser's controls do to its look, without a browser."""
+"""What one browser's controls do to its display transform, without a browser."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -12,7 +12,7 @@ pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 
 from p2gs_jax.viewer import session as sessions
 from p2gs_jax.viewer.session import Session
-from p2gs_jax.viewer.settings import Settings, common_settings, same_look, settings_of_view
+from p2gs_jax.viewer.settings import Settings, common_settings, same_display, settings_of_view
 
 
 class Panel:
@@ -98,6 +98,6 @@ def test_the_exposure_can_be_locked(session):
 
 def test_looks_are_compared_without_what_is_shown():
     a = Settings(gamma=2.2, exposure_ev=0.5)
-    assert same_look(a, replace(a, mode="split", split=0.1, splats=True))
-    assert not same_look(a, replace(a, exposure_ev=0.6))
+    assert same_display(a, replace(a, mode="split", split=0.1, splats=True))
+    assert not same_display(a, replace(a, exposure_ev=0.6))
     assert np.isclose(a.gamma, 2.2)

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.formats.false_color import OVER, clipping_overlay, depth_color, false_color
-from p2gs_jax.photometry.display import Look, develop
+from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.types import Camera
 from p2gs_jax.viewer.shade import (
     MIDDLE_GREY,
@@ -20,7 +20,7 @@ from p2gs_jax.viewer.shade import (
     shade,
 )
 
-LOOK = Look(2.0, 2.2, PhotometryConfig())
+LOOK = DisplayTransform(2.0, 2.2, PhotometryConfig())
 
 
 def camera(width=40, height=24, focal=50.0, rotation=(0, 0, 0), K=None):
@@ -59,7 +59,7 @@ def test_every_mode_shows_what_it_says():
 def test_stops_count_from_middle_grey_at_the_exposure():
     grey = jnp.full((4, 4, 3), 1.01 * MIDDLE_GREY / LOOK.exposure)
     f = Frame(grey, np.ones((4, 4)), np.ones((4, 4)), camera(4, 4))
-    one_up = Look(2 * LOOK.exposure, LOOK.gamma, LOOK.formation)
+    one_up = DisplayTransform(2 * LOOK.exposure, LOOK.gamma, LOOK.formation)
     twice = Frame(2 * grey, f.alpha, f.depth, f.camera)
     np.testing.assert_array_equal(shade(f, "stops", one_up), shade(twice, "stops", LOOK))
     assert np.any(shade(f, "stops", LOOK) != shade(f, "stops", one_up))

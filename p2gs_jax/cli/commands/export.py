@@ -24,13 +24,13 @@ from p2gs_jax.gaussians.bake import (
     Target,
     bake,
     baking_error,
-    look_comments,
-    look_of_splats,
+    display_comments,
+    display_of_splats,
     refine,
     summary,
     true_target,
 )
-from p2gs_jax.photometry.display import Look
+from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.render.host import make_renderer
 from p2gs_jax.render.spherical_harmonics import MAX_DEGREE
 from p2gs_jax.run.read import Run, load_run
@@ -59,7 +59,7 @@ def run(options: Export) -> int:
     if "spz" in formats:
         require_gsply()
     fitted = load_run(options.run, options.scene)
-    look = _look(fitted, options)
+    transform = _display_transform(fitted, options)
     folder = options.out or options.run / "exports"
     _check_places(folder, formats, options.overwrite)
     _check_names(fitted, formats)
@@ -69,7 +69,7 @@ def run(options: Export) -> int:
     with TerminalReporter() as reporter:
         display = None
         if set(formats) & set(DISPLAY):
-            display = _Display(fitted, store, look, options.bake_steps, reporter)
+            display = _Display(fitted, store, transform, options.bake_steps, reporter)
         for name in formats:
             begin = time.monotonic()
             if name == "linear-ply":
@@ -86,24 +86,24 @@ def run(options: Export) -> int:
     return 0
 
 
-def _look(fitted: Run, options: Export) -> Look:
-    """Return the look of display colours.
+def _display_transform(fitted: Run, options: Export) -> DisplayTransform:
+    """Return the display transform of display colours.
 
     Raises:
         UserError: the run has no such curve.
     """
-    look = fitted.common_look(options.exposure_ev or 0.0)
+    transform = fitted.common_display(options.exposure_ev or 0.0)
     if options.gamma is not None:
-        look = replace(look, gamma=options.gamma)
+        transform = replace(transform, gamma=options.gamma)
     if options.curve is not None:
         try:
-            look = look.with_curve(options.curve)
+            transform = transform.with_curve(options.curve)
         except ValueError as error:
             raise UserError(
                 f"--curve {options.curve}: {error}.",
-                fix=f"leave it out for the run's own ({look.formation.curve})",
+                fix=f"leave it out for the run's own ({transform.formation.curve})",
             ) from error
-    return look_of_splats(look)
+    return display_of_splats(transform)
 
 
 def _check_places(folder: Path, formats: Sequence[Format], overwrite: bool) -> None:
@@ -160,15 +160,15 @@ def _exr(folder: Path, fitted: Run, store: ImageStore, reporter: Reporter) -> st
     render, views = make_renderer(fitted.cfg.render), fitted.scene.views
     with atomic_folder(folder / PLACES["exr"][0]) as temporary:
         for index, view in enumerate(views):
-            camera, look = camera_of(store, index), fitted.own_look(index)
+            camera, transform = camera_of(store, index), fitted.own_display(index)
             result = render(fitted.params.gaussians, fitted.alive, camera)
             write_exr(
                 (temporary / view.name).with_suffix(".exr"),
                 np.asarray(result.linear),
                 depth=np.asarray(result.depth),
                 alpha=np.asarray(result.alpha),
-                exposure=look.exposure,
-                gamma=look.gamma,
+                exposure=transform.exposure,
+                gamma=transform.gamma,
                 camera=camera,
                 shot=read_shot(view.image_path),
             )
@@ -192,12 +192,17 @@ WRITERS = {
 
 
 class _Display:
-    """Display colours at one look, baked once for each degree, and measured."""
+    """Display colours at one display transform, baked once for each degree, and measured."""
 
     def __init__(
-        self, fitted: Run, store: ImageStore, look: Look, steps: int | None, reporter: Reporter
+        self,
+        fitted: Run,
+        store: ImageStore,
+        transform: DisplayTransform,
+        steps: int | None,
+        reporter: Reporter,
     ):
-        self.fitted, self.look, self.reporter = fitted, look, reporter
+        self.fitted, self.transform, self.reporter = fitted, transform, reporter
         scene = fitted.scene
         self.steps = max(STEPS, len(scene.train_indices)) if steps is None else steps
         self.baked: dict[int, Gaussians] = {}
@@ -210,7 +215,7 @@ class _Display:
                 scene.views[index].name,
                 fitted.params.gaussians,
                 camera_of(store, index),
-                look,
+                transform,
                 render,
             )
             reporter.stage("Rendering true pictures", done + 1, len(rows))
@@ -222,7 +227,10 @@ class _Display:
         if name == "display-ply":
             shown = self._bake(MAX_DEGREE)
             error = self._error(shown)
-            comments = [*look_comments(self.look), *(f"p2gs-jax: {t}" for t in _sentences(error))]
+            comments = [
+                *display_comments(self.transform),
+                *(f"p2gs-jax: {t}" for t in _sentences(error)),
+            ]
             write_ply(path, shown, comments)
         else:
             writer = WRITERS[name]
@@ -233,12 +241,12 @@ class _Display:
             {
                 "file": path.name,
                 "gaussians": self.fitted.params.gaussians.capacity,
-                "exposure": self.look.exposure,
+                "exposure": self.transform.exposure,
                 "exposure_ev_from_mean": float(
-                    np.log2(self.look.exposure / self.fitted.mean.exposure_geometric)
+                    np.log2(self.transform.exposure / self.fitted.mean.exposure_geometric)
                 ),
-                "gamma": self.look.gamma,
-                "curve": self.look.formation.curve,
+                "gamma": self.transform.gamma,
+                "curve": self.transform.formation.curve,
                 "bake_steps": self.steps,
                 "seconds": time.monotonic() - begin,
                 "baking_error": error,
@@ -250,7 +258,7 @@ class _Display:
         cfg, g = self.fitted.cfg, self.fitted.params.gaussians
         if degree not in self.baked:
             self.reporter.stage("Baking")
-            start = bake(g, self.look, cfg.render.radiance, degree)
+            start = bake(g, self.transform, cfg.render.radiance, degree)
             train = self.fitted.scene.train_indices
             self.baked[degree] = refine(
                 start,

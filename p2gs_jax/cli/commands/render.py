@@ -39,7 +39,7 @@ from p2gs_jax.paths.pictures import (
     shot_frames,
     wide_frames,
 )
-from p2gs_jax.photometry.display import Look
+from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.run.read import Run, load_run
 
 FPS = 24.0
@@ -190,21 +190,23 @@ def _check(options: Render) -> None:
         raise UserError("--fps must be between 1 and 240.")
 
 
-def _look(fitted: Run, options: Render, shot: Shot | None = None) -> Look:
+def _display_transform(fitted: Run, options: Render, shot: Shot | None = None) -> DisplayTransform:
     """Return how a shot is developed: as the options say, else as it says, else as it was taken."""
     if shot is not None and shot.view is not None:
-        look = fitted.own_look(shot.view)
+        transform = fitted.own_display(shot.view)
     else:
         ev = None if shot is None else shot.exposure_ev
-        look = fitted.common_look(0.0 if ev is None else ev)
+        transform = fitted.common_display(0.0 if ev is None else ev)
     if isinstance(options.exposure_ev, float | int):
-        look = replace(fitted.common_look(float(options.exposure_ev)), gamma=look.gamma)
+        transform = replace(
+            fitted.common_display(float(options.exposure_ev)), gamma=transform.gamma
+        )
     gamma = options.gamma
     if gamma is None and shot is not None:
         gamma = shot.gamma
     if gamma is not None:
-        look = replace(look, gamma=gamma)
-    return look if options.curve == "run" else look.with_curve(options.curve)
+        transform = replace(transform, gamma=gamma)
+    return transform if options.curve == "run" else transform.with_curve(options.curve)
 
 
 def _chosen(options: Render, fitted: Run) -> list[Shot]:
@@ -244,7 +246,9 @@ def _shots(
     if options.width is not None:
         shots = [shot.resized(options.width) for shot in shots]
     size = (max(s.width for s in shots), max(s.height for s in shots))
-    frames = shot_frames(studio, shots, lambda shot: _look(fitted, options, shot), photograph)
+    frames = shot_frames(
+        studio, shots, lambda shot: _display_transform(fitted, options, shot), photograph
+    )
     return Job(frames, len(shots), size, shots, notes)
 
 
@@ -268,11 +272,11 @@ def _recorded(shots: list[Shot], options: Render, fitted: Run) -> list[Shot]:
     """Return shots with the exposures and gammas of their photographs where `own` asks for them."""
     if options.exposure_ev != "own":
         return shots
-    looks = [fitted.own_look(shot.view) for shot in shots if shot.view is not None]
+    transforms = [fitted.own_display(shot.view) for shot in shots if shot.view is not None]
     mean = fitted.mean.exposure_geometric
     return [
-        replace(shot, exposure_ev=math.log2(look.exposure / mean), gamma=look.gamma)
-        for shot, look in zip(shots, looks, strict=True)
+        replace(shot, exposure_ev=math.log2(transform.exposure / mean), gamma=transform.gamma)
+        for shot, transform in zip(shots, transforms, strict=True)
     ]
 
 
@@ -284,7 +288,7 @@ def _panoramas(options: Render, studio: Studio) -> Job:
     cylinder = covering(rig.mounts.values(), np.eye(4))
     if options.width is not None:
         cylinder = cylinder.resized(options.width)
-    look = _look(fitted, options)
+    transform = _display_transform(fitted, options)
     if options.path == "drive":
         if len(rig.steps) < 2:
             raise UserError(
@@ -293,7 +297,7 @@ def _panoramas(options: Render, studio: Studio) -> Job:
         path = PosePath(rig.poses)
         poses = path(path.evenly(frame_count(len(rig.steps), options.frames)))
         size = (cylinder.width, cylinder.height)
-        return Job(wide_frames(studio, cylinder, poses, look), len(poses), size)
+        return Job(wide_frames(studio, cylinder, poses, transform), len(poses), size)
     allowed = {shot.view for shot in _chosen(options, fitted)}
     steps = []
     for step in rig.steps:
@@ -310,5 +314,5 @@ def _panoramas(options: Render, studio: Studio) -> Job:
         notes.append("Corrections of display values that this run learned stay in the photographs.")
     taken = [shot.view for step in steps for shot in step.shots.values() if shot.view is not None]
     fitted.require_photographs(taken)
-    frames = comparison_frames(studio, rig, steps, cylinder, look, fitted.store)
+    frames = comparison_frames(studio, rig, steps, cylinder, transform, fitted.store)
     return Job(frames, len(steps), comparison_size(cylinder), (), notes)

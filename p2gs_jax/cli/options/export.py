@@ -15,7 +15,7 @@ from p2gs_jax.errors import UserError
 
 Format = Literal["linear-ply", "display-ply", "splat", "spz", "colmap", "exr"]
 FORMATS: tuple[Format, ...] = get_args(Format)
-# The formats that hold display colours and therefore one look.
+# The formats that hold display colours and therefore one display transform.
 DISPLAY: tuple[Format, ...] = ("display-ply", "splat", "spz")
 
 
