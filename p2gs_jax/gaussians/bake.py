@@ -2,8 +2,8 @@
 
 A viewer composites display values; the true picture composites light and then applies the tone
 curve. The curve of a mixture is not the mixture of the curves, so colours taken from each Gaussian
-by itself miss by many codes where translucent ones overlap (BUILD_NOTES, "Display PLY"). `refine`
-then moves colours and opacities until a viewer's pictures of given views agree with the true ones;
+by itself are far off where translucent ones overlap (BUILD_NOTES, "Display PLY"). `refine` then
+moves colours and opacities until a viewer's pictures of given views agree with the true ones;
 places and shapes stay.
 """
 
@@ -23,9 +23,9 @@ from jaxtyping import Array, Float, UInt8
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.photometry.display import DisplayTransform, develop
-from p2gs_jax.render import render_linear, required_capacity
-from p2gs_jax.render.capacity import bucket
-from p2gs_jax.render.host import RenderView, make_renderer
+from p2gs_jax.render import render_linear
+from p2gs_jax.render.capacity import TileCapacity, until_it_fits
+from p2gs_jax.render.host import RenderView, count_needed, make_renderer
 from p2gs_jax.render.radiance import RadianceKind, radiance_activation
 from p2gs_jax.render.spherical_harmonics import C0, basis, coefficient_count, degree_of
 from p2gs_jax.render.xla_cpu import compiler_options
@@ -61,7 +61,7 @@ class ViewError:
     Attributes:
         name: of the view.
         psnr: dB.
-        mean_codes: mean absolute difference, 8-bit codes.
+        mean_codes: mean absolute difference, 8-bit levels.
         max_codes: largest absolute difference of any channel.
         psnr_on_white: dB, in a viewer whose background is white instead of black.
     """
@@ -86,8 +86,8 @@ def true_target(
         render: of the run, from `make_renderer`.
     """
     linear = render(gaussians, _all(gaussians), camera).linear
-    codes = np.rint(255 * develop(linear, transform)).astype(np.uint8)
-    return Target(name, camera, codes)
+    picture = np.rint(255 * develop(linear, transform)).astype(np.uint8)
+    return Target(name, camera, picture)
 
 
 def display_of_splats(transform: DisplayTransform) -> DisplayTransform:
@@ -208,13 +208,15 @@ def refine(
     if steps == 0 or not targets or gaussians.capacity == 0:
         return gaussians
     cfg, optimizer = viewer_config(cfg), optax.scale_by_adam(eps=1e-15)
-    fitting = jax.jit(lambda g, camera: required_capacity(g, _all(g), camera, cfg))
-    capacity = bucket(max(int(fitting(gaussians, t.camera)) for t in targets), 1.2)
+    alive = _all(gaussians)
+    needed = max(int(count_needed(gaussians, alive, t.camera, cfg=cfg)) for t in targets)
+    capacity = TileCapacity.allocate(needed)
     bands = jnp.full((gaussians.sh.shape[1], 1), BANDS_RATE).at[0].set(COLOR_RATE)
     rates = _Moving(bands, jnp.asarray(OPACITY_RATE))
 
+    # Made here: places and shapes are constants to XLA, which folds what depends on them alone.
     @functools.partial(jax.jit, static_argnames="capacity", compiler_options=compiler_options())
-    def step(moving, state, camera, picture, background, decay, capacity):
+    def step(moving, state, camera, picture, background, decay, *, capacity):
         def loss(moving: _Moving):
             shown = replace(gaussians, **moving._asdict())
             result = render_linear(shown, _all(shown), camera, cfg, capacity, with_depth=False)
@@ -227,7 +229,7 @@ def refine(
         moved = cast(_Moving, optax.apply_updates(cast(Any, moving), cast(Any, changes)))
         limit = 0.5 / C0
         sh = moved.sh.at[:, 0].set(jnp.clip(moved.sh[:, 0], -limit, limit))
-        return _Moving(sh, moved.opacity_logits), state, result.count, result.overflow
+        return (_Moving(sh, moved.opacity_logits), state), result.count, result.overflow
 
     rng, order = np.random.default_rng(seed), []
     moving = _Moving(gaussians.sh, gaussians.opacity_logits)
@@ -238,14 +240,10 @@ def refine(
         decay = jnp.float32(DECAY ** (done / steps))
         picture = jnp.asarray(target.picture)
         background = jnp.asarray(rng.uniform(size=3) * (done % 2), jnp.float32)
-        while True:
-            moved, after, count, overflow = step(
-                moving, state, target.camera, picture, background, decay, capacity=capacity
-            )
-            if not bool(overflow):
-                break
-            capacity = bucket(int(count), 1.1)
-        moving, state = moved, after
+        given = (moving, state, target.camera, picture, background, decay)
+        (moving, state), capacity = until_it_fits(
+            lambda entries, given=given: step(*given, capacity=entries), capacity
+        )
         on_step(done + 1, steps)
     return replace(gaussians, **moving._asdict())
 
@@ -269,19 +267,19 @@ def _over(render: Render, background: Float[Array, " 3"]) -> Float[Array, "h w 3
 
 
 def _difference(target: Target, render: Render) -> ViewError:
-    codes, on_white = (
+    on_black, on_white = (
         np.abs(
             255.0 * np.clip(np.asarray(_over(render, jnp.full(3, level))), 0, 1) - target.picture
         )
         for level in (0.0, 1.0)
     )
-    return ViewError(
-        target.name, _psnr(codes), float(codes.mean()), float(codes.max()), _psnr(on_white)
-    )
+    mean, most = float(on_black.mean()), float(on_black.max())
+    return ViewError(target.name, _psnr(on_black), mean, most, _psnr(on_white))
 
 
-def _psnr(codes: Float[np.ndarray, "h w 3"]) -> float:
-    mse = float(np.mean((codes / 255.0) ** 2, dtype=np.float64))
+def _psnr(difference: Float[np.ndarray, "h w 3"]) -> float:
+    """Return the PSNR of absolute differences in 8-bit levels, dB."""
+    mse = float(np.mean((difference / 255.0) ** 2, dtype=np.float64))
     return float(-10 * np.log10(max(mse, 1e-10)))
 
 

@@ -4,43 +4,49 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import jax
 from jaxtyping import Array, Bool
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render import render_linear, required_capacity
-from p2gs_jax.render.capacity import bucket
+from p2gs_jax.render.capacity import TileCapacity, until_it_fits
 from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.types import Camera, Gaussians, Render
 
 RenderView = Callable[[Gaussians, Bool[Array, " n"], Camera], Render]
 
+count_needed = jax.jit(required_capacity, static_argnames="cfg")
+"""`required_capacity`, compiled."""
+
 
 @functools.cache
-def _programs(cfg: RenderConfig):
-    """Return the jitted renderer and counter; renderers of one configuration share them."""
+def compiled_renderer() -> Any:
+    """Return `render_linear`, compiled; static are `cfg`, `capacity` and `with_depth`.
 
-    @functools.partial(jax.jit, static_argnames="capacity", compiler_options=compiler_options())
-    def render(gaussians, alive, camera, capacity):
-        return render_linear(gaussians, alive, camera, cfg, capacity)
-
-    return render, jax.jit(lambda g, alive, camera: required_capacity(g, alive, camera, cfg))
+    On first use: its options depend on the backend, which an import should not start.
+    """
+    static = ("cfg", "capacity", "with_depth")
+    return jax.jit(render_linear, static_argnames=static, compiler_options=compiler_options())
 
 
 def make_renderer(cfg: RenderConfig) -> RenderView:
     """Return a function that renders one view exactly, growing its tile lists when it must."""
-    capacities: dict[tuple[int, int], int] = {}
-    render, count = _programs(cfg)
+    capacities: dict[tuple[int, int], TileCapacity] = {}
 
     def render_view(gaussians: Gaussians, alive: Bool[Array, " n"], camera: Camera) -> Render:
         size = (camera.width, camera.height)
         if size not in capacities:
-            capacities[size] = bucket(int(count(gaussians, alive, camera)), 1.2)
-        while True:
-            result = render(gaussians, alive, camera, capacity=capacities[size])
-            if not bool(result.overflow):
-                return result
-            capacities[size] = bucket(int(result.count), 1.1)
+            needed = int(count_needed(gaussians, alive, camera, cfg=cfg))
+            capacities[size] = TileCapacity.allocate(needed)
+
+        def draw(entries: int) -> tuple[Render, Array, Array]:
+            render = compiled_renderer()
+            result = render(gaussians, alive, camera, cfg=cfg, capacity=entries)
+            return result, result.count, result.overflow
+
+        result, capacities[size] = until_it_fits(draw, capacities[size])
+        return result
 
     return render_view

@@ -13,8 +13,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from p2gs_jax.config import RenderConfig
-from p2gs_jax.render.blocks import whole_blocks
-from p2gs_jax.render.capacity import Room, bucket
+from p2gs_jax.render.capacity import Room
 from p2gs_jax.render.cutoff import smallest_cutoff
 from p2gs_jax.render.project import LOG_SCALE_RANGE, TANGENT_LIMIT
 from p2gs_jax.render.visible import in_view
@@ -22,10 +21,6 @@ from p2gs_jax.types import Camera, Gaussians
 
 # Of the first of these many views, evenly spread.
 SAMPLED_VIEWS = 32
-# Entries: splats widen before they settle, and share their places as they grow in number; visible:
-# views between the sampled ones.
-ENTRIES_MARGIN, VISIBLE_MARGIN = 1.5, 1.1
-ENTRIES_PER_GAUSSIAN, FEWEST_ENTRIES = 4, 16_384
 
 
 def count_view(
@@ -89,9 +84,4 @@ def room_for(
     counts = [count_view(gaussians, alive, cameras[i], cfg) for i in picks]
     entries, visible = (max(c[k] for c in counts) for k in (0, 1))
     growth = max(max(limit, 1) / max(int(alive.sum()), 1), 1.0)
-    wanted = int(visible * VISIBLE_MARGIN * growth)
-    lists = int(ENTRIES_MARGIN * entries * growth**0.5)
-    return Room(
-        bucket(max(lists, ENTRIES_PER_GAUSSIAN * wanted, FEWEST_ENTRIES)),
-        min(whole_blocks(wanted), whole_blocks(limit)),
-    )
+    return Room.allocate(entries, visible, growth, limit)

@@ -12,21 +12,17 @@ import time
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import jax
 from jaxtyping import Array, Bool
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.errors import UserError
-from p2gs_jax.render import render_linear, required_capacity
-from p2gs_jax.render.capacity import bucket
-from p2gs_jax.render.xla_cpu import compiler_options
+from p2gs_jax.render.capacity import ANYWHERE, TileCapacity
+from p2gs_jax.render.host import compiled_renderer, count_needed
 from p2gs_jax.types import Camera, Gaussians, Render
 from p2gs_jax.viewer.ladder import Size
 
-# Room for views that need more than those probed.
-MARGIN = 1.5
 # Entries of the longest tile lists worth having; a camera inside a splat may ask for any number.
 MOST_ENTRIES = 2**26
 PROBES = 4
@@ -34,7 +30,7 @@ PROBES = 4
 
 @dataclass(frozen=True)
 class _Program:
-    capacity: int
+    capacity: TileCapacity
     run: Callable[[Gaussians, Bool[Array, " n"], Camera], Render]
 
 
@@ -192,18 +188,17 @@ class Programs:
             with self._changed:
                 if self._stopping:
                     return
-                capacity = bucket(self._expected(size), MARGIN)
+                capacity = TileCapacity.allocate(self._expected(size), ANYWHERE)
                 old = self._programs.get(size)
-            if old is not None and old.capacity >= capacity:
+            if old is not None and old.capacity.holds(capacity.entries):
                 return
+            static = {"cfg": self._cfg, "capacity": capacity.entries}
             camera = self._probes[0](size)
-            draw = partial(render_linear, cfg=self._cfg, capacity=capacity)
-            jitted = jax.jit(draw, compiler_options=compiler_options())
-            run = jitted.lower(*self._scene, camera).compile()
+            run = compiled_renderer().lower(*self._scene, camera, **static).compile()
             most, fastest = self._try(run, size)
             with self._changed:
                 self._most[size] = max(self._most.get(size, 0), most)
-                if most <= capacity:
+                if capacity.holds(most):
                     self._programs[size] = _Program(capacity, run)
                     self._took_ms[size] = fastest
                     self._compiled += 1
@@ -211,8 +206,8 @@ class Programs:
 
     def _count(self, size: Size) -> None:
         """Count what typical views need: cheaper than to compile twice."""
-        count = jax.jit(partial(required_capacity, cfg=self._cfg))
-        most = max(int(count(*self._scene, probe(size))) for probe in self._probes)
+        needed = [count_needed(*self._scene, probe(size), cfg=self._cfg) for probe in self._probes]
+        most = max(map(int, needed))
         with self._changed:
             self._most[size] = most
 
