@@ -22,9 +22,10 @@ from p2gs_jax.render import bin_tiles, project, rasterize, required_capacity, vi
 from p2gs_jax.render.blocks import whole_blocks
 from p2gs_jax.render.capacity import Room, bucket
 from p2gs_jax.render.xla_cpu import compiler_options
+from p2gs_jax.train.advance import Controls
 from p2gs_jax.train.optimizer import learning_rates, make_optimizer
 from p2gs_jax.train.state import initial_state
-from p2gs_jax.train.step import Controls, make_step
+from p2gs_jax.train.step import Step, compilations
 from p2gs_jax.types import Batch, Params, Photometry
 
 
@@ -48,7 +49,7 @@ class WholeStep(NamedTuple):
 
     Attributes:
         run: takes a step, from where the last one ended, and returns its loss.
-        compilations: returns how many programs the step has become.
+        compilations: returns how many programs the step has become that were not there before.
         fault: returns the kind of the first fault; after one, steps do nothing.
     """
 
@@ -73,14 +74,14 @@ def whole_step(scene: BenchScene, cfg: FitConfig, batch: Batch, entries: int) ->
     holder = [jax.tree.map(jnp.copy, initial_state(params, alive, optimizer))]
     controls = Controls(jnp.float32(0.5), jnp.int32(cfg.render.sh_degree))
     partner = Partner(jnp.int32(0))
-    step = make_step(cfg, optimizer, 1.0)
+    step, before = Step(cfg, optimizer, 1.0), compilations()
     room, degree = Room(entries, whole_blocks(scene.gaussians.capacity)), cfg.render.sh_degree
 
     def run():
         holder[0], report = step(holder[0], batch, partner, controls, room=room, degree=degree)
         return report.loss
 
-    return WholeStep(run, step.compilations, lambda: int(holder[0].fault.kind))
+    return WholeStep(run, lambda: compilations() - before, lambda: int(holder[0].fault.kind))
 
 
 def measure_step(scene: BenchScene, cfg: FitConfig, repeats: int = 7) -> StepCost:

@@ -42,6 +42,7 @@ from p2gs_jax.losses.total import OBSERVED_FORMS, SECOND_RENDER_FORMS, Partner
 from p2gs_jax.render.capacity import Room
 from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.train import decisions, growth, schedule
+from p2gs_jax.train.advance import Controls, StepReport, finite_names
 from p2gs_jax.train.demand import demand
 from p2gs_jax.train.growth import Stage, StageResult
 from p2gs_jax.train.host import HostState
@@ -59,7 +60,7 @@ from p2gs_jax.train.state import (
     initial_state,
     replace_gaussians,
 )
-from p2gs_jax.train.step import Controls, StepReport, finite_names, make_step
+from p2gs_jax.train.step import Step
 from p2gs_jax.train.validation import make_judge
 from p2gs_jax.train.views import TrainingViews
 from p2gs_jax.types import Batch, Camera, Gaussians, Params
@@ -130,7 +131,7 @@ class Trainer:
         self.run_dir, self.on_log, self.on_message = run_dir, on_log, on_message
         self.decided = decisions.recorded(cfg, reasons)
         self.optimizer = make_optimizer(cfg)
-        self.step = make_step(cfg, self.optimizer, extent)
+        self.step = Step(cfg, self.optimizer, extent)
         self.programs = programs
         self._rng = jax.jit(functools.partial(densification_key, cfg.train.seed))
         self._alive = jax.jit(jnp.sum)

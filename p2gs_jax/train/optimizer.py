@@ -8,6 +8,7 @@ it was seen. Everything else has one count.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -116,11 +117,18 @@ class Optimizer(NamedTuple):
 
 
 def make_optimizer(cfg: FitConfig) -> Optimizer:
-    """Return Adam followed by the group rates."""
-    o = cfg.optimizer
+    """Return Adam followed by the group rates; the same object for the same constants.
+
+    So it can be a static argument of compiled functions.
+    """
+    return _adam_with_rates(cfg.optimizer.b1, cfg.optimizer.b2, cfg.optimizer.eps)
+
+
+@functools.cache
+def _adam_with_rates(b1: float, b2: float, eps: float) -> Optimizer:
     return Optimizer(
-        optax.chain(scale_by_adam(o.b1, o.b2, o.eps, by_row=True), scale_by_rates()),
-        optax.chain(scale_by_adam(B1, B2, o.eps, by_row=False), scale_by_rates()),
+        optax.chain(scale_by_adam(b1, b2, eps, by_row=True), scale_by_rates()),
+        optax.chain(scale_by_adam(B1, B2, eps, by_row=False), scale_by_rates()),
     )
 
 

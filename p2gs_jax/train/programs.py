@@ -63,7 +63,7 @@ class StepPrograms:
         """Begin to compile a step in the background.
 
         Args:
-            step: from `make_step`.
+            step: of the fit.
             key: what for.
             arguments: of the step, or their shapes.
             images: the program between as well, which knows the tone curve.
@@ -79,7 +79,10 @@ class StepPrograms:
             "differentiate": (key.size, key.room.entries, rows, key.pixels),
             "advance": of_gaussians,
         }
-        keys = {name: (name, step.options(name), shape) for name, shape in shapes.items()}
+        keys = {
+            name: (name, tuple(step.settings(name).values()), shape)
+            for name, shape in shapes.items()
+        }
         # The longest first.
         wanted = ("differentiate", "show", "advance") if images else ("advance", "show")
         for name in wanted:
@@ -90,17 +93,18 @@ class StepPrograms:
                 )
         return [self._made[keys[name]] for name in shapes if name in wanted]
 
-    def ahead(self, key: Hashable, program, *arguments: Any):
+    def ahead(self, key: Hashable, program, *arguments: Any, **static: Any) -> Callable:
         """Begin to compile another program in the background, and return it.
 
         Args:
             key: tells it from others.
-            program: a jitted function, called with arguments of these shapes from here on.
+            program: a jitted function.
             arguments: its arguments, or their shapes.
+            static: its static arguments, which the returned function is called without.
         """
         if key not in self._made:
             self._made[key] = self._worker.submit(
-                lambda: program.lower(*_shapes(arguments)).compile()
+                lambda: program.lower(*_shapes(arguments), **static).compile()
             )
         future = self._made[key]
         return lambda *given: self._wait(future)(*given)

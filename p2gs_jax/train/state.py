@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import equinox as eqx
 import jax
@@ -64,20 +65,24 @@ def initial_state(params: Params, alive: Array, optimizer: Optimizer, slots: int
         optimizer: from `make_optimizer`.
         slots: room of the population, at least what `params` holds.
     """
+    # The step donates its state: the caller keeps its parameters.
+    return jax.tree.map(jnp.asarray, _initial_state(params, alive, optimizer, slots))
 
-    @jax.jit
-    def build(params, alive):
-        state = FitState(
-            params,
-            optimizer.init(params),
-            fresh_population(alive),
-            jnp.int32(0),
-            Fault.none(),
-        )
-        return grow_state(state, slots)
 
-    # The step gives its state away: the caller keeps its parameters.
-    return jax.tree.map(jnp.asarray, build(params, alive))
+@functools.partial(jax.jit, static_argnames=("optimizer", "slots"))
+def _initial_state(params: Params, alive: Array, optimizer: Optimizer, slots: int) -> FitState:
+    state = FitState(
+        params, optimizer.init(params), fresh_population(alive), jnp.int32(0), Fault.none()
+    )
+    return grow_state(state, slots)
+
+
+def count_alive(state: FitState) -> int:
+    """Return the population, read from the device."""
+    return int(_sum(state.population.alive))
+
+
+_sum = jax.jit(jnp.sum)
 
 
 def grow_state(state: FitState, capacity: int) -> FitState:

@@ -13,8 +13,8 @@ from p2gs_jax.core.numerics import on_host
 from p2gs_jax.gaussians.population import Coverage
 from p2gs_jax.sweep import with_fields
 from p2gs_jax.train import loop, session
+from p2gs_jax.train.advance import StepReport
 from p2gs_jax.train.state import FAULT_NONFINITE, FAULT_OVERFLOW, Fault, FitState
-from p2gs_jax.train.step import StepReport
 from p2gs_jax.types import Batch, Camera, Gaussians, Params, Photometry, Population
 
 VIEWS, SEEDS = 4, 10

@@ -17,10 +17,11 @@ from p2gs_jax.pipeline.fit import fit
 from p2gs_jax.render.blocks import BLOCK, splat
 from p2gs_jax.render.capacity import Room
 from p2gs_jax.render.visible import in_view
-from p2gs_jax.train import step as step_module
+from p2gs_jax.train import advance, image_gradient
+from p2gs_jax.train.advance import Controls, finite_names
 from p2gs_jax.train.optimizer import B1, learning_rates, make_optimizer
 from p2gs_jax.train.state import FAULT_NONE, FAULT_NONFINITE, FAULT_OVERFLOW, initial_state
-from p2gs_jax.train.step import Controls, finite_names, make_step
+from p2gs_jax.train.step import Step
 from p2gs_jax.types import Batch, Camera, Gaussians, Params, Photometry
 
 COUNT, HIDDEN = 6000, 600
@@ -76,7 +77,7 @@ def made():
 
     def steps(cfg):
         optimizer = make_optimizer(cfg)
-        run = make_step(cfg, optimizer, EXTENT)
+        run = Step(cfg, optimizer, EXTENT)
 
         def step(room, params=params, alive=alive):
             state = initial_state(params, alive, optimizer)
@@ -266,12 +267,13 @@ def test_a_short_fit_traces_its_step_once_per_image_size(tmp_path, monkeypatch):
         return image_loss(shown, photometry, appearance, batch, *others)
 
     chex.clear_trace_counter()
+    jax.clear_caches()  # steps of all fits share what was traced
     # Once more before exposures are known, for the shapes that the last program of a step takes.
-    monkeypatch.setattr(step_module, "image_loss", chex.assert_max_traces(counted, n=3))
+    monkeypatch.setattr(image_gradient, "image_loss", chex.assert_max_traces(counted, n=3))
     # What is done per Gaussian knows no image size: once before exposures are known, once after.
-    for name in ("splat_listed", "update_listed"):
-        twice = chex.assert_max_traces(getattr(step_module, name), n=2)
-        monkeypatch.setattr(step_module, name, twice)
+    for module, name in ((image_gradient, "splat_listed"), (advance, "update_listed")):
+        twice = chex.assert_max_traces(getattr(module, name), n=2)
+        monkeypatch.setattr(module, name, twice)
     fit(scene, tmp_path / "run", cfg)
     assert len(set(sizes)) == 2
     assert len(sizes) <= 3

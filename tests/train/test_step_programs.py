@@ -12,7 +12,7 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.render.capacity import Room
 from p2gs_jax.train.optimizer import make_optimizer
 from p2gs_jax.train.programs import Key, StepPrograms
-from p2gs_jax.train.step import make_step
+from p2gs_jax.train.step import Step
 
 COARSE = Key((120, 80), 500, Room(4096, 4096), 3, ("uint16",))
 FULL = COARSE._replace(size=(240, 160), room=Room(8192, 4096), pixels=("uint8",))
@@ -23,8 +23,8 @@ class Traced:
     """Stands for a step: counts what is compiled, and computes nothing."""
 
     def __init__(self, cfg: FitConfig):
-        real = make_step(cfg, make_optimizer(cfg), 1.0)
-        self.options, self.made, self.gate = real.options, [], threading.Event()
+        real = Step(cfg, make_optimizer(cfg), 1.0)
+        self.settings, self.made, self.gate = real.settings, [], threading.Event()
         self.gate.set()
 
     def lowered(self, name, *arguments, room, degree):

@@ -1,0 +1,208 @@
+"""The parameters' side of a step: the optimiser moves what was seen, or a fault keeps everything.
+
+A step that finds no room or whose loss is not finite changes nothing but `state.fault`, and so do
+all steps after it, until the host has dealt with it; where only the gradient of some Gaussians is
+not finite, these keep their place.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple, cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float, Int
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.core.streams import noise_key
+from p2gs_jax.losses.regularizers import population_terms
+from p2gs_jax.render.blocks import splat
+from p2gs_jax.render.spherical_harmonics import coefficient_count
+from p2gs_jax.train.image_gradient import ImageGradient, differentiable
+from p2gs_jax.train.optimizer import Optimizer, OptState, learning_rates, means_rate
+from p2gs_jax.train.state import FAULT_NONE, FAULT_NONFINITE, FAULT_OVERFLOW, Fault, FitState
+from p2gs_jax.train.update import update_listed
+from p2gs_jax.types import Frustum, Gaussians, Params, Photometry, Population
+
+
+class Controls(eqx.Module):
+    """What the schedule says about this step.
+
+    Attributes:
+        progress: fraction of the run completed.
+        active_degree: spherical-harmonics degree in use.
+    """
+
+    progress: Float[Array, ""]
+    active_degree: Int[Array, ""]
+
+
+class StepReport(NamedTuple):
+    """What a step tells the host, which reads it after a burst.
+
+    Attributes:
+        loss: sum of the terms.
+        terms: by name, weighted.
+        psnr: of the view, dB.
+        entries: tile-list entries that the view needed.
+        visible: Gaussians that it showed.
+    """
+
+    loss: Float[Array, ""]
+    terms: dict[str, Float[Array, ""]]
+    psnr: Float[Array, ""]
+    entries: Int[Array, ""]
+    visible: Int[Array, ""]
+
+
+GRADIENT_NAMES = (
+    *(f"gradient of {f.name}" for f in dataclasses.fields(Gaussians)),
+    "gradient of exposures",
+    "gradient of gammas",
+    "gradient of appearance",
+)
+
+
+def finite_names(terms: dict) -> tuple[str, ...]:
+    """Return the names, in the order of `Fault.term`."""
+    return (*(f"loss term {k}" for k in terms), *GRADIENT_NAMES)
+
+
+def advance(
+    state: FitState,
+    ids: Int[Array, " v"],
+    count: Int[Array, ""],
+    gradient: ImageGradient,
+    frusta: tuple[Frustum, ...],
+    controls: Controls,
+    *,
+    cfg: FitConfig,
+    optimizer: Optimizer,
+    extent: float,
+    degree: int,
+) -> tuple[FitState, StepReport]:
+    """Move the listed Gaussians, exposures, gammas and corrections by one step.
+
+    Args:
+        state: before the step; donated.
+        ids: of the listed Gaussians, from `show`.
+        count: how many the views may show.
+        gradient: of the images' loss.
+        frusta: the views.
+        controls: of the schedule.
+        cfg: rendering, the terms on the Gaussians, rates, noise and its seed.
+        optimizer: from `make_optimizer`.
+        extent: scene extent, scene units.
+        degree: highest spherical-harmonics degree that moves.
+    """
+    mcmc = cfg.densify.method == "mcmc"
+    gaussians, population = state.params.gaussians, state.population
+    alive = population.alive
+    n, bands = gaussians.capacity, coefficient_count(degree)
+    fits = ~gradient.overflow & (count <= ids.shape[0])
+    first = state.fault.kind == FAULT_NONE
+    healthy = first & fits & jnp.all(_finite((gradient.terms, gradient.v_rest)))
+
+    rates = learning_rates(controls.progress, extent, state.params, cfg, bands)
+    listed = jnp.sum(alive.at[ids].get(mode="fill", fill_value=False))
+    updated = update_listed(
+        gaussians,
+        state.opt_state.gaussians[0],
+        alive,
+        ids,
+        count,
+        healthy,
+        bands=bands,
+        seen=lambda block, on: differentiable(
+            splat(block, on, frusta, cfg.render, controls.active_degree)
+        ),
+        v_seen=gradient.v_shown,
+        own=lambda block, on: population_terms(block, on, cfg, extent, listed),
+        optimizer=optimizer.gaussians,
+        rates=rates.gaussians,
+        key=noise_key(cfg.train.seed, state.step),
+        noise_rate=cfg.densify.noise * means_rate(controls.progress, extent, cfg) if mcmc else None,
+    )
+    old_rest = (state.params.photometry, state.params.appearance)
+    rest, rest_moments = _rest_updated(
+        optimizer,
+        state.opt_state.rest,
+        old_rest,
+        gradient.v_rest,
+        (rates.photometry, rates.appearance),
+        cfg,
+    )
+    if not mcmc:
+        where = jnp.where(healthy, ids, n)
+        population = _observed(population, where, gradient, frusta[0])
+
+    # In the order of `finite_names`.
+    terms = gradient.terms | updated.value
+    checked = jnp.concatenate([_finite(terms), updated.finite, _finite(gradient.v_rest)])
+    broken = FAULT_NONFINITE * ~jnp.all(checked)
+    kind = jnp.where(fits, broken, FAULT_OVERFLOW).astype(jnp.int32)
+    term = jnp.argmin(checked).astype(jnp.int32)
+    fault = jax.tree.map(
+        lambda a, b: jnp.where(first, a, b),
+        Fault(kind, gradient.entries, count, term),
+        state.fault,
+    )
+    rest, rest_moments = jax.tree.map(
+        lambda new, old: jnp.where(healthy, new, old),
+        (rest, rest_moments),
+        (old_rest, state.opt_state.rest),
+    )
+    state = FitState(
+        Params(updated.gaussians, *rest),
+        OptState((updated.moments, optax.EmptyState()), rest_moments),
+        population,
+        state.step + (fault.kind == FAULT_NONE),
+        fault,
+    )
+    loss = jax.tree.reduce(jnp.add, updated.value, gradient.loss)
+    return state, StepReport(loss, terms, gradient.psnr, gradient.entries, count)
+
+
+def _rest_updated(optimizer: Optimizer, moments, rest, grads, rates, cfg: FitConfig):
+    """Return photometry and appearance after a step, and their moments."""
+    # optax annotates trees as nests of containers and does not know our records.
+    updates, moments = optimizer.rest.update(grads, moments, rest, rates=rates)
+    photometry, appearance = cast(Any, optax.apply_updates(rest, updates))
+    return (_recentered(photometry, cfg), appearance), moments
+
+
+def _recentered(photometry: Photometry, cfg: FitConfig) -> Photometry:
+    """Project the scale gauge: mean log e = 0 exactly (docs/photometry.md, 4)."""
+    if photometry.parameterization != "log":
+        return photometry
+    if cfg.loss.regularizers.log_exposure_mean is None:
+        return photometry
+    raw = photometry.raw_exposures
+    return dataclasses.replace(photometry, raw_exposures=raw - jnp.mean(raw))
+
+
+def _observed(population: Population, ids, image: ImageGradient, frustum: Frustum) -> Population:
+    """Add this view to the densification statistics of what it shows.
+
+    Gradients are in units of half the image, as 3DGS has them.
+    """
+    v_means2d = image.v_shown[0][0]
+    gradient = v_means2d * jnp.stack([frustum.width / 2, frustum.height / 2])
+    seen = image.visible & (jnp.sum(jnp.abs(gradient), -1) > 0)
+
+    def added(a, b):
+        return a.at[ids].add(b, mode="drop", unique_indices=True)
+
+    return dataclasses.replace(
+        population,
+        grad2d_sum=added(population.grad2d_sum, jnp.linalg.norm(gradient, axis=-1)),
+        seen_count=added(population.seen_count, seen.astype(jnp.float32)),
+    )
+
+
+def _finite(values) -> Bool[Array, " k"]:
+    """Return whether each array of a tree is finite."""
+    return jnp.stack([jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(values)])
