@@ -5,7 +5,7 @@ In numpy: counting exactly would be one more program to compile for every image 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import jax
 import numpy as np
@@ -17,6 +17,7 @@ from p2gs_jax.render.capacity import Room
 from p2gs_jax.render.cutoff import smallest_cutoff
 from p2gs_jax.render.project import LOG_SCALE_RANGE, TANGENT_LIMIT
 from p2gs_jax.render.visible import in_view
+from p2gs_jax.train.views import TrainingViews
 from p2gs_jax.types import Camera, Gaussians
 
 # Of the first of these many views, evenly spread.
@@ -85,3 +86,74 @@ def room_for(
     entries, visible = (max(c[k] for c in counts) for k in (0, 1))
     growth = max(max(limit, 1) / max(int(alive.sum()), 1), 1.0)
     return Room.allocate(entries, visible, growth, limit)
+
+
+Rooms = dict[str, Room]
+"""Room of a view for every image size, by its name."""
+
+
+def size_name(size: tuple[int, int]) -> str:
+    """Return the name of an image size: "WxH"."""
+    return f"{size[0]}x{size[1]}"
+
+
+def cameras_by_size(views: TrainingViews, shrink: int) -> dict[tuple[int, int], list[Camera]]:
+    """Return the cameras of a level by the size of their images."""
+    cameras: dict[tuple[int, int], list[Camera]] = {}
+    for index in range(len(views)):
+        camera = views.camera(index, shrink)
+        cameras.setdefault((camera.width, camera.height), []).append(camera)
+    return cameras
+
+
+def allocate(
+    rooms: Mapping[str, Room],
+    begun: Mapping[str, Room],
+    views: TrainingViews,
+    shrinks: Iterable[int],
+    gaussians: Gaussians,
+    alive: Bool[np.ndarray, " n"],
+    limit: int,
+    cfg: RenderConfig,
+) -> Rooms:
+    """Return rooms for every image size to come.
+
+    Args:
+        rooms: those that are known; they stay.
+        begun: those for which programs are compiled already, taken where they suffice.
+        views: the training views.
+        shrinks: factors by which images are still to be shrunk.
+        gaussians: the population.
+        alive: slots in use.
+        limit: the largest population to come.
+        cfg: see `count_view`.
+    """
+    found = dict(rooms)
+    gaussians, alive = jax.tree.map(np.asarray, gaussians), np.asarray(alive)
+    for shrink in shrinks:
+        for size, cameras in cameras_by_size(views, shrink).items():
+            name = size_name(size)
+            if name not in found:
+                room = room_for(gaussians, alive, cameras, limit, cfg)
+                made = begun.get(name, room)
+                found[name] = made if made.holds(room) else room
+    return _sharing_visible(found)
+
+
+def grown(rooms: Mapping[str, Room], size: tuple[int, int], entries: int, visible: int) -> Rooms:
+    """Return rooms after a view found none.
+
+    Args:
+        rooms: before.
+        size: of the view's image.
+        entries: that it needs.
+        visible: Gaussians that it shows.
+    """
+    name = size_name(size)
+    return _sharing_visible({**rooms, name: rooms[name].grown(entries, visible)})
+
+
+def _sharing_visible(rooms: Rooms) -> Rooms:
+    """Give all sizes the same room for Gaussians: what is done per Gaussian is shared."""
+    most = max((room.visible for room in rooms.values()), default=0)
+    return {name: room._replace(visible=most) for name, room in rooms.items()}

@@ -15,16 +15,19 @@ MIN_LEVEL_PIXELS = 96
 MIN_STEPS_LEFT = 8
 MAX_SPEED_UP = 1.5
 
+# End of each level as a progress, and the factor by which its images are shrunk; in order.
+Levels = tuple[tuple[float, int], ...]
+
 
 def shrinks(cfg: TrainConfig) -> tuple[int, ...]:
     """Return the factors by which images are shrunk, level by level; the last is 1."""
     return tuple(2**k for k in range(len(cfg.coarse_to_fine), -1, -1))
 
 
-def levels(cfg: TrainConfig, width: int, height: int) -> tuple[tuple[float, int], ...]:
-    """Return (end of level as a progress, factor by which images are shrunk) in order.
+def levels(cfg: TrainConfig, width: int, height: int) -> Levels:
+    """Return the levels of the schedule.
 
-    Levels that would make images smaller than 96 pixels across are left out.
+    Those that would make images smaller than 96 pixels across are left out.
     """
     kept = [
         (end, shrink)
@@ -34,9 +37,24 @@ def levels(cfg: TrainConfig, width: int, height: int) -> tuple[tuple[float, int]
     return (*kept, (1.0, 1))
 
 
-def shrink_at(progress: float, plan: tuple[tuple[float, int], ...]) -> int:
+def shrink_at(progress: float, plan: Levels) -> int:
     """Return the factor by which images are shrunk at this point of the run."""
     return next((shrink for end, shrink in plan if progress < end), 1)
+
+
+def shrinks_left(progress: float, plan: Levels) -> list[int]:
+    """Return the factors of the levels that are not over, in order."""
+    return [shrink for end, shrink in plan if end > progress]
+
+
+def is_over(progress: float, per_step: float) -> bool:
+    """Return whether a run is complete, up to half a step.
+
+    Args:
+        progress: fraction completed.
+        per_step: progress of one step.
+    """
+    return progress >= 1.0 - 0.5 * per_step
 
 
 def sh_degree_at(progress: float, cfg: TrainConfig, highest: int) -> int:

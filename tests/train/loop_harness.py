@@ -12,9 +12,10 @@ from p2gs_jax.core.atomic import read_jsonl
 from p2gs_jax.core.numerics import on_host
 from p2gs_jax.gaussians.population import Coverage
 from p2gs_jax.sweep import with_fields
-from p2gs_jax.train import loop, session
+from p2gs_jax.train import burst, checkpoints, loop, session, state
 from p2gs_jax.train.advance import StepReport
 from p2gs_jax.train.state import FAULT_NONFINITE, FAULT_OVERFLOW, Fault, FitState
+from p2gs_jax.train.strategies import automatic, mcmc
 from p2gs_jax.types import Batch, Camera, Gaussians, Params, Photometry, Population
 
 VIEWS, SEEDS = 4, 10
@@ -71,7 +72,7 @@ class Programs:
     def expect(self, *arguments, **options):
         pass
 
-    def ahead(self, key, program, *arguments):
+    def ahead(self, key, program, *arguments, **static):
         return program
 
     def get(self, step, key, *arguments):
@@ -151,15 +152,16 @@ class Harness:
         self.folder, self.checkpoints = folder, Checkpoints()
         self.said, self.records = [], []
         stopped = SimpleNamespace(monotonic=lambda: self.clock.now)
-        for module in (loop, session):
+        for module in (burst, loop, session):
             monkeypatch.setattr(module, "time", stopped)
-        monkeypatch.setattr(loop, "CheckpointStore", lambda folder: self.checkpoints)
+        monkeypatch.setattr(checkpoints, "CheckpointStore", lambda folder: self.checkpoints)
         monkeypatch.setattr(loop, "initial_state", lambda p, a, o, slots: state_of(SEEDS, slots))
-        monkeypatch.setattr(loop, "grow_state", self._grown)
-        monkeypatch.setattr(loop.Trainer, "_relocate_step", self._relocated)
-        # Copies that stay on the host compile nothing.
-        monkeypatch.setattr(loop.jnp, "copy", np.copy)
-        monkeypatch.setattr(loop, "make_judge", lambda *a, **k: self.judge)
+        monkeypatch.setattr(automatic, "grow_state", self._grown)
+        monkeypatch.setattr(mcmc.Mcmc, "relocated", self._relocated)
+        # Copies and sums on the host compile nothing.
+        monkeypatch.setattr(automatic.jnp, "copy", np.copy)
+        monkeypatch.setattr(state, "_sum", np.sum)
+        monkeypatch.setattr(automatic, "make_judge", lambda *a, **k: self.judge)
         self.judge = lambda params, alive: 20.0
 
     def _grown(self, state, slots):
@@ -188,7 +190,6 @@ class Harness:
             on_message=self.said.append,
             validation=(1,) if cfg.densify.max_gaussians == "auto" else (),
         )
-        trainer._alive = np.sum
         result = trainer.run(
             state_of(SEEDS, SEEDS).params, np.ones(SEEDS, bool), resume=resume, **options
         )

@@ -14,9 +14,10 @@ from p2gs_jax.config import from_dict, to_dict
 from p2gs_jax.core.progress import Silent
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.sweep import with_fields
-from p2gs_jax.train import growth, loop
+from p2gs_jax.train import growth
 from p2gs_jax.train.growth import Growth, StageResult
 from p2gs_jax.train.host import HostState
+from p2gs_jax.train.strategies import automatic
 from p2gs_jax.train.validation import pick_validation
 from p2gs_jax.train.views import TrainingViews
 
@@ -76,7 +77,7 @@ class Listener(Silent):
 
 
 def fit(monkeypatch, scene, run, judge, cfg=SMALL, **options):
-    monkeypatch.setattr(loop, "make_judge", lambda *args, **kwargs: judge)
+    monkeypatch.setattr(automatic, "make_judge", lambda *args, **kwargs: judge)
     listener = options.pop("reporter", Listener())
     result = p2gs_jax.fit(scene, run, cfg, reporter=listener, **options)
     return result, [text for text in listener.said if "Growth ended" in text]

@@ -1,0 +1,87 @@
+"""What a run's checkpoints hold, and how it continues from them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.run.checkpoint import CheckpointStore
+from p2gs_jax.train import decisions
+from p2gs_jax.train.host import HostState
+from p2gs_jax.train.state import FitState, grow_state
+
+
+class RunCheckpoints:
+    """State and counters of a run, and what its scene decided.
+
+    Args:
+        run_dir: the run folder.
+        cfg: what the run is optimised under.
+        reasons: for the photometric model, in words; a resumed run repeats them.
+        on_message: told what the user must know.
+    """
+
+    def __init__(
+        self,
+        run_dir: Path,
+        cfg: FitConfig,
+        reasons: Sequence[str],
+        on_message: Callable[[str], None],
+    ):
+        self.cfg, self.on_message = cfg, on_message
+        self._decided = decisions.recorded(cfg, reasons)
+        self._store = CheckpointStore(run_dir / "checkpoints")
+
+    def save(self, state: FitState, host: HostState) -> None:
+        """Write a checkpoint."""
+        meta = {
+            "host": dataclasses.asdict(host),
+            "gaussian_capacity": state.params.gaussians.capacity,
+            decisions.KEY: self._decided,
+        }
+        self._store.save(host.step, state, meta)
+
+    def restore(self, template: FitState) -> tuple[FitState, HostState] | None:
+        """Return the newest checkpoint, or None where there is none; what is newer is removed.
+
+        Args:
+            template: a state of the same structure, of any population.
+
+        Raises:
+            UserError: none can be read, or the scene decides otherwise now.
+        """
+        found = self._store.restore_latest(
+            lambda meta: jax.eval_shape(lambda: grow_state(template, meta["gaussian_capacity"])),
+            self.on_message,
+        )
+        if found is None:
+            return None
+        decisions.check(found[1].get(decisions.KEY), self.cfg, self._store.folder)
+        state = jax.tree.map(jnp.asarray, found[0])
+        host = HostState.from_dict(found[1]["host"])
+        self._store.discard_after(host.step)
+        self.on_message(f"Resuming after step {host.step} ({host.progress:.0%}).")
+        if not _repeats(self.cfg):
+            self.on_message(
+                "Sums on this device come in no fixed order: the rest of the run is as good as "
+                "without the interruption, but not the same bit for bit "
+                "(--render.deterministic from the start fixes the order of the renderer's)."
+            )
+        return state, host
+
+    def last_good(self) -> str:
+        """Return in words where the newest checkpoint is."""
+        latest = self._store.latest_step()
+        if latest is None:
+            return "no checkpoint was written yet"
+        return f"the last good checkpoint is step {latest} in {self._store.folder}"
+
+
+def _repeats(cfg: FitConfig) -> bool:
+    """Return whether the same steps give the same bits here."""
+    return jax.default_backend() == "cpu" or cfg.render.deterministic

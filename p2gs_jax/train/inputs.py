@@ -1,0 +1,68 @@
+"""What a step is given beside its state: a photograph, a second view, the schedule."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.core.numerics import on_host
+from p2gs_jax.losses.relative_exposure import ColorPairs
+from p2gs_jax.losses.total import Partner
+from p2gs_jax.train import schedule
+from p2gs_jax.train.advance import Controls
+from p2gs_jax.train.partner import partner_at
+from p2gs_jax.train.views import TrainingViews
+from p2gs_jax.types import Batch
+
+
+class Inputs(NamedTuple):
+    """Arguments of a step, all on the host.
+
+    Attributes:
+        batch: the view and its photograph.
+        partner: what the relative-exposure loss compares it with.
+        controls: of the schedule.
+    """
+
+    batch: Batch
+    partner: Partner
+    controls: Controls
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the image, pixels."""
+        return self.batch.camera.width, self.batch.camera.height
+
+
+class InputSource:
+    """The inputs of every step of a fit; they follow from the seed and the step number.
+
+    Args:
+        cfg: everything.
+        views: the training views.
+        pairs: corresponding observations, for the relative-exposure readings that need them.
+    """
+
+    def __init__(self, cfg: FitConfig, views: TrainingViews, pairs: ColorPairs | None):
+        self.cfg, self.views, self.pairs = cfg, views, pairs
+
+    def at(self, step: int, progress: float, shrink: int) -> Inputs:
+        """Return the inputs of a step.
+
+        Args:
+            step: its number.
+            progress: fraction of the run completed before it.
+            shrink: factor by which images are shrunk.
+        """
+        degree = schedule.sh_degree_at(progress, self.cfg.train, self.cfg.render.sh_degree)
+        return Inputs(
+            self.views.batch(self.views.index_at(step), shrink),
+            partner_at(step, shrink, self.views, self.pairs, self.cfg),
+            on_host(Controls, np.float32(progress), np.int32(degree)),
+        )
+
+    def prefetch(self, step: int, shrink: int) -> None:
+        """Begin decoding the photograph of a step in the background."""
+        self.views.prefetch(self.views.index_at(step), shrink)
