@@ -7,7 +7,10 @@ from p2gs_jax.train.strategies.automatic import Automatic
 from p2gs_jax.train.strategies.base import RunContext, Strategy
 from p2gs_jax.train.strategies.mcmc import Mcmc
 
-__all__ = ["RunContext", "Strategy", "make_strategy"]
+__all__ = ["METHODS", "RunContext", "Strategy", "make_strategy"]
+
+# By `DensifyConfig.method`.
+METHODS: dict[str | None, type[Strategy]] = {"mcmc": Mcmc, "adaptive": Adaptive, None: Strategy}
 
 
 def make_strategy(run: RunContext, seeds: int) -> Strategy:
@@ -18,9 +21,5 @@ def make_strategy(run: RunContext, seeds: int) -> Strategy:
         seeds: initial population.
     """
     d = run.cfg.densify
-    if d.max_gaussians == "auto":
-        return Automatic(run, seeds)
-    if d.method == "mcmc":
-        return Mcmc(run, seeds)
-    method = Adaptive if d.method == "adaptive" else Strategy
-    return method(run, seeds, limit=d.max_gaussians)
+    kind = Automatic if d.max_gaussians == "auto" else METHODS[d.method]
+    return kind(run, seeds)

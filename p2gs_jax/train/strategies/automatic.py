@@ -23,21 +23,19 @@ from p2gs_jax.train.validation import make_judge
 
 
 class Automatic(Mcmc):
-    """Mcmc that grows in stages only (`train/growth.py`), judged by held-out training views.
-
-    Args:
-        run: what the strategy may use.
-        seeds: initial population.
-    """
+    """Mcmc that grows in stages only (`train/growth.py`), judged by held-out training views."""
 
     slots_stay = False
 
     def __init__(self, run: RunContext, seeds: int):
-        default = default_max_gaussians(seeds, run.coverage, run.cfg.train)
-        self.bound = growth.upper_bound(seeds, default)
-        super().__init__(run, seeds, limit=self.bound, slots=seeds)
+        super().__init__(run, seeds)
         self.window = growth.window(run.cfg.densify, run.levels)
         self.judge = make_judge(run.views, run.validation, run.cfg, own_exposures=run.own_exposures)
+
+    def bounds(self, seeds: int) -> tuple[int | None, int]:
+        """Return the population at which growth ends in any case; slots follow its stages."""
+        default = default_max_gaussians(seeds, self.run.coverage, self.run.cfg.train)
+        return growth.upper_bound(seeds, default), seeds
 
     def begin(self, host: HostState) -> None:
         """Leave the held-out views out of the steps while growth goes on."""
@@ -84,14 +82,15 @@ class Automatic(Mcmc):
         What does not grow runs first. Where time ends within the stage, it is the run: it is never
         behind, and needs no comparison. A checkpoint holds one population: none is written here.
         """
-        stage = self._next_stage(count_alive(state), host)
+        bound = self.most
+        stage = self._next_stage(count_alive(state), bound, host)
         if stage is None:
             self.end(state, host)
             return state, host
         begun = host.step
         # Both have the same slots, and so the same random draws.
-        slots = bucket_for(stage.target(stage.events), state.params.gaussians.capacity, self.bound)
-        state = grow_state(state, slots)
+        needed = stage.target(stage.events)
+        state = grow_state(state, bucket_for(needed, state.params.gaussians.capacity, bound))
         trial_host = copy.deepcopy(host)
         trial = jax.tree.map(jnp.copy, state)  # steps donate their state
         trial = self._run_stage(trial, trial_host, session, stage, grow=False)
@@ -144,13 +143,13 @@ class Automatic(Mcmc):
                     return state
         return state
 
-    def _next_stage(self, population: int, host: HostState) -> Stage | None:
+    def _next_stage(self, population: int, bound: int, host: HostState) -> Stage | None:
         """Return the next stage, or None where there is no room or time for one."""
         left = (self.window[1] - host.progress) / host.pace
         # The host looks after every burst only.
         burst = min(self.run.cfg.train.log_every, MAX_BURST)
         interval = math.ceil(self.interval(host) / host.pace / burst - 1e-6) * burst
-        return growth.plan_stage(population, self.bound, left, interval)
+        return growth.plan_stage(population, bound, left, interval)
 
     def _score(self, state: FitState) -> float:
         """Return the mean PSNR of the held-out views, dB."""

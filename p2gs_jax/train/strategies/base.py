@@ -89,19 +89,20 @@ class Strategy:
 
     slots_stay = True
 
-    def __init__(
-        self, run: RunContext, seeds: int, limit: int | None = None, slots: int | None = None
-    ):
+    def __init__(self, run: RunContext, seeds: int):
         """Prepare.
 
         Args:
             run: what the strategy may use.
             seeds: initial population.
-            limit: bound on the population.
-            slots: room for it; None for no more than the seeds.
         """
-        self.run, self.limit = run, limit
-        self.slots = seeds if slots is None else slots
+        self.run = run
+        self.limit, self.slots = self.bounds(seeds)
+
+    def bounds(self, seeds: int) -> tuple[int | None, int]:
+        """Return `limit` and `slots` for an initial population."""
+        given = self.run.cfg.densify.max_gaussians
+        return (given if isinstance(given, int) else None), seeds
 
     @property
     def most(self) -> int:

@@ -40,33 +40,21 @@ def relocate(key, gaussians, population, moments, births, *, cfg: DensifyConfig,
 
 
 class Mcmc(Strategy):
-    """Kheradmand et al. 2024, with births where they are needed.
+    """Kheradmand et al. 2024, with births where they are needed."""
 
-    Args:
-        run: what the strategy may use.
-        seeds: initial population.
-        limit: bound on the population; None for the configured one.
-        slots: room for it; None for as much as the bound.
-    """
-
-    def __init__(
-        self, run: RunContext, seeds: int, limit: int | None = None, slots: int | None = None
-    ):
-        if limit is None:
-            limit = max(self._configured(run, seeds), seeds)
-        if slots is None:
-            # Rounded: a seed more or less, known late, should not be another program.
-            slots = -(-max(limit, seeds) // SLOTS) * SLOTS
-        super().__init__(run, seeds, limit, slots)
+    def __init__(self, run: RunContext, seeds: int):
+        super().__init__(run, seeds)
         self._static = {"cfg": run.cfg.densify, "b2": run.cfg.optimizer.b2}
         self._relocate = functools.partial(relocate, **self._static)
 
-    @staticmethod
-    def _configured(run: RunContext, seeds: int) -> int:
-        given = run.cfg.densify.max_gaussians
-        if isinstance(given, int):
-            return given
-        return default_max_gaussians(seeds, run.coverage, run.cfg.train)
+    def bounds(self, seeds: int) -> tuple[int | None, int]:
+        """Return the bound, configured or chosen, and slots for as many."""
+        limit, _ = super().bounds(seeds)
+        if limit is None:
+            limit = default_max_gaussians(seeds, self.run.coverage, self.run.cfg.train)
+        limit = max(limit, seeds)
+        # Rounded: a seed more or less, known late, should not be another program.
+        return limit, -(-limit // SLOTS) * SLOTS
 
     def expect(self, state: FitState) -> None:
         """Begin to compile the relocation."""
