@@ -33,7 +33,7 @@ class Outcome(NamedTuple):
 
 def fresh_population(alive: Bool[Array, " n"]) -> Population:
     """Return a population with empty statistics."""
-    # Two arrays, not one twice: the step donates its input and each may be given away once.
+    # Two arrays, not one twice: the step donates its input, and each may be donated once.
     return Population(alive, *(jnp.zeros(alive.shape, jnp.float32) for _ in range(2)))
 
 

@@ -1,4 +1,4 @@
-"""A burst: steps that are only dispatched, then one look at what became of them."""
+"""A burst: steps that are only dispatched; then the host reads fault flag and reports, once."""
 
 from __future__ import annotations
 
@@ -47,9 +47,9 @@ class Bursts:
         self.checkpoints, self.clock = checkpoints, clock
 
     def take(self, state: FitState, host: HostState) -> tuple[FitState, list[StepReport]]:
-        """Dispatch steps up to the next point where the host must look, then look.
+        """Dispatch steps up to the next line of the log, then read how they went.
 
-        Where a view finds no room, the steps that the device refused are taken back and the room
+        Where a view finds no room, the steps that the device refused do not count, and the room
         grows.
 
         Args:

@@ -81,7 +81,7 @@ class Growth:
     """How far growth has come; part of what checkpoints remember.
 
     Attributes:
-        looks: the history.
+        results: of its stages, in order.
         limit: the population at which growth ended, or None while it goes on.
     """
 

@@ -146,7 +146,7 @@ class Automatic(Mcmc):
     def _next_stage(self, population: int, bound: int, host: HostState) -> Stage | None:
         """Return the next stage, or None where there is no room or time for one."""
         left = (self.window[1] - host.progress) / host.pace
-        # The host looks after every burst only.
+        # Strategies are asked after every burst only.
         burst = min(self.run.cfg.train.log_every, MAX_BURST)
         interval = math.ceil(self.interval(host) / host.pace / burst - 1e-6) * burst
         return growth.plan_stage(population, bound, left, interval)
