@@ -11,7 +11,7 @@ parameters to parameters, repeated until nothing moves.
 
 On the host, in numpy: derivatives are written out anyway, a round takes milliseconds, and four
 programs for the models, curves and sizes of one scene took longer to compile than to solve
-(BUILD_NOTES, "Compile less").
+(BUILD_NOTES, "Compile less, outside the step").
 """
 
 from __future__ import annotations

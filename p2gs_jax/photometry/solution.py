@@ -31,7 +31,7 @@ NOTICEABLE_BALANCE_EV = 0.1
 TOLERANCE, ROUGH = 1e-5, 1e-3
 # Standard deviation of a = 2.2 / gamma about 1 (gammas of 1.9 to 2.6 are within one of these).
 A_PRIOR = 0.15
-# Points by which a view is solved; more only repeat them (BUILD_NOTES, "Every second counts").
+# Points by which a view is solved; more only repeat them (BUILD_NOTES, "Exposures from a part").
 PER_VIEW = 1000
 # A known exposure that is to be kept: stops.
 FIXED_EV = 1e-5

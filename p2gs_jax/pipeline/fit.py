@@ -266,7 +266,7 @@ def _finish_estimate(
     for view in scene.views:
         width, height = size_at(view, cfg.data.max_width)
         pixels += width * height
-    # Measured (BUILD_NOTES, "Smaller things"): programs, then every view, and every pixel.
+    # Measured (BUILD_NOTES, "Reserve for evaluation"): programs, then every view, and every pixel.
     per_view, per_pixel = (0.13, 0.35e-6) if reference else (0.09, 0.25e-6)
     if lpips_weights is not None:
         # Under two protocols, and three more against a reference.

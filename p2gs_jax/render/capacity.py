@@ -1,7 +1,7 @@
 """How much room a view gets: allocate outside jit, check for overflow, grow.
 
-Time follows what a view needs, memory the room: 54 bytes an entry (BUILD_NOTES, "The kernel"). So
-room is generous and an overflow, which costs a compilation, is rare.
+Time follows what a view needs, memory the room: 54 bytes an entry (BUILD_NOTES, "Growth and
+memory"). So room is generous and an overflow, which costs a compilation, is rare.
 """
 
 from __future__ import annotations
