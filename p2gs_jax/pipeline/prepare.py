@@ -32,16 +32,17 @@ from p2gs_jax.gaussians.population import Coverage, default_max_gaussians
 from p2gs_jax.losses.relative_exposure import ColorPairs
 from p2gs_jax.losses.total import OBSERVED_FORMS
 from p2gs_jax.photometry.appearance import identity
+from p2gs_jax.photometry.calibrate import calibrate_observations, options_of
 from p2gs_jax.photometry.formation import inverse_tone_map
-from p2gs_jax.photometry.observations import Observations
+from p2gs_jax.photometry.models import ModelName
+from p2gs_jax.photometry.observations import Observations, overlapping_views, sample_pairs
 from p2gs_jax.photometry.response import Response
-from p2gs_jax.photometry.selection import Selection, select
-from p2gs_jax.photometry.solution import KnownExposures, ModelName, PhotometricSolution
-from p2gs_jax.photometry.sources.sampling import COARSEST, overlapping_views, sample, sample_pairs
-from p2gs_jax.photometry.sources.tracks import has_tracks, surface_colors
+from p2gs_jax.photometry.selection import Selection
+from p2gs_jax.photometry.solution import PhotometricSolution
+from p2gs_jax.photometry.sources import has_tracks, surface_colors
+from p2gs_jax.photometry.sources.sampling import sample
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.scene.known_exposures import read_known_exposures
 from p2gs_jax.scene.visibility import shown_share
 from p2gs_jax.types import GAMMA_SRGB, Gaussians, Params, Photometry, Scene
 
@@ -197,7 +198,7 @@ def prepare(
     if cfg.photometry.start == "tracks":
         if tracks is not None and len(tracks.points):
             reporter.stage("Photometric bundle adjustment")
-            selection = calibrate_observations(tracks, scene, cfg, on_chosen=chosen)
+            selection = calibrate_observations(tracks, options_of(cfg, scene), chosen)
             if reasons:
                 selection = dataclasses.replace(selection, reasons=tuple(reasons))
             notes += [*selection.reasons, *selection.solution.warnings]
@@ -367,51 +368,6 @@ def _seed_gaussians(
         opacity=opacity,
         quats=quats,
     )
-
-
-def calibrate_observations(
-    observations: Observations,
-    scene: Scene,
-    cfg: FitConfig,
-    seed: int | None = None,
-    on_chosen: Callable[[ModelName, Response], None] = lambda model, response: None,
-) -> Selection:
-    """Choose the photometric model and solve it.
-
-    Args:
-        observations: colours of shared points in the training views.
-        scene: for known exposures.
-        cfg: options; with `photometry.select` off the given model and curve are solved.
-        seed: which observations are held out; default the run's.
-        on_chosen: receives model and curve before they are solved on all observations.
-
-    Raises:
-        UserError: the known exposures cannot be read.
-    """
-    p = cfg.photometry
-    known = None
-    if p.known is not None:
-        views = [scene.views[i] for i in scene.train_indices]
-        known = KnownExposures(read_known_exposures(p.known, views), p.known_deviation_ev)
-    given = Response("power" if p.curve == "power" else "srgb", p.spline)
-    selection = select(
-        observations,
-        black=cfg.loss.black,
-        saturation=cfg.loss.saturation,
-        pivot=p.pivot,
-        known=known,
-        seed=cfg.train.seed if seed is None else seed,
-        fixed=None if p.select else (p.model, given),
-        on_chosen=on_chosen,
-    )
-    coarse = observations.too_coarse
-    if not coarse:
-        return selection
-    said = (
-        f"{coarse} of {coarse + len(observations.points)} observations were left out: their pixels "
-        f"cover more than {COARSEST:g} times what the closest view of the point resolves."
-    )
-    return dataclasses.replace(selection, reasons=(said, *selection.reasons))
 
 
 def with_choice(cfg: FitConfig, model: ModelName, response: Response) -> FitConfig:
