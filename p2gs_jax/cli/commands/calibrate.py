@@ -41,7 +41,7 @@ def run(options: Calibrate) -> int:
         else:
             result = calibrate(scene, out, cfg, compare_with=compare_with, reporter=reporter)
     s, seconds = result.solution, result.seconds
-    _print_table(result)
+    _print_table(result, _tone_columns(result))
     stdout().print(
         f"{result.observations} observations, {100 * s.outliers:.0f} % ignored as outliers; "
         f"residual {s.residual_ev:.2f} EV; {seconds['reading']:.1f} s reading, "
@@ -78,14 +78,14 @@ def _run_static(folder: Path, out: Path, cfg: FitConfig, compare_with: str | Non
     return 0
 
 
-def _print_table(result: CalibrationResult, more: dict[str, list[str]] | None = None) -> None:
-    """Print exposures and gammas with their standard errors, and what to make of them.
+def _print_table(result: CalibrationResult, more: dict[str, list[str]]) -> None:
+    """Print exposures with their standard errors, and what to make of them.
 
     Args:
         result: of any source.
         more: further columns by title.
     """
-    console, columns = stdout(), {**_columns(result), **(more or {})}
+    console, columns = stdout(), {**_exposure_columns(result), **more}
     table = Table(title="Exposures in stops from their mean", title_justify="left", box=SIMPLE)
     for name in columns:
         table.add_column(name, justify="left" if name in ("view", "camera") else "right")
@@ -96,11 +96,11 @@ def _print_table(result: CalibrationResult, more: dict[str, list[str]] | None = 
         console.print(message)
 
 
-def _columns(result: CalibrationResult) -> dict[str, list[str]]:
-    """Return the table's columns by title, without those that would say nothing."""
+def _exposure_columns(result: CalibrationResult) -> dict[str, list[str]]:
+    """Return columns by title, without those that would say nothing."""
     s, views = result.solution, result.views
-    errors, stated = s.exposure_errors / LN2, result.stated_ev
-    known, given = np.isfinite(errors), np.isfinite(stated)
+    errors, stated, gaps = s.exposure_errors / LN2, result.stated_ev, result.agreement.gap_ev
+    known, given, wrong = np.isfinite(errors), np.isfinite(stated), result.agreement.disagrees
     rows = range(len(views))
     columns = {"view": [v.name for v in views]}
     if len({v.camera for v in views}) > 1:
@@ -109,17 +109,23 @@ def _columns(result: CalibrationResult) -> dict[str, list[str]]:
         f"{s.exposures_ev[i]:+.2f} +- {errors[i]:.2f}" if known[i] else "unknown" for i in rows
     ]
     if given.any():
-        gaps, wrong = result.agreement.gap_ev, result.agreement.disagrees
         columns["stated"] = [f"{stated[i]:+.2f}" if given[i] else "" for i in rows]
         columns["gap"] = [
-            f"{gaps[i]:+.2f}{' !' if wrong[i] else ''}" if given[i] and known[i] else ""
+            f"{gaps[i]:+.2f}{' !' if wrong[i] else ''}" if np.isfinite(gaps[i]) else ""
             for i in rows
         ]
-    columns["gamma"] = [
+    return columns
+
+
+def _tone_columns(result: CalibrationResult) -> dict[str, list[str]]:
+    """Return gammas with their standard errors, and residuals in stops."""
+    s, rows = result.solution, range(len(result.views))
+    known = np.isfinite(s.exposure_errors)
+    gammas = [
         f"{s.gammas[i]:.2f}"
         + (f" +- {s.gamma_errors[i]:.2f}" if known[i] and s.gamma_errors[i] > 0 else "")
         + (" (weak)" if known[i] and s.gamma_errors[i] > WEAK_GAMMA else "")
         for i in rows
     ]
-    columns["residual"] = [f"{s.view_residual_ev[i]:.2f}" if known[i] else "" for i in rows]
-    return columns
+    residuals = [f"{s.view_residual_ev[i]:.2f}" if known[i] else "" for i in rows]
+    return {"gamma": gammas, "residual": residuals}
