@@ -66,8 +66,8 @@ def options_of(cfg: FitConfig, scene: Scene) -> CalibrationOptions:
     p = cfg.photometry
     known = None
     if p.known is not None:
-        views = [scene.views[i] for i in scene.train_indices]
-        known = KnownExposures(read_known_exposures(p.known, views), p.known_deviation_ev)
+        values = read_known_exposures(p.known, scene.training_views)
+        known = KnownExposures(values, p.known_deviation_ev)
     given = Response("power" if p.curve == "power" else "srgb", p.spline)
     return CalibrationOptions(
         black=cfg.loss.black,

@@ -60,9 +60,8 @@ def calibrate_run(
             fix="fit longer, or calibrate from the scene's tracks",
         )
     selection = calibrate_observations(observations, options_of(cfg, run.scene))
-    training = tuple(run.scene.views[i] for i in run.scene.train_indices)
     result = with_stated(
-        dataclasses.replace(run.scene, views=training),
+        dataclasses.replace(run.scene, views=tuple(run.scene.training_views)),
         selection,
         photometry,
         observations=len(observations.views),
