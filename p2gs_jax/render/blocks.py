@@ -2,8 +2,8 @@
 
 The list of what a view shows has a static length and a dynamic count. A loop over blocks costs what
 the count costs, and keeps what it computes in a core's cache: gathering 48 spherical-harmonics
-coefficients of 57k Gaussians at once took as long as projecting them (BUILD_NOTES, "Every second
-counts").
+coefficients of 57k Gaussians at once took as long as projecting them (BUILD_NOTES, "The step costs
+what a view shows").
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """How long lists are: allocate outside jit, check for overflow, grow.
 
-Time follows what a view needs, memory the length of its list: 54 bytes an entry (BUILD_NOTES, "The
-kernel"). So lists are generous and an overflow, which costs a compilation, is rare.
+Time follows what a view needs, memory the length of its list: 54 bytes an entry (BUILD_NOTES,
+"Growth and memory"). So lists are generous and an overflow, which costs a compilation, is rare.
 """
 
 from __future__ import annotations

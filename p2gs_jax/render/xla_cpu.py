@@ -1,6 +1,6 @@
 """How to make XLA's CPU backend compute what was meant: a few idioms, each measured.
 
-None of them changes a result; on other backends they are harmless. BUILD_NOTES, "Kernel".
+None of them changes a result; on other backends they are harmless. BUILD_NOTES, "The kernel".
 """
 
 from __future__ import annotations

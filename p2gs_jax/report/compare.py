@@ -191,7 +191,7 @@ def _model(run: RunFiles) -> str:
     if run.photometry is None:
         return ""
     model = run.photometry["model"]
-    return words.MODELS.get(model, model)
+    return words.DESCRIPTIONS.get(model, model)
 
 
 def _curve(run: RunFiles) -> str:

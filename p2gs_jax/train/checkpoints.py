@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.run.checkpoint import CheckpointStore
-from p2gs_jax.train import decisions
+from p2gs_jax.run.decisions import KEY, Decisions
 from p2gs_jax.train.host import HostState
 from p2gs_jax.train.state import FitState, grow_state
 
@@ -22,7 +22,7 @@ class RunCheckpoints:
     Args:
         run_dir: the run folder.
         cfg: what the run is optimised under.
-        reasons: for the photometric model, in words; a resumed run repeats them.
+        decided: what the scene settled.
         on_message: told what the user must know.
     """
 
@@ -30,11 +30,11 @@ class RunCheckpoints:
         self,
         run_dir: Path,
         cfg: FitConfig,
-        reasons: Sequence[str],
+        decided: Decisions,
         on_message: Callable[[str], None],
     ):
         self.cfg, self.on_message = cfg, on_message
-        self._decided = decisions.recorded(cfg, reasons)
+        self._decided = decided
         self._store = CheckpointStore(run_dir / "checkpoints")
 
     def save(self, state: FitState, host: HostState) -> None:
@@ -42,7 +42,7 @@ class RunCheckpoints:
         meta = {
             "host": dataclasses.asdict(host),
             "gaussian_capacity": state.params.gaussians.capacity,
-            decisions.KEY: self._decided,
+            KEY: self._decided.to_dict(),
         }
         self._store.save(host.step, state, meta)
 
@@ -61,7 +61,7 @@ class RunCheckpoints:
         )
         if found is None:
             return None
-        decisions.check(found[1].get(decisions.KEY), self.cfg, self._store.folder)
+        self._decided.require_same(found[1].get(KEY), self._store.folder)
         state = jax.tree.map(jnp.asarray, found[0])
         host = HostState.from_dict(found[1]["host"])
         self._store.discard_after(host.step)

@@ -25,6 +25,7 @@ from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.core.progress import LogRecord
 from p2gs_jax.gaussians.population import STEP_SECONDS_PER_PIXEL, Coverage
 from p2gs_jax.losses.relative_exposure import ColorPairs
+from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.train import room, schedule
 from p2gs_jax.train.burst import Bursts
 from p2gs_jax.train.checkpoints import RunCheckpoints
@@ -76,11 +77,11 @@ class Trainer:
         coverage: how much of the scene the views show.
         run_dir: where `log.jsonl`, `growth.jsonl` and `checkpoints/` go.
         programs: compiled steps, some of them perhaps begun.
+        decided: what the scene settled; a run that is resumed must have settled the same.
         on_log: called with every log record.
         on_message: called with everything the user must know.
         validation: training views that automatic growth is judged by.
         own_exposures: their exposures come from tracks, so they may be judged under these.
-        reasons: for the photometric model, in words; a resumed run repeats them.
     """
 
     def __init__(
@@ -92,11 +93,11 @@ class Trainer:
         coverage: Coverage,
         run_dir: Path,
         programs: StepPrograms,
+        decided: Decisions,
         on_log: Callable[[LogRecord], None] = lambda record: None,
         on_message: Callable[[str], None] = lambda text: None,
         validation: Sequence[int] = (),
         own_exposures: bool = False,
-        reasons: Sequence[str] = (),
     ):
         self.cfg, self.views, self.coverage = cfg, views, coverage
         self.programs, self.on_message = programs, on_message
@@ -105,7 +106,7 @@ class Trainer:
         self.levels = schedule.levels(cfg.train, width, height)
         self.clock = Stopwatch()
         self.log = RunLog(run_dir, on_log)
-        self.checkpoints = RunCheckpoints(run_dir, cfg, reasons, on_message)
+        self.checkpoints = RunCheckpoints(run_dir, cfg, decided, on_message)
         self.optimizer = make_optimizer(cfg)
         self.source = InputSource(cfg, views, pairs)
         step = Step(cfg, self.optimizer, extent)

@@ -45,6 +45,13 @@ class Shell:
     xy: Float32[np.ndarray, "s v 2"]
     empty_fraction: float
 
+    def note(self) -> str:
+        """Say what it is and how to do without."""
+        return (
+            f"{self.empty_fraction:.0%} of the images look past every seed point: a far shell "
+            f"of {len(self.points)} Gaussians was added (--init.shell off leaves it out)."
+        )
+
 
 def fibonacci_sphere(count: int) -> Float[np.ndarray, "n 3"]:
     """Return evenly spread unit vectors."""
