@@ -1,7 +1,7 @@
-"""The renderer compiled ahead for a few sizes, in the background, so that no frame ever waits.
+"""The renderer, compiled for a few sizes in the background, so that frames never wait.
 
-`render/host.py` compiles when it must; here a frame whose tile lists overflow is left to a smaller
-size while a program with longer lists is compiled.
+`render/host.py` waits for the compiler; here a frame whose tile lists overflow is rendered at a
+smaller size while a program with longer lists is compiled.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from p2gs_jax.render import render_linear, required_capacity
 from p2gs_jax.render.capacity import bucket
 from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.types import Camera, Gaussians, Render
-from p2gs_jax.viewer.ladder import Size
+from p2gs_jax.viewer.render_sizes import Size
 
-# Room for views that need more than those probed.
+# Margin of the tile lists over what the probed views need.
 MARGIN = 1.5
-# Entries of the longest tile lists worth having; a camera inside a splat may ask for any number.
+# Most entries of a tile list; a camera inside a splat may need any number.
 MOST_ENTRIES = 2**26
 PROBES = 4
 
@@ -39,7 +39,7 @@ class _Program:
 
 
 class Programs:
-    """Renders views of the sizes that are compiled; compiles others in a thread of its own.
+    """Renders views of compiled sizes, and compiles others in a thread.
 
     All methods may be called from any thread; one frame is rendered at a time.
     """
@@ -53,15 +53,15 @@ class Programs:
         on_change: Callable[[], None] = lambda: None,
         warm_up: Callable[[Render], object] = lambda result: None,
     ):
-        """Prepare; nothing is compiled yet.
+        """Begin without a program.
 
         Args:
             gaussians: the scene.
             alive: slots in use.
             cfg: rendering options.
-            probes: functions from a size to a typical camera, which new programs are tried on.
-            on_change: called when something was compiled, or is about to be.
-            warm_up: called with a render of every new size, to compile what follows on it.
+            probes: functions from a size to a typical camera; new programs are run on them.
+            on_change: called when a program was compiled, or is about to be.
+            warm_up: called with a render of every new size, to compile what uses it.
         """
         self._scene = (gaussians, alive)
         self._cfg = cfg
@@ -105,8 +105,8 @@ class Programs:
         with self._changed:
             return dict(self._took_ms)
 
-    def want(self, sizes: Sequence[Size]) -> None:
-        """Compile these next, in this order, and then what was wanted before."""
+    def request(self, sizes: Sequence[Size]) -> None:
+        """Compile these sizes next, in this order, and then those requested before."""
         with self._changed:
             new = [s for s in sizes if s not in self._programs]
             self._wanted = list(dict.fromkeys((*new, *self._wanted)))
@@ -136,7 +136,7 @@ class Programs:
         return None
 
     def render_now(self, camera: Camera) -> Render:
-        """Return a view of any size, compiling and growing as long as it takes.
+        """Return a view of any size; compile a program and enlarge its tile lists as needed.
 
         Raises:
             UserError: it would need more memory than is reasonable.
@@ -154,7 +154,7 @@ class Programs:
             self._compile(size)
 
     def stop(self) -> None:
-        """Stop compiling, and wait until what is being compiled is done.
+        """Stop compiling, and wait for the program that is being compiled.
 
         An interpreter that ends while JAX works in another thread aborts.
         """
@@ -183,7 +183,7 @@ class Programs:
             self._on_change()
 
     def _compile(self, size: Size) -> None:
-        """Compile a size with tile lists that hold what it is known to need, and try it."""
+        """Compile a size, with tile lists as long as it is known to need, and run it once."""
         with self._changed:
             first = not self._most
         if first:
@@ -200,7 +200,7 @@ class Programs:
             draw = partial(render_linear, cfg=self._cfg, capacity=capacity)
             jitted = jax.jit(draw, compiler_options=compiler_options())
             run = jitted.lower(*self._scene, camera).compile()
-            most, fastest = self._try(run, size)
+            most, fastest = self._run_probes(run, size)
             with self._changed:
                 self._most[size] = max(self._most.get(size, 0), most)
                 if most <= capacity:
@@ -210,22 +210,22 @@ class Programs:
                     return
 
     def _count(self, size: Size) -> None:
-        """Count what typical views need: cheaper than to compile twice."""
+        """Count the entries that typical views need: cheaper than compiling twice."""
         count = jax.jit(partial(required_capacity, cfg=self._cfg))
         most = max(int(count(*self._scene, probe(size))) for probe in self._probes)
         with self._changed:
             self._most[size] = most
 
     def _expected(self, size: Size) -> int:
-        """Return how many entries a size may need; lists never grow faster than the area."""
+        """Return an upper bound of the entries of a size, from another size: they grow with area."""
         if size in self._most:
             return self._most[size]
         area = size[0] * size[1]
         near = min(self._most, key=lambda other: abs(other[0] * other[1] - area))
         return int(self._most[near] * max(1.0, area / (near[0] * near[1])))
 
-    def _try(self, run, size: Size) -> tuple[int, float]:
-        """Return the entries that typical views need, and how long the fastest of them took."""
+    def _run_probes(self, run, size: Size) -> tuple[int, float]:
+        """Return the entries that typical views need, and the time of the fastest one."""
         most, fastest = 0, float("inf")
         for camera in [probe(size) for probe in self._probes]:
             with self._one_frame:

@@ -42,14 +42,14 @@ def run(finished_run):
 @pytest.fixture
 def session(run, monkeypatch):
     """Return a session at the photograph in row 1, with +1 EV of the person's own."""
-    monkeypatch.setattr(sessions, "seen_by", lambda client: SimpleNamespace(aspect=1.5))
+    monkeypatch.setattr(sessions, "browser_view", lambda client: SimpleNamespace(aspect=1.5))
     out = object.__new__(Session)
     pose = SimpleNamespace(fov=1.0)
     out._run, out._client = run, None
-    room = SimpleNamespace(view_at=lambda camera: 1, nearest_view=lambda camera: 1)
-    out._studio = SimpleNamespace(pose=lambda index, aspect: pose, darkroom=lambda: room)
-    out._screen = SimpleNamespace(
-        moved=lambda: None, retouched=lambda: None, camera=lambda seen, size: None
+    cache = SimpleNamespace(view_at=lambda camera: 1, nearest_view=lambda camera: 1)
+    out._viewed = SimpleNamespace(pose=lambda index, aspect: pose, new_frame_cache=lambda: cache)
+    out._render_loop = SimpleNamespace(
+        moved=lambda: None, display_changed=lambda: None, camera=lambda seen, size: None
     )
     out._player = SimpleNamespace(stop=lambda: None)
     out._move = lambda pose: None
