@@ -108,7 +108,7 @@ def _curve(axis: str, held: str, samples: list[Sample]) -> Curve:
     )
 
 
-def measure(
+def measure_growth(
     *,
     quick: bool = False,
     repeats: int = 5,

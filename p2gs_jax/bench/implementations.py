@@ -28,7 +28,7 @@ from p2gs_jax.render import view_radiance
 SIZES = (100_000, 1_000_000, 3_000_000)
 PIXELS = (1920, 1080)
 WINDOW = (96, 72)
-# Operations per pair of entry and pixel, forward and with gradients (KERNEL.md).
+# Operations per pair of entry and pixel, forward and with gradients (docs/kernel.md).
 OPERATIONS = {"forward": 30, "both": 65}
 ROW_BYTES = 4 * (9 + 1)  # a row without depth, and its id
 
@@ -155,7 +155,7 @@ def gsplat_jobs(
     return forward, both, peak
 
 
-def measure(
+def measure_implementations(
     *,
     quick: bool = False,
     repeats: int = 7,

@@ -119,7 +119,7 @@ def photograph(linear: np.ndarray, scene: BenchScene) -> Batch:
     return Batch(scene.camera, ldr, mask, jnp.int32(0))
 
 
-def measure(
+def measure_levels(
     scenes: dict[str, Callable[[], BenchScene]] = SCENES,
     cfg: FitConfig | None = None,
     *,

@@ -59,7 +59,7 @@ def _number(name: str, value: float) -> str:
 
 
 def speed_error_table(points: list[Point]) -> str:
-    """Return the table of `speed_error.measure`."""
+    """Return the table of `speed_error.measure_speed_error`."""
     on_front = front(points)
     rows = []
     for p in points:

@@ -196,7 +196,7 @@ def programs(scene: BenchScene, variant: Variant, base: RenderConfig, weights: n
     return (lambda: forward(gaussians)), (lambda: both(gaussians)), kept, need, temporaries
 
 
-def measure(
+def measure_speed_error(
     scene: BenchScene,
     variants: tuple[Variant, ...] = VARIANTS,
     base: RenderConfig | None = None,

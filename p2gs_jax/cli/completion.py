@@ -6,7 +6,7 @@ import re
 
 import tyro
 
-from p2gs_jax.cli import wording
+from p2gs_jax.cli import help_text
 from p2gs_jax.cli.options.render import PATHS
 from p2gs_jax.cli.options.setup import Shell
 from p2gs_jax.cli.parser import every_command
@@ -32,7 +32,7 @@ ZSH_CALL = '_tyro_p2gs_jax "$@"'
 
 def script(shell: Shell) -> str:
     """Return the script that a shell reads to complete commands, options and their values."""
-    text = wording.captured(
+    text = help_text.captured(
         lambda: tyro.cli(
             every_command(),
             prog="p2gs-jax",

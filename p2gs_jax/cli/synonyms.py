@@ -40,7 +40,7 @@ SYNONYMS = {
 }
 
 
-def check_words(command: str, argv: Sequence[str], options: Collection[str]) -> None:
+def check_option_names(command: str, argv: Sequence[str], options: Collection[str]) -> None:
     """Complain about an option that is called otherwise here.
 
     Args:

@@ -112,7 +112,9 @@ def _fields(kind: type, default: Any) -> Iterator[StructFieldSpec]:
         yield StructFieldSpec(
             name=field.name,
             # What a field says of itself comes last, and wins.
-            type=Annotated[(_plain(hint), *_looks(kind, field.name, hint, value), *_extras(hint))],  # type: ignore
+            type=Annotated[
+                (_plain(hint), *_option_config(kind, field.name, hint, value), *_extras(hint))
+            ],  # type: ignore
             default=value,
             helptext=functools.partial(_text, kind, field.name),
         )
@@ -130,7 +132,7 @@ def _default(field: dataclasses.Field, parent: Any) -> Any:
     return MISSING_NONPROP
 
 
-def _looks(kind: type, name: str, hint: Any, default: Any) -> tuple[Any, ...]:
+def _option_config(kind: type, name: str, hint: Any, default: Any) -> tuple[Any, ...]:
     """Return how an option shows itself, unless its field says otherwise.
 
     In the configuration None is a value like others, in a command's own options it means that

@@ -24,7 +24,7 @@ class Cache:
     remark: str
 
 
-def look() -> Cache:
+def inspect_cache() -> Cache:
     """Make JAX use the cache, and say how it is; never raises."""
     try:
         from p2gs_jax.core.compile_cache import MOST_BYTES, cache_folder, use_compile_cache

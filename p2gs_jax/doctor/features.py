@@ -29,7 +29,7 @@ class Feature:
     remark: str
 
 
-def look(libraries: Sequence[Library], backend: str | None) -> list[Feature]:
+def list_features(libraries: Sequence[Library], backend: str | None) -> list[Feature]:
     """Return all features.
 
     Args:

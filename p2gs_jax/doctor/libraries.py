@@ -33,7 +33,7 @@ class Library:
     trouble: str | None
 
 
-def look() -> list[Library]:
+def check_libraries() -> list[Library]:
     """Try to import everything that p2gs-jax depends on; never raises."""
     wanted = requirements()
     return [_try(name, wanted[name]) for name in sorted(wanted, key=str.lower)]

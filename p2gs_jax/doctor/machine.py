@@ -35,7 +35,7 @@ class Machine:
     free: int | None
 
 
-def look(folder: Path) -> Machine:
+def inspect_machine(folder: Path) -> Machine:
     """Return what the machine has; never raises."""
     total, available = memory()
     return Machine(platform.platform(), cores(), total, available, str(folder), _free(folder))

@@ -47,7 +47,7 @@ class SelfTest:
     difference: float | None = None
 
 
-def look() -> Devices:
+def inspect_devices() -> Devices:
     """Return devices and what a fit would choose on them; never raises."""
     try:
         import jax

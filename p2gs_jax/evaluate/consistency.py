@@ -1,4 +1,4 @@
-"""How steady a video is: HIS and Std-Luminance (paper, appendix Metrics; docs/photometry.md, 6).
+"""Consistency of videos: HIS and Std-Luminance (paper, appendix Metrics; docs/photometry.md, 6).
 
 Both are small for a dark or blurred video, and HIS contains the motion of the scene: never read
 them without PSNR, and compare with those of the photographs.

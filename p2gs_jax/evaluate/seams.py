@@ -1,4 +1,4 @@
-"""Seams: how far photographs of one surface are apart, as taken and under one display transform.
+"""Seams: the difference of photographs of one surface, as taken and under one display transform.
 
 Pixels of one view are found in a neighbouring one through rendered depth, with an occlusion test
 (render/warp.py). Over the pixels that both show, unsaturated and not near black, the seam is the
@@ -9,9 +9,9 @@ median over pixels and channels of the absolute difference, in 8-bit codes and i
 - after: of the photographs developed alike: each is decoded with its own gamma, divided by its own
   exposure, and shown in the common display transform.
 
-The step is what the two still differ by throughout: the median of the signed difference after, in
-stops. What is left beyond it contains the misplacement of pixels on texture, view-dependent shine,
-vignetting and white balance: no exposure explains these.
+The step is the constant part of what is left: the median of the signed difference after, in stops.
+The rest contains misplaced pixels on texture, view-dependent reflection, vignetting and white
+balance, which no exposure explains.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from p2gs_jax.render.warp import sample_bilinear, warp
 from p2gs_jax.scene.visibility import project_points, unoccluded
 from p2gs_jax.types import Camera, Scene
 
-# Fewer common pixels say nothing.
+# Least pixels in common.
 FEWEST_PIXELS = 200
-# Views that share fewer points are not worth rendering.
+# Least points in common of two views that are compared.
 FEWEST_SHARED = 30
-# Without tracks, overlaps are counted on this many of the points.
+# Points that overlaps are counted on where there are no tracks.
 MOST_COUNTED = 5000
 
 
 class Photographed(NamedTuple):
-    """A photograph with what is known about it.
+    """A photograph with camera, depth and display transform.
 
     Attributes:
         ldr: display values.
@@ -57,7 +57,7 @@ class Photographed(NamedTuple):
 
 
 class Seam(NamedTuple):
-    """How far two photographs are apart; see the module for what is measured.
+    """The difference of two photographs; see the module for the definitions.
 
     Attributes:
         before_ev: as taken, stops.
@@ -132,7 +132,7 @@ def _shared_points(scene: Scene) -> np.ndarray:
     return shared
 
 
-def measure(
+def measure_seam(
     first: Photographed, second: Photographed, common: DisplayTransform, cfg: LossConfig
 ) -> Seam | None:
     """Return the seam between two photographs, or None where they have too little in common.

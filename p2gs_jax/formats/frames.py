@@ -17,7 +17,7 @@ from p2gs_jax.types import Camera
 
 
 @dataclass(frozen=True)
-class Frame:
+class OutputFrame:
     """A rendered picture.
 
     Attributes:
@@ -43,10 +43,10 @@ class Frame:
     photograph: Float32[np.ndarray, "h3 w3 3"] | None = None
 
 
-WriteFrame = Callable[[Frame], None]
+WriteFrame = Callable[[OutputFrame], None]
 
 
-def write_frame(folder: Path, frame: Frame) -> None:
+def write_frame(folder: Path, frame: OutputFrame) -> None:
     """Write `NAME.exr` and `NAME.png`; beside a photograph, `NAME.render.png` and its own.
 
     Args:

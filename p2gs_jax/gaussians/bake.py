@@ -285,7 +285,7 @@ def _psnr(codes: Float[np.ndarray, "h w 3"]) -> float:
     return float(-10 * np.log10(max(mse, 1e-10)))
 
 
-def summary(errors: Sequence[ViewError]) -> dict | None:
+def error_summary(errors: Sequence[ViewError]) -> dict | None:
     """Return median and worst of some views as plain values; None where there are none."""
     if not errors:
         return None

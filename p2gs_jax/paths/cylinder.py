@@ -60,7 +60,7 @@ class Cylinder:
         return np.stack([np.sin(a), h, np.cos(a)], -1) @ self.viewmat[:3, :3]
 
 
-class Seen(NamedTuple):
+class Projected(NamedTuple):
     """Where a pinhole camera sees directions.
 
     Attributes:
@@ -79,7 +79,7 @@ def project(
     rays: Float[np.ndarray, "h w 3"],
     origin: Float[np.ndarray, " 3"] | None = None,
     nearness: Float[np.ndarray, "h w"] | None = None,
-) -> Seen:
+) -> Projected:
     """Return where a pinhole camera sees what lies along rays.
 
     Args:
@@ -97,7 +97,7 @@ def project(
     xy = local[..., :2] / np.where(front, z, 1.0)[..., None]
     xy = xy * shot.K[[0, 1], [0, 1]] + shot.K[:2, 2]
     inside = front & np.all((xy >= 0) & (xy <= (shot.width, shot.height)), axis=-1)
-    return Seen(xy, z / np.maximum(np.linalg.norm(local, axis=-1), 1e-12), inside)
+    return Projected(xy, z / np.maximum(np.linalg.norm(local, axis=-1), 1e-12), inside)
 
 
 def covering(shots: Iterable[Shot], viewmat: Pose) -> Cylinder:

@@ -46,7 +46,7 @@ class Orbit:
     sway: float
     met: bool
 
-    def describe(self) -> str:
+    def description(self) -> str:
         """Return in a sentence what the camera does, and why."""
         degrees = f"{np.rad2deg(self.sway):.0f} degrees to either side"
         if not self.met:

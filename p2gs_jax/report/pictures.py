@@ -1,4 +1,4 @@
-"""Pictures inside the page: encoded small, as data."""
+"""Pictures in the page, as data URLs."""
 
 from __future__ import annotations
 

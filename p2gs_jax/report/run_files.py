@@ -1,4 +1,4 @@
-"""What a run folder holds, read without its scene; what is missing is named, not fatal."""
+"""The files of a run folder, read without its scene; missing ones are listed, not fatal."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class RunFiles:
         log: lines of `log.jsonl`.
         held_out: held-out views in `renders/`, by name.
         missing: sentences on what could not be read.
-        broken: names of files that are there and say nothing that can be read.
+        broken: names of files that exist but cannot be read.
     """
 
     folder: Path

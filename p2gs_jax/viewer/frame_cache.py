@@ -1,4 +1,4 @@
-"""The last rendered frame in linear radiance: new display settings are applied without rendering."""
+"""The last rendered frame, in linear radiance: new display settings need no rendering."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class FrameCache:
         return True
 
     def set_depth_limits(self) -> None:
-        """Fit the colour scale of depth to the frame; not done for every frame, or it would flicker."""
+        """Fit the colour scale of depth to the frame; done for every frame it would flicker."""
         assert self.frame is not None
         self.depth_limits = limits_of_depth(self.frame)
 

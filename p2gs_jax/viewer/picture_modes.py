@@ -1,4 +1,4 @@
-"""What the viewer can show of a rendered frame: the picture, luminance in stops, clipping, depth."""
+"""What the viewer shows of a rendered frame: the picture, luminance in stops, clipping, depth."""
 
 from __future__ import annotations
 

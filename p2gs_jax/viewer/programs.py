@@ -217,7 +217,7 @@ class Programs:
             self._most[size] = most
 
     def _expected(self, size: Size) -> int:
-        """Return an upper bound of the entries of a size, from another size: they grow with area."""
+        """Return the expected entries of a size; at most in proportion to the area."""
         if size in self._most:
             return self._most[size]
         area = size[0] * size[1]

@@ -1,8 +1,8 @@
 """The thread that keeps one browser's picture up to date.
 
-Every frame is rendered for the newest camera; older ones are skipped. While anything changes, frames
-are as large as the frame rate allows and are sent as JPEG; at rest the canvas is rendered pixel for
-pixel and sent as PNG.
+Every frame is rendered for the newest camera; older ones are skipped. While anything changes,
+frames are as large as the frame rate allows and are sent as JPEG; at rest the canvas is rendered
+pixel for pixel and sent as PNG.
 """
 
 from __future__ import annotations

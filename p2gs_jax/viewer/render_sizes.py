@@ -23,8 +23,8 @@ NEWEST, FORGET = 0.3, 0.01
 FULL_FROM = 0.6
 # Target time of a frame while the camera moves, milliseconds.
 TARGET_MS = 75.0
-# Move to a larger size if it is expected within the first share of the target time, and to a smaller
-# one beyond the second.
+# Move to a larger size if it is expected within the first share of the target time, and to a
+# smaller one beyond the second.
 ENLARGE_WITHIN, SHRINK_BEYOND = 0.85, 1.25
 
 
@@ -100,7 +100,7 @@ class FrameTimes:
         self.ms = dict(known) | self.ms
 
     def update(self, size: Size, milliseconds: float) -> None:
-        """Add the time of a frame; expected times of larger sizes fall a little, to try them again."""
+        """Add the time of a frame; lower those of larger sizes a little, to try them again."""
         before = self.ms.get(size, milliseconds)
         self.ms[size] = before + NEWEST * (milliseconds - before)
         for other in self.ms:
@@ -109,7 +109,7 @@ class FrameTimes:
 
 
 def expected_ms(size: Size, took_ms: Mapping[Size, float]) -> float:
-    """Return the expected time of a frame; from the nearest known size where it has none of its own."""
+    """Return the expected time of a frame, estimated from the nearest size with a known one."""
     if size in took_ms:
         return took_ms[size]
     if not took_ms:

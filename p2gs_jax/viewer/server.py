@@ -77,7 +77,9 @@ def open_viewer(run: Run, *, host: str, port: int, max_width: int) -> Iterator[s
         if port not in (0, server.get_port()):
             raise UserError(f"port {port} was taken just now.", fix="choose another with --port")
         _set_up_server(server, viewed, sessions)
-        viewed.programs.request(compilation_order(render_sizes(full_size(LIKELY_CANVAS, max_width))))
+        viewed.programs.request(
+            compilation_order(render_sizes(full_size(LIKELY_CANVAS, max_width)))
+        )
         shown = "localhost" if host in ("0.0.0.0", "::", "") else host
         yield f"http://{f'[{shown}]' if ':' in shown else shown}:{server.get_port()}"
     finally:

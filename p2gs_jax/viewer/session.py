@@ -92,7 +92,7 @@ class Session:
             if before is None:
                 self._before_split = now
             camera = self._render_loop.camera(browser_view(self._client), (64, 64))
-            cache = self._viewed.frame_cache()
+            cache = self._viewed.new_frame_cache()
             here = cache.view_at(camera)
             self.go_to(cache.nearest_view(camera) if here is None else here)
         elif before is not None:
@@ -193,7 +193,7 @@ class Session:
         """Send the view as a file, rendered at a width of its own."""
         view, settings = browser_view(self._client), self._panel.settings()
         size = saved_size(width, view.aspect)
-        cache = self._viewed.frame_cache()
+        cache = self._viewed.new_frame_cache()
         cache.depth_limits = self._render_loop.frame_cache.depth_limits
         with self._busy(f"Rendering {size[0]} x {size[1]} pixels ..."):
             cache.render(self._render_loop.camera(view, size), wait=True)

@@ -184,7 +184,7 @@ class ViewedRun:
         return small
 
     def splats(self) -> BrowserSplats:
-        """Return the scene as the browser's splats, with the colours seen from the cameras' mean."""
+        """Return the scene as the browser's splats, in the colours seen from the cameras' mean."""
         with self._lock:
             return self._splats
 

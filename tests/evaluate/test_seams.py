@@ -8,7 +8,7 @@ import pytest
 
 from p2gs_jax.config import LossConfig, PhotometryConfig
 from p2gs_jax.evaluate.seam_picture import halfway, halves, redeveloped
-from p2gs_jax.evaluate.seams import Photographed, measure, neighbours
+from p2gs_jax.evaluate.seams import Photographed, measure_seam, neighbours
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.types import Camera, Render, Scene, Tracks, View
 
@@ -43,7 +43,7 @@ def photographed(x: float, exposure: float, gamma: float = 2.2, claimed: float |
 
 
 def test_a_stop_between_photographs_goes_when_they_are_developed_alike():
-    found = measure(photographed(0.0, 0.8), photographed(0.5, 1.6), COMMON, LossConfig())
+    found = measure_seam(photographed(0.0, 0.8), photographed(0.5, 1.6), COMMON, LossConfig())
     assert found is not None
     assert found.before_ev == pytest.approx(1.0, abs=0.02)
     assert found.after_ev < 0.02
@@ -55,14 +55,14 @@ def test_a_stop_between_photographs_goes_when_they_are_developed_alike():
 
 def test_a_wrong_exposure_leaves_its_error_as_the_seam():
     wrong = photographed(0.5, 1.6, claimed=1.6 * 2**0.25)
-    found = measure(photographed(0.0, 0.8), wrong, COMMON, LossConfig())
+    found = measure_seam(photographed(0.0, 0.8), wrong, COMMON, LossConfig())
     assert found is not None
     assert found.after_ev == pytest.approx(0.25, abs=0.02)
     assert found.step_ev == pytest.approx(0.25, abs=0.02)
 
 
 def test_a_gamma_of_its_own_is_undone():
-    found = measure(photographed(0.0, 1.0), photographed(0.5, 1.0, 2.8), COMMON, LossConfig())
+    found = measure_seam(photographed(0.0, 1.0), photographed(0.5, 1.0, 2.8), COMMON, LossConfig())
     assert found is not None
     assert found.before_ev > 0.1
     assert found.after_ev < 0.02
@@ -70,12 +70,12 @@ def test_a_gamma_of_its_own_is_undone():
 
 def test_saturated_masked_and_hidden_pixels_do_not_count():
     first, second = photographed(0.0, 1.0), photographed(0.0, 1.0)
-    full = measure(first, second, COMMON, LossConfig())
+    full = measure_seam(first, second, COMMON, LossConfig())
     assert full is not None
     assert full.pixels == SIZE * SIZE
     ldr, mask, depth = first.ldr.copy(), second.mask.copy(), second.depth.copy()
     ldr[:8], mask[16:24], depth[40:48] = 1.0, 0.0, 0.5
-    some = measure(
+    some = measure_seam(
         first._replace(ldr=ldr), second._replace(mask=mask, depth=depth), COMMON, LossConfig()
     )
     assert some is not None
@@ -83,7 +83,9 @@ def test_saturated_masked_and_hidden_pixels_do_not_count():
 
 
 def test_views_with_nothing_in_common_have_no_seam():
-    assert measure(photographed(0.0, 1.0), photographed(9.0, 1.0), COMMON, LossConfig()) is None
+    assert (
+        measure_seam(photographed(0.0, 1.0), photographed(9.0, 1.0), COMMON, LossConfig()) is None
+    )
 
 
 def test_a_photograph_developed_in_another_look():

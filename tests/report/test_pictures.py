@@ -19,8 +19,8 @@ from p2gs_jax.report.pictures import (
     stop_shares,
 )
 from p2gs_jax.report.run_charts import Training, training_chart
-from p2gs_jax.report.strips import spread
 from p2gs_jax.report.svg import VARIABLES, spread_apart
+from p2gs_jax.report.view_comparisons import spread
 
 
 def grey(values):

@@ -47,7 +47,8 @@ def test_every_mode_shows_what_it_says():
     np.testing.assert_array_equal(picture_of(f, "clipping", TRANSFORM), clipping_overlay(shown))
     limits = (2.0, 9.0)
     np.testing.assert_array_equal(
-        picture_of(f, "depth", TRANSFORM, depth_limits=limits), depth_color(f.depth, f.alpha, limits)
+        picture_of(f, "depth", TRANSFORM, depth_limits=limits),
+        depth_color(f.depth, f.alpha, limits),
     )
     np.testing.assert_array_equal(
         picture_of(f, "stops", TRANSFORM), false_color(linear, MIDDLE_GREY / TRANSFORM.exposure)
@@ -60,7 +61,9 @@ def test_stops_count_from_middle_grey_at_the_exposure():
     f = RenderedFrame(grey, np.ones((4, 4)), np.ones((4, 4)), camera(4, 4))
     one_up = DisplayTransform(2 * TRANSFORM.exposure, TRANSFORM.gamma, TRANSFORM.formation)
     twice = RenderedFrame(2 * grey, f.alpha, f.depth, f.camera)
-    np.testing.assert_array_equal(picture_of(f, "stops", one_up), picture_of(twice, "stops", TRANSFORM))
+    np.testing.assert_array_equal(
+        picture_of(f, "stops", one_up), picture_of(twice, "stops", TRANSFORM)
+    )
     assert np.any(picture_of(f, "stops", TRANSFORM) != picture_of(f, "stops", one_up))
 
 
@@ -75,7 +78,9 @@ def test_the_limits_of_depth_hold_almost_everything():
 
 
 def test_split_without_a_photograph_is_the_picture():
-    np.testing.assert_array_equal(picture_of(frame(), "split", TRANSFORM), develop(frame().linear, TRANSFORM))
+    np.testing.assert_array_equal(
+        picture_of(frame(), "split", TRANSFORM), develop(frame().linear, TRANSFORM)
+    )
 
 
 def test_photograph_left_render_right():

@@ -109,10 +109,8 @@ def setup(run):
         listeners=[],
         new_frame_cache=lambda: FrameCache(run, store, programs, 4.0),
     )
-    loop =  RenderLoop(client, viewed, panel)
-    yield SimpleNamespace(
-        loop=loop, client=client, panel=panel, programs=programs, viewed=viewed
-    )
+    loop = RenderLoop(client, viewed, panel)
+    yield SimpleNamespace(loop=loop, client=client, panel=panel, programs=programs, viewed=viewed)
     loop.stop()
     store.close()
 

@@ -42,14 +42,14 @@ def examine(*, self_test: bool = True) -> dict:
     Args:
         self_test: render three Gaussians as well.
     """
-    tried = libraries.look()
-    devices = render.look()
-    kept = cache.look()
+    tried = libraries.check_libraries()
+    devices = render.inspect_devices()
+    kept = cache.inspect_cache()
     test = render.self_test() if self_test else render.SelfTest(None, "skipped")
     return {
         "p2gs_jax": libraries.installed("p2gs-jax"),
         "python": platform.python_version(),
-        "machine": dataclasses.asdict(machine.look(Path.cwd())),
+        "machine": dataclasses.asdict(machine.inspect_machine(Path.cwd())),
         "devices": dataclasses.asdict(devices),
         "compile_cache": dataclasses.asdict(kept),
         "self_test": dataclasses.asdict(test),
@@ -59,7 +59,7 @@ def examine(*, self_test: bool = True) -> dict:
             for name in features.OPTIONAL
             if name not in {x.name for x in tried}
         },
-        "features": [dataclasses.asdict(f) for f in features.look(tried, devices.backend)],
+        "features": [dataclasses.asdict(f) for f in features.list_features(tried, devices.backend)],
         "healthy": test.ok is not False
         and devices.trouble is None
         and not any(x.trouble for x in tried),

@@ -26,8 +26,8 @@ from p2gs_jax.gaussians.bake import (
     baking_error,
     display_comments,
     display_of_splats,
+    error_summary,
     refine,
-    summary,
     true_target,
 )
 from p2gs_jax.photometry.display import DisplayTransform
@@ -276,7 +276,9 @@ class _Display:
         scene, render = self.fitted.scene, self.fitted.cfg.render
         splits = {"train": scene.train_indices, "test": scene.test_indices}
         return {
-            split: summary(baking_error(shown, [self.targets[i] for i in _spread(rows)], render))
+            split: error_summary(
+                baking_error(shown, [self.targets[i] for i in _spread(rows)], render)
+            )
             for split, rows in splits.items()
         }
 

@@ -16,7 +16,7 @@ from p2gs_jax.cli.options.render import PATHS, Render
 from p2gs_jax.core.clock import CompileCounter
 from p2gs_jax.core.progress import TerminalReporter
 from p2gs_jax.errors import UserError
-from p2gs_jax.formats.frames import Frame, open_frames
+from p2gs_jax.formats.frames import OutputFrame, open_frames
 from p2gs_jax.paths import (
     PosePath,
     Shot,
@@ -33,7 +33,7 @@ from p2gs_jax.paths import (
 from p2gs_jax.paths.drive import frame_count
 from p2gs_jax.paths.files import LARGEST, MOST_STOPS
 from p2gs_jax.paths.pictures import (
-    Studio,
+    RunRenderer,
     comparison_frames,
     comparison_size,
     shot_frames,
@@ -59,7 +59,7 @@ class Job:
         notes: what the user should know.
     """
 
-    frames: Iterator[Frame]
+    frames: Iterator[OutputFrame]
     count: int
     size: tuple[int, int]
     shots: Sequence[Shot] = ()
@@ -80,12 +80,12 @@ def run(options: Render) -> int:
             f"--curve spline: {options.run} has none; its curve is {fitted.cfg.photometry.curve}.",
             fix="choose run, srgb, power or linear",
         )
-    studio = Studio(fitted)
+    renderer = RunRenderer(fitted)
     with TerminalReporter() as reporter:
         job = (
-            _panoramas(options, studio)
+            _panoramas(options, renderer)
             if options.panorama
-            else _shots(options, studio, given, reporter.message)
+            else _shots(options, renderer, given, reporter.message)
         )
         reading = time.monotonic() - begin
         for note in job.notes:
@@ -102,8 +102,8 @@ def run(options: Render) -> int:
     console.print(f"{job.count} {what}: {out}", soft_wrap=True)
     console.print(_spent(time.monotonic() - begin, reading, compiler.seconds))
     console.print(
-        f"A frame takes {_median_ms(studio.render_seconds)} to render and "
-        f"{_median_ms(studio.develop_seconds)} to expose and encode, whatever exposure and gamma."
+        f"A frame takes {_median_ms(renderer.render_seconds)} to render and "
+        f"{_median_ms(renderer.develop_seconds)} to expose and encode, whatever exposure and gamma."
     )
     return 0
 
@@ -223,10 +223,10 @@ def _chosen(options: Render, fitted: Run) -> list[Shot]:
 
 
 def _shots(
-    options: Render, studio: Studio, given: list[Shot] | None, say: Callable[[str], None]
+    options: Render, renderer: RunRenderer, given: list[Shot] | None, say: Callable[[str], None]
 ) -> Job:
     """Return the job of rendering pinhole cameras."""
-    fitted, notes, photograph = studio.run, [], None
+    fitted, notes, photograph = renderer.run, [], None
     if given is not None:
         shots = given
     else:
@@ -242,12 +242,12 @@ def _shots(
             else:
                 circle = find_orbit(chosen, own, np.asarray(fitted.scene.points, np.float64))
                 shots = orbit(circle, own, options.frames)
-                notes = [circle.describe()]
+                notes = [circle.description()]
     if options.width is not None:
         shots = [shot.resized(options.width) for shot in shots]
     size = (max(s.width for s in shots), max(s.height for s in shots))
     frames = shot_frames(
-        studio, shots, lambda shot: _display_transform(fitted, options, shot), photograph
+        renderer, shots, lambda shot: _display_transform(fitted, options, shot), photograph
     )
     return Job(frames, len(shots), size, shots, notes)
 
@@ -280,9 +280,9 @@ def _recorded(shots: list[Shot], options: Render, fitted: Run) -> list[Shot]:
     ]
 
 
-def _panoramas(options: Render, studio: Studio) -> Job:
+def _panoramas(options: Render, renderer: RunRenderer) -> Job:
     """Return the job of rendering what all cameras of a rig see."""
-    fitted = studio.run
+    fitted = renderer.run
     views = fitted.scene.views
     rig = find_rig(view_shots(views, fitted.cfg.data.max_width), views)
     cylinder = covering(rig.mounts.values(), np.eye(4))
@@ -297,7 +297,7 @@ def _panoramas(options: Render, studio: Studio) -> Job:
         path = PosePath(rig.poses)
         poses = path(path.evenly(frame_count(len(rig.steps), options.frames)))
         size = (cylinder.width, cylinder.height)
-        return Job(wide_frames(studio, cylinder, poses, transform), len(poses), size)
+        return Job(wide_frames(renderer, cylinder, poses, transform), len(poses), size)
     allowed = {shot.view for shot in _chosen(options, fitted)}
     steps = []
     for step in rig.steps:
@@ -314,5 +314,5 @@ def _panoramas(options: Render, studio: Studio) -> Job:
         notes.append("Corrections of display values that this run learned stay in the photographs.")
     taken = [shot.view for step in steps for shot in step.shots.values() if shot.view is not None]
     fitted.require_photographs(taken)
-    frames = comparison_frames(studio, rig, steps, cylinder, transform, fitted.store)
+    frames = comparison_frames(renderer, rig, steps, cylinder, transform, fitted.store)
     return Job(frames, len(steps), comparison_size(cylinder), (), notes)

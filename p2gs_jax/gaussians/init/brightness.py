@@ -17,7 +17,7 @@ from p2gs_jax.types import GAMMA_SRGB, Scene
 
 TABLE = 1024
 LUMINANCE = np.array([0.25, 0.6, 0.15], np.float32)
-# Frames kept at once: a view, its neighbours, and those of the views that follow.
+# MatchImages kept at once: a view, its neighbours, and those of the views that follow.
 FRAMES = 48
 # The brightest pixels may clip in the comparison: a lamp should not leave the rest in the dark.
 WHITE_QUANTILE = 0.995
@@ -94,7 +94,7 @@ def rough_tones(tracks: Observations | None, count: int) -> Tones:
 
 
 @dataclass(frozen=True)
-class Frame:
+class MatchImage:
     """A training view as it is compared.
 
     Attributes:
@@ -115,7 +115,7 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Frames:
+class MatchImages:
     """The training views of a scene, loaded when asked for; from any thread.
 
     Attributes:
@@ -139,11 +139,11 @@ class Frames:
         """Keep the last frames."""
         object.__setattr__(self, "_load", lru_cache(FRAMES)(self._make))
 
-    def __getitem__(self, row: int) -> Frame:
+    def __getitem__(self, row: int) -> MatchImage:
         """Return a training view by its row."""
         return self._load(row)  # type: ignore[operator]
 
-    def _make(self, row: int) -> Frame:
+    def _make(self, row: int) -> MatchImage:
         index = self.scene.train_indices[row]
         shrink = max(1.0, max(self.store.camera(index)[2:]) / self.longest)
         ldr, mask = self.store.get(index, shrink)
@@ -153,7 +153,7 @@ class Frames:
         # A pixel beside a clipped one has some of its light.
         usable = cv2.erode(usable.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
         luminance = np.exp(self.tones.log_radiance(row, ldr)) @ LUMINANCE
-        return Frame(
+        return MatchImage(
             ldr,
             luminance,
             usable,
@@ -163,7 +163,9 @@ class Frames:
         )
 
 
-def alike(a: Frame, b: Frame) -> tuple[UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h2 w2"]]:
+def alike(
+    a: MatchImage, b: MatchImage
+) -> tuple[UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h2 w2"]]:
     """Return two photographs as the longer of their exposures shows them, 8 bits.
 
     What is clipped under that exposure is white in both, so both stay alike everywhere. Dark pairs

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.streams import Stream, generator
-from p2gs_jax.gaussians.init.brightness import Frames, Tones
+from p2gs_jax.gaussians.init.brightness import MatchImages, Tones
 from p2gs_jax.gaussians.init.flow import CHECKS, DepthMap, Flows, depth_map, pixel_centers
 from p2gs_jax.gaussians.init.pairs import neighbours, visibility
 from p2gs_jax.scene.images import ImageStore
@@ -136,7 +136,7 @@ def dense_seeds(
     rows = scene.train_indices
     if len(rows) < FEWEST_VIEWS or limit < 1 or not len(scene.points):
         return _none()
-    frames = Frames(scene, store, match, MATCH_SIDE, cfg.loss.black, cfg.loss.saturation)
+    frames = MatchImages(scene, store, match, MATCH_SIDE, cfg.loss.black, cfg.loss.saturation)
     seen = visibility(scene, cfg.train.seed)
     near = neighbours(scene, seen, match.log_exposures, NEIGHBOURS)
     wanted = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), most_views)).round())
@@ -203,7 +203,7 @@ def _normals(depth: DepthMap, K, y, x) -> Float32[np.ndarray, "c 3"]:
 
 def choose(
     found: list[Candidates],
-    frames: Frames,
+    frames: MatchImages,
     existing: Float[np.ndarray, "p 3"],
     limit: int,
     seed: int,
@@ -242,14 +242,14 @@ def choose(
     )
 
 
-def _world(candidates: Candidates, frames: Frames, pick) -> Float[np.ndarray, "c 3"]:
+def _world(candidates: Candidates, frames: MatchImages, pick) -> Float[np.ndarray, "c 3"]:
     frame = frames[candidates.row]
     xy1 = np.concatenate([candidates.xy[pick], np.ones((len(pick), 1))], 1)
     local = xy1 @ np.linalg.inv(frame.K).T / candidates.inverse[pick, None]
     return (local - frame.viewmat[:3, 3]) @ frame.viewmat[:3, :3]
 
 
-def _draw(found, frames: Frames, existing, tree, cell: float, plain: float):
+def _draw(found, frames: MatchImages, existing, tree, cell: float, plain: float):
     """Return for each view the chosen candidates and their spacing in pixels; and the refused."""
     chosen, refused, drawn = [existing], 0, []
     for candidates in found:
@@ -304,7 +304,7 @@ def _draw(found, frames: Frames, existing, tree, cell: float, plain: float):
     return drawn, refused
 
 
-def _seeds(candidates: Candidates, frames: Frames, pick, spacing):
+def _seeds(candidates: Candidates, frames: MatchImages, pick, spacing):
     """Return points, radiance, scales and quaternions of chosen candidates."""
     frame = frames[candidates.row]
     z = 1 / candidates.inverse[pick]

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from scipy.spatial import KDTree
 
-from p2gs_jax.gaussians.init.brightness import Frame, Frames, alike
+from p2gs_jax.gaussians.init.brightness import MatchImage, MatchImages, alike
 
 # Pixels, at the size that is matched.
 FORWARD_BACKWARD = 1.0
@@ -84,7 +84,7 @@ def pixel_centers(height: int, width: int) -> Float32[np.ndarray, "h w 2"]:
     return np.stack([x, y], -1)
 
 
-def _geometry(a: Frame, b: Frame) -> _Geometry:
+def _geometry(a: MatchImage, b: MatchImage) -> _Geometry:
     height, width = a.luminance.shape
     relative = b.viewmat @ np.linalg.inv(a.viewmat)
     turn = (b.K @ relative[:3, :3] @ np.linalg.inv(a.K)).astype(np.float32)
@@ -94,7 +94,7 @@ def _geometry(a: Frame, b: Frame) -> _Geometry:
     return _Geometry(x * turn[:, 0] + y * turn[:, 1] + turn[:, 2], shift)
 
 
-def guide(frame: Frame, points: Float[np.ndarray, "p 3"]) -> Float32[np.ndarray, "h w"]:
+def guide(frame: MatchImage, points: Float[np.ndarray, "p 3"]) -> Float32[np.ndarray, "h w"]:
     """Return inverse depth interpolated between points that the view sees, to start the flow."""
     height, width = frame.luminance.shape
     local = points @ frame.viewmat[:3, :3].T + frame.viewmat[:3, 3]
@@ -167,7 +167,7 @@ class Flows:
         seen: which training view sees which.
     """
 
-    frames: Frames
+    frames: MatchImages
     points: Float[np.ndarray, "p 3"]
     seen: Bool[np.ndarray, "v p"]
     _kept: tuple = field(init=False, repr=False, compare=False)

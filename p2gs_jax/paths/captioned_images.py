@@ -17,7 +17,7 @@ FONT, SMALLEST_FONT = 1 / 60, 11
 
 
 @dataclass(frozen=True)
-class Row:
+class CaptionedImage:
     """An image with its title.
 
     Attributes:
@@ -46,7 +46,7 @@ def stacked_size(width: int, heights: Sequence[int], captions: int) -> tuple[int
     return width, sum(heights) + (len(heights) + captions) * _line(width)
 
 
-def stacked(rows: Sequence[Row]) -> Float32[np.ndarray, "h w 3"]:
+def stacked(rows: Sequence[CaptionedImage]) -> Float32[np.ndarray, "h w 3"]:
     """Return images of one width below each other, as display values."""
     width = rows[0].image.shape[1]
     captions = sum(bool(row.captions) for row in rows)

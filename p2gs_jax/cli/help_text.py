@@ -46,7 +46,7 @@ def overview(commands: Mapping[str, type], groups: Mapping[str, tuple[str, ...]]
             lines += ["", heading]
         for name in present:
             head = f"  {name}".ljust(indent)
-            lines += _wrapped(summary(commands[name]), head, " " * indent)
+            lines += _wrapped(first_paragraph(commands[name]), head, " " * indent)
     return "\n".join(
         [
             *lines,
@@ -59,7 +59,7 @@ def overview(commands: Mapping[str, type], groups: Mapping[str, tuple[str, ...]]
     )
 
 
-def summary(kind: type) -> str:
+def first_paragraph(kind: type) -> str:
     """Return the first paragraph of an option class's docstring."""
     return _paragraphs(kind)[0]
 
