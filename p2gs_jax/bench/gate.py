@@ -1,4 +1,4 @@
-"""Holding a bench against the committed baseline."""
+"""Comparison of a bench with the committed baseline."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Rows = dict[str, dict[str, float]]
 def values(points: list[Point]) -> Rows:
     """Return per variant what the gate compares.
 
-    The total error shows what the rules leave out; `numerics ...` shows the implementation alone.
+    The total error includes the rules' cutoffs; `numerics ...` is the implementation's own error.
     """
     rows = {}
     for p in points:

@@ -1,4 +1,4 @@
-"""How time and memory grow with Gaussians, pixels, overlap and views."""
+"""Scaling of time and memory with Gaussians, pixels, overlap and views."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ class Curve(NamedTuple):
     """Samples along one axis, and the exponents p of time ~ work^p fitted to them.
 
     Attributes:
-        axis: what grows.
-        held: what stays the same.
+        axis: quantity that grows.
+        held: quantities that stay the same.
         samples: in growing order.
         forward_exponent: least squares in log-log.
         both_exponent: likewise.

@@ -41,7 +41,7 @@ class Timing(NamedTuple):
         implementation: `xla`, `pallas` or `gsplat`.
         forward: milliseconds.
         both: milliseconds, forward and backward.
-        megabytes: temporaries of forward and backward; peak memory for gsplat.
+        megabytes: temporaries of forward and backward; for gsplat, peak memory.
         error: metrics against float64 in the window.
     """
 
@@ -54,7 +54,7 @@ class Timing(NamedTuple):
 
 
 class Work(NamedTuple):
-    """What one view asks of the device, whoever composites it tile by tile.
+    """Work of compositing one view tile by tile, whatever the implementation.
 
     Attributes:
         scene: its name.

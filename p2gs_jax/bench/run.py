@@ -30,7 +30,7 @@ Progress = Callable[[str, int, int], None]
 
 
 def sweep_scene(quick: bool) -> BenchScene:
-    """Return the scene whose knobs are turned: a street, degree 3, about five stops of contrast."""
+    """Return the scene of `speed_error`: a street, degree 3, about five stops of contrast."""
     if quick:
         return street(4000, 256, 144, radius=6.0, degree=3)
     return street(20_000, 640, 360, radius=4.0, spread=1.1, degree=3)

@@ -30,8 +30,8 @@ class Variant:
     """One point of the plot.
 
     Attributes:
-        knob: what is turned.
-        setting: how far.
+        knob: name of the varied option.
+        setting: its value, in words.
         changes: fields of `RenderConfig`.
         storage: precision that parameters are kept in: `float32`, `sh` for bfloat16 spherical
             harmonics, `all` for bfloat16 everything.
@@ -204,7 +204,7 @@ def measure_speed_error(
     repeats: int = 7,
     on_progress: Callable[[str, int, int], None] = lambda stage, done, count: None,
 ) -> list[Point]:
-    """Time every variant and hold it against the float64 truth.
+    """Time every variant and compare it with the float64 truth.
 
     Args:
         scene: what to render.

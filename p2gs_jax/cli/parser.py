@@ -1,4 +1,4 @@
-"""From words to options: the table of commands, and the parser of each."""
+"""The table of commands, and the parser of their options."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ COMMANDS: dict[str, type] = {
     "doctor": Doctor,
     "completion": Completion,
 }
-# How `p2gs-jax --help` lists them: in the order in which a newcomer meets them.
+# The order of `p2gs-jax --help`: as a new user needs them.
 GROUPS: dict[str, tuple[str, ...]] = {
     "First": ("doctor", "demo"),
     "From photographs": ("fit", "calibrate"),
@@ -112,13 +112,13 @@ def _options(name: str, argv: list[str]) -> Any:
 
 
 def _own_options(name: str) -> set[str]:
-    """Return a command's options as they are written, without those of the configuration."""
+    """Return the names of a command's own options, such as `--max-width`."""
     fields = dataclasses.fields(COMMANDS[name])
     return {f"--{field.name.replace('_', '-')}" for field in fields}
 
 
 def _defaults(name: str, argv: list[str]) -> Any:
-    """Return what options are when nothing is said; a preset decides for the configuration."""
+    """Return the defaults of a command's options; those of the configuration are the preset's."""
     if name not in WITH_PRESET:
         return tyro.MISSING_NONPROP
     cfg = named_preset(_preset_name(argv))

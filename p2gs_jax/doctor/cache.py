@@ -1,4 +1,4 @@
-"""Where compiled programs are kept, how many there are, and whether more can be."""
+"""The state of the compile cache."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Cache:
 
 
 def inspect_cache() -> Cache:
-    """Make JAX use the cache, and say how it is; never raises."""
+    """Set up JAX's compile cache and return its state; never raises."""
     try:
         from p2gs_jax.core.compile_cache import MOST_BYTES, cache_folder, use_compile_cache
 

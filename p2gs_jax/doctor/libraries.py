@@ -6,7 +6,7 @@ import importlib
 import importlib.metadata
 from dataclasses import dataclass
 
-# What is imported under another name than it is installed under; pip may write names in lower case.
+# Import names that differ from the distribution's; pip may write names in lower case.
 MODULES = {
     "colour-science": "colour",
     "openexr": "OpenEXR",
@@ -14,7 +14,7 @@ MODULES = {
     "orbax-checkpoint": "orbax.checkpoint",
     "pillow": "PIL",
 }
-# Tried where pip knows nothing of p2gs-jax: a copy that was never installed.
+# Checked where pip has no metadata of p2gs-jax: a copy that was never installed.
 CORE = ("jax", "optax", "optimistix", "equinox", "jaxtyping", "numpy", "tyro", "rich", "pycolmap")
 
 
@@ -25,7 +25,7 @@ class Library:
     Attributes:
         name: as pip knows it.
         version: None where pip does not know it.
-        trouble: why it cannot be used, or None.
+        trouble: the error on import, or a version that is too old; None where it works.
     """
 
     name: str

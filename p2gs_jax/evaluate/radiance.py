@@ -67,7 +67,7 @@ def delta_e_itp(linear, truth, mask: Bool[np.ndarray, "h w"], white: float) -> f
     shown = np.flatnonzero(mask)
     shown = shown[:: max(1, len(shown) // COLOR_PIXELS)]
 
-    # Imported here: it takes seconds to load.
+    # Imported here: colour-science is slow to load.
     import colour
 
     def encoded(x):

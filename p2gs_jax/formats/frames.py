@@ -1,4 +1,4 @@
-"""Rendered frames as files of a folder, or as one video."""
+"""Output frames: rendered pictures as files in a folder, or as one video."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class OutputFrame:
         name: of its files, without suffix; may name subfolders.
         linear: radiance, without exposure.
         alpha: opacity.
-        ldr: what is shown, display values in [0, 1].
+        ldr: display values in [0, 1].
         exposure: e of `ldr`.
         gamma: of `ldr`.
         depth: alpha-weighted, or None.

@@ -1,4 +1,4 @@
-"""`.splat`: 32 bytes a Gaussian, no view dependence; what many web viewers stream.
+"""`.splat`: 32 bytes per Gaussian, no view dependence; the format of many web viewers.
 
 Three float32 of position, three of standard deviations, four bytes of colour and opacity, four of
 the rotation as wxyz * 128 + 128; the most conspicuous Gaussians first. No header. Layout: the

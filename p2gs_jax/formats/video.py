@@ -24,7 +24,7 @@ AddFrame = Callable[[Float32[np.ndarray, "h w 3"]], None]
 
 @contextlib.contextmanager
 def open_video(path: Path, width: int, height: int, fps: float) -> Iterator[AddFrame]:
-    """Yield a function that appends display values in [0, 1]; the file appears when all are there.
+    """Yield a function that appends display values in [0, 1]; the file appears at the end.
 
     Smaller frames are centred on black. The size is rounded down to even numbers, which the codec
     wants. Display values are tagged as BT.709 primaries with the sRGB curve.
@@ -49,7 +49,7 @@ def open_video(path: Path, width: int, height: int, fps: float) -> Iterator[AddF
             "This build of PyAV cannot encode H.264.",
             fix="install the wheel of `av` from PyPI, or write frames into a folder",
         )
-    # The index goes first, so that a browser can start before it has all.
+    # The index comes first, so that browsers can play a file while it loads.
     options = {"movflags": "+faststart"}
     with (
         atomic_write(path) as temporary,

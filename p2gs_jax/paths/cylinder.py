@@ -14,7 +14,7 @@ from p2gs_jax.paths.shots import Shot
 
 # Coverage is judged at this many directions per radian, up to this height (tangent of elevation).
 PROBES, HIGHEST = 2 * 180 / np.pi, 3.0
-# A column counts as covered with this part of the tallest column.
+# A column counts as covered from this share of the tallest column on.
 FULL_COLUMN = 0.75
 
 
@@ -61,7 +61,7 @@ class Cylinder:
 
 
 class Projected(NamedTuple):
-    """Where a pinhole camera sees directions.
+    """Directions projected into a pinhole camera.
 
     Attributes:
         xy: pixels, centres at +0.5.
@@ -125,7 +125,7 @@ def covering(shots: Iterable[Shot], viewmat: Pose) -> Cylinder:
         rows = covered.any(1)
     first, last = np.flatnonzero(rows)[[0, -1]]
     focal = max(float(max(s.K[0, 0], s.K[1, 1])) for s in shots)
-    # Probes stand for their surroundings: one less at every edge is surely covered.
+    # A probe stands for its surroundings: leave one out at every edge.
     cut = 0 if count == around else 1
     top = probe.top + (first + 1) / probe.focal
     bottom = probe.top + last / probe.focal

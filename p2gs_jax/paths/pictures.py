@@ -1,4 +1,4 @@
-"""Pictures of a finished run: from shots, wide ones, and ones that compare it with photographs."""
+"""Pictures of a finished run: of shots, panoramas, and comparisons with photographs."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from p2gs_jax.render.host import make_renderer
 from p2gs_jax.run.read import Run
 from p2gs_jax.scene.images import ImageStore
 
-# Where no camera has seen anything.
+# Display value where no camera sees anything.
 NOTHING = 0.92
-# Photographs are placed by the field's depth, smoothed over this part of the width: its noise would
-# fray their edges.
+# Photographs are placed by the field's depth, smoothed over this part of the width, as noise of the
+# depth would fray their edges.
 SMOOTH = 1 / 80
 
 
 class RunRenderer:
-    """Renders a run and develops what it renders, and knows how long either took.
+    """Renders and develops pictures of a run, and measures the time of both.
 
     Attributes:
         run: the run.
-        render_seconds: of every picture rendered.
-        develop_seconds: of every picture developed.
+        render_seconds: of every rendered picture.
+        develop_seconds: of every developed picture.
     """
 
     def __init__(self, run: Run):
@@ -81,7 +81,7 @@ def shot_frames(
         renderer: renders.
         shots: what to render.
         display_of: how to develop each.
-        photograph: returns what goes beside the render of a view, or None; by default nothing.
+        photograph: returns the photograph to write beside the render of a view, or None.
     """
     for shot in shots:
         linear, alpha, depth = renderer.linear(shot)

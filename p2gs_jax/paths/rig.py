@@ -1,4 +1,4 @@
-"""Cameras that are carried together: which photographs were taken at the same time, and from where.
+"""Rigs: cameras that move together, and which of their photographs were taken at the same time.
 
 Photographs of different cameras belong to the same time step where their file names agree
 (`front/000003.png`, `front_left/000003.png`).
@@ -18,7 +18,7 @@ from p2gs_jax.paths.geometry import Pose, Poses, angles, inverse, mean_pose, rig
 from p2gs_jax.paths.shots import Shot
 from p2gs_jax.types import View
 
-# Median angle by which cameras may turn against each other.
+# Largest median angle between the cameras' relative rotations over time.
 LEAST_RIGID = np.deg2rad(5)
 
 
@@ -96,7 +96,7 @@ def _poses(found: dict[str, Shot], mounts: dict[str, Shot]) -> Poses:
 
 
 def _mounts(cameras: list[str], steps: dict[str, dict[str, Shot]]) -> dict[str, Shot]:
-    """Return the mean place of every camera on the rig."""
+    """Return the mean pose of every camera on the rig."""
     counts = {c: sum(c in found for found in steps.values()) for c in cameras}
     anchor = max(cameras, key=lambda c: counts[c])
     from_anchor: dict[str, Pose] = {}

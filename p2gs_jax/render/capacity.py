@@ -1,7 +1,7 @@
-"""How much room a view gets: allocate outside jit, check for overflow, grow.
+"""Capacities of the static arrays of a view: allocate outside jit, check for overflow, grow.
 
-Time follows what a view needs, memory the room: 54 bytes an entry (BUILD_NOTES, "The kernel"). So
-room is generous and an overflow, which costs a compilation, is rare.
+Time depends on what a view needs, memory on the capacity: 54 bytes per entry (BUILD_NOTES, "The
+kernel"). So capacities are generous, and overflows, which cost a compilation, are rare.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ SMALLEST = 4096
 
 
 def bucket(needed: int, margin: float = 1.0) -> int:
-    """Return the room for `needed`: a power of 1.25, so that few programs exist."""
+    """Return a capacity for `needed`: one of few values, a factor of 1.25 apart."""
     room = SMALLEST
     while room < needed * margin:
         room = int(room * STEP) + 1
@@ -32,11 +32,11 @@ class Room(NamedTuple):
     visible: int
 
     def holds(self, other: Room) -> bool:
-        """Return whether what fits the other fits this."""
+        """Return whether every view that fits the other fits this."""
         return self.entries >= other.entries and self.visible >= other.visible
 
     def grown(self, entries: int, visible: int) -> Room:
-        """Return room for a view that did not fit, with some to spare."""
+        """Return a room for a view that did not fit, with a margin."""
         return Room(
             self.entries if entries <= self.entries else bucket(entries, 1.5),
             self.visible if visible <= self.visible else bucket(visible, 1.2),

@@ -1,4 +1,4 @@
-"""Rendering from the host: allocate outside jit, check for overflow, grow, render again."""
+"""Rendering of single views: allocate outside jit, check for overflow, grow, render again."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def _programs(cfg: RenderConfig):
 
 
 def make_renderer(cfg: RenderConfig) -> RenderView:
-    """Return a function that renders one view exactly, growing its tile lists when it must."""
+    """Return a function that renders one view, and grows its tile lists after an overflow."""
     capacities: dict[tuple[int, int], int] = {}
     render, count = _programs(cfg)
 

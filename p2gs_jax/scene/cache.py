@@ -1,4 +1,4 @@
-"""Results of long computations, kept in a run's folder so that a resume does not repeat them."""
+"""Results of long computations, kept in the run folder for a resume."""
 
 from __future__ import annotations
 

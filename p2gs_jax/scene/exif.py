@@ -1,4 +1,4 @@
-"""The exposure a camera wrote into its file."""
+"""Exposure settings from a photograph's EXIF."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _DEFAULT_ISO = 100.0
 
 @dataclass(frozen=True)
 class Shot:
-    """How a photograph was taken, as far as its EXIF says.
+    """Settings of a photograph, as far as its EXIF has them.
 
     Attributes:
         time: exposure time, seconds.
@@ -34,7 +34,7 @@ class Shot:
 
 
 def read_shot(path: Path) -> Shot:
-    """Return what the EXIF of any image says; broken or absent EXIF says nothing."""
+    """Return the settings in the EXIF of an image; without, or with broken EXIF, all are None."""
     tags = _exif_tags(path)
     isos = (_positive(tags.get(tag)) for tag in _SENSITIVITIES)
     taken = str(tags.get(_TAKEN, "")).strip("\0 ")
@@ -62,7 +62,7 @@ def read_exif_ev(path: Path) -> float | None:
 
 
 def read_exif_camera(path: Path) -> str:
-    """Return make, model and focal length as one string; empty where EXIF says nothing."""
+    """Return make, model and focal length as one string; empty without EXIF."""
     tags = _exif_tags(path)
     parts = (tags.get(tag) for tag in (0x010F, 0x0110, 0x920A))
     return " ".join(str(part).strip("\0 ") for part in parts if part is not None)

@@ -1,4 +1,4 @@
-"""Which points a view sees, judged by the points alone."""
+"""Visibility of points, estimated from the points alone."""
 
 from __future__ import annotations
 
@@ -57,8 +57,8 @@ def unoccluded(
 ) -> Bool[np.ndarray, " p"]:
     """Return which projected points no nearer point hides.
 
-    A coarse depth buffer of the points themselves, its cells as wide as their spacing; sparse
-    foregrounds let some background through, which the robust loss has to bear.
+    A coarse depth buffer of the points themselves, its cells as wide as their spacing. Sparse
+    foregrounds let some background through, an outlier for the robust loss.
     """
     inside = in_frame(xy, z, width, height)
     count = int(inside.sum())

@@ -1,4 +1,4 @@
-"""Rays against a town: what they meet first, what stands in the sun, how open the sky is.
+"""Rays against a town: first hits, shadows, and ambient occlusion.
 
 Loops over short lists of primitives, vectorised over some thousand rays. Arrays are channel-first:
 points and directions are [3 R].
@@ -39,7 +39,7 @@ def nearest_hit(
 def in_shadow(
     town: Town, o: Float[Array, "3 r"], to_sun: np.ndarray, lower: Array, upper: Array
 ) -> Float[Array, " r"]:
-    """Return 1 where a primitive stands between o and the sun.
+    """Return 1 where a primitive lies between o and the sun.
 
     Args:
         town: the scene.

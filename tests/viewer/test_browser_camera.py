@@ -8,6 +8,7 @@ from p2gs_jax.types import Scene, View
 from p2gs_jax.viewer.browser_camera import (
     TYPICAL_DISTANCE,
     ViewerSpace,
+    camera_center,
     camera_of_browser,
     distance_seen,
     fov_that_holds,

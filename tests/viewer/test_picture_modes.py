@@ -16,6 +16,7 @@ from p2gs_jax.viewer.picture_modes import (
     limits_of_depth,
     picture_of,
     split_picture,
+    to_uint8,
     warp_photograph,
 )
 

@@ -49,7 +49,7 @@ def session(run, monkeypatch):
     cache = SimpleNamespace(view_at=lambda camera: 1, nearest_view=lambda camera: 1)
     out._viewed = SimpleNamespace(pose=lambda index, aspect: pose, new_frame_cache=lambda: cache)
     out._render_loop = SimpleNamespace(
-        moved=lambda: None, display_changed=lambda: None, camera=lambda seen, size: None
+        camera_moved=lambda: None, display_changed=lambda: None, camera=lambda seen, size: None
     )
     out._player = SimpleNamespace(stop=lambda: None)
     out._move = lambda pose: None

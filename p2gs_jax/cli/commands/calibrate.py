@@ -80,7 +80,7 @@ def _run_static(folder: Path, out: Path, cfg: FitConfig, compare_with: str | Non
 
 
 def _print_calibration(result: Calibration) -> None:
-    """Print exposures and gammas with their standard errors, and what to make of them."""
+    """Print exposures and gammas with their standard errors, and the notes."""
     console, s, columns = stdout(), result.selection.solution, _columns(result)
     table = Table(title="Exposures in stops from their mean", title_justify="left", box=SIMPLE)
     for name in columns:
@@ -98,7 +98,7 @@ def _print_calibration(result: Calibration) -> None:
 
 
 def _columns(result: Calibration) -> dict[str, list[str]]:
-    """Return the table's columns by title, without those that would say nothing."""
+    """Return the table's columns by title, without those that are empty or constant."""
     s, views = result.selection.solution, result.scene.views
     errors, stated = s.exposure_errors / LN2, result.stated_ev
     known, given = np.isfinite(errors), np.isfinite(stated)

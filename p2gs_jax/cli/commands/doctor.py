@@ -1,4 +1,4 @@
-"""`p2gs-jax doctor`: plain text, since the libraries that draw tables may be what is broken."""
+"""`p2gs-jax doctor`: plain text, as the libraries for tables may be the broken ones."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ if TYPE_CHECKING:  # options need tyro, which may be what is broken
 
 
 def run(options: Doctor) -> int:
-    """Say what works here; 1 where something that everything needs is broken."""
+    """Print what works here; 1 where something that everything needs is broken."""
     return diagnose(as_json=options.json, self_test=not options.skip_self_test)
 
 
 def diagnose(*, as_json: bool, self_test: bool = True) -> int:
-    """Look at everything and print it; never raises.
+    """Examine this machine and print the result; never raises.
 
     Args:
         as_json: print JSON instead of text.
@@ -37,7 +37,7 @@ def diagnose(*, as_json: bool, self_test: bool = True) -> int:
 
 
 def examine(*, self_test: bool = True) -> dict:
-    """Return everything that was found, as plain values.
+    """Return the state of this machine, as plain values.
 
     Args:
         self_test: render three Gaussians as well.

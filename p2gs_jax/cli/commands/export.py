@@ -53,7 +53,7 @@ PLACES: dict[Format, tuple[str, ...]] = {
 
 
 def run(options: Export) -> int:
-    """Write every format that was asked for."""
+    """Write every requested format."""
     check_export(options)
     formats = tuple(dict.fromkeys(options.format))
     if "spz" in formats:
@@ -178,7 +178,7 @@ def _exr(folder: Path, fitted: Run, store: ImageStore, reporter: Reporter) -> st
 
 @dataclass(frozen=True)
 class _Writer:
-    """How a format with display colours is written and read back."""
+    """Writer and reader of a format with display colours."""
 
     write: Callable[[Path, Gaussians], int]
     read: Callable[[Path], Gaussians]
@@ -192,7 +192,7 @@ WRITERS = {
 
 
 class _Display:
-    """Display colours at one display transform, baked once for each degree, and measured."""
+    """Display colours under one display transform, baked once per degree, with their error."""
 
     def __init__(
         self,
@@ -221,7 +221,7 @@ class _Display:
             reporter.stage("Rendering true pictures", done + 1, len(rows))
 
     def write(self, name: Format, folder: Path) -> str:
-        """Write one format and its JSON; return what to say about it."""
+        """Write one format and its JSON; return sentences about it."""
         path, sidecar = (folder / place for place in PLACES[name])
         begin = time.monotonic()
         if name == "display-ply":
@@ -290,7 +290,7 @@ def _spread(rows: Sequence[int]) -> list[int]:
 
 
 def _sentences(error: dict) -> list[str]:
-    """Say how far a viewer's pictures are from the true ones."""
+    """Return sentences on the baking error."""
     said = []
     for split, name in (("train", "training"), ("test", "held-out")):
         s = error[split]

@@ -49,10 +49,10 @@ OTHER_FILES = (".mov", ".avi", ".mkv", ".webm", ".gif", ".png", ".jpg", ".exr", 
 
 @dataclass(frozen=True)
 class Job:
-    """What is to be rendered.
+    """Frames to render.
 
     Attributes:
-        frames: made when they are asked for.
+        frames: rendered one by one as the iterator advances.
         count: of frames.
         size: (width, height) of the largest, pixels.
         shots: cameras that can be kept as a file; none for panoramas.
@@ -109,7 +109,7 @@ def run(options: Render) -> int:
 
 
 def _spent(total: float, reading: float, compiling: float) -> str:
-    """Return in words where the seconds of a command went."""
+    """Return a sentence on the seconds of a command, part by part."""
     frames = max(total - reading - compiling, 0.0)
     kept = " (kept: the next time is faster)" if compiling >= 1.0 else ""
     return (
@@ -119,7 +119,7 @@ def _spent(total: float, reading: float, compiling: float) -> str:
 
 
 def _check_place(out: Path, overwrite: bool) -> None:
-    """Refuse to write over what is there, unless that was asked for."""
+    """Refuse to overwrite files, unless asked to."""
     there = out.is_file() or (out.is_dir() and any(out.iterdir()))
     if there and not overwrite:
         what = f"{out} exists already" if out.is_file() else f"{out} holds files already"
@@ -129,7 +129,7 @@ def _check_place(out: Path, overwrite: bool) -> None:
 
 
 def _median_ms(seconds: list[float]) -> str:
-    """Return the median; the first waited for the compiler and counts only where it is alone."""
+    """Return the median; the first time includes compiling and counts only if it is alone."""
     return f"{1e3 * float(np.median(seconds[1:] or seconds)):.1f} ms"
 
 
@@ -145,7 +145,7 @@ def _default_name(options: Render) -> str:
 
 
 def _check(options: Render) -> None:
-    """Complain about options that make no sense, alone or together, before anything is read."""
+    """Reject options that make no sense, alone or together, before anything is read."""
     path, ev, out = options.path, options.exposure_ev, options.out
     if path not in PATHS and not path.lower().endswith(".json"):
         raise UserError(
@@ -191,7 +191,7 @@ def _check(options: Render) -> None:
 
 
 def _display_transform(fitted: Run, options: Render, shot: Shot | None = None) -> DisplayTransform:
-    """Return how a shot is developed: as the options say, else as it says, else as it was taken."""
+    """Return a shot's display transform: from the options, else its own, else its photograph's."""
     if shot is not None and shot.view is not None:
         transform = fitted.own_display(shot.view)
     else:
@@ -253,7 +253,7 @@ def _shots(
 
 
 class _Photographs:
-    """Photographs that go beside their renders, as far as they are there."""
+    """Photographs to write beside their renders, where they exist."""
 
     def __init__(self, fitted: Run, say: Callable[[str], None]):
         self._fitted, self._say, self._silent = fitted, say, False
@@ -281,7 +281,7 @@ def _recorded(shots: list[Shot], options: Render, fitted: Run) -> list[Shot]:
 
 
 def _panoramas(options: Render, renderer: RunRenderer) -> Job:
-    """Return the job of rendering what all cameras of a rig see."""
+    """Return the job of rendering panoramas of a rig."""
     fitted = renderer.run
     views = fitted.scene.views
     rig = find_rig(view_shots(views, fitted.cfg.data.max_width), views)

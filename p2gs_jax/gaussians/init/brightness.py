@@ -1,4 +1,4 @@
-"""Photographs under one exposure, so that they can be compared pixel by pixel; host side."""
+"""Photographs prepared for matching: radiance and usable pixels; host side."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from p2gs_jax.types import GAMMA_SRGB, Scene
 
 TABLE = 1024
 LUMINANCE = np.array([0.25, 0.6, 0.15], np.float32)
-# MatchImages kept at once: a view, its neighbours, and those of the views that follow.
-FRAMES = 48
-# The brightest pixels may clip in the comparison: a lamp should not leave the rest in the dark.
+# Images kept at once: a view, its neighbours, and those of the next views.
+CACHED = 48
+# Quantile of luminance that becomes white in the comparison: lamps may clip.
 WHITE_QUANTILE = 0.995
 LARGEST_GAIN = 30.0
 ROUNDS = 30
@@ -95,7 +95,7 @@ def rough_tones(tracks: Observations | None, count: int) -> Tones:
 
 @dataclass(frozen=True)
 class MatchImage:
-    """A training view as it is compared.
+    """A training view prepared for matching.
 
     Attributes:
         ldr: photograph.
@@ -136,8 +136,8 @@ class MatchImages:
     _load: object = field(init=False, repr=False, compare=False)
 
     def __post_init__(self):
-        """Keep the last frames."""
-        object.__setattr__(self, "_load", lru_cache(FRAMES)(self._make))
+        """Cache the last images."""
+        object.__setattr__(self, "_load", lru_cache(CACHED)(self._make))
 
     def __getitem__(self, row: int) -> MatchImage:
         """Return a training view by its row."""
@@ -150,7 +150,7 @@ class MatchImages:
         viewmat, K, _, _ = self.store.camera(index, shrink)
         brightest = ldr.max(2)
         usable = (mask > 0) & (brightest < self.saturation) & (brightest > self.black)
-        # A pixel beside a clipped one has some of its light.
+        # Pixels beside clipped ones contain some of their light.
         usable = cv2.erode(usable.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
         luminance = np.exp(self.tones.log_radiance(row, ldr)) @ LUMINANCE
         return MatchImage(

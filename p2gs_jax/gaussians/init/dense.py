@@ -94,7 +94,7 @@ class DenseSeeds:
     views: int = 0
 
     def note(self) -> str:
-        """Say what was accepted and refused, and why."""
+        """Return a sentence on what was accepted and rejected, and why."""
         total, *refused, accepted = (int(c) for c in self.counts)
         total = max(total, 1)
         said = ", ".join(f"{name} {n / total:.0%}" for name, n in zip(CHECKS, refused, strict=True))
@@ -136,12 +136,12 @@ def dense_seeds(
     rows = scene.train_indices
     if len(rows) < FEWEST_VIEWS or limit < 1 or not len(scene.points):
         return _none()
-    frames = MatchImages(scene, store, match, MATCH_SIDE, cfg.loss.black, cfg.loss.saturation)
+    images = MatchImages(scene, store, match, MATCH_SIDE, cfg.loss.black, cfg.loss.saturation)
     seen = visibility(scene, cfg.train.seed)
     near = neighbours(scene, seen, match.log_exposures, NEIGHBOURS)
     wanted = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), most_views)).round())
     wanted = [int(r) for r in wanted if len(near[int(r)]) >= 2]
-    flows = Flows(frames, scene.points, seen)
+    flows = Flows(images, scene.points, seen)
     found: list[Candidates] = []
 
     def one(row: int) -> Candidates:
@@ -153,7 +153,7 @@ def dense_seeds(
             on_view(done + 1, len(wanted))
     if not sum(len(c.xy) for c in found):
         return _none()
-    return choose(found, frames, np.asarray(existing, np.float64), limit, cfg.train.seed)
+    return choose(found, images, np.asarray(existing, np.float64), limit, cfg.train.seed)
 
 
 def _none() -> DenseSeeds:
@@ -162,7 +162,7 @@ def _none() -> DenseSeeds:
 
 
 def _candidates(row: int, near, flows: Flows, color: Tones, seed: int) -> Candidates:
-    frame, depth = flows.frames[row], depth_map(flows, row, near)
+    frame, depth = flows.images[row], depth_map(flows, row, near)
     shown = frame.ldr.mean(2)
     steep = np.hypot(*np.gradient(shown)).astype(np.float32)
     texture = cv2.blur(steep, (9, 9))
@@ -203,7 +203,7 @@ def _normals(depth: DepthMap, K, y, x) -> Float32[np.ndarray, "c 3"]:
 
 def choose(
     found: list[Candidates],
-    frames: MatchImages,
+    images: MatchImages,
     existing: Float[np.ndarray, "p 3"],
     limit: int,
     seed: int,
@@ -212,7 +212,7 @@ def choose(
 
     Args:
         found: candidates of each view.
-        frames: their cameras.
+        images: their cameras.
         existing: seeds that keep their place.
         limit: most seeds to return.
         seed: of the order of views, and of what is left out.
@@ -224,14 +224,14 @@ def choose(
     tree = KDTree(existing) if len(existing) else None
     cell, drawn, refused = float(FINEST_CELL), [], 0
     for _ in range(ATTEMPTS):
-        drawn, refused = _draw(found, frames, existing, tree, cell, plain)
+        drawn, refused = _draw(found, images, existing, tree, cell, plain)
         count = sum(len(pick) for pick, _ in drawn)
         # A few too many are left out at random below.
         few = count < (1 - SLACK) * limit and cell > FINEST_CELL
         if not few and count <= (1 + SLACK) * limit:
             break
         cell = max(cell * float(np.sqrt(max(count, 1) / limit)), float(FINEST_CELL))
-    parts = [_seeds(c, frames, *d) for c, d in zip(found, drawn, strict=True)]
+    parts = [_seeds(c, images, *d) for c, d in zip(found, drawn, strict=True)]
     points, radiance, scales, quats = (
         np.concatenate(p).astype(np.float32) for p in zip(*parts, strict=True)
     )
@@ -242,18 +242,18 @@ def choose(
     )
 
 
-def _world(candidates: Candidates, frames: MatchImages, pick) -> Float[np.ndarray, "c 3"]:
-    frame = frames[candidates.row]
+def _world(candidates: Candidates, images: MatchImages, pick) -> Float[np.ndarray, "c 3"]:
+    frame = images[candidates.row]
     xy1 = np.concatenate([candidates.xy[pick], np.ones((len(pick), 1))], 1)
     local = xy1 @ np.linalg.inv(frame.K).T / candidates.inverse[pick, None]
     return (local - frame.viewmat[:3, 3]) @ frame.viewmat[:3, :3]
 
 
-def _draw(found, frames: MatchImages, existing, tree, cell: float, plain: float):
+def _draw(found, images: MatchImages, existing, tree, cell: float, plain: float):
     """Return for each view the chosen candidates and their spacing in pixels; and the refused."""
     chosen, refused, drawn = [existing], 0, []
     for candidates in found:
-        frame = frames[candidates.row]
+        frame = images[candidates.row]
         height, width = frame.luminance.shape
         xy, z = candidates.xy, 1 / candidates.inverse
         across = int(np.ceil(width / cell)) + 1
@@ -293,7 +293,7 @@ def _draw(found, frames: MatchImages, existing, tree, cell: float, plain: float)
             zs, hit = local[inside, 2][known][hit >= 0], hit[hit >= 0]
             taken[hit[np.abs(zs / z[pick[hit]] - 1) < SAME_DEPTH]] = True
         pick, spacing = pick[~taken], spacing[~taken]
-        points = _world(candidates, frames, pick)
+        points = _world(candidates, images, pick)
         if tree is not None and len(points):
             size = spacing * z[pick] / np.mean(np.diag(frame.K)[:2])
             free = np.asarray(tree.query(points)[0]) > size
@@ -304,9 +304,9 @@ def _draw(found, frames: MatchImages, existing, tree, cell: float, plain: float)
     return drawn, refused
 
 
-def _seeds(candidates: Candidates, frames: MatchImages, pick, spacing):
+def _seeds(candidates: Candidates, images: MatchImages, pick, spacing):
     """Return points, radiance, scales and quaternions of chosen candidates."""
-    frame = frames[candidates.row]
+    frame = images[candidates.row]
     z = 1 / candidates.inverse[pick]
     size = SPREAD * spacing * z / np.mean(np.diag(frame.K)[:2])
     normal = candidates.normals[pick].astype(np.float64)
@@ -331,4 +331,4 @@ def _seeds(candidates: Candidates, frames: MatchImages, pick, spacing):
     scales = size[:, None] * np.stack(
         [np.where(flat, 1 / facing, 1), np.ones_like(size), across], 1
     )
-    return _world(candidates, frames, pick), candidates.radiance[pick], scales, quats
+    return _world(candidates, images, pick), candidates.radiance[pick], scales, quats

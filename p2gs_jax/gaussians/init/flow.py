@@ -39,7 +39,7 @@ FLAT = 0.01
 GUIDES, GUIDE_CELL = 6, 16
 # DIS at full resolution: half the depth error of its preset `medium`, which ends at half of it.
 PATCH, STRIDE, DESCENTS = 8, 4, 16
-# Flows kept: those back serve the neighbours' own depth.
+# Flows kept: those in the other direction serve the neighbours' own depth.
 KEPT_FLOWS = 128
 
 CHECKS = ("unusable", "forward-backward", "epipolar", "parallax", "colour", "third view", "alone")
@@ -162,12 +162,12 @@ class Flows:
     """Flows between training views, computed when asked for; from any thread.
 
     Attributes:
-        frames: the views.
+        images: the views.
         points: that start the flow, scene units.
         seen: which training view sees which.
     """
 
-    frames: MatchImages
+    images: MatchImages
     points: Float[np.ndarray, "p 3"]
     seen: Bool[np.ndarray, "v p"]
     _kept: tuple = field(init=False, repr=False, compare=False)
@@ -182,11 +182,11 @@ class Flows:
         return self._kept[1](i, j)
 
     def _guide(self, i: int):
-        return guide(self.frames[i], self.points[self.seen[i]])
+        return guide(self.images[i], self.points[self.seen[i]])
 
     def _flow(self, i: int, j: int):
-        a, b = self.frames[i], self.frames[j]
-        # In one order, so that there and back see the same pictures.
+        a, b = self.images[i], self.images[j]
+        # Always in one order, so that both directions compare the same pictures.
         first, second = alike(a, b) if i < j else alike(b, a)[::-1]
         here = pixel_centers(*a.luminance.shape)
         return _flow(first, second, _start(_geometry(a, b), self._kept[0](i), here))
@@ -194,7 +194,7 @@ class Flows:
 
 def _match(flows: Flows, i: int, j: int) -> _Pair:
     """Return inverse depth of a view from its flow to another."""
-    a, b = flows.frames[i], flows.frames[j]
+    a, b = flows.images[i], flows.images[j]
     first, second = alike(a, b)
     here, to_b = pixel_centers(*a.luminance.shape), _geometry(a, b)
     forward, backward = flows.between(i, j), flows.between(j, i)
@@ -244,7 +244,7 @@ def depth_map(flows: Flows, row: int, near: Sequence[int]) -> DepthMap:
     third = (agreeing.sum(0) >= 2) & sharp
     smooth, slope, flat, support = plane_fit(fused, third)
     valid = third & (support > SUPPORT)
-    # A pixel is refused by the check that its luckiest neighbour failed.
+    # A rejected pixel counts for the last check that any of its neighbours reached.
     rank = np.arange(5)[:, None, None]
     last = np.max([(rank * np.stack(p.refused)).sum(0) for p in pairs], axis=0)
     refused = [int((~matched & (last == i)).sum()) for i in range(5)]

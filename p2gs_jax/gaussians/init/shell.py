@@ -1,8 +1,8 @@
 """A far shell of Gaussians, where views look past every seed point: sky, hills, far facades.
 
-Seeds mark surfaces. A pixel with no seed anywhere near it has nothing to grow from except distant
-splats stretched over it, so directions that views look into and no seed explains get a Gaussian
-each, far behind the seeds. Scenes whose views are covered by seeds get none.
+Pixels without any seed nearby could only be covered by stretching distant splats over them. So
+directions that views look into, but in which no seed lies, get a Gaussian each, far behind the
+seeds. Scenes whose views are covered by seeds get none.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ CELLS_ACROSS = 16
 COVERED_FRACTION = 0.3
 # Less empty image than this is a gap in the seeds, not a sky.
 EMPTY_IMAGE_FRACTION = 0.04
-# How far the shell stands behind the far seeds.
+# Distance of the shell over that of the far seeds.
 BEHIND_SEEDS = 2.0
 OVERLAP = 0.7
 
