@@ -61,13 +61,6 @@ def exposure_error(
     }
 
 
-def align_scale(linear: Float[np.ndarray, "... 3"], truth: Float[np.ndarray, "... 3"]) -> float:
-    """Return the factor c for which c * linear matches truth best in the median of logarithms."""
-    keep = (linear > 0) & (truth > 0)
-    ratio = np.log(truth[keep].astype(np.float64)) - np.log(linear[keep].astype(np.float64))
-    return float(np.exp(np.median(ratio))) if keep.any() else 1.0
-
-
 @functools.partial(jax.jit, static_argnames="cfg")
 def fit_exposure(
     linear: Float[Array, "h w 3"],

@@ -24,6 +24,7 @@ from jaxtyping import Bool, Float, Float32
 from scipy.sparse import csr_array
 
 from p2gs_jax.config import LossConfig
+from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import inverse_tone_map
 from p2gs_jax.render.warp import sample_bilinear, warp
@@ -97,8 +98,8 @@ def neighbours(scene: Scene, most: int) -> list[tuple[int, int]]:
         if moments[a] == moments[b] and cameras[a] != cameras[b] and shared[a, b] >= FEWEST_SHARED
     ]
     pairs = together or _closest(shared)
-    picks = np.unique(np.linspace(0, len(pairs) - 1, min(most, len(pairs))).round().astype(int))
-    return [(train[pairs[k][0]], train[pairs[k][1]]) for k in picks]
+    picked = [pairs[k] for k in evenly_spaced(len(pairs), most)]
+    return [(train[a], train[b]) for a, b in picked]
 
 
 def _closest(shared: np.ndarray) -> list[tuple[int, int]]:
@@ -122,10 +123,10 @@ def _shared_points(scene: Scene) -> np.ndarray:
         seen = seen.tocsr()[train]
     else:
         rows = []
-        counted = np.linspace(0, len(scene.points) - 1, MOST_COUNTED).round().astype(int)
+        counted = evenly_spaced(len(scene.points), MOST_COUNTED)
         for view in (scene.views[i] for i in train):
             xy, z = project_points(scene.points, view)
-            rows.append(unoccluded(xy, z, view.width, view.height)[np.unique(counted)])
+            rows.append(unoccluded(xy, z, view.width, view.height)[counted])
         seen = csr_array(np.array(rows, np.float32))
     shared = (seen @ seen.T).toarray()
     np.fill_diagonal(shared, 0)

@@ -14,6 +14,7 @@ from jaxtyping import Float32
 
 from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.errors import UserError
+from p2gs_jax.formats.png import to_uint8
 
 # Constant quality: at 16 compression is hardly visible.
 QUALITY = "16"
@@ -74,7 +75,7 @@ def open_video(path: Path, width: int, height: int, fps: float) -> Iterator[AddF
 
 def _codes(ldr: Float32[np.ndarray, "h w 3"], size: tuple[int, int]) -> np.ndarray:
     """Return 8-bit values, centred and cut to the size of the video."""
-    codes = np.rint(np.clip(np.nan_to_num(ldr), 0, 1) * 255).astype(np.uint8)
+    codes = to_uint8(ldr)
     width, height = size
     codes = codes[:height, :width]
     above, before = (height - codes.shape[0]) // 2, (width - codes.shape[1]) // 2

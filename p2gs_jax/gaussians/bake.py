@@ -21,7 +21,7 @@ import optax
 from jaxtyping import Array, Float, UInt8
 
 from p2gs_jax.config import RenderConfig
-from p2gs_jax.core.numerics import on_device
+from p2gs_jax.core.numerics import fibonacci_sphere, on_device
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.render import render_linear, required_capacity
 from p2gs_jax.render.capacity import bucket
@@ -141,7 +141,7 @@ def display_sh(
         activation: of the spherical harmonics.
         degree: of the result; None keeps the radiance's.
     """
-    directions = _sphere(DIRECTIONS)
+    directions = fibonacci_sphere(DIRECTIONS).astype(np.float32)
     axes = tuple(directions.T)
     table = np.stack(_basis(axes, degree_of(sh.shape[1])), 1)
     kept = table if degree is None else table[:, : coefficient_count(degree)]
@@ -158,14 +158,6 @@ def display_sh(
 
 
 _basis = jax.jit(basis, static_argnums=1)
-
-
-def _sphere(count: int) -> Float[np.ndarray, "n 3"]:
-    i = np.arange(count) + 0.5
-    z = 1 - 2 * i / count
-    azimuth = np.pi * (1 + 5**0.5) * i
-    r = np.sqrt(1 - z * z)
-    return np.stack([r * np.cos(azimuth), r * np.sin(azimuth), z], -1).astype(np.float32)
 
 
 def viewer_config(cfg: RenderConfig) -> RenderConfig:

@@ -11,6 +11,8 @@ import numpy as np
 from jaxtyping import Float32
 from PIL import Image, ImageDraw, ImageFont
 
+from p2gs_jax.formats.png import to_uint8
+
 BACKGROUND, INK, FAINT = (255, 255, 255), (30, 30, 30), (120, 120, 120)
 # Sizes as parts of the width, and the smallest font that is still read, pixels.
 FONT, SMALLEST_FONT = 1 / 60, 11
@@ -57,7 +59,7 @@ def stacked(rows: Sequence[CaptionedImage]) -> Float32[np.ndarray, "h w 3"]:
     top = 0
     for row in rows:
         draw.text((2, top + line / 2), row.title, INK, font, anchor="lm")
-        codes = np.rint(np.clip(np.nan_to_num(row.image), 0, 1) * 255).astype(np.uint8)
+        codes = to_uint8(row.image)
         sheet.paste(Image.fromarray(codes), (0, top + line))
         top += line + codes.shape[0]
         for text, start, end in row.captions:

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
+from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.report.run_files import HeldOut, RunFiles, number_at
@@ -71,9 +72,7 @@ def _psnr(scores: dict, files: HeldOut) -> float:
 
 def spread(items: Sequence, most: int) -> list:
     """Return at most `most` items, evenly spaced, the first and the last included."""
-    if len(items) <= most:
-        return list(items)
-    return [items[i] for i in np.linspace(0, len(items) - 1, most).round().astype(int)]
+    return [items[i] for i in evenly_spaced(len(items), most)]
 
 
 def read_png(path: Path) -> Float32[np.ndarray, "h w 3"]:

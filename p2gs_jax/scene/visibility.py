@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import minimum_filter
 
+from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.types import View
 
 # A point is hidden where a nearer one lies within about this many point spacings in the image.
@@ -43,7 +44,7 @@ def shown_share(points: Float[np.ndarray, "p 3"], views: Sequence[View]) -> floa
     """
     if not len(points):
         return 1.0
-    picked = np.linspace(0, len(views) - 1, min(SHARE_VIEWS, len(views))).round().astype(int)
+    picked = evenly_spaced(len(views), SHARE_VIEWS)
     sample = points[:: max(1, len(points) // SHARE_POINTS)]
     shares = []
     for view in (views[i] for i in picked):

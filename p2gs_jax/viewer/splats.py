@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 from scipy.spatial.transform import Rotation
+from scipy.special import expit
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.formats.false_color import false_color
@@ -73,7 +74,7 @@ def browser_splats(
     return BrowserSplats(
         (np.asarray(gaussians.means)[rows] * unit).astype(np.float32),
         (axes @ axes.transpose(0, 2, 1)).astype(np.float32),
-        (1 / (1 + np.exp(-logits)))[:, None].astype(np.float32),
+        expit(logits)[:, None].astype(np.float32),
         np.asarray(jax.jit(partial(view_radiance, cfg=cfg))(gaussians, there))[rows],
     )
 

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.display import develop
 from p2gs_jax.run.read import Run
@@ -65,7 +66,7 @@ class ViewedRun:
         if not len(self._points):
             self._points = np.asarray(run.params.gaussians.means)
         self.space = make_viewer_space(run.scene, self._points)
-        rows = np.unique(np.linspace(0, len(run.scene.views) - 1, PROBES).round().astype(int))
+        rows = evenly_spaced(len(run.scene.views), PROBES)
         self.programs = Programs(
             run.params.gaussians,
             run.alive,

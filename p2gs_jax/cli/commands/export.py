@@ -12,6 +12,7 @@ import numpy as np
 from p2gs_jax.cli.commands.console import stdout
 from p2gs_jax.cli.options.export import DISPLAY, Export, Format, check_export
 from p2gs_jax.core.atomic import atomic_folder, write_array, write_json
+from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.core.progress import Reporter, TerminalReporter
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.colmap_folder import write_colmap_folder
@@ -285,8 +286,7 @@ class _Display:
 
 def _spread(rows: Sequence[int]) -> list[int]:
     """Return at most MEASURED of the rows, evenly spread."""
-    picks = np.linspace(0, len(rows) - 1, min(len(rows), MEASURED)).round().astype(int)
-    return [rows[i] for i in picks]
+    return [rows[i] for i in evenly_spaced(len(rows), MEASURED)]
 
 
 def _sentences(error: dict) -> list[str]:

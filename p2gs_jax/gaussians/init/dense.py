@@ -19,6 +19,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from p2gs_jax.config import FitConfig
+from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.gaussians.init.brightness import MatchImages, Tones
 from p2gs_jax.gaussians.init.flow import CHECKS, DepthMap, Flows, depth_map, pixel_centers
@@ -139,8 +140,7 @@ def dense_seeds(
     images = MatchImages(scene, store, match, MATCH_SIDE, cfg.loss.black, cfg.loss.saturation)
     seen = visibility(scene, cfg.train.seed)
     near = neighbours(scene, seen, match.log_exposures, NEIGHBOURS)
-    wanted = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), most_views)).round())
-    wanted = [int(r) for r in wanted if len(near[int(r)]) >= 2]
+    wanted = [int(r) for r in evenly_spaced(len(rows), most_views) if len(near[r]) >= 2]
     flows = Flows(images, scene.points, seen)
     found: list[Candidates] = []
 
