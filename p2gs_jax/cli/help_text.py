@@ -10,12 +10,10 @@ import textwrap
 from collections.abc import Callable, Mapping
 from contextlib import redirect_stdout, suppress
 from itertools import chain
-from pathlib import Path
 from typing import Any
 
 # Placeholder of the description in tyro's help, replaced by `with_prose`.
 ABOUT = "@about@"
-PLACEHOLDERS = {int: "N", float: "X", str: "TEXT", Path: "PATH"}
 EXAMPLE = "p2gs-jax "
 INDENT = "    "
 

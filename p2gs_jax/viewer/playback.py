@@ -61,11 +61,6 @@ class Player:
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
 
-    @property
-    def playing(self) -> bool:
-        """Whether it plays."""
-        return self._thread is not None and self._thread.is_alive()
-
     def play(self, start: float, last: float, speed: Callable[[], float]) -> None:
         """Play from a place to the last frame, then from the first one, in a loop.
 
