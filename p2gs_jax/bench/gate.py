@@ -6,14 +6,14 @@ import json
 from pathlib import Path
 
 from p2gs_jax.bench.metrics import METRICS
-from p2gs_jax.bench.speed_error import Point
+from p2gs_jax.bench.speed_error import MeasuredVariant
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.errors import UserError
 
 Rows = dict[str, dict[str, float]]
 
 
-def values(points: list[Point]) -> Rows:
+def values(points: list[MeasuredVariant]) -> Rows:
     """Return per variant what the gate compares.
 
     The total error includes the rules' cutoffs; `numerics ...` is the implementation's own error.

@@ -111,7 +111,7 @@ def gate_rows(levels: list[Level]) -> dict[str, dict[str, float]]:
     }
 
 
-def photograph(linear: np.ndarray, scene: BenchScene) -> Batch:
+def photograph_of(linear: np.ndarray, scene: BenchScene) -> Batch:
     """Return a view of the scene at half the exposure, near what a fit compares with."""
     ldr = np.clip(0.5 * linear, 0, 1) ** (1 / 2.2)
     shape = linear.shape[:2]
@@ -152,7 +152,7 @@ def measure_levels(
         linear, step = np.asarray(linear, np.float64), None
         if steps is None or name in steps:
             # Stepping moves the Gaussians a little.
-            step = whole_step(scene, cfg, photograph(linear, scene), bucket(need, 1.2))
+            step = whole_step(scene, cfg, photograph_of(linear, scene), bucket(need, 1.2))
             jobs["step"] = step.run
         times = interleaved(jobs, repeats)
         if step is not None and step.fault():

@@ -92,7 +92,7 @@ VARIANTS = (
 )
 
 
-class Point(NamedTuple):
+class MeasuredVariant(NamedTuple):
     """One measured variant.
 
     Attributes:
@@ -203,7 +203,7 @@ def measure_speed_error(
     *,
     repeats: int = 7,
     on_progress: Callable[[str, int, int], None] = lambda stage, done, count: None,
-) -> list[Point]:
+) -> list[MeasuredVariant]:
     """Time every variant and compare it with the float64 truth.
 
     Args:
@@ -241,7 +241,7 @@ def measure_speed_error(
             rules = untouched and not {"alpha_cutoff", "cutoff_rule"} & {k for k, _ in v.changes}
             ms = {k: times[f"{v.name} {k}"] for k in ("forward", "both")}
             points.append(
-                Point(
+                MeasuredVariant(
                     v,
                     ms,
                     {k: t / times[REFERENCE] for k, t in ms.items()},
@@ -255,7 +255,7 @@ def measure_speed_error(
     return points
 
 
-def front(points: list[Point], time: str = "both", error: str = "gradient") -> list[str]:
+def front(points: list[MeasuredVariant], time: str = "both", error: str = "gradient") -> list[str]:
     """Return the names of the points that no other beats in both time and error."""
     return [
         p.variant.name

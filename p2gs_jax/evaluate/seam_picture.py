@@ -32,7 +32,7 @@ def redeveloped(
     return develop(decoded(ldr, own) / own.exposure, common)
 
 
-class Halves(NamedTuple):
+class SeamPicture(NamedTuple):
     """One picture made of two photographs, with a hard edge in the middle.
 
     Attributes:
@@ -46,12 +46,12 @@ class Halves(NamedTuple):
     left_first: bool
 
 
-def halves(
+def seam_picture(
     first: Photographed,
     second: Photographed,
     common: DisplayTransform,
     render: Callable[[Camera], Render],
-) -> Halves:
+) -> SeamPicture:
     """Warp half of each photograph into a camera halfway between the two.
 
     There is no occlusion test: beside foreground edges the picture repeats the foreground. Pixels
@@ -63,7 +63,7 @@ def halves(
         common: the display transform of "after".
         render: of a camera, with depth.
     """
-    camera = halfway(first.camera, second.camera)
+    camera = camera_between(first.camera, second.camera)
     result = render(camera)
     depth = np.asarray(surface_depth(result, OPAQUE))
     known = depth > 0
@@ -89,10 +89,10 @@ def halves(
     def joined(images: list[np.ndarray]) -> np.ndarray:
         return np.concatenate([images[left][:, :edge], images[right][:, edge:]], 1)
 
-    return Halves(joined(before), joined(after), left_first)
+    return SeamPicture(joined(before), joined(after), left_first)
 
 
-def halfway(first: Camera, second: Camera) -> Camera:
+def camera_between(first: Camera, second: Camera) -> Camera:
     """Return a camera halfway between two, with the size of the first."""
     viewmats = np.stack([np.asarray(c.viewmat, np.float64) for c in (first, second)])
     turns, shifts = viewmats[:, :3, :3], viewmats[:, :3, 3]

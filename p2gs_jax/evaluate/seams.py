@@ -77,7 +77,7 @@ class Seam(NamedTuple):
     pixels: int
 
 
-def neighbours(scene: Scene, most: int) -> list[tuple[int, int]]:
+def neighbouring_pairs(scene: Scene, most: int) -> list[tuple[int, int]]:
     """Return pairs of training views that should show the same surfaces, rows of `scene.views`.
 
     On a rig these are different cameras at the same time: files of the same name in different

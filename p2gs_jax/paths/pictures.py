@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from p2gs_jax.formats.frames import OutputFrame
-from p2gs_jax.paths import Cylinder, Rig, Shot, Step, Wide, render_wide, stitch
+from p2gs_jax.paths import Cylinder, Rig, Shot, TimeStep, Wide, render_wide, stitch
 from p2gs_jax.paths.captioned_images import CaptionedImage, stacked, stacked_size
 from p2gs_jax.paths.cylinder import borders
 from p2gs_jax.paths.geometry import Poses, inverse
@@ -119,7 +119,7 @@ def comparison_size(cylinder: Cylinder) -> tuple[int, int]:
 def comparison_frames(
     renderer: RunRenderer,
     rig: Rig,
-    steps: Sequence[Step],
+    steps: Sequence[TimeStep],
     cylinder: Cylinder,
     transform: DisplayTransform,
     store: ImageStore,

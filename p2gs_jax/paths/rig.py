@@ -23,7 +23,7 @@ LEAST_RIGID = np.deg2rad(5)
 
 
 @dataclass(frozen=True)
-class Step:
+class TimeStep:
     """One time step.
 
     Attributes:
@@ -50,7 +50,7 @@ class Rig:
     """
 
     mounts: dict[str, Shot]
-    steps: tuple[Step, ...]
+    steps: tuple[TimeStep, ...]
 
     @property
     def poses(self) -> Poses:
@@ -86,7 +86,8 @@ def find_rig(shots: Sequence[Shot], views: Sequence[View]) -> Rig:
     return Rig(
         mounts,
         tuple(
-            Step(name, mean_pose(_poses(found, mounts)), found) for name, found in common.items()
+            TimeStep(name, mean_pose(_poses(found, mounts)), found)
+            for name, found in common.items()
         ),
     )
 

@@ -202,7 +202,7 @@ def set_title(axes: Axes, text: str) -> None:
 
 
 @dataclass(frozen=True)
-class Curve:
+class ToneCurve:
     """A tone curve.
 
     Attributes:
@@ -224,7 +224,7 @@ class Curve:
     opacity: float = 1.0
 
 
-def response_chart(curves: Sequence[Curve], *, label: str) -> str:
+def response_chart(curves: Sequence[ToneCurve], *, label: str) -> str:
     """Return tone curves.
 
     Args:

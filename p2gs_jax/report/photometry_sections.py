@@ -19,8 +19,8 @@ from p2gs_jax.report.charts import (
     STATED,
     TRUE,
     ChartPanel,
-    Curve,
     Series,
+    ToneCurve,
     panels_chart,
     response_chart,
 )
@@ -234,11 +234,11 @@ def response_section(run: RunFiles) -> Section:
     curves = []
     low, middle, high = min(gammas), float(np.median(gammas)), max(gammas)
     if high - low > 0.02:
-        curves.append(Curve(f"γ {low:.2f}", _stops(y, low, cfg), y, SECOND, "-."))
-        curves.append(Curve(f"γ {high:.2f}", _stops(y, high, cfg), y, SECOND, ":"))
+        curves.append(ToneCurve(f"γ {low:.2f}", _stops(y, low, cfg), y, SECOND, "-."))
+        curves.append(ToneCurve(f"γ {high:.2f}", _stops(y, high, cfg), y, SECOND, ":"))
     own, standard = _stops(y, middle, cfg), _stops(y, GAMMA_SRGB, srgb)
-    curves.append(Curve("this run", own, y, FIRST, "-", 5.0, 0.45))
-    curves.append(Curve("sRGB", standard, y, INK, (0, (4, 4))))
+    curves.append(ToneCurve("this run", own, y, FIRST, "-", 5.0, 0.45))
+    curves.append(ToneCurve("sRGB", standard, y, INK, (0, (4, 4))))
     same = np.abs(own - standard)[y > 0.05].max()
     said = "How exposed radiance becomes a value in the photograph. "
     if same < 0.01:

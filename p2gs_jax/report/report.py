@@ -61,9 +61,9 @@ def write_report(
     run = read_run(folder, None if scene is None else Path(scene))
     path = folder / "report.html" if out is None else Path(out)
     check_place(path)
-    told = measure_scene(run, reporter, render=render)
+    measured = measure_scene(run, reporter, render=render)
     reporter.stage("Drawing")
-    write_page(path, report_page(run, told))
+    write_page(path, report_page(run, measured))
     return path
 
 

@@ -16,7 +16,7 @@ from p2gs_jax.run.places import find
 
 
 @dataclass(frozen=True)
-class HeldOut:
+class HeldOutFiles:
     """Files of a held-out view.
 
     Attributes:
@@ -58,7 +58,7 @@ class RunFiles:
     metrics: dict[str, Any]
     photometry: PhotometryFile | None
     log: list[dict[str, Any]]
-    held_out: tuple[HeldOut, ...]
+    held_out: tuple[HeldOutFiles, ...]
     missing: tuple[str, ...]
     broken: tuple[str, ...]
 
@@ -177,7 +177,7 @@ def read_log(path: Path, missing: list[str]) -> list[dict[str, Any]]:
     return kept
 
 
-def find_held_out(folder: Path, names: list[str]) -> tuple[HeldOut, ...]:
+def find_held_out(folder: Path, names: list[str]) -> tuple[HeldOutFiles, ...]:
     """Return the held-out views that `fit` wrote.
 
     Args:
@@ -195,7 +195,7 @@ def find_held_out(folder: Path, names: list[str]) -> tuple[HeldOut, ...]:
             continue
         exr = render.with_name(f"{stem}.exr")
         name = whole.get(short, short)
-        out.append(HeldOut(name, photograph, render, exr if exr.is_file() else None))
+        out.append(HeldOutFiles(name, photograph, render, exr if exr.is_file() else None))
     return tuple(out)
 
 

@@ -9,8 +9,8 @@ import numpy as np
 from p2gs_jax.core.progress import Reporter
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.metrics import psnr
-from p2gs_jax.evaluate.seam_picture import Halves, halves
-from p2gs_jax.evaluate.seams import Photographed, Seam, measure_seam, neighbours
+from p2gs_jax.evaluate.seam_picture import SeamPicture, seam_picture
+from p2gs_jax.evaluate.seams import Photographed, Seam, measure_seam, neighbouring_pairs
 from p2gs_jax.photometry.display import develop
 from p2gs_jax.render.host import make_renderer
 from p2gs_jax.render.warp import surface_depth
@@ -62,7 +62,7 @@ class SceneMeasurements:
     seams: tuple[SeamPair, ...] = ()
     tried_pairs: int = 0
     shown: SeamPair | None = None
-    picture: Halves | None = None
+    picture: SeamPicture | None = None
     clipped: dict[str, float] = field(default_factory=dict)
     comparisons: tuple[ViewComparison, ...] = ()
     missing: tuple[str, ...] = ()
@@ -113,7 +113,7 @@ def _rendered(
             "cannot be undone in a photograph."
         )
     else:
-        tried = neighbours(run.scene, MOST_PAIRS)
+        tried = neighbouring_pairs(run.scene, MOST_PAIRS)
         photographed = _Photographs(run, store, render_camera)
         found: dict[tuple[int, int], Seam] = {}
         for done, (i, j) in enumerate(tried):
@@ -129,7 +129,9 @@ def _rendered(
         if widest is not None:
             i, j = widest
             shown = SeamPair(names[i], names[j], found[widest])
-            picture = halves(photographed(i), photographed(j), run.common_display(), render_camera)
+            picture = seam_picture(
+                photographed(i), photographed(j), run.common_display(), render_camera
+            )
     comparisons: list[ViewComparison] = []
     if not files.held_out:
         for index in spread(run.scene.train_indices, MOST_RENDERED):

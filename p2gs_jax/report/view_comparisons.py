@@ -13,7 +13,7 @@ from jaxtyping import Float32
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.exr import read_exr
-from p2gs_jax.report.run_files import HeldOut, RunFiles, number_at
+from p2gs_jax.report.run_files import HeldOutFiles, RunFiles, number_at
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def held_out_comparisons(run: RunFiles, most: int, problems: list[str]) -> list[
     return out
 
 
-def _psnr(scores: dict, files: HeldOut) -> float:
+def _psnr(scores: dict, files: HeldOutFiles) -> float:
     value = number_at(scores, files.name, "psnr")
     return float("inf") if value is None else value
 

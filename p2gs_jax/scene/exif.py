@@ -17,7 +17,7 @@ _DEFAULT_ISO = 100.0
 
 
 @dataclass(frozen=True)
-class Shot:
+class ExifSettings:
     """Settings of a photograph, as far as its EXIF has them.
 
     Attributes:
@@ -33,12 +33,12 @@ class Shot:
     taken: str | None = None
 
 
-def read_shot(path: Path) -> Shot:
+def read_exif_settings(path: Path) -> ExifSettings:
     """Return the settings in the EXIF of an image; without, or with broken EXIF, all are None."""
     tags = _exif_tags(path)
     isos = (_positive(tags.get(tag)) for tag in _SENSITIVITIES)
     taken = str(tags.get(_TAKEN, "")).strip("\0 ")
-    return Shot(
+    return ExifSettings(
         time=_positive(tags.get(_EXPOSURE_TIME)),
         aperture=_positive(tags.get(_F_NUMBER)),
         iso=next((value for value in isos if value not in (None, 65535.0)), None),
@@ -55,7 +55,7 @@ def read_exif_ev(path: Path) -> float | None:
     Args:
         path: any image; broken or absent EXIF gives None, never an error.
     """
-    shot = read_shot(path)
+    shot = read_exif_settings(path)
     if shot.time is None or shot.aperture is None:
         return None
     return math.log2(shot.time * (shot.iso or _DEFAULT_ISO) / shot.aperture**2)

@@ -23,7 +23,7 @@ from p2gs_jax.types import Camera
 from p2gs_jax.viewer.browser_camera import camera_of_browser
 from p2gs_jax.viewer.legend import clipping_legend, depth_legend, note, stops_legend
 from p2gs_jax.viewer.panel import Panel
-from p2gs_jax.viewer.picture_modes import RenderedFrame, to_uint8
+from p2gs_jax.viewer.picture_modes import RenderedFrame, to_uint8_fast
 from p2gs_jax.viewer.render_sizes import (
     FrameTimes,
     Size,
@@ -241,7 +241,7 @@ class RenderLoop:
     def _show(self, settings: Settings, *, sharp: bool) -> None:
         frame = self.frame_cache.frame
         assert frame is not None
-        image = to_uint8(self.frame_cache.develop(settings))
+        image = to_uint8_fast(self.frame_cache.develop(settings))
         self._client.scene.set_background_image(
             image,
             "png" if sharp else "jpeg",

@@ -18,7 +18,7 @@ import viser
 from p2gs_jax.errors import UserError
 from p2gs_jax.run.read import Run
 from p2gs_jax.viewer.render_sizes import compilation_order, full_size, render_sizes
-from p2gs_jax.viewer.session import Session
+from p2gs_jax.viewer.session import BrowserSession
 from p2gs_jax.viewer.viewed_run import ViewedRun
 
 # Canvas of a common browser window: its programs are compiled before any browser connects.
@@ -72,7 +72,7 @@ def open_viewer(run: Run, *, host: str, port: int, max_width: int) -> Iterator[s
         server = viser.ViserServer(
             host=host, port=port, label=f"p2gs-jax: {run.folder.name}", verbose=False
         )
-    sessions: dict[int, Session] = {}
+    sessions: dict[int, BrowserSession] = {}
     try:
         if port not in (0, server.get_port()):
             raise UserError(f"port {port} was taken just now.", fix="choose another with --port")
@@ -92,7 +92,7 @@ def open_viewer(run: Run, *, host: str, port: int, max_width: int) -> Iterator[s
 
 
 def _set_up_server(
-    server: viser.ViserServer, viewed: ViewedRun, sessions: dict[int, Session]
+    server: viser.ViserServer, viewed: ViewedRun, sessions: dict[int, BrowserSession]
 ) -> None:
     """Set the page's theme, the initial camera, and what happens when a browser connects.
 
@@ -112,7 +112,7 @@ def _set_up_server(
 
     @server.on_client_connect
     def _(client: viser.ClientHandle) -> None:
-        session = Session(client, viewed)
+        session = BrowserSession(client, viewed)
         with lock:
             sessions[client.client_id] = session
 

@@ -30,7 +30,7 @@ from p2gs_jax.viewer.viewed_run import ViewedRun
 SLIDER_S = 0.25
 
 
-class Session:
+class BrowserSession:
     """One browser's panel, camera, frusta and render loop."""
 
     def __init__(self, client: viser.ClientHandle, viewed: ViewedRun):

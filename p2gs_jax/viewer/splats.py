@@ -21,7 +21,7 @@ from p2gs_jax.formats.false_color import false_color
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.render import view_radiance
 from p2gs_jax.types import Camera, Gaussians
-from p2gs_jax.viewer.picture_modes import MIDDLE_GREY, to_uint8
+from p2gs_jax.viewer.picture_modes import MIDDLE_GREY, to_uint8_fast
 from p2gs_jax.viewer.settings import Settings
 
 # viser sends covariances as 16-bit floats, at most 65504.
@@ -88,7 +88,7 @@ def splat_colors(
     """
     column = splats.linear[:, None]
     if settings.mode == "stops":
-        return to_uint8(false_color(column, MIDDLE_GREY / transform.exposure))[:, 0]
+        return to_uint8_fast(false_color(column, MIDDLE_GREY / transform.exposure))[:, 0]
     if transform.formation.appearance == "bilateral":
         transform = replace(transform, correction=None)
-    return to_uint8(develop(column, transform))[:, 0]
+    return to_uint8_fast(develop(column, transform))[:, 0]

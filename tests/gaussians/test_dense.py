@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import DataConfig, DensifyConfig, FitConfig, InitConfig, preset
-from p2gs_jax.gaussians.init.brightness import MatchImages, Tones, alike, rough_tones
+from p2gs_jax.gaussians.init.brightness import MatchImages, Tones, at_common_exposure, rough_tones
 from p2gs_jax.gaussians.init.dense import MATCH_SIDE, dense_seeds
 from p2gs_jax.gaussians.init.flow import CHECKS, Flows, depth_map
 from p2gs_jax.gaussians.init.pairs import neighbours, visibility
@@ -224,7 +224,7 @@ def test_pairs_see_the_same_from_different_places(plane):
 def test_photographs_are_alike_under_one_exposure(tmp_path):
     world = World(tmp_path, exposures=[1.0, 1.0, 4.0, 1.0, 1.0], change=lambda k, image: image)
     images = MatchImages(world.scene, world.store, world.tones, MATCH_SIDE, 0.02, 0.98)
-    first, second = alike(images[0], images[2])
+    first, second = at_common_exposure(images[0], images[2])
     assert abs(float(first.mean()) - float(second.mean())) < 6
     assert first.std() > 20
 

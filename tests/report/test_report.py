@@ -12,7 +12,7 @@ import pytest
 from page_tools import copy_run, edit, look_at
 
 from p2gs_jax.cli import main
-from p2gs_jax.evaluate.seam_picture import Halves
+from p2gs_jax.evaluate.seam_picture import SeamPicture
 from p2gs_jax.evaluate.seams import Seam
 from p2gs_jax.report.report import report_page, write_report
 from p2gs_jax.report.run_files import read_run
@@ -63,7 +63,7 @@ def full_scene(files):
         seams=pairs,
         tried_pairs=len(pairs),
         shown=pairs[0],
-        picture=Halves(dark, light, left_first=False),
+        picture=SeamPicture(dark, light, left_first=False),
         clipped={names[0]: 0.5},
     )
 

@@ -16,7 +16,7 @@ from p2gs_jax.viewer.picture_modes import (
     limits_of_depth,
     picture_of,
     split_picture,
-    to_uint8,
+    to_uint8_fast,
     warp_photograph,
 )
 
@@ -149,6 +149,6 @@ def test_masked_pixels_are_not_shown():
 
 def test_codes_are_rounded_and_kept_in_range():
     np.testing.assert_array_equal(
-        to_uint8(np.array([[[0.0, 1.4 / 255, 1.6 / 255], [1.0, 1.2, 0.5]]], np.float32))[0],
+        to_uint8_fast(np.array([[[0.0, 1.4 / 255, 1.6 / 255], [1.0, 1.2, 0.5]]], np.float32))[0],
         [[0, 1, 2], [255, 255, 128]],
     )

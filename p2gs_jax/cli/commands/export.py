@@ -36,7 +36,7 @@ from p2gs_jax.render.host import make_renderer
 from p2gs_jax.render.spherical_harmonics import MAX_DEGREE
 from p2gs_jax.run.read import Run, load_run
 from p2gs_jax.scene.device import camera_of
-from p2gs_jax.scene.exif import read_shot
+from p2gs_jax.scene.exif import read_exif_settings
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Gaussians
 
@@ -171,7 +171,7 @@ def _exr(folder: Path, fitted: Run, store: ImageStore, reporter: Reporter) -> st
                 exposure=transform.exposure,
                 gamma=transform.gamma,
                 camera=camera,
-                shot=read_shot(view.image_path),
+                shot=read_exif_settings(view.image_path),
             )
             reporter.stage("Rendering", index + 1, len(views))
     return f"{len(views)} linear renders"

@@ -163,7 +163,7 @@ class MatchImages:
         )
 
 
-def alike(
+def at_common_exposure(
     a: MatchImage, b: MatchImage
 ) -> tuple[UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h2 w2"]]:
     """Return two photographs as the longer of their exposures shows them, 8 bits.

@@ -40,7 +40,7 @@ FINEST_CELL = 3
 # Standard deviation of a seed over the spacing of seeds, along the surface and across it.
 SPREAD, THICKNESS = 0.6, 0.2
 # Seeds stretch along slanted surfaces at most this much.
-STRETCH = 3.0
+LARGEST_STRETCH = 3.0
 # A cell shows a seed already if that lies within this share of its depth.
 SAME_DEPTH = 0.05
 # Cells with more texture than this share of all are cut in four.
@@ -153,7 +153,7 @@ def dense_seeds(
             on_view(done + 1, len(wanted))
     if not sum(len(c.xy) for c in found):
         return _none()
-    return choose(found, images, np.asarray(existing, np.float64), limit, cfg.train.seed)
+    return choose_seeds(found, images, np.asarray(existing, np.float64), limit, cfg.train.seed)
 
 
 def _none() -> DenseSeeds:
@@ -201,7 +201,7 @@ def _normals(depth: DepthMap, K, y, x) -> Float32[np.ndarray, "c 3"]:
     return np.where(depth.flat[y, x][:, None], n, 0).astype(np.float32)
 
 
-def choose(
+def choose_seeds(
     found: list[Candidates],
     images: MatchImages,
     existing: Float[np.ndarray, "p 3"],
@@ -315,7 +315,7 @@ def _seeds(candidates: Candidates, images: MatchImages, pick, spacing):
     ray = ray @ np.linalg.inv(frame.K).T
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     normal[~flat] = -ray[~flat]
-    facing = np.clip(-(normal * ray).sum(1), 1 / STRETCH, 1)
+    facing = np.clip(-(normal * ray).sum(1), 1 / LARGEST_STRETCH, 1)
     # First axis: down the slope, where a pixel covers more of the surface.
     helper = np.where(np.abs(normal[:, :1]) < 0.7, [[1.0, 0, 0]], [[0, 1.0, 0]])
     down = ray - (ray * normal).sum(1, keepdims=True) * normal

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from scipy.spatial import KDTree
 
-from p2gs_jax.gaussians.init.brightness import MatchImage, MatchImages, alike
+from p2gs_jax.gaussians.init.brightness import MatchImage, MatchImages, at_common_exposure
 
 # Pixels, at the size that is matched.
 FORWARD_BACKWARD = 1.0
@@ -187,7 +187,7 @@ class Flows:
     def _flow(self, i: int, j: int):
         a, b = self.images[i], self.images[j]
         # Always in one order, so that both directions compare the same pictures.
-        first, second = alike(a, b) if i < j else alike(b, a)[::-1]
+        first, second = at_common_exposure(a, b) if i < j else at_common_exposure(b, a)[::-1]
         here = pixel_centers(*a.luminance.shape)
         return _flow(first, second, _start(_geometry(a, b), self._kept[0](i), here))
 
@@ -195,7 +195,7 @@ class Flows:
 def _match(flows: Flows, i: int, j: int) -> _Pair:
     """Return inverse depth of a view from its flow to another."""
     a, b = flows.images[i], flows.images[j]
-    first, second = alike(a, b)
+    first, second = at_common_exposure(a, b)
     here, to_b = pixel_centers(*a.luminance.shape), _geometry(a, b)
     forward, backward = flows.between(i, j), flows.between(j, i)
     match = here + forward
