@@ -171,5 +171,5 @@ def _minification(pull: Float[np.ndarray, "3 3"], size: tuple[int, int]) -> floa
 
 
 def to_uint8_fast(ldr: Float[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Return display values in [0, 1], rounded to 8 bits; ten times as fast as `formats.png`'s."""
+    """Return display values in [0, 1], rounded to 8 bits (cv2: 1 ms for 1920 x 1080, numpy 32)."""
     return cv2.convertScaleAbs(ldr, alpha=255.0)
