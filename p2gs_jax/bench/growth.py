@@ -47,7 +47,7 @@ class GrowthCurve(NamedTuple):
         held: quantities that stay the same.
         samples: in growing order.
         forward_exponent: least squares in log-log.
-        both_exponent: likewise.
+        both_exponent: least squares in log-log, forward and backward.
         last_exponents: slopes between the last two samples, where fixed costs no longer show.
     """
 

@@ -61,7 +61,7 @@ class Work(NamedTuple):
         entries: tile-list entries.
         pairs: entries times pixels of a tile.
         gigaflops: `OPERATIONS` times pairs, forward and with gradients.
-        gigabytes: read and written by compositing, likewise.
+        gigabytes: read and written by compositing, forward and with gradients.
     """
 
     scene: str

@@ -147,7 +147,7 @@ def speed_error_plot(path: Path, points: list[MeasuredVariant], title: str) -> N
 
 
 def _label(axis, points: list[tuple[str, float, float]]) -> None:
-    """Name points, the first ones first, where no other name stands."""
+    """Label points in order, skipping labels that would overlap others."""
     x, y = (np.log([p[i] for p in points]) for i in (1, 2))
     x, y = (a - a.min() for a in (x, y))
     x, y = x / max(x.max(), 1e-9), y / max(y.max(), 1e-9)

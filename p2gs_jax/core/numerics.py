@@ -63,6 +63,6 @@ def fibonacci_sphere(count: int) -> Float[np.ndarray, "n 3"]:
 def on_host(record: Callable[..., Record], *values: Any) -> Record:
     """Return a device record made of host arrays, which a compiled program takes as they are.
 
-    Its annotations say `Array`, as most of its life is on a device.
+    Its annotations are `Array`, as records are mostly on a device.
     """
     return record(*values)

@@ -66,7 +66,7 @@ def installed(name: str) -> str | None:
 
 
 def requirements() -> dict:
-    """Return ranges of versions by distribution; None where the range cannot be told."""
+    """Return ranges of versions by distribution; None where unknown."""
     try:
         from packaging.requirements import Requirement
 

@@ -15,7 +15,7 @@ class Devices:
 
     Attributes:
         backend: `cpu`, `gpu` or another of JAX's; None where it does not start.
-        names: one a device, with its memory where it tells.
+        names: of the devices, with their memory where known.
         rasterizer: implementation of compositing.
         binning: implementation of the tile lists.
         trouble: why JAX does not start, or None.

@@ -142,7 +142,7 @@ def measure_seam(
         first: in whose pixels the two are compared.
         second: its neighbour.
         common: the display transform of "after", and the gamma of "before".
-        cfg: from and up to which values a photograph says something.
+        cfg: display values between which a pixel is used.
     """
     there = warp(jnp.asarray(first.depth), first.camera, jnp.asarray(second.depth), second.camera)
     ldr = sample_bilinear(jnp.asarray(second.ldr), there.xy)

@@ -27,8 +27,8 @@ AddFrame = Callable[[Float32[np.ndarray, "h w 3"]], None]
 def open_video(path: Path, width: int, height: int, fps: float) -> Iterator[AddFrame]:
     """Yield a function that appends display values in [0, 1]; the file appears at the end.
 
-    Smaller frames are centred on black. The size is rounded down to even numbers, which the codec
-    wants. Display values are tagged as BT.709 primaries with the sRGB curve.
+    Smaller frames are centred on black. The size is rounded down to even numbers, as the codec
+    requires. Display values are tagged as BT.709 primaries with the sRGB curve.
 
     Args:
         path: of the .mp4.

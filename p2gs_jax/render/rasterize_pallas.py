@@ -73,7 +73,7 @@ def _longest_first(starts, ends, plan: Plan):
 
 
 class _Tile:
-    """The pixels of one tile, and what an entry's row says about them."""
+    """The pixels of one tile, and an entry's values at them."""
 
     def __init__(self, tile, plan: Plan):
         self.plan = plan

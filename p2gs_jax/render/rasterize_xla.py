@@ -32,7 +32,7 @@ from p2gs_jax.render.segments import cut, merge
 from p2gs_jax.render.tile_rows import DARKEST, GEOMETRY, Plan, geometry_gradient
 from p2gs_jax.render.xla_cpu import materialize
 
-# The backward pass spends more on bookkeeping an iteration and wants more pixels in flight.
+# The backward pass has more overhead per iteration: more pixels in flight are faster.
 BACKWARD_LANE_FACTOR = 2
 PREFIX_GROUP = 8
 

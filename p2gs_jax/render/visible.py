@@ -76,14 +76,14 @@ def _list_in_parallel(seen, blank):
 
 
 def compact(seen: Bool[Array, " n"], room: int) -> tuple[Int[Array, " v"], Int[Array, ""]]:
-    """List what is seen, in order.
+    """Return the indices of set flags, in order.
 
     Args:
         seen: flags.
         room: length of the list.
 
     Returns:
-        Indices, padded with n; and how many there are, which may be more than there is room for.
+        Indices, padded with n; and their number, which may exceed `room`.
     """
     n = seen.shape[0]
     # One more place than `room` receives what does not fit.

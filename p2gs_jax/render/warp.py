@@ -92,7 +92,7 @@ def warp(
     Args:
         depth: of this view, 0 where it shows no surface.
         camera: this view.
-        other_depth: of the other view, likewise.
+        other_depth: of the other view, 0 where it shows no surface.
         other_camera: the other view.
     """
     xy, z = project_points(unproject(depth, camera), other_camera)

@@ -1,4 +1,4 @@
-"""Sections on the cameras: what was modelled and why, exposures, gammas, tone curve."""
+"""Sections on the photometry: model, exposures, gammas, tone curve."""
 
 from __future__ import annotations
 

@@ -110,7 +110,7 @@ def _seam_picture(scene: SceneMeasurements) -> str:
 
 
 def comparison_section(comparisons: Sequence[ViewComparison], total: int) -> Section:
-    """Photographs, renders and what is between them.
+    """Photographs, renders and their differences.
 
     Args:
         comparisons: what to show.

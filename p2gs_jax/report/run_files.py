@@ -39,7 +39,7 @@ class RunFiles:
     Attributes:
         folder: where it lies.
         scene: the scene that it was fitted to: where it lies, or lay.
-        given: what the caller says about that, or None.
+        given: the scene's place as the caller gave it, or None.
         options: `config.json`, nested values.
         cfg: the same as this version reads it, or None where it cannot.
         metrics: `metrics.json`; empty where there is none.

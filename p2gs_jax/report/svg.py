@@ -22,7 +22,7 @@ import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-# Natural widths, CSS pixels; a length in a figure is one pixel where matplotlib says a point.
+# Widths of the charts, CSS pixels; one point of matplotlib is one pixel.
 WIDE, NARROW = 860, 280
 TEXT = 12.0
 NARROW_TEXT = 11.0

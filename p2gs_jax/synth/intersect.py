@@ -46,7 +46,7 @@ def in_shadow(
         o: points, m.
         to_sun: unit vector.
         lower: bounds of the points; primitives whose shadow misses them are skipped.
-        upper: likewise.
+        upper: bounds of the points.
     """
     side = np.cross(to_sun, (0.0, 0.0, 1.0))
     axes = np.stack([side, np.cross(side, to_sun)])  # the plane the sun projects on
@@ -114,7 +114,7 @@ def open_sky(
         p: points, m.
         n: unit normals.
         lower: bounds of the points.
-        upper: likewise.
+        upper: bounds of the points.
     """
     probes = [p + reach * n for reach in _REACH]
     far = p + _CANYON_REACH * n

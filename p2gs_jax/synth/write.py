@@ -46,7 +46,7 @@ FORMAT = "p2gs-jax street, version 2"
 
 @dataclass(frozen=True)
 class StreetTruth:
-    """What was written, one row per photograph, sorted by name.
+    """The true parameters of a data set, one row per photograph, sorted by name.
 
     Attributes:
         root: the scene folder.

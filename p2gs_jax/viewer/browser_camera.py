@@ -140,7 +140,7 @@ def fov_that_holds(K: Float[np.ndarray, "3 3"], width: int, height: int, aspect:
     Args:
         K: of the photograph.
         width: of the photograph, pixels.
-        height: likewise.
+        height: of the photograph, pixels.
         aspect: width / height of the canvas.
     """
     across = max(K[0, 2], width - K[0, 2]) / K[0, 0]

@@ -132,7 +132,7 @@ def serve(run: Run, *, host: str, port: int, max_width: int, say: Callable[[str]
     Args:
         run: what to show.
         host: address to listen on.
-        port: likewise.
+        port: to listen on.
         max_width: widest picture to render, pixels.
         say: prints a line.
 

@@ -123,7 +123,7 @@ class MatchImages:
         store: photographs.
         tones: how they are compared.
         longest: longest side, pixels.
-        black: display values up to here say nothing.
+        black: display values up to here are not used.
         saturation: display values from here on are clipped.
     """
 
@@ -168,8 +168,7 @@ def at_common_exposure(
 ) -> tuple[UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h2 w2"]]:
     """Return two photographs as the longer of their exposures shows them, 8 bits.
 
-    What is clipped under that exposure is white in both, so both stay alike everywhere. Dark pairs
-    are brightened.
+    Pixels clipped under that exposure are white in both. Dark pairs are brightened.
     """
     exposure = np.exp(max(a.log_exposure, b.log_exposure))
     bright = max(float(np.quantile(f.luminance[::4, ::4], WHITE_QUANTILE)) for f in (a, b))

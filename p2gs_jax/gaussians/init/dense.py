@@ -35,7 +35,7 @@ NEIGHBOURS = 5
 # Longest side of the photographs that are matched, pixels.
 MATCH_SIDE = 640
 WORKERS = 2
-# Candidates are kept one in so many pixels each way; no bound wants them denser.
+# Stride of the candidates over pixels, along each axis.
 FINEST_CELL = 3
 # Standard deviation of a seed over the spacing of seeds, along the surface and across it.
 SPREAD, THICKNESS = 0.6, 0.2
@@ -81,7 +81,7 @@ class DenseSeeds:
         radiance: linear, in the gauge of the exposures.
         scales: standard deviations along the axes of `quats`.
         quats: w, x, y, z.
-        counts: pixels looked at; refused by each of `CHECKS`; accepted.
+        counts: pixels in all; refused by each of `CHECKS`; accepted.
         near_existing: seeds dropped in favour of an existing one.
         views: how many views were matched.
     """

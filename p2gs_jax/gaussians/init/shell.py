@@ -79,7 +79,7 @@ def find_shell(
         views: training views.
         points: seed points.
         extent: scene extent, scene units.
-        cfg: how many directions, how far, whether at all.
+        cfg: number of directions, radius, and whether there is a shell.
     """
     if cfg.shell == "off":
         return None
