@@ -25,6 +25,7 @@ OUTSIDE = (
     "CONTRIBUTING.md",
     "experiments/README.md",
     "experiments/RESULTS.md",
+    *sorted(p.relative_to(ROOT).as_posix() for p in (ROOT / "experiments/results").glob("*.md")),
 )
 FENCED = re.compile(r"(^```.*?^```)", re.M | re.S)
 LINK = re.compile(r"(!?)\[([^\]]*)\]\((?!https?:|mailto:|#)([^)\s#]+)(#[^)\s]*)?\)")

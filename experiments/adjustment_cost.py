@@ -28,7 +28,8 @@ def peak_mb() -> float:
 def measure(frames: int, points: int) -> dict[str, float]:
     """Return one row; to be called in a fresh process."""
     from p2gs_jax import exposure_error
-    from p2gs_jax.photometry.solution import fit_model, make_problem
+    from p2gs_jax.photometry.adjustment.fit import fit_model
+    from p2gs_jax.photometry.adjustment.problem import make_problem
     from p2gs_jax.synth.drive import make_drive, make_exposures, observe
 
     drive = make_drive(frames, points)

@@ -19,7 +19,8 @@ import numpy as np
 
 import p2gs_jax
 from p2gs_jax.config import FitConfig
-from p2gs_jax.pipeline.prepare import without_tracks
+from p2gs_jax.pipeline.decide import without_tracks
+from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.sweep.rows import read_row
 
 # Name of the column, column of a sweep's table.
@@ -50,7 +51,8 @@ def variants() -> dict[str, FitConfig]:
     """Return the formulations compared."""
     robust = p2gs_jax.preset("robust")
     photometry = dataclasses.replace(robust.photometry, start="random", start_std=0.0, select=False)
-    learned = without_tracks(dataclasses.replace(robust, photometry=photometry))
+    given = dataclasses.replace(robust, photometry=photometry)
+    learned = without_tracks(Decisions.as_asked(given)).resolve(given)
 
     def reading(form: str, weight: float, correspondence: str = "depth") -> FitConfig:
         relative = dataclasses.replace(

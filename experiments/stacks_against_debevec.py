@@ -18,16 +18,12 @@ import cv2
 import numpy as np
 
 from p2gs_jax.evaluate.alignment import exposure_error
+from p2gs_jax.photometry.adjustment.curve import fit_response
+from p2gs_jax.photometry.adjustment.fit import fit_model
+from p2gs_jax.photometry.adjustment.problem import KnownExposures, make_problem
 from p2gs_jax.photometry.response import Response, log_exposed
-from p2gs_jax.photometry.solution import KnownExposures, fit_model, fit_response, make_problem
-from p2gs_jax.pipeline.calibrate_stack import (
-    PIVOT,
-    SATURATED,
-    StackResult,
-    calibrate_stack,
-    predict,
-    read_stack,
-)
+from p2gs_jax.photometry.sources.stack import SATURATED, read_stack
+from p2gs_jax.pipeline.calibrate_stack import PIVOT, StackResult, calibrate_stack
 
 
 def times_of(folder: Path, names: list[str]) -> np.ndarray:
@@ -39,6 +35,13 @@ def times_of(folder: Path, names: list[str]) -> np.ndarray:
         ev = row.get("rel_exposure_ev")
         values.append(2.0 ** float(ev) if ev else float(row["exposure_time_s"]))
     return np.array(values)
+
+
+def predict(log_exposure: float, log_radiance: np.ndarray, response: Response) -> np.ndarray:
+    """Return display values of points (p, 3) under an exposure."""
+    y = np.linspace(1 / 510, 1, 4096)
+    z = np.maximum.accumulate(log_exposed(y, response)[0])
+    return np.interp(log_exposure + log_radiance, z, y)
 
 
 def without_frame(result: StackResult, frame: int, times: np.ndarray):

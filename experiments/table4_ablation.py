@@ -28,7 +28,8 @@ from towns import (
 )
 
 from p2gs_jax.config import FitConfig, preset
-from p2gs_jax.pipeline.prepare import without_tracks
+from p2gs_jax.pipeline.decide import without_tracks
+from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.sweep import with_fields
 
 # Table 4 of the paper (Waymo): PSNR.
@@ -51,7 +52,8 @@ def variants() -> dict[str, FitConfig]:
         return with_fields(base, {k.replace("__", "."): v for k, v in fields.items()})
 
     every = {f"loss.regularizers.{name}": None for name in REGULARIZERS}
-    learned = without_tracks(with_fields(robust, LEARNED))
+    given = with_fields(robust, LEARNED)
+    learned = without_tracks(Decisions.as_asked(given)).resolve(given)
     return {
         ROBUST: robust,
         "robust, no bundle adjustment": learned,

@@ -27,7 +27,7 @@ from towns import (
 )
 
 from p2gs_jax.config import FitConfig, preset
-from p2gs_jax.photometry.solution import LADDER
+from p2gs_jax.photometry.models import MODELS
 from p2gs_jax.sweep import with_fields
 
 FACTORS = (0.5, 1.0, 1.6, 2.5, 4.0)
@@ -45,7 +45,7 @@ def variants(o: Options) -> dict[str, FitConfig]:
     degrees = {f"SH degree {d}": {"render.sh_degree": d} for d in DEGREES}
     models = {
         f"model: {m.replace('_', ' ')}": {"photometry.select": False, "photometry.model": m}
-        for m in LADDER
+        for m in MODELS
     }
     auto = {AUTO: {"densify.max_gaussians": "auto"}}
     ladders = counts | auto | models | {"model: chosen": {}} | degrees

@@ -243,8 +243,8 @@ class OptimizerConfig:
     """Likewise of their squares (3DGS: 0.999; the rest keeps that)."""
     visible_only: bool = True
     """Update only what a view may show; all other Gaussians and their moments rest (as gsplat's
-    selective Adam; ours: BUILD_NOTES, "Every second counts"). Off: every Gaussian in every step,
-    by momentum where it is not seen (3DGS)."""
+    selective Adam; ours: BUILD_NOTES, "The step costs what a view shows"). Off: every Gaussian in
+    every step, by momentum where it is not seen (3DGS)."""
 
 
 @dataclass(frozen=True)

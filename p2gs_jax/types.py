@@ -310,6 +310,11 @@ class Scene:
         return tuple(i for i, v in enumerate(self.views) if v.split == "train")
 
     @property
+    def training_views(self) -> list[View]:
+        """The views that are fitted, in order."""
+        return [self.views[i] for i in self.train_indices]
+
+    @property
     def test_indices(self) -> tuple[int, ...]:
         """Rows of the held-out views."""
         return tuple(i for i, v in enumerate(self.views) if v.split == "test")

@@ -1,7 +1,7 @@
 """How the process of a command runs JAX on a CPU; programs that import the package decide alone.
 
 Large arrays are made and freed in every step. By default the C library hands each back to the
-system and takes it, page by page, anew: a fifth of a step (BUILD_NOTES, "Every second counts").
+system and takes it, page by page, anew: a fifth of a step (BUILD_NOTES, "Memory is kept").
 """
 
 from __future__ import annotations

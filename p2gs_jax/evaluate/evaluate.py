@@ -29,7 +29,7 @@ from p2gs_jax.evaluate.parallel import map_in_order
 from p2gs_jax.evaluate.radiance import RadianceScores, Truth
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import inverse_tone_map
-from p2gs_jax.photometry.solution import LADDER
+from p2gs_jax.photometry.models import MODELS
 from p2gs_jax.render.host import RenderView
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
@@ -192,7 +192,7 @@ def evaluate(
 
     def with_both(linear, photograph, mask, exposure) -> dict[str, float] | None:
         """Score a held-out view with its exposure and gamma solved, where each view has both."""
-        if LADDER[tone.model].gamma != "view":
+        if MODELS[tone.model].gamma != "view":
             return None
         start = (exposure, mean.gamma)
         both = fit_exposure_and_gamma(linear, photograph, mask, *start, tone, mean_correction)

@@ -2,7 +2,7 @@
 
 SSIM is memory-bound. Its blurs are eleven shifted adds per axis, one colour channel at a time so
 that its maps stay in cache, and its gradient is written out: three more blurs, done while the
-moments are at hand, instead of autodiff through four (BUILD_NOTES, "The step").
+moments are at hand, instead of autodiff through four (BUILD_NOTES, "SSIM").
 """
 
 from __future__ import annotations

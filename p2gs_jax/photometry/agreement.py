@@ -7,9 +7,17 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from p2gs_jax.core.numerics import LN2
+from p2gs_jax.photometry.models import MODELS
+from p2gs_jax.photometry.solution import PhotometricSolution
+
 # A view disagrees when its gap exceeds this, and three standard errors.
 NOTICEABLE_EV = 0.2
 STANDARD_ERRORS = 3.0
+# Linear values at which exposures may be read instead of at the pivot.
+LEVELS = (0.05, 0.1, 0.18, 0.3, 0.5, 0.8)
+# One of them is worth a word where its RMS gap is below this share of the pivot's.
+NOTICEABLE_RMS_SHARE = 0.8
 
 
 class Agreement(NamedTuple):
@@ -87,3 +95,32 @@ def compare(
         gap,
         disagrees & both,
     )
+
+
+def note_on_levels(
+    solution: PhotometricSolution,
+    stated_ev: Float[np.ndarray, " v"],
+    agreement: Agreement,
+    pivot: float,
+) -> list[str]:
+    """Say at which level stated exposures agree best, where gammas make them depend on it.
+
+    Args:
+        solution: exposures and gammas.
+        stated_ev: stops up to a constant; NaN where unknown.
+        agreement: of the two at the pivot.
+        pivot: linear value that gammas leave alone.
+    """
+    if MODELS[solution.model].gamma is None or agreement.views < 3:
+        return []
+    errors_ev = solution.exposure_errors / LN2
+    options = {x: compare(solution.exposures_ev_at(x, pivot), errors_ev, stated_ev) for x in LEVELS}
+    level = min(options, key=lambda x: options[x].rms_ev)
+    best = options[level]
+    if not best.rms_ev < NOTICEABLE_RMS_SHARE * agreement.rms_ev:
+        return []
+    return [
+        f"Read at a linear value of {level:g} instead of {pivot:g}, correlation is "
+        f"{best.correlation:.3f}, slope {best.slope:.2f}, RMS {best.rms_ev:.2f} EV: the cameras "
+        "did not only change exposure, they also moved other tones against it."
+    ]

@@ -1,8 +1,7 @@
-"""Colours of the same surface points in several views, in rows for the bundle adjustment."""
+"""Colours of the same surface points in several views: what all of photometry starts from."""
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,9 +10,11 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import connected_components
 
 from p2gs_jax.core.streams import Stream, generator
-from p2gs_jax.photometry.response import Response, deviation, hat, log_exposed
+from p2gs_jax.photometry.response import Response, deviation, log_exposed
 
-LONGEST_ROW = 16
+# Sources sample a point in its coarsest view, which is at most this many times coarser than its
+# finest: what is still farther away mixes in neighbours (BUILD_NOTES).
+COARSEST = 4.0
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class Observations:
         view_count: number of views.
         point_count: number of points.
         cameras: physical camera of each view, 0, 1, ...
-        too_coarse: observations of these points that were left out for their scale.
+        too_coarse: observations of these points that were left out for their scale (`COARSEST`).
         names: what people call the views; their rows if empty.
     """
 
@@ -88,120 +89,46 @@ class Observations:
         return kept[self.points]
 
 
-@dataclass(frozen=True)
-class Rows:
-    """Observations by row: one point each, or a part of a point that many views saw.
-
-    Attributes:
-        views: row of the view.
-        row: which row an observation belongs to.
-        z: log exposed radiance under the base curve, relative to the pivot.
-        sigma: its standard deviation.
-        weight: 1 used, 0 masked or held out.
-        knot: left spline knot.
-        fraction: of the way to the next knot.
-        slope: dz/dy under the base curve.
-        by_row: sums observations over their rows.
-        layout: the same observations in the order of their rows, and the pairs of them.
-        count: number of rows.
-        view_count: number of views.
-    """
-
-    views: Int[np.ndarray, " o"]
-    row: Int[np.ndarray, " o"]
-    z: Float[np.ndarray, "o 3"]
-    sigma: Float[np.ndarray, "o 3"]
-    weight: Float[np.ndarray, "o 3"]
-    knot: Int[np.ndarray, "o 3"]
-    fraction: Float[np.ndarray, "o 3"]
-    slope: Float[np.ndarray, "o 3"]
-    by_row: sp.csr_array
-    layout: Layout
-    count: int
-    view_count: int
-
-
-class Layout:
-    """Which row each observation belongs to.
-
-    Tracks longer than `slots` are split into interleaved rows with a radiance of their own each,
-    which loses a few degrees of freedom and bounds the number of pairs.
-
-    Attributes:
-        slots: longest row.
-        row: of each observation.
-        rows: their number.
-        point_of_row: the point of each row.
-        by_row: sums observations over their rows.
-        order: observations sorted by row.
-    """
-
-    def __init__(self, observations: Observations):
-        points = np.asarray(observations.points)
-        lengths = np.bincount(points, minlength=observations.point_count)
-        used = lengths[lengths > 0]
-        typical = int(np.quantile(used, 0.9)) if len(used) else 2
-        self.slots = int(min(LONGEST_ROW, max(2, 2 ** int(np.ceil(np.log2(max(typical, 2)))))))
-        split = -(-lengths // self.slots)
-        first = np.concatenate([[0], np.cumsum(split)])
-        order = np.argsort(points, kind="stable")
-        starts = np.concatenate([[0], np.cumsum(lengths)])
-        rank = np.empty(len(points), int)
-        rank[order] = np.arange(len(points)) - starts[points[order]]
-        self.row = first[points] + rank % np.maximum(split[points], 1)
-        self.rows = int(first[-1])
-        self.point_of_row = np.repeat(np.arange(observations.point_count), split)
-        count = len(points)
-        self.by_row = sp.csr_array(
-            (np.ones(count), (self.row, np.arange(count))), shape=(self.rows, count)
-        )
-        self.order = np.argsort(self.row, kind="stable")
-
-    @functools.cached_property
-    def pairs(self) -> tuple[Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"]]:
-        """Every pair of observations in a row once, themselves included: places in `order`."""
-        return _pairs(self.row[self.order])
-
-
-def _pairs(row: Int[np.ndarray, " o"]):
-    """Return every pair of equal entries of a sorted array once, each with itself included."""
-    here = np.arange(len(row))
-    # Every entry with itself and those behind it that equal it.
-    behind = np.searchsorted(row, row, side="right") - here
-    first = np.repeat(here, behind)
-    offset = np.arange(len(first)) - np.repeat(np.cumsum(behind) - behind, behind)
-    return first, first + offset
-
-
-def make_rows(
-    observations: Observations,
-    layout: Layout,
-    weight: Float[np.ndarray, "o 3"],
-    response: Response,
-    log_pivot: float,
-) -> Rows:
-    """Return rows under one response.
+def sample_pairs(
+    observations: Observations, count: int, seed: int
+) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
+    """Draw pairs of observations of the same point in different views.
 
     Args:
-        observations: the colours.
-        layout: of these observations.
-        weight: 1 used, 0 not.
-        response: what decodes the colours.
-        log_pivot: log of the linear value that gamma leaves alone.
+        observations: of points; those seen once are in no pair.
+        count: number of pairs, drawn with replacement.
+        seed: of the draws.
+
+    Returns:
+        Rows of `observations`: the first of each pair, the second; none where no point is shared.
     """
-    z, sigma, slope = observations.decoded(response)
-    knot, fraction = hat(np.asarray(observations.colors, np.float64))
-    return Rows(
-        views=np.asarray(observations.views),
-        row=layout.row,
-        z=z - log_pivot,
-        sigma=sigma,
-        weight=np.asarray(weight, np.float64),
-        knot=knot,
-        fraction=fraction,
-        slope=slope,
-        by_row=layout.by_row,
-        layout=layout,
-        count=layout.rows,
-        view_count=observations.view_count,
-    )
+    order = np.argsort(observations.points, kind="stable")
+    bounds = np.flatnonzero(np.diff(observations.points[order], prepend=-1, append=-1))
+    lengths = np.diff(bounds)
+    starts, lengths = bounds[:-1][lengths >= 2], lengths[lengths >= 2]
+    if not len(starts):
+        return np.zeros(0, int), np.zeros(0, int)
+    rng = generator(seed, Stream.COLOR_PAIRS)
+    pick = rng.integers(0, len(starts), count)
+    first = rng.integers(0, lengths[pick])
+    second = (first + rng.integers(1, lengths[pick])) % lengths[pick]
+    return order[starts[pick] + first], order[starts[pick] + second]
+
+
+def overlapping_views(observations: Observations, fewest: int) -> list[Int[np.ndarray, " k"]]:
+    """Return for every view the others that share at least `fewest` points with it.
+
+    A view that shares fewer with all of them keeps the one it shares most with, if any.
+
+    Args:
+        observations: of shared points.
+        fewest: points.
+    """
+    ones = np.ones(len(observations.views), np.float32)
+    shape = (observations.view_count, observations.point_count)
+    seen = sp.csr_array((ones, (observations.views, observations.points)), shape=shape)
+    seen.data[:] = 1
+    shared = (seen @ seen.T).toarray()
+    np.fill_diagonal(shared, 0)
+    enough = np.minimum(fewest, np.maximum(shared.max(1, initial=0), 1))
+    return [np.flatnonzero(row >= least) for row, least in zip(shared, enough, strict=True)]

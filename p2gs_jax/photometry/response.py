@@ -1,7 +1,7 @@
 """From photographed values to log exposed radiance, with its uncertainty: z = F(y).
 
-F is the logarithm of a base curve's decoding, optionally bent by a spline: F(y) = log base^-1(y) +
-B(y) c, with hat functions B over fixed knots. Host side, float64.
+F is the logarithm of a base curve's decoding, optionally changed by a spline: F(y) = log base^-1(y)
++ B(y) c, with hat functions B over fixed knots. Host side, float64.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ DARKEST = 0.5 / 255
 # Noise model: 8-bit quantisation, photon and read noise (linear units), and a floor in log units
 # for what no model explains: texture, specularity, interpolation.
 SHOT_NOISE, READ_NOISE, FLOOR = 2e-4, 1e-6, 0.03
-# A bent curve may be at most this much flatter than its base, so that noise stays finite.
+# A curve with a spline may be at most this much flatter than its base, so that noise stays finite.
 SMALLEST_SLOPE = 0.2
 
 
@@ -36,7 +36,7 @@ class Response:
     """A camera's response.
 
     Attributes:
-        base: curve that the spline bends.
+        base: curve that the spline is added to.
         spline: values of log exposure added at `KNOTS`, or None.
     """
 
@@ -85,8 +85,8 @@ def log_exposed(y: Float[np.ndarray, "..."], response: Response):
         c = np.asarray(response.spline)
         left, t = hat(y)
         z = z + (1 - t) * c[left] + t * c[left + 1]
-        bent = slope + (c[left + 1] - c[left]) / (KNOTS[left + 1] - KNOTS[left])
-        slope = np.maximum(bent, SMALLEST_SLOPE * slope)
+        steeper = (c[left + 1] - c[left]) / (KNOTS[left + 1] - KNOTS[left])
+        slope = np.maximum(slope + steeper, SMALLEST_SLOPE * slope)
     return z, slope
 
 

@@ -13,21 +13,21 @@ import jax
 import numpy as np
 
 from p2gs_jax.config import FitConfig, require_config
-from p2gs_jax.config import to_dict as config_to_dict
-from p2gs_jax.core.atomic import no_empty_folders, write_json
+from p2gs_jax.core.atomic import no_empty_folders
 from p2gs_jax.core.clock import CompileCounter, Stopwatch
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
-from p2gs_jax.evaluate.lpips import LpipsWeights
 from p2gs_jax.photometry.gauge import recentre
 from p2gs_jax.photometry.selection import Selection
-from p2gs_jax.pipeline.finish import finish
+from p2gs_jax.pipeline.decide import kept_choice
+from p2gs_jax.pipeline.finish import Account, finish
 from p2gs_jax.pipeline.preflight import Paths, check_scene, preflight
 from p2gs_jax.pipeline.prepare import Expected, Prepared, load, prepare
+from p2gs_jax.pipeline.reserve import seconds_to_finish
 from p2gs_jax.run.checkpoint import CheckpointStore
-from p2gs_jax.run.places import remembered
-from p2gs_jax.scene.images import size_at
-from p2gs_jax.train import decisions
+from p2gs_jax.run.decisions import Decisions
+from p2gs_jax.run.layout import RunFolder
+from p2gs_jax.run.write import write_start
 from p2gs_jax.train.loop import Trainer, TrainResult
 from p2gs_jax.train.programs import StepPrograms
 from p2gs_jax.train.views import TrainingViews
@@ -36,8 +36,7 @@ from p2gs_jax.types import Params, Scene
 
 def optimise(
     prepared: Prepared,
-    run_dir: Path,
-    cfg: FitConfig,
+    folder: RunFolder,
     reporter: Reporter,
     programs: StepPrograms,
     *,
@@ -50,8 +49,7 @@ def optimise(
 
     Args:
         prepared: from `prepare`.
-        run_dir: where the log and checkpoints go.
-        cfg: everything.
+        folder: of the run: where the log and checkpoints go.
         reporter: receives progress.
         programs: compiled steps, some of them perhaps begun.
         resume: continue from the newest checkpoint.
@@ -59,6 +57,7 @@ def optimise(
         spent_s: seconds of the budget that are already gone.
         reserve_s: seconds of the budget to keep for evaluation and files.
     """
+    cfg = prepared.cfg
     views = TrainingViews(
         prepared.store, prepared.scene.train_indices, cfg.train.seed, prepared.overlaps
     )
@@ -73,22 +72,31 @@ def optimise(
         prepared.extent,
         prepared.pairs,
         prepared.coverage,
-        run_dir,
+        folder.root,
         programs,
+        prepared.decisions,
         on_log=reporter.log,
         on_message=say,
         validation=validation,
         own_exposures=prepared.selection is not None,
-        reasons=() if prepared.selection is None else prepared.selection.reasons,
     )
     alive = np.ones(prepared.params.gaussians.capacity, bool)
     return trainer.run(prepared.params, alive, resume=resume, spent_s=spent_s, finish_s=reserve_s)
 
 
-def _begin(programs: StepPrograms, known: Expected, scene: Scene, run_dir: Path) -> None:
+def _begin(programs: StepPrograms, known: Expected, scene: Scene, folder: RunFolder) -> None:
     """Begin to compile steps while the exposures are solved, mostly on one core."""
     views = TrainingViews(known.store, scene.train_indices, known.cfg.train.seed)
-    trainer = Trainer(known.cfg, views, known.extent, None, known.coverage, run_dir, programs)
+    trainer = Trainer(
+        known.cfg,
+        views,
+        known.extent,
+        None,
+        known.coverage,
+        folder.root,
+        programs,
+        known.decisions,
+    )
     trainer.expect(known.params, known.images)
 
 
@@ -110,6 +118,7 @@ class FitResult:
         metrics: what `metrics.json` holds.
         run_dir: the run folder.
         selection: what the bundle adjustment found, or None.
+        decisions: what the scene settled.
     """
 
     params: Params
@@ -117,6 +126,7 @@ class FitResult:
     metrics: dict
     run_dir: Path
     selection: Selection | None
+    decisions: Decisions
 
 
 def fit(
@@ -148,55 +158,43 @@ def fit(
     cfg = require_config(cfg)
     reporter = reporter or Silent()
     paths = Paths(Path(scene_dir), Path(run_dir), None if reference is None else Path(reference))
-    scene_dir, run_dir = paths.scene, paths.run
+    folder = RunFolder(paths.run)
     begin = time.monotonic() - spent_s
     clock, compiler = Stopwatch(), CompileCounter()
     lpips_weights = preflight(cfg, paths, resume=resume)
-    with no_empty_folders(run_dir):
+    with no_empty_folders(paths.run):
         reading = time.monotonic()
-        scene = load(scene_dir, run_dir, cfg, reporter)
+        scene = load(paths.scene, paths.run, cfg, reporter)
         # Without a model, nearly all of it is finding and matching features.
         found = scene.format in ("images", "transforms")
         clock.add("structure_from_motion" if found else "reading", time.monotonic() - reading)
         views = check_scene(scene, cfg, paths, lpips_weights)
-    truth, given = views.truth, cfg
-    reasons: tuple[str, ...] = ()
-    if resume:
-        cfg, reasons = decisions.kept(cfg, run_dir)
-    programs = StepPrograms()
-    with contextlib.closing(programs):
+    with contextlib.closing(StepPrograms()) as programs:
         prepared = prepare(
             scene,
             cfg,
             reporter,
             clock,
-            lambda known: _begin(programs, known, scene, run_dir),
-            reasons=reasons,
+            lambda known: _begin(programs, known, scene, folder),
+            kept=kept_choice(cfg, folder) if resume else None,
         )
-        cfg = prepared.cfg
-        with _lock(paths, given):
+        with _lock(folder, paths, cfg, prepared.decisions):
             result = optimise(
                 prepared,
-                run_dir,
-                cfg,
+                folder,
                 reporter,
                 programs,
                 resume=resume,
                 validation=views.validation,
                 spent_s=time.monotonic() - begin,
-                reserve_s=_finish_estimate(scene, cfg, lpips_weights, truth is not None),
+                reserve_s=seconds_to_finish(
+                    scene, cfg, lpips_weights, reference=views.truth is not None
+                ),
             )
     params = compact(result)
     if cfg.photometry.parameterization == "log" and cfg.photometry.known is None:
         params = recentre(params, cfg.render.radiance)
-    metrics = finish(
-        params,
-        prepared,
-        run_dir,
-        cfg,
-        reporter,
-        truth=truth,
-        lpips_weights=lpips_weights,
+    account = Account(
         counts={
             "gaussians": params.gaussians.capacity,
             "seed_points": len(scene.points),
@@ -206,7 +204,6 @@ def fit(
             "refused_densifications": result.host.refused,
             "tile_lists_grown": result.host.overflows,
         },
-        growth=result.growth,
         seconds={
             **({"starting": spent_s} if spent_s else {}),
             **clock.seconds,
@@ -215,60 +212,34 @@ def fit(
             "optimisation": result.host.elapsed_s,
         },
         compiler=compiler,
+        growth=result.growth,
+    )
+    metrics = finish(
+        params,
+        prepared,
+        folder,
+        account,
+        reporter,
+        truth=views.truth,
+        lpips_weights=lpips_weights,
         true_ev=None
         if true_exposures is None
-        else np.log2([true_exposures[scene.views[i].name] for i in scene.train_indices]),
+        else np.log2([true_exposures[view.name] for view in scene.training_views]),
     )
-    return FitResult(params, scene, metrics, run_dir, prepared.selection)
+    return FitResult(params, scene, metrics, paths.run, prepared.selection, prepared.decisions)
 
 
 @contextlib.contextmanager
-def _lock(paths: Paths, cfg: FitConfig) -> Iterator[None]:
+def _lock(folder: RunFolder, paths: Paths, cfg: FitConfig, decisions: Decisions) -> Iterator[None]:
     """Make the folder a run's while its steps are taken, and keep it where they left something.
 
     A run that failed before its first checkpoint leaves nothing to continue or to overwrite.
-
-    Args:
-        paths: of the fit.
-        cfg: as the user gave it.
     """
-    path = paths.run / "config.json"
-    write_json(
-        path,
-        {
-            **remembered("scene", paths.scene, paths.run),
-            **remembered("reference", paths.reference, paths.run),
-            "fit": config_to_dict(cfg),
-        },
-    )
+    write_start(folder, paths.scene, paths.reference, cfg, decisions)
     try:
         yield
     except UserError:
-        if CheckpointStore(paths.run / "checkpoints").latest_step() is None:
-            path.unlink(missing_ok=True)
+        if CheckpointStore(folder.checkpoints).latest_step() is None:
+            for path in (folder.config, folder.decisions):
+                path.unlink(missing_ok=True)
         raise
-
-
-def _finish_estimate(
-    scene: Scene, cfg: FitConfig, lpips_weights: LpipsWeights | None, reference: bool
-) -> float:
-    """Return a guess of the seconds that evaluation and files will take.
-
-    Args:
-        scene: its views are judged.
-        cfg: their size, and the budget, of which a quarter at most is kept.
-        lpips_weights: whether LPIPS is computed, and on which network.
-        reference: whether each view is compared with a reference photograph as well.
-    """
-    if cfg.train.budget_s is None:
-        return 0.0
-    pixels = 0
-    for view in scene.views:
-        width, height = size_at(view, cfg.data.max_width)
-        pixels += width * height
-    # Measured (BUILD_NOTES, "Smaller things"): programs, then every view, and every pixel.
-    per_view, per_pixel = (0.13, 0.35e-6) if reference else (0.09, 0.25e-6)
-    if lpips_weights is not None:
-        # Under two protocols, and three more against a reference.
-        per_pixel += (5 if reference else 2) * lpips_weights.network.seconds_per_pixel
-    return min(6.0 + per_view * len(scene.views) + per_pixel * pixels, 0.25 * cfg.train.budget_s)

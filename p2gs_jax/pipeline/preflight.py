@@ -14,8 +14,9 @@ from p2gs_jax.core.atomic import plain
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.lpips import LpipsWeights
 from p2gs_jax.evaluate.lpips_weights import read_lpips_weights
+from p2gs_jax.evaluate.references import Reference, check_reference, load_reference
 from p2gs_jax.losses.total import SECOND_RENDER_FORMS
-from p2gs_jax.pipeline.finish import Reference, check_reference, load_reference
+from p2gs_jax.run.layout import RunFolder
 from p2gs_jax.scene.images import size_at
 from p2gs_jax.scene.known_exposures import check_source, read_known_exposures
 from p2gs_jax.train.growth import check_method
@@ -90,7 +91,7 @@ def check_scene(
     Raises:
         UserError: the options do not suit the views.
     """
-    training = [scene.views[i] for i in scene.train_indices]
+    training = scene.training_views
     if lpips_weights is not None:
         lpips_weights.require_sizes(scene.views, cfg.data.max_width)
     if cfg.photometry.known is not None:
@@ -166,7 +167,7 @@ def check_run_dir(run_dir: Path, resume: bool, cfg: FitConfig) -> None:
     """
     if run_dir.exists() and not run_dir.is_dir():
         raise UserError(f"{run_dir} is a file.", fix="name a folder with --out")
-    path = run_dir / "config.json"
+    path = RunFolder(run_dir).config
     if not path.exists():
         return
     if not resume:

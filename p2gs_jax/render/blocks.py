@@ -2,7 +2,7 @@
 
 Their list has a static length and a dynamic count. The time of a loop over blocks follows the
 count, and a block fits a core's cache: gathering 48 spherical-harmonics coefficients of 57k
-Gaussians at once took as long as projecting them (BUILD_NOTES, "Every second counts").
+Gaussians at once took as long as projecting them (BUILD_NOTES, "The step costs what a view shows").
 """
 
 from __future__ import annotations

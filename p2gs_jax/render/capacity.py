@@ -1,7 +1,7 @@
 """Capacities of the static arrays of a view: allocate outside jit, check for overflow, grow.
 
-Time depends on what a view needs, memory on the capacity: 54 bytes per entry (BUILD_NOTES, "The
-kernel"). So capacities are generous, and overflows, which cost a compilation, are rare.
+Time depends on what a view needs, memory on the capacity: 54 bytes per entry (BUILD_NOTES, "Growth
+and memory"). So capacities are generous, and overflows, which cost a compilation, are rare.
 """
 
 from __future__ import annotations

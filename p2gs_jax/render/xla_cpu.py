@@ -1,4 +1,4 @@
-"""Idioms that XLA's CPU backend compiles well, each measured (BUILD_NOTES, "Kernel").
+"""Idioms that XLA's CPU backend compiles well, each measured (BUILD_NOTES, "The kernel").
 
 None of them changes a result; on other backends they are harmless.
 """

@@ -191,7 +191,7 @@ def _model(run: RunFiles) -> str:
     if run.photometry is None:
         return ""
     model = run.photometry["model"]
-    return run_summary.MODELS.get(model, model)
+    return run_summary.DESCRIPTIONS.get(model, model)
 
 
 def _curve(run: RunFiles) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.formation import inverse_tone_map
-from p2gs_jax.photometry.solution import LADDER
+from p2gs_jax.photometry.models import MODELS
 from p2gs_jax.report import run_summary
 from p2gs_jax.report.charts import (
     FITTED,
@@ -43,7 +43,7 @@ def model_section(run: RunFiles) -> Section:
     if run.photometry is None:
         return Section("model", "What was modelled, and why", "")
     model, curve = run.photometry["model"], run.photometry["curve"]
-    what = run_summary.MODELS.get(model, model)
+    what = run_summary.DESCRIPTIONS.get(model, model)
     body = paragraph(f"Model: {what}. Tone curve: {_curve_words(curve)}.")
     body += listed(run_summary.reasons(run))
     if run_summary.reasons(run):
@@ -192,7 +192,7 @@ def gamma_section(run: RunFiles) -> Section:
     found = [v["gamma"] for v in run.train if v["gamma"] is not None]
     if not found or run.photometry is None:
         return Section("gamma", "Gamma", "")
-    level = LADDER[run.photometry["model"]].gamma if run.photometry["model"] in LADDER else "view"
+    level = MODELS[run.photometry["model"]].gamma if run.photometry["model"] in MODELS else "view"
     if level is None or np.ptp(found) < 1e-3:
         body = paragraph(
             f"Gamma was not modelled: it is {np.mean(found):.2f} in all views. Contrast that "

@@ -7,7 +7,7 @@ import numpy as np
 from p2gs_jax.core.clock import whole_run
 from p2gs_jax.evaluate.alignment import ExposureError, exposure_error
 from p2gs_jax.photometry.agreement import Agreement, compare
-from p2gs_jax.photometry.selection import WORDS
+from p2gs_jax.photometry.models import MODELS
 from p2gs_jax.report.run_files import RunFiles
 from p2gs_jax.report.scene_measurements import SceneMeasurements
 
@@ -17,7 +17,7 @@ CURVES = {
     "spline": "a tone curve fitted to this camera",
     "linear": "no tone curve: display values are splatted as they are",
 }
-MODELS: dict[str, str] = {**WORDS}
+DESCRIPTIONS: dict[str, str] = {name: model.description for name, model in MODELS.items()}
 # How sentences of the photometric selection begin (photometry/selection.py).
 REASONS = ("Chosen:", "Simpler (", "Richer (", "What predicts best")
 
@@ -69,7 +69,7 @@ def _modelled(run: RunFiles) -> str:
     if run.photometry is None:
         return "What was modelled of the cameras is not known: photometry.json is missing."
     model, curve = run.photometry["model"], run.photometry["curve"].get("name", "")
-    what = MODELS.get(model, model)
+    what = DESCRIPTIONS.get(model, model)
     if curve == "linear" and model == "constant":
         return (
             f"The preset {run.preset} models no camera: display values are splatted as they are"

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from p2gs_jax.photometry.solution import LADDER, MIN_OBSERVATIONS
-from p2gs_jax.pipeline.calibrate import WEAK_GAMMA
+from p2gs_jax.photometry.models import MODELS
+from p2gs_jax.photometry.solution import MIN_OBSERVATIONS, WEAK_GAMMA
 from p2gs_jax.report.run_files import RunFiles, number_at
 from p2gs_jax.report.run_summary import against_exif, count
 from p2gs_jax.report.scene_measurements import SceneMeasurements
@@ -22,7 +22,8 @@ OUTLIER = 6.0
 WEAK_EV = 0.1
 # Least drift of an exposure from its start, stops; it must exceed three standard errors as well.
 DRIFT_EV = 0.1
-# Gammas of cameras lie between these: two priors' widths about 2.2 (photometry/solution.py).
+# Gammas of cameras lie between these: two priors' widths about 2.2 (`A_PRIOR` in
+# photometry/adjustment/system.py).
 GAMMAS = (1.65, 3.15)
 # The floor of exposures and gammas in the `linear` parameterisation (types.py).
 FLOOR = 1e-3
@@ -237,7 +238,7 @@ def _gammas(run: RunFiles) -> RunWarning | None:
 
 def _weak_gammas(run: RunFiles) -> RunWarning | None:
     model = "" if run.photometry is None else run.photometry["model"]
-    if model not in LADDER or LADDER[model].gamma is None:
+    if model not in MODELS or MODELS[model].gamma is None:
         return None
     weak = [v for v in run.train if (v.get("gamma_error") or 0) > WEAK_GAMMA]
     if not weak:

@@ -1,3 +1,72 @@
-"""Names of the files in a run folder that several parts of the program use (docs/files.md)."""
+"""Where things lie in a run folder; docs/files.md says what they hold."""
 
-APPEARANCE = "appearance.npy"
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """The paths of a run folder.
+
+    Attributes:
+        root: the folder itself.
+    """
+
+    root: Path
+
+    @property
+    def config(self) -> Path:
+        """The options as they were asked for, and where the scene lies."""
+        return self.root / "config.json"
+
+    @property
+    def decisions(self) -> Path:
+        """What the scene decided, with reasons."""
+        return self.root / "decisions.json"
+
+    @property
+    def log(self) -> Path:
+        """A line for every burst of steps."""
+        return self.root / "log.jsonl"
+
+    @property
+    def checkpoints(self) -> Path:
+        """Folder of the states that a run resumes from."""
+        return self.root / "checkpoints"
+
+    @property
+    def radiance(self) -> Path:
+        """The Gaussians, with linear radiance."""
+        return self.root / "radiance.ply"
+
+    @property
+    def splats(self) -> Path:
+        """The Gaussians, with display colours."""
+        return self.root / "splats.ply"
+
+    @property
+    def photometry(self) -> Path:
+        """Exposures, gammas, tone curve."""
+        return self.root / "photometry.json"
+
+    @property
+    def appearance(self) -> Path:
+        """Corrections of display values, where a baseline learns them."""
+        return self.root / "appearance.npy"
+
+    @property
+    def metrics(self) -> Path:
+        """Scores, counts, seconds."""
+        return self.root / "metrics.json"
+
+    @property
+    def summary(self) -> Path:
+        """The picture to open first."""
+        return self.root / "summary.png"
+
+    @property
+    def renders(self) -> Path:
+        """Folder of the held-out views."""
+        return self.root / "renders"

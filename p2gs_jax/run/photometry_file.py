@@ -15,6 +15,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.types import View
 
+MEAN_GAUGE = "mean log exposure is 0 over each connected group of views"
 # Absent from files of runs without a bundle adjustment.
 OPTIONAL = frozenset({"exposure_ev_error", "gamma_error", "exposure_ev_start", "observations"})
 
@@ -82,7 +83,7 @@ def write_solution(
     views: Sequence[View],
     pivot: float,
     known: str | None,
-    gauge: str = "mean log exposure is 0 over each connected group of views",
+    gauge: str,
 ) -> None:
     """Write the file from a photometric solution; views it knows nothing about get nulls.
 

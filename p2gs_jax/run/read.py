@@ -20,7 +20,8 @@ from p2gs_jax.formats.ply import read_ply
 from p2gs_jax.photometry.appearance import identity
 from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.render.host import RenderView, make_renderer
-from p2gs_jax.run.layout import APPEARANCE
+from p2gs_jax.run.decisions import read_decisions
+from p2gs_jax.run.layout import RunFolder
 from p2gs_jax.run.photometry_file import AGAIN, PhotometryFile, read_photometry
 from p2gs_jax.run.places import candidates, find
 from p2gs_jax.run.scene_file import read_scene
@@ -42,7 +43,7 @@ class Run:
     Attributes:
         folder: where it lies.
         params: the fit.
-        cfg: how it was made.
+        cfg: what it was made under: the options as asked, with what the scene decided filled in.
         scene: what it was fitted to; its photographs may be gone.
         reference: photographs under one common exposure, or None.
         photometry: `photometry.json`, with what `params` does not hold: standard errors, EXIF,
@@ -159,7 +160,7 @@ class Run:
 
 
 def resolved(cfg: PhotometryConfig, saved: PhotometryFile) -> PhotometryConfig:
-    """Return the options with the model and curve that the fit chose.
+    """Return the options with the model and curve that a fit of an older version chose.
 
     Raises:
         UserError: the file names none.
@@ -191,49 +192,60 @@ def load_run(folder: str | Path, scene: str | Path | None = None) -> Run:
         UserError: the folder is no run, is unfinished or damaged; `scene` does not exist; or the
             run is of an older version, which kept no cameras, and its scene has moved.
     """
-    folder = Path(folder)
-    config_path = folder / "config.json"
-    if not config_path.is_file():
+    files = RunFolder(Path(folder))
+    _require_finished(files)
+    saved, asked = _read_config(files.config)
+    found = _load_scene(saved, None if scene is None else Path(scene), asked, files.root)
+    gaussians = read_ply(files.radiance)
+    photometry_file = read_photometry(files.photometry)
+    decisions = read_decisions(files.decisions)
+    if decisions is None:
+        cfg = replace(asked, photometry=resolved(asked.photometry, photometry_file))
+    else:
+        cfg = decisions.resolve(asked)
+    photometry = _photometry(photometry_file, found, cfg, files)
+    appearance = _appearance(files.appearance, cfg, len(found.train_indices))
+    return Run(
+        files.root,
+        Params(gaussians, photometry, appearance),
+        cfg,
+        found,
+        find(saved, "reference", files.root),
+        photometry_file,
+    )
+
+
+def _require_finished(files: RunFolder) -> None:
+    if not files.config.is_file():
         raise UserError(
-            f"{folder} is not a run folder: {config_path.name} is missing.",
+            f"{files.root} is not a run folder: {files.config.name} is missing.",
             fix="name the folder that was given to `p2gs-jax fit --out`",
         )
-    for name in ("radiance.ply", "photometry.json"):
-        if not (folder / name).is_file():
+    for path in (files.radiance, files.photometry):
+        if not path.is_file():
             raise UserError(
-                f"{folder} is unfinished: {name} is missing.",
+                f"{files.root} is unfinished: {path.name} is missing.",
                 fix="finish it with `p2gs-jax fit ... --resume`",
             )
-    saved, cfg = _read_config(config_path)
-    found = _load_scene(saved, None if scene is None else Path(scene), cfg, folder)
-    gaussians = read_ply(folder / "radiance.ply")
-    photometry_file = read_photometry(folder / "photometry.json")
-    cfg = replace(cfg, photometry=resolved(cfg.photometry, photometry_file))
-    views = {v["image"]: v for v in photometry_file["views"]}
-    train = [views.get(found.views[i].name) for i in found.train_indices]
+
+
+def _photometry(
+    saved: PhotometryFile, scene: Scene, cfg: FitConfig, files: RunFolder
+) -> Photometry:
+    """Return exposures and gammas of the training views."""
+    views = {v["image"]: v for v in saved["views"]}
+    train = [views.get(view.name) for view in scene.training_views]
     if any(v is None or v["exposure"] is None for v in train):
         raise UserError(
-            f"{folder / 'photometry.json'} does not belong to the scene {found.root}: its "
-            "training views differ.",
+            f"{files.photometry} does not belong to the scene {scene.root}: its training views "
+            "differ.",
             fix="restore the scene folder as it was during the fit",
         )
     exposures = np.array([v["exposure"] for v in train if v is not None])
     gammas = np.array([v["gamma"] for v in train if v is not None])
     if cfg.photometry.parameterization == "log":
         exposures, gammas = np.log(exposures), np.log(gammas / GAMMA_SRGB)
-    photometry = Photometry(
-        on_device(exposures),
-        on_device(gammas),
-        cfg.photometry.parameterization,
-    )
-    return Run(
-        folder,
-        Params(gaussians, photometry, _appearance(folder, cfg, len(train))),
-        cfg,
-        found,
-        find(saved, "reference", folder),
-        photometry_file,
-    )
+    return Photometry(on_device(exposures), on_device(gammas), cfg.photometry.parameterization)
 
 
 def _read_config(path: Path) -> tuple[dict[str, Any], FitConfig]:
@@ -272,11 +284,10 @@ def _load_scene(saved: dict[str, Any], given: Path | None, cfg: FitConfig, folde
     return load_scene(root, cfg.data, folder / "cache", lambda text: None)
 
 
-def _appearance(folder: Path, cfg: FitConfig, views: int):
+def _appearance(path: Path, cfg: FitConfig, views: int):
     """Return the corrections of display values that the run learned, or None."""
     if cfg.photometry.appearance is None:
         return None
-    path = folder / APPEARANCE
     try:
         corrections = np.load(path, allow_pickle=False)
     except (OSError, ValueError) as error:

@@ -14,6 +14,7 @@ from p2gs_jax.core.compile_cache import use_compile_cache
 from p2gs_jax.core.runtime import tune_process
 from p2gs_jax.errors import UserError
 from p2gs_jax.pipeline.fit import fit
+from p2gs_jax.run.layout import RunFolder
 
 REASON = "failure.json"
 
@@ -33,7 +34,7 @@ def main(job_path: Path) -> int:
             run,
             from_dict(job["fit"]),
             reference=job["reference"],
-            resume=(run / "config.json").exists(),
+            resume=RunFolder(run).config.exists(),
             # As for `p2gs-jax fit`: starting the interpreter counts.
             spent_s=time.process_time(),
         )

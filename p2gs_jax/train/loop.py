@@ -41,7 +41,8 @@ from p2gs_jax.losses.relative_exposure import ColorPairs
 from p2gs_jax.losses.total import OBSERVED_FORMS, SECOND_RENDER_FORMS, Partner
 from p2gs_jax.render.capacity import Room
 from p2gs_jax.run.checkpoint import CheckpointStore
-from p2gs_jax.train import decisions, growth, schedule
+from p2gs_jax.run.decisions import KEY, Decisions
+from p2gs_jax.train import growth, schedule
 from p2gs_jax.train.demand import demand
 from p2gs_jax.train.growth import Stage, StageResult
 from p2gs_jax.train.host import HostState
@@ -103,11 +104,11 @@ class Trainer:
         coverage: how much of the scene the views show.
         run_dir: where `log.jsonl`, `growth.jsonl` and `checkpoints/` go.
         programs: compiled steps, some of them perhaps begun.
+        decided: what the scene settled; a run that is resumed must have settled the same.
         on_log: called with every log record.
         on_message: called with everything the user must know.
         validation: training views that automatic growth is judged by.
         own_exposures: their exposures come from tracks, so they may be judged under these.
-        reasons: for the photometric model, in words; a resumed run repeats them.
     """
 
     def __init__(
@@ -119,16 +120,16 @@ class Trainer:
         coverage: Coverage,
         run_dir: Path,
         programs: StepPrograms,
+        decided: Decisions,
         on_log: Callable[[LogRecord], None] = lambda record: None,
         on_message: Callable[[str], None] = lambda text: None,
         validation: Sequence[int] = (),
         own_exposures: bool = False,
-        reasons: Sequence[str] = (),
     ):
         self.cfg, self.views, self.extent, self.pairs = cfg, views, extent, pairs
         self.coverage = coverage
         self.run_dir, self.on_log, self.on_message = run_dir, on_log, on_message
-        self.decided = decisions.recorded(cfg, reasons)
+        self.decided = decided
         self.optimizer = make_optimizer(cfg)
         self.step = make_step(cfg, self.optimizer, extent)
         self.programs = programs
@@ -163,7 +164,7 @@ class Trainer:
         )
         if found is None:
             return None
-        decisions.check(found[1].get(decisions.KEY), self.cfg, self.checkpoints.folder)
+        self.decided.require_same(found[1].get(KEY), self.checkpoints.folder)
         state = jax.tree.map(jnp.asarray, found[0])
         host = HostState.from_dict(found[1]["host"])
         self.checkpoints.discard_after(host.step)
@@ -184,7 +185,7 @@ class Trainer:
         meta = {
             "host": dataclasses.asdict(host),
             "gaussian_capacity": state.params.gaussians.capacity,
-            decisions.KEY: self.decided,
+            KEY: self.decided.to_dict(),
         }
         self.checkpoints.save(host.step, state, meta)
 

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.gaussians.population import grow
-from p2gs_jax.photometry.solution import LADDER
+from p2gs_jax.photometry.models import MODELS
 from p2gs_jax.types import Gaussians, Params, Photometry
 
 # For exposures, gammas and corrections (Kingma and Ba).
@@ -159,7 +159,7 @@ def learning_rates(
     decay = o.final**progress
     sh = jnp.full((bands, 1), o.sh_rest).at[0].set(o.sh_dc) * decay
     gate = photometry_gate(progress, cfg)
-    varies = LADDER[cfg.photometry.model]
+    varies = MODELS[cfg.photometry.model]
     return Params(
         gaussians=Gaussians(
             means=means_rate(progress, extent, cfg),

@@ -152,7 +152,7 @@ class Step:
 
     The first and the last work per Gaussian and know no image size, so all levels of a fit share
     them; the one between knows neither the population nor the optimiser. In one program, every
-    level compiled all of it (BUILD_NOTES, "Every second counts").
+    level compiled all of it (BUILD_NOTES, "A step is three programs").
 
     Attributes:
         show: (gaussians, alive, frusta, active_degree, room=, degree=) -> Listed.

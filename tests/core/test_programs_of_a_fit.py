@@ -11,8 +11,9 @@ from p2gs_jax.core.clock import CompileCounter
 from p2gs_jax.core.progress import Silent
 from p2gs_jax.photometry.gauge import recentre
 from p2gs_jax.pipeline.calibrate import calibrate
-from p2gs_jax.pipeline.finish import finish
+from p2gs_jax.pipeline.finish import Account, finish
 from p2gs_jax.pipeline.prepare import load, prepare
+from p2gs_jax.run.layout import RunFolder
 from p2gs_jax.run.read import load_run
 
 
@@ -43,14 +44,11 @@ def test_a_fit_without_its_steps_compiles_few_programs(scene, tmp_path):
     metrics = finish(
         params,
         prepared,
-        tmp_path,
-        prepared.cfg,
+        RunFolder(tmp_path),
+        Account(counts={}, seconds={"reading": 1.0}, compiler=counter),
         Silent(),
         truth=None,
         lpips_weights=None,
-        counts={},
-        compiler=counter,
-        seconds={"reading": 1.0},
     )
     # Counting tiles, rendering, developing (images; colours of splats), fitting an exposure, PSNR,
     # SSIM, and the basis of spherical harmonics.

@@ -9,17 +9,14 @@ import pytest
 
 from p2gs_jax.config import preset
 from p2gs_jax.evaluate.alignment import exposure_error
-from p2gs_jax.photometry.sources.sampling import sample, track_colors
-from p2gs_jax.photometry.sources.tracks import (
-    MOST_PER_POINT,
-    project_points,
-    projected_colors,
-    unoccluded,
-)
+from p2gs_jax.photometry.calibrate import calibrate_observations, options_of
+from p2gs_jax.photometry.sources.projected import MOST_PER_POINT, projected_colors
+from p2gs_jax.photometry.sources.sampling import sample
+from p2gs_jax.photometry.sources.tracks import track_colors
 from p2gs_jax.photometry.srgb import srgb_decode, srgb_encode
-from p2gs_jax.pipeline.prepare import calibrate_observations
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.visibility import project_points, unoccluded
 from p2gs_jax.synth.write import write_street
 from p2gs_jax.types import Scene, Tracks, View
 
@@ -67,7 +64,7 @@ def test_exposures_without_tracks(street, tmp_path):
     scene = dataclasses.replace(scene, tracks=None)
     observations = projected_colors(scene, ImageStore(scene.views, cfg.data))
     assert np.bincount(observations.points).max() <= MOST_PER_POINT
-    solved = calibrate_observations(observations, scene, cfg).solution
+    solved = calibrate_observations(observations, options_of(cfg, scene)).solution
     with (street / "truth" / "exposures.csv").open(newline="") as file:
         truth = {r["image"]: float(r["exposure"]) for r in csv.DictReader(file)}
     expected = np.array([truth[scene.views[i].name] for i in scene.train_indices])
@@ -144,8 +141,8 @@ def test_what_was_left_out_is_said(street, tmp_path):
     cfg = preset("robust")
     scene = load_scene(street, cfg.data, tmp_path, lambda text: None)
     observations = track_colors(scene, ImageStore(scene.views, cfg.data))
-    assert not any(
-        "left out" in r for r in calibrate_observations(observations, scene, cfg).reasons
-    )
+    options = options_of(cfg, scene)
+    reasons = calibrate_observations(observations, options).reasons
+    assert not any("left out" in r for r in reasons)
     some = dataclasses.replace(observations, too_coarse=7)
-    assert calibrate_observations(some, scene, cfg).reasons[0].startswith("7 of ")
+    assert calibrate_observations(some, options).reasons[0].startswith("7 of ")

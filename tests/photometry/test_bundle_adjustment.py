@@ -10,10 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from p2gs_jax.evaluate.alignment import exposure_error
-from p2gs_jax.photometry import bundle_adjustment, solution
-from p2gs_jax.photometry.observations import Observations, make_rows
+from p2gs_jax.photometry.adjustment import fit as fitting
+from p2gs_jax.photometry.adjustment import robust
+from p2gs_jax.photometry.adjustment.fit import fit_model, solve_model
+from p2gs_jax.photometry.adjustment.problem import KnownExposures, make_problem
+from p2gs_jax.photometry.adjustment.rows import make_rows
+from p2gs_jax.photometry.models import MODELS
+from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import Response
-from p2gs_jax.photometry.solution import KnownExposures, fit_model, make_problem
 from p2gs_jax.synth.drive import make_drive, make_exposures, observe
 
 LIMITS = {"black": 4 / 255, "saturation": 250 / 255, "pivot": 0.18}
@@ -50,7 +54,7 @@ def test_a_part_of_the_observations_tells_exposures_and_all_points_get_a_radianc
     o = observe(DRIVE, ISO4, outliers=0.1)
     whole = adjust(o)
     few = 100
-    monkeypatch.setattr(solution, "PER_VIEW", few)
+    monkeypatch.setattr(fitting, "PER_VIEW", few)
     kept = o.thinned(few, 0)
     assert 0.1 < kept.mean() < 0.9
     seen = np.bincount(o.views, minlength=o.view_count)
@@ -104,10 +108,10 @@ def test_standard_errors_have_the_size_of_the_errors(model):
 def test_the_fixed_point_minimises_the_robust_loss():
     o = observe(DRIVE, ISO4)
     problem = make_problem(o, **LIMITS)
-    fit, _ = solution.solve_model(problem, "view_exposure_gamma", Response())
+    fit, _ = solve_model(problem, "view_exposure_gamma", Response())
     with jax.enable_x64(True):
         rows = make_rows(o, problem.layout, problem.usable, Response(), problem.log_pivot)
-        bound = (bundle_adjustment.GEMAN_MCCLURE * fit.scale) ** 2
+        bound = (robust.GEMAN_MCCLURE * fit.scale) ** 2
         channels = jnp.maximum(rows.weight.sum(-1), 1)
 
         def loss(b):
@@ -167,7 +171,7 @@ def test_a_view_without_information_keeps_one_and_is_said(level):
     assert exposure_error(np.exp(s.log_exposures[rest]), ISO4[rest])["ev"] < 0.01
 
 
-@pytest.mark.parametrize("model", solution.LADDER)
+@pytest.mark.parametrize("model", MODELS)
 def test_nothing_to_go_by(model):
     empty = np.zeros((0, 3))
     none = np.zeros(0, int)

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import PhotometryConfig
+from p2gs_jax.photometry.adjustment.curve import fit_response
+from p2gs_jax.photometry.adjustment.problem import make_problem
 from p2gs_jax.photometry.formation import eotf, inverse_tone_map, tone_map
 from p2gs_jax.photometry.response import (
     FREE,
@@ -18,7 +20,6 @@ from p2gs_jax.photometry.response import (
     log_slope_minimum,
     monotone,
 )
-from p2gs_jax.photometry.solution import fit_response, make_problem
 from p2gs_jax.synth.drive import make_drive, make_exposures, observe
 from p2gs_jax.synth.sensor import encode
 

@@ -32,8 +32,8 @@ def test_what_varies_is_found(exposures, curve, gamma, model, response):
         assert any("too little to tell the shape" in r for r in s.reasons)
 
 
-def candidate(model, parameters, density, behind, error, codes=9.0):
-    return Candidate(model, Response(), parameters, density, behind, error, codes)
+def candidate(model, parameters, density, deficit, error, difference=9.0):
+    return Candidate(model, Response(), parameters, density, deficit, error, difference)
 
 
 def test_the_simplest_that_is_not_clearly_worse_wins():

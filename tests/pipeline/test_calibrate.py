@@ -12,7 +12,8 @@ from p2gs_jax.cli import main
 from p2gs_jax.config import preset
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.alignment import exposure_error
-from p2gs_jax.pipeline.calibrate_stack import calibrate_stack, read_stack
+from p2gs_jax.photometry.sources.stack import read_stack
+from p2gs_jax.pipeline.calibrate_stack import calibrate_stack
 from p2gs_jax.run.photometry_file import read_photometry
 from p2gs_jax.synth.write import write_street
 
@@ -126,6 +127,28 @@ def test_stack_exposures(tmp_path, response):
     error = exposure_error(np.exp(result.solution.log_exposures[use]), times[use])
     assert error["ev_scale_power"] < 0.05
     assert result.one_response
+
+
+def test_the_command_writes_what_a_stack_says(tmp_path, capsys):
+    times = 2.0 ** np.arange(2, -3, -1)
+    stack(tmp_path / "s", times)
+    listed = tmp_path / "times.csv"
+    rows = (f"{i:02d}.png,{t}" for i, t in enumerate(times))
+    listed.write_text("image,exposure_time_s\n" + "\n".join(rows))
+    out = tmp_path / "out"
+    code, text = run(
+        capsys, "calibrate", tmp_path / "s", "--static", "--out", out, "--compare-with", listed
+    )
+    assert code == 0
+    assert all(word in text for word in ("00.png", "stated", "signal", "Response: "))
+    saved = read_photometry(out / "photometry.json")
+    assert [v["image"] for v in saved["views"]] == [f"{i:02d}.png" for i in range(len(times))]
+    assert "stretched together" in saved["gauge"]
+    assert "nan" not in text
+    details = json.loads((out / "calibration.json").read_text())
+    assert details["one_response"]
+    assert any("The stated exposures of" in m for m in details["messages"])
+    assert (out / "calibration.png").stat().st_size > 10_000
 
 
 def test_stack_tone_mapped_by_region_is_recognised(tmp_path):

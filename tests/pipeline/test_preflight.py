@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,10 +14,12 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import DivergenceError, UserError
 from p2gs_jax.losses.relative_exposure import ExposurePairs, relative_exposure_loss
 from p2gs_jax.pipeline import fit as pipeline
+from p2gs_jax.pipeline.decide import kept_choice
 from p2gs_jax.pipeline.preflight import Paths, check_run_dir, check_sizes, preflight
 from p2gs_jax.run.checkpoint import CheckpointStore
+from p2gs_jax.run.decisions import KEY, Decisions
+from p2gs_jax.run.layout import RunFolder
 from p2gs_jax.sweep import with_fields
-from p2gs_jax.train import decisions
 from p2gs_jax.types import View
 
 
@@ -74,7 +77,7 @@ def test_a_folder_is_a_runs_once_there_is_something_to_continue(
             CheckpointStore(run / "checkpoints").save(3, {"a": np.zeros(2)}, {})
         raise DivergenceError("Step 1: no.", fix="lower the learning rates")
 
-    prepared = dataclasses.make_dataclass("Prepared", ["cfg"])(FitConfig())
+    prepared = SimpleNamespace(cfg=FitConfig(), decisions=Decisions.as_asked(FitConfig()))
     monkeypatch.setattr(pipeline, "prepare", lambda *a, **k: prepared)
     monkeypatch.setattr(pipeline, part, fails)
     with pytest.raises(DivergenceError):
@@ -95,29 +98,29 @@ def test_a_resumed_run_keeps_the_model_and_curve_of_its_checkpoints(tmp_path, sc
         "photometry.curve": "spline",
         "photometry.spline": list(spline),
     }
-    under = with_fields(FitConfig(), chosen)
-    meta = {decisions.KEY: decisions.recorded(under, ("Chosen: that.",))}
+    under = Decisions.as_asked(with_fields(FitConfig(), chosen))
+    decided = dataclasses.replace(under, reasons=("Chosen: that.",))
+    meta = {KEY: decided.to_dict()}
     CheckpointStore(run / "checkpoints").save(3, {"a": np.zeros(2)}, meta)
     given = []
 
-    def prepare(scene, cfg, reporter, clock, on_expected, *, reasons):
-        given.append((cfg, reasons))
+    def prepare(scene, cfg, reporter, clock, on_expected, *, kept):
+        given.append((cfg, kept))
         raise KeyboardInterrupt
 
     monkeypatch.setattr(pipeline, "prepare", prepare)
     for resume in (True, False):
         with pytest.raises(KeyboardInterrupt):
             p2gs_jax.fit(scene, run, FitConfig(), resume=resume)
-    (kept, reasons), (anew, none) = given
-    assert kept.photometry == with_fields(under, {"photometry.select": False}).photometry
-    assert kept.photometry.spline == spline
-    assert reasons == ("Chosen: that.",)
-    assert (anew, none) == (FitConfig(), ())
-    decisions.check(meta[decisions.KEY], kept, run)
+    # What was asked stays; what was decided comes beside it.
+    assert given == [(FitConfig(), decided), (FitConfig(), None)]
+    photometry = decided.resolve(FitConfig()).photometry
+    assert (photometry.curve, photometry.spline, photometry.select) == ("spline", spline, False)
+    decided.require_same(meta[KEY], run)
     # What the user fixes, or starts at random, was never chosen.
     for fixed in ({"photometry.select": False}, {"photometry.start": "random"}):
         cfg = with_fields(FitConfig(), fixed)
-        assert decisions.kept(cfg, run) == (cfg, ())
+        assert kept_choice(cfg, RunFolder(run)) is None
 
 
 def test_the_saved_choice_is_solved_and_its_reasons_repeated(tmp_path, scene):
@@ -130,15 +133,16 @@ def test_the_saved_choice_is_solved_and_its_reasons_repeated(tmp_path, scene):
     assert first.selection is not None
     reasons = first.selection.reasons
     CheckpointStore(tmp_path / "checkpoints").save(
-        3, {"a": np.zeros(2)}, {decisions.KEY: decisions.recorded(first.cfg, reasons)}
+        3, {"a": np.zeros(2)}, {KEY: first.decisions.to_dict()}
     )
-    kept, saved = decisions.kept(cfg, tmp_path)
-    again = prepare(loaded, kept, Silent(), reasons=saved)
+    kept = kept_choice(cfg, RunFolder(tmp_path))
+    assert kept == first.decisions
+    again = prepare(loaded, cfg, Silent(), kept=kept)
     assert again.selection is not None
     assert again.selection.reasons == reasons
     assert again.notes == first.notes
     assert again.selection.candidates == ()
-    decisions.check(decisions.recorded(first.cfg, reasons), again.cfg, tmp_path)
+    assert again.decisions == first.decisions
     solved = (first.selection.solution, again.selection.solution)
     np.testing.assert_array_equal(*(s.log_exposures for s in solved))
     np.testing.assert_array_equal(*(s.gammas for s in solved))

@@ -11,6 +11,7 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import read_jsonl
 from p2gs_jax.core.numerics import on_host
 from p2gs_jax.gaussians.population import Coverage
+from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.sweep import with_fields
 from p2gs_jax.train import loop, session
 from p2gs_jax.train.state import FAULT_NONFINITE, FAULT_OVERFLOW, Fault, FitState
@@ -184,6 +185,7 @@ class Harness:
             Coverage(400 * 300 if pixels is None else pixels, 1.0),
             self.folder,
             programs,
+            Decisions.as_asked(cfg),
             on_log=self.records.append,
             on_message=self.said.append,
             validation=(1,) if cfg.densify.max_gaussians == "auto" else (),

@@ -6,8 +6,8 @@ import pytest
 from loop_harness import SHORT, Harness, Programs
 
 from p2gs_jax.errors import DivergenceError, UserError
+from p2gs_jax.run.decisions import KEY
 from p2gs_jax.sweep import with_fields
-from p2gs_jax.train import decisions
 
 BUDGET = with_fields(SHORT, {"train.budget_s": 60.0})
 LEVELS = with_fields(SHORT, {"train.coarse_to_fine": [0.33]})
@@ -80,7 +80,7 @@ def test_checkpoints_remember_what_the_scene_decided(harness):
     assert "restore the scene" in str(error.value.fix)
     # Checkpoints of older versions say nothing, and are believed.
     for _, meta in harness.checkpoints.saved.values():
-        del meta[decisions.KEY]
+        del meta[KEY]
     assert harness.run(other, resume=True)[0].host.step == 100
 
 

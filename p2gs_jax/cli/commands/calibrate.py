@@ -14,9 +14,11 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.core.progress import TerminalReporter
 from p2gs_jax.errors import UserError
-from p2gs_jax.pipeline.calibrate import WEAK_GAMMA, Calibration, calibrate
+from p2gs_jax.photometry.solution import WEAK_GAMMA
+from p2gs_jax.pipeline.calibrate import calibrate
 from p2gs_jax.pipeline.calibrate_run import calibrate_run
-from p2gs_jax.pipeline.calibrate_stack import calibrate_stack, write_stack
+from p2gs_jax.pipeline.calibrate_stack import calibrate_stack
+from p2gs_jax.run.calibration_files import CalibrationResult, write_calibration
 
 
 def run(options: Calibrate) -> int:
@@ -38,7 +40,13 @@ def run(options: Calibrate) -> int:
             )
         else:
             result = calibrate(scene, out, cfg, compare_with=compare_with, reporter=reporter)
-    _print_calibration(result)
+    s, seconds = result.solution, result.seconds
+    _print_table(result, _tone_columns(result))
+    stdout().print(
+        f"{result.observations} observations, {100 * s.outliers:.0f} % ignored as outliers; "
+        f"residual {s.residual_ev:.2f} EV; {seconds['reading']:.1f} s reading, "
+        f"{seconds['adjustment']:.1f} s adjusting."
+    )
     stdout().print(f"Results: {out} (open {out / 'calibration.png'} first)")
     return 0
 
@@ -57,31 +65,27 @@ def _run_static(folder: Path, out: Path, cfg: FitConfig, compare_with: str | Non
             known_deviation_ev=cfg.photometry.known_deviation_ev,
             compare_with=compare_with,
         )
-        write_stack(result, out)
-    console, s = stdout(), result.solution
-    table = Table(title="Exposures in stops from their mean", title_justify="left")
-    table.add_column("frame")
-    for name in ("exposure", "stated", "usable points", "signal"):
-        table.add_column(name, justify="right")
-    for i, name in enumerate(result.names):
-        error = s.exposure_errors[i] / LN2
-        table.add_row(
-            name,
-            f"{s.exposures_ev[i]:+.2f} +- {error:.2f}" if np.isfinite(error) else "unknown",
-            f"{result.stated_ev[i]:+.2f}" if np.isfinite(result.stated_ev[i]) else "",
-            str(s.observations_per_view[i]),
-            "yes" if result.signal[i] else "little",
-        )
-    console.print(table)
-    for message in result.messages:
-        console.print(message)
-    console.print(f"Response: {s.response.name}; residual {s.residual_ev:.2f} EV. Results: {out}")
+        write_calibration(result, out)
+    s = result.solution
+    _print_table(
+        result,
+        {
+            "usable points": [str(count) for count in s.observations_per_view],
+            "signal": ["yes" if signal else "little" for signal in result.signal],
+        },
+    )
+    stdout().print(f"Response: {s.response.name}; residual {s.residual_ev:.2f} EV. Results: {out}")
     return 0
 
 
-def _print_calibration(result: Calibration) -> None:
-    """Print exposures and gammas with their standard errors, and the notes."""
-    console, s, columns = stdout(), result.selection.solution, _columns(result)
+def _print_table(result: CalibrationResult, more: dict[str, list[str]]) -> None:
+    """Print exposures with their standard errors, and the notes.
+
+    Args:
+        result: of any source.
+        more: further columns by title.
+    """
+    console, columns = stdout(), {**_exposure_columns(result), **more}
     table = Table(title="Exposures in stops from their mean", title_justify="left", box=SIMPLE)
     for name in columns:
         table.add_column(name, justify="left" if name in ("view", "camera") else "right")
@@ -90,18 +94,13 @@ def _print_calibration(result: Calibration) -> None:
     console.print(table)
     for message in result.messages:
         console.print(message)
-    console.print(
-        f"{result.observations} observations, {100 * s.outliers:.0f} % ignored as outliers; "
-        f"residual {s.residual_ev:.2f} EV; {result.seconds['reading']:.1f} s reading, "
-        f"{result.seconds['adjustment']:.1f} s adjusting."
-    )
 
 
-def _columns(result: Calibration) -> dict[str, list[str]]:
-    """Return the table's columns by title, without those that are empty or constant."""
-    s, views = result.selection.solution, result.scene.views
-    errors, stated = s.exposure_errors / LN2, result.stated_ev
-    known, given = np.isfinite(errors), np.isfinite(stated)
+def _exposure_columns(result: CalibrationResult) -> dict[str, list[str]]:
+    """Return columns by title, without those that are empty or constant."""
+    s, views = result.solution, result.views
+    errors, stated, gaps = s.exposure_errors / LN2, result.stated_ev, result.agreement.gap_ev
+    known, given, wrong = np.isfinite(errors), np.isfinite(stated), result.agreement.disagrees
     rows = range(len(views))
     columns = {"view": [v.name for v in views]}
     if len({v.camera for v in views}) > 1:
@@ -110,17 +109,23 @@ def _columns(result: Calibration) -> dict[str, list[str]]:
         f"{s.exposures_ev[i]:+.2f} +- {errors[i]:.2f}" if known[i] else "unknown" for i in rows
     ]
     if given.any():
-        gaps, wrong = result.agreement.gap_ev, result.agreement.disagrees
         columns["stated"] = [f"{stated[i]:+.2f}" if given[i] else "" for i in rows]
         columns["gap"] = [
-            f"{gaps[i]:+.2f}{' !' if wrong[i] else ''}" if given[i] and known[i] else ""
+            f"{gaps[i]:+.2f}{' !' if wrong[i] else ''}" if np.isfinite(gaps[i]) else ""
             for i in rows
         ]
-    columns["gamma"] = [
+    return columns
+
+
+def _tone_columns(result: CalibrationResult) -> dict[str, list[str]]:
+    """Return gammas with their standard errors, and residuals in stops."""
+    s, rows = result.solution, range(len(result.views))
+    known = np.isfinite(s.exposure_errors)
+    gammas = [
         f"{s.gammas[i]:.2f}"
         + (f" +- {s.gamma_errors[i]:.2f}" if known[i] and s.gamma_errors[i] > 0 else "")
         + (" (weak)" if known[i] and s.gamma_errors[i] > WEAK_GAMMA else "")
         for i in rows
     ]
-    columns["residual"] = [f"{s.view_residual_ev[i]:.2f}" if known[i] else "" for i in rows]
-    return columns
+    residuals = [f"{s.view_residual_ev[i]:.2f}" if known[i] else "" for i in rows]
+    return {"gamma": gammas, "residual": residuals}

@@ -13,8 +13,9 @@ from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.progress import TerminalReporter
 from p2gs_jax.evaluate.evaluate import evaluate
 from p2gs_jax.evaluate.lpips_weights import read_lpips_weights
-from p2gs_jax.pipeline.finish import find_radiance, load_reference
+from p2gs_jax.evaluate.references import find_radiance, load_reference
 from p2gs_jax.render.host import make_renderer
+from p2gs_jax.run.layout import RunFolder
 from p2gs_jax.run.read import load_run
 
 
@@ -43,7 +44,7 @@ def run(options: Eval) -> int:
             lpips_weights=weights,
             on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
         )
-    path = options.run / "metrics.json"
+    path = RunFolder(options.run).metrics
     kept = _kept_metrics(path)
     write_json(path, {**metrics, **kept})
     print_metrics({**metrics, **kept}, options.run)

@@ -47,6 +47,13 @@ class Shell:
     xy: Float32[np.ndarray, "s v 2"]
     empty_fraction: float
 
+    def note(self) -> str:
+        """Say what it is and how to do without."""
+        return (
+            f"{self.empty_fraction:.0%} of the images look past every seed point: a far shell "
+            f"of {len(self.points)} Gaussians was added (--init.shell off leaves it out)."
+        )
+
 
 def _project(view: View, points: Float[np.ndarray, "p 3"]):
     """Return pixel positions [p 2] and which points are in front and inside the image."""

@@ -1,4 +1,4 @@
-"""What the photographs show at tracks and at shell directions."""
+"""What photographs show at given positions, and at given points in all of their views."""
 
 from __future__ import annotations
 
@@ -8,10 +8,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
-from scipy.sparse import csr_array
 
-from p2gs_jax.core.streams import Stream, generator
-from p2gs_jax.photometry.observations import Observations
+from p2gs_jax.photometry.observations import COARSEST, Observations
 from p2gs_jax.photometry.srgb import srgb_decode, srgb_encode
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.scene.visibility import project_points
@@ -22,9 +20,9 @@ PATCH = 3
 # A track's position is uncertain by this much, in pixels of the sampled image; where the image is
 # steep, so is its colour.
 POSITION_DEVIATION = 0.5
-# Patches are widened to the coarsest view of a point, which is at most this many times coarser than
-# the finest: what is still farther away mixes in neighbours (BUILD_NOTES).
-COARSEST = 4.0
+# Positions that come from calibration or rendered depth, not from matching, are less certain than
+# tracks by this factor.
+PROJECTED_UNCERTAINTY = 2.0
 
 
 class Samples(NamedTuple):
@@ -109,25 +107,6 @@ def camera_rows(scene: Scene) -> Int[np.ndarray, " v"]:
     return np.unique(names, return_inverse=True)[1]
 
 
-def track_colors(
-    scene: Scene, store: ImageStore, on_view: Callable[[int, int], None] = lambda i, n: None
-) -> Observations:
-    """Sample every track in every training view.
-
-    Args:
-        scene: with tracks.
-        store: photographs, sampled at their training resolution.
-        on_view: progress: views done, views in all.
-    """
-    assert scene.tracks is not None
-    order = np.argsort(scene.tracks.view_indices, kind="stable")
-    bounds = np.searchsorted(scene.tracks.view_indices[order], np.arange(len(scene.views) + 1))
-    picks = [order[bounds[i] : bounds[i + 1]] for i in scene.train_indices]
-    points = [scene.tracks.point_indices[pick] for pick in picks]
-    xy = [scene.tracks.xy[pick] for pick in picks]
-    return point_colors(scene, store, points, xy, on_view=on_view)
-
-
 def point_colors(
     scene: Scene,
     store: ImageStore,
@@ -190,33 +169,43 @@ def point_colors(
     )
 
 
-def sample_pairs(
-    tracks: Observations, count: int, seed: int
-) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
-    """Draw pairs of observations of the same point; rows of `tracks`, in different views."""
-    order = np.argsort(tracks.points, kind="stable")
-    bounds = np.flatnonzero(np.diff(tracks.points[order], prepend=-1, append=-1))
-    lengths = np.diff(bounds)
-    starts, lengths = bounds[:-1][lengths >= 2], lengths[lengths >= 2]
-    if not len(starts):
-        return np.zeros(0, int), np.zeros(0, int)
-    rng = generator(seed, Stream.COLOR_PAIRS)
-    pick = rng.integers(0, len(starts), count)
-    first = rng.integers(0, lengths[pick])
-    second = (first + rng.integers(1, lengths[pick])) % lengths[pick]
-    return order[starts[pick] + first], order[starts[pick] + second]
+def sample_where_seen(
+    scene: Scene,
+    store: ImageStore,
+    chosen: Int[np.ndarray, " c"],
+    where: list[Float[np.ndarray, "c 2"]],
+    kept: Bool[np.ndarray, "v c"],
+    on_view: Callable[[int, int], None] = lambda i, n: None,
+) -> Observations:
+    """Sample chosen points at their positions in the training views that keep them.
 
-
-def overlapping_views(tracks: Observations, fewest: int) -> list[Int[np.ndarray, " k"]]:
-    """Return for every view the others that share at least `fewest` points with it.
-
-    A view that shares fewer with all of them keeps the one it shares most with, if any.
+    Args:
+        scene: the views.
+        store: photographs.
+        chosen: row of each point.
+        where: positions in each training view, full resolution.
+        kept: which view samples which point.
+        on_view: progress.
     """
-    ones = np.ones(len(tracks.views), np.float32)
-    shape = (tracks.view_count, tracks.point_count)
-    seen = csr_array((ones, (tracks.views, tracks.points)), shape=shape)
-    seen.data[:] = 1
-    shared = (seen @ seen.T).toarray()
-    np.fill_diagonal(shared, 0)
-    enough = np.minimum(fewest, np.maximum(shared.max(1, initial=0), 1))
-    return [np.flatnonzero(row >= least) for row, least in zip(shared, enough, strict=True)]
+    picks = [np.flatnonzero(row) for row in kept]
+    points = [chosen[pick] for pick in picks]
+    xy = [where[row][pick] for row, pick in enumerate(picks)]
+    return point_colors(
+        scene, store, points, xy, uncertainty=PROJECTED_UNCERTAINTY, on_view=on_view
+    )
+
+
+def thinned(
+    seen: Bool[np.ndarray, "v p"], rng: np.random.Generator, most: int
+) -> Bool[np.ndarray, "v p"]:
+    """Return at most `most` views of each point, evenly at random.
+
+    Args:
+        seen: which view sees which point.
+        rng: draws the views.
+        most: views of a point.
+    """
+    order = rng.random(seen.shape)
+    order[~seen] = 2.0
+    rank = np.argsort(np.argsort(order, axis=0), axis=0)
+    return seen & (rank < most)

@@ -1,0 +1,97 @@
+"""Residuals at given parameters, and the weights that keep outliers from counting."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from p2gs_jax.photometry.adjustment.rows import Rows
+from p2gs_jax.photometry.adjustment.spline import under_spline
+from p2gs_jax.photometry.adjustment.system import EMPTY, Parameters
+
+Loss = Literal["l1", "geman_mcclure"]
+# Width of the Geman-McClure loss in robust standard deviations.
+GEMAN_MCCLURE = 3.0
+SMALLEST_SCALE = 0.3
+MEDIAN_ROWS = 4096
+
+
+class Weighted(NamedTuple):
+    """Everything per observation at given parameters.
+
+    Attributes:
+        weight: robust weight over variance.
+        sigma: stated standard deviation of z.
+        slope: dz/dy.
+        residual: of each observation, log units.
+        radiance: log radiance of each row's point relative to the pivot.
+        precision: of `radiance`.
+        scale: robust standard deviation of one observation in units of its stated one.
+        curvature: mean second derivative of the robust loss over its weight (1 for squares).
+    """
+
+    weight: Float[np.ndarray, "o 3"]
+    sigma: Float[np.ndarray, "o 3"]
+    slope: Float[np.ndarray, "o 3"]
+    residual: Float[np.ndarray, "o 3"]
+    radiance: Float[np.ndarray, "r 3"]
+    precision: Float[np.ndarray, "r 3"]
+    scale: float
+    curvature: float
+
+
+def noise_weight(rows: Rows) -> Float[np.ndarray, "o 3"]:
+    """Return weights by the stated noise alone: where robust ones start."""
+    return rows.weight / rows.sigma**2
+
+
+def weigh(rows: Rows, theta: Parameters, weight: Float[np.ndarray, "o 3"], loss: Loss) -> Weighted:
+    """Return residuals and the weights they imply.
+
+    Args:
+        rows: observations.
+        theta: parameters.
+        weight: from the round before; decides the point radiances that residuals are taken from.
+        loss: what the weights are of.
+    """
+    z, sigma, slope = rows.z, rows.sigma, rows.slope
+    if theta.c.size:
+        z, sigma, slope = under_spline(rows, theta.c)
+    a, b = theta.a[rows.views][:, None], theta.b[rows.views][:, None]
+    radiance, _ = _radiance(rows, a, b, z, weight)
+    u = (z - b - a * radiance[rows.row]) / sigma
+    scale = max(1.4826 * _median(rows, np.abs(u)), SMALLEST_SCALE)
+    # One weight for the whole observation: an outlier is wrong in all channels.
+    used = rows.weight.sum(1)
+    square = (u**2 * rows.weight).sum(1) / np.maximum(used, 1) / (GEMAN_MCCLURE * scale) ** 2
+    robust = 1 / (1 + square) ** 2
+    of_l1 = loss == "l1"
+    factor = 1 / np.maximum(np.abs(u) / scale, 0.5) if of_l1 else robust[:, None]
+    weight = rows.weight / sigma**2 * factor
+    radiance, precision = _radiance(rows, a, b, z, weight)
+    seen = used > 0
+    second_derivative = ((1 - 3 * square) / (1 + square) ** 3)[seen].sum()
+    curvature = second_derivative / max(robust[seen].sum(), 1e-9)
+    residual = z - b - a * radiance[rows.row]
+    return Weighted(weight, sigma, slope, residual, radiance, precision, scale, float(curvature))
+
+
+def _radiance(rows: Rows, a, b, z, weight):
+    """Return the log radiance of each row and its precision; a and b per observation."""
+    precision = rows.by_row @ (weight * a**2)
+    return rows.by_row @ (weight * a * (z - b)) / (precision + EMPTY), precision
+
+
+def _median(rows: Rows, values: Float[np.ndarray, "o 3"]) -> float:
+    """Return the median of used values; of more rows than MEDIAN_ROWS, of every n-th row."""
+    used = rows.weight > 0
+    step = max(1, rows.count // MEDIAN_ROWS)
+    if step > 1:
+        used = used & (rows.row % step == 0)[:, None]
+    picked = values[used]
+    if not picked.size:
+        return 0.0
+    middle = (picked.size + 1) // 2 - 1
+    return float(np.partition(picked, middle)[middle])

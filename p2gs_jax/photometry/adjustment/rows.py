@@ -1,0 +1,134 @@
+"""Observations in rows, one point each: what the adjustment sums over."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Float, Int
+
+from p2gs_jax.photometry.observations import Observations
+from p2gs_jax.photometry.response import Response, hat
+
+LONGEST_ROW = 16
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Observations by row: one point each, or a part of a point that many views saw.
+
+    Attributes:
+        views: row of the view.
+        row: which row an observation belongs to.
+        z: log exposed radiance under the base curve, relative to the pivot.
+        sigma: its standard deviation.
+        weight: 1 used, 0 masked or held out.
+        knot: left spline knot.
+        fraction: of the way to the next knot.
+        slope: dz/dy under the base curve.
+        by_row: sums observations over their rows.
+        layout: the same observations in the order of their rows, and the pairs of them.
+        count: number of rows.
+        view_count: number of views.
+    """
+
+    views: Int[np.ndarray, " o"]
+    row: Int[np.ndarray, " o"]
+    z: Float[np.ndarray, "o 3"]
+    sigma: Float[np.ndarray, "o 3"]
+    weight: Float[np.ndarray, "o 3"]
+    knot: Int[np.ndarray, "o 3"]
+    fraction: Float[np.ndarray, "o 3"]
+    slope: Float[np.ndarray, "o 3"]
+    by_row: sp.csr_array
+    layout: Layout
+    count: int
+    view_count: int
+
+
+class Layout:
+    """Which row each observation belongs to.
+
+    Tracks longer than `slots` are split into interleaved rows with a radiance of their own each,
+    which loses a few degrees of freedom and bounds the number of pairs.
+
+    Attributes:
+        slots: longest row.
+        row: of each observation.
+        rows: their number.
+        point_of_row: the point of each row.
+        by_row: sums observations over their rows.
+        order: observations sorted by row.
+    """
+
+    def __init__(self, observations: Observations):
+        points = np.asarray(observations.points)
+        lengths = np.bincount(points, minlength=observations.point_count)
+        used = lengths[lengths > 0]
+        typical = int(np.quantile(used, 0.9)) if len(used) else 2
+        self.slots = int(min(LONGEST_ROW, max(2, 2 ** int(np.ceil(np.log2(max(typical, 2)))))))
+        split = -(-lengths // self.slots)
+        first = np.concatenate([[0], np.cumsum(split)])
+        order = np.argsort(points, kind="stable")
+        starts = np.concatenate([[0], np.cumsum(lengths)])
+        rank = np.empty(len(points), int)
+        rank[order] = np.arange(len(points)) - starts[points[order]]
+        self.row = first[points] + rank % np.maximum(split[points], 1)
+        self.rows = int(first[-1])
+        self.point_of_row = np.repeat(np.arange(observations.point_count), split)
+        count = len(points)
+        self.by_row = sp.csr_array(
+            (np.ones(count), (self.row, np.arange(count))), shape=(self.rows, count)
+        )
+        self.order = np.argsort(self.row, kind="stable")
+
+    @functools.cached_property
+    def pairs(self) -> tuple[Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"]]:
+        """Every pair of observations in a row once, themselves included: places in `order`."""
+        return _pairs(self.row[self.order])
+
+
+def _pairs(row: Int[np.ndarray, " o"]):
+    """Return every pair of equal entries of a sorted array once, each with itself included."""
+    here = np.arange(len(row))
+    # Every entry with itself and those after it that equal it.
+    following = np.searchsorted(row, row, side="right") - here
+    first = np.repeat(here, following)
+    offset = np.arange(len(first)) - np.repeat(np.cumsum(following) - following, following)
+    return first, first + offset
+
+
+def make_rows(
+    observations: Observations,
+    layout: Layout,
+    weight: Float[np.ndarray, "o 3"],
+    response: Response,
+    log_pivot: float,
+) -> Rows:
+    """Return rows under one response.
+
+    Args:
+        observations: the colours.
+        layout: of these observations.
+        weight: 1 used, 0 not.
+        response: what decodes the colours.
+        log_pivot: log of the linear value that gamma leaves alone.
+    """
+    z, sigma, slope = observations.decoded(response)
+    knot, fraction = hat(np.asarray(observations.colors, np.float64))
+    return Rows(
+        views=np.asarray(observations.views),
+        row=layout.row,
+        z=z - log_pivot,
+        sigma=sigma,
+        weight=np.asarray(weight, np.float64),
+        knot=knot,
+        fraction=fraction,
+        slope=slope,
+        by_row=layout.by_row,
+        layout=layout,
+        count=layout.rows,
+        view_count=observations.view_count,
+    )

@@ -1,0 +1,78 @@
+"""Exposures, gammas and corrections before the first step."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.core.numerics import on_device
+from p2gs_jax.core.streams import Stream, generator
+from p2gs_jax.photometry.appearance import identity
+from p2gs_jax.photometry.formation import inverse_tone_map
+from p2gs_jax.photometry.solution import PhotometricSolution
+from p2gs_jax.types import GAMMA_SRGB, Photometry, Scene
+
+# Exposures drawn at random are at least this.
+LEAST_EXPOSURE = 0.1
+
+
+def initial_photometry(
+    solution: PhotometricSolution | None, count: int, cfg: FitConfig
+) -> Photometry:
+    """Return the exposures and gammas that a fit starts from.
+
+    Args:
+        solution: of the bundle adjustment; None: drawn at random (paper), or equal.
+        count: training views.
+        cfg: parametrisation and kind of start.
+    """
+    p = cfg.photometry
+    if solution is not None:
+        log_exposures = np.asarray(solution.log_exposures)
+    elif p.start == "random":
+        draws = generator(cfg.train.seed, Stream.START_EXPOSURES).normal(1.0, p.start_std, count)
+        log_exposures = np.log(np.maximum(draws, LEAST_EXPOSURE))
+    else:
+        log_exposures = np.zeros(count)
+    gammas = np.full(count, GAMMA_SRGB) if solution is None else solution.gammas
+    if p.parameterization == "log":
+        exposures, gammas = log_exposures, np.log(gammas / GAMMA_SRGB)
+    else:
+        exposures = np.exp(log_exposures)
+    return Photometry(on_device(exposures), on_device(gammas), p.parameterization)
+
+
+def initial_appearance(count: int, cfg: FitConfig) -> Float[Array, "v ..."] | None:
+    """Return corrections of display values that change nothing; None: the fit has none.
+
+    Args:
+        count: training views.
+        cfg: their kind.
+    """
+    kind = cfg.photometry.appearance
+    return None if kind is None else identity(kind, count)
+
+
+def linearized(
+    colors: Float[np.ndarray, "... 3"], cfg: FitConfig, gamma: float = GAMMA_SRGB
+) -> Float[np.ndarray, "... 3"]:
+    """Return exposed radiance of display values under the tone curve."""
+    return inverse_tone_map(np.asarray(colors, np.float32), np.float32(gamma), cfg.photometry)
+
+
+def point_radiance(
+    scene: Scene, solution: PhotometricSolution | None, cfg: FitConfig
+) -> Float[np.ndarray, "p 3"]:
+    """Return linear radiance of the scene's points: the solution's where it knows, else colours'.
+
+    Args:
+        scene: points and their colours.
+        solution: of the bundle adjustment, or None.
+        cfg: the tone curve.
+    """
+    radiance = linearized(scene.point_colors.astype(np.float32) / 255.0, cfg)
+    if solution is not None:
+        known = np.exp(solution.point_log_radiance)
+        radiance = np.where(np.isfinite(known), known, radiance)
+    return radiance.astype(np.float32)

@@ -1,0 +1,203 @@
+"""Observations of a stack: photographs of one fixed viewpoint at several exposures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from p2gs_jax.core.streams import Stream, generator
+from p2gs_jax.errors import UserError
+from p2gs_jax.photometry.observations import Observations
+from p2gs_jax.photometry.sources.sampling import sample
+from p2gs_jax.scene.exif import read_exif_ev
+from p2gs_jax.types import View
+
+POINTS, CANDIDATES = 4000, 40_000
+MARGIN = 8
+SATURATED = 250 / 255
+# Above the black level by this much a value carries signal, display values.
+ABOVE_BLACK = 8 / 255
+# A spike below this 8-bit value that holds this share of a frame is its black level.
+BLACKEST, SPIKE = 40, 0.3
+# Frames in which fewer pixels than this share carry signal say little.
+SIGNAL = 0.15
+# Shifts beyond this many pixels are mistakes of the matcher, not of the tripod.
+LARGEST_SHIFT = 7
+SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"}
+
+
+class Stack(NamedTuple):
+    """Photographs of one viewpoint.
+
+    Attributes:
+        views: the photographs; poses mean nothing.
+        images: 8-bit RGB.
+        valid: pixels that hold data in every frame (a pure blue border is none).
+    """
+
+    views: tuple[View, ...]
+    images: list[UInt8[np.ndarray, "h w 3"]]
+    valid: Bool[np.ndarray, "h w"]
+
+
+class StackColors(NamedTuple):
+    """What a stack shows at points.
+
+    Attributes:
+        observations: colours, every frame at every point.
+        xy: positions of the points in the first frame, pixel centres at +0.5.
+        shifts: pixels by which each frame was moved to fit the first.
+        black: values up to here were taken as black.
+        signal: frames in which enough pixels are neither black nor saturated.
+    """
+
+    observations: Observations
+    xy: Float[np.ndarray, "p 2"]
+    shifts: Float[np.ndarray, "v 2"]
+    black: float
+    signal: Bool[np.ndarray, " v"]
+
+
+def read_stack(folder: Path) -> Stack:
+    """Read the photographs of a folder (or of its `images/`).
+
+    Raises:
+        UserError: fewer than two photographs, unreadable ones, or different sizes.
+    """
+    if not folder.is_dir():
+        raise UserError(f"{folder} is not a folder.", fix="name the folder of the photographs")
+    inner = folder / "images" if (folder / "images").is_dir() else folder
+    files = sorted(p for p in inner.iterdir() if p.suffix.lower() in SUFFIXES)
+    if len(files) < 2:
+        raise UserError(
+            f"{inner} holds {len(files)} photograph(s); a stack needs two.",
+            fix="name a folder of photographs from one viewpoint at several exposures",
+        )
+    images = []
+    for path in files:
+        image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        if image is None:
+            raise UserError(f"{path} cannot be read as an image.", fix="replace or remove it")
+        if images and image.shape != images[0].shape:
+            raise UserError(
+                f"{path} is {image.shape[1]}x{image.shape[0]}, {files[0].name} "
+                f"{images[0].shape[1]}x{images[0].shape[0]}.",
+                fix="a stack has one size",
+            )
+        images.append(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
+    blue = np.all([(i[..., 2] > 200) & (i[..., 0] < 60) & (i[..., 1] < 60) for i in images], 0)
+    grown = cv2.dilate(blue.astype(np.uint8), np.ones((15, 15), np.uint8)) > 0
+    return Stack(tuple(_view(path) for path in files), images, ~grown)
+
+
+def _view(path: Path) -> View:
+    return View(
+        path.name,
+        path,
+        "0",
+        np.eye(4, dtype=np.float32),
+        np.eye(3, dtype=np.float32),
+        1,
+        1,
+        exif_ev=read_exif_ev(path),
+    )
+
+
+def align(images: list[UInt8[np.ndarray, "h w 3"]]) -> Float[np.ndarray, "v 2"]:
+    """Return shifts that bring each frame onto the first, through its neighbours.
+
+    Median threshold bitmaps do not depend on exposure; frames that are mostly black or white give
+    wild values, which count as no shift.
+    """
+    matcher = cv2.createAlignMTB(3)
+    gray = [cv2.cvtColor(i, cv2.COLOR_RGB2GRAY) for i in images]
+    shifts = np.zeros((len(images), 2))
+    for k in range(1, len(images)):
+        step = np.array(matcher.calculateShift(gray[k - 1], gray[k]), float)
+        useful = all(25 < np.median(g) < 230 for g in (gray[k - 1], gray[k]))
+        if not useful or np.abs(step).max() > LARGEST_SHIFT:
+            step = np.zeros(2)
+        shifts[k] = shifts[k - 1] + step
+    return shifts
+
+
+def black_level(images: list[UInt8[np.ndarray, "h w 3"]], valid) -> float:
+    """Return the value up to which the darkest frame shows nothing but its black level.
+
+    A frame that is mostly black has a spike in its histogram there, whatever the offset (film
+    scans: 13-16 of 255); one that is not is trusted down to its darkest percent.
+    """
+    darkest = min(images, key=lambda i: float(np.mean(i)))
+    values = darkest[valid]
+    level = float(np.percentile(values, 1))
+    for channel in range(3):
+        counts = np.bincount(values[:, channel], minlength=256)[:BLACKEST] / len(values)
+        spike = int(np.argmax(counts))
+        if counts[max(spike - 2, 0) : spike + 3].sum() > SPIKE:
+            level = max(level, float(spike + 2))
+    return level / 255 + ABOVE_BLACK
+
+
+def signal_share(values: UInt8[np.ndarray, "n 3"], black: float) -> float:
+    """Return the share of pixels that are neither black nor saturated in some channel."""
+    return float(((values > 255 * black) & (values < 255 * SATURATED)).any(-1).mean())
+
+
+def choose_points(stack: Stack, black: float, seed: int) -> Float[np.ndarray, "p 2"]:
+    """Return positions, as many in the mid tones of each frame."""
+    rng = generator(seed, Stream.STACK_PIXELS)
+    height, width = stack.valid.shape
+    x = rng.integers(MARGIN, width - MARGIN, CANDIDATES)
+    y = rng.integers(MARGIN, height - MARGIN, CANDIDATES)
+    keep = stack.valid[y, x]
+    x, y = x[keep], y[keep]
+    each = POINTS // len(stack.images)
+    chosen = np.zeros(len(x), bool)
+    for image in stack.images:
+        level = image[y, x].max(-1) / 255
+        good = np.flatnonzero((level > black + 0.1) & (level < 0.9) & ~chosen)
+        chosen[rng.permutation(good)[:each]] = True
+    rest = rng.permutation(np.flatnonzero(~chosen))[: max(POINTS - int(chosen.sum()), 0)]
+    chosen[rest] = True
+    return np.stack([x[chosen], y[chosen]], 1) + 0.5
+
+
+def stack_colors(stack: Stack, seed: int = 0) -> StackColors:
+    """Align a stack, choose points with signal and sample every frame at them.
+
+    Args:
+        stack: from `read_stack`.
+        seed: of the sampled positions.
+    """
+    shifts = align(stack.images)
+    black = black_level(stack.images, stack.valid)
+    xy = choose_points(stack, black, seed)
+    signal = np.array([signal_share(i[stack.valid], black) > SIGNAL for i in stack.images])
+    return StackColors(_observe(stack, xy, shifts), xy, shifts, black, signal)
+
+
+def _observe(
+    stack: Stack, xy: Float[np.ndarray, "p 2"], shifts: Float[np.ndarray, "v 2"]
+) -> Observations:
+    """Sample every frame at the same surface points."""
+    frames, points = len(stack.images), len(xy)
+    mask = stack.valid.astype(np.float32)
+    colors, spread = [], []
+    for image, shift in zip(stack.images, shifts, strict=True):
+        s = sample((image / 255).astype(np.float32), mask, xy - shift)
+        colors.append(np.where(s.valid[:, None], s.colors, 0))
+        spread.append(0.5 * s.spread)
+    return Observations(
+        np.repeat(np.arange(frames), points),
+        np.tile(np.arange(points), frames),
+        np.concatenate(colors),
+        np.concatenate(spread),
+        frames,
+        points,
+        np.zeros(frames, int),
+        names=tuple(v.name for v in stack.views),
+    )

@@ -1,0 +1,148 @@
+"""What a fit decided from its scene, as one record: `decisions.json`, and in every checkpoint.
+
+The options stay as they were asked for (`config.json`). Model and curve are chosen from the
+photographs, in numpy and threads: another machine may break a near tie the other way, and a state
+that was optimised under one curve means little under another. So a resumed run keeps what its
+checkpoints say.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from p2gs_jax.config import FitConfig, PhotometricModel
+from p2gs_jax.core.atomic import plain, write_json
+from p2gs_jax.errors import UserError
+
+# Under this name in the metadata of checkpoints.
+KEY = "decided"
+
+
+@dataclass(frozen=True)
+class Decisions:
+    """Values that the scene settles where the options leave them open.
+
+    Attributes:
+        model: photometric model.
+        curve: base of the tone curve.
+        spline: its correction, or None.
+        freeze_until: share of the run during which exposures and gammas keep still.
+        correspondence: how the relative-exposure loss finds pixels of one surface, or None.
+        log_exposure_mean: weight of the pull on the mean log exposure; None: no pull.
+        exposure_rate: learning rate of the exposures.
+        gamma_rate: learning rate of the gammas.
+        reasons: for the model and the curve, in words.
+    """
+
+    model: PhotometricModel
+    curve: Literal["power", "srgb", "spline", "linear"]
+    spline: tuple[float, ...] | None
+    freeze_until: float
+    correspondence: Literal["tracks", "depth"] | None
+    log_exposure_mean: float | None
+    exposure_rate: float
+    gamma_rate: float
+    reasons: tuple[str, ...] = ()
+
+    @classmethod
+    def as_asked(cls, cfg: FitConfig) -> Decisions:
+        """Return what the options say before a scene is known."""
+        p = cfg.photometry
+        return cls(
+            model=p.model,
+            curve=p.curve,
+            spline=p.spline,
+            freeze_until=p.freeze_until,
+            correspondence=cfg.loss.relative_exposure.correspondence,
+            log_exposure_mean=cfg.loss.regularizers.log_exposure_mean,
+            exposure_rate=cfg.optimizer.exposures,
+            gamma_rate=cfg.optimizer.gammas,
+        )
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> Decisions:
+        """Return what `to_dict` and JSON made of it.
+
+        Raises:
+            KeyError, TypeError: something is missing or of another kind.
+        """
+        spline = values["spline"]
+        kept = {f.name: values[f.name] for f in dataclasses.fields(cls)}
+        kept["spline"] = None if spline is None else tuple(map(float, spline))
+        return cls(**{**kept, "reasons": tuple(values["reasons"])})
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values."""
+        return plain(dataclasses.asdict(self))
+
+    def resolve(self, cfg: FitConfig) -> FitConfig:
+        """Return the options that a fit computes under: as asked, with these values filled in."""
+        replace, loss, o = dataclasses.replace, cfg.loss, cfg.optimizer
+        return replace(
+            cfg,
+            photometry=replace(
+                cfg.photometry,
+                select=False,
+                model=self.model,
+                curve=self.curve,
+                spline=self.spline,
+                freeze_until=self.freeze_until,
+            ),
+            loss=replace(
+                loss,
+                relative_exposure=replace(
+                    loss.relative_exposure, correspondence=self.correspondence
+                ),
+                regularizers=replace(loss.regularizers, log_exposure_mean=self.log_exposure_mean),
+            ),
+            optimizer=replace(o, exposures=self.exposure_rate, gammas=self.gamma_rate),
+        )
+
+    def require_same(self, saved: dict[str, Any] | None, folder: Path) -> None:
+        """Refuse to continue a run whose scene decides otherwise than it did; reasons may differ.
+
+        Args:
+            saved: from the checkpoint; None, as older versions wrote, is believed.
+            folder: of the checkpoints.
+
+        Raises:
+            UserError: a decision differs.
+        """
+        if saved is None:
+            return
+        now = self.to_dict()
+        del now["reasons"]
+        other = [f"{k} was {saved.get(k)}, now {v}" for k, v in now.items() if saved.get(k) != v]
+        if other:
+            raise UserError(
+                f"The checkpoints in {folder} were made under other decisions than this scene "
+                f"leads to now: {'; '.join(other)}.",
+                fix="restore the scene as it was when the run began, or start again in another "
+                "folder with --out",
+            )
+
+
+def write_decisions(path: Path, decisions: Decisions) -> None:
+    """Write `decisions.json`."""
+    write_json(path, decisions.to_dict())
+
+
+def read_decisions(path: Path) -> Decisions | None:
+    """Read `decisions.json`; None where there is none, as in runs of older versions.
+
+    Raises:
+        UserError: it is broken.
+    """
+    if not path.exists():
+        return None
+    try:
+        return Decisions.from_dict(json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(
+            f"{path} cannot be read ({error}).",
+            fix="restore it from a copy, or finish the fit again with --resume, which writes it",
+        ) from error

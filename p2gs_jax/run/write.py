@@ -1,0 +1,226 @@
+"""The one writer of a run folder; the log and the checkpoints are written while steps are taken."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.config import to_dict as config_to_dict
+from p2gs_jax.core.atomic import write_array, write_json
+from p2gs_jax.core.numerics import LN2
+from p2gs_jax.evaluate.evaluate import MeanParameters, ViewResult, mean_parameters
+from p2gs_jax.formats.exr import write_exr
+from p2gs_jax.formats.ply import write_ply, write_radiance
+from p2gs_jax.formats.png import write_png
+from p2gs_jax.gaussians.bake import bake, display_comments, display_of_splats
+from p2gs_jax.photometry.display import DisplayTransform, develop
+from p2gs_jax.photometry.solution import PhotometricSolution
+from p2gs_jax.render.spherical_harmonics import MAX_DEGREE
+from p2gs_jax.run.decisions import Decisions, write_decisions
+from p2gs_jax.run.layout import RunFolder
+from p2gs_jax.run.photometry_file import ViewPhotometry, write_photometry
+from p2gs_jax.run.places import remembered
+from p2gs_jax.run.scene_file import write_scene
+from p2gs_jax.run.summary import write_summary
+from p2gs_jax.scene.device import camera_of
+from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.types import Params, Photometry, Scene
+
+SUMMARY_VIEWS = 4
+
+
+def write_start(
+    folder: RunFolder,
+    scene: Path,
+    reference: Path | None,
+    cfg: FitConfig,
+    decisions: Decisions,
+) -> None:
+    """Write what was asked and what was decided: the folder is a run's from here on.
+
+    Args:
+        folder: of the run.
+        scene: what is fitted.
+        reference: photographs of the same views under one common exposure, or None.
+        cfg: as asked.
+        decisions: of the scene.
+    """
+    write_decisions(folder.decisions, decisions)
+    write_json(
+        folder.config,
+        {
+            **remembered("scene", scene, folder.root),
+            **remembered("reference", reference, folder.root),
+            "fit": config_to_dict(cfg),
+        },
+    )
+
+
+def write_results(
+    folder: RunFolder,
+    params: Params,
+    scene: Scene,
+    cfg: FitConfig,
+    *,
+    fitted: dict[int, float],
+    solution: PhotometricSolution | None,
+    shown: Sequence[ViewResult],
+    true_ev: np.ndarray | None = None,
+) -> None:
+    """Write the scene, the Gaussians, the photometry and the summary.
+
+    Args:
+        folder: of the run.
+        params: live Gaussians and photometry.
+        scene: its views.
+        cfg: what the fit computed under.
+        fitted: exposures solved for held-out views, by row.
+        solution: what the fit started from, or None.
+        shown: views of the summary.
+        true_ev: true exposures of the training views for the plot, or None.
+    """
+    write_scene(folder.root, scene)
+    _write_models(folder, params, cfg)
+    model, curve, gauge = _photometry_model(params, cfg)
+    mean = mean_parameters(params.photometry)
+    write_photometry(
+        folder.photometry,
+        model=model,
+        curve=curve,
+        gauge=gauge,
+        mean=dataclasses.asdict(mean),
+        views=_photometry_views(params, scene, fitted, solution),
+    )
+    if params.appearance is not None:
+        write_array(folder.appearance, np.asarray(params.appearance))
+    _write_summary(folder.summary, shown, params, scene, mean, cfg, true_ev)
+
+
+def write_view(folder: Path, name: str, result: ViewResult, store: ImageStore) -> None:
+    """Write one view as EXR, PNG and its photograph, under the photograph's own name."""
+    stem = folder / Path(name).with_suffix("")
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    camera = camera_of(store, result.index)
+    write_exr(
+        stem.with_suffix(".exr"),
+        result.linear,
+        depth=result.depth,
+        alpha=result.alpha,
+        exposure=result.exposure,
+        gamma=result.gamma,
+        camera=camera,
+    )
+    write_png(stem.with_name(f"{stem.name}.render.png"), result.ldr)
+    write_png(stem.with_name(f"{stem.name}.photograph.png"), result.photograph)
+
+
+def summary_rows(scene: Scene) -> list[int]:
+    """Return which views the summary shows: held-out ones first, spread over cameras and time."""
+    pool = list(scene.test_indices) or list(scene.train_indices)
+    if len(pool) < SUMMARY_VIEWS:
+        pool += [i for i in scene.train_indices if i not in pool]
+    picks = np.linspace(0, len(pool) - 1, min(SUMMARY_VIEWS, len(pool))).round().astype(int)
+    return [pool[i] for i in picks]
+
+
+def _write_models(folder: RunFolder, params: Params, cfg: FitConfig) -> None:
+    """Write `splats.ply` (display colours) and `radiance.ply` (linear)."""
+    mean = mean_parameters(params.photometry)
+    alive = np.ones(params.gaussians.capacity, bool)
+    transform = DisplayTransform(
+        mean.exposure_geometric, mean.gamma, cfg.photometry, params.mean_correction
+    )
+    transform = display_of_splats(transform)
+    shown = bake(params.gaussians, transform, cfg.render.radiance, MAX_DEGREE)
+    write_ply(folder.splats, shown, display_comments(transform))
+    write_radiance(folder.radiance, params.gaussians, alive, activation=cfg.render.radiance)
+
+
+def _photometry_views(
+    params: Params,
+    scene: Scene,
+    fitted: dict[int, float],
+    solution: PhotometricSolution | None = None,
+) -> list[ViewPhotometry]:
+    """Return the `views` of `photometry.json`; held-out views have no exposure of their own.
+
+    Args:
+        params: the fit.
+        scene: its views.
+        fitted: exposures solved for held-out views.
+        solution: what the fit started from; it, its standard errors and its number of observations
+            are passed on.
+    """
+    taken: Photometry = jax.tree.map(np.asarray, params.photometry)
+    exposures, gammas = taken.exposures, taken.gammas
+    rows = {index: k for k, index in enumerate(scene.train_indices)}
+    out: list[ViewPhotometry] = []
+    for index, view in enumerate(scene.views):
+        k = rows.get(index)
+        e = None if k is None else float(exposures[k])
+        out.append(
+            {
+                "image": view.name,
+                "camera": view.camera,
+                "exposure": e,
+                "exposure_ev": None if e is None else float(np.log2(e)),
+                "gamma": None if k is None else float(gammas[k]),
+                "exif_ev": view.exif_ev,
+                "split": view.split,
+                "exposure_fitted": fitted.get(index),
+            }
+        )
+        if k is not None and solution is not None and np.isfinite(solution.exposure_errors[k]):
+            out[-1]["exposure_ev_error"] = float(solution.exposure_errors[k] / LN2)
+            out[-1]["gamma_error"] = float(solution.gamma_errors[k])
+            out[-1]["exposure_ev_start"] = float(solution.exposures_ev[k])
+            out[-1]["observations"] = int(solution.observations_per_view[k])
+    return out
+
+
+def _photometry_model(params: Params, cfg: FitConfig) -> tuple[str, dict, str]:
+    """Return (model, curve, gauge) as `photometry.json` names them."""
+    gauge = (
+        "mean log exposure over the training views is 0; radiance is relative to it"
+        if params.photometry.parameterization == "log"
+        else "soft: the mean exposure is pulled towards 1 (paper, eq. 10)"
+    )
+    p = cfg.photometry
+    curve = {"name": p.curve, "pivot": p.pivot, "spline": p.spline}
+    if p.known is not None:
+        gauge = f"known exposures ({p.known}); radiance is in their units"
+    return p.model, curve, gauge
+
+
+def _write_summary(
+    path: Path,
+    shown: Sequence[ViewResult],
+    params: Params,
+    scene: Scene,
+    mean: MeanParameters,
+    cfg: FitConfig,
+    true_ev: np.ndarray | None,
+) -> None:
+    common = DisplayTransform(
+        mean.exposure_geometric, mean.gamma, cfg.photometry, params.mean_correction
+    )
+    train = scene.training_views
+    exif = [v.exif_ev for v in train]
+    write_summary(
+        path,
+        photographs=[v.photograph for v in shown],
+        rendered=[v.ldr for v in shown],
+        linear_tonemapped=[develop(v.linear, common) for v in shown],
+        names=[f"{scene.views[v.index].name} ({scene.views[v.index].split})" for v in shown],
+        exposures_ev=np.log2(jax.tree.map(np.asarray, params.photometry).exposures),
+        cameras=[v.camera for v in train],
+        true_ev=true_ev,
+        exif_ev=None
+        if all(e is None for e in exif)
+        else np.array([np.nan if e is None else e for e in exif]),
+    )

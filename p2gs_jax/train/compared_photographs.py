@@ -1,0 +1,63 @@
+"""What the relative-exposure loss compares where it looks at photographs."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.core.numerics import on_device
+from p2gs_jax.errors import UserError
+from p2gs_jax.losses.relative_exposure import ColorPairs
+from p2gs_jax.losses.total import OBSERVED_FORMS
+from p2gs_jax.photometry.observations import Observations, overlapping_views, sample_pairs
+
+PAIR_POOL = 200_000
+# Views that share this many points are worth comparing through depth.
+FEWEST_SHARED = 30
+
+
+def color_pairs(tracks: Observations | None, cfg: FitConfig) -> ColorPairs | None:
+    """Return pairs of colours of one point in two views; None where the loss uses none.
+
+    Args:
+        tracks: colours of shared points, or None.
+        cfg: the loss, and the seed.
+
+    Raises:
+        UserError: the loss wants them and the scene has no tracks.
+    """
+    if not _compares_photographs(cfg, "tracks"):
+        return None
+    if tracks is None or not len(tracks.points):
+        raise UserError(
+            "the relative-exposure loss was to compare photographs at tracks, and this scene has "
+            "none.",
+            fix="use --loss.relative-exposure.correspondence depth, or a scene with tracks",
+        )
+    first, second = sample_pairs(tracks, PAIR_POOL, cfg.train.seed)
+    return ColorPairs(
+        on_device(tracks.colors[first]),
+        on_device(tracks.colors[second]),
+        on_device(tracks.views[first], np.int32),
+        on_device(tracks.views[second], np.int32),
+        on_device(np.ones(len(first))),
+    )
+
+
+def overlaps(tracks: Observations | None, cfg: FitConfig) -> list[np.ndarray] | None:
+    """Return for every view those worth comparing through depth; None where the loss does not.
+
+    Args:
+        tracks: colours of shared points, or None.
+        cfg: the loss.
+    """
+    if tracks is None or not len(tracks.points) or not _compares_photographs(cfg, "depth"):
+        return None
+    return overlapping_views(tracks, FEWEST_SHARED)
+
+
+def _compares_photographs(cfg: FitConfig, correspondence: str) -> bool:
+    """Return whether the loss compares photographs in the given way."""
+    relative = cfg.loss.relative_exposure
+    observed = relative.weight is not None and relative.form in OBSERVED_FORMS
+    return observed and relative.correspondence == correspondence
