@@ -26,7 +26,9 @@ from p2gs_jax.report.svg import (
     INK,
     MUTED,
     NARROW,
+    NARROW_TEXT,
     SECOND,
+    TEXT,
     THIRD,
     WIDE,
     chart,
@@ -37,6 +39,8 @@ from p2gs_jax.report.svg import (
 
 # Half of a rolling median's window, in shares of the run.
 SMOOTHING = 0.01
+# Width of a character over the size of the text, with a margin: names of losses vary.
+CHARACTER = 0.62
 
 
 def seams_chart(rows: Sequence[tuple[str, float, float]], *, label: str) -> str:
@@ -94,6 +98,7 @@ class Training:
 def training_chart(training: Training, *, label: str) -> str:
     """Return PSNR, loss and Gaussians over the steps."""
     t = training
+    longest = max(map(len, t.losses), default=0)
     window = max(3, 2 * round(SMOOTHING * len(t.steps)) + 1)
     styles = [(INK, "-"), (FIRST, "--"), (SECOND, "-."), (THIRD, ":"), (FOURTH, (0, (5, 1, 1, 1)))]
 
@@ -102,6 +107,7 @@ def training_chart(training: Training, *, label: str) -> str:
 
     def draw(wide: bool) -> Figure:
         left, right = (LEFT, RIGHT) if wide else (NARROW_LEFT + 4, NARROW_RIGHT)
+        right = max(right, CHARACTER * (TEXT if wide else NARROW_TEXT) * longest)
         across = (WIDE if wide else NARROW) - left - right
         each = 150 if wide else 120
         step, top = each + 34, 56 if wide else 22
