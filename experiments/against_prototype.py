@@ -14,19 +14,48 @@ import argparse
 import importlib.util
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial import KDTree
 
-from p2gs_jax.bench.scenes import STREETS, garden
+from p2gs_jax.bench.scenes import BenchScene, make_gaussians, street
 from p2gs_jax.bench.timing import interleaved
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render import bin_tiles, count_entries, project, rasterize
 from p2gs_jax.render.capacity import bucket
 from p2gs_jax.render.spherical_harmonics import C0
 from p2gs_jax.render.xla_cpu import compiler_options
+from p2gs_jax.types import Camera
+
+
+def garden(path: Path, degree: int = 0) -> BenchScene:
+    """Return a crop of a real capture with nearest-neighbour scales.
+
+    Args:
+        path: `test_garden.npz` (means3d, colors, viewmats, Ks).
+        degree: spherical-harmonics degree.
+    """
+    data, rng = np.load(path), np.random.default_rng(1)
+    means = data["means3d"]
+    count = len(means)
+    near = KDTree(means).query(means, k=4)[0][:, 1:].mean(1)
+    log_scales = np.log(np.maximum(near, 1e-4))[:, None] + rng.normal(0, 0.4, (count, 3))
+    logits, quats = rng.normal(0, 2, count), rng.normal(size=(count, 4))
+    log_radiance = np.log(data["colors"] / 255 + 1e-3)
+    gaussians = make_gaussians(means, quats, log_scales, logits, log_radiance, degree, rng)
+    viewmat, K = (jnp.asarray(data[k][0], jnp.float32) for k in ("viewmats", "Ks"))
+    return BenchScene("garden crop", gaussians, Camera(viewmat, K, 648, 420))
+
+
+STREETS: dict[str, Callable[[], BenchScene]] = {
+    "street20k": lambda: street(20_000, 640, 360, radius=4.0, spread=1.1),
+    "street100k": lambda: street(100_000, 960, 650),
+    "street300k": lambda: street(300_000, 960, 650, radius=2.0, spread=1.0),
+}
 
 
 def load(path: Path):

@@ -87,5 +87,5 @@ def __getattr__(name: str):
 
 
 def __dir__() -> list[str]:
-    """List what is imported lazily too, for completion."""
+    """List lazily imported names as well, for completion."""
     return sorted({*globals(), *__all__, "__version__"})

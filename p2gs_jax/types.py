@@ -293,7 +293,7 @@ class Scene:
         points: seed points, scene units.
         point_colors: their display-encoded colours.
         tracks: observations of the points, or None.
-        notes: what the reader wants the user to know (skipped frames, unregistered images, ...).
+        notes: messages of the reader for the user (skipped frames, unregistered images, ...).
     """
 
     root: Path

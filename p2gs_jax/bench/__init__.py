@@ -1,1 +1,1 @@
-"""Benches: speed, and the error it is bought with, measured in one process."""
+"""Benches: speed against error, measured in one process."""

@@ -1,9 +1,9 @@
-"""Scenes as a fit meets them: the populations and cameras of its levels, made from nothing.
+"""Synthetic scenes with the populations and cameras of a fit's levels.
 
 No fit is run and no file read. A town's surfaces are sampled where the drive's cameras see them and
-become Gaussians as seeds do at the start of a fit; opacities, sizes, shapes and colours then leave
-that start in the measured way of a finished fit (`FITTED`), in part or wholly. The room is filled
-layer behind layer with splats that hide little, as indoor captures end up.
+become Gaussians as seeds do at the start of a fit; opacities, sizes, shapes and colours are then
+changed to the statistics measured on a finished fit (`FITTED`), in part or wholly. The room has
+layers of splats that hide little, as fits of indoor captures do.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from p2gs_jax.types import Camera, Gaussians, View
 FRAMES, SEEN_PER_CAMERA = 30, 6
 FARTHEST = 90.0  # m, as of the seed points of `synth`
 GROUND_ALBEDO, AMBIENT = 0.12, 0.35
-# How far a fit has come at each level of coarse-to-fine, as a part of the way to `FITTED`.
+# State of a fit at each level of coarse-to-fine: 0 are the seeds, 1 is `FITTED`.
 WAY = {4: 0.25, 2: 0.6, 1: 1.0}
 
 
 @dataclasses.dataclass(frozen=True)
 class Statistics:
-    """What the Gaussians of a fit look like.
+    """Statistics of the Gaussians of a fit.
 
     Attributes:
         logit: mean and standard deviation of the opacity's logit.
@@ -66,7 +66,7 @@ FITTED = Statistics(
 
 
 def town_level(shrink: int, *, width: int = 480, points: int = 60_000, seed: int = 3) -> BenchScene:
-    """Return a town as a fit has it at one level of coarse-to-fine.
+    """Return a town with the population and camera of one level of coarse-to-fine.
 
     Args:
         shrink: factor by which the photographs are smaller there: 4, 2 or 1.
@@ -99,8 +99,8 @@ def along_a_fit(
         radiance: of the seeds.
         views: training views.
         way: from the start, 0, to the end, 1.
-        rng: source of chance.
-        end: what they come to look like.
+        rng: random numbers.
+        end: statistics at the end.
     """
     start = gaussians_from_points(xyz, radiance, views, FitConfig())
     clones = rng.choice(len(xyz), round(way * (end.grown - 1) * len(xyz)))
@@ -118,7 +118,7 @@ def along_a_fit(
     leaves["log_scales"] = near[:, None] + way * rng.permuted(axes.T, axis=1)
     leaves["opacity_logits"] += way * (logit - leaves["opacity_logits"])
     leaves["quats"] = leaves["quats"] + way * rng.normal(size=(count, 4))
-    # Off the surface by part of its own size, and less evenly where relocation put it.
+    # Off the surface by part of the Gaussian's size, and more where relocation has put it.
     leaves["means"] += way * 0.5 * np.exp(near)[:, None] * rng.normal(size=(count, 3))
     size = end.sh[0] * np.exp(rng.normal(0, end.sh[1], (count, 1, 1)))
     leaves["sh"][:, 1:] = way * size * rng.normal(size=leaves["sh"][:, 1:].shape)
@@ -157,7 +157,7 @@ def _surface_points(width: int, points: int, seed: int) -> tuple[np.ndarray, np.
     xyz, radiance = [], []
     for view in views:
         R, t = view.viewmat[:3, :3].astype(np.float64), view.viewmat[:3, 3].astype(np.float64)
-        # Enough of them do not go to the sky.
+        # Rays to the sky are dropped; enough others remain.
         pixels = rng.uniform((0, 0), (view.width, view.height), (2 * each, 2))
         rays = np.c_[pixels, np.ones(len(pixels))] @ np.linalg.inv(view.K.astype(np.float64)).T
         origin, direction = -R.T @ t, rays @ R
@@ -191,7 +191,7 @@ def _first_hits(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return distances along rays (inf: sky), rows of the primitives `among`, and normals.
 
-    Every primitive counts as its bounding box: their number and size in the view is what matters.
+    Every primitive is taken as its bounding box: only number and size in the view matter.
     """
     safe = np.where(np.abs(direction) < 1e-9, 1e-9, direction)
     with np.errstate(divide="ignore"):
@@ -209,7 +209,7 @@ def _first_hits(
     return best, row, normal
 
 
-# Corners, m: walls, floor and ceiling, and what stands between them.
+# Corners, m: of the room, and of its furniture.
 ROOM = ((-3.0, -2.0, 0.0), (3.0, 2.0, 2.6))
 FURNITURE = (
     ((-0.6, -0.5, 0.0), (0.9, 0.5, 0.75)),  # table

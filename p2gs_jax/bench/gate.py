@@ -1,4 +1,4 @@
-"""Holding a bench against the committed baseline."""
+"""Comparison of a bench with the committed baseline."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ import json
 from pathlib import Path
 
 from p2gs_jax.bench.metrics import METRICS
-from p2gs_jax.bench.speed_error import Point
+from p2gs_jax.bench.speed_error import MeasuredVariant
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.errors import UserError
 
 Rows = dict[str, dict[str, float]]
 
 
-def values(points: list[Point]) -> Rows:
+def values(points: list[MeasuredVariant]) -> Rows:
     """Return per variant what the gate compares.
 
-    The total error shows what the rules leave out; `numerics ...` shows the implementation alone.
+    The total error includes the rules' cutoffs; `numerics ...` is the implementation's own error.
     """
     rows = {}
     for p in points:

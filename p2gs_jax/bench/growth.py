@@ -1,4 +1,4 @@
-"""How time and memory grow with Gaussians, pixels, overlap and views."""
+"""Scaling of time and memory with Gaussians, pixels, overlap and views."""
 
 from __future__ import annotations
 
@@ -39,15 +39,15 @@ class Sample(NamedTuple):
     temporaries: int
 
 
-class Curve(NamedTuple):
+class GrowthCurve(NamedTuple):
     """Samples along one axis, and the exponents p of time ~ work^p fitted to them.
 
     Attributes:
-        axis: what grows.
-        held: what stays the same.
+        axis: quantity that grows.
+        held: quantities that stay the same.
         samples: in growing order.
         forward_exponent: least squares in log-log.
-        both_exponent: likewise.
+        both_exponent: least squares in log-log, forward and backward.
         last_exponents: slopes between the last two samples, where fixed costs no longer show.
     """
 
@@ -93,9 +93,9 @@ def exponent(work, times) -> float:
     return float(np.polyfit(np.log(np.asarray(work, float)), np.log(np.asarray(times)), 1)[0])
 
 
-def _curve(axis: str, held: str, samples: list[Sample]) -> Curve:
+def _curve(axis: str, held: str, samples: list[Sample]) -> GrowthCurve:
     work = [s.work for s in samples]
-    return Curve(
+    return GrowthCurve(
         axis,
         held,
         samples,
@@ -108,12 +108,12 @@ def _curve(axis: str, held: str, samples: list[Sample]) -> Curve:
     )
 
 
-def measure(
+def measure_growth(
     *,
     quick: bool = False,
     repeats: int = 5,
     on_progress: Callable[[str, int, int], None] = lambda stage, done, count: None,
-) -> list[Curve]:
+) -> list[GrowthCurve]:
     """Measure every axis; each axis is one interleaved run."""
     curves = []
     base = RenderConfig()
@@ -135,7 +135,7 @@ def measure(
     return curves
 
 
-def _views(quick: bool, repeats: int) -> Curve:
+def _views(quick: bool, repeats: int) -> GrowthCurve:
     """Several views in one program, one after another (a batch of a data-parallel step)."""
     scene = street(20_000, 640, 360, radius=4.0)
     cfg = RenderConfig()

@@ -1,4 +1,4 @@
-"""Scenes that break rasterizers: what must happen, how far float32 is from float64."""
+"""Scenes that break rasterizers, with the expected result and float32's error against float64."""
 
 from __future__ import annotations
 
@@ -201,13 +201,13 @@ CASES = (
 
 
 class Gap(NamedTuple):
-    """How far an implementation is from the float64 oracle.
+    """Differences between an implementation and the float64 oracle.
 
     Attributes:
         value: largest image error beyond undecided pairs, relative to the largest value.
         relative: largest relative error of a pixel (pixels below 1e-4 of the largest held to it).
-        gradient: largest relative L2 error of a gradient group; groups smaller than `SMALL_GROUP`
-            of the largest (what cancels, as along a needle) are held to that size.
+        gradient: largest relative L2 error of a gradient group; errors of groups smaller than
+            `SMALL_GROUP` of the largest (cancellation, as along a needle) are relative to that.
         undecided: pairs within float32's reach of the cutoff, where either side is right.
         finite: no NaN or infinity in any value or gradient.
         silent: nothing appeared and every gradient is exactly zero.
@@ -289,7 +289,7 @@ def float64_oracle(gaussians: Gaussians, view: Camera, cfg: RenderConfig):
 
 
 def gap(case: HardCase, cfg: RenderConfig, oracle=None) -> Gap:
-    """Hold one implementation against the float64 oracle on one case.
+    """Compare one implementation with the float64 oracle on one case.
 
     Args:
         case: the scene.

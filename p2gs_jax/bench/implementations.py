@@ -28,7 +28,7 @@ from p2gs_jax.render import view_radiance
 SIZES = (100_000, 1_000_000, 3_000_000)
 PIXELS = (1920, 1080)
 WINDOW = (96, 72)
-# Operations per pair of entry and pixel, forward and with gradients (KERNEL.md).
+# Operations per pair of entry and pixel, forward and with gradients (docs/kernel.md).
 OPERATIONS = {"forward": 30, "both": 65}
 ROW_BYTES = 4 * (9 + 1)  # a row without depth, and its id
 
@@ -41,7 +41,7 @@ class Timing(NamedTuple):
         implementation: `xla`, `pallas` or `gsplat`.
         forward: milliseconds.
         both: milliseconds, forward and backward.
-        megabytes: temporaries of forward and backward; peak memory for gsplat.
+        megabytes: temporaries of forward and backward; for gsplat, peak memory.
         error: metrics against float64 in the window.
     """
 
@@ -54,14 +54,14 @@ class Timing(NamedTuple):
 
 
 class Work(NamedTuple):
-    """What one view asks of the device, whoever composites it tile by tile.
+    """Work of compositing one view tile by tile, whatever the implementation.
 
     Attributes:
         scene: its name.
         entries: tile-list entries.
         pairs: entries times pixels of a tile.
         gigaflops: `OPERATIONS` times pairs, forward and with gradients.
-        gigabytes: read and written by compositing, likewise.
+        gigabytes: read and written by compositing, forward and with gradients.
     """
 
     scene: str
@@ -155,7 +155,7 @@ def gsplat_jobs(
     return forward, both, peak
 
 
-def measure(
+def measure_implementations(
     *,
     quick: bool = False,
     repeats: int = 7,

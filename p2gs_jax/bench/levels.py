@@ -1,7 +1,7 @@
 """The whole training step at every level of coarse-to-fine, and indoors.
 
-Full-size views of streets do not show what a fit runs most: small images of many Gaussians, whose
-tiles have long lists. Each scene here has the population and the camera of a point along a fit.
+A fit mostly renders small images of many Gaussians, whose tiles have long lists; full-size views of
+streets do not show that. Each scene here has the population and camera of one level of a fit.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ QUICK: dict[str, Callable[[], BenchScene]] = {
     "small town 1/4": lambda: town_level(4, width=160, points=6700),
     "small room": lambda: room(width=160, points=2700),
 }
-# Of the quick ones; a step takes longest to compile.
+# Levels of a quick bench whose whole step is timed; a step takes longest to compile.
 QUICK_STEPS = ("small town 1/4",)
 GATED = ("relative_99", "gradient_99")
 
 
 class Lists(NamedTuple):
-    """How long the tile lists of a view are.
+    """Lengths of the tile lists of a view.
 
     Attributes:
         tiles: number of lists.
@@ -64,7 +64,7 @@ class Lists(NamedTuple):
 
 
 def lists(scene: BenchScene, cfg: FitConfig) -> Lists:
-    """Return how long the tile lists of a scene are."""
+    """Return the lengths of a scene's tile lists."""
     g, camera = scene.gaussians, scene.camera
     alive = jnp.ones(g.capacity, bool)
     capacity = bucket(int(required_capacity(g, alive, camera, cfg.render)))
@@ -82,7 +82,7 @@ class Level(NamedTuple):
         scene: its name.
         gaussians: how many.
         size: width and height, pixels.
-        lists: what there is to composite.
+        lists: lengths of the tile lists.
         milliseconds: medians: `forward`, `both` (forward and backward), `step` (the whole training
             step) where it was asked for.
         ratios: the same over the reference workload of the same run.
@@ -102,7 +102,7 @@ class Level(NamedTuple):
 def gate_rows(levels: list[Level]) -> dict[str, dict[str, float]]:
     """Return per scene what the gate compares.
 
-    Of the accuracy, what does not hang on the few contributions that lie on the cutoff itself.
+    Of the accuracy, only metrics that do not depend on the few contributions at the cutoff itself.
     """
     return {
         level.scene: level.ratios
@@ -111,7 +111,7 @@ def gate_rows(levels: list[Level]) -> dict[str, dict[str, float]]:
     }
 
 
-def photograph(linear: np.ndarray, scene: BenchScene) -> Batch:
+def photograph_of(linear: np.ndarray, scene: BenchScene) -> Batch:
     """Return a view of the scene at half the exposure, near what a fit compares with."""
     ldr = np.clip(0.5 * linear, 0, 1) ** (1 / 2.2)
     shape = linear.shape[:2]
@@ -119,7 +119,7 @@ def photograph(linear: np.ndarray, scene: BenchScene) -> Batch:
     return Batch(scene.camera, ldr, mask, jnp.int32(0))
 
 
-def measure(
+def measure_levels(
     scenes: dict[str, Callable[[], BenchScene]] = SCENES,
     cfg: FitConfig | None = None,
     *,
@@ -134,7 +134,7 @@ def measure(
         scenes: by name.
         cfg: as for a fit; default: `robust`.
         steps: scenes whose whole step is timed; None times all.
-        judged: hold image and gradient against the float64 truth, too.
+        judged: compare image and gradient with the float64 truth, too.
         repeats: timed runs of each.
         on_progress: called with (stage, done, count).
     """
@@ -152,7 +152,7 @@ def measure(
         linear, step = np.asarray(linear, np.float64), None
         if steps is None or name in steps:
             # Stepping moves the Gaussians a little.
-            step = whole_step(scene, cfg, photograph(linear, scene), bucket(need, 1.2))
+            step = whole_step(scene, cfg, photograph_of(linear, scene), bucket(need, 1.2))
             jobs["step"] = step.run
         times = interleaved(jobs, repeats)
         if step is not None and step.fault():

@@ -1,4 +1,4 @@
-"""What a bench measures: each metric declared once, with its direction and tolerance."""
+"""Metrics of the benches, each declared once with its direction and tolerance."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def trimmed_errors(
     """Return accuracy without the worst percent, of pixels and of Gaussians.
 
     Where many splats meet at a pixel, some contributions lie on the cutoff itself, and float32 and
-    float64 may decide differently; a few of these would hide what all the others say.
+    float64 may decide differently; a few of these would dominate the metrics.
     """
     error = np.abs(linear - truth.linear).max(-1)
     brightest = truth.linear.max(-1)

@@ -26,7 +26,7 @@ NEGLIGIBLE = 1e-9
 
 
 class Truth(NamedTuple):
-    """What a scene looks like, and how that depends on it.
+    """The float64 image of a scene and its gradient.
 
     Attributes:
         linear: radiance, (H, W, 3), float64.

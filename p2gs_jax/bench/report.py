@@ -16,13 +16,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.ticker import FormatStrFormatter, NullFormatter
 
-from p2gs_jax.bench.growth import Curve
+from p2gs_jax.bench.growth import GrowthCurve
 from p2gs_jax.bench.hard_cases import CASES, Gap
 from p2gs_jax.bench.implementations import Timing, Work
 from p2gs_jax.bench.levels import Level
 from p2gs_jax.bench.memory import Footprint
 from p2gs_jax.bench.metrics import ACCURACY, METRICS
-from p2gs_jax.bench.speed_error import DEFAULT, Point, front
+from p2gs_jax.bench.speed_error import DEFAULT, MeasuredVariant, front
 from p2gs_jax.bench.step import StepCost
 from p2gs_jax.core.atomic import atomic_write
 
@@ -58,8 +58,8 @@ def _number(name: str, value: float) -> str:
     return f"{value:.1f}" if name == "psnr" else f"{value:.1e}"
 
 
-def speed_error_table(points: list[Point]) -> str:
-    """Return the table of `speed_error.measure`."""
+def speed_error_table(points: list[MeasuredVariant]) -> str:
+    """Return the table of `speed_error.measure_speed_error`."""
     on_front = front(points)
     rows = []
     for p in points:
@@ -98,7 +98,7 @@ PANELS = (
 )
 
 
-def speed_error_plot(path: Path, points: list[Point], title: str) -> None:
+def speed_error_plot(path: Path, points: list[MeasuredVariant], title: str) -> None:
     """Draw milliseconds against error: image, gradient, and what is not due to the cutoff."""
     figure, axes = plt.subplots(1, 3, figsize=(15, 5), layout="constrained")
     knobs = list(dict.fromkeys(p.variant.knob for p in points))
@@ -107,7 +107,7 @@ def speed_error_plot(path: Path, points: list[Point], title: str) -> None:
     for axis, panel in zip(axes, PANELS, strict=True):
         shown = [p for p in points if not panel.numerics or p.numerics is not None]
 
-        def at(p: Point, panel=panel) -> tuple[float, float]:
+        def at(p: MeasuredVariant, panel=panel) -> tuple[float, float]:
             error = p.numerics if panel.numerics else p.error
             assert error is not None
             return p.ratios[panel.time] * reference, error[panel.error]
@@ -147,7 +147,7 @@ def speed_error_plot(path: Path, points: list[Point], title: str) -> None:
 
 
 def _label(axis, points: list[tuple[str, float, float]]) -> None:
-    """Name points, the first ones first, where no other name stands."""
+    """Label points in order, skipping labels that would overlap others."""
     x, y = (np.log([p[i] for p in points]) for i in (1, 2))
     x, y = (a - a.min() for a in (x, y))
     x, y = x / max(x.max(), 1e-9), y / max(y.max(), 1e-9)
@@ -165,7 +165,7 @@ def _label(axis, points: list[tuple[str, float, float]]) -> None:
             )
 
 
-def growth_table(curves: list[Curve]) -> str:
+def growth_table(curves: list[GrowthCurve]) -> str:
     """Return every sample of every curve and the fitted exponents."""
     rows = []
     for c in curves:
@@ -198,7 +198,7 @@ def growth_table(curves: list[Curve]) -> str:
     )
 
 
-def memory_coefficients(curves: list[Curve]) -> dict[str, float]:
+def memory_coefficients(curves: list[GrowthCurve]) -> dict[str, float]:
     """Return bytes of temporaries per Gaussian, pixel and entry (non-negative least squares)."""
     from scipy.optimize import nnls
 
@@ -217,7 +217,7 @@ def memory_coefficients(curves: list[Curve]) -> dict[str, float]:
     return dict(zip(("Gaussian", "pixel", "entry"), map(float, solution), strict=True))
 
 
-def growth_plot(path: Path, curves: list[Curve]) -> None:
+def growth_plot(path: Path, curves: list[GrowthCurve]) -> None:
     """Draw every curve in log-log."""
     figure, axes = plt.subplots(1, len(curves), figsize=(3.1 * len(curves), 3), sharey=True)
     for axis, c in zip(axes, curves, strict=True):

@@ -30,7 +30,7 @@ Progress = Callable[[str, int, int], None]
 
 
 def sweep_scene(quick: bool) -> BenchScene:
-    """Return the scene whose knobs are turned: a street, degree 3, about five stops of contrast."""
+    """Return the scene of `speed_error`: a street, degree 3, about five stops of contrast."""
     if quick:
         return street(4000, 256, 144, radius=6.0, degree=3)
     return street(20_000, 640, 360, radius=4.0, spread=1.1, degree=3)
@@ -72,7 +72,7 @@ def run(
         scene = sweep_scene(quick)
         camera = scene.camera
         variants = speed_error.QUICK if quick else speed_error.VARIANTS
-        points = speed_error.measure(scene, variants, on_progress=on_progress)
+        points = speed_error.measure_speed_error(scene, variants, on_progress=on_progress)
         title = f"{scene.gaussians.capacity} Gaussians, {camera.width}x{camera.height}, SH degree 3"
         section(f"Speed against error: {title}", report.speed_error_table(points))
         report.speed_error_plot(out / "speed_error.png", points, title)
@@ -80,7 +80,7 @@ def run(
         gated |= gate.values(points)
     if "levels" in parts:
         cfg = dataclasses.replace(preset("robust"), render=render or RenderConfig())
-        found = levels.measure(
+        found = levels.measure_levels(
             levels.QUICK if quick else levels.SCENES,
             cfg,
             steps=levels.QUICK_STEPS if quick else None,
@@ -95,7 +95,7 @@ def run(
     if baseline:
         complaints = gate.check(baseline, gated)
     if "growth" in parts:
-        curves = growth.measure(quick=quick, on_progress=on_progress)
+        curves = growth.measure_growth(quick=quick, on_progress=on_progress)
         per = report.memory_coefficients(curves)
         line = "Buffers of forward + backward, bytes: " + ", ".join(
             f"{v:.0f} per {k}" for k, v in per.items()
@@ -134,7 +134,9 @@ def run(
         section("Hard cases: float32 against float64", report.hard_case_table(gaps))
         data["hard_cases"] = {k: g._asdict() for k, g in gaps.items()}
     if "implementations" in parts:
-        timings, works = implementations.measure(quick=quick, on_progress=on_progress)
+        timings, works = implementations.measure_implementations(
+            quick=quick, on_progress=on_progress
+        )
         counted = "Work of compositing tile by tile, counted:"
         tables = report.implementations_table(timings), counted, report.work_table(works)
         section("Rasterizers on this device", *tables)

@@ -1,14 +1,11 @@
-"""The scenes that benches render: splats with the statistics of streets and of real captures."""
+"""Scenes of the benches: splats with the statistics of streets."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.spatial import KDTree
 
 from p2gs_jax.render.spherical_harmonics import C0
 from p2gs_jax.types import Camera, Gaussians
@@ -33,7 +30,8 @@ def _camera(width: int, height: int, focal: float) -> Camera:
     return Camera(jnp.eye(4), jnp.asarray(K), width, height)
 
 
-def _gaussians(means, quats, log_scales, logits, log_radiance, degree: int, rng) -> Gaussians:
+def make_gaussians(means, quats, log_scales, logits, log_radiance, degree: int, rng) -> Gaussians:
+    """Return Gaussians whose radiance of degree 0 is given; higher degrees are random."""
     sh = rng.normal(0, 0.1, (len(means), (degree + 1) ** 2, 3))
     # exp(C0 sh0) is the radiance seen from everywhere.
     sh[:, 0] = log_radiance / C0
@@ -89,31 +87,5 @@ def street(
         log_radiance = rng.uniform(0, np.log(dynamic_range), (count, 1)) * np.ones(3)
     means = np.stack([dx * z, dy * z, z], -1)
     quats = rng.normal(size=(count, 4))
-    gaussians = _gaussians(means, quats, log_scales, logits, log_radiance, degree, rng)
+    gaussians = make_gaussians(means, quats, log_scales, logits, log_radiance, degree, rng)
     return BenchScene(f"street {count // 1000}k", gaussians, _camera(width, height, focal))
-
-
-def garden(path: Path, degree: int = 0) -> BenchScene:
-    """Return a crop of a real capture with nearest-neighbour scales.
-
-    Args:
-        path: `test_garden.npz` (means3d, colors, viewmats, Ks).
-        degree: spherical-harmonics degree.
-    """
-    data, rng = np.load(path), np.random.default_rng(1)
-    means = data["means3d"]
-    count = len(means)
-    near = KDTree(means).query(means, k=4)[0][:, 1:].mean(1)
-    log_scales = np.log(np.maximum(near, 1e-4))[:, None] + rng.normal(0, 0.4, (count, 3))
-    logits, quats = rng.normal(0, 2, count), rng.normal(size=(count, 4))
-    log_radiance = np.log(data["colors"] / 255 + 1e-3)
-    gaussians = _gaussians(means, quats, log_scales, logits, log_radiance, degree, rng)
-    viewmat, K = (jnp.asarray(data[k][0], jnp.float32) for k in ("viewmats", "Ks"))
-    return BenchScene("garden crop", gaussians, Camera(viewmat, K, 648, 420))
-
-
-STREETS: dict[str, Callable[[], BenchScene]] = {
-    "street20k": lambda: street(20_000, 640, 360, radius=4.0, spread=1.1),
-    "street100k": lambda: street(100_000, 960, 650),
-    "street300k": lambda: street(300_000, 960, 650, radius=2.0, spread=1.0),
-}

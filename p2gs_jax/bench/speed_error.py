@@ -30,8 +30,8 @@ class Variant:
     """One point of the plot.
 
     Attributes:
-        knob: what is turned.
-        setting: how far.
+        knob: name of the varied option.
+        setting: its value, in words.
         changes: fields of `RenderConfig`.
         storage: precision that parameters are kept in: `float32`, `sh` for bfloat16 spherical
             harmonics, `all` for bfloat16 everything.
@@ -92,7 +92,7 @@ VARIANTS = (
 )
 
 
-class Point(NamedTuple):
+class MeasuredVariant(NamedTuple):
     """One measured variant.
 
     Attributes:
@@ -196,15 +196,15 @@ def programs(scene: BenchScene, variant: Variant, base: RenderConfig, weights: n
     return (lambda: forward(gaussians)), (lambda: both(gaussians)), kept, need, temporaries
 
 
-def measure(
+def measure_speed_error(
     scene: BenchScene,
     variants: tuple[Variant, ...] = VARIANTS,
     base: RenderConfig | None = None,
     *,
     repeats: int = 7,
     on_progress: Callable[[str, int, int], None] = lambda stage, done, count: None,
-) -> list[Point]:
-    """Time every variant and hold it against the float64 truth.
+) -> list[MeasuredVariant]:
+    """Time every variant and compare it with the float64 truth.
 
     Args:
         scene: what to render.
@@ -241,7 +241,7 @@ def measure(
             rules = untouched and not {"alpha_cutoff", "cutoff_rule"} & {k for k, _ in v.changes}
             ms = {k: times[f"{v.name} {k}"] for k in ("forward", "both")}
             points.append(
-                Point(
+                MeasuredVariant(
                     v,
                     ms,
                     {k: t / times[REFERENCE] for k, t in ms.items()},
@@ -255,7 +255,7 @@ def measure(
     return points
 
 
-def front(points: list[Point], time: str = "both", error: str = "gradient") -> list[str]:
+def front(points: list[MeasuredVariant], time: str = "both", error: str = "gradient") -> list[str]:
     """Return the names of the points that no other beats in both time and error."""
     return [
         p.variant.name

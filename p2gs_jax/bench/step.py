@@ -1,4 +1,4 @@
-"""Where the milliseconds of an optimisation step go, part by part."""
+"""Times of the parts of an optimisation step."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Wall times that can be compared: interleaved in one process, medians, after a warm-up."""
+"""Comparable wall times: medians of interleaved runs in one process, after a warm-up."""
 
 from __future__ import annotations
 

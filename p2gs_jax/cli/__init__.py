@@ -11,11 +11,11 @@ from importlib import import_module
 
 from p2gs_jax.errors import UserError
 
-# Quiet the native libraries before they load; our own messages say what matters.
+# Silence the native libraries before they load.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 os.environ.setdefault("GLOG_minloglevel", "3")
 
-# What must answer even where JAX cannot be imported, and at once where it can.
+# Commands that must work without JAX.
 WITHOUT_JAX = ("doctor", "completion")
 
 
@@ -67,7 +67,7 @@ def _complain(error: UserError) -> int:
 
 
 def _missing(error: ImportError, argv: list[str]) -> int:
-    """Say which library is broken; `doctor` says it itself, even where it is the parser's."""
+    """Report which library is broken; `doctor` runs even if it is the parser's."""
     if (error.name or "").split(".")[0] == "p2gs_jax":
         raise error
     if argv[:1] == ["doctor"]:
@@ -79,7 +79,7 @@ def _missing(error: ImportError, argv: list[str]) -> int:
 
 
 def _from_the_system(error: OSError) -> int:
-    """Say what the system refused; a broken pipe only means that our reader has seen enough."""
+    """Report an error of the operating system; after a broken pipe, end silently."""
     if isinstance(error, BrokenPipeError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0

@@ -6,13 +6,13 @@ import re
 
 import tyro
 
-from p2gs_jax.cli import wording
+from p2gs_jax.cli import help_text
 from p2gs_jax.cli.options.render import PATHS
 from p2gs_jax.cli.options.setup import Shell
 from p2gs_jax.cli.parser import every_command
 from p2gs_jax.cli.tyro_rules import registry
 
-# tyro offers no path where an option could stand: shells shall look for one themselves.
+# tyro completes no paths in the places of options; these lines let the shells do it.
 BASH_PATHS = """
 _p2gs_jax() {
   _tyro_p2gs_jax "$@"
@@ -24,7 +24,7 @@ FISH_PATHS = """
 complete --command p2gs-jax --force-files --condition \\
   "test (count (commandline -opc)) -gt 1; and not string match -q -- '-*' (commandline -ct)"
 """
-# `--path` takes a word or a file; tyro takes every word for a path. Shells look for files where no
+# `--path` takes a word or a file; tyro completes files only. The shells look for files where no
 # word fits.
 PATH_OPTION = re.compile(r"('flags': \['--path'\].*?'type': )'path'(, 'cascade': \w+, 'nargs': 1)")
 ZSH_CALL = '_tyro_p2gs_jax "$@"'
@@ -32,7 +32,7 @@ ZSH_CALL = '_tyro_p2gs_jax "$@"'
 
 def script(shell: Shell) -> str:
     """Return the script that a shell reads to complete commands, options and their values."""
-    text = wording.captured(
+    text = help_text.captured(
         lambda: tyro.cli(
             every_command(),
             prog="p2gs-jax",

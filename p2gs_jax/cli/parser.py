@@ -1,4 +1,4 @@
-"""From words to options: the table of commands, and the parser of each."""
+"""The table of commands, and the parser of their options."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated, Any, Union
 
 import tyro
 
-from p2gs_jax.cli import wording
+from p2gs_jax.cli import help_text
 from p2gs_jax.cli.options.experiments import Bench, Demo, Sweep, Synth
 from p2gs_jax.cli.options.export import Export
 from p2gs_jax.cli.options.fit import Calibrate, Fit, named_preset
@@ -18,7 +18,7 @@ from p2gs_jax.cli.options.render import Render
 from p2gs_jax.cli.options.results import Eval
 from p2gs_jax.cli.options.setup import Completion, Doctor
 from p2gs_jax.cli.options.view import View
-from p2gs_jax.cli.synonyms import check_words
+from p2gs_jax.cli.synonyms import check_option_names
 from p2gs_jax.cli.tyro_rules import registry
 from p2gs_jax.errors import UserError
 
@@ -39,7 +39,7 @@ COMMANDS: dict[str, type] = {
     "doctor": Doctor,
     "completion": Completion,
 }
-# How `p2gs-jax --help` lists them: in the order in which a newcomer meets them.
+# The order of `p2gs-jax --help`: as a new user needs them.
 GROUPS: dict[str, tuple[str, ...]] = {
     "First": ("doctor", "demo"),
     "From photographs": ("fit", "calibrate"),
@@ -60,13 +60,13 @@ def parse(argv: list[str]) -> tuple[str, Any]:
     """
     first = argv[0] if argv else ""
     if first in HELP or first == HELP_ALL:
-        _leave(wording.overview(COMMANDS, GROUPS), 0)
+        _print_and_exit(help_text.overview(COMMANDS, GROUPS), 0)
     if first in VERSION:
         from p2gs_jax import __version__
 
-        _leave(f"p2gs-jax {__version__}", 0)
+        _print_and_exit(f"p2gs-jax {__version__}", 0)
     if not first:
-        _leave(wording.overview(COMMANDS, GROUPS), 2)
+        _print_and_exit(help_text.overview(COMMANDS, GROUPS), 2)
     if first not in COMMANDS:
         raise _unknown(first)
     return first, _options(first, argv[1:])
@@ -79,7 +79,7 @@ def every_command() -> Any:
             Annotated[
                 kind,
                 tyro.conf.subcommand(
-                    name, description=wording.summary(kind), default=_defaults(name, [])
+                    name, description=help_text.first_paragraph(kind), default=_defaults(name, [])
                 ),
             ]
             for name, kind in COMMANDS.items()
@@ -88,7 +88,7 @@ def every_command() -> Any:
 
 
 def _options(name: str, argv: list[str]) -> Any:
-    check_words(name, argv, _own_options(name))
+    check_option_names(name, argv, _own_options(name))
     wants_all = HELP_ALL in argv
     argv = ["--help" if a == HELP_ALL else a for a in argv]
     brief = not wants_all and any(a in HELP for a in argv)
@@ -97,7 +97,7 @@ def _options(name: str, argv: list[str]) -> Any:
         return tyro.cli(
             COMMANDS[name],
             prog=f"p2gs-jax {name}",
-            description=wording.ABOUT,
+            description=help_text.ABOUT,
             args=argv,
             default=_defaults(name, argv),
             registry=registry(brief),
@@ -105,18 +105,20 @@ def _options(name: str, argv: list[str]) -> Any:
 
     if not any(a in HELP for a in argv):
         return answer()
-    text = wording.captured(answer)
-    _leave(wording.with_prose(text, COMMANDS[name], brief and name in WITH_PRESET, name), 0)
+    text = help_text.captured(answer)
+    _print_and_exit(
+        help_text.with_prose(text, COMMANDS[name], brief and name in WITH_PRESET, name), 0
+    )
 
 
 def _own_options(name: str) -> set[str]:
-    """Return a command's options as they are written, without those of the configuration."""
+    """Return the names of a command's own options, such as `--max-width`."""
     fields = dataclasses.fields(COMMANDS[name])
     return {f"--{field.name.replace('_', '-')}" for field in fields}
 
 
 def _defaults(name: str, argv: list[str]) -> Any:
-    """Return what options are when nothing is said; a preset decides for the configuration."""
+    """Return the defaults of a command's options; those of the configuration are the preset's."""
     if name not in WITH_PRESET:
         return tyro.MISSING_NONPROP
     cfg = named_preset(_preset_name(argv))
@@ -143,6 +145,6 @@ def _unknown(word: str) -> UserError:
     )
 
 
-def _leave(text: str, code: int) -> None:
+def _print_and_exit(text: str, code: int) -> None:
     print(text, file=sys.stderr if code else sys.stdout)
     sys.exit(code)

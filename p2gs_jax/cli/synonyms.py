@@ -1,4 +1,4 @@
-"""What other programs call our options: 3DGS, gsplat and nerfstudio."""
+"""Names that 3DGS, gsplat and nerfstudio give to our options."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 from p2gs_jax.errors import UserError
 
 SCENE = "the scene's folder itself, without an option"
-# Their words, and what ours are called.
+# Their names and ours.
 SYNONYMS = {
     "--iterations": "--steps",
     "--iters": "--steps",
@@ -40,16 +40,16 @@ SYNONYMS = {
 }
 
 
-def check_words(command: str, argv: Sequence[str], options: Collection[str]) -> None:
-    """Complain about an option that is called otherwise here.
+def check_option_names(command: str, argv: Sequence[str], options: Collection[str]) -> None:
+    """Reject options of other programs, and name ours.
 
     Args:
-        command: which.
-        argv: its words.
-        options: names of the command's own options, as `--max-width`.
+        command: name of the command.
+        argv: its arguments.
+        options: names of the command's own options, such as `--max-width`.
 
     Raises:
-        UserError: there is one.
+        UserError: there is an option of another program.
     """
     for word in argv:
         name = word.split("=", 1)[0].replace("_", "-")

@@ -1,7 +1,7 @@
-"""How tyro reads our option classes: one paragraph of help an option, and short placeholders.
+"""Rules for tyro: one paragraph of help per option, and short placeholders.
 
-tyro takes the text of an option from the string below its field. What it would print beside that
-(names of types, `(default: None)`, line ends of the source) is replaced here.
+The text of an option is the string below its field. What tyro prints beside it (names of types,
+`(default: None)`) is replaced here.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def registry(brief: bool) -> ConstructorRegistry:
 
 
 def _number_rule(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-    """Return how a number is read, or a number, a few words or None: complaints in plain words."""
+    """Return the parser of a number, a few words, or None, with plain error messages."""
     kinds = set(get_args(info.type)) if _is_union(info.type) else {info.type}
     optional = NoneType in kinds
     kinds -= {NoneType}
@@ -94,7 +94,7 @@ def _number_rule(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
 
 
 def _configuration(info: StructTypeInfo, brief: bool) -> StructConstructorSpec:
-    """Return the configuration's groups; which preset it started from is the command's option."""
+    """Return the configuration's groups without `preset`, which is an option of the command."""
     default = info.default if isinstance(info.default, FitConfig) else FitConfig()
     if brief:
         return StructConstructorSpec(lambda: default, ())
@@ -111,8 +111,10 @@ def _fields(kind: type, default: Any) -> Iterator[StructFieldSpec]:
         value = _default(field, default)
         yield StructFieldSpec(
             name=field.name,
-            # What a field says of itself comes last, and wins.
-            type=Annotated[(_plain(hint), *_looks(kind, field.name, hint, value), *_extras(hint))],  # type: ignore
+            # A field's own settings come last and take precedence.
+            type=Annotated[
+                (_plain(hint), *_option_config(kind, field.name, hint, value), *_extras(hint))
+            ],  # type: ignore
             default=value,
             helptext=functools.partial(_text, kind, field.name),
         )
@@ -130,11 +132,11 @@ def _default(field: dataclasses.Field, parent: Any) -> Any:
     return MISSING_NONPROP
 
 
-def _looks(kind: type, name: str, hint: Any, default: Any) -> tuple[Any, ...]:
-    """Return how an option shows itself, unless its field says otherwise.
+def _option_config(kind: type, name: str, hint: Any, default: Any) -> tuple[Any, ...]:
+    """Return tyro's settings of an option, which those of its field may override.
 
-    In the configuration None is a value like others, in a command's own options it means that
-    nothing was said; and there a switch that is off can only be turned on.
+    In the configuration None is a value like others; in a command's own options it means "not
+    given", and there a switch that is off can only be turned on.
     """
     plain, none_counts = _plain(hint), kind.__module__ == FitConfig.__module__
     if plain is bool and not none_counts and not default:
@@ -146,7 +148,7 @@ def _looks(kind: type, name: str, hint: Any, default: Any) -> tuple[Any, ...]:
 
 
 def _placeholder(plain: Any, none_counts: bool) -> str | None:
-    """Return what stands for a value of a type, or None where tyro shall decide."""
+    """Return the placeholder of a value of a type, or None for tyro's own."""
     origin, args = get_origin(plain), get_args(plain)
     if _is_union(plain):
         parts = [_placeholder(a, none_counts) or "" for a in args if a is not NoneType]
@@ -164,7 +166,7 @@ def _placeholder(plain: Any, none_counts: bool) -> str | None:
 
 
 def _default_shown(default: str, *, none_counts: bool) -> str:
-    """Return what follows an option's text: its default, where there is one to name."""
+    """Return the default that follows an option's text, or nothing."""
     if not default or (default == "None" and not none_counts):
         return ""
     with suppress(ValueError):

@@ -1,4 +1,4 @@
-"""Files appear whole or not at all."""
+"""Files and folders that are written whole or not at all."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from p2gs_jax.errors import UserError
 
 @contextlib.contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path`; on success it replaces `path`, on failure it goes.
+    """Yield a temporary path beside `path`; it replaces `path`, or is deleted after an error.
 
     Args:
         path: the file to write; its folder is created. The temporary name keeps the suffix, for
@@ -42,7 +42,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
-    """Yield an empty folder beside `path`; on success it replaces `path`, on failure it goes.
+    """Yield an empty folder beside `path`; it replaces `path`, or is deleted after an error.
 
     Args:
         path: the folder to make; what lies there is removed once the new one is whole.
@@ -62,7 +62,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def no_empty_folders(path: Path) -> Iterator[None]:
-    """Create a folder for a `with` block; where that fails, what is empty of it goes again.
+    """Create a folder for a `with` block; after an error, delete the empty parts of it again.
 
     Args:
         path: the folder. It, and those above it, are removed only if they were not there before.
@@ -115,7 +115,7 @@ def write_array(path: Path, array: np.ndarray) -> None:
 
 
 def append_jsonl(path: Path, record: dict) -> None:
-    """Append one line to a JSON-lines file, in one write call; a line torn before it goes."""
+    """Append one line to a JSON-lines file in one write call; a torn last line is removed first."""
     line = json.dumps(plain(record), allow_nan=False).encode() + b"\n"
     with Path(path).open("ab+", buffering=0) as file:
         end = file.seek(0, os.SEEK_END)

@@ -1,4 +1,4 @@
-"""Where the time goes: named seconds, and what the compiler took of them."""
+"""Seconds by name, and the compiler's share of them."""
 
 from __future__ import annotations
 

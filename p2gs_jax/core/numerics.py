@@ -1,4 +1,4 @@
-"""Power and logarithm that stay finite, in value and in gradient, over all of float32."""
+"""Power and logarithm that stay finite over all of float32, and small numeric helpers."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike, DTypeLike
 
 LN2 = math.log(2.0)
@@ -46,9 +46,23 @@ def positive_pow(x: Values, p: Scalar, floor: float) -> Values:
     return namespace(x, p).exp(p * safe_log(x, floor))
 
 
+def evenly_spaced(count: int, most: int) -> Int[np.ndarray, " k"]:
+    """Return at most `most` of the indices below `count`, evenly spaced, both ends included."""
+    return np.linspace(0, count - 1, min(count, most)).round().astype(int)
+
+
+def fibonacci_sphere(count: int) -> Float[np.ndarray, "n 3"]:
+    """Return evenly spread unit vectors."""
+    i = np.arange(count) + 0.5
+    z = 1 - 2 * i / count
+    azimuth = np.pi * (1 + 5**0.5) * i
+    r = np.sqrt(1 - z * z)
+    return np.stack([r * np.cos(azimuth), r * np.sin(azimuth), z], -1)
+
+
 def on_host(record: Callable[..., Record], *values: Any) -> Record:
     """Return a device record made of host arrays, which a compiled program takes as they are.
 
-    Its annotations say `Array`, as most of its life is on a device.
+    Its annotations are `Array`, as records are mostly on a device.
     """
     return record(*values)

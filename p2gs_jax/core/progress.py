@@ -1,4 +1,4 @@
-"""Where a fit says what it does: a live display in a terminal, plain lines elsewhere."""
+"""Progress of a fit: a live display in a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class LogRecord:
 
 
 class Reporter(Protocol):
-    """What a fit tells its user."""
+    """Receives the progress and the messages of a fit."""
 
     def message(self, text: str) -> None:
         """Say something the user must know."""

@@ -1,1 +1,1 @@
-"""What works on this machine: nothing here is imported before it is tried."""
+"""Checks of this machine; every library is imported inside a check, as it may be broken."""

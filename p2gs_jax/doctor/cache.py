@@ -1,4 +1,4 @@
-"""Where compiled programs are kept, how many there are, and whether more can be."""
+"""The state of the compile cache."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class Cache:
     remark: str
 
 
-def look() -> Cache:
-    """Make JAX use the cache, and say how it is; never raises."""
+def inspect_cache() -> Cache:
+    """Set up JAX's compile cache and return its state; never raises."""
     try:
         from p2gs_jax.core.compile_cache import MOST_BYTES, cache_folder, use_compile_cache
 

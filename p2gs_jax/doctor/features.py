@@ -1,4 +1,4 @@
-"""What works as it is, and what to install for what does not."""
+"""Features that work here, and what to install for the others."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ OPTIONAL = ("viser", "av", "gsply", "playwright")
 
 @dataclass(frozen=True)
 class Feature:
-    """Something a person may want to do.
+    """A feature of the program.
 
     Attributes:
-        name: what.
+        name: of the feature.
         ready: whether it works here.
-        remark: with what it works, or what to do about it.
+        remark: what it uses, or what to install.
     """
 
     name: str
@@ -29,11 +29,11 @@ class Feature:
     remark: str
 
 
-def look(libraries: Sequence[Library], backend: str | None) -> list[Feature]:
+def list_features(libraries: Sequence[Library], backend: str | None) -> list[Feature]:
     """Return all features.
 
     Args:
-        libraries: what was tried.
+        libraries: from `check_libraries`.
         backend: of JAX; None where it does not work.
     """
     broken = [x.name for x in libraries if x.trouble is not None]

@@ -6,7 +6,7 @@ import importlib
 import importlib.metadata
 from dataclasses import dataclass
 
-# What is imported under another name than it is installed under; pip may write names in lower case.
+# Import names that differ from the distribution's; pip may write names in lower case.
 MODULES = {
     "colour-science": "colour",
     "openexr": "OpenEXR",
@@ -14,7 +14,7 @@ MODULES = {
     "orbax-checkpoint": "orbax.checkpoint",
     "pillow": "PIL",
 }
-# Tried where pip knows nothing of p2gs-jax: a copy that was never installed.
+# Checked where pip has no metadata of p2gs-jax: a copy that was never installed.
 CORE = ("jax", "optax", "optimistix", "equinox", "jaxtyping", "numpy", "tyro", "rich", "pycolmap")
 
 
@@ -25,7 +25,7 @@ class Library:
     Attributes:
         name: as pip knows it.
         version: None where pip does not know it.
-        trouble: why it cannot be used, or None.
+        trouble: the error on import, or a version that is too old; None where it works.
     """
 
     name: str
@@ -33,7 +33,7 @@ class Library:
     trouble: str | None
 
 
-def look() -> list[Library]:
+def check_libraries() -> list[Library]:
     """Try to import everything that p2gs-jax depends on; never raises."""
     wanted = requirements()
     return [_try(name, wanted[name]) for name in sorted(wanted, key=str.lower)]
@@ -66,7 +66,7 @@ def installed(name: str) -> str | None:
 
 
 def requirements() -> dict:
-    """Return ranges of versions by distribution; None where the range cannot be told."""
+    """Return ranges of versions by distribution; None where unknown."""
     try:
         from packaging.requirements import Requirement
 

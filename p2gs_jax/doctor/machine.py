@@ -1,4 +1,4 @@
-"""Cores, memory, disk: what the operating system says, wherever it says it."""
+"""Cores, memory and disk, as the operating system reports them."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ MEMINFO = Path("/proc/meminfo")
 
 @dataclass(frozen=True)
 class Machine:
-    """What the machine has; None where it cannot be told.
+    """Resources of the machine; None where unknown.
 
     Attributes:
         system: name and version of the operating system, and the processor.
         cores: cores that this process may use.
         memory: bytes in all, a container's limit included.
-        available: bytes that can still be had.
-        folder: where `free` was looked up.
+        available: bytes that can still be allocated.
+        folder: that `free` refers to.
         free: bytes free on the disk.
     """
 
@@ -35,8 +35,8 @@ class Machine:
     free: int | None
 
 
-def look(folder: Path) -> Machine:
-    """Return what the machine has; never raises."""
+def inspect_machine(folder: Path) -> Machine:
+    """Return the machine's resources; never raises."""
     total, available = memory()
     return Machine(platform.platform(), cores(), total, available, str(folder), _free(folder))
 
@@ -54,7 +54,7 @@ def cores() -> int:
 
 
 def memory() -> tuple[int | None, int | None]:
-    """Return (total, available) bytes of memory, each None where it cannot be told."""
+    """Return (total, available) bytes of memory, each None where unknown."""
     total, available = _system_memory()
     limit, used = _read(CGROUP / "memory.max"), _read(CGROUP / "memory.current")
     if limit.isdigit() and (total is None or int(limit) < total):
@@ -75,7 +75,7 @@ def _system_memory() -> tuple[int | None, int | None]:
 
 
 def _pages(name: str) -> int | None:
-    """Return bytes from a count of pages; macOS knows the total alone."""
+    """Return bytes from a count of pages; macOS has the total only."""
     try:
         return os.sysconf(name) * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError, OSError):

@@ -1,4 +1,4 @@
-"""Which devices and rasterizer a fit would use here, and whether three Gaussians come out right."""
+"""The devices and the rasterizer that a fit would use, and a self-test with three Gaussians."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ TOLERANCE = 1e-4
 
 @dataclass(frozen=True)
 class Devices:
-    """What JAX runs on.
+    """Devices of JAX.
 
     Attributes:
         backend: `cpu`, `gpu` or another of JAX's; None where it does not start.
-        names: one a device, with its memory where it tells.
-        rasterizer: what composites.
-        binning: what makes the lists of tiles.
+        names: of the devices, with their memory where known.
+        rasterizer: implementation of compositing.
+        binning: implementation of the tile lists.
         trouble: why JAX does not start, or None.
     """
 
@@ -30,10 +30,10 @@ class Devices:
 
 @dataclass(frozen=True)
 class SelfTest:
-    """What came of rendering three Gaussians.
+    """Result of rendering three Gaussians.
 
     Attributes:
-        ok: image and gradients are what they should be; None where that was not tried.
+        ok: whether image and gradients are right; None where it was not run.
         remark: in words.
         first_ms: the first time, with compilation.
         then_ms: once compiled.
@@ -47,8 +47,8 @@ class SelfTest:
     difference: float | None = None
 
 
-def look() -> Devices:
-    """Return devices and what a fit would choose on them; never raises."""
+def inspect_devices() -> Devices:
+    """Return the devices and the implementations that a fit would use; never raises."""
     try:
         import jax
 

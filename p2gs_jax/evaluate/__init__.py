@@ -1,1 +1,1 @@
-"""Judging a finished fit: photographs, radiance, seams, steadiness."""
+"""Evaluation of a finished fit: image scores, radiance, seams, consistency of videos."""

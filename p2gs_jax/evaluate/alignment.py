@@ -16,9 +16,9 @@ from p2gs_jax.photometry.formation import display, formation
 
 SEARCH_STOPS, SEARCH_STEPS, GOLDEN_STEPS = 5.0, 41, 30
 REFINE_STEPS = 30
-# The coarse search looks at one pixel in so many each way.
+# Stride of the coarse search over pixels, along each axis.
 SEARCH_STRIDE = 3
-# Stops: so much changes a display value by 1e-4, and 40 dB by 1e-3 dB.
+# Tolerance, stops: changes a display value by 1e-4, and a PSNR of 40 dB by 1e-3 dB.
 TOLERANCE = 5e-4
 
 
@@ -61,13 +61,6 @@ def exposure_error(
     }
 
 
-def align_scale(linear: Float[np.ndarray, "... 3"], truth: Float[np.ndarray, "... 3"]) -> float:
-    """Return the factor c for which c * linear matches truth best in the median of logarithms."""
-    keep = (linear > 0) & (truth > 0)
-    ratio = np.log(truth[keep].astype(np.float64)) - np.log(linear[keep].astype(np.float64))
-    return float(np.exp(np.median(ratio))) if keep.any() else 1.0
-
-
 @functools.partial(jax.jit, static_argnames="cfg")
 def fit_exposure(
     linear: Float[Array, "h w 3"],
@@ -94,7 +87,7 @@ def fit_exposure(
     grid = jnp.linspace(-SEARCH_STOPS, SEARCH_STOPS, SEARCH_STEPS)
     best = grid[jnp.argmin(lax.map(functools.partial(error, stride=SEARCH_STRIDE), grid))]
     width = 2 * SEARCH_STOPS / (SEARCH_STEPS - 1)
-    # The bracket begins at zero: optimistix 0.1.0 places the first inner point as if all did.
+    # The bracket begins at zero: optimistix 0.1.0 places its first inner point correctly only then.
     low = best - width
     found = optimistix.minimise(
         lambda above, _: error(low + above),

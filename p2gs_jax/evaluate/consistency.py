@@ -1,4 +1,4 @@
-"""How steady a video is: HIS and Std-Luminance (paper, appendix Metrics; docs/photometry.md, 6).
+"""Consistency of videos: HIS and Std-Luminance (paper, appendix Metrics; docs/photometry.md, 6).
 
 Both are small for a dark or blurred video, and HIS contains the motion of the scene: never read
 them without PSNR, and compare with those of the photographs.
@@ -8,56 +8,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from p2gs_jax.photometry.formation import eotf
 from p2gs_jax.types import LUMINANCE
 
 
-def his_paper(ldr: Float[Array, "t h w 3"], exposures: Float[Array, " t"]) -> Float[Array, ""]:
-    """Return the HDR inconsistency score as printed: OETF^-1(R_t) e_t, RMS over pixels.
-
-    It multiplies by e where undoing an exposure means dividing, and is zero for a black video:
-    never report it without PSNR.
-    """
-    scaled = eotf(ldr, "srgb") * exposures[:, None, None, None]
-    return jnp.mean(_frame_rms(scaled))
-
-
-def his(ldr: Float[Array, "t h w 3"], exposures: Float[Array, " t"]) -> Float[Array, ""]:
-    """Return the corrected score: divided by e and by the mean radiance; invariant to e -> c e."""
-    radiance = eotf(ldr, "srgb") / exposures[:, None, None, None]
-    return jnp.mean(_frame_rms(radiance)) / jnp.maximum(jnp.mean(radiance), 1e-12)
-
-
-def _frame_rms(frames: Float[Array, "t h w 3"]) -> Float[Array, " t1"]:
-    return jnp.sqrt(jnp.mean((frames[:-1] - frames[1:]) ** 2, axis=(1, 2, 3)))
-
-
-def mean_luminances(ldr: Float[Array, "n h w 3"]) -> Float[Array, " n"]:
-    """Return the mean BT.601 luminance of every frame."""
-    return jnp.mean(ldr @ jnp.asarray(LUMINANCE, ldr.dtype), axis=(1, 2))
-
-
-def std_luminance(ldr: Float[Array, "n h w 3"]) -> Float[Array, ""]:
-    """Return the standard deviation over frames of their mean luminance, as printed."""
-    return jnp.std(mean_luminances(ldr))
-
-
-def std_luminance_relative(ldr: Float[Array, "n h w 3"]) -> Float[Array, ""]:
-    """Return `std_luminance` divided by the mean: darkening a video does not improve it."""
-    luminances = mean_luminances(ldr)
-    return jnp.std(luminances) / jnp.maximum(jnp.mean(luminances), 1e-12)
-
-
 @dataclass
 class VideoScores:
-    """The same scores over the videos of several cameras, frame by frame.
+    """Scores of the videos of several cameras, frame by frame.
 
     Frames of a camera follow each other in time; pairs of frames never mix cameras. HIS is averaged
     over all pairs of all cameras.
+
+    - `his_paper`, as printed: RMS over pixels of the difference of two frames' OETF^-1(R_t) e_t. It
+      multiplies by e where undoing an exposure means dividing, and is 0 for a black video: never
+      report it without PSNR.
+    - `his`, corrected: divided by e and by the mean radiance; invariant to e -> c e.
+    - `std_luminance`, as printed: standard deviation over frames of their mean BT.601 luminance.
+    - `std_luminance_relative`: divided by the mean, so that darkening a video does not improve it.
     """
 
     _last: dict[str, tuple[np.ndarray, float]] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""Judging a finished fit: every view, every protocol, with names that say what was compared.
+"""Evaluation of a finished fit: every view under every protocol.
 
 Protocols (docs/photometry.md, 6): `per_view` renders a training view with its own exposure and
 gamma; `averaged` uses the mean parameters over the training views (paper, Rendering for
@@ -21,12 +21,12 @@ from jaxtyping import Bool, Float32
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.evaluate.alignment import fit_exposure, fit_exposure_and_gamma
+from p2gs_jax.evaluate.array_store import ArrayStore, StoredArray
 from p2gs_jax.evaluate.consistency import VideoScores
-from p2gs_jax.evaluate.in_order import in_order
 from p2gs_jax.evaluate.lpips import LpipsWeights, lpips
 from p2gs_jax.evaluate.metrics import psnr, ssim
+from p2gs_jax.evaluate.parallel import map_in_order
 from p2gs_jax.evaluate.radiance import RadianceScores, Truth
-from p2gs_jax.evaluate.shelf import Kept, Shelf
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import inverse_tone_map
 from p2gs_jax.photometry.models import MODELS
@@ -64,17 +64,17 @@ def mean_parameters(photometry: Photometry) -> MeanParameters:
 
 @dataclass(frozen=True)
 class ViewResult:
-    """One view, rendered and judged.
+    """One rendered view.
 
     Attributes:
         index: row in `Scene.views`.
         linear: linear radiance.
         alpha: opacity.
         depth: alpha-weighted depth.
-        ldr: display image with the exposure that belongs to it (own, or fitted).
-        photograph: what was taken.
-        exposure: that exposure.
-        gamma: that gamma.
+        ldr: display image under `exposure` and `gamma`.
+        photograph: of the view.
+        exposure: the view's own, or fitted to the photograph of a held-out view.
+        gamma: the view's own, or the mean.
     """
 
     index: int
@@ -88,7 +88,7 @@ class ViewResult:
 
 
 def _score(lpips_weights: LpipsWeights | None, ldr, target, mask) -> dict[str, float]:
-    """Return how an image compares with a photograph; LPIPS where there are weights for it."""
+    """Return PSNR and SSIM of an image; LPIPS if there are weights for it."""
     row = {"psnr": float(psnr(ldr, target, mask)), "ssim": float(ssim(ldr, target, mask))}
     if lpips_weights is not None:
         row["lpips"] = float(lpips(lpips_weights, ldr, target, mask))
@@ -96,7 +96,7 @@ def _score(lpips_weights: LpipsWeights | None, ldr, target, mask) -> dict[str, f
 
 
 class _Judged(NamedTuple):
-    """A view with its scores, and what it is compared with once all are known.
+    """A view with its scores, and the references that need all views to compare with.
 
     Attributes:
         result: the view.
@@ -173,7 +173,7 @@ def evaluate(
         UserError: an image is too small for LPIPS.
     """
     mean = mean_parameters(params.photometry)
-    # What is small is computed on the host; what is large goes to the device once.
+    # Small arrays stay on the host; large ones are moved to the device once.
     small = jax.tree.map(np.asarray, replace(params, gaussians=None))
     exposures, gammas = small.photometry.exposures, small.photometry.gammas
     gaussians = jax.device_put(params.gaussians)
@@ -230,11 +230,11 @@ def evaluate(
     own, averaged = _Collector(), _Collector()
     test_averaged, test_fitted, test_both = _Collector(), _Collector(), _Collector()
     videos = {name: VideoScores() for name in ("per_view", "averaged", "photographs")}
-    with Shelf() as shelf:
-        scores = RadianceScores(shelf)
-        reference_views: list[tuple[int, tuple[Kept, ...]]] = []
-        # In the order of their names, so that the frames of a camera follow each other.
-        for found in in_order(judged, range(len(scene.views))):
+    with ArrayStore() as arrays:
+        scores = RadianceScores(arrays)
+        reference_views: list[tuple[int, tuple[StoredArray, ...]]] = []
+        # In the order of names: the frames of a camera are then in sequence.
+        for found in map_in_order(judged, range(len(scene.views))):
             result = found.result
             index, view = result.index, scene.views[result.index]
             training = view.split == "train"
@@ -243,12 +243,12 @@ def evaluate(
             if found.scores_both is not None:
                 test_both.add(view.name, found.scores_both)
             again = found.radiance is not None or found.reference is not None
-            linear = shelf.put(result.linear) if again else result.linear
+            linear = arrays.put(result.linear) if again else result.linear
             if found.radiance is not None:
                 scores.add(view.name, view.split, linear, found.radiance, found.mask)
             if found.reference is not None:
                 images = (linear, found.reference, found.mask)
-                reference_views.append((index, tuple(map(shelf.put, images))))
+                reference_views.append((index, tuple(map(arrays.put, images))))
             on_view(result)
             videos["per_view"].add(view.camera, result.ldr, result.exposure)
             videos["averaged"].add(view.camera, found.ldr_averaged, mean.exposure)
@@ -279,7 +279,7 @@ def _lookup(reference, index: int):
 
 
 def _against_reference(views, scene: Scene, mean: MeanParameters, shown, fitted, score) -> dict:
-    """Judge all views against photographs of one common exposure.
+    """Score all views against photographs of one common exposure.
 
     Args:
         views: row of each; linear radiance, reference photograph and mask, kept.
@@ -293,7 +293,7 @@ def _against_reference(views, scene: Scene, mean: MeanParameters, shown, fitted,
     def images(view):
         return (kept.read() for kept in view[1])
 
-    scales = list(in_order(lambda view: fitted(*images(view)), views))
+    scales = list(map_in_order(lambda view: fitted(*images(view)), views))
     common = float(np.exp(np.median(np.log(scales))))
     protocols = {
         "averaged": mean.exposure,
@@ -309,7 +309,7 @@ def _against_reference(views, scene: Scene, mean: MeanParameters, shown, fitted,
         }
 
     parts = {name: {part: _Collector() for part in ("all", "train", "test")} for name in protocols}
-    for (index, *_), rows in zip(views, in_order(judged, views), strict=True):
+    for (index, *_), rows in zip(views, map_in_order(judged, views), strict=True):
         view = scene.views[index]
         for name, row in rows.items():
             for part in ("all", view.split):

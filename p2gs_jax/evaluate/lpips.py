@@ -198,7 +198,7 @@ def lpips(
     Args:
         weights: the network.
         ldr: a rendered image, display values in [0, 1].
-        target: the photograph, likewise.
+        target: the photograph, display values in [0, 1].
         mask: 1 = use; elsewhere the photograph takes the rendered image's place. The mean over the
             image keeps those pixels, so that a masked area lowers the distance.
 

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from p2gs_jax.core.numerics import LN2
-from p2gs_jax.evaluate.in_order import in_order
+from p2gs_jax.evaluate.array_store import ArrayStore, StoredArray
 from p2gs_jax.evaluate.metrics import ssim
-from p2gs_jax.evaluate.shelf import Kept, Shelf
+from p2gs_jax.evaluate.parallel import map_in_order
 
 Truth = Callable[[int], Float[np.ndarray, "h w 3"] | None]
 
@@ -22,7 +22,7 @@ PU21_RANGE = (0.005, 10_000.0)
 # PU21 maps 100 cd/m^2, a standard display's white, to this; PSNR and SSIM take it as their peak.
 PU21_PEAK = 256.0
 WHITE_NITS = 100.0
-# Pixels of a view, evenly taken, for alignment and for the colour difference: at least so many.
+# Least number of evenly spaced pixels of a view for alignment and colour difference.
 ALIGNMENT_PIXELS, COLOR_PIXELS = 10_000, 20_000
 STOPS_CAP = 3.0
 
@@ -67,7 +67,7 @@ def delta_e_itp(linear, truth, mask: Bool[np.ndarray, "h w"], white: float) -> f
     shown = np.flatnonzero(mask)
     shown = shown[:: max(1, len(shown) // COLOR_PIXELS)]
 
-    # Imported here: it takes as long to load as a small scene to read.
+    # Imported here: colour-science is slow to load.
     import colour
 
     def encoded(x):
@@ -83,17 +83,19 @@ class RadianceScores:
     """Collects views, then scores them under one common alignment.
 
     Attributes:
-        shelf: where images wait.
+        arrays: keeps the images.
         views: (name, split, recovered, truth, mask) of each view.
     """
 
-    shelf: Shelf = field(default_factory=Shelf)
-    views: list[tuple[str, str, Kept, Kept, Kept]] = field(default_factory=list)
+    arrays: ArrayStore = field(default_factory=ArrayStore)
+    views: list[tuple[str, str, StoredArray, StoredArray, StoredArray]] = field(
+        default_factory=list
+    )
 
     def add(self, name: str, split: str, linear, truth, mask) -> None:
-        """Keep one view; its images are arrays, or on the shelf already."""
-        linear, truth = self.shelf.put(linear), self.shelf.put(truth)
-        self.views.append((name, split, linear, truth, self.shelf.put(np.asarray(mask) > 0.5)))
+        """Keep one view; images that the store holds already are not copied."""
+        linear, truth = self.arrays.put(linear), self.arrays.put(truth)
+        self.views.append((name, split, linear, truth, self.arrays.put(np.asarray(mask) > 0.5)))
 
     def summary(self, brightest: float) -> dict:
         """Return means over all, training and held-out views.
@@ -129,7 +131,7 @@ class RadianceScores:
                 "delta_e_itp": delta_e_itp(linear * scale, truth, mask, white),
             }
 
-        found = in_order(judged, self.views)
+        found = map_in_order(judged, self.views)
         rows = {name: row for (name, *_), row in zip(self.views, found, strict=True)}
         splits = {name: split for name, split, *_ in self.views}
         parts = {

@@ -1,4 +1,4 @@
-"""A seam to look at: half of one photograph beside half of another, with a hard edge."""
+"""A picture of a seam: half of one photograph beside half of another, with a hard edge."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.render.warp import project_points, sample_bilinear, surface_depth, unproject
 from p2gs_jax.types import Camera, Render
 
-# Where the halfway view is at least this opaque, the picture trusts the rendered depth.
+# Opacity of the halfway view from which on its rendered depth is used.
 OPAQUE = 0.5
-# Elsewhere it shows something this many times farther than anything it sees.
+# Depth used elsewhere, as a multiple of the largest rendered depth.
 FAR = 100.0
 BLANK = 0.5
 
@@ -25,14 +25,14 @@ BLANK = 0.5
 def redeveloped(
     ldr: Float[np.ndarray, "... 3"], own: DisplayTransform, common: DisplayTransform
 ) -> Float32[np.ndarray, "... 3"]:
-    """Return a photograph as it would look had it been taken in the common display transform.
+    """Return a photograph, taken back to radiance and developed with the common display transform.
 
-    What it saturated stays at the value of its white.
+    Saturated pixels stay at the value of its white.
     """
     return develop(decoded(ldr, own) / own.exposure, common)
 
 
-class Halves(NamedTuple):
+class SeamPicture(NamedTuple):
     """One picture made of two photographs, with a hard edge in the middle.
 
     Attributes:
@@ -46,16 +46,16 @@ class Halves(NamedTuple):
     left_first: bool
 
 
-def halves(
+def seam_picture(
     first: Photographed,
     second: Photographed,
     common: DisplayTransform,
     render: Callable[[Camera], Render],
-) -> Halves:
-    """Show half of each photograph as a camera halfway between the two sees it.
+) -> SeamPicture:
+    """Warp half of each photograph into a camera halfway between the two.
 
-    Hidden surfaces are not looked for: beside foreground edges the picture repeats the foreground.
-    What a photograph does not reach is grey.
+    There is no occlusion test: beside foreground edges the picture repeats the foreground. Pixels
+    that a photograph does not cover are grey.
 
     Args:
         first: one photograph.
@@ -63,7 +63,7 @@ def halves(
         common: the display transform of "after".
         render: of a camera, with depth.
     """
-    camera = halfway(first.camera, second.camera)
+    camera = camera_between(first.camera, second.camera)
     result = render(camera)
     depth = np.asarray(surface_depth(result, OPAQUE))
     known = depth > 0
@@ -89,10 +89,10 @@ def halves(
     def joined(images: list[np.ndarray]) -> np.ndarray:
         return np.concatenate([images[left][:, :edge], images[right][:, edge:]], 1)
 
-    return Halves(joined(before), joined(after), left_first)
+    return SeamPicture(joined(before), joined(after), left_first)
 
 
-def halfway(first: Camera, second: Camera) -> Camera:
+def camera_between(first: Camera, second: Camera) -> Camera:
     """Return a camera halfway between two, with the size of the first."""
     viewmats = np.stack([np.asarray(c.viewmat, np.float64) for c in (first, second)])
     turns, shifts = viewmats[:, :3, :3], viewmats[:, :3, 3]

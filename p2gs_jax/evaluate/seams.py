@@ -1,4 +1,4 @@
-"""Seams: how far photographs of one surface are apart, as taken and under one display transform.
+"""Seams: the difference of photographs of one surface, as taken and under one display transform.
 
 Pixels of one view are found in a neighbouring one through rendered depth, with an occlusion test
 (render/warp.py). Over the pixels that both show, unsaturated and not near black, the seam is the
@@ -9,9 +9,9 @@ median over pixels and channels of the absolute difference, in 8-bit codes and i
 - after: of the photographs developed alike: each is decoded with its own gamma, divided by its own
   exposure, and shown in the common display transform.
 
-The step is what the two still differ by throughout: the median of the signed difference after, in
-stops. What is left beyond it contains the misplacement of pixels on texture, view-dependent shine,
-vignetting and white balance: no exposure explains these.
+The step is the constant part of what is left: the median of the signed difference after, in stops.
+The rest contains misplaced pixels on texture, view-dependent reflection, vignetting and white
+balance, which no exposure explains.
 """
 
 from __future__ import annotations
@@ -24,22 +24,23 @@ from jaxtyping import Bool, Float, Float32
 from scipy.sparse import csr_array
 
 from p2gs_jax.config import LossConfig
+from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import inverse_tone_map
 from p2gs_jax.render.warp import sample_bilinear, warp
 from p2gs_jax.scene.visibility import project_points, unoccluded
 from p2gs_jax.types import Camera, Scene
 
-# Fewer common pixels say nothing.
+# Least pixels in common.
 FEWEST_PIXELS = 200
-# Views that share fewer points are not worth rendering.
+# Least points in common of two views that are compared.
 FEWEST_SHARED = 30
-# Without tracks, overlaps are counted on this many of the points.
+# Points that overlaps are counted on where there are no tracks.
 MOST_COUNTED = 5000
 
 
 class Photographed(NamedTuple):
-    """A photograph with what is known about it.
+    """A photograph with camera, depth and display transform.
 
     Attributes:
         ldr: display values.
@@ -57,7 +58,7 @@ class Photographed(NamedTuple):
 
 
 class Seam(NamedTuple):
-    """How far two photographs are apart; see the module for what is measured.
+    """The difference of two photographs; see the module for the definitions.
 
     Attributes:
         before_ev: as taken, stops.
@@ -76,7 +77,7 @@ class Seam(NamedTuple):
     pixels: int
 
 
-def neighbours(scene: Scene, most: int) -> list[tuple[int, int]]:
+def neighbouring_pairs(scene: Scene, most: int) -> list[tuple[int, int]]:
     """Return pairs of training views that should show the same surfaces, rows of `scene.views`.
 
     On a rig these are different cameras at the same time: files of the same name in different
@@ -97,8 +98,8 @@ def neighbours(scene: Scene, most: int) -> list[tuple[int, int]]:
         if moments[a] == moments[b] and cameras[a] != cameras[b] and shared[a, b] >= FEWEST_SHARED
     ]
     pairs = together or _closest(shared)
-    picks = np.unique(np.linspace(0, len(pairs) - 1, min(most, len(pairs))).round().astype(int))
-    return [(train[pairs[k][0]], train[pairs[k][1]]) for k in picks]
+    picked = [pairs[k] for k in evenly_spaced(len(pairs), most)]
+    return [(train[a], train[b]) for a, b in picked]
 
 
 def _closest(shared: np.ndarray) -> list[tuple[int, int]]:
@@ -122,17 +123,17 @@ def _shared_points(scene: Scene) -> np.ndarray:
         seen = seen.tocsr()[train]
     else:
         rows = []
-        counted = np.linspace(0, len(scene.points) - 1, MOST_COUNTED).round().astype(int)
+        counted = evenly_spaced(len(scene.points), MOST_COUNTED)
         for view in (scene.views[i] for i in train):
             xy, z = project_points(scene.points, view)
-            rows.append(unoccluded(xy, z, view.width, view.height)[np.unique(counted)])
+            rows.append(unoccluded(xy, z, view.width, view.height)[counted])
         seen = csr_array(np.array(rows, np.float32))
     shared = (seen @ seen.T).toarray()
     np.fill_diagonal(shared, 0)
     return shared
 
 
-def measure(
+def measure_seam(
     first: Photographed, second: Photographed, common: DisplayTransform, cfg: LossConfig
 ) -> Seam | None:
     """Return the seam between two photographs, or None where they have too little in common.
@@ -141,7 +142,7 @@ def measure(
         first: in whose pixels the two are compared.
         second: its neighbour.
         common: the display transform of "after", and the gamma of "before".
-        cfg: from and up to which values a photograph says something.
+        cfg: display values between which a pixel is used.
     """
     there = warp(jnp.asarray(first.depth), first.camera, jnp.asarray(second.depth), second.camera)
     ldr = sample_bilinear(jnp.asarray(second.ldr), there.xy)

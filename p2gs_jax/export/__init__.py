@@ -1,1 +1,1 @@
-"""Files that a run writes and that other programs read."""
+"""Exports of a run for other programs."""

@@ -1,4 +1,4 @@
-"""A COLMAP model that other programs train on at once, with the exposures beside it.
+"""A COLMAP model of the scene for other programs, with the exposures beside it.
 
 Cameras are PINHOLE at the size of the fit, and the photographs are undistorted to match. Points
 and tracks are those the fit started from. COLMAP has no place for exposures: `exposures.csv` is

@@ -1,1 +1,1 @@
-"""Files that other programs know."""
+"""Readers and writers of file formats that other programs know."""

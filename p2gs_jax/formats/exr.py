@@ -15,7 +15,7 @@ from jaxtyping import Float, Float32
 
 from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene.exif import Shot
+from p2gs_jax.scene.exif import ExifSettings
 from p2gs_jax.types import Camera
 
 BT709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
@@ -32,7 +32,7 @@ def write_exr(
     exposure: float | None = None,
     gamma: float | None = None,
     camera: Camera | None = None,
-    shot: Shot | None = None,
+    shot: ExifSettings | None = None,
 ) -> None:
     """Write linear radiance, without exposure applied; docs/exports.md lists the header.
 
@@ -108,7 +108,7 @@ def _to_ndc(K: Float[np.ndarray, "3 3"], width: int, height: int) -> Float[np.nd
     return out
 
 
-def _shot_attributes(shot: Shot) -> dict:
+def _shot_attributes(shot: ExifSettings) -> dict:
     named = {
         "expTime": shot.time,
         "aperture": shot.aperture,

@@ -1,6 +1,6 @@
-"""Pictures of what a display cannot show: luminance in stops, clipping, depth.
+"""False colours: luminance in stops, clipping, depth.
 
-All colour maps rise evenly in lightness, so that they read without colour as well.
+The lightness of all colour maps rises evenly, so that they can be read without colour as well.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ STRIPE = 6
 
 
 class Clipping(NamedTuple):
-    """Where an image leaves the range of a display."""
+    """Pixels of an image outside the range of a display."""
 
     over: Bool[np.ndarray, "h w"]
     under: Bool[np.ndarray, "h w"]

@@ -1,4 +1,4 @@
-"""Rendered frames as files of a folder, or as one video."""
+"""Output frames: rendered pictures as files in a folder, or as one video."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from p2gs_jax.types import Camera
 
 
 @dataclass(frozen=True)
-class Frame:
+class OutputFrame:
     """A rendered picture.
 
     Attributes:
         name: of its files, without suffix; may name subfolders.
         linear: radiance, without exposure.
         alpha: opacity.
-        ldr: what is shown, display values in [0, 1].
+        ldr: display values in [0, 1].
         exposure: e of `ldr`.
         gamma: of `ldr`.
         depth: alpha-weighted, or None.
@@ -43,10 +43,10 @@ class Frame:
     photograph: Float32[np.ndarray, "h3 w3 3"] | None = None
 
 
-WriteFrame = Callable[[Frame], None]
+WriteFrame = Callable[[OutputFrame], None]
 
 
-def write_frame(folder: Path, frame: Frame) -> None:
+def write_frame(folder: Path, frame: OutputFrame) -> None:
     """Write `NAME.exr` and `NAME.png`; beside a photograph, `NAME.render.png` and its own.
 
     Args:

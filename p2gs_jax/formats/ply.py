@@ -1,7 +1,7 @@
 """Gaussians as PLY in the field order of the reference implementation (Inria).
 
-Common viewers show files with display colours (gaussians/bake.py) as they should look;
-`radiance.ply` carries the linear pre-activation coefficients, untouched.
+Common viewers show files with display colours (gaussians/bake.py) correctly; `radiance.ply` holds
+the linear pre-activation coefficients, unchanged.
 """
 
 from __future__ import annotations

@@ -6,9 +6,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32, UInt8
 
 from p2gs_jax.core.atomic import atomic_write
+
+
+def to_uint8(ldr: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
+    """Return display values, clamped to [0, 1] and rounded to 8 bits; NaN becomes black."""
+    return np.rint(np.clip(np.nan_to_num(ldr), 0, 1) * 255).astype(np.uint8)
 
 
 def write_png(path: Path, ldr: Float32[np.ndarray, "h w 3"]) -> None:
@@ -17,7 +22,7 @@ def write_png(path: Path, ldr: Float32[np.ndarray, "h w 3"]) -> None:
     Raises:
         OSError: the file cannot be written.
     """
-    codes = np.rint(np.clip(np.nan_to_num(ldr), 0, 1) * 255).astype(np.uint8)
+    codes = to_uint8(ldr)
     with atomic_write(Path(path)) as temporary:
         if not cv2.imwrite(str(temporary), codes[..., ::-1]):
             raise OSError(f"{path} could not be written")

@@ -1,4 +1,4 @@
-"""`.splat`: 32 bytes a Gaussian, no view dependence; what many web viewers stream.
+"""`.splat`: 32 bytes per Gaussian, no view dependence; the format of many web viewers.
 
 Three float32 of position, three of standard deviations, four bytes of colour and opacity, four of
 the rotation as wxyz * 128 + 128; the most conspicuous Gaussians first. No header. Layout: the
@@ -11,6 +11,7 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
+from scipy.special import expit
 
 from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.errors import UserError
@@ -29,7 +30,7 @@ def write_splat(path: Path, gaussians: Gaussians) -> int:
     if gaussians.sh.shape[1] != 1:
         raise ValueError(".splat holds colours of degree 0")
     records = np.empty(gaussians.capacity, RECORD)
-    opacities = 1 / (1 + np.exp(-np.asarray(gaussians.opacity_logits, np.float64)))
+    opacities = expit(np.asarray(gaussians.opacity_logits, np.float64))
     colors = 0.5 + C0 * np.asarray(gaussians.sh[:, 0])
     quats = np.asarray(gaussians.quats, np.float64)
     norms = np.linalg.norm(quats, axis=1, keepdims=True)

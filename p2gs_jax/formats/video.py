@@ -14,6 +14,7 @@ from jaxtyping import Float32
 
 from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.errors import UserError
+from p2gs_jax.formats.png import to_uint8
 
 # Constant quality: at 16 compression is hardly visible.
 QUALITY = "16"
@@ -24,10 +25,10 @@ AddFrame = Callable[[Float32[np.ndarray, "h w 3"]], None]
 
 @contextlib.contextmanager
 def open_video(path: Path, width: int, height: int, fps: float) -> Iterator[AddFrame]:
-    """Yield a function that appends display values in [0, 1]; the file appears when all are there.
+    """Yield a function that appends display values in [0, 1]; the file appears at the end.
 
-    Smaller frames are centred on black. The size is rounded down to even numbers, which the codec
-    wants. Display values are tagged as BT.709 primaries with the sRGB curve.
+    Smaller frames are centred on black. The size is rounded down to even numbers, as the codec
+    requires. Display values are tagged as BT.709 primaries with the sRGB curve.
 
     Args:
         path: of the .mp4.
@@ -49,7 +50,7 @@ def open_video(path: Path, width: int, height: int, fps: float) -> Iterator[AddF
             "This build of PyAV cannot encode H.264.",
             fix="install the wheel of `av` from PyPI, or write frames into a folder",
         )
-    # The index goes first, so that a browser can start before it has all.
+    # The index comes first, so that browsers can play a file while it loads.
     options = {"movflags": "+faststart"}
     with (
         atomic_write(path) as temporary,
@@ -74,7 +75,7 @@ def open_video(path: Path, width: int, height: int, fps: float) -> Iterator[AddF
 
 def _codes(ldr: Float32[np.ndarray, "h w 3"], size: tuple[int, int]) -> np.ndarray:
     """Return 8-bit values, centred and cut to the size of the video."""
-    codes = np.rint(np.clip(np.nan_to_num(ldr), 0, 1) * 255).astype(np.uint8)
+    codes = to_uint8(ldr)
     width, height = size
     codes = codes[:height, :width]
     above, before = (height - codes.shape[0]) // 2, (width - codes.shape[1]) // 2

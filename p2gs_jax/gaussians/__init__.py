@@ -1,1 +1,1 @@
-"""The population: where it begins, how it grows, what it is exported as."""
+"""The Gaussians: initialisation, growth, and conversion to display colours."""

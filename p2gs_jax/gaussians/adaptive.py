@@ -19,7 +19,7 @@ RESET_OPACITY = 0.01
 
 
 class Proposal(NamedTuple):
-    """What one densification wants, before slots are assigned."""
+    """The Gaussians that one densification prunes, clones and splits, before slots are assigned."""
 
     prune: Bool[Array, " n"]
     clone: Bool[Array, " n"]
@@ -35,7 +35,7 @@ def propose(
     prune_large: Bool[Array, ""] | bool,
     cfg: DensifyConfig,
 ) -> Proposal:
-    """Decide who is pruned, cloned and split.
+    """Decide which Gaussians are pruned, cloned and split.
 
     Args:
         gaussians: the scene.
@@ -96,7 +96,7 @@ def apply(
 
 
 def reset_opacities(gaussians: Gaussians) -> Gaussians:
-    """Lower every opacity to at most 0.01, so that only what is needed grows back (3DGS)."""
+    """Lower every opacity to at most 0.01; needed Gaussians become opaque again (3DGS)."""
     ceiling = jnp.log(RESET_OPACITY / (1 - RESET_OPACITY))
     return dataclasses.replace(
         gaussians, opacity_logits=jnp.minimum(gaussians.opacity_logits, ceiling)

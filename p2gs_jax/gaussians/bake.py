@@ -1,10 +1,10 @@
-"""Display colours for ordinary 3DGS viewers, and how far their pictures are from the true ones.
+"""Display colours for ordinary 3DGS viewers, and the error of their pictures.
 
-A viewer composites display values; the true picture composites light and then applies the tone
-curve. The curve of a mixture is not the mixture of the curves, so colours taken from each Gaussian
-by itself are far off where translucent ones overlap (BUILD_NOTES, "Display PLY"). `refine` then
-moves colours and opacities until a viewer's pictures of given views agree with the true ones;
-places and shapes stay.
+A viewer composites display values; the true picture composites radiance and then applies the tone
+curve, which is not linear. Display colours computed for each Gaussian by itself are therefore wrong
+by many codes where translucent ones overlap (BUILD_NOTES, "Display PLY"). `refine` optimises
+colours and opacities so that a viewer's pictures of given views agree with the true ones; means and
+shapes stay.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import optax
 from jaxtyping import Array, Float, UInt8
 
 from p2gs_jax.config import RenderConfig
-from p2gs_jax.core.numerics import on_device
+from p2gs_jax.core.numerics import fibonacci_sphere, on_device
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.render import render_linear
 from p2gs_jax.render.capacity import TileCapacity, until_it_fits
@@ -32,7 +32,7 @@ from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.types import Camera, Gaussians, Render
 
 DIRECTIONS = 64
-# Gaussians at once: the last ones are filled up, so that their number compiles nothing.
+# Gaussians per block; the last block is padded, so that one program fits all.
 CHUNK = 8192
 # Adam's rates per step for colours of degree 0, of the others, and for opacity logits; they decay
 # to a tenth. Measured on two runs (BUILD_NOTES, "Display PLY").
@@ -41,7 +41,7 @@ COLOR_RATE, BANDS_RATE, OPACITY_RATE, DECAY = 0.05, 0.0025, 0.3, 0.1
 
 @dataclass(frozen=True)
 class Target:
-    """A view, and what a viewer should show of it.
+    """A view and its true picture.
 
     Attributes:
         name: of the view.
@@ -56,7 +56,7 @@ class Target:
 
 @dataclass(frozen=True)
 class ViewError:
-    """How far a viewer's picture of one view is from the true one.
+    """Differences between a viewer's picture of one view and the true one.
 
     Attributes:
         name: of the view.
@@ -76,13 +76,13 @@ class ViewError:
 def true_target(
     name: str, gaussians: Gaussians, camera: Camera, transform: DisplayTransform, render: RenderView
 ) -> Target:
-    """Return what a view truly looks like: light composited, then developed.
+    """Return the true picture of a view: radiance is composited, then developed.
 
     Args:
         name: of the view.
         gaussians: linear radiance.
         camera: the view.
-        transform: how to show it.
+        transform: from radiance to display values.
         render: of the run, from `make_renderer`.
     """
     linear = render(gaussians, _all(gaussians), camera).linear
@@ -91,7 +91,7 @@ def true_target(
 
 
 def display_of_splats(transform: DisplayTransform) -> DisplayTransform:
-    """Return the transform without what splats cannot carry: a correction by image position."""
+    """Return the transform without a correction by image position, which splats cannot hold."""
     return (
         replace(transform, correction=None)
         if transform.formation.appearance == "bilateral"
@@ -111,11 +111,11 @@ def display_comments(transform: DisplayTransform) -> list[str]:
 def bake(
     gaussians: Gaussians, transform: DisplayTransform, activation: RadianceKind, degree: int
 ) -> Gaussians:
-    """Return Gaussians with display colours, each taken by itself.
+    """Return Gaussians with display colours, computed for each by itself.
 
     Args:
         gaussians: linear radiance.
-        transform: how to show it.
+        transform: from radiance to display values.
         activation: of the spherical harmonics.
         degree: of the display colours; a higher one than the radiance has changes nothing.
     """
@@ -141,7 +141,7 @@ def display_sh(
         activation: of the spherical harmonics.
         degree: of the result; None keeps the radiance's.
     """
-    directions = _sphere(DIRECTIONS)
+    directions = fibonacci_sphere(DIRECTIONS).astype(np.float32)
     axes = tuple(directions.T)
     table = np.stack(_basis(axes, degree_of(sh.shape[1])), 1)
     kept = table if degree is None else table[:, : coefficient_count(degree)]
@@ -160,21 +160,13 @@ def display_sh(
 _basis = jax.jit(basis, static_argnums=1)
 
 
-def _sphere(count: int) -> Float[np.ndarray, "n 3"]:
-    i = np.arange(count) + 0.5
-    z = 1 - 2 * i / count
-    azimuth = np.pi * (1 + 5**0.5) * i
-    r = np.sqrt(1 - z * z)
-    return np.stack([r * np.cos(azimuth), r * np.sin(azimuth), z], -1).astype(np.float32)
-
-
 def viewer_config(cfg: RenderConfig) -> RenderConfig:
-    """Return how an ordinary 3DGS viewer renders: max(0, sh + 1/2), composited as it is."""
+    """Return the options of an ordinary 3DGS viewer: display colours max(0, sh + 1/2)."""
     return replace(cfg, radiance="linear", cutoff_rule="opacity")
 
 
-class _Moving(NamedTuple):
-    """What `refine` changes."""
+class _Trainable(NamedTuple):
+    """The parameters that `refine` optimises."""
 
     sh: Float[Array, "n k 3"]
     opacity_logits: Float[Array, " n"]
@@ -191,15 +183,14 @@ def refine(
 ) -> Gaussians:
     """Return Gaussians whose pictures in a viewer are closer to the targets.
 
-    Adam on the mean squared difference, one view a step, in a random order that shows all views
-    before it repeats. Every other step has a background of random colour instead of black: what
-    is dark because it is transparent would be bright in a viewer with a bright background. Base
-    colours stay in [0, 1], so that viewers with 8-bit colours can hold them. A Gaussian that no
-    target shows stays as it is.
+    Adam on the mean squared difference, one view a step, in epochs of random order. Every
+    other step has a background of random colour instead of black, as viewers may have bright
+    backgrounds. Base colours stay in [0, 1], which viewers with 8-bit colours need. Gaussians that
+    no target shows stay as they are.
 
     Args:
         gaussians: from `bake`.
-        targets: what to agree with.
+        targets: the true pictures.
         cfg: rendering options of the run.
         steps: 0 returns the Gaussians as they are.
         seed: of the order.
@@ -212,12 +203,12 @@ def refine(
     needed = max(int(count_needed(gaussians, alive, t.camera, cfg=cfg)) for t in targets)
     capacity = TileCapacity.allocate(needed)
     bands = jnp.full((gaussians.sh.shape[1], 1), BANDS_RATE).at[0].set(COLOR_RATE)
-    rates = _Moving(bands, jnp.asarray(OPACITY_RATE))
+    rates = _Trainable(bands, jnp.asarray(OPACITY_RATE))
 
     # Made here: places and shapes are constants to XLA, which folds what depends on them alone.
     @functools.partial(jax.jit, static_argnames="capacity", compiler_options=compiler_options())
     def step(moving, state, camera, picture, background, decay, *, capacity):
-        def loss(moving: _Moving):
+        def loss(moving: _Trainable):
             shown = replace(gaussians, **moving._asdict())
             result = render_linear(shown, _all(shown), camera, cfg, capacity, with_depth=False)
             picture_shown = _over(result, background)
@@ -226,13 +217,13 @@ def refine(
         (_, result), gradient = jax.value_and_grad(loss, has_aux=True)(moving)
         updates, state = optimizer.update(gradient, state)
         changes = jax.tree.map(lambda rate, u: -decay * rate * u, rates, updates)
-        moved = cast(_Moving, optax.apply_updates(cast(Any, moving), cast(Any, changes)))
+        moved = cast(_Trainable, optax.apply_updates(cast(Any, moving), cast(Any, changes)))
         limit = 0.5 / C0
         sh = moved.sh.at[:, 0].set(jnp.clip(moved.sh[:, 0], -limit, limit))
-        return (_Moving(sh, moved.opacity_logits), state), result.count, result.overflow
+        return (_Trainable(sh, moved.opacity_logits), state), result.count, result.overflow
 
     rng, order = np.random.default_rng(seed), []
-    moving = _Moving(gaussians.sh, gaussians.opacity_logits)
+    moving = _Trainable(gaussians.sh, gaussians.opacity_logits)
     state = optimizer.init(cast(Any, moving))
     for done in range(steps):
         order = order or list(rng.permutation(len(targets)))
@@ -283,7 +274,7 @@ def _psnr(difference: Float[np.ndarray, "h w 3"]) -> float:
     return float(-10 * np.log10(max(mse, 1e-10)))
 
 
-def summary(errors: Sequence[ViewError]) -> dict | None:
+def error_summary(errors: Sequence[ViewError]) -> dict | None:
     """Return median and worst of some views as plain values; None where there are none."""
     if not errors:
         return None

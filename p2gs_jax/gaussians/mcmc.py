@@ -45,7 +45,7 @@ def share(
 def transparent(
     gaussians: Gaussians, population: Population, cfg: DensifyConfig
 ) -> Bool[Array, " n"]:
-    """Return which live Gaussians are too transparent to keep their place."""
+    """Return which live Gaussians are transparent enough to be relocated."""
     return population.alive & (opacities(gaussians) <= cfg.prune_opacity)
 
 
@@ -59,10 +59,10 @@ def relocate_and_grow(
 ) -> Outcome:
     """Move transparent Gaussians onto opaque ones and add `births` new ones there.
 
-    Targets are drawn in proportion to opacity times demand. Everyone in one place shares its look,
-    and they are moved apart by `cfg.spread` of their extent: Gaussians in exactly one place have
-    the same gradients, and at opacities that no noise reaches they never part (BUILD_NOTES,
-    "Twins").
+    Targets are drawn in proportion to opacity times demand. All Gaussians in one place get the
+    opacity and scale of `share`, and they are moved apart by `cfg.spread` of their extent: in
+    exactly one place they would have the same gradients, and opaque ones, which no noise reaches,
+    would never separate (BUILD_NOTES, "Twins").
 
     Args:
         key: randomness.
@@ -100,7 +100,7 @@ def relocate_and_grow(
     )
     source = jnp.where(movers, jnp.minimum(target, n - 1), jnp.arange(n))
     gaussians = jax.tree.map(lambda a: a[source], gaussians)
-    # Whoever stays gives way to the other side, so that the centre of the place stays.
+    # The target itself moves to the opposite side, so that their mean stays.
     away = jax.random.normal(jax.random.fold_in(key, 1), (n, 3)) * movers[:, None]
     pushed = jnp.zeros((n, 3)).at[target].add(away, mode="drop")
     away = away - pushed / jnp.maximum(arrivals, 1)[:, None]
@@ -114,12 +114,12 @@ def relocate_and_grow(
 def _apart(
     gaussians: Gaussians, away: Float[Array, "n 3"], where: Bool[Array, " n"], spread: float
 ) -> Gaussians:
-    """Move Gaussians within their own extent, and shrink them by what that adds to the place.
+    """Move Gaussians within their own extent, and shrink them so that their joint extent stays.
 
     Args:
         gaussians: the scene.
         away: directions in units of the principal axes, variance 1; zero for all others.
-        where: whom.
+        where: which Gaussians.
         spread: deviation of the moves over that of the Gaussian, below 1.
     """
     scales = jnp.exp(gaussians.log_scales)

@@ -15,13 +15,13 @@ from jaxtyping import Array, Bool, Float, Int
 from p2gs_jax.config import TrainConfig
 from p2gs_jax.types import Gaussians, Population
 
-# Logit of an opacity that no cutoff lets through: what empty slots hold.
+# Opacity logit of empty slots: below every cutoff.
 EMPTY_LOGIT = -20.0
 GROWTH_BUCKET = 1.5
 
 
 class Outcome(NamedTuple):
-    """The new population and what must follow from it."""
+    """The result of a densification."""
 
     gaussians: Gaussians
     population: Population
@@ -33,7 +33,7 @@ class Outcome(NamedTuple):
 
 def fresh_population(alive: Bool[Array, " n"]) -> Population:
     """Return a population with empty statistics."""
-    # Two arrays, not one twice: the step donates its input, and each may be donated once.
+    # Two arrays, not one twice: the step donates its input, and a buffer can be donated once only.
     return Population(alive, *(jnp.zeros(alive.shape, jnp.float32) for _ in range(2)))
 
 
@@ -47,16 +47,16 @@ def empty_gaussians(count: int, like: Gaussians) -> Gaussians:
     )
 
 
-# A step costs about this many seconds a pixel (ours; two cores of 2025).
+# Time of a step, seconds per pixel (ours; two cores of 2025).
 STEP_SECONDS_PER_PIXEL = 5e-7
-# Gaussians a pixel of a view that it shows: rising with the steps of a run from the first to the
-# second (ours: BUILD_NOTES, "Population").
+# Gaussians shown per pixel of a view: from the first to the second with the steps of a run (ours:
+# BUILD_NOTES, "Population").
 SMALLEST_SHARE, LARGEST_SHARE, STEPS_PER_SHARE = 0.1, 0.3, 15_000
 MOST_BY_DEFAULT = 400_000
 
 
 class Coverage(NamedTuple):
-    """How much of a scene its views show.
+    """Size of the views, and the share of the scene that each shows.
 
     Attributes:
         pixels: of one view.

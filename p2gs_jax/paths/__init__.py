@@ -6,7 +6,7 @@ from p2gs_jax.paths.files import read_cameras, write_cameras
 from p2gs_jax.paths.orbit import Orbit, find_orbit, orbit
 from p2gs_jax.paths.panorama import Wide, render_wide, slices, stitch
 from p2gs_jax.paths.pinhole import make_camera
-from p2gs_jax.paths.rig import Rig, Step, find_rig
+from p2gs_jax.paths.rig import Rig, TimeStep, find_rig
 from p2gs_jax.paths.shots import Shot, of_camera, view_shots
 
 __all__ = [
@@ -15,7 +15,7 @@ __all__ = [
     "PosePath",
     "Rig",
     "Shot",
-    "Step",
+    "TimeStep",
     "Wide",
     "covering",
     "drive",

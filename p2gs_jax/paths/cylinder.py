@@ -14,7 +14,7 @@ from p2gs_jax.paths.shots import Shot
 
 # Coverage is judged at this many directions per radian, up to this height (tangent of elevation).
 PROBES, HIGHEST = 2 * 180 / np.pi, 3.0
-# A column counts as covered with this part of the tallest column.
+# A column counts as covered from this share of the tallest column on.
 FULL_COLUMN = 0.75
 
 
@@ -60,8 +60,8 @@ class Cylinder:
         return np.stack([np.sin(a), h, np.cos(a)], -1) @ self.viewmat[:3, :3]
 
 
-class Seen(NamedTuple):
-    """Where a pinhole camera sees directions.
+class Projected(NamedTuple):
+    """Directions projected into a pinhole camera.
 
     Attributes:
         xy: pixels, centres at +0.5.
@@ -79,7 +79,7 @@ def project(
     rays: Float[np.ndarray, "h w 3"],
     origin: Float[np.ndarray, " 3"] | None = None,
     nearness: Float[np.ndarray, "h w"] | None = None,
-) -> Seen:
+) -> Projected:
     """Return where a pinhole camera sees what lies along rays.
 
     Args:
@@ -97,7 +97,7 @@ def project(
     xy = local[..., :2] / np.where(front, z, 1.0)[..., None]
     xy = xy * shot.K[[0, 1], [0, 1]] + shot.K[:2, 2]
     inside = front & np.all((xy >= 0) & (xy <= (shot.width, shot.height)), axis=-1)
-    return Seen(xy, z / np.maximum(np.linalg.norm(local, axis=-1), 1e-12), inside)
+    return Projected(xy, z / np.maximum(np.linalg.norm(local, axis=-1), 1e-12), inside)
 
 
 def covering(shots: Iterable[Shot], viewmat: Pose) -> Cylinder:
@@ -125,7 +125,7 @@ def covering(shots: Iterable[Shot], viewmat: Pose) -> Cylinder:
         rows = covered.any(1)
     first, last = np.flatnonzero(rows)[[0, -1]]
     focal = max(float(max(s.K[0, 0], s.K[1, 1])) for s in shots)
-    # Probes stand for their surroundings: one less at every edge is surely covered.
+    # A probe stands for its surroundings: leave one out at every edge.
     cut = 0 if count == around else 1
     top = probe.top + (first + 1) / probe.focal
     bottom = probe.top + last / probe.focal

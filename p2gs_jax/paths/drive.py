@@ -14,9 +14,9 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.paths.geometry import Poses, angles, inverse, rigid
 from p2gs_jax.paths.shots import Shot, common_lens
 
-# Frames from one pose to the next where nobody says how many.
+# Default number of frames from one pose to the next.
 FRAMES_BETWEEN = 8
-# A camera that stands still takes this part of the mean time between two poses.
+# Least time between two poses, as a share of the mean: cameras may stand still.
 SHORTEST = 0.1
 
 
@@ -75,7 +75,7 @@ def drive(knots: Sequence[Shot], frames: int | None = None) -> list[Shot]:
         frames: how many shots; None takes `FRAMES_BETWEEN` from one knot to the next.
 
     Raises:
-        UserError: there are less than two knots.
+        UserError: there are fewer than two knots.
     """
     if len(knots) < 2:
         raise UserError(

@@ -1,4 +1,4 @@
-"""A circle around what the cameras look at, or part of one where they did not go around it."""
+"""A circle around what the cameras look at, or an arc where they did not surround it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from p2gs_jax.paths.shots import Shot, common_lens
 FRAMES = 120
 # Optical axes meet where they spread at least this much (sine squared) ...
 LEAST_SPREAD = 0.01
-# ... and the point is before most cameras, within this angle from their axes (median).
+# ... and the point is in front of most cameras, within this angle from their axes (median).
 MOST_IN_FRONT, WIDEST = 0.9, np.deg2rad(25)
 # A full circle needs cameras all around, with no larger gap than this.
 LARGEST_GAP = np.deg2rad(100)
@@ -24,17 +24,17 @@ HIGHEST = np.deg2rad(85)
 
 @dataclass(frozen=True)
 class Orbit:
-    """A circle, or an arc to go back and forth on.
+    """A circle, or an arc that is followed back and forth.
 
     Attributes:
-        focus: its centre seen from above, and what is looked at.
+        focus: point that the camera looks at; centre of the circle seen from above.
         up: unit vector.
         forward: horizontal unit vector, azimuth 0 as seen from the focus.
         radius: distance from the focus, scene units.
         elevation: of the camera above the focus, radians.
         middle: azimuth of the middle of the arc, radians.
         sway: half the arc, radians; pi for a circle.
-        met: whether the optical axes meet in the focus; otherwise it lies before one camera.
+        met: whether the optical axes meet in the focus; otherwise it lies in front of one camera.
     """
 
     focus: Float[np.ndarray, " 3"]
@@ -46,8 +46,8 @@ class Orbit:
     sway: float
     met: bool
 
-    def describe(self) -> str:
-        """Return in a sentence what the camera does, and why."""
+    def description(self) -> str:
+        """Return a sentence on the shape of the orbit, and the reason for it."""
         degrees = f"{np.rad2deg(self.sway):.0f} degrees to either side"
         if not self.met:
             return (
@@ -59,7 +59,7 @@ class Orbit:
         return "A full circle around the point where the optical axes meet."
 
     def center(self, azimuth: float) -> Float[np.ndarray, " 3"]:
-        """Return where the camera is at an azimuth."""
+        """Return the camera's centre at an azimuth."""
         side = np.cross(self.up, self.forward)
         level = np.cos(azimuth) * self.forward + np.sin(azimuth) * side
         direction = np.cos(self.elevation) * level + np.sin(self.elevation) * self.up

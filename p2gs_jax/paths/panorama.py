@@ -1,7 +1,7 @@
 """Panoramas: pinhole images around a common centre, reprojected to a cylinder.
 
-Photographs stitched so show the seams as they were taken. A wide view of the radiance field is
-stitched the same way, from slices that one camera would see turning about its centre.
+Photographs are stitched with hard edges, so that their seams show. A wide view of the radiance
+field is stitched the same way, from narrow slices around one centre.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from p2gs_jax.paths.cylinder import Cylinder, project
 from p2gs_jax.paths.geometry import inverse, rigid
 from p2gs_jax.paths.shots import Shot
 
-# Splats are projected by an affine approximation that is off far from the axis; narrow slices keep
-# it nearly the same on both sides of an edge between them.
+# Angle of a slice: the affine approximation of splats is off far from the axis; in narrow slices it
+# is nearly the same on both sides of an edge.
 WIDEST_SLICE = np.deg2rad(20)
-# Expected depth means something from this opacity on; what is less opaque counts as far.
+# Opacity from which on expected depth is used; below it the surface counts as infinitely far.
 OPAQUE = 0.5
 
 Layers = tuple[np.ndarray, np.ndarray, np.ndarray]  # linear [h w 3], alpha [h w], depth [h w]
@@ -61,7 +61,7 @@ def stitch(
 ) -> Stitched:
     """Reproject images to a cylinder: every pixel from the one camera that sees it most centrally.
 
-    Edges between cameras are hard and nothing is blended, so that differences show.
+    Nothing is blended, so that differences show.
 
     Args:
         images: of at most 4 channels.
@@ -106,7 +106,7 @@ def slices(cylinder: Cylinder) -> list[Shot]:
     half = cylinder.span / count / 2
     f = cylinder.focal
     tallest = max(abs(cylinder.top), abs(cylinder.top + cylinder.height / f))
-    # A pixel on each side for interpolation; the axis in the middle, as the renderer likes it.
+    # One more pixel on each side for interpolation; principal point in the middle.
     width = 2 * (int(np.ceil(f * np.tan(half))) + 1)
     height = 2 * (int(np.ceil(f * tallest / np.cos(half))) + 1)
     K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1.0]])

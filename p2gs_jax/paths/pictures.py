@@ -1,4 +1,4 @@
-"""Pictures of a finished run: from shots, wide ones, and ones that compare it with photographs."""
+"""Pictures of a finished run: of shots, panoramas, and comparisons with photographs."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
-from p2gs_jax.formats.frames import Frame
-from p2gs_jax.paths import Cylinder, Rig, Shot, Step, Wide, render_wide, stitch
-from p2gs_jax.paths.captioned_rows import Row, stacked, stacked_size
+from p2gs_jax.formats.frames import OutputFrame
+from p2gs_jax.paths import Cylinder, Rig, Shot, TimeStep, Wide, render_wide, stitch
+from p2gs_jax.paths.captioned_images import CaptionedImage, stacked, stacked_size
 from p2gs_jax.paths.cylinder import borders
 from p2gs_jax.paths.geometry import Poses, inverse
 from p2gs_jax.paths.panorama import Layers
@@ -21,20 +21,20 @@ from p2gs_jax.render.host import make_renderer
 from p2gs_jax.run.read import Run
 from p2gs_jax.scene.images import ImageStore
 
-# Where no camera has seen anything.
+# Display value where no camera sees anything.
 NOTHING = 0.92
-# Photographs are placed by the field's depth, smoothed over this part of the width: its noise would
-# fray their edges.
+# Photographs are placed by the field's depth, smoothed over this part of the width, as noise of the
+# depth would fray their edges.
 SMOOTH = 1 / 80
 
 
-class Studio:
-    """Renders a run and develops what it renders, and knows how long either took.
+class RunRenderer:
+    """Renders and develops pictures of a run, and measures the time of both.
 
     Attributes:
         run: the run.
-        render_seconds: of every picture rendered.
-        develop_seconds: of every picture developed.
+        render_seconds: of every rendered picture.
+        develop_seconds: of every developed picture.
     """
 
     def __init__(self, run: Run):
@@ -70,43 +70,45 @@ class Studio:
 
 
 def shot_frames(
-    studio: Studio,
+    renderer: RunRenderer,
     shots: Sequence[Shot],
     display_of: Callable[[Shot], DisplayTransform],
     photograph: Callable[[int], Float32[np.ndarray, "h w 3"] | None] | None = None,
-) -> Iterator[Frame]:
+) -> Iterator[OutputFrame]:
     """Yield a frame for every shot.
 
     Args:
-        studio: renders.
+        renderer: renders.
         shots: what to render.
         display_of: how to develop each.
-        photograph: returns what goes beside the render of a view, or None; by default nothing.
+        photograph: returns the photograph to write beside the render of a view, or None.
     """
     for shot in shots:
-        linear, alpha, depth = studio.linear(shot)
+        linear, alpha, depth = renderer.linear(shot)
         transform = display_of(shot)
-        ldr = studio.develop(linear, transform)
+        ldr = renderer.develop(linear, transform)
         taken = None if photograph is None or shot.view is None else photograph(shot.view)
         how = (transform.exposure, transform.gamma)
-        yield Frame(shot.name, linear, alpha, ldr, *how, depth, shot.camera(), taken)
+        yield OutputFrame(shot.name, linear, alpha, ldr, *how, depth, shot.camera(), taken)
 
 
 def wide_frames(
-    studio: Studio, cylinder: Cylinder, poses: Poses, transform: DisplayTransform
-) -> Iterator[Frame]:
+    renderer: RunRenderer, cylinder: Cylinder, poses: Poses, transform: DisplayTransform
+) -> Iterator[OutputFrame]:
     """Yield wide views of the field.
 
     Args:
-        studio: renders.
+        renderer: renders.
         cylinder: the view from a rig: its viewmat is rig-to-camera.
         poses: rig-to-world.
         transform: how to develop all.
     """
     for k, pose in enumerate(poses):
-        wide = studio.wide(_placed(cylinder, pose))
-        ldr = studio.develop(wide.linear, transform)
-        yield Frame(f"{k:05d}", wide.linear, wide.alpha, ldr, transform.exposure, transform.gamma)
+        wide = renderer.wide(_placed(cylinder, pose))
+        ldr = renderer.develop(wide.linear, transform)
+        yield OutputFrame(
+            f"{k:05d}", wide.linear, wide.alpha, ldr, transform.exposure, transform.gamma
+        )
 
 
 def comparison_size(cylinder: Cylinder) -> tuple[int, int]:
@@ -115,13 +117,13 @@ def comparison_size(cylinder: Cylinder) -> tuple[int, int]:
 
 
 def comparison_frames(
-    studio: Studio,
+    renderer: RunRenderer,
     rig: Rig,
-    steps: Sequence[Step],
+    steps: Sequence[TimeStep],
     cylinder: Cylinder,
     transform: DisplayTransform,
     store: ImageStore,
-) -> Iterator[Frame]:
+) -> Iterator[OutputFrame]:
     """Yield three panoramas below each other for every time step.
 
     Photographs stitched as taken; the same, each taken back to radiance by its own exposure and
@@ -129,7 +131,7 @@ def comparison_frames(
     placed by the field's smoothed depth, and nothing is blended. The frame's `linear` is the field.
 
     Args:
-        studio: renders.
+        renderer: renders.
         rig: the cameras.
         steps: of the rig.
         cylinder: the view from the rig: its viewmat is rig-to-camera.
@@ -137,13 +139,13 @@ def comparison_frames(
         store: the photographs.
     """
     names = list(rig.mounts)
-    mean = studio.run.mean.exposure_geometric
+    mean = renderer.run.mean.exposure_geometric
     for step in steps:
         placed = _placed(cylinder, step.pose)
-        wide = studio.wide(placed)
+        wide = renderer.wide(placed)
         shots = [step.shots[name] for name in names if name in step.shots]
         rows = [shot.view for shot in shots if shot.view is not None]
-        transforms = [studio.run.own_display(row) for row in rows]
+        transforms = [renderer.run.own_display(row) for row in rows]
         photographs, masks = zip(*(store.get(row) for row in rows), strict=True)
         radiance = [undevelop(p, own) for p, own in zip(photographs, transforms, strict=True)]
         near = cv2.GaussianBlur(wide.nearness, (0, 0), SMOOTH * cylinder.width)
@@ -156,19 +158,21 @@ def comparison_frames(
             (f"{cameras[k]} {stops[k]:+.1f} EV".replace("-", "−"), start, end)
             for k, start, end in borders(taken.source[cylinder.height // 2])
         ]
-        field = studio.develop(wide.linear, transform)
+        field = renderer.develop(wide.linear, transform)
         picture = stacked(
             [
-                Row("photographs as taken", np.where(seen, taken.image, NOTHING), captions),
-                Row(
+                CaptionedImage(
+                    "photographs as taken", np.where(seen, taken.image, NOTHING), captions
+                ),
+                CaptionedImage(
                     "the same photographs, developed to one exposure",
                     np.where(seen, develop(same.image, transform), NOTHING),
                 ),
-                Row("the radiance field at that exposure", field),
+                CaptionedImage("the radiance field at that exposure", field),
             ]
         )
         how = (transform.exposure, transform.gamma)
-        yield Frame(step.name, wide.linear, wide.alpha, picture, *how)
+        yield OutputFrame(step.name, wide.linear, wide.alpha, picture, *how)
 
 
 def _placed(cylinder: Cylinder, pose) -> Cylinder:

@@ -1,4 +1,4 @@
-"""Cameras of one's own: checked, and made into what the renderer takes."""
+"""Cameras given by a user: checks, and conversion to the renderer's."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.types import Camera
 
 LARGEST = 16384  # pixels
-# Rotations written with few digits are accepted and made orthonormal again.
+# Tolerance of rotations that were written with few digits; they are made orthonormal again.
 TOLERANCE = 0.01
 
 
@@ -25,7 +25,7 @@ def make_camera(K: ArrayLike, viewmat: ArrayLike, width: int, height: int) -> Ca
         height: pixels.
 
     Raises:
-        UserError: one of them is no such thing.
+        UserError: an argument has another shape or meaning.
     """
     fix = "docs/conventions.md says what K and viewmat are"
     for name, value in (("width", width), ("height", height)):
@@ -47,7 +47,7 @@ def as_matrix(values: ArrayLike, name: str, size: int) -> Float[np.ndarray, "n n
     """Return values as a square matrix.
 
     Raises:
-        ValueError: they are none, or not finite.
+        ValueError: they have another shape, or are not finite.
     """
     try:
         out = np.array(values, np.float64)
@@ -61,10 +61,10 @@ def as_matrix(values: ArrayLike, name: str, size: int) -> Float[np.ndarray, "n n
 
 
 def checked_lens(K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-    """Return a camera matrix that the renderer knows.
+    """Return a camera matrix, checked to be that of a pinhole without skew.
 
     Raises:
-        ValueError: it is none.
+        ValueError: it is not.
     """
     if K[0, 0] <= 0 or K[1, 1] <= 0 or not np.array_equal(K[2], [0, 0, 1]):
         raise ValueError("has a K with no positive focal lengths, or a last row other than 0 0 1")
@@ -77,7 +77,7 @@ def orthonormal(matrix: Float[np.ndarray, "4 4"], name: str) -> Float[np.ndarray
     """Return a pose with its rotation made orthonormal.
 
     Raises:
-        ValueError: it is no rotation and translation.
+        ValueError: it is not a rotation and a translation.
     """
     u, sizes, vt = np.linalg.svd(matrix[:3, :3])
     turned = u @ vt

@@ -1,4 +1,4 @@
-"""Cameras that are carried together: which photographs were taken at the same time, and from where.
+"""Rigs: cameras that move together, and which of their photographs were taken at the same time.
 
 Photographs of different cameras belong to the same time step where their file names agree
 (`front/000003.png`, `front_left/000003.png`).
@@ -18,12 +18,12 @@ from p2gs_jax.paths.geometry import Pose, Poses, angles, inverse, mean_pose, rig
 from p2gs_jax.paths.shots import Shot
 from p2gs_jax.types import View
 
-# Median angle by which cameras may turn against each other.
+# Largest median angle between the cameras' relative rotations over time.
 LEAST_RIGID = np.deg2rad(5)
 
 
 @dataclass(frozen=True)
-class Step:
+class TimeStep:
     """One time step.
 
     Attributes:
@@ -50,7 +50,7 @@ class Rig:
     """
 
     mounts: dict[str, Shot]
-    steps: tuple[Step, ...]
+    steps: tuple[TimeStep, ...]
 
     @property
     def poses(self) -> Poses:
@@ -86,7 +86,8 @@ def find_rig(shots: Sequence[Shot], views: Sequence[View]) -> Rig:
     return Rig(
         mounts,
         tuple(
-            Step(name, mean_pose(_poses(found, mounts)), found) for name, found in common.items()
+            TimeStep(name, mean_pose(_poses(found, mounts)), found)
+            for name, found in common.items()
         ),
     )
 
@@ -96,7 +97,7 @@ def _poses(found: dict[str, Shot], mounts: dict[str, Shot]) -> Poses:
 
 
 def _mounts(cameras: list[str], steps: dict[str, dict[str, Shot]]) -> dict[str, Shot]:
-    """Return the mean place of every camera on the rig."""
+    """Return the mean pose of every camera on the rig."""
     counts = {c: sum(c in found for found in steps.values()) for c in cameras}
     anchor = max(cameras, key=lambda c: counts[c])
     from_anchor: dict[str, Pose] = {}

@@ -1,4 +1,4 @@
-"""A picture to be taken of a fitted scene: where, with which lens, and how it is developed."""
+"""Shots: pictures to render of a fitted scene, with pose, lens, exposure and gamma."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Shot:
         return replace(self, K=K, width=width, height=height)
 
     def camera(self) -> Camera:
-        """Return what the renderer takes."""
+        """Return the renderer's camera."""
         viewmat, K = jnp.asarray(self.viewmat, jnp.float32), jnp.asarray(self.K, jnp.float32)
         return Camera(viewmat, K, self.width, self.height)
 

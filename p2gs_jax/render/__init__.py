@@ -73,7 +73,7 @@ def rasterize(
 def fastest_here() -> TileImplementation:
     """Return the rasterizer of the default backend: `pallas` on NVIDIA GPUs that Triton knows.
 
-    Asked while tracing, so that a program holds one of them.
+    Called while tracing, so that a program contains one of them only.
     """
     if jax.default_backend() != "gpu":
         return "xla"

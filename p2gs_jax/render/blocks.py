@@ -1,9 +1,8 @@
-"""Projection and radiance of what a view shows, block by block.
+"""Projection and radiance of the Gaussians that a view may show, block by block.
 
-The list of what a view shows has a static length and a dynamic count. A loop over blocks costs what
-the count costs, and keeps what it computes in a core's cache: gathering 48 spherical-harmonics
-coefficients of 57k Gaussians at once took as long as projecting them (BUILD_NOTES, "The step costs
-what a view shows").
+Their list has a static length and a dynamic count. The time of a loop over blocks follows the
+count, and a block fits a core's cache: gathering 48 spherical-harmonics coefficients of 57k
+Gaussians at once took as long as projecting them (BUILD_NOTES, "The step costs what a view shows").
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ Shown = tuple[Splats2D, Float[Array, "v 3"]]
 
 
 def whole_blocks(room: int) -> int:
-    """Return the length of a list that has room for so many and ends with a block."""
+    """Return `room` rounded up to whole blocks."""
     return -(-max(room, 1) // BLOCK) * BLOCK
 
 
@@ -73,9 +72,9 @@ def put_rows(gaussians: Gaussians, ids: Int[Array, " v"], new: Gaussians) -> Gau
 
 
 def block_size(length: int) -> int:
-    """Return how many rows of a list are handled at once: all where there is no cache to fit.
+    """Return the number of rows of a block: all rows on devices other than CPUs.
 
-    Asked while tracing, so that a program holds one of them.
+    Called while tracing, so that a program contains one of them only.
     """
     return min(BLOCK, length) if jax.default_backend() == "cpu" else length
 
@@ -119,7 +118,7 @@ def splat_listed(
         cameras: the views.
         cfg: rendering options.
         active_degree: spherical-harmonics degree in use.
-        bands: coefficients that are looked at.
+        bands: number of coefficients in use.
     """
 
     length = ids.shape[0]

@@ -1,7 +1,7 @@
-"""How long lists are: allocate outside jit, check for overflow, grow.
+"""Capacities of the static arrays of a view: allocate outside jit, check for overflow, grow.
 
-Time follows what a view needs, memory the length of its list: 54 bytes an entry (BUILD_NOTES,
-"Growth and memory"). So lists are generous and an overflow, which costs a compilation, is rare.
+Time depends on what a view needs, memory on the capacity: 54 bytes per entry (BUILD_NOTES, "Growth
+and memory"). So capacities are generous, and overflows, which cost a compilation, are rare.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ class Room(NamedTuple):
         )
 
     def holds(self, other: Room) -> bool:
-        """Return whether what fits the other fits this."""
+        """Return whether every view that fits the other fits this."""
         return self.entries >= other.entries and self.visible >= other.visible
 
     def grown(self, entries: int, visible: int) -> Room:

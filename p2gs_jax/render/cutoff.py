@@ -1,4 +1,4 @@
-"""How faint a contribution may be before it is skipped, where radiance matters."""
+"""The opacity below which a contribution is skipped, under the rule `radiance`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rendering from the host: allocate outside jit, check for overflow, grow, render again."""
+"""Rendering of single views: allocate outside jit, check for overflow, grow, render again."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def compiled_renderer() -> Any:
 
 
 def make_renderer(cfg: RenderConfig) -> RenderView:
-    """Return a function that renders one view exactly, growing its tile lists when it must."""
+    """Return a function that renders one view, and grows its tile lists after an overflow."""
     capacities: dict[tuple[int, int], TileCapacity] = {}
 
     def render_view(gaussians: Gaussians, alive: Bool[Array, " n"], camera: Camera) -> Render:

@@ -1,4 +1,4 @@
-"""Which segment a lane takes next: the longest that is left."""
+"""The queue of segments: a lane that is done takes the longest one left."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from p2gs_jax.render.tile_rows import Plan
 
 
 class Queue(NamedTuple):
-    """Segments in the order in which lanes take them, then one parking place per lane.
+    """Segments in the order in which lanes take them, then one empty slot per lane.
 
-    S slots hold segments; those from S on are parking places, empty.
+    S slots hold segments; those from S on are empty: lanes wait there at the end.
     """
 
     order: Array  # [S + B]

@@ -11,8 +11,8 @@ moments and the channels are summed over the tile and added to the Gaussian's gr
 or, where runs must repeat bit for bit, written per entry and summed per Gaussian in the order of
 the list.
 
-On a CPU the kernels are interpreted, so that the shared tests run on them. What was and was not
-measured: BUILD_NOTES, "The GPU kernel".
+On a CPU the kernels are interpreted, so that the shared tests run on them. Measurements:
+BUILD_NOTES, "The GPU kernel".
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def _longest_first(starts, ends, plan: Plan):
 
 
 class _Tile:
-    """The pixels of one tile, and what an entry's row says about them."""
+    """The pixels of one tile, and an entry's values at them."""
 
     def __init__(self, tile, plan: Plan):
         self.plan = plan

@@ -1,7 +1,7 @@
 """The oracle: dense compositing by plain autodiff, in whatever precision it is given.
 
-Every pixel meets every Gaussian in depth order. Slow, short and readable: what the fast
-implementations are held against, in float64.
+Every pixel composites every Gaussian in depth order. Slow, short and readable: the fast
+implementations are tested against it in float64.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ from p2gs_jax.render.segments import cut, merge
 from p2gs_jax.render.tile_rows import DARKEST, GEOMETRY, Plan, geometry_gradient
 from p2gs_jax.render.xla_cpu import materialize
 
-# The backward pass spends more on bookkeeping an iteration and wants more pixels in flight.
+# The backward pass has more overhead per iteration: more pixels in flight are faster.
 BACKWARD_LANE_FACTOR = 2
 PREFIX_GROUP = 8
 
@@ -196,7 +196,7 @@ def backward(rows, ids_list, residuals, image, v_image, plan: Plan):
         [one, local_x, local_y, local_x**2, local_x * local_y, local_y**2, zero, zero], 1
     )
 
-    # Parking places need no values: nothing of theirs is kept.
+    # Empty slots need no values: none of their results is kept.
     tiles = jnp.concatenate([segments.tiles, jnp.zeros(lanes, jnp.int32)])
     light = functools.reduce(jnp.add, (a * v for a, v in zip(image, v_image, strict=True)))
     v_channels = jnp.stack(v_image[:-1], 1)

@@ -1,9 +1,9 @@
 """Long tile lists cut into segments that are composited independently and merged.
 
-Front-to-back compositing is associative: behind a segment of colour c and transmittance t lies
-another of colour d, and together they have colour c + t d. A queue of whole lists is done no sooner
-than its longest one: at a quarter of the resolution of a fit, lanes stood idle for two thirds of
-the time (BUILD_NOTES, "Full lanes").
+Front-to-back compositing is associative: a segment of colour c and transmittance t in front of one
+of colour d gives colour c + t d. A queue of whole lists takes at least as long as its longest list:
+at a quarter of the resolution of a fit, lanes were idle for two thirds of the time (BUILD_NOTES,
+"Full lanes").
 
 A segment is L chunks long, L being the fair share of a lane over `SEGMENTS_PER_LANE`. So there are
 at most as many segments as tiles and `SEGMENTS_PER_LANE` times lanes: a static bound.
@@ -82,7 +82,7 @@ def _merge(composited, tiles, extra):
 
     count = composited[0].shape[0] - tiles.shape[0]
 
-    # What is in front travels with the loop: an array that is read and written would be copied.
+    # The front is part of the loop's state: an array both read and written would be copied.
     def body(k, state):
         image, before, last, front = state
         tile = lax.dynamic_slice(tiles, (k,), (1,))[0]

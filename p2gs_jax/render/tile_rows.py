@@ -20,7 +20,8 @@ from p2gs_jax.types import Splats2D
 
 DUMMY_LOG_OPACITY = -100.0
 GEOMETRY = 6  # columns of a row before its channels
-# Pixels darker than this, relative to the brightest splat, are held to its absolute error.
+# Floor of a pixel's brightness in the stop rule, over the brightest splat
+# (RenderConfig.stop_error).
 DARKEST = 1e-4
 
 

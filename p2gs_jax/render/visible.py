@@ -25,13 +25,13 @@ SLACK = 1.0
 def in_view(
     gaussians: Gaussians, alive: Bool[Array, " n"], camera: Camera | Frustum, cfg: RenderConfig
 ) -> Bool[Array, " n"]:
-    """Return which Gaussians may reach a pixel: all that do, and few that do not.
+    """Return which Gaussians may reach a pixel: a conservative bound.
 
     The projected covariance is bounded by that of a ball as wide as the widest axis: along x its
     deviation is at most s f / z sqrt(1 + t^2), t being the tangent at which `project` evaluates.
 
     Args:
-        gaussians: the scene; on the host if everything is, and then so is the answer.
+        gaussians: the scene; NumPy arrays give a NumPy result.
         alive: slots in use.
         camera: the view.
         cfg: near plane, blur and cutoffs.
@@ -76,17 +76,17 @@ def _list_in_parallel(seen, blank):
 
 
 def compact(seen: Bool[Array, " n"], room: int) -> tuple[Int[Array, " v"], Int[Array, ""]]:
-    """List what is seen, in order.
+    """Return the indices of set flags, in order.
 
     Args:
         seen: flags.
         room: length of the list.
 
     Returns:
-        Indices, padded with n; and how many there are, which may be more than there is room for.
+        Indices, padded with n; and their number, which may exceed `room`.
     """
     n = seen.shape[0]
-    # One place more than asked for takes what does not fit.
+    # One more place than `room` receives what does not fit.
     blank = jnp.full(room + 1, n, jnp.int32)
     count, ids = lax.platform_dependent(seen, blank, cpu=_list, default=_list_in_parallel)
     used = jnp.arange(room, dtype=jnp.int32) < count

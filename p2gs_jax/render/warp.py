@@ -1,4 +1,4 @@
-"""Where a pixel of one view lies in another, by rendered depth, and whether it is seen there."""
+"""Warping of pixels from one view into another by rendered depth, with an occlusion test."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def unproject(depth: Float[Array, "h w"], camera: Camera) -> Float[Array, "h w 3
 def project_points(
     points: Float[Array, "*n 3"], camera: Camera
 ) -> tuple[Float[Array, "*n 2"], Float[Array, "*n"]]:
-    """Return pixel positions (centres at +0.5) and camera z; positions behind it mean nothing."""
+    """Return pixel positions (centres at +0.5) and camera z; valid where z > 0."""
     local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     z = local[..., 2]
     ahead = jnp.where(z > 1e-6, z, 1.0)
@@ -71,7 +71,7 @@ def visible(
     Args:
         xy: positions in the view.
         z: their depths in it.
-        depth: what the view shows, 0 where it shows nothing; see `surface_depth`.
+        depth: of the view, 0 where there is no surface; see `surface_depth`.
     """
     height, width = depth.shape
     at = jnp.floor(xy).astype(jnp.int32)
@@ -92,7 +92,7 @@ def warp(
     Args:
         depth: of this view, 0 where it shows no surface.
         camera: this view.
-        other_depth: of the other view, likewise.
+        other_depth: of the other view, 0 where it shows no surface.
         other_camera: the other view.
     """
     xy, z = project_points(unproject(depth, camera), other_camera)

@@ -1,6 +1,6 @@
-"""Charts of what cameras did: series over the photographs, and tone curves.
+"""Charts of the photometry: series over the photographs, and tone curves.
 
-Series differ by marker and line as well as by colour, and name themselves at their ends.
+Series differ by marker and line as well as by colour, and are labelled at their ends.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from p2gs_jax.report.svg import (
 # Margins, CSS pixels: left for numbers, right for the names of curves.
 LEFT, NARROW_LEFT, RIGHT, NARROW_RIGHT = 58, 40, 74, 56
 LABEL_GAP = 15.0
-# CSS pixels a view needs for its marks at their full size; below half of it they are dots.
+# CSS pixels per view for markers of full size; below it they are smaller.
 ROOM = 11.0
 
 
 @dataclass(frozen=True)
 class Style:
-    """How a series looks without colour, and its colour."""
+    """Line, marker and colour of a series."""
 
     color: str
     marker: str
@@ -79,7 +79,7 @@ class Series:
         label: its name.
         x: places.
         y: values; NaN where there is none.
-        style: how it looks.
+        style: of its line and markers.
         error: half lengths of error bars, or None.
     """
 
@@ -91,7 +91,7 @@ class Series:
 
 
 @dataclass(frozen=True)
-class Panel:
+class ChartPanel:
     """Axes with curves; `title` names the camera."""
 
     title: str
@@ -99,16 +99,21 @@ class Panel:
 
 
 def panels_chart(
-    panels: Sequence[Panel], *, y_label: str, x_label: str, label: str, band: float | None = None
+    panels: Sequence[ChartPanel],
+    *,
+    y_label: str,
+    x_label: str,
+    label: str,
+    band: float | None = None,
 ) -> str:
-    """Return panels above each other that share their axes.
+    """Return panels above each other with common axes.
 
     Args:
         panels: from top to bottom.
         y_label: with its unit.
-        x_label: likewise.
-        label: what it shows, for those who cannot see it.
-        band: draw a line at this height.
+        x_label: with its unit.
+        label: text alternative of the chart.
+        band: height of a horizontal line, or None.
     """
     values = [_reach(s) for p in panels for s in p.series]
     low = min((v[0] for v in values), default=0.0)
@@ -138,7 +143,7 @@ def panels_chart(
             last = k == len(panels) - 1
             axes.tick_params(labelbottom=last)
             axes.set_xlabel(x_label if last else "")
-        # Said once for all panels, where it needs no turning of the head.
+        # One horizontal label for all panels.
         place_text(figure, left, 12, y_label, MUTED)
         return figure
 
@@ -157,18 +162,18 @@ def _plot(axes: Axes, s: Series, room: float) -> None:
     """Draw a series.
 
     Args:
-        axes: where.
-        s: what.
+        axes: to draw into.
+        s: the series.
         room: CSS pixels from one view to the next.
     """
     known = np.isfinite(s.y)
-    look = s.style.keywords
+    style = s.style.keywords
     crowded = room < ROOM
     if crowded:
         size = s.style.size * (0.5 if room > ROOM / 2 else 0.32)
-        look |= {"markersize": size, "markeredgewidth": 0.8, "linewidth": 1.0}
+        style |= {"markersize": size, "markeredgewidth": 0.8, "linewidth": 1.0}
     # Lines break where a value is missing.
-    axes.plot(s.x, s.y, **look)
+    axes.plot(s.x, s.y, **style)
     if s.error is not None and np.isfinite(s.error).any():
         axes.errorbar(
             s.x[known],
@@ -192,12 +197,12 @@ def _ends(series: Sequence[Series]) -> list[tuple[str, float, str]]:
 
 
 def set_title(axes: Axes, text: str) -> None:
-    """Say above axes, from their left, what they show."""
+    """Set the title of axes, aligned to the left."""
     axes.set_title(text, loc="left", fontsize="medium", color=INK, pad=6)
 
 
 @dataclass(frozen=True)
-class Curve:
+class ToneCurve:
     """A tone curve.
 
     Attributes:
@@ -219,12 +224,12 @@ class Curve:
     opacity: float = 1.0
 
 
-def response_chart(curves: Sequence[Curve], *, label: str) -> str:
+def response_chart(curves: Sequence[ToneCurve], *, label: str) -> str:
     """Return tone curves.
 
     Args:
         curves: the last is drawn on top.
-        label: what it shows, for those who cannot see it.
+        label: text alternative of the chart.
     """
 
     def draw(wide: bool) -> Figure:
@@ -235,8 +240,8 @@ def response_chart(curves: Sequence[Curve], *, label: str) -> str:
         axes = place(figure, left, 26, across, tall)
         ends = []
         for c in curves:
-            look = {"color": c.color, "linestyle": c.line, "linewidth": c.width}
-            axes.plot(c.stops, c.values, alpha=c.opacity, **look)
+            style = {"color": c.color, "linestyle": c.line, "linewidth": c.width}
+            axes.plot(c.stops, c.values, alpha=c.opacity, **style)
             ends.append((c.label, float(c.values[-1]), c.color))
         axes.set_xlim(-7, 3)
         axes.set_ylim(0, 1.02)

@@ -10,18 +10,18 @@ from typing import Literal
 import numpy as np
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.report import words
-from p2gs_jax.report.from_scene import FromScene
+from p2gs_jax.report import run_summary
 from p2gs_jax.report.run_files import RunFiles, part_at, read_run
 from p2gs_jax.report.run_sections import flat, option_text
-from p2gs_jax.report.strips import read_png
+from p2gs_jax.report.scene_measurements import SceneMeasurements
+from p2gs_jax.report.view_comparisons import read_png
 from p2gs_jax.synth.exposures import read_true_exposures
 
 Better = Literal["high", "low"] | None
 
 
 @dataclass(frozen=True)
-class Row:
+class TableRow:
     """One line of the table.
 
     Attributes:
@@ -37,13 +37,13 @@ class Row:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What is known of several runs together.
+    """A comparison of several runs.
 
     Attributes:
         runs: in the order given.
         labels: a short name for each, all different.
         remarks: sentences on what cannot be compared.
-        same_scene: scores may be held against each other.
+        same_scene: whether scores can be compared.
         scores: the table.
         options: options that differ.
         exposures: label of each later run, and exposures of the first and of it in stops, of the
@@ -54,8 +54,8 @@ class Comparison:
     labels: tuple[str, ...]
     remarks: tuple[str, ...]
     same_scene: bool
-    scores: tuple[Row, ...]
-    options: tuple[Row, ...]
+    scores: tuple[TableRow, ...]
+    options: tuple[TableRow, ...]
     exposures: tuple[tuple[str, np.ndarray, np.ndarray], ...]
 
 
@@ -91,7 +91,7 @@ NUMBERS: tuple[tuple[str, tuple[str, ...], int, Better], ...] = (
 
 
 def compare_runs(folders: Sequence[str | Path]) -> Comparison:
-    """Read runs and hold them against each other.
+    """Read and compare runs.
 
     Args:
         folders: run folders; exposures are drawn over those of the first.
@@ -155,9 +155,9 @@ def _same_scene(first: RunFiles, other: RunFiles) -> bool:
     return False
 
 
-def _scores(runs: Sequence[RunFiles], same: bool) -> list[Row]:
-    def line(name: str, say: Callable[[RunFiles], str]) -> Row:
-        return Row(name, tuple(say(run) for run in runs))
+def _scores(runs: Sequence[RunFiles], same: bool) -> list[TableRow]:
+    def line(name: str, say: Callable[[RunFiles], str]) -> TableRow:
+        return TableRow(name, tuple(say(run) for run in runs))
 
     rows = [
         line("preset", lambda run: run.preset),
@@ -169,7 +169,7 @@ def _scores(runs: Sequence[RunFiles], same: bool) -> list[Row]:
         values = [run.number(*path) for run in runs]
         if any(v is not None for v in values):
             rows.append(_row(name, values, digits, better if same else None))
-    seconds = [words.seconds_of(run) for run in runs]
+    seconds = [run_summary.seconds_of(run) for run in runs]
     if any(s is not None for s in seconds):
         rows.insert(6, _row("seconds, whole run", seconds, 0, None))
     errors = [_true_error(run) for run in runs]
@@ -178,20 +178,20 @@ def _scores(runs: Sequence[RunFiles], same: bool) -> list[Row]:
     return rows
 
 
-def _row(name: str, values: Sequence[float | None], digits: int, better: Better) -> Row:
+def _row(name: str, values: Sequence[float | None], digits: int, better: Better) -> TableRow:
     cells = tuple("" if v is None else f"{v:,.{digits}f}" for v in values)
     known = [v for v in values if v is not None]
     if better is None or len(known) < 2 or len(set(filter(None, cells))) < 2:
-        return Row(name, cells)
+        return TableRow(name, cells)
     best = f"{(max if better == 'high' else min)(known):,.{digits}f}"
-    return Row(name, cells, frozenset(i for i, cell in enumerate(cells) if cell == best))
+    return TableRow(name, cells, frozenset(i for i, cell in enumerate(cells) if cell == best))
 
 
 def _model(run: RunFiles) -> str:
     if run.photometry is None:
         return ""
     model = run.photometry["model"]
-    return words.DESCRIPTIONS.get(model, model)
+    return run_summary.DESCRIPTIONS.get(model, model)
 
 
 def _curve(run: RunFiles) -> str:
@@ -203,18 +203,18 @@ def _true_error(run: RunFiles) -> float | None:
         truth = read_true_exposures(run.scene)
     except (OSError, KeyError, ValueError):
         return None
-    error = words.true_error(run, FromScene(true_exposures=truth))
+    error = run_summary.true_error(run, SceneMeasurements(true_exposures=truth))
     return None if error is None else error["ev"]
 
 
-def _options(runs: Sequence[RunFiles]) -> list[Row]:
+def _options(runs: Sequence[RunFiles]) -> list[TableRow]:
     every = [flat(run.options) for run in runs]
     names = list(dict.fromkeys(name for options in every for name in options))
     rows = []
     for name in names:
         cells = tuple(option_text(options[name]) if name in options else "" for options in every)
         if len(set(cells)) > 1:
-            rows.append(Row(name, cells))
+            rows.append(TableRow(name, cells))
     return rows
 
 
@@ -266,7 +266,7 @@ def apart(x: np.ndarray, y: np.ndarray) -> float:
     return float(np.sqrt(np.mean((x - y) ** 2)))
 
 
-def _markdown_table(head: str, labels: Sequence[str], rows: Sequence[Row]) -> list[str]:
+def _markdown_table(head: str, labels: Sequence[str], rows: Sequence[TableRow]) -> list[str]:
     def plain(text: str) -> str:
         return text.replace("|", "\\|")
 

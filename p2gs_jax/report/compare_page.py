@@ -9,7 +9,7 @@ from p2gs_jax.core.atomic import write_text
 from p2gs_jax.errors import UserError
 from p2gs_jax.report.compare import (
     Comparison,
-    Row,
+    TableRow,
     apart,
     common_held_out,
     psnr_of,
@@ -28,7 +28,7 @@ from p2gs_jax.report.page import (
 )
 from p2gs_jax.report.pictures import jpeg
 from p2gs_jax.report.run_charts import against_chart
-from p2gs_jax.report.strips import read_png, spread
+from p2gs_jax.report.view_comparisons import read_png, spread
 
 MOST_VIEWS = 4
 
@@ -71,8 +71,8 @@ def comparison_page(found: Comparison) -> str:
     )
 
 
-def _table(rows: Sequence[Row], labels: Sequence[str], head: str) -> str:
-    def cell(row: Row, i: int) -> str:
+def _table(rows: Sequence[TableRow], labels: Sequence[str], head: str) -> str:
+    def cell(row: TableRow, i: int) -> str:
         kind = "n best" if i in row.best else "n"
         return f'<td class="{kind}">{text(row.cells[i])}</td>'
 

@@ -1,4 +1,4 @@
-"""The page: one HTML file with everything in it, and nothing that it must fetch."""
+"""Building blocks of the pages: one HTML file each, without external resources."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 from p2gs_jax.core.atomic import write_text
 from p2gs_jax.errors import UserError
 
-# Nothing is fetched, whatever the page came to hold.
+# The browser loads nothing from elsewhere, whatever the page contains.
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 
 
@@ -74,7 +74,7 @@ def page(title: str, head: str, sections: Sequence[Section], foot: str) -> str:
 
 
 def check_place(path: Path) -> None:
-    """Refuse a name that is no page's, before there is work to lose.
+    """Check the name of a page before any work is done.
 
     Raises:
         UserError: it is a folder, or does not end in .html.
@@ -87,7 +87,7 @@ def write_page(path: Path, html_text: str) -> None:
     """Write a page.
 
     Raises:
-        UserError: there is no writing there, or its name is no page's.
+        UserError: the file cannot be written, or does not end in .html.
     """
     check_place(path)
     try:
@@ -137,10 +137,10 @@ def figure(content: str, caption: str = "") -> str:
 
 
 def row(cells: Sequence[tuple[str, str]], columns: str) -> str:
-    """Return pictures beside each other, or above each other where the screen is narrow.
+    """Return pictures beside each other; above each other on narrow screens.
 
     Args:
-        cells: picture as HTML, and what it shows.
+        cells: picture as HTML, and its caption.
         columns: `two`, `three`, or `many` where there may be more.
     """
     inner = "".join(f"<div>{picture}<span>{text(said)}</span></div>" for picture, said in cells)
@@ -154,13 +154,13 @@ def table(
     numbers: Iterable[int] = (),
     tall: bool = False,
 ) -> str:
-    """Return a table that scrolls by itself where it is too wide.
+    """Return a table, with a scroll bar of its own where it is too wide.
 
     Args:
         names: of the columns.
         rows: text of the cells.
         numbers: columns that are numbers.
-        tall: many rows: scroll these as well.
+        tall: scroll vertically as well.
     """
     of = [' class="n"' if i in set(numbers) else "" for i in range(len(names))]
 
@@ -176,7 +176,7 @@ def table(
 
 
 def key_numbers(items: Sequence[tuple[str, str, str]]) -> str:
-    """Return the numbers to see first.
+    """Return the key numbers at the top of a page.
 
     Args:
         items: name, value, and a remark.
@@ -189,5 +189,5 @@ def key_numbers(items: Sequence[tuple[str, str, str]]) -> str:
 
 
 def folded(title: str, content: str) -> str:
-    """Return content that opens on demand."""
+    """Return collapsed content with a title."""
     return f"<details><summary>{text(title)}</summary>{content}</details>"

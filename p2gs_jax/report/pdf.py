@@ -1,4 +1,4 @@
-"""A page on paper: printed by a browser that is already here."""
+"""A page as PDF, printed by an installed browser."""
 
 from __future__ import annotations
 

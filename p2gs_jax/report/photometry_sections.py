@@ -1,4 +1,4 @@
-"""Sections on the cameras: what was modelled and why, exposures, gammas, tone curve."""
+"""Sections on the photometry: model, exposures, gammas, tone curve."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.formation import inverse_tone_map
 from p2gs_jax.photometry.models import MODELS
-from p2gs_jax.report import words
+from p2gs_jax.report import run_summary
 from p2gs_jax.report.charts import (
     FITTED,
     RECOVERED,
     STATED,
     TRUE,
-    Curve,
-    Panel,
+    ChartPanel,
     Series,
+    ToneCurve,
     panels_chart,
     response_chart,
 )
-from p2gs_jax.report.from_scene import FromScene, true_stops
 from p2gs_jax.report.page import Section, figure, folded, listed, paragraph, table
 from p2gs_jax.report.run_files import RunFiles
+from p2gs_jax.report.scene_measurements import SceneMeasurements, true_stops
 from p2gs_jax.report.svg import FIRST, INK, SECOND
 from p2gs_jax.run.photometry_file import ViewPhotometry
 from p2gs_jax.run.read import resolved
@@ -43,10 +43,10 @@ def model_section(run: RunFiles) -> Section:
     if run.photometry is None:
         return Section("model", "What was modelled, and why", "")
     model, curve = run.photometry["model"], run.photometry["curve"]
-    what = words.DESCRIPTIONS.get(model, model)
+    what = run_summary.DESCRIPTIONS.get(model, model)
     body = paragraph(f"Model: {what}. Tone curve: {_curve_words(curve)}.")
-    body += listed(words.reasons(run))
-    if words.reasons(run):
+    body += listed(run_summary.reasons(run))
+    if run_summary.reasons(run):
         body += paragraph(
             "Models and curves compete on colours of shared surface points that were held out, by "
             "their log-likelihood: 0.01 per observation is little, 1 is a lot. The simplest model "
@@ -59,10 +59,10 @@ def model_section(run: RunFiles) -> Section:
 
 def _curve_words(curve: dict) -> str:
     name = str(curve.get("name"))
-    return words.CURVES.get(name, name)
+    return run_summary.CURVES.get(name, name)
 
 
-def exposure_section(run: RunFiles, scene: FromScene) -> Section:
+def exposure_section(run: RunFiles, scene: SceneMeasurements) -> Section:
     """Exposures over time for each camera, with what EXIF and the truth say."""
     views = [v for v in run.views if v["exposure"] is not None or v["exposure_fitted"] is not None]
     if not views:
@@ -93,8 +93,8 @@ def _groups(run: RunFiles) -> list[tuple[str, list[ViewPhotometry]]]:
 
 
 def _exposure_panel(
-    title: str, rows: list[ViewPhotometry], run: RunFiles, scene: FromScene, center: float
-) -> Panel:
+    title: str, rows: list[ViewPhotometry], run: RunFiles, scene: SceneMeasurements, center: float
+) -> ChartPanel:
     x = np.arange(1, len(rows) + 1, dtype=float)
     found = _column(v["exposure_ev"] for v in rows) - center
     with np.errstate(divide="ignore"):
@@ -110,7 +110,7 @@ def _exposure_panel(
     if shift is not None:
         true = true_stops([v["image"] for v in rows], scene.true_exposures) + shift - center
         series.append(Series("true", x, true, TRUE))
-    return Panel(title, tuple(s for s in series if np.isfinite(s.y).any()))
+    return ChartPanel(title, tuple(s for s in series if np.isfinite(s.y).any()))
 
 
 def _column(values) -> np.ndarray:
@@ -119,11 +119,11 @@ def _column(values) -> np.ndarray:
 
 def _exif_offset(run: RunFiles) -> float | None:
     """Return what lays EXIF over the recovered exposures, stops."""
-    agreement = words.against_exif(run)
+    agreement = run_summary.against_exif(run)
     return None if agreement is None else agreement.offset_ev
 
 
-def _truth_offset(run: RunFiles, scene: FromScene) -> float | None:
+def _truth_offset(run: RunFiles, scene: SceneMeasurements) -> float | None:
     """Return what lays the true exposures over the recovered ones, stops."""
     found = _column(v["exposure_ev"] for v in run.train)
     true = true_stops([v["image"] for v in run.train], scene.true_exposures)
@@ -131,7 +131,7 @@ def _truth_offset(run: RunFiles, scene: FromScene) -> float | None:
     return float(np.mean((found - true)[both])) if both.any() else None
 
 
-def _exposure_caption(run: RunFiles, scene: FromScene) -> list[str]:
+def _exposure_caption(run: RunFiles, scene: SceneMeasurements) -> list[str]:
     out = ["Filled circles: found by the fit."]
     errors = [e for v in run.train if (e := v.get("exposure_ev_error")) is not None]
     if errors and max(errors) > 0:
@@ -143,13 +143,13 @@ def _exposure_caption(run: RunFiles, scene: FromScene) -> list[str]:
         out.append("There are no error bars: nothing was solved beforehand from shared points.")
     if any(v["split"] == "test" for v in run.views):
         out.append("Open diamonds: fitted to held-out photographs after the run.")
-    agreement = words.against_exif(run)
+    agreement = run_summary.against_exif(run)
     if agreement is not None:
         out.append(
             f"Crosses, dotted: EXIF, laid over them; correlation {agreement.correlation:.2f}, RMS "
             f"{agreement.rms_ev:.2f} stops."
         )
-    error = words.true_error(run, scene)
+    error = run_summary.true_error(run, scene)
     if error is not None:
         out.append(
             f"Open squares, dashed: the true exposures; RMS error {error['ev']:.3f} stops, largest "
@@ -158,7 +158,7 @@ def _exposure_caption(run: RunFiles, scene: FromScene) -> list[str]:
     return out
 
 
-def _exposure_table(run: RunFiles, scene: FromScene, center: float) -> str:
+def _exposure_table(run: RunFiles, scene: SceneMeasurements, center: float) -> str:
     def shown(value: float, digits: str = "+.2f") -> str:
         return format(value, digits) if np.isfinite(value) else ""
 
@@ -204,7 +204,7 @@ def gamma_section(run: RunFiles) -> Section:
         x = np.arange(1, len(rows) + 1, dtype=float)
         gammas = _column(v["gamma"] for v in rows)
         errors = 2 * _column(v.get("gamma_error") for v in rows)
-        panels.append(Panel(title, (Series("", x, gammas, RECOVERED, errors),)))
+        panels.append(ChartPanel(title, (Series("", x, gammas, RECOVERED, errors),)))
     chart = panels_chart(
         panels,
         y_label="gamma",
@@ -234,11 +234,11 @@ def response_section(run: RunFiles) -> Section:
     curves = []
     low, middle, high = min(gammas), float(np.median(gammas)), max(gammas)
     if high - low > 0.02:
-        curves.append(Curve(f"γ {low:.2f}", _stops(y, low, cfg), y, SECOND, "-."))
-        curves.append(Curve(f"γ {high:.2f}", _stops(y, high, cfg), y, SECOND, ":"))
+        curves.append(ToneCurve(f"γ {low:.2f}", _stops(y, low, cfg), y, SECOND, "-."))
+        curves.append(ToneCurve(f"γ {high:.2f}", _stops(y, high, cfg), y, SECOND, ":"))
     own, standard = _stops(y, middle, cfg), _stops(y, GAMMA_SRGB, srgb)
-    curves.append(Curve("this run", own, y, FIRST, "-", 5.0, 0.45))
-    curves.append(Curve("sRGB", standard, y, INK, (0, (4, 4))))
+    curves.append(ToneCurve("this run", own, y, FIRST, "-", 5.0, 0.45))
+    curves.append(ToneCurve("sRGB", standard, y, INK, (0, (4, 4))))
     same = np.abs(own - standard)[y > 0.05].max()
     said = "How exposed radiance becomes a value in the photograph. "
     if same < 0.01:
@@ -257,7 +257,7 @@ def _stops(y: np.ndarray, gamma: float, cfg: PhotometryConfig) -> np.ndarray:
     return np.log2(np.maximum(linear, 1e-6) / MID_GREY)
 
 
-def camera_sections(run: RunFiles, scene: FromScene) -> Sequence[Section]:
+def camera_sections(run: RunFiles, scene: SceneMeasurements) -> Sequence[Section]:
     """All of them."""
     return (
         model_section(run),

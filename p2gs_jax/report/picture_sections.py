@@ -1,4 +1,4 @@
-"""Sections to look at: seams, held-out views, radiance in stops."""
+"""Sections with pictures: seams, held-out views, radiance in stops."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from p2gs_jax.formats.false_color import STOPS
-from p2gs_jax.report import words
-from p2gs_jax.report.from_scene import FromScene
+from p2gs_jax.report import run_summary
 from p2gs_jax.report.page import Section, figure, folded, paragraph, row, table, text
 from p2gs_jax.report.pictures import (
     GAIN,
@@ -22,14 +21,15 @@ from p2gs_jax.report.pictures import (
 )
 from p2gs_jax.report.run_charts import seams_chart
 from p2gs_jax.report.run_files import RunFiles
-from p2gs_jax.report.strips import Strip
+from p2gs_jax.report.scene_measurements import SceneMeasurements
+from p2gs_jax.report.view_comparisons import ViewComparison
 
 MOST_HDR = 2
 MID_GREY = 0.18
 
 
-def seam_section(scene: FromScene) -> Section:
-    """How far neighbouring photographs are apart, as taken and developed alike."""
+def seam_section(scene: SceneMeasurements) -> Section:
+    """Differences of neighbouring photographs, as taken and developed alike."""
     title = "Seams before and after"
     if not scene.seams:
         said = " ".join(m for m in scene.missing if m.startswith("Seams"))
@@ -40,13 +40,13 @@ def seam_section(scene: FromScene) -> Section:
             )
         said = said or "No two training views share enough of the scene to be compared."
         return Section("seams", title, paragraph(said))
-    before, after = words.seam_medians(scene)
+    before, after = run_summary.seam_medians(scene)
     step = float(np.median([abs(p.seam.step_ev) for p in scene.seams]))
     said = f"{step:.2f}" if step >= 0.005 else "less than 0.01"
     body = paragraph(
         f"The same surfaces in neighbouring photographs differ by {before:.2f} stops as taken, and "
         f"by {after:.2f} once each photograph is decoded, divided by its exposure and developed "
-        f"alike (medians over {words.count(len(scene.seams), 'pair')}). Of what is left, "
+        f"alike (medians over {run_summary.count(len(scene.seams), 'pair')}). Of what is left, "
         f"{said} stops are a step that runs through the whole pair; the rest is texture that "
         "does not meet exactly, shine, vignetting and colour balance."
     )
@@ -85,7 +85,7 @@ def _short(name: str) -> str:
     return name.rsplit(".", 1)[0]
 
 
-def _seam_picture(scene: FromScene) -> str:
+def _seam_picture(scene: SceneMeasurements) -> str:
     assert scene.picture is not None
     assert scene.shown is not None
     names = [_short(scene.shown.first), _short(scene.shown.second)]
@@ -109,23 +109,23 @@ def _seam_picture(scene: FromScene) -> str:
     return figure(row(cells, "two"), said)
 
 
-def strip_section(strips: Sequence[Strip], total: int) -> Section:
-    """Photographs, renders and what is between them.
+def comparison_section(comparisons: Sequence[ViewComparison], total: int) -> Section:
+    """Photographs, renders and their differences.
 
     Args:
-        strips: what to show.
+        comparisons: what to show.
         total: how many held-out views there are.
     """
-    if not strips:
+    if not comparisons:
         return Section("views", "Held-out views", "")
-    held_out = strips[0].split == "test"
+    held_out = comparisons[0].split == "test"
     if held_out:
         title = "Held-out views"
         said = (
             "The fit never saw these photographs; each is rendered at the exposure fitted to it. "
-            if len(strips) == total
-            else f"The fit never saw these photographs ({len(strips)} of {total}, evenly from the "
-            "worst to the best); each is rendered at the exposure fitted to it. "
+            if len(comparisons) == total
+            else f"The fit never saw these photographs ({len(comparisons)} of {total}, evenly from "
+            "the worst to the best); each is rendered at the exposure fitted to it. "
         )
     else:
         title = "Training views"
@@ -135,7 +135,7 @@ def strip_section(strips: Sequence[Strip], total: int) -> Section:
         f"darker where it is too dark, white and black from {128 / GAIN * 2:.0f} of 255 on."
     )
     body = paragraph(said)
-    for s in strips:
+    for s in comparisons:
         score = "" if s.psnr is None else f" · {s.psnr:.1f} dB"
         cells = [
             (jpeg(s.photograph, f"Photograph {s.name}"), "Photograph"),
@@ -146,22 +146,22 @@ def strip_section(strips: Sequence[Strip], total: int) -> Section:
     return Section("views", title, body)
 
 
-def _difference(s: Strip) -> np.ndarray:
+def _difference(s: ViewComparison) -> np.ndarray:
     if s.render.shape != s.photograph.shape:
         return np.full_like(s.render, 0.5)
     return signed_difference(s.render, s.photograph)
 
 
-def hdr_section(run: RunFiles, strips: Sequence[Strip]) -> Section:
+def hdr_section(run: RunFiles, comparisons: Sequence[ViewComparison]) -> Section:
     """Radiance as whole stops, with numbers."""
-    known = [s for s in strips if s.linear is not None]
+    known = [s for s in comparisons if s.linear is not None]
     title = "Radiance in stops"
     if not known:
         return Section("hdr", title, "")
     mean = {} if run.photometry is None else run.photometry["mean"]
     exposure = float(mean.get("exposure_geometric") or 1.0)
     middle = MID_GREY / exposure
-    # What a fit does not know is black: views that it fails at seem to have the widest range.
+    # Unseen areas render black: a view that the fit fails at would seem to have the widest range.
     middling = float(np.median([s.psnr or 0.0 for s in known]))
     good = [s for s in known if (s.psnr or 0.0) >= middling]
     widest = sorted(good, key=lambda s: -dynamic_range(_linear(s)))[:MOST_HDR]
@@ -187,7 +187,7 @@ def hdr_section(run: RunFiles, strips: Sequence[Strip]) -> Section:
     return Section("hdr", title, body)
 
 
-def _linear(s: Strip) -> np.ndarray:
+def _linear(s: ViewComparison) -> np.ndarray:
     assert s.linear is not None
     return s.linear
 

@@ -1,14 +1,16 @@
-"""Pictures inside the page: encoded small, as data."""
+"""Pictures in the page, as data URLs."""
 
 from __future__ import annotations
 
 import base64
+import html
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 
 from p2gs_jax.formats.false_color import STOPS, false_color, luminance, stops
+from p2gs_jax.formats.png import to_uint8
 
 # Largest width, pixels: a third of the page on a screen of twice its resolution, and all of it.
 SMALL, LARGE = 560, 900
@@ -28,32 +30,26 @@ def shrunk(image: Float[np.ndarray, "h w c"], width: int) -> Float[np.ndarray, "
 
 def jpeg(ldr: Float[np.ndarray, "h w 3"], alt: str, width: int = SMALL) -> str:
     """Return an `img` element of display values; NaN becomes black."""
-    return _element(".jpg", "jpeg", shrunk(_finite(ldr), width), alt)
+    return _element(".jpg", "jpeg", shrunk(_clamped(ldr), width), alt)
 
 
 def png(ldr: Float[np.ndarray, "h w 3"], alt: str) -> str:
     """Return an `img` element without loss: for flat colours, which JPEG would smear."""
-    return _element(".png", "png", _finite(ldr), alt)
+    return _element(".png", "png", np.asarray(ldr, np.float32), alt)
 
 
-def _finite(image: np.ndarray) -> np.ndarray:
+def _clamped(image: np.ndarray) -> np.ndarray:
     return np.clip(np.nan_to_num(np.asarray(image, np.float32)), 0, 1)
 
 
 def _element(suffix: str, kind: str, image: np.ndarray, alt: str) -> str:
-    codes = np.rint(image * 255).astype(np.uint8)[..., ::-1]
+    codes = to_uint8(image)[..., ::-1]
     options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if kind == "jpeg" else []
     good, data = cv2.imencode(suffix, codes, options)
     assert good
     text = base64.b64encode(data.tobytes()).decode("ascii")
-    h, w = image.shape[:2]
-    return (
-        f'<img src="data:image/{kind};base64,{text}" width="{w}" height="{h}" alt="{_quoted(alt)}">'
-    )
-
-
-def _quoted(text: str) -> str:
-    return text.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
+    (h, w), alt = image.shape[:2], html.escape(alt)
+    return f'<img src="data:image/{kind};base64,{text}" width="{w}" height="{h}" alt="{alt}">'
 
 
 def signed_difference(
@@ -61,7 +57,7 @@ def signed_difference(
 ) -> Float32[np.ndarray, "h w 3"]:
     """Return render minus photograph in luminance: grey where they agree, lighter where the render
     is too bright."""
-    gap = luminance(np.clip(_finite(render), 0, 1)) - luminance(np.clip(_finite(photograph), 0, 1))
+    gap = luminance(_clamped(render)) - luminance(_clamped(photograph))
     shown = np.clip(0.5 + 0.5 * GAIN * gap, 0, 1)
     return np.repeat(shown[..., None], 3, -1).astype(np.float32)
 

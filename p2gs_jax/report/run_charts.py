@@ -26,7 +26,9 @@ from p2gs_jax.report.svg import (
     INK,
     MUTED,
     NARROW,
+    NARROW_TEXT,
     SECOND,
+    TEXT,
     THIRD,
     WIDE,
     chart,
@@ -37,14 +39,16 @@ from p2gs_jax.report.svg import (
 
 # Half of a rolling median's window, in shares of the run.
 SMOOTHING = 0.01
+# Width of a character over the size of the text, with a margin: names of losses vary.
+CHARACTER = 0.62
 
 
 def seams_chart(rows: Sequence[tuple[str, float, float]], *, label: str) -> str:
-    """Return a line per pair of photographs, from how far they are apart to what is left of it.
+    """Return a line per pair of photographs, from their difference as taken to that after.
 
     Args:
         rows: name, before and after, stops.
-        label: what it shows, for those who cannot see it.
+        label: text alternative of the chart.
     """
     most = max(max(before, after) for _, before, after in rows)
 
@@ -74,7 +78,7 @@ def seams_chart(rows: Sequence[tuple[str, float, float]], *, label: str) -> str:
 
 @dataclass(frozen=True)
 class Training:
-    """How a run went.
+    """The log of a run, for its chart.
 
     Attributes:
         steps: of the log's lines.
@@ -94,14 +98,16 @@ class Training:
 def training_chart(training: Training, *, label: str) -> str:
     """Return PSNR, loss and Gaussians over the steps."""
     t = training
+    longest = max(map(len, t.losses), default=0)
     window = max(3, 2 * round(SMOOTHING * len(t.steps)) + 1)
-    looks = [(INK, "-"), (FIRST, "--"), (SECOND, "-."), (THIRD, ":"), (FOURTH, (0, (5, 1, 1, 1)))]
+    styles = [(INK, "-"), (FIRST, "--"), (SECOND, "-."), (THIRD, ":"), (FOURTH, (0, (5, 1, 1, 1)))]
 
     def smooth(values: np.ndarray) -> np.ndarray:
         return median_filter(values, window, mode="nearest")
 
     def draw(wide: bool) -> Figure:
         left, right = (LEFT, RIGHT) if wide else (NARROW_LEFT + 4, NARROW_RIGHT)
+        right = max(right, CHARACTER * (TEXT if wide else NARROW_TEXT) * longest)
         across = (WIDE if wide else NARROW) - left - right
         each = 150 if wide else 120
         step, top = each + 34, 56 if wide else 22
@@ -113,7 +119,7 @@ def training_chart(training: Training, *, label: str) -> str:
         set_title(rows[1], "Loss and its largest terms")
         rows[1].set_yscale("log")
         ends = []
-        for (name, values), (color, line) in zip(t.losses.items(), looks, strict=False):
+        for (name, values), (color, line) in zip(t.losses.items(), styles, strict=False):
             shown = smooth(values)
             rows[1].plot(t.steps, shown, color=color, linestyle=line, linewidth=1.6)
             ends.append((name, float(shown[-1]), color))
@@ -143,10 +149,10 @@ def training_chart(training: Training, *, label: str) -> str:
 
 
 def _marks(axes: Axes, marks: Sequence[tuple[float, str]], wide: bool) -> None:
-    """Name vertical lines above the first axes, where there is room."""
+    """Label vertical lines above the first axes, in the wide chart."""
     if not wide:
         return
-    # Two heights in turn: neighbours may be close.
+    # Alternating heights: neighbours may be close.
     where = axes.get_xaxis_transform()
     for k, (at, text) in enumerate(marks):
         axes.text(at, 1.13 + 0.1 * (k % 2), text, transform=where, color=MUTED)
@@ -159,12 +165,12 @@ def _plain(value: float, _: int) -> str:
 def against_chart(
     panels: Sequence[tuple[str, np.ndarray, np.ndarray]], *, first: str, label: str
 ) -> str:
-    """Return exposures of several runs over those of the first one.
+    """Return scatter plots of the exposures of several runs over those of the first one.
 
     Args:
         panels: name of a run, exposures of the first run, exposures of this one, stops.
         first: name of the first run.
-        label: what it shows, for those who cannot see it.
+        label: text alternative of the chart.
     """
     every = np.concatenate([v for _, x, y in panels for v in (x, y)])
     low, high = float(every.min()), float(every.max())

@@ -1,4 +1,4 @@
-"""What a run folder holds, read without its scene; what is missing is named, not fatal."""
+"""The files of a run folder, read without its scene; missing ones are listed, not fatal."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from p2gs_jax.run.places import find
 
 
 @dataclass(frozen=True)
-class HeldOut:
+class HeldOutFiles:
     """Files of a held-out view.
 
     Attributes:
@@ -39,7 +39,7 @@ class RunFiles:
     Attributes:
         folder: where it lies.
         scene: the scene that it was fitted to: where it lies, or lay.
-        given: what the caller says about that, or None.
+        given: the scene's place as the caller gave it, or None.
         options: `config.json`, nested values.
         cfg: the same as this version reads it, or None where it cannot.
         metrics: `metrics.json`; empty where there is none.
@@ -47,7 +47,7 @@ class RunFiles:
         log: lines of `log.jsonl`.
         held_out: held-out views in `renders/`, by name.
         missing: sentences on what could not be read.
-        broken: names of files that are there and say nothing that can be read.
+        broken: names of files that exist but cannot be read.
     """
 
     folder: Path
@@ -58,7 +58,7 @@ class RunFiles:
     metrics: dict[str, Any]
     photometry: PhotometryFile | None
     log: list[dict[str, Any]]
-    held_out: tuple[HeldOut, ...]
+    held_out: tuple[HeldOutFiles, ...]
     missing: tuple[str, ...]
     broken: tuple[str, ...]
 
@@ -177,7 +177,7 @@ def read_log(path: Path, missing: list[str]) -> list[dict[str, Any]]:
     return kept
 
 
-def find_held_out(folder: Path, names: list[str]) -> tuple[HeldOut, ...]:
+def find_held_out(folder: Path, names: list[str]) -> tuple[HeldOutFiles, ...]:
     """Return the held-out views that `fit` wrote.
 
     Args:
@@ -195,7 +195,7 @@ def find_held_out(folder: Path, names: list[str]) -> tuple[HeldOut, ...]:
             continue
         exr = render.with_name(f"{stem}.exr")
         name = whole.get(short, short)
-        out.append(HeldOut(name, photograph, render, exr if exr.is_file() else None))
+        out.append(HeldOutFiles(name, photograph, render, exr if exr.is_file() else None))
     return tuple(out)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from p2gs_jax.config import preset, to_dict
 from p2gs_jax.errors import UserError
-from p2gs_jax.report import words
+from p2gs_jax.report import run_summary
 from p2gs_jax.report.page import Section, figure, folded, paragraph, table, text
 from p2gs_jax.report.run_charts import Training, training_chart
 from p2gs_jax.report.run_files import RunFiles, number_at, part_at
@@ -135,24 +135,24 @@ def training_section(run: RunFiles) -> Section:
         said += f" Dotted: {marks}."
     seconds = number_at(log[-1], "seconds")
     if seconds is not None:
-        said += f" The last step came after {words.duration(seconds)}."
+        said += f" The last step came after {run_summary.duration(seconds)}."
     return Section("training", "Training", figure(chart, said) + _growth(run))
 
 
 def _growth(run: RunFiles) -> str:
-    """Return what automatic growth tried, where it was asked for."""
-    looks = run.part("growth").get("looks")
-    if not isinstance(looks, list) or not looks:
+    """Return the stages of automatic growth; empty where it was not asked for."""
+    stages = run.part("growth").get("looks")
+    if not isinstance(stages, list) or not stages:
         return ""
     rows = [
         [
-            f"{number_at(look, 'before') or 0:,.0f} → {number_at(look, 'gaussians') or 0:,.0f}",
-            _shown(number_at(look, "without"), 2),
-            _shown(number_at(look, "psnr"), 2),
-            _shown(number_at(look, "gain"), 2),
-            "kept" if part_at(look).get("kept") else "taken back",
+            f"{number_at(stage, 'before') or 0:,.0f} → {number_at(stage, 'gaussians') or 0:,.0f}",
+            _shown(number_at(stage, "without"), 2),
+            _shown(number_at(stage, "psnr"), 2),
+            _shown(number_at(stage, "gain"), 2),
+            "kept" if part_at(stage).get("kept") else "taken back",
         ]
-        for look in looks
+        for stage in stages
     ]
     names = ["Gaussians", "PSNR without, dB", "PSNR with, dB", "gain, dB", ""]
     return (
@@ -187,14 +187,14 @@ def timing_section(run: RunFiles) -> Section:
     after = run.number("seconds", "evaluation_and_files")
     rows = []
     if before is not None and optimisation is not None and before >= optimisation:
-        rows.append(["Reading, exposures, seeds", words.duration(before - optimisation)])
+        rows.append(["Reading, exposures, seeds", run_summary.duration(before - optimisation)])
     if optimisation is not None:
-        rows.append(["Optimisation, with compiling", words.duration(optimisation)])
+        rows.append(["Optimisation, with compiling", run_summary.duration(optimisation)])
     if after is not None:
-        rows.append(["Judging and writing files", words.duration(after)])
-    total = words.seconds_of(run)
+        rows.append(["Judging and writing files", run_summary.duration(after)])
+    total = run_summary.seconds_of(run)
     if total is not None:
-        rows.append(["In all", words.duration(total)])
+        rows.append(["In all", run_summary.duration(total)])
     step = run.number("seconds_per_step")
     steps = run.number("counts", "steps")
     if step is not None and steps is not None:

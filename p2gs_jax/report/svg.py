@@ -1,8 +1,8 @@
-"""Charts as inline SVG: crisp, in the page's own font and colours, once wide and once narrow.
+"""matplotlib's SVG made fit for the page: its font and colours, a wide and a narrow version.
 
-An SVG that is shrunk to a telephone's width has unreadable text, so every chart is drawn twice and
-the style sheet shows the one that fits. Colours are placeholders here and variables of the style
-sheet in the page, so that charts follow its light or dark theme.
+An SVG shrunk to a telephone's width has unreadable text, so every chart is drawn twice and the
+style sheet shows the one that fits. matplotlib draws in placeholder colours; in the page they are
+variables of the style sheet, so that charts follow its light or dark theme.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-# Natural widths, CSS pixels; a length in a figure is one pixel where matplotlib says a point.
+# Widths of the charts, CSS pixels; one point of matplotlib is one pixel.
 WIDE, NARROW = 860, 280
 TEXT = 12.0
 NARROW_TEXT = 11.0
@@ -75,7 +75,7 @@ def chart(draw: Draw, label: str) -> str:
 
     Args:
         draw: returns the figure; True asks for the wide one. Called with the page's settings.
-        label: what it shows, for those who cannot see it.
+        label: text alternative of the chart.
     """
     parts = []
     for wide in (True, False):
@@ -107,7 +107,7 @@ def place(figure: Figure, left: float, top: float, width: float, height: float, 
 
 
 def place_text(figure: Figure, left: float, base: float, text: str, color: str) -> None:
-    """Write a line of text, its base so many CSS pixels below the top."""
+    """Write a line of text with its base line `base` CSS pixels below the top."""
     across, down = figure.get_size_inches() * 72
     figure.text(left / across, 1 - base / down, text, color=color)
 
@@ -116,7 +116,7 @@ def label_ends(axes: Axes, labels: list[tuple[str, float, str]], gap: float) -> 
     """Write names of curves beside their ends, moved apart where they would overlap.
 
     Args:
-        axes: the right margin is outside it.
+        axes: of the curves; the names are written to their right.
         labels: text, height of the curve's end in data, colour.
         gap: least distance between two names, CSS pixels.
     """

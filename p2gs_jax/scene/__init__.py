@@ -37,7 +37,7 @@ def load_scene(
         root: folder, or .json file.
         cfg: which photographs are used, and how.
         work_dir: results of long computations are kept here for a resume; None keeps nothing.
-        report: told about progress, one line at a time.
+        report: receives progress, a line at a time.
 
     Returns:
         Views sorted by name, with split, masks and EXIF exposures; points; tracks; notes.

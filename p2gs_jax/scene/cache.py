@@ -1,15 +1,16 @@
-"""Results of long computations, kept in a run's folder so that a resume does not repeat them."""
+"""Results of long computations, kept in the run folder for a resume."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+
+from p2gs_jax.core.atomic import write_text
 
 _MARKER = "finished"
 
@@ -41,12 +42,7 @@ def cached_folder(
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         build(folder)
-        partial = folder / (_MARKER + ".partial")
-        with partial.open("w") as file:
-            file.write(digest)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, marker)
+        write_text(marker, digest)
     yield folder
 
 

@@ -144,7 +144,7 @@ def subfolder(name: str) -> str | None:
 
 
 def _camera_names(images: Sequence[ImageRecord]) -> dict[int, str]:
-    """Name cameras by id; a model with one camera per image does not know which are the same."""
+    """Name cameras by id; a model with one camera per image does not identify the same ones."""
     uses = Counter(image.camera_id for image in images)
     alone = len(uses) > 1 and max(uses.values()) == 1
     return {camera_id: "0" if alone else str(camera_id) for camera_id in uses}

@@ -1,9 +1,9 @@
 """Reads COLMAP's cameras, images and points3D files, binary or text, into plain records.
 
-Why not `pycolmap.Reconstruction`: version 4.2.1 accepts a `cameras.bin` cut in half without a word
-and never returns from a truncated `points3D.bin`. Here every count is checked against the bytes
-that are there. Newer models' `rigs.bin` and `frames.bin` are not needed: `images.bin` still holds
-every registered image with its own pose. tests/scene/test_colmap.py holds this to pycolmap.
+Why not `pycolmap.Reconstruction`: version 4.2.1 accepts a truncated `cameras.bin` without an error
+and never returns from a truncated `points3D.bin`. Here every count is checked against the size of
+the file. Newer models' `rigs.bin` and `frames.bin` are not needed: `images.bin` still holds every
+registered image with its own pose. tests/scene/test_colmap.py compares this with pycolmap.
 
 Format: https://colmap.github.io/format.html
 """
@@ -137,7 +137,7 @@ def read_model(folder: Path) -> Model:
 
 
 class _Cursor:
-    """Walks through a binary file and refuses to walk past its end."""
+    """A position in a binary file; reading past the end is an error."""
 
     def __init__(self, path: Path):
         self.path = path

@@ -1,4 +1,4 @@
-"""The exposure a camera wrote into its file."""
+"""Exposure settings from a photograph's EXIF."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ _DEFAULT_ISO = 100.0
 
 
 @dataclass(frozen=True)
-class Shot:
-    """How a photograph was taken, as far as its EXIF says.
+class ExifSettings:
+    """Settings of a photograph, as far as its EXIF has them.
 
     Attributes:
         time: exposure time, seconds.
@@ -33,12 +33,12 @@ class Shot:
     taken: str | None = None
 
 
-def read_shot(path: Path) -> Shot:
-    """Return what the EXIF of any image says; broken or absent EXIF says nothing."""
+def read_exif_settings(path: Path) -> ExifSettings:
+    """Return the settings in the EXIF of an image; without, or with broken EXIF, all are None."""
     tags = _exif_tags(path)
     isos = (_positive(tags.get(tag)) for tag in _SENSITIVITIES)
     taken = str(tags.get(_TAKEN, "")).strip("\0 ")
-    return Shot(
+    return ExifSettings(
         time=_positive(tags.get(_EXPOSURE_TIME)),
         aperture=_positive(tags.get(_F_NUMBER)),
         iso=next((value for value in isos if value not in (None, 65535.0)), None),
@@ -55,14 +55,14 @@ def read_exif_ev(path: Path) -> float | None:
     Args:
         path: any image; broken or absent EXIF gives None, never an error.
     """
-    shot = read_shot(path)
+    shot = read_exif_settings(path)
     if shot.time is None or shot.aperture is None:
         return None
     return math.log2(shot.time * (shot.iso or _DEFAULT_ISO) / shot.aperture**2)
 
 
 def read_exif_camera(path: Path) -> str:
-    """Return make, model and focal length as one string; empty where EXIF says nothing."""
+    """Return make, model and focal length as one string; empty without EXIF."""
     tags = _exif_tags(path)
     parts = (tags.get(tag) for tag in (0x010F, 0x0110, 0x920A))
     return " ".join(str(part).strip("\0 ") for part in parts if part is not None)

@@ -27,7 +27,7 @@ Pair = tuple[str, str]
 
 
 def quiet_colmap() -> None:
-    """Let COLMAP log errors only; it reports progress through glog otherwise."""
+    """Set COLMAP's log to errors only; otherwise it reports progress."""
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
 
 
@@ -49,7 +49,7 @@ def extract(
         enlarge: look for features in images of twice the size as well.
 
     Raises:
-        UserError: COLMAP gave up.
+        UserError: COLMAP failed.
     """
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size = MAX_IMAGE_SIZE
@@ -96,7 +96,7 @@ def match(database: Path, pairs: Iterable[Pair] | None) -> None:
 
 
 def pairs_by_name(names: Sequence[str]) -> list[Pair] | None:
-    """Return the pairs to match where nothing but the names is known; None means all.
+    """Return the pairs to match by their names alone; None means all.
 
     Long lists count as sequences, one a top folder: each image meets the next 10 and those 16, 32,
     ... 512 later; images of different folders meet at the same place in the sequence and next to it

@@ -1,4 +1,4 @@
-"""Image files on disk: which there are, how large, and what to say when one is missing."""
+"""Image files on disk: listing, sizes, and errors about missing ones."""
 
 from __future__ import annotations
 
@@ -57,13 +57,13 @@ def undecodable(path: Path) -> UserError:
 
 
 def check_missing(missing: Sequence[str], total: int, source: Path, cfg: DataConfig) -> list[str]:
-    """Complain about images that a model names and the disk does not have.
+    """Reject a model whose images are missing on disk.
 
     Args:
         missing: their names.
-        total: how many images the model names.
+        total: number of images of the model.
         source: the file or folder that names them.
-        cfg: `allow_missing` turns the complaint into a note.
+        cfg: `allow_missing` turns the error into a note.
 
     Returns:
         Notes for the user: none or one.
@@ -94,7 +94,7 @@ def check_size(
         path: the image.
         width: pixels, according to the model.
         height: pixels, according to the model.
-        source: the file that says so.
+        source: the file of the model.
 
     Returns:
         Real width and height, the factors from model to file, and whether they differ.

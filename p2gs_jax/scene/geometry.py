@@ -13,7 +13,7 @@ from jaxtyping import Float, Float32
 
 from p2gs_jax.types import Distortion
 
-# OpenCV's default (5 iterations) leaves errors of tenths of a pixel in the corners of wide lenses.
+# OpenCV's default, 5 iterations, leaves errors of tenths of a pixel in the corners of wide lenses.
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-10)
 
 
@@ -60,8 +60,8 @@ def undistortion_maps(
 ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
     """Return where each undistorted pixel lies in the photograph, for `cv2.remap`.
 
-    Positions are in OpenCV's convention (pixel centres at integers), -10 where the lens model has
-    folded over and no longer means anything.
+    Positions are in OpenCV's convention (pixel centres at integers), -10 where the lens model is
+    not monotonic any more.
 
     Args:
         K: intrinsics in pixels, centres at +0.5, of the photograph and of the result.

@@ -74,10 +74,10 @@ class ImageStore:
     """
 
     def __init__(self, views: Sequence[View], cfg: DataConfig):
-        """Prepare; nothing is read yet.
+        """Begin with an empty cache.
 
         Args:
-            views: whose photographs.
+            views: of the scene.
             cfg: `max_width` and `cache_mb`.
         """
         self._views = tuple(views)
@@ -116,7 +116,7 @@ class ImageStore:
     def stored(
         self, index: int, shrink: float = 1.0
     ) -> tuple[UInt[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-        """Return what `get` does as it is kept, read-only: integers, of which the largest is 1."""
+        """Return a photograph as it is cached, read-only: integers whose maximum stands for 1."""
         entry = self._entry(index, shrink)
         return entry.pixels, entry.valid
 
@@ -292,6 +292,6 @@ def _complete(path: Path, data: bytes) -> bool:
         with Image.open(path) as image:
             image.load()
     except (OSError, SyntaxError, ValueError):
-        # Formats that Pillow does not know are left to OpenCV's judgement.
+        # Of formats that Pillow does not know, OpenCV decides.
         return data[:2] != b"\xff\xd8" and data[:4] != b"\x89PNG"
     return True

@@ -25,7 +25,7 @@ def read_known_exposures(source: str, views: list[View]) -> Float[np.ndarray, " 
         views: the views wanted, in order.
 
     Raises:
-        UserError: the file cannot be used, or says nothing about any of the views.
+        UserError: the file cannot be used, or holds none of the views.
     """
     if source == "exif":
         values = _exif_ev(views) * LN2
@@ -51,7 +51,7 @@ def read_known_exposures(source: str, views: list[View]) -> Float[np.ndarray, " 
 
 
 def check_source(source: str | None) -> None:
-    """Complain about a source that cannot be used, before there are any views.
+    """Check that a source can be used, before there are any views.
 
     Args:
         source: see `read_known_exposures`; None is fine.

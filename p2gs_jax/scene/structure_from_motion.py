@@ -42,7 +42,7 @@ def load_images(
         cfg: passed on to the COLMAP reader.
         work_dir: keeps the result under `sfm/`; it is reused while names, sizes and modification
             times of the photographs stay the same.
-        report: told what is going on.
+        report: receives progress.
 
     Raises:
         UserError: fewer than two photographs, one of them is no image, or none registered.

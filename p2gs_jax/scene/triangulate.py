@@ -16,8 +16,8 @@ from p2gs_jax.scene.colmap_model import read_model
 from p2gs_jax.scene.features import extract, match, pairs_by_pose, quiet_colmap
 from p2gs_jax.types import Scene, View
 
-# Features of photographs this long, pixels, are sought in them as they are (nerf_fox: 53 s and
-# 12,017 points become 15 s and 5,449); exposures and dense seeds need no more of them.
+# Photographs with at least this many pixels along their longer side are not enlarged for SIFT
+# (nerf_fox: 53 s and 12,017 points become 15 s and 5,449); exposures and dense seeds need no more.
 LONG_ENOUGH = 800
 
 
@@ -27,7 +27,7 @@ def triangulate(scene: Scene, work_dir: Path | None, report: Callable[[str], Non
     Args:
         scene: its views' names must be relative to one folder.
         work_dir: keeps the result under `triangulated/`.
-        report: told what is going on.
+        report: receives progress.
 
     Raises:
         UserError: no point could be triangulated.

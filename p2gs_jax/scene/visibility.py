@@ -1,4 +1,4 @@
-"""Which points a view sees, judged by the points alone."""
+"""Visibility of points, estimated from the points alone."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import minimum_filter
 
+from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.types import View
 
 # A point is hidden where a nearer one lies within about this many point spacings in the image.
@@ -43,7 +44,7 @@ def shown_share(points: Float[np.ndarray, "p 3"], views: Sequence[View]) -> floa
     """
     if not len(points):
         return 1.0
-    picked = np.linspace(0, len(views) - 1, min(SHARE_VIEWS, len(views))).round().astype(int)
+    picked = evenly_spaced(len(views), SHARE_VIEWS)
     sample = points[:: max(1, len(points) // SHARE_POINTS)]
     shares = []
     for view in (views[i] for i in picked):
@@ -57,8 +58,8 @@ def unoccluded(
 ) -> Bool[np.ndarray, " p"]:
     """Return which projected points no nearer point hides.
 
-    A coarse depth buffer of the points themselves, its cells as wide as their spacing; sparse
-    foregrounds let some background through, which the robust loss has to bear.
+    A coarse depth buffer of the points themselves, its cells as wide as their spacing. Sparse
+    foregrounds let some background through, an outlier for the robust loss.
     """
     inside = in_frame(xy, z, width, height)
     count = int(inside.sum())

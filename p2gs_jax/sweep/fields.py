@@ -1,4 +1,4 @@
-"""Configuration fields by their dotted names, checked: what sweeps vary."""
+"""Configuration fields by their dotted names, with checks of their values."""
 
 from __future__ import annotations
 

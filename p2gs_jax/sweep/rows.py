@@ -1,4 +1,4 @@
-"""One line of a sweep's table: what a finished run says about itself."""
+"""The table of a sweep: columns read from the finished runs."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def _exposures(run: Path, scene: Path) -> dict[str, float]:
     return {"ev": error["ev"], "ev_power": error["ev_scale_power"]}
 
 
-# What the columns are, where their names do not say it.
+# Explanations of the columns' names.
 MEANING = {
     "seconds": "of the whole run, compilation and evaluation included",
     "train_": "training views, each under its own exposure and gamma",
@@ -83,7 +83,7 @@ MEANING = {
     "ev": "RMS error of the exposures against the truth, stops, after one scale",
     "ev_power": "likewise after the best power as well",
 }
-# What fits a terminal: column, heading, digits.
+# Columns of the short table, which fits a terminal: column, heading, digits.
 BRIEF = (
     ("seconds", "seconds", 0),
     ("gaussians", "Gaussians", 0),

@@ -1,4 +1,4 @@
-"""Many fits of one scene: in processes of their own, resumable, into one table."""
+"""Fits of one scene under many configurations: in processes, resumable, into one table."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ TABLE, TABLE_TEXT, JOBS = "sweep.json", "sweep.md", "jobs"
 
 @dataclass(frozen=True)
 class SweepResult:
-    """What a sweep found.
+    """Result of a sweep.
 
     Attributes:
         rows: one dict per configuration and seed: name, seed, status (`done` or `failed`), run, the

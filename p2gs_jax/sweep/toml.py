@@ -38,7 +38,7 @@ KEYS = ("scene", "reference", "out", "preset", "seeds", "max_parallel", "set", "
 
 @dataclass(frozen=True)
 class SweepFile:
-    """What the file asks for; see `sweep`."""
+    """Contents of the file; see `sweep`."""
 
     scene: Path
     out: Path

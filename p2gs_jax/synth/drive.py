@@ -1,8 +1,9 @@
 """Points of known radiance seen by three cameras on a car: observations without images.
 
-What a photometric adjustment sees of a drive, with every quantity known: three cameras, frames one
-unit apart, facades, road and sky, 4-6 stops of contrast plus a bright sky, 8-bit photographs with
-photon noise, texture and outliers (our own proxy; docs/photometry.md, 3 describes the like).
+The input of the photometric adjustment on a drive, with every quantity known: three cameras, frames
+one unit apart, facades, road and sky, 4-6 stops of contrast plus a bright sky, 8-bit photographs
+with photon noise, texture and outliers (our own proxy; docs/photometry.md, 3 describes a similar
+one).
 """
 
 from __future__ import annotations

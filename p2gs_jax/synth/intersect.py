@@ -1,4 +1,4 @@
-"""Rays against a town: what they meet first, what stands in the sun, how open the sky is.
+"""Rays against a town: first hits, shadows, and ambient occlusion.
 
 Loops over short lists of primitives, vectorised over some thousand rays. Arrays are channel-first:
 points and directions are [3 R].
@@ -39,14 +39,14 @@ def nearest_hit(
 def in_shadow(
     town: Town, o: Float[Array, "3 r"], to_sun: np.ndarray, lower: Array, upper: Array
 ) -> Float[Array, " r"]:
-    """Return 1 where a primitive stands between o and the sun.
+    """Return 1 where a primitive lies between o and the sun.
 
     Args:
         town: the scene.
         o: points, m.
         to_sun: unit vector.
         lower: bounds of the points; primitives whose shadow misses them are skipped.
-        upper: likewise.
+        upper: bounds of the points.
     """
     side = np.cross(to_sun, (0.0, 0.0, 1.0))
     axes = np.stack([side, np.cross(side, to_sun)])  # the plane the sun projects on
@@ -114,7 +114,7 @@ def open_sky(
         p: points, m.
         n: unit normals.
         lower: bounds of the points.
-        upper: likewise.
+        upper: bounds of the points.
     """
     probes = [p + reach * n for reach in _REACH]
     far = p + _CANYON_REACH * n

@@ -45,7 +45,7 @@ class Scanner:
     """Scans one town; compiled once."""
 
     def __init__(self, town: Town, lidar: Lidar | None = None):
-        """Keep the town; nothing is compiled yet."""
+        """Begin without a compiled program."""
         self.town, self.lidar = town, lidar or Lidar()
         self._scan = jax.jit(self._trace)
 

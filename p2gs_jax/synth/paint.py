@@ -127,7 +127,7 @@ def paint(
                 jnp.where(here, new, old) for new, old in zip(brush(), so_far, strict=True)
             )
 
-        # A tile sees few materials: the others cost nothing.
+        # A tile sees few materials; the others are skipped.
         so_far = (albedo, emission, gloss)
         albedo, emission, gloss = lax.cond(jnp.any(here), stroke, lambda x: x, so_far)
     relief = jnp.where(material == Material.FOLIAGE, 1.3, 0.05)

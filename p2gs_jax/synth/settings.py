@@ -1,4 +1,4 @@
-"""What a data set can be asked for, apart from what makes it: `--help` needs no numpy."""
+"""Options of a data set, apart from the code that makes it: `--help` needs no numpy."""
 
 from __future__ import annotations
 

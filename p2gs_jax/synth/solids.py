@@ -1,4 +1,4 @@
-"""Solids put down one by one, and a town made of them."""
+"""Solids, placed one by one, and the town made of them."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ class Solid:
 
 @dataclass
 class Builder:
-    """Puts solids down in an order that decides what is drawn at random.
+    """Places solids; their order decides which random numbers they get.
 
     Attributes:
         rng: of everything random.
-        clear: extent along x where no tree and no lamp may stand, or None.
-        solids: what was put down so far.
+        clear: extent along x without trees and lamps, or None.
+        solids: placed so far.
     """
 
     rng: np.random.Generator
@@ -62,7 +62,7 @@ class Builder:
         use: float = 0.0,
         top: tuple[float, float, float, float] | None = None,
     ) -> None:
-        """Put down a solid between two corners; with a `top`, a tapered box."""
+        """Place a solid between two corners; with a `top`, a tapered box."""
         params = (style, bay, use, float(self.rng.random()))
         a = tuple(min(p, q) for p, q in zip(lo, hi, strict=True))
         b = tuple(max(p, q) for p, q in zip(lo, hi, strict=True))
@@ -75,7 +75,7 @@ class Builder:
         return self.clear is not None and (self.clear[0] - reach < x < self.clear[1] + reach)
 
     def blob(self, center: Vec3, radii: Vec3, material: Material, color: Vec3) -> None:
-        """Put down an ellipsoid."""
+        """Place an ellipsoid."""
         c, r = np.array(center), np.array(radii)
         self.add(tuple(c - r), tuple(c + r), material, color, kind=2)
 
@@ -84,7 +84,7 @@ class Builder:
         return float(self.rng.uniform(low, high))
 
     def pick(self, items: list[Vec3]) -> Vec3:
-        """Return one of them at random."""
+        """Return a random choice."""
         return items[int(self.rng.integers(len(items)))]
 
 

@@ -1,4 +1,4 @@
-"""What a material is painted on, and what it gives to light.
+"""Points on surfaces, and their properties under light.
 
 All arrays are channel-first over R rays: points and colours are [3 R].
 """
@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 
 class Surface(NamedTuple):
-    """What light does at R points.
+    """Optical properties at R points.
 
     Attributes:
         albedo: diffuse reflectance.

@@ -66,8 +66,8 @@ def value_noise(x: Array, y: Array, z: Array, seeds: tuple[int, ...]) -> Array:
 
     Args:
         x: coordinates in cells, [S R]; a row for each seed.
-        y: likewise.
-        z: likewise.
+        y: coordinates in cells, [S R].
+        z: coordinates in cells, [S R].
         seeds: of the S rows.
 
     Returns:

@@ -1,4 +1,4 @@
-"""What a town is: primitives with materials under a sun and a sky.
+"""A town: primitives with materials under a sun and a sky.
 
 World: right-handed, metres, x along the street (the driving direction), y to the left, z up, the
 road surface at z = 0. Primitives are axis-aligned boxes, tapered boxes (car cabins, roofs) and

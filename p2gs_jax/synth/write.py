@@ -16,8 +16,6 @@ all.
 from __future__ import annotations
 
 import json
-import shutil
-import tempfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
@@ -28,6 +26,7 @@ import OpenEXR
 from jaxtyping import Float32, Float64, Int, UInt8
 from PIL import Image
 
+from p2gs_jax.core.atomic import atomic_folder
 from p2gs_jax.core.streams import SceneStream, generator
 from p2gs_jax.errors import UserError
 from p2gs_jax.synth.build_town import build_town
@@ -47,7 +46,7 @@ FORMAT = "p2gs-jax street, version 2"
 
 @dataclass(frozen=True)
 class StreetTruth:
-    """What was written, one row per photograph, sorted by name.
+    """The true parameters of a data set, one row per photograph, sorted by name.
 
     Attributes:
         root: the scene folder.
@@ -129,7 +128,6 @@ def write_street(
     sensor = sensor or Sensor(iso_std=iso_std)
     _check(out, frames, width, height, sensor.iso_std, supersample)
     say = report or (lambda line: None)
-    out.parent.mkdir(parents=True, exist_ok=True)
     town = build_town(seed, layout)
     names = tuple(f"{camera}/{f:06d}.png" for camera in sorted(MOUNTS) for f in range(frames))
     cameras = tuple(name.split("/")[0] for name in names)
@@ -140,9 +138,7 @@ def write_street(
     )
     shots = draw_shots(sensor, frames, len(MOUNTS), seed)
     K = intrinsics(width, height)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
-    temporary.chmod(0o755)
-    try:
+    with atomic_folder(out) as temporary:
         photographs, depths = [], []
         say(f"rendering {len(names)} views of a street with {town.size} solids")
         for row, (linear, depth) in enumerate(
@@ -194,12 +190,7 @@ def write_street(
             "lidar": asdict(Lidar()) if lidar else None,
         }
         (temporary / "dataset.json").write_text(json.dumps(card, indent=2) + "\n")
-        if out.exists():
-            out.rmdir()  # empty, or it would have been refused
-        temporary.rename(out)
-    except BaseException:
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise
+        _require_free(out)
     say(f"wrote {out}: {len(names)} photographs, {len(xyz)} points, {int(seen.sum())} observations")
     return StreetTruth(
         root=out,
@@ -232,6 +223,10 @@ def _check(
             f"and ISO std {iso_std}",
             fix="use at least 1 frame, 16x16 pixels, 1 sample, and a spread of 0 or more",
         )
+    _require_free(out)
+
+
+def _require_free(out: Path) -> None:
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UserError(f"{out} exists and is not an empty folder", fix="name another folder")
 

@@ -1,1 +1,1 @@
-"""`p2gs-jax view`: a finished run in the browser, rendered live and developed like a photograph."""
+"""`p2gs-jax view`: a finished run in the browser, rendered live at any exposure."""

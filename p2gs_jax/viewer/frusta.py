@@ -1,4 +1,4 @@
-"""The photographs' cameras in the scene, coloured by exposure, with what they saw."""
+"""The photographs' cameras in the scene: frusta, coloured by exposure, with thumbnails."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
 from p2gs_jax.types import View
-from p2gs_jax.viewer.frames import Stage, center
+from p2gs_jax.viewer.browser_camera import ViewerSpace, camera_center
 
 THUMBNAIL_WIDTH = 128
-# Whoever stands closer than this, in sizes of a frustum, would look at the inside of its picture.
+# Frusta closer to the camera than this, in sizes of a frustum, are hidden.
 TOO_CLOSE = 2.5
 LINE = 2.0
 
 
-def typical_size(views: Sequence[View], stage: Stage) -> float:
-    """Return a size at which neighbouring cameras of a sequence hardly touch, viewer units."""
+def typical_size(views: Sequence[View], space: ViewerSpace) -> float:
+    """Return a size at which frusta of neighbouring views hardly touch, viewer units."""
     names: dict[str, list[View]] = {}
     for view in views:
         names.setdefault(view.camera, []).append(view)
     steps = [
-        np.linalg.norm(center(a.viewmat) - center(b.viewmat))
+        np.linalg.norm(camera_center(a.viewmat) - camera_center(b.viewmat))
         for rows in names.values()
         for a, b in pairwise(rows)
     ]
     moved = [step for step in steps if step > 0]
-    step = float(np.median(moved)) * stage.unit if moved else 1.0
+    step = float(np.median(moved)) * space.unit if moved else 1.0
     return float(np.clip(0.35 * step, 0.02, 1.5))
 
 
@@ -42,21 +42,21 @@ class Frusta:
         client: viser.ClientHandle,
         views: Sequence[View],
         colors: UInt8[np.ndarray, "v 3"],
-        stage: Stage,
+        space: ViewerSpace,
         size: float,
         on_click: Callable[[int], None],
     ):
-        """Add them, without pictures and hidden.
+        """Add a hidden frustum without a picture for every view.
 
         Args:
-            client: whose.
-            views: all of them.
-            colors: one each.
-            stage: of the scene.
+            client: the browser.
+            views: of the scene.
+            colors: of the frusta.
+            space: of the scene.
             size: viewer units.
             on_click: called with the row of a view whose frustum was clicked.
         """
-        self._positions = np.stack([center(v.viewmat) for v in views]) * stage.unit
+        self._positions = np.stack([camera_center(v.viewmat) for v in views]) * space.unit
         self._size = size
         self._visible = False
         self._near = np.zeros(len(views), bool)
@@ -100,7 +100,7 @@ class Frusta:
         self._apply()
 
     def keep_clear(self, position: Float[np.ndarray, " 3"]) -> None:
-        """Hide those that would stand in the way of a camera.
+        """Hide the frusta that are too close to a camera.
 
         Args:
             position: of the camera, viewer units.
@@ -111,7 +111,7 @@ class Frusta:
             self._apply()
 
     def set_thumbnail(self, index: int, image: UInt8[np.ndarray, "h w 3"]) -> None:
-        """Show what a view saw."""
+        """Set the picture of a view's frustum."""
         self._handles[index].image = image
 
     def _apply(self) -> None:

@@ -1,4 +1,4 @@
-"""What colours mean, as small pieces of HTML for the panel."""
+"""Legends of the viewer's colours, as HTML for the panel."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ COLORS = 12
 
 
 def stops_legend() -> str:
-    """Return one box for every stop of the false colours."""
+    """Return the legend of false colours: one box for every stop."""
     low, high = (int(limit) for limit in STOPS)
     values = 2.0 ** (np.arange(low, high) + 0.5)
     colors = false_color(np.repeat(values[None, :, None], 3, -1).astype(np.float32), 1.0)[0]
@@ -31,29 +31,29 @@ def stops_legend() -> str:
 
 
 def clipping_legend() -> str:
-    """Return what the stripes mean."""
+    """Return the legend of the clipping stripes."""
     return _box(
         f"{_swatch(OVER)} a channel is at its top &ensp; {_swatch(UNDER)} all are at the bottom"
     )
 
 
 def depth_legend(near: float, far: float) -> str:
-    """Return the colours of depth; near is bright.
+    """Return the colour scale of depth; near is bright.
 
     Args:
         near: scene units.
-        far: likewise.
+        far: scene units.
     """
     colors = matplotlib.colormaps[DEPTH_MAP](np.linspace(1, 0, COLORS))[:, :3]
     return _box(_gradient(colors), _ends(f"{near:.3g}", f"{far:.3g}"), "depth, scene units")
 
 
 def exposure_legend(low: float, high: float) -> str:
-    """Return the colours of the cameras.
+    """Return the colour scale of the cameras.
 
     Args:
         low: smallest exposure, stops.
-        high: largest.
+        high: largest exposure, stops.
     """
     colors = matplotlib.colormaps[STOPS_MAP](np.linspace(0, 1, COLORS))[:, :3]
     text = "exposure, EV from the mean; grey: held out"
@@ -73,7 +73,7 @@ def exposure_colors(evs: Sequence[float | None]) -> UInt8[np.ndarray, "n 3"]:
 
 
 def note(text: str) -> str:
-    """Return a short text as it stands below a control."""
+    """Return a short text for the place below a control."""
     return _box(text)
 
 

@@ -1,18 +1,18 @@
-"""The controls, and what they are set to."""
+"""The controls beside the picture, and their values."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Protocol, get_args
+from collections.abc import Callable
+from typing import get_args
 
 import viser
 
 from p2gs_jax.viewer.legend import note
+from p2gs_jax.viewer.panel_interface import PanelActions, RunInfo
+from p2gs_jax.viewer.picture_modes import Mode
 from p2gs_jax.viewer.save import SAVED_WIDTHS
 from p2gs_jax.viewer.settings import ChosenCurve, Settings
-from p2gs_jax.viewer.shade import Mode
 
 MODES: dict[str, Mode] = {
     "picture": "display",
@@ -27,82 +27,19 @@ FULL, SPLATS = "full (linear light)", "browser splats (fast)"
 KEYS = "Drag to orbit, right-drag to pan, scroll to approach; W A S D Q E fly, arrows turn."
 
 
-class Actions(Protocol):
-    """What controls do beyond changing the display transform."""
-
-    def display_changed(self) -> None:
-        """Develop anew."""
-        ...
-
-    def take_display_of(self, index: int | None) -> None:
-        """Take the exposure, gamma and correction of a view, or the mean."""
-        ...
-
-    def mode_changed(self) -> None:
-        """Show something else."""
-        ...
-
-    def go_to(self, index: int) -> None:
-        """Move to where a view was taken, and take its display transform unless that is locked."""
-        ...
-
-    def set_fov(self, degrees: float) -> None:
-        """Set the vertical field of view."""
-        ...
-
-    def show_cameras(self, visible: bool, scale: float) -> None:
-        """Show or hide the photographs' cameras, times their usual size."""
-        ...
-
-    def set_place(self, camera: str, place: float) -> None:
-        """Move along the drive of a camera."""
-        ...
-
-    def play(self, playing: bool) -> None:
-        """Begin or stop playing along the drive."""
-        ...
-
-    def save(self, kind: str, width: int) -> None:
-        """Send the view as a file."""
-        ...
-
-
-@dataclass(frozen=True)
-class Facts:
-    """What the controls must know of a run.
-
-    Attributes:
-        names: of all views.
-        cameras: physical cameras and how many views each has.
-        start: settings to begin with.
-        most_ev: largest distance of an exposure from the mean, stops.
-        gammas: all that occur.
-        curve: of the run.
-        camera_legend: what their colours mean.
-    """
-
-    names: Sequence[str]
-    cameras: dict[str, int]
-    start: Settings
-    most_ev: float
-    gammas: Sequence[float]
-    curve: str
-    camera_legend: str
-
-
 class Panel:
     """The controls of one browser."""
 
-    def __init__(self, gui: viser.GuiApi, facts: Facts, actions: Actions):
-        """Add them.
+    def __init__(self, gui: viser.GuiApi, info: RunInfo, actions: PanelActions):
+        """Add the controls to the page.
 
         Args:
             gui: of the client.
-            facts: of the run.
-            actions: what they do.
+            info: of the run.
+            actions: called by the controls.
         """
-        self._gui, self._facts, self._actions = gui, facts, actions
-        self._taken_as: int | None = facts.start.taken_as
+        self._gui, self._info, self._actions = gui, info, actions
+        self._taken_as: int | None = info.start.taken_as
         self._status = gui.add_html(note("starting ..."))
         with gui.add_folder("Picture"):
             self._add_picture()
@@ -112,10 +49,10 @@ class Panel:
             self._add_drive()
         with gui.add_folder("Save", expand_by_default=False):
             self._add_save()
-        self.put(facts.start)
+        self.put(info.start)
 
     def _add_picture(self) -> None:
-        gui, facts, actions = self._gui, self._facts, self._actions
+        gui, info, actions = self._gui, self._info, self._actions
         self._mode = gui.add_dropdown(
             "Show",
             list(MODES),
@@ -131,7 +68,7 @@ class Panel:
             visible=False,
             hint="Share of the photograph, from the left.",
         )
-        reach = float(max(8, math.ceil(facts.most_ev) + 2))
+        reach = float(max(8, math.ceil(info.most_ev) + 2))
         self._exposure = gui.add_slider(
             "Exposure",
             -reach,
@@ -143,8 +80,8 @@ class Panel:
                 (float(ev), f"{ev:+d}" if ev else "0") for ev in (-round(reach), 0, round(reach))
             ),
         )
-        low = min(1.0, math.floor(10 * min(facts.gammas)) / 10)
-        high = max(4.0, math.ceil(10 * max(facts.gammas)) / 10)
+        low = min(1.0, math.floor(10 * min(info.gammas)) / 10)
+        high = max(4.0, math.ceil(10 * max(info.gammas)) / 10)
         self._gamma = gui.add_slider(
             "Gamma",
             low,
@@ -154,14 +91,14 @@ class Panel:
             hint="2.2 is the curve itself; middle grey stays where it is.",
             marks=((low, f"{low:g}"), (2.2, "2.2"), (high, f"{high:g}")),
         )
-        self._curves: dict[str, ChosenCurve] = {f"run's ({facts.curve})": "run"}
-        self._curves |= {c: c for c in get_args(ChosenCurve) if c not in ("run", facts.curve)}
+        self._curves: dict[str, ChosenCurve] = {f"run's ({info.curve})": "run"}
+        self._curves |= {c: c for c in get_args(ChosenCurve) if c not in ("run", info.curve)}
         self._curve = gui.add_dropdown(
             "Curve", list(self._curves), hint="The tone curve from exposed light to display values."
         )
         self._match = gui.add_dropdown(
             "Match photo",
-            [MEAN, *facts.names],
+            [MEAN, *info.names],
             hint="Sets exposure, gamma, curve and correction as a photograph was taken.",
         )
         self._renderer = gui.add_dropdown(
@@ -176,11 +113,11 @@ class Panel:
         self._when_chosen(self._match, lambda name: actions.take_display_of(self._index(name)))
 
     def _add_camera(self) -> None:
-        gui, facts, actions = self._gui, self._facts, self._actions
+        gui, info, actions = self._gui, self._info, self._actions
         gui.add_html(note(KEYS))
         self._go_to = gui.add_dropdown(
             "Go to",
-            [NOWHERE, *facts.names],
+            [NOWHERE, *info.names],
             hint="Stands where a photograph was taken, and matches its exposure and gamma.",
         )
         steps = gui.add_button_group("", ["previous", "next"])
@@ -198,7 +135,7 @@ class Panel:
         self._size = gui.add_slider(
             "Camera size", 0.2, 8.0, 0.1, 1.0, visible=False, hint="Times the usual.", marks=()
         )
-        self._camera_legend = gui.add_html(facts.camera_legend, visible=False)
+        self._camera_legend = gui.add_html(info.camera_legend, visible=False)
 
         def choose(name: str) -> None:
             if (index := self._index(name)) is not None:
@@ -207,7 +144,7 @@ class Panel:
         def step(name: str) -> None:
             now = self._index(self._go_to.value)
             by = 1 if name == "next" else -1
-            count = len(facts.names)
+            count = len(info.names)
             actions.go_to((0 if by > 0 else count - 1) if now is None else (now + by) % count)
 
         def show(_: object) -> None:
@@ -221,10 +158,10 @@ class Panel:
             self._when_chosen(handle, show)
 
     def _add_drive(self) -> None:
-        gui, facts, actions = self._gui, self._facts, self._actions
-        names = list(facts.cameras)
+        gui, info, actions = self._gui, self._info, self._actions
+        names = list(info.cameras)
         self._drive = gui.add_dropdown("Along", names, visible=len(names) > 1)
-        last = max(facts.cameras[names[0]] - 1, 1)
+        last = max(info.cameras[names[0]] - 1, 1)
         self._place = gui.add_slider(
             "Frame", 0.0, float(last), 0.01, 0.0, marks=((0.0, "0"), (float(last), str(last)))
         )
@@ -240,7 +177,7 @@ class Panel:
         self._playing = False
 
         def choose(name: str) -> None:
-            end = max(facts.cameras[name] - 1, 1)
+            end = max(info.cameras[name] - 1, 1)
             self._place.value = 0.0
             self._place.max = float(end)
             actions.set_place(name, 0.0)
@@ -271,7 +208,7 @@ class Panel:
 
     @staticmethod
     def _when_chosen(handle, act: Callable) -> None:
-        """Act on what a person does, not on what `put` does."""
+        """Call `act` when a person changes a control, but not when `put` does."""
 
         def on_update(event: viser.GuiEvent) -> None:
             if event.client_id is not None:
@@ -280,10 +217,10 @@ class Panel:
         handle.on_update(on_update)
 
     def _index(self, name: str) -> int | None:
-        return self._facts.names.index(name) if name in self._facts.names else None
+        return self._info.names.index(name) if name in self._info.names else None
 
     def settings(self) -> Settings:
-        """Return what is chosen now."""
+        """Return the present settings."""
         return Settings(
             gamma=self._gamma.value,
             exposure_ev=self._exposure.value,
@@ -295,27 +232,27 @@ class Panel:
         )
 
     def put(self, settings: Settings) -> None:
-        """Show a display transform on the controls; the mode stays."""
+        """Set the controls to a display transform; the mode stays."""
         self._taken_as = settings.taken_as
         self._exposure.value = settings.exposure_ev
         self._gamma.value = settings.gamma
         names = {value: name for name, value in self._curves.items()}
         self._curve.value = names.get(settings.curve, names["run"])
         index = settings.taken_as
-        self._match.value = MEAN if index is None else self._facts.names[index]
+        self._match.value = MEAN if index is None else self._info.names[index]
 
     def put_view(self, index: int, degrees: float) -> None:
-        """Show on the controls where the camera went."""
-        self._go_to.value = self._facts.names[index]
+        """Set the controls to the camera of a view."""
+        self._go_to.value = self._info.names[index]
         self._fov.value = degrees
 
     def put_place(self, place: float) -> None:
-        """Show how far along the drive the camera is."""
+        """Set the slider to a place on the drive."""
         self._place.value = min(place, self._place.max)
 
     @property
     def drive(self) -> tuple[str, float]:
-        """The camera to play along, and the place on it."""
+        """Name of the camera whose drive is played, and the place on it."""
         return self._drive.value, self._place.value
 
     @property
@@ -325,7 +262,7 @@ class Panel:
 
     @property
     def locked(self) -> bool:
-        """Whether going somewhere leaves the display transform as it is."""
+        """Whether moving to a view leaves the display transform as it is."""
         return self._locked.value
 
     @property
@@ -334,18 +271,18 @@ class Panel:
         return self._own.value
 
     def set_playing(self, playing: bool) -> None:
-        """Show whether it plays."""
+        """Set the button to `Pause` or `Play`."""
         self._playing = playing
         self._play.label = "Pause" if playing else "Play"
         self._play.icon = viser.Icon.PLAYER_PAUSE if playing else viser.Icon.PLAYER_PLAY
 
     def set_status(self, html: str) -> None:
-        """Say what goes on."""
+        """Show a status line."""
         if self._status.content != html:
             self._status.content = html
 
     def set_legend(self, html: str | None) -> None:
-        """Say what the colours of the picture mean."""
+        """Show the legend of the picture's colours, or none."""
         self._split.visible = MODES[self._mode.value] == "split"
         if html is not None and self._legend.content != html:
             self._legend.content = html

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation, Slerp
 
 from p2gs_jax.types import Scene
-from p2gs_jax.viewer.frames import center
+from p2gs_jax.viewer.browser_camera import camera_center
 
 # Poses sent to the browser per second.
 RATE = 25.0
@@ -28,11 +28,11 @@ def pose_between(
 ) -> Float[np.ndarray, "4 4"]:
     """Return the world-to-camera matrix at a place along recorded poses.
 
-    Centres move on straight lines and rotations at constant speed from one to the next.
+    Centres are interpolated linearly, rotations spherically.
 
     Args:
         viewmats: the poses, in order.
-        place: 0 is the first, 1 the second; beyond the ends it stays there.
+        place: 0 is the first pose, 1 the second; clamped to the ends.
     """
     place = float(np.clip(place, 0, len(viewmats) - 1))
     first = min(int(place), max(len(viewmats) - 2, 0))
@@ -42,17 +42,17 @@ def pose_between(
     share = place - first
     rotations = Rotation.from_matrix([m[:3, :3] for m in pair])
     rotation = Slerp([0.0, 1.0], rotations)(share).as_matrix()
-    at = (1 - share) * center(pair[0]) + share * center(pair[1])
+    at = (1 - share) * camera_center(pair[0]) + share * camera_center(pair[1])
     out = np.eye(4)
     out[:3, :3], out[:3, 3] = rotation, -rotation @ at
     return out
 
 
 class Player:
-    """Moves a place along a drive at a steady speed, in a thread that lives while it plays."""
+    """Moves a place along a drive at a steady speed, in a thread of its own."""
 
     def __init__(self, move: Callable[[float], None]):
-        """Prepare.
+        """Begin stopped.
 
         Args:
             move: called with the place, in frames, at `RATE`.
@@ -61,18 +61,13 @@ class Player:
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
 
-    @property
-    def playing(self) -> bool:
-        """Whether it plays."""
-        return self._thread is not None and self._thread.is_alive()
-
     def play(self, start: float, last: float, speed: Callable[[], float]) -> None:
-        """Play from a place to the last frame, over and over.
+        """Play from a place to the last frame, then from the first one, in a loop.
 
         Args:
-            start: where to begin, frames.
-            last: where it starts again, frames.
-            speed: frames per second, asked at every step.
+            start: first place, frames.
+            last: last place of the loop, frames.
+            speed: returns frames per second, called at every step.
         """
         self.stop()
         self._stop = stop = threading.Event()
@@ -90,7 +85,7 @@ class Player:
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop playing, and wait until nothing moves any more."""
+        """Stop playing, and wait for the thread to end."""
         self._stop.set()
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join()

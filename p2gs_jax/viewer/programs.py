@@ -1,7 +1,7 @@
-"""The renderer compiled ahead for a few sizes, in the background, so that no frame ever waits.
+"""The renderer, compiled for a few sizes in the background, so that frames never wait.
 
-`render/host.py` compiles when it must; here a frame whose tile lists overflow is left to a smaller
-size while a program with longer lists is compiled.
+`render/host.py` waits for the compiler; here a frame whose tile lists overflow is rendered at a
+smaller size while a program with longer lists is compiled.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.render.capacity import ANYWHERE, TileCapacity
 from p2gs_jax.render.host import compiled_renderer, count_needed
 from p2gs_jax.types import Camera, Gaussians, Render
-from p2gs_jax.viewer.ladder import Size
+from p2gs_jax.viewer.render_sizes import Size
 
-# Entries of the longest tile lists worth having; a camera inside a splat may ask for any number.
+# Most entries of a tile list; a camera inside a splat may need any number.
 MOST_ENTRIES = 2**26
 PROBES = 4
 
@@ -35,7 +35,7 @@ class _Program:
 
 
 class Programs:
-    """Renders views of the sizes that are compiled; compiles others in a thread of its own.
+    """Renders views of compiled sizes, and compiles others in a thread.
 
     All methods may be called from any thread; one frame is rendered at a time.
     """
@@ -49,15 +49,15 @@ class Programs:
         on_change: Callable[[], None] = lambda: None,
         warm_up: Callable[[Render], object] = lambda result: None,
     ):
-        """Prepare; nothing is compiled yet.
+        """Begin without a program.
 
         Args:
             gaussians: the scene.
             alive: slots in use.
             cfg: rendering options.
-            probes: functions from a size to a typical camera, which new programs are tried on.
-            on_change: called when something was compiled, or is about to be.
-            warm_up: called with a render of every new size, to compile what follows on it.
+            probes: functions from a size to a typical camera; new programs are run on them.
+            on_change: called when a program was compiled, or is about to be.
+            warm_up: called with a render of every new size, to compile what uses it.
         """
         self._scene = (gaussians, alive)
         self._cfg = cfg
@@ -101,8 +101,8 @@ class Programs:
         with self._changed:
             return dict(self._took_ms)
 
-    def want(self, sizes: Sequence[Size]) -> None:
-        """Compile these next, in this order, and then what was wanted before."""
+    def request(self, sizes: Sequence[Size]) -> None:
+        """Compile these sizes next, in this order, and then those requested before."""
         with self._changed:
             new = [s for s in sizes if s not in self._programs]
             self._wanted = list(dict.fromkeys((*new, *self._wanted)))
@@ -132,7 +132,7 @@ class Programs:
         return None
 
     def render_now(self, camera: Camera) -> Render:
-        """Return a view of any size, compiling and growing as long as it takes.
+        """Return a view of any size; compile a program and enlarge its tile lists as needed.
 
         Raises:
             UserError: it would need more memory than is reasonable.
@@ -150,7 +150,7 @@ class Programs:
             self._compile(size)
 
     def stop(self) -> None:
-        """Stop compiling, and wait until what is being compiled is done.
+        """Stop compiling, and wait for the program that is being compiled.
 
         An interpreter that ends while JAX works in another thread aborts.
         """
@@ -179,7 +179,7 @@ class Programs:
             self._on_change()
 
     def _compile(self, size: Size) -> None:
-        """Compile a size with tile lists that hold what it is known to need, and try it."""
+        """Compile a size, with tile lists as long as it is known to need, and run it once."""
         with self._changed:
             first = not self._most
         if first:
@@ -195,7 +195,7 @@ class Programs:
             static = {"cfg": self._cfg, "capacity": capacity.entries}
             camera = self._probes[0](size)
             run = compiled_renderer().lower(*self._scene, camera, **static).compile()
-            most, fastest = self._try(run, size)
+            most, fastest = self._run_probes(run, size)
             with self._changed:
                 self._most[size] = max(self._most.get(size, 0), most)
                 if capacity.holds(most):
@@ -205,22 +205,22 @@ class Programs:
                     return
 
     def _count(self, size: Size) -> None:
-        """Count what typical views need: cheaper than to compile twice."""
+        """Count the entries that typical views need: cheaper than compiling twice."""
         needed = [count_needed(*self._scene, probe(size), cfg=self._cfg) for probe in self._probes]
         most = max(map(int, needed))
         with self._changed:
             self._most[size] = most
 
     def _expected(self, size: Size) -> int:
-        """Return how many entries a size may need; lists never grow faster than the area."""
+        """Return the expected entries of a size; at most in proportion to the area."""
         if size in self._most:
             return self._most[size]
         area = size[0] * size[1]
         near = min(self._most, key=lambda other: abs(other[0] * other[1] - area))
         return int(self._most[near] * max(1.0, area / (near[0] * near[1])))
 
-    def _try(self, run, size: Size) -> tuple[int, float]:
-        """Return the entries that typical views need, and how long the fastest of them took."""
+    def _run_probes(self, run, size: Size) -> tuple[int, float]:
+        """Return the entries that typical views need, and the time of the fastest one."""
         most, fastest = 0, float("inf")
         for camera in [probe(size) for probe in self._probes]:
             with self._one_frame:

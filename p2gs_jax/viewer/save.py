@@ -1,4 +1,4 @@
-"""The view on the screen as a file to keep: PNG as it is shown, EXR with its light."""
+"""The shown view as a file: PNG with display values, EXR with linear radiance."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jaxtyping import Float32
 from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.formats.png import write_png
 from p2gs_jax.photometry.display import DisplayTransform
-from p2gs_jax.viewer.shade import Frame
+from p2gs_jax.viewer.picture_modes import RenderedFrame
 
 # Fewest and most pixels across.
 SAVED_WIDTHS = (16, 16384)
@@ -35,7 +35,7 @@ def png_bytes(ldr: Float32[np.ndarray, "h w 3"]) -> bytes:
         return path.read_bytes()
 
 
-def exr_bytes(frame: Frame, transform: DisplayTransform) -> bytes:
+def exr_bytes(frame: RenderedFrame, transform: DisplayTransform) -> bytes:
     """Return a frame as an EXR file with depth, opacity, display transform and camera in it."""
     with tempfile.TemporaryDirectory(prefix="p2gs-view-") as folder:
         path = Path(folder) / "view.exr"

@@ -1,4 +1,4 @@
-"""The web server: one studio, and a session for every browser."""
+"""The web server: one viewed run, and a session for every browser."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ import viser
 
 from p2gs_jax.errors import UserError
 from p2gs_jax.run.read import Run
-from p2gs_jax.viewer.ladder import full_size, ladder, order_of_compilation
-from p2gs_jax.viewer.session import Session
-from p2gs_jax.viewer.studio import Studio
+from p2gs_jax.viewer.render_sizes import compilation_order, full_size, render_sizes
+from p2gs_jax.viewer.session import BrowserSession
+from p2gs_jax.viewer.viewed_run import ViewedRun
 
-# Canvas of a common browser window, compiled for before anyone has connected.
+# Canvas of a common browser window: its programs are compiled before any browser connects.
 LIKELY_CANVAS = (1280, 800)
 
 
 def check_address(host: str, port: int) -> None:
-    """Make sure that one can listen there.
+    """Check that a server can listen on an address.
 
     Raises:
         UserError: the port is taken or not allowed, or the host is none of this machine's.
@@ -56,59 +56,63 @@ def open_viewer(run: Run, *, host: str, port: int, max_width: int) -> Iterator[s
     """Serve a run until the block ends; yield the address to open.
 
     Args:
-        run: what to show.
+        run: the run to show.
         host: address to listen on.
-        port: likewise; 0 takes any free one.
+        port: to listen on; 0 takes any free one.
         max_width: widest picture to render, pixels.
 
     Raises:
         UserError: one cannot listen there.
     """
     check_address(host, port)
-    # A browser that goes while a picture is on its way is nothing to warn of.
+    # viser warns when a browser disconnects while a picture is being sent.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
-    studio = Studio(run, max_width)
+    viewed = ViewedRun(run, max_width)
     with contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(
             host=host, port=port, label=f"p2gs-jax: {run.folder.name}", verbose=False
         )
-    sessions: dict[int, Session] = {}
+    sessions: dict[int, BrowserSession] = {}
     try:
         if port not in (0, server.get_port()):
             raise UserError(f"port {port} was taken just now.", fix="choose another with --port")
-        _furnish(server, studio, sessions)
-        studio.programs.want(order_of_compilation(ladder(full_size(LIKELY_CANVAS, max_width))))
+        _set_up_server(server, viewed, sessions)
+        viewed.programs.request(
+            compilation_order(render_sizes(full_size(LIKELY_CANVAS, max_width)))
+        )
         shown = "localhost" if host in ("0.0.0.0", "::", "") else host
         yield f"http://{f'[{shown}]' if ':' in shown else shown}:{server.get_port()}"
     finally:
         for session in tuple(sessions.values()):
             session.stop()
-        studio.programs.stop()
+        viewed.programs.stop()
         with contextlib.redirect_stdout(io.StringIO()):
             server.stop()
-        studio.store.close()
+        viewed.store.close()
 
 
-def _furnish(server: viser.ViserServer, studio: Studio, sessions: dict[int, Session]) -> None:
-    """Set the look of the page, where cameras begin, and what happens when a browser comes.
+def _set_up_server(
+    server: viser.ViserServer, viewed: ViewedRun, sessions: dict[int, BrowserSession]
+) -> None:
+    """Set the page's theme, the initial camera, and what happens when a browser connects.
 
     Args:
         server: the server.
-        studio: what it shows.
-        sessions: those of the browsers that are here, by their ids; kept up to date.
+        viewed: the run to show.
+        sessions: of the connected browsers, by their ids; kept up to date.
     """
     server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
-    # No button asks for it, but any page may: publishing a run through viser's relay.
+    # Any page could ask viser's relay to publish the run, also without a button for it.
     server.request_share_url = lambda verbose=True: None
-    server.scene.set_up_direction(studio.stage.up)
-    start = studio.pose(studio.first_view, LIKELY_CANVAS[0] / LIKELY_CANVAS[1])
+    server.scene.set_up_direction(viewed.space.up)
+    start = viewed.pose(viewed.first_view, LIKELY_CANVAS[0] / LIKELY_CANVAS[1])
     camera = server.initial_camera
     camera.position, camera.look_at, camera.fov = start.position, start.look_at, start.fov
     lock = threading.Lock()
 
     @server.on_client_connect
     def _(client: viser.ClientHandle) -> None:
-        session = Session(client, studio)
+        session = BrowserSession(client, viewed)
         with lock:
             sessions[client.client_id] = session
 
@@ -128,7 +132,7 @@ def serve(run: Run, *, host: str, port: int, max_width: int, say: Callable[[str]
     Args:
         run: what to show.
         host: address to listen on.
-        port: likewise.
+        port: to listen on.
         max_width: widest picture to render, pixels.
         say: prints a line.
 

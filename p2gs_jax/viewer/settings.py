@@ -1,4 +1,4 @@
-"""What a person has chosen about the picture, and the display transform that follows from it."""
+"""The viewer's settings, and the display transform that they give."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.run.read import Run
-from p2gs_jax.viewer.shade import Mode
+from p2gs_jax.viewer.picture_modes import Mode
 
 ChosenCurve = Literal["run", "srgb", "power", "linear"]
 
@@ -25,7 +25,7 @@ class Settings:
         taken_as: row in `scene.views` of the view whose correction applies, or None for the mean.
         mode: what is shown.
         split: share of the photograph in `split`.
-        splats: whether the browser draws, instead of the renderer.
+        splats: whether the browser draws splats itself, instead of the renderer's pictures.
     """
 
     gamma: float
@@ -38,11 +38,11 @@ class Settings:
 
 
 def common_settings(run: Run, before: Settings | None = None) -> Settings:
-    """Return the display transform of no view in particular: mean exposure and gamma.
+    """Return settings with the mean exposure and gamma.
 
     Args:
-        run: whose means.
-        before: what does not belong to the display transform is kept from it.
+        run: the run.
+        before: settings that all other fields are kept from.
     """
     gamma = run.mean.gamma
     if before is None:
@@ -51,12 +51,12 @@ def common_settings(run: Run, before: Settings | None = None) -> Settings:
 
 
 def settings_of_view(run: Run, index: int, before: Settings) -> Settings:
-    """Return the settings under which a view looks like its photograph.
+    """Return settings with the exposure, gamma and correction of a view.
 
     Args:
-        run: with the view.
+        run: the run.
         index: row in `scene.views`.
-        before: what does not belong to the display transform is kept from it.
+        before: settings that all other fields are kept from.
     """
     own = run.own_display(index)
     ev = float(np.log2(own.exposure / run.mean.exposure_geometric))
@@ -64,12 +64,12 @@ def settings_of_view(run: Run, index: int, before: Settings) -> Settings:
 
 
 def same_display(a: Settings, b: Settings) -> bool:
-    """Return whether two settings develop alike, whatever they show."""
+    """Return whether two settings have the same display transform, whatever their mode."""
     return replace(a, mode=b.mode, split=b.split, splats=b.splats) == b
 
 
 def display_of(run: Run, settings: Settings) -> DisplayTransform:
-    """Return how the settings show radiance; corrections hold under the run's curve only."""
+    """Return the display transform of settings; corrections apply under the run's curve only."""
     transform = run.common_display(settings.exposure_ev)
     if settings.taken_as is not None:
         transform = replace(transform, correction=run.own_display(settings.taken_as).correction)

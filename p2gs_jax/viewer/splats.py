@@ -1,7 +1,7 @@
-"""The scene as splats that the browser draws by itself: any speed, display colours only.
+"""The scene as splats that the browser draws itself: fast, but with display colours only.
 
-The browser composites display values instead of light, so soft edges differ a little from the
-renderer's picture; it knows no spherical harmonics, so colours are those seen from one place.
+The browser composites display values instead of radiance, so soft edges differ a little from the
+renderer's picture. viser has no spherical harmonics: colours are those seen from one place.
 """
 
 from __future__ import annotations
@@ -14,16 +14,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 from scipy.spatial.transform import Rotation
+from scipy.special import expit
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.formats.false_color import false_color
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.render import view_radiance
 from p2gs_jax.types import Camera, Gaussians
+from p2gs_jax.viewer.picture_modes import MIDDLE_GREY, to_uint8_fast
 from p2gs_jax.viewer.settings import Settings
-from p2gs_jax.viewer.shade import MIDDLE_GREY, codes
 
-# Covariances travel as 16-bit floats, which end at 65504.
+# viser sends covariances as 16-bit floats, at most 65504.
 LARGEST_DEVIATION = 250.0
 
 
@@ -33,7 +34,7 @@ class BrowserSplats:
 
     Attributes:
         centers: of the Gaussians.
-        covariances: likewise.
+        covariances: of the Gaussians.
         opacities: peak, in [0, 1].
         linear: radiance towards one place.
     """
@@ -58,7 +59,7 @@ def browser_splats(
         gaussians: the scene.
         alive: slots in use.
         cfg: activation of the radiance.
-        seen_from: where their colours are looked at from, scene units.
+        seen_from: the place that their colours are seen from, scene units.
         unit: viewer units in a scene unit.
     """
     rows = np.flatnonzero(np.asarray(alive))
@@ -73,7 +74,7 @@ def browser_splats(
     return BrowserSplats(
         (np.asarray(gaussians.means)[rows] * unit).astype(np.float32),
         (axes @ axes.transpose(0, 2, 1)).astype(np.float32),
-        (1 / (1 + np.exp(-logits)))[:, None].astype(np.float32),
+        expit(logits)[:, None].astype(np.float32),
         np.asarray(jax.jit(partial(view_radiance, cfg=cfg))(gaussians, there))[rows],
     )
 
@@ -81,13 +82,13 @@ def browser_splats(
 def splat_colors(
     splats: BrowserSplats, transform: DisplayTransform, settings: Settings
 ) -> UInt8[np.ndarray, "n 3"]:
-    """Return a colour for each splat: in stops where the mode is that, else as displayed.
+    """Return a colour for each splat: false colour in mode `stops`, else display values.
 
-    A correction that depends on the place in the image is left out.
+    A correction that depends on the position in the image is left out.
     """
     column = splats.linear[:, None]
     if settings.mode == "stops":
-        return codes(false_color(column, MIDDLE_GREY / transform.exposure))[:, 0]
+        return to_uint8_fast(false_color(column, MIDDLE_GREY / transform.exposure))[:, 0]
     if transform.formation.appearance == "bilateral":
         transform = replace(transform, correction=None)
-    return codes(develop(column, transform))[:, 0]
+    return to_uint8_fast(develop(column, transform))[:, 0]

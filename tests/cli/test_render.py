@@ -13,7 +13,7 @@ import pytest
 from p2gs_jax.cli import main
 from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.paths import Shot, covering, find_rig, view_shots
-from p2gs_jax.paths.pictures import Studio
+from p2gs_jax.paths.pictures import RunRenderer
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.run.read import load_run
 
@@ -53,7 +53,7 @@ def rig_run(finished_run, tmp_path_factory) -> Path:
     """Return a run whose photographs are its own field, taken by a rig at known exposures."""
     root = tmp_path_factory.mktemp("rig")
     shutil.copytree(finished_run, root / "run")
-    studio = Studio(load_run(finished_run))
+    renderer = RunRenderer(load_run(finished_run))
     K = np.array([[70.0, 0, SIZE[0] / 2], [0, 70.0, SIZE[1] / 2], [0, 0, 1]])
     model = root / "scene" / "sparse" / "0"
     model.mkdir(parents=True)
@@ -64,8 +64,8 @@ def rig_run(finished_run, tmp_path_factory) -> Path:
         turn = np.cos(2 * half), np.sin(2 * half)
         viewmat[0, [0, 2]], viewmat[2, [0, 2]] = (turn[0], -turn[1]), (turn[1], turn[0])
         viewmat[:3, 3] = -viewmat[:3, :3] @ [0.3 * step, 0, 0]
-        linear, _, _ = studio.linear(Shot("", viewmat, K, *SIZE))
-        transform = DisplayTransform(2.0**ev, 2.2, studio.run.cfg.photometry)
+        linear, _, _ = renderer.linear(Shot("", viewmat, K, *SIZE))
+        transform = DisplayTransform(2.0**ev, 2.2, renderer.run.cfg.photometry)
         name = f"{camera}/{step:03d}.png"
         path = root / "scene" / "images" / name
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -4,6 +4,7 @@ import importlib
 import json
 import re
 
+import pytest
 from pages import ROOT
 
 DOCS = ROOT / "docs"
@@ -40,6 +41,22 @@ def test_the_map_for_contributors_names_what_exists():
             continue
         assert (ROOT / path).exists(), f"there is no {path}"
         holder = importlib.import_module(_module(path)) if name else None
+        for part in name.split(".") if name else []:
+            assert hasattr(holder, part), f"{path} has no {name}"
+            holder = getattr(holder, part)
+
+
+@pytest.mark.parametrize("page", ["architecture.md", "conventions.md", "paper_to_code.md"])
+def test_pages_name_modules_and_what_they_hold(page):
+    """`folder/file.py:name`, relative to the package but for tests."""
+    found = re.findall(
+        r"`((?:\w+/)*\w+\.py)(?::([\w.]+))?`", (DOCS / page).read_text(encoding="utf-8")
+    )
+    assert len(found) > 10
+    for path, name in found:
+        package = "" if path.startswith("tests/") else "p2gs_jax/"
+        assert (ROOT / package / path).is_file(), f"there is no {path}"
+        holder = importlib.import_module(_module(package + path)) if name else None
         for part in name.split(".") if name else []:
             assert hasattr(holder, part), f"{path} has no {name}"
             holder = getattr(holder, part)

@@ -78,7 +78,7 @@ def test_a_broken_library_is_said_and_costs_the_exit_code(capsys, monkeypatch, t
 def test_an_old_library_is_said(monkeypatch):
     wanted = {"numpy": Requirement("numpy>=999").specifier}
     monkeypatch.setattr(libraries, "requirements", lambda: wanted)
-    (found,) = libraries.look()
+    (found,) = libraries.check_libraries()
     assert found.trouble == "too old: numpy>=999 is needed"
 
 
@@ -113,7 +113,7 @@ def test_a_renderer_that_raises_fails_the_self_test(monkeypatch):
 def test_features_say_what_to_install(monkeypatch):
     monkeypatch.setattr(features.importlib.util, "find_spec", lambda name: None)
     monkeypatch.setattr(features.shutil, "which", lambda name: None)
-    found = {f.name: f for f in features.look([library("jax")], "cpu")}
+    found = {f.name: f for f in features.list_features([library("jax")], "cpu")}
     assert found["fit, calibrate, render, eval"].ready
     assert not found["view"].ready
     assert "p2gs-jax[viewer]" in found["view"].remark
@@ -122,16 +122,19 @@ def test_features_say_what_to_install(monkeypatch):
 
 
 def test_pycolmap_is_only_for_photographs_without_poses():
-    found = {f.name: f for f in features.look([library("pycolmap", "no"), library("jax")], "cpu")}
+    found = {
+        f.name: f
+        for f in features.list_features([library("pycolmap", "no"), library("jax")], "cpu")
+    }
     assert found["fit, calibrate, render, eval"].ready
     assert not found["photographs without poses"].ready
 
 
 def test_a_gpu_that_jax_does_not_use(monkeypatch):
     monkeypatch.setattr(features.shutil, "which", lambda name: f"/usr/bin/{name}")
-    remark = {f.name: f.remark for f in features.look([], "cpu")}["NVIDIA GPU"]
+    remark = {f.name: f.remark for f in features.list_features([], "cpu")}["NVIDIA GPU"]
     assert "p2gs-jax[cuda]" in remark
-    assert {f.name: f.ready for f in features.look([], "gpu")}["NVIDIA GPU"]
+    assert {f.name: f.ready for f in features.list_features([], "gpu")}["NVIDIA GPU"]
 
 
 @pytest.fixture
@@ -181,8 +184,8 @@ def test_an_unwritable_cache_is_said(monkeypatch, tmp_path):
     monkeypatch.setattr(compile_cache, "use_compile_cache", lambda: None)
     monkeypatch.setattr(compile_cache, "cache_folder", lambda: tmp_path)
     (tmp_path / "program").write_bytes(b"x" * 2_000_000)
-    assert cache.look().remark.startswith("2 MB of at most")
+    assert cache.inspect_cache().remark.startswith("2 MB of at most")
     monkeypatch.setattr(cache.os, "access", lambda folder, mode: False)
-    assert "JAX_COMPILATION_CACHE_DIR" in cache.look().remark
+    assert "JAX_COMPILATION_CACHE_DIR" in cache.inspect_cache().remark
     monkeypatch.setattr(compile_cache, "cache_folder", lambda: None)
-    assert "nothing is kept" in cache.look().remark
+    assert "nothing is kept" in cache.inspect_cache().remark

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import LossConfig, PhotometryConfig
-from p2gs_jax.evaluate.seam_picture import halfway, halves, redeveloped
-from p2gs_jax.evaluate.seams import Photographed, measure, neighbours
+from p2gs_jax.evaluate.seam_picture import camera_between, redeveloped, seam_picture
+from p2gs_jax.evaluate.seams import Photographed, measure_seam, neighbouring_pairs
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.types import Camera, Render, Scene, Tracks, View
 
@@ -43,7 +43,7 @@ def photographed(x: float, exposure: float, gamma: float = 2.2, claimed: float |
 
 
 def test_a_stop_between_photographs_goes_when_they_are_developed_alike():
-    found = measure(photographed(0.0, 0.8), photographed(0.5, 1.6), COMMON, LossConfig())
+    found = measure_seam(photographed(0.0, 0.8), photographed(0.5, 1.6), COMMON, LossConfig())
     assert found is not None
     assert found.before_ev == pytest.approx(1.0, abs=0.02)
     assert found.after_ev < 0.02
@@ -55,14 +55,14 @@ def test_a_stop_between_photographs_goes_when_they_are_developed_alike():
 
 def test_a_wrong_exposure_leaves_its_error_as_the_seam():
     wrong = photographed(0.5, 1.6, claimed=1.6 * 2**0.25)
-    found = measure(photographed(0.0, 0.8), wrong, COMMON, LossConfig())
+    found = measure_seam(photographed(0.0, 0.8), wrong, COMMON, LossConfig())
     assert found is not None
     assert found.after_ev == pytest.approx(0.25, abs=0.02)
     assert found.step_ev == pytest.approx(0.25, abs=0.02)
 
 
 def test_a_gamma_of_its_own_is_undone():
-    found = measure(photographed(0.0, 1.0), photographed(0.5, 1.0, 2.8), COMMON, LossConfig())
+    found = measure_seam(photographed(0.0, 1.0), photographed(0.5, 1.0, 2.8), COMMON, LossConfig())
     assert found is not None
     assert found.before_ev > 0.1
     assert found.after_ev < 0.02
@@ -70,12 +70,12 @@ def test_a_gamma_of_its_own_is_undone():
 
 def test_saturated_masked_and_hidden_pixels_do_not_count():
     first, second = photographed(0.0, 1.0), photographed(0.0, 1.0)
-    full = measure(first, second, COMMON, LossConfig())
+    full = measure_seam(first, second, COMMON, LossConfig())
     assert full is not None
     assert full.pixels == SIZE * SIZE
     ldr, mask, depth = first.ldr.copy(), second.mask.copy(), second.depth.copy()
     ldr[:8], mask[16:24], depth[40:48] = 1.0, 0.0, 0.5
-    some = measure(
+    some = measure_seam(
         first._replace(ldr=ldr), second._replace(mask=mask, depth=depth), COMMON, LossConfig()
     )
     assert some is not None
@@ -83,7 +83,9 @@ def test_saturated_masked_and_hidden_pixels_do_not_count():
 
 
 def test_views_with_nothing_in_common_have_no_seam():
-    assert measure(photographed(0.0, 1.0), photographed(9.0, 1.0), COMMON, LossConfig()) is None
+    assert (
+        measure_seam(photographed(0.0, 1.0), photographed(9.0, 1.0), COMMON, LossConfig()) is None
+    )
 
 
 def test_a_photograph_developed_in_another_look():
@@ -109,9 +111,9 @@ def test_halves_lie_on_the_side_of_their_camera_and_match_when_developed_alike()
         )
 
     # The second photograph reaches farther left.
-    picture = halves(first, second, COMMON, render)
+    picture = seam_picture(first, second, COMMON, render)
     assert not picture.left_first
-    assert np.array_equal(halves(second, first, COMMON, render).before, picture.before)
+    assert np.array_equal(seam_picture(second, first, COMMON, render).before, picture.before)
     middle = radiance(0.0)
     edge = SIZE // 2
     inner = slice(8, -8)
@@ -135,7 +137,9 @@ def test_halfway_turns_and_moves_half_as_far():
     turned = np.eye(4, dtype=np.float32)
     turned[:3, :3] = [[c, 0, -s], [0, 1, 0], [s, 0, c]]
     turned[:3, 3] = -turned[:3, :3] @ [2, 0, 0]
-    between = halfway(camera(0.0), dataclasses.replace(camera(0.0), viewmat=jnp.asarray(turned)))
+    between = camera_between(
+        camera(0.0), dataclasses.replace(camera(0.0), viewmat=jnp.asarray(turned))
+    )
     viewmat = np.asarray(between.viewmat)
     np.testing.assert_allclose(-viewmat[:3, :3].T @ viewmat[:3, 3], [1, 0, 0], atol=1e-5)
     assert np.arctan2(viewmat[2, 0], viewmat[0, 0]) == pytest.approx(0.4, abs=1e-5)
@@ -160,20 +164,20 @@ def test_a_rig_pairs_cameras_at_the_same_time():
     near, far = np.arange(0, 100), np.arange(200, 300)
     names = ["a/0.png", "a/1.png", "b/0.png", "b/1.png", "c/0.png"]
     scene = scene_of(names, list("aabbc"), [near, near, near, near, far])
-    assert neighbours(scene, 9) == [(0, 2), (1, 3)]
-    assert neighbours(scene, 1) == [(0, 2)]
+    assert neighbouring_pairs(scene, 9) == [(0, 2), (1, 3)]
+    assert neighbouring_pairs(scene, 1) == [(0, 2)]
 
 
 def test_elsewhere_views_are_paired_with_those_they_share_most_with():
     seen = [np.arange(0, 100), np.arange(10, 110), np.arange(60, 160), np.arange(900, 910)]
     scene = scene_of(["0.png", "1.png", "2.png", "3.png"], ["x"] * 4, seen)
-    assert neighbours(scene, 9) == [(0, 1), (1, 2)]
+    assert neighbouring_pairs(scene, 9) == [(0, 1), (1, 2)]
     alike = scene_of(["0.png", "1.png", "2.png", "3.png"], ["x"] * 4, [np.arange(100)] * 4)
-    assert neighbours(alike, 9) == [(0, 1), (1, 2), (2, 3)]
+    assert neighbouring_pairs(alike, 9) == [(0, 1), (1, 2), (2, 3)]
     held_out = scene_of(
         ["0.png", "1.png", "2.png", "3.png"], ["x"] * 4, seen, ["train", "test", "train", "train"]
     )
-    assert neighbours(held_out, 9) == [(0, 2)]
+    assert neighbouring_pairs(held_out, 9) == [(0, 2)]
 
 
 def test_without_tracks_points_are_projected():
@@ -189,5 +193,5 @@ def test_without_tracks_points_are_projected():
     views = (view("0.png", 0.0), view("1.png", 3.65), view("2.png", 0.3))
     colors = np.zeros((400, 3), np.uint8)
     scene = Scene(None, "test", views, points.astype(np.float32), colors)
-    assert (0, 2) in neighbours(scene, 9)
-    assert (0, 1) not in neighbours(scene, 9)
+    assert (0, 2) in neighbouring_pairs(scene, 9)
+    assert (0, 1) not in neighbouring_pairs(scene, 9)

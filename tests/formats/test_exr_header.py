@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from p2gs_jax.formats.exr import read_exr, write_exr
-from p2gs_jax.scene.exif import Shot
+from p2gs_jax.scene.exif import ExifSettings
 from p2gs_jax.types import Camera
 
 WIDTH, HEIGHT = 90, 70
@@ -100,7 +100,7 @@ def test_the_screen_window_bounds_the_image_at_distance_1(tmp_path):
 
 
 def test_exif_goes_into_the_attributes_of_its_own(tmp_path):
-    shot = Shot(time=1 / 60, aperture=2.8, iso=None, taken="2010:10:12 14:43:07")
+    shot = ExifSettings(time=1 / 60, aperture=2.8, iso=None, taken="2010:10:12 14:43:07")
     header = written(tmp_path / "a.exr", shot=shot)
     assert header["expTime"] == pytest.approx(1 / 60)
     assert header["aperture"] == pytest.approx(2.8)
@@ -111,7 +111,9 @@ def test_exif_goes_into_the_attributes_of_its_own(tmp_path):
 
 def test_attributes_have_the_standard_types(tmp_path):
     path = tmp_path / "a.exr"
-    written(path, shot=Shot(0.1, 2.0, 100.0, "2010:10:12 14:43:07"), exposure=1.0, gamma=2.2)
+    written(
+        path, shot=ExifSettings(0.1, 2.0, 100.0, "2010:10:12 14:43:07"), exposure=1.0, gamma=2.2
+    )
     expected = {
         "chromaticities": "chromaticities",
         "adoptedNeutral": "v2f",

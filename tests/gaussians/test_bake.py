@@ -15,8 +15,8 @@ from p2gs_jax.gaussians.bake import (
     baking_error,
     display_of_splats,
     display_sh,
+    error_summary,
     refine,
-    summary,
     true_target,
     viewer_config,
 )
@@ -101,8 +101,8 @@ def test_refining_brings_viewers_closer_to_unseen_views_as_well(targets):
     plain = bake(haze(), SRGB, "exp", 1)
     refined = refine(plain, seen, CFG, steps=60)
     for views in (seen, unseen):
-        before = summary(baking_error(plain, views, CFG))
-        after = summary(baking_error(refined, views, CFG))
+        before = error_summary(baking_error(plain, views, CFG))
+        after = error_summary(baking_error(refined, views, CFG))
         assert after["psnr_worst"] > before["psnr_worst"] + 3
         assert after["mean_codes"] < before["mean_codes"]
     base = 0.5 + C0 * np.asarray(refined.sh[:, 0])
@@ -166,7 +166,7 @@ def test_a_viewer_is_measured_as_3dgs_renders(targets):
 
 def test_summary_names_the_worst_view(targets):
     errors = baking_error(bake(haze(), SRGB, "exp", 1), targets, CFG)
-    s = summary(errors)
+    s = error_summary(errors)
     assert s["worst_view"] == min(errors, key=lambda e: e.psnr).name
     assert s["views"] == len(s["per_view"]) == 5
-    assert summary([]) is None
+    assert error_summary([]) is None

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import DataConfig, DensifyConfig, FitConfig, InitConfig, preset
-from p2gs_jax.gaussians.init.brightness import Frames, Tones, alike, rough_tones
+from p2gs_jax.gaussians.init.brightness import MatchImages, Tones, at_common_exposure, rough_tones
 from p2gs_jax.gaussians.init.dense import MATCH_SIDE, dense_seeds
 from p2gs_jax.gaussians.init.dense_bound import coverage_of, dense_limit, wants_dense
 from p2gs_jax.gaussians.init.flow import CHECKS, Flows, depth_map
@@ -82,8 +82,8 @@ class World:
     def depth(self, row=0):
         cfg = FitConfig().loss
         side, tones = MATCH_SIDE, self.tones
-        frames = Frames(self.scene, self.store, tones, side, cfg.black, cfg.saturation)
-        flows = Flows(frames, self.scene.points, visibility(self.scene, 0))
+        images = MatchImages(self.scene, self.store, tones, side, cfg.black, cfg.saturation)
+        flows = Flows(images, self.scene.points, visibility(self.scene, 0))
         found = depth_map(flows, row, [k for k in range(len(CENTERS)) if k != row])
         return found, np.abs(1 / np.maximum(found.inverse, 1e-9) / self.depths[row] - 1)
 
@@ -223,8 +223,8 @@ def test_pairs_see_the_same_from_different_places(plane):
 
 def test_photographs_are_alike_under_one_exposure(tmp_path):
     world = World(tmp_path, exposures=[1.0, 1.0, 4.0, 1.0, 1.0], change=lambda k, image: image)
-    frames = Frames(world.scene, world.store, world.tones, MATCH_SIDE, 0.02, 0.98)
-    first, second = alike(frames[0], frames[2])
+    images = MatchImages(world.scene, world.store, world.tones, MATCH_SIDE, 0.02, 0.98)
+    first, second = at_common_exposure(images[0], images[2])
     assert abs(float(first.mean()) - float(second.mean())) < 6
     assert first.std() > 20
 

@@ -35,7 +35,7 @@ def test_a_circle_around_what_all_cameras_look_at():
     np.testing.assert_allclose(radius, 5)
     steps = (np.diff(azimuth) + 180) % 360 - 180
     np.testing.assert_allclose(np.abs(steps), 10)
-    assert "full circle" in circle.describe().lower()
+    assert "full circle" in circle.description().lower()
 
 
 def test_every_camera_looks_at_the_focus_upright():
@@ -57,7 +57,7 @@ def test_cameras_on_one_side_give_an_arc_over_what_they_cover():
     azimuth = azimuth % 360
     assert azimuth.min() == pytest.approx(150)
     assert azimuth.max() == pytest.approx(250)
-    assert "50 degrees" in circle.describe()
+    assert "50 degrees" in circle.description()
 
 
 def test_axes_that_miss_each_other_a_little_still_meet():
@@ -82,7 +82,7 @@ def test_a_vehicle_sways_about_its_middle_view(yaws):
     aside = [inverse(s.viewmat)[0, 3] for s in shots]
     assert max(aside) == pytest.approx(20 * np.sin(np.deg2rad(10)), rel=1e-6)
     assert min(aside) == pytest.approx(-max(aside))
-    assert "no common point" in circle.describe()
+    assert "no common point" in circle.description()
 
 
 def test_a_vehicle_without_points_still_orbits():

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from p2gs_jax.report.charts import RECOVERED, TRUE, Panel, Series, panels_chart
+from p2gs_jax.report.charts import RECOVERED, TRUE, ChartPanel, Series, panels_chart
 from p2gs_jax.report.pictures import (
     GAIN,
     dynamic_range,
@@ -19,8 +19,8 @@ from p2gs_jax.report.pictures import (
     stop_shares,
 )
 from p2gs_jax.report.run_charts import Training, training_chart
-from p2gs_jax.report.strips import spread
 from p2gs_jax.report.svg import VARIABLES, spread_apart
+from p2gs_jax.report.view_comparisons import spread
 
 
 def grey(values):
@@ -93,7 +93,7 @@ def chart_of(error=None, second=None):
     series = [Series("found", x, np.sin(x), RECOVERED, error)]
     if second is not None:
         series.append(Series("true", x, second, TRUE))
-    return panels_chart([Panel("a", tuple(series))], y_label="y", x_label="x", label="l")
+    return panels_chart([ChartPanel("a", tuple(series))], y_label="y", x_label="x", label="l")
 
 
 def test_error_bars_are_drawn():

@@ -12,11 +12,11 @@ import pytest
 from page_tools import copy_run, edit, look_at
 
 from p2gs_jax.cli import main
-from p2gs_jax.evaluate.seam_picture import Halves
+from p2gs_jax.evaluate.seam_picture import SeamPicture
 from p2gs_jax.evaluate.seams import Seam
-from p2gs_jax.report.from_scene import FromScene, SeamPair
 from p2gs_jax.report.report import report_page, write_report
 from p2gs_jax.report.run_files import read_run
+from p2gs_jax.report.scene_measurements import SceneMeasurements, SeamPair
 
 HEADINGS = [
     *("What to watch", "What was modelled, and why", "Exposures", "Gamma", "Tone curve"),
@@ -58,12 +58,12 @@ def full_scene(files):
         SeamPair(a, b, Seam(1.25, 0.07, 40.0, 2.5, 0.01, 900)) for a, b in itertools.pairwise(names)
     )
     dark, light = np.full((40, 60, 3), 0.25, np.float32), np.full((40, 60, 3), 0.75, np.float32)
-    return FromScene(
+    return SceneMeasurements(
         true_exposures={v["image"]: 1.0 + i / 4 for i, v in enumerate(files.views)},
         seams=pairs,
         tried_pairs=len(pairs),
         shown=pairs[0],
-        picture=Halves(dark, light, left_first=False),
+        picture=SeamPicture(dark, light, left_first=False),
         clipped={names[0]: 0.5},
     )
 
@@ -245,7 +245,7 @@ def test_truth_exif_and_errors_are_drawn(run):
     for i, view in enumerate(files.train):
         view["exif_ev"] = (view["exposure_ev"] or 0) - 7 + (0.5 if i == 0 else 0)
     truth = {v["image"]: 3 * v["exposure"] for v in files.train}
-    text = words_of(report_page(files, FromScene(true_exposures=truth)))
+    text = words_of(report_page(files, SceneMeasurements(true_exposures=truth)))
     assert "RMS error 0.000 stops" in text
     assert "Crosses, dotted: EXIF" in text
     for label in ("found", "held out", "EXIF", "true"):
@@ -258,7 +258,9 @@ def test_error_bars_are_those_of_the_views(run):
         files = read_run(run)
         for view in files.train:
             view["exposure_ev_error"] = error
-        section = re.search(r'id="exposures".*?</section>', report_page(files, FromScene()), re.S)
+        section = re.search(
+            r'id="exposures".*?</section>', report_page(files, SceneMeasurements()), re.S
+        )
         return section[0].count("<use"), words_of(section[0])
 
     with_errors, said = marks(0.04)
@@ -279,7 +281,7 @@ def test_changes_of_resolution_and_freezing_are_marked(run):
         }
         for i in range(1, 101)
     ]
-    said = words_of(report_page(files, FromScene()))
+    said = words_of(report_page(files, SceneMeasurements()))
     for mark in ("images at 1/2 from step 250", "full-size images from step 500"):
         assert mark in said
     assert "exposures move from step 600" in said
@@ -289,19 +291,19 @@ def test_automatic_growth_is_told(run):
     files = read_run(run)
     look = {"gaussians": 500, "psnr": 21.5, "before": 400, "without": 21.25, "progress": 0.2}
     files.metrics["growth"] = {"looks": [{**look, "gain": 0.25, "kept": True}]}
-    assert "400 → 500 21.25 21.50 0.25 kept" in words_of(report_page(files, FromScene()))
+    assert "400 → 500 21.25 21.50 0.25 kept" in words_of(report_page(files, SceneMeasurements()))
 
 
 def test_two_cameras_get_a_panel_each_and_many_share_one(run):
     files = read_run(run)
     for i, view in enumerate(files.views):
         view["camera"] = "left" if i < 3 else "right"
-    text = words_of(report_page(files, FromScene()))
+    text = words_of(report_page(files, SceneMeasurements()))
     assert "camera left" in text
     assert "camera right" in text
     for i, view in enumerate(files.views):
         view["camera"] = str(i)
-    text = words_of(report_page(files, FromScene()))
+    text = words_of(report_page(files, SceneMeasurements()))
     assert "all photographs" in text
     assert "camera 0" not in text
 
@@ -311,14 +313,14 @@ def test_gammas_are_drawn_where_they_are_modelled(run):
     files.photometry["model"] = "view_exposure_gamma"
     for i, view in enumerate(files.train):
         view.update(gamma=2.0 + 0.1 * i, gamma_error=0.02)
-    text = words_of(report_page(files, FromScene()))
+    text = words_of(report_page(files, SceneMeasurements()))
     assert "Gamma turns the tone curve about mid-grey" in text
     assert "γ 2.00" in text
     assert "γ 2.30" in text
     files.photometry["model"] = "view_exposure"
     for view in files.train:
         view.update(gamma=2.2)
-    assert "Gamma was not modelled" in words_of(report_page(files, FromScene()))
+    assert "Gamma was not modelled" in words_of(report_page(files, SceneMeasurements()))
 
 
 @pytest.mark.parametrize("name", ["page.pdf", "page", "folder.html", "file/page.html"])

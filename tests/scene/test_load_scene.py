@@ -12,7 +12,7 @@ from scene.helpers import write_tiny_model
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene import ImageStore, load_scene
-from p2gs_jax.scene.exif import Shot, read_exif_ev, read_shot
+from p2gs_jax.scene.exif import ExifSettings, read_exif_ev, read_exif_settings
 from p2gs_jax.scene.split import assign_split
 from p2gs_jax.types import View
 
@@ -106,11 +106,16 @@ def test_exif_rules(tmp_path):
 def test_how_a_photograph_was_taken(tmp_path):
     path = tmp_path / "a.jpg"
     taken = {36867: "2010:10:12 14:43:07"}
-    shot = read_shot(_jpeg_with_exif(path, {33434: 0.01, 33437: 2.0, 34855: 400, **taken}))
-    assert shot == Shot(pytest.approx(0.01), 2.0, 400.0, "2010:10:12 14:43:07")
-    assert read_shot(_jpeg_with_exif(path, {36867: "    :  :     :  :  "})) == Shot()
-    assert read_shot(_jpeg_with_exif(path, {34855: 65535, 36867: "yesterday"})) == Shot()
-    assert read_shot(tmp_path / "absent.jpg") == Shot()
+    shot = read_exif_settings(_jpeg_with_exif(path, {33434: 0.01, 33437: 2.0, 34855: 400, **taken}))
+    assert shot == ExifSettings(pytest.approx(0.01), 2.0, 400.0, "2010:10:12 14:43:07")
+    assert (
+        read_exif_settings(_jpeg_with_exif(path, {36867: "    :  :     :  :  "})) == ExifSettings()
+    )
+    assert (
+        read_exif_settings(_jpeg_with_exif(path, {34855: 65535, 36867: "yesterday"}))
+        == ExifSettings()
+    )
+    assert read_exif_settings(tmp_path / "absent.jpg") == ExifSettings()
 
 
 def _view(name, camera):

@@ -12,12 +12,12 @@ from p2gs_jax.formats.false_color import luminance
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.render import view_radiance
 from p2gs_jax.types import Camera, Gaussians, Scene, View
-from p2gs_jax.viewer.frames import center
+from p2gs_jax.viewer.browser_camera import camera_center
 from p2gs_jax.viewer.legend import exposure_colors, stops_legend
+from p2gs_jax.viewer.picture_modes import RenderedFrame
 from p2gs_jax.viewer.playback import frames_of, pose_between
 from p2gs_jax.viewer.save import exr_bytes, png_bytes, saved_size
 from p2gs_jax.viewer.settings import Settings
-from p2gs_jax.viewer.shade import Frame
 from p2gs_jax.viewer.splats import LARGEST_DEVIATION, browser_splats, splat_colors
 
 
@@ -145,7 +145,7 @@ def test_saved_files_hold_what_is_shown():
     alpha, depth = np.full((6, 8), 0.5, np.float32), np.full((6, 8), 2.0, np.float32)
     camera = Camera(jnp.asarray(viewmat([0, 0.1, 0], [1, 2, 3])), jnp.eye(3), 8, 6)
     transform = DisplayTransform(4.0, 2.4, PhotometryConfig())
-    path_bytes = exr_bytes(Frame(jnp.asarray(linear), alpha, depth, camera), transform)
+    path_bytes = exr_bytes(RenderedFrame(jnp.asarray(linear), alpha, depth, camera), transform)
     assert path_bytes[:4] == b"\x76\x2f\x31\x01"
     png = cv2.imdecode(np.frombuffer(png_bytes(linear / 9), np.uint8), cv2.IMREAD_COLOR)
     np.testing.assert_array_equal(png[..., ::-1], np.rint(linear / 9 * 255))
@@ -158,10 +158,10 @@ def test_a_saved_exr_can_be_read_back(tmp_path):
     camera = Camera(jnp.asarray(viewmat([0, 0.1, 0], [1, 2, 3])), jnp.eye(3), 8, 6)
     transform = DisplayTransform(4.0, 2.4, PhotometryConfig())
     (tmp_path / "a.exr").write_bytes(
-        exr_bytes(Frame(jnp.asarray(linear), alpha, depth, camera), transform)
+        exr_bytes(RenderedFrame(jnp.asarray(linear), alpha, depth, camera), transform)
     )
     back, header = read_exr(tmp_path / "a.exr")
     np.testing.assert_allclose(back, linear, rtol=1e-3)
     assert header["p2gsExposureEV"] == pytest.approx(2.0)
-    at = center(np.asarray(header["p2gsViewmat"]).reshape(4, 4))
+    at = camera_center(np.asarray(header["p2gsViewmat"]).reshape(4, 4))
     np.testing.assert_allclose(at, [1, 2, 3], atol=1e-5)

@@ -65,7 +65,7 @@ def test_renders_what_the_renderer_renders(made):
     scene = gaussians()
     programs, changed = made(scene)
     assert programs.render(camera(SIZE)) is None
-    programs.want([SIZE])
+    programs.request([SIZE])
     wait_for(programs, changed, SIZE)
     expected = make_renderer(CFG)(scene, jnp.ones(scene.capacity, bool), camera(SIZE, 0.3))
     shown = programs.render(camera(SIZE, 0.3))
@@ -77,7 +77,7 @@ def test_renders_what_the_renderer_renders(made):
 def test_a_view_that_overflows_comes_as_soon_as_there_is_room(made):
     scene = gaussians(scale=-0.5)
     programs, changed = made(scene, z=-100.0)  # probes look away, so lists are short
-    programs.want([LARGE])
+    programs.request([LARGE])
     wait_for(programs, changed, LARGE)
     before = programs.compiled
     assert programs.render(camera(LARGE)) is None

@@ -11,7 +11,7 @@ from p2gs_jax.run.read import load_run
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 
 from p2gs_jax.viewer import session as sessions
-from p2gs_jax.viewer.session import Session
+from p2gs_jax.viewer.session import BrowserSession
 from p2gs_jax.viewer.settings import Settings, common_settings, same_display, settings_of_view
 
 
@@ -42,14 +42,14 @@ def run(finished_run):
 @pytest.fixture
 def session(run, monkeypatch):
     """Return a session at the photograph in row 1, with +1 EV of the person's own."""
-    monkeypatch.setattr(sessions, "seen_by", lambda client: SimpleNamespace(aspect=1.5))
-    out = object.__new__(Session)
+    monkeypatch.setattr(sessions, "browser_view", lambda client: SimpleNamespace(aspect=1.5))
+    out = object.__new__(BrowserSession)
     pose = SimpleNamespace(fov=1.0)
     out._run, out._client = run, None
-    room = SimpleNamespace(view_at=lambda camera: 1, nearest_view=lambda camera: 1)
-    out._studio = SimpleNamespace(pose=lambda index, aspect: pose, darkroom=lambda: room)
-    out._screen = SimpleNamespace(
-        moved=lambda: None, retouched=lambda: None, camera=lambda seen, size: None
+    cache = SimpleNamespace(view_at=lambda camera: 1, nearest_view=lambda camera: 1)
+    out._viewed = SimpleNamespace(pose=lambda index, aspect: pose, new_frame_cache=lambda: cache)
+    out._render_loop = SimpleNamespace(
+        camera_moved=lambda: None, display_changed=lambda: None, camera=lambda seen, size: None
     )
     out._player = SimpleNamespace(stop=lambda: None)
     out._move = lambda pose: None

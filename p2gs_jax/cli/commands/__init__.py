@@ -1,1 +1,1 @@
-"""What each subcommand does, one file each: `run(options)` returns the exit code."""
+"""The subcommands, one module each: `run(options)` returns the exit code."""

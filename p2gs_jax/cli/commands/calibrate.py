@@ -79,7 +79,7 @@ def _run_static(folder: Path, out: Path, cfg: FitConfig, compare_with: str | Non
 
 
 def _print_table(result: CalibrationResult, more: dict[str, list[str]]) -> None:
-    """Print exposures with their standard errors, and what to make of them.
+    """Print exposures with their standard errors, and the notes.
 
     Args:
         result: of any source.
@@ -97,7 +97,7 @@ def _print_table(result: CalibrationResult, more: dict[str, list[str]]) -> None:
 
 
 def _exposure_columns(result: CalibrationResult) -> dict[str, list[str]]:
-    """Return columns by title, without those that would say nothing."""
+    """Return columns by title, without those that are empty or constant."""
     s, views = result.solution, result.views
     errors, stated, gaps = s.exposure_errors / LN2, result.stated_ev, result.agreement.gap_ev
     known, given, wrong = np.isfinite(errors), np.isfinite(stated), result.agreement.disagrees

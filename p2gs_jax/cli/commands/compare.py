@@ -7,7 +7,7 @@ from rich.text import Text
 
 from p2gs_jax.cli.commands.console import stdout
 from p2gs_jax.cli.options.pages import Compare
-from p2gs_jax.report.compare import Row, apart, compare_runs
+from p2gs_jax.report.compare import TableRow, apart, compare_runs
 from p2gs_jax.report.compare_page import write_comparison
 
 
@@ -33,7 +33,7 @@ def run(options: Compare) -> int:
     return 0
 
 
-def _table(title: str, labels: tuple[str, ...], rows: tuple[Row, ...]) -> Table:
+def _table(title: str, labels: tuple[str, ...], rows: tuple[TableRow, ...]) -> Table:
     table = Table(title=title, title_justify="left")
     table.add_column("")
     for label in labels:

@@ -1,4 +1,4 @@
-"""`p2gs-jax doctor`: plain text, since the libraries that draw tables may be what is broken."""
+"""`p2gs-jax doctor`: plain text, as the libraries for tables may be the broken ones."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ if TYPE_CHECKING:  # options need tyro, which may be what is broken
 
 
 def run(options: Doctor) -> int:
-    """Say what works here; 1 where something that everything needs is broken."""
+    """Print what works here; 1 where something that everything needs is broken."""
     return diagnose(as_json=options.json, self_test=not options.skip_self_test)
 
 
 def diagnose(*, as_json: bool, self_test: bool = True) -> int:
-    """Look at everything and print it; never raises.
+    """Examine this machine and print the result; never raises.
 
     Args:
         as_json: print JSON instead of text.
@@ -37,19 +37,19 @@ def diagnose(*, as_json: bool, self_test: bool = True) -> int:
 
 
 def examine(*, self_test: bool = True) -> dict:
-    """Return everything that was found, as plain values.
+    """Return the state of this machine, as plain values.
 
     Args:
         self_test: render three Gaussians as well.
     """
-    tried = libraries.look()
-    devices = render.look()
-    kept = cache.look()
+    tried = libraries.check_libraries()
+    devices = render.inspect_devices()
+    kept = cache.inspect_cache()
     test = render.self_test() if self_test else render.SelfTest(None, "skipped")
     return {
         "p2gs_jax": libraries.installed("p2gs-jax"),
         "python": platform.python_version(),
-        "machine": dataclasses.asdict(machine.look(Path.cwd())),
+        "machine": dataclasses.asdict(machine.inspect_machine(Path.cwd())),
         "devices": dataclasses.asdict(devices),
         "compile_cache": dataclasses.asdict(kept),
         "self_test": dataclasses.asdict(test),
@@ -59,7 +59,7 @@ def examine(*, self_test: bool = True) -> dict:
             for name in features.OPTIONAL
             if name not in {x.name for x in tried}
         },
-        "features": [dataclasses.asdict(f) for f in features.look(tried, devices.backend)],
+        "features": [dataclasses.asdict(f) for f in features.list_features(tried, devices.backend)],
         "healthy": test.ok is not False
         and devices.trouble is None
         and not any(x.trouble for x in tried),

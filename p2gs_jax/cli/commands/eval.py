@@ -20,7 +20,7 @@ from p2gs_jax.run.read import load_run
 
 
 def run(options: Eval) -> int:
-    """Judge a run again and rewrite its metrics; options replace what the run was judged by."""
+    """Evaluate a run again and rewrite its metrics; options replace those of the run."""
     fitted = load_run(options.run, options.scene)
     fitted.require_photographs()
     lpips_weights = options.lpips_weights or fitted.cfg.evaluation.lpips_weights
@@ -52,7 +52,7 @@ def run(options: Eval) -> int:
 
 
 def _kept_metrics(path: Path) -> dict:
-    """Return what only the fit itself knows: counts, times, notes."""
+    """Return the metrics that only a fit can measure: counts, times, notes."""
     try:
         old = json.loads(path.read_text())
     except (OSError, ValueError):

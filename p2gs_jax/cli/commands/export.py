@@ -12,6 +12,7 @@ import numpy as np
 from p2gs_jax.cli.commands.console import stdout
 from p2gs_jax.cli.options.export import DISPLAY, Export, Format, check_export
 from p2gs_jax.core.atomic import atomic_folder, write_array, write_json
+from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.core.progress import Reporter, TerminalReporter
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.colmap_folder import write_colmap_folder
@@ -26,8 +27,8 @@ from p2gs_jax.gaussians.bake import (
     baking_error,
     display_comments,
     display_of_splats,
+    error_summary,
     refine,
-    summary,
     true_target,
 )
 from p2gs_jax.photometry.display import DisplayTransform
@@ -35,7 +36,7 @@ from p2gs_jax.render.host import make_renderer
 from p2gs_jax.render.spherical_harmonics import MAX_DEGREE
 from p2gs_jax.run.read import Run, load_run
 from p2gs_jax.scene.device import camera_of
-from p2gs_jax.scene.exif import read_shot
+from p2gs_jax.scene.exif import read_exif_settings
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Gaussians
 
@@ -53,7 +54,7 @@ PLACES: dict[Format, tuple[str, ...]] = {
 
 
 def run(options: Export) -> int:
-    """Write every format that was asked for."""
+    """Write every requested format."""
     check_export(options)
     formats = tuple(dict.fromkeys(options.format))
     if "spz" in formats:
@@ -170,7 +171,7 @@ def _exr(folder: Path, fitted: Run, store: ImageStore, reporter: Reporter) -> st
                 exposure=transform.exposure,
                 gamma=transform.gamma,
                 camera=camera,
-                shot=read_shot(view.image_path),
+                shot=read_exif_settings(view.image_path),
             )
             reporter.stage("Rendering", index + 1, len(views))
     return f"{len(views)} linear renders"
@@ -178,7 +179,7 @@ def _exr(folder: Path, fitted: Run, store: ImageStore, reporter: Reporter) -> st
 
 @dataclass(frozen=True)
 class _Writer:
-    """How a format with display colours is written and read back."""
+    """Writer and reader of a format with display colours."""
 
     write: Callable[[Path, Gaussians], int]
     read: Callable[[Path], Gaussians]
@@ -192,7 +193,7 @@ WRITERS = {
 
 
 class _Display:
-    """Display colours at one display transform, baked once for each degree, and measured."""
+    """Display colours under one display transform, baked once per degree, with their error."""
 
     def __init__(
         self,
@@ -221,7 +222,7 @@ class _Display:
             reporter.stage("Rendering true pictures", done + 1, len(rows))
 
     def write(self, name: Format, folder: Path) -> str:
-        """Write one format and its JSON; return what to say about it."""
+        """Write one format and its JSON; return sentences about it."""
         path, sidecar = (folder / place for place in PLACES[name])
         begin = time.monotonic()
         if name == "display-ply":
@@ -276,19 +277,20 @@ class _Display:
         scene, render = self.fitted.scene, self.fitted.cfg.render
         splits = {"train": scene.train_indices, "test": scene.test_indices}
         return {
-            split: summary(baking_error(shown, [self.targets[i] for i in _spread(rows)], render))
+            split: error_summary(
+                baking_error(shown, [self.targets[i] for i in _spread(rows)], render)
+            )
             for split, rows in splits.items()
         }
 
 
 def _spread(rows: Sequence[int]) -> list[int]:
     """Return at most MEASURED of the rows, evenly spread."""
-    picks = np.linspace(0, len(rows) - 1, min(len(rows), MEASURED)).round().astype(int)
-    return [rows[i] for i in picks]
+    return [rows[i] for i in evenly_spaced(len(rows), MEASURED)]
 
 
 def _sentences(error: dict) -> list[str]:
-    """Say how far a viewer's pictures are from the true ones."""
+    """Return sentences on the baking error."""
     said = []
     for split, name in (("train", "training"), ("test", "held-out")):
         s = error[split]

@@ -11,7 +11,7 @@ from p2gs_jax.pipeline.fit import fit
 
 
 def run(options: Fit) -> int:
-    """Fit a scene; print where the results are and how good they are."""
+    """Fit a scene; print the place and the scores of the results."""
     o = options
     with TerminalReporter() as reporter:
         result = fit(

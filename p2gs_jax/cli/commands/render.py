@@ -16,7 +16,7 @@ from p2gs_jax.cli.options.render import PATHS, Render
 from p2gs_jax.core.clock import CompileCounter
 from p2gs_jax.core.progress import TerminalReporter
 from p2gs_jax.errors import UserError
-from p2gs_jax.formats.frames import Frame, open_frames
+from p2gs_jax.formats.frames import OutputFrame, open_frames
 from p2gs_jax.paths import (
     PosePath,
     Shot,
@@ -33,7 +33,7 @@ from p2gs_jax.paths import (
 from p2gs_jax.paths.drive import frame_count
 from p2gs_jax.paths.files import LARGEST, MOST_STOPS
 from p2gs_jax.paths.pictures import (
-    Studio,
+    RunRenderer,
     comparison_frames,
     comparison_size,
     shot_frames,
@@ -49,17 +49,17 @@ OTHER_FILES = (".mov", ".avi", ".mkv", ".webm", ".gif", ".png", ".jpg", ".exr", 
 
 @dataclass(frozen=True)
 class Job:
-    """What is to be rendered.
+    """Frames to render.
 
     Attributes:
-        frames: made when they are asked for.
+        frames: rendered one by one as the iterator advances.
         count: of frames.
         size: (width, height) of the largest, pixels.
         shots: cameras that can be kept as a file; none for panoramas.
         notes: what the user should know.
     """
 
-    frames: Iterator[Frame]
+    frames: Iterator[OutputFrame]
     count: int
     size: tuple[int, int]
     shots: Sequence[Shot] = ()
@@ -80,12 +80,12 @@ def run(options: Render) -> int:
             f"--curve spline: {options.run} has none; its curve is {fitted.cfg.photometry.curve}.",
             fix="choose run, srgb, power or linear",
         )
-    studio = Studio(fitted)
+    renderer = RunRenderer(fitted)
     with TerminalReporter() as reporter:
         job = (
-            _panoramas(options, studio)
+            _panoramas(options, renderer)
             if options.panorama
-            else _shots(options, studio, given, reporter.message)
+            else _shots(options, renderer, given, reporter.message)
         )
         reading = time.monotonic() - begin
         for note in job.notes:
@@ -102,14 +102,14 @@ def run(options: Render) -> int:
     console.print(f"{job.count} {what}: {out}", soft_wrap=True)
     console.print(_spent(time.monotonic() - begin, reading, compiler.seconds))
     console.print(
-        f"A frame takes {_median_ms(studio.render_seconds)} to render and "
-        f"{_median_ms(studio.develop_seconds)} to expose and encode, whatever exposure and gamma."
+        f"A frame takes {_median_ms(renderer.render_seconds)} to render and "
+        f"{_median_ms(renderer.develop_seconds)} to expose and encode, whatever exposure and gamma."
     )
     return 0
 
 
 def _spent(total: float, reading: float, compiling: float) -> str:
-    """Return in words where the seconds of a command went."""
+    """Return a sentence on the seconds of a command, part by part."""
     frames = max(total - reading - compiling, 0.0)
     kept = " (kept: the next time is faster)" if compiling >= 1.0 else ""
     return (
@@ -119,7 +119,7 @@ def _spent(total: float, reading: float, compiling: float) -> str:
 
 
 def _check_place(out: Path, overwrite: bool) -> None:
-    """Refuse to write over what is there, unless that was asked for."""
+    """Refuse to overwrite files, unless asked to."""
     there = out.is_file() or (out.is_dir() and any(out.iterdir()))
     if there and not overwrite:
         what = f"{out} exists already" if out.is_file() else f"{out} holds files already"
@@ -129,7 +129,7 @@ def _check_place(out: Path, overwrite: bool) -> None:
 
 
 def _median_ms(seconds: list[float]) -> str:
-    """Return the median; the first waited for the compiler and counts only where it is alone."""
+    """Return the median; the first time includes compiling and counts only if it is alone."""
     return f"{1e3 * float(np.median(seconds[1:] or seconds)):.1f} ms"
 
 
@@ -145,7 +145,7 @@ def _default_name(options: Render) -> str:
 
 
 def _check(options: Render) -> None:
-    """Complain about options that make no sense, alone or together, before anything is read."""
+    """Reject options that make no sense, alone or together, before anything is read."""
     path, ev, out = options.path, options.exposure_ev, options.out
     if path not in PATHS and not path.lower().endswith(".json"):
         raise UserError(
@@ -191,7 +191,7 @@ def _check(options: Render) -> None:
 
 
 def _display_transform(fitted: Run, options: Render, shot: Shot | None = None) -> DisplayTransform:
-    """Return how a shot is developed: as the options say, else as it says, else as it was taken."""
+    """Return a shot's display transform: from the options, else its own, else its photograph's."""
     if shot is not None and shot.view is not None:
         transform = fitted.own_display(shot.view)
     else:
@@ -223,10 +223,10 @@ def _chosen(options: Render, fitted: Run) -> list[Shot]:
 
 
 def _shots(
-    options: Render, studio: Studio, given: list[Shot] | None, say: Callable[[str], None]
+    options: Render, renderer: RunRenderer, given: list[Shot] | None, say: Callable[[str], None]
 ) -> Job:
     """Return the job of rendering pinhole cameras."""
-    fitted, notes, photograph = studio.run, [], None
+    fitted, notes, photograph = renderer.run, [], None
     if given is not None:
         shots = given
     else:
@@ -242,18 +242,18 @@ def _shots(
             else:
                 circle = find_orbit(chosen, own, np.asarray(fitted.scene.points, np.float64))
                 shots = orbit(circle, own, options.frames)
-                notes = [circle.describe()]
+                notes = [circle.description()]
     if options.width is not None:
         shots = [shot.resized(options.width) for shot in shots]
     size = (max(s.width for s in shots), max(s.height for s in shots))
     frames = shot_frames(
-        studio, shots, lambda shot: _display_transform(fitted, options, shot), photograph
+        renderer, shots, lambda shot: _display_transform(fitted, options, shot), photograph
     )
     return Job(frames, len(shots), size, shots, notes)
 
 
 class _Photographs:
-    """Photographs that go beside their renders, as far as they are there."""
+    """Photographs to write beside their renders, where they exist."""
 
     def __init__(self, fitted: Run, say: Callable[[str], None]):
         self._fitted, self._say, self._silent = fitted, say, False
@@ -280,9 +280,9 @@ def _recorded(shots: list[Shot], options: Render, fitted: Run) -> list[Shot]:
     ]
 
 
-def _panoramas(options: Render, studio: Studio) -> Job:
-    """Return the job of rendering what all cameras of a rig see."""
-    fitted = studio.run
+def _panoramas(options: Render, renderer: RunRenderer) -> Job:
+    """Return the job of rendering panoramas of a rig."""
+    fitted = renderer.run
     views = fitted.scene.views
     rig = find_rig(view_shots(views, fitted.cfg.data.max_width), views)
     cylinder = covering(rig.mounts.values(), np.eye(4))
@@ -297,7 +297,7 @@ def _panoramas(options: Render, studio: Studio) -> Job:
         path = PosePath(rig.poses)
         poses = path(path.evenly(frame_count(len(rig.steps), options.frames)))
         size = (cylinder.width, cylinder.height)
-        return Job(wide_frames(studio, cylinder, poses, transform), len(poses), size)
+        return Job(wide_frames(renderer, cylinder, poses, transform), len(poses), size)
     allowed = {shot.view for shot in _chosen(options, fitted)}
     steps = []
     for step in rig.steps:
@@ -314,5 +314,5 @@ def _panoramas(options: Render, studio: Studio) -> Job:
         notes.append("Corrections of display values that this run learned stay in the photographs.")
     taken = [shot.view for step in steps for shot in step.shots.values() if shot.view is not None]
     fitted.require_photographs(taken)
-    frames = comparison_frames(studio, rig, steps, cylinder, transform, fitted.store)
+    frames = comparison_frames(renderer, rig, steps, cylinder, transform, fitted.store)
     return Job(frames, len(steps), comparison_size(cylinder), (), notes)

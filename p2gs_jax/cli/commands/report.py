@@ -14,7 +14,7 @@ from p2gs_jax.report.run_files import read_run
 
 def run(options: Report) -> int:
     """Write the page of a run, and print it where that is asked for; 1 where a file is broken."""
-    # Looked for first: a missing browser should not cost the page's rendering.
+    # Before anything is rendered: there may be no browser.
     browser = find_browser() if options.pdf else None
     with TerminalReporter() as reporter:
         page = write_report(

@@ -1,1 +1,1 @@
-"""What each subcommand can be asked, without what answers it: `--help` must come at once."""
+"""Options of the subcommands, without heavy imports: `--help` must be fast."""

@@ -51,7 +51,7 @@ class Export:
 
 
 def check_export(args: Export) -> None:
-    """Complain about values that make no sense.
+    """Reject values that make no sense.
 
     Raises:
         UserError: one does not.

@@ -1,4 +1,4 @@
-"""Values of options that are words rather than numbers."""
+"""Parsers of option values that are words rather than numbers."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def parse_duration(text: str) -> float:
 
 
 def parse_gaussians(text: str) -> int | Literal["auto"]:
-    """Return what `--gaussians` says: a whole number from 1 on, or `auto`.
+    """Return the value of `--gaussians`: a whole number from 1 on, or `auto`.
 
     Raises:
         UserError: it is neither.
@@ -41,7 +41,7 @@ def parse_gaussians(text: str) -> int | Literal["auto"]:
 
 
 def check(condition: bool, text: str, *, fix: str | None = None) -> None:
-    """Complain unless the condition holds.
+    """Raise an error unless the condition holds.
 
     Raises:
         UserError: it does not.

@@ -1,4 +1,4 @@
-"""`eval`: what can be asked of a finished run besides pictures."""
+"""`eval`: scores of a finished run."""
 
 from __future__ import annotations
 

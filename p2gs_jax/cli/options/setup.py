@@ -1,4 +1,4 @@
-"""`doctor` and `completion`: what a machine has, and what a shell can do."""
+"""`doctor` and `completion`: checks of the machine, and set-up of the shell."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`view`: what can be asked of the viewer."""
+"""`view`: the viewer of a finished run."""
 
 from __future__ import annotations
 

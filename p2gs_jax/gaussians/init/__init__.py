@@ -1,1 +1,1 @@
-"""Gaussians before the first step: points, dense seeds, a far shell."""
+"""Initial Gaussians: from points, from dense depth, and a far shell."""

@@ -1,4 +1,4 @@
-"""Photographs under one exposure, so that they can be compared pixel by pixel; host side."""
+"""Photographs prepared for matching: radiance and usable pixels; host side."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from p2gs_jax.types import GAMMA_SRGB, Scene
 
 TABLE = 1024
 LUMINANCE = np.array([0.25, 0.6, 0.15], np.float32)
-# Frames kept at once: a view, its neighbours, and those of the views that follow.
-FRAMES = 48
-# The brightest pixels may clip in the comparison: a lamp should not leave the rest in the dark.
+# Images kept at once: a view, its neighbours, and those of the next views.
+CACHED = 48
+# Quantile of luminance that becomes white in the comparison: lamps may clip.
 WHITE_QUANTILE = 0.995
 LARGEST_GAIN = 30.0
 ROUNDS = 30
@@ -94,8 +94,8 @@ def rough_tones(tracks: Observations | None, count: int) -> Tones:
 
 
 @dataclass(frozen=True)
-class Frame:
-    """A training view as it is compared.
+class MatchImage:
+    """A training view prepared for matching.
 
     Attributes:
         ldr: photograph.
@@ -115,7 +115,7 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Frames:
+class MatchImages:
     """The training views of a scene, loaded when asked for; from any thread.
 
     Attributes:
@@ -123,7 +123,7 @@ class Frames:
         store: photographs.
         tones: how they are compared.
         longest: longest side, pixels.
-        black: display values up to here say nothing.
+        black: display values up to here are not used.
         saturation: display values from here on are clipped.
     """
 
@@ -136,24 +136,24 @@ class Frames:
     _load: object = field(init=False, repr=False, compare=False)
 
     def __post_init__(self):
-        """Keep the last frames."""
-        object.__setattr__(self, "_load", lru_cache(FRAMES)(self._make))
+        """Cache the last images."""
+        object.__setattr__(self, "_load", lru_cache(CACHED)(self._make))
 
-    def __getitem__(self, row: int) -> Frame:
+    def __getitem__(self, row: int) -> MatchImage:
         """Return a training view by its row."""
         return self._load(row)  # type: ignore[operator]
 
-    def _make(self, row: int) -> Frame:
+    def _make(self, row: int) -> MatchImage:
         index = self.scene.train_indices[row]
         shrink = max(1.0, max(self.store.camera(index)[2:]) / self.longest)
         ldr, mask = self.store.get(index, shrink)
         viewmat, K, _, _ = self.store.camera(index, shrink)
         brightest = ldr.max(2)
         usable = (mask > 0) & (brightest < self.saturation) & (brightest > self.black)
-        # A pixel beside a clipped one has some of its light.
+        # Pixels beside clipped ones contain some of their light.
         usable = cv2.erode(usable.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
         luminance = np.exp(self.tones.log_radiance(row, ldr)) @ LUMINANCE
-        return Frame(
+        return MatchImage(
             ldr,
             luminance,
             usable,
@@ -163,11 +163,12 @@ class Frames:
         )
 
 
-def alike(a: Frame, b: Frame) -> tuple[UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h2 w2"]]:
+def at_common_exposure(
+    a: MatchImage, b: MatchImage
+) -> tuple[UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h2 w2"]]:
     """Return two photographs as the longer of their exposures shows them, 8 bits.
 
-    What is clipped under that exposure is white in both, so both stay alike everywhere. Dark pairs
-    are brightened.
+    Pixels clipped under that exposure are white in both. Dark pairs are brightened.
     """
     exposure = np.exp(max(a.log_exposure, b.log_exposure))
     bright = max(float(np.quantile(f.luminance[::4, ::4], WHITE_QUANTILE)) for f in (a, b))

@@ -19,8 +19,9 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from p2gs_jax.config import FitConfig
+from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.core.streams import Stream, generator
-from p2gs_jax.gaussians.init.brightness import Frames, Tones
+from p2gs_jax.gaussians.init.brightness import MatchImages, Tones
 from p2gs_jax.gaussians.init.flow import CHECKS, DepthMap, Flows, depth_map, pixel_centers
 from p2gs_jax.gaussians.init.pairs import neighbours, visibility
 from p2gs_jax.scene.images import ImageStore
@@ -34,12 +35,12 @@ NEIGHBOURS = 5
 # Longest side of the photographs that are matched, pixels.
 MATCH_SIDE = 640
 WORKERS = 2
-# Candidates are kept one in so many pixels each way; no bound wants them denser.
+# Stride of the candidates over pixels, along each axis.
 FINEST_CELL = 3
 # Standard deviation of a seed over the spacing of seeds, along the surface and across it.
 SPREAD, THICKNESS = 0.6, 0.2
 # Seeds stretch along slanted surfaces at most this much.
-STRETCH = 3.0
+LARGEST_STRETCH = 3.0
 # A cell shows a seed already if that lies within this share of its depth.
 SAME_DEPTH = 0.05
 # Cells with more texture than this share of all are cut in four.
@@ -80,7 +81,7 @@ class DenseSeeds:
         radiance: linear, in the gauge of the exposures.
         scales: standard deviations along the axes of `quats`.
         quats: w, x, y, z.
-        counts: pixels looked at; refused by each of `CHECKS`; accepted.
+        counts: pixels in all; refused by each of `CHECKS`; accepted.
         near_existing: seeds dropped in favour of an existing one.
         views: how many views were matched.
     """
@@ -94,7 +95,7 @@ class DenseSeeds:
     views: int = 0
 
     def note(self) -> str:
-        """Say what was accepted and refused, and why."""
+        """Return a sentence on what was accepted and rejected, and why."""
         total, *refused, accepted = (int(c) for c in self.counts)
         total = max(total, 1)
         said = ", ".join(f"{name} {n / total:.0%}" for name, n in zip(CHECKS, refused, strict=True))
@@ -136,12 +137,11 @@ def dense_seeds(
     rows = scene.train_indices
     if len(rows) < FEWEST_VIEWS or limit < 1 or not len(scene.points):
         return _none()
-    frames = Frames(scene, store, match, MATCH_SIDE, cfg.loss.black, cfg.loss.saturation)
+    images = MatchImages(scene, store, match, MATCH_SIDE, cfg.loss.black, cfg.loss.saturation)
     seen = visibility(scene, cfg.train.seed)
     near = neighbours(scene, seen, match.log_exposures, NEIGHBOURS)
-    wanted = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), most_views)).round())
-    wanted = [int(r) for r in wanted if len(near[int(r)]) >= 2]
-    flows = Flows(frames, scene.points, seen)
+    wanted = [int(r) for r in evenly_spaced(len(rows), most_views) if len(near[r]) >= 2]
+    flows = Flows(images, scene.points, seen)
     found: list[Candidates] = []
 
     def one(row: int) -> Candidates:
@@ -153,7 +153,7 @@ def dense_seeds(
             on_view(done + 1, len(wanted))
     if not sum(len(c.xy) for c in found):
         return _none()
-    return choose(found, frames, np.asarray(existing, np.float64), limit, cfg.train.seed)
+    return choose_seeds(found, images, np.asarray(existing, np.float64), limit, cfg.train.seed)
 
 
 def _none() -> DenseSeeds:
@@ -162,7 +162,7 @@ def _none() -> DenseSeeds:
 
 
 def _candidates(row: int, near, flows: Flows, color: Tones, seed: int) -> Candidates:
-    frame, depth = flows.frames[row], depth_map(flows, row, near)
+    frame, depth = flows.images[row], depth_map(flows, row, near)
     shown = frame.ldr.mean(2)
     steep = np.hypot(*np.gradient(shown)).astype(np.float32)
     texture = cv2.blur(steep, (9, 9))
@@ -201,9 +201,9 @@ def _normals(depth: DepthMap, K, y, x) -> Float32[np.ndarray, "c 3"]:
     return np.where(depth.flat[y, x][:, None], n, 0).astype(np.float32)
 
 
-def choose(
+def choose_seeds(
     found: list[Candidates],
-    frames: Frames,
+    images: MatchImages,
     existing: Float[np.ndarray, "p 3"],
     limit: int,
     seed: int,
@@ -212,7 +212,7 @@ def choose(
 
     Args:
         found: candidates of each view.
-        frames: their cameras.
+        images: their cameras.
         existing: seeds that keep their place.
         limit: most seeds to return.
         seed: of the order of views, and of what is left out.
@@ -224,14 +224,14 @@ def choose(
     tree = KDTree(existing) if len(existing) else None
     cell, drawn, refused = float(FINEST_CELL), [], 0
     for _ in range(ATTEMPTS):
-        drawn, refused = _draw(found, frames, existing, tree, cell, plain)
+        drawn, refused = _draw(found, images, existing, tree, cell, plain)
         count = sum(len(pick) for pick, _ in drawn)
         # A few too many are left out at random below.
         few = count < (1 - SLACK) * limit and cell > FINEST_CELL
         if not few and count <= (1 + SLACK) * limit:
             break
         cell = max(cell * float(np.sqrt(max(count, 1) / limit)), float(FINEST_CELL))
-    parts = [_seeds(c, frames, *d) for c, d in zip(found, drawn, strict=True)]
+    parts = [_seeds(c, images, *d) for c, d in zip(found, drawn, strict=True)]
     points, radiance, scales, quats = (
         np.concatenate(p).astype(np.float32) for p in zip(*parts, strict=True)
     )
@@ -242,18 +242,18 @@ def choose(
     )
 
 
-def _world(candidates: Candidates, frames: Frames, pick) -> Float[np.ndarray, "c 3"]:
-    frame = frames[candidates.row]
+def _world(candidates: Candidates, images: MatchImages, pick) -> Float[np.ndarray, "c 3"]:
+    frame = images[candidates.row]
     xy1 = np.concatenate([candidates.xy[pick], np.ones((len(pick), 1))], 1)
     local = xy1 @ np.linalg.inv(frame.K).T / candidates.inverse[pick, None]
     return (local - frame.viewmat[:3, 3]) @ frame.viewmat[:3, :3]
 
 
-def _draw(found, frames: Frames, existing, tree, cell: float, plain: float):
+def _draw(found, images: MatchImages, existing, tree, cell: float, plain: float):
     """Return for each view the chosen candidates and their spacing in pixels; and the refused."""
     chosen, refused, drawn = [existing], 0, []
     for candidates in found:
-        frame = frames[candidates.row]
+        frame = images[candidates.row]
         height, width = frame.luminance.shape
         xy, z = candidates.xy, 1 / candidates.inverse
         across = int(np.ceil(width / cell)) + 1
@@ -293,7 +293,7 @@ def _draw(found, frames: Frames, existing, tree, cell: float, plain: float):
             zs, hit = local[inside, 2][known][hit >= 0], hit[hit >= 0]
             taken[hit[np.abs(zs / z[pick[hit]] - 1) < SAME_DEPTH]] = True
         pick, spacing = pick[~taken], spacing[~taken]
-        points = _world(candidates, frames, pick)
+        points = _world(candidates, images, pick)
         if tree is not None and len(points):
             size = spacing * z[pick] / np.mean(np.diag(frame.K)[:2])
             free = np.asarray(tree.query(points)[0]) > size
@@ -304,9 +304,9 @@ def _draw(found, frames: Frames, existing, tree, cell: float, plain: float):
     return drawn, refused
 
 
-def _seeds(candidates: Candidates, frames: Frames, pick, spacing):
+def _seeds(candidates: Candidates, images: MatchImages, pick, spacing):
     """Return points, radiance, scales and quaternions of chosen candidates."""
-    frame = frames[candidates.row]
+    frame = images[candidates.row]
     z = 1 / candidates.inverse[pick]
     size = SPREAD * spacing * z / np.mean(np.diag(frame.K)[:2])
     normal = candidates.normals[pick].astype(np.float64)
@@ -315,7 +315,7 @@ def _seeds(candidates: Candidates, frames: Frames, pick, spacing):
     ray = ray @ np.linalg.inv(frame.K).T
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     normal[~flat] = -ray[~flat]
-    facing = np.clip(-(normal * ray).sum(1), 1 / STRETCH, 1)
+    facing = np.clip(-(normal * ray).sum(1), 1 / LARGEST_STRETCH, 1)
     # First axis: down the slope, where a pixel covers more of the surface.
     helper = np.where(np.abs(normal[:, :1]) < 0.7, [[1.0, 0, 0]], [[0, 1.0, 0]])
     down = ray - (ray * normal).sum(1, keepdims=True) * normal
@@ -331,4 +331,4 @@ def _seeds(candidates: Candidates, frames: Frames, pick, spacing):
     scales = size[:, None] * np.stack(
         [np.where(flat, 1 / facing, 1), np.ones_like(size), across], 1
     )
-    return _world(candidates, frames, pick), candidates.radiance[pick], scales, quats
+    return _world(candidates, images, pick), candidates.radiance[pick], scales, quats

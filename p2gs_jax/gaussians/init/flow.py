@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from scipy.spatial import KDTree
 
-from p2gs_jax.gaussians.init.brightness import Frame, Frames, alike
+from p2gs_jax.gaussians.init.brightness import MatchImage, MatchImages, at_common_exposure
 
 # Pixels, at the size that is matched.
 FORWARD_BACKWARD = 1.0
@@ -39,7 +39,7 @@ FLAT = 0.01
 GUIDES, GUIDE_CELL = 6, 16
 # DIS at full resolution: half the depth error of its preset `medium`, which ends at half of it.
 PATCH, STRIDE, DESCENTS = 8, 4, 16
-# Flows kept: those back serve the neighbours' own depth.
+# Flows kept: those in the other direction serve the neighbours' own depth.
 KEPT_FLOWS = 128
 
 CHECKS = ("unusable", "forward-backward", "epipolar", "parallax", "colour", "third view", "alone")
@@ -84,7 +84,7 @@ def pixel_centers(height: int, width: int) -> Float32[np.ndarray, "h w 2"]:
     return np.stack([x, y], -1)
 
 
-def _geometry(a: Frame, b: Frame) -> _Geometry:
+def _geometry(a: MatchImage, b: MatchImage) -> _Geometry:
     height, width = a.luminance.shape
     relative = b.viewmat @ np.linalg.inv(a.viewmat)
     turn = (b.K @ relative[:3, :3] @ np.linalg.inv(a.K)).astype(np.float32)
@@ -94,7 +94,7 @@ def _geometry(a: Frame, b: Frame) -> _Geometry:
     return _Geometry(x * turn[:, 0] + y * turn[:, 1] + turn[:, 2], shift)
 
 
-def guide(frame: Frame, points: Float[np.ndarray, "p 3"]) -> Float32[np.ndarray, "h w"]:
+def guide(frame: MatchImage, points: Float[np.ndarray, "p 3"]) -> Float32[np.ndarray, "h w"]:
     """Return inverse depth interpolated between points that the view sees, to start the flow."""
     height, width = frame.luminance.shape
     local = points @ frame.viewmat[:3, :3].T + frame.viewmat[:3, 3]
@@ -162,12 +162,12 @@ class Flows:
     """Flows between training views, computed when asked for; from any thread.
 
     Attributes:
-        frames: the views.
+        images: the views.
         points: that start the flow, scene units.
         seen: which training view sees which.
     """
 
-    frames: Frames
+    images: MatchImages
     points: Float[np.ndarray, "p 3"]
     seen: Bool[np.ndarray, "v p"]
     _kept: tuple = field(init=False, repr=False, compare=False)
@@ -182,20 +182,20 @@ class Flows:
         return self._kept[1](i, j)
 
     def _guide(self, i: int):
-        return guide(self.frames[i], self.points[self.seen[i]])
+        return guide(self.images[i], self.points[self.seen[i]])
 
     def _flow(self, i: int, j: int):
-        a, b = self.frames[i], self.frames[j]
-        # In one order, so that there and back see the same pictures.
-        first, second = alike(a, b) if i < j else alike(b, a)[::-1]
+        a, b = self.images[i], self.images[j]
+        # Always in one order, so that both directions compare the same pictures.
+        first, second = at_common_exposure(a, b) if i < j else at_common_exposure(b, a)[::-1]
         here = pixel_centers(*a.luminance.shape)
         return _flow(first, second, _start(_geometry(a, b), self._kept[0](i), here))
 
 
 def _match(flows: Flows, i: int, j: int) -> _Pair:
     """Return inverse depth of a view from its flow to another."""
-    a, b = flows.frames[i], flows.frames[j]
-    first, second = alike(a, b)
+    a, b = flows.images[i], flows.images[j]
+    first, second = at_common_exposure(a, b)
     here, to_b = pixel_centers(*a.luminance.shape), _geometry(a, b)
     forward, backward = flows.between(i, j), flows.between(j, i)
     match = here + forward
@@ -244,7 +244,7 @@ def depth_map(flows: Flows, row: int, near: Sequence[int]) -> DepthMap:
     third = (agreeing.sum(0) >= 2) & sharp
     smooth, slope, flat, support = plane_fit(fused, third)
     valid = third & (support > SUPPORT)
-    # A pixel is refused by the check that its luckiest neighbour failed.
+    # A rejected pixel counts for the last check that any of its neighbours reached.
     rank = np.arange(5)[:, None, None]
     last = np.max([(rank * np.stack(p.refused)).sum(0) for p in pairs], axis=0)
     refused = [int((~matched & (last == i)).sum()) for i in range(5)]

@@ -17,7 +17,7 @@ NARROW, WIDE, FADE = 4.0, 12.0, 8.0
 EXPOSURE_FADE = 1.5
 FEWEST_SHARED = 5
 MOST_POINTS = 20_000
-# Fewer points in a view are too far apart to say what hides what.
+# Least points in a view for an occlusion test among them.
 FEWEST_HIDING = 1000
 
 

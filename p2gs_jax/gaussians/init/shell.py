@@ -1,8 +1,8 @@
 """A far shell of Gaussians, where views look past every seed point: sky, hills, far facades.
 
-Seeds mark surfaces. A pixel with no seed anywhere near it has nothing to grow from except distant
-splats stretched over it, so directions that views look into and no seed explains get a Gaussian
-each, far behind the seeds. Scenes whose views are covered by seeds get none.
+Pixels without any seed nearby could only be covered by stretching distant splats over them. So
+directions that views look into, but in which no seed lies, get a Gaussian each, far behind the
+seeds. Scenes whose views are covered by seeds get none.
 """
 
 from __future__ import annotations
@@ -13,7 +13,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from p2gs_jax.config import InitConfig
+from p2gs_jax.core.numerics import fibonacci_sphere
 from p2gs_jax.gaussians.init.seeds import camera_centers
+from p2gs_jax.scene.visibility import in_frame, project_points
 from p2gs_jax.types import View
 
 # Each view is cut into cells; a cell with a seed in it or beside it counts as covered.
@@ -22,7 +24,7 @@ CELLS_ACROSS = 16
 COVERED_FRACTION = 0.3
 # Less empty image than this is a gap in the seeds, not a sky.
 EMPTY_IMAGE_FRACTION = 0.04
-# How far the shell stands behind the far seeds.
+# Distance of the shell over that of the far seeds.
 BEHIND_SEEDS = 2.0
 OVERLAP = 0.7
 
@@ -53,35 +55,17 @@ class Shell:
         )
 
 
-def fibonacci_sphere(count: int) -> Float[np.ndarray, "n 3"]:
-    """Return evenly spread unit vectors."""
-    i = np.arange(count) + 0.5
-    z = 1 - 2 * i / count
-    azimuth = np.pi * (1 + 5**0.5) * i
-    r = np.sqrt(1 - z * z)
-    return np.stack([r * np.cos(azimuth), r * np.sin(azimuth), z], -1)
-
-
-def project_points(view: View, points: Float[np.ndarray, "p 3"]):
+def _project(view: View, points: Float[np.ndarray, "p 3"]):
     """Return pixel positions [p 2] and which points are in front and inside the image."""
-    local = points @ view.viewmat[:3, :3].T.astype(np.float64) + view.viewmat[:3, 3]
-    z = np.where(local[:, 2] > 1e-6, local[:, 2], 1.0)
-    xy = local[:, :2] / z[:, None] * [view.K[0, 0], view.K[1, 1]] + view.K[:2, 2]
-    inside = (
-        (local[:, 2] > 1e-6)
-        & (xy[:, 0] >= 0)
-        & (xy[:, 1] >= 0)
-        & (xy[:, 0] < view.width)
-        & (xy[:, 1] < view.height)
-    )
-    return xy, inside
+    xy, z = project_points(points.astype(np.float64), view)
+    return xy, in_frame(xy, z, view.width, view.height)
 
 
 def covered_cells(view: View, points: Float[np.ndarray, "p 3"]) -> Bool[np.ndarray, "gy gx"]:
     """Return which cells of a view hold a seed, or touch one that does."""
     across = CELLS_ACROSS
     down = max(1, round(across * view.height / view.width))
-    xy, inside = project_points(view, points)
+    xy, inside = _project(view, points)
     cells = np.zeros((down + 2, across + 2), bool)
     column = (xy[inside, 0] * across / view.width).astype(int)
     row = (xy[inside, 1] * down / view.height).astype(int)
@@ -102,7 +86,7 @@ def find_shell(
         views: training views.
         points: seed points.
         extent: scene extent, scene units.
-        cfg: how many directions, how far, whether at all.
+        cfg: number of directions, radius, and whether there is a shell.
     """
     if cfg.shell == "off":
         return None
@@ -121,7 +105,7 @@ def find_shell(
     explained = np.zeros_like(seen)
     xy = np.zeros((len(candidates), len(views), 2), np.float32)
     for k, (view, cells) in enumerate(zip(views, covered, strict=True)):
-        position, inside = project_points(view, candidates)
+        position, inside = _project(view, candidates)
         xy[:, k], seen[:, k] = position, inside
         column = (position[inside, 0] * cells.shape[1] / view.width).astype(int)
         row = (position[inside, 1] * cells.shape[0] / view.height).astype(int)

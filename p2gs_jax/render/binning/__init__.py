@@ -1,8 +1,7 @@
 """Binning: which Gaussians each tile composites, in depth order, without a per-tile cap.
 
-No gradients flow here. Two ways to the same list: `counting`, sequential and linear, for CPUs;
-`sorting`, data-parallel, for everything else. `RenderConfig.binning` None takes the one that suits
-the device.
+No gradients flow here. Two implementations: `counting`, sequential and linear, for CPUs; `sorting`,
+data-parallel, for everything else. `RenderConfig.binning` None takes the device's.
 """
 
 from __future__ import annotations

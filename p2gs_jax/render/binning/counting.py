@@ -5,7 +5,7 @@ they touch and rows into tiles; then a counting sort by tile. Between the two ex
 columns that an ellipse covers in a row of tiles are solved in closed form, for all rows at once,
 so that no bounding box is ever expanded and the list holds exactly what is composited.
 
-Time follows what a view needs, not the capacity of its list: rooms may be generous.
+Time depends on what a view needs, not on the capacity of its list: capacities may be generous.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from p2gs_jax.types import Splats2D, TileList
 DIGIT_BITS = 13
 # Elements written at once: one vector register.
 WRITES = 8
-# Counting stops here rather than leave int32.
+# Counts saturate here, within int32.
 MOST_ENTRIES = 2**30
 # Keeps splats that rounding alone would put below the cutoff.
 REACH_MARGIN = 1e-4
@@ -106,8 +106,8 @@ def _expand(firsts, lengths, used, capacity: int):
     """Expand ranges: range i gives the values firsts[i], firsts[i] + 1, ... (lengths[i] of them).
 
     Returns:
-        How many values there are in all, up to MOST_ENTRIES; the first `capacity` of them; and
-        for each the range it came from. Both arrays have room for one write more.
+        The number of values, up to MOST_ENTRIES; the first `capacity` of them; and the range of
+        each. Both arrays have room for one more write.
     """
 
     @compiled_loop

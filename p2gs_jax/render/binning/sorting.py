@@ -1,4 +1,4 @@
-"""Binning by sorts: what a GPU wants, and the fallback wherever loops are not compiled.
+"""Binning by sorts: for GPUs, and wherever sequential loops are slow.
 
 Integer work throughout. Single-operand uint32 sorts of packed keys are about five times as fast
 per element on XLA's CPU backend as comparator or multi-operand sorts (docs/kernel.md).

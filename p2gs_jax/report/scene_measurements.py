@@ -1,4 +1,4 @@
-"""What only the scene can tell: seams, clipped photographs, true exposures, views to look at."""
+"""What a page needs from the scene itself: seams, clipped photographs, true exposures, renders."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import numpy as np
 from p2gs_jax.core.progress import Reporter
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.metrics import psnr
-from p2gs_jax.evaluate.seam_picture import Halves, halves
-from p2gs_jax.evaluate.seams import Photographed, Seam, measure, neighbours
+from p2gs_jax.evaluate.seam_picture import SeamPicture, seam_picture
+from p2gs_jax.evaluate.seams import Photographed, Seam, measure_seam, neighbouring_pairs
 from p2gs_jax.photometry.display import develop
 from p2gs_jax.render.host import make_renderer
 from p2gs_jax.render.warp import surface_depth
 from p2gs_jax.report.run_files import RunFiles
-from p2gs_jax.report.strips import Strip, spread
+from p2gs_jax.report.view_comparisons import ViewComparison, spread
 from p2gs_jax.run.read import Run, load_run
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
@@ -24,8 +24,7 @@ from p2gs_jax.synth.exposures import read_true_exposures
 MOST_PAIRS, MOST_CLIPPED, MOST_RENDERED = 12, 24, 3
 # Seams are measured on images of at most this many pixels across.
 SEAM_WIDTH = 960
-# A picture of a seam should show some of it: pairs with less than this share of the median overlap
-# are not chosen for it.
+# The pair for the picture of a seam has at least this share of the median overlap.
 LEAST_OVERLAP = 0.5
 
 
@@ -45,37 +44,37 @@ class SeamPair:
 
 
 @dataclass(frozen=True)
-class FromScene:
-    """What the scene told.
+class SceneMeasurements:
+    """What was measured on the scene.
 
     Attributes:
-        true_exposures: by view, where the scene carries them.
+        true_exposures: by view, where the scene has them.
         seams: pairs in the order of the views.
-        tried_pairs: pairs that were compared, with or without enough in common.
+        tried_pairs: number of pairs that were compared, with or without enough in common.
         shown: the pair of the picture.
-        picture: the widest seam to look at, or None.
+        picture: of the widest seam, or None.
         clipped: share of clipped pixels by view, for a sample of the training views.
-        strips: rendered training views, where the folder has no held-out ones.
-        missing: sentences on what could not be found out.
+        comparisons: rendered training views, where the folder has no held-out ones.
+        missing: sentences on what could not be measured.
     """
 
     true_exposures: dict[str, float] = field(default_factory=dict)
     seams: tuple[SeamPair, ...] = ()
     tried_pairs: int = 0
     shown: SeamPair | None = None
-    picture: Halves | None = None
+    picture: SeamPicture | None = None
     clipped: dict[str, float] = field(default_factory=dict)
-    strips: tuple[Strip, ...] = ()
+    comparisons: tuple[ViewComparison, ...] = ()
     missing: tuple[str, ...] = ()
 
 
-def ask_scene(files: RunFiles, reporter: Reporter, *, render: bool = True) -> FromScene:
-    """Load the scene and render what the page needs; a scene that has gone is said, not fatal.
+def measure_scene(files: RunFiles, reporter: Reporter, *, render: bool = True) -> SceneMeasurements:
+    """Load the scene and measure what the page needs; without a scene, say so in `missing`.
 
     Args:
         files: the run folder.
         reporter: receives progress.
-        render: False leaves the scene alone, but for its true exposures.
+        render: False reads only the true exposures.
     """
     truth: dict[str, float] = {}
     missing: list[str] = []
@@ -85,7 +84,7 @@ def ask_scene(files: RunFiles, reporter: Reporter, *, render: bool = True) -> Fr
         missing.append(f"The scene's true exposures cannot be read ({error!r}).")
     if not render:
         missing.append("Seams were not measured: the page was made without rendering.")
-        return FromScene(true_exposures=truth, missing=tuple(missing))
+        return SceneMeasurements(true_exposures=truth, missing=tuple(missing))
     reporter.stage("Reading the scene")
     try:
         run = load_run(files.folder, files.given)
@@ -93,12 +92,12 @@ def ask_scene(files: RunFiles, reporter: Reporter, *, render: bool = True) -> Fr
         return _rendered(run, files, reporter, truth, missing)
     except UserError as error:
         missing.append(f"Seams were not measured, and nothing was rendered: {error.message}")
-        return FromScene(true_exposures=truth, missing=tuple(missing))
+        return SceneMeasurements(true_exposures=truth, missing=tuple(missing))
 
 
 def _rendered(
     run: Run, files: RunFiles, reporter: Reporter, truth: dict[str, float], missing: list[str]
-) -> FromScene:
+) -> SceneMeasurements:
     store = ImageStore(run.scene.views, run.cfg.data)
     render = make_renderer(run.cfg.render)
 
@@ -114,12 +113,14 @@ def _rendered(
             "cannot be undone in a photograph."
         )
     else:
-        tried = neighbours(run.scene, MOST_PAIRS)
+        tried = neighbouring_pairs(run.scene, MOST_PAIRS)
         photographed = _Photographs(run, store, render_camera)
         found: dict[tuple[int, int], Seam] = {}
         for done, (i, j) in enumerate(tried):
             reporter.stage("Measuring seams", done, len(tried))
-            seam = measure(photographed(i), photographed(j), run.common_display(), run.cfg.loss)
+            seam = measure_seam(
+                photographed(i), photographed(j), run.common_display(), run.cfg.loss
+            )
             if seam is not None:
                 found[i, j] = seam
         names = [v.name for v in run.scene.views]
@@ -128,27 +129,29 @@ def _rendered(
         if widest is not None:
             i, j = widest
             shown = SeamPair(names[i], names[j], found[widest])
-            picture = halves(photographed(i), photographed(j), run.common_display(), render_camera)
-    strips: list[Strip] = []
+            picture = seam_picture(
+                photographed(i), photographed(j), run.common_display(), render_camera
+            )
+    comparisons: list[ViewComparison] = []
     if not files.held_out:
         for index in spread(run.scene.train_indices, MOST_RENDERED):
-            reporter.stage("Rendering views", len(strips), MOST_RENDERED)
-            strips.append(_strip(run, store, render_camera, index))
+            reporter.stage("Rendering views", len(comparisons), MOST_RENDERED)
+            comparisons.append(_comparison(run, store, render_camera, index))
     reporter.stage("Looking for clipped pixels")
-    return FromScene(
+    return SceneMeasurements(
         truth,
         tuple(pairs),
         len(tried),
         shown,
         picture,
         _clipped(run, store),
-        tuple(strips),
+        tuple(comparisons),
         tuple(missing),
     )
 
 
 class _Photographs:
-    """Photographs with depth, each rendered once."""
+    """Photographs with rendered depth, each rendered once."""
 
     def __init__(self, run: Run, store: ImageStore, render):
         self.run, self.store, self.render = run, store, render
@@ -166,7 +169,7 @@ class _Photographs:
 
 
 def _widest(found: dict[tuple[int, int], Seam]) -> tuple[int, int] | None:
-    """Return the pair with the widest seam among those that have a good part in common."""
+    """Return the pair with the widest seam among those with enough overlap."""
     if not found:
         return None
     enough = LEAST_OVERLAP * float(np.median([s.pixels for s in found.values()]))
@@ -174,17 +177,17 @@ def _widest(found: dict[tuple[int, int], Seam]) -> tuple[int, int] | None:
     return max(good, key=lambda k: good[k].before_ev)
 
 
-def _strip(run: Run, store: ImageStore, render, index: int) -> Strip:
+def _comparison(run: Run, store: ImageStore, render, index: int) -> ViewComparison:
     photograph, mask = store.get(index)
     linear = np.asarray(render(camera_of(store, index)).linear)
     shown = develop(linear, run.own_display(index))
     score = float(psnr(shown, photograph, mask))
     view = run.scene.views[index]
-    return Strip(view.name, view.split, photograph, shown, linear, score)
+    return ViewComparison(view.name, view.split, photograph, shown, linear, score)
 
 
 def _clipped(run: Run, store: ImageStore) -> dict[str, float]:
-    """Return which share of a training photograph is clipped in some channel."""
+    """Return the share of pixels with a clipped channel, for a sample of the training views."""
     out = {}
     for index in spread(run.scene.train_indices, MOST_CLIPPED):
         ldr, mask = store.get(index)

@@ -1,8 +1,8 @@
 """The thread that keeps one browser's picture up to date.
 
-The newest camera wins: a frame is rendered for where the camera is now, never for where it was.
-While anything changes, frames are as large as keeps up with it and travel as JPEG; at rest the
-canvas is rendered pixel for pixel and travels as PNG.
+Every frame is rendered for the newest camera; older ones are skipped. While anything changes,
+frames are as large as the frame rate allows and are sent as JPEG; at rest the canvas is rendered
+pixel for pixel and sent as PNG.
 """
 
 from __future__ import annotations
@@ -20,29 +20,36 @@ from jaxtyping import Float, Float32
 
 from p2gs_jax.errors import UserError
 from p2gs_jax.types import Camera
-from p2gs_jax.viewer.frames import camera_of_browser
-from p2gs_jax.viewer.ladder import Pace, Size, choose, full_size, ladder, order_of_compilation
+from p2gs_jax.viewer.browser_camera import camera_of_browser
 from p2gs_jax.viewer.legend import clipping_legend, depth_legend, note, stops_legend
 from p2gs_jax.viewer.panel import Panel
+from p2gs_jax.viewer.picture_modes import RenderedFrame, to_uint8_fast
+from p2gs_jax.viewer.render_sizes import (
+    FrameTimes,
+    Size,
+    choose_size,
+    compilation_order,
+    full_size,
+    render_sizes,
+)
 from p2gs_jax.viewer.settings import Settings, display_of
-from p2gs_jax.viewer.shade import Frame, codes
 from p2gs_jax.viewer.splats import splat_colors
-from p2gs_jax.viewer.studio import Studio
+from p2gs_jax.viewer.viewed_run import ViewedRun
 
-# A camera or a slider that has not moved for this long is at rest, seconds.
+# Nothing has changed for this long: at rest, seconds.
 REST_S = 0.3
 JPEG_QUALITY = 85
-# Depth that hides frusta behind things travels this coarsely and this far, viewer units.
+# Depth that is sent along to hide frusta: width in pixels, quantum and maximum in viewer units.
 DEPTH_WIDTH, DEPTH_STEP, FARTHEST = 480, 256e-5, 167.0
-# Colours of a million splats are sent at most this often, seconds.
+# Least time between two updates of a million splats' colours, seconds.
 SPLATS_S = 1.0
 BLACK = np.zeros((1, 1, 3), np.uint8)
-NO_PHOTOGRAPH = "No photograph was taken from here: choose one under Camera, Go to."
+NO_PHOTOGRAPH = "No photograph was taken from here: choose_size one under Camera, Go to."
 
 Job = Literal["move", "develop", "rest"]
 
 
-class Seen(NamedTuple):
+class BrowserView(NamedTuple):
     """The browser's camera and canvas."""
 
     wxyz: Float[np.ndarray, " 4"]
@@ -56,35 +63,35 @@ class Seen(NamedTuple):
         return self.canvas[0] / self.canvas[1]
 
 
-def seen_by(client: viser.ClientHandle) -> Seen:
+def browser_view(client: viser.ClientHandle) -> BrowserView:
     """Return the newest camera of a browser."""
     camera = client.camera
     canvas = max(camera.image_width, 1), max(camera.image_height, 1)
-    return Seen(camera.wxyz, camera.position, camera.fov, canvas)
+    return BrowserView(camera.wxyz, camera.position, camera.fov, canvas)
 
 
-class Screen:
-    """What one browser is shown."""
+class RenderLoop:
+    """Renders and sends the picture of one browser, in a thread."""
 
-    def __init__(self, client: viser.ClientHandle, studio: Studio, panel: Panel):
-        """Prepare; `start` begins.
+    def __init__(self, client: viser.ClientHandle, viewed: ViewedRun, panel: Panel):
+        """Prepare the thread; `start` starts it.
 
         Args:
             client: the browser.
-            studio: what it looks at.
-            panel: says what is shown how, and is told what goes on.
+            viewed: the run.
+            panel: gives the settings, and shows status and legend.
         """
-        self._client, self._studio, self._panel = client, studio, panel
-        self.darkroom = studio.darkroom()
+        self._client, self._viewed, self._panel = client, viewed, panel
+        self.frame_cache = viewed.new_frame_cache()
         self.with_depth = False
         self._changed = threading.Condition()
-        self._moved, self._retouched = True, False
-        # What was shown at rest: the size hoped for, and the programs there were then.
+        self._camera_moved, self._display_changed = True, False
+        # What was shown at rest: the wanted size, and how many programs were compiled by then.
         self._settled: tuple[Size | None, int] | None = None
         self._last_change = 0.0
         self._stopping = False
-        self._pace = Pace()
-        self._stale = False  # whether the frame is of a camera that has moved on since
+        self._frame_times = FrameTimes()
+        self._stale = False  # whether the frame is of an older camera
         self._moving_size: Size | None = None
         self._last_ms = 0.0
         self._splats: viser.GaussianSplatHandle | None = None
@@ -92,30 +99,30 @@ class Screen:
         self._thread = threading.Thread(target=self._work, name="draw", daemon=True)
 
     def start(self) -> None:
-        """Begin to draw."""
-        self._studio.listeners.append(self._programs_changed)
-        self._say_status()
+        """Start the thread."""
+        self._viewed.listeners.append(self._programs_changed)
+        self._update_status()
         self._thread.start()
 
     def stop(self) -> None:
-        """Draw no more, and wait for the frame that is being drawn."""
+        """Stop the thread once its present frame is done."""
         with self._changed:
             self._stopping = True
             self._changed.notify_all()
-        if self._programs_changed in self._studio.listeners:
-            self._studio.listeners.remove(self._programs_changed)
+        if self._programs_changed in self._viewed.listeners:
+            self._viewed.listeners.remove(self._programs_changed)
         self._thread.join()
 
-    def moved(self) -> None:
-        """The camera is somewhere else: render anew."""
+    def camera_moved(self) -> None:
+        """Render again: the camera has moved."""
         with self._changed:
-            self._moved = True
+            self._camera_moved = True
             self._touch()
 
-    def retouched(self) -> None:
-        """The display transform is another: develop anew."""
+    def display_changed(self) -> None:
+        """Develop the frame again: the display settings have changed."""
         with self._changed:
-            self._retouched = True
+            self._display_changed = True
             self._touch()
 
     def _touch(self) -> None:
@@ -126,19 +133,19 @@ class Screen:
     def _programs_changed(self) -> None:
         with self._changed:
             self._changed.notify_all()
-        self._say_status()
+        self._update_status()
 
     # ------------------------------------------------------------------ what to do next
 
     def _work(self) -> None:
         while (job := self._next_job()) is not None:
             try:
-                self._do(job)
+                self._run_job(job)
             except UserError as error:
-                self._complain(str(error))
+                self._show_error(str(error))
             except Exception as error:
                 traceback.print_exc(file=sys.stderr)
-                self._complain(f"{type(error).__name__}: {error}")
+                self._show_error(f"{type(error).__name__}: {error}")
 
     def _next_job(self) -> Job | None:
         """Wait for something to do; None at the end."""
@@ -146,13 +153,15 @@ class Screen:
             while not self._stopping:
                 wait = None
                 splats = self._panel.settings().splats
-                if self._moved and (splats or self._studio.programs.ready):
-                    self._moved = self._retouched = False
+                if self._camera_moved and (splats or self._viewed.programs.ready):
+                    self._camera_moved = self._display_changed = False
                     return "move"
-                if self._retouched and not self._moved:
-                    self._retouched = False
+                if self._display_changed and not self._camera_moved:
+                    self._display_changed = False
                     return "develop"
-                if not self._moved and (self._settled is None or not (splats or self._sharp())):
+                if not self._camera_moved and (
+                    self._settled is None or not (splats or self._sharp())
+                ):
                     wait = self._last_change + REST_S - time.monotonic()
                     if wait <= 0:
                         return "rest"
@@ -160,84 +169,84 @@ class Screen:
         return None
 
     def _sharp(self) -> bool:
-        """Whether the picture at rest is the best there can be with the programs there are."""
-        programs, frame = self._studio.programs, self.darkroom.frame
-        best = self._best(seen_by(self._client), programs.ready)
+        """Whether the picture at rest is the best that the compiled programs allow."""
+        programs, frame = self._viewed.programs, self.frame_cache.frame
+        best = self._best(browser_view(self._client), programs.ready)
         if self._settled is None or best != self._settled[0]:
             return False
         as_hoped = not self._stale and frame is not None and frame.size == best
         return as_hoped or self._settled[1] == programs.compiled
 
-    def _best(self, seen: Seen, ready: frozenset[Size]) -> Size | None:
-        return choose(self._rungs(seen), ready, {}, target_ms=np.inf)
+    def _best(self, view: BrowserView, ready: frozenset[Size]) -> Size | None:
+        return choose_size(self._sizes(view), ready, {}, target_ms=np.inf)
 
-    def _rungs(self, seen: Seen) -> tuple[Size, ...]:
-        return ladder(full_size(seen.canvas, self._studio.max_width))
+    def _sizes(self, view: BrowserView) -> tuple[Size, ...]:
+        return render_sizes(full_size(view.canvas, self._viewed.max_width))
 
     # ------------------------------------------------------------------ doing it
 
-    def _do(self, job: Job) -> None:
+    def _run_job(self, job: Job) -> None:
         settings = self._panel.settings()
         if settings.splats:
             self._draw_splats(settings)
             with self._changed:
-                self._settled = None if self._moved or self._retouched else (None, 0)
+                self._settled = None if self._camera_moved or self._display_changed else (None, 0)
             return
         self._hide_splats()
         begin = time.perf_counter()
-        seen = seen_by(self._client)
-        programs = self._studio.programs
+        view = browser_view(self._client)
+        programs = self._viewed.programs
         compiled, ready = programs.compiled, programs.ready
         size = None
         if job == "move":
-            self._pace.begin(programs.took_ms)
-            size = choose(self._rungs(seen), ready, self._pace.ms, self._moving_size)
+            self._frame_times.add_known(programs.took_ms)
+            size = choose_size(self._sizes(view), ready, self._frame_times.ms, self._moving_size)
             self._moving_size = size
-            self._render(seen, size, ready)
+            self._render(view, size, ready)
         elif job == "rest":
-            programs.want(order_of_compilation(self._rungs(seen)))
-            size = self._best(seen, ready)
-            if self._stale or self.darkroom.frame is None or self.darkroom.frame.size != size:
-                self._render(seen, size, ready)
-            self.darkroom.set_depth_limits()
-        if self.darkroom.frame is None:
+            programs.request(compilation_order(self._sizes(view)))
+            size = self._best(view, ready)
+            if self._stale or self.frame_cache.frame is None or self.frame_cache.frame.size != size:
+                self._render(view, size, ready)
+            self.frame_cache.set_depth_limits()
+        if self.frame_cache.frame is None:
             return
         self._show(settings, sharp=job == "rest")
         milliseconds = 1e3 * (time.perf_counter() - begin)
         with self._changed:
-            if job == "rest" and not self._moved and not self._retouched:
+            if job == "rest" and not self._camera_moved and not self._display_changed:
                 self._settled = (size, compiled)
         if job == "move" and size is not None:
-            self._pace.took(size, milliseconds)
+            self._frame_times.update(size, milliseconds)
         if job != "develop":
             self._last_ms = milliseconds
-        self._say_status()
+        self._update_status()
 
-    def _render(self, seen: Seen, size: Size | None, ready: frozenset[Size]) -> None:
+    def _render(self, view: BrowserView, size: Size | None, ready: frozenset[Size]) -> None:
         """Render the largest size up to `size` whose tile lists hold the view."""
         self._stale = True
         if size is None:
             return
         smaller = sorted((s for s in ready if s[0] * s[1] < size[0] * size[1]), reverse=True)
         for candidate in (size, *smaller):
-            if self.darkroom.render(self.camera(seen, candidate)):
+            if self.frame_cache.render(self.camera(view, candidate)):
                 self._stale = False
                 return
 
-    def camera(self, seen: Seen, size: Size) -> Camera:
-        """Return the camera that renders what the browser looks at."""
-        stage = self._studio.stage
-        return camera_of_browser(seen.wxyz, seen.position, seen.fov, seen.aspect, size, stage)
+    def camera(self, view: BrowserView, size: Size) -> Camera:
+        """Return the camera that renders a browser's view."""
+        space = self._viewed.space
+        return camera_of_browser(view.wxyz, view.position, view.fov, view.aspect, size, space)
 
     def _show(self, settings: Settings, *, sharp: bool) -> None:
-        frame = self.darkroom.frame
+        frame = self.frame_cache.frame
         assert frame is not None
-        image = codes(self.darkroom.develop(settings))
+        image = to_uint8_fast(self.frame_cache.develop(settings))
         self._client.scene.set_background_image(
             image,
             "png" if sharp else "jpeg",
             jpeg_quality=JPEG_QUALITY,
-            depth=_depth_for_browser(frame, self._studio.stage.unit) if self.with_depth else None,
+            depth=_depth_for_browser(frame, self._viewed.space.unit) if self.with_depth else None,
         )
         self._client.flush()
         self._panel.set_legend(self._legend(settings))
@@ -247,12 +256,14 @@ class Screen:
             return stops_legend()
         if settings.mode == "clipping":
             return clipping_legend()
-        if settings.mode == "depth" and self.darkroom.depth_limits is not None:
-            return depth_legend(*self.darkroom.depth_limits)
-        if settings.mode == "split" and not self.darkroom.photographed_from_here:
+        if settings.mode == "depth" and self.frame_cache.depth_limits is not None:
+            return depth_legend(*self.frame_cache.depth_limits)
+        if settings.mode == "split" and not self.frame_cache.photographed_from_here:
             return note(NO_PHOTOGRAPH)
-        if settings.mode == "split" and self.darkroom.trouble is not None:
-            return note(html.escape(f"The photograph cannot be shown: {self.darkroom.trouble}"))
+        if settings.mode == "split" and self.frame_cache.photograph_error is not None:
+            return note(
+                html.escape(f"The photograph cannot be shown: {self.frame_cache.photograph_error}")
+            )
         return None
 
     # ------------------------------------------------------------------ the browser's splats
@@ -263,9 +274,9 @@ class Screen:
         handle = self._splats
         if handle is None:
             self._panel.set_status(note("preparing splats ..."))
-        splats = self._studio.splats()
+        splats = self._viewed.splats()
         begin = time.monotonic()
-        colors = splat_colors(splats, display_of(self._studio.run, settings), settings)
+        colors = splat_colors(splats, display_of(self._viewed.run, settings), settings)
         if handle is None:
             self._splats = self._client.scene.add_gaussian_splats(
                 "/splats", splats.centers, splats.covariances, colors, splats.opacities
@@ -287,26 +298,26 @@ class Screen:
 
     # ------------------------------------------------------------------ saying what goes on
 
-    def _say_status(self) -> None:
+    def _update_status(self) -> None:
         if self._panel.settings().splats:
             return
-        frame, busy = self.darkroom.frame, self._studio.programs.compiling
+        frame, busy = self.frame_cache.frame, self._viewed.programs.compiling
         parts = []
         if frame is not None:
             parts.append(f"{frame.size[0]} x {frame.size[1]}")
             parts.append(f"{self._last_ms:.0f} ms")
         if busy is not None:
             parts.append(f"compiling {busy[0]} x {busy[1]} ...")
-        if self._studio.programs.failure is not None:
-            parts.append(html.escape(self._studio.programs.failure[:200]))
+        if self._viewed.programs.failure is not None:
+            parts.append(html.escape(self._viewed.programs.failure[:200]))
         self._panel.set_status(note(" &middot; ".join(parts) or "starting ..."))
 
-    def _complain(self, text: str) -> None:
+    def _show_error(self, text: str) -> None:
         self._client.add_notification("This went wrong", text, color="red")
 
 
-def _depth_for_browser(frame: Frame, unit: float) -> Float32[np.ndarray, "h w"]:
-    """Return depth in viewer units, coarse enough to travel with every frame."""
+def _depth_for_browser(frame: RenderedFrame, unit: float) -> Float32[np.ndarray, "h w"]:
+    """Return depth in viewer units, coarse enough to be sent with every frame."""
     step = max(1, frame.size[0] // DEPTH_WIDTH)
     alpha, depth = frame.alpha[::step, ::step], frame.depth[::step, ::step]
     expected = np.where(alpha > 0.5, unit * depth / np.maximum(alpha, 1e-6), FARTHEST)

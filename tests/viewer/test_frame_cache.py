@@ -11,7 +11,7 @@ from p2gs_jax.render.host import make_renderer
 from p2gs_jax.run.read import load_run
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.viewer.darkroom import Darkroom
+from p2gs_jax.viewer.frame_cache import FrameCache
 from p2gs_jax.viewer.settings import (
     Settings,
     common_settings,
@@ -38,20 +38,20 @@ def run(finished_run):
 
 
 @pytest.fixture
-def room(run):
+def setup(run):
     store = ImageStore(run.scene.views, run.cfg.data)
     programs = Counting(run)
-    out = Darkroom(run, store, programs, typical=4.0)
+    out = FrameCache(run, store, programs, typical=4.0)
     assert out.render(camera_of(store, 1))
     yield out, programs, store
     store.close()
 
 
-def test_a_new_look_renders_nothing(room, run):
-    darkroom, programs, _ = room
+def test_a_new_look_renders_nothing(setup, run):
+    frame_cache, programs, _ = setup
     start = common_settings(run)
     shown = [
-        darkroom.develop(replace(start, **change))
+        frame_cache.develop(replace(start, **change))
         for change in (
             {},
             {"exposure_ev": 1.5},
@@ -67,21 +67,21 @@ def test_a_new_look_renders_nothing(room, run):
     assert all(np.any(a != b) for i, a in enumerate(shown) for b in shown[:i])
 
 
-def test_one_stop_doubles_the_light(room, run):
-    darkroom, _, _ = room
+def test_one_stop_doubles_the_light(setup, run):
+    frame_cache, _, _ = setup
     start = Settings(gamma=2.2, curve="linear")
-    dark, light = (darkroom.develop(replace(start, exposure_ev=ev)) for ev in (-3.0, -2.0))
+    dark, light = (frame_cache.develop(replace(start, exposure_ev=ev)) for ev in (-3.0, -2.0))
     inside = (light < 1) & (dark > 1e-5)
     assert inside.mean() > 0.5
     np.testing.assert_allclose(light[inside], 2 * dark[inside], rtol=1e-4)
 
 
-def test_a_view_looks_as_the_run_says(room, run):
-    darkroom, _, _ = room
+def test_a_view_looks_as_the_run_says(setup, run):
+    frame_cache, _, _ = setup
     for index in (run.scene.train_indices[0], run.scene.test_indices[0]):
         settings = settings_of_view(run, index, common_settings(run))
-        expected = develop(darkroom.frame.linear, run.own_display(index))
-        np.testing.assert_allclose(darkroom.develop(settings), expected, atol=1e-5)
+        expected = develop(frame_cache.frame.linear, run.own_display(index))
+        np.testing.assert_allclose(frame_cache.develop(settings), expected, atol=1e-5)
 
 
 def test_exposures_count_from_the_mean_whatever_the_gauge(run):
@@ -124,32 +124,32 @@ def test_corrections_hold_under_the_curve_they_were_learned_with(run):
     assert display_of(with_corrections, other).correction is None
 
 
-def test_photographs_are_found_where_they_were_taken(room, run):
-    darkroom, _, store = room
+def test_photographs_are_found_where_they_were_taken(setup, run):
+    frame_cache, _, store = setup
     here = camera_of(store, 3)
-    assert darkroom.view_at(here) == 3
+    assert frame_cache.view_at(here) == 3
     moved = replace(here, viewmat=here.viewmat.at[0, 3].add(0.05))
-    assert darkroom.view_at(moved) is None
-    assert darkroom.nearest_view(moved) == 3
+    assert frame_cache.view_at(moved) is None
+    assert frame_cache.nearest_view(moved) == 3
 
 
-def test_the_split_shows_the_photograph_in_its_place(room, run):
-    darkroom, _, store = room
+def test_the_split_shows_the_photograph_in_its_place(setup, run):
+    frame_cache, _, store = setup
     settings = settings_of_view(run, 1, Settings(gamma=2.2, mode="split", split=0.5))
-    shown = darkroom.develop(settings)
+    shown = frame_cache.develop(settings)
     photo = store.get(1)[0]
     width = photo.shape[1]
     left = np.s_[2:-2, 2 : width // 2 - 3]
     np.testing.assert_allclose(shown[left], photo[left], atol=2e-3)
     right = np.s_[:, width // 2 + 3 :]
-    rendered = darkroom.develop(replace(settings, mode="display"))
+    rendered = frame_cache.develop(replace(settings, mode="display"))
     np.testing.assert_array_equal(shown[right], rendered[right])
     # ... and it is about the same thing, so the halves belong together.
     assert np.mean(np.abs(rendered[left] - photo[left])) < 0.15
 
 
-def test_a_broken_photograph_is_said_until_one_can_be_shown(room, run, monkeypatch):
-    darkroom, _, store = room
+def test_a_broken_photograph_is_said_until_one_can_be_shown(setup, run, monkeypatch):
+    frame_cache, _, store = setup
 
     def broken(*args):
         raise UserError("0.png is torn.", fix="mend it")
@@ -157,31 +157,31 @@ def test_a_broken_photograph_is_said_until_one_can_be_shown(room, run, monkeypat
     split = replace(common_settings(run), mode="split")
     with monkeypatch.context() as patch:
         patch.setattr(store, "get", broken)
-        darkroom.develop(split)
-        assert darkroom.trouble == "0.png is torn."
-    darkroom.develop(split)
-    assert darkroom.trouble is None
+        frame_cache.develop(split)
+        assert frame_cache.photograph_error == "0.png is torn."
+    frame_cache.develop(split)
+    assert frame_cache.photograph_error is None
 
 
-def test_where_no_photograph_was_taken_the_split_is_the_picture(room, run):
-    darkroom, _, store = room
+def test_where_no_photograph_was_taken_the_split_is_the_picture(setup, run):
+    frame_cache, _, store = setup
     here = camera_of(store, 1)
-    darkroom.render(replace(here, viewmat=here.viewmat.at[2, 3].add(0.4)))
+    frame_cache.render(replace(here, viewmat=here.viewmat.at[2, 3].add(0.4)))
     settings = Settings(gamma=2.2, mode="split")
-    assert not darkroom.photographed_from_here
+    assert not frame_cache.photographed_from_here
     np.testing.assert_array_equal(
-        darkroom.develop(settings), darkroom.develop(replace(settings, mode="display"))
+        frame_cache.develop(settings), frame_cache.develop(replace(settings, mode="display"))
     )
 
 
-def test_depth_colours_stay_until_they_are_set_anew(room):
-    darkroom, _, store = room
+def test_depth_colours_stay_until_they_are_set_anew(setup):
+    frame_cache, _, store = setup
     settings = Settings(gamma=2.2, mode="depth")
-    darkroom.develop(settings)
-    limits = darkroom.depth_limits
+    frame_cache.develop(settings)
+    limits = frame_cache.depth_limits
     here = camera_of(store, 1)
-    darkroom.render(replace(here, viewmat=here.viewmat.at[2, 3].add(2.0)))
-    darkroom.develop(settings)
-    assert darkroom.depth_limits == limits
-    darkroom.set_depth_limits()
-    assert darkroom.depth_limits != limits
+    frame_cache.render(replace(here, viewmat=here.viewmat.at[2, 3].add(2.0)))
+    frame_cache.develop(settings)
+    assert frame_cache.depth_limits == limits
+    frame_cache.set_depth_limits()
+    assert frame_cache.depth_limits != limits

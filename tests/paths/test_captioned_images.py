@@ -1,13 +1,19 @@
 import numpy as np
 
-from p2gs_jax.paths.captioned_rows import Row, stacked, stacked_size
+from p2gs_jax.paths.captioned_images import CaptionedImage, stacked, stacked_size
 
 
 def test_images_come_through_between_lines_of_text():
     rng = np.random.default_rng(0)
     images = [np.rint(255 * rng.uniform(size=(20 + k, 300, 3))) / 255 for k in range(3)]
     captions = [("left", 0, 100), ("right", 100, 300)]
-    sheet = stacked([Row("one", images[0], captions), Row("two", images[1]), Row("", images[2])])
+    sheet = stacked(
+        [
+            CaptionedImage("one", images[0], captions),
+            CaptionedImage("two", images[1]),
+            CaptionedImage("", images[2]),
+        ]
+    )
     assert sheet.shape[1::-1] == stacked_size(300, [20, 21, 22], captions=1)
     line = (sheet.shape[0] - 63) // 4
     tops = [line, 20 + 3 * line, 41 + 4 * line]
@@ -22,6 +28,6 @@ def test_images_come_through_between_lines_of_text():
 def test_captions_that_do_not_fit_are_left_out():
     image = np.zeros((10, 300, 3))
     captions = [("a caption that is much too long for it", 0, 20), ("", 20, 300)]
-    sheet = stacked([Row("", image, captions)])
-    without = stacked([Row("", image, [("", 0, 20), ("", 20, 300)])])
+    sheet = stacked([CaptionedImage("", image, captions)])
+    without = stacked([CaptionedImage("", image, [("", 0, 20), ("", 20, 300)])])
     np.testing.assert_array_equal(sheet, without)

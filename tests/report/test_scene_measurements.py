@@ -12,8 +12,8 @@ from p2gs_jax.config import FitConfig, to_dict
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.progress import Silent
 from p2gs_jax.formats.ply import write_radiance
-from p2gs_jax.report.from_scene import ask_scene
 from p2gs_jax.report.run_files import read_run
+from p2gs_jax.report.scene_measurements import measure_scene
 from p2gs_jax.run.photometry_file import write_photometry
 from p2gs_jax.types import Gaussians
 
@@ -95,7 +95,7 @@ def wall_run(tmp_path_factory):
 
 
 def test_pairs_a_stop_apart_meet_when_developed_alike(wall_run):
-    found = ask_scene(read_run(wall_run), Silent())
+    found = measure_scene(read_run(wall_run), Silent())
     assert [(p.first, p.second) for p in found.seams] == [("0.png", "1.png"), ("1.png", "2.png")]
     for pair in found.seams:
         assert pair.seam.before_ev == pytest.approx(1.0, abs=0.05)
@@ -105,11 +105,11 @@ def test_pairs_a_stop_apart_meet_when_developed_alike(wall_run):
     assert found.missing == ()
     assert found.clipped == {f"{i}.png": 0.0 for i in range(3)}
     # Nothing was held out, so training views are rendered.
-    assert [s.split for s in found.strips] == ["train"] * 3
+    assert [s.split for s in found.comparisons] == ["train"] * 3
 
 
 def test_the_picture_shows_the_step_before_and_not_after(wall_run):
-    picture = ask_scene(read_run(wall_run), Silent()).picture
+    picture = measure_scene(read_run(wall_run), Silent()).picture
     assert picture is not None
     middle = picture.before.shape[1] // 2
 
@@ -127,6 +127,6 @@ def test_presets_with_corrections_have_no_seams_and_say_so(wall_run, tmp_path):
     saved["fit"]["photometry"]["appearance"] = "affine"
     (run / "config.json").write_text(json.dumps(saved))
     np.save(run / "appearance.npy", np.zeros((3, 3, 4), np.float32))
-    found = ask_scene(read_run(run), Silent())
+    found = measure_scene(read_run(run), Silent())
     assert found.seams == ()
     assert any("corrections of display values" in m for m in found.missing)

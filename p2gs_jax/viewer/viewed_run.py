@@ -1,4 +1,4 @@
-"""What all browsers share: the run, its photographs, the compiled programs."""
+"""A run prepared for the viewer: what all browsers share."""
 
 from __future__ import annotations
 
@@ -10,49 +10,50 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.display import develop
 from p2gs_jax.run.read import Run
 from p2gs_jax.scene.images import size_at
 from p2gs_jax.types import Camera
-from p2gs_jax.viewer.darkroom import Darkroom
-from p2gs_jax.viewer.frames import (
+from p2gs_jax.viewer.browser_camera import (
     TYPICAL_DISTANCE,
     Pose,
+    camera_center,
     camera_of_browser,
-    center,
     distance_seen,
     fov_that_holds,
-    make_stage,
+    make_viewer_space,
     pose_of,
 )
+from p2gs_jax.viewer.frame_cache import FrameCache
 from p2gs_jax.viewer.frusta import THUMBNAIL_WIDTH, typical_size
-from p2gs_jax.viewer.ladder import Size
 from p2gs_jax.viewer.legend import exposure_colors, exposure_legend
-from p2gs_jax.viewer.panel import Facts
+from p2gs_jax.viewer.panel_interface import RunInfo
 from p2gs_jax.viewer.playback import frames_of, pose_between
 from p2gs_jax.viewer.programs import PROBES, Programs
+from p2gs_jax.viewer.render_sizes import Size
 from p2gs_jax.viewer.settings import common_settings, exposures_ev
 from p2gs_jax.viewer.splats import BrowserSplats, browser_splats
 
 
-class Studio:
-    """A run, ready to be looked at from several browsers.
+class ViewedRun:
+    """A run with its photographs, its scale in the viewer and its compiled renderer.
 
     Attributes:
         run: the run.
         max_width: widest picture to render, pixels.
         store: its photographs.
-        stage: how the scene stands in the viewer.
-        programs: render it.
-        listeners: called when programs were compiled, or are about to be.
+        space: scale and orientation of the scene in the viewer.
+        programs: its renderer.
+        listeners: called when a program was compiled, or is about to be.
     """
 
     def __init__(self, run: Run, max_width: int):
-        """Find the ground and the size of things; compile nothing yet.
+        """Find scale and orientation of the scene; compile nothing yet.
 
         Args:
-            run: what is looked at.
+            run: the run.
             max_width: widest picture to render, pixels.
         """
         self.run, self.max_width = run, max_width
@@ -64,18 +65,18 @@ class Studio:
         self._points = run.scene.points
         if not len(self._points):
             self._points = np.asarray(run.params.gaussians.means)
-        self.stage = make_stage(run.scene, self._points)
-        rows = np.unique(np.linspace(0, len(run.scene.views) - 1, PROBES).round().astype(int))
+        self.space = make_viewer_space(run.scene, self._points)
+        rows = evenly_spaced(len(run.scene.views), PROBES)
         self.programs = Programs(
             run.params.gaussians,
             run.alive,
             run.cfg.render,
             [self._probe(int(row)) for row in rows],
-            self._tell,
+            self._notify,
             lambda result: develop(result.linear, run.common_display()),
         )
 
-    def _tell(self) -> None:
+    def _notify(self) -> None:
         for listener in tuple(self.listeners):
             listener()
 
@@ -83,18 +84,18 @@ class Studio:
         def camera(size: Size) -> Camera:
             aspect = size[0] / size[1]
             pose = self.pose(index, aspect)
-            return camera_of_browser(pose.wxyz, pose.position, pose.fov, aspect, size, self.stage)
+            return camera_of_browser(pose.wxyz, pose.position, pose.fov, aspect, size, self.space)
 
         return camera
 
     @property
     def typical(self) -> float:
-        """How far away things typically are, scene units."""
-        return TYPICAL_DISTANCE / self.stage.unit
+        """Typical distance from a camera to what it sees, scene units."""
+        return TYPICAL_DISTANCE / self.space.unit
 
     @property
     def first_view(self) -> int:
-        """Where a browser begins: the first training view."""
+        """Row of the view that a browser starts from: the first training view."""
         return self.run.scene.train_indices[0]
 
     def pose(self, index: int, aspect: float) -> Pose:
@@ -102,11 +103,11 @@ class Studio:
 
         Args:
             index: row in `scene.views`.
-            aspect: width / height of the canvas, which shows the whole photograph.
+            aspect: width / height of the canvas; the whole photograph fits into it.
         """
         view = self.run.scene.views[index]
         fov = fov_that_holds(view.K, view.width, view.height, aspect)
-        return pose_of(view.viewmat, self.stage, distance=self._distance(index), fov=fov)
+        return pose_of(view.viewmat, self.space, distance=self._distance(index), fov=fov)
 
     def pose_along(self, camera: str, place: float, aspect: float) -> tuple[Pose, int]:
         """Return the browser's camera on a drive, and the row of the view nearest to it.
@@ -121,31 +122,31 @@ class Studio:
         viewmat = pose_between([views[i].viewmat for i in frames], place)
         fov = self.pose(nearest, aspect).fov
         distance = self._distance(nearest)
-        return pose_of(viewmat, self.stage, distance=distance, fov=fov), nearest
+        return pose_of(viewmat, self.space, distance=distance, fov=fov), nearest
 
     def _distance(self, index: int) -> float:
-        """Return how far away things typically are from a view, scene units."""
+        """Return the typical distance to what a view sees, scene units."""
         if index not in self._distances:
             viewmat = self.run.scene.views[index].viewmat
             self._distances[index] = distance_seen(viewmat, self._points)
         return self._distances[index]
 
-    def darkroom(self) -> Darkroom:
-        """Return a darkroom of one's own."""
-        return Darkroom(self.run, self.store, self.programs, self.typical)
+    def new_frame_cache(self) -> FrameCache:
+        """Return an empty cache that renders this run."""
+        return FrameCache(self.run, self.store, self.programs, self.typical)
 
     def frames(self, camera: str) -> tuple[int, ...]:
         """Return the rows of a physical camera's views."""
         return frames_of(self.run.scene, camera)
 
     @cached_property
-    def facts(self) -> Facts:
-        """What the panel must know."""
+    def info(self) -> RunInfo:
+        """What the panel needs to know of the run."""
         run = self.run
         views = run.scene.views
         evs = exposures_ev(run)
         cameras = dict.fromkeys(view.camera for view in views)
-        return Facts(
+        return RunInfo(
             names=[view.name for view in views],
             cameras={name: len(self.frames(name)) for name in cameras},
             start=common_settings(run),
@@ -158,7 +159,7 @@ class Studio:
     @cached_property
     def camera_size(self) -> float:
         """Usual size of the views' cameras, viewer units."""
-        return typical_size(self.run.scene.views, self.stage)
+        return typical_size(self.run.scene.views, self.space)
 
     @cached_property
     def camera_colors(self) -> UInt8[np.ndarray, "v 3"]:
@@ -184,18 +185,18 @@ class Studio:
         return small
 
     def splats(self) -> BrowserSplats:
-        """Return the scene as the browser's splats, in the colours seen from amid the cameras."""
+        """Return the scene as the browser's splats, in the colours seen from the cameras' mean."""
         with self._lock:
             return self._splats
 
     @cached_property
     def _splats(self) -> BrowserSplats:
         run = self.run
-        middle = np.mean([center(view.viewmat) for view in run.scene.views], axis=0)
+        middle = np.mean([camera_center(view.viewmat) for view in run.scene.views], axis=0)
         return browser_splats(
             run.params.gaussians,
             np.asarray(run.alive),
             run.cfg.render,
             seen_from=middle,
-            unit=self.stage.unit,
+            unit=self.space.unit,
         )

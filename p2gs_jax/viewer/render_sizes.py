@@ -1,7 +1,7 @@
-"""How many pixels to render while the camera moves: the most that keep up with it.
+"""The resolutions of the viewer, and which one to render next: the largest that keeps up.
 
-A program is compiled for every size, so there are few: the rungs of a ladder, in a few shapes.
-Pixels need not be square, so any rung fills any canvas until the right one is compiled.
+Every size needs its own compiled program, so there are few: six widths in a few aspect ratios.
+Pixels need not be square: until the size of a canvas is compiled, another one is stretched over it.
 """
 
 from __future__ import annotations
@@ -13,17 +13,19 @@ Size = tuple[int, int]
 
 # Widths at an aspect of 16:10; areas grow by 2.25.
 WIDTHS = (320, 480, 720, 1080, 1620, 2430)
-# Shapes lie this many to a factor of two, so that no pixel is more than 9 % out of square.
+# Aspect ratios per factor of two: pixels are at most 9 % out of square.
 SHAPES_PER_OCTAVE = 4
 ALIGN = 8
-# Weight of the newest frame in what is expected of its size, and what each takes off the others'.
+# Weight of the newest frame in the expected time of its size, and the share by which every frame
+# lowers the expected times of larger sizes.
 NEWEST, FORGET = 0.3, 0.01
-# A rung of more than this share of all pixels saves too little.
+# Sizes with more than this share of the full size's pixels would save too little.
 FULL_FROM = 0.6
-# Frames of a moving camera should take this long, milliseconds.
+# Target time of a frame while the camera moves, milliseconds.
 TARGET_MS = 75.0
-# A larger rung must be expected within this share of the target, and a rung is left beyond that.
-CLIMB, FALL = 0.85, 1.25
+# Move to a larger size if it is expected within the first share of the target time, and to a
+# smaller one beyond the second.
+ENLARGE_WITHIN, SHRINK_BEYOND = 0.85, 1.25
 
 
 def full_size(canvas: Size, max_width: int) -> Size:
@@ -33,28 +35,28 @@ def full_size(canvas: Size, max_width: int) -> Size:
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
-def ladder(full: Size) -> tuple[Size, ...]:
+def render_sizes(full: Size) -> tuple[Size, ...]:
     """Return the sizes to render a canvas at, smallest first and `full` last."""
     octaves = round(math.log2(full[0] / full[1]) * SHAPES_PER_OCTAVE) / SHAPES_PER_OCTAVE
     aspect = 2.0**octaves
-    rungs = []
+    sizes = []
     for nominal in WIDTHS:
         area = nominal * nominal / 1.6
         size = _aligned(math.sqrt(area * aspect)), _aligned(math.sqrt(area / aspect))
         if area < FULL_FROM * full[0] * full[1]:
-            rungs.append(size)
-    return (*rungs, full)
+            sizes.append(size)
+    return (*sizes, full)
 
 
-def order_of_compilation(rungs: tuple[Size, ...]) -> tuple[Size, ...]:
-    """Return the rungs in the order in which they help most: one to begin with, then the best."""
-    first = rungs[min(1, len(rungs) - 1)]
-    rest = (rungs[-1], *reversed(rungs[:-1]))
+def compilation_order(sizes: tuple[Size, ...]) -> tuple[Size, ...]:
+    """Return the sizes in the order to compile them: a small one, the full size, then the rest."""
+    first = sizes[min(1, len(sizes) - 1)]
+    rest = (sizes[-1], *reversed(sizes[:-1]))
     return tuple(dict.fromkeys((first, *rest)))
 
 
-def choose(
-    rungs: tuple[Size, ...],
+def choose_size(
+    sizes: tuple[Size, ...],
     ready: Collection[Size],
     took_ms: Mapping[Size, float],
     current: Size | None = None,
@@ -63,38 +65,42 @@ def choose(
     """Return the size for the next frame of a moving camera, or None where none is ready.
 
     Args:
-        rungs: smallest first.
-        ready: sizes that are compiled; where no rung is, any of them serves.
+        sizes: of the canvas, smallest first.
+        ready: sizes that are compiled, of this canvas or another.
         took_ms: how long frames of each size take; others are guessed from the nearest.
         current: size of the last frame, kept unless another is clearly better.
         target_ms: how long a frame may take.
     """
-    usable = [rung for rung in rungs if rung in ready]
+    usable = [size for size in sizes if size in ready]
     if not usable:
-        return min(ready, key=lambda size: abs(_area(size) - _area(rungs[0])), default=None)
+        return min(ready, key=lambda size: abs(_area(size) - _area(sizes[0])), default=None)
     best = usable[0]
-    for rung in usable:
-        higher = current is None or _area(rung) > _area(current)
-        if expected_ms(rung, took_ms) <= (CLIMB if higher else FALL) * target_ms:
-            best = rung
+    for size in usable:
+        higher = current is None or _area(size) > _area(current)
+        if expected_ms(size, took_ms) <= (ENLARGE_WITHIN if higher else SHRINK_BEYOND) * target_ms:
+            best = size
             if higher and current is not None:
-                break  # one step at a time: what is expected of higher ones may be out of date
+                break  # one step at a time: expected times of larger sizes may be out of date
     return best
 
 
-class Pace:
-    """How long frames of every size take, learned while they are shown."""
+class FrameTimes:
+    """Running averages of the time that a frame of each size takes.
+
+    Attributes:
+        ms: milliseconds by size.
+    """
 
     def __init__(self):
-        """Nothing is known yet."""
+        """Begin without any times."""
         self.ms: dict[Size, float] = {}
 
-    def begin(self, known: Mapping[Size, float]) -> None:
-        """Take what was measured elsewhere, for sizes of which nothing is known."""
+    def add_known(self, known: Mapping[Size, float]) -> None:
+        """Add times measured elsewhere, for sizes that have none yet."""
         self.ms = dict(known) | self.ms
 
-    def took(self, size: Size, milliseconds: float) -> None:
-        """Learn from a frame; larger sizes become worth another try little by little."""
+    def update(self, size: Size, milliseconds: float) -> None:
+        """Add the time of a frame; lower those of larger sizes a little, to try them again."""
         before = self.ms.get(size, milliseconds)
         self.ms[size] = before + NEWEST * (milliseconds - before)
         for other in self.ms:
@@ -103,7 +109,7 @@ class Pace:
 
 
 def expected_ms(size: Size, took_ms: Mapping[Size, float]) -> float:
-    """Return how long a frame should take, at most in proportion to its pixels; inf if unknown."""
+    """Return the expected time of a frame, estimated from the nearest size with a known one."""
     if size in took_ms:
         return took_ms[size]
     if not took_ms:

@@ -1,4 +1,4 @@
-"""Views to look at: a photograph, what the fit makes of it, and its radiance."""
+"""Views for the page: photograph, render and radiance."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
+from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.exr import read_exr
-from p2gs_jax.report.run_files import HeldOut, RunFiles, number_at
+from p2gs_jax.report.run_files import HeldOutFiles, RunFiles, number_at
 
 
 @dataclass(frozen=True)
-class Strip:
-    """One view.
+class ViewComparison:
+    """A photograph and its render.
 
     Attributes:
         name: of the view.
@@ -25,7 +26,7 @@ class Strip:
         photograph: display values.
         render: under the view's own exposure, or that fitted to its photograph.
         linear: radiance, or None.
-        psnr: of the two, dB, or None where nothing tells.
+        psnr: of the render, dB, or None if unknown.
     """
 
     name: str
@@ -36,13 +37,13 @@ class Strip:
     psnr: float | None
 
 
-def held_out_strips(run: RunFiles, most: int, problems: list[str]) -> list[Strip]:
-    """Return held-out views from files, from the worst to the best: evenly over all of them.
+def held_out_comparisons(run: RunFiles, most: int, problems: list[str]) -> list[ViewComparison]:
+    """Return held-out views from files: evenly over all of them, the worst first.
 
     Args:
         run: the folder.
         most: views at most.
-        problems: receives what could not be read.
+        problems: receives a sentence for every view that could not be read.
     """
     scores = run.part("test", "exposure_fitted", "per_view")
     ranked = sorted(run.held_out, key=lambda h: (_psnr(scores, h), h.name))
@@ -50,7 +51,7 @@ def held_out_strips(run: RunFiles, most: int, problems: list[str]) -> list[Strip
     for files in spread(ranked, most):
         try:
             out.append(
-                Strip(
+                ViewComparison(
                     files.name,
                     "test",
                     read_png(files.photograph),
@@ -64,16 +65,14 @@ def held_out_strips(run: RunFiles, most: int, problems: list[str]) -> list[Strip
     return out
 
 
-def _psnr(scores: dict, files: HeldOut) -> float:
+def _psnr(scores: dict, files: HeldOutFiles) -> float:
     value = number_at(scores, files.name, "psnr")
     return float("inf") if value is None else value
 
 
 def spread(items: Sequence, most: int) -> list:
-    """Return at most so many items, the first, the last and evenly between."""
-    if len(items) <= most:
-        return list(items)
-    return [items[i] for i in np.linspace(0, len(items) - 1, most).round().astype(int)]
+    """Return at most `most` items, evenly spaced, the first and the last included."""
+    return [items[i] for i in evenly_spaced(len(items), most)]
 
 
 def read_png(path: Path) -> Float32[np.ndarray, "h w 3"]:

@@ -5,10 +5,10 @@ import copy
 import numpy as np
 import pytest
 
-from p2gs_jax.report.cautions import cautions
-from p2gs_jax.report.from_scene import FromScene
 from p2gs_jax.report.run_files import read_run
-from p2gs_jax.report.words import count, duration, reasons, remarks, summary
+from p2gs_jax.report.run_summary import count, duration, reasons, remarks, summary_sentences
+from p2gs_jax.report.run_warnings import run_warnings
+from p2gs_jax.report.scene_measurements import SceneMeasurements
 
 
 @pytest.fixture
@@ -26,11 +26,11 @@ def run(finished_run):
 
 
 def titles(run, scene=None):
-    return [c.title for c in cautions(run, scene or FromScene())]
+    return [c.title for c in run_warnings(run, scene or SceneMeasurements())]
 
 
 def text(run, title, scene=None):
-    return next(c.text for c in cautions(run, scene or FromScene()) if c.title == title)
+    return next(c.text for c in run_warnings(run, scene or SceneMeasurements()) if c.title == title)
 
 
 def test_a_good_run_has_none(run):
@@ -132,7 +132,7 @@ def test_a_fit_says_where_it_started(finished_run):
 
 
 def test_clipped_photographs(run):
-    scene = FromScene(clipped={"a": 0.4, "b": 0.01})
+    scene = SceneMeasurements(clipped={"a": 0.4, "b": 0.01})
     said = text(run, "Clipped photographs", scene)
     assert "a 40%" in said
     assert "1 of the 2" in said
@@ -154,12 +154,12 @@ def test_still_rising(run):
 
 
 def test_many_names_are_counted(run):
-    scene = FromScene(clipped={f"{i}.png": 0.5 for i in range(9)})
+    scene = SceneMeasurements(clipped={f"{i}.png": 0.5 for i in range(9)})
     assert "and 4 more" in text(run, "Clipped photographs", scene)
 
 
 def test_the_summary_is_three_sentences(run):
-    what, model, good = summary(run, FromScene())
+    what, model, good = summary_sentences(run, SceneMeasurements())
     assert what.startswith("4 photographs of scene by 1 camera (2 more were held out)")
     assert "an exposure per view under the sRGB tone curve" in model
     assert "simplest" in model
@@ -167,9 +167,9 @@ def test_the_summary_is_three_sentences(run):
     run.photometry["curve"]["name"] = "linear"
     run.photometry["model"] = "constant"
     run.options["preset"] = "3dgs"
-    assert "models no camera" in summary(run, FromScene())[1]
+    assert "models no camera" in summary_sentences(run, SceneMeasurements())[1]
     run.metrics.clear()
-    assert "metrics.json is missing" in summary(run, FromScene())[2]
+    assert "metrics.json is missing" in summary_sentences(run, SceneMeasurements())[2]
 
 
 def test_notes_are_reasons_or_remarks(run):

@@ -9,18 +9,18 @@ from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.formats.false_color import OVER, clipping_overlay, depth_color, false_color
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.types import Camera
-from p2gs_jax.viewer.shade import (
+from p2gs_jax.viewer.picture_modes import (
     MIDDLE_GREY,
-    Frame,
-    Photograph,
-    as_seen_by,
-    codes,
-    compare,
+    RenderedFrame,
+    WarpedPhotograph,
     limits_of_depth,
-    shade,
+    picture_of,
+    split_picture,
+    to_uint8_fast,
+    warp_photograph,
 )
 
-LOOK = DisplayTransform(2.0, 2.2, PhotometryConfig())
+TRANSFORM = DisplayTransform(2.0, 2.2, PhotometryConfig())
 
 
 def camera(width=40, height=24, focal=50.0, rotation=(0, 0, 0), K=None):
@@ -37,32 +37,35 @@ def frame(seed=0):
     linear = np.exp2(rng.uniform(-8, 3, (24, 40, 3))).astype(np.float32)
     alpha = rng.uniform(0, 1, (24, 40)).astype(np.float32)
     depth = alpha * rng.uniform(2, 9, (24, 40)).astype(np.float32)
-    return Frame(jnp.asarray(linear), alpha, depth, camera())
+    return RenderedFrame(jnp.asarray(linear), alpha, depth, camera())
 
 
 def test_every_mode_shows_what_it_says():
     f = frame()
     linear = np.asarray(f.linear)
-    shown = develop(linear, LOOK)
-    np.testing.assert_array_equal(shade(f, "display", LOOK), shown)
-    np.testing.assert_array_equal(shade(f, "clipping", LOOK), clipping_overlay(shown))
+    shown = develop(linear, TRANSFORM)
+    np.testing.assert_array_equal(picture_of(f, "display", TRANSFORM), shown)
+    np.testing.assert_array_equal(picture_of(f, "clipping", TRANSFORM), clipping_overlay(shown))
     limits = (2.0, 9.0)
     np.testing.assert_array_equal(
-        shade(f, "depth", LOOK, depth_limits=limits), depth_color(f.depth, f.alpha, limits)
+        picture_of(f, "depth", TRANSFORM, depth_limits=limits),
+        depth_color(f.depth, f.alpha, limits),
     )
     np.testing.assert_array_equal(
-        shade(f, "stops", LOOK), false_color(linear, MIDDLE_GREY / LOOK.exposure)
+        picture_of(f, "stops", TRANSFORM), false_color(linear, MIDDLE_GREY / TRANSFORM.exposure)
     )
-    assert np.any(np.all(np.isclose(shade(f, "clipping", LOOK), OVER), axis=-1))
+    assert np.any(np.all(np.isclose(picture_of(f, "clipping", TRANSFORM), OVER), axis=-1))
 
 
 def test_stops_count_from_middle_grey_at_the_exposure():
-    grey = jnp.full((4, 4, 3), 1.01 * MIDDLE_GREY / LOOK.exposure)
-    f = Frame(grey, np.ones((4, 4)), np.ones((4, 4)), camera(4, 4))
-    one_up = DisplayTransform(2 * LOOK.exposure, LOOK.gamma, LOOK.formation)
-    twice = Frame(2 * grey, f.alpha, f.depth, f.camera)
-    np.testing.assert_array_equal(shade(f, "stops", one_up), shade(twice, "stops", LOOK))
-    assert np.any(shade(f, "stops", LOOK) != shade(f, "stops", one_up))
+    grey = jnp.full((4, 4, 3), 1.01 * MIDDLE_GREY / TRANSFORM.exposure)
+    f = RenderedFrame(grey, np.ones((4, 4)), np.ones((4, 4)), camera(4, 4))
+    one_up = DisplayTransform(2 * TRANSFORM.exposure, TRANSFORM.gamma, TRANSFORM.formation)
+    twice = RenderedFrame(2 * grey, f.alpha, f.depth, f.camera)
+    np.testing.assert_array_equal(
+        picture_of(f, "stops", one_up), picture_of(twice, "stops", TRANSFORM)
+    )
+    assert np.any(picture_of(f, "stops", TRANSFORM) != picture_of(f, "stops", one_up))
 
 
 def test_the_limits_of_depth_hold_almost_everything():
@@ -70,34 +73,36 @@ def test_the_limits_of_depth_hold_almost_everything():
     near, far = limits_of_depth(f)
     assert 2 <= near < 3
     assert 8 < far <= 9
-    nothing = Frame(f.linear, 0 * f.alpha, 0 * f.depth, f.camera)
+    nothing = RenderedFrame(f.linear, 0 * f.alpha, 0 * f.depth, f.camera)
     near, far = limits_of_depth(nothing)
     assert 0 < near < far
 
 
 def test_split_without_a_photograph_is_the_picture():
-    np.testing.assert_array_equal(shade(frame(), "split", LOOK), develop(frame().linear, LOOK))
+    np.testing.assert_array_equal(
+        picture_of(frame(), "split", TRANSFORM), develop(frame().linear, TRANSFORM)
+    )
 
 
 def test_photograph_left_render_right():
     inside = np.zeros((24, 40), bool)
     inside[4:20, 10:30] = True
-    photo = Photograph(np.full((24, 40, 3), 0.25, np.float32), inside)
-    out = compare(photo, np.full((24, 40, 3), 0.75, np.float32), 0.5)
+    photo = WarpedPhotograph(np.full((24, 40, 3), 0.25, np.float32), inside)
+    out = split_picture(photo, np.full((24, 40, 3), 0.75, np.float32), 0.5)
     assert np.all(out[4:20, 10:19] == 0.25)
     assert np.all(out[:, 21:] == 0.75)
     assert np.all(out[:, :10] == 0.75)
     assert np.all(out[:4, :19] == 0.75)
     assert np.all(out[:, 19:21] == 1)
-    whole = compare(photo, np.full((24, 40, 3), 0.75, np.float32), 1.0)
+    whole = split_picture(photo, np.full((24, 40, 3), 0.75, np.float32), 1.0)
     assert np.all(whole[inside] == 0.25)
-    none = compare(photo, np.full((24, 40, 3), 0.75, np.float32), 0.0)
+    none = split_picture(photo, np.full((24, 40, 3), 0.75, np.float32), 0.0)
     assert np.all(none == 0.75)
 
 
 def test_a_photograph_in_its_own_camera_stays_as_it_is():
     ldr = np.random.default_rng(0).uniform(0, 1, (24, 40, 3)).astype(np.float32)
-    seen = as_seen_by(ldr, np.ones((24, 40), np.float32), camera(), camera())
+    seen = warp_photograph(ldr, np.ones((24, 40), np.float32), camera(), camera())
     np.testing.assert_allclose(seen.ldr, ldr, atol=1e-4)
     assert seen.inside[1:-1, 1:-1].all()
 
@@ -115,7 +120,7 @@ def test_a_photograph_lines_up_with_a_turned_camera(size):
         return rays / rays[..., 2:]
 
     ldr = (0.5 + 0.4 * directions(taken)).astype(np.float32)
-    seen = as_seen_by(ldr, np.ones((300, 400), np.float32), taken, other)
+    seen = warp_photograph(ldr, np.ones((300, 400), np.float32), taken, other)
     expected = 0.5 + 0.4 * directions(other)
     np.testing.assert_allclose(seen.ldr[seen.inside], expected[seen.inside], atol=2e-3)
     local = directions(other) @ np.asarray(taken.viewmat, float)[:3, :3].T
@@ -130,20 +135,20 @@ def test_a_photograph_lines_up_with_a_turned_camera(size):
 
 def test_nothing_is_seen_behind_oneself():
     back = camera(rotation=(0, np.pi, 0))
-    seen = as_seen_by(np.ones((24, 40, 3), np.float32), np.ones((24, 40)), camera(), back)
+    seen = warp_photograph(np.ones((24, 40, 3), np.float32), np.ones((24, 40)), camera(), back)
     assert not seen.inside.any()
 
 
 def test_masked_pixels_are_not_shown():
     mask = np.ones((24, 40), np.float32)
     mask[:, :20] = 0
-    seen = as_seen_by(np.ones((24, 40, 3), np.float32), mask, camera(), camera())
+    seen = warp_photograph(np.ones((24, 40, 3), np.float32), mask, camera(), camera())
     assert not seen.inside[:, :19].any()
     assert seen.inside[2:-2, 21:-2].all()
 
 
 def test_codes_are_rounded_and_kept_in_range():
     np.testing.assert_array_equal(
-        codes(np.array([[[0.0, 1.4 / 255, 1.6 / 255], [1.0, 1.2, 0.5]]], np.float32))[0],
+        to_uint8_fast(np.array([[[0.0, 1.4 / 255, 1.6 / 255], [1.0, 1.2, 0.5]]], np.float32))[0],
         [[0, 1, 2], [255, 255, 128]],
     )

@@ -11,17 +11,17 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.render.host import make_renderer
 from p2gs_jax.run.read import load_run
 from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.viewer.darkroom import Darkroom
-from p2gs_jax.viewer.frames import Stage
-from p2gs_jax.viewer.ladder import full_size, ladder
+from p2gs_jax.viewer.browser_camera import ViewerSpace
+from p2gs_jax.viewer.frame_cache import FrameCache
+from p2gs_jax.viewer.render_sizes import full_size, render_sizes
 from p2gs_jax.viewer.settings import Settings
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 
-from p2gs_jax.viewer.screen import Screen
+from p2gs_jax.viewer.render_loop import RenderLoop
 
 CANVAS = (560, 400)
-RUNGS = ladder(full_size(CANVAS, 1920))
+SIZES = render_sizes(full_size(CANVAS, 1920))
 PATIENCE_S = 60
 
 
@@ -30,11 +30,11 @@ class Programs:
 
     def __init__(self, run):
         self.run, self.renderer = run, make_renderer(run.cfg.render)
-        self.ready, self.took_ms = frozenset(RUNGS), dict.fromkeys(RUNGS, 1.0)
-        self.compiled, self.compiling, self.failure = len(RUNGS), None, None
+        self.ready, self.took_ms = frozenset(SIZES), dict.fromkeys(SIZES, 1.0)
+        self.compiled, self.compiling, self.failure = len(SIZES), None, None
         self.rendered, self.wanted, self.refused = [], [], set()
 
-    def want(self, sizes):
+    def request(self, sizes):
         self.wanted.append(tuple(sizes))
 
     def render(self, camera):
@@ -101,19 +101,17 @@ def run(finished_run):
 def setup(run):
     store = ImageStore(run.scene.views, run.cfg.data)
     programs, client, panel = Programs(run), Client(), Panel()
-    studio = SimpleNamespace(
+    viewed = SimpleNamespace(
         run=run,
         programs=programs,
-        stage=Stage(2.0, np.array([0.0, -1, 0])),
+        space=ViewerSpace(2.0, np.array([0.0, -1, 0])),
         max_width=1920,
         listeners=[],
-        darkroom=lambda: Darkroom(run, store, programs, 4.0),
+        new_frame_cache=lambda: FrameCache(run, store, programs, 4.0),
     )
-    screen = Screen(client, studio, panel)
-    yield SimpleNamespace(
-        screen=screen, client=client, panel=panel, programs=programs, studio=studio
-    )
-    screen.stop()
+    loop = RenderLoop(client, viewed, panel)
+    yield SimpleNamespace(loop=loop, client=client, panel=panel, programs=programs, viewed=viewed)
+    loop.stop()
     store.close()
 
 
@@ -126,23 +124,23 @@ def shape(picture):
 
 
 def test_it_sharpens_at_rest(setup):
-    setup.screen.start()
+    setup.loop.start()
     setup.client.wait(sharp)
     kinds = [kind for kind, *_ in setup.client.pictures]
     assert kinds == ["jpeg", "png"]
     assert shape(setup.client.pictures[-1]) == CANVAS
-    assert set(setup.programs.wanted[0]) == set(RUNGS)
+    assert set(setup.programs.wanted[0]) == set(SIZES)
     time.sleep(0.5)
     assert len(setup.client.pictures) == 2  # nothing changes, nothing is sent
 
 
 def test_a_new_look_renders_nothing(setup):
-    setup.screen.start()
+    setup.loop.start()
     setup.client.wait(sharp)
     before, seen = len(setup.programs.rendered), len(setup.client.pictures)
     for ev in (0.5, 1.0, 2.0):
         setup.panel.now = Settings(gamma=2.2, exposure_ev=ev)
-        setup.screen.retouched()
+        setup.loop.display_changed()
         setup.client.wait(lambda p: len(p) > seen)
     setup.client.wait(lambda p: len(p) > seen and sharp(p))
     assert len(setup.programs.rendered) == before
@@ -151,23 +149,23 @@ def test_a_new_look_renders_nothing(setup):
 
 
 def test_slow_frames_make_small_pictures_while_moving(setup):
-    setup.programs.took_ms = {rung: 1e4 for rung in RUNGS}
-    setup.screen.start()
+    setup.programs.took_ms = {size: 1e4 for size in SIZES}
+    setup.loop.start()
     setup.client.wait(sharp)
-    assert shape(setup.client.pictures[0]) == RUNGS[0]
+    assert shape(setup.client.pictures[0]) == SIZES[0]
     assert shape(setup.client.pictures[-1]) == CANVAS
 
 
 def test_the_newest_camera_wins(setup):
-    setup.screen.start()
+    setup.loop.start()
     setup.client.wait(sharp)
     for step in range(30):
         setup.client.camera.position = np.array([0.02 * step, 0, 0])
-        setup.screen.moved()
+        setup.loop.camera_moved()
     setup.client.wait(sharp)
     end = time.monotonic() + PATIENCE_S
     while time.monotonic() < end:
-        shown = setup.screen.darkroom.frame.camera.viewmat[0, 3]
+        shown = setup.loop.frame_cache.frame.camera.viewmat[0, 3]
         if np.isclose(shown, -0.58 / 2.0, atol=1e-5):
             break
         time.sleep(0.05)
@@ -176,21 +174,21 @@ def test_the_newest_camera_wins(setup):
 
 
 def test_the_best_there_is_until_more_is_compiled(setup):
-    setup.programs.ready = frozenset(RUNGS[:1])
-    setup.screen.start()
+    setup.programs.ready = frozenset(SIZES[:1])
+    setup.loop.start()
     setup.client.wait(sharp)
-    assert shape(setup.client.pictures[-1]) == RUNGS[0]
-    setup.programs.ready, setup.programs.compiled = frozenset(RUNGS), 99
-    for listener in setup.studio.listeners:
+    assert shape(setup.client.pictures[-1]) == SIZES[0]
+    setup.programs.ready, setup.programs.compiled = frozenset(SIZES), 99
+    for listener in setup.viewed.listeners:
         listener()
     setup.client.wait(lambda p: shape(p[-1]) == CANVAS)
 
 
 def test_what_overflows_is_shown_smaller(setup):
-    setup.programs.refused = {RUNGS[-1]}
-    setup.screen.start()
+    setup.programs.refused = {SIZES[-1]}
+    setup.loop.start()
     setup.client.wait(sharp)
-    assert shape(setup.client.pictures[-1]) == RUNGS[-2]
+    assert shape(setup.client.pictures[-1]) == SIZES[-2]
     time.sleep(0.5)
     sent = len(setup.client.pictures)
     time.sleep(0.5)
@@ -198,43 +196,43 @@ def test_what_overflows_is_shown_smaller(setup):
 
 
 def test_what_no_size_holds_comes_once_there_is_room(setup):
-    setup.screen.start()
+    setup.loop.start()
     setup.client.wait(sharp)
-    setup.programs.refused = set(RUNGS)
+    setup.programs.refused = set(SIZES)
     setup.client.camera.position = np.array([0.4, 0, 0])
-    setup.screen.moved()
+    setup.loop.camera_moved()
     time.sleep(0.7)
-    assert setup.screen.darkroom.frame.camera.viewmat[0, 3] == 0
+    assert setup.loop.frame_cache.frame.camera.viewmat[0, 3] == 0
     seen = len(setup.client.pictures)
     setup.programs.refused, setup.programs.compiled = set(), 99
-    for listener in setup.studio.listeners:
+    for listener in setup.viewed.listeners:
         listener()
     setup.client.wait(lambda p: len(p) > seen and sharp(p))
-    np.testing.assert_allclose(setup.screen.darkroom.frame.camera.viewmat[0, 3], -0.2)
+    np.testing.assert_allclose(setup.loop.frame_cache.frame.camera.viewmat[0, 3], -0.2)
 
 
 def test_nothing_compiled_shows_nothing_and_waits(setup):
     setup.programs.ready = frozenset()
-    setup.programs.compiling = RUNGS[1]
-    setup.screen.start()
+    setup.programs.compiling = SIZES[1]
+    setup.loop.start()
     assert not setup.client.pictures
     assert "compiling" in setup.panel.status
-    setup.programs.ready, setup.programs.compiling = frozenset(RUNGS), None
-    for listener in setup.studio.listeners:
+    setup.programs.ready, setup.programs.compiling = frozenset(SIZES), None
+    for listener in setup.viewed.listeners:
         listener()
     setup.client.wait(sharp)
 
 
 def test_depth_travels_only_where_cameras_are_shown(setup):
-    setup.screen.start()
+    setup.loop.start()
     setup.client.wait(sharp)
     assert setup.client.pictures[-1][2]["depth"] is None
-    setup.screen.with_depth = True
+    setup.loop.with_depth = True
     seen = len(setup.client.pictures)
-    setup.screen.retouched()
+    setup.loop.display_changed()
     setup.client.wait(lambda p: len(p) > seen)
     depth = setup.client.pictures[-1][2]["depth"]
-    frame = setup.screen.darkroom.frame
+    frame = setup.loop.frame_cache.frame
     opaque = frame.alpha > 0.9
     expected = 2.0 * frame.depth / np.maximum(frame.alpha, 1e-6)
     np.testing.assert_allclose(depth[opaque], expected[opaque], atol=2e-3)
@@ -242,18 +240,18 @@ def test_depth_travels_only_where_cameras_are_shown(setup):
 
 
 def test_an_error_is_said_and_the_next_picture_comes(setup, monkeypatch):
-    setup.screen.start()
+    setup.loop.start()
     setup.client.wait(sharp)
-    develop = setup.screen.darkroom.develop
+    develop = setup.loop.frame_cache.develop
     monkeypatch.setattr(
-        setup.screen.darkroom, "develop", lambda s: (_ for _ in ()).throw(UserError("no photo"))
+        setup.loop.frame_cache, "develop", lambda s: (_ for _ in ()).throw(UserError("no photo"))
     )
-    setup.screen.retouched()
+    setup.loop.display_changed()
     end = time.monotonic() + PATIENCE_S
     while not setup.client.said and time.monotonic() < end:
         time.sleep(0.02)
     assert setup.client.said[0] == "no photo"
-    monkeypatch.setattr(setup.screen.darkroom, "develop", develop)
+    monkeypatch.setattr(setup.loop.frame_cache, "develop", develop)
     seen = len(setup.client.pictures)
-    setup.screen.retouched()
+    setup.loop.display_changed()
     setup.client.wait(lambda p: len(p) > seen)

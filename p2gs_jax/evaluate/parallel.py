@@ -1,4 +1,4 @@
-"""Views judged side by side, their results in order."""
+"""A map over views in threads, with results in order."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ from typing import TypeVar
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-# More would hold too many rendered images at once.
+# A bound on the rendered images held at once.
 MOST_WORKERS = 4
 
 
-def in_order(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
-    """Yield what a function returns for every item, in their order, computed in threads.
+def map_in_order(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+    """Yield a function's results in the order of the items, computed in threads.
 
-    Numpy, JAX and image files leave the interpreter to other threads. The first item is computed
-    alone: it compiles what all need. At most one result more than there are threads is held.
+    NumPy, JAX and image readers release the interpreter's lock. The first item is computed alone,
+    so that programs compile once. `Executor.map` would submit all items at once; here at most one
+    result more than there are threads is held.
     """
     workers = min(os.cpu_count() or 1, MOST_WORKERS)
     rest = iter(items)

@@ -5,18 +5,18 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from p2gs_jax.types import Scene, View
-from p2gs_jax.viewer.frames import (
+from p2gs_jax.viewer.browser_camera import (
     TYPICAL_DISTANCE,
-    Stage,
+    ViewerSpace,
+    camera_center,
     camera_of_browser,
-    center,
     distance_seen,
     fov_that_holds,
-    make_stage,
+    make_viewer_space,
     pose_of,
 )
 
-STAGE = Stage(2.5, np.array([0.0, -1.0, 0.0]))
+SPACE = ViewerSpace(2.5, np.array([0.0, -1.0, 0.0]))
 
 
 def a_viewmat(seed=0):
@@ -47,11 +47,11 @@ def test_a_point_is_where_the_browser_draws_it():
     # canvas from -1 to 1 upwards.
     rotation = Rotation.from_euler("xyz", [0.2, -0.4, 0.1])
     position, fov, aspect, size = np.array([1.0, -2.0, 0.5]), 0.9, 1.7, (340, 200)
-    point = position / STAGE.unit + rotation.apply([0.3, 0.2, 4.0])
+    point = position / SPACE.unit + rotation.apply([0.3, 0.2, 4.0])
     camera = camera_of_browser(
-        rotation.as_quat(scalar_first=True), position, fov, aspect, size, STAGE
+        rotation.as_quat(scalar_first=True), position, fov, aspect, size, SPACE
     )
-    x, y, z = rotation.inv().apply(point * STAGE.unit - position) * [1, -1, -1]
+    x, y, z = rotation.inv().apply(point * SPACE.unit - position) * [1, -1, -1]
     ndc = np.array([x / aspect, y]) / (-z * np.tan(fov / 2))
     expected = (ndc * [1, -1] + 1) / 2 * size
     np.testing.assert_allclose(pixel(camera, point), expected, rtol=1e-5)
@@ -59,19 +59,19 @@ def test_a_point_is_where_the_browser_draws_it():
 
 def test_a_view_survives_the_trip():
     viewmat = a_viewmat()
-    pose = pose_of(viewmat, STAGE, distance=3.0, fov=0.7)
-    camera = camera_of_browser(pose.wxyz, pose.position, pose.fov, 1.5, (300, 200), STAGE)
+    pose = pose_of(viewmat, SPACE, distance=3.0, fov=0.7)
+    camera = camera_of_browser(pose.wxyz, pose.position, pose.fov, 1.5, (300, 200), SPACE)
     np.testing.assert_allclose(camera.viewmat, viewmat, atol=1e-6)
     np.testing.assert_allclose(camera.K[0, 0], camera.K[1, 1], rtol=1e-6)
-    ahead = (pose.look_at / STAGE.unit - center(viewmat)) / 3.0
+    ahead = (pose.look_at / SPACE.unit - camera_center(viewmat)) / 3.0
     np.testing.assert_allclose(ahead, viewmat[2, :3], atol=1e-6)
 
 
 def test_any_size_shows_the_same_part_of_the_world():
-    pose = pose_of(a_viewmat(), STAGE, distance=3.0, fov=0.7)
-    point = center(a_viewmat()) + a_viewmat()[:3, :3].T @ [0.2, -0.1, 2.0]
+    pose = pose_of(a_viewmat(), SPACE, distance=3.0, fov=0.7)
+    point = camera_center(a_viewmat()) + a_viewmat()[:3, :3].T @ [0.2, -0.1, 2.0]
     shares = [
-        pixel(camera_of_browser(pose.wxyz, pose.position, 0.7, 1.6, size, STAGE), point) / size
+        pixel(camera_of_browser(pose.wxyz, pose.position, 0.7, 1.6, size, SPACE), point) / size
         for size in ((1280, 800), (328, 200), (480, 480))
     ]
     np.testing.assert_allclose(shares, shares[:1] * 3, rtol=1e-5)
@@ -82,7 +82,7 @@ def test_a_whole_photograph_is_seen(aspect):
     K, width, height = np.array([[90.0, 0, 70], [0, 110, 30], [0, 0, 1]]), 120, 80
     fov = fov_that_holds(K, width, height, aspect)
     size = (round(1000 * aspect), 1000)
-    camera = camera_of_browser((1, 0, 0, 0), (0, 0, 0), fov, size[0] / size[1], size, STAGE)
+    camera = camera_of_browser((1, 0, 0, 0), (0, 0, 0), fov, size[0] / size[1], size, SPACE)
     corners = [(np.linalg.inv(K) @ [x, y, 1.0]) for x in (0, width) for y in (0, height)]
     at = np.array([pixel(camera, corner) for corner in corners])
     assert at.min() > -1
@@ -99,15 +99,15 @@ def test_up_is_what_cameras_hold_up_and_distances_are_typical():
         viewmat[:3, :3] = Rotation.from_euler("z", roll).as_matrix()
         views.append(a_view(viewmat))
     points = np.random.default_rng(0).uniform([-0.1, -0.1, 4.9], [0.1, 0.1, 5.1], (50, 3))
-    stage = make_stage(scene_of(views, points), points)
-    np.testing.assert_allclose(stage.up, [0, -1, 0], atol=0.02)
-    np.testing.assert_allclose(stage.unit, TYPICAL_DISTANCE / 5, rtol=0.03)
+    space = make_viewer_space(scene_of(views, points), points)
+    np.testing.assert_allclose(space.up, [0, -1, 0], atol=0.02)
+    np.testing.assert_allclose(space.unit, TYPICAL_DISTANCE / 5, rtol=0.03)
 
 
 def test_a_scene_without_points_is_measured_by_its_gaussians():
     means = np.array([[0, 0, 2.0], [0.1, 0, 2.0]])
-    stage = make_stage(scene_of([a_view(np.eye(4))], np.zeros((0, 3))), means)
-    np.testing.assert_allclose(stage.unit, TYPICAL_DISTANCE / 2)
+    space = make_viewer_space(scene_of([a_view(np.eye(4))], np.zeros((0, 3))), means)
+    np.testing.assert_allclose(space.unit, TYPICAL_DISTANCE / 2)
 
 
 def test_what_is_behind_or_beside_has_no_distance():

@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from p2gs_jax.evaluate.in_order import MOST_WORKERS, in_order
+from p2gs_jax.evaluate.parallel import MOST_WORKERS, map_in_order
 
 
 def test_results_keep_their_order_whatever_finishes_first():
@@ -13,8 +13,8 @@ def test_results_keep_their_order_whatever_finishes_first():
         time.sleep(0.01 * (k % 2 == 0))
         return k * k
 
-    assert list(in_order(slow_if_even, range(20))) == [k * k for k in range(20)]
-    assert list(in_order(slow_if_even, [])) == []
+    assert list(map_in_order(slow_if_even, range(20))) == [k * k for k in range(20)]
+    assert list(map_in_order(slow_if_even, [])) == []
 
 
 def test_the_first_item_is_computed_alone_and_few_results_wait():
@@ -27,7 +27,7 @@ def test_the_first_item_is_computed_alone_and_few_results_wait():
         done.append(k)
         return k
 
-    results = in_order(counted, range(100))
+    results = map_in_order(counted, range(100))
     assert running == []
     assert next(results) == 0
     assert running == [0]
@@ -48,5 +48,5 @@ def test_an_error_reaches_the_caller_and_ends_the_rest():
         return k
 
     with pytest.raises(ValueError, match="no such view"):
-        list(in_order(failing, range(1000)))
+        list(map_in_order(failing, range(1000)))
     assert len(seen) < 1000

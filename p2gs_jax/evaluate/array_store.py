@@ -1,6 +1,6 @@
-"""Arrays kept for a second look: in memory up to a bound, in a temporary folder beyond it.
+"""Arrays that are needed twice: in memory up to a bound, in a temporary folder beyond it.
 
-Two judgements need every view twice, once for a scale that all have in common and once under it.
+Some scores need two passes over the views: one for a scale common to all, one for the scores.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ MOST_BYTES = 1 << 30
 
 
 @dataclass(frozen=True)
-class Kept:
-    """An array on a shelf.
+class StoredArray:
+    """An array in a store.
 
     Attributes:
-        held: the array; nothing of it where it lies on disk.
+        held: the array; empty where it is on disk.
         shape: of the array.
         path: its file, or None.
     """
@@ -32,48 +32,48 @@ class Kept:
         """Return the array, bit for bit; from any thread."""
         if self.path is None:
             return self.held
-        # Not np.load: it parses a header as Python does, which some 3.11 cannot in two threads.
+        # Not np.load: it parses headers with `ast`, which is not thread-safe in some Python 3.11.
         return np.fromfile(self.path, self.held.dtype).reshape(self.shape)
 
 
-class Shelf:
-    """Keeps arrays; use as a context manager, whose end removes the folder.
+class ArrayStore:
+    """Keeps arrays; as a context manager it removes its folder at the end.
 
     Attributes:
-        bytes_held: in memory.
+        bytes_held: bytes in memory.
     """
 
     def __init__(self, most_bytes: int = MOST_BYTES):
         """Begin empty; the folder is made when it is needed.
 
         Args:
-            most_bytes: in memory.
+            most_bytes: bound on the bytes in memory.
         """
         self.bytes_held = 0
         self._most, self._count = most_bytes, 0
         self._folder: tempfile.TemporaryDirectory | None = None
 
-    def __enter__(self) -> Shelf:
+    def __enter__(self) -> ArrayStore:
         return self
 
     def __exit__(self, *exc) -> None:
         if self._folder is not None:
             self._folder.cleanup()
 
-    def put(self, array: np.ndarray | Kept) -> Kept:
-        """Keep an array; one that is kept already stays where it is.
+    def put(self, array: np.ndarray | StoredArray) -> StoredArray:
+        """Keep an array; one that is kept already is returned as it is.
 
         Raises:
-            OSError: it found no room on disk either.
+            OSError: the disk is full.
         """
-        if isinstance(array, Kept):
+        if isinstance(array, StoredArray):
             return array
         if self.bytes_held + array.nbytes <= self._most:
             self.bytes_held += array.nbytes
-            return Kept(array, array.shape)
+            return StoredArray(array, array.shape)
         if self._folder is None:
             self._folder = tempfile.TemporaryDirectory(prefix="p2gs-jax-evaluation-")
         self._count += 1
         path = Path(self._folder.name) / str(self._count)
         array.tofile(path)
-        return Kept(np.zeros(0, array.dtype), array.shape, path)
+        return StoredArray(np.zeros(0, array.dtype), array.shape, path)

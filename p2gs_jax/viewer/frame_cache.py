@@ -1,4 +1,4 @@
-"""The last frame, kept as light: a new display transform develops it again and renders nothing."""
+"""The last rendered frame, in linear radiance: new display settings need no rendering."""
 
 from __future__ import annotations
 
@@ -10,48 +10,53 @@ from p2gs_jax.run.read import Run
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Camera
-from p2gs_jax.viewer.frames import center
+from p2gs_jax.viewer.browser_camera import camera_center
+from p2gs_jax.viewer.picture_modes import (
+    RenderedFrame,
+    WarpedPhotograph,
+    limits_of_depth,
+    picture_of,
+    warp_photograph,
+)
 from p2gs_jax.viewer.programs import Programs
 from p2gs_jax.viewer.settings import Settings, display_of
-from p2gs_jax.viewer.shade import Frame, Photograph, as_seen_by, limits_of_depth, shade
 
-# A camera this close to a photograph's sees the same rays, in typical distances.
+# Cameras closer than this count as being in one place, in typical distances.
 SAME_PLACE = 1e-3
 
 
-class Darkroom:
-    """Renders frames and develops the last one; for one thread.
+class FrameCache:
+    """Renders frames, keeps the last one and develops it; for one thread.
 
     Attributes:
         frame: the last frame, or None.
-        depth_limits: nearest and farthest depth that the depth colours span, scene units.
-        trouble: why a photograph could not be shown last, or None.
+        depth_limits: nearest and farthest depth of the colour scale, scene units.
+        photograph_error: why the last photograph could not be shown, or None.
     """
 
     def __init__(self, run: Run, store: ImageStore, programs: Programs, typical: float):
-        """Prepare.
+        """Begin without a frame.
 
         Args:
-            run: what is looked at.
+            run: the run to show.
             store: its photographs.
-            programs: render it.
-            typical: how far away things typically are, scene units.
+            programs: its renderer.
+            typical: typical distance from a camera to what it sees, scene units.
         """
-        self.frame: Frame | None = None
+        self.frame: RenderedFrame | None = None
         self.depth_limits: tuple[float, float] | None = None
-        self.trouble: str | None = None
+        self.photograph_error: str | None = None
         self._run, self._store, self._programs = run, store, programs
-        self._centers = np.stack([center(view.viewmat) for view in run.scene.views])
+        self._centers = np.stack([camera_center(view.viewmat) for view in run.scene.views])
         self._tolerance = SAME_PLACE * typical
-        self._photograph: tuple[int, Camera, Photograph] | None = None
+        self._photograph: tuple[int, Camera, WarpedPhotograph] | None = None
 
     def render(self, camera: Camera, *, wait: bool = False) -> bool:
-        """Render the frame that `develop` shows from now on; return whether there is one.
+        """Render a new frame; return whether that was possible.
 
         Args:
             camera: of the frame.
-            wait: compile where no program is ready for it, which takes seconds; otherwise the old
-                frame stays.
+            wait: compile a program (seconds) if none is ready; otherwise the old frame stays.
         """
         programs = self._programs
         result = programs.render_now(camera) if wait else programs.render(camera)
@@ -59,11 +64,11 @@ class Darkroom:
             return False
         assert result.depth is not None
         alpha, depth = np.asarray(result.alpha), np.asarray(result.depth)
-        self.frame = Frame(result.linear, alpha, depth, camera)
+        self.frame = RenderedFrame(result.linear, alpha, depth, camera)
         return True
 
     def set_depth_limits(self) -> None:
-        """Span what the frame shows; limits that followed every frame would flicker."""
+        """Fit the colour scale of depth to the frame; done for every frame it would flicker."""
         assert self.frame is not None
         self.depth_limits = limits_of_depth(self.frame)
 
@@ -72,7 +77,7 @@ class Darkroom:
         assert self.frame is not None
         if settings.mode == "depth" and self.depth_limits is None:
             self.set_depth_limits()
-        return shade(
+        return picture_of(
             self.frame,
             settings.mode,
             display_of(self._run, settings),
@@ -83,28 +88,28 @@ class Darkroom:
 
     @property
     def photographed_from_here(self) -> bool:
-        """Whether a photograph was taken from where the frame's camera stands."""
+        """Whether a photograph was taken from the place of the frame's camera."""
         return self.frame is not None and self.view_at(self.frame.camera) is not None
 
     def view_at(self, camera: Camera) -> int | None:
-        """Return the row of the view that was taken from where a camera stands, or None."""
-        away = np.linalg.norm(self._centers - center(np.asarray(camera.viewmat)), axis=1)
+        """Return the row of the view taken from the place of a camera, or None."""
+        away = np.linalg.norm(self._centers - camera_center(np.asarray(camera.viewmat)), axis=1)
         near = np.flatnonzero(away <= self._tolerance)
         if not len(near):
             return None
-        # Of a rig's or a panorama's views, the one that looks the same way.
+        # Several views may share a place (rigs, panoramas): take the one with the same direction.
         forward = np.asarray(camera.viewmat)[2, :3]
         views = self._run.scene.views
         return int(max(near, key=lambda i: float(views[i].viewmat[2, :3] @ forward)))
 
     def nearest_view(self, camera: Camera) -> int:
-        """Return the row of the view that was taken nearest to a camera."""
-        away = np.linalg.norm(self._centers - center(np.asarray(camera.viewmat)), axis=1)
+        """Return the row of the view taken nearest to a camera."""
+        away = np.linalg.norm(self._centers - camera_center(np.asarray(camera.viewmat)), axis=1)
         return int(np.argmin(away))
 
-    def _photograph_here(self) -> Photograph | None:
+    def _photograph_here(self) -> WarpedPhotograph | None:
         assert self.frame is not None
-        self.trouble = None
+        self.photograph_error = None
         camera = self.frame.camera
         index = self.view_at(camera)
         if index is None:
@@ -114,8 +119,8 @@ class Darkroom:
             try:
                 ldr, mask = self._store.get(index)
             except UserError as error:
-                self.trouble = error.message
+                self.photograph_error = error.message
                 return None
-            seen = as_seen_by(ldr, mask, camera_of(self._store, index), camera)
+            seen = warp_photograph(ldr, mask, camera_of(self._store, index), camera)
             self._photograph = kept = (index, camera, seen)
         return kept[2]

@@ -1,8 +1,4 @@
-"""What `--help` says: an overview of the commands, and options that read well at 80 columns.
-
-tyro takes the text of an option from the string below its field. What it would print beside that
-(types, `(default: None)`, line ends of the source) is replaced here by a struct rule.
-"""
+"""The text of `--help`: an overview of the commands, and prose around the options of each."""
 
 from __future__ import annotations
 
@@ -14,12 +10,10 @@ import textwrap
 from collections.abc import Callable, Mapping
 from contextlib import redirect_stdout, suppress
 from itertools import chain
-from pathlib import Path
 from typing import Any
 
-# Stands where tyro prints the description, until `with_prose` puts the prose there.
+# Placeholder of the description in tyro's help, replaced by `with_prose`.
 ABOUT = "@about@"
-PLACEHOLDERS = {int: "N", float: "X", str: "TEXT", Path: "PATH"}
 EXAMPLE = "p2gs-jax "
 INDENT = "    "
 
@@ -46,7 +40,7 @@ def overview(commands: Mapping[str, type], groups: Mapping[str, tuple[str, ...]]
             lines += ["", heading]
         for name in present:
             head = f"  {name}".ljust(indent)
-            lines += _wrapped(summary(commands[name]), head, " " * indent)
+            lines += _wrapped(first_paragraph(commands[name]), head, " " * indent)
     return "\n".join(
         [
             *lines,
@@ -59,7 +53,7 @@ def overview(commands: Mapping[str, type], groups: Mapping[str, tuple[str, ...]]
     )
 
 
-def summary(kind: type) -> str:
+def first_paragraph(kind: type) -> str:
     """Return the first paragraph of an option class's docstring."""
     return _paragraphs(kind)[0]
 
@@ -68,10 +62,10 @@ def with_prose(text: str, kind: type, brief: bool, name: str) -> str:
     """Return tyro's help with the docstring's prose above the options and its examples below.
 
     Args:
-        text: what tyro printed, described as `ABOUT`.
+        text: tyro's help, with `ABOUT` as the description.
         kind: the option class.
-        brief: say where the options are that were left out.
-        name: the command's.
+        brief: add how to list the options that were left out.
+        name: of the command.
     """
     prose = [p for p in _paragraphs(kind) if not p.startswith(EXAMPLE)]
     examples = [p for p in _paragraphs(kind) if p.startswith(EXAMPLE)]
@@ -87,7 +81,7 @@ def with_prose(text: str, kind: type, brief: bool, name: str) -> str:
 
 
 def captured(print_help: Callable[[], Any]) -> str:
-    """Return what a function prints before it exits, coloured as it would be in the terminal."""
+    """Return what a function prints before it exits, with the colours of the terminal."""
     stream = _Recorder(io.BytesIO(), encoding=sys.stdout.encoding or "utf-8", write_through=True)
     with redirect_stdout(stream), suppress(SystemExit):
         print_help()

@@ -10,17 +10,17 @@ import pytest
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.evaluate import evaluate as evaluation
-from p2gs_jax.evaluate.shelf import Shelf
+from p2gs_jax.evaluate.array_store import ArrayStore
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Gaussians, Params, Photometry, Render, Scene, View
 
 
 def test_arrays_beyond_the_bound_lie_on_disk_until_the_end():
     arrays = [np.random.default_rng(k).normal(size=(50, 3)).astype(np.float32) for k in range(3)]
-    with Shelf(most_bytes=arrays[0].nbytes) as shelf:
-        kept = [shelf.put(a) for a in arrays]
-        assert shelf.bytes_held == arrays[0].nbytes
-        assert shelf.put(kept[1]) is kept[1]
+    with ArrayStore(most_bytes=arrays[0].nbytes) as store:
+        kept = [store.put(a) for a in arrays]
+        assert store.bytes_held == arrays[0].nbytes
+        assert store.put(kept[1]) is kept[1]
         files = [k.path for k in kept if k.path is not None]
         assert len(files) == 2
         for a, k in zip(arrays, kept, strict=True):
@@ -35,10 +35,10 @@ def shelves(monkeypatch):
 
     def bound(most_bytes):
         def make():
-            made.append(Shelf(most_bytes))
+            made.append(ArrayStore(most_bytes))
             return made[-1]
 
-        monkeypatch.setattr(evaluation, "Shelf", make)
+        monkeypatch.setattr(evaluation, "ArrayStore", make)
 
     return made, bound
 

@@ -11,13 +11,15 @@ import numpy as np
 from jaxtyping import Float32
 from PIL import Image, ImageDraw, ImageFont
 
+from p2gs_jax.formats.png import to_uint8
+
 BACKGROUND, INK, FAINT = (255, 255, 255), (30, 30, 30), (120, 120, 120)
 # Sizes as parts of the width, and the smallest font that is still read, pixels.
 FONT, SMALLEST_FONT = 1 / 60, 11
 
 
 @dataclass(frozen=True)
-class Row:
+class CaptionedImage:
     """An image with its title.
 
     Attributes:
@@ -46,7 +48,7 @@ def stacked_size(width: int, heights: Sequence[int], captions: int) -> tuple[int
     return width, sum(heights) + (len(heights) + captions) * _line(width)
 
 
-def stacked(rows: Sequence[Row]) -> Float32[np.ndarray, "h w 3"]:
+def stacked(rows: Sequence[CaptionedImage]) -> Float32[np.ndarray, "h w 3"]:
     """Return images of one width below each other, as display values."""
     width = rows[0].image.shape[1]
     captions = sum(bool(row.captions) for row in rows)
@@ -57,7 +59,7 @@ def stacked(rows: Sequence[Row]) -> Float32[np.ndarray, "h w 3"]:
     top = 0
     for row in rows:
         draw.text((2, top + line / 2), row.title, INK, font, anchor="lm")
-        codes = np.rint(np.clip(np.nan_to_num(row.image), 0, 1) * 255).astype(np.uint8)
+        codes = to_uint8(row.image)
         sheet.paste(Image.fromarray(codes), (0, top + line))
         top += line + codes.shape[0]
         for text, start, end in row.captions:

@@ -1,7 +1,4 @@
-"""What the picture shows: the photograph, its luminance in stops, what clips, how far things are.
-
-A frame is rendered once and shaded as often as the display transform changes.
-"""
+"""What the viewer shows of a rendered frame: the picture, luminance in stops, clipping, depth."""
 
 from __future__ import annotations
 
@@ -17,22 +14,22 @@ from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.types import Camera
 
 Mode = Literal["display", "stops", "clipping", "depth", "split"]
-# Exposed radiance shown as 0 stops.
+# Exposed radiance at 0 stops.
 MIDDLE_GREY = 0.18
-# Shares of the nearest and farthest pixels that the depth colours leave out, percent.
+# Percentiles of depth at the ends of the colour scale.
 DEPTH_TAILS = (1.0, 99.0)
 LINE = 1.0
 
 
 @dataclass(frozen=True)
-class Frame:
+class RenderedFrame:
     """A rendered view, from which every mode is made.
 
     Attributes:
         linear: radiance.
         alpha: opacity.
         depth: alpha-weighted depth, scene units.
-        camera: which rendered it.
+        camera: of the view.
     """
 
     linear: Float[Array, "h w 3"]
@@ -47,38 +44,38 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Photograph:
-    """A photograph as the frame's camera would have taken it from the same place.
+class WarpedPhotograph:
+    """A photograph resampled into the pixels of a frame's camera.
 
     Attributes:
         ldr: display values.
-        inside: where the photograph reaches.
+        inside: pixels that the photograph covers.
     """
 
     ldr: Float32[np.ndarray, "h w 3"]
     inside: Bool[np.ndarray, "h w"]
 
 
-def shade(
-    frame: Frame,
+def picture_of(
+    frame: RenderedFrame,
     mode: Mode,
     transform: DisplayTransform,
     *,
     depth_limits: tuple[float, float] | None = None,
-    photograph: Photograph | None = None,
+    photograph: WarpedPhotograph | None = None,
     split: float = 0.5,
 ) -> Float32[np.ndarray, "h w 3"]:
-    """Return display values of a frame.
+    """Return display values of a frame in one of the modes.
 
     Args:
-        frame: what was rendered.
+        frame: the rendered view.
         mode: `stops` counts from middle grey at the exposure of the transform; `split` without
             a photograph is `display`.
-        transform: how radiance is shown.
-        depth_limits: nearest and farthest depth of the colours, scene units; None takes the
+        transform: from radiance to display values.
+        depth_limits: nearest and farthest depth of the colour scale, scene units; None takes the
             frame's own.
         photograph: for `split`.
-        split: share of the width that the photograph takes, from the left.
+        split: share of the photograph's width that is shown, from the left.
     """
     if mode == "stops":
         return false_color(np.asarray(frame.linear), MIDDLE_GREY / transform.exposure)
@@ -88,19 +85,19 @@ def shade(
     if mode == "clipping":
         return clipping_overlay(ldr)
     if mode == "split" and photograph is not None:
-        return compare(photograph, ldr, split)
+        return split_picture(photograph, ldr, split)
     return ldr
 
 
-def compare(
-    photograph: Photograph, ldr: Float32[np.ndarray, "h w 3"], split: float
+def split_picture(
+    photograph: WarpedPhotograph, ldr: Float32[np.ndarray, "h w 3"], split: float
 ) -> Float32[np.ndarray, "h w 3"]:
-    """Return the photograph left of a white line and the render right of it and around it.
+    """Return the photograph left of a white line, and the render everywhere else.
 
     Args:
         photograph: in the frame's pixels.
         ldr: display values of the frame.
-        split: where the line is, as a share of the photograph's width from its left edge.
+        split: position of the line, as a share of the photograph's width from its left edge.
     """
     out = np.array(ldr)
     columns = np.flatnonzero(photograph.inside.any(0))
@@ -116,8 +113,8 @@ def compare(
     return out
 
 
-def limits_of_depth(frame: Frame) -> tuple[float, float]:
-    """Return the depths between which almost all of a frame lies, scene units; nearest first."""
+def limits_of_depth(frame: RenderedFrame) -> tuple[float, float]:
+    """Return the 1st and 99th percentile of a frame's depth, scene units."""
     alpha, depth = frame.alpha[::4, ::4], frame.depth[::4, ::4]
     there = alpha > 0.5
     if not there.any():
@@ -126,22 +123,21 @@ def limits_of_depth(frame: Frame) -> tuple[float, float]:
     return max(float(near), 1e-6), max(float(far), 1.001 * float(near), 2e-6)
 
 
-def as_seen_by(
+def warp_photograph(
     ldr: Float32[np.ndarray, "h w 3"],
     mask: Float32[np.ndarray, "h w"],
     taken_by: Camera,
     frame: Camera,
-) -> Photograph:
+) -> WarpedPhotograph:
     """Return a photograph resampled into the pixels of another camera at the same place.
 
-    Cameras that share a centre see the same rays, so a homography carries one image into the
-    other, whatever their directions and lenses.
+    Images of cameras with a common centre are related by a homography.
 
     Args:
         ldr: display values.
         mask: 1 = use.
         taken_by: its camera.
-        frame: whose pixels.
+        frame: the other camera.
     """
     rotation = (
         np.asarray(taken_by.viewmat, float)[:3, :3] @ np.asarray(frame.viewmat, float)[:3, :3].T
@@ -163,7 +159,7 @@ def as_seen_by(
     inside = cv2.warpPerspective(mask, pull, size, flags=how) > 0.5
     x, y = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
     behind = pull[2, 0] * x + pull[2, 1] * y + pull[2, 2] <= 0
-    return Photograph(pixels.astype(np.float32), inside & ~behind)
+    return WarpedPhotograph(pixels.astype(np.float32), inside & ~behind)
 
 
 def _minification(pull: Float[np.ndarray, "3 3"], size: tuple[int, int]) -> float:
@@ -174,6 +170,6 @@ def _minification(pull: Float[np.ndarray, "3 3"], size: tuple[int, int]) -> floa
     return float(min(np.hypot(*(at[1] - at[0])), np.hypot(*(at[2] - at[0]))))
 
 
-def codes(ldr: Float[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Return display values in [0, 1] as 8-bit codes, rounded."""
+def to_uint8_fast(ldr: Float[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Return display values in [0, 1], rounded to 8 bits (cv2: 1 ms for 1920 x 1080, numpy 32)."""
     return cv2.convertScaleAbs(ldr, alpha=255.0)

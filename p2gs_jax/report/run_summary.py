@@ -1,4 +1,4 @@
-"""What a run found, in plain sentences."""
+"""The results of a run, in sentences."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from p2gs_jax.core.clock import whole_run
 from p2gs_jax.evaluate.alignment import ExposureError, exposure_error
 from p2gs_jax.photometry.agreement import Agreement, compare
 from p2gs_jax.photometry.models import MODELS
-from p2gs_jax.report.from_scene import FromScene
 from p2gs_jax.report.run_files import RunFiles
+from p2gs_jax.report.scene_measurements import SceneMeasurements
 
 CURVES = {
     "srgb": "the sRGB tone curve",
@@ -29,7 +29,7 @@ def count(number: float, one: str, many: str | None = None) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Return seconds as a person says them."""
+    """Return seconds in words, such as `5 min 12 s`."""
     whole = round(seconds)
     if whole < 100:
         return f"{seconds:.0f} s"
@@ -41,11 +41,11 @@ def duration(seconds: float) -> str:
 
 
 def seconds_of(run: RunFiles) -> float | None:
-    """Return how long the run took, or None where it does not say."""
+    """Return the seconds that the run took, or None where they are unknown."""
     return whole_run(run.part("seconds"))
 
 
-def summary(run: RunFiles, scene: FromScene) -> list[str]:
+def summary_sentences(run: RunFiles, scene: SceneMeasurements) -> list[str]:
     """Return three sentences: what was fitted, what was modelled, how good it is."""
     return [_what(run), _modelled(run), _how_good(run, scene)]
 
@@ -95,7 +95,7 @@ def _why(run: RunFiles) -> str:
     return f"as the preset {run.preset} or the options say"
 
 
-def _how_good(run: RunFiles, scene: FromScene) -> str:
+def _how_good(run: RunFiles, scene: SceneMeasurements) -> str:
     parts = []
     train = run.number("train", "psnr")
     held_out = run.number("test", "exposure_fitted", "psnr")
@@ -125,7 +125,7 @@ def exposure_span(run: RunFiles) -> float | None:
     return max(values) - min(values) if values else None
 
 
-def seam_medians(scene: FromScene) -> tuple[float, float]:
+def seam_medians(scene: SceneMeasurements) -> tuple[float, float]:
     """Return the median over pairs of the seams before and after, stops."""
     seams = [p.seam for p in scene.seams]
     return (
@@ -134,7 +134,7 @@ def seam_medians(scene: FromScene) -> tuple[float, float]:
     )
 
 
-def true_error(run: RunFiles, scene: FromScene) -> ExposureError | None:
+def true_error(run: RunFiles, scene: SceneMeasurements) -> ExposureError | None:
     """Return the error of the exposures where the scene knows the true ones."""
     pairs = [
         (v["exposure"], scene.true_exposures[v["image"]])
@@ -153,7 +153,7 @@ def reasons(run: RunFiles) -> list[str]:
 
 
 def remarks(run: RunFiles) -> list[str]:
-    """Return everything else that the fit wanted its user to know."""
+    """Return all other notes of the fit."""
     return [n for n in _notes(run) if not n.startswith(REASONS)]
 
 
@@ -177,5 +177,5 @@ def against_exif(run: RunFiles) -> Agreement | None:
 
 
 def scene_title(run: RunFiles) -> str:
-    """Return what a run is called: its scene, or its folder."""
+    """Return the name of the run's scene, or else of its folder."""
     return run.scene.name or run.folder.resolve().name
