@@ -7,9 +7,11 @@ import resource
 import shutil
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
 # Programs compiled by one test or its child processes serve the others of the session; a fresh
 # session compiles everything once.
@@ -59,6 +61,9 @@ EFFORT = {
     "xla_cpu_use_fusion_emitters": False,
     "xla_backend_optimization_level": 0,
     "xla_llvm_disable_expensive_passes": True,
+    # Processes of a test run share the cores already: threads of one compilation only wait.
+    "xla_cpu_parallel_codegen_split_count": 1,
+    "xla_cpu_multi_thread_eigen": False,
 }
 if "XLA_FLAGS" not in os.environ:
     os.environ["XLA_FLAGS"] = " ".join(f"--{k}={str(v).lower()}" for k, v in EFFORT.items())
@@ -88,13 +93,46 @@ def shared_data():
 
 
 @pytest.fixture(scope="session")
-def finished_run(tmp_path_factory) -> Path:
+def made_once(tmp_path_factory, request):
+    """Return a function that makes a folder once for all processes of a test run.
+
+    What several files read costs seconds to make, and xdist's processes share no fixtures.
+    """
+    base = tmp_path_factory.getbasetemp()
+    shared = base.parent if hasattr(request.config, "workerinput") else base
+
+    def folder(name: str, make: Callable[[Path], None]) -> Path:
+        root, done = shared / name, shared / f"{name}.done"
+        with FileLock(shared / f"{name}.lock"):
+            if not done.exists():
+                shutil.rmtree(root, ignore_errors=True)
+                make(root)
+                done.touch()
+        return root
+
+    return folder
+
+
+@pytest.fixture(scope="session")
+def noisy_street(made_once) -> Path:
+    """Return a small street whose cameras chose different ISO values; only to be read."""
+    from p2gs_jax.synth.write import write_street
+
+    size = {"frames": 5, "width": 192, "height": 128, "points": 6000}
+    return made_once("noisy_street", lambda root: write_street(root, **size, iso_std=4.0, seed=3))
+
+
+@pytest.fixture(scope="session")
+def finished_run(made_once) -> Path:
     """Return the folder of a small finished `robust` run; copy it before writing to it."""
+    return made_once("finished", _fit_small_scene) / "run"
+
+
+def _fit_small_scene(root: Path) -> None:
     from tiny_scene import make_scene
 
     from p2gs_jax.cli import main
 
-    root = tmp_path_factory.mktemp("finished")
     argv = [
         *("fit", str(make_scene(root / "scene")), "--out", str(root / "run")),
         *("--steps", "60", "--train.coarse-to-fine", "--test-every", "3"),
@@ -103,7 +141,6 @@ def finished_run(tmp_path_factory) -> Path:
     with pytest.raises(SystemExit) as stop:
         main(argv)
     assert stop.value.code == 0
-    return root / "run"
 
 
 CHROMIUM = ("chromium", "chromium-browser", "google-chrome")

@@ -241,10 +241,11 @@ def _padded(gaussians: Gaussians):
     """Return the scene with room for others of its size, and which Gaussians are alive."""
     n = gaussians.capacity
     padding = -n % PADDING
+    # By numpy: every shape would be a program otherwise.
     padded = jax.tree.map(
-        lambda a: jnp.concatenate([a, jnp.zeros((padding, *a.shape[1:]), a.dtype)]), gaussians
+        lambda a: np.pad(np.asarray(a), [(0, padding)] + [(0, 0)] * (np.ndim(a) - 1)), gaussians
     )
-    return padded, jnp.arange(n + padding) < n
+    return jax.device_put(padded), jax.device_put(np.arange(n + padding) < n)
 
 
 def _evaluate(gaussians: Gaussians, view: Camera, cfg: RenderConfig):
@@ -254,7 +255,7 @@ def _evaluate(gaussians: Gaussians, view: Camera, cfg: RenderConfig):
     gradient, result = _value_and_gradient(
         padded, alive, view, weights, cfg, across * down * padded.capacity
     )
-    gradient = jax.tree.map(lambda a: np.asarray(a[: gaussians.capacity]), gradient)
+    gradient = jax.tree.map(lambda a: np.asarray(a)[: gaussians.capacity], gradient)
     return jax.tree.map(np.asarray, result), gradient
 
 

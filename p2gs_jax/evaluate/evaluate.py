@@ -29,37 +29,12 @@ from p2gs_jax.evaluate.parallel import map_in_order
 from p2gs_jax.evaluate.radiance import RadianceScores, Truth
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import inverse_tone_map
+from p2gs_jax.photometry.mean import MeanParameters, mean_parameters
 from p2gs_jax.photometry.models import MODELS
 from p2gs_jax.render.host import RenderView
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.types import Params, Photometry, Scene
-
-
-@dataclass(frozen=True)
-class MeanParameters:
-    """Parameters of a view that has none of its own.
-
-    Attributes:
-        exposure: arithmetic mean over the training views (paper, eq. 6).
-        exposure_geometric: geometric mean, which the gauges leave in place.
-        gamma: arithmetic mean.
-    """
-
-    exposure: float
-    exposure_geometric: float
-    gamma: float
-
-
-def mean_parameters(photometry: Photometry) -> MeanParameters:
-    """Return the means over the training views."""
-    taken: Photometry = jax.tree.map(np.asarray, photometry)
-    e = taken.exposures.astype(np.float64)
-    return MeanParameters(
-        float(e.mean()),
-        float(np.exp(np.log(e).mean())),
-        float(taken.gammas.astype(np.float64).mean()),
-    )
+from p2gs_jax.types import Params, Scene
 
 
 @dataclass(frozen=True)

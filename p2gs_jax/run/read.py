@@ -15,10 +15,10 @@ from jaxtyping import Array, Bool, Float32
 from p2gs_jax.config import FitConfig, PhotometryConfig, from_dict
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.errors import UserError
-from p2gs_jax.evaluate.evaluate import MeanParameters, mean_parameters
 from p2gs_jax.formats.ply import read_ply
 from p2gs_jax.photometry.appearance import identity
 from p2gs_jax.photometry.display import DisplayTransform
+from p2gs_jax.photometry.mean import MeanParameters, mean_parameters
 from p2gs_jax.render.host import RenderView, make_renderer
 from p2gs_jax.run.decisions import read_decisions
 from p2gs_jax.run.layout import RunFolder

@@ -12,13 +12,14 @@ import numpy as np
 from p2gs_jax.config import FitConfig
 from p2gs_jax.config import to_dict as config_to_dict
 from p2gs_jax.core.atomic import write_array, write_json
-from p2gs_jax.core.numerics import LN2
-from p2gs_jax.evaluate.evaluate import MeanParameters, ViewResult, mean_parameters
+from p2gs_jax.core.numerics import LN2, evenly_spaced
+from p2gs_jax.evaluate.evaluate import ViewResult
 from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.formats.ply import write_ply, write_radiance
 from p2gs_jax.formats.png import write_png
 from p2gs_jax.gaussians.bake import bake, display_comments, display_of_splats
 from p2gs_jax.photometry.display import DisplayTransform, develop
+from p2gs_jax.photometry.mean import MeanParameters, mean_parameters
 from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.render.spherical_harmonics import MAX_DEGREE
 from p2gs_jax.run.decisions import Decisions, write_decisions
@@ -124,8 +125,7 @@ def summary_rows(scene: Scene) -> list[int]:
     pool = list(scene.test_indices) or list(scene.train_indices)
     if len(pool) < SUMMARY_VIEWS:
         pool += [i for i in scene.train_indices if i not in pool]
-    picks = np.linspace(0, len(pool) - 1, min(SUMMARY_VIEWS, len(pool))).round().astype(int)
-    return [pool[i] for i in picks]
+    return [pool[i] for i in evenly_spaced(len(pool), SUMMARY_VIEWS)]
 
 
 def _write_models(folder: RunFolder, params: Params, cfg: FitConfig) -> None:

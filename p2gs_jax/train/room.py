@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from p2gs_jax.config import RenderConfig
+from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.render.capacity import Room
 from p2gs_jax.render.cutoff import smallest_cutoff
 from p2gs_jax.render.project import LOG_SCALE_RANGE, TANGENT_LIMIT
@@ -81,7 +82,7 @@ def room_for(
         limit: the largest population to come; the share that a view shows is taken to stay.
         cfg: see `count_view`.
     """
-    picks = np.linspace(0, len(cameras) - 1, min(SAMPLED_VIEWS, len(cameras))).round().astype(int)
+    picks = evenly_spaced(len(cameras), SAMPLED_VIEWS)
     counts = [count_view(gaussians, alive, cameras[i], cfg) for i in picks]
     entries, visible = (max(c[k] for c in counts) for k in (0, 1))
     growth = max(max(limit, 1) / max(int(alive.sum()), 1), 1.0)

@@ -11,9 +11,9 @@ from jaxtyping import Array, Bool
 from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.alignment import fit_exposure
-from p2gs_jax.evaluate.evaluate import mean_parameters
 from p2gs_jax.evaluate.metrics import psnr
 from p2gs_jax.photometry.formation import display, formation
+from p2gs_jax.photometry.mean import mean_parameters
 from p2gs_jax.render.host import make_renderer
 from p2gs_jax.train.views import TrainingViews
 from p2gs_jax.types import Params

@@ -5,11 +5,11 @@ import dataclasses
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from p2gs_jax.config import preset
 from p2gs_jax.evaluate.alignment import exposure_error
 from p2gs_jax.photometry.calibrate import calibrate_observations, options_of
+from p2gs_jax.photometry.response import Response
 from p2gs_jax.photometry.sources.projected import MOST_PER_POINT, projected_colors
 from p2gs_jax.photometry.sources.sampling import sample
 from p2gs_jax.photometry.sources.tracks import track_colors
@@ -17,7 +17,6 @@ from p2gs_jax.photometry.srgb import srgb_decode, srgb_encode
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.scene.visibility import project_points, unoccluded
-from p2gs_jax.synth.write import write_street
 from p2gs_jax.types import Scene, Tracks, View
 
 
@@ -41,16 +40,9 @@ def test_behind_and_outside_are_invisible():
     assert not unoccluded(xy[1:2], z[1:2], 10, 10).any()
 
 
-@pytest.fixture(scope="module")
-def street(tmp_path_factory):
-    root = tmp_path_factory.mktemp("street") / "scene"
-    write_street(root, frames=5, width=192, height=128, points=6000, iso_std=4.0, seed=3)
-    return root
-
-
-def test_positions_are_those_of_the_tracks(street, tmp_path):
+def test_positions_are_those_of_the_tracks(noisy_street, tmp_path):
     cfg = preset("robust")
-    scene = load_scene(street, cfg.data, tmp_path, lambda text: None)
+    scene = load_scene(noisy_street, cfg.data, tmp_path, lambda text: None)
     tracks = scene.tracks
     mine = tracks.view_indices == 3
     xy, z = project_points(scene.points[tracks.point_indices[mine]], scene.views[3])
@@ -58,14 +50,14 @@ def test_positions_are_those_of_the_tracks(street, tmp_path):
     assert np.median(np.abs(xy - tracks.xy[mine])) < 0.5
 
 
-def test_exposures_without_tracks(street, tmp_path):
+def test_exposures_without_tracks(noisy_street, tmp_path):
     cfg = preset("robust")
-    scene = load_scene(street, cfg.data, tmp_path, lambda text: None)
+    scene = load_scene(noisy_street, cfg.data, tmp_path, lambda text: None)
     scene = dataclasses.replace(scene, tracks=None)
     observations = projected_colors(scene, ImageStore(scene.views, cfg.data))
     assert np.bincount(observations.points).max() <= MOST_PER_POINT
     solved = calibrate_observations(observations, options_of(cfg, scene)).solution
-    with (street / "truth" / "exposures.csv").open(newline="") as file:
+    with (noisy_street / "truth" / "exposures.csv").open(newline="") as file:
         truth = {r["image"]: float(r["exposure"]) for r in csv.DictReader(file)}
     expected = np.array([truth[scene.views[i].name] for i in scene.train_indices])
     assert exposure_error(np.exp(solved.log_exposures), expected)["ev"] < 0.03
@@ -137,11 +129,11 @@ def test_wide_patches_keep_away_from_the_border():
     assert sample(image, mask, xy, np.full(2, 4.0)).valid.tolist() == [False, True]
 
 
-def test_what_was_left_out_is_said(street, tmp_path):
+def test_what_was_left_out_is_said(noisy_street, tmp_path):
     cfg = preset("robust")
-    scene = load_scene(street, cfg.data, tmp_path, lambda text: None)
+    scene = load_scene(noisy_street, cfg.data, tmp_path, lambda text: None)
     observations = track_colors(scene, ImageStore(scene.views, cfg.data))
-    options = options_of(cfg, scene)
+    options = dataclasses.replace(options_of(cfg, scene), choice=("view_exposure", Response()))
     reasons = calibrate_observations(observations, options).reasons
     assert not any("left out" in r for r in reasons)
     some = dataclasses.replace(observations, too_coarse=7)

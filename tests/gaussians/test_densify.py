@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import DensifyConfig, RenderConfig
+from p2gs_jax.core.numerics import on_device
 from p2gs_jax.gaussians import adaptive, mcmc
 from p2gs_jax.gaussians.population import (
     bucket_for,
@@ -24,16 +25,22 @@ from p2gs_jax.train.optimizer import AdamState
 from p2gs_jax.types import Camera, Gaussians
 
 CFG = DensifyConfig()
+# As strategies call them: one program a shape, where eager calls make one an operation.
+propose = jax.jit(adaptive.propose, static_argnums=(3, 4))
+apply = jax.jit(adaptive.apply)
+relocate_and_grow = jax.jit(mcmc.relocate_and_grow, static_argnums=4)
+share = jax.jit(mcmc.share)
+exploration_noise = jax.jit(mcmc.exploration_noise)
 
 
 def made(n=8, seed=0, opacity=0.6):
     rng = np.random.default_rng(seed)
     return Gaussians(
-        means=jnp.asarray(rng.normal(0, 0.5, (n, 3)) + np.array([0, 0, 4]), jnp.float32),
-        quats=jnp.asarray(rng.normal(size=(n, 4)), jnp.float32),
-        log_scales=jnp.full((n, 3), -2.0),
-        opacity_logits=jnp.full((n,), float(np.log(opacity / (1 - opacity)))),
-        sh=jnp.asarray(rng.normal(size=(n, 1, 3)), jnp.float32),
+        means=on_device(rng.normal(0, 0.5, (n, 3)) + np.array([0, 0, 4])),
+        quats=on_device(rng.normal(size=(n, 4))),
+        log_scales=on_device(np.full((n, 3), -2.0)),
+        opacity_logits=on_device(np.full((n,), np.log(opacity / (1 - opacity)))),
+        sh=on_device(rng.normal(size=(n, 1, 3))),
     )
 
 
@@ -83,11 +90,11 @@ def test_clone_copies_and_split_replaces():
     grown = grow(g, empty_gaussians(4, g))
     p = hot_population(8, np.arange(8) < 2)
     p = grow(p, fresh_population(jnp.zeros(4, bool)))
-    proposal = adaptive.propose(grown, p, 1.0, False, CFG)
+    proposal = propose(grown, p, 1.0, False, CFG)
     assert proposal.clone.tolist()[:2] == [False, True]
     assert proposal.split.tolist()[:2] == [True, False]
     assert int(proposal.wanted) == 10
-    out = adaptive.apply(jax.random.key(0), grown, p, proposal)
+    out = apply(jax.random.key(0), grown, p, proposal)
     assert int(out.population.alive.sum()) == 10
     assert int(out.refused) == 0
     # Slot 8 took the split's second child, slot 9 the clone.
@@ -103,9 +110,9 @@ def test_transparent_are_pruned_and_full_house_is_counted():
     g = made()
     g = dataclasses.replace(g, opacity_logits=g.opacity_logits.at[3].set(-9.0))
     p = hot_population(8, np.arange(8) < 3)
-    proposal = adaptive.propose(g, p, 1.0, False, CFG)
+    proposal = propose(g, p, 1.0, False, CFG)
     assert proposal.prune.tolist().index(True) == 3
-    out = adaptive.apply(jax.random.key(0), g, p, proposal)
+    out = apply(jax.random.key(0), g, p, proposal)
     assert int(out.refused) == 2  # one slot came free, three asked
     assert int(out.population.alive.sum()) == 8
 
@@ -121,7 +128,7 @@ def test_reset_lowers_only():
 @pytest.mark.parametrize("opacity", [0.01, 0.5, 0.95])
 def test_shares_look_like_the_whole(copies, opacity):
     """N equal Gaussians composited at their centre, and over their plane, match the one."""
-    new, factor = mcmc.share(jnp.array([opacity]), jnp.array([float(copies)]))
+    new, factor = share(jnp.array([opacity]), jnp.array([float(copies)]))
     together = 1 - (1 - float(new[0])) ** copies
     assert together == pytest.approx(opacity, rel=2e-3)
     # The factor is defined by equal integrals over a line through the centre.
@@ -139,13 +146,13 @@ def test_relocation_moves_the_transparent_and_adds_births():
     g = dataclasses.replace(g, opacity_logits=g.opacity_logits.at[:3].set(-9.0))
     grown = grow(g, empty_gaussians(6, g))
     p = fresh_population(jnp.arange(16) < 10)
-    out = mcmc.relocate_and_grow(jax.random.key(1), grown, p, jnp.int32(4), CFG)
+    out = relocate_and_grow(jax.random.key(1), grown, p, jnp.int32(4), CFG)
     assert int(out.population.alive.sum()) == 14
     assert int(out.refused) == 0
     live = np.asarray(out.population.alive)
     assert float(opacities(out.gaussians)[live].min()) > CFG.prune_opacity
     together = dataclasses.replace(CFG, spread=0.0)
-    same = mcmc.relocate_and_grow(jax.random.key(1), grown, p, jnp.int32(4), together)
+    same = relocate_and_grow(jax.random.key(1), grown, p, jnp.int32(4), together)
     healthy = np.asarray(g.means[3:])
     widest = float(np.exp(g.log_scales).max())
     for i in np.flatnonzero(live):
@@ -153,7 +160,7 @@ def test_relocation_moves_the_transparent_and_adds_births():
         # Moved apart, each still lies within a few deviations of one that was healthy.
         distance = np.linalg.norm(healthy - np.asarray(out.gaussians.means[i]), axis=1)
         assert distance.min() < 3 * widest
-    more = mcmc.relocate_and_grow(jax.random.key(1), grown, p, jnp.int32(9), CFG)
+    more = relocate_and_grow(jax.random.key(1), grown, p, jnp.int32(9), CFG)
     assert int(more.refused) == 3
 
 
@@ -170,7 +177,7 @@ def test_two_that_share_a_place_part_about_its_centre_and_keep_its_extent():
         cfg = dataclasses.replace(CFG, spread=spread)
 
         def born(key):
-            return mcmc.relocate_and_grow(key, grown, p, jnp.int32(1), cfg).gaussians
+            return relocate_and_grow(key, grown, p, jnp.int32(1), cfg).gaussians
 
         return jax.vmap(born)(keys)
 
@@ -190,11 +197,11 @@ def test_births_go_where_they_are_needed():
     grown, p = grow(g, empty_gaussians(6, g)), fresh_population(jnp.arange(16) < 10)
     needed = jnp.zeros(16).at[7].set(1.0)
     together = dataclasses.replace(CFG, spread=0.0)
-    out = mcmc.relocate_and_grow(jax.random.key(0), grown, p, jnp.int32(4), together, needed)
+    out = relocate_and_grow(jax.random.key(0), grown, p, jnp.int32(4), together, needed)
     assert int(out.population.alive.sum()) == 14
     np.testing.assert_array_equal(out.gaussians.means[10:14], np.tile(g.means[7], (4, 1)))
     # Where nothing is needed yet, nobody is born; those without a place are not put anywhere.
-    none = mcmc.relocate_and_grow(jax.random.key(0), grown, p, jnp.int32(4), together, 0 * needed)
+    none = relocate_and_grow(jax.random.key(0), grown, p, jnp.int32(4), together, 0 * needed)
     assert int(none.population.alive.sum()) == 10
     np.testing.assert_array_equal(none.gaussians.means, grown.means)
 
@@ -213,7 +220,7 @@ def test_demand_is_the_mean_pull_on_what_was_seen():
 def test_relocation_with_nobody_healthy_changes_nothing():
     g = made(opacity=0.001)
     p = fresh_population(jnp.ones(8, bool))
-    out = mcmc.relocate_and_grow(jax.random.key(1), g, p, jnp.int32(0), CFG)
+    out = relocate_and_grow(jax.random.key(1), g, p, jnp.int32(0), CFG)
     np.testing.assert_array_equal(out.gaussians.means, g.means)
 
 
@@ -225,10 +232,10 @@ def test_noise_reaches_only_the_transparent_and_has_their_shape():
         log_scales=jnp.tile(jnp.log(jnp.array([[0.5, 0.1, 0.02]])), (2000, 1)),
     )
     alive = jnp.arange(2000) < 1500
-    noise = np.asarray(mcmc.exploration_noise(jax.random.key(0), g, alive, jnp.float32(1.0)))
+    noise = np.asarray(exploration_noise(jax.random.key(0), g, alive, jnp.float32(1.0)))
     assert not noise[1500:].any()
     spread = noise[:1500].std(0)
     np.testing.assert_allclose(spread / spread[0], [1, 0.04, 0.0016], rtol=0.15)
     solid = dataclasses.replace(g, opacity_logits=jnp.full((2000,), 2.0))
-    quiet = mcmc.exploration_noise(jax.random.key(0), solid, alive, jnp.float32(1.0))
+    quiet = exploration_noise(jax.random.key(0), solid, alive, jnp.float32(1.0))
     assert float(jnp.abs(quiet).max()) < 1e-6

@@ -15,7 +15,6 @@ from p2gs_jax.evaluate.alignment import exposure_error
 from p2gs_jax.photometry.sources.stack import read_stack
 from p2gs_jax.pipeline.calibrate_stack import calibrate_stack
 from p2gs_jax.run.photometry_file import read_photometry
-from p2gs_jax.synth.write import write_street
 
 
 def run(capsys, *argv):
@@ -31,18 +30,11 @@ def read_truth(root):
         return {row["image"]: float(row["exposure"]) for row in csv.DictReader(file)}
 
 
-@pytest.fixture(scope="module")
-def street(tmp_path_factory):
-    root = tmp_path_factory.mktemp("street") / "scene"
-    write_street(root, frames=5, width=192, height=128, points=4000, iso_std=4.0, seed=3)
-    return root
-
-
-def test_street(street, tmp_path):
-    result = calibrate(street, tmp_path / "out", preset("robust"))
+def test_street(noisy_street, tmp_path):
+    result = calibrate(noisy_street, tmp_path / "out", preset("robust"))
     saved = read_photometry(tmp_path / "out" / "photometry.json")
     found = {v["image"]: v["exposure"] for v in saved["views"]}
-    truth = read_truth(street)
+    truth = read_truth(noisy_street)
     names = sorted(found)
     error = exposure_error(np.array([found[n] for n in names]), np.array([truth[n] for n in names]))
     assert error["ev"] < 0.05
@@ -54,11 +46,11 @@ def test_street(street, tmp_path):
     assert max(c["codes"] for c in candidates) > 1
 
 
-def test_command_keeps_known_exposures(street, tmp_path, capsys):
-    truth = read_truth(street)
+def test_command_keeps_known_exposures(noisy_street, tmp_path, capsys):
+    truth = read_truth(noisy_street)
     path = tmp_path / "known.csv"
     path.write_text("image,exposure\n" + "\n".join(f"{k},{5 * v}" for k, v in truth.items()))
-    argv = ("calibrate", street, "--out", tmp_path / "out", "--known-exposures", path)
+    argv = ("calibrate", noisy_street, "--out", tmp_path / "out", "--known-exposures", path)
     code, text = run(capsys, *argv)
     assert code == 0
     assert "Chosen:" in text
@@ -66,10 +58,19 @@ def test_command_keeps_known_exposures(street, tmp_path, capsys):
         assert view["exposure"] == pytest.approx(5 * truth[view["image"]], rel=1e-3)
 
 
-def test_fit_refuses_known_exposures_it_would_ignore(street, tmp_path, capsys):
+def test_fit_refuses_known_exposures_it_would_ignore(noisy_street, tmp_path, capsys):
     path = tmp_path / "known.csv"
-    path.write_text("image,exposure\n" + "\n".join(f"{k},1" for k in read_truth(street)))
-    argv = ("fit", street, "--out", tmp_path / "r", "--preset", "paper", "--known-exposures", path)
+    path.write_text("image,exposure\n" + "\n".join(f"{k},1" for k in read_truth(noisy_street)))
+    argv = (
+        "fit",
+        noisy_street,
+        "--out",
+        tmp_path / "r",
+        "--preset",
+        "paper",
+        "--known-exposures",
+        path,
+    )
     code, text = run(capsys, *argv)
     assert code == 2
     assert "starts exposures at random" in text

@@ -180,7 +180,7 @@ MOST = 1000
 def padded(g):
     """Return the scene with room for `MOST`, so that all share one program."""
     return jax.tree.map(
-        lambda a: jnp.concatenate([a, jnp.zeros((MOST - len(a), *a.shape[1:]), a.dtype)]), g
+        lambda a: np.pad(np.asarray(a), [(0, MOST - len(a))] + [(0, 0)] * (np.ndim(a) - 1)), g
     )
 
 

@@ -19,7 +19,7 @@ from p2gs_jax.synth.rig import MOUNTS, camera_viewmat, carla_rotation, image_hei
 from p2gs_jax.synth.sensor import draw_iso, photograph
 from p2gs_jax.synth.write import read_truth, write_street
 
-SIZE = {"frames": 4, "width": 192, "height": 128, "points": 4000, "seed": 3}
+SIZE = {"frames": 3, "width": 192, "height": 128, "points": 4000, "seed": 3}
 
 
 def read_png(path: Path) -> np.ndarray:

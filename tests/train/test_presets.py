@@ -30,7 +30,8 @@ def check(result, run):
     return log
 
 
-@pytest.mark.parametrize("name", ["paper", pytest.param("paper_appendix", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["paper", "paper_appendix"])
 def test_the_paper_runs_as_printed(tmp_path, name):
     cfg = small(p2gs_jax.preset(name), steps=60)
     cfg = dataclasses.replace(cfg, densify=dataclasses.replace(cfg.densify, grad_threshold=1e-6))
@@ -71,10 +72,8 @@ def test_every_reading_runs(tmp_path, form, correspondence):
 BASELINES = ("3dgs", "3dgs_gain", "3dgs_affine", "3dgs_bilateral", "3dgs_curve")
 
 
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(n, marks=[] if n == "3dgs_affine" else pytest.mark.slow) for n in BASELINES],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", BASELINES)
 def test_baselines_run_and_come_back_as_they_were_saved(tmp_path, name):
     scene = make_scene(tmp_path / "scene")
     result = p2gs_jax.fit(scene, tmp_path / "run", small(p2gs_jax.preset(name)))

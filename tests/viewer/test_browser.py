@@ -9,6 +9,8 @@ import pytest
 from p2gs_jax.run.read import load_run
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
+# Browsers wait more than they compute: a minute and a half.
+pytestmark = pytest.mark.slow
 
 SIZE = {"width": 900, "height": 640}
 PATIENCE_S = 120
