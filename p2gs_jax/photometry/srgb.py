@@ -1,4 +1,4 @@
-"""The sRGB curve on the host, for values in [0, 1]; the device has its own in `formation`."""
+"""The sRGB curve in double precision, for values in [0, 1]; fits use the one in `formation`."""
 
 from __future__ import annotations
 

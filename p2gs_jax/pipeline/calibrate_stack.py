@@ -33,7 +33,7 @@ class StackResult:
         stated_ev: stated exposures in stops, moved to the recovered ones; NaN where unknown.
         agreement: of the two, on frames that carry signal.
         signal: frames in which enough points are neither black nor saturated.
-        shifts: pixels by which each frame was moved to fit its neighbour.
+        shifts: pixels by which each frame was moved to fit the first.
         black: values up to here were taken as black.
         curve_ev: residual that depends on brightness, frame by frame, stops.
         local_ev: smooth residual over the image at equal brightness, stops.

@@ -1,4 +1,4 @@
-"""The one writer of a run folder; the log and the checkpoints are written while steps are taken."""
+"""The start and the results of a run folder; `metrics.json` follows in `pipeline/finish.py`."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ DEPTH_WIDTH, DEPTH_STEP, FARTHEST = 480, 256e-5, 167.0
 # Least time between two updates of a million splats' colours, seconds.
 SPLATS_S = 1.0
 BLACK = np.zeros((1, 1, 3), np.uint8)
-NO_PHOTOGRAPH = "No photograph was taken from here: choose_size one under Camera, Go to."
+NO_PHOTOGRAPH = "No photograph was taken from here: choose one under Camera, Go to."
 
 Job = Literal["move", "develop", "rest"]
 

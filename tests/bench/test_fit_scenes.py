@@ -39,6 +39,7 @@ def test_levels_differ_in_size_and_have_the_population_of_their_time():
     assert 0.6 < high < 0.9
 
 
+@pytest.mark.slow
 def test_coarse_levels_of_a_town_have_the_longest_lists():
     coarse, fine = (levels.lists(town_level(s, **SMALL), FitConfig()) for s in (4, 1))
     assert coarse.longest > 1500

@@ -144,7 +144,7 @@ def test_a_broken_library_is_named_with_what_to_do(broken, tmp_path, module):
     assert "Traceback" not in done.stderr
 
 
-@pytest.mark.parametrize("module", ["jax", "tyro"])
+@pytest.mark.parametrize("module", ["jax", pytest.param("tyro", marks=pytest.mark.slow)])
 def test_doctor_survives_what_it_looks_for(broken, module):
     done = broken(module, "doctor", "--skip-self-test")
     assert done.returncode == 1, done.stderr

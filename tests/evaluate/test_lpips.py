@@ -96,7 +96,7 @@ def test_agrees_with_the_plain_version(weights, net, noise):
     assert float(lpips(weights[net], a, b, mask)) == pytest.approx(expected, rel=1e-4)
 
 
-@pytest.mark.parametrize("net", NETS)
+@pytest.mark.parametrize("net", ["alex", pytest.param("vgg", marks=pytest.mark.slow)])
 def test_a_distance(weights, net):
     a, b, mask = images(net)
     assert float(lpips(weights[net], b, b, mask)) < ROUNDING

@@ -54,7 +54,13 @@ def oracle():
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 @pytest.mark.parametrize(
-    ("tile", "stop"), [((16, 8), 1e-4), ((16, 8), None), ((16, 16), None), ((8, 8), None)]
+    ("tile", "stop"),
+    [
+        ((16, 8), 1e-4),
+        ((16, 8), None),
+        ((16, 16), None),
+        pytest.param((8, 8), None, marks=pytest.mark.slow),
+    ],
 )
 def test_values_and_gradients_match_oracle(oracle, tile, stop, implementation):
     expected, v_expected, weights = oracle

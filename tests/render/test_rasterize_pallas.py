@@ -51,7 +51,7 @@ def test_the_ordered_sum_counts_every_entry():
     np.testing.assert_allclose(summed, expected, atol=1e-5)
 
 
-@pytest.mark.parametrize("deterministic", [False, True])
+@pytest.mark.parametrize("deterministic", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_views_batch(deterministic):
     """A batch of cameras by vmap is one launch, and the sum of its views."""
     g, cam = street(n=60, width=24, height=16)

@@ -80,6 +80,7 @@ def test_towns_have_an_underpass_and_their_own_sun():
     assert build_town(0).underpass is None
 
 
+@pytest.mark.slow
 def test_the_data_set_card_and_table_say_what_was_done(tmp_path):
     sensor = Sensor(iso_std=2.0, camera_gain_ev=0.3, white_balance_ev=0.1, vignetting=0.2)
     street = write_street(

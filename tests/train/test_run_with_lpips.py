@@ -22,6 +22,7 @@ def run(*argv):
     return stop.value.code
 
 
+@pytest.mark.slow
 def test_a_run_is_judged_with_it_and_again_with_another(tmp_path, capsys):
     scene, out = make_scene(tmp_path / "scene"), tmp_path / "run"
     alex = write_weights(tmp_path / "alex.npz", made_arrays("alex"))

@@ -250,6 +250,7 @@ def test_the_first_term_that_is_no_number_is_named(made):
     assert finite_names(report.terms)[int(state.fault.term)] == "loss term log_exposure_mean"
 
 
+@pytest.mark.slow
 def test_a_short_fit_traces_its_step_once_per_image_size(tmp_path, monkeypatch):
     scene = make_scene(tmp_path / "scene", size=(200, 192))
     base = FitConfig()
