@@ -9,21 +9,18 @@ import p2gs_jax
 from p2gs_jax.evaluate.alignment import exposure_error
 from p2gs_jax.pipeline.calibrate_run import calibrate_run
 from p2gs_jax.run.photometry_file import read_photometry
-from p2gs_jax.synth.write import write_street
 
 
 @pytest.mark.slow
-def test_a_run_gives_its_exposures_again(tmp_path):
-    street = write_street(
-        tmp_path / "street", frames=4, width=160, height=112, points=6000, iso_std=4.0, seed=1
-    )
+def test_a_run_gives_its_exposures_again(noisy_street, tmp_path):
     cfg = p2gs_jax.preset("robust")
     cfg = dataclasses.replace(
         cfg,
         train=dataclasses.replace(cfg.train, steps=80, coarse_to_fine=()),
-        data=dataclasses.replace(cfg.data, test_every=0),
+        render=dataclasses.replace(cfg.render, sh_degree=1),
+        data=dataclasses.replace(cfg.data, test_every=0, max_width=128),
     )
-    result = p2gs_jax.fit(street.root, tmp_path / "run", cfg)
+    result = p2gs_jax.fit(noisy_street, tmp_path / "run", cfg)
     started = read_photometry(tmp_path / "run" / "photometry.json")["views"]
     assert all(0 < v["exposure_ev_error"] < 0.1 for v in started)
     again = calibrate_run(tmp_path / "run", tmp_path / "out", cfg.photometry)
