@@ -32,6 +32,12 @@ PhotometricModel = Literal[
     "view_exposure_camera_gamma",
     "view_exposure_gamma",
 ]
+# Per what it varies: one physical camera, or one photograph.
+Level = Literal["camera", "view"]
+# Vignetting per camera: the same for all channels, or one for each.
+VignettingKind = Literal["camera", "channel"]
+# What has a response of its own.
+ResponseKind = Literal["all", "camera", "channel"]
 ExposureLossForm = Literal[
     "literal_same_pose", "literal_pixels", "exposed", "observed_linear", "observed_ldr"
 ]
@@ -103,6 +109,23 @@ class RenderConfig:
 
 
 @dataclass(frozen=True)
+class CameraFormation:
+    """What one physical camera does to light besides exposing it; solved, never learned.
+
+    Attributes:
+        name: of the camera, as in `View.camera`.
+        vignetting: coefficients k of log V(r) = k1 r^2 + k2 r^4 + k3 r^6 with r = 1 in the corners
+            of the image: one row for all channels, or a row for each; empty: none.
+        splines: log exposure added to sRGB's at the knots, as `PhotometryConfig.spline`: one row
+            for all channels, or a row for each; empty: the spline of all cameras, if any.
+    """
+
+    name: str
+    vignetting: tuple[tuple[float, ...], ...] = ()
+    splines: tuple[tuple[float, ...], ...] = ()
+
+
+@dataclass(frozen=True)
 class PhotometryConfig:
     """The image formation model y = T(e L)."""
 
@@ -116,6 +139,15 @@ class PhotometryConfig:
     values splatted as they are (3DGS)."""
     spline: tuple[float, ...] | None = None
     """Log exposure that `spline` adds to sRGB's at its knots (photometry/response.py)."""
+    white_balance: Level | None = None
+    """Per what the white balance varies (with `select`: chosen)."""
+    vignetting: VignettingKind | None = None
+    """Whether cameras darken towards the corners, and whether each channel does so in its own way
+    (with `select`: chosen)."""
+    responses: ResponseKind = "all"
+    """What has a fitted response of its own, where the curve is `spline` (with `select`: chosen)."""
+    cameras: tuple[CameraFormation, ...] = ()
+    """What each camera does besides; the photographs decide, not the options."""
     known: str | None = None
     """Exposures known beforehand: a CSV file (image, exposure or ev), or `exif`."""
     known_deviation_ev: float = 0.0

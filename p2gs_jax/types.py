@@ -54,6 +54,23 @@ class Gaussians(eqx.Module):
         return self.means.shape[0]
 
 
+class Capture(eqx.Module):
+    """What one photograph did to the light.
+
+    Attributes:
+        exposure: e > 0.
+        gamma: > 0.
+        white_balance: log factors on red, green, blue beside e, mean 0; None: all 1.
+        camera: row in `PhotometryConfig.cameras`, -1 for a camera that is not there; None where no
+            camera does anything of its own.
+    """
+
+    exposure: Float[Array, ""]
+    gamma: Float[Array, ""]
+    white_balance: Float[Array, " 3"] | None = None
+    camera: Int[Array, ""] | int | None = None
+
+
 class Photometry(eqx.Module):
     """What each camera did to the light: an exposure and a gamma for every training view.
 
@@ -61,11 +78,16 @@ class Photometry(eqx.Module):
         raw_exposures: exposures as the optimiser sees them: log e (`log`) or e (`linear`).
         raw_gammas: gammas likewise: log(gamma / 2.2) (`log`) or gamma (`linear`).
         parameterization: `log` keeps both positive by construction; `linear` is the paper's.
+        raw_white_balance: log factors on the channels; their mean does not count (exposures hold
+            it). None where the white balance does not vary: it then costs nothing.
+        cameras: the row of each view in `PhotometryConfig.cameras`; None where that is empty.
     """
 
     raw_exposures: Float[Array, " v"]
     raw_gammas: Float[Array, " v"]
     parameterization: Literal["log", "linear"] = eqx.field(static=True, default="log")
+    raw_white_balance: Float[Array, "v 3"] | None = None
+    cameras: tuple[int, ...] | None = eqx.field(static=True, default=None)
 
     @property
     def exposures(self) -> Float[Array, " v"]:
@@ -82,6 +104,25 @@ class Photometry(eqx.Module):
         if self.parameterization == "log":
             return GAMMA_SRGB * xp.exp(self.raw_gammas)
         return xp.maximum(self.raw_gammas, 1e-3)
+
+    @property
+    def white_balance(self) -> Float[Array, "v 3"] | None:
+        """Log factors on red, green, blue, mean 0 in every view, or None."""
+        raw = self.raw_white_balance
+        return None if raw is None else raw - raw.mean(axis=1, keepdims=True)
+
+    def capture(self, row: Int[Array, ""] | int) -> Capture:
+        """Return what the training view in a row did to the light."""
+        balance = self.white_balance
+        camera = None
+        if self.cameras is not None:
+            camera = _namespace(self.raw_exposures).asarray(self.cameras)[row]
+        return Capture(
+            self.exposures[row],
+            self.gammas[row],
+            None if balance is None else balance[row],
+            camera,
+        )
 
 
 class Params(eqx.Module):

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from p2gs_jax.config import CameraFormation, Level, VignettingKind
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.photometry.models import ModelName
 from p2gs_jax.photometry.response import Response
@@ -44,6 +45,14 @@ class PhotometricSolution:
         converged: that was no more than the tolerance.
         unknown_errors: observed views whose standard errors cannot be told.
         warnings: what the user should know.
+        white_balance_level: per what the white balance varies; None: it does not.
+        white_balance: log factors on red, green, blue beside the exposure: mean 0 in every view,
+            and over the views of a component; zeros where it does not vary.
+        white_balance_errors: standard errors, as `exposure_errors`.
+        vignetting: whether cameras darken towards their corners, and each channel in its own way.
+        cameras: what each physical camera does, by its row in `Observations.cameras`; empty where
+            none does anything of its own.
+        corner_errors: standard errors of log V in the corner, per camera and row of `vignetting`.
     """
 
     model: ModelName
@@ -64,6 +73,12 @@ class PhotometricSolution:
     converged: bool
     unknown_errors: int
     warnings: tuple[str, ...]
+    white_balance_level: Level | None
+    white_balance: Float[np.ndarray, "v 3"]
+    white_balance_errors: Float[np.ndarray, "v 3"]
+    vignetting: VignettingKind | None
+    cameras: tuple[CameraFormation, ...]
+    corner_errors: Float[np.ndarray, "c k"]
 
     @property
     def state(self) -> dict[str, Any]:

@@ -80,6 +80,12 @@ def solution_of(
             *solver_warnings(fit, h_errors[known], np.flatnonzero(lost), o.names),
             *observation_warnings(per_view, component, active, balance, o.names),
         ),
+        white_balance_level=None,
+        white_balance=np.zeros((o.view_count, 3)),
+        white_balance_errors=np.zeros((o.view_count, 3)),
+        vignetting=None,
+        cameras=(),
+        corner_errors=np.zeros((0, 0)),
     )
 
 
