@@ -145,7 +145,8 @@ class PhotometryConfig:
     """Whether cameras darken towards the corners, and whether each channel does so in its own way
     (with `select`: chosen)."""
     responses: ResponseKind = "all"
-    """What has a fitted response of its own, where the curve is `spline` (with `select`: chosen)."""
+    """What has a fitted response of its own, where the curve is `spline` (with `select`:
+    chosen)."""
     cameras: tuple[CameraFormation, ...] = ()
     """What each camera does besides; the photographs decide, not the options."""
     known: str | None = None

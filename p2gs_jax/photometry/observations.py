@@ -31,6 +31,9 @@ class Observations:
         cameras: physical camera of each view, 0, 1, ...
         too_coarse: observations of these points that were left out for their scale (`COARSEST`).
         names: what people call the views; their rows if empty.
+        positions: in the image, from its centre in units of half its diagonal; None where nobody
+            knows, and nothing depends on the place.
+        camera_names: what people call the cameras; their rows if empty.
     """
 
     views: Int[np.ndarray, " o"]
@@ -42,6 +45,8 @@ class Observations:
     cameras: Int[np.ndarray, " v"]
     too_coarse: int = 0
     names: tuple[str, ...] = ()
+    positions: Float[np.ndarray, "o 2"] | None = None
+    camera_names: tuple[str, ...] = ()
 
     def decoded(self, response: Response):
         """Return log exposed radiance, its stated standard deviation and dz/dy, each (O, 3)."""
@@ -68,6 +73,8 @@ class Observations:
     def picked(self, pick: Bool[np.ndarray, " o"]) -> Observations:
         """Return some of them."""
         taken = {k: getattr(self, k)[pick] for k in ("views", "points", "colors", "spread")}
+        if self.positions is not None:
+            taken["positions"] = self.positions[pick]
         return replace(self, **taken)
 
     def thinned(self, per_view: int, seed: int) -> Bool[np.ndarray, " o"]:

@@ -143,7 +143,7 @@ def point_colors(
     coarsest = np.zeros(len(scene.points))
     for mine, footprint, kept in zip(points, footprints, keep, strict=True):
         np.maximum.at(coarsest, mine[kept], footprint[kept])
-    views, seen, colors, spreads = [], [], [], []
+    views, seen, colors, spreads, places = [], [], [], [], []
     for row, (index, kept) in enumerate(zip(scene.train_indices, keep, strict=True)):
         mine = points[row][kept]
         if len(mine):
@@ -154,6 +154,8 @@ def point_colors(
             seen.append(mine[found.valid])
             colors.append(found.colors[found.valid])
             spreads.append(found.spread[found.valid])
+            centred = there[found.valid] - [width / 2, height / 2]
+            places.append((centred / np.hypot(width / 2, height / 2)).astype(np.float32))
         on_view(row + 1, len(scene.train_indices))
     empty = np.zeros((0, 3), np.float32)
     return Observations(
@@ -166,6 +168,8 @@ def point_colors(
         cameras=camera_rows(scene),
         too_coarse=int(sum((~kept).sum() for kept in keep)),
         names=tuple(scene.views[i].name for i in scene.train_indices),
+        positions=np.concatenate([np.zeros((0, 2), np.float32), *places]),
+        camera_names=tuple(sorted({scene.views[i].camera for i in scene.train_indices})),
     )
 
 
