@@ -77,8 +77,9 @@ class Case:
 
     @property
     def model(self) -> ModelName:
-        """The model that made the photographs."""
-        return _MODELS[_VARIES.get(self.exposures, "view"), self.gammas]
+        """The model that made the photographs; with a white balance per view, one per view."""
+        level = "view" if self.white_balance == "view" else _VARIES.get(self.exposures, "view")
+        return _MODELS[level, self.gammas]
 
     @property
     def white_balance(self) -> Level | None:

@@ -53,23 +53,15 @@ class Limits(TypedDict):
 # ------------------------------------------------------------------ scores
 
 
-def responses_of(solution: PhotometricSolution) -> str:
-    """Return what has a response of its own: all, camera or channel."""
-    rows = max((len(c.splines) for c in solution.cameras), default=0)
-    return {0: "all", 1: "camera"}.get(rows, "channel")
-
-
 def parts_right(solution: PhotometricSolution, case: Case) -> dict[str, bool]:
     """Return which parts of a case were found."""
     told = case.response is not None
-    found = (solution.response.curve, responses_of(solution))
-    # A curve for each camera or channel is a spline, whatever the one for all is called.
-    curve = "spline" if found[1] != "all" else found[0]
+    found = (solution.response.curve, solution.response.by)
     return {
         "model": solution.model == case.model,
         "white_balance": solution.white_balance_level == case.white_balance,
         "vignetting": solution.vignetting == case.vignetting,
-        "response": not told or (curve, found[1]) == (case.response, case.responses),
+        "response": not told or found == (case.response, case.responses),
     }
 
 
@@ -119,11 +111,11 @@ def measure(index: int, seed: int) -> dict:
     by_camera = case.responses == "camera"
     ev, after_power = exposure_errors(s.log_exposures, drawn, by_camera=by_camera)
     plain = None
-    if case.plain and responses_of(s) == "all":
+    if case.plain:
         same = fit_model(make_problem(drawn.observations, **limits), case.model, s.response)
         plain = exposure_errors(same.log_exposures, drawn, by_camera=False)[0]
     right = parts_right(s, case)
-    found = [s.model, s.response.name if responses_of(s) == "all" else responses_of(s) + "s'"]
+    found = [s.model, s.response.name]
     found += [f"white balance {s.white_balance_level}"] if s.white_balance_level else []
     found += [f"vignetting {s.vignetting}"] if s.vignetting else []
     return {

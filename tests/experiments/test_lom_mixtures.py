@@ -1,0 +1,95 @@
+"""The table of mixtures: the common exposure is the mean of one group, and nothing is invented."""
+
+import sys
+from pathlib import Path
+from typing import Any, cast
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "experiments"))
+
+import lom_mixtures
+import mixtures
+
+from p2gs_jax.config import FitConfig, preset
+from p2gs_jax.run.read import Run
+from p2gs_jax.types import Params, Photometry, Scene, View
+
+EYE = np.eye(4, dtype=np.float32)
+
+
+def run_of(cfg: FitConfig, appearance=None) -> Run:
+    """Return a run of four training views, of groups high, low, high, low."""
+    views = [
+        View(f"{name}.JPG", Path(f"{name}.JPG"), "0", EYE, EYE[:3, :3], 8, 8) for name in "abcd"
+    ]
+    scene = Scene(
+        Path(), "colmap", tuple(views), np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+    )
+    photometry = Photometry(jnp.log(jnp.array([2.0, 0.1, 8.0, 0.2])), jnp.zeros(4))
+    params = Params(cast(Any, None), photometry, appearance)
+    return Run(Path(), params, cfg, scene, None, cast(Any, {"views": []}))
+
+
+GROUPS = {"a": "high", "b": "low", "c": "high", "d": "low"}
+
+
+def test_the_common_exposure_is_the_geometric_mean_of_a_group():
+    display = lom_mixtures.common_display(run_of(preset("robust")), GROUPS, "high")
+    assert display(1).exposure == pytest.approx(4.0)
+    assert display(1) == display(0)
+    with pytest.raises(SystemExit, match="no training view"):
+        lom_mixtures.common_display(run_of(preset("robust")), GROUPS, "over_exp")
+
+
+def test_corrections_are_averaged_over_the_group():
+    corrections = jnp.arange(4.0)[:, None, None] * jnp.ones((4, 3, 4))
+    run = run_of(preset("3dgs_affine"), corrections)
+    shown = lom_mixtures.common_display(run, GROUPS, "low")(0)
+    assert shown.correction is not None
+    np.testing.assert_allclose(shown.correction, 2.0)
+
+
+def test_presets_that_are_not_there_are_skipped(capsys):
+    found = lom_mixtures.configs(("3dgs", "nobody"), steps=5)
+    assert list(found) == ["3dgs"]
+    assert found["3dgs"].train.steps == 5
+    assert "nobody is skipped" in capsys.readouterr().err
+
+
+def test_spreads_are_those_of_solved_exposures_only():
+    def file(*evs):
+        names = ("a.JPG", "b.JPG", "c.JPG", "d.JPG")
+        return {"views": [dict(image=n, exposure_ev=e) for n, e in zip(names, evs, strict=True)]}
+
+    assert lom_mixtures.spreads(file(1.0, 0.0, 1.2, None), GROUPS)["spread_ev"] == pytest.approx(
+        {"high": 0.1, "low": 0.0}
+    )
+    assert lom_mixtures.spreads(file(0.0, 0.0, 0.0, 0.0), GROUPS) == {"spread_ev": {}}
+    assert mixtures.within_groups_ev(file(1.0, 0.0, 1.2, 0.0), GROUPS) == pytest.approx(0.005**0.5)
+
+
+def test_rows_without_a_value_have_empty_cells():
+    rows = [
+        {"method": "calibrate", "spread_ev": {"low": 0.01}},
+        {"method": "3dgs", "failed": "no light"},
+        {"method": "robust", "spread_ev": {"low": 0.02, "high": 0.03}, "own_exposure": 25.0}
+        | {"own_all": 26.0, "common": 24.0, "steps": 600, "seconds": 61.0},
+    ]
+    lines = lom_mixtures.to_markdown(rows, ("low", "high")).splitlines()
+    assert len({line.count("|") for line in lines}) == 1
+    assert lines[2] == "| calibrate | 0.010 |  |  |  |  |  |  |"
+    assert "no light" in lines[3]
+    assert lines[4] == "| robust | 0.020 | 0.030 | 25.00 | 26.00 | 24.00 | 600 | 61 |"
+
+
+def test_pictures_stay_outside_the_project(monkeypatch):
+    inside = Path(lom_mixtures.__file__).parent / "results"
+    monkeypatch.setattr(sys, "argv", ["x", "scene", "--out", str(inside)])
+    with pytest.raises(SystemExit, match="inside this project"):
+        lom_mixtures.main()
+    monkeypatch.setattr(sys, "argv", ["x", "scene", "--groups", "low"])
+    with pytest.raises(SystemExit, match="needs high"):
+        lom_mixtures.main()
