@@ -19,17 +19,15 @@ No photograph of these scenes may be in this project: keep --out outside of it.
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
+from judging import common_display, configs, found_by
 from mixtures import GROUPS, REFERENCE, read_groups, spread_by_group, write_mixture
 
 import p2gs_jax
@@ -47,59 +45,20 @@ SHOWN, SHEET_ROWS = ("robust", "3dgs_affine"), 3
 NOT_ALL = frozenset({"averaged", "exposure_fitted"})
 
 
-def configs(names: Sequence[str], **train: Any) -> dict[str, FitConfig]:
-    """Return presets under a budget; those that this version has not are named on stderr."""
-    found = {}
-    for name in names:
-        try:
-            cfg = p2gs_jax.preset(name)  # pyright: ignore[reportArgumentType]
-        except p2gs_jax.UserError as error:
-            print(f"{name} is skipped: {error}", file=sys.stderr, flush=True)
-            continue
-        found[name] = dataclasses.replace(cfg, train=dataclasses.replace(cfg.train, **train))
-    return found
-
-
 # ------------------------------------------------------------------ the common exposure
 
 
-def mean_of_rows(run: p2gs_jax.Run, rows: Sequence[int]) -> p2gs_jax.Run:
-    """Return a run all of whose training views have the mean parameters of some of them.
+def rows_of_group(run: p2gs_jax.Run, groups: dict[str, str], group: str) -> list[int]:
+    """Return the rows of the training views that drew a group.
 
-    Args:
-        run: the run.
-        rows: of the training views that are averaged: exposures as logarithms, where the run has
-            them so.
+    Raises:
+        SystemExit: there are none.
     """
-    views, taken = len(run.scene.train_indices), jnp.asarray(rows)
-
-    def mean(values):
-        # What is not per view is the camera's.
-        if np.ndim(values) == 0 or len(values) != views:
-            return values
-        return jnp.broadcast_to(jnp.asarray(values)[taken].mean(0), np.shape(values))
-
-    p = run.params
-    per_view = jax.tree.map(mean, (p.photometry, p.appearance))
-    params = dataclasses.replace(p, photometry=per_view[0], appearance=per_view[1])
-    return dataclasses.replace(run, params=params)
-
-
-def common_display(
-    run: p2gs_jax.Run, groups: dict[str, str], group: str
-) -> Callable[[int], p2gs_jax.DisplayTransform]:
-    """Return how a view of each row is shown under the mean of a group's training views."""
-    training = run.scene.train_indices
-    rows = [
-        row
-        for row, index in enumerate(training)
-        if groups[Path(run.scene.views[index].name).stem] == group
-    ]
+    names = [Path(view.name).stem for view in run.scene.training_views]
+    rows = [row for row, name in enumerate(names) if groups[name] == group]
     if not rows:
         raise SystemExit(f"no training view of {run.folder} is in the group {group}")
-    averaged = mean_of_rows(run, rows)
-    of_camera = {run.scene.views[i].camera: i for i in reversed(training)}
-    return lambda index: averaged.own_display(of_camera[run.scene.views[index].camera])
+    return rows
 
 
 class Common(NamedTuple):
@@ -119,7 +78,7 @@ class Common(NamedTuple):
 def under_common_exposure(run: p2gs_jax.Run, groups: dict[str, str]) -> Common:
     """Render held-out views under the exposure of the reference photographs and compare."""
     scene = run.scene
-    display = common_display(run, groups, REFERENCE)
+    display = common_display(run, rows_of_group(run, groups, REFERENCE))
     reference = load_reference(scene.root / "reference", scene, run.cfg)
     scores, pictures = [], {}
     for index in scene.test_indices:
@@ -138,16 +97,18 @@ def calibrated(scene: Path, out: Path) -> dict[str, Any]:
     """Return the row of `calibrate`: exposures without any fit."""
     if not (out / "photometry.json").is_file():
         p2gs_jax.calibrate(scene, out)
-    photometry = json.loads((out / "photometry.json").read_text())
-    return {"method": "calibrate", **spreads(photometry, read_groups(scene))}
+    views = json.loads((out / "photometry.json").read_text())["views"]
+    evs = {v["image"]: v["exposure_ev"] for v in views if v["exposure_ev"] is not None}
+    return {"method": "calibrate", "spread_ev": spread_by_group(evs, read_groups(scene))}
 
 
-def spreads(photometry: dict[str, Any], groups: dict[str, str]) -> dict[str, Any]:
-    """Return the spread within every group, EV; none where all exposures are one."""
-    evs = [v["exposure_ev"] for v in photometry["views"] if v["exposure_ev"] is not None]
-    if np.ptp(evs) == 0:
-        return {"spread_ev": {}}
-    return {"spread_ev": {g: std for g, (_, std) in spread_by_group(photometry, groups).items()}}
+def spreads(run: p2gs_jax.Run, groups: dict[str, str]) -> dict[str, float]:
+    """Return the spread within every group, EV; nothing where a run has no exposures."""
+    evs = found_by(run).exposures_ev
+    if evs is None:
+        return {}
+    names = (view.name for view in run.scene.training_views)
+    return spread_by_group(dict(zip(names, evs, strict=True)), groups)
 
 
 def judged(method: str, folder: Path, scene: Path) -> tuple[dict[str, Any], Common]:
@@ -160,7 +121,7 @@ def judged(method: str, folder: Path, scene: Path) -> tuple[dict[str, Any], Comm
     all_fitted = [v["psnr"] for k, v in test.items() if k not in NOT_ALL and "psnr" in v]
     row = {
         "method": method,
-        **spreads(json.loads((folder / "photometry.json").read_text()), groups),
+        "spread_ev": spreads(run, groups),
         "own_exposure": test["exposure_fitted"]["psnr"],
         # The protocol that fits most comes last.
         "own_all": all_fitted[-1] if all_fitted else test["exposure_fitted"]["psnr"],

@@ -59,20 +59,16 @@ def read_groups(scene: Path) -> dict[str, str]:
 
 
 def spread_by_group(
-    photometry: Mapping[str, Any], groups: Mapping[str, str]
-) -> dict[str, tuple[int, float]]:
-    """Return, for each group, how many exposures there are and their standard deviation, EV.
+    exposures_ev: Mapping[str, float], groups: Mapping[str, str]
+) -> dict[str, float]:
+    """Return the standard deviation of exposures within every group, EV.
 
     Args:
-        photometry: what `photometry.json` holds.
+        exposures_ev: by the name of the view.
         groups: name of a view without its suffix -> group.
     """
-    found: dict[str, list[float]] = {}
-    for view in photometry["views"]:
-        group = groups.get(Path(view["image"]).stem)
-        if group is not None and view["exposure_ev"] is not None:
-            found.setdefault(group, []).append(view["exposure_ev"])
-    return {group: (len(evs), float(np.std(evs))) for group, evs in found.items()}
+    found = _by_group(exposures_ev, groups)
+    return {group: float(np.std(evs)) for group, evs in found.items()}
 
 
 def within_groups_ev(photometry: Mapping[str, Any], groups: Mapping[str, str]) -> float | None:
@@ -82,6 +78,17 @@ def within_groups_ev(photometry: Mapping[str, Any], groups: Mapping[str, str]) -
         photometry: what `photometry.json` holds.
         groups: name of a view without its suffix -> group; empty: None is returned.
     """
-    spread = spread_by_group(photometry, groups).values()
-    count = sum(n for n, _ in spread)
-    return float(np.sqrt(sum(n * std**2 for n, std in spread) / count)) if count else None
+    views = photometry.get("views", ())
+    evs = {v["image"]: v["exposure_ev"] for v in views if v["exposure_ev"] is not None}
+    off = [ev - np.mean(g) for g in _by_group(evs, groups).values() for ev in g]
+    return float(np.sqrt(np.mean(np.square(off)))) if off else None
+
+
+def _by_group(
+    exposures_ev: Mapping[str, float], groups: Mapping[str, str]
+) -> dict[str, list[float]]:
+    found: dict[str, list[float]] = {}
+    for name, ev in exposures_ev.items():
+        if (group := groups.get(Path(name).stem)) is not None:
+            found.setdefault(group, []).append(ev)
+    return found

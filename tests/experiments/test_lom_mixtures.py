@@ -1,5 +1,6 @@
 """The table of mixtures: the common exposure is the mean of one group, and nothing is invented."""
 
+import dataclasses
 import sys
 from pathlib import Path
 from typing import Any, cast
@@ -10,10 +11,10 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "experiments"))
 
+import judging
 import lom_mixtures
-import mixtures
 
-from p2gs_jax.config import FitConfig, preset
+from p2gs_jax.config import CameraFormation, FitConfig, preset
 from p2gs_jax.run.read import Run
 from p2gs_jax.types import Params, Photometry, Scene, View
 
@@ -37,38 +38,50 @@ GROUPS = {"a": "high", "b": "low", "c": "high", "d": "low"}
 
 
 def test_the_common_exposure_is_the_geometric_mean_of_a_group():
-    display = lom_mixtures.common_display(run_of(preset("robust")), GROUPS, "high")
+    run = run_of(preset("robust"))
+    rows = lom_mixtures.rows_of_group(run, GROUPS, "high")
+    assert rows == [0, 2]
+    display = judging.common_display(run, rows)
     assert display(1).exposure == pytest.approx(4.0)
     assert display(1) == display(0)
     with pytest.raises(SystemExit, match="no training view"):
-        lom_mixtures.common_display(run_of(preset("robust")), GROUPS, "over_exp")
+        lom_mixtures.rows_of_group(run, GROUPS, "over_exp")
 
 
 def test_corrections_are_averaged_over_the_group():
     corrections = jnp.arange(4.0)[:, None, None] * jnp.ones((4, 3, 4))
     run = run_of(preset("3dgs_affine"), corrections)
-    shown = lom_mixtures.common_display(run, GROUPS, "low")(0)
+    shown = judging.common_display(run, [1, 3])(0)
     assert shown.correction is not None
     np.testing.assert_allclose(shown.correction, 2.0)
 
 
 def test_presets_that_are_not_there_are_skipped(capsys):
-    found = lom_mixtures.configs(("3dgs", "nobody"), steps=5)
+    found = judging.configs(("3dgs", "nobody"), steps=5)
     assert list(found) == ["3dgs"]
     assert found["3dgs"].train.steps == 5
     assert "nobody is skipped" in capsys.readouterr().err
 
 
 def test_spreads_are_those_of_solved_exposures_only():
-    def file(*evs):
-        names = ("a.JPG", "b.JPG", "c.JPG", "d.JPG")
-        return {"views": [dict(image=n, exposure_ev=e) for n, e in zip(names, evs, strict=True)]}
+    run = run_of(preset("robust"))
+    assert lom_mixtures.spreads(run, GROUPS) == pytest.approx({"high": 1.0, "low": 0.5})
+    learned = dataclasses.replace(run.params.photometry, raw_exposures=jnp.zeros(4))
+    params = dataclasses.replace(run.params, photometry=learned)
+    plain = dataclasses.replace(run_of(preset("3dgs")), params=params)
+    assert lom_mixtures.spreads(plain, GROUPS) == {}
 
-    assert lom_mixtures.spreads(file(1.0, 0.0, 1.2, None), GROUPS)["spread_ev"] == pytest.approx(
-        {"high": 0.1, "low": 0.0}
-    )
-    assert lom_mixtures.spreads(file(0.0, 0.0, 0.0, 0.0), GROUPS) == {"spread_ev": {}}
-    assert mixtures.within_groups_ev(file(1.0, 0.0, 1.2, 0.0), GROUPS) == pytest.approx(0.005**0.5)
+
+def test_what_cameras_do_is_read_from_where_a_run_keeps_it():
+    cfg = preset("robust")
+    lens = CameraFormation("0", vignetting=((-0.2, 0.0, -0.1),))
+    cfg = dataclasses.replace(cfg, photometry=dataclasses.replace(cfg.photometry, cameras=(lens,)))
+    found = judging.found_by(run_of(cfg))
+    assert found.exposures_ev == pytest.approx(np.log2([2.0, 0.1, 8.0, 0.2]))
+    assert found.corners == pytest.approx({"0": np.exp(-0.3)})
+    np.testing.assert_array_equal(found.balance_ev, 0)
+    assert judging.found_by(run_of(preset("robust"))).corners == {"0": 1.0}
+    assert judging.found_by(run_of(preset("3dgs_affine"), jnp.zeros((4, 3, 4)))).corners is None
 
 
 def test_rows_without_a_value_have_empty_cells():
