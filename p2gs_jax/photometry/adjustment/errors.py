@@ -10,6 +10,7 @@ import scipy.sparse as sp
 from jaxtyping import Float, Int
 
 from p2gs_jax.core.streams import Stream, generator
+from p2gs_jax.photometry.adjustment.clusters import small_sample
 from p2gs_jax.photometry.adjustment.linear import DENSE, Balanced
 from p2gs_jax.photometry.adjustment.normal import scores
 from p2gs_jax.photometry.adjustment.parameters import Parameters
@@ -35,11 +36,13 @@ class Uncertainty(NamedTuple):
     Attributes:
         roots: columns whose outer products sum to the covariance of all parameters.
         unknown: directions that the observations do not hold: `roots` knows nothing of them.
+        few: factors on the errors of views that few clusters tell of.
         system: what was solved.
     """
 
     roots: Float[np.ndarray, "d r"]
     unknown: Float[np.ndarray, "d k"]
+    few: Float[np.ndarray, " v"]
     system: System
 
     def of(self, asked: Asked) -> Float[np.ndarray, " n"]:
@@ -63,14 +66,18 @@ def uncertainty(fit: Fit, system: System, clusters: Int[np.ndarray, " o"]) -> Un
         system: what it was solved with.
         clusters: what each observation is counted with.
     """
+    rows = fit.model.rows
     each = scores(fit.model, fit.theta, fit.at, clusters)
+    seen = rows.weight.any(1)
+    few = small_sample(clusters[seen], rows.views[seen], rows.view_count)
     bread = sp.csr_array(fit.normal * fit.at.curvature + system.priors.normal)
     bread = bread + gauge_strength(bread, system.unknowns) * system.anchors.normal
     if system.basis.shape[1] > DENSE:
-        return Uncertainty(_drawn(bread, each, system), np.zeros((bread.shape[0], 0)), system)
+        drawn = _drawn(bread, each, system)
+        return Uncertainty(drawn, np.zeros((bread.shape[0], 0)), few, system)
     # A prior is itself an observation with variance 1 / precision: it is its own meat.
     meat = each.T @ each + system.priors.normal
-    return Uncertainty(*_whole(bread, meat, system.basis), system)
+    return Uncertainty(*_whole(bread, meat, system.basis), few, system)
 
 
 def _whole(bread, meat, basis) -> tuple[Float[np.ndarray, "d r"], Float[np.ndarray, "d k"]]:

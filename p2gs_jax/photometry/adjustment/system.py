@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,7 +46,7 @@ class Held:
     targets: Float[np.ndarray, " n"]
     precisions: Float[np.ndarray, " n"]
 
-    @property
+    @functools.cached_property
     def normal(self) -> sp.csr_array:
         """Its normal matrix."""
         return sp.csr_array(self.rows.T @ self.rows.multiply(self.precisions[:, None]))
