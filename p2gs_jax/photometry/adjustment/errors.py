@@ -10,7 +10,9 @@ import scipy.sparse as sp
 from jaxtyping import Float, Int
 
 from p2gs_jax.core.streams import Stream, generator
-from p2gs_jax.photometry.adjustment.linear import DENSE, Balanced
+from p2gs_jax.photometry.adjustment.clusters import small_sample
+from p2gs_jax.photometry.adjustment.linear import Balanced, one_thread
+from p2gs_jax.photometry.adjustment.matrices import DENSE
 from p2gs_jax.photometry.adjustment.normal import scores
 from p2gs_jax.photometry.adjustment.parameters import Parameters
 from p2gs_jax.photometry.adjustment.solve import Fit
@@ -35,11 +37,13 @@ class Uncertainty(NamedTuple):
     Attributes:
         roots: columns whose outer products sum to the covariance of all parameters.
         unknown: directions that the observations do not hold: `roots` knows nothing of them.
+        few: factors on the errors of views that few clusters tell of.
         system: what was solved.
     """
 
     roots: Float[np.ndarray, "d r"]
     unknown: Float[np.ndarray, "d k"]
+    few: Float[np.ndarray, " v"]
     system: System
 
     def of(self, asked: Asked) -> Float[np.ndarray, " n"]:
@@ -63,14 +67,19 @@ def uncertainty(fit: Fit, system: System, clusters: Int[np.ndarray, " o"]) -> Un
         system: what it was solved with.
         clusters: what each observation is counted with.
     """
+    rows = fit.model.rows
     each = scores(fit.model, fit.theta, fit.at, clusters)
-    bread = sp.csr_array(fit.normal * fit.at.curvature + system.priors.normal)
+    seen = rows.weight.any(1)
+    few = small_sample(clusters[seen], rows.views[seen], rows.view_count)
+    bread = fit.normal * fit.at.curvature + system.priors.normal
     bread = bread + gauge_strength(bread, system.unknowns) * system.anchors.normal
     if system.basis.shape[1] > DENSE:
-        return Uncertainty(_drawn(bread, each, system), np.zeros((bread.shape[0], 0)), system)
+        drawn = _drawn(bread, each, system)
+        return Uncertainty(drawn, np.zeros((bread.shape[0], 0)), few, system)
     # A prior is itself an observation with variance 1 / precision: it is its own meat.
     meat = each.T @ each + system.priors.normal
-    return Uncertainty(*_whole(bread, meat, system.basis), system)
+    with one_thread():
+        return Uncertainty(*_whole(bread, meat, system.basis), few, system)
 
 
 def _whole(bread, meat, basis) -> tuple[Float[np.ndarray, "d r"], Float[np.ndarray, "d k"]]:
@@ -79,13 +88,17 @@ def _whole(bread, meat, basis) -> tuple[Float[np.ndarray, "d r"], Float[np.ndarr
     # Exposures that are known say so much more than pixels that only ratios can be compared.
     diagonal = (basis.T @ bread @ basis).diagonal()
     g = basis @ sp.diags_array(1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)))
-    value, direction = np.linalg.eigh((g.T @ bread @ g).toarray())
+    value, direction = np.linalg.eigh(_array(g.T @ bread @ g))
     held = value > HELD
     inverse = (direction[:, held] / value[held]) @ direction[:, held].T
-    size, across = np.linalg.eigh((g.T @ meat @ g).toarray())
+    size, across = np.linalg.eigh(_array(g.T @ meat @ g))
     roots = inverse @ (across * np.sqrt(np.maximum(size, 0)))
     unknown = g @ direction[:, ~held]
     return g @ roots, unknown / np.linalg.norm(unknown, axis=0)
+
+
+def _array(matrix) -> Float[np.ndarray, "n n"]:
+    return matrix.toarray() if sp.issparse(matrix) else matrix
 
 
 def _drawn(bread, each, system: System) -> Float[np.ndarray, "d r"]:

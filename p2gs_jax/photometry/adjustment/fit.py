@@ -8,6 +8,7 @@ from jaxtyping import Float
 from p2gs_jax.config import ResponseKind
 from p2gs_jax.photometry.adjustment.clusters import clusters
 from p2gs_jax.photometry.adjustment.errors import uncertainty
+from p2gs_jax.photometry.adjustment.linear import one_thread
 from p2gs_jax.photometry.adjustment.problem import Problem
 from p2gs_jax.photometry.adjustment.result import solution_of
 from p2gs_jax.photometry.adjustment.rows import Layout, make_rows
@@ -47,7 +48,8 @@ def solve_model(
         problem.observations, problem.layout, weight, response, problem.log_pivot, splines or "all"
     )
     system = make_system(problem, form, splines)
-    return solve(rows, system, tolerance), system
+    with one_thread():
+        return solve(rows, system, tolerance), system
 
 
 def fit_model(

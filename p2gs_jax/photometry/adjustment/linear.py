@@ -2,20 +2,37 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
 import scipy.sparse.linalg
+import threadpoolctl
 from jaxtyping import Float
+
+from p2gs_jax.photometry.adjustment.matrices import DENSE, Matrix
 
 # Of the balanced matrix, whose diagonal is 1.
 DAMPING = 1e-8
-# Up to so many unknowns the matrix is factorised as a whole.
-DENSE = 1500
 # Groups of neighbouring unknowns, whose common changes a coarse system solves.
 GROUPS = 400
 # Relative residual at which the iteration ends; a round's step need not be exact.
 PRECISION, MOST_ITERATIONS = 1e-7, 2000
+
+
+@functools.cache
+def _libraries() -> threadpoolctl.ThreadpoolController:
+    return threadpoolctl.ThreadpoolController()
+
+
+def one_thread():
+    """Return a context in which BLAS does not wake threads.
+
+    It does so for a system of a hundred unknowns, and waits for busy cores: 52 ms instead of 2
+    while something else computes (BUILD_NOTES).
+    """
+    return _libraries().limit(limits=1, user_api="blas")
 
 
 class Balanced:
@@ -26,16 +43,22 @@ class Balanced:
         basis: columns are the free directions.
     """
 
-    def __init__(self, normal: sp.csr_array, basis: sp.csr_array):
-        reduced = sp.csr_array(basis.T @ normal @ basis)
+    def __init__(self, normal: Matrix, basis: sp.csr_array):
+        reduced = basis.T @ normal @ basis
         diagonal = reduced.diagonal()
         free = np.flatnonzero(diagonal > 1e-30)
         self._scale = 1 / np.sqrt(diagonal[free])
         self._directions = basis[:, free]
-        scaling = sp.diags_array(self._scale)
-        matrix = scaling @ reduced[free][:, free] @ scaling
-        self._matrix = sp.csr_array(matrix + DAMPING * sp.eye_array(len(free)))
-        self._solve = _dense(self._matrix) if len(free) <= DENSE else _iterative(self._matrix)
+        matrix = reduced[free][:, free]
+        if len(free) <= DENSE:
+            whole = matrix.toarray() if sp.issparse(matrix) else matrix
+            self._solve = _dense(whole * self._scale[:, None] * self._scale)
+        else:
+            scaling = sp.diags_array(self._scale)
+            damping = DAMPING * sp.eye_array(len(free))
+            self._solve = _iterative(
+                sp.csr_array(scaling @ sp.csr_array(matrix) @ scaling + damping)
+            )
 
     def solve(self, right: Float[np.ndarray, "d ..."]) -> Float[np.ndarray, "d ..."]:
         """Return the solution along the free directions."""
@@ -43,9 +66,9 @@ class Balanced:
         return self._directions @ (scale * self._solve(scale * (self._directions.T @ right)))
 
 
-def _dense(matrix: sp.csr_array):
-    whole = matrix.toarray()
-    return lambda right: np.linalg.solve(whole, right)
+def _dense(matrix: Float[np.ndarray, "n n"]):
+    matrix[np.diag_indices_from(matrix)] += DAMPING
+    return lambda right: np.linalg.solve(matrix, right)
 
 
 def _iterative(matrix: sp.csr_array):

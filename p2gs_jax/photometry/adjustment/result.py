@@ -58,15 +58,15 @@ def solution_of(
         moved = np.broadcast_to(moved, (o.view_count, 3, moved.shape[2]))
         return color.centred(moved - moved.mean(1, keepdims=True)).reshape(-1, moved.shape[2])
 
-    h_errors = known.of(lambda change: scale.centred(of_light(change).mean(1)))
-    a_errors = known.of(lambda change: change.a)
+    h_errors = known.few * known.of(lambda change: scale.centred(of_light(change).mean(1)))
+    a_errors = known.few * known.of(lambda change: change.a)
     gamma = GAMMA_SRGB / a
     lost = active & ~(np.isfinite(h_errors) & np.isfinite(a_errors))
     seen = active & ~lost
     if known.system.unknowns.features.balance:
         balance = balance + _balance_of_views(fit, fit.theta.k[:, None])[..., 0]
     balance = np.where(active[:, None], color.centred(np.broadcast_to(balance, (len(h), 3))), 0.0)
-    balance_errors = known.of(of_balance).reshape(-1, 3)
+    balance_errors = known.few[:, None] * known.of(of_balance).reshape(-1, 3)
     shift = scale.shift(h)
     shifts = shift[:, None] + color.shift(_broad(light, 3) - _broad(light, 3).mean(1)[:, None])
     h = np.where(active, h - shift, 0.0)

@@ -10,11 +10,11 @@ import functools
 from typing import NamedTuple
 
 import numpy as np
-import scipy.sparse as sp
 from jaxtyping import Float
 
 from p2gs_jax.photometry.adjustment.forward import Forward
 from p2gs_jax.photometry.adjustment.linear import Balanced
+from p2gs_jax.photometry.adjustment.matrices import Matrix
 from p2gs_jax.photometry.adjustment.normal import normal_equations
 from p2gs_jax.photometry.adjustment.parameters import Parameters
 from p2gs_jax.photometry.adjustment.robust import Loss, Weighted, noise_weight, weigh
@@ -43,7 +43,7 @@ class Fit(NamedTuple):
     theta: Parameters
     at: Weighted
     model: Forward
-    normal: sp.csr_array
+    normal: Matrix
     rounds: int
     moved: float
     left: float

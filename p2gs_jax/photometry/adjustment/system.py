@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,7 @@ from jaxtyping import Float
 from p2gs_jax.config import Level, ResponseKind
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.photometry.adjustment.features import Features
+from p2gs_jax.photometry.adjustment.matrices import Matrix
 from p2gs_jax.photometry.adjustment.parameters import Parameters, Unknowns
 from p2gs_jax.photometry.adjustment.problem import Problem
 from p2gs_jax.photometry.adjustment.spline import Splines
@@ -45,7 +47,7 @@ class Held:
     targets: Float[np.ndarray, " n"]
     precisions: Float[np.ndarray, " n"]
 
-    @property
+    @functools.cached_property
     def normal(self) -> sp.csr_array:
         """Its normal matrix."""
         return sp.csr_array(self.rows.T @ self.rows.multiply(self.precisions[:, None]))
@@ -207,7 +209,7 @@ def _smoothness(splines: Splines) -> Float[np.ndarray, "k k"]:
     return np.kron(np.eye(splines.groups), SMOOTHNESS * second.T @ second)
 
 
-def gauge_strength(normal: sp.csr_array, unknowns: Unknowns) -> float:
+def gauge_strength(normal: Matrix, unknowns: Unknowns) -> float:
     """Return how hard the anchors hold, on the scale of the exposures' information.
 
     Args:
@@ -219,8 +221,8 @@ def gauge_strength(normal: sp.csr_array, unknowns: Unknowns) -> float:
 
 
 def with_priors(
-    system: System, theta: Parameters, normal: sp.csr_array, right: Float[np.ndarray, " d"]
-) -> tuple[sp.csr_array, Float[np.ndarray, " d"]]:
+    system: System, theta: Parameters, normal: Matrix, right: Float[np.ndarray, " d"]
+) -> tuple[Matrix, Float[np.ndarray, " d"]]:
     """Return normal equations with priors and gauges.
 
     Args:
@@ -237,8 +239,8 @@ def with_priors(
     right = right + strength * system.anchors.pull(vector)
     if theta.c.size:
         stiffness = float(np.mean(normal.diagonal()[u.of_c]))
-        smooth = sp.csr_array(stiffness * system.smoothness)
+        smooth = stiffness * system.smoothness
         before = sp.csr_array((u.of_c.start,) * 2)
         normal = normal + sp.block_diag([before, smooth], format="csr")
         right = right - np.concatenate([np.zeros(u.of_c.start), smooth @ theta.c])
-    return sp.csr_array(normal), right
+    return normal, right
