@@ -114,9 +114,9 @@ def measure_long(views: int, observations: int, everything: bool) -> dict[str, f
 
 def _solve_densely_up_to(unknowns: int) -> None:
     """Set from how many unknowns on the system is solved iteratively."""
-    from p2gs_jax.photometry.adjustment import errors, linear
+    from p2gs_jax.photometry.adjustment import matrices
 
-    linear.DENSE = errors.DENSE = unknowns
+    matrices.DENSE = unknowns
 
 
 def in_own_process(*arguments: str) -> dict:

@@ -54,21 +54,26 @@ class Observations:
         z, slope = log_exposed(y, response, self.cameras[self.views])
         return z, deviation(y, slope, self.spread, response.base), slope
 
-    def usable(self, black: float, saturation: float) -> Float[np.ndarray, "o 3"]:
-        """Return 1 where a value is neither near black nor saturated and its point is shared."""
+    def usable(self, black: float, saturation: float) -> Bool[np.ndarray, "o 3"]:
+        """Return whether a value is neither near black nor saturated and its point is shared."""
         keep = (self.colors > black) & (self.colors < saturation)
         seen = keep.any(1)
         shared = np.bincount(self.points[seen], minlength=self.point_count)[self.points] >= 2
-        return (keep & (seen & shared)[:, None]).astype(np.float64)
+        return keep & (seen & shared)[:, None]
 
-    def components(self, usable: Float[np.ndarray, "o 3"]) -> Int[np.ndarray, " v"]:
+    def components(self, usable: Bool[np.ndarray, "o 3"]) -> Int[np.ndarray, " v"]:
         """Return a label per view; views with different labels cannot be compared."""
         seen = usable.any(1)
-        incidence = sp.csr_matrix(
-            (np.ones(int(seen.sum())), (self.views[seen], self.points[seen])),
-            shape=(self.view_count, self.point_count),
+        size = self.view_count + self.point_count
+        edges = sp.csr_array(
+            (
+                np.ones(int(seen.sum()), np.int8),
+                (self.views[seen], self.view_count + self.points[seen]),
+            ),
+            shape=(size, size),
         )
-        return connected_components(incidence @ incidence.T, directed=False)[1]
+        labels = connected_components(edges, directed=False)[1][: self.view_count]
+        return np.unique(labels, return_inverse=True)[1]
 
     def picked(self, pick: Bool[np.ndarray, " o"]) -> Observations:
         """Return some of them."""

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.photometry.adjustment.clusters import small_sample
 from p2gs_jax.photometry.adjustment.linear import Balanced, one_thread
-from p2gs_jax.photometry.adjustment.matrices import DENSE
+from p2gs_jax.photometry.adjustment.matrices import is_small
 from p2gs_jax.photometry.adjustment.normal import scores
 from p2gs_jax.photometry.adjustment.parameters import Parameters
 from p2gs_jax.photometry.adjustment.solve import Fit
@@ -73,7 +73,7 @@ def uncertainty(fit: Fit, system: System, clusters: Int[np.ndarray, " o"]) -> Un
     few = small_sample(clusters[seen], rows.views[seen], rows.view_count)
     bread = fit.normal * fit.at.curvature + system.priors.normal
     bread = bread + gauge_strength(bread, system.unknowns) * system.anchors.normal
-    if system.basis.shape[1] > DENSE:
+    if not is_small(system.basis.shape[1]):
         drawn = _drawn(bread, each, system)
         return Uncertainty(drawn, np.zeros((bread.shape[0], 0)), few, system)
     # A prior is itself an observation with variance 1 / precision: it is its own meat.

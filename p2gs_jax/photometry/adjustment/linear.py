@@ -11,7 +11,7 @@ import scipy.sparse.linalg
 import threadpoolctl
 from jaxtyping import Float
 
-from p2gs_jax.photometry.adjustment.matrices import DENSE, Matrix
+from p2gs_jax.photometry.adjustment.matrices import Matrix, is_small
 
 # Of the balanced matrix, whose diagonal is 1.
 DAMPING = 1e-8
@@ -50,7 +50,7 @@ class Balanced:
         self._scale = 1 / np.sqrt(diagonal[free])
         self._directions = basis[:, free]
         matrix = reduced[free][:, free]
-        if len(free) <= DENSE:
+        if is_small(len(free)):
             whole = matrix.toarray() if sp.issparse(matrix) else matrix
             self._solve = _dense(whole * self._scale[:, None] * self._scale)
         else:

@@ -14,6 +14,11 @@ DENSE = 1500
 Matrix = np.ndarray | sp.csr_array
 
 
+def is_small(size: int) -> bool:
+    """Return whether matrices of so many unknowns are kept as a whole."""
+    return size <= DENSE
+
+
 class Entries(NamedTuple):
     """Values at places of a matrix; those at one place are summed.
 
@@ -42,7 +47,7 @@ def assembled(parts: list[Entries], size: int) -> Matrix:
         size: of the matrix.
     """
     rows, columns, values = (np.concatenate(part) for part in zip(*parts, strict=True))
-    if size > DENSE:
+    if not is_small(size):
         return sp.csr_array((values, (rows, columns)), shape=(size, size))
     return np.bincount(rows * size + columns, values, size**2).reshape(size, size)
 

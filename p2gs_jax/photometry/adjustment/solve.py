@@ -115,18 +115,3 @@ def solve(rows: Rows, system: System, tolerance: float) -> Fit:
         left=moved**2 / (before - moved) if moved < before else np.inf if moved else 0.0,
         converged=moved < tolerance,
     )
-
-
-def complete(fit: Fit, rows: Rows) -> Fit:
-    """Return the solution of some observations with radiances and residuals of all of them.
-
-    Args:
-        fit: from `solve`, on some of the observations; its parameters and errors stay.
-        rows: all observations.
-    """
-    rest: tuple[Loss, ...] = ("l1", "geman_mcclure", "geman_mcclure")
-    model = Forward.of(rows, fit.model.unknowns)
-    at = weigh(model, fit.theta, noise_weight(rows), "l1")
-    for loss in rest:
-        at = weigh(model, fit.theta, at.weight, loss)
-    return fit._replace(at=at)
