@@ -93,9 +93,24 @@ def test_exposures_of_cameras_with_their_own_responses_are_judged_apart(drawn):
     assert ev > 0.01 > 1e-9 > after_power
 
 
+def test_error_bars_are_judged_by_what_is_left_after_scale_and_power(drawn):
+    off = np.tile([0.02, -0.02], 30)
+    logs = 1.1 * (np.log(drawn.exposures) + off) + 3
+    errors = np.full(60, 0.01)
+    errors[0] = np.inf
+    found = solution(drawn, log_exposures=logs, exposure_errors=errors)
+    ratio = selection_on_drive.over_stated(found, drawn, by_camera=False)
+    assert ratio == pytest.approx(2, rel=0.05)
+    none = solution(drawn, log_exposures=logs, exposure_errors=np.zeros(60))
+    assert selection_on_drive.over_stated(none, drawn, by_camera=False) is None
+
+
 def test_the_table_says_how_often_each_part_was_right():
-    row = dict.fromkeys(("ev", "ev_scale_power", "white_balance_ev", "corner_percent"), 0.01)
+    row: dict[str, Any] = dict.fromkeys(
+        ("ev", "ev_scale_power", "white_balance_ev", "corner_percent"), 0.01
+    )
     row |= {"case": "a", "right": True, "seconds": 2.0, "found": "x", "plain_ev": 0.008}
+    row["over_stated"] = None
     row["parts"] = dict.fromkeys(selection_on_drive.PARTS, True)
     wrong = {**row, "right": False, "parts": {**row["parts"], "vignetting": False}}
     text = selection_on_drive.to_markdown([row, wrong])
@@ -132,7 +147,9 @@ def test_factors_per_channel_are_those_that_fit_all_pictures():
     targets[1] = targets[1] + 0.5  # masked
     found = sensor_town._fitted_factors(lambda ev: list(linear * 2**ev), targets, masks)
     np.testing.assert_allclose(found, true, atol=3e-3)
-    rows = [dict.fromkeys(("ev", "ev_scale_power", "white_balance_ev", "corner_percent"))]
-    rows[0] |= {"method": "m", "own": 20.0, "iso_8": 21.0, "seconds": 3.0}  # pyright: ignore
+    rows: list[dict[str, Any]] = [
+        dict.fromkeys(("ev", "ev_scale_power", "white_balance_ev", "corner_percent"))
+    ]
+    rows[0] |= {"method": "m", "own": 20.0, "iso_8": 21.0, "seconds": 3.0}
     lines = sensor_town.to_markdown([*rows, {"method": "n", "failed": "no"}]).splitlines()
     assert len({line.count("|") for line in lines}) == 1
