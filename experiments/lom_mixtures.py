@@ -7,7 +7,7 @@ fitted to this mixture for equal steps and, with --budget-min, for equal minutes
 
 - the spread of solved exposures within each group (in truth 0), from `calibrate` and after the fit;
 - PSNR of held-out views under their own exposure, fitted to each photograph: exposure alone, and
-  everything that the method has per view;
+  everything that the method has per view (dark photographs score high by their darkness);
 - PSNR of held-out views under one common exposure against the `high` photographs. One transform
   serves all of them: for methods with parameters per view (exposure, gamma, white balance, colour
   correction) their mean over the training views of the group `high`, and nothing where a method
@@ -208,14 +208,14 @@ def contact_sheet(path: Path, scene: Path, shown: dict[str, Common]) -> None:
     for index in picked:
         name = Path(run.scene.views[index].name).stem
         columns = [("as photographed", run.photograph(index))]
-        columns += [(f"{m}, common exposure", c.pictures[index]) for m, c in shown.items()]
+        columns += [(m, c.pictures[index]) for m, c in shown.items()]
         target = reference(index)
         assert target is not None
         columns.append((f"photographed as {REFERENCE}", target))
         width = columns[0][1].shape[1]
         captions = [(text, k * width, (k + 1) * width) for k, (text, _) in enumerate(columns)]
         picture = np.concatenate([image for _, image in columns], axis=1)
-        title = f"{scene.name}, view {name}, drawn: {groups[name]}"
+        title = f"{scene.name}, view {name}: drew {groups[name]}; methods under the common exposure"
         rows.append(CaptionedImage(title, picture, captions))
     write_png(path, stacked(rows))
 

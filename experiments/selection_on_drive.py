@@ -7,6 +7,8 @@ Synthetic: the cases of `drive_cases.py`. Right means the exposures and gammas t
 photographs, the white balance, the vignetting (for all channels alike or for each) and, where
 exposures vary enough to tell, the curve and whether cameras or channels have curves of their own.
 "Plain" is the error of the same model without white balance and vignetting, where it has none.
+"Over stated" is the RMS of errors of exposures, after scale and power, over their stated errors: 1
+where error bars are right.
 Scenes given are calibrated and the reasons are printed.
 """
 
@@ -38,7 +40,7 @@ BLACK, SATURATION = 4 / 255, 250 / 255
 PARTS = ("model", "white_balance", "vignetting", "response")
 HEADER = (
     *("case", "right", *(p.replace("_", " ") for p in PARTS), "EV", "EV, scale and power"),
-    *("plain EV", "white balance EV", "corners %", "seconds", "otherwise"),
+    *("over stated", "plain EV", "white balance EV", "corners %", "seconds", "otherwise"),
 )
 
 
@@ -85,6 +87,25 @@ def exposure_errors(
     return float(ev), float(after_power)
 
 
+def over_stated(solution: PhotometricSolution, drawn: Drawn, *, by_camera: bool) -> float | None:
+    """Return the RMS of errors over their stated standard deviations; None where none are stated.
+
+    Args:
+        solution: what was found.
+        drawn: the truth.
+        by_camera: see `exposure_errors`.
+    """
+    stated = solution.exposure_errors
+    known = np.isfinite(stated) & (stated > 0)
+    if not known.any() or by_camera:
+        return None
+    found, true = solution.log_exposures, np.log(drawn.exposures)
+    found, true = found - found.mean(), true - true.mean()
+    power = found @ true / (found @ found) if true @ true > 0 else 1.0
+    off = (power * found - true)[known] / stated[known]
+    return float(np.sqrt(np.mean(off**2)))
+
+
 def balance_error(solution: PhotometricSolution, drawn: Drawn) -> float:
     """Return the RMS error of the white balance, EV; what all views share is no error."""
     error = solution.white_balance / LN2 - np.log2(drawn.balance)
@@ -126,6 +147,7 @@ def measure(index: int, seed: int) -> dict:
         "found": ", ".join(found),
         "ev": ev,
         "ev_scale_power": after_power,
+        "over_stated": over_stated(s, drawn, by_camera=by_camera),
         "plain_ev": plain,
         "white_balance_ev": balance_error(s, drawn),
         "corner_percent": corner_error(s, drawn),
@@ -145,7 +167,9 @@ def _row(done: list[dict]) -> list[str]:
         done[0]["case"],
         f"{sum(r['right'] for r in done)} of {len(done)}",
         *(str(sum(r["parts"][part] for r in done)) for part in PARTS),
-        *(mean(key, 3) for key in ("ev", "ev_scale_power", "plain_ev", "white_balance_ev")),
+        *(mean(key, 3) for key in ("ev", "ev_scale_power")),
+        mean("over_stated", 2),
+        *(mean(key, 3) for key in ("plain_ev", "white_balance_ev")),
         mean("corner_percent", 1),
         mean("seconds", 1),
         "; ".join(r["found"] for r in done if not r["right"]),
