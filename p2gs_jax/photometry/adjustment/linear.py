@@ -16,7 +16,7 @@ from p2gs_jax.photometry.adjustment.matrices import Matrix, is_small
 # Of the balanced matrix, whose diagonal is 1.
 DAMPING = 1e-8
 # Groups of neighbouring unknowns, whose common changes a coarse system solves.
-GROUPS = 400
+GROUPS = 1000
 # Relative residual at which the iteration ends; a round's step need not be exact.
 PRECISION, MOST_ITERATIONS = 1e-7, 2000
 
@@ -40,25 +40,24 @@ class Balanced:
 
     Args:
         normal: over all parameters.
+        gauges: few rows, whose outer products are added to it.
         basis: columns are the free directions.
     """
 
-    def __init__(self, normal: Matrix, basis: sp.csr_array):
-        reduced = basis.T @ normal @ basis
-        diagonal = reduced.diagonal()
+    def __init__(self, normal: Matrix, gauges: sp.csr_array, basis: sp.csr_array):
+        reduced, held = basis.T @ normal @ basis, sp.csr_array(gauges @ basis)
+        diagonal = reduced.diagonal() + held.power(2).sum(0)
         free = np.flatnonzero(diagonal > 1e-30)
         self._scale = 1 / np.sqrt(diagonal[free])
         self._directions = basis[:, free]
-        matrix = reduced[free][:, free]
+        scaling = sp.diags_array(self._scale, format="csr")
+        matrix = scaling @ reduced[free][:, free] @ scaling
+        low_rank = held[:, free] @ scaling
         if is_small(len(free)):
             whole = matrix.toarray() if sp.issparse(matrix) else matrix
-            self._solve = _dense(whole * self._scale[:, None] * self._scale)
+            self._solve = _dense(whole + (low_rank.T @ low_rank).toarray())
         else:
-            scaling = sp.diags_array(self._scale)
-            damping = DAMPING * sp.eye_array(len(free))
-            self._solve = _iterative(
-                sp.csr_array(scaling @ sp.csr_array(matrix) @ scaling + damping)
-            )
+            self._solve = _iterative(sp.csr_array(matrix), low_rank.toarray())
 
     def solve(self, right: Float[np.ndarray, "d ..."]) -> Float[np.ndarray, "d ..."]:
         """Return the solution along the free directions."""
@@ -71,22 +70,29 @@ def _dense(matrix: Float[np.ndarray, "n n"]):
     return lambda right: np.linalg.solve(matrix, right)
 
 
-def _iterative(matrix: sp.csr_array):
+def _iterative(sparse: sp.csr_array, low_rank: Float[np.ndarray, "g n"]):
     """Conjugate gradients with a two-level preconditioner.
 
     A long drive is a chain: what is wrong by a little everywhere adds up from its one end to its
     other, and takes as many iterations as there are links. Sums over groups of neighbours are
     therefore solved exactly.
     """
-    count = matrix.shape[0]
+    count = sparse.shape[0]
+    sparse = sp.csr_array(sparse + DAMPING * sp.eye_array(count))
     group = np.arange(count) * GROUPS // count
     coarse = sp.csr_array((np.ones(count), (np.arange(count), group)))
-    factor = scipy.linalg.cho_factor((coarse.T @ matrix @ coarse).toarray())
+    grouped = low_rank @ coarse
+    factor = scipy.linalg.cho_factor((coarse.T @ sparse @ coarse).toarray() + grouped.T @ grouped)
+
+    def multiply(x):
+        return sparse @ x + low_rank.T @ (low_rank @ x)
 
     def precondition(residual):
         return residual + coarse @ scipy.linalg.cho_solve(factor, coarse.T @ residual)
 
-    preconditioner = scipy.sparse.linalg.LinearOperator((count, count), precondition)
+    shape = (count, count)
+    matrix = scipy.sparse.linalg.LinearOperator(shape, multiply)
+    preconditioner = scipy.sparse.linalg.LinearOperator(shape, precondition)
 
     def one(right):
         found, _ = scipy.sparse.linalg.cg(

@@ -71,8 +71,8 @@ def _next(model: Forward, system: System, last: _Round, loss: Loss) -> _Round:
     theta, u = last.theta, system.unknowns
     at = weigh(model, theta, last.weight, loss)
     normal, right = normal_equations(model, theta, at, np.float32)
-    normal, right = with_priors(system, theta, normal, right)
-    step = u.split(Balanced(normal, system.basis).solve(right))
+    normal, gauges, right = with_priors(system, theta, normal, right)
+    step = u.split(Balanced(normal, gauges, system.basis).solve(right))
     new = Parameters(
         theta.b + step.b,
         np.clip(theta.a + step.a, *A_RANGE),

@@ -222,8 +222,10 @@ def gauge_strength(normal: Matrix, unknowns: Unknowns) -> float:
 
 def with_priors(
     system: System, theta: Parameters, normal: Matrix, right: Float[np.ndarray, " d"]
-) -> tuple[Matrix, Float[np.ndarray, " d"]]:
-    """Return normal equations with priors and gauges.
+) -> tuple[Matrix, sp.csr_array, Float[np.ndarray, " d"]]:
+    """Return normal equations with priors, the rows of the gauges, and the right side of both.
+
+    A gauge is a mean over views: of thousands, its normal matrix would not be sparse.
 
     Args:
         system: priors and gauges.
@@ -235,7 +237,6 @@ def with_priors(
     normal = normal + system.priors.normal
     right = right + system.priors.pull(vector)
     strength = gauge_strength(normal, u)
-    normal = normal + strength * system.anchors.normal
     right = right + strength * system.anchors.pull(vector)
     if theta.c.size:
         stiffness = float(np.mean(normal.diagonal()[u.of_c]))
@@ -243,4 +244,4 @@ def with_priors(
         before = sp.csr_array((u.of_c.start,) * 2)
         normal = normal + sp.block_diag([before, smooth], format="csr")
         right = right - np.concatenate([np.zeros(u.of_c.start), smooth @ theta.c])
-    return normal, right
+    return normal, np.sqrt(strength) * system.anchors.rows, right
