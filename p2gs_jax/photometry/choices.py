@@ -90,8 +90,11 @@ def neighbours(choice: Choice, scope: Scope) -> list[Choice]:
     if gamma is not None and exposure == gamma:
         forms += [form._replace(model=_BY_LEVELS[(None, None)])]
     if form.white_balance == "view" and exposure == "view":
-        per_camera = [name for name in MODELS if MODELS[name].exposure == "camera"]
-        forms += [Form(name, "camera", form.vignetting) for name in per_camera]
+        forms += [
+            Form(name, "camera", form.vignetting)
+            for name, model in MODELS.items()
+            if model.exposure == "camera"
+        ]
     forms += [form._replace(white_balance=level) for level in _LEVELS]
     forms += [form._replace(vignetting=kind) for kind in _VIGNETTING]
     near = [Choice(f, curve) for f in forms] + [Choice(form, c) for c in _CURVES[curve.splines]]

@@ -75,8 +75,8 @@ class Observations:
         labels = connected_components(edges, directed=False)[1][: self.view_count]
         return np.unique(labels, return_inverse=True)[1]
 
-    def picked(self, pick: Bool[np.ndarray, " o"]) -> Observations:
-        """Return some of them."""
+    def picked(self, pick: np.ndarray | slice) -> Observations:
+        """Return some of them, chosen by a mask or by their rows."""
         taken = {k: getattr(self, k)[pick] for k in ("views", "points", "colors", "spread")}
         if self.positions is not None:
             taken["positions"] = self.positions[pick]

@@ -79,12 +79,13 @@ def uncertainty(fit: Fit, system: System, clusters: Int[np.ndarray, " o"]) -> Un
     # A prior is itself an observation with variance 1 / precision: it is its own meat.
     meat = each.T @ each + system.priors.normal
     with one_thread():
-        return Uncertainty(*_whole(bread + gauges.T @ gauges, meat, system.basis), few, system)
+        whole = _array(bread + gauges.T @ gauges)
+        return Uncertainty(*_whole(whole, meat, system.basis), few, system)
 
 
 def _whole(bread, meat, basis) -> tuple[Float[np.ndarray, "d r"], Float[np.ndarray, "d k"]]:
-    if not basis.shape[1]:
-        return np.zeros((basis.shape[0], 1)), np.zeros((basis.shape[0], 0))
+    if not basis.nnz:
+        return np.zeros((len(bread), 1)), np.zeros((len(bread), 0))
     # Exposures that are known say so much more than pixels that only ratios can be compared.
     diagonal = (basis.T @ bread @ basis).diagonal()
     g = basis @ sp.diags_array(1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)))

@@ -77,7 +77,7 @@ def _iterative(sparse: sp.csr_array, low_rank: Float[np.ndarray, "g n"]):
     other, and takes as many iterations as there are links. Sums over groups of neighbours are
     therefore solved exactly.
     """
-    count = sparse.shape[0]
+    count = low_rank.shape[1]
     sparse = sp.csr_array(sparse + DAMPING * sp.eye_array(count))
     group = np.arange(count) * GROUPS // count
     coarse = sp.csr_array((np.ones(count), (np.arange(count), group)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -52,7 +53,8 @@ def assembled(parts: list[Entries], size: int) -> Matrix:
     return np.bincount(rows * size + columns, values, size**2).reshape(size, size)
 
 
-class Terms(NamedTuple):
+@dataclass(frozen=True)
+class Terms:
     """What every value depends on linearly, in a fixed number of terms.
 
     Attributes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -86,9 +87,9 @@ def _others(model: Forward, theta: Parameters) -> Terms | None:
     features, basis = model.features, model.basis
     if features is not None:
         a = theta.a[model.rows.views][:, None, None]
-        features = features._replace(factor=a * features.factor)
+        features = replace(features, factor=a * features.factor)
     if basis is not None:
-        basis = basis._replace(factor=-basis.factor)
+        basis = replace(basis, factor=-basis.factor)
     if features is None or basis is None:
         return features or basis
     return features.joined(basis)

@@ -48,7 +48,7 @@ class Problem:
         """Where each observation lies."""
         return Layout(self.observations)
 
-    def part(self, pick: np.ndarray) -> Problem:
+    def part(self, pick: np.ndarray | slice) -> Problem:
         """Return some of the observations, chosen by a mask or their rows."""
         some = self.observations.picked(pick)
         return replace(self, observations=some, usable=self.usable[pick])

@@ -183,7 +183,7 @@ def _priors(u: Unknowns, log_exposure, precision) -> Held:
     exposures = sp.csr_array(
         (values, (np.tile(at, u.channels + 1), columns)), shape=(len(given), u.count)
     )
-    whole = sp.eye_array(u.count, format="csr")
+    whole = sp.csr_array(sp.eye_array(u.count))
     of_a = whole[u.of_a.start + views] if u.gammas else whole[:0]
     lenses = np.arange(u.of_k.start + u.features.balance_count, u.of_k.stop)
     rows = sp.vstack([exposures, of_a, whole[lenses]])
