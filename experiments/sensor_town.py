@@ -115,7 +115,8 @@ def without_corners(transform: p2gs_jax.DisplayTransform) -> p2gs_jax.DisplayTra
     """Return a transform without vignetting; a bilateral grid, which is all there is, stays."""
     if transform.formation.appearance == "bilateral":
         return transform
-    return display_of_splats(transform)
+    # What no splat can hold: of transforms and of corrections.
+    return display_of_splats(getattr(transform, "without_place", lambda: transform)())
 
 
 def _fitted_factors(
