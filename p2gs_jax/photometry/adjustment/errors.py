@@ -73,7 +73,7 @@ def uncertainty(fit: Fit, system: System, clusters: Int[np.ndarray, " o"]) -> Un
     few = small_sample(clusters[seen], rows.views[seen], rows.view_count)
     bread = fit.normal * fit.at.curvature + system.priors.normal
     gauges = np.sqrt(gauge_strength(bread, system.unknowns)) * system.anchors.rows
-    if not is_small(np.shape(system.basis)[1]):
+    if not is_small(system.directions):
         drawn = _drawn(bread, gauges, each, system)
         return Uncertainty(drawn, np.zeros((len(drawn), 0)), few, system)
     # A prior is itself an observation with variance 1 / precision: it is its own meat.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 import scipy.sparse as sp
@@ -76,6 +77,11 @@ class System:
     priors: Held
     log_exposure: Float[np.ndarray, " v"]
     smoothness: Float[np.ndarray, "k k"]
+
+    @property
+    def directions(self) -> int:
+        """Number of free directions."""
+        return cast(tuple[int, int], self.basis.shape)[1]
 
     @property
     def start(self) -> Parameters:
