@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from p2gs_jax.config import FitConfig
+from p2gs_jax.config import FitConfig, PhotometryConfig, ResponseKind
 from p2gs_jax.photometry.adjustment.fit import fit_model
 from p2gs_jax.photometry.adjustment.problem import KnownExposures, Problem, make_problem
 from p2gs_jax.photometry.models import Form
@@ -68,7 +68,7 @@ def options_of(cfg: FitConfig, scene: Scene) -> CalibrationOptions:
     if p.known is not None:
         values = read_known_exposures(p.known, scene.training_views)
         known = KnownExposures(values, p.known_deviation_ev)
-    given = Response("power" if p.curve == "power" else "srgb", p.spline)
+    given = Response("power" if p.curve == "power" else "srgb", p.spline, *_splines(p))
     return CalibrationOptions(
         black=cfg.loss.black,
         saturation=cfg.loss.saturation,
@@ -77,6 +77,14 @@ def options_of(cfg: FitConfig, scene: Scene) -> CalibrationOptions:
         seed=cfg.train.seed,
         choice="held_out" if p.select else (Form(p.model, p.white_balance, p.vignetting), given),
     )
+
+
+def _splines(p: PhotometryConfig) -> tuple[ResponseKind, tuple[tuple[float, ...], ...]]:
+    """Return what has splines of its own, and these; as with one, what was not solved is not."""
+    own = [camera.splines for camera in p.cameras]
+    if p.responses == "all" or not all(own):
+        return "all", ()
+    return p.responses, own[0] if p.responses == "channel" else tuple(s for (s,) in own)
 
 
 def calibrate_observations(

@@ -124,8 +124,8 @@ FAULTS = (
     Fault(
         "recentring moves exposures but not radiance",
         "photometry/gauge.py",
-        "sh[:, 0] += log_scale / C0",
-        "sh[:, 0] += 0.0 * log_scale / C0",
+        "sh[:, 0] += log_scales / C0",
+        "sh[:, 0] += 0.0 * log_scales / C0",
         "photometry/test_gauge.py",
     ),
     Fault(
