@@ -7,7 +7,7 @@ al. 2023; "ours" is measured, see BUILD_NOTES.md. A weight or option set to None
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
@@ -127,7 +127,7 @@ class CameraFormation:
 
 @dataclass(frozen=True)
 class PhotometryConfig:
-    """The image formation model y = T(e L)."""
+    """The image formation model y = T(e L), or T(e W V L) with white balance and vignetting."""
 
     select: bool = True
     """Choose `model` and `curve` on held-out track observations; where there are none, or with
@@ -148,7 +148,7 @@ class PhotometryConfig:
     """What has a fitted response of its own, where the curve is `spline` (with `select`:
     chosen)."""
     cameras: tuple[CameraFormation, ...] = ()
-    """What each camera does besides; the photographs decide, not the options."""
+    """What each camera does besides; the photographs decide, and no option sets it."""
     known: str | None = None
     """Exposures known beforehand: a CSV file (image, exposure or ev), or `exif`."""
     known_deviation_ev: float = 0.0
@@ -536,6 +536,21 @@ def from_dict(values: dict) -> FitConfig:
     return _build(FitConfig, values)
 
 
+def camera_formations(values: Sequence[dict]) -> tuple[CameraFormation, ...]:
+    """Return cameras as `dataclasses.asdict` and JSON left them.
+
+    Raises:
+        KeyError, TypeError, ValueError: something is missing or of another kind.
+    """
+    return tuple(
+        CameraFormation(
+            str(each["name"]),
+            *(tuple(tuple(map(float, row)) for row in each[k]) for k in ("vignetting", "splines")),
+        )
+        for each in values
+    )
+
+
 def _build(cls, values: dict):
     kwargs = {}
     for f in dataclasses.fields(cls):
@@ -545,6 +560,8 @@ def _build(cls, values: dict):
         factory = f.default_factory
         if dataclasses.is_dataclass(factory) and isinstance(value, dict):
             value = _build(factory, value)
+        elif cls is PhotometryConfig and f.name == "cameras":
+            value = camera_formations(value)
         elif isinstance(value, list):
             value = tuple(value)
         kwargs[f.name] = value

@@ -108,6 +108,8 @@ def _fields(kind: type, default: Any) -> Iterator[StructFieldSpec]:
     hints = get_type_hints(kind, include_extras=True)
     for field in dataclasses.fields(kind):
         hint = hints[field.name]
+        if get_origin(hint) is tuple and any(map(dataclasses.is_dataclass, get_args(hint))):
+            continue  # Records that a scene decides: no option.
         value = _default(field, default)
         yield StructFieldSpec(
             name=field.name,

@@ -1,4 +1,7 @@
-"""The scale gauge, fixed exactly: exposures recentred, radiance moved the other way."""
+"""The scale gauges, fixed exactly: exposures recentred, radiance moved the other way.
+
+With white balance every channel has a scale of its own.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,9 @@ from p2gs_jax.types import Params
 
 
 def recentre(params: Params, activation: RadianceKind) -> Params:
-    """Return the same photographs with mean log exposure 0 (docs/photometry.md, 2, scale).
+    """Return the same photographs with mean log exposure and white balance 0.
+
+    docs/photometry.md, 2, scale.
 
     Args:
         params: the fit.
@@ -26,19 +31,27 @@ def recentre(params: Params, activation: RadianceKind) -> Params:
     photometry = jax.tree.map(np.asarray, params.photometry)
     sh = np.array(params.gaussians.sh)
     log_scale = np.mean(np.log(photometry.exposures))
-    factor = np.exp(log_scale)
+    balance = photometry.white_balance
+    tint = np.zeros(3, np.float32) if balance is None else balance.mean(0)
+    log_scales = log_scale + tint
     if activation == "exp":
-        sh[:, 0] += log_scale / C0
+        sh[:, 0] += log_scales / C0
     else:
         # radiance = value + 1/2: the half must grow with the rest.
-        sh *= factor
-        sh[:, 0] += (factor - 1) * 0.5 / C0
+        factors = np.exp(log_scales)
+        sh *= factors
+        sh[:, 0] += (factors - 1) * 0.5 / C0
     if photometry.parameterization == "log":
         raw = photometry.raw_exposures - log_scale
     else:
-        raw = photometry.raw_exposures / factor
+        raw = photometry.raw_exposures / np.exp(log_scale)
+    moved = dataclasses.replace(
+        photometry,
+        raw_exposures=raw,
+        raw_white_balance=None if balance is None else balance - tint,
+    )
     return dataclasses.replace(
         params,
         gaussians=dataclasses.replace(params.gaussians, sh=jax.device_put(sh)),
-        photometry=jax.device_put(dataclasses.replace(photometry, raw_exposures=raw)),
+        photometry=jax.device_put(moved),
     )

@@ -1,6 +1,8 @@
-"""Exposures, gammas and corrections before the first step."""
+"""Exposures, gammas, white balances and corrections before the first step."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Array, Float
@@ -9,6 +11,7 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.photometry.appearance import identity
+from p2gs_jax.photometry.cameras import camera_rows
 from p2gs_jax.photometry.formation import inverse_tone_map
 from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.types import GAMMA_SRGB, Photometry, Scene
@@ -18,15 +21,16 @@ LEAST_EXPOSURE = 0.1
 
 
 def initial_photometry(
-    solution: PhotometricSolution | None, count: int, cfg: FitConfig
+    solution: PhotometricSolution | None, taken_by: Sequence[str], cfg: FitConfig
 ) -> Photometry:
-    """Return the exposures and gammas that a fit starts from.
+    """Return the exposures, gammas and white balances that a fit starts from.
 
     Args:
         solution: of the bundle adjustment; None: drawn at random (paper), or equal.
-        count: training views.
-        cfg: parametrisation and kind of start.
+        taken_by: the camera of every training view.
+        cfg: parametrisation and kind of start, and what the scene decided.
     """
+    count = len(taken_by)
     p = cfg.photometry
     if solution is not None:
         log_exposures = np.asarray(solution.log_exposures)
@@ -40,7 +44,11 @@ def initial_photometry(
         exposures, gammas = log_exposures, np.log(gammas / GAMMA_SRGB)
     else:
         exposures = np.exp(log_exposures)
-    return Photometry(on_device(exposures), on_device(gammas), p.parameterization)
+    balance = None
+    if p.white_balance is not None:
+        balance = on_device(np.zeros((count, 3)) if solution is None else solution.white_balance)
+    rows = camera_rows(taken_by, p)
+    return Photometry(on_device(exposures), on_device(gammas), p.parameterization, balance, rows)
 
 
 def initial_appearance(count: int, cfg: FitConfig) -> Float[Array, "v ..."] | None:
@@ -54,13 +62,6 @@ def initial_appearance(count: int, cfg: FitConfig) -> Float[Array, "v ..."] | No
     return None if kind is None else identity(kind, count)
 
 
-def linearized(
-    colors: Float[np.ndarray, "... 3"], cfg: FitConfig, gamma: float = GAMMA_SRGB
-) -> Float[np.ndarray, "... 3"]:
-    """Return exposed radiance of display values under the tone curve."""
-    return inverse_tone_map(np.asarray(colors, np.float32), np.float32(gamma), cfg.photometry)
-
-
 def point_radiance(
     scene: Scene, solution: PhotometricSolution | None, cfg: FitConfig
 ) -> Float[np.ndarray, "p 3"]:
@@ -71,7 +72,8 @@ def point_radiance(
         solution: of the bundle adjustment, or None.
         cfg: the tone curve.
     """
-    radiance = linearized(scene.point_colors.astype(np.float32) / 255.0, cfg)
+    colors = scene.point_colors.astype(np.float32) / np.float32(255)
+    radiance = inverse_tone_map(colors, np.float32(GAMMA_SRGB), cfg.photometry)
     if solution is not None:
         known = np.exp(solution.point_log_radiance)
         radiance = np.where(np.isfinite(known), known, radiance)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 from p2gs_jax.config import FitConfig
-from p2gs_jax.photometry.models import ModelName
+from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.response import Response
 from p2gs_jax.photometry.selection import Selection
 from p2gs_jax.run.checkpoint import CheckpointStore
@@ -16,20 +16,29 @@ from p2gs_jax.run.layout import RunFolder
 FROM_NOTHING = 10.0
 
 
-def decide(cfg: FitConfig, selection: Selection | None, *, matched: bool) -> Decisions:
+def decide(
+    cfg: FitConfig, selection: Selection | None, *, matched: bool, kept: Decisions | None = None
+) -> Decisions:
     """Return what the photographs decided.
 
     Args:
         cfg: as asked.
         selection: what the bundle adjustment chose and solved, or None.
         matched: there are colours of shared points.
+        kept: from the checkpoints of a run that is resumed: what its cameras do stays to the digit.
     """
     decided = with_correspondence(Decisions.as_asked(cfg), matched)
     if selection is None:
+        decided = unsolved(decided)
         return without_tracks(decided) if cfg.photometry.start == "tracks" else decided
     s = selection.solution
-    decided = with_choice(decided, s.model, s.response)
-    decided = dataclasses.replace(decided, reasons=tuple(selection.reasons))
+    form = Form(s.model, s.white_balance_level, s.vignetting)
+    decided = with_choice(decided, form, s.response)
+    decided = dataclasses.replace(
+        decided,
+        reasons=tuple(selection.reasons),
+        cameras=s.cameras if kept is None else kept.cameras,
+    )
     if cfg.photometry.known is None:
         return decided
     # Known exposures that are to be kept are not learned, and nothing pulls at their mean.
@@ -53,19 +62,44 @@ def likely(cfg: FitConfig, kept: Decisions | None, *, matched: bool) -> Decision
     slots_known = d.method == "mcmc" and d.max_gaussians != "auto"
     if p.known is not None or cfg.loss.relative_exposure.weight is not None or not slots_known:
         return None
+    # What cameras do enters the programs, and is not solved yet.
+    if kept is None and not p.select and (p.vignetting is not None or p.responses != "all"):
+        return None
     decided = Decisions.as_asked(cfg)
     if kept is not None:
+        chosen = ("model", "curve", "spline", "white_balance", "vignetting", "responses", "cameras")
+        decided = dataclasses.replace(decided, **{name: getattr(kept, name) for name in chosen})
+    elif p.start != "tracks":
+        decided = unsolved(decided)
+    elif p.select:
         decided = dataclasses.replace(
-            decided, model=kept.model, curve=kept.curve, spline=kept.spline
+            decided, model="view_exposure", white_balance=None, vignetting=None, responses="all"
         )
-    elif p.start == "tracks" and p.select:
-        decided = dataclasses.replace(decided, model="view_exposure")
     return with_correspondence(decided, matched or p.start == "tracks")
 
 
-def with_choice(decided: Decisions, model: ModelName, response: Response) -> Decisions:
-    """Return the decisions under a model and a curve."""
-    return dataclasses.replace(decided, model=model, curve=response.curve, spline=response.spline)
+def with_choice(decided: Decisions, form: Form, response: Response) -> Decisions:
+    """Return the decisions under a form and a curve; what cameras do follows from the solution."""
+    return dataclasses.replace(
+        decided,
+        model=form.model,
+        curve=response.curve,
+        spline=response.spline,
+        white_balance=form.white_balance,
+        vignetting=form.vignetting,
+        responses=response.by,
+    )
+
+
+def unsolved(decided: Decisions) -> Decisions:
+    """Return the decisions without what only a solution can give; views may still learn theirs."""
+    by_view = decided.white_balance == "view"
+    return dataclasses.replace(
+        decided,
+        white_balance="view" if by_view else None,
+        vignetting=None,
+        responses="all",
+    )
 
 
 def with_correspondence(decided: Decisions, matched: bool) -> Decisions:
@@ -86,14 +120,15 @@ def without_tracks(decided: Decisions) -> Decisions:
 
 
 def kept_choice(cfg: FitConfig, folder: RunFolder) -> Decisions | None:
-    """Return what the checkpoints of a run remember; None: nothing was chosen, or there are none.
+    """Return what the checkpoints of a run remember; None: nothing was found, or there are none.
 
     Args:
         cfg: as asked.
         folder: of the run.
     """
     p = cfg.photometry
-    if not (p.select and p.start == "tracks"):
+    solved = p.vignetting is not None or p.responses != "all"
+    if not ((p.select or solved) and p.start == "tracks"):
         return None
     saved = (CheckpointStore(folder.checkpoints).latest_meta() or {}).get(KEY)
     return None if saved is None else Decisions.from_dict(saved)

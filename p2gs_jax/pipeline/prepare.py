@@ -143,6 +143,7 @@ def prepare(
     begin = time.monotonic()
     store = ImageStore(scene.views, cfg.data)
     views = scene.training_views
+    taken_by = [view.camera for view in views]
     extent = scene_extent(views, scene.points)
     coverage = coverage_of(scene, store)
     dense = wants_dense(scene, coverage, cfg)
@@ -155,23 +156,29 @@ def prepare(
     if guess is not None:
         params = Params(
             black_gaussians(scene.points[seeds.keep], shell, views, cfg),
-            initial_photometry(None, len(views), cfg),
+            initial_photometry(None, taken_by, guess.resolve(cfg)),
             initial_appearance(len(views), cfg),
         )
         known = kept is not None or not cfg.photometry.select
         expected = Expected(store, params, extent, coverage, guess, guess.resolve(cfg), known)
         on_expected(expected)
 
-    def chosen(model: ModelName, response: Response) -> None:
-        if expected is not None:
-            told = with_choice(expected.decisions, model, response)
-            on_expected(expected._replace(decisions=told, cfg=told.resolve(cfg), images=True))
+    def chosen(form: Form, response: Response) -> None:
+        # What cameras do enters the programs, and is only solved now.
+        if expected is None or form.vignetting is not None or response.by != "all":
+            return
+        told = with_choice(expected.decisions, form, response)
+        under = told.resolve(cfg)
+        start = initial_photometry(None, taken_by, under)
+        params = dataclasses.replace(expected.params, photometry=start)
+        on_expected(expected._replace(params=params, decisions=told, cfg=under, images=True))
 
     tracks, selection, notes = _solve(scene, store, cfg, reporter, chosen, dense=dense, kept=kept)
-    decisions = decide(cfg, selection, matched=tracks is not None and len(tracks.points) > 0)
+    matched = tracks is not None and len(tracks.points) > 0
+    decisions = decide(cfg, selection, matched=matched, kept=kept)
     resolved = decisions.resolve(cfg)
     solution = None if selection is None else selection.solution
-    photometry = initial_photometry(solution, len(views), resolved)
+    photometry = initial_photometry(solution, taken_by, resolved)
     solved = time.monotonic()
     clock.add("photometry", solved - begin)
 
@@ -182,7 +189,13 @@ def prepare(
             store,
             rough_tones(tracks, len(views))
             if solution is None
-            else Tones.of(solution.log_exposures, solution.gammas, resolved.photometry),
+            else Tones(
+                solution.log_exposures,
+                solution.gammas,
+                resolved.photometry,
+                None if solution.white_balance_level is None else solution.white_balance,
+                photometry.cameras,
+            ),
             scene.points[seeds.keep],
             photometry,
             resolved,

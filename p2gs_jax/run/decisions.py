@@ -14,12 +14,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from p2gs_jax.config import FitConfig, PhotometricModel
+from p2gs_jax.config import (
+    CameraFormation,
+    FitConfig,
+    Level,
+    PhotometricModel,
+    ResponseKind,
+    VignettingKind,
+    camera_formations,
+)
 from p2gs_jax.core.atomic import plain, write_json
 from p2gs_jax.errors import UserError
 
 # Under this name in the metadata of checkpoints.
 KEY = "decided"
+# What decisions said nothing of before versions that choose it.
+_OLDER = {"white_balance": None, "vignetting": None, "responses": "all", "cameras": []}
 
 
 @dataclass(frozen=True)
@@ -36,6 +46,10 @@ class Decisions:
         exposure_rate: learning rate of the exposures.
         gamma_rate: learning rate of the gammas.
         reasons: for the model and the curve, in words.
+        white_balance: per what it varies, or None.
+        vignetting: whether cameras have it, and per what it varies, or None.
+        responses: what has a spline of its own.
+        cameras: what each physical camera does; empty: nothing of its own.
     """
 
     model: PhotometricModel
@@ -47,6 +61,10 @@ class Decisions:
     exposure_rate: float
     gamma_rate: float
     reasons: tuple[str, ...] = ()
+    white_balance: Level | None = None
+    vignetting: VignettingKind | None = None
+    responses: ResponseKind = "all"
+    cameras: tuple[CameraFormation, ...] = ()
 
     @classmethod
     def as_asked(cls, cfg: FitConfig) -> Decisions:
@@ -61,18 +79,24 @@ class Decisions:
             log_exposure_mean=cfg.loss.regularizers.log_exposure_mean,
             exposure_rate=cfg.optimizer.exposures,
             gamma_rate=cfg.optimizer.gammas,
+            white_balance=p.white_balance,
+            vignetting=p.vignetting,
+            responses=p.responses,
+            cameras=p.cameras,
         )
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Decisions:
-        """Return what `to_dict` and JSON made of it.
+        """Return what `to_dict` and JSON made of it; older versions knew less.
 
         Raises:
             KeyError, TypeError: something is missing or of another kind.
         """
+        values = _OLDER | values
         spline = values["spline"]
         kept = {f.name: values[f.name] for f in dataclasses.fields(cls)}
         kept["spline"] = None if spline is None else tuple(map(float, spline))
+        kept["cameras"] = camera_formations(values["cameras"])
         return cls(**{**kept, "reasons": tuple(values["reasons"])})
 
     def to_dict(self) -> dict[str, Any]:
@@ -90,6 +114,10 @@ class Decisions:
                 model=self.model,
                 curve=self.curve,
                 spline=self.spline,
+                white_balance=self.white_balance,
+                vignetting=self.vignetting,
+                responses=self.responses,
+                cameras=self.cameras,
                 freeze_until=self.freeze_until,
             ),
             loss=replace(
@@ -114,7 +142,7 @@ class Decisions:
         """
         if saved is None:
             return
-        now = self.to_dict()
+        now, saved = self.to_dict(), _OLDER | saved
         del now["reasons"]
         other = [f"{k} was {saved.get(k)}, now {v}" for k, v in now.items() if saved.get(k) != v]
         if other:

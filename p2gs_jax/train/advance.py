@@ -62,13 +62,22 @@ GRADIENT_NAMES = (
     *(f"gradient of {f.name}" for f in dataclasses.fields(Gaussians)),
     "gradient of exposures",
     "gradient of gammas",
-    "gradient of appearance",
 )
 
 
-def finite_names(terms: dict) -> tuple[str, ...]:
-    """Return the names, in the order of `Fault.term`."""
-    return (*(f"loss term {k}" for k in terms), *GRADIENT_NAMES)
+def finite_names(terms: dict, params: Params) -> tuple[str, ...]:
+    """Return the names, in the order of `Fault.term`.
+
+    Args:
+        terms: of the loss.
+        params: of the fit, for what they consist of.
+    """
+    given = {
+        "gradient of white balances": params.photometry.raw_white_balance,
+        "gradient of appearance": params.appearance,
+    }
+    rest = (name for name, value in given.items() if value is not None)
+    return (*(f"loss term {k}" for k in terms), *GRADIENT_NAMES, *rest)
 
 
 def advance(
@@ -84,7 +93,7 @@ def advance(
     extent: float,
     degree: int,
 ) -> tuple[FitState, StepReport]:
-    """Move the listed Gaussians, exposures, gammas and corrections by one step.
+    """Move the listed Gaussians, photometry and corrections by one step.
 
     Args:
         state: before the step; donated.
@@ -175,7 +184,11 @@ def _rest_updated(optimizer: Optimizer, moments, rest, grads, rates, cfg: FitCon
 
 
 def _recentered(photometry: Photometry, cfg: FitConfig) -> Photometry:
-    """Project the scale gauge: mean log e = 0 exactly (docs/photometry.md, 4)."""
+    """Project the scale gauges: mean log e = 0 and mean log W = 0 (docs/photometry.md, 2, 4)."""
+    balance = photometry.raw_white_balance
+    if balance is not None:
+        balance = balance - jnp.mean(balance, 0)
+        photometry = dataclasses.replace(photometry, raw_white_balance=balance)
     if photometry.parameterization != "log":
         return photometry
     if cfg.loss.regularizers.log_exposure_mean is None:

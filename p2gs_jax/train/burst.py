@@ -106,7 +106,7 @@ class Bursts:
         return state, reports, sizes
 
     def _diverged(self, state: FitState, step: int, report: StepReport) -> None:
-        name = finite_names(report.terms)[int(state.fault.term)]
+        name = finite_names(report.terms, state.params)[int(state.fault.term)]
         raise DivergenceError(
             f"Step {step + 1}: the {name} is not finite; {self.checkpoints.last_good()}.",
             fix="lower the learning rates (--optimizer.*) or report the scene; "

@@ -139,7 +139,7 @@ def means_rate(progress: Array, extent: float, cfg: FitConfig) -> Float[Array, "
 
 
 def photometry_gate(progress: Array, cfg: FitConfig) -> Float[Array, ""]:
-    """Return the factor on exposure and gamma rates: 0 while frozen, then decaying.
+    """Return the factor on exposure, white balance and gamma rates: 0 while frozen, then decaying.
 
     Only a start from tracks is worth freezing; a random one must move from the first step.
     """
@@ -167,7 +167,8 @@ def learning_rates(
     decay = o.final**progress
     sh = jnp.full((bands, 1), o.sh_rest).at[0].set(o.sh_dc) * decay
     gate = photometry_gate(progress, cfg)
-    varies = MODELS[cfg.photometry.model]
+    varies, balance = MODELS[cfg.photometry.model], like.photometry.raw_white_balance
+    by_view = cfg.photometry.white_balance == "view"
     return Params(
         gaussians=Gaussians(
             means=means_rate(progress, extent, cfg),
@@ -180,6 +181,8 @@ def learning_rates(
             o.exposures * gate * (varies.exposure == "view"),
             o.gammas * gate * (varies.gamma == "view"),
             like.photometry.parameterization,
+            None if balance is None else o.exposures * gate * by_view,
+            like.photometry.cameras,
         ),
         appearance=None
         if like.appearance is None

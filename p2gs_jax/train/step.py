@@ -97,7 +97,8 @@ class Step:
         """Return what one of the three programs takes from the configuration, by argument.
 
         Everything else is as in `FitConfig()`: programs are shared by fits that differ there.
-        Neither knows the curve but `differentiate`; that does not know which exposures move.
+        Neither knows the curve but `differentiate`; that does not know which exposures move. White
+        balance and cameras decide what `Photometry` consists of, which both take.
         """
         cfg, p = self.cfg, self.cfg.photometry
         if name == "show":
@@ -106,7 +107,13 @@ class Step:
         if name == "differentiate":
             photometry = dataclasses.replace(p, model="constant")
             return {"cfg": dataclasses.replace(known, photometry=photometry)}
-        moving = PhotometryConfig(model=p.model, start=p.start, freeze_until=p.freeze_until)
+        moving = PhotometryConfig(
+            model=p.model,
+            start=p.start,
+            freeze_until=p.freeze_until,
+            white_balance=p.white_balance,
+            cameras=p.cameras,
+        )
         known = dataclasses.replace(
             known,
             densify=cfg.densify,

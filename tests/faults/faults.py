@@ -124,8 +124,8 @@ FAULTS = (
     Fault(
         "recentring moves exposures but not radiance",
         "photometry/gauge.py",
-        "sh[:, 0] += log_scale / C0",
-        "sh[:, 0] += 0.0 * log_scale / C0",
+        "sh[:, 0] += log_scales / C0",
+        "sh[:, 0] += 0.0 * log_scales / C0",
         "photometry/test_gauge.py",
     ),
     Fault(
@@ -138,8 +138,8 @@ FAULTS = (
     Fault(
         "an exposure ratio is turned over",
         "losses/relative_exposure.py",
-        "exposures[pairs.views_j] / exposures[pairs.views_i]",
-        "exposures[pairs.views_i] / exposures[pairs.views_j]",
+        "photometry.capture(pairs.views_i), photometry.capture(pairs.views_j)",
+        "photometry.capture(pairs.views_j), photometry.capture(pairs.views_i)",
         "properties/test_pir.py::test_11_observed_readings",
     ),
     Fault(

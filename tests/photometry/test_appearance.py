@@ -10,7 +10,7 @@ from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.evaluate.alignment import fit_exposure
 from p2gs_jax.photometry.appearance import GRID, corrected, identity, roughness
 from p2gs_jax.photometry.formation import formation
-from p2gs_jax.types import LUMINANCE
+from p2gs_jax.types import LUMINANCE, Capture
 
 KINDS = ("affine", "bilateral", "curve")
 IMAGE = jnp.asarray(np.random.default_rng(0).uniform(0.02, 0.98, (20, 28, 3)), jnp.float32)
@@ -81,8 +81,8 @@ def test_roughness_is_for_grids_only():
 def test_a_correction_is_part_of_the_image_and_of_the_fitted_exposure():
     cfg = PhotometryConfig(curve="linear", appearance="affine")
     correction = noisy("affine", 0.05)
-    photo = formation(0.5 * IMAGE, jnp.float32(1.4), jnp.float32(2.2), cfg, correction)
+    photo = formation(0.5 * IMAGE, Capture(jnp.float32(1.4), jnp.float32(2.2)), cfg, correction)
     np.testing.assert_allclose(photo, corrected(0.7 * IMAGE, correction, "affine"), atol=1e-6)
-    mask = jnp.ones(IMAGE.shape[:2])
-    found = fit_exposure(0.5 * IMAGE, jnp.clip(photo, 0, 1), mask, 2.2, cfg, correction)
+    mask, usual = jnp.ones(IMAGE.shape[:2]), Capture(jnp.float32(1.0), jnp.float32(2.2))
+    found = fit_exposure(0.5 * IMAGE, jnp.clip(photo, 0, 1), mask, usual, cfg, correction)
     assert float(found) == pytest.approx(1.4, rel=0.01)

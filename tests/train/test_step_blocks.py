@@ -223,7 +223,7 @@ def broken(made, field, value):
     changed = dataclasses.replace(gaussians, **{field: array.at[row].set(value)})
     params = dataclasses.replace(made.params, gaussians=changed)
     state, report = made.selective(made.room, params)
-    return params, state, finite_names(report.terms)[int(state.fault.term)]
+    return params, state, finite_names(report.terms, state.params)[int(state.fault.term)]
 
 
 def test_a_radiance_that_is_no_number_is_named(made):
@@ -247,7 +247,10 @@ def test_the_first_term_that_is_no_number_is_named(made):
     params = dataclasses.replace(made.params, photometry=photometry)
     state, report = made.selective(made.room, params)
     assert int(state.fault.kind) == FAULT_NONFINITE
-    assert finite_names(report.terms)[int(state.fault.term)] == "loss term log_exposure_mean"
+    assert (
+        finite_names(report.terms, state.params)[int(state.fault.term)]
+        == "loss term log_exposure_mean"
+    )
 
 
 @pytest.mark.slow

@@ -10,8 +10,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from p2gs_jax.config import PhotometryConfig
+from p2gs_jax.photometry.cameras import darkens, log_vignetting, squared_radii
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import Response, base_log, log_exposed
+from p2gs_jax.photometry.spline_curve import spline_of
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import GAMMA_SRGB, Scene
 
@@ -27,44 +29,62 @@ ROUNDS = 30
 
 @dataclass(frozen=True)
 class Tones:
-    """How display values of each training view become radiance: L = T^-1(y) / e, in numpy.
+    """How display values of each training view become radiance: L = T^-1(y) / (e W V), in numpy.
 
     Attributes:
         log_exposures: natural logarithm.
         gammas: of the tone curves.
-        curve: base curve, with its spline.
-        spline: as in `PhotometryConfig`, or None.
-        pivot: linear value that gammas leave alone.
+        formation: base curve, with its splines; cameras; pivot.
+        white_balance: log factors on the channels, or None.
+        cameras: row of each view in `formation.cameras`, or None.
     """
 
     log_exposures: Float[np.ndarray, " v"]
     gammas: Float[np.ndarray, " v"]
-    curve: str = "srgb"
-    spline: tuple[float, ...] | None = None
-    pivot: float = 0.18
+    formation: PhotometryConfig = field(default_factory=PhotometryConfig)
+    white_balance: Float[np.ndarray, "v 3"] | None = None
+    cameras: tuple[int, ...] | None = None
 
-    @classmethod
-    def of(
-        cls,
-        log_exposures: Float[np.ndarray, " v"],
-        gammas: Float[np.ndarray, " v"],
-        cfg: PhotometryConfig,
-    ) -> Tones:
-        """Return the tones of solved exposures under a configuration's curve."""
-        return cls(log_exposures, gammas, cfg.curve, cfg.spline, cfg.pivot)
+    def log_radiance(
+        self,
+        row: int,
+        ldr: Float32[np.ndarray, "... 3"],
+        positions: Float[np.ndarray, "... 2"] | None = None,
+    ) -> Float32[np.ndarray, "... 3"]:
+        """Return log radiance of display values of a training view.
 
-    def log_radiance(self, row: int, ldr: Float32[np.ndarray, "..."]) -> Float32[np.ndarray, "..."]:
-        """Return log radiance of display values of a training view."""
+        Args:
+            row: of the view.
+            ldr: an image, or loose pixels of one.
+            positions: of loose pixels, where vignetting counts (photometry/cameras.py:places).
+        """
+        camera = None if self.cameras is None else self.cameras[row]
         y = np.linspace(0.0, 1.0, TABLE)
-        if self.curve == "linear":
-            z = np.log(np.maximum(y, 0.5 / 255))
+        log_pivot = np.log(self.formation.pivot)
+        curves = []
+        for z in self._curves(y, camera):
+            bent = log_pivot + (z - log_pivot) * (self.gammas[row] / GAMMA_SRGB)
+            curves.append(bent - self.log_exposures[row])
+        if len(curves) == 1:
+            logs = np.interp(ldr, y, curves[0])
         else:
-            base = "power" if self.curve == "power" else "srgb"
-            spline = self.spline if self.curve == "spline" else None
-            z = log_exposed(y, Response(base, spline))[0]
-        log_pivot = np.log(self.pivot)
-        bent = log_pivot + (z - log_pivot) * (self.gammas[row] / GAMMA_SRGB)
-        return np.interp(ldr, y, bent - self.log_exposures[row]).astype(np.float32)
+            logs = np.stack([np.interp(ldr[..., c], y, curves[c]) for c in range(3)], -1)
+        if self.white_balance is not None:
+            logs = logs - self.white_balance[row]
+        if camera is not None and darkens(self.formation):
+            squared = squared_radii(*ldr.shape[:2]) if positions is None else (positions**2).sum(-1)
+            logs = logs - log_vignetting(squared, camera, self.formation)
+        return logs.astype(np.float32)
+
+    def _curves(self, y: Float[np.ndarray, " t"], camera: int | None) -> list[np.ndarray]:
+        """Return log exposed radiance of display values: for all channels, or for each."""
+        curve = self.formation.curve
+        if curve == "linear":
+            return [np.log(np.maximum(y, 0.5 / 255))]
+        if curve == "spline":
+            splines = spline_of(self.formation, camera)
+            return [log_exposed(y, Response("srgb", spline))[0] for spline in splines]
+        return [log_exposed(y, Response("power" if curve == "power" else "srgb"))[0]]
 
 
 def rough_tones(tracks: Observations | None, count: int) -> Tones:

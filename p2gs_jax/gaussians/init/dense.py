@@ -24,6 +24,7 @@ from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.gaussians.init.brightness import MatchImages, Tones
 from p2gs_jax.gaussians.init.flow import CHECKS, DepthMap, Flows, depth_map, pixel_centers
 from p2gs_jax.gaussians.init.pairs import neighbours, visibility
+from p2gs_jax.photometry.cameras import places
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Scene
 
@@ -179,7 +180,7 @@ def _candidates(row: int, near, flows: Flows, color: Tones, seed: int) -> Candid
         centers,
         depth.inverse[y, x],
         _normals(depth, frame.K, y, x),
-        np.exp(color.log_radiance(row, frame.ldr[y, x])),
+        np.exp(color.log_radiance(row, frame.ldr[y, x], places(centers, *shown.shape[::-1]))),
         texture[y, x],
         depth.counts,
     )

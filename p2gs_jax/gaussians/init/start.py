@@ -12,10 +12,11 @@ from p2gs_jax.gaussians.init.brightness import Tones
 from p2gs_jax.gaussians.init.dense import MOST_VIEWS, DenseSeeds, dense_seeds
 from p2gs_jax.gaussians.init.seeds import gaussians_from_points, merge, neighbour_scales
 from p2gs_jax.gaussians.init.shell import Shell
-from p2gs_jax.photometry.initial import linearized
+from p2gs_jax.photometry.cameras import places
+from p2gs_jax.photometry.formation import inverse_formation
 from p2gs_jax.photometry.sources.sampling import sample
 from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.types import GAMMA_SRGB, Gaussians, Photometry, Scene, View
+from p2gs_jax.types import Gaussians, Photometry, Scene, View
 
 # Of a time budget at most this share goes into dense seeds, if two idle cores need so long a view.
 DENSE_TIME, DENSE_SECONDS, FEWEST_DENSE_VIEWS = 0.25, 0.6, 8
@@ -56,25 +57,23 @@ def match_photographs(
         store: photographs.
         match: brings photographs to one brightness, for matching.
         points: seeds that are there already.
-        photometry: exposures and gammas of the start.
+        photometry: of the start.
         cfg: everything.
         limit: number of seeds at most.
         on_view: receives progress.
     """
-    raw, gammas = np.asarray(photometry.raw_exposures), np.asarray(photometry.raw_gammas)
+    taken: Photometry = jax.tree.map(np.asarray, photometry)
     most_views, budget = MOST_VIEWS, cfg.train.budget_s
     if budget is not None:
         affordable = int(DENSE_TIME * budget / DENSE_SECONDS)
         most_views = min(most_views, max(affordable, FEWEST_DENSE_VIEWS))
-    if photometry.parameterization == "log":
-        log_exposures, gammas = raw, GAMMA_SRGB * np.exp(gammas)
-    else:
-        log_exposures = np.log(raw)
+    logs = taken.raw_exposures if taken.parameterization == "log" else np.log(taken.raw_exposures)
+    tones = Tones(logs, taken.gammas, cfg.photometry, taken.white_balance, taken.cameras)
     return dense_seeds(
         scene,
         store,
         match,
-        Tones.of(log_exposures, gammas, cfg.photometry),
+        tones,
         cfg,
         existing=points,
         limit=limit,
@@ -137,12 +136,11 @@ def shell_gaussians(
         shell: directions, positions, sizes.
         scene: views.
         store: photographs.
-        photometry: exposures and gammas of the start.
+        photometry: of the start.
         views: training views.
         cfg: everything.
     """
     taken: Photometry = jax.tree.map(np.asarray, photometry)
-    exposures, gammas = taken.exposures, taken.gammas
     total = np.zeros((len(shell.points), 3))
     weight = np.zeros(len(shell.points))
     for row, index in enumerate(scene.train_indices):
@@ -152,9 +150,11 @@ def shell_gaussians(
         ldr, mask = store.get(index, SHELL_SHRINK)
         view = scene.views[index]
         scale = [mask.shape[1] / view.width, mask.shape[0] / view.height]
-        colors, _, valid = sample(ldr, mask, shell.xy[seen, row] * scale)
-        linear = linearized(colors[valid], cfg, float(gammas[row]))
-        total[seen[valid]] += linear / exposures[row]
+        xy = shell.xy[seen, row] * scale
+        colors, _, valid = sample(ldr, mask, xy)
+        place = places(xy[valid], *mask.shape[::-1])
+        colors = np.asarray(colors[valid], np.float32)
+        total[seen[valid]] += inverse_formation(colors, taken.capture(row), cfg.photometry, place)
         weight[seen[valid]] += 1
     seen = weight > 0
     radiance = total[seen] / weight[seen, None]
