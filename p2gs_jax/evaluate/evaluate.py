@@ -27,6 +27,7 @@ from p2gs_jax.evaluate.lpips import LpipsWeights, lpips
 from p2gs_jax.evaluate.metrics import psnr, ssim
 from p2gs_jax.evaluate.parallel import map_in_order
 from p2gs_jax.evaluate.radiance import RadianceScores, Truth
+from p2gs_jax.photometry.appearance import Correction, correction_of, mean_correction
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import inverse_tone_map
 from p2gs_jax.photometry.mean import MeanParameters, mean_parameters
@@ -154,25 +155,29 @@ def evaluate(
     gaussians = jax.device_put(params.gaussians)
     living = jax.device_put(np.asarray(alive))
     score = functools.partial(_score, lpips_weights)
-    mean_correction = small.mean_correction
 
     tone = cfg.photometry
 
-    def shown(linear, exposure, gamma, correction=mean_correction):
+    def common(index: int) -> Correction | None:
+        """Return the correction of a view that has none of its own."""
+        return mean_correction(small.appearance, scene.views[index].camera)
+
+    def shown(linear, exposure, gamma, correction):
         return develop(linear, DisplayTransform(exposure, gamma, tone, correction))
 
-    def fitted(linear, photograph, mask) -> float:
+    def fitted(linear, photograph, mask, correction) -> float:
         """Solve the exposure of a view that has none of its own."""
-        return float(fit_exposure(linear, photograph, mask, mean.gamma, tone, mean_correction))
+        return float(fit_exposure(linear, photograph, mask, mean.gamma, tone, correction))
 
-    def with_both(linear, photograph, mask, exposure) -> dict[str, float] | None:
+    def with_both(linear, photograph, mask, exposure, correction) -> dict[str, float] | None:
         """Score a held-out view with its exposure and gamma solved, where each view has both."""
         if MODELS[tone.model].gamma != "view":
             return None
         start = (exposure, mean.gamma)
-        both = fit_exposure_and_gamma(linear, photograph, mask, *start, tone, mean_correction)
+        both = fit_exposure_and_gamma(linear, photograph, mask, *start, tone, correction)
         e, g = map(float, both)
-        return {**score(shown(linear, e, g), photograph, mask), "exposure": e, "gamma": g}
+        ldr = shown(linear, e, g, correction)
+        return {**score(ldr, photograph, mask), "exposure": e, "gamma": g}
 
     row_of = {index: row for row, index in enumerate(scene.train_indices)}
 
@@ -180,16 +185,17 @@ def evaluate(
         photograph, mask = store.get(index, 1)
         result = render(gaussians, living, camera_of(store, index))
         linear = np.asarray(result.linear)
-        ldr_mean = shown(linear, mean.exposure, mean.gamma)
+        correction = common(index)
+        ldr_mean = shown(linear, mean.exposure, mean.gamma, correction)
         if scene.views[index].split == "train":
             row = row_of[index]
             e, g = float(exposures[row]), float(gammas[row])
-            ldr = shown(linear, e, g, small.correction(row))
+            ldr = shown(linear, e, g, correction_of(small.appearance, row))
             extra, both = {}, None
         else:
-            e, g = fitted(linear, photograph, mask), mean.gamma
-            ldr = shown(linear, e, g)
-            extra, both = {"exposure": e}, with_both(linear, photograph, mask, e)
+            e, g = fitted(linear, photograph, mask, correction), mean.gamma
+            ldr = shown(linear, e, g, correction)
+            extra, both = {"exposure": e}, with_both(linear, photograph, mask, e, correction)
         depth, alpha = np.asarray(result.depth), np.asarray(result.alpha)
         return _Judged(
             ViewResult(index, linear, alpha, depth, ldr, photograph, e, g),
@@ -244,7 +250,7 @@ def evaluate(
             metrics["radiance"] = scores.summary(exposed / float(np.median(exposures)))
         if reference_views:
             metrics["reference"] = _against_reference(
-                reference_views, scene, mean, shown, fitted, score
+                reference_views, scene, mean, common, shown, fitted, score
             )
         return metrics
 
@@ -253,33 +259,39 @@ def _lookup(reference, index: int):
     return reference(index) if callable(reference) else reference.get(index)
 
 
-def _against_reference(views, scene: Scene, mean: MeanParameters, shown, fitted, score) -> dict:
+def _against_reference(
+    views, scene: Scene, mean: MeanParameters, correction, shown, fitted, score
+) -> dict:
     """Score all views against photographs of one common exposure.
 
     Args:
         views: row of each; linear radiance, reference photograph and mask, kept.
         scene: their names and splits.
         mean: exposures to show them at.
-        shown: (linear, exposure, gamma) -> display image.
-        fitted: (linear, photograph, mask) -> the exposure that fits best.
+        correction: row of a view -> what it is shown under, or None.
+        shown: (linear, exposure, gamma, correction) -> display image.
+        fitted: (linear, photograph, mask, correction) -> the exposure that fits best.
         score: (display image, photograph, mask) -> scores by name.
     """
 
     def images(view):
         return (kept.read() for kept in view[1])
 
-    scales = list(map_in_order(lambda view: fitted(*images(view)), views))
-    common = float(np.exp(np.median(np.log(scales))))
+    def scale(view) -> float:
+        return fitted(*images(view), correction(view[0]))
+
+    scales = list(map_in_order(scale, views))
+    median = float(np.exp(np.median(np.log(scales))))
     protocols = {
         "averaged": mean.exposure,
         "geometric": mean.exposure_geometric,
-        "scale_aligned": common,
+        "scale_aligned": median,
     }
 
     def judged(view):
         linear, truth, mask = images(view)
         return {
-            name: score(shown(linear, exposure, mean.gamma), truth, mask)
+            name: score(shown(linear, exposure, mean.gamma, correction(view[0])), truth, mask)
             for name, exposure in protocols.items()
         }
 

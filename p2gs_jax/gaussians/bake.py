@@ -22,6 +22,7 @@ from jaxtyping import Array, Float, UInt8
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.numerics import fibonacci_sphere, on_device
+from p2gs_jax.photometry.appearance import without_place
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.render import render_linear
 from p2gs_jax.render.capacity import TileCapacity, until_it_fits
@@ -91,12 +92,9 @@ def true_target(
 
 
 def display_of_splats(transform: DisplayTransform) -> DisplayTransform:
-    """Return the transform without a correction by image position, which splats cannot hold."""
-    return (
-        replace(transform, correction=None)
-        if transform.formation.appearance == "bilateral"
-        else transform
-    )
+    """Return the transform without what depends on the place in the image: splats have none."""
+    kept = without_place(transform.correction, transform.formation.appearance)
+    return replace(transform, correction=kept)
 
 
 def display_comments(transform: DisplayTransform) -> list[str]:

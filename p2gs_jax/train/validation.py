@@ -12,6 +12,7 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.alignment import fit_exposure
 from p2gs_jax.evaluate.metrics import psnr
+from p2gs_jax.photometry.appearance import mean_correction
 from p2gs_jax.photometry.formation import display, formation
 from p2gs_jax.photometry.mean import mean_parameters
 from p2gs_jax.render.host import make_renderer
@@ -81,9 +82,10 @@ def make_judge(
 
     def judge(params: Params, alive: Bool[Array, " n"]) -> float:
         mean_gamma = jnp.float32(mean_parameters(params.photometry).gamma)
-        correction = params.mean_correction
         scores = []
         for row in rows:
+            camera = views.store.views[views.rows[row]].camera
+            correction = mean_correction(params.appearance, camera)
             photograph, mask = views.store.get(views.rows[row])
             linear = render(params.gaussians, alive, views.camera(row, 1)).linear
             if own_exposures:

@@ -89,6 +89,4 @@ def splat_colors(
     column = splats.linear[:, None]
     if settings.mode == "stops":
         return to_uint8_fast(false_color(column, MIDDLE_GREY / transform.exposure))[:, 0]
-    if transform.formation.appearance == "bilateral":
-        transform = replace(transform, correction=None)
-    return to_uint8_fast(develop(column, transform))[:, 0]
+    return to_uint8_fast(develop(column, display_of_splats(transform)))[:, 0]
