@@ -55,7 +55,7 @@ class Gaussians(eqx.Module):
 
 
 class Capture(eqx.Module):
-    """What one photograph did to the light.
+    """What one photograph did to the light; of loose pixels, what each one's photograph did.
 
     Attributes:
         exposure: e > 0.
@@ -111,8 +111,8 @@ class Photometry(eqx.Module):
         raw = self.raw_white_balance
         return None if raw is None else raw - raw.mean(axis=1, keepdims=True)
 
-    def capture(self, row: Int[Array, ""] | int) -> Capture:
-        """Return what the training view in a row did to the light."""
+    def capture(self, row: Int[Array, "..."] | int) -> Capture:
+        """Return what the training view in a row did to the light; rows give it for each."""
         balance = self.white_balance
         camera = None
         if self.cameras is not None:

@@ -26,7 +26,7 @@ from p2gs_jax.train.advance import Controls
 from p2gs_jax.train.optimizer import learning_rates, make_optimizer
 from p2gs_jax.train.state import initial_state
 from p2gs_jax.train.step import Step, compilations
-from p2gs_jax.types import Batch, Params, Photometry
+from p2gs_jax.types import Batch, Capture, Params, Photometry
 
 
 class StepCost(NamedTuple):
@@ -136,7 +136,7 @@ def measure_step(scene: BenchScene, cfg: FitConfig, repeats: int = 7) -> StepCos
         return jit(run)
 
     def loss(linear):
-        y = formation(linear, jnp.float32(0.5), jnp.float32(2.2), cfg.photometry)
+        y = formation(linear, Capture(jnp.float32(0.5), jnp.float32(2.2)), cfg.photometry)
         return sum(photometric_loss(y, ldr, mask, cfg.loss).values())
 
     def update(params, moments, grads):

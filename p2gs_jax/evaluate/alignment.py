@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from typing import TypedDict
 
@@ -12,7 +13,9 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from p2gs_jax.config import PhotometryConfig
+from p2gs_jax.photometry.appearance import Correction
 from p2gs_jax.photometry.formation import display, formation
+from p2gs_jax.types import Capture
 
 SEARCH_STOPS, SEARCH_STEPS, GOLDEN_STEPS = 5.0, 41, 30
 REFINE_STEPS = 30
@@ -66,21 +69,29 @@ def fit_exposure(
     linear: Float[Array, "h w 3"],
     photograph: Float[Array, "h w 3"],
     mask: Float[Array, "h w"],
-    gamma: Float[Array, ""] | float,
+    capture: Capture,
     cfg: PhotometryConfig,
-    appearance: Float[Array, "..."] | None = None,
+    correction: Correction | None = None,
 ) -> Float[Array, ""]:
     """Return the one exposure with which a render fits a photograph best, in squared LDR error.
 
     A coarse search over +-5 stops around 1 followed by golden sections: the error of a clipped
     image has flat stretches where Newton's method stalls.
+
+    Args:
+        linear: the render.
+        photograph: display values.
+        mask: 1 = use.
+        capture: all but the exposure, which is not looked at.
+        cfg: formation model.
+        correction: of display values, or None.
     """
     # Imported late: of what evaluates, little searches.
     import optimistix
 
     def error(log2_exposure, stride=1):
-        exposure = jnp.exp2(log2_exposure)
-        ldr = display(formation(linear, exposure, jnp.asarray(gamma), cfg, appearance))
+        taken = dataclasses.replace(capture, exposure=jnp.exp2(log2_exposure))
+        ldr = display(formation(linear, taken, cfg, correction))
         squared = mask[..., None] * (ldr - photograph) ** 2
         return jnp.sum(squared[::stride, ::stride]) / jnp.maximum(jnp.sum(mask), 1)
 
@@ -100,35 +111,61 @@ def fit_exposure(
     return jnp.exp2(low + found.value)
 
 
-@functools.partial(jax.jit, static_argnames="cfg")
-def fit_exposure_and_gamma(
+@functools.partial(jax.jit, static_argnames=("cfg", "gamma", "white_balance"))
+def fit_capture(
     linear: Float[Array, "h w 3"],
     photograph: Float[Array, "h w 3"],
     mask: Float[Array, "h w"],
-    exposure: Float[Array, ""] | float,
-    gamma: Float[Array, ""] | float,
+    start: Capture,
     cfg: PhotometryConfig,
-    appearance: Float[Array, "..."] | None = None,
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return (exposure, gamma) with which a render fits a photograph best, in squared LDR error.
+    correction: Correction | None = None,
+    *,
+    gamma: bool,
+    white_balance: bool,
+) -> Capture:
+    """Return exposure, and what else is asked for, that fit a photograph best (squared LDR error).
 
-    Levenberg-Marquardt on their logarithms from the given ones, which `fit_exposure` found.
+    Levenberg-Marquardt on their logarithms.
+
+    Args:
+        linear: the render.
+        photograph: display values.
+        mask: 1 = use.
+        start: with the exposure that `fit_exposure` found.
+        cfg: formation model.
+        correction: of display values, or None.
+        gamma: solve it too, or leave it.
+        white_balance: likewise.
     """
     # Imported late: of what evaluates, little searches.
     import optimistix
 
     weight = jnp.sqrt(mask / jnp.maximum(jnp.sum(mask), 1))[..., None]
 
-    def residuals(logs, _):
-        ldr = display(formation(linear, jnp.exp(logs[0]), jnp.exp(logs[1]), cfg, appearance))
-        return weight * (ldr - photograph)
+    def moved(by) -> Capture:
+        gamma_by, balance_by = by[1:], by[1 + gamma :]
+        balance = start.white_balance
+        if white_balance:
+            before = jnp.zeros(3) if balance is None else balance
+            # Two numbers: the mean over channels is the exposure's.
+            red, blue = balance_by
+            balance = before + jnp.stack([red, -red - blue, blue])
+        return dataclasses.replace(
+            start,
+            exposure=start.exposure * jnp.exp(by[0]),
+            gamma=start.gamma * jnp.exp(gamma_by[0]) if gamma else start.gamma,
+            white_balance=balance,
+        )
+
+    def residuals(by, _):
+        return weight * (display(formation(linear, moved(by), cfg, correction)) - photograph)
 
     found = optimistix.least_squares(
         residuals,
         optimistix.LevenbergMarquardt(rtol=TOLERANCE, atol=TOLERANCE),
-        jnp.log(jnp.stack([jnp.float32(exposure), jnp.float32(gamma)])),
+        jnp.zeros(1 + gamma + 2 * white_balance),
         options={"jac": "fwd"},
         max_steps=REFINE_STEPS,
         throw=False,
     )
-    return jnp.exp(found.value[0]), jnp.exp(found.value[1])
+    return moved(found.value)

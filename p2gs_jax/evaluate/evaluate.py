@@ -1,11 +1,11 @@
 """Evaluation of a finished fit: every view under every protocol.
 
-Protocols (docs/photometry.md, 6): `per_view` renders a training view with its own exposure and
-gamma; `averaged` uses the mean parameters over the training views (paper, Rendering for
-evaluation); `exposure_fitted` solves one scalar exposure from the photograph, because a held-out
-view has none of its own; `exposure_and_gamma_fitted` solves both, where the model gives every view
-a gamma too; against reference photographs of one common exposure, `scale_aligned` solves one
-scalar for all of them.
+Protocols (docs/photometry.md, 6): `per_view` renders a training view with its own exposure, gamma
+and white balance; `averaged` uses the mean parameters over the training views (paper, Rendering
+for evaluation); `exposure_fitted` solves one scalar exposure from the photograph, because a
+held-out view has none of its own; `photometry_fitted` solves all that the model gives every view,
+where that is more than an exposure; against reference photographs of one common exposure,
+`scale_aligned` solves one scalar for all of them. Vignetting and responses are the camera's in all.
 """
 
 from __future__ import annotations
@@ -20,17 +20,16 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from p2gs_jax.config import FitConfig
-from p2gs_jax.evaluate.alignment import fit_exposure, fit_exposure_and_gamma
+from p2gs_jax.evaluate.alignment import fit_capture, fit_exposure
 from p2gs_jax.evaluate.array_store import ArrayStore, StoredArray
 from p2gs_jax.evaluate.consistency import VideoScores
 from p2gs_jax.evaluate.lpips import LpipsWeights, lpips
 from p2gs_jax.evaluate.metrics import psnr, ssim
 from p2gs_jax.evaluate.parallel import map_in_order
 from p2gs_jax.evaluate.radiance import RadianceScores, Truth
-from p2gs_jax.photometry.appearance import Correction, correction_of, mean_correction
-from p2gs_jax.photometry.display import DisplayTransform, develop
+from p2gs_jax.photometry.display import DisplayTransform, develop, display_of_view, with_capture
 from p2gs_jax.photometry.formation import inverse_tone_map
-from p2gs_jax.photometry.mean import MeanParameters, mean_parameters
+from p2gs_jax.photometry.mean import MeanParameters, mean_parameters, usual_display
 from p2gs_jax.photometry.models import MODELS
 from p2gs_jax.render.host import RenderView
 from p2gs_jax.scene.device import camera_of
@@ -47,10 +46,10 @@ class ViewResult:
         linear: linear radiance.
         alpha: opacity.
         depth: alpha-weighted depth.
-        ldr: display image under `exposure` and `gamma`.
+        ldr: display image under `transform`.
         photograph: of the view.
-        exposure: the view's own, or fitted to the photograph of a held-out view.
-        gamma: the view's own, or the mean.
+        transform: the view's own; of a held-out view the usual one with the exposure fitted to its
+            photograph.
     """
 
     index: int
@@ -59,8 +58,7 @@ class ViewResult:
     depth: Float32[np.ndarray, "h w"]
     ldr: Float32[np.ndarray, "h w 3"]
     photograph: Float32[np.ndarray, "h w 3"]
-    exposure: float
-    gamma: float
+    transform: DisplayTransform
 
 
 def _score(lpips_weights: LpipsWeights | None, ldr, target, mask) -> dict[str, float]:
@@ -80,7 +78,7 @@ class _Judged(NamedTuple):
         mask: which pixels count.
         scores: of `result.ldr`.
         scores_averaged: of `ldr_averaged`.
-        scores_both: of a held-out view with exposure and gamma fitted, or None.
+        scores_all: of a held-out view with all fitted that varies per view, or None.
         radiance: true linear radiance, or None.
         reference: photograph under the common exposure, or None.
     """
@@ -90,7 +88,7 @@ class _Judged(NamedTuple):
     mask: Float32[np.ndarray, "h w"]
     scores: dict[str, float]
     scores_averaged: dict[str, float]
-    scores_both: dict[str, float] | None
+    scores_all: dict[str, float] | None
     radiance: np.ndarray | None
     reference: np.ndarray | None
 
@@ -151,33 +149,22 @@ def evaluate(
     mean = mean_parameters(params.photometry)
     # Small arrays stay on the host; large ones are moved to the device once.
     small = jax.tree.map(np.asarray, replace(params, gaussians=None))
-    exposures, gammas = small.photometry.exposures, small.photometry.gammas
     gaussians = jax.device_put(params.gaussians)
     living = jax.device_put(np.asarray(alive))
     score = functools.partial(_score, lpips_weights)
+    taken_by = [view.camera for view in scene.training_views]
 
     tone = cfg.photometry
 
-    def common(index: int) -> Correction | None:
-        """Return the correction of a view that has none of its own."""
-        return mean_correction(small.appearance, scene.views[index].camera)
+    def usual(index: int) -> DisplayTransform:
+        """Return how a view is shown by the mean parameters."""
+        return usual_display(small, taken_by, scene.views[index].camera, tone)
 
-    def shown(linear, exposure, gamma, correction):
-        return develop(linear, DisplayTransform(exposure, gamma, tone, correction))
-
-    def fitted(linear, photograph, mask, correction) -> float:
+    def fitted(index, linear, photograph, mask) -> DisplayTransform:
         """Solve the exposure of a view that has none of its own."""
-        return float(fit_exposure(linear, photograph, mask, mean.gamma, tone, correction))
-
-    def with_both(linear, photograph, mask, exposure, correction) -> dict[str, float] | None:
-        """Score a held-out view with its exposure and gamma solved, where each view has both."""
-        if MODELS[tone.model].gamma != "view":
-            return None
-        start = (exposure, mean.gamma)
-        both = fit_exposure_and_gamma(linear, photograph, mask, *start, tone, correction)
-        e, g = map(float, both)
-        ldr = shown(linear, e, g, correction)
-        return {**score(ldr, photograph, mask), "exposure": e, "gamma": g}
+        plain = usual(index)
+        how = (plain.capture, tone, plain.correction)
+        return replace(plain, exposure=float(fit_exposure(linear, photograph, mask, *how)))
 
     row_of = {index: row for row, index in enumerate(scene.train_indices)}
 
@@ -185,31 +172,29 @@ def evaluate(
         photograph, mask = store.get(index, 1)
         result = render(gaussians, living, camera_of(store, index))
         linear = np.asarray(result.linear)
-        correction = common(index)
-        ldr_mean = shown(linear, mean.exposure, mean.gamma, correction)
+        ldr_mean = develop(linear, replace(usual(index), exposure=mean.exposure))
+        extra, everything = {}, None
         if scene.views[index].split == "train":
-            row = row_of[index]
-            e, g = float(exposures[row]), float(gammas[row])
-            ldr = shown(linear, e, g, correction_of(small.appearance, row))
-            extra, both = {}, None
+            transform = display_of_view(small, row_of[index], tone)
         else:
-            e, g = fitted(linear, photograph, mask, correction), mean.gamma
-            ldr = shown(linear, e, g, correction)
-            extra, both = {"exposure": e}, with_both(linear, photograph, mask, e, correction)
+            transform = fitted(index, linear, photograph, mask)
+            extra = {"exposure": transform.exposure}
+            everything = _all_fitted(linear, photograph, mask, transform, score)
+        ldr = develop(linear, transform)
         depth, alpha = np.asarray(result.depth), np.asarray(result.alpha)
         return _Judged(
-            ViewResult(index, linear, alpha, depth, ldr, photograph, e, g),
+            ViewResult(index, linear, alpha, depth, ldr, photograph, transform),
             ldr_mean,
             mask,
             {**score(ldr, photograph, mask), **extra},
             score(ldr_mean, photograph, mask),
-            both,
+            everything,
             None if radiance is None else radiance(index),
             None if reference is None else _lookup(reference, index),
         )
 
     own, averaged = _Collector(), _Collector()
-    test_averaged, test_fitted, test_both = _Collector(), _Collector(), _Collector()
+    test_averaged, test_fitted, test_all = _Collector(), _Collector(), _Collector()
     videos = {name: VideoScores() for name in ("per_view", "averaged", "photographs")}
     with ArrayStore() as arrays:
         scores = RadianceScores(arrays)
@@ -221,8 +206,8 @@ def evaluate(
             training = view.split == "train"
             (own if training else test_fitted).add(view.name, found.scores)
             (averaged if training else test_averaged).add(view.name, found.scores_averaged)
-            if found.scores_both is not None:
-                test_both.add(view.name, found.scores_both)
+            if found.scores_all is not None:
+                test_all.add(view.name, found.scores_all)
             again = found.radiance is not None or found.reference is not None
             linear = arrays.put(result.linear) if again else result.linear
             if found.radiance is not None:
@@ -231,67 +216,82 @@ def evaluate(
                 images = (linear, found.reference, found.mask)
                 reference_views.append((index, tuple(map(arrays.put, images))))
             on_view(result)
-            videos["per_view"].add(view.camera, result.ldr, result.exposure)
+            videos["per_view"].add(view.camera, result.ldr, result.transform.exposure)
             videos["averaged"].add(view.camera, found.ldr_averaged, mean.exposure)
-            videos["photographs"].add(view.camera, result.photograph, result.exposure)
+            videos["photographs"].add(view.camera, result.photograph, result.transform.exposure)
             on_progress(index + 1, len(scene.views))
 
         metrics = {
             "train": {**own.summary(), "averaged": averaged.summary()},
             "test": {"averaged": test_averaged.summary(), "exposure_fitted": test_fitted.summary()},
         }
-        if test_both.rows:
-            metrics["test"]["exposure_and_gamma_fitted"] = test_both.summary()
+        if test_all.rows:
+            metrics["test"]["photometry_fitted"] = test_all.summary()
         metrics["train"]["per_view"] = metrics["train"].pop("per_view", {})
         metrics["consistency"] = {name: video.summary() for name, video in videos.items()}
         if scores.views:
             gamma, saturated = np.float32(mean.gamma), np.array(cfg.loss.saturation, np.float32)
             exposed = float(inverse_tone_map(saturated, gamma, cfg.photometry))
-            metrics["radiance"] = scores.summary(exposed / float(np.median(exposures)))
+            typical = float(np.median(small.photometry.exposures))
+            metrics["radiance"] = scores.summary(exposed / typical)
         if reference_views:
             metrics["reference"] = _against_reference(
-                reference_views, scene, mean, common, shown, fitted, score
+                reference_views, scene, mean, usual, fitted, score
             )
         return metrics
+
+
+def _all_fitted(
+    linear, photograph, mask, start: DisplayTransform, score
+) -> dict[str, float] | None:
+    """Score a held-out view with all solved that varies per view; None: that is one scalar."""
+    tone = start.formation
+    gamma, balance = MODELS[tone.model].gamma == "view", tone.white_balance == "view"
+    if not (gamma or balance):
+        return None
+    given, how = (linear, photograph, mask), (start.capture, tone, start.correction)
+    found = fit_capture(*given, *how, gamma=gamma, white_balance=balance)
+    transform = with_capture(start, found)
+    row = {**score(develop(linear, transform), photograph, mask), "exposure": transform.exposure}
+    if gamma:
+        row["gamma"] = transform.gamma
+    if balance:
+        row["red_green_ev"], row["blue_green_ev"] = transform.white_balance_ev
+    return row
 
 
 def _lookup(reference, index: int):
     return reference(index) if callable(reference) else reference.get(index)
 
 
-def _against_reference(
-    views, scene: Scene, mean: MeanParameters, correction, shown, fitted, score
-) -> dict:
+def _against_reference(views, scene: Scene, mean: MeanParameters, usual, fitted, score) -> dict:
     """Score all views against photographs of one common exposure.
 
     Args:
         views: row of each; linear radiance, reference photograph and mask, kept.
         scene: their names and splits.
         mean: exposures to show them at.
-        correction: row of a view -> what it is shown under, or None.
-        shown: (linear, exposure, gamma, correction) -> display image.
-        fitted: (linear, photograph, mask, correction) -> the exposure that fits best.
+        usual: row -> how a view is shown by the mean parameters.
+        fitted: (row, linear, photograph, mask) -> that with the exposure that fits best.
         score: (display image, photograph, mask) -> scores by name.
     """
 
     def images(view):
         return (kept.read() for kept in view[1])
 
-    def scale(view) -> float:
-        return fitted(*images(view), correction(view[0]))
-
-    scales = list(map_in_order(scale, views))
-    median = float(np.exp(np.median(np.log(scales))))
+    scales = list(map_in_order(lambda view: fitted(view[0], *images(view)).exposure, views))
+    common = float(np.exp(np.median(np.log(scales))))
     protocols = {
         "averaged": mean.exposure,
         "geometric": mean.exposure_geometric,
-        "scale_aligned": median,
+        "scale_aligned": common,
     }
 
     def judged(view):
         linear, truth, mask = images(view)
+        shown = usual(view[0])
         return {
-            name: score(shown(linear, exposure, mean.gamma, correction(view[0])), truth, mask)
+            name: score(develop(linear, replace(shown, exposure=exposure)), truth, mask)
             for name, exposure in protocols.items()
         }
 

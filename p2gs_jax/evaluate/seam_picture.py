@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 from scipy.spatial.transform import Rotation
 
-from p2gs_jax.evaluate.seams import Photographed, decoded
+from p2gs_jax.evaluate.seams import Photographed, radiance_of
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.render.warp import project_points, sample_bilinear, surface_depth, unproject
 from p2gs_jax.types import Camera, Render
@@ -29,7 +29,7 @@ def redeveloped(
 
     Saturated pixels stay at the value of its white.
     """
-    return develop(decoded(ldr, own) / own.exposure, common)
+    return develop(radiance_of(ldr, own), common)
 
 
 class SeamPicture(NamedTuple):

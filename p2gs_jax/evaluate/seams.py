@@ -6,12 +6,13 @@ median over pixels and channels of the absolute difference, in 8-bit codes and i
 
 - before: of the photographs as taken. In stops, as if all were taken alike: both are decoded with
   the common gamma, and no exposure is undone.
-- after: of the photographs developed alike: each is decoded with its own gamma, divided by its own
-  exposure, and shown in the common display transform.
+- after: of the photographs developed alike: each is decoded with its own gamma and response,
+  divided by its own exposure, white balance and vignetting, and shown in the common display
+  transform.
 
 The step is the constant part of what is left: the median of the signed difference after, in stops.
-The rest contains misplaced pixels on texture, view-dependent reflection, vignetting and white
-balance, which no exposure explains.
+The rest contains misplaced pixels on texture, view-dependent reflection, and what the formation
+model leaves out.
 """
 
 from __future__ import annotations
@@ -25,8 +26,9 @@ from scipy.sparse import csr_array
 
 from p2gs_jax.config import LossConfig
 from p2gs_jax.core.numerics import evenly_spaced
+from p2gs_jax.photometry.cameras import places
 from p2gs_jax.photometry.display import DisplayTransform, develop
-from p2gs_jax.photometry.formation import inverse_tone_map
+from p2gs_jax.photometry.formation import inverse_formation, inverse_tone_map
 from p2gs_jax.render.warp import sample_bilinear, warp
 from p2gs_jax.scene.visibility import project_points, unoccluded
 from p2gs_jax.types import Camera, Scene
@@ -152,9 +154,12 @@ def measure_seam(
     if use.sum() < FEWEST_PIXELS:
         return None
     a, b = first.ldr[use], np.asarray(ldr)[use]
-    plain = [decoded(values, common) for values in (a, b)]
-    own = [decoded(a, first.transform), decoded(b, second.transform)]
-    radiance = [own[0] / first.transform.exposure, own[1] / second.transform.exposure]
+    where = [np.argwhere(use)[:, ::-1] + np.float32(0.5), np.asarray(there.xy)[use]]
+    plain = [_decoded(values, common) for values in (a, b)]
+    radiance = [
+        radiance_of(values, view.transform, places(xy, view.camera.width, view.camera.height))
+        for values, view, xy in zip((a, b), (first, second), where, strict=True)
+    ]
     shown = [develop(linear, common) for linear in radiance]
     return Seam(
         _apart(np.log2(plain[0]), np.log2(plain[1])),
@@ -166,13 +171,26 @@ def measure_seam(
     )
 
 
-def decoded(
-    ldr: Float[np.ndarray, "... 3"], transform: DisplayTransform
+def radiance_of(
+    ldr: Float[np.ndarray, "... 3"],
+    transform: DisplayTransform,
+    positions: Float[np.ndarray, "... 2"] | None = None,
 ) -> Float32[np.ndarray, "... 3"]:
-    """Return the exposed radiance e L of a photograph."""
-    return inverse_tone_map(
-        np.asarray(ldr, np.float32), np.float32(transform.gamma), transform.formation
-    )
+    """Return the radiance that a photograph shows: what was done to light undone, on the host.
+
+    Args:
+        ldr: an image, or loose pixels of one.
+        transform: how it was taken.
+        positions: of loose pixels, where vignetting counts (photometry/cameras.py:places).
+    """
+    ldr = np.asarray(ldr, np.float32)
+    return inverse_formation(ldr, transform.capture, transform.formation, positions)
+
+
+def _decoded(ldr: Float[np.ndarray, "m 3"], common: DisplayTransform):
+    """Return the exposed radiance of a photograph as if all were taken alike."""
+    gamma = np.float32(common.gamma)
+    return inverse_tone_map(np.asarray(ldr, np.float32), gamma, common.formation)
 
 
 def _informative(ldr: Float[np.ndarray, "h w 3"], cfg: LossConfig) -> Bool[np.ndarray, "h w"]:

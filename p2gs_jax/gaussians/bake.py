@@ -22,7 +22,6 @@ from jaxtyping import Array, Float, UInt8
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.numerics import fibonacci_sphere, on_device
-from p2gs_jax.photometry.appearance import without_place
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.render import render_linear
 from p2gs_jax.render.capacity import TileCapacity, until_it_fits
@@ -93,8 +92,7 @@ def true_target(
 
 def display_of_splats(transform: DisplayTransform) -> DisplayTransform:
     """Return the transform without what depends on the place in the image: splats have none."""
-    kept = without_place(transform.correction, transform.formation.appearance)
-    return replace(transform, correction=kept)
+    return transform.without_place()
 
 
 def display_comments(transform: DisplayTransform) -> list[str]:

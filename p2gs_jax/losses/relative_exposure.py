@@ -2,7 +2,8 @@
 
 Printed: L_exp = (1/M) sum |alpha_ij L_i - L_j|_1 with alpha_ij = e_j / e_i and L free of exposure.
 At the truth L_i = L_j for the same surface, so the printed formula is zero only where all
-exposures are equal; each reading below is one way of making sense of it.
+exposures are equal; each reading below is one way of making sense of it. Where white balance and
+vignetting are modelled, e W V stands for e.
 """
 
 from __future__ import annotations
@@ -12,7 +13,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from p2gs_jax.config import LossConfig, PhotometryConfig
-from p2gs_jax.photometry.formation import inverse_tone_map, tone_map
+from p2gs_jax.photometry.formation import (
+    expose,
+    gain,
+    inverse_formation,
+    inverse_tone_map,
+    tone_map,
+)
+from p2gs_jax.types import Photometry
 
 
 class ColorPairs(eqx.Module):
@@ -24,6 +32,9 @@ class ColorPairs(eqx.Module):
         views_i: rows in `Photometry`.
         views_j: likewise.
         valid: 1 = use.
+        positions_i: where in the first view's image, from its centre in units of half its
+            diagonal; None where nothing depends on it.
+        positions_j: likewise in the second.
     """
 
     colors_i: Float[Array, "m 3"]
@@ -31,6 +42,8 @@ class ColorPairs(eqx.Module):
     views_i: Int[Array, " m"]
     views_j: Int[Array, " m"]
     valid: Float[Array, " m"]
+    positions_i: Float[Array, "m 2"] | None = None
+    positions_j: Float[Array, "m 2"] | None = None
 
 
 # Where less than this share of the pairs is valid, the mean is taken as if that many were.
@@ -45,8 +58,7 @@ class ExposurePairs(eqx.Module):
         linear_j: render of view j, for `literal_pixels` and `exposed`.
         view_i: row of view i.
         view_j: row of view j.
-        exposures: all exposures.
-        gammas: all gammas.
+        photometry: what every view did to light.
         pairs: corresponding observations, for the `observed` readings.
     """
 
@@ -54,8 +66,7 @@ class ExposurePairs(eqx.Module):
     linear_j: Float[Array, "h w 3"] | None
     view_i: Int[Array, ""]
     view_j: Int[Array, ""]
-    exposures: Float[Array, " v"]
-    gammas: Float[Array, " v"]
+    photometry: Photometry
     pairs: ColorPairs | None
 
 
@@ -84,10 +95,11 @@ def usable(colors: Float[Array, "m 3"], cfg: LossConfig) -> Float[Array, "m 3"]:
     return ((colors > cfg.black) & (colors < cfg.saturation)).astype(colors.dtype)
 
 
-def _linear_pair(pairs: ColorPairs, exposures, gammas, photometry: PhotometryConfig):
-    ratio = (exposures[pairs.views_j] / exposures[pairs.views_i])[:, None]
-    gamma_i, gamma_j = gammas[pairs.views_i][:, None], gammas[pairs.views_j][:, None]
-    return ratio * inverse_tone_map(pairs.colors_i, gamma_i, photometry), gamma_j
+def _exposed_alike(pairs: ColorPairs, photometry: Photometry, cfg: PhotometryConfig):
+    """Return what the first photograph's surfaces are in the second's exposure, and its capture."""
+    capture_i, capture_j = photometry.capture(pairs.views_i), photometry.capture(pairs.views_j)
+    radiance = inverse_formation(pairs.colors_i, capture_i, cfg, pairs.positions_i)
+    return expose(radiance, capture_j, cfg, pairs.positions_j), capture_j
 
 
 def _mean_over_pairs(
@@ -100,12 +112,12 @@ def _mean_over_pairs(
 
 
 def observed_linear(
-    pairs: ColorPairs, exposures, gammas, cfg: LossConfig, photometry: PhotometryConfig
+    pairs: ColorPairs, photometry: Photometry, loss: LossConfig, cfg: PhotometryConfig
 ) -> Float[Array, ""]:
     """alpha T_i^-1(I_i(u)) against T_j^-1(I_j(w(u))), at corresponding surface points."""
-    predicted, gamma_j = _linear_pair(pairs, exposures, gammas, photometry)
-    seen = inverse_tone_map(pairs.colors_j, gamma_j, photometry)
-    return _mean_over_pairs(jnp.abs(predicted - seen), pairs, cfg)
+    predicted, capture_j = _exposed_alike(pairs, photometry, cfg)
+    seen = inverse_tone_map(pairs.colors_j, capture_j.gamma[:, None], cfg, capture_j.camera)
+    return _mean_over_pairs(jnp.abs(predicted - seen), pairs, loss)
 
 
 def huber(x: Float[Array, "..."], delta: float) -> Float[Array, "..."]:
@@ -115,12 +127,13 @@ def huber(x: Float[Array, "..."], delta: float) -> Float[Array, "..."]:
 
 
 def observed_ldr(
-    pairs: ColorPairs, exposures, gammas, cfg: LossConfig, photometry: PhotometryConfig
+    pairs: ColorPairs, photometry: Photometry, loss: LossConfig, cfg: PhotometryConfig
 ) -> Float[Array, ""]:
     """Huber(T_j(alpha T_i^-1(I_i(u))) - I_j(w(u))): PIR in display units, scale-invariant."""
-    predicted, gamma_j = _linear_pair(pairs, exposures, gammas, photometry)
-    residual = tone_map(predicted, gamma_j, photometry) - pairs.colors_j
-    return _mean_over_pairs(huber(residual, cfg.relative_exposure.huber_delta), pairs, cfg)
+    predicted, capture_j = _exposed_alike(pairs, photometry, cfg)
+    shown = tone_map(predicted, capture_j.gamma[:, None], cfg, capture_j.camera)
+    error = huber(shown - pairs.colors_j, loss.relative_exposure.huber_delta)
+    return _mean_over_pairs(error, pairs, loss)
 
 
 def relative_exposure_loss(
@@ -133,19 +146,23 @@ def relative_exposure_loss(
             renders of one size.
     """
     form = cfg.relative_exposure.form
-    e_i, e_j = given.exposures[given.view_i], given.exposures[given.view_j]
+    if form in ("observed_linear", "observed_ldr"):
+        if given.pairs is None:
+            raise ValueError(f"the reading {form!r} needs corresponding observations")
+        reading = observed_linear if form == "observed_linear" else observed_ldr
+        return reading(given.pairs, given.photometry, cfg, photometry)
+    shape = given.linear_i.shape
+    e_i, e_j = (
+        gain(shape, given.photometry.capture(row), photometry)
+        for row in (given.view_i, given.view_j)
+    )
     if form == "literal_same_pose":
         return literal_same_pose(given.linear_i, e_i, e_j)
-    if form in ("literal_pixels", "exposed"):
-        if given.linear_j is None:
-            raise ValueError(f"the reading {form!r} needs the render of a second view")
-        if given.linear_j.shape != given.linear_i.shape:
-            sizes = f"{given.linear_i.shape} and {given.linear_j.shape}"
-            raise ValueError(f"the reading {form!r} subtracts renders of one size, not {sizes}")
-        if form == "exposed":
-            return exposed(given.linear_i, given.linear_j, e_j)
-        return literal_pixels(given.linear_i, given.linear_j, e_i, e_j)
-    if given.pairs is None:
-        raise ValueError(f"the reading {form!r} needs corresponding observations")
-    reading = observed_linear if form == "observed_linear" else observed_ldr
-    return reading(given.pairs, given.exposures, given.gammas, cfg, photometry)
+    if given.linear_j is None:
+        raise ValueError(f"the reading {form!r} needs the render of a second view")
+    if given.linear_j.shape != shape:
+        sizes = f"{shape} and {given.linear_j.shape}"
+        raise ValueError(f"the reading {form!r} subtracts renders of one size, not {sizes}")
+    if form == "exposed":
+        return exposed(given.linear_i, given.linear_j, e_j)
+    return literal_pixels(given.linear_i, given.linear_j, e_i, e_j)

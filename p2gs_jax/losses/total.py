@@ -20,6 +20,7 @@ from p2gs_jax.losses.relative_exposure import (
     relative_exposure_loss,
 )
 from p2gs_jax.photometry.appearance import Corrections, correction_of, regularisation
+from p2gs_jax.photometry.cameras import darkens, places
 from p2gs_jax.photometry.formation import formation
 from p2gs_jax.render import render_splats
 from p2gs_jax.render.blocks import Shown, splat
@@ -75,7 +76,9 @@ def decoded(batch: Batch) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"]]:
     return ldr / scale, batch.mask.astype(jnp.float32)
 
 
-def depth_pairs(render: Render, batch: Batch, other: Render, other_batch: Batch) -> ColorPairs:
+def depth_pairs(
+    render: Render, batch: Batch, other: Render, other_batch: Batch, placed: bool = False
+) -> ColorPairs:
     """Return the photographed colours of every pixel and of where depth finds it in another view.
 
     Args:
@@ -83,6 +86,7 @@ def depth_pairs(render: Render, batch: Batch, other: Render, other_batch: Batch)
         batch: its photograph.
         other: of the other view, with depth.
         other_batch: its photograph.
+        placed: say where in their images the colours are, as vignetting needs.
     """
     there = warp(surface_depth(render), batch.camera, surface_depth(other), other_batch.camera)
     (ldr, mask), (other_ldr, other_mask) = decoded(batch), decoded(other_batch)
@@ -90,6 +94,13 @@ def depth_pairs(render: Render, batch: Batch, other: Render, other_batch: Batch)
     seen = sample_bilinear(both, there.xy)
     valid = there.seen & (mask > 0) & (seen[..., 3] > ALL_UNMASKED)
     count = mask.size
+    positions = ()
+    if placed:
+        here = jnp.stack(jnp.meshgrid(*map(jnp.arange, mask.shape[::-1])), -1) + 0.5
+        positions = tuple(
+            places(xy.reshape(-1, 2), c.width, c.height)
+            for xy, c in ((here, batch.camera), (there.xy, other_batch.camera))
+        )
     return lax.stop_gradient(
         ColorPairs(
             ldr.reshape(-1, 3),
@@ -97,6 +108,7 @@ def depth_pairs(render: Render, batch: Batch, other: Render, other_batch: Batch)
             jnp.full(count, batch.view_index),
             jnp.full(count, other_batch.view_index),
             valid.reshape(-1).astype(jnp.float32),
+            *positions,
         )
     )
 
@@ -146,11 +158,10 @@ def image_loss(
         )
     render, *others = renders
     entries, overflow = render.count, render.overflow
-    exposures, gammas = photometry.exposures, photometry.gammas
     i, j = batch.view_index, partner.view_index
     correction = correction_of(appearance, i)
     photograph, mask = decoded(batch)
-    ldr = formation(render.linear, exposures[i], gammas[i], cfg.photometry, correction)
+    ldr = formation(render.linear, photometry.capture(i), cfg.photometry, correction)
     terms = dict(photometric_loss(ldr, photograph, mask, cfg.loss))
 
     if relative.weight is not None:
@@ -159,10 +170,10 @@ def image_loss(
             entries = jnp.maximum(entries, other.count)
             overflow = overflow | other.overflow
         if through_depth and other is not None and partner.batch is not None:
-            pairs = depth_pairs(render, batch, other, partner.batch)
+            pairs = depth_pairs(render, batch, other, partner.batch, darkens(cfg.photometry))
         linear_j = None if other is None else other.linear
         terms["relative_exposure"] = relative.weight * relative_exposure_loss(
-            ExposurePairs(render.linear, linear_j, i, j, exposures, gammas, pairs),
+            ExposurePairs(render.linear, linear_j, i, j, photometry, pairs),
             cfg.loss,
             cfg.photometry,
         )

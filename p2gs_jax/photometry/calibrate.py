@@ -10,7 +10,7 @@ from typing import Literal
 from p2gs_jax.config import FitConfig
 from p2gs_jax.photometry.adjustment.fit import fit_model
 from p2gs_jax.photometry.adjustment.problem import KnownExposures, Problem, make_problem
-from p2gs_jax.photometry.models import ModelName
+from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.observations import COARSEST, Observations
 from p2gs_jax.photometry.one_response import solve_response
 from p2gs_jax.photometry.response import Response
@@ -18,7 +18,7 @@ from p2gs_jax.photometry.selection import Selection, select
 from p2gs_jax.scene.known_exposures import read_known_exposures
 from p2gs_jax.types import Scene
 
-Choice = Literal["held_out", "one_response"] | tuple[ModelName, Response]
+Choice = Literal["held_out", "one_response"] | tuple[Form, Response]
 
 
 @dataclass(frozen=True)
@@ -75,14 +75,14 @@ def options_of(cfg: FitConfig, scene: Scene) -> CalibrationOptions:
         pivot=p.pivot,
         known=known,
         seed=cfg.train.seed,
-        choice="held_out" if p.select else (p.model, given),
+        choice="held_out" if p.select else (Form(p.model, p.white_balance, p.vignetting), given),
     )
 
 
 def calibrate_observations(
     observations: Observations,
     options: CalibrationOptions,
-    on_chosen: Callable[[ModelName, Response], None] = lambda model, response: None,
+    on_chosen: Callable[[Form, Response], None] = lambda form, response: None,
 ) -> Selection:
     """Choose the photometric model and solve it.
 

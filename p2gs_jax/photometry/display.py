@@ -1,4 +1,7 @@
-"""From radiance to a picture: an exposure, a gamma, a tone curve, and what else a view does."""
+"""From radiance to a picture: an exposure, a gamma, a tone curve, and what else a view does.
+
+A transform without a camera shows no vignetting, and the response of no camera in particular.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,11 @@ import numpy as np
 from jaxtyping import Array, Float, Float32
 
 from p2gs_jax.config import PhotometryConfig
-from p2gs_jax.photometry.formation import display, formation, inverse_tone_map
+from p2gs_jax.core.numerics import LN2, on_host
+from p2gs_jax.photometry.appearance import Correction, correction_of, without_place
+from p2gs_jax.photometry.formation import display, formation, inverse_formation
+from p2gs_jax.photometry.spline_curve import by_camera
+from p2gs_jax.types import Capture, Params
 
 Curve = Literal["power", "srgb", "spline", "linear"]
 CURVES: tuple[Curve, ...] = get_args(Curve)
@@ -24,14 +31,65 @@ class DisplayTransform:
     Attributes:
         exposure: e > 0, in the run's gauge.
         gamma: > 0.
-        formation: base curve, pivot, clamping, kind of correction.
+        formation: base curve, pivot, clamping, cameras, kind of correction.
         correction: of display values (photometry/appearance.py), or None.
+        white_balance: log factors on red, green, blue beside the exposure; None: all 1.
+        camera: row in `formation.cameras`, whose vignetting and response it has; None: no camera's.
     """
 
     exposure: float
     gamma: float
     formation: PhotometryConfig
-    correction: Float[Array, "..."] | None = None
+    correction: Correction | None = None
+    white_balance: tuple[float, float, float] | None = None
+    camera: int | None = None
+
+    @property
+    def capture(self) -> Capture:
+        """What it does to light, for `formation`."""
+        w = self.white_balance
+        return on_host(
+            Capture,
+            np.float32(self.exposure),
+            np.float32(self.gamma),
+            None if w is None else np.asarray(w, np.float32),
+            None if self.camera is None else np.int32(self.camera),
+        )
+
+    @property
+    def factors(self) -> Float[np.ndarray, " 3"]:
+        """Exposure times white balance of each channel."""
+        w = (0.0, 0.0, 0.0) if self.white_balance is None else self.white_balance
+        return self.exposure * np.exp(np.asarray(w, float))
+
+    @property
+    def white_balance_ev(self) -> tuple[float, float]:
+        """Gains of red and of blue over green, stops."""
+        red, green, blue = (0.0, 0.0, 0.0) if self.white_balance is None else self.white_balance
+        return (red - green) / LN2, (blue - green) / LN2
+
+    def with_white_balance_ev(self, red: float, blue: float) -> DisplayTransform:
+        """Return the transform with gains of red and blue over green; the exposure stays.
+
+        Args:
+            red: stops.
+            blue: stops.
+        """
+        mean = (red + blue) / 3
+        balance = ((red - mean) * LN2, -mean * LN2, (blue - mean) * LN2)
+        return replace(self, white_balance=balance)
+
+    def without_place(self) -> DisplayTransform:
+        """Return the transform for what lies nowhere in an image: without vignetting.
+
+        The response of the camera stays, and of a correction what is the same everywhere.
+        """
+        kept = without_place(self.correction, self.formation.appearance)
+        plain = self if kept is self.correction else replace(self, correction=kept)
+        if self.camera is None:
+            return plain
+        cameras = tuple(replace(c, vignetting=()) for c in self.formation.cameras)
+        return replace(plain, formation=replace(self.formation, cameras=cameras))
 
     def with_curve(self, curve: Curve) -> DisplayTransform:
         """Return the transform under another base curve; a correction belongs to the old one.
@@ -41,7 +99,7 @@ class DisplayTransform:
         """
         if curve == self.formation.curve:
             return self
-        if curve == "spline" and self.formation.spline is None:
+        if curve == "spline" and self.formation.spline is None and not by_camera(self.formation):
             raise ValueError("the run has no spline")
         return replace(self, formation=replace(self.formation, curve=curve), correction=None)
 
@@ -51,23 +109,26 @@ def develop(
 ) -> Float32[np.ndarray, "... 3"]:
     """Return display values in [0, 1] of linear radiance.
 
-    Exposure, gamma and correction are traced: changing them compiles nothing.
+    All but the configuration is traced: changing it compiles nothing.
 
     Args:
-        linear: radiance; an image where there is a correction.
+        linear: radiance; an image where there is a correction or vignetting.
         transform: how to show it.
     """
-    e, g = np.float32(transform.exposure), np.float32(transform.gamma)
-    return np.asarray(_develop(linear, e, g, transform.correction, transform.formation))
+    return np.asarray(
+        _develop(linear, transform.capture, transform.correction, transform.formation)
+    )
 
 
 @functools.partial(jax.jit, static_argnames="cfg")
-def _develop(linear, exposure, gamma, correction, cfg: PhotometryConfig):
-    return display(formation(linear, exposure, gamma, cfg, correction))
+def _develop(linear, capture, correction, cfg: PhotometryConfig):
+    return display(formation(linear, capture, cfg, correction))
 
 
 def undevelop(
-    ldr: Float[Array, "... 3"] | Float[np.ndarray, "... 3"], transform: DisplayTransform
+    ldr: Float[Array, "... 3"] | Float[np.ndarray, "... 3"],
+    transform: DisplayTransform,
+    positions: Float[np.ndarray, "... 2"] | None = None,
 ) -> Float32[np.ndarray, "... 3"]:
     """Return the linear radiance that a photograph shows: the inverse of `develop`.
 
@@ -77,11 +138,37 @@ def undevelop(
     Args:
         ldr: display values.
         transform: how it was taken.
+        positions: of loose pixels, where vignetting counts (photometry/cameras.py:places).
     """
-    e, g = np.float32(transform.exposure), np.float32(transform.gamma)
-    return np.asarray(_undevelop(ldr, e, g, transform.formation))
+    return np.asarray(_undevelop(ldr, transform.capture, positions, transform.formation))
 
 
 @functools.partial(jax.jit, static_argnames="cfg")
-def _undevelop(ldr, exposure, gamma, cfg: PhotometryConfig):
-    return inverse_tone_map(ldr, gamma, cfg) / exposure
+def _undevelop(ldr, capture, positions, cfg: PhotometryConfig):
+    return inverse_formation(ldr, capture, cfg, positions)
+
+
+def display_of_view(params: Params, row: int, cfg: PhotometryConfig) -> DisplayTransform:
+    """Return how a training view was taken.
+
+    Args:
+        params: the fit; of its small arrays, host ones compile nothing.
+        row: of the view in `Photometry`.
+        cfg: the formation model.
+    """
+    taken = jax.tree.map(np.asarray, params.photometry).capture(row)
+    plain = DisplayTransform(1.0, 1.0, cfg, correction_of(params.appearance, row))
+    return with_capture(plain, taken)
+
+
+def with_capture(transform: DisplayTransform, taken: Capture) -> DisplayTransform:
+    """Return a transform that does to light what a photograph did."""
+    balance = taken.white_balance
+    red, green, blue = (0.0, 0.0, 0.0) if balance is None else map(float, balance)
+    return replace(
+        transform,
+        exposure=float(taken.exposure),
+        gamma=float(taken.gamma),
+        white_balance=None if balance is None else (red, green, blue),
+        camera=None if taken.camera is None else int(taken.camera),
+    )

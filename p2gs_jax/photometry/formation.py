@@ -2,7 +2,10 @@
 
 Paper: y = clamp(clamp(eL, 1e-6, 10)^(1/gamma), 0, 1). Robust (docs/photometry.md, 4):
 y = OETF(x0 (eL/x0)^(2.2/gamma)) with a pivot x0 at mid-grey that a change of gamma leaves alone,
-continued above 1 so that over-bright predictions keep a gradient.
+continued above 1 so that over-bright predictions keep a gradient. Where a scene needs it, e L is
+e W V L with the white balance W of the view and the vignetting V of its camera
+(photometry/cameras.py), and each camera has an OETF of its own (photometry/spline_curve.py). What
+is not modelled leaves the trace.
 
 All functions compute with numpy on host arrays and with JAX on others (`numerics.namespace`).
 """
@@ -12,44 +15,23 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.core.numerics import Scalar, Values, namespace, positive_pow, safe_log
-from p2gs_jax.photometry.appearance import corrected
-from p2gs_jax.photometry.response import DARKEST, Response, log_exposed
-from p2gs_jax.types import GAMMA_SRGB
+from p2gs_jax.photometry.appearance import Correction, corrected
+from p2gs_jax.photometry.cameras import darkens, log_vignetting, squared_radii
+from p2gs_jax.photometry.spline_curve import decode, encode
+from p2gs_jax.types import GAMMA_SRGB, Capture
 
 EXPOSED_FLOOR, EXPOSED_CEILING = 1e-6, 10.0  # paper, Tone-mapping estimation
 SRGB_LINEAR_END, SRGB_ENCODED_END = 0.0031308, 0.04045
 # Darkest photographed value that is inverted: half a code of 8 bits.
 LDR_FLOOR = 0.5 / 255.0
-SPLINE_TABLE = 1024
-
-
-def _spline_table(cfg: PhotometryConfig) -> tuple[float, float, np.ndarray]:
-    """Return (first log value, step, display values) of a response over equal steps of log x."""
-    if cfg.spline is None:
-        raise ValueError("the curve 'spline' needs the values of its spline")
-    y = np.linspace(DARKEST, 1.0, 4096)
-    z = np.maximum.accumulate(log_exposed(y, Response("srgb", cfg.spline))[0])
-    z = z + 1e-9 * np.arange(len(z))
-    grid = np.linspace(z[0], z[-1], SPLINE_TABLE)
-    return float(grid[0]), float(grid[1] - grid[0]), np.interp(grid, z, y)
-
-
-def _spline_encode(log_linear: Values, cfg: PhotometryConfig) -> Values:
-    """Encode through the table; linear in x below it, linear in log x above it."""
-    xp = namespace(log_linear)
-    first, step, table = _spline_table(cfg)
-    place = (log_linear - first) / step
-    left = xp.clip(xp.floor(place), 0, SPLINE_TABLE - 2).astype(np.int32)
-    values = xp.asarray(table, log_linear.dtype)
-    # Above the table the last segment goes on, so that over-bright predictions keep a gradient.
-    inside = values[left] + (place - left) * (values[left + 1] - values[left])
-    dark = place < 0
-    below = float(table[0]) * xp.exp(xp.where(dark, log_linear - first, 0.0))
-    return xp.where(dark, below, inside)
+# A row of `PhotometryConfig.cameras`, one for every pixel, or None where it makes no difference.
+CameraRow = Int[Array, "..."] | int | None
+# Of loose pixels in their images, from the centre in units of half the diagonal.
+Positions = Float[Array, "*n 2"] | Float[np.ndarray, "*n 2"] | None
 
 
 def oetf(linear: Values, curve: str) -> Values:
@@ -76,18 +58,59 @@ def eotf(encoded: Values, curve: str) -> Values:
     return xp.where(toe, encoded / 12.92, positive_pow(base, 2.4, 1e-3))
 
 
-def expose(linear: Float[Array, "..."], exposure: Float[Array, ""]) -> Float[Array, "..."]:
-    """Return e L (paper, eq. 4)."""
-    return exposure * linear
+def gain(
+    shape: tuple[int, ...],
+    capture: Capture,
+    cfg: PhotometryConfig,
+    positions: Positions = None,
+) -> Any:
+    """Return e W V: what exposed radiance is of radiance, shaped to broadcast against it.
+
+    Args:
+        shape: of the radiance: of an image, or of loose pixels.
+        capture: of the view, or of each pixel.
+        cfg: the vignetting of cameras.
+        positions: of loose pixels, from the image's centre in units of half its diagonal; None: of
+            an image, or of pixels that have no place.
+
+    Raises:
+        ValueError: vignetting is modelled, and nobody knows where in the image the pixels lie.
+    """
+    e = _by_pixel(capture.exposure)
+    logs: Any = capture.white_balance
+    if capture.camera is not None and darkens(cfg):
+        squared: Any
+        if positions is not None:
+            squared = (positions**2).sum(-1)
+        elif len(shape) == 3 and not np.ndim(capture.camera):
+            squared = squared_radii(*shape[:2], namespace(e, logs, capture.camera))
+        else:
+            raise ValueError("vignetting needs an image, or the positions of pixels in theirs")
+        shade = log_vignetting(squared, capture.camera, cfg)
+        logs = shade if logs is None else logs + shade
+    return e if logs is None else e * namespace(e, logs).exp(logs)
 
 
-def tone_map(exposed: Values, gamma: Scalar, cfg: PhotometryConfig) -> Values:
+def expose(
+    linear: Values,
+    capture: Capture,
+    cfg: PhotometryConfig,
+    positions: Positions = None,
+) -> Values:
+    """Return e W V L (paper, eq. 4: e L); see `gain`."""
+    return gain(linear.shape, capture, cfg, positions) * linear
+
+
+def tone_map(
+    exposed: Values, gamma: Scalar, cfg: PhotometryConfig, camera: CameraRow = None
+) -> Values:
     """Return the display-encoded image of exposed radiance.
 
     Args:
         exposed: e L, any value; below 1e-6 it counts as 1e-6 with zero gradient.
         gamma: > 0; dT/dgamma = -(ln x / gamma^2) x^(1/gamma) in the paper's form.
         cfg: base curve, pivot, clamping.
+        camera: row in `cfg.cameras`, where cameras have curves of their own.
     """
     xp = namespace(exposed, gamma)
     if cfg.clamp:
@@ -104,7 +127,7 @@ def tone_map(exposed: Values, gamma: Scalar, cfg: PhotometryConfig) -> Values:
         elif cfg.curve == "linear":
             y = xp.exp(log_linear)
         elif cfg.curve == "spline":
-            y = _spline_encode(log_linear, cfg)
+            y = encode(log_linear, cfg, camera)
         else:
             toe = log_linear <= float(np.log(SRGB_LINEAR_END))
             low = 12.92 * xp.exp(xp.where(toe, log_linear, 0.0))
@@ -113,17 +136,23 @@ def tone_map(exposed: Values, gamma: Scalar, cfg: PhotometryConfig) -> Values:
     return xp.clip(y, 0.0, 1.0) if cfg.clamp else y
 
 
-def inverse_tone_map(ldr: Values, gamma: Scalar, cfg: PhotometryConfig) -> Values:
-    """Return the exposed radiance e L of display values; values below half a code count as that."""
+def inverse_tone_map(
+    ldr: Values, gamma: Scalar, cfg: PhotometryConfig, camera: CameraRow = None
+) -> Values:
+    """Return the exposed radiance e L of display values; values below half a code count as that.
+
+    Args:
+        ldr: display values.
+        gamma: > 0.
+        cfg: base curve, pivot.
+        camera: row in `cfg.cameras`, where cameras have curves of their own.
+    """
     xp = namespace(ldr, gamma)
     y = xp.maximum(ldr, LDR_FLOOR)
     if cfg.curve == "power" and cfg.pivot == 1.0:
         return xp.exp(gamma * xp.log(y))
     if cfg.curve == "spline":
-        first, step, table = _spline_table(cfg)
-        logs = first + step * np.arange(SPLINE_TABLE)
-        # numpy's interp computes and returns double precision.
-        log_linear = xp.interp(y, table.astype(y.dtype), logs.astype(y.dtype)).astype(y.dtype)
+        log_linear = decode(y, cfg, camera)
     else:
         log_linear = xp.log(eotf(y, cfg.curve))
     log_pivot = float(np.log(cfg.pivot))
@@ -131,25 +160,52 @@ def inverse_tone_map(ldr: Values, gamma: Scalar, cfg: PhotometryConfig) -> Value
 
 
 def formation(
-    linear: Float[Array, "..."],
-    exposure: Float[Array, ""],
-    gamma: Float[Array, ""],
+    linear: Values,
+    capture: Capture,
     cfg: PhotometryConfig,
-    appearance: Float[Array, "..."] | None = None,
-) -> Float[Array, "..."]:
-    """Return T(e L): what the camera records of radiance `linear`.
+    correction: Correction | None = None,
+    positions: Positions = None,
+) -> Values:
+    """Return T(e W V L): what the camera records of radiance `linear`.
 
     Args:
         linear: radiance; an image where there is a correction.
-        exposure: e.
-        gamma: of T.
-        cfg: base curve, pivot, clamping, kind of correction.
-        appearance: the view's correction of display values, or None.
+        capture: exposure, gamma, white balance and camera: of the view, or of each pixel.
+        cfg: base curve, pivot, clamping, cameras, kind of correction.
+        correction: of the view's display values, or None.
+        positions: where the pixels lie, if `linear` is no image and vignetting counts; see `gain`.
     """
-    ldr = tone_map(expose(linear, exposure), gamma, cfg)
-    if cfg.appearance is None or appearance is None:
+    exposed = expose(linear, capture, cfg, positions)
+    ldr: Any = tone_map(exposed, _by_pixel(capture.gamma), cfg, capture.camera)
+    if cfg.appearance is None or correction is None:
         return ldr
-    return corrected(ldr, appearance, cfg.appearance)
+    shown: Any = corrected(ldr, correction, cfg.appearance)
+    return shown
+
+
+def inverse_formation(
+    ldr: Values,
+    capture: Capture,
+    cfg: PhotometryConfig,
+    positions: Positions = None,
+) -> Values:
+    """Return the radiance of display values: the inverse of `formation` below saturation.
+
+    Corrections are not undone.
+
+    Args:
+        ldr: display values; below half a code they count as that.
+        capture: of the view, or of each pixel.
+        cfg: base curve, pivot, cameras.
+        positions: as for `formation`.
+    """
+    exposed = inverse_tone_map(ldr, _by_pixel(capture.gamma), cfg, capture.camera)
+    return exposed / gain(ldr.shape, capture, cfg, positions)
+
+
+def _by_pixel(gamma: Any) -> Any:
+    """Return the gamma of a view as it is, and those of pixels with an axis for the channels."""
+    return gamma[..., None] if np.ndim(gamma) else gamma
 
 
 def display(ldr: Values) -> Values:

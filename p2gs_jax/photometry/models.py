@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
-import numpy as np
-from jaxtyping import Int
-
+from p2gs_jax.config import Level, VignettingKind
 from p2gs_jax.config import PhotometricModel as ModelName
 from p2gs_jax.photometry.response import Response
-
-Level = Literal["camera", "view"]
 
 
 class Model(NamedTuple):
@@ -39,25 +35,67 @@ MODELS: dict[ModelName, Model] = {
 }
 
 
-def distinct_models(cameras: Int[np.ndarray, " v"]) -> list[ModelName]:
-    """Return the models that differ: with one camera, "per camera" means "for all".
+# Powers of the radius in log V(r) = k1 r^2 + k2 r^4 + k3 r^6.
+VIGNETTING_POWERS = (2, 4, 6)
+
+
+class Form(NamedTuple):
+    """Everything that may vary: a model of exposures and gammas, and what cameras do besides.
+
+    Attributes:
+        model: of exposures and gammas.
+        white_balance: per what it varies; per view only where exposures do.
+        vignetting: whether cameras darken towards their corners, each channel in its own way or
+            all in the same.
+    """
+
+    model: ModelName
+    white_balance: Level | None = None
+    vignetting: VignettingKind | None = None
+
+    @property
+    def description(self) -> str:
+        """What reports call it."""
+        said = MODELS[self.model].description
+        if self.white_balance is not None:
+            said += f", a white balance per {self.white_balance}"
+        if self.vignetting is not None:
+            said += ", vignetting per camera"
+        if self.vignetting == "channel":
+            said += " and channel"
+        return said
+
+
+def possible(form: Form, cameras: int) -> bool:
+    """Return whether a form differs from every simpler one, and can be solved.
 
     Args:
-        cameras: physical camera of each view, 0, 1, ...
+        form: what varies.
+        cameras: number of physical cameras; with one, "per camera" means "for all".
     """
-    several = cameras.max(initial=0) > 0
-    return [name for name, m in MODELS.items() if several or "camera" not in (m.exposure, m.gamma)]
+    varies = MODELS[form.model]
+    levels = (varies.exposure, varies.gamma, form.white_balance)
+    if cameras < 2 and "camera" in levels:
+        return False
+    return form.white_balance != "view" or varies.exposure == "view"
 
 
-def parameter_count(model: ModelName, response: Response, cameras: int, views: int) -> int:
+def parameter_count(form: Form, response: Response, cameras: int, views: int) -> int:
     """Return the number of free parameters; each level loses one to its gauge.
 
     Args:
-        model: what varies.
-        response: adds those of its spline.
+        form: what varies.
+        response: adds those of its splines.
         cameras: number of physical cameras.
         views: number of views.
     """
     size = {None: 0, "camera": cameras - 1, "view": views - 1}
-    varies = MODELS[model]
-    return size[varies.exposure] + size[varies.gamma] + response.extra_parameters
+    rows = {None: 0, "camera": 1, "channel": 3}[form.vignetting]
+    varies = MODELS[form.model]
+    return (
+        size[varies.exposure]
+        + size[varies.gamma]
+        + 2 * size[form.white_balance]
+        + cameras * rows * len(VIGNETTING_POWERS)
+        + response.extra_parameters
+    )

@@ -51,7 +51,7 @@ class Observations:
     def decoded(self, response: Response):
         """Return log exposed radiance, its stated standard deviation and dz/dy, each (O, 3)."""
         y = np.asarray(self.colors, np.float64)
-        z, slope = log_exposed(y, response)
+        z, slope = log_exposed(y, response, self.cameras[self.views])
         return z, deviation(y, slope, self.spread, response.base), slope
 
     def usable(self, black: float, saturation: float) -> Float[np.ndarray, "o 3"]:

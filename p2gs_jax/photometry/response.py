@@ -1,7 +1,8 @@
 """From photographed values to log exposed radiance, with its uncertainty: z = F(y).
 
 F is the logarithm of a base curve's decoding, optionally changed by a spline: F(y) = log base^-1(y)
-+ B(y) c, with hat functions B over fixed knots. Host side, float64.
++ B(y) c, with hat functions B over fixed knots; cameras or channels may have splines of their own.
+Host side, float64.
 """
 
 from __future__ import annotations
@@ -11,6 +12,8 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
+
+from p2gs_jax.config import ResponseKind
 
 Base = Literal["srgb", "power"]
 BASES: tuple[Base, ...] = ("srgb", "power")
@@ -23,6 +26,7 @@ KNOTS = np.array(
 )
 HELD = (6, 16)
 FREE = tuple(k for k in range(len(KNOTS)) if k not in HELD)
+FREE_OF_EACH = tuple(k for k in range(len(KNOTS)) if k != HELD[0])
 DARKEST = 0.5 / 255
 # Noise model: 8-bit quantisation, photon and read noise (linear units), and a floor in log units
 # for what no model explains: texture, specularity, interpolation.
@@ -33,20 +37,27 @@ SMALLEST_SLOPE = 0.2
 
 @dataclass(frozen=True)
 class Response:
-    """A camera's response.
+    """A response: one for all photographs, or one for each camera or channel.
 
     Attributes:
-        base: curve that the spline is added to.
-        spline: values of log exposure added at `KNOTS`, or None.
+        base: curve that splines are added to.
+        spline: values of log exposure added at `KNOTS`, or None; where several are, their mean.
+        by: what has a spline of its own.
+        splines: of each camera, or of red, green and blue; empty where one is for all.
     """
 
     base: Base = "srgb"
     spline: tuple[float, ...] | None = None
+    by: ResponseKind = "all"
+    splines: tuple[tuple[float, ...], ...] = ()
 
     @property
     def name(self) -> str:
         """What reports call it."""
-        return self.base if self.spline is None else f"spline over {self.base}"
+        if self.spline is None:
+            return self.base
+        each = "" if self.by == "all" else f" per {self.by}"
+        return f"spline{each} over {self.base}"
 
     @property
     def curve(self) -> Literal["srgb", "power", "spline"]:
@@ -56,7 +67,39 @@ class Response:
     @property
     def extra_parameters(self) -> int:
         """Parameters besides those of the base curve."""
-        return 0 if self.spline is None else len(FREE)
+        if self.spline is None:
+            return 0
+        if self.by == "all":
+            return len(FREE)
+        # Of a power and a shape each, one power is a gauge.
+        return len(self.splines) * len(FREE_OF_EACH) - 1
+
+    @property
+    def each(self) -> tuple[tuple[float, ...], ...]:
+        """All its splines."""
+        if self.spline is None:
+            return ()
+        return self.splines or (self.spline,)
+
+
+def free_knots(by: ResponseKind) -> tuple[int, ...]:
+    """Return the knots that are solved for: of several splines, the powers differ as well."""
+    return FREE if by == "all" else FREE_OF_EACH
+
+
+def spline_groups(
+    by: ResponseKind, cameras: Int[np.ndarray, " o"], shape: tuple[int, ...]
+) -> Int[np.ndarray, "o 3"]:
+    """Return which spline decodes each value.
+
+    Args:
+        by: what has one of its own.
+        cameras: of each observation.
+        shape: of the values: observations and channels.
+    """
+    if by == "camera":
+        return np.broadcast_to(cameras[:, None], shape)
+    return np.broadcast_to(np.arange(3) if by == "channel" else 0, shape)
 
 
 def hat(y: Float[np.ndarray, "..."]) -> tuple[Int[np.ndarray, "..."], Float[np.ndarray, "..."]]:
@@ -78,16 +121,30 @@ def base_log(y: Float[np.ndarray, "..."], base: Base):
     )
 
 
-def log_exposed(y: Float[np.ndarray, "..."], response: Response):
-    """Return z = F(y) and dz/dy."""
+def log_exposed(
+    y: Float[np.ndarray, "..."],
+    response: Response,
+    cameras: Int[np.ndarray, " o"] | None = None,
+):
+    """Return z = F(y) and dz/dy.
+
+    Args:
+        y: display values; (o, 3) where splines are several.
+        response: the curve.
+        cameras: of each observation, where cameras have splines of their own.
+    """
     z, slope = base_log(y, response.base)
-    if response.spline is not None:
-        c = np.asarray(response.spline)
-        left, t = hat(y)
-        z = z + (1 - t) * c[left] + t * c[left + 1]
-        steeper = (c[left + 1] - c[left]) / (KNOTS[left + 1] - KNOTS[left])
-        slope = np.maximum(slope + steeper, SMALLEST_SLOPE * slope)
-    return z, slope
+    if response.spline is None:
+        return z, slope
+    table = np.asarray(response.each, np.float64)
+    group: Int[np.ndarray, "..."] | int = 0
+    if response.splines:
+        of_camera = np.zeros(len(y), int) if cameras is None else cameras
+        group = spline_groups(response.by, of_camera, np.shape(y))
+    left, t = hat(y)
+    low, high = table[group, left], table[group, left + 1]
+    steeper = (high - low) / (KNOTS[left + 1] - KNOTS[left])
+    return z + (1 - t) * low + t * high, np.maximum(slope + steeper, SMALLEST_SLOPE * slope)
 
 
 def deviation(
@@ -113,11 +170,16 @@ def deviation(
 def monotone(response: Response) -> bool:
     """Return whether the response rises everywhere between its outer knots."""
     y = np.linspace(KNOTS[0], KNOTS[-1], 400)
-    return bool(np.all(np.diff(log_exposed(y, response)[0]) > 0))
+    return all(np.all(np.diff(log_exposed(y, one)[0]) > 0) for one in _apart(response))
 
 
 def log_slope_minimum(response: Response) -> float:
     """Return the smallest d log exposure / d log value over mid tones; a collapse shows here."""
     y = np.linspace(0.06, 0.94, 90)
-    z = log_exposed(y, response)[0]
-    return float(np.gradient(z, np.log(y)).min())
+    logs = [log_exposed(y, one)[0] for one in _apart(response)]
+    return min(float(np.gradient(z, np.log(y)).min()) for z in logs)
+
+
+def _apart(response: Response) -> list[Response]:
+    """Return the curves of a response, one for all each."""
+    return [Response(response.base, s) for s in response.each] or [response]

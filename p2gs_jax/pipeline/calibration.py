@@ -89,7 +89,9 @@ class Calibration:
             "agreement": self.agreement._asdict(),
             "candidates": [
                 {
-                    "model": c.model,
+                    "model": c.form.model,
+                    "white_balance": c.form.white_balance,
+                    "vignetting": c.form.vignetting,
                     "curve": c.response.name,
                     "parameters": c.parameters,
                     "density": c.density,

@@ -71,7 +71,7 @@ def finish(
     def on_view(result: ViewResult) -> None:
         view = scene.views[result.index]
         if view.split == "test":
-            fitted[result.index] = result.exposure
+            fitted[result.index] = result.transform.exposure
             with watch("files"):
                 write_view(folder.renders, view.name, result, store)
         if result.index in picks:

@@ -33,7 +33,7 @@ from p2gs_jax.gaussians.population import Coverage
 from p2gs_jax.losses.relative_exposure import ColorPairs
 from p2gs_jax.photometry.calibrate import calibrate_observations, options_of
 from p2gs_jax.photometry.initial import initial_appearance, initial_photometry, point_radiance
-from p2gs_jax.photometry.models import ModelName
+from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import Response
 from p2gs_jax.photometry.selection import Selection
@@ -243,7 +243,7 @@ def _solve(
     store: ImageStore,
     cfg: FitConfig,
     reporter: Reporter,
-    on_chosen: Callable[[ModelName, Response], None],
+    on_chosen: Callable[[Form, Response], None],
     *,
     dense: bool,
     kept: Decisions | None,

@@ -16,10 +16,10 @@ from p2gs_jax.config import FitConfig, PhotometryConfig, from_dict
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.ply import read_ply
-from p2gs_jax.photometry.appearance import identity
-from p2gs_jax.photometry.display import DisplayTransform
-from p2gs_jax.photometry.mean import MeanParameters, mean_parameters
+from p2gs_jax.photometry.display import DisplayTransform, display_of_view
+from p2gs_jax.photometry.mean import MeanParameters, mean_parameters, usual_display
 from p2gs_jax.render.host import RenderView, make_renderer
+from p2gs_jax.run.appearance_file import read_appearance
 from p2gs_jax.run.decisions import read_decisions
 from p2gs_jax.run.layout import RunFolder
 from p2gs_jax.run.photometry_file import AGAIN, PhotometryFile, read_photometry
@@ -128,35 +128,34 @@ class Run:
         return mean_parameters(self.params.photometry)
 
     def own_display(self, index: int) -> DisplayTransform:
-        """Return how a view was taken; a held-out view's exposure is that fitted to its photograph.
+        """Return how a view was taken.
+
+        Of a held-out view the exposure is that fitted to its photograph, all else is as usual for
+        its camera.
 
         Args:
             index: row in `scene.views`.
         """
         if index in self.scene.train_indices:
             row = self.scene.train_indices.index(index)
-            p = self.params.photometry
-            e, g = float(p.exposures[row]), float(p.gammas[row])
-            return DisplayTransform(e, g, self.cfg.photometry, self.params.correction(row))
-        name = self.scene.views[index].name
-        fitted = {v["image"]: v["exposure_fitted"] for v in self.photometry["views"]}.get(name)
-        if fitted is None:
-            return self.common_display()
-        return replace(self.common_display(), exposure=fitted)
+            return display_of_view(self.params, row, self.cfg.photometry)
+        view = self.scene.views[index]
+        usual = self._usual(view.camera)
+        fitted = {v["image"]: v["exposure_fitted"] for v in self.photometry["views"]}.get(view.name)
+        return usual if fitted is None else replace(usual, exposure=fitted)
 
     def common_display(self, exposure_ev: float = 0.0) -> DisplayTransform:
-        """Return one look for all views.
+        """Return one look for all views: of no camera in particular, without vignetting.
 
         Args:
             exposure_ev: stops from the geometric mean of the training views' exposures.
         """
-        mean = self.mean
-        return DisplayTransform(
-            mean.exposure_geometric * 2**exposure_ev,
-            mean.gamma,
-            self.cfg.photometry,
-            self.params.mean_correction,
-        )
+        usual = self._usual(None)
+        return replace(usual, exposure=usual.exposure * 2**exposure_ev)
+
+    def _usual(self, camera: str | None) -> DisplayTransform:
+        taken_by = [view.camera for view in self.scene.training_views]
+        return usual_display(self.params, taken_by, camera, self.cfg.photometry)
 
 
 def resolved(cfg: PhotometryConfig, saved: PhotometryFile) -> PhotometryConfig:
@@ -204,7 +203,8 @@ def load_run(folder: str | Path, scene: str | Path | None = None) -> Run:
     else:
         cfg = decisions.resolve(asked)
     photometry = _photometry(photometry_file, found, cfg, files)
-    appearance = _appearance(files.appearance, cfg, len(found.train_indices))
+    kind, views = cfg.photometry.appearance, found.training_views
+    appearance = None if kind is None else read_appearance(files.appearance(kind), kind, views)
     return Run(
         files.root,
         Params(gaussians, photometry, appearance),
@@ -282,18 +282,3 @@ def _load_scene(saved: dict[str, Any], given: Path | None, cfg: FitConfig, folde
             fix="put it back, or name its folder with --scene",
         )
     return load_scene(root, cfg.data, folder / "cache", lambda text: None)
-
-
-def _appearance(path: Path, cfg: FitConfig, views: int):
-    """Return the corrections of display values that the run learned, or None."""
-    if cfg.photometry.appearance is None:
-        return None
-    try:
-        corrections = np.load(path, allow_pickle=False)
-    except (OSError, ValueError) as error:
-        raise UserError(
-            f"{path} cannot be read: {error}.", fix="finish the fit again with --resume"
-        ) from error
-    if corrections.shape != identity(cfg.photometry.appearance, views).shape:
-        raise UserError(f"{path} does not belong to this run.", fix="fit again")
-    return on_device(corrections)

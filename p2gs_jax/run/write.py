@@ -11,17 +11,18 @@ import numpy as np
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.config import to_dict as config_to_dict
-from p2gs_jax.core.atomic import write_array, write_json
+from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.numerics import LN2, evenly_spaced
 from p2gs_jax.evaluate.evaluate import ViewResult
 from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.formats.ply import write_ply, write_radiance
 from p2gs_jax.formats.png import write_png
 from p2gs_jax.gaussians.bake import bake, display_comments, display_of_splats
-from p2gs_jax.photometry.display import DisplayTransform, develop
-from p2gs_jax.photometry.mean import MeanParameters, mean_parameters
+from p2gs_jax.photometry.display import develop
+from p2gs_jax.photometry.mean import mean_parameters, usual_display
 from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.render.spherical_harmonics import MAX_DEGREE
+from p2gs_jax.run.appearance_file import write_appearance
 from p2gs_jax.run.decisions import Decisions, write_decisions
 from p2gs_jax.run.layout import RunFolder
 from p2gs_jax.run.photometry_file import ViewPhotometry, write_photometry
@@ -97,9 +98,10 @@ def write_results(
         mean=dataclasses.asdict(mean),
         views=_photometry_views(params, scene, fitted, solution),
     )
-    if params.appearance is not None:
-        write_array(folder.appearance, np.asarray(params.appearance))
-    _write_summary(folder.summary, shown, params, scene, mean, cfg, true_ev)
+    kind = cfg.photometry.appearance
+    if kind is not None:
+        write_appearance(folder.appearance(kind), params.appearance, scene.training_views)
+    _write_summary(folder.summary, shown, params, scene, cfg, true_ev)
 
 
 def write_view(folder: Path, name: str, result: ViewResult, store: ImageStore) -> None:
@@ -112,8 +114,8 @@ def write_view(folder: Path, name: str, result: ViewResult, store: ImageStore) -
         result.linear,
         depth=result.depth,
         alpha=result.alpha,
-        exposure=result.exposure,
-        gamma=result.gamma,
+        exposure=result.transform.exposure,
+        gamma=result.transform.gamma,
         camera=camera,
     )
     write_png(stem.with_name(f"{stem.name}.render.png"), result.ldr)
@@ -130,12 +132,8 @@ def summary_rows(scene: Scene) -> list[int]:
 
 def _write_models(folder: RunFolder, params: Params, cfg: FitConfig) -> None:
     """Write `splats.ply` (display colours) and `radiance.ply` (linear)."""
-    mean = mean_parameters(params.photometry)
     alive = np.ones(params.gaussians.capacity, bool)
-    transform = DisplayTransform(
-        mean.exposure_geometric, mean.gamma, cfg.photometry, params.mean_correction
-    )
-    transform = display_of_splats(transform)
+    transform = display_of_splats(usual_display(params, (), None, cfg.photometry))
     shown = bake(params.gaussians, transform, cfg.render.radiance, MAX_DEGREE)
     write_ply(folder.splats, shown, display_comments(transform))
     write_radiance(folder.radiance, params.gaussians, alive, activation=cfg.render.radiance)
@@ -202,13 +200,10 @@ def _write_summary(
     shown: Sequence[ViewResult],
     params: Params,
     scene: Scene,
-    mean: MeanParameters,
     cfg: FitConfig,
     true_ev: np.ndarray | None,
 ) -> None:
-    common = DisplayTransform(
-        mean.exposure_geometric, mean.gamma, cfg.photometry, params.mean_correction
-    )
+    common = usual_display(params, (), None, cfg.photometry)
     train = scene.training_views
     exif = [v.exif_ev for v in train]
     write_summary(

@@ -80,7 +80,7 @@ class ImageStore:
             views: of the scene.
             cfg: `max_width` and `cache_mb`.
         """
-        self._views = tuple(views)
+        self.views = tuple(views)
         self._max_width = cfg.max_width
         self._limit = cfg.cache_mb * 2**20
         self._cache: OrderedDict[tuple[int, int, int], _Entry] = OrderedDict()
@@ -135,7 +135,7 @@ class ImageStore:
         self, index: int, shrink: float = 1.0
     ) -> tuple[Float32[np.ndarray, "4 4"], Float32[np.ndarray, "3 3"], int, int]:
         """Return viewmat, K, width and height of a view at the size that `get` gives it."""
-        view = self._views[index]
+        view = self.views[index]
         return (view.viewmat, *camera_at(view, self._max_width, shrink))
 
     def prefetch(self, index: int, shrink: float = 1.0) -> None:
@@ -160,7 +160,7 @@ class ImageStore:
             self._bytes = 0
 
     def _key(self, index: int, shrink: float) -> tuple[int, int, int]:
-        return (index, *size_at(self._views[index], self._max_width, shrink))
+        return (index, *size_at(self.views[index], self._max_width, shrink))
 
     def _load_pending(self, key: tuple[int, int, int]) -> _Entry:
         try:
@@ -171,7 +171,7 @@ class ImageStore:
 
     def _load(self, key: tuple[int, int, int]) -> _Entry:
         index, width, height = key
-        entry = _prepare(self._views[index], width, height)
+        entry = _prepare(self.views[index], width, height)
         with self._lock:
             if key not in self._cache:
                 self._cache[key] = entry

@@ -9,6 +9,7 @@ from p2gs_jax.core.numerics import on_device
 from p2gs_jax.errors import UserError
 from p2gs_jax.losses.relative_exposure import ColorPairs
 from p2gs_jax.losses.total import OBSERVED_FORMS
+from p2gs_jax.photometry.cameras import darkens
 from p2gs_jax.photometry.observations import Observations, overlapping_views, sample_pairs
 
 PAIR_POOL = 200_000
@@ -41,7 +42,17 @@ def color_pairs(tracks: Observations | None, cfg: FitConfig) -> ColorPairs | Non
         on_device(tracks.views[first], np.int32),
         on_device(tracks.views[second], np.int32),
         on_device(np.ones(len(first))),
+        *_positions(tracks, (first, second), cfg),
     )
+
+
+def _positions(tracks: Observations, picks, cfg: FitConfig):
+    """Return where in their images observations lie; nothing where no camera has vignetting."""
+    if not darkens(cfg.photometry):
+        return ()
+    if tracks.positions is None:
+        raise ValueError("vignetting is modelled, and nobody knows where in the images points lie")
+    return tuple(on_device(tracks.positions[pick]) for pick in picks)
 
 
 def overlaps(tracks: Observations | None, cfg: FitConfig) -> list[np.ndarray] | None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Array, Bool
 
@@ -12,9 +13,8 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.alignment import fit_exposure
 from p2gs_jax.evaluate.metrics import psnr
-from p2gs_jax.photometry.appearance import mean_correction
-from p2gs_jax.photometry.formation import display, formation
-from p2gs_jax.photometry.mean import mean_parameters
+from p2gs_jax.photometry.display import develop, display_of_view
+from p2gs_jax.photometry.mean import usual_display
 from p2gs_jax.render.host import make_renderer
 from p2gs_jax.train.views import TrainingViews
 from p2gs_jax.types import Params
@@ -74,27 +74,28 @@ def make_judge(
         views: the training views.
         rows: which of them.
         cfg: renderer and formation model.
-        own_exposures: compare under the view's exposure and gamma, which then must come from
-            elsewhere than the optimisation; else under the mean gamma and the one exposure that
-            fits best, as for test views.
+        own_exposures: compare under the view's exposure, gamma and white balance, which then must
+            come from elsewhere than the optimisation; else under the mean ones and the one exposure
+            that fits best, as for test views.
     """
-    render = make_renderer(cfg.render)
+    render, tone = make_renderer(cfg.render), cfg.photometry
 
     def judge(params: Params, alive: Bool[Array, " n"]) -> float:
-        mean_gamma = jnp.float32(mean_parameters(params.photometry).gamma)
+        small = jax.tree.map(np.asarray, dataclasses.replace(params, gaussians=None))
+        taken_by = [views.store.views[i].camera for i in views.rows]
         scores = []
         for row in rows:
-            camera = views.store.views[views.rows[row]].camera
-            correction = mean_correction(params.appearance, camera)
             photograph, mask = views.store.get(views.rows[row])
             linear = render(params.gaussians, alive, views.camera(row, 1)).linear
+            transform = usual_display(small, taken_by, taken_by[row], tone)
             if own_exposures:
-                gamma = params.photometry.gammas[row]
-                exposure = params.photometry.exposures[row]
+                own = display_of_view(small, row, tone)
+                transform = dataclasses.replace(own, correction=transform.correction)
             else:
-                gamma = mean_gamma
-                exposure = fit_exposure(linear, photograph, mask, gamma, cfg.photometry, correction)
-            ldr = display(formation(linear, exposure, gamma, cfg.photometry, correction))
+                how = (transform.capture, tone, transform.correction)
+                exposure = float(fit_exposure(linear, photograph, mask, *how))
+                transform = dataclasses.replace(transform, exposure=exposure)
+            ldr = develop(linear, transform)
             scores.append(float(psnr(ldr, photograph, mask)))
         return float(np.mean(scores))
 

@@ -1,5 +1,7 @@
 """Gauges are removed before scoring, and only gauges."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -7,11 +9,14 @@ import pytest
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.evaluate.alignment import (
     exposure_error,
+    fit_capture,
     fit_exposure,
-    fit_exposure_and_gamma,
 )
 from p2gs_jax.evaluate.metrics import psnr
 from p2gs_jax.photometry.formation import display, formation
+from p2gs_jax.types import Capture
+
+USUAL = Capture(jnp.float32(1.0), jnp.float32(2.2))
 
 
 def test_exposure_error_ignores_scale_and_reports_power():
@@ -35,8 +40,8 @@ def test_fit_exposure_finds_the_exposure(true, curve):
     cfg = PhotometryConfig(curve=curve)
     rng = np.random.default_rng(0)
     linear = jnp.asarray(np.exp2(rng.normal(-3, 2, (20, 30, 3))), jnp.float32)
-    photo = display(formation(linear, jnp.float32(true), jnp.float32(2.2), cfg))
-    found = fit_exposure(linear, photo, jnp.ones((20, 30)), 2.2, cfg)
+    photo = display(formation(linear, Capture(jnp.float32(true), jnp.float32(2.2)), cfg))
+    found = fit_exposure(linear, photo, jnp.ones((20, 30)), USUAL, cfg)
     assert float(found) == pytest.approx(true, rel=2e-3)
 
 
@@ -45,22 +50,44 @@ def test_exposure_and_gamma_are_found_together(true, gamma):
     cfg = PhotometryConfig()
     rng = np.random.default_rng(0)
     linear = jnp.asarray(np.exp2(rng.normal(-3, 2, (20, 30, 3))), jnp.float32)
-    photo = display(formation(linear, jnp.float32(true), jnp.float32(gamma), cfg))
+    photo = display(formation(linear, Capture(jnp.float32(true), jnp.float32(gamma)), cfg))
     mask = jnp.ones((20, 30)).at[:4].set(0.0)
     photo = photo.at[:4].set(1.0)
-    start = fit_exposure(linear, photo, mask, 2.2, cfg)
-    found = fit_exposure_and_gamma(linear, photo, mask, start, 2.2, cfg)
-    assert float(found[0]) == pytest.approx(true, rel=5e-3)
-    assert float(found[1]) == pytest.approx(gamma, rel=5e-3)
+    start = fit_exposure(linear, photo, mask, USUAL, cfg)
+    given = replace(USUAL, exposure=start)
+    found = fit_capture(linear, photo, mask, given, cfg, gamma=True, white_balance=False)
+    assert float(found.exposure) == pytest.approx(true, rel=5e-3)
+    assert float(found.gamma) == pytest.approx(gamma, rel=5e-3)
+    assert found.white_balance is None
+
+
+@pytest.mark.parametrize("gamma", [None, 2.7])
+@pytest.mark.parametrize("before", [None, (0.1, 0.0, -0.1)])
+def test_white_balance_is_found_with_the_exposure(gamma, before):
+    cfg = PhotometryConfig()
+    rng = np.random.default_rng(0)
+    linear = jnp.asarray(np.exp2(rng.normal(-3, 2, (20, 30, 3))), jnp.float32)
+    balance = np.array([0.3, -0.1, -0.2], np.float32)
+    true = Capture(jnp.float32(1.4), jnp.float32(gamma or 2.2), jnp.asarray(balance))
+    photo, mask = display(formation(linear, true, cfg)), jnp.ones((20, 30))
+    given = replace(USUAL, white_balance=None if before is None else jnp.asarray(before))
+    given = replace(given, exposure=fit_exposure(linear, photo, mask, given, cfg))
+    found = fit_capture(
+        linear, photo, mask, given, cfg, gamma=gamma is not None, white_balance=True
+    )
+    assert found.white_balance is not None
+    np.testing.assert_allclose(found.white_balance, balance, atol=2e-3)
+    assert float(found.exposure) == pytest.approx(1.4, rel=5e-3)
+    assert float(found.gamma) == pytest.approx(gamma or 2.2, rel=5e-3)
 
 
 def test_fit_exposure_ignores_masked_pixels():
     cfg = PhotometryConfig()
     linear = jnp.full((8, 8, 3), 0.2)
-    photo = display(formation(linear, jnp.float32(1.5), jnp.float32(2.2), cfg))
+    photo = display(formation(linear, Capture(jnp.float32(1.5), jnp.float32(2.2)), cfg))
     photo = photo.at[:4].set(1.0)
     mask = jnp.ones((8, 8)).at[:4].set(0.0)
-    assert float(fit_exposure(linear, photo, mask, 2.2, cfg)) == pytest.approx(1.5, rel=2e-3)
+    assert float(fit_exposure(linear, photo, mask, USUAL, cfg)) == pytest.approx(1.5, rel=2e-3)
 
 
 def test_psnr_is_masked():

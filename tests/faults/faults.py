@@ -138,8 +138,8 @@ FAULTS = (
     Fault(
         "an exposure ratio is turned over",
         "losses/relative_exposure.py",
-        "exposures[pairs.views_j] / exposures[pairs.views_i]",
-        "exposures[pairs.views_i] / exposures[pairs.views_j]",
+        "photometry.capture(pairs.views_i), photometry.capture(pairs.views_j)",
+        "photometry.capture(pairs.views_j), photometry.capture(pairs.views_i)",
         "properties/test_pir.py::test_11_observed_readings",
     ),
     Fault(

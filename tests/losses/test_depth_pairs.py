@@ -14,7 +14,7 @@ from p2gs_jax.config import FitConfig, LossConfig, PhotometryConfig, RelativeExp
 from p2gs_jax.losses import relative_exposure as rel
 from p2gs_jax.losses.total import Partner, depth_pairs, total_loss
 from p2gs_jax.photometry.formation import formation
-from p2gs_jax.types import Batch, Camera, Gaussians, Params, Photometry, Render
+from p2gs_jax.types import Batch, Camera, Capture, Gaussians, Params, Photometry, Render
 
 WIDTH, HEIGHT, FOCAL, DEPTH = 48, 32, 40.0, 5.0
 PHOTOMETRY = PhotometryConfig()
@@ -34,7 +34,7 @@ def wall(x: float, exposure: float, row: int) -> tuple[Render, Batch]:
     X, Y = (u - WIDTH / 2) / FOCAL * DEPTH + x, (v - HEIGHT / 2) / FOCAL * DEPTH
     L = 0.15 * np.exp2(np.stack([np.sin(X), np.cos(0.7 * X + Y), np.sin(Y - 0.5 * X)], -1))
     linear = jnp.asarray(L, jnp.float32)
-    ldr = formation(linear, jnp.float32(exposure), jnp.float32(2.2), PHOTOMETRY)
+    ldr = formation(linear, Capture(jnp.float32(exposure), jnp.float32(2.2)), PHOTOMETRY)
     one = jnp.ones((HEIGHT, WIDTH))
     render = Render(linear, one, DEPTH * one, jnp.int32(0), jnp.array(False), jnp.zeros(0, bool))
     return render, Batch(camera(x), jnp.clip(ldr, 0, 1), one, jnp.int32(row))
@@ -43,20 +43,23 @@ def wall(x: float, exposure: float, row: int) -> tuple[Render, Batch]:
 paired = jax.jit(depth_pairs)
 
 
+def exposed(exposures) -> Photometry:
+    return Photometry(exposures, jnp.full(2, 2.2), "linear")
+
+
 @settings(max_examples=15, deadline=None)
 @given(x=st.floats(-1.5, 1.5), e_i=st.floats(0.4, 1.5), e_j=st.floats(0.4, 1.5))
 def test_zero_at_the_true_exposures_and_not_elsewhere(x, e_i, e_j):
     pairs = paired(*wall(0.0, e_i, 0), *wall(x, e_j, 1))
     inside = 1 - abs(x) * FOCAL / DEPTH / WIDTH
     assert float(jnp.mean(pairs.valid)) == pytest.approx(inside, abs=1.5 / WIDTH)
-    gammas = jnp.full(2, 2.2)
-    wrong = jnp.array([e_i, 1.3 * e_j])
+    truth, wrong = (exposed(jnp.array([e_i, f * e_j])) for f in (1.0, 1.3))
     for form, reading in READINGS.items():
         loss = LossConfig(relative_exposure=RelativeExposureConfig(1.0, form))
-        at_truth = float(reading(pairs, jnp.array([e_i, e_j]), gammas, loss, PHOTOMETRY))
+        at_truth = float(reading(pairs, truth, loss, PHOTOMETRY))
         # Bilinear samples of a curved wall are not exact.
         assert at_truth < 2e-3
-        assert float(reading(pairs, wrong, gammas, loss, PHOTOMETRY)) > 0.02
+        assert float(reading(pairs, wrong, loss, PHOTOMETRY)) > 0.02
 
 
 def test_hidden_and_masked_pixels_do_not_count():
@@ -78,7 +81,7 @@ def test_nothing_in_common_costs_nothing():
     loss = LossConfig(relative_exposure=RelativeExposureConfig(1.0, "observed_ldr"))
 
     def of(e):
-        return rel.observed_ldr(pairs, e, jnp.full(2, 2.2), loss, PHOTOMETRY)
+        return rel.observed_ldr(pairs, exposed(e), loss, PHOTOMETRY)
 
     value, gradient = jax.value_and_grad(of)(jnp.array([0.5, 2.0]))
     assert value == 0

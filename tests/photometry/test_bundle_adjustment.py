@@ -15,7 +15,7 @@ from p2gs_jax.photometry.adjustment import robust
 from p2gs_jax.photometry.adjustment.fit import fit_model, solve_model
 from p2gs_jax.photometry.adjustment.problem import KnownExposures, make_problem
 from p2gs_jax.photometry.adjustment.rows import make_rows
-from p2gs_jax.photometry.models import MODELS
+from p2gs_jax.photometry.models import MODELS, Form
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import Response
 from p2gs_jax.synth.drive import make_drive, make_exposures, observe
@@ -108,20 +108,20 @@ def test_standard_errors_have_the_size_of_the_errors(model):
 def test_the_fixed_point_minimises_the_robust_loss():
     o = observe(DRIVE, ISO4)
     problem = make_problem(o, **LIMITS)
-    fit, _ = solve_model(problem, "view_exposure_gamma", Response())
+    fit, _ = solve_model(problem, Form("view_exposure_gamma"), Response())
     with jax.enable_x64(True):
         rows = make_rows(o, problem.layout, problem.usable, Response(), problem.log_pivot)
-        bound = (robust.GEMAN_MCCLURE * fit.scale) ** 2
+        bound = (robust.GEMAN_MCCLURE * fit.at.scale) ** 2
         channels = jnp.maximum(rows.weight.sum(-1), 1)
 
         def loss(b):
-            level = fit.radiance[rows.row] * fit.theta.a[rows.views][..., None]
+            level = fit.at.radiance[rows.row] * fit.theta.a[rows.views][..., None]
             u = (rows.z - b[rows.views][..., None] - level) / rows.sigma
             square = jnp.sum(u**2 * rows.weight, -1) / channels / bound
             return jnp.sum(0.5 * bound * channels * square / (1 + square))
 
-        gradient = np.asarray(jax.grad(loss)(jnp.asarray(fit.theta.b)))
-        curvature = np.diag(fit.normal)[: len(gradient)]
+        gradient = np.asarray(jax.grad(loss)(jnp.asarray(fit.theta.b[:, 0])))
+        curvature = fit.normal.diagonal()[: len(gradient)]
     # What a Newton step would still move, stops.
     assert np.abs(gradient / curvature).max() < 1e-4
 

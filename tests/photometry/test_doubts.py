@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from p2gs_jax.photometry.adjustment import solve
-from p2gs_jax.photometry.adjustment.errors import covariance, deviations
+from p2gs_jax.photometry.adjustment.errors import uncertainty
 from p2gs_jax.photometry.adjustment.fit import TOLERANCE, fit_model, solve_model
 from p2gs_jax.photometry.adjustment.problem import make_problem
 from p2gs_jax.photometry.adjustment.result import solution_of
+from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import Response
 from p2gs_jax.photometry.selection import select
@@ -53,27 +54,16 @@ def test_a_thin_link_does_not_make_exposures_certain():
     assert s.unknown_errors == 0
 
 
-def test_less_than_nothing_is_not_certainty():
-    jacobian, none = np.eye(3), np.zeros((3, 0))
-    found = deviations(jacobian, np.diag([4.0, -1e-9, 0.0]), none)
-    np.testing.assert_array_equal(found, [2.0, np.inf, 0.0])
-    # A difference of equal numbers is 0, give or take rounding.
-    apart = np.array([[1.0, -1.0, 0.0]])
-    almost = np.ones((3, 3)) - 1e-9 * np.eye(3)
-    np.testing.assert_array_equal(deviations(apart, almost, none), [0.0])
-    unknown = np.array([[0.0], [1.0], [0.0]])
-    found = deviations(jacobian, np.eye(3), unknown)
-    np.testing.assert_array_equal(found, [1.0, np.inf, 1.0])
-
-
 def test_what_no_observation_holds_is_unknown_and_said():
     o = observe(DRIVE, ISO2)
     # A view whose pixels are misplaced by so much that they say nothing.
     o.spread[o.views == 3] = 1e8
     problem = make_problem(o, **LIMITS)
-    fit, system = solve_model(problem, "view_exposure", Response())
-    assert covariance(fit, system)[1].shape[1] == 1
-    s = solution_of(problem, "view_exposure", Response(), fit, system)
+    form = Form("view_exposure")
+    fit, system = solve_model(problem, form, Response())
+    known = uncertainty(fit, system, fit.model.rows.row)
+    assert known.unknown.shape[1] == 1
+    s = solution_of(problem, form, Response(), fit, known)
     assert np.isinf(s.exposure_errors[3])
     assert np.isinf(s.gamma_errors[3])
     assert s.state["unknown_errors"] > 0

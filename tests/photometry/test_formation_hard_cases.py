@@ -10,7 +10,7 @@ from p2gs_jax.losses.image import photometric_loss
 from p2gs_jax.losses.regularizers import variance
 from p2gs_jax.photometry.formation import eotf, formation, oetf, tone_map
 from p2gs_jax.render.radiance import radiance_activation, radiance_preactivation
-from p2gs_jax.types import Photometry
+from p2gs_jax.types import Capture, Photometry
 
 PAPER = PhotometryConfig(curve="power", pivot=1.0, clamp=True, parameterization="linear")
 ROBUST = PhotometryConfig()
@@ -53,9 +53,8 @@ def test_over_bright_start_has_a_gradient_where_the_photograph_is_not_saturated(
 
 def test_nan_is_not_clipped_away():
     for cfg in (PAPER, ROBUST):
-        assert np.isnan(
-            float(formation(jnp.float32(np.nan), jnp.float32(1), jnp.float32(2.2), cfg))
-        )
+        usual = Capture(jnp.float32(1), jnp.float32(2.2))
+        assert np.isnan(float(formation(jnp.float32(np.nan), usual, cfg)))
 
 
 @pytest.mark.parametrize("gamma", [1e-3, 0.1, 10.0, 1e3])

@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 
+from p2gs_jax.photometry.candidates import Candidate, choose
+from p2gs_jax.photometry.choices import Choice
+from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.response import Response
-from p2gs_jax.photometry.selection import Candidate, choose, select
+from p2gs_jax.photometry.selection import select
 from p2gs_jax.synth.drive import make_drive, make_exposures, observe
 
 LIMITS = {"black": 4 / 255, "saturation": 250 / 255, "pivot": 0.18}
@@ -33,7 +36,9 @@ def test_what_varies_is_found(exposures, curve, gamma, model, response):
 
 
 def candidate(model, parameters, density, deficit, error, difference=9.0):
-    return Candidate(model, Response(), parameters, density, deficit, error, difference)
+    return Candidate(
+        Choice(Form(model)), Response(), parameters, density, deficit, error, difference
+    )
 
 
 def test_the_simplest_that_is_not_clearly_worse_wins():
@@ -42,7 +47,9 @@ def test_the_simplest_that_is_not_clearly_worse_wins():
     rich = candidate("view_exposure", 40, -0.5, 0.0, 0.0)
     assert choose([rich, simple, middle]) is middle
     # Two standard errors count, where they are more than the smallest gain.
-    assert choose([rich, candidate("constant", 0, -0.6, 0.1, 0.06), middle]).model == "constant"
+    assert (
+        choose([rich, candidate("constant", 0, -0.6, 0.1, 0.06), middle]).form.model == "constant"
+    )
     # A difference that nobody can see does not count, however sure it is.
     assert choose([rich, candidate("constant", 0, -0.9, 0.4, 0.01, 0.8), middle]).parameters == 0
 
@@ -55,5 +62,5 @@ def test_sharp_images_do_not_earn_parameters_for_invisible_differences():
     seen = observe(drive, cameras * wobble, noise=0.0, outliers=0.0, bits=None)
     found = select(seen, **LIMITS)
     assert found.solution.model == "constant"
-    assert found.candidates[0].model != "constant"
+    assert found.candidates[0].form.model != "constant"
     assert any("8-bit levels in any view" in r for r in found.reasons)

@@ -6,7 +6,8 @@ import numpy as np
 
 from p2gs_jax.config import LossConfig, PhotometryConfig
 from p2gs_jax.losses.image import photometric_loss
-from p2gs_jax.photometry.formation import formation, inverse_tone_map
+from p2gs_jax.photometry.formation import formation, inverse_formation
+from p2gs_jax.types import Capture
 
 CFG = PhotometryConfig()
 RNG = np.random.default_rng(0)
@@ -18,8 +19,8 @@ class Variants(chex.TestCase):
     def test_an_inverse_takes_formation_back(self):
         @self.variant
         def there_and_back(linear, exposure, gamma):
-            ldr = formation(linear, exposure, gamma, CFG)
-            return inverse_tone_map(ldr, gamma, CFG) / exposure
+            taken = Capture(exposure, gamma)
+            return inverse_formation(formation(linear, taken, CFG), taken, CFG)
 
         found = there_and_back(LINEAR, np.float32(1.3), np.float32(2.0))
         np.testing.assert_allclose(found, LINEAR, rtol=2e-4)

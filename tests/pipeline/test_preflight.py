@@ -20,7 +20,7 @@ from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.run.decisions import KEY, Decisions
 from p2gs_jax.run.layout import RunFolder
 from p2gs_jax.sweep import with_fields
-from p2gs_jax.types import View
+from p2gs_jax.types import Photometry, View
 
 
 @pytest.fixture(scope="module")
@@ -168,7 +168,7 @@ def test_readings_that_subtract_images_need_one_size(tmp_path, form):
     check_sizes(unequal, cfg)
     check_sizes(unequal, with_fields(subtracting, {"loss.relative_exposure.weight": None}))
     nothing = np.zeros((4, 6, 3), np.float32)
-    pairs = ExposurePairs(nothing, nothing[:1], 0, 1, np.ones(2), np.ones(2), None)
+    pairs = ExposurePairs(nothing, nothing[:1], 0, 1, Photometry(np.zeros(2), np.zeros(2)), None)
     with pytest.raises(ValueError, match="renders of one size"):
         relative_exposure_loss(pairs, subtracting.loss, subtracting.photometry)
 

@@ -22,7 +22,7 @@ from p2gs_jax.losses.image import photometric_loss
 from p2gs_jax.losses.regularizers import photometry_regularizers
 from p2gs_jax.photometry.formation import eotf, formation, inverse_tone_map, tone_map
 from p2gs_jax.render import render_linear
-from p2gs_jax.types import LUMINANCE, Camera, Gaussians, Photometry
+from p2gs_jax.types import LUMINANCE, Camera, Capture, Gaussians, Photometry
 
 PAPER = PhotometryConfig(curve="power", pivot=1.0, clamp=True, parameterization="linear")
 ROBUST = PhotometryConfig()
@@ -48,8 +48,8 @@ def radiance(seed, n=64, low=-6.0, high=-0.5):
 def test_1_scale_gauge(cfg, seed, c, e, gamma):
     """L -> cL, e -> e/c leaves LDR alone, away from the clamps."""
     L = radiance(seed)
-    a = formation(L, jnp.float32(e), jnp.float32(gamma), cfg)
-    b = formation(c * L, jnp.float32(e) / jnp.float32(c), jnp.float32(gamma), cfg)
+    a = formation(L, Capture(jnp.float32(e), jnp.float32(gamma)), cfg)
+    b = formation(c * L, Capture(jnp.float32(e) / jnp.float32(c), jnp.float32(gamma)), cfg)
     np.testing.assert_allclose(a, b, atol=1e-6)
 
 
@@ -60,8 +60,8 @@ def test_2_power_gauge(cfg, seed, k, e):
     """L -> L^k, e -> e^k, gamma -> k gamma leaves LDR alone."""
     L = radiance(seed, low=-4.0)
     e = jnp.float32(e)
-    a = formation(L, e, jnp.float32(2.2), cfg)
-    b = formation(L**k, e**k, jnp.float32(2.2 * k), cfg)
+    a = formation(L, Capture(e, jnp.float32(2.2)), cfg)
+    b = formation(L**k, Capture(e**k, jnp.float32(2.2 * k)), cfg)
     np.testing.assert_allclose(a, b, atol=2e-6)
 
 
@@ -71,13 +71,13 @@ def test_2_power_gauge_about_a_pivot(seed, k, e):
     """With a pivot the gauge acts on x / x0: it is exact for every base curve."""
     L, x0 = radiance(seed, low=-4.0), ROBUST.pivot
     e = jnp.float32(e)
-    a = formation(L, e, jnp.float32(2.2), ROBUST)
-    b = formation(x0 * (L / x0) ** k, e**k, jnp.float32(2.2 * k), ROBUST)
+    a = formation(L, Capture(e, jnp.float32(2.2)), ROBUST)
+    b = formation(x0 * (L / x0) ** k, Capture(e**k, jnp.float32(2.2 * k)), ROBUST)
     np.testing.assert_allclose(a, b, atol=4e-6)
 
 
 def scalar_loss(L, log_e, gamma, target, cfg):
-    ldr = formation(L, jnp.exp(log_e), gamma, cfg)
+    ldr = formation(L, Capture(jnp.exp(log_e), gamma), cfg)
     return jnp.sum((ldr - target) ** 2)
 
 
@@ -117,12 +117,12 @@ def test_5_inverse(cfg, seed, gamma):
 @given(gamma=GAMMAS, e=SCALES)
 def test_6_monotone(cfg, gamma, e):
     x = jnp.logspace(-7, 2, 400, dtype=jnp.float32)
-    y = np.asarray(formation(x, jnp.float32(e), jnp.float32(gamma), cfg))
+    y = np.asarray(formation(x, Capture(jnp.float32(e), jnp.float32(gamma)), cfg))
     assert np.all(np.diff(y) >= -1e-7)
     assert y.min() >= 0
     if cfg.clamp:
         assert y.max() <= 1
-    z = np.asarray(formation(x, jnp.float32(1.1 * e), jnp.float32(gamma), cfg))
+    z = np.asarray(formation(x, Capture(jnp.float32(1.1 * e), jnp.float32(gamma)), cfg))
     assert np.all(z >= y - 1e-7)
 
 
@@ -167,16 +167,14 @@ def observed(seed, cfg, noise_free=True, views=5, n=400):
     L = np.exp2(rng.uniform(-5, 0, (n, 3)))
     i = rng.integers(0, views, n)
     j = (i + rng.integers(1, views, n)) % views
-    I = [
-        np.asarray(formation(jnp.asarray(L, jnp.float32), e[k][:, None], gammas[k][:, None], cfg))
-        for k in (i, j)
-    ]
+    taken = Photometry(e, gammas, "linear")
+    I = [np.asarray(formation(jnp.asarray(L, jnp.float32), taken.capture(k), cfg)) for k in (i, j)]
     I = [np.clip(a, 0, 1) for a in I]
     if not noise_free:
         I = [np.rint(a * 255) / 255 for a in I]
     rows = (i.astype(np.int32), j.astype(np.int32), np.ones(n, np.float32))
     pairs = rel.ColorPairs(*(jnp.asarray(a) for a in (*I, *rows)))
-    return pairs, jnp.asarray(e), jnp.asarray(gammas)
+    return pairs, jax.tree.map(jnp.asarray, taken)
 
 
 LOSS = LossConfig(relative_exposure=RelativeExposureConfig(1.0, "observed_ldr"))
@@ -187,15 +185,20 @@ LOSS = LossConfig(relative_exposure=RelativeExposureConfig(1.0, "observed_ldr"))
 @given(seed=SEEDS, c=SCALES)
 def test_11_observed_readings(cfg, seed, c):
     """Zero at the truth, small with 8 bits, and the LDR one invariant to a common factor."""
-    pairs, e, gammas = observed(seed, cfg)
+    pairs, truth = observed(seed, cfg)
+
+    def exposed(e):
+        return dataclasses.replace(truth, raw_exposures=e)
+
+    e = truth.exposures
     for reading in (rel.observed_linear, rel.observed_ldr):
-        assert float(reading(pairs, e, gammas, LOSS, cfg)) < 1e-5
-        flat = float(reading(pairs, jnp.ones_like(e), gammas, LOSS, cfg))
+        assert float(reading(pairs, truth, LOSS, cfg)) < 1e-5
+        flat = float(reading(pairs, exposed(jnp.ones_like(e)), LOSS, cfg))
         assert flat > 0.01
-        a, b = (float(reading(pairs, s * jnp.sqrt(e), gammas, LOSS, cfg)) for s in (1.0, c))
+        a, b = (float(reading(pairs, exposed(s * jnp.sqrt(e)), LOSS, cfg)) for s in (1.0, c))
         assert a == pytest.approx(b, rel=1e-6, abs=1e-6)
-    pairs, e, gammas = observed(seed, cfg, noise_free=False)
-    assert float(rel.observed_ldr(pairs, e, gammas, LOSS, cfg)) <= 0.01
+    pairs, truth = observed(seed, cfg, noise_free=False)
+    assert float(rel.observed_ldr(pairs, truth, LOSS, cfg)) <= 0.01
 
 
 @FEW

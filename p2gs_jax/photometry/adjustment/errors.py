@@ -1,10 +1,19 @@
-"""Standard errors that hold for robust weights and correlated channels, and what nothing holds."""
+"""Standard errors that hold for robust weights and correlated pixels, and what nothing holds."""
 
 from __future__ import annotations
 
-import numpy as np
-from jaxtyping import Float
+from collections.abc import Callable
+from typing import NamedTuple
 
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Float, Int
+
+from p2gs_jax.core.streams import Stream, generator
+from p2gs_jax.photometry.adjustment.clusters import small_sample
+from p2gs_jax.photometry.adjustment.linear import DENSE, Balanced
+from p2gs_jax.photometry.adjustment.normal import scores
+from p2gs_jax.photometry.adjustment.parameters import Parameters
 from p2gs_jax.photometry.adjustment.solve import Fit
 from p2gs_jax.photometry.adjustment.system import System, gauge_strength
 
@@ -13,62 +22,87 @@ CANCELLED = 1e-6
 # Share of a parameter's information that must be left beside all others'. Rounding leaves less, and
 # so does what keeps points without observations finite (`system.EMPTY`).
 HELD = 1e-11
+# Draws from the errors where unknowns are too many for their covariance: a standard error is then
+# known to 9 %.
+DRAWS = 64
+
+# What is asked, of changes of all parameters (columns) about the solution.
+Asked = Callable[[Parameters], Float[np.ndarray, "n c"]]
 
 
-def covariance(
-    fit: Fit, system: System
-) -> tuple[Float[np.ndarray, "d d"], Float[np.ndarray, "d k"]]:
-    """Return the robust covariance of (b, a, c): bread, meat, bread (Huber; White).
+class Uncertainty(NamedTuple):
+    """How sure a solution is.
 
-    Residuals of the three channels of an observation, and of a point, are not independent: the
-    meat is summed over points, and counts them once.
+    Attributes:
+        roots: columns whose outer products sum to the covariance of all parameters.
+        unknown: directions that the observations do not hold: `roots` knows nothing of them.
+        few: factors on the errors of views that few clusters tell of.
+        system: what was solved.
+    """
+
+    roots: Float[np.ndarray, "d r"]
+    unknown: Float[np.ndarray, "d k"]
+    few: Float[np.ndarray, " v"]
+    system: System
+
+    def of(self, asked: Asked) -> Float[np.ndarray, " n"]:
+        """Return the standard deviations of what is asked; inf where nothing is known."""
+        split = self.system.unknowns.split
+        deviation = np.linalg.norm(asked(split(self.roots)), axis=1)
+        if not self.unknown.size:
+            return deviation
+        lost = (np.abs(asked(split(self.unknown))) > CANCELLED).any(1)
+        return np.where(lost, np.inf, deviation)
+
+
+def uncertainty(fit: Fit, system: System, clusters: Int[np.ndarray, " o"]) -> Uncertainty:
+    """Return the robust covariance of all parameters: bread, meat, bread (Huber; White).
+
+    Residuals of the three channels of an observation, of a point, and of its neighbours are not
+    independent: the meat is summed over clusters, and counts them once.
 
     Args:
         fit: the solution.
         system: what it was solved with.
-
-    Returns:
-        The covariance, and the free directions that the observations do not hold: the covariance
-        knows nothing of them.
+        clusters: what each observation is counted with.
     """
-    both = slice(0, 2 * len(fit.theta.b))
-    bread, meat = fit.normal * fit.curvature, fit.scores.copy()
-    bread[both, both] += system.prior
-    strength = gauge_strength(bread, len(fit.theta.b))
+    rows = fit.model.rows
+    each = scores(fit.model, fit.theta, fit.at, clusters)
+    seen = rows.weight.any(1)
+    few = small_sample(clusters[seen], rows.views[seen], rows.view_count)
+    bread = sp.csr_array(fit.normal * fit.at.curvature + system.priors.normal)
+    bread = bread + gauge_strength(bread, system.unknowns) * system.anchors.normal
+    if system.basis.shape[1] > DENSE:
+        drawn = _drawn(bread, each, system)
+        return Uncertainty(drawn, np.zeros((bread.shape[0], 0)), few, system)
     # A prior is itself an observation with variance 1 / precision: it is its own meat.
-    meat[both, both] += system.prior
-    bread[both, both] += strength * system.anchors.T @ system.anchors
-    free = np.abs(system.basis).sum(0) > 0
-    g = system.basis[:, free]
-    if not g.size:
-        return np.zeros_like(bread), np.zeros((len(bread), 0))
-    reduced = g.T @ bread @ g
+    meat = each.T @ each + system.priors.normal
+    return Uncertainty(*_whole(bread, meat, system.basis), few, system)
+
+
+def _whole(bread, meat, basis) -> tuple[Float[np.ndarray, "d r"], Float[np.ndarray, "d k"]]:
+    if not basis.shape[1]:
+        return np.zeros((basis.shape[0], 1)), np.zeros((basis.shape[0], 0))
     # Exposures that are known say so much more than pixels that only ratios can be compared.
-    diagonal = np.diag(reduced)
-    g = g / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    value, direction = np.linalg.eigh(g.T @ bread @ g)
+    diagonal = (basis.T @ bread @ basis).diagonal()
+    g = basis @ sp.diags_array(1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)))
+    value, direction = np.linalg.eigh((g.T @ bread @ g).toarray())
     held = value > HELD
     inverse = (direction[:, held] / value[held]) @ direction[:, held].T
+    size, across = np.linalg.eigh((g.T @ meat @ g).toarray())
+    roots = inverse @ (across * np.sqrt(np.maximum(size, 0)))
     unknown = g @ direction[:, ~held]
-    unknown = unknown / np.linalg.norm(unknown, axis=0)
-    return g @ inverse @ (g.T @ meat @ g) @ inverse @ g.T, unknown
+    return g @ roots, unknown / np.linalg.norm(unknown, axis=0)
 
 
-def deviations(
-    jacobian: Float[np.ndarray, "v d"],
-    cov: Float[np.ndarray, "d d"],
-    unknown: Float[np.ndarray, "d k"],
-) -> Float[np.ndarray, " v"]:
-    """Return standard deviations; inf where nothing is known, or where rounding left less than 0.
+def _drawn(bread, each, system: System) -> Float[np.ndarray, "d r"]:
+    """Return solutions for clusters and priors with random signs (wild bootstrap)."""
+    rng = generator(0, Stream.SCORE_SIGNS)
 
-    Args:
-        jacobian: of what is asked, by (b, a).
-        cov: covariance of (b, a).
-        unknown: directions in (b, a) that no observation holds.
-    """
-    variance = ((jacobian @ cov) * jacobian).sum(1)
-    # What cancels to zero, such as a model's only exposure in its gauge, ends this near to it.
-    size = np.abs(jacobian)
-    rounding = CANCELLED * ((size @ np.abs(cov)) * size).sum(1)
-    lost = (np.abs(jacobian @ unknown) > CANCELLED).any(1) | (variance < -rounding)
-    return np.where(lost, np.inf, np.sqrt(np.maximum(variance, 0)))
+    def signs(count: int) -> Float[np.ndarray, "n r"]:
+        return rng.choice([-1.0, 1.0], (count, DRAWS))
+
+    priors = system.priors
+    right = each.T @ signs(each.shape[0])
+    right += priors.rows.T @ (np.sqrt(priors.precisions)[:, None] * signs(len(priors.targets)))
+    return Balanced(bread, system.basis).solve(right) / np.sqrt(DRAWS)

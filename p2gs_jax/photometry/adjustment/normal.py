@@ -1,144 +1,156 @@
-"""Normal equations over the views, points eliminated: the Schur complement and its scores."""
+"""Normal equations, points eliminated: the Schur complement and the scores of its rows."""
 
 from __future__ import annotations
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
+from p2gs_jax.photometry.adjustment.forward import Forward
+from p2gs_jax.photometry.adjustment.parameters import Parameters
 from p2gs_jax.photometry.adjustment.robust import Weighted
-from p2gs_jax.photometry.adjustment.rows import Rows
-from p2gs_jax.photometry.adjustment.spline import at_knots, basis_at_values, log_slope_terms
-from p2gs_jax.photometry.adjustment.system import EMPTY, Parameters
-
-# Pairs whose products are formed at once: they stay in the cache.
-CHUNK = 1 << 15
+from p2gs_jax.photometry.adjustment.system import EMPTY
 
 
 def normal_equations(
-    rows: Rows,
-    theta: Parameters,
-    at: Weighted,
-    gammas: bool,
-    kind: type[np.floating] = np.float64,
-) -> tuple[Float[np.ndarray, "d d"], Float[np.ndarray, " d"]]:
-    """Return the reduced normal matrix and right side over (b, a, c), without gauges and priors.
+    model: Forward, theta: Parameters, at: Weighted, kind: type[np.floating] = np.float64
+) -> tuple[sp.csr_array, Float[np.ndarray, " d"]]:
+    """Return the reduced normal matrix and right side, without gauges and priors.
+
+    A prediction b + a (l + k features) - c basis has the derivatives 1, l + k features, a features
+    and -basis; a point's own is a.
 
     Args:
-        rows: observations.
+        model: observations, and what explains them.
         theta: parameters.
         at: residuals and weights at these.
-        gammas: whether a's part is wanted; zeros otherwise.
-        kind: see `_pair_sums`.
+        kind: of the products of pairs; see `Pairs.sums`.
     """
-    views = rows.view_count
-    w, residual = at.weight, at.residual
-    level = at.radiance[rows.row]
-    powers = [np.ones_like(level), level, level**2]
+    rows, u = model.rows, model.unknowns
+    w, pull = at.weight, at.weight * at.residual
+    a = theta.a[rows.views][:, None]
+    coupling = w * a / np.sqrt(at.precision + EMPTY)[rows.row]
+    derivatives = _of_views(model, at)
+    diagonals = {
+        (x, y): _per_view(rows, (w * p * q)[:, common])
+        for x, (p, of_x) in enumerate(derivatives)
+        for y, (q, of_y) in enumerate(derivatives[x:], x)
+        if (common := _common(of_x, of_y)).size
+    }
+    count = len(derivatives)
+    blocks = [[None] * count for _ in range(count)]
+    for (x, y), values in diagonals.items():
+        blocks[x][y] = blocks[y][x] = sp.diags_array(values)
+    factors = [(coupling * p)[:, of_x] for p, of_x in derivatives]
+    shared = [
+        [(list(of_x).index(c), list(of_y).index(c)) for c in _common(of_x, of_y)]
+        for _, of_x in derivatives
+        for _, of_y in derivatives
+    ]
+    coupled = rows.layout.pairs.sums(factors, shared, kind)
+    views = sp.csr_array(sp.block_array(blocks)) - coupled
+    right = [_per_view(rows, (pull * p)[:, of_x]) for p, of_x in derivatives]
+    if not u.gammas:
+        # a keeps its place in the vector.
+        views = sp.block_diag([views, sp.csr_array((u.views, u.views))], format="csr")
+        right.append(np.zeros(u.views))
+    if model.features is None and model.basis is None:
+        return sp.csr_array(views), np.concatenate(right)
+    return _with_others(model, theta, at, views, right, derivatives, coupling)
 
-    def per_view(values):
-        # Of nothing at all, numpy counts in integers.
-        return np.bincount(rows.views, values.sum(1), views).astype(np.float64)
 
-    h_bb, h_ba, h_aa = (per_view(w * p) for p in powers)
-    g_b, g_a = (per_view(w * residual * p) for p in powers[:2])
-    root = np.sqrt(at.precision + EMPTY)[rows.row]
-    coupling = w * theta.a[rows.views][:, None] / root
-    factors = np.stack([coupling, coupling * level][: 1 + gammas], -1)
-    if not gammas:
-        h_ba, h_aa, g_a = (np.zeros(views) for _ in range(3))
-    normal = np.block([[np.diag(h_bb), np.diag(h_ba)], [np.diag(h_ba), np.diag(h_aa)]])
-    normal -= _pair_sums(rows, factors, kind)
-    right = np.concatenate([g_b, g_a])
-    if not theta.c.size:
-        return normal, right
-    # The spline moves z itself: d residual / dc is +basis where d residual / db is -1.
-    at_view, one = rows.views[:, None], np.zeros((1, 1), int)
-    basis = basis_at_values(rows)
-    h_cc = basis.T @ basis.multiply(w.reshape(-1, 1)).tocsr()
-    h_bc, h_ac = (-at_knots(rows, w * p, at_view, views) for p in powers[:2])
-    at_channel = 3 * rows.row[:, None] + np.arange(3)
-    through = -at_knots(rows, coupling, at_channel, 3 * rows.count)
-    s_bc, s_ac = (
-        _by_view(rows, factors[..., x], at_channel, 3 * rows.count) @ through
-        if x <= gammas
-        else np.zeros((views, theta.c.size))
-        for x in range(2)
+def _of_views(model: Forward, at: Weighted) -> list[tuple[np.ndarray, Int[np.ndarray, " f"]]]:
+    """Return the derivatives by the parameters of a view, and the channels in which they act."""
+    every = np.arange(3)
+    one = np.ones((1, 3))
+    if model.unknowns.channels == 3:
+        derivatives = [(one, every[c : c + 1]) for c in range(3)]
+    else:
+        derivatives = [(one, every)]
+    return [*derivatives, (at.level, every)] if model.unknowns.gammas else derivatives
+
+
+def _common(a: Int[np.ndarray, " f"], b: Int[np.ndarray, " g"]) -> Int[np.ndarray, " h"]:
+    return np.intersect1d(a, b)
+
+
+def _per_view(rows, values: Float[np.ndarray, "o f"]) -> Float[np.ndarray, " v"]:
+    # Of nothing at all, numpy counts in integers.
+    return np.bincount(rows.views, values.sum(1), rows.view_count).astype(np.float64)
+
+
+def _with_others(model: Forward, theta, at: Weighted, views, right, derivatives, coupling):
+    """Return the equations with the parameters of cameras and splines."""
+    rows, u = model.rows, model.unknowns
+    w = at.weight.reshape(-1, 1)
+    a = np.repeat(theta.a[rows.views], 3)[:, None]
+    parts = []
+    if model.features is not None:
+        parts.append(model.features.multiply(a))
+    if model.basis is not None:
+        parts.append(-model.basis)
+    others = sp.csr_array(sp.hstack(parts))
+    weighted = sp.csr_array(others.multiply(w))
+    through = rows.layout.by_row_and_channel @ sp.csr_array(
+        others.multiply(coupling.reshape(-1, 1))
     )
-    side = np.concatenate([h_bc - s_bc, h_ac - s_ac])
-    g_c = -at_knots(rows, w * residual, one, 1)[0]
-    share = at.weight * at.sigma**2 * at.scale**2
-    v_log, h_log = log_slope_terms(rows, share, at.slope)
-    # Not `through.T @ through`: BLAS wakes threads for it, and waits for busy cores.
-    corner = h_cc.toarray() + h_log - np.einsum("rk,rl->kl", through, through)
-    normal = np.block([[normal, side], [side.T, corner]])
-    return normal, np.concatenate([right, g_c + v_log])
+    sides = []
+    for p, channels in derivatives:
+        # Values are summed over the channels in which a parameter of the view acts.
+        direct = _at_views(rows, np.broadcast_to(p, rows.z.shape), channels)
+        by_point = _at_views(rows, coupling * p, channels, rows.row)
+        sides.append(direct @ weighted - by_point @ through)
+    if not u.gammas:
+        sides.append(sp.csr_array((u.views, others.shape[1])))
+    side = sp.vstack(sides)
+    corner = (others.T @ weighted - through.T @ through).toarray()
+    pulled = others.T @ (at.weight * at.residual).ravel()
+    if model.basis is not None:
+        share = at.weight * at.sigma**2 * at.scale**2
+        gradient, curvature = u.splines.log_slope_terms(rows, share, at.slope)
+        pulled[-len(gradient) :] += gradient
+        corner[-len(gradient) :, -len(gradient) :] += curvature
+    normal = sp.block_array([[views, side], [side.T, sp.csr_array(corner)]])
+    return sp.csr_array(normal), np.concatenate([*right, pulled])
 
 
-def score_products(
-    rows: Rows, theta: Parameters, at: Weighted, gammas: bool
-) -> Float[np.ndarray, "d d"]:
-    """Return the sum of outer products of row scores over (b, a, c).
+def _at_views(rows, values, channels, row=None) -> sp.csr_array:
+    """Return the matrix that holds values at their views, and at themselves or at their points."""
+    count = len(rows.views)
+    index = np.arange(count) if row is None else row
+    at = (3 * index[:, None] + channels).ravel()
+    views = np.repeat(rows.views, len(channels))
+    width = 3 * (count if row is None else rows.count)
+    return sp.csr_array((values[:, channels].ravel(), (views, at)), shape=(rows.view_count, width))
+
+
+def scores(
+    model: Forward, theta: Parameters, at: Weighted, clusters: Int[np.ndarray, " o"]
+) -> sp.csr_array:
+    """Return the scores of clusters of observations over all parameters: (clusters, d).
 
     Args:
-        rows: observations.
+        model: observations, and what explains them.
         theta: parameters.
         at: residuals and weights at these.
-        gammas: see `normal_equations`.
+        clusters: what each observation is counted with.
     """
-    g = at.weight * at.residual
-    factors = np.stack([g.sum(1), (g * at.radiance[rows.row]).sum(1)][: 1 + gammas], -1)
-    scores = _pair_sums(rows, factors[:, None, :])
-    if not theta.c.size:
-        return scores
-    s_c = -at_knots(rows, g, rows.row[:, None], rows.count)
-    side = [_by_view(rows, factors[:, x], rows.row, rows.count) @ s_c for x in range(1 + gammas)]
-    side += [np.zeros_like(side[0])] * (1 - gammas)
-    side = np.concatenate(side)
-    return np.block([[scores, side], [side.T, s_c.T @ s_c]])
-
-
-def _pair_sums(
-    rows: Rows, factors: Float[np.ndarray, "o f x"], kind: type[np.floating] = np.float64
-) -> Float[np.ndarray, "d d"]:
-    """Return sum over rows of the outer products of per-view vectors, as a (2 V, 2 V) matrix.
-
-    Each pair of observations once.
-
-    Args:
-        rows: for the pairs.
-        factors: f vectors per row; entry (o, f, x) belongs to the view of observation o, parameter
-            x. One parameter leaves the second's part zero.
-        kind: of the products. In the rounds float32: there the matrix decides how fast they
-            converge, never where they end. Standard errors need float64: what joins groups of views
-            by a few dark points is less than the rounding of what joins the views of a group.
-    """
-    views, count = rows.view_count, factors.shape[-1]
-    # In the order of the rows: the two of a pair then lie close together.
-    order = rows.layout.order
-    parts = [factors[order, :, x].astype(kind) for x in range(count)]
-    seen_by = rows.views[order]
-    sums = np.zeros((count, count, views * views))
-    # Not fewer at once than half of the entries they are added to.
-    chunk = max(CHUNK, views * views // 2)
-    pairs = rows.layout.pairs
-    for start in range(0, len(pairs[0]), chunk):
-        first, second = (p[start : start + chunk] for p in pairs)
-        at = seen_by[first] * views + seen_by[second]
-        # A product of an observation with itself is counted twice below.
-        half = np.where(first == second, kind(0.5), kind(1.0))
-        right = [np.take(p, second, 0) for p in parts]
-        for x, part in enumerate(parts):
-            left = np.take(part, first, 0) * half[:, None]
-            for y in range(count):
-                products = np.einsum("pf,pf->p", left, right[y])
-                sums[x, y] += np.bincount(at, products, views * views)
-    matrix = sums.reshape(count, count, views, views).transpose(0, 2, 1, 3)
-    matrix = matrix.reshape(count * views, count * views)
-    return np.pad(matrix + matrix.T, (0, (2 - count) * views))
-
-
-def _by_view(rows: Rows, values, at, size: int) -> sp.csr_array:
-    """Return the (views, size) matrix that holds values at their views and places."""
-    views = np.broadcast_to(rows.views.reshape(-1, *[1] * (values.ndim - 1)), values.shape)
-    return sp.csr_array((values.ravel(), (views.ravel(), at.ravel())), (rows.view_count, size))
+    rows, u = model.rows, model.unknowns
+    pull = at.weight * at.residual
+    count = int(clusters.max(initial=-1)) + 1
+    parts = []
+    for p, channels in _of_views(model, at):
+        values = (pull * p)[:, channels].sum(1)
+        shape = (count, u.views)
+        parts.append(sp.csr_array((values, (clusters, rows.views)), shape=shape))
+    if not u.gammas:
+        parts.append(sp.csr_array((count, u.views)))
+    of_values = sp.csr_array(
+        (pull.ravel(), (np.repeat(clusters, 3), np.arange(pull.size))), shape=(count, pull.size)
+    )
+    if model.features is not None:
+        a = np.repeat(theta.a[rows.views], 3)[:, None]
+        parts.append(of_values @ sp.csr_array(model.features.multiply(a)))
+    if model.basis is not None:
+        parts.append(-(of_values @ model.basis))
+    return sp.csr_array(sp.hstack(parts))

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy.sparse as sp
 from jaxtyping import Bool, Float, Int
 
+from p2gs_jax.config import CameraFormation
 from p2gs_jax.core.numerics import LN2
-from p2gs_jax.photometry.adjustment.errors import covariance, deviations
+from p2gs_jax.photometry.adjustment.errors import Uncertainty
+from p2gs_jax.photometry.adjustment.parameters import Parameters
 from p2gs_jax.photometry.adjustment.problem import Problem
 from p2gs_jax.photometry.adjustment.solve import Fit
-from p2gs_jax.photometry.adjustment.system import System
 from p2gs_jax.photometry.adjustment.warnings import observation_warnings, solver_warnings
-from p2gs_jax.photometry.models import ModelName
+from p2gs_jax.photometry.models import Form
+from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import Response
 from p2gs_jax.photometry.solution import MIN_OBSERVATIONS, PhotometricSolution
 from p2gs_jax.types import GAMMA_SRGB
@@ -21,19 +24,18 @@ IGNORED = 0.25
 
 
 def solution_of(
-    problem: Problem, name: ModelName, response: Response, fit: Fit, system: System
+    problem: Problem, form: Form, response: Response, fit: Fit, known: Uncertainty
 ) -> PhotometricSolution:
     """Return exposures in their gauge, with errors and warnings.
 
     Args:
         problem: all observations.
-        name: what varies.
+        form: what varies.
         response: what decoded the colours.
         fit: the parameters; radiances and residuals of all observations.
-        system: what it was solved with.
+        known: how sure the parameters are.
     """
     o, component = problem.observations, problem.component
-    a, h = fit.theta.a, fit.theta.b / fit.theta.a
     per_view = np.bincount(o.views[problem.usable.any(1)], minlength=o.view_count)
     active = per_view > 0
     free_scale = np.ones(o.view_count, bool)
@@ -42,88 +44,165 @@ def solution_of(
         anchored = np.unique(component[given])
         free_scale = ~np.isin(component, anchored)
         active = active | given
-    shift, to_h = _centering(a, h, component, active, free_scale)
-    both = slice(0, 2 * o.view_count)
-    cov, unknown = covariance(fit, system)
-    cov, unknown = cov[both, both], unknown[both]
-    h_errors = deviations(to_h, cov, unknown)
+    scale, color = _Gauge(component, active & free_scale), _Gauge(component, active)
+    a, light = fit.theta.a, _light(fit)
+    h, balance = light.mean(1), light - light.mean(1, keepdims=True)
+
+    def of_light(change: Parameters):
+        return (change.b - light[..., None] * change.a[:, None]) / a[:, None, None]
+
+    def of_balance(change: Parameters):
+        moved = of_light(change)
+        if known.system.unknowns.features.balance:
+            moved = moved + _balance_of_views(fit, change.k)
+        moved = np.broadcast_to(moved, (o.view_count, 3, moved.shape[2]))
+        return color.centred(moved - moved.mean(1, keepdims=True)).reshape(-1, moved.shape[2])
+
+    h_errors = known.few * known.of(lambda change: scale.centred(of_light(change).mean(1)))
+    a_errors = known.few * known.of(lambda change: change.a)
     gamma = GAMMA_SRGB / a
-    a_errors = deviations(np.eye(2 * o.view_count)[o.view_count :], cov, unknown)
     lost = active & ~(np.isfinite(h_errors) & np.isfinite(a_errors))
-    known = active & ~lost
+    seen = active & ~lost
+    if known.system.unknowns.features.balance:
+        balance = balance + _balance_of_views(fit, fit.theta.k[:, None])[..., 0]
+    balance = np.where(active[:, None], color.centred(np.broadcast_to(balance, (len(h), 3))), 0.0)
+    balance_errors = known.few[:, None] * known.of(of_balance).reshape(-1, 3)
+    shift = scale.shift(h)
+    shifts = shift[:, None] + color.shift(_broad(light, 3) - _broad(light, 3).mean(1)[:, None])
     h = np.where(active, h - shift, 0.0)
 
     used = problem.usable > 0
-    residual = fit.residual / a[o.views][:, None]
-    view_residual, balance = _per_view_ev(o.views, residual, used, o.view_count)
+    residual = fit.at.residual / a[o.views][:, None]
+    view_residual, tint = _per_view_ev(o.views, residual, used, o.view_count)
     ideal = 1 / o.decoded(response)[1] ** 2
-    ignored = (fit.weight / ideal)[used] < IGNORED
+    ignored = (fit.at.weight / ideal)[used] < IGNORED
+    cameras, corner_errors = camera_formations(fit, response, known, o)
     return PhotometricSolution(
-        model=name,
+        model=form.model,
         response=response,
         log_exposures=h,
-        exposure_errors=np.where(known, h_errors, np.inf),
+        exposure_errors=np.where(seen, h_errors, np.inf),
         gammas=np.where(active, gamma, GAMMA_SRGB),
-        gamma_errors=np.where(known, gamma / a * a_errors, np.inf),
+        gamma_errors=np.where(seen, gamma / a * a_errors, np.inf),
         observations_per_view=per_view,
         component=component,
-        point_log_radiance=_point_radiance(problem, fit, shift),
+        point_log_radiance=_point_radiance(problem, fit, shifts),
         residual_ev=_spread_ev(residual[used]) if used.any() else 0.0,
         view_residual_ev=view_residual,
-        view_balance_ev=balance,
+        view_balance_ev=tint,
         outliers=float(ignored.mean()) if ignored.size else 0.0,
         rounds=fit.rounds,
         moved=fit.moved,
         converged=fit.converged,
         unknown_errors=int(lost.sum()),
         warnings=(
-            *solver_warnings(fit, h_errors[known], np.flatnonzero(lost), o.names),
-            *observation_warnings(per_view, component, active, balance, o.names),
+            *solver_warnings(fit, h_errors[seen], np.flatnonzero(lost), o.names),
+            *observation_warnings(per_view, component, active, tint, o.names),
         ),
-        white_balance_level=None,
-        white_balance=np.zeros((o.view_count, 3)),
-        white_balance_errors=np.zeros((o.view_count, 3)),
-        vignetting=None,
-        cameras=(),
-        corner_errors=np.zeros((0, 0)),
+        white_balance_level=form.white_balance,
+        white_balance=balance,
+        white_balance_errors=np.where(seen[:, None], balance_errors, np.inf),
+        vignetting=form.vignetting,
+        cameras=cameras,
+        corner_errors=corner_errors,
     )
 
 
-def _centering(
-    a: Float[np.ndarray, " v"],
-    h: Float[np.ndarray, " v"],
-    component: Int[np.ndarray, " v"],
-    active: Bool[np.ndarray, " v"],
-    free_scale: Bool[np.ndarray, " v"],
-) -> tuple[Float[np.ndarray, " v"], Float[np.ndarray, "v 2v"]]:
-    """Return what is subtracted from h, and the derivative of the result by (b, a)."""
-    views = len(a)
-    jacobian = np.concatenate([np.diag(1 / a), np.diag(-h / a)], 1)
-    shift = np.zeros(views)
-    center = np.eye(views)
-    for label in np.unique(component):
-        members = (component == label) & active & free_scale
-        if members.any():
-            shift[component == label] = h[members].mean()
-            center[np.ix_(component == label, members)] -= 1 / members.sum()
-    return shift, center @ jacobian
+class _Gauge:
+    """Means over the views of a component that are not known in absolute terms.
+
+    Args:
+        component: label of each view.
+        counted: views whose mean is taken.
+    """
+
+    def __init__(self, component: Int[np.ndarray, " v"], counted: Bool[np.ndarray, " v"]):
+        views = len(component)
+        labels = np.unique(component, return_inverse=True)[1]
+        count = int(labels.max(initial=-1)) + 1
+        members = np.flatnonzero(counted)
+        sizes = np.bincount(labels[members], minlength=count)
+        shares = 1 / sizes[labels[members]]
+        mean = sp.csr_array((shares, (labels[members], members)), shape=(count, views))
+        of_label = sp.csr_array((np.ones(views), (np.arange(views), labels)), shape=(views, count))
+        self._mean, self._of_label = mean, of_label
+
+    def shift(self, values: Float[np.ndarray, "v ..."]) -> Float[np.ndarray, "v ..."]:
+        """Return the mean of each view's component."""
+        flat = values.reshape(len(values), -1)
+        return (self._of_label @ (self._mean @ flat)).reshape(values.shape)
+
+    def centred(self, values: Float[np.ndarray, "v ..."]) -> Float[np.ndarray, "v ..."]:
+        """Return values less that."""
+        return values - self.shift(values)
+
+
+def _light(fit: Fit) -> Float[np.ndarray, "v x"]:
+    """Return log exposures, or those of each channel."""
+    return fit.theta.b / fit.theta.a[:, None]
+
+
+def _broad(values: Float[np.ndarray, "v x"], width: int) -> Float[np.ndarray, "v 3"]:
+    return np.broadcast_to(values, (len(values), width))
+
+
+def _balance_of_views(fit: Fit, k: Float[np.ndarray, "k c"]) -> Float[np.ndarray, "v 3 c"]:
+    """Return the white balance of each view's camera."""
+    features, cameras = fit.model.unknowns.features, fit.model.rows.cameras
+    each = [features.balance_of(column) for column in k.T]
+    return np.stack(each, -1)[cameras]
+
+
+def camera_formations(
+    fit: Fit, response: Response, known: Uncertainty, o: Observations
+) -> tuple[tuple[CameraFormation, ...], Float[np.ndarray, "c j"]]:
+    """Return what each physical camera does, and standard errors of log V in its corners.
+
+    Args:
+        fit: the parameters.
+        response: what decoded the colours.
+        known: how sure the parameters are.
+        o: for the names of cameras.
+    """
+    features = fit.model.unknowns.features
+    if features.vignetting is None and not response.splines:
+        return (), np.zeros((0, 0))
+    coefficients = features.vignetting_of(fit.theta.k)
+    shape = coefficients.shape[:2]
+    names = o.camera_names or tuple(str(c) for c in range(features.cameras))
+    formations = []
+    for row, name in enumerate(names):
+        splines: tuple[tuple[float, ...], ...] = ()
+        if response.by == "camera":
+            splines = (response.splines[row],)
+        elif response.by == "channel":
+            splines = response.splines
+        polynomials = tuple(tuple(float(x) for x in each) for each in coefficients[row])
+        formations.append(CameraFormation(name, polynomials, splines))
+
+    def corner(change: Parameters):
+        each = [features.vignetting_of(column).sum(2).ravel() for column in change.k.T]
+        return np.stack(each, 1)
+
+    errors = known.of(corner).reshape(shape) if np.prod(shape) else np.zeros(shape)
+    return tuple(formations), errors
 
 
 def _point_radiance(
-    problem: Problem, fit: Fit, shift: Float[np.ndarray, " v"]
+    problem: Problem, fit: Fit, shifts: Float[np.ndarray, "v 3"]
 ) -> Float[np.ndarray, "p 3"]:
     """Combine the rows of each point; the gauge shift of its views goes the other way."""
     o, layout = problem.observations, problem.layout
-    precision, level = fit.precision, fit.radiance
+    precision, level = fit.at.precision, fit.at.radiance
     total = np.zeros((o.point_count, 3))
     weight = np.zeros((o.point_count, 3))
     np.add.at(total, layout.point_of_row, precision * level)
     np.add.at(weight, layout.point_of_row, precision)
-    moved = np.zeros(o.point_count)
+    moved = np.zeros((o.point_count, 3))
     seen = problem.usable.any(1)
-    moved[o.points[seen]] = shift[o.views[seen]]
+    moved[o.points[seen]] = shifts[o.views[seen]]
     with np.errstate(invalid="ignore", divide="ignore"):
-        level = total / weight + moved[:, None] + problem.log_pivot
+        level = total / weight + moved + problem.log_pivot
     return np.where(weight > 0, level, np.nan)
 
 

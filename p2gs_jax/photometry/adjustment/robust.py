@@ -7,9 +7,10 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from p2gs_jax.photometry.adjustment.forward import Forward
+from p2gs_jax.photometry.adjustment.parameters import Parameters
 from p2gs_jax.photometry.adjustment.rows import Rows
-from p2gs_jax.photometry.adjustment.spline import under_spline
-from p2gs_jax.photometry.adjustment.system import EMPTY, Parameters
+from p2gs_jax.photometry.adjustment.system import EMPTY
 
 Loss = Literal["l1", "geman_mcclure"]
 # Width of the Geman-McClure loss in robust standard deviations.
@@ -27,6 +28,7 @@ class Weighted(NamedTuple):
         slope: dz/dy.
         residual: of each observation, log units.
         radiance: log radiance of each row's point relative to the pivot.
+        level: the same at every observation, with what its camera adds.
         precision: of `radiance`.
         scale: robust standard deviation of one observation in units of its stated one.
         curvature: mean second derivative of the robust loss over its weight (1 for squares).
@@ -37,6 +39,7 @@ class Weighted(NamedTuple):
     slope: Float[np.ndarray, "o 3"]
     residual: Float[np.ndarray, "o 3"]
     radiance: Float[np.ndarray, "r 3"]
+    level: Float[np.ndarray, "o 3"]
     precision: Float[np.ndarray, "r 3"]
     scale: float
     curvature: float
@@ -47,21 +50,26 @@ def noise_weight(rows: Rows) -> Float[np.ndarray, "o 3"]:
     return rows.weight / rows.sigma**2
 
 
-def weigh(rows: Rows, theta: Parameters, weight: Float[np.ndarray, "o 3"], loss: Loss) -> Weighted:
+def weigh(
+    model: Forward, theta: Parameters, weight: Float[np.ndarray, "o 3"], loss: Loss
+) -> Weighted:
     """Return residuals and the weights they imply.
 
     Args:
-        rows: observations.
+        model: observations, and what explains them.
         theta: parameters.
         weight: from the round before; decides the point radiances that residuals are taken from.
         loss: what the weights are of.
     """
+    rows = model.rows
     z, sigma, slope = rows.z, rows.sigma, rows.slope
     if theta.c.size:
-        z, sigma, slope = under_spline(rows, theta.c)
-    a, b = theta.a[rows.views][:, None], theta.b[rows.views][:, None]
-    radiance, _ = _radiance(rows, a, b, z, weight)
-    u = (z - b - a * radiance[rows.row]) / sigma
+        z, sigma, slope = model.unknowns.splines.decode(rows, theta.c)
+    a, b = theta.a[rows.views][:, None], theta.b[rows.views]
+    added = model.of_cameras(theta.k)
+    z_of_point = z - (b + a * added)
+    radiance, _ = _radiance(rows, a, z_of_point, weight)
+    u = (z_of_point - a * radiance[rows.row]) / sigma
     scale = max(1.4826 * _median(rows, np.abs(u)), SMALLEST_SCALE)
     # One weight for the whole observation: an outlier is wrong in all channels.
     used = rows.weight.sum(1)
@@ -70,18 +78,22 @@ def weigh(rows: Rows, theta: Parameters, weight: Float[np.ndarray, "o 3"], loss:
     of_l1 = loss == "l1"
     factor = 1 / np.maximum(np.abs(u) / scale, 0.5) if of_l1 else robust[:, None]
     weight = rows.weight / sigma**2 * factor
-    radiance, precision = _radiance(rows, a, b, z, weight)
+    radiance, precision = _radiance(rows, a, z_of_point, weight)
     seen = used > 0
     second_derivative = ((1 - 3 * square) / (1 + square) ** 3)[seen].sum()
     curvature = second_derivative / max(robust[seen].sum(), 1e-9)
-    residual = z - b - a * radiance[rows.row]
-    return Weighted(weight, sigma, slope, residual, radiance, precision, scale, float(curvature))
+    of_point = radiance[rows.row]
+    residual = z_of_point - a * of_point
+    level = of_point + added
+    return Weighted(
+        weight, sigma, slope, residual, radiance, level, precision, scale, float(curvature)
+    )
 
 
-def _radiance(rows: Rows, a, b, z, weight):
-    """Return the log radiance of each row and its precision; a and b per observation."""
+def _radiance(rows: Rows, a, z, weight):
+    """Return the log radiance of each row and its precision; a per observation."""
     precision = rows.by_row @ (weight * a**2)
-    return rows.by_row @ (weight * a * (z - b)) / (precision + EMPTY), precision
+    return rows.by_row @ (weight * a * z) / (precision + EMPTY), precision
 
 
 def _median(rows: Rows, values: Float[np.ndarray, "o 3"]) -> float:

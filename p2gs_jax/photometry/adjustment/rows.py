@@ -9,8 +9,10 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Int
 
+from p2gs_jax.config import ResponseKind
+from p2gs_jax.photometry.adjustment.pairs import Pairs
 from p2gs_jax.photometry.observations import Observations
-from p2gs_jax.photometry.response import Response, hat
+from p2gs_jax.photometry.response import Response, hat, spline_groups
 
 LONGEST_ROW = 16
 
@@ -28,10 +30,10 @@ class Rows:
         knot: left spline knot.
         fraction: of the way to the next knot.
         slope: dz/dy under the base curve.
-        by_row: sums observations over their rows.
+        group: which spline decodes a value, where they are solved for.
         layout: the same observations in the order of their rows, and the pairs of them.
-        count: number of rows.
-        view_count: number of views.
+        cameras: physical camera of each view.
+        radius2: squared distance from the image centre, 1 in the corners.
     """
 
     views: Int[np.ndarray, " o"]
@@ -42,10 +44,25 @@ class Rows:
     knot: Int[np.ndarray, "o 3"]
     fraction: Float[np.ndarray, "o 3"]
     slope: Float[np.ndarray, "o 3"]
-    by_row: sp.csr_array
+    group: Int[np.ndarray, "o 3"]
     layout: Layout
-    count: int
-    view_count: int
+    cameras: Int[np.ndarray, " v"]
+    radius2: Float[np.ndarray, " o"]
+
+    @property
+    def count(self) -> int:
+        """Number of rows."""
+        return self.layout.rows
+
+    @property
+    def view_count(self) -> int:
+        """Number of views."""
+        return len(self.cameras)
+
+    @property
+    def by_row(self) -> sp.csr_array:
+        """Sums observations over their rows."""
+        return self.layout.by_row
 
 
 class Layout:
@@ -60,7 +77,6 @@ class Layout:
         rows: their number.
         point_of_row: the point of each row.
         by_row: sums observations over their rows.
-        order: observations sorted by row.
     """
 
     def __init__(self, observations: Observations):
@@ -82,22 +98,17 @@ class Layout:
         self.by_row = sp.csr_array(
             (np.ones(count), (self.row, np.arange(count))), shape=(self.rows, count)
         )
-        self.order = np.argsort(self.row, kind="stable")
+        self._views, self._view_count = observations.views, observations.view_count
 
     @functools.cached_property
-    def pairs(self) -> tuple[Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"]]:
-        """Every pair of observations in a row once, themselves included: places in `order`."""
-        return _pairs(self.row[self.order])
+    def pairs(self) -> Pairs:
+        """Every pair of observations in a row once, themselves included."""
+        return Pairs(self.row, self._views, self._view_count)
 
-
-def _pairs(row: Int[np.ndarray, " o"]):
-    """Return every pair of equal entries of a sorted array once, each with itself included."""
-    here = np.arange(len(row))
-    # Every entry with itself and those after it that equal it.
-    following = np.searchsorted(row, row, side="right") - here
-    first = np.repeat(here, following)
-    offset = np.arange(len(first)) - np.repeat(np.cumsum(following) - following, following)
-    return first, first + offset
+    @functools.cached_property
+    def by_row_and_channel(self) -> sp.csr_array:
+        """Sums values over the rows of their observations, channels apart: (3 r, 3 o)."""
+        return sp.csr_array(sp.kron(self.by_row, sp.eye_array(3), format="csr"))
 
 
 def make_rows(
@@ -106,6 +117,7 @@ def make_rows(
     weight: Float[np.ndarray, "o 3"],
     response: Response,
     log_pivot: float,
+    splines: ResponseKind = "all",
 ) -> Rows:
     """Return rows under one response.
 
@@ -115,9 +127,13 @@ def make_rows(
         weight: 1 used, 0 not.
         response: what decodes the colours.
         log_pivot: log of the linear value that gamma leaves alone.
+        splines: what gets a spline of its own, where they are solved for.
     """
     z, sigma, slope = observations.decoded(response)
     knot, fraction = hat(np.asarray(observations.colors, np.float64))
+    places = observations.positions
+    radius2 = np.zeros(len(layout.row)) if places is None else (places.astype(float) ** 2).sum(1)
+    cameras = np.asarray(observations.cameras)
     return Rows(
         views=np.asarray(observations.views),
         row=layout.row,
@@ -127,8 +143,8 @@ def make_rows(
         knot=knot,
         fraction=fraction,
         slope=slope,
-        by_row=layout.by_row,
+        group=spline_groups(splines, cameras[observations.views], z.shape),
         layout=layout,
-        count=layout.rows,
-        view_count=observations.view_count,
+        cameras=cameras,
+        radius2=radius2,
     )

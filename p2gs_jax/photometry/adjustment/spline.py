@@ -1,79 +1,103 @@
-"""The response spline in the adjustment: values under it, and sums over its basis."""
+"""Response splines in the adjustment: values under them, and sums over their basis."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float
 
+from p2gs_jax.config import ResponseKind
 from p2gs_jax.photometry.adjustment.rows import Rows
-from p2gs_jax.photometry.response import FLOOR, FREE, KNOTS, SMALLEST_SLOPE
-
-_FREE = np.array(FREE)
+from p2gs_jax.photometry.response import FLOOR, HELD, KNOTS, SMALLEST_SLOPE, free_knots
 
 
-def under_spline(
-    rows: Rows, c: Float[np.ndarray, " k"]
-) -> tuple[Float[np.ndarray, "o 3"], Float[np.ndarray, "o 3"], Float[np.ndarray, "o 3"]]:
-    """Return z, its standard deviation and dz/dy under a spline over the base curve.
+@dataclass(frozen=True)
+class Splines:
+    """Which splines are solved for.
 
-    Args:
-        rows: observations.
-        c: the spline at its free knots.
+    Attributes:
+        by: what has one of its own.
+        groups: number of splines; 0 where none is solved for.
     """
-    full = np.zeros(len(KNOTS))
-    full[_FREE] = c
-    z = rows.z + (1 - rows.fraction) * full[rows.knot] + rows.fraction * full[rows.knot + 1]
-    steeper = (np.diff(full) / np.diff(KNOTS))[rows.knot]
-    slope = np.maximum(rows.slope + steeper, SMALLEST_SLOPE * rows.slope)
-    of_pixel = np.maximum(rows.sigma**2 - FLOOR**2, 0) * (slope / rows.slope) ** 2
-    return z, np.sqrt(of_pixel + FLOOR**2), slope
 
+    by: ResponseKind = "all"
+    groups: int = 0
 
-def at_knots(
-    rows: Rows, values: Float[np.ndarray, "o 3"], index: np.ndarray, size: int
-) -> Float[np.ndarray, "size k"]:
-    """Return sums of values times the spline's basis, free knots only.
+    @property
+    def free(self) -> np.ndarray:
+        """Knots of a spline that are solved for."""
+        return np.array(free_knots(self.by))
 
-    Args:
-        rows: for the knots; of its basis functions two are not zero at a value.
-        values: what is summed.
-        index: where each value belongs, broadcast to the shape of `values`.
-        size: number of those places.
-    """
-    at = (np.broadcast_to(index, values.shape) * len(KNOTS) + rows.knot).ravel()
-    length = size * len(KNOTS)
-    right = values * rows.fraction
-    sums = np.bincount(at, (values - right).ravel(), length)
-    sums += np.bincount(at + 1, right.ravel(), length + 1)[:length]
-    return sums.reshape(size, len(KNOTS))[:, _FREE]
+    @property
+    def count(self) -> int:
+        """Number of parameters."""
+        return self.groups * len(self.free)
 
+    @property
+    def powers(self) -> np.ndarray:
+        """Parameters whose mean is a gauge: how steep the splines are, where they are several."""
+        if self.by == "all":
+            return np.zeros(0, int)
+        place = int(np.flatnonzero(self.free == HELD[1])[0])
+        return place + len(self.free) * np.arange(self.groups)
 
-def basis_at_values(rows: Rows) -> sp.csr_array:
-    """Return the spline's basis at every observed value, free knots only: (3 o, k)."""
-    count = rows.knot.size
-    knot, fraction = rows.knot.ravel(), rows.fraction.ravel()
-    values = np.stack([1 - fraction, fraction], 1).ravel()
-    columns = np.stack([knot, knot + 1], 1).ravel()
-    shape = (count, len(KNOTS))
-    return sp.csr_array((values, columns, 2 * np.arange(count + 1)), shape=shape)[:, _FREE]
+    def values(self, c: Float[np.ndarray, " k"]) -> Float[np.ndarray, "g n"]:
+        """Return the splines at all knots."""
+        full = np.zeros((self.groups, len(KNOTS)))
+        full[:, self.free] = c.reshape(self.groups, -1)
+        return full
 
+    def matrix(self, rows: Rows) -> sp.csr_array:
+        """Return the basis at every value, free knots only: (3 o, count), channels fastest."""
+        size = rows.knot.size
+        knot, fraction = rows.knot.ravel(), rows.fraction.ravel()
+        values = np.stack([1 - fraction, fraction], 1).ravel()
+        left = rows.group.ravel() * len(KNOTS) + knot
+        columns = np.stack([left, left + 1], 1).ravel()
+        shape = (size, self.groups * len(KNOTS))
+        whole = sp.csr_array((values, columns, 2 * np.arange(size + 1)), shape=shape)
+        kept = (len(KNOTS) * np.arange(self.groups)[:, None] + self.free).ravel()
+        return sp.csr_array(whole[:, kept])
 
-def log_slope_terms(
-    rows: Rows, share: Float[np.ndarray, "o 3"], slope: Float[np.ndarray, "o 3"]
-) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
-    """Return gradient and curvature of the sum of log dz/dy over the spline's free knots.
+    def decode(
+        self, rows: Rows, c: Float[np.ndarray, " k"]
+    ) -> tuple[Float[np.ndarray, "o 3"], Float[np.ndarray, "o 3"], Float[np.ndarray, "o 3"]]:
+        """Return z, its standard deviation and dz/dy under splines over the base curve.
 
-    A density over photographed values carries the slope of the transform. Without it, a curve that
-    is flat nearly everywhere and jumps once explains everything: the residuals vanish with it.
+        Args:
+            rows: observations.
+            c: the splines at their free knots.
+        """
+        full = self.values(c)
+        low, high = full[rows.group, rows.knot], full[rows.group, rows.knot + 1]
+        z = rows.z + (1 - rows.fraction) * low + rows.fraction * high
+        steeper = (high - low) / np.diff(KNOTS)[rows.knot]
+        slope = np.maximum(rows.slope + steeper, SMALLEST_SLOPE * rows.slope)
+        of_pixel = np.maximum(rows.sigma**2 - FLOOR**2, 0) * (slope / rows.slope) ** 2
+        return z, np.sqrt(of_pixel + FLOOR**2), slope
 
-    Args:
-        rows: for the knots.
-        share: how much each value counts.
-        slope: dz/dy under the spline.
-    """
-    steps = np.diff(np.eye(len(KNOTS)), axis=0)[:, _FREE] / np.diff(KNOTS)[:, None]
-    first, second = (
-        np.bincount(rows.knot.ravel(), (share / slope**k).ravel(), len(KNOTS) - 1) for k in (1, 2)
-    )
-    return steps.T @ first, steps.T @ (second[:, None] * steps)
+    def log_slope_terms(
+        self, rows: Rows, share: Float[np.ndarray, "o 3"], slope: Float[np.ndarray, "o 3"]
+    ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
+        """Return gradient and curvature of the sum of log dz/dy over the free knots.
+
+        A density over photographed values carries the slope of the transform. Without it, a curve
+        that is flat nearly everywhere and jumps once explains everything: the residuals vanish with
+        it.
+
+        Args:
+            rows: for the knots.
+            share: how much each value counts.
+            slope: dz/dy under the splines.
+        """
+        steps = np.diff(np.eye(len(KNOTS)), axis=0)[:, self.free] / np.diff(KNOTS)[:, None]
+        gaps = len(KNOTS) - 1
+        at = (rows.group * gaps + rows.knot).ravel()
+        first, second = (
+            np.bincount(at, (share / slope**k).ravel(), self.groups * gaps).reshape(-1, gaps)
+            for k in (1, 2)
+        )
+        curvature = sp.block_diag([steps.T @ (s[:, None] * steps) for s in second]).toarray()
+        return (first @ steps).ravel(), curvature

@@ -1,18 +1,22 @@
-"""What is solved for, in which directions it may move, and what holds it besides photographs."""
+"""In which directions parameters may move, and what holds them besides photographs."""
 
 from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
+import scipy.sparse as sp
 from jaxtyping import Float
 
+from p2gs_jax.config import Level, ResponseKind
 from p2gs_jax.core.numerics import LN2
+from p2gs_jax.photometry.adjustment.features import Features
+from p2gs_jax.photometry.adjustment.parameters import Parameters, Unknowns
 from p2gs_jax.photometry.adjustment.problem import Problem
-from p2gs_jax.photometry.models import Level, Model
-from p2gs_jax.photometry.response import FREE, KNOTS
+from p2gs_jax.photometry.adjustment.spline import Splines
+from p2gs_jax.photometry.models import MODELS, Form
+from p2gs_jax.photometry.response import KNOTS
 
 # How hard gauges are held, relative to the mean diagonal of the normal matrix.
 ANCHOR = 10.0
@@ -20,24 +24,36 @@ ANCHOR = 10.0
 EMPTY = 1e-9
 # Standard deviation of a = 2.2 / gamma about 1 (gammas of 1.9 to 2.6 are within one of these).
 A_PRIOR = 0.15
+# Standard deviation of each coefficient of log V about 0: lenses lose up to two stops.
+VIGNETTING_PRIOR = 0.7
 # A known exposure that is to be kept: stops.
 FIXED_EV = 1e-5
 # Smoothness of the spline relative to its mean information, and the spacing of knots it is told at.
 SMOOTHNESS, KNOT_SPACING = 3e-3, 0.12
 
 
-class Parameters(NamedTuple):
-    """What is solved for.
+@dataclass(frozen=True)
+class Held:
+    """Linear combinations of the parameters, and where they are held.
 
     Attributes:
-        b: a h per view.
-        a: 2.2 / gamma per view.
-        c: response spline at its free knots; empty where the response is given.
+        rows: of a matrix; its product with the parameters is what is held.
+        targets: where.
+        precisions: how hard: inverse variances.
     """
 
-    b: Float[np.ndarray, " v"]
-    a: Float[np.ndarray, " v"]
-    c: Float[np.ndarray, " k"]
+    rows: sp.csr_array
+    targets: Float[np.ndarray, " n"]
+    precisions: Float[np.ndarray, " n"]
+
+    @functools.cached_property
+    def normal(self) -> sp.csr_array:
+        """Its normal matrix."""
+        return sp.csr_array(self.rows.T @ self.rows.multiply(self.precisions[:, None]))
+
+    def pull(self, vector: Float[np.ndarray, " d"]) -> Float[np.ndarray, " d"]:
+        """Return its right side at some parameters."""
+        return self.rows.T @ (self.precisions * (self.targets - self.rows @ vector))
 
 
 @dataclass(frozen=True)
@@ -45,62 +61,53 @@ class System:
     """Which directions are free, and what is known besides the photographs.
 
     Attributes:
-        basis: columns are the free directions in (b, a, c); zero columns are allowed.
-        anchors: rows whose product with (b, a) is held at its target: the gauges.
-        targets: of `anchors`.
-        log_exposure: prior mean of h.
-        log_exposure_precision: inverse variance of that; 0 for none.
-        a_precision: inverse variance of a about 1; 0 for none.
-        smoothness: matrix whose quadratic form keeps the spline smooth, (k, k).
+        unknowns: what the parameters are.
+        basis: columns are the free directions.
+        anchors: the gauges; their precisions are relative (`gauge_strength`).
+        priors: what is known.
+        log_exposure: prior mean of h: where rounds start.
+        smoothness: matrix whose quadratic form keeps a spline smooth, (k, k).
     """
 
-    basis: Float[np.ndarray, "d q"]
-    anchors: Float[np.ndarray, "g 2v"]
-    targets: Float[np.ndarray, " g"]
+    unknowns: Unknowns
+    basis: sp.csr_array
+    anchors: Held
+    priors: Held
     log_exposure: Float[np.ndarray, " v"]
-    log_exposure_precision: Float[np.ndarray, " v"]
-    a_precision: Float[np.ndarray, " v"]
     smoothness: Float[np.ndarray, "k k"]
 
-    @functools.cached_property
-    def prior(self) -> Float[np.ndarray, "2v 2v"]:
-        """The normal matrix of the priors: of h by b = a h (residual b - a mu), and of a."""
-        tau, mu = self.log_exposure_precision, self.log_exposure
-        cross = np.diag(-tau * mu)
-        of_a = np.diag(tau * mu**2 + self.a_precision)
-        return np.block([[np.diag(tau), cross], [cross, of_a]])
-
-    @functools.cached_property
-    def anchored(self) -> Float[np.ndarray, "2v 2v"]:
-        """The normal matrix of the anchors."""
-        return self.anchors.T @ self.anchors
+    @property
+    def start(self) -> Parameters:
+        """Where rounds begin."""
+        u = self.unknowns
+        b = np.repeat(self.log_exposure[:, None], u.channels, 1)
+        return Parameters(
+            b, np.ones(u.views), np.zeros(u.features.count), np.zeros(u.splines.count)
+        )
 
 
-def _level_basis(level: Level | None, cameras: np.ndarray) -> np.ndarray:
-    views = len(cameras)
-    columns = np.zeros((views, views))
-    if level == "view":
-        columns = np.eye(views)
-    elif level == "camera":
-        columns[:, : cameras.max() + 1] = np.eye(cameras.max() + 1)[cameras]
-    return columns
-
-
-def make_system(problem: Problem, model: Model, spline: bool) -> System:
-    """Return free directions, gauges and priors of a model.
+def make_system(problem: Problem, form: Form, splines: ResponseKind | None = None) -> System:
+    """Return free directions, gauges and priors of a form.
 
     Args:
         problem: for cameras, groups of views and known exposures.
-        model: what varies.
-        spline: the response's spline is free as well.
+        form: what varies.
+        splines: what gets a spline that is solved for as well; None: the response is given.
     """
     cameras, views = problem.observations.cameras, problem.observations.view_count
-    knots = len(FREE) if spline else 0
-    d = 2 * views + knots
-    basis = np.zeros((d, d))
-    basis[:views, :views] = _level_basis(model.exposure, cameras)
-    basis[views : 2 * views, views : 2 * views] = _level_basis(model.gamma, cameras)
-    basis[2 * views :, 2 * views :] = np.eye(knots)
+    camera_count = int(cameras.max(initial=0)) + 1
+    model = MODELS[form.model]
+    groups = {None: 0, "all": 1, "camera": camera_count, "channel": 3}[splines]
+    unknowns = Unknowns(
+        views,
+        3 if form.white_balance == "view" else 1,
+        model.gamma is not None,
+        Features(camera_count, form.white_balance == "camera", form.vignetting),
+        Splines(splines or "all", groups),
+    )
+    of_b, of_a = _directions(model.exposure, cameras), _directions(model.gamma, cameras)
+    others = sp.eye_array(unknowns.count - unknowns.per_view)
+    basis = sp.block_diag([*[of_b] * unknowns.channels, of_a, others], format="csr")
 
     known = problem.known
     log_exposure, precision = np.zeros(views), np.zeros(views)
@@ -108,69 +115,131 @@ def make_system(problem: Problem, model: Model, spline: bool) -> System:
         given = np.isfinite(known.log_exposures)
         log_exposure = np.where(given, known.log_exposures, 0.0)
         precision = given / (max(known.deviation_ev, FIXED_EV) * LN2) ** 2
-    anchors, targets = np.zeros((2 * views, 2 * views)), np.zeros(2 * views)
-    for label in np.unique(problem.component):
-        members = problem.component == label
-        if not (precision[members] > 0).any():
-            anchors[label, :views] = members / members.sum()
-        if (precision[members] > 0).sum() < 2 or np.ptp(log_exposure[members]) < 1e-3:
-            anchors[views + label, views:] = members / members.sum()
-            targets[views + label] = 1.0
     return System(
-        basis=basis,
-        anchors=anchors,
-        targets=targets,
+        unknowns=unknowns,
+        basis=sp.csr_array(basis),
+        anchors=_anchors(problem, unknowns, log_exposure, precision),
+        priors=_priors(unknowns, log_exposure, precision),
         log_exposure=log_exposure,
-        log_exposure_precision=precision,
-        a_precision=np.full(views, 1 / A_PRIOR**2 if model.gamma else 0.0),
-        smoothness=_smoothness()[:knots, :knots],
+        smoothness=_smoothness(unknowns.splines),
     )
 
 
-def _smoothness() -> Float[np.ndarray, "k k"]:
-    """Return the quadratic form of second differences between the spline's knots."""
+def _directions(level: Level | None, cameras: np.ndarray) -> sp.csr_array:
+    """Return what may move together: nothing, the views of a camera, or each by itself."""
+    views = len(cameras)
+    if level is None:
+        return sp.csr_array((views, 0))
+    column = np.arange(views) if level == "view" else cameras
+    return sp.csr_array((np.ones(views), (np.arange(views), column)))
+
+
+def _selection(index, weights, size: int) -> Float[np.ndarray, " d"]:
+    row = np.zeros(size)
+    row[index] = weights
+    return row
+
+
+def _anchors(problem: Problem, u: Unknowns, log_exposure, precision) -> Held:
+    """Return the gauges: scale, power and colour of each group of views that share points."""
+    size = u.count
+    rows, targets = [sp.csr_array((0, size))], []
+
+    def hold(index, weights, target=0.0) -> None:
+        rows.append(sp.csr_array(_selection(index, weights, size)[None]))
+        targets.append(target)
+
+    for label in np.unique(problem.component):
+        members = np.flatnonzero(problem.component == label)
+        share, known = 1 / len(members), precision[members] > 0
+        if not known.any():
+            for channel in range(u.channels):
+                hold(channel * u.views + members, share)
+        elif u.channels == 3:
+            # Known exposures say nothing of colours.
+            for channel in (0, 2):
+                both = np.concatenate([channel * u.views + members, u.views + members])
+                hold(both, np.repeat([share, -share], len(members)))
+        if known.sum() < 2 or np.ptp(log_exposure[members]) < 1e-3:
+            hold(u.of_a.start + members, share, 1.0)
+    if u.features.balance:
+        views_of = np.bincount(problem.observations.cameras, minlength=u.features.cameras)
+        for direction in range(u.features.balance_count // u.features.cameras):
+            at = u.of_k.start + direction * u.features.cameras + np.arange(u.features.cameras)
+            hold(at, views_of / views_of.sum())
+    if u.splines.powers.size:
+        hold(u.of_c.start + u.splines.powers, 1 / u.splines.groups)
+    return Held(sp.csr_array(sp.vstack(rows)), np.array(targets), np.ones(len(targets)))
+
+
+def _priors(u: Unknowns, log_exposure, precision) -> Held:
+    """Return what is known: exposures (b - a mu = 0 for h = mu), gammas, lenses."""
+    given, views = np.flatnonzero(precision > 0), np.arange(u.views)
+    at = np.arange(len(given))
+    b = [(np.full(len(given), 1 / u.channels), c * u.views + given) for c in range(u.channels)]
+    b.append((-log_exposure[given], u.of_a.start + given))
+    values, columns = (np.concatenate(part) for part in zip(*b, strict=True))
+    exposures = sp.csr_array(
+        (values, (np.tile(at, u.channels + 1), columns)), shape=(len(given), u.count)
+    )
+    whole = sp.eye_array(u.count, format="csr")
+    of_a = whole[u.of_a.start + views] if u.gammas else whole[:0]
+    lenses = np.arange(u.of_k.start + u.features.balance_count, u.of_k.stop)
+    rows = sp.vstack([exposures, of_a, whole[lenses]])
+    targets = np.concatenate([np.zeros(len(given)), np.ones(of_a.shape[0]), np.zeros(len(lenses))])
+    precisions = np.concatenate(
+        [
+            precision[given],
+            np.full(of_a.shape[0], 1 / A_PRIOR**2),
+            np.full(len(lenses), 1 / VIGNETTING_PRIOR**2),
+        ]
+    )
+    return Held(sp.csr_array(rows), targets, precisions)
+
+
+def _smoothness(splines: Splines) -> Float[np.ndarray, "k k"]:
+    """Return the quadratic form of second differences between the knots of each spline."""
+    if not splines.groups:
+        return np.zeros((0, 0))
     gaps = np.diff(KNOTS)
-    second = np.diff(np.diff(np.eye(len(KNOTS)), axis=0) / gaps[:, None], axis=0)[:, list(FREE)]
+    second = np.diff(np.diff(np.eye(len(KNOTS)), axis=0) / gaps[:, None], axis=0)[:, splines.free]
     between = 0.5 * (gaps[1:] + gaps[:-1])
     second = second * (KNOT_SPACING**1.5 / np.sqrt(between))[:, None]
-    return SMOOTHNESS * second.T @ second
+    return np.kron(np.eye(splines.groups), SMOOTHNESS * second.T @ second)
 
 
-def gauge_strength(normal: Float[np.ndarray, "d d"], views: int) -> float:
+def gauge_strength(normal: sp.csr_array, unknowns: Unknowns) -> float:
     """Return how hard the anchors hold, on the scale of the exposures' information.
 
     Args:
-        normal: over (b, a, c).
-        views: number of views.
+        normal: over all parameters.
+        unknowns: what they are.
     """
-    return ANCHOR * float(np.mean(np.diagonal(normal)[:views]) + EMPTY)
+    of_b = normal.diagonal()[: unknowns.channels * unknowns.views]
+    return ANCHOR * float(np.mean(of_b) + EMPTY)
 
 
-def add_priors(
-    system: System,
-    theta: Parameters,
-    normal: Float[np.ndarray, "d d"],
-    right: Float[np.ndarray, " d"],
-) -> None:
-    """Add priors and gauges to normal equations, in place.
+def with_priors(
+    system: System, theta: Parameters, normal: sp.csr_array, right: Float[np.ndarray, " d"]
+) -> tuple[sp.csr_array, Float[np.ndarray, " d"]]:
+    """Return normal equations with priors and gauges.
 
     Args:
         system: priors and gauges.
         theta: parameters.
-        normal: matrix of the observations over (b, a, c).
+        normal: matrix of the observations.
         right: its right side.
     """
-    views = len(theta.b)
-    both, part = np.concatenate([theta.b, theta.a]), slice(0, 2 * views)
-    normal[part, part] += system.prior
-    right[part] -= system.prior @ both
-    right[views : 2 * views] += system.a_precision
-    strength = gauge_strength(normal, views)
-    pulled = system.targets - system.anchors @ both
-    normal[part, part] += strength * system.anchored
-    right[part] += strength * (pulled @ system.anchors)
+    u, vector = system.unknowns, theta.vector()
+    normal = normal + system.priors.normal
+    right = right + system.priors.pull(vector)
+    strength = gauge_strength(normal, u)
+    normal = normal + strength * system.anchors.normal
+    right = right + strength * system.anchors.pull(vector)
     if theta.c.size:
-        rest = slice(2 * views, None)
-        stiffness = np.mean(np.diagonal(normal)[rest])
-        normal[rest, rest] += stiffness * system.smoothness
-        right[rest] -= stiffness * system.smoothness @ theta.c
+        stiffness = float(np.mean(normal.diagonal()[u.of_c]))
+        smooth = sp.csr_array(stiffness * system.smoothness)
+        before = sp.csr_array((u.of_c.start,) * 2)
+        normal = normal + sp.block_diag([before, smooth], format="csr")
+        right = right - np.concatenate([np.zeros(u.of_c.start), smooth @ theta.c])
+    return sp.csr_array(normal), right

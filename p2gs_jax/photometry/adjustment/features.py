@@ -1,0 +1,90 @@
+"""What cameras do besides exposing: sums of few features, linear in log radiance.
+
+A white balance per camera is a constant per channel; vignetting is a polynomial of the radius. Both
+act on light, before the tone curve: like a point's log radiance they are multiplied by a = 2.2 /
+gamma.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Float
+
+from p2gs_jax.config import VignettingKind
+from p2gs_jax.photometry.adjustment.rows import Rows
+from p2gs_jax.photometry.models import VIGNETTING_POWERS
+
+# Two directions that change the ratios of red, green and blue, and not their mean.
+CHROMA = np.array([[2.0, -1.0, -1.0], [0.0, 1.0, -1.0]]) / np.sqrt([[6.0], [2.0]])
+
+
+@dataclass(frozen=True)
+class Features:
+    """Which features there are; parameters are ordered as these fields are, camera by camera.
+
+    Attributes:
+        cameras: number of physical cameras.
+        balance: a white balance per camera.
+        vignetting: per camera, or per camera and channel.
+    """
+
+    cameras: int
+    balance: bool = False
+    vignetting: VignettingKind | None = None
+
+    @property
+    def vignetting_rows(self) -> int:
+        """Polynomials of a camera: none, one for all channels, or three."""
+        return {None: 0, "camera": 1, "channel": 3}[self.vignetting]
+
+    @property
+    def balance_count(self) -> int:
+        """Parameters of white balance."""
+        return len(CHROMA) * self.cameras * self.balance
+
+    @property
+    def count(self) -> int:
+        """Number of parameters."""
+        polynomials = self.cameras * self.vignetting_rows
+        return self.balance_count + polynomials * len(VIGNETTING_POWERS)
+
+    def matrix(self, rows: Rows) -> sp.csr_array:
+        """Return the features of every value: (3 o, count), channels running fastest."""
+        camera = rows.cameras[rows.views]
+        size = 3 * len(camera)
+        blocks = []
+        if self.balance:
+            for channel_of in CHROMA:
+                values = np.broadcast_to(channel_of, (len(camera), 3))
+                blocks.append((values, np.broadcast_to(camera[:, None], values.shape)))
+        columns, width = [], self.cameras
+        for k, (values, at) in enumerate(blocks):
+            columns.append((values.ravel(), (at + k * width).ravel()))
+        base = self.balance_count
+        if self.vignetting:
+            of_channel = np.arange(3) if self.vignetting == "channel" else np.zeros(3, int)
+            polynomial = camera[:, None] * self.vignetting_rows + of_channel
+            powers = len(VIGNETTING_POWERS)
+            for k, power in enumerate(VIGNETTING_POWERS):
+                values = np.broadcast_to(rows.radius2[:, None] ** (power // 2), polynomial.shape)
+                columns.append((values.ravel(), (base + polynomial * powers + k).ravel()))
+        if not columns:
+            return sp.csr_array((size, 0))
+        values = np.stack([v for v, _ in columns], 1).ravel()
+        at = np.stack([a for _, a in columns], 1).ravel()
+        starts = len(columns) * np.arange(size + 1)
+        return sp.csr_array((values, at, starts), shape=(size, self.count))
+
+    def balance_of(self, k: Float[np.ndarray, " k"]) -> Float[np.ndarray, "c 3"]:
+        """Return the log factors of each camera on the channels."""
+        if not self.balance:
+            return np.zeros((self.cameras, 3))
+        return k[: self.balance_count].reshape(len(CHROMA), self.cameras).T @ CHROMA
+
+    def vignetting_of(self, k: Float[np.ndarray, " k"]) -> Float[np.ndarray, "c j p"]:
+        """Return the coefficients of each camera's polynomials."""
+        shape = (self.cameras, self.vignetting_rows, len(VIGNETTING_POWERS))
+        return k[self.balance_count :].reshape(shape)

@@ -1,0 +1,90 @@
+"""What may be chosen: a form and a kind of curve; and which choices are one step apart."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from p2gs_jax.config import Level, ResponseKind, VignettingKind
+from p2gs_jax.photometry.models import MODELS, Form, ModelName, possible
+from p2gs_jax.photometry.response import BASES, Base
+
+_BY_LEVELS: dict[tuple[Level | None, Level | None], ModelName] = {
+    (model.exposure, model.gamma): name for name, model in MODELS.items()
+}
+_LEVELS: tuple[Level | None, ...] = (None, "camera", "view")
+_VIGNETTING: tuple[VignettingKind | None, ...] = (None, "camera", "channel")
+_SPLINES: tuple[ResponseKind, ...] = ("all", "camera", "channel")
+
+
+class Curve(NamedTuple):
+    """A kind of curve.
+
+    Attributes:
+        base: what is decoded with.
+        splines: what has a fitted spline over it; None: nothing.
+    """
+
+    base: Base = "srgb"
+    splines: ResponseKind | None = None
+
+
+class Choice(NamedTuple):
+    """What varies, and under which kind of curve.
+
+    Attributes:
+        form: what varies.
+        curve: how values are decoded.
+    """
+
+    form: Form
+    curve: Curve = Curve()
+
+
+class Scope(NamedTuple):
+    """What there is to choose from.
+
+    Attributes:
+        cameras: number of physical cameras.
+        places: positions in the images are known: vignetting can be told.
+        curves: exposures differ enough to tell a curve by.
+    """
+
+    cameras: int
+    places: bool
+    curves: bool
+
+    def allows(self, choice: Choice) -> bool:
+        """Return whether a choice differs from simpler ones and can be solved."""
+        by = choice.curve.splines
+        told = by is None or self.curves
+        several = by != "camera" or self.cameras > 1
+        seen = choice.form.vignetting is None or self.places
+        return told and several and seen and possible(choice.form, self.cameras)
+
+
+def neighbours(choice: Choice, scope: Scope) -> list[Choice]:
+    """Return the choices that differ in one thing, simpler and richer ones.
+
+    Args:
+        choice: where from.
+        scope: what there is.
+    """
+    form, curve = choice
+    exposure, gamma, _ = MODELS[form.model]
+    forms = [
+        form._replace(model=name)
+        for e in _LEVELS
+        for g in _LEVELS
+        if (e == exposure) != (g == gamma) and (name := _BY_LEVELS.get((e, g)))
+    ]
+    # Exposures alone may not become simpler while more depends on them.
+    if gamma is not None and exposure == gamma:
+        forms += [form._replace(model=_BY_LEVELS[(None, None)])]
+    if form.white_balance == "view" and exposure == "view":
+        per_camera = [name for name in MODELS if MODELS[name].exposure == "camera"]
+        forms += [Form(name, "camera", form.vignetting) for name in per_camera]
+    forms += [form._replace(white_balance=level) for level in _LEVELS]
+    forms += [form._replace(vignetting=kind) for kind in _VIGNETTING]
+    curves = [Curve(base) for base in BASES] + [Curve("srgb", by) for by in _SPLINES]
+    near = [Choice(f, curve) for f in forms] + [Choice(form, c) for c in curves]
+    return [c for c in dict.fromkeys(near) if c != choice and scope.allows(c)]
