@@ -84,7 +84,7 @@ def oracle(linear, view: OneView):
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_it_computes_what_the_paper_says(seed):
     view = some_view(seed)
-    ours = applied(jnp.asarray(IMAGE, jnp.float32), view)
+    ours = jax.jit(applied)(jnp.asarray(IMAGE, jnp.float32), view)
     np.testing.assert_allclose(ours, oracle(IMAGE, view), atol=3e-5)
 
 
@@ -186,37 +186,36 @@ def test_gradients_match_finite_differences():
         view = some_view(dtype=np.float64)
         weight = jnp.asarray(np.random.default_rng(3).normal(size=image.shape))
 
-        def f(view, linear):
+        @jax.jit
+        def f(given):
+            view, linear = given
             return jnp.sum(weight * applied(linear, view))
 
         rng = np.random.default_rng(4)
-        along = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), (view, image))
-        gradient = jax.grad(f, argnums=(0, 1))(view, image)
+        leaves, tree = jax.tree.flatten((view, image))
+        gradient = jax.tree.leaves(jax.jit(jax.grad(f))((view, image)))
         h = 1e-7
-        for part in range(2):
-            for one in range(len(jax.tree.leaves(gradient[part]))):
-                step = jax.tree.leaves(along[part])[one]
+        for k, leaf in enumerate(leaves):
+            along = jnp.asarray(rng.normal(size=leaf.shape))
 
-                def moved(sign, part=part, one=one, step=step):
-                    leaves = jax.tree.leaves((view, image)[part])
-                    leaves[one] = leaves[one] + sign * h * step
-                    there = jax.tree.unflatten(jax.tree.structure((view, image)[part]), leaves)
-                    return f(*((there, image) if part == 0 else (view, there)))
+            def moved(step, k=k, along=along):
+                there = [*leaves[:k], leaves[k] + step * along, *leaves[k + 1 :]]
+                return float(f(jax.tree.unflatten(tree, there)))
 
-                numeric = float((moved(1) - moved(-1)) / (2 * h))
-                exact = float(jnp.sum(jax.tree.leaves(gradient[part])[one] * step))
-                assert exact == pytest.approx(numeric, rel=1e-4, abs=1e-6)
+            numeric = (moved(h) - moved(-h)) / (2 * h)
+            exact = float(jnp.sum(gradient[k] * along))
+            assert exact == pytest.approx(numeric, rel=1e-4, abs=1e-6)
 
 
 def test_black_and_saturated_pixels_have_finite_gradients():
     image = jnp.asarray([[[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [3.0, 0.0, 1e-9]]], jnp.float32)
     view = some_view(2, 1.5)
-    gradient = jax.grad(lambda v, x: jnp.sum(applied(x, v)), argnums=(0, 1))(view, image)
+    gradient = jax.jit(jax.grad(lambda v, x: jnp.sum(applied(x, v)), (0, 1)))(view, image)
     assert all(bool(jnp.all(jnp.isfinite(g))) for g in jax.tree.leaves(gradient))
     # At the identity the clips stand on their bounds; their parameters must be able to leave.
     start = identity(["a"])
     image = jnp.asarray(IMAGE, jnp.float32)
-    at_start = jax.grad(lambda p: jnp.sum(applied(image, p.view(0))))(start)
+    at_start = jax.jit(jax.grad(lambda p: jnp.sum(applied(image, p.view(0)))))(start)
     y, x = np.mgrid[:12, :20] + 0.5
     r2 = ((y - 6) ** 2 + (x - 10) ** 2) / 20**2
     expected = (IMAGE * r2[..., None]).sum((0, 1))
