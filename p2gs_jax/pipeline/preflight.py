@@ -128,7 +128,7 @@ def check_start(p: PhotometryConfig, preset: str) -> None:
         raise UserError(
             "the curve 'linear' splats display values; the tracks' bundle adjustment does not know "
             "it.",
-            fix="add --photometry.start random, or use a preset whose name begins with 3dgs",
+            fix="add --photometry.start random, or use the preset ppisp or one of 3dgs*",
         )
 
 
