@@ -91,12 +91,8 @@ def true_target(
 
 
 def display_of_splats(transform: DisplayTransform) -> DisplayTransform:
-    """Return the transform without a correction by image position, which splats cannot hold."""
-    return (
-        replace(transform, correction=None)
-        if transform.formation.appearance == "bilateral"
-        else transform
-    )
+    """Return the transform without what depends on the place in the image: splats have none."""
+    return transform.without_place()
 
 
 def display_comments(transform: DisplayTransform) -> list[str]:

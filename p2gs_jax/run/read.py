@@ -16,10 +16,10 @@ from p2gs_jax.config import FitConfig, PhotometryConfig, from_dict
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.ply import read_ply
-from p2gs_jax.photometry.appearance import identity
 from p2gs_jax.photometry.display import DisplayTransform, display_of_view
 from p2gs_jax.photometry.mean import MeanParameters, mean_parameters, usual_display
 from p2gs_jax.render.host import RenderView, make_renderer
+from p2gs_jax.run.appearance_file import read_appearance
 from p2gs_jax.run.decisions import read_decisions
 from p2gs_jax.run.layout import RunFolder
 from p2gs_jax.run.photometry_file import AGAIN, PhotometryFile, read_photometry
@@ -203,7 +203,8 @@ def load_run(folder: str | Path, scene: str | Path | None = None) -> Run:
     else:
         cfg = decisions.resolve(asked)
     photometry = _photometry(photometry_file, found, cfg, files)
-    appearance = _appearance(files.appearance, cfg, len(found.train_indices))
+    kind, views = cfg.photometry.appearance, found.training_views
+    appearance = None if kind is None else read_appearance(files.appearance(kind), kind, views)
     return Run(
         files.root,
         Params(gaussians, photometry, appearance),
@@ -281,18 +282,3 @@ def _load_scene(saved: dict[str, Any], given: Path | None, cfg: FitConfig, folde
             fix="put it back, or name its folder with --scene",
         )
     return load_scene(root, cfg.data, folder / "cache", lambda text: None)
-
-
-def _appearance(path: Path, cfg: FitConfig, views: int):
-    """Return the corrections of display values that the run learned, or None."""
-    if cfg.photometry.appearance is None:
-        return None
-    try:
-        corrections = np.load(path, allow_pickle=False)
-    except (OSError, ValueError) as error:
-        raise UserError(
-            f"{path} cannot be read: {error}.", fix="finish the fit again with --resume"
-        ) from error
-    if corrections.shape != identity(cfg.photometry.appearance, views).shape:
-        raise UserError(f"{path} does not belong to this run.", fix="fit again")
-    return on_device(corrections)

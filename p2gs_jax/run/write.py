@@ -11,7 +11,7 @@ import numpy as np
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.config import to_dict as config_to_dict
-from p2gs_jax.core.atomic import write_array, write_json
+from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.numerics import LN2, evenly_spaced
 from p2gs_jax.evaluate.evaluate import ViewResult
 from p2gs_jax.formats.exr import write_exr
@@ -22,6 +22,7 @@ from p2gs_jax.photometry.display import develop
 from p2gs_jax.photometry.mean import mean_parameters, usual_display
 from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.render.spherical_harmonics import MAX_DEGREE
+from p2gs_jax.run.appearance_file import write_appearance
 from p2gs_jax.run.decisions import Decisions, write_decisions
 from p2gs_jax.run.layout import RunFolder
 from p2gs_jax.run.photometry_file import ViewPhotometry, write_photometry
@@ -97,8 +98,9 @@ def write_results(
         mean=dataclasses.asdict(mean),
         views=_photometry_views(params, scene, fitted, solution),
     )
-    if params.appearance is not None:
-        write_array(folder.appearance, np.asarray(params.appearance))
+    kind = cfg.photometry.appearance
+    if kind is not None:
+        write_appearance(folder.appearance(kind), params.appearance, scene.training_views)
     _write_summary(folder.summary, shown, params, scene, cfg, true_ev)
 
 

@@ -6,7 +6,7 @@ renderer's picture. viser has no spherical harmonics: colours are those seen fro
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import jax
@@ -84,11 +84,9 @@ def splat_colors(
 ) -> UInt8[np.ndarray, "n 3"]:
     """Return a colour for each splat: false colour in mode `stops`, else display values.
 
-    A correction that depends on the position in the image is left out.
+    What depends on the position in the image is left out.
     """
     column = splats.linear[:, None]
     if settings.mode == "stops":
         return to_uint8_fast(false_color(column, MIDDLE_GREY / transform.exposure))[:, 0]
-    if transform.formation.appearance == "bilateral":
-        transform = replace(transform, correction=None)
-    return to_uint8_fast(develop(column, transform))[:, 0]
+    return to_uint8_fast(develop(column, transform.without_place()))[:, 0]
