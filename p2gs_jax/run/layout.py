@@ -52,6 +52,11 @@ class RunFolder:
         return self.root / "photometry.json"
 
     @property
+    def metering(self) -> Path:
+        """How exposures of new pictures are chosen, and what explains those of the photographs."""
+        return self.root / "metering.json"
+
+    @property
     def appearance(self) -> Path:
         """Corrections of display values, where a baseline learns them."""
         return self.root / "appearance.npy"

@@ -20,10 +20,12 @@ from p2gs_jax.formats.png import write_png
 from p2gs_jax.gaussians.bake import bake, display_comments, display_of_splats
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.mean import MeanParameters, mean_parameters
+from p2gs_jax.photometry.metering import Metering
 from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.render.spherical_harmonics import MAX_DEGREE
 from p2gs_jax.run.decisions import Decisions, write_decisions
 from p2gs_jax.run.layout import RunFolder
+from p2gs_jax.run.metering_file import write_metering
 from p2gs_jax.run.photometry_file import ViewPhotometry, write_photometry
 from p2gs_jax.run.places import remembered
 from p2gs_jax.run.scene_file import write_scene
@@ -71,6 +73,7 @@ def write_results(
     fitted: dict[int, float],
     solution: PhotometricSolution | None,
     shown: Sequence[ViewResult],
+    metering: Metering | None = None,
     true_ev: np.ndarray | None = None,
 ) -> None:
     """Write the scene, the Gaussians, the photometry and the summary.
@@ -83,6 +86,7 @@ def write_results(
         fitted: exposures solved for held-out views, by row.
         solution: what the fit started from, or None.
         shown: views of the summary.
+        metering: what explains the exposures, or None.
         true_ev: true exposures of the training views for the plot, or None.
     """
     write_scene(folder.root, scene)
@@ -97,6 +101,8 @@ def write_results(
         mean=dataclasses.asdict(mean),
         views=_photometry_views(params, scene, fitted, solution),
     )
+    if metering is not None:
+        write_metering(folder.metering, metering)
     if params.appearance is not None:
         write_array(folder.appearance, np.asarray(params.appearance))
     _write_summary(folder.summary, shown, params, scene, mean, cfg, true_ev)
