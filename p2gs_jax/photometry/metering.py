@@ -188,7 +188,10 @@ class Metering:
 
     def typical_log_exposure(self, of: ExposureOf = "auto") -> float:
         """Return the mean over the training views: one exposure for all of a scene."""
-        rows = (dict(zip(METERS, row, strict=True)) for row in self.readings.tolist())
+        rows: list[dict[str, float]] = [
+            {str(name): value for name, value in zip(METERS, row, strict=True)}
+            for row in self.readings.tolist()
+        ]
         return float(np.mean([self.log_exposure(row, of) for row in rows]))
 
     @property
