@@ -195,6 +195,11 @@ class Metering:
         return float(np.mean([self.log_exposure(row, of) for row in rows]))
 
     @property
+    def telling(self) -> bool:
+        """Whether exposures vary in enough views for a rule to explain them or not."""
+        return len(self.candidates) > 1 and self.constant.left_out_ev >= NEGLIGIBLE_EV
+
+    @property
     def sentence(self) -> str:
         """Which rule explains the camera's exposures, or that none does."""
         constant = self.constant.left_out_ev

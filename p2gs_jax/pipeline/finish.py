@@ -94,8 +94,9 @@ def finish(
             on_metering=metering.append,
             on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
         )
-    prepared.notes.append(metering[0].sentence)
-    reporter.message(metering[0].sentence)
+    if metering[0].telling:
+        prepared.notes.append(metering[0].sentence)
+        reporter.message(metering[0].sentence)
     # Views are written while they are judged.
     watch.add("evaluation", -watch.seconds.get("files", 0.0))
     reporter.stage("Writing files")
