@@ -34,6 +34,8 @@ class Observations:
         positions: in the image, from its centre in units of half its diagonal; None where nobody
             knows, and nothing depends on the place.
         camera_names: what people call the cameras; their rows if empty.
+        surroundings: log2 brightness of the photograph about each, as `sources/surroundings.py`
+            measures it; None where nobody knows.
     """
 
     views: Int[np.ndarray, " o"]
@@ -47,6 +49,7 @@ class Observations:
     names: tuple[str, ...] = ()
     positions: Float[np.ndarray, "o 2"] | None = None
     camera_names: tuple[str, ...] = ()
+    surroundings: Float[np.ndarray, " o"] | None = None
 
     def decoded(self, response: Response):
         """Return log exposed radiance, its stated standard deviation and dz/dy, each (O, 3)."""
@@ -80,6 +83,8 @@ class Observations:
         taken = {k: getattr(self, k)[pick] for k in ("views", "points", "colors", "spread")}
         if self.positions is not None:
             taken["positions"] = self.positions[pick]
+        if self.surroundings is not None:
+            taken["surroundings"] = self.surroundings[pick]
         return replace(self, **taken)
 
     def thinned(self, per_view: int, seed: int) -> Bool[np.ndarray, " o"]:

@@ -62,6 +62,11 @@ class RunFolder:
         return self.root / ("ppisp.json" if kind == "ppisp" else "appearance.npy")
 
     @property
+    def metering(self) -> Path:
+        """How exposures of new pictures are chosen, and what explains those of the photographs."""
+        return self.root / "metering.json"
+
+    @property
     def metrics(self) -> Path:
         """Scores, counts, seconds."""
         return self.root / "metrics.json"

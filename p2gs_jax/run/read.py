@@ -18,10 +18,12 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.formats.ply import read_ply
 from p2gs_jax.photometry.display import DisplayTransform, display_of_view
 from p2gs_jax.photometry.mean import MeanParameters, mean_parameters, usual_display
+from p2gs_jax.photometry.metering import ExposureOf, Metering, meter, meter_views
 from p2gs_jax.render.host import RenderView, make_renderer
 from p2gs_jax.run.appearance_file import read_appearance
 from p2gs_jax.run.decisions import read_decisions
 from p2gs_jax.run.layout import RunFolder
+from p2gs_jax.run.metering_file import read_metering
 from p2gs_jax.run.photometry_file import AGAIN, PhotometryFile, read_photometry
 from p2gs_jax.run.places import candidates, find
 from p2gs_jax.run.scene_file import read_scene
@@ -156,6 +158,32 @@ class Run:
     def _usual(self, camera: str | None) -> DisplayTransform:
         taken_by = [view.camera for view in self.scene.training_views]
         return usual_display(self.params, taken_by, camera, self.cfg.photometry)
+
+    @cached_property
+    def metering(self) -> Metering:
+        """The rule that explains the training exposures; runs of older versions are rendered."""
+        saved = read_metering(RunFolder(self.folder).metering)
+        if saved is not None:
+            return saved
+        rendered = (self.render(self.camera(i)) for i in self.scene.train_indices)
+        names = [view.name for view in self.scene.training_views]
+        e, gamma = np.asarray(self.params.photometry.exposures), self.mean.gamma
+        return meter_views(names, rendered, e, gamma, self.cfg.photometry)
+
+    def metered_display(
+        self, rendered: Render, of: ExposureOf = "auto", exposure_ev: float = 0.0
+    ) -> DisplayTransform:
+        """Return the display transform of a new picture, with its exposure metered.
+
+        Args:
+            rendered: the picture, from `render`.
+            of: `auto`: as the camera that took the photographs would have chosen, where a rule
+                explains it, else the mean; or a given rule.
+            exposure_ev: stops more than that.
+        """
+        readings = meter(np.asarray(rendered.linear), np.asarray(rendered.alpha))
+        exposure = float(np.exp(self.metering.log_exposure(readings, of))) * 2**exposure_ev
+        return replace(self.common_display(), exposure=exposure)
 
 
 def resolved(cfg: PhotometryConfig, saved: PhotometryFile) -> PhotometryConfig:

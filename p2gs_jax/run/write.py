@@ -20,11 +20,13 @@ from p2gs_jax.formats.png import write_png
 from p2gs_jax.gaussians.bake import bake, display_comments, display_of_splats
 from p2gs_jax.photometry.display import develop
 from p2gs_jax.photometry.mean import mean_parameters, usual_display
+from p2gs_jax.photometry.metering import Metering
 from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.render.spherical_harmonics import MAX_DEGREE
 from p2gs_jax.run.appearance_file import write_appearance
 from p2gs_jax.run.decisions import Decisions, write_decisions
 from p2gs_jax.run.layout import RunFolder
+from p2gs_jax.run.metering_file import write_metering
 from p2gs_jax.run.photometry_file import ViewPhotometry, write_photometry
 from p2gs_jax.run.places import remembered
 from p2gs_jax.run.scene_file import write_scene
@@ -72,6 +74,7 @@ def write_results(
     fitted: dict[int, float],
     solution: PhotometricSolution | None,
     shown: Sequence[ViewResult],
+    metering: Metering | None = None,
     true_ev: np.ndarray | None = None,
 ) -> None:
     """Write the scene, the Gaussians, the photometry and the summary.
@@ -84,6 +87,7 @@ def write_results(
         fitted: exposures solved for held-out views, by row.
         solution: what the fit started from, or None.
         shown: views of the summary.
+        metering: what explains the exposures, or None.
         true_ev: true exposures of the training views for the plot, or None.
     """
     write_scene(folder.root, scene)
@@ -98,6 +102,8 @@ def write_results(
         mean=dataclasses.asdict(mean),
         views=_photometry_views(params, scene, fitted, solution),
     )
+    if metering is not None:
+        write_metering(folder.metering, metering)
     kind = cfg.photometry.appearance
     if kind is not None:
         write_appearance(folder.appearance(kind), params.appearance, scene.training_views)

@@ -20,12 +20,14 @@ class Settings:
 
     Attributes:
         gamma: > 0.
-        exposure_ev: stops from the geometric mean of the training exposures.
+        exposure_ev: stops from the geometric mean of the training exposures, or from the metered
+            exposure.
         curve: `run` is what the fit chose.
         taken_as: row in `scene.views` of the view whose correction applies, or None for the mean.
         mode: what is shown.
         split: share of the photograph in `split`.
         splats: whether the browser draws splats itself, instead of the renderer's pictures.
+        metered: whether the exposure follows what is seen; not of the browser's splats.
     """
 
     gamma: float
@@ -35,6 +37,7 @@ class Settings:
     mode: Mode = "display"
     split: float = 0.5
     splats: bool = False
+    metered: bool = False
 
 
 def common_settings(run: Run, before: Settings | None = None) -> Settings:
@@ -47,7 +50,7 @@ def common_settings(run: Run, before: Settings | None = None) -> Settings:
     gamma = run.mean.gamma
     if before is None:
         return Settings(gamma)
-    return replace(before, gamma=gamma, exposure_ev=0.0, curve="run", taken_as=None)
+    return replace(before, gamma=gamma, exposure_ev=0.0, curve="run", taken_as=None, metered=False)
 
 
 def settings_of_view(run: Run, index: int, before: Settings) -> Settings:
@@ -60,7 +63,9 @@ def settings_of_view(run: Run, index: int, before: Settings) -> Settings:
     """
     own = run.own_display(index)
     ev = float(np.log2(own.exposure / run.mean.exposure_geometric))
-    return replace(before, gamma=own.gamma, exposure_ev=ev, curve="run", taken_as=index)
+    return replace(
+        before, gamma=own.gamma, exposure_ev=ev, curve="run", taken_as=index, metered=False
+    )
 
 
 def same_display(a: Settings, b: Settings) -> bool:

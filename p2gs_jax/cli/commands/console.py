@@ -46,6 +46,7 @@ def print_metrics(metrics: dict, out: Path) -> None:
     row("held out", "exposure fitted to each photograph", metrics["test"]["exposure_fitted"])
     both = metrics["test"].get("exposure_and_gamma_fitted")
     row("held out", "exposure and gamma fitted to each photograph", both)
+    row("held out", "metered, as the camera would", metrics["test"].get("metered"))
     for name, part in metrics.get("reference", {}).items():
         row("all", f"reference photographs, {name.replace('_', ' ')}", part)
         row("held out", f"reference photographs, {name.replace('_', ' ')}", part["test"])

@@ -94,7 +94,11 @@ def _display_transform(fitted: Run, options: Export) -> DisplayTransform:
     Raises:
         UserError: the run has no such curve.
     """
-    transform = fitted.common_display(options.exposure_ev or 0.0)
+    ev = options.exposure_ev or 0.0
+    transform = fitted.common_display(ev)
+    if options.exposure_of is not None:
+        typical = fitted.metering.typical_log_exposure(options.exposure_of)
+        transform = replace(transform, exposure=float(np.exp(typical)) * 2**ev)
     if options.gamma is not None:
         transform = replace(transform, gamma=options.gamma)
     if options.curve is not None:

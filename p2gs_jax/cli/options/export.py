@@ -37,6 +37,9 @@ class Export:
     """Folder to write into (default: RUN/exports)."""
     exposure_ev: float | None = None
     """Display colours: exposure in stops relative to the mean (default: 0)."""
+    exposure_of: Literal["auto", "log_average", "centre", "highlights", "protected"] | None = None
+    """Display colours: exposure metered in the training views, one for all: their mean of what the
+    rule of `p2gs-jax render` gives; --exposure-ev then adds stops."""
     gamma: float | None = None
     """Display colours: gamma (default: the run's mean)."""
     curve: Literal["power", "srgb", "spline", "linear"] | None = None
@@ -63,9 +66,8 @@ def check_export(args: Export) -> None:
     gamma = args.gamma
     check(gamma is None or (math.isfinite(gamma) and gamma > 0), "--gamma must be positive")
     check(args.bake_steps is None or args.bake_steps >= 0, "--bake-steps must be 0 or more")
-    given = [
-        n for n in ("exposure_ev", "gamma", "curve", "bake_steps") if getattr(args, n) is not None
-    ]
+    names = ("exposure_ev", "exposure_of", "gamma", "curve", "bake_steps")
+    given = [n for n in names if getattr(args, n) is not None]
     if given and not set(args.format) & set(DISPLAY):
         raise UserError(
             f"--{given[0].replace('_', '-')} says nothing without a format that holds display "
