@@ -177,6 +177,9 @@ class _Search:
         self.solve(Choice(Form(model), curve) for curve in curves for model in MODELS)
         richest = Form("view_exposure", "view", "camera" if self.scope.places else None)
         self.solve(Choice(richest, curve) for curve in curves)
+        # One response for different cameras may collapse where theirs would not.
+        for by in ("camera", "channel"):
+            self.solve(Choice(form, Curve("srgb", by)) for form in (EXPOSURES, richest))
         if not self.scope.curves:
             return [
                 f"Exposures differ by {self.spread / LN2:.2f} EV (standard deviation): too little "
