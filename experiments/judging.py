@@ -19,6 +19,9 @@ from jaxtyping import Float
 import p2gs_jax
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import LN2
+from p2gs_jax.photometry.ppisp.homography import recolored
+from p2gs_jax.photometry.ppisp.parameters import Ppisp
+from p2gs_jax.photometry.ppisp.vignetting import falloff
 
 # Grey that a colour correction is applied to, where it is no factor per channel.
 GREY = 0.18
@@ -50,17 +53,19 @@ def mean_of_rows(run: p2gs_jax.Run, rows: Sequence[int]) -> p2gs_jax.Run:
         rows: of the training views that are averaged: exposures as logarithms, where the run has
             them so.
     """
-    views, taken = len(run.scene.train_indices), jnp.asarray(rows)
+    taken = jnp.asarray(rows)
 
     def mean(values):
-        # What is not per view is the camera's.
-        if np.ndim(values) == 0 or len(values) != views:
-            return values
         return jnp.broadcast_to(jnp.asarray(values)[taken].mean(0), np.shape(values))
 
-    p = run.params
-    photometry, appearance = jax.tree.map(mean, (p.photometry, p.appearance))
-    params = dataclasses.replace(p, photometry=photometry, appearance=appearance)
+    photometry, appearance = jax.tree.map(mean, run.params.photometry), run.params.appearance
+    if isinstance(appearance, Ppisp):
+        # All else is the cameras'.
+        per_view = {k: mean(getattr(appearance, k)) for k in ("exposures", "colors")}
+        appearance = dataclasses.replace(appearance, **per_view)
+    elif appearance is not None:
+        appearance = mean(appearance)
+    params = dataclasses.replace(run.params, photometry=photometry, appearance=appearance)
     return dataclasses.replace(run, params=params)
 
 
@@ -95,7 +100,7 @@ class Found(NamedTuple):
 def found_by(run: p2gs_jax.Run) -> Found:
     """Return what a run found of exposures, white balances and vignetting."""
     appearance = run.params.appearance
-    if hasattr(appearance, "vignettings"):
+    if isinstance(appearance, Ppisp):
         return _found_by_ppisp(run, appearance)
     p, cameras = run.params.photometry, run.cfg.photometry.cameras
     exposures = np.log2(np.asarray(p.exposures, np.float64))
@@ -111,16 +116,8 @@ def found_by(run: p2gs_jax.Run) -> Found:
     return Found(exposures, zeros if balance is None else np.asarray(balance) / LN2, corners)
 
 
-def _found_by_ppisp(run: p2gs_jax.Run, learned: Any) -> Found:
+def _found_by_ppisp(run: p2gs_jax.Run, learned: Ppisp) -> Found:
     """Return PPISP's parameters; its colour correction as the factors that it has on grey."""
-    # Imported here: not every version has it.
-    from p2gs_jax.photometry.ppisp.homography import (  # pyright: ignore[reportMissingImports]
-        recolored,
-    )
-    from p2gs_jax.photometry.ppisp.vignetting import (  # pyright: ignore[reportMissingImports]
-        falloff,
-    )
-
     grey = jnp.full(3, GREY)
     colored = jax.vmap(lambda color: recolored(grey, color))(jnp.asarray(learned.colors))
     stops = np.log2(np.maximum(np.asarray(colored), 1e-6) / GREY)

@@ -35,7 +35,6 @@ import p2gs_jax
 from p2gs_jax.core.atomic import write_json, write_text
 from p2gs_jax.evaluate.metrics import psnr
 from p2gs_jax.evaluate.references import load_reference
-from p2gs_jax.gaussians.bake import display_of_splats
 from p2gs_jax.synth.exposures import read_true_shots
 from p2gs_jax.synth.rig import image_height
 from p2gs_jax.synth.settings import Sensor
@@ -115,8 +114,7 @@ def without_corners(transform: p2gs_jax.DisplayTransform) -> p2gs_jax.DisplayTra
     """Return a transform without vignetting; a bilateral grid, which is all there is, stays."""
     if transform.formation.appearance == "bilateral":
         return transform
-    # What no splat can hold: of transforms and of corrections.
-    return display_of_splats(getattr(transform, "without_place", lambda: transform)())
+    return transform.without_place()
 
 
 def _fitted_factors(

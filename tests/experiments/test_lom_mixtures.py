@@ -15,6 +15,7 @@ import judging
 import lom_mixtures
 
 from p2gs_jax.config import CameraFormation, FitConfig, preset
+from p2gs_jax.photometry.ppisp.parameters import OneView, identity
 from p2gs_jax.run.read import Run
 from p2gs_jax.types import Params, Photometry, Scene, View
 
@@ -54,6 +55,30 @@ def test_corrections_are_averaged_over_the_group():
     shown = judging.common_display(run, [1, 3])(0)
     assert shown.correction is not None
     np.testing.assert_allclose(shown.correction, 2.0)
+
+
+def test_a_learned_camera_keeps_what_is_the_cameras():
+    learned = identity(["0"] * 4)
+    learned = dataclasses.replace(
+        learned,
+        exposures=jnp.array([1.0, -3.0, 2.0, -2.0]),
+        colors=learned.colors.at[0, 6:].set(2.0),
+        vignettings=learned.vignettings.at[:, :, 2].set(-0.5),
+    )
+    run = run_of(preset("ppisp"), learned)
+    shown = judging.common_display(run, [0, 2])(0).correction
+    assert isinstance(shown, OneView)
+    assert float(shown.exposure) == 1.5
+    np.testing.assert_array_equal(shown.vignetting, learned.vignettings[0])
+    found = judging.found_by(run)
+    assert found.exposures_ev is not None
+    assert found.balance_ev is not None
+    np.testing.assert_allclose(found.exposures_ev[1:], [-3, 2, -2], atol=1e-3)
+    np.testing.assert_allclose(found.balance_ev[1:], 0, atol=1e-3)
+    # Its control point moved towards red and green.
+    assert found.balance_ev[0, 2] < -0.05
+    # 8 x 8 pixels: r^2 is 2 (3.5 / 8)^2 in the middle of a corner's pixel.
+    assert found.corners == pytest.approx({"0": 1 - 0.5 * 2 * (3.5 / 8) ** 2})
 
 
 def test_presets_that_are_not_there_are_skipped(capsys):
