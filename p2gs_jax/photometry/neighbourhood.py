@@ -9,7 +9,7 @@ said. Evidence is counted by blocks of the image, as residuals of one surface ar
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -29,11 +29,17 @@ REACH = 0.24
 MOST_LAMPS = 200
 # Residuals beyond this many robust standard deviations count as that.
 CLIPPED = 3.0
-# Chance of a false alarm, a view and kind of dependence; and what is too small to say, stops.
-CHANCE = 2e-4
-NOTICEABLE_EV = 0.08
+# By kind: the chance of noise to look as clear in a view, and what is too small to say, stops. Few
+# blocks hold what is dark and near light: asked for more, flare is never clear.
+CHANCE = {"place": 2e-4, "local": 2e-4, "flare": 5e-3}
+NOTICEABLE_EV = {"place": 0.08, "local": 0.08, "flare": 0.1}
 # The darkest share of the values, where a veil shows, and values that are its sources.
 DARK, SOURCE = 0.35, 250 / 255
+# A veil that is looked for: light where all is light, 1 = white. Its size is then found.
+VEIL = 0.05
+
+
+Kind = Literal["place", "local", "flare"]
 
 
 class Evidence(NamedTuple):
@@ -41,18 +47,13 @@ class Evidence(NamedTuple):
 
     Attributes:
         ev: size, stops: RMS over the view for places, the change over the spread (two standard
-            deviations) of the surroundings for local tone mapping, near less far from the light for
-            flare; negative where it goes the other way. NaN where nothing can be told.
+            deviations) of the surroundings for local tone mapping, over the dark for flare;
+            negative where it goes the other way. NaN where nothing can be told.
         chance: of as much where there is nothing.
     """
 
     ev: float
     chance: float
-
-    @property
-    def clear(self) -> bool:
-        """Whether it is larger than noise, and large enough to say."""
-        return bool(self.chance < CHANCE and self.ev > NOTICEABLE_EV)
 
 
 NOTHING = Evidence(float("nan"), 1.0)
@@ -71,6 +72,12 @@ class Neighbourhood:
     place: tuple[Evidence, ...]
     local: tuple[Evidence, ...]
     flare: tuple[Evidence, ...]
+
+    def clear(self, kind: Kind) -> list[int]:
+        """Return the views where a dependence is larger than noise and large enough to say."""
+        found: tuple[Evidence, ...] = getattr(self, kind)
+        chance, least = CHANCE[kind], NOTICEABLE_EV[kind]
+        return [k for k, e in enumerate(found) if e.chance < chance and e.ev > least]
 
     def record(self) -> dict[str, list[dict[str, float]]]:
         """Return numbers for `calibration.json`."""
@@ -265,19 +272,18 @@ def _flare(
     lamps: Float[np.ndarray, "l 2"],
     block: Int[np.ndarray, " n"],
 ) -> Evidence:
-    """Test whether dark values are lifted the more the nearer bright light is."""
-    dark = value <= np.quantile(value, DARK)
-    if len(lamps) < 3 or dark.sum() < FEWEST // 2:
+    """Test for a veil of light that is added about saturated values: it lifts the dark most."""
+    if len(lamps) < 3:
         return NOTHING
     lamps = lamps[:: -(-len(lamps) // MOST_LAMPS)]
-    distance = np.sqrt(((places[dark][:, None] - lamps[None]) ** 2).sum(-1))
-    near = np.log(np.exp(-distance / REACH).sum(1) + 1e-6)
-    rest, near = (_beside(other[dark], x) for x in (flat[dark], near))
-    slope, t = _slope(rest, near, block[dark])
-    return Evidence(2 * slope * float(near.std()), _chance(t))
+    distance = np.sqrt(((places[:, None] - lamps[None]) ** 2).sum(-1))
+    veil = np.log2(1 + VEIL * np.exp(-distance / REACH).mean(1) * 2.0**-value)
+    spread = float(veil[value <= np.quantile(value, DARK)].std())
+    slope, t = _slope(_beside(other, flat), _beside(other, veil), block)
+    return Evidence(2 * slope * spread, _chance(t))
 
 
-SAID = {
+SAID: dict[Kind, str] = {
     "place": (
         "depend on the place in the image: flare, a shade, reflections, or vignetting that is not "
         "modelled"
@@ -300,7 +306,7 @@ def sentences(found: Neighbourhood, names: tuple[str, ...] | list[str]) -> list[
     out = []
     for kind, said in SAID.items():
         rows: tuple[Evidence, ...] = getattr(found, kind)
-        clear = [k for k, e in enumerate(rows) if e.clear]
+        clear = found.clear(kind)
         if not clear:
             continue
         clear.sort(key=lambda k: -rows[k].ev)
