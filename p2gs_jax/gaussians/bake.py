@@ -91,21 +91,26 @@ def true_target(
 
 
 def display_of_splats(transform: DisplayTransform) -> DisplayTransform:
-    """Return the transform without a correction by image position, which splats cannot hold."""
-    return (
-        replace(transform, correction=None)
-        if transform.formation.appearance == "bilateral"
-        else transform
-    )
+    """Return the transform without what depends on the place in the image: splats cannot hold it.
+
+    That is vignetting, and a correction by image position.
+    """
+    if transform.formation.appearance == "bilateral":
+        transform = replace(transform, correction=None)
+    return transform.without_place()
 
 
 def display_comments(transform: DisplayTransform) -> list[str]:
     """Return the header lines of a PLY with display colours."""
-    return [
+    said = [
         "p2gs-jax: display colours, tone-mapped",
         f"p2gs-jax: exposure {transform.exposure:.6g}, gamma {transform.gamma:.6g}, "
         f"curve {transform.formation.curve}",
     ]
+    if transform.white_balance is not None:
+        factors = ", ".join(f"{w:.6g}" for w in np.exp(transform.white_balance))
+        said.append(f"p2gs-jax: white balance {factors}")
+    return said
 
 
 def bake(

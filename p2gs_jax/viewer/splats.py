@@ -6,7 +6,7 @@ renderer's picture. viser has no spherical harmonics: colours are those seen fro
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import jax
@@ -18,6 +18,7 @@ from scipy.special import expit
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.formats.false_color import false_color
+from p2gs_jax.gaussians.bake import display_of_splats
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.render import view_radiance
 from p2gs_jax.types import Camera, Gaussians
@@ -84,11 +85,9 @@ def splat_colors(
 ) -> UInt8[np.ndarray, "n 3"]:
     """Return a colour for each splat: false colour in mode `stops`, else display values.
 
-    A correction that depends on the position in the image is left out.
+    What depends on the place in the image is left out.
     """
     column = splats.linear[:, None]
     if settings.mode == "stops":
         return to_uint8_fast(false_color(column, MIDDLE_GREY / transform.exposure))[:, 0]
-    if transform.formation.appearance == "bilateral":
-        transform = replace(transform, correction=None)
-    return to_uint8_fast(develop(column, transform))[:, 0]
+    return to_uint8_fast(develop(column, display_of_splats(transform)))[:, 0]
