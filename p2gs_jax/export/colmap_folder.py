@@ -66,14 +66,20 @@ def write_colmap_folder(
 
 
 def exposure_table(photometry: Sequence[ViewPhotometry]) -> str:
-    """Return exposures as CSV; a held-out view's is that fitted to its photograph."""
+    """Return exposures as CSV; a held-out view's is that fitted to its photograph.
+
+    Where white balance is modelled, its factors follow.
+    """
     out = io.StringIO()
     table = csv.writer(out, lineterminator="\n")
-    table.writerow(("image", "camera", "split", "ev", "exposure", "gamma"))
+    balanced = any(v.get("white_balance") is not None for v in photometry)
+    more = ("red", "green", "blue") if balanced else ()
+    table.writerow(("image", "camera", "split", "ev", "exposure", "gamma", *more))
     for v in photometry:
         e = v["exposure_fitted"] if v["exposure"] is None else v["exposure"]
         ev = "" if e is None else repr(float(np.log2(e)))
-        table.writerow((v["image"], v["camera"], v["split"], ev, e, v["gamma"]))
+        balance = (v.get("white_balance") or [None] * 3) if balanced else ()
+        table.writerow((v["image"], v["camera"], v["split"], ev, e, v["gamma"], *balance))
     return out.getvalue()
 
 

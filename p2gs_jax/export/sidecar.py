@@ -9,8 +9,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Float32
 
-from p2gs_jax.config import Appearance, FitConfig
+from p2gs_jax.config import Appearance, FitConfig, PhotometryConfig
 from p2gs_jax.formats.exr import BT709
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import EXPOSED_CEILING, EXPOSED_FLOOR
@@ -20,7 +21,7 @@ from p2gs_jax.run.photometry_file import PhotometryFile, ViewPhotometry
 from p2gs_jax.scene import ImageStore
 from p2gs_jax.types import GAMMA_SRGB, Gaussians, Scene
 
-FORMAT, VERSION = "p2gs-jax linear Gaussians", 1
+FORMAT, VERSION = "p2gs-jax linear Gaussians", 2
 ACTIVATIONS = {
     "exp": f"L = exp(clip(s, -{LOG_RADIANCE_LIMIT:g}, {LOG_RADIANCE_LIMIT:g}))",
     "softplus": "L = log(1 + exp(s))",
@@ -68,7 +69,7 @@ def linear_sidecar(
         cfg: how they were fitted, with the chosen model and curve.
         scene: the views.
         store: their cameras at the size of the fit.
-        photometry: exposures and gammas.
+        photometry: what views and cameras did to light.
     """
     count, coefficients = gaussians.sh.shape[:2]
     return {
@@ -100,7 +101,8 @@ def linear_sidecar(
             + " of the sum s of coefficients times basis, by channel",
             "color_space": "linear light, primaries and white of BT.709 (the photographs' sRGB)",
             "chromaticities": list(BT709),
-            "unit": "relative; multiplied by a view's exposure it is what its tone curve takes",
+            "unit": "relative; multiplied by what a view did to it it is what its tone curve takes "
+            "(tone.formula)",
         },
         "rendering": {
             "compositing": "front to back, by alpha, in linear light, over black",
@@ -124,26 +126,50 @@ def linear_sidecar(
 
 
 def _tone(cfg: FitConfig, photometry: PhotometryFile) -> dict[str, Any]:
+    p = cfg.photometry
     exposed = np.exp2(np.linspace(DARKEST_EV, BRIGHTEST_EV, SAMPLES)).astype(np.float32)
-    base = develop(exposed, DisplayTransform(1.0, GAMMA_SRGB, cfg.photometry))
-    kind = cfg.photometry.appearance
-    limits = [EXPOSED_FLOOR, EXPOSED_CEILING if cfg.photometry.clamp else None]
+    kind = p.appearance
+    limits = [EXPOSED_FLOOR, EXPOSED_CEILING if p.clamp else None]
     return {
-        "formula": f"display = base(pivot * (e * L / pivot) ** ({GAMMA_SRGB} / gamma)); e * L is "
-        "first clipped to exposed_limits; base is the curve, tabulated",
+        "formula": f"display = base(pivot * (e * W * V * L / pivot) ** ({GAMMA_SRGB} / gamma)); "
+        "e * W * V * L is first clipped to exposed_limits; W is the view's white_balance by "
+        "channel, 1 where it is null; V is its camera's vignetting, 1 where that is null; base is "
+        "the curve, tabulated, or its camera's own",
+        "vignetting": "log V = k1 r^2 + k2 r^4 + k3 r^6 with the row k1, k2, k3 of all channels or "
+        "of each; r is the distance from the image's centre over half its diagonal",
         "model": photometry["model"],
         "curve": photometry["curve"]["name"],
-        "pivot": cfg.photometry.pivot,
+        "pivot": p.pivot,
         "exposed_limits": limits,
-        "base": {"linear": exposed, "display": base},
+        "base": {"linear": exposed, "display": _base(exposed, p, None)[:, 0]},
+        "cameras": [
+            {
+                "name": camera.name,
+                "vignetting": camera.vignetting or None,
+                "base": _base(exposed, p, row).T if camera.splines else None,
+            }
+            for row, camera in enumerate(p.cameras)
+        ],
         "correction": None if kind is None else {"kind": kind, "file": corrections_name(kind)},
     }
+
+
+def _base(
+    exposed: Float[np.ndarray, " s"], p: PhotometryConfig, camera: int | None
+) -> Float32[np.ndarray, "s 3"]:
+    """Return display values of each channel under a camera's curve, or that of an unknown one."""
+    grey = np.repeat(exposed[:, None], 3, 1)
+    transform = DisplayTransform(1.0, GAMMA_SRGB, p, camera=camera).without_place()
+    return develop(grey, transform)
 
 
 def _views(
     scene: Scene, store: ImageStore, photometry: Mapping[str, ViewPhotometry]
 ) -> list[dict[str, Any]]:
-    keys = ("exposure", "exposure_ev", "exposure_ev_error", "gamma", "exposure_fitted")
+    keys = (
+        *("exposure", "exposure_ev", "exposure_ev_error", "gamma", "exposure_fitted"),
+        *("white_balance", "white_balance_ev_error"),
+    )
     out = []
     for index, view in enumerate(scene.views):
         viewmat, K, width, height = store.camera(index)

@@ -1,4 +1,4 @@
-"""OpenEXR: linear radiance with the exposure, gamma and camera that belong to it.
+"""OpenEXR: linear radiance with the photometry and the camera that belong to it.
 
 Standard attributes follow https://openexr.com/en/latest/StandardAttributes.html: matrices act on
 row vectors, as Imath's; camera space is left-handed with x right, y up and z forward; NDC runs
@@ -8,6 +8,7 @@ from (0, 0) at the upper left of the display window to (1, 1) at its lower right
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenEXR
@@ -15,6 +16,7 @@ from jaxtyping import Float, Float32
 
 from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.errors import UserError
+from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.scene.exif import ExifSettings
 from p2gs_jax.types import Camera
 
@@ -29,8 +31,7 @@ def write_exr(
     half: bool = True,
     depth: Float32[np.ndarray, "h w"] | None = None,
     alpha: Float32[np.ndarray, "h w"] | None = None,
-    exposure: float | None = None,
-    gamma: float | None = None,
+    taken: DisplayTransform | None = None,
     camera: Camera | None = None,
     shot: ExifSettings | None = None,
 ) -> None:
@@ -42,8 +43,7 @@ def write_exr(
         half: 16-bit floats, unless a value would overflow; then 32-bit.
         depth: alpha-weighted depth, written as expected depth in channel Z.
         alpha: opacity, channel A.
-        exposure: e that turns it into the photograph's exposed radiance.
-        gamma: its gamma.
+        taken: how a photograph of it was taken, or a picture developed: the header says so.
         camera: what saw it.
         shot: how the photograph of the same view was taken.
     """
@@ -57,11 +57,8 @@ def write_exr(
         "adoptedNeutral": BT709[6:],
         "comments": "linear relative radiance; no exposure applied",
     }
-    if exposure is not None:
-        header["p2gsExposure"] = float(exposure)
-        header["p2gsExposureEV"] = float(np.log2(exposure))
-    if gamma is not None:
-        header["p2gsGamma"] = float(gamma)
+    if taken is not None:
+        header |= _display_attributes(taken)
     if camera is not None:
         header |= camera_attributes(camera)
     if shot is not None:
@@ -105,6 +102,21 @@ def _to_ndc(K: Float[np.ndarray, "3 3"], width: int, height: int) -> Float[np.nd
     out[1, :3] = K[1] / height
     out[2, 3] = 1.0
     out[3, 2] = 1.0
+    return out
+
+
+def _display_attributes(taken: DisplayTransform) -> dict:
+    """Return exposure, gamma, and white balance and vignetting where they are modelled."""
+    out: dict[str, Any] = {
+        "p2gsExposure": float(taken.exposure),
+        "p2gsExposureEV": float(np.log2(taken.exposure)),
+        "p2gsGamma": float(taken.gamma),
+    }
+    if taken.white_balance is not None:
+        out["p2gsWhiteBalance"] = tuple(float(w) for w in np.exp(taken.white_balance))
+    rows = taken.vignetting * 3 if len(taken.vignetting) == 1 else taken.vignetting
+    for name, row in zip(("Red", "Green", "Blue"), rows, strict=False):
+        out[f"p2gsVignetting{name}"] = tuple(row)
     return out
 
 

@@ -13,6 +13,7 @@ from jaxtyping import Float32
 from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.formats.png import write_png
 from p2gs_jax.formats.video import open_video
+from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.types import Camera
 
 
@@ -25,8 +26,7 @@ class OutputFrame:
         linear: radiance, without exposure.
         alpha: opacity.
         ldr: display values in [0, 1].
-        exposure: e of `ldr`.
-        gamma: of `ldr`.
+        transform: from `linear` to `ldr`.
         depth: alpha-weighted, or None.
         camera: the pinhole, or None for other images.
         photograph: taken from there, display values, or None.
@@ -36,8 +36,7 @@ class OutputFrame:
     linear: Float32[np.ndarray, "h w 3"]
     alpha: Float32[np.ndarray, "h w"]
     ldr: Float32[np.ndarray, "h2 w2 3"]
-    exposure: float
-    gamma: float
+    transform: DisplayTransform
     depth: Float32[np.ndarray, "h w"] | None = None
     camera: Camera | None = None
     photograph: Float32[np.ndarray, "h3 w3 3"] | None = None
@@ -59,8 +58,7 @@ def write_frame(folder: Path, frame: OutputFrame) -> None:
         frame.linear,
         depth=frame.depth,
         alpha=frame.alpha,
-        exposure=frame.exposure,
-        gamma=frame.gamma,
+        taken=frame.transform,
         camera=frame.camera,
     )
     if frame.photograph is None:

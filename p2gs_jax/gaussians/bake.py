@@ -97,11 +97,15 @@ def display_of_splats(transform: DisplayTransform) -> DisplayTransform:
 
 def display_comments(transform: DisplayTransform) -> list[str]:
     """Return the header lines of a PLY with display colours."""
-    return [
+    said = [
         "p2gs-jax: display colours, tone-mapped",
         f"p2gs-jax: exposure {transform.exposure:.6g}, gamma {transform.gamma:.6g}, "
         f"curve {transform.formation.curve}",
     ]
+    if transform.white_balance is not None:
+        factors = ", ".join(f"{w:.6g}" for w in np.exp(transform.white_balance))
+        said.append(f"p2gs-jax: white balance {factors}")
+    return said
 
 
 def bake(

@@ -122,8 +122,7 @@ def shot_frames(
         transform = display_of(shot)
         ldr = renderer.develop(linear, transform)
         taken = None if photograph is None or shot.view is None else photograph(shot.view)
-        how = (transform.exposure, transform.gamma)
-        yield OutputFrame(shot.name, linear, alpha, ldr, *how, depth, shot.camera(), taken)
+        yield OutputFrame(shot.name, linear, alpha, ldr, transform, depth, shot.camera(), taken)
 
 
 def wide_frames(
@@ -140,9 +139,7 @@ def wide_frames(
     for k, pose in enumerate(poses):
         wide = renderer.wide(_placed(cylinder, pose))
         ldr = renderer.develop(wide.linear, transform)
-        yield OutputFrame(
-            f"{k:05d}", wide.linear, wide.alpha, ldr, transform.exposure, transform.gamma
-        )
+        yield OutputFrame(f"{k:05d}", wide.linear, wide.alpha, ldr, transform)
 
 
 def comparison_size(cylinder: Cylinder) -> tuple[int, int]:
@@ -160,9 +157,9 @@ def comparison_frames(
 ) -> Iterator[OutputFrame]:
     """Yield three panoramas below each other for every time step.
 
-    Photographs stitched as taken; the same, each taken back to radiance by its own exposure and
-    gamma and developed with one display transform; the field under the same. Photographs are
-    placed by the field's smoothed depth, and nothing is blended. The frame's `linear` is the field.
+    Photographs stitched as taken; the same, each taken back to radiance by all that its camera did
+    and developed with one display transform; the field under the same. Photographs are placed by
+    the field's smoothed depth, and nothing is blended. The frame's `linear` is the field.
 
     Args:
         renderer: renders.
@@ -205,8 +202,7 @@ def comparison_frames(
                 CaptionedImage("the radiance field at that exposure", field),
             ]
         )
-        how = (transform.exposure, transform.gamma)
-        yield OutputFrame(step.name, wide.linear, wide.alpha, picture, *how)
+        yield OutputFrame(step.name, wide.linear, wide.alpha, picture, transform)
 
 
 def _placed(cylinder: Cylinder, pose) -> Cylinder:

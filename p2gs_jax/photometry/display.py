@@ -63,6 +63,12 @@ class DisplayTransform:
         return self.exposure * np.exp(np.asarray(w, float))
 
     @property
+    def vignetting(self) -> tuple[tuple[float, ...], ...]:
+        """Coefficients of its vignetting: for all channels, or for each; empty: none."""
+        known = self.camera is not None and self.camera >= 0
+        return self.formation.cameras[self.camera].vignetting if known else ()  # pyright: ignore
+
+    @property
     def white_balance_ev(self) -> tuple[float, float]:
         """Gains of red and of blue over green, stops."""
         red, green, blue = (0.0, 0.0, 0.0) if self.white_balance is None else self.white_balance
@@ -105,7 +111,9 @@ class DisplayTransform:
 
 
 def develop(
-    linear: Float[Array, "... 3"] | Float[np.ndarray, "... 3"], transform: DisplayTransform
+    linear: Float[Array, "... 3"] | Float[np.ndarray, "... 3"],
+    transform: DisplayTransform,
+    positions: Float[np.ndarray, "... 2"] | None = None,
 ) -> Float32[np.ndarray, "... 3"]:
     """Return display values in [0, 1] of linear radiance.
 

@@ -8,16 +8,26 @@ from pathlib import Path
 from typing import Any, NotRequired, TypedDict
 
 import numpy as np
+from jaxtyping import Float
 
+from p2gs_jax.config import CameraFormation
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.errors import UserError
+from p2gs_jax.photometry.cameras import corner
 from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.types import View
 
 MEAN_GAUGE = "mean log exposure is 0 over each connected group of views"
-# Absent from files of runs without a bundle adjustment.
-OPTIONAL = frozenset({"exposure_ev_error", "gamma_error", "exposure_ev_start", "observations"})
+# 2 knows white balance and cameras; files of before have no version.
+VERSION = 2
+# Absent from files of runs without a bundle adjustment, or of before version 2.
+OPTIONAL = frozenset(
+    {
+        *("exposure_ev_error", "gamma_error", "exposure_ev_start", "observations"),
+        *("version", "cameras", "white_balance", "white_balance_ev_error"),
+    }
+)
 
 
 class ViewPhotometry(TypedDict):
@@ -36,6 +46,9 @@ class ViewPhotometry(TypedDict):
         gamma_error: standard error of `gamma`, or null.
         exposure_ev_start: `exposure_ev` before the first step, where a bundle adjustment gave it.
         observations: usable observations of shared points that it had in this view.
+        white_balance: factors on red, green and blue beside the exposure, of geometric mean 1; null
+            where it is not modelled, and of a held-out view.
+        white_balance_ev_error: standard errors of their log2 from the bundle adjustment, or null.
     """
 
     image: str
@@ -50,30 +63,103 @@ class ViewPhotometry(TypedDict):
     gamma_error: NotRequired[float | None]
     exposure_ev_start: NotRequired[float | None]
     observations: NotRequired[int | None]
+    white_balance: NotRequired[list[float] | None]
+    white_balance_ev_error: NotRequired[list[float] | None]
+
+
+class CameraPhotometry(TypedDict):
+    """What one physical camera does besides; rows are one for all channels, or one for each.
+
+    Attributes:
+        name: as `camera` of its views.
+        vignetting: rows of k1, k2, k3 in log V(r) = k1 r^2 + k2 r^4 + k3 r^6, with r = 1 in the
+            corners; null: none.
+        corner: V in the corners, of every row, or null.
+        corner_ev_error: standard errors of their log2 from the bundle adjustment, or null.
+        splines: rows of a response of its own, as `curve.spline`; null: that one.
+    """
+
+    name: str
+    vignetting: list[list[float]] | None
+    corner: list[float] | None
+    corner_ev_error: list[float] | None
+    splines: list[list[float]] | None
 
 
 class PhotometryFile(TypedDict):
-    """The file: model, tone curve, gauge, mean parameters, views."""
+    """The file: model, tone curve, gauge, mean parameters, cameras, views."""
 
+    version: NotRequired[int]
     model: str
     curve: dict
     gauge: str
     mean: dict
+    cameras: NotRequired[list[CameraPhotometry]]
     views: list[ViewPhotometry]
 
 
 def write_photometry(
-    path: Path, *, model: str, curve: dict, gauge: str, mean: dict, views: list[ViewPhotometry]
+    path: Path,
+    *,
+    model: str,
+    curve: dict,
+    gauge: str,
+    mean: dict,
+    views: list[ViewPhotometry],
+    cameras: Sequence[CameraPhotometry] = (),
 ) -> None:
     """Write the file atomically.
 
     Raises:
         ValueError: a view lacks a field.
     """
-    data = {"model": model, "curve": curve, "gauge": gauge, "mean": mean, "views": views}
+    data = {
+        "version": VERSION,
+        "model": model,
+        "curve": curve,
+        "gauge": gauge,
+        "mean": mean,
+        "cameras": list(cameras),
+        "views": views,
+    }
     if problem := _problem(data):
         raise ValueError(problem)
     write_json(path, data)
+
+
+def camera_rows(
+    cameras: Sequence[CameraFormation], corner_errors: Float[np.ndarray, "c k"] | None = None
+) -> list[CameraPhotometry]:
+    """Return the `cameras` of the file.
+
+    Args:
+        cameras: what each does.
+        corner_errors: standard errors of log V in the corners, where a bundle adjustment gave them.
+    """
+    known = corner_errors is not None and len(corner_errors) == len(cameras)
+    return [
+        {
+            "name": camera.name,
+            "vignetting": [list(row) for row in camera.vignetting] or None,
+            "corner": list(corner(camera)) or None,
+            "corner_ev_error": (corner_errors[i] / LN2).tolist() or None
+            if known and corner_errors is not None
+            else None,
+            "splines": [list(row) for row in camera.splines] or None,
+        }
+        for i, camera in enumerate(cameras)
+    ]
+
+
+def balance_of(
+    solution: PhotometricSolution, row: int
+) -> tuple[list[float] | None, list[float] | None]:
+    """Return white balance and its errors of a view as the file has them: factors, and stops."""
+    if solution.white_balance_level is None or not np.isfinite(solution.exposure_errors[row]):
+        return None, None
+    errors = solution.white_balance_errors[row] / LN2
+    known = errors.tolist() if np.isfinite(errors).all() else None
+    return np.exp(solution.white_balance[row]).tolist(), known
 
 
 def write_solution(
@@ -108,6 +194,7 @@ def write_solution(
             s.gamma_errors[i],
         )
         exposure, ev, ev_error, gamma, gamma_error = (float(v) if seen[i] else None for v in values)
+        balance, balance_error = balance_of(s, i)
         rows.append(
             {
                 "image": view.name,
@@ -120,6 +207,8 @@ def write_solution(
                 "exif_ev": view.exif_ev,
                 "split": "train",
                 "exposure_fitted": None,
+                "white_balance": balance,
+                "white_balance_ev_error": balance_error,
             }
         )
     write_photometry(
@@ -133,6 +222,7 @@ def write_solution(
             "gamma": float(s.gammas.mean()),
         },
         views=rows,
+        cameras=camera_rows(s.cameras, s.corner_errors),
     )
 
 
@@ -158,6 +248,8 @@ def _problem(data) -> str | None:
     """Return what keeps `data` from being a `PhotometryFile`, or None."""
     if missing := _missing(data, PhotometryFile):
         return missing
+    if data.get("version", 1) not in range(1, VERSION + 1):
+        return f"its version is {data['version']}, and this program knows {VERSION}"
     if not isinstance(data["views"], list):
         return "views is no list"
     for number, view in enumerate(data["views"]):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,6 +17,7 @@ from p2gs_jax.config import FitConfig, PhotometryConfig, from_dict
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.ply import read_ply
+from p2gs_jax.photometry.cameras import camera_rows
 from p2gs_jax.photometry.display import DisplayTransform, display_of_view
 from p2gs_jax.photometry.mean import MeanParameters, mean_parameters, usual_display
 from p2gs_jax.photometry.metering import ExposureOf, Metering, meter, meter_views
@@ -155,6 +157,26 @@ class Run:
         usual = self._usual(None)
         return replace(usual, exposure=usual.exposure * 2**exposure_ev)
 
+    def white_balance_of(self, name: str) -> tuple[float, float, float]:
+        """Return the log factors of a view's white balance, by its name in the scene.
+
+        Raises:
+            UserError: there is no such view, or white balance is not modelled.
+        """
+        names = [view.name for view in self.scene.views]
+        if name not in names:
+            near = difflib.get_close_matches(name, names, 1) or names[:1]
+            raise UserError(
+                f"the run has no view {name!r}.", fix=f"name one as photometry.json does: {near[0]}"
+            )
+        balance = self.own_display(names.index(name)).white_balance
+        if balance is None:
+            raise UserError(
+                "this run models no white balance: all its photographs have the same.",
+                fix="leave --white-balance-of out",
+            )
+        return balance
+
     def _usual(self, camera: str | None) -> DisplayTransform:
         taken_by = [view.camera for view in self.scene.training_views]
         return usual_display(self.params, taken_by, camera, self.cfg.photometry)
@@ -260,7 +282,7 @@ def _require_finished(files: RunFolder) -> None:
 def _photometry(
     saved: PhotometryFile, scene: Scene, cfg: FitConfig, files: RunFolder
 ) -> Photometry:
-    """Return exposures and gammas of the training views."""
+    """Return exposures, gammas and white balances of the training views."""
     views = {v["image"]: v for v in saved["views"]}
     train = [views.get(view.name) for view in scene.training_views]
     if any(v is None or v["exposure"] is None for v in train):
@@ -273,7 +295,15 @@ def _photometry(
     gammas = np.array([v["gamma"] for v in train if v is not None])
     if cfg.photometry.parameterization == "log":
         exposures, gammas = np.log(exposures), np.log(gammas / GAMMA_SRGB)
-    return Photometry(on_device(exposures), on_device(gammas), cfg.photometry.parameterization)
+    p = cfg.photometry
+    balances = None
+    if p.white_balance is not None:
+        factors = [v.get("white_balance") for v in train if v is not None]
+        if any(each is None for each in factors):
+            raise UserError(f"{files.photometry} lacks the white balance of a view.", fix=AGAIN)
+        balances = on_device(np.log(np.array(factors, float)))
+    rows = camera_rows([view.camera for view in scene.training_views], p)
+    return Photometry(on_device(exposures), on_device(gammas), p.parameterization, balances, rows)
 
 
 def _read_config(path: Path) -> tuple[dict[str, Any], FitConfig]:

@@ -19,7 +19,7 @@ from p2gs_jax.formats.ply import write_ply, write_radiance
 from p2gs_jax.formats.png import write_png
 from p2gs_jax.gaussians.bake import bake, display_comments, display_of_splats
 from p2gs_jax.photometry.display import develop
-from p2gs_jax.photometry.mean import mean_parameters, usual_display
+from p2gs_jax.photometry.mean import MeanParameters, mean_parameters, usual_display
 from p2gs_jax.photometry.metering import Metering
 from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.render.spherical_harmonics import MAX_DEGREE
@@ -27,7 +27,12 @@ from p2gs_jax.run.appearance_file import write_appearance
 from p2gs_jax.run.decisions import Decisions, write_decisions
 from p2gs_jax.run.layout import RunFolder
 from p2gs_jax.run.metering_file import write_metering
-from p2gs_jax.run.photometry_file import ViewPhotometry, write_photometry
+from p2gs_jax.run.photometry_file import (
+    ViewPhotometry,
+    balance_of,
+    camera_rows,
+    write_photometry,
+)
 from p2gs_jax.run.places import remembered
 from p2gs_jax.run.scene_file import write_scene
 from p2gs_jax.run.summary import write_summary
@@ -99,8 +104,11 @@ def write_results(
         model=model,
         curve=curve,
         gauge=gauge,
-        mean=dataclasses.asdict(mean),
+        mean=mean_row(mean),
         views=_photometry_views(params, scene, fitted, solution),
+        cameras=camera_rows(
+            cfg.photometry.cameras, None if solution is None else solution.corner_errors
+        ),
     )
     if metering is not None:
         write_metering(folder.metering, metering)
@@ -120,8 +128,7 @@ def write_view(folder: Path, name: str, result: ViewResult, store: ImageStore) -
         result.linear,
         depth=result.depth,
         alpha=result.alpha,
-        exposure=result.transform.exposure,
-        gamma=result.transform.gamma,
+        taken=result.transform,
         camera=camera,
     )
     write_png(stem.with_name(f"{stem.name}.render.png"), result.ldr)
@@ -161,12 +168,13 @@ def _photometry_views(
             are passed on.
     """
     taken: Photometry = jax.tree.map(np.asarray, params.photometry)
-    exposures, gammas = taken.exposures, taken.gammas
+    exposures, gammas, balances = taken.exposures, taken.gammas, taken.white_balance
     rows = {index: k for k, index in enumerate(scene.train_indices)}
     out: list[ViewPhotometry] = []
     for index, view in enumerate(scene.views):
         k = rows.get(index)
         e = None if k is None else float(exposures[k])
+        balance = None if k is None or balances is None else np.exp(balances[k]).tolist()
         out.append(
             {
                 "image": view.name,
@@ -177,6 +185,8 @@ def _photometry_views(
                 "exif_ev": view.exif_ev,
                 "split": view.split,
                 "exposure_fitted": fitted.get(index),
+                "white_balance": balance,
+                "white_balance_ev_error": None,
             }
         )
         if k is not None and solution is not None and np.isfinite(solution.exposure_errors[k]):
@@ -184,7 +194,15 @@ def _photometry_views(
             out[-1]["gamma_error"] = float(solution.gamma_errors[k])
             out[-1]["exposure_ev_start"] = float(solution.exposures_ev[k])
             out[-1]["observations"] = int(solution.observations_per_view[k])
+            out[-1]["white_balance_ev_error"] = balance_of(solution, k)[1]
     return out
+
+
+def mean_row(mean: MeanParameters) -> dict:
+    """Return the `mean` of `photometry.json`: white balance as factors, where it is modelled."""
+    row = dataclasses.asdict(mean)
+    balance = row.pop("white_balance")
+    return row if balance is None else {**row, "white_balance": np.exp(balance).tolist()}
 
 
 def _photometry_model(params: Params, cfg: FitConfig) -> tuple[str, dict, str]:

@@ -44,8 +44,7 @@ def exr_bytes(frame: RenderedFrame, transform: DisplayTransform) -> bytes:
             np.asarray(frame.linear),
             depth=frame.depth,
             alpha=frame.alpha,
-            exposure=transform.exposure,
-            gamma=transform.gamma,
+            taken=transform,
             camera=frame.camera,
         )
         return path.read_bytes()

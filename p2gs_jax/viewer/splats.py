@@ -18,6 +18,7 @@ from scipy.special import expit
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.formats.false_color import false_color
+from p2gs_jax.gaussians.bake import display_of_splats
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.render import view_radiance
 from p2gs_jax.types import Camera, Gaussians
@@ -84,9 +85,9 @@ def splat_colors(
 ) -> UInt8[np.ndarray, "n 3"]:
     """Return a colour for each splat: false colour in mode `stops`, else display values.
 
-    What depends on the position in the image is left out.
+    What depends on the place in the image is left out.
     """
     column = splats.linear[:, None]
     if settings.mode == "stops":
         return to_uint8_fast(false_color(column, MIDDLE_GREY / transform.exposure))[:, 0]
-    return to_uint8_fast(develop(column, transform.without_place()))[:, 0]
+    return to_uint8_fast(develop(column, display_of_splats(transform)))[:, 0]

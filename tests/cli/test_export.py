@@ -243,7 +243,7 @@ def test_what_is_there_is_replaced_only_when_asked(finished_run, capsys, tmp_pat
     assert not (tmp_path / "linear.ply").exists()
     code, _ = run(capsys, *argv, "--overwrite")
     assert code == 0
-    assert json.loads((tmp_path / "linear.json").read_text())["version"] == 1
+    assert json.loads((tmp_path / "linear.json").read_text())["version"] == 2
 
 
 def test_exports_lie_in_the_run_unless_told_otherwise(finished_run, capsys, tmp_path):

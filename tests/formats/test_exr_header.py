@@ -8,7 +8,9 @@ import OpenEXR
 import pytest
 from scipy.spatial.transform import Rotation
 
+from p2gs_jax.config import CameraFormation, PhotometryConfig
 from p2gs_jax.formats.exr import read_exr, write_exr
+from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.scene.exif import ExifSettings
 from p2gs_jax.types import Camera
 
@@ -46,7 +48,8 @@ def test_exr_holds_radiance_exposure_and_depth(tmp_path):
     linear = np.exp2(rng.uniform(-10, 6, (7, 9, 3))).astype(np.float32)
     depth, alpha = np.full((7, 9), 4.0, np.float32), np.full((7, 9), 0.5, np.float32)
     path = tmp_path / "a.exr"
-    write_exr(path, linear, depth=depth, alpha=alpha, exposure=2.0, gamma=2.1)
+    taken = DisplayTransform(2.0, 2.1, PhotometryConfig())
+    write_exr(path, linear, depth=depth, alpha=alpha, taken=taken)
     back, header = read_exr(path)
     np.testing.assert_allclose(back, linear, rtol=1e-3)
     assert header["p2gsExposure"] == 2.0
@@ -58,6 +61,7 @@ def test_exr_holds_radiance_exposure_and_depth(tmp_path):
     np.testing.assert_allclose(header["adoptedNeutral"], (0.3127, 0.329))
     assert "whiteLuminance" not in header, "radiance is relative"
     assert "worldToCamera" not in header
+    assert not {"p2gsWhiteBalance", "p2gsVignettingRed"} & set(header)
     with OpenEXR.File(str(path), separate_channels=True) as file:
         np.testing.assert_allclose(file.channels()["Z"].pixels, 8.0)
 
@@ -111,9 +115,8 @@ def test_exif_goes_into_the_attributes_of_its_own(tmp_path):
 
 def test_attributes_have_the_standard_types(tmp_path):
     path = tmp_path / "a.exr"
-    written(
-        path, shot=ExifSettings(0.1, 2.0, 100.0, "2010:10:12 14:43:07"), exposure=1.0, gamma=2.2
-    )
+    taken = DisplayTransform(1.0, 2.2, PhotometryConfig())
+    written(path, shot=ExifSettings(0.1, 2.0, 100.0, "2010:10:12 14:43:07"), taken=taken)
     expected = {
         "chromaticities": "chromaticities",
         "adoptedNeutral": "v2f",
@@ -132,3 +135,20 @@ def test_attributes_have_the_standard_types(tmp_path):
     }
     found = attribute_types(path)
     assert {name: found[name] for name in expected} == expected
+
+
+def test_the_header_holds_white_balance_and_vignetting(tmp_path):
+    linear, path = np.ones((4, 6, 3), np.float32), tmp_path / "a.exr"
+    for rows in (((-0.3, 0.1, 0.0),), ((-0.3, 0.1, 0.0), (-0.2, 0.0, 0.0), (-0.1, 0.0, 0.05))):
+        cfg = PhotometryConfig(cameras=(CameraFormation("a"), CameraFormation("b", rows)))
+        balance = (0.2, -0.05, -0.15)
+        taken = DisplayTransform(1.0, 2.2, cfg, white_balance=balance, camera=1)
+        write_exr(path, linear, taken=taken)
+        header = read_exr(path)[1]
+        np.testing.assert_allclose(header["p2gsWhiteBalance"], np.exp(balance), rtol=1e-6)
+        for name, row in zip(
+            ("Red", "Green", "Blue"), rows if len(rows) == 3 else rows * 3, strict=True
+        ):
+            np.testing.assert_allclose(header[f"p2gsVignetting{name}"], row, rtol=1e-6)
+    write_exr(path, linear, taken=taken.without_place())
+    assert "p2gsVignettingRed" not in read_exr(path)[1]

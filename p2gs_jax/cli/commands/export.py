@@ -92,13 +92,16 @@ def _display_transform(fitted: Run, options: Export) -> DisplayTransform:
     """Return the display transform of display colours.
 
     Raises:
-        UserError: the run has no such curve.
+        UserError: the run has no such curve, or no such white balance.
     """
     ev = options.exposure_ev or 0.0
     transform = fitted.common_display(ev)
     if options.exposure_of is not None:
         typical = fitted.metering.typical_log_exposure(options.exposure_of)
         transform = replace(transform, exposure=float(np.exp(typical)) * 2**ev)
+    if options.white_balance_of is not None:
+        balance = fitted.white_balance_of(options.white_balance_of)
+        transform = replace(transform, white_balance=balance)
     if options.gamma is not None:
         transform = replace(transform, gamma=options.gamma)
     if options.curve is not None:
@@ -175,8 +178,7 @@ def _exr(folder: Path, fitted: Run, store: ImageStore, reporter: Reporter) -> st
                 np.asarray(result.linear),
                 depth=np.asarray(result.depth),
                 alpha=np.asarray(result.alpha),
-                exposure=transform.exposure,
-                gamma=transform.gamma,
+                taken=transform,
                 camera=camera,
                 shot=read_exif_settings(view.image_path),
             )
@@ -255,6 +257,9 @@ class _Display:
                 ),
                 "gamma": self.transform.gamma,
                 "curve": self.transform.formation.curve,
+                "white_balance": None
+                if self.transform.white_balance is None
+                else np.exp(self.transform.white_balance).tolist(),
                 "bake_steps": self.steps,
                 "seconds": time.monotonic() - begin,
                 "baking_error": error,

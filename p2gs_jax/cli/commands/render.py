@@ -78,11 +78,13 @@ def run(options: Render) -> int:
     _check_place(out, options.overwrite)
     given = read_cameras(Path(options.path)) if options.path not in PATHS else None
     fitted = load_run(options.run, options.scene)
-    if options.curve == "spline" and fitted.cfg.photometry.spline is None:
+    if options.curve == "spline" and fitted.cfg.photometry.curve != "spline":
         raise UserError(
             f"--curve spline: {options.run} has none; its curve is {fitted.cfg.photometry.curve}.",
             fix="choose run, srgb, power or linear",
         )
+    if options.white_balance_of is not None:
+        fitted.white_balance_of(options.white_balance_of)
     renderer = RunRenderer(fitted)
     with TerminalReporter() as reporter:
         job = (
@@ -209,9 +211,13 @@ def _display_transform(fitted: Run, options: Render, shot: Shot | None = None) -
         metered = fitted.common_display(shot.exposure_ev)  # with --exposure-ev already
         transform = replace(transform, exposure=metered.exposure)
     elif isinstance(options.exposure_ev, float | int):
-        transform = replace(
-            fitted.common_display(float(options.exposure_ev)), gamma=transform.gamma
-        )
+        common = fitted.common_display(float(options.exposure_ev))
+        transform = replace(common, gamma=transform.gamma, camera=transform.camera)
+    if options.white_balance_of is not None:
+        balance = fitted.white_balance_of(options.white_balance_of)
+        transform = replace(transform, white_balance=balance)
+    if options.no_vignetting:
+        transform = transform.without_place()
     gamma = options.gamma
     if gamma is None and shot is not None:
         gamma = shot.gamma

@@ -44,6 +44,8 @@ class Export:
     """Display colours: gamma (default: the run's mean)."""
     curve: Literal["power", "srgb", "spline", "linear"] | None = None
     """Display colours: base tone curve (default: the run's)."""
+    white_balance_of: str | None = None
+    """Display colours: white balance of this view (default: neutral), where views differ in it."""
     bake_steps: int | None = None
     """Display colours: steps that bring a viewer's pictures closer to the true ones; 0 takes every
     Gaussian by itself (default: 240, or one for every training view if that is more)."""
@@ -66,8 +68,8 @@ def check_export(args: Export) -> None:
     gamma = args.gamma
     check(gamma is None or (math.isfinite(gamma) and gamma > 0), "--gamma must be positive")
     check(args.bake_steps is None or args.bake_steps >= 0, "--bake-steps must be 0 or more")
-    names = ("exposure_ev", "exposure_of", "gamma", "curve", "bake_steps")
-    given = [n for n in names if getattr(args, n) is not None]
+    display = ("exposure_ev", "exposure_of", "gamma", "curve", "white_balance_of", "bake_steps")
+    given = [n for n in display if getattr(args, n) is not None]
     if given and not set(args.format) & set(DISPLAY):
         raise UserError(
             f"--{given[0].replace('_', '-')} says nothing without a format that holds display "

@@ -48,6 +48,11 @@ class Render:
     """Gamma; default: each view's own, or the training views' mean for other paths."""
     curve: Literal["run", "srgb", "power", "linear", "spline"] = "run"
     """Tone curve; run: the one that was fitted."""
+    white_balance_of: str | None = None
+    """Name of the view whose white balance is shown, where views differ in it (default: each
+    view's own; neutral where an exposure is given, and for other paths)."""
+    no_vignetting: bool = False
+    """Leave out the darkening towards the corners that the cameras of this run have."""
     frames: int | None = None
     """Frames of a drive (default: 8 from one view to the next) or an orbit (default: 120)."""
     width: int | None = None
