@@ -17,11 +17,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from p2gs_jax.config import Appearance
-from p2gs_jax.core.numerics import on_device
+from p2gs_jax.core.numerics import LN2, on_device
 from p2gs_jax.photometry.ppisp import parameters as isp
 from p2gs_jax.photometry.ppisp.parameters import OneView, Ppisp
 from p2gs_jax.photometry.ppisp.regularisation import regularisation as ppisp_regularisation
-from p2gs_jax.types import LUMINANCE
+from p2gs_jax.types import LUMINANCE, Params
 
 # Of all training views: a row for each, or what PPISP learns of views and cameras.
 Corrections = Float[Array, "v ..."] | Ppisp
@@ -63,6 +63,24 @@ def mean_correction(appearance: Corrections | None, camera: str | None = None) -
     if isinstance(appearance, Ppisp):
         return appearance.mean(camera)
     return None if appearance is None else appearance.mean(axis=0)
+
+
+def exposures_apart(params: Params) -> Params:
+    """Return a finished fit with PPISP's exposures where all others have theirs: in `Photometry`.
+
+    Photographs stay as they are.
+    """
+    if not isinstance(params.appearance, Ppisp):
+        return params
+    stops, photometry = params.appearance.exposures, params.photometry
+    raw = photometry.raw_exposures + LN2 * stops
+    if photometry.parameterization == "linear":
+        raw = photometry.exposures * 2.0**stops
+    return dataclasses.replace(
+        params,
+        photometry=dataclasses.replace(photometry, raw_exposures=raw),
+        appearance=dataclasses.replace(params.appearance, exposures=0.0 * stops),
+    )
 
 
 def without_place(correction: Correction | None, kind: Appearance | None) -> Correction | None:

@@ -19,7 +19,7 @@ from p2gs_jax.types import View
 
 
 def write_appearance(path: Path, appearance: Corrections, views: Sequence[View]) -> None:
-    """Write what was learned of all training views.
+    """Write what was learned of all training views; exposures lie in `photometry.json`.
 
     Args:
         path: of the file.
@@ -68,10 +68,8 @@ def _ppisp_values(p: Ppisp, views: Sequence[View]) -> dict[str, Any]:
             )
         },
         "views": {
-            view.name: {"camera": view.camera, "exposure_ev": exposure, "color": color}
-            for view, exposure, color in zip(
-                views, np.asarray(p.exposures), np.asarray(p.colors), strict=True
-            )
+            view.name: {"camera": view.camera, "color": color}
+            for view, color in zip(views, np.asarray(p.colors), strict=True)
         },
     }
 
@@ -89,7 +87,7 @@ def _read_ppisp(saved: dict[str, Any], like: Ppisp, views: Sequence[View]) -> Pp
         return on_device(np.array([row[key] for row in rows], np.float32).reshape(shape))
 
     return Ppisp(
-        stacked(of_views, "exposure_ev", like.exposures.shape),
+        like.exposures,
         stacked(of_views, "color", like.colors.shape),
         stacked(of_cameras, "response", like.responses.shape),
         stacked(of_cameras, "vignetting", like.vignettings.shape),

@@ -1,5 +1,7 @@
 """PPISP against its formulas in numpy: what each part keeps, and true gradients."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,11 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from p2gs_jax.config import PhotometryConfig
+from p2gs_jax.photometry.appearance import correction_of, exposures_apart
+from p2gs_jax.photometry.formation import formation
 from p2gs_jax.photometry.ppisp.homography import SOURCES, homography, offsets, recolored
 from p2gs_jax.photometry.ppisp.parameters import OneView, applied, identity
 from p2gs_jax.photometry.ppisp.regularisation import regularisation
 from p2gs_jax.photometry.ppisp.response import identity_response, respond
 from p2gs_jax.photometry.ppisp.vignetting import falloff
+from p2gs_jax.types import Params, Photometry
 
 IMAGE = np.random.default_rng(0).uniform(0.02, 0.9, (12, 20, 3))
 IDENTITY = np.tile(identity_response(), (3, 1))
@@ -246,3 +252,28 @@ def test_the_regularisation_is_what_is_published():
         + 0.01 * np.maximum(vignettings[..., 2:], 0).mean()
     )
     assert float(regularisation(parameters)) == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize("parameterization", ["log", "linear"])
+def test_exposures_are_handed_on_and_photographs_stay(parameterization):
+    learned = identity(["a", "b"])
+    learned = replace(learned, exposures=jnp.asarray([0.7, -1.2], jnp.float32))
+    one = jnp.zeros(2) if parameterization == "log" else jnp.ones(2)
+    gammas = jnp.zeros(2) if parameterization == "log" else jnp.full(2, 2.2)
+    photometry = Photometry(one, gammas, parameterization)
+    before = Params(None, photometry, learned)  # pyright: ignore[reportArgumentType]
+    after = exposures_apart(before)
+    np.testing.assert_allclose(after.photometry.exposures, [2**0.7, 2**-1.2], rtol=1e-5)
+    cfg = PhotometryConfig(curve="linear", appearance="ppisp")
+    for row in range(2):
+        pictures = [
+            formation(
+                jnp.asarray(0.4 * IMAGE, jnp.float32),
+                p.photometry.capture(row),
+                cfg,
+                correction_of(p.appearance, row),
+            )
+            for p in (before, after)
+        ]
+        np.testing.assert_allclose(*pictures, atol=1e-5)
+        assert float(jnp.abs(pictures[0] - 0.4 * IMAGE).max()) > 0.05
