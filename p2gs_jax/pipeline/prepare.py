@@ -189,13 +189,7 @@ def prepare(
             store,
             rough_tones(tracks, len(views))
             if solution is None
-            else Tones(
-                solution.log_exposures,
-                solution.gammas,
-                resolved.photometry,
-                None if solution.white_balance_level is None else solution.white_balance,
-                photometry.cameras,
-            ),
+            else Tones.of(photometry, resolved.photometry),
             scene.points[seeds.keep],
             photometry,
             resolved,
