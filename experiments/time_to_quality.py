@@ -22,7 +22,6 @@ import hashlib
 import itertools
 import json
 import os
-import random
 import re
 import resource
 import shutil
@@ -37,8 +36,9 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
+from mixtures import read_groups, within_groups_ev, write_mixture
 
-from p2gs_jax.core.atomic import atomic_folder, atomic_write, write_json
+from p2gs_jax.core.atomic import atomic_write, write_json
 from p2gs_jax.evaluate.alignment import exposure_error
 from p2gs_jax.synth.exposures import read_true_exposures
 from p2gs_jax.synth.rig import image_height
@@ -49,7 +49,6 @@ HERE = Path(__file__).resolve().parents[1]
 Temperature = Literal["cold", "warm"]
 BUDGETS = (60, 120, 240, 480)
 QUICK_BUDGET = 30
-MIXTURE_SEED, MIXTURE_GROUPS, MIXTURE_REFERENCE = 7, ("low", "high", "over_exp"), "high"
 THIS, AGAINST = "this", "against"
 TICKS = (15, 20, 30, 45, 60, 90, 120, 180, 240, 360, 480, 720, 960)
 COLORS = {THIS: "#0072B2", AGAINST: "#D55E00"}
@@ -108,38 +107,6 @@ class SceneToFit(NamedTuple):
     name: str
     folder: Path
     options: tuple[str, ...] = ()
-
-
-def mixture_groups(
-    views: Sequence[str], groups: Sequence[str] = MIXTURE_GROUPS, seed: int = MIXTURE_SEED
-) -> dict[str, str]:
-    """Return which exposure each view gets: drawn in the order of the views' sorted names."""
-    rng = random.Random(seed)
-    return {view: rng.choice(groups) for view in sorted(views)}
-
-
-def write_mixture(lom: Path, out: Path) -> None:
-    """Write a scene of `lom` whose views have one of three exposures each.
-
-    Args:
-        lom: a LOM scene: a folder of photographs per exposure, and `colmap_sparse`.
-        out: gets `images/`, `sparse/0`, `reference/` and `groups.json` (view -> exposure).
-    """
-
-    def photographs(group: str) -> dict[str, Path]:
-        return {f.stem: f for f in (lom / group).iterdir() if f.suffix.lower() == ".jpg"}
-
-    files = {group: photographs(group) for group in MIXTURE_GROUPS}
-    groups = mixture_groups(list(files[MIXTURE_REFERENCE]))
-    with atomic_folder(out) as folder:
-        for name in ("images", "reference"):
-            (folder / name).mkdir()
-        shutil.copytree(lom / "colmap_sparse" / "0", folder / "sparse" / "0")
-        for view, group in groups.items():
-            shutil.copy(files[group][view], folder / "images" / f"{view}.JPG")
-            reference = files[MIXTURE_REFERENCE][view]
-            shutil.copy(reference, folder / "reference" / f"{view}.JPG")
-        (folder / "groups.json").write_text(json.dumps(groups, indent=1))
 
 
 def _town(work: Path, *, quick: bool) -> SceneToFit:
@@ -304,22 +271,6 @@ def true_ev(photometry: Mapping[str, Any], truth: Mapping[str, float]) -> float 
     return exposure_error(*np.array(pairs).T)["ev"] if pairs else None
 
 
-def within_groups_ev(photometry: Mapping[str, Any], groups: Mapping[str, str]) -> float | None:
-    """Return how far exposures stray from the mean of their group, RMS in stops.
-
-    Args:
-        photometry: a run's photometry.json.
-        groups: stem of a view -> group; exposures of a group are equal in truth.
-    """
-    solved: dict[str, list[float]] = {}
-    for view in photometry.get("views", ()):
-        group = groups.get(Path(view["image"]).stem)
-        if group is not None and view["exposure_ev"] is not None:
-            solved.setdefault(group, []).append(view["exposure_ev"])
-    off = [ev - np.mean(g) for g in solved.values() for ev in g]
-    return float(np.sqrt(np.mean(np.square(off)))) if off else None
-
-
 def compiling(output: str) -> tuple[int, float]:
     """Return how many programs XLA compiled or read from the cache, and the seconds of that."""
     seconds = [float(s) for s in COMPILED.findall(output)]
@@ -388,9 +339,8 @@ def execute(job: Job, cache: Path, work: Path) -> dict[str, Any]:
             "ev": true_ev(photometry, read_true_exposures(job.scene.folder)),
             "seconds": metrics.get("seconds"),
         }
-        groups = job.scene.folder / "groups.json"
-        if groups.is_file():
-            row["ev_within_groups"] = within_groups_ev(photometry, json.loads(groups.read_text()))
+        if groups := read_groups(job.scene.folder):
+            row["ev_within_groups"] = within_groups_ev(photometry, groups)
         return row
 
 

@@ -13,7 +13,7 @@ from typing import Literal, get_args
 
 from p2gs_jax.errors import UserError
 
-Appearance = Literal["affine", "bilateral", "curve"]
+Appearance = Literal["affine", "bilateral", "curve", "ppisp"]
 PresetName = Literal[
     "paper",
     "paper_appendix",
@@ -23,6 +23,8 @@ PresetName = Literal[
     "3dgs_affine",
     "3dgs_bilateral",
     "3dgs_curve",
+    "ppisp",
+    "ppisp_solved",
 ]
 PhotometricModel = Literal[
     "constant",
@@ -168,7 +170,8 @@ class PhotometryConfig:
     """Standard deviation of the random start (paper, Exposure modeling)."""
     appearance: Appearance | None = None
     """A learned correction of display values per view, as baselines have: a colour matrix (3DGS's
-    exposure compensation), a bilateral grid of them, or a curve (photometry/appearance.py)."""
+    exposure compensation), a bilateral grid of them, or a curve (photometry/appearance.py); or, in
+    place of a tone curve, a whole camera (`ppisp`, photometry/ppisp)."""
     freeze_until: float = 0.6
     """Fraction of the run during which exposure and gamma stay at their start, where that start
     comes from tracks (ours: docs/photometry.md, 4)."""
@@ -206,7 +209,8 @@ class RegularizerConfig:
     gamma_mean_variance: float | None = 0.1
     """(mean gamma - 2.2)^2 + Var gamma: fixes the common contrast (ours)."""
     appearance: float | None = 10.0
-    """Roughness of bilateral grids (bilateral-guided radiance fields: 10)."""
+    """Roughness of bilateral grids (bilateral-guided radiance fields: 10); a factor on the
+    published weights of PPISP (1)."""
     opacity: float | None = None
     """Mean opacity (3DGS-MCMC: 0.01, which empties splats so that relocation can reuse them; ours:
     at our populations it empties the scene within some thousand steps, BUILD_NOTES)."""
@@ -263,6 +267,8 @@ class OptimizerConfig:
     """Corrections of display values (3DGS's exposure compensation starts at 1e-2)."""
     appearance_final: float = 0.1
     """They decay exponentially to this fraction (3DGS: 0.1)."""
+    appearance_warmup: float = 0.0
+    """Fraction of the run in which they rise from a hundredth (PPISP: 500 of 30,000 steps)."""
     photometry_final: float = 0.01
     """Exposure and gamma rates decay exponentially to this fraction (ours)."""
     final: float = 0.1
@@ -391,6 +397,10 @@ class FitConfig:
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
 
 
+# Of PPISP's parameters. Published: 2e-3 over 30,000 steps.
+PPISP_RATE = 2e-2
+
+
 def _robust() -> FitConfig:
     return FitConfig()
 
@@ -478,13 +488,43 @@ def _ldr(
     )
 
 
+def _ppisp() -> FitConfig:
+    """Return PPISP without its controller, under the schedule, renderer and budget of `robust`."""
+    base = _ldr("ppisp", appearance="ppisp", rate=PPISP_RATE)
+    return dataclasses.replace(
+        base,
+        loss=dataclasses.replace(
+            base.loss, regularizers=dataclasses.replace(base.loss.regularizers, appearance=1.0)
+        ),
+        optimizer=dataclasses.replace(
+            base.optimizer, appearance_final=0.01, appearance_warmup=500 / 30_000
+        ),
+    )
+
+
+def _ppisp_solved() -> FitConfig:
+    """Return what PPISP models, solved beforehand: neither chosen nor learned from nothing."""
+    robust = _robust()
+    photometry = dataclasses.replace(
+        robust.photometry,
+        select=False,
+        model="view_exposure",
+        curve="spline",
+        white_balance="view",
+        vignetting="channel",
+        responses="camera",
+    )
+    return dataclasses.replace(robust, preset="ppisp_solved", photometry=photometry)
+
+
 def preset(name: PresetName) -> FitConfig:
     """Return the configuration of a preset.
 
     Args:
         name: `robust`; `paper` (as printed, lambda_exp 0.01) or `paper_appendix` (0.1); baselines
             that splat display values: `3dgs`, with a gain per view `3dgs_gain`, or with a learned
-            correction per view `3dgs_affine`, `3dgs_bilateral`, `3dgs_curve`.
+            correction per view `3dgs_affine`, `3dgs_bilateral`, `3dgs_curve`; `ppisp`, a camera
+            learned beside the splats, and `ppisp_solved`, about the same camera solved before.
 
     Raises:
         UserError: there is no such preset.
@@ -498,6 +538,8 @@ def preset(name: PresetName) -> FitConfig:
         "3dgs_affine": lambda: _ldr("3dgs_affine", appearance="affine"),
         "3dgs_bilateral": lambda: _ldr("3dgs_bilateral", appearance="bilateral", rate=2e-3),
         "3dgs_curve": lambda: _ldr("3dgs_curve", appearance="curve"),
+        "ppisp": _ppisp,
+        "ppisp_solved": _ppisp_solved,
     }
     if name not in known:
         raise UserError(

@@ -130,17 +130,8 @@ class Params(eqx.Module):
 
     gaussians: Gaussians
     photometry: Photometry
-    appearance: Float[Array, "v ..."] | None = None
-    """Corrections of display values per training view (photometry/appearance.py), or None."""
-
-    def correction(self, row: Int[Array, ""] | int) -> Float[Array, "..."] | None:
-        """Return the correction of the training view in a row of `Photometry`, or None."""
-        return None if self.appearance is None else self.appearance[row]
-
-    @property
-    def mean_correction(self) -> Float[Array, "..."] | None:
-        """The mean over the training views, for views that have none of their own, or None."""
-        return None if self.appearance is None else self.appearance.mean(axis=0)
+    appearance: Any = None
+    """Corrections of all training views (`Corrections` of photometry/appearance.py), or None."""
 
 
 class Camera(eqx.Module):

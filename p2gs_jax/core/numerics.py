@@ -46,6 +46,11 @@ def positive_pow(x: Values, p: Scalar, floor: float) -> Values:
     return namespace(x, p).exp(p * safe_log(x, floor))
 
 
+def unit_clip(x: Array) -> Array:
+    """Return x clipped to [0, 1]; at the bounds themselves the gradient passes whole."""
+    return jnp.where(x > 1, 1.0, jnp.where(x < 0, 0.0, x))
+
+
 def evenly_spaced(count: int, most: int) -> Int[np.ndarray, " k"]:
     """Return at most `most` of the indices below `count`, evenly spaced, both ends included."""
     return np.linspace(0, count - 1, min(count, most)).round().astype(int)

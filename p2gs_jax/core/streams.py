@@ -63,6 +63,8 @@ class SceneStream(IntEnum):
     CAMERAS = 4
     LIGHT = 5
     PHOTOGRAPH = 6
+    OPTICS = 7
+    """Lenses, and the white balance of every photograph."""
 
 
 def generator(seed: int, stream: Stream | SceneStream, *more: int) -> np.random.Generator:

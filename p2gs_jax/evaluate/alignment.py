@@ -13,6 +13,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from p2gs_jax.config import PhotometryConfig
+from p2gs_jax.photometry.appearance import Correction
 from p2gs_jax.photometry.formation import display, formation
 from p2gs_jax.types import Capture
 
@@ -70,7 +71,7 @@ def fit_exposure(
     mask: Float[Array, "h w"],
     capture: Capture,
     cfg: PhotometryConfig,
-    correction: Float[Array, "..."] | None = None,
+    correction: Correction | None = None,
 ) -> Float[Array, ""]:
     """Return the one exposure with which a render fits a photograph best, in squared LDR error.
 
@@ -117,7 +118,7 @@ def fit_capture(
     mask: Float[Array, "h w"],
     start: Capture,
     cfg: PhotometryConfig,
-    correction: Float[Array, "..."] | None = None,
+    correction: Correction | None = None,
     *,
     gamma: bool,
     white_balance: bool,

@@ -4,8 +4,10 @@ Protocols (docs/photometry.md, 6): `per_view` renders a training view with its o
 and white balance; `averaged` uses the mean parameters over the training views (paper, Rendering
 for evaluation); `exposure_fitted` solves one scalar exposure from the photograph, because a
 held-out view has none of its own; `photometry_fitted` solves all that the model gives every view,
-where that is more than an exposure; against reference photographs of one common exposure,
-`scale_aligned` solves one scalar for all of them. Vignetting and responses are the camera's in all.
+where that is more than an exposure; `metered` takes the exposure that the rule gives its render
+that explains the training exposures, where there is one (photometry/metering.py); against
+reference photographs of one common exposure, `scale_aligned` solves one scalar for all of them.
+Vignetting and responses are the camera's in all.
 """
 
 from __future__ import annotations
@@ -24,12 +26,14 @@ from p2gs_jax.evaluate.alignment import fit_capture, fit_exposure
 from p2gs_jax.evaluate.array_store import ArrayStore, StoredArray
 from p2gs_jax.evaluate.consistency import VideoScores
 from p2gs_jax.evaluate.lpips import LpipsWeights, lpips
+from p2gs_jax.evaluate.metered import MeteredViews
 from p2gs_jax.evaluate.metrics import psnr, ssim
 from p2gs_jax.evaluate.parallel import map_in_order
 from p2gs_jax.evaluate.radiance import RadianceScores, Truth
 from p2gs_jax.photometry.display import DisplayTransform, develop, display_of_view, with_capture
 from p2gs_jax.photometry.formation import inverse_tone_map
 from p2gs_jax.photometry.mean import MeanParameters, mean_parameters, usual_display
+from p2gs_jax.photometry.metering import Metering, Readings, meter
 from p2gs_jax.photometry.models import MODELS
 from p2gs_jax.render.host import RenderView
 from p2gs_jax.scene.device import camera_of
@@ -81,6 +85,7 @@ class _Judged(NamedTuple):
         scores_all: of a held-out view with all fitted that varies per view, or None.
         radiance: true linear radiance, or None.
         reference: photograph under the common exposure, or None.
+        readings: of the meters.
     """
 
     result: ViewResult
@@ -91,13 +96,14 @@ class _Judged(NamedTuple):
     scores_all: dict[str, float] | None
     radiance: np.ndarray | None
     reference: np.ndarray | None
+    readings: Readings
 
 
 class _Collector:
     """Per-view scores and their means."""
 
-    def __init__(self):
-        self.rows: dict[str, dict[str, float]] = {}
+    def __init__(self, rows: dict[str, dict[str, float]] | None = None):
+        self.rows = {} if rows is None else rows
 
     def add(self, name: str, row: dict[str, float]) -> None:
         self.rows[name] = row
@@ -122,6 +128,7 @@ def evaluate(
     radiance: Truth | None = None,
     lpips_weights: LpipsWeights | None = None,
     on_view: Callable[[ViewResult], None] = lambda result: None,
+    on_metering: Callable[[Metering], None] = lambda metering: None,
     on_progress: Callable[[int, int], None] = lambda done, count: None,
 ) -> dict:
     """Render and judge all views.
@@ -138,6 +145,7 @@ def evaluate(
         lpips_weights: adds `lpips` wherever a view is compared with a photograph; None leaves it
             out.
         on_view: receives every rendered view.
+        on_metering: receives the metering rule that explains the training views, once.
         on_progress: views done, views in all.
 
     Returns:
@@ -191,13 +199,14 @@ def evaluate(
             everything,
             None if radiance is None else radiance(index),
             None if reference is None else _lookup(reference, index),
+            meter(linear, alpha),
         )
 
     own, averaged = _Collector(), _Collector()
     test_averaged, test_fitted, test_all = _Collector(), _Collector(), _Collector()
     videos = {name: VideoScores() for name in ("per_view", "averaged", "photographs")}
     with ArrayStore() as arrays:
-        scores = RadianceScores(arrays)
+        scores, metered = RadianceScores(arrays), MeteredViews(arrays)
         reference_views: list[tuple[int, tuple[StoredArray, ...]]] = []
         # In the order of names: the frames of a camera are then in sequence.
         for found in map_in_order(judged, range(len(scene.views))):
@@ -215,6 +224,11 @@ def evaluate(
             if found.reference is not None:
                 images = (linear, found.reference, found.mask)
                 reference_views.append((index, tuple(map(arrays.put, images))))
+            if training:
+                metered.add_training(view.name, found.readings)
+            else:
+                images = (linear, result.photograph, found.mask)
+                metered.add_held_out(view.name, found.readings, *images)
             on_view(result)
             videos["per_view"].add(view.camera, result.ldr, result.transform.exposure)
             videos["averaged"].add(view.camera, found.ldr_averaged, mean.exposure)
@@ -227,6 +241,17 @@ def evaluate(
         }
         if test_all.rows:
             metrics["test"]["photometry_fitted"] = test_all.summary()
+        metering = metered.fit(np.asarray(small.photometry.exposures), mean.gamma, tone)
+        on_metering(metering)
+
+        row_of_name = {view.name: index for index, view in enumerate(scene.views)}
+
+        def under_rule(name, linear, exposure, photograph, mask):
+            shown = develop(linear, replace(usual(row_of_name[name]), exposure=exposure))
+            return score(shown, photograph, mask)
+
+        if metered_scores := metered.scores(metering, under_rule):
+            metrics["test"]["metered"] = _Collector(metered_scores).summary()
         metrics["train"]["per_view"] = metrics["train"].pop("per_view", {})
         metrics["consistency"] = {name: video.summary() for name, video in videos.items()}
         if scores.views:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32
 
-from p2gs_jax.config import FitConfig, PhotometryConfig
+from p2gs_jax.config import Appearance, FitConfig, PhotometryConfig
 from p2gs_jax.formats.exr import BT709
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import EXPOSED_CEILING, EXPOSED_FLOOR
@@ -22,7 +22,6 @@ from p2gs_jax.scene import ImageStore
 from p2gs_jax.types import GAMMA_SRGB, Gaussians, Scene
 
 FORMAT, VERSION = "p2gs-jax linear Gaussians", 2
-CORRECTIONS = "linear.appearance.npy"
 ACTIVATIONS = {
     "exp": f"L = exp(clip(s, -{LOG_RADIANCE_LIMIT:g}, {LOG_RADIANCE_LIMIT:g}))",
     "softplus": "L = log(1 + exp(s))",
@@ -49,6 +48,11 @@ BASIS = (
 )
 # Stops about 1 at which the tone curve is tabulated.
 DARKEST_EV, BRIGHTEST_EV, SAMPLES = -14.0, 4.0, 433
+
+
+def corrections_name(kind: Appearance) -> str:
+    """Return the name of the file beside it that holds learned corrections."""
+    return "linear.ppisp.json" if kind == "ppisp" else "linear.appearance.npy"
 
 
 def linear_sidecar(
@@ -146,7 +150,7 @@ def _tone(cfg: FitConfig, photometry: PhotometryFile) -> dict[str, Any]:
             }
             for row, camera in enumerate(p.cameras)
         ],
-        "correction": None if kind is None else {"kind": kind, "file": CORRECTIONS},
+        "correction": None if kind is None else {"kind": kind, "file": corrections_name(kind)},
     }
 
 

@@ -91,12 +91,7 @@ def true_target(
 
 
 def display_of_splats(transform: DisplayTransform) -> DisplayTransform:
-    """Return the transform without what depends on the place in the image: splats cannot hold it.
-
-    That is vignetting, and a correction by image position.
-    """
-    if transform.formation.appearance == "bilateral":
-        transform = replace(transform, correction=None)
+    """Return the transform without what depends on the place in the image: splats have none."""
     return transform.without_place()
 
 

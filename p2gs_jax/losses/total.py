@@ -19,7 +19,7 @@ from p2gs_jax.losses.relative_exposure import (
     ExposurePairs,
     relative_exposure_loss,
 )
-from p2gs_jax.photometry.appearance import roughness
+from p2gs_jax.photometry.appearance import Corrections, correction_of, regularisation
 from p2gs_jax.photometry.cameras import darkens, places
 from p2gs_jax.photometry.formation import formation
 from p2gs_jax.render import render_splats
@@ -128,7 +128,7 @@ def partner_cameras(partner: Partner, cfg: FitConfig) -> tuple[Camera, ...]:
 def image_loss(
     shown: tuple[Shown, ...],
     photometry: Photometry,
-    appearance: Float[Array, "v ..."] | None,
+    appearance: Corrections | None,
     batch: Batch,
     partner: Partner,
     cfg: FitConfig,
@@ -159,7 +159,7 @@ def image_loss(
     render, *others = renders
     entries, overflow = render.count, render.overflow
     i, j = batch.view_index, partner.view_index
-    correction = None if appearance is None else appearance[i]
+    correction = correction_of(appearance, i)
     photograph, mask = decoded(batch)
     ldr = formation(render.linear, photometry.capture(i), cfg.photometry, correction)
     terms = dict(photometric_loss(ldr, photograph, mask, cfg.loss))
@@ -178,10 +178,11 @@ def image_loss(
             cfg.photometry,
         )
     terms |= photometry_regularizers(photometry, cfg.loss.regularizers)
-    smoothness = cfg.loss.regularizers.appearance
-    if cfg.photometry.appearance == "bilateral" and smoothness is not None:
+    kind, weight = cfg.photometry.appearance, cfg.loss.regularizers.appearance
+    if kind is not None and weight is not None:
         assert appearance is not None
-        terms["appearance"] = smoothness * roughness(appearance, "bilateral")
+        asked = regularisation(appearance, kind)
+        terms |= {} if asked is None else {"appearance": weight * asked}
     return jax.tree.reduce(jnp.add, terms), LossAux(terms, render, ldr, entries, overflow)
 
 

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
+from p2gs_jax.core.numerics import LN2
 from p2gs_jax.formats.frames import OutputFrame
 from p2gs_jax.paths import Cylinder, Rig, Shot, TimeStep, Wide, render_wide, stitch
 from p2gs_jax.paths.captioned_images import CaptionedImage, stacked, stacked_size
@@ -17,10 +18,13 @@ from p2gs_jax.paths.cylinder import borders
 from p2gs_jax.paths.geometry import Poses, inverse
 from p2gs_jax.paths.panorama import Layers
 from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
+from p2gs_jax.photometry.metering import ExposureOf, adapted, meter
 from p2gs_jax.render.host import make_renderer
 from p2gs_jax.run.read import Run
 from p2gs_jax.scene.images import ImageStore
 
+# Pictures are metered at this width, pixels.
+METERED_WIDTH = 240
 # Display value where no camera sees anything.
 NOTHING = 0.92
 # Photographs are placed by the field's depth, smoothed over this part of the width, as noise of the
@@ -67,6 +71,36 @@ class RunRenderer:
         ldr = develop(linear, transform)
         self.develop_seconds.append(time.perf_counter() - begin)
         return ldr
+
+
+def metered_shots(
+    renderer: RunRenderer,
+    shots: Sequence[Shot],
+    of: ExposureOf,
+    exposure_ev: float = 0.0,
+    frames: float = 0.0,
+) -> list[Shot]:
+    """Return shots with the exposures that a metering rule gives small pictures of them.
+
+    Args:
+        renderer: renders.
+        shots: in the order in which they are shown.
+        of: the rule.
+        exposure_ev: stops more than that.
+        frames: exposures follow what is seen within about this many; 0: each by itself.
+    """
+    run = renderer.run
+    logs = []
+    for shot in shots:
+        small = shot.resized(METERED_WIDTH) if shot.width > METERED_WIDTH else shot
+        rendered = run.render(small.camera())
+        readings = meter(np.asarray(rendered.linear), np.asarray(rendered.alpha))
+        logs.append(run.metering.log_exposure(readings, of))
+    if frames > 0:
+        logs = adapted(np.array(logs), frames).tolist()
+    mean = np.log(run.mean.exposure_geometric)
+    stops = [(float(log) - float(mean)) / LN2 + exposure_ev for log in logs]
+    return [replace(shot, exposure_ev=ev) for shot, ev in zip(shots, stops, strict=True)]
 
 
 def shot_frames(

@@ -2,41 +2,106 @@
 
 `affine`: a 3x4 colour matrix per view (the 3DGS code's exposure compensation). `bilateral`: a grid
 of such matrices over the image and luminance (bilateral-guided radiance fields). `curve`: one
-rising curve per view for all channels (in the manner of Luminance-GS). Parameters are deviations:
-zeros change nothing.
+rising curve per view for all channels (in the manner of Luminance-GS). Their parameters are
+deviations: zeros change nothing. `ppisp` takes the place of the tone curve and has parameters of
+cameras as well: `ppisp/`.
 """
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from p2gs_jax.config import Appearance
-from p2gs_jax.core.numerics import on_device
-from p2gs_jax.types import LUMINANCE
+from p2gs_jax.core.numerics import LN2, on_device
+from p2gs_jax.photometry.ppisp import parameters as isp
+from p2gs_jax.photometry.ppisp.parameters import OneView, Ppisp
+from p2gs_jax.photometry.ppisp.regularisation import regularisation as ppisp_regularisation
+from p2gs_jax.types import LUMINANCE, Params
+
+# Of all training views: a row for each, or what PPISP learns of views and cameras.
+Corrections = Float[Array, "v ..."] | Ppisp
+# Of one view.
+Correction = Float[Array, "..."] | OneView
 
 # Luminance levels, rows and columns of a bilateral grid, as its authors use.
 GRID = (8, 16, 16)
 CURVE_KNOTS = 16
 
 
-def identity(kind: Appearance, views: int) -> Float[Array, "v ..."]:
-    """Return parameters that change nothing."""
+def identity(kind: Appearance, cameras: Sequence[str]) -> Corrections:
+    """Return parameters that change nothing.
+
+    Args:
+        kind: which correction.
+        cameras: the physical camera of every training view.
+    """
+    if kind == "ppisp":
+        return isp.identity(cameras)
     shapes = {"affine": (3, 4), "bilateral": (12, *GRID), "curve": (CURVE_KNOTS,)}
-    return on_device(np.zeros((views, *shapes[kind])))
+    return on_device(np.zeros((len(cameras), *shapes[kind])))
+
+
+def correction_of(appearance: Corrections | None, row: Int[Array, ""] | int) -> Correction | None:
+    """Return the correction of the training view in a row of `Photometry`, or None."""
+    if isinstance(appearance, Ppisp):
+        return appearance.view(row)
+    return None if appearance is None else appearance[row]
+
+
+def mean_correction(appearance: Corrections | None, camera: str | None = None) -> Correction | None:
+    """Return the mean over the training views, for views that have none of their own, or None.
+
+    Args:
+        appearance: of all training views.
+        camera: the physical camera of the view; None: none of them.
+    """
+    if isinstance(appearance, Ppisp):
+        return appearance.mean(camera)
+    return None if appearance is None else appearance.mean(axis=0)
+
+
+def exposures_apart(params: Params) -> Params:
+    """Return a finished fit with PPISP's exposures where all others have theirs: in `Photometry`.
+
+    Photographs stay as they are.
+    """
+    if not isinstance(params.appearance, Ppisp):
+        return params
+    stops, photometry = params.appearance.exposures, params.photometry
+    raw = photometry.raw_exposures + LN2 * stops
+    if photometry.parameterization == "linear":
+        raw = photometry.exposures * 2.0**stops
+    return dataclasses.replace(
+        params,
+        photometry=dataclasses.replace(photometry, raw_exposures=raw),
+        appearance=dataclasses.replace(params.appearance, exposures=0.0 * stops),
+    )
+
+
+def without_place(correction: Correction | None, kind: Appearance | None) -> Correction | None:
+    """Return what of a correction does not depend on the position in the image."""
+    if isinstance(correction, OneView):
+        return dataclasses.replace(correction, vignetting=None)
+    return None if kind == "bilateral" else correction
 
 
 def corrected(
-    ldr: Float[Array, "h w 3"], parameters: Float[Array, "..."], kind: Appearance
+    ldr: Float[Array, "h w 3"], parameters: Correction, kind: Appearance
 ) -> Float[Array, "h w 3"]:
     """Return display values as one view shows them.
 
     Args:
-        ldr: rendered display values.
+        ldr: rendered display values; for `ppisp` radiance.
         parameters: of that view.
         kind: which correction.
     """
+    if isinstance(parameters, OneView):
+        return isp.applied(ldr, parameters)
     if kind == "affine":
         return ldr + ldr @ parameters[:, :3].T + parameters[:, 3]
     if kind == "curve":
@@ -71,8 +136,13 @@ def _hats(pixels: int, cells: int) -> np.ndarray:
     return np.maximum(1.0 - np.abs(at - np.arange(cells)), 0.0)
 
 
-def roughness(parameters: Float[Array, "v ..."], kind: Appearance) -> Float[Array, ""]:
-    """Return the mean squared difference of neighbouring cells of bilateral grids; else 0."""
+def regularisation(parameters: Corrections, kind: Appearance) -> Float[Array, ""] | None:
+    """Return what a kind of correction asks of its parameters; None: nothing.
+
+    Of bilateral grids it is the mean squared difference of neighbouring cells.
+    """
+    if isinstance(parameters, Ppisp):
+        return ppisp_regularisation(parameters)
     if kind != "bilateral":
-        return jnp.zeros(())
+        return None
     return sum((jnp.mean(jnp.diff(parameters, axis=k) ** 2) for k in (2, 3, 4)), jnp.zeros(()))

@@ -7,9 +7,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from p2gs_jax.config import FitConfig, PhotometryConfig, ResponseKind
+from p2gs_jax.config import FitConfig, PhotometryConfig
+from p2gs_jax.photometry.adjustment.curve import fit_response
 from p2gs_jax.photometry.adjustment.fit import fit_model
 from p2gs_jax.photometry.adjustment.problem import KnownExposures, Problem, make_problem
+from p2gs_jax.photometry.choices import Curve
 from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.observations import COARSEST, Observations
 from p2gs_jax.photometry.one_response import solve_response
@@ -18,7 +20,10 @@ from p2gs_jax.photometry.selection import Selection, select
 from p2gs_jax.scene.known_exposures import read_known_exposures
 from p2gs_jax.types import Scene
 
-Choice = Literal["held_out", "one_response"] | tuple[Form, Response]
+# Points of a view that a given kind of curve is fitted to.
+RESPONSE_PER_VIEW = 200
+
+Choice = Literal["held_out", "one_response"] | tuple[Form, Response | Curve]
 
 
 @dataclass(frozen=True)
@@ -31,8 +36,9 @@ class CalibrationOptions:
         pivot: linear value that gamma leaves alone.
         known: exposures known beforehand, or None.
         seed: which observations are held out.
-        choice: model and curve: those that predict held-out colours, an exposure per view under
-            one fitted response (stacks), or given ones.
+        choice: what varies, and the curve: those that predict held-out colours, an exposure per
+            view under one fitted response (stacks), or given ones; of a kind of curve, the splines
+            are fitted.
     """
 
     black: float
@@ -68,23 +74,28 @@ def options_of(cfg: FitConfig, scene: Scene) -> CalibrationOptions:
     if p.known is not None:
         values = read_known_exposures(p.known, scene.training_views)
         known = KnownExposures(values, p.known_deviation_ev)
-    given = Response("power" if p.curve == "power" else "srgb", p.spline, *_splines(p))
     return CalibrationOptions(
         black=cfg.loss.black,
         saturation=cfg.loss.saturation,
         pivot=p.pivot,
         known=known,
         seed=cfg.train.seed,
-        choice="held_out" if p.select else (Form(p.model, p.white_balance, p.vignetting), given),
+        choice="held_out" if p.select else _given(p),
     )
 
 
-def _splines(p: PhotometryConfig) -> tuple[ResponseKind, tuple[tuple[float, ...], ...]]:
-    """Return what has splines of its own, and these; as with one, what was not solved is not."""
-    own = [camera.splines for camera in p.cameras]
-    if p.responses == "all" or not all(own):
-        return "all", ()
-    return p.responses, own[0] if p.responses == "channel" else tuple(s for (s,) in own)
+def _given(p: PhotometryConfig) -> tuple[Form, Response | Curve]:
+    """Return what varies and the curve as the options say."""
+    form = Form(p.model, p.white_balance, p.vignetting)
+    if p.curve == "spline" and p.spline is None:
+        return form, Curve("srgb", p.responses)
+    splines: tuple[tuple[float, ...], ...] = ()
+    if p.responses == "camera":
+        splines = tuple(camera.splines[0] for camera in p.cameras if camera.splines)
+    elif p.responses == "channel":
+        splines = next((camera.splines for camera in p.cameras), ())
+    by = p.responses if splines else "all"
+    return form, Response("power" if p.curve == "power" else "srgb", p.spline, by, splines)
 
 
 def calibrate_observations(
@@ -123,6 +134,16 @@ def _solved(observations: Observations, options: CalibrationOptions, on_chosen) 
         )
     problem = options.problem(observations)
     if options.choice == "one_response":
-        solution, notes = solve_response(problem)
-        return Selection(solution, (), tuple(notes))
-    return Selection(fit_model(problem, *options.choice), (), ())
+        solution, said = solve_response(problem)
+        return Selection(solution, (), tuple(said))
+    form, response = options.choice
+    notes: tuple[str, ...] = ()
+    if isinstance(response, Curve):
+        few = problem.part(observations.thinned(RESPONSE_PER_VIEW, options.seed))
+        beside = form._replace(model="view_exposure")
+        by = response.splines or "all"
+        fitted = fit_response(few, Response(response.base), form=beside, by=by)
+        if fitted is None:
+            notes = (f"A fitted response collapsed: {response.base} was used as it is.",)
+        response = fitted or Response(response.base)
+    return Selection(fit_model(problem, form, response), (), notes)

@@ -75,12 +75,14 @@ class Candidate:
 
 
 def choose(candidates: list[Candidate]) -> Candidate:
-    """Return the simplest candidate that is not clearly worse than the best."""
-    ordered = sorted(candidates, key=lambda c: (c.parameters, -c.density))
-    first = next(c for c in ordered if c.good)
-    # Curves cost nothing within a form: take the best of them.
-    same = [c for c in candidates if (c.form, c.parameters) == (first.form, first.parameters)]
-    return max(same, key=lambda c: c.density)
+    """Return the simplest candidate that is not clearly worse than the best.
+
+    Of those as simple, or simpler, the one that predicts best: curves cost nothing within a form,
+    and a candidate may count as good only because nobody knows how much worse it is.
+    """
+    simplest = min((c for c in candidates if c.good), key=lambda c: c.parameters)
+    as_simple = [c for c in candidates if c.parameters <= simplest.parameters]
+    return max(as_simple, key=lambda c: c.density)
 
 
 class Comparison:

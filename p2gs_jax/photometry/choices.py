@@ -13,7 +13,6 @@ _BY_LEVELS: dict[tuple[Level | None, Level | None], ModelName] = {
 }
 _LEVELS: tuple[Level | None, ...] = (None, "camera", "view")
 _VIGNETTING: tuple[VignettingKind | None, ...] = (None, "camera", "channel")
-_SPLINES: tuple[ResponseKind, ...] = ("all", "camera", "channel")
 
 
 class Curve(NamedTuple):
@@ -26,6 +25,16 @@ class Curve(NamedTuple):
 
     base: Base = "srgb"
     splines: ResponseKind | None = None
+
+
+_ONE_FOR_ALL = Curve("srgb", "all")
+# One step from each kind: several splines are worth trying where one is.
+_CURVES: dict[ResponseKind | None, list[Curve]] = {
+    None: [*(Curve(base) for base in BASES), _ONE_FOR_ALL],
+    "all": [*(Curve(base) for base in BASES), Curve("srgb", "camera"), Curve("srgb", "channel")],
+    "camera": [_ONE_FOR_ALL, Curve("srgb", "channel")],
+    "channel": [_ONE_FOR_ALL, Curve("srgb", "camera")],
+}
 
 
 class Choice(NamedTuple):
@@ -81,10 +90,12 @@ def neighbours(choice: Choice, scope: Scope) -> list[Choice]:
     if gamma is not None and exposure == gamma:
         forms += [form._replace(model=_BY_LEVELS[(None, None)])]
     if form.white_balance == "view" and exposure == "view":
-        per_camera = [name for name in MODELS if MODELS[name].exposure == "camera"]
-        forms += [Form(name, "camera", form.vignetting) for name in per_camera]
+        forms += [
+            Form(name, "camera", form.vignetting)
+            for name, model in MODELS.items()
+            if model.exposure == "camera"
+        ]
     forms += [form._replace(white_balance=level) for level in _LEVELS]
     forms += [form._replace(vignetting=kind) for kind in _VIGNETTING]
-    curves = [Curve(base) for base in BASES] + [Curve("srgb", by) for by in _SPLINES]
-    near = [Choice(f, curve) for f in forms] + [Choice(form, c) for c in curves]
+    near = [Choice(f, curve) for f in forms] + [Choice(form, c) for c in _CURVES[curve.splines]]
     return [c for c in dict.fromkeys(near) if c != choice and scope.allows(c)]

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Float32
 
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.core.numerics import LN2, on_host
+from p2gs_jax.photometry.appearance import Correction, correction_of, without_place
 from p2gs_jax.photometry.formation import display, formation, inverse_formation
 from p2gs_jax.photometry.spline_curve import by_camera
 from p2gs_jax.types import Capture, Params
@@ -39,7 +40,7 @@ class DisplayTransform:
     exposure: float
     gamma: float
     formation: PhotometryConfig
-    correction: Float[Array, "..."] | None = None
+    correction: Correction | None = None
     white_balance: tuple[float, float, float] | None = None
     camera: int | None = None
 
@@ -87,12 +88,14 @@ class DisplayTransform:
     def without_place(self) -> DisplayTransform:
         """Return the transform for what lies nowhere in an image: without vignetting.
 
-        The response of the camera stays.
+        The response of the camera stays, and of a correction what is the same everywhere.
         """
+        kept = without_place(self.correction, self.formation.appearance)
+        plain = self if kept is self.correction else replace(self, correction=kept)
         if self.camera is None:
-            return self
-        plain = tuple(replace(c, vignetting=()) for c in self.formation.cameras)
-        return replace(self, formation=replace(self.formation, cameras=plain))
+            return plain
+        cameras = tuple(replace(c, vignetting=()) for c in self.formation.cameras)
+        return replace(plain, formation=replace(self.formation, cameras=cameras))
 
     def with_curve(self, curve: Curve) -> DisplayTransform:
         """Return the transform under another base curve; a correction belongs to the old one.
@@ -162,7 +165,7 @@ def display_of_view(params: Params, row: int, cfg: PhotometryConfig) -> DisplayT
         cfg: the formation model.
     """
     taken = jax.tree.map(np.asarray, params.photometry).capture(row)
-    plain = DisplayTransform(1.0, 1.0, cfg, params.correction(row))
+    plain = DisplayTransform(1.0, 1.0, cfg, correction_of(params.appearance, row))
     return with_capture(plain, taken)
 
 

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int
 
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.core.numerics import Scalar, Values, namespace, positive_pow, safe_log
-from p2gs_jax.photometry.appearance import corrected
+from p2gs_jax.photometry.appearance import Correction, corrected
 from p2gs_jax.photometry.cameras import darkens, log_vignetting, squared_radii
 from p2gs_jax.photometry.spline_curve import decode, encode
 from p2gs_jax.types import GAMMA_SRGB, Capture
@@ -163,7 +163,7 @@ def formation(
     linear: Values,
     capture: Capture,
     cfg: PhotometryConfig,
-    correction: Float[Array, "..."] | None = None,
+    correction: Correction | None = None,
     positions: Positions = None,
 ) -> Values:
     """Return T(e W V L): what the camera records of radiance `linear`.

@@ -46,7 +46,7 @@ def predict_held_out(
     sigma, slope = (a[held] for a in o.decoded(response)[1:])
     residual = fit.at.residual[held]
     precision = fit.at.precision[layout.row[held]]
-    known = (problem.usable[held] > 0) & (precision > 1e-3)
+    known = problem.usable[held] & (precision > 1e-3)
     a = fit.theta.a[o.views[held]][:, None]
     variance = (scale * sigma) ** 2 + (scale * a) ** 2 / np.maximum(precision, 1e-9)
 

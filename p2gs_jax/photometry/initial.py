@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.core.streams import Stream, generator
-from p2gs_jax.photometry.appearance import identity
+from p2gs_jax.photometry.appearance import Corrections, identity
 from p2gs_jax.photometry.cameras import camera_rows
 from p2gs_jax.photometry.formation import inverse_tone_map
 from p2gs_jax.photometry.solution import PhotometricSolution
-from p2gs_jax.types import GAMMA_SRGB, Photometry, Scene
+from p2gs_jax.types import GAMMA_SRGB, Photometry, Scene, View
 
 # Exposures drawn at random are at least this.
 LEAST_EXPOSURE = 0.1
@@ -51,15 +51,15 @@ def initial_photometry(
     return Photometry(on_device(exposures), on_device(gammas), p.parameterization, balance, rows)
 
 
-def initial_appearance(count: int, cfg: FitConfig) -> Float[Array, "v ..."] | None:
-    """Return corrections of display values that change nothing; None: the fit has none.
+def initial_appearance(views: Sequence[View], cfg: FitConfig) -> Corrections | None:
+    """Return corrections that change nothing; None: the fit has none.
 
     Args:
-        count: training views.
+        views: training views.
         cfg: their kind.
     """
     kind = cfg.photometry.appearance
-    return None if kind is None else identity(kind, count)
+    return None if kind is None else identity(kind, [view.camera for view in views])
 
 
 def point_radiance(

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from p2gs_jax.config import PhotometryConfig
+from p2gs_jax.photometry.appearance import mean_correction
 from p2gs_jax.photometry.cameras import camera_row
 from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.types import Params, Photometry
@@ -50,7 +51,8 @@ def usual_display(
 
     Its exposure is the geometric mean over the training views, its gamma and its correction are the
     mean ones. Its white balance is the mean over all training views, or over those of its camera
-    where it varies by camera only. Its vignetting and its response are its camera's.
+    where it varies by camera only. Its vignetting and its response are its
+    camera's, those of a correction as well.
 
     Args:
         params: the fit.
@@ -68,7 +70,7 @@ def usual_display(
         mean.exposure_geometric,
         mean.gamma,
         cfg,
-        params.mean_correction,
+        mean_correction(params.appearance, camera),
         balance,
         None if camera is None else camera_row(camera, cfg),
     )

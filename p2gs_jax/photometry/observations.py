@@ -34,6 +34,8 @@ class Observations:
         positions: in the image, from its centre in units of half its diagonal; None where nobody
             knows, and nothing depends on the place.
         camera_names: what people call the cameras; their rows if empty.
+        surroundings: log2 brightness of the photograph about each, as `sources/surroundings.py`
+            measures it; None where nobody knows.
     """
 
     views: Int[np.ndarray, " o"]
@@ -47,6 +49,7 @@ class Observations:
     names: tuple[str, ...] = ()
     positions: Float[np.ndarray, "o 2"] | None = None
     camera_names: tuple[str, ...] = ()
+    surroundings: Float[np.ndarray, " o"] | None = None
 
     def decoded(self, response: Response):
         """Return log exposed radiance, its stated standard deviation and dz/dy, each (O, 3)."""
@@ -54,27 +57,34 @@ class Observations:
         z, slope = log_exposed(y, response, self.cameras[self.views])
         return z, deviation(y, slope, self.spread, response.base), slope
 
-    def usable(self, black: float, saturation: float) -> Float[np.ndarray, "o 3"]:
-        """Return 1 where a value is neither near black nor saturated and its point is shared."""
+    def usable(self, black: float, saturation: float) -> Bool[np.ndarray, "o 3"]:
+        """Return whether a value is neither near black nor saturated and its point is shared."""
         keep = (self.colors > black) & (self.colors < saturation)
         seen = keep.any(1)
         shared = np.bincount(self.points[seen], minlength=self.point_count)[self.points] >= 2
-        return (keep & (seen & shared)[:, None]).astype(np.float64)
+        return keep & (seen & shared)[:, None]
 
-    def components(self, usable: Float[np.ndarray, "o 3"]) -> Int[np.ndarray, " v"]:
+    def components(self, usable: Bool[np.ndarray, "o 3"]) -> Int[np.ndarray, " v"]:
         """Return a label per view; views with different labels cannot be compared."""
         seen = usable.any(1)
-        incidence = sp.csr_matrix(
-            (np.ones(int(seen.sum())), (self.views[seen], self.points[seen])),
-            shape=(self.view_count, self.point_count),
+        size = self.view_count + self.point_count
+        edges = sp.csr_array(
+            (
+                np.ones(int(seen.sum()), np.int8),
+                (self.views[seen], self.view_count + self.points[seen]),
+            ),
+            shape=(size, size),
         )
-        return connected_components(incidence @ incidence.T, directed=False)[1]
+        labels = connected_components(edges, directed=False)[1][: self.view_count]
+        return np.unique(labels, return_inverse=True)[1]
 
-    def picked(self, pick: Bool[np.ndarray, " o"]) -> Observations:
-        """Return some of them."""
+    def picked(self, pick: np.ndarray | slice) -> Observations:
+        """Return some of them, chosen by a mask or by their rows."""
         taken = {k: getattr(self, k)[pick] for k in ("views", "points", "colors", "spread")}
         if self.positions is not None:
             taken["positions"] = self.positions[pick]
+        if self.surroundings is not None:
+            taken["surroundings"] = self.surroundings[pick]
         return replace(self, **taken)
 
     def thinned(self, per_view: int, seed: int) -> Bool[np.ndarray, " o"]:

@@ -51,7 +51,7 @@ def residuals(problem: Problem, solution: PhotometricSolution) -> Float[np.ndarr
     o = problem.observations
     z, _ = log_exposed(np.asarray(o.colors, np.float64), solution.response)
     level = solution.log_exposures[o.views][:, None] + solution.point_log_radiance[o.points]
-    return np.where(problem.usable > 0, z - level, 0.0)
+    return np.where(problem.usable, z - level, 0.0)
 
 
 class Unexplained(NamedTuple):

@@ -25,9 +25,9 @@ from p2gs_jax.photometry.adjustment.problem import KnownExposures, Problem, make
 from p2gs_jax.photometry.adjustment.solve import MOST_ROUNDS
 from p2gs_jax.photometry.candidates import Candidate, Comparison, choose
 from p2gs_jax.photometry.choices import Choice, Curve, Scope, neighbours
-from p2gs_jax.photometry.models import MODELS, Form
+from p2gs_jax.photometry.models import MODELS, Form, parameter_count
 from p2gs_jax.photometry.observations import Observations
-from p2gs_jax.photometry.response import BASES, Response
+from p2gs_jax.photometry.response import BASES, KNOTS, Response
 from p2gs_jax.photometry.solution import PhotometricSolution
 
 HELD_OUT = 0.2
@@ -149,6 +149,13 @@ class _Search:
             )
         return self._fitted[key]
 
+    def parameters(self, choice: Choice) -> int:
+        """Return the number of free parameters of a choice; of its curve as if it were fitted."""
+        curve, views = choice.curve, self.comparison.problem.observations.view_count
+        groups = {None: 0, "all": 1, "camera": self.scope.cameras, "channel": 3}[curve.splines]
+        count = parameter_count(choice.form, Response(), self.scope.cameras, views)
+        return count + groups * len(KNOTS)
+
     def solve(self, choices: Iterable[Choice]) -> bool:
         """Solve choices that are possible and not solved yet; return whether there were any."""
         found = False
@@ -170,6 +177,9 @@ class _Search:
         self.solve(Choice(Form(model), curve) for curve in curves for model in MODELS)
         richest = Form("view_exposure", "view", "camera" if self.scope.places else None)
         self.solve(Choice(richest, curve) for curve in curves)
+        # One response for different cameras may collapse where theirs would not.
+        for by in ("camera", "channel"):
+            self.solve(Choice(form, Curve("srgb", by)) for form in (EXPOSURES, richest))
         if not self.scope.curves:
             return [
                 f"Exposures differ by {self.spread / LN2:.2f} EV (standard deviation): too little "
@@ -180,12 +190,17 @@ class _Search:
         return []
 
     def rest(self) -> Candidate:
-        """Compare what is one step from the choice and the best, until nothing new is; choose."""
+        """Compare what is one step from the choice, or simpler than the best; choose."""
         while True:
             candidates = self.comparison.judged()
             chosen = choose(candidates)
             best = max(candidates, key=lambda c: c.density)
-            near = [*neighbours(chosen.choice, self.scope), *neighbours(best.choice, self.scope)]
+            near = neighbours(chosen.choice, self.scope)
+            near += [
+                choice
+                for choice in neighbours(best.choice, self.scope)
+                if self.parameters(choice) < best.parameters
+            ]
             if len(candidates) > MOST_COMPARED or not self.solve(near):
                 return chosen
 

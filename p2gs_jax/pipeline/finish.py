@@ -14,6 +14,7 @@ from p2gs_jax.core.progress import Reporter
 from p2gs_jax.evaluate.evaluate import ViewResult, evaluate
 from p2gs_jax.evaluate.lpips import LpipsWeights
 from p2gs_jax.evaluate.references import Reference, find_radiance
+from p2gs_jax.photometry.metering import Metering
 from p2gs_jax.pipeline.prepare import Prepared
 from p2gs_jax.render.host import make_renderer
 from p2gs_jax.run.layout import RunFolder
@@ -67,6 +68,7 @@ def finish(
     fitted: dict[int, float] = {}
     shown: dict[int, ViewResult] = {}
     picks = summary_rows(scene)
+    metering: list[Metering] = []
 
     def on_view(result: ViewResult) -> None:
         view = scene.views[result.index]
@@ -89,8 +91,12 @@ def finish(
             radiance=find_radiance(scene, store),
             lpips_weights=lpips_weights,
             on_view=on_view,
+            on_metering=metering.append,
             on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
         )
+    if metering[0].telling:
+        prepared.notes.append(metering[0].sentence)
+        reporter.message(metering[0].sentence)
     # Views are written while they are judged.
     watch.add("evaluation", -watch.seconds.get("files", 0.0))
     reporter.stage("Writing files")
@@ -103,6 +109,7 @@ def finish(
             fitted=fitted,
             solution=None if prepared.selection is None else prepared.selection.solution,
             shown=[shown[i] for i in picks],
+            metering=metering[0],
             true_ev=true_ev,
         )
     metrics |= _accounted(account, watch, prepared, reporter)

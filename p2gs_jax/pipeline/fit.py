@@ -17,6 +17,7 @@ from p2gs_jax.core.atomic import no_empty_folders
 from p2gs_jax.core.clock import CompileCounter, Stopwatch
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
+from p2gs_jax.photometry.appearance import exposures_apart
 from p2gs_jax.photometry.gauge import recentre
 from p2gs_jax.photometry.selection import Selection
 from p2gs_jax.pipeline.decide import kept_choice
@@ -191,7 +192,7 @@ def fit(
                     scene, cfg, lpips_weights, reference=views.truth is not None
                 ),
             )
-    params = compact(result)
+    params = exposures_apart(compact(result))
     if cfg.photometry.parameterization == "log" and cfg.photometry.known is None:
         params = recentre(params, cfg.render.radiance)
     account = Account(

@@ -119,11 +119,16 @@ def check_start(p: PhotometryConfig, preset: str) -> None:
             f"the preset {preset!r} starts exposures at random: known ones would be ignored.",
             fix="leave out --known-exposures, or add --photometry.start tracks",
         )
+    if p.appearance == "ppisp" and p.curve != "linear":
+        raise UserError(
+            f"ppisp learns a whole camera: the curve {p.curve!r} would come before it.",
+            fix="use --preset ppisp, or add --photometry.curve linear --photometry.start random",
+        )
     if p.curve == "linear" and p.start == "tracks":
         raise UserError(
             "the curve 'linear' splats display values; the tracks' bundle adjustment does not know "
             "it.",
-            fix="add --photometry.start random, or use a preset whose name begins with 3dgs",
+            fix="add --photometry.start random, or use the preset ppisp or one of 3dgs*",
         )
 
 

@@ -157,7 +157,7 @@ def prepare(
         params = Params(
             black_gaussians(scene.points[seeds.keep], shell, views, cfg),
             initial_photometry(None, taken_by, guess.resolve(cfg)),
-            initial_appearance(len(views), cfg),
+            initial_appearance(views, cfg),
         )
         known = kept is not None or not cfg.photometry.select
         expected = Expected(store, params, extent, coverage, guess, guess.resolve(cfg), known)
@@ -189,13 +189,7 @@ def prepare(
             store,
             rough_tones(tracks, len(views))
             if solution is None
-            else Tones(
-                solution.log_exposures,
-                solution.gammas,
-                resolved.photometry,
-                None if solution.white_balance_level is None else solution.white_balance,
-                photometry.cameras,
-            ),
+            else Tones.of(photometry, resolved.photometry),
             scene.points[seeds.keep],
             photometry,
             resolved,
@@ -220,7 +214,7 @@ def prepare(
     return Prepared(
         scene,
         store,
-        Params(gaussians, photometry, initial_appearance(len(views), resolved)),
+        Params(gaussians, photometry, initial_appearance(views, resolved)),
         extent,
         selection,
         color_pairs(tracks, resolved),

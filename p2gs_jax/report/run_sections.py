@@ -26,6 +26,7 @@ PROTOCOLS = (
         "all that varies per view fitted to each photograph",
         ("test", "photometry_fitted"),
     ),
+    ("held out", "exposure metered, as the camera would", ("test", "metered")),
     ("all", "reference photographs, mean exposure", ("reference", "averaged")),
     ("all", "reference photographs, geometric mean exposure", ("reference", "geometric")),
     ("all", "reference photographs, one scale for all", ("reference", "scale_aligned")),

@@ -70,6 +70,11 @@ def _modelled(run: RunFiles) -> str:
         return "What was modelled of the cameras is not known: photometry.json is missing."
     model, curve = run.photometry["model"], run.photometry["curve"].get("name", "")
     what = DESCRIPTIONS.get(model, model)
+    if run.option("photometry", "appearance") == "ppisp":
+        return (
+            f"The preset {run.preset} learns cameras beside the splats: exposure and colours of "
+            "every view, vignetting and response of every camera."
+        )
     if curve == "linear" and model == "constant":
         return (
             f"The preset {run.preset} models no camera: display values are splatted as they are"

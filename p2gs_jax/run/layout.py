@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from p2gs_jax.config import Appearance
+
 
 @dataclass(frozen=True)
 class RunFolder:
@@ -51,10 +53,18 @@ class RunFolder:
         """Exposures, gammas, tone curve."""
         return self.root / "photometry.json"
 
+    def appearance(self, kind: Appearance) -> Path:
+        """Corrections that a baseline learns.
+
+        Args:
+            kind: which; PPISP's parameters are of views and of cameras.
+        """
+        return self.root / ("ppisp.json" if kind == "ppisp" else "appearance.npy")
+
     @property
-    def appearance(self) -> Path:
-        """Corrections of display values, where a baseline learns them."""
-        return self.root / "appearance.npy"
+    def metering(self) -> Path:
+        """How exposures of new pictures are chosen, and what explains those of the photographs."""
+        return self.root / "metering.json"
 
     @property
     def metrics(self) -> Path:

@@ -17,13 +17,15 @@ from p2gs_jax.config import FitConfig, PhotometryConfig, from_dict
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.ply import read_ply
-from p2gs_jax.photometry.appearance import identity
 from p2gs_jax.photometry.cameras import camera_rows
 from p2gs_jax.photometry.display import DisplayTransform, display_of_view
 from p2gs_jax.photometry.mean import MeanParameters, mean_parameters, usual_display
+from p2gs_jax.photometry.metering import ExposureOf, Metering, meter, meter_views
 from p2gs_jax.render.host import RenderView, make_renderer
+from p2gs_jax.run.appearance_file import read_appearance
 from p2gs_jax.run.decisions import read_decisions
 from p2gs_jax.run.layout import RunFolder
+from p2gs_jax.run.metering_file import read_metering
 from p2gs_jax.run.photometry_file import AGAIN, PhotometryFile, read_photometry
 from p2gs_jax.run.places import candidates, find
 from p2gs_jax.run.scene_file import read_scene
@@ -179,6 +181,32 @@ class Run:
         taken_by = [view.camera for view in self.scene.training_views]
         return usual_display(self.params, taken_by, camera, self.cfg.photometry)
 
+    @cached_property
+    def metering(self) -> Metering:
+        """The rule that explains the training exposures; runs of older versions are rendered."""
+        saved = read_metering(RunFolder(self.folder).metering)
+        if saved is not None:
+            return saved
+        rendered = (self.render(self.camera(i)) for i in self.scene.train_indices)
+        names = [view.name for view in self.scene.training_views]
+        e, gamma = np.asarray(self.params.photometry.exposures), self.mean.gamma
+        return meter_views(names, rendered, e, gamma, self.cfg.photometry)
+
+    def metered_display(
+        self, rendered: Render, of: ExposureOf = "auto", exposure_ev: float = 0.0
+    ) -> DisplayTransform:
+        """Return the display transform of a new picture, with its exposure metered.
+
+        Args:
+            rendered: the picture, from `render`.
+            of: `auto`: as the camera that took the photographs would have chosen, where a rule
+                explains it, else the mean; or a given rule.
+            exposure_ev: stops more than that.
+        """
+        readings = meter(np.asarray(rendered.linear), np.asarray(rendered.alpha))
+        exposure = float(np.exp(self.metering.log_exposure(readings, of))) * 2**exposure_ev
+        return replace(self.common_display(), exposure=exposure)
+
 
 def resolved(cfg: PhotometryConfig, saved: PhotometryFile) -> PhotometryConfig:
     """Return the options with the model and curve that a fit of an older version chose.
@@ -225,7 +253,8 @@ def load_run(folder: str | Path, scene: str | Path | None = None) -> Run:
     else:
         cfg = decisions.resolve(asked)
     photometry = _photometry(photometry_file, found, cfg, files)
-    appearance = _appearance(files.appearance, cfg, len(found.train_indices))
+    kind, views = cfg.photometry.appearance, found.training_views
+    appearance = None if kind is None else read_appearance(files.appearance(kind), kind, views)
     return Run(
         files.root,
         Params(gaussians, photometry, appearance),
@@ -311,18 +340,3 @@ def _load_scene(saved: dict[str, Any], given: Path | None, cfg: FitConfig, folde
             fix="put it back, or name its folder with --scene",
         )
     return load_scene(root, cfg.data, folder / "cache", lambda text: None)
-
-
-def _appearance(path: Path, cfg: FitConfig, views: int):
-    """Return the corrections of display values that the run learned, or None."""
-    if cfg.photometry.appearance is None:
-        return None
-    try:
-        corrections = np.load(path, allow_pickle=False)
-    except (OSError, ValueError) as error:
-        raise UserError(
-            f"{path} cannot be read: {error}.", fix="finish the fit again with --resume"
-        ) from error
-    if corrections.shape != identity(cfg.photometry.appearance, views).shape:
-        raise UserError(f"{path} does not belong to this run.", fix="fit again")
-    return on_device(corrections)

@@ -11,7 +11,7 @@ import numpy as np
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.config import to_dict as config_to_dict
-from p2gs_jax.core.atomic import write_array, write_json
+from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.numerics import LN2, evenly_spaced
 from p2gs_jax.evaluate.evaluate import ViewResult
 from p2gs_jax.formats.exr import write_exr
@@ -20,10 +20,13 @@ from p2gs_jax.formats.png import write_png
 from p2gs_jax.gaussians.bake import bake, display_comments, display_of_splats
 from p2gs_jax.photometry.display import develop
 from p2gs_jax.photometry.mean import MeanParameters, mean_parameters, usual_display
+from p2gs_jax.photometry.metering import Metering
 from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.render.spherical_harmonics import MAX_DEGREE
+from p2gs_jax.run.appearance_file import write_appearance
 from p2gs_jax.run.decisions import Decisions, write_decisions
 from p2gs_jax.run.layout import RunFolder
+from p2gs_jax.run.metering_file import write_metering
 from p2gs_jax.run.photometry_file import (
     ViewPhotometry,
     balance_of,
@@ -76,6 +79,7 @@ def write_results(
     fitted: dict[int, float],
     solution: PhotometricSolution | None,
     shown: Sequence[ViewResult],
+    metering: Metering | None = None,
     true_ev: np.ndarray | None = None,
 ) -> None:
     """Write the scene, the Gaussians, the photometry and the summary.
@@ -88,6 +92,7 @@ def write_results(
         fitted: exposures solved for held-out views, by row.
         solution: what the fit started from, or None.
         shown: views of the summary.
+        metering: what explains the exposures, or None.
         true_ev: true exposures of the training views for the plot, or None.
     """
     write_scene(folder.root, scene)
@@ -105,8 +110,11 @@ def write_results(
             cfg.photometry.cameras, None if solution is None else solution.corner_errors
         ),
     )
-    if params.appearance is not None:
-        write_array(folder.appearance, np.asarray(params.appearance))
+    if metering is not None:
+        write_metering(folder.metering, metering)
+    kind = cfg.photometry.appearance
+    if kind is not None:
+        write_appearance(folder.appearance(kind), params.appearance, scene.training_views)
     _write_summary(folder.summary, shown, params, scene, cfg, true_ev)
 
 

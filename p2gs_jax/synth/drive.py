@@ -3,7 +3,7 @@
 The input of the photometric adjustment on a drive, with every quantity known: three cameras, frames
 one unit apart, facades, road and sky, 4-6 stops of contrast plus a bright sky, 8-bit photographs
 with photon noise, texture and outliers (our own proxy; docs/photometry.md, 3 describes a similar
-one).
+one). What else cameras do to the light is drawn by `drive_optics`.
 """
 
 from __future__ import annotations
@@ -14,11 +14,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from p2gs_jax.photometry.observations import Observations
-from p2gs_jax.synth.sensor import READ_NOISE, SHOT_NOISE, encode
-from p2gs_jax.synth.settings import Curve
+from p2gs_jax.synth.drive_optics import Curves, encode_by, falloff, smooth_errors
+from p2gs_jax.synth.sensor import READ_NOISE, SHOT_NOISE
 
 Exposures = Literal["constant", "iso2", "iso4", "cameras", "auto"]
 YAWS = (0.0, -44.2, 44.8)
+CAMERA_NAMES = ("front", "right", "left")
 HALF_WIDTH, HALF_HEIGHT = 30.0, 21.0
 NEAREST, FARTHEST = 3.0, 45.0
 LONGEST_TRACK, SHORTEST_TRACK = 30, 3
@@ -33,6 +34,8 @@ class Drive(NamedTuple):
         radiance: linear, (P, 3).
         cameras: of each view.
         frames: number of frames.
+        positions: of each observation in its image: x to the right, y down, from the centre in
+            units of half the diagonal.
     """
 
     views: Int[np.ndarray, " o"]
@@ -40,6 +43,19 @@ class Drive(NamedTuple):
     radiance: Float[np.ndarray, "p 3"]
     cameras: Int[np.ndarray, " v"]
     frames: int
+    positions: Float[np.ndarray, "o 2"]
+
+
+def _on_image(
+    azimuth: Float[np.ndarray, " p"], height: Float[np.ndarray, " p"]
+) -> Float[np.ndarray, "p 2"]:
+    """Return where a pinhole sees directions, degrees to the left and up, inside its image."""
+    a, h = np.radians(azimuth), np.radians(height)
+    half_width = np.tan(np.radians(HALF_WIDTH))
+    # What is HALF_HEIGHT up at the edge of the image is still inside.
+    half_height = np.tan(np.radians(HALF_HEIGHT)) / np.cos(np.radians(HALF_WIDTH))
+    places = np.stack([-np.tan(a), -np.tan(h) / np.cos(a)], axis=1)
+    return places / np.hypot(half_width, half_height)
 
 
 def make_drive(frames: int = 20, points: int = 1200, seed: int = 0, seen: float = 0.6) -> Drive:
@@ -59,7 +75,7 @@ def make_drive(frames: int = 20, points: int = 1200, seed: int = 0, seen: float 
     y = np.concatenate([side, rng.uniform(-7, 7, road)])
     z = np.concatenate([rng.uniform(-2, 6, facade), np.full(road, -2.0)])
     sky_azimuth, sky_height = rng.uniform(-75, 75, sky), rng.uniform(8, 20, sky)
-    views, ids = [], []
+    views, ids, places = [], [], []
     for frame in range(frames):
         distance = np.hypot(x - frame, y)
         azimuth = np.concatenate([np.degrees(np.arctan2(y, x - frame)), sky_azimuth])
@@ -76,15 +92,16 @@ def make_drive(frames: int = 20, points: int = 1200, seed: int = 0, seen: float 
             found = np.flatnonzero(inside)
             views.append(np.full(len(found), camera * frames + frame))
             ids.append(found)
-    v, p = np.concatenate(views), np.concatenate(ids)
+            places.append(_on_image(azimuth[found] - yaw, height[found]))
+    v, p, xy = map(np.concatenate, (views, ids, places))
     shuffled = rng.permutation(len(v))
-    v, p = v[shuffled], p[shuffled]
+    v, p, xy = v[shuffled], p[shuffled], xy[shuffled]
     order = np.argsort(p, kind="stable")
-    v, p = v[order], p[order]
+    v, p, xy = v[order], p[order], xy[order]
     counts = np.bincount(p, minlength=points)
     rank = np.arange(len(p)) - np.concatenate([[0], np.cumsum(counts)])[p]
     keep = (rank < LONGEST_TRACK) & (counts[p] >= SHORTEST_TRACK)
-    v, p = v[keep], p[keep]
+    v, p, xy = v[keep], p[keep], xy[keep]
     kind = np.repeat([0, 1, 2], [facade, road, sky])
     used, p = np.unique(p, return_inverse=True)
     kind = kind[used]
@@ -92,7 +109,7 @@ def make_drive(frames: int = 20, points: int = 1200, seed: int = 0, seen: float 
     stops = (mean + spread * rng.standard_normal(len(used)))[:, None]
     stops = stops + 0.3 * rng.standard_normal((len(used), 3))
     stops[kind == 2] += [-0.3, 0.0, 0.3]
-    return Drive(v, p, 2.0**stops, np.repeat([0, 1, 2], frames), frames)
+    return Drive(v, p, 2.0**stops, np.repeat([0, 1, 2], frames), frames, xy)
 
 
 def make_exposures(drive: Drive, kind: Exposures, seed: int = 2) -> Float[np.ndarray, " v"]:
@@ -120,13 +137,15 @@ def observe(
     drive: Drive,
     exposures: Float[np.ndarray, " v"] | Float[np.ndarray, "v 3"],
     *,
-    curve: Curve = "srgb",
+    curve: Curves = "srgb",
     gammas: Float[np.ndarray, " v"] | None = None,
     pivot: float = 1.0,
     outliers: float = 0.08,
     texture: float = 0.03,
     noise: float = 1.0,
     bits: int | None = 8,
+    corner_loss: Float[np.ndarray, "c k"] | None = None,
+    shared_texture: float = 0.0,
     seed: int = 3,
 ) -> Observations:
     """Photograph the points.
@@ -134,13 +153,17 @@ def observe(
     Args:
         drive: who sees what.
         exposures: of every view, or of every channel of it (a white balance).
-        curve: response.
+        curve: response of all, or an array of names that fits cameras x channels.
         gammas: of every view, replacing the curve by x^(1 / gamma) about the pivot.
         pivot: linear value that gammas leave alone (encoded by 2.2).
         outliers: share of observations that show another point.
         texture: standard deviation of log radiance between views, common to the channels.
         noise: factor of photon noise and texture.
         bits: of the photographs; None does not round.
+        corner_loss: share of the light that each camera loses in its corners, for all channels or
+            for each; None: none.
+        shared_texture: standard deviation of further errors of log radiance that points near each
+            other in an image have in common.
         seed: of the random numbers.
     """
     rng = np.random.default_rng(seed)
@@ -149,11 +172,17 @@ def observe(
     wrong = rng.random(len(p)) < outliers
     shown[wrong] = rng.integers(0, len(drive.radiance), int(wrong.sum()))
     exposed = exposures.reshape(len(exposures), -1)[v] * drive.radiance[shown]
+    if corner_loss is not None:
+        radius = np.linalg.norm(drive.positions, axis=1)[:, None]
+        exposed = exposed * falloff(radius, corner_loss[drive.cameras[v]])
     exposed = exposed * np.exp(noise * texture * rng.standard_normal((len(p), 1)))
+    if shared_texture:
+        common = smooth_errors(v, drive.positions, len(drive.cameras), (seed, 1))
+        exposed = exposed * np.exp(shared_texture * common[:, None])
     shot = np.sqrt(SHOT_NOISE * exposed + READ_NOISE)
     exposed = np.maximum(exposed + noise * shot * rng.standard_normal(exposed.shape), 0)
     if gammas is None:
-        ldr = encode(exposed, curve)
+        ldr = encode_by(exposed, curve, drive.cameras[v])
     else:
         ldr = pivot ** (1 / 2.2) * (exposed / pivot) ** (1 / gammas[v][:, None])
     ldr = np.clip(ldr, 0, 1)
@@ -167,4 +196,6 @@ def observe(
         view_count=len(drive.cameras),
         point_count=len(drive.radiance),
         cameras=drive.cameras,
+        positions=drive.positions,
+        camera_names=CAMERA_NAMES,
     )

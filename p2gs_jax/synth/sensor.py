@@ -1,18 +1,20 @@
 """The cameras' pipeline: ISO drawn per photograph, sRGB, eight bits (paper, appendix "Exposure
 Control"), and on request what real ones add: a filmic curve, gains, drift, vignetting, white
-balance, noise.
+balance, a lens and a curve per camera, noise.
 
 Exposure is ISO / 8 times the gains: ISO-Const photographs (ISO 8) show the truth with e = 1.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from p2gs_jax.core.streams import SceneStream, generator
+from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.srgb import srgb_encode
 from p2gs_jax.synth.settings import Curve, Sensor
 
@@ -21,6 +23,8 @@ ISO_MINIMUM = 1
 # Variances of photon noise per unit of exposed radiance, and of read noise.
 SHOT_NOISE, READ_NOISE = 2e-4, 1e-6
 DRIFT_PERIODS = 1.3
+# Lenses lose no more than this in their corners, whatever was drawn.
+MOST_LOST = 0.8
 
 
 class Shots(NamedTuple):
@@ -30,11 +34,30 @@ class Shots(NamedTuple):
         iso: drawn ISO.
         exposures: factor on radiance, ISO-Const without gains = 1.
         balance: factors on red, green, blue.
+        corner_loss: share of the light lost in the corners.
+        curves: response.
     """
 
     iso: Int[np.ndarray, " v"]
     exposures: Float[np.ndarray, " v"]
     balance: Float[np.ndarray, "v 3"]
+    corner_loss: Float[np.ndarray, " v"]
+    curves: tuple[Curve, ...]
+
+    @property
+    def mean_exposures(self) -> Float[np.ndarray, " v"]:
+        """Exposures of the channels together: what balances is not in them."""
+        return self.exposures * np.exp(np.log(self.balance).mean(1))
+
+    @property
+    def tints(self) -> Float[np.ndarray, "v 3"]:
+        """Factors on red, green, blue beside `mean_exposures`; their product is 1."""
+        return self.balance / np.exp(np.log(self.balance).mean(1, keepdims=True))
+
+    def sensor(self, sensor: Sensor, row: int) -> Sensor:
+        """Return the pipeline of one photograph."""
+        lost = float(self.corner_loss[row])
+        return dataclasses.replace(sensor, curve=self.curves[row], vignetting=lost)
 
 
 def draw_iso(shape: tuple[int, ...], std: float, seed: int) -> Int[np.ndarray, "..."]:
@@ -57,7 +80,15 @@ def draw_shots(sensor: Sensor, frames: int, cameras: int, seed: int) -> Shots:
         frames: of each camera.
         cameras: how many.
         seed: of everything drawn.
+
+    Raises:
+        UserError: there are curves for another number of cameras.
     """
+    if len(sensor.curves) not in (0, cameras):
+        raise UserError(
+            f"there are {cameras} cameras, but {len(sensor.curves)} curves.",
+            fix=f"name {cameras} curves, or none",
+        )
     iso = draw_iso((frames, cameras), sensor.iso_std, seed).T.ravel()
     rng = generator(seed, SceneStream.CAMERAS)
     gain = sensor.camera_gain_ev * rng.standard_normal(cameras)
@@ -66,8 +97,16 @@ def draw_shots(sensor: Sensor, frames: int, cameras: int, seed: int) -> Shots:
     turn = 2 * np.pi * DRIFT_PERIODS * np.arange(frames) / max(frames, 1)
     stops = gain[:, None] + sensor.drift_ev * np.sin(turn + phase[:, None])
     balance = np.exp2(np.stack([tint[:, 0], np.zeros(cameras), tint[:, 1]], 1))
+    optics = generator(seed, SceneStream.OPTICS)
+    lost = sensor.vignetting + sensor.vignetting_spread * optics.standard_normal(cameras)
+    turned = sensor.white_balance_drift_ev * optics.standard_normal((cameras * frames, 3))
+    balance = np.repeat(balance, frames, axis=0)
     return Shots(
-        iso, iso / ISO_REFERENCE * np.exp2(stops.ravel()), np.repeat(balance, frames, axis=0)
+        iso,
+        iso / ISO_REFERENCE * np.exp2(stops.ravel()),
+        balance * np.exp2(turned - turned.mean(1, keepdims=True)),
+        np.repeat(np.clip(lost, 0, MOST_LOST), frames),
+        tuple(c for c in sensor.curves or (sensor.curve,) * cameras for _ in range(frames)),
     )
 
 
@@ -83,10 +122,13 @@ def encode(exposed: Float[np.ndarray, "..."], curve: Curve) -> Float[np.ndarray,
 
 
 def vignette(height: int, width: int, lost: float) -> Float[np.ndarray, "h w 1"]:
-    """Return the light that reaches each pixel: 1 in the centre, 1 - lost in the corners."""
+    """Return the light that reaches each pixel: 1 in the centre, 1 - lost in the corners.
+
+    Circles about the centre are equally bright, as behind a lens.
+    """
     y, x = np.mgrid[:height, :width] + 0.5
-    squared = (x / width - 0.5) ** 2 + (y / height - 0.5) ** 2
-    return (1 - lost * squared / 0.5)[..., None]
+    squared = (x - width / 2) ** 2 + (y - height / 2) ** 2
+    return (1 - lost * squared / ((width / 2) ** 2 + (height / 2) ** 2))[..., None]
 
 
 def photograph(

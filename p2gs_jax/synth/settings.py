@@ -17,13 +17,20 @@ class Sensor:
     """Spread of the ISO about 8 (paper: 2 and 4); 0 is ISO-Const."""
     curve: Curve = "srgb"
     """Response; `filmic` bends it into an S before sRGB."""
+    curves: tuple[Curve, ...] = ()
+    """Responses of the cameras in turn, sorted by name; none: `curve` for all. References keep
+    `curve`."""
     camera_gain_ev: float = 0.0
     """Standard deviation of a fixed gain per camera, stops."""
     drift_ev: float = 0.0
     """Amplitude of a slow automatic exposure, each camera at its own phase, stops."""
     vignetting: float = 0.0
     """Share of the light lost in the corners."""
+    vignetting_spread: float = 0.0
+    """Standard deviation of that share between cameras."""
     white_balance_ev: float = 0.0
     """Standard deviation of red and blue gains per camera, stops."""
+    white_balance_drift_ev: float = 0.0
+    """Standard deviation of each channel's gain per photograph, stops."""
     noise: float = 0.0
     """Standard deviation of photon and read noise, 1 = a small sensor in daylight."""

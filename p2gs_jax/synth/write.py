@@ -4,7 +4,7 @@
     reference/<camera>/<frame>.png   the same views at ISO 8, without gains, vignetting and noise
     truth/linear/<camera>/<frame>.exr   radiance R G B (half), camera z Z (float; inf: sky)
     truth/sky_masks/<camera>/<frame>.png   255 where the pixel's centre sees the sky
-    truth/exposures.csv              image, camera, iso, exposure, exposure_ev, red, blue
+    truth/exposures.csv              how every photograph was taken, see `exposures`
     sparse/0/*.bin                   PINHOLE cameras, poses, seed points with tracks
     calib.txt, poses.txt, lidar_poses.txt, velodyne/<frame>.bin   see `kitti_files`
     dataset.json                     every parameter
@@ -57,7 +57,7 @@ class StreetTruth:
         width: pixels.
         height: pixels.
         iso: drawn ISO.
-        exposures: iso / 8 times the gains.
+        exposures: iso / 8 times the gains, mean over the channels.
         points: number of seed points.
         observations: number of their observations.
     """
@@ -146,7 +146,11 @@ def write_street(
         ):
             rng = generator(seed, SceneStream.PHOTOGRAPH, row)
             shot = photograph(
-                linear, shots.exposures[row], sensor, balance=shots.balance[row], rng=rng
+                linear,
+                shots.exposures[row],
+                shots.sensor(sensor, row),
+                balance=shots.balance[row],
+                rng=rng,
             )
             reference = photograph(linear, 1.0, Sensor(curve=sensor.curve))
             _write_view(temporary, names[row], shot, reference, linear, depth)
@@ -201,7 +205,7 @@ def write_street(
         width=width,
         height=height,
         iso=shots.iso,
-        exposures=shots.exposures,
+        exposures=shots.mean_exposures,
         points=len(xyz),
         observations=int(seen.sum()),
     )

@@ -150,7 +150,11 @@ def advance(
 
     # In the order of `finite_names`.
     terms = gradient.terms | updated.value
-    checked = jnp.concatenate([_finite(terms), updated.finite, _finite(gradient.v_rest)])
+    v_photometry, v_appearance = gradient.v_rest
+    checked = [_finite(terms), updated.finite, _finite(v_photometry)]
+    if v_appearance is not None:
+        checked.append(jnp.all(_finite(v_appearance))[None])
+    checked = jnp.concatenate(checked)
     broken = FAULT_NONFINITE * ~jnp.all(checked)
     kind = jnp.where(fits, broken, FAULT_OVERFLOW).astype(jnp.int32)
     term = jnp.argmin(checked).astype(jnp.int32)

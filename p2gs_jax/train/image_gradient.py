@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from p2gs_jax.config import FitConfig, RenderConfig
 from p2gs_jax.losses.total import Partner, decoded, image_loss
+from p2gs_jax.photometry.appearance import Corrections
 from p2gs_jax.render.blocks import Shown, splat_listed, whole_blocks
 from p2gs_jax.render.spherical_harmonics import coefficient_count
 from p2gs_jax.render.visible import compact, in_view
@@ -93,7 +94,7 @@ def show(
 def differentiate(
     shown: tuple[Shown, ...],
     photometry: Photometry,
-    appearance: Float[Array, "v ..."] | None,
+    appearance: Corrections | None,
     batch: Batch,
     partner: Partner,
     *,

@@ -23,6 +23,8 @@ from p2gs_jax.types import Gaussians, Params, Photometry
 
 # For exposures, gammas and corrections (Kingma and Ba).
 B1, B2 = 0.9, 0.999
+# Of a rate that warms up, what it starts from (PPISP: 0.01).
+WARMUP_START = 0.01
 
 
 class AdamState(NamedTuple):
@@ -151,6 +153,17 @@ def photometry_gate(progress: Array, cfg: FitConfig) -> Float[Array, ""]:
     return jnp.where(along >= 0, rate, 0.0)
 
 
+def appearance_rate(progress: Array, cfg: FitConfig) -> Float[Array, ""]:
+    """Return the rate of corrections: rising where there is a warm-up, then decaying."""
+    o = cfg.optimizer
+    if o.appearance_warmup == 0:
+        return jnp.asarray(o.appearance * o.appearance_final**progress)
+    along = progress / o.appearance_warmup
+    rising = WARMUP_START + (1 - WARMUP_START) * along
+    decaying = o.appearance_final ** (progress - o.appearance_warmup)
+    return o.appearance * jnp.where(along < 1, rising, decaying)
+
+
 def learning_rates(
     progress: Array, extent: float, like: Params, cfg: FitConfig, bands: int
 ) -> Params:
@@ -184,9 +197,7 @@ def learning_rates(
             None if balance is None else o.exposures * gate * by_view,
             like.photometry.cameras,
         ),
-        appearance=None
-        if like.appearance is None
-        else jnp.asarray(o.appearance * o.appearance_final**progress),
+        appearance=jax.tree.map(lambda _: appearance_rate(progress, cfg), like.appearance),
     )
 
 

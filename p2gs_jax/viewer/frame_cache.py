@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import time
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float32
 
 from p2gs_jax.errors import UserError
+from p2gs_jax.photometry.display import DisplayTransform
+from p2gs_jax.photometry.metering import meter
 from p2gs_jax.run.read import Run
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
@@ -23,6 +28,8 @@ from p2gs_jax.viewer.settings import Settings, display_of
 
 # Cameras closer than this count as being in one place, in typical distances.
 SAME_PLACE = 1e-3
+# A metered exposure comes this close (1/e) to what is seen within this time, seconds.
+ADAPT_S = 0.5
 
 
 class FrameCache:
@@ -50,6 +57,8 @@ class FrameCache:
         self._centers = np.stack([camera_center(view.viewmat) for view in run.scene.views])
         self._tolerance = SAME_PLACE * typical
         self._photograph: tuple[int, Camera, WarpedPhotograph] | None = None
+        # The frame that was metered last, when, and the log exposure that had been reached.
+        self._metered: tuple[RenderedFrame, float, float] | None = None
 
     def render(self, camera: Camera, *, wait: bool = False) -> bool:
         """Render a new frame; return whether that was possible.
@@ -72,15 +81,35 @@ class FrameCache:
         assert self.frame is not None
         self.depth_limits = limits_of_depth(self.frame)
 
-    def develop(self, settings: Settings) -> Float32[np.ndarray, "h w 3"]:
-        """Return display values of the frame."""
+    def transform(self, settings: Settings, *, settled: bool = True) -> DisplayTransform:
+        """Return the display transform of the frame; a metered exposure follows what it shows.
+
+        Args:
+            settings: of the panel.
+            settled: do not wait for the exposure to adapt.
+        """
+        shown = display_of(self._run, settings)
+        if not settings.metered or self.frame is None:
+            return shown
+        frame, before, now = self.frame, self._metered, time.monotonic()
+        if before is None or before[0] is not frame or settled:
+            readings = meter(np.asarray(frame.linear), frame.alpha)
+            log = self._run.metering.log_exposure(readings)
+            if before is not None and not settled:
+                share = 1 - float(np.exp(-(now - before[1]) / ADAPT_S))
+                log = before[2] + share * (log - before[2])
+            self._metered = before = (frame, now, log)
+        return replace(shown, exposure=float(np.exp(before[2])) * 2**settings.exposure_ev)
+
+    def develop(self, settings: Settings, *, settled: bool = True) -> Float32[np.ndarray, "h w 3"]:
+        """Return display values of the frame; `settled` as of `transform`."""
         assert self.frame is not None
         if settings.mode == "depth" and self.depth_limits is None:
             self.set_depth_limits()
         return picture_of(
             self.frame,
             settings.mode,
-            display_of(self._run, settings),
+            self.transform(settings, settled=settled),
             depth_limits=self.depth_limits,
             photograph=self._photograph_here() if settings.mode == "split" else None,
             split=settings.split,

@@ -80,6 +80,11 @@ class Panel:
                 (float(ev), f"{ev:+d}" if ev else "0") for ev in (-round(reach), 0, round(reach))
             ),
         )
+        self._metered = gui.add_checkbox(
+            "Auto exposure",
+            False,
+            hint="The exposure follows what is seen, as the camera's did; the slider adds stops.",
+        )
         low = min(1.0, math.floor(10 * min(info.gammas)) / 10)
         high = max(4.0, math.ceil(10 * max(info.gammas)) / 10)
         self._gamma = gui.add_slider(
@@ -109,6 +114,7 @@ class Panel:
         )
         for handle in (self._exposure, self._gamma, self._curve, self._split):
             self._when_chosen(handle, lambda _: actions.display_changed())
+        self._when_chosen(self._metered, actions.set_metered)
         for handle in (self._mode, self._renderer):
             self._when_chosen(handle, lambda _: actions.mode_changed())
         self._when_chosen(self._match, lambda name: actions.take_display_of(self._index(name)))
@@ -259,6 +265,7 @@ class Panel:
             mode=MODES[self._mode.value],
             split=self._split.value,
             splats=self._renderer.value == SPLATS,
+            metered=self._metered.value,
         )
 
     def _balance_ev(self) -> tuple[float, float] | None:
@@ -270,6 +277,7 @@ class Panel:
     def put(self, settings: Settings) -> None:
         """Set the controls to a display transform; the mode stays."""
         self._taken_as = settings.taken_as
+        self._metered.value = settings.metered
         self._exposure.value = settings.exposure_ev
         self._gamma.value = settings.gamma
         for handle, ev in zip(self._balance, settings.balance_ev or (), strict=False):

@@ -16,6 +16,10 @@ class PanelActions(Protocol):
         """Show the frame under the new settings."""
         ...
 
+    def set_metered(self, metered: bool) -> None:
+        """Let the exposure follow what is seen, or keep it where it is now."""
+        ...
+
     def take_display_of(self, index: int | None) -> None:
         """Take all that a view was taken with, or the mean."""
         ...

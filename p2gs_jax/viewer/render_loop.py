@@ -241,7 +241,7 @@ class RenderLoop:
     def _show(self, settings: Settings, *, sharp: bool) -> None:
         frame = self.frame_cache.frame
         assert frame is not None
-        image = to_uint8_fast(self.frame_cache.develop(settings))
+        image = to_uint8_fast(self.frame_cache.develop(settings, settled=sharp))
         self._client.scene.set_background_image(
             image,
             "png" if sharp else "jpeg",

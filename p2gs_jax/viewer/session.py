@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 import viser
@@ -20,7 +21,6 @@ from p2gs_jax.viewer.save import exr_bytes, png_bytes, saved_size
 from p2gs_jax.viewer.settings import (
     Settings,
     common_settings,
-    display_of,
     same_display,
     settings_of_view,
 )
@@ -80,6 +80,19 @@ class BrowserSession:
 
     def display_changed(self) -> None:
         """Show the frame under the new settings."""
+        self._render_loop.display_changed()
+
+    def set_metered(self, metered: bool) -> None:
+        """Let the exposure follow what is seen, or keep it where it is now."""
+        now = self._panel.settings()
+        stops = 0.0
+        if metered:
+            with self._busy("Metering the training views ...", "Auto exposure"):
+                _ = self._run.metering  # of runs of older versions it takes a while
+        else:
+            transform = self._render_loop.frame_cache.transform(replace(now, metered=True))
+            stops = float(np.log2(transform.exposure / self._run.mean.exposure_geometric))
+        self._panel.put(replace(now, metered=metered, exposure_ev=stops))
         self._render_loop.display_changed()
 
     def mode_changed(self) -> None:
@@ -199,7 +212,7 @@ class BrowserSession:
             cache.render(self._render_loop.camera(view, size), wait=True)
             if kind == "exr":
                 assert cache.frame is not None
-                shown = display_of(self._run, settings).without_place()
+                shown = cache.transform(settings).without_place()
                 content = exr_bytes(cache.frame, shown)
             else:
                 content = png_bytes(cache.develop(settings))
@@ -207,13 +220,11 @@ class BrowserSession:
         self._client.send_file_download(name, content, save_immediately=True)
 
     @contextmanager
-    def _busy(self, text: str) -> Iterator[None]:
-        notice = self._client.add_notification(
-            "Saving", text, loading=True, with_close_button=False
-        )
+    def _busy(self, text: str, what: str = "Saving") -> Iterator[None]:
+        notice = self._client.add_notification(what, text, loading=True, with_close_button=False)
         try:
             yield
         except UserError as error:
-            self._client.add_notification("Not saved", str(error), color="red")
+            self._client.add_notification(f"{what} failed", str(error), color="red")
         finally:
             notice.remove()

@@ -20,7 +20,8 @@ class Settings:
 
     Attributes:
         gamma: > 0.
-        exposure_ev: stops from the geometric mean of the training exposures.
+        exposure_ev: stops from the geometric mean of the training exposures, or from the metered
+            exposure.
         curve: `run` is what the fit chose.
         taken_as: row in `scene.views` of the view whose correction and whose camera's vignetting
             and response apply, or None for the mean and no camera.
@@ -29,6 +30,7 @@ class Settings:
         mode: what is shown.
         split: share of the photograph in `split`.
         splats: whether the browser draws splats itself, instead of the renderer's pictures.
+        metered: whether the exposure follows what is seen; not of the browser's splats.
     """
 
     gamma: float
@@ -40,6 +42,7 @@ class Settings:
     mode: Mode = "display"
     split: float = 0.5
     splats: bool = False
+    metered: bool = False
 
 
 def common_settings(run: Run, before: Settings | None = None) -> Settings:
@@ -56,6 +59,7 @@ def common_settings(run: Run, before: Settings | None = None) -> Settings:
         exposure_ev=0.0,
         curve="run",
         taken_as=None,
+        metered=False,
         balance_ev=_balance_of(common),
     )
 
@@ -76,6 +80,7 @@ def settings_of_view(run: Run, index: int, before: Settings) -> Settings:
         exposure_ev=ev,
         curve="run",
         taken_as=index,
+        metered=False,
         balance_ev=_balance_of(own),
     )
 

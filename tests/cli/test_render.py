@@ -169,6 +169,26 @@ def test_a_drive_can_be_exposed_as_photographed(capsys, own_run, tmp_path):
         assert entry["gamma"] == pytest.approx(transform.gamma, rel=1e-6)
 
 
+def test_a_drive_can_be_metered(capsys, own_run, tmp_path):
+    bare = ["--path", "drive", "--frames", 5, "--width", 64]
+    for name, more in (("of", []), ("more", ["--exposure-ev", 1])):
+        argv = [own_run, *bare, "--exposure-of", "log_average", *more, "--out", tmp_path / name]
+        code, said = run(capsys, *argv)
+        assert code == 0, said
+    metered, brighter = (
+        [shot["exposure_ev"] for shot in json.loads((tmp_path / n / "cameras.json").read_text())]
+        for n in ("of", "more")
+    )
+    np.testing.assert_allclose(np.subtract(brighter, metered), 1.0, atol=1e-5)
+    linear, _ = read_exr(tmp_path / "of" / "00002.exr")
+    light = linear @ [0.2126, 0.7152, 0.0722]
+    exposed = load_run(own_run).common_display(metered[2]).exposure * light
+    assert np.exp(np.log(exposed[exposed > 0]).mean()) == pytest.approx(0.18, rel=0.3)
+    code, said = run(capsys, own_run, *bare, "--exposure-of", "auto", "--out", tmp_path / "auto")
+    assert code == 0, said
+    assert "Metering:" in said
+
+
 def test_an_orbit_says_what_it_does(capsys, own_run, tmp_path):
     code, text = run(capsys, own_run, "--path", "orbit", "--frames", "3", "--out", tmp_path)
     assert code == 0
@@ -222,6 +242,8 @@ def test_a_wide_drive(capsys, rig_run, tmp_path):
         (("--exposure-ev", "5000"), "--exposure-ev"),
         (("--exposure-ev", "nan"), "--exposure-ev"),
         (("--exposure-ev", "own", "--path", "orbit"), "own"),
+        (("--exposure-of", "auto", "--exposure-ev", "own"), "--exposure-of"),
+        (("--exposure-of", "best"), "--exposure-of"),
         (("--panorama",), "one camera"),
         (("--panorama", "--path", "orbit"), "--panorama"),
         (("--camera", "front"), "'front'"),

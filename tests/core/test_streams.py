@@ -20,7 +20,7 @@ from p2gs_jax.core.streams import (
 
 PACKAGE = Path(p2gs_jax.__file__).parent
 # Each draws everything from one stream of its own: toy data, benchmarks, an export's order.
-ALONE = ("core/streams.py", "synth/drive.py", "gaussians/bake.py", "bench/")
+ALONE = ("core/streams.py", "synth/drive", "gaussians/bake.py", "bench/")
 
 
 @pytest.mark.parametrize("streams", [Stream, SceneStream])

@@ -8,6 +8,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "experiments"))
 
+import mixtures
 import time_to_quality as t2q
 
 TOWN = t2q.SceneToFit("town", Path("/somewhere/town"), ("--reference", "/somewhere/reference"))
@@ -101,9 +102,9 @@ def test_exposures_are_judged_by_truth_or_within_their_groups():
     assert t2q.true_ev(photometry, truth) == pytest.approx(0.0, abs=1e-9)
     assert t2q.true_ev(photometry, {}) is None
     groups = {"a": "low", "b": "high", "c": "high", "held": "low"}
-    within = t2q.within_groups_ev(photometry, groups)
+    within = mixtures.within_groups_ev(photometry, groups)
     assert within == pytest.approx((2 * 0.1**2 / 3) ** 0.5)
-    assert t2q.within_groups_ev(photometry, {}) is None
+    assert mixtures.within_groups_ev(photometry, {}) is None
 
 
 def test_seconds_of_compiling_are_counted():
@@ -113,20 +114,20 @@ def test_seconds_of_compiling_are_counted():
 
 def test_the_mixture_is_drawn_in_the_order_of_names(tmp_path):
     views = [f"v{i}" for i in range(20)]
-    groups = t2q.mixture_groups(views[::-1])
-    assert groups == t2q.mixture_groups(views)
-    assert set(groups.values()) == set(t2q.MIXTURE_GROUPS)
-    for group in t2q.MIXTURE_GROUPS:
+    groups = mixtures.mixture_groups(views[::-1])
+    assert groups == mixtures.mixture_groups(views)
+    assert set(groups.values()) == set(mixtures.GROUPS)
+    for group in mixtures.GROUPS:
         (tmp_path / "lom" / group).mkdir(parents=True)
         for view in views:
             (tmp_path / "lom" / group / f"{view}.JPG").write_text(group)
     (tmp_path / "lom" / "colmap_sparse" / "0").mkdir(parents=True)
-    t2q.write_mixture(tmp_path / "lom", tmp_path / "out")
+    mixtures.write_mixture(tmp_path / "lom", tmp_path / "out")
     assert json.loads((tmp_path / "out" / "groups.json").read_text()) == groups
     for view, group in groups.items():
         assert (tmp_path / "out" / "images" / f"{view}.JPG").read_text() == group
         reference = tmp_path / "out" / "reference" / f"{view}.JPG"
-        assert reference.read_text() == t2q.MIXTURE_REFERENCE
+        assert reference.read_text() == mixtures.REFERENCE
 
 
 def test_runs_use_their_own_code_and_an_own_cache(monkeypatch):

@@ -8,7 +8,7 @@ from scipy.interpolate import RegularGridInterpolator
 
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.evaluate.alignment import fit_exposure
-from p2gs_jax.photometry.appearance import GRID, corrected, identity, roughness
+from p2gs_jax.photometry.appearance import GRID, corrected, identity, regularisation
 from p2gs_jax.photometry.formation import formation
 from p2gs_jax.types import LUMINANCE, Capture
 
@@ -17,14 +17,16 @@ IMAGE = jnp.asarray(np.random.default_rng(0).uniform(0.02, 0.98, (20, 28, 3)), j
 
 
 def noisy(kind, size=0.1, seed=1):
-    zero = identity(kind, 1)[0]
+    zero = identity(kind, ["a"])[0]
     noise = np.random.default_rng(seed).normal(0, size, zero.shape)
     return jnp.asarray(noise, jnp.float32)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_zeros_change_nothing(kind):
-    np.testing.assert_allclose(corrected(IMAGE, identity(kind, 3)[1], kind), IMAGE, atol=1e-6)
+    np.testing.assert_allclose(
+        corrected(IMAGE, identity(kind, ["a"] * 3)[1], kind), IMAGE, atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -71,11 +73,11 @@ def test_a_curve_rises_and_goes_on():
     assert np.abs(np.diff(y, 2)).max() < 0.05
 
 
-def test_roughness_is_for_grids_only():
-    smooth = jnp.ones_like(identity("bilateral", 2))
-    assert float(roughness(smooth, "bilateral")) == 0
-    assert float(roughness(noisy("bilateral")[None], "bilateral")) > 1e-3
-    assert float(roughness(noisy("affine")[None], "affine")) == 0
+def test_only_grids_are_kept_smooth():
+    smooth = jnp.ones_like(identity("bilateral", ["a", "b"]))
+    assert float(regularisation(smooth, "bilateral")) == 0
+    assert float(regularisation(noisy("bilateral")[None], "bilateral")) > 1e-3
+    assert regularisation(noisy("affine")[None], "affine") is None
 
 
 def test_a_correction_is_part_of_the_image_and_of_the_fitted_exposure():

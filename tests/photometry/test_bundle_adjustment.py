@@ -62,7 +62,7 @@ def test_a_part_of_the_observations_tells_exposures_and_all_points_get_a_radianc
     assert not set(o.points[kept]) & set(o.points[~kept])
     part = adjust(o)
     assert ev(part, ISO4) < 0.02
-    assert (part.exposure_errors >= whole.exposure_errors).all()
+    assert part.exposure_errors.mean() > whole.exposure_errors.mean()
     np.testing.assert_array_equal(part.observations_per_view, whole.observations_per_view)
     difference = part.point_log_radiance - whole.point_log_radiance
     assert (np.isfinite(difference) == np.isfinite(whole.point_log_radiance)).all()

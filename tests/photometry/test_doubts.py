@@ -5,6 +5,7 @@ import pytest
 
 from p2gs_jax.photometry.adjustment import solve
 from p2gs_jax.photometry.adjustment.errors import uncertainty
+from p2gs_jax.photometry.adjustment.explained import explain
 from p2gs_jax.photometry.adjustment.fit import TOLERANCE, fit_model, solve_model
 from p2gs_jax.photometry.adjustment.problem import make_problem
 from p2gs_jax.photometry.adjustment.result import solution_of
@@ -63,7 +64,8 @@ def test_what_no_observation_holds_is_unknown_and_said():
     fit, system = solve_model(problem, form, Response())
     known = uncertainty(fit, system, fit.model.rows.row)
     assert known.unknown.shape[1] == 1
-    s = solution_of(problem, form, Response(), fit, known)
+    explained = explain(fit, problem, Response())
+    s = solution_of(problem, form, Response(), fit, explained, known)
     assert np.isinf(s.exposure_errors[3])
     assert np.isinf(s.gamma_errors[3])
     assert s.state["unknown_errors"] > 0

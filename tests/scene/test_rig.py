@@ -2,18 +2,20 @@
 
 import shutil
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene import load_scene
+from p2gs_jax.scene import load_scene, rig
 from p2gs_jax.scene.rig import load_rig
 from p2gs_jax.synth.build_town import build_town
 from p2gs_jax.synth.intersect import nearest_hit
 from p2gs_jax.synth.lidar import Lidar, Scanner
 from p2gs_jax.synth.write import write_street
+from p2gs_jax.types import View
 
 RIG = DataConfig(format="rig")
 
@@ -110,6 +112,22 @@ def test_one_point_per_voxel(street):
     distance = cKDTree(scene.points).query(scene.points, k=2)[0][:, 1]
     assert np.median(distance) > 0.02
     assert any("thinned" in note for note in scene.notes)
+
+
+def test_a_view_may_see_more_points_than_an_image_is_wide(tmp_path):
+    """OpenCV samples at no more than 32,766 positions; a LiDAR sees more."""
+    ramp = np.tile(np.arange(240, dtype=np.uint8)[None, :, None], (200, 1, 3))
+    path = tmp_path / "ramp.png"
+    cv2.imwrite(str(path), ramp)
+    K = np.array([[100, 0, 120], [0, 100, 100], [0, 0, 1]], np.float32)
+    view = View("ramp.png", path, "0", np.eye(4, dtype=np.float32), K, 240, 200)
+    v, u = np.mgrid[5:195, 5:235] + 0.5
+    points = np.stack([(u - 120) / 100, (v - 100) / 100, np.ones_like(u)], -1).reshape(-1, 3)
+    assert len(points) > 32_767
+    seen, colors, unseen = rig._colored(points.astype(np.float32), (view,), DataConfig())
+    assert unseen == 0
+    assert len(seen) == len(points)
+    np.testing.assert_allclose(colors[:, 0].astype(float), u.ravel() - 0.5, atol=1)
 
 
 def test_what_is_wrong_is_named(copy):

@@ -1,14 +1,16 @@
 """What the cameras add to the light is what was asked for, and nothing by default."""
 
 import csv
+import dataclasses
 import json
 
 import numpy as np
 import pytest
 
+from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.srgb import srgb_decode
 from p2gs_jax.synth.build_town import build_town
-from p2gs_jax.synth.exposures import read_true_exposures
+from p2gs_jax.synth.exposures import read_true_exposures, read_true_shots
 from p2gs_jax.synth.sensor import draw_shots, encode, photograph, vignette
 from p2gs_jax.synth.settings import Sensor
 from p2gs_jax.synth.town import UNDERPASS, Material
@@ -43,9 +45,55 @@ def test_vignetting_spares_the_centre():
     assert light[32, 48] == pytest.approx(1, abs=1e-3)
     assert light[0, 0] == pytest.approx(0.6, abs=0.02)
     np.testing.assert_allclose(light, light[::-1, ::-1])
+    assert light[32, 80] == pytest.approx(light[0, 48], abs=0.005)  # as far from the centre
     flat = np.full((65, 97, 3), 0.2)
     shot = srgb_decode(photograph(flat, 1.0, Sensor(vignetting=0.4)) / 255.0)[..., 0]
     np.testing.assert_allclose(shot, 0.2 * light, atol=0.003)
+
+
+def test_every_camera_can_have_a_lens_and_a_curve_of_its_own():
+    sensor = Sensor(vignetting=0.3, vignetting_spread=0.1, curves=("srgb", "filmic", "power"))
+    shots = draw_shots(sensor, 4, 3, seed=2)
+    lost = shots.corner_loss.reshape(3, 4)
+    assert np.ptp(lost, axis=1).max() == 0
+    assert 0.01 < np.std(lost[:, 0]) < 0.3
+    assert shots.curves == ("srgb",) * 4 + ("filmic",) * 4 + ("power",) * 4
+    mine = shots.sensor(sensor, 5)
+    assert (mine.curve, mine.vignetting) == ("filmic", lost[1, 0])
+    strong = draw_shots(Sensor(vignetting_spread=9.0), 1, 40, seed=0).corner_loss
+    assert (strong.min(), strong.max()) == (0, 0.8)
+    with pytest.raises(UserError, match="3 cameras, but 1 curves"):
+        draw_shots(Sensor(curves=("srgb",)), 4, 3, seed=2)
+
+
+def test_white_balance_of_every_photograph_leaves_its_exposure():
+    shots = draw_shots(Sensor(white_balance_drift_ev=0.1), 100, 3, seed=2)
+    np.testing.assert_allclose(shots.mean_exposures, shots.exposures, rtol=1e-12)
+    np.testing.assert_allclose(np.log(shots.tints).sum(1), 0, atol=1e-12)
+    # One of three degrees of freedom went to the exposure.
+    assert np.log2(shots.tints).std() == pytest.approx(0.1 * np.sqrt(2 / 3), rel=0.1)
+
+
+def test_what_is_new_and_off_changes_no_photograph():
+    sensor = Sensor(camera_gain_ev=0.3, drift_ev=0.4, white_balance_ev=0.1)
+    shots = draw_shots(sensor, 5, 3, seed=7)
+    # Drawn before lenses, and white balances per photograph, could be.
+    np.testing.assert_allclose(
+        shots.exposures[[0, 7, 14]],
+        [1.87855992736123, 1.15341964545267, 1.05287613137381],
+        rtol=1e-12,
+    )
+    np.testing.assert_allclose(
+        shots.balance[7], [0.864293188480262, 1, 1.05668099323479], rtol=1e-12
+    )
+    more = dataclasses.replace(sensor, vignetting_spread=0.1, white_balance_drift_ev=0.1)
+    again = draw_shots(more, 5, 3, seed=7)
+    np.testing.assert_array_equal(again.exposures, shots.exposures)
+    linear = np.random.default_rng(0).uniform(0, 1, (8, 12, 3))
+    np.testing.assert_array_equal(
+        photograph(linear, shots.exposures[3], shots.sensor(sensor, 3), balance=shots.balance[3]),
+        photograph(linear, shots.exposures[3], sensor, balance=shots.balance[3]),
+    )
 
 
 def test_noise_has_the_stated_size_and_needs_a_generator():
@@ -99,3 +147,8 @@ def test_the_data_set_card_and_table_say_what_was_done(tmp_path):
     assert {r["red"] for r in rows if r["camera"] == "front"} != {
         r["red"] for r in rows if r["camera"] == "front_left"
     }
+    true = read_true_shots(street.root)
+    assert [s.exposure for s in true.values()] == list(read.values())
+    assert {s.corners for s in true.values()} == {0.8}
+    assert all(np.prod(s.balance) == pytest.approx(1, abs=1e-4) for s in true.values())
+    assert read_true_shots(tmp_path) == {}

@@ -2,12 +2,16 @@
 
 import dataclasses
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from tiny_scene import make_scene
 
 import p2gs_jax
 from p2gs_jax.core.atomic import read_jsonl
+from p2gs_jax.photometry.appearance import identity
+from p2gs_jax.train.optimizer import appearance_rate
 
 FORMS = ("literal_same_pose", "literal_pixels", "exposed", "observed_linear", "observed_ldr")
 
@@ -69,7 +73,9 @@ def test_every_reading_runs(tmp_path, form, correspondence):
     assert "relative_exposure" in check(result, tmp_path / "run")[0]["terms"]
 
 
-BASELINES = ("3dgs", "3dgs_gain", "3dgs_affine", "3dgs_bilateral", "3dgs_curve")
+# Of 30,000 steps: factor on the rate (arXiv 2601.18336, C.1).
+RATES = {0: 0.01, 250: 0.505, 500: 1.0, 15_500: 0.1, 30_000: 0.01 ** (1 - 1 / 60)}
+BASELINES = ("3dgs", "3dgs_gain", "3dgs_affine", "3dgs_bilateral", "3dgs_curve", "ppisp")
 
 
 @pytest.mark.slow
@@ -87,8 +93,33 @@ def test_baselines_run_and_come_back_as_they_were_saved(tmp_path, name):
         assert again.appearance is None
         assert (np.ptp(exposures) > 1e-3) == (name == "3dgs_gain")
     else:
-        np.testing.assert_array_equal(again.appearance, saved)
-        assert float(np.abs(np.asarray(saved)).max()) > 1e-3
+        assert jax.tree.structure(again.appearance) == jax.tree.structure(saved)
+        start = identity(name.removeprefix("3dgs_"), ["1"] * len(exposures))
+        jax.tree.map(np.testing.assert_array_equal, again.appearance, saved)
+        moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), saved, start)
+        if name == "ppisp":
+            # Its exposures are handed on to where all others have theirs.
+            assert moved.exposures == 0
+            assert np.ptp(exposures) > 1e-3
+            moved = (moved.colors, moved.responses, moved.vignettings)
+        assert min(jax.tree.leaves(moved)) > 1e-3
+
+
+def test_a_learned_camera_takes_the_place_of_the_curve(tmp_path):
+    cfg = p2gs_jax.preset("ppisp")
+    cfg = dataclasses.replace(cfg, photometry=dataclasses.replace(cfg.photometry, curve="srgb"))
+    with pytest.raises(p2gs_jax.UserError, match="a whole camera"):
+        p2gs_jax.fit(make_scene(tmp_path / "scene"), tmp_path / "run", cfg)
+
+
+def test_a_learned_camera_warms_up_and_decays_as_published():
+    cfg = p2gs_jax.preset("ppisp")
+    o = cfg.optimizer
+    at = {step: float(appearance_rate(jnp.float32(step / 30_000), cfg)) for step in RATES}
+    expected = {step: o.appearance * factor for step, factor in RATES.items()}
+    assert at == pytest.approx(expected, rel=1e-4)
+    affine = p2gs_jax.preset("3dgs_affine")
+    assert float(appearance_rate(jnp.float32(0.0), affine)) == pytest.approx(1e-2)
 
 
 def test_display_values_know_no_track_start(tmp_path):

@@ -185,3 +185,20 @@ def test_depth_colours_stay_until_they_are_set_anew(setup):
     assert frame_cache.depth_limits == limits
     frame_cache.set_depth_limits()
     assert frame_cache.depth_limits != limits
+
+
+def test_a_metered_exposure_follows_the_picture(setup, run):
+    frame_cache, _, store = setup
+    settings = replace(common_settings(run), metered=True)
+    here = frame_cache.transform(settings).exposure
+    rendered = run.render(frame_cache.frame.camera)
+    assert here == pytest.approx(run.metered_display(rendered).exposure, rel=1e-4)
+    more = frame_cache.transform(replace(settings, exposure_ev=1.0)).exposure
+    assert more == pytest.approx(2 * here)
+    plain = frame_cache.transform(replace(settings, metered=False)).exposure
+    assert plain == pytest.approx(run.mean.exposure_geometric, rel=1e-5)
+    frame_cache.render(camera_of(store, 2))
+    there = run.metered_display(run.render(camera_of(store, 2))).exposure
+    adapting = frame_cache.transform(settings, settled=False).exposure
+    assert min(here, there) <= adapting <= max(here, there)
+    assert frame_cache.transform(settings).exposure == pytest.approx(there, rel=1e-4)

@@ -46,6 +46,7 @@ def print_metrics(metrics: dict, out: Path) -> None:
     row("held out", "exposure fitted to each photograph", metrics["test"]["exposure_fitted"])
     everything = metrics["test"].get("photometry_fitted")
     row("held out", "all that varies per view fitted to each photograph", everything)
+    row("held out", "metered, as the camera would", metrics["test"].get("metered"))
     for name, part in metrics.get("reference", {}).items():
         row("all", f"reference photographs, {name.replace('_', ' ')}", part)
         row("held out", f"reference photographs, {name.replace('_', ' ')}", part["test"])

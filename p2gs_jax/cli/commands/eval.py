@@ -16,6 +16,7 @@ from p2gs_jax.evaluate.lpips_weights import read_lpips_weights
 from p2gs_jax.evaluate.references import find_radiance, load_reference
 from p2gs_jax.render.host import make_renderer
 from p2gs_jax.run.layout import RunFolder
+from p2gs_jax.run.metering_file import write_metering
 from p2gs_jax.run.read import load_run
 
 
@@ -42,6 +43,7 @@ def run(options: Eval) -> int:
             reference=truth,
             radiance=find_radiance(fitted.scene, store),
             lpips_weights=weights,
+            on_metering=lambda found: write_metering(RunFolder(options.run).metering, found),
             on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
         )
     path = RunFolder(options.run).metrics

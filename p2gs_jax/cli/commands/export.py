@@ -11,12 +11,12 @@ import numpy as np
 
 from p2gs_jax.cli.commands.console import stdout
 from p2gs_jax.cli.options.export import DISPLAY, Export, Format, check_export
-from p2gs_jax.core.atomic import atomic_folder, write_array, write_json
+from p2gs_jax.core.atomic import atomic_folder, write_json
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.core.progress import Reporter, TerminalReporter
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.colmap_folder import write_colmap_folder
-from p2gs_jax.export.sidecar import CORRECTIONS, linear_sidecar
+from p2gs_jax.export.sidecar import corrections_name, linear_sidecar
 from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.formats.ply import write_ply, write_radiance
 from p2gs_jax.formats.splat import read_splat, write_splat
@@ -34,6 +34,7 @@ from p2gs_jax.gaussians.bake import (
 from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.render.host import make_renderer
 from p2gs_jax.render.spherical_harmonics import MAX_DEGREE
+from p2gs_jax.run.appearance_file import write_appearance
 from p2gs_jax.run.read import Run, load_run
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.exif import read_exif_settings
@@ -93,7 +94,11 @@ def _display_transform(fitted: Run, options: Export) -> DisplayTransform:
     Raises:
         UserError: the run has no such curve, or no such white balance.
     """
-    transform = fitted.common_display(options.exposure_ev or 0.0)
+    ev = options.exposure_ev or 0.0
+    transform = fitted.common_display(ev)
+    if options.exposure_of is not None:
+        typical = fitted.metering.typical_log_exposure(options.exposure_of)
+        transform = replace(transform, exposure=float(np.exp(typical)) * 2**ev)
     if options.white_balance_of is not None:
         balance = fitted.white_balance_of(options.white_balance_of)
         transform = replace(transform, white_balance=balance)
@@ -142,8 +147,10 @@ def _linear_ply(folder: Path, fitted: Run, store: ImageStore) -> str:
     count = write_radiance(ply, g, np.asarray(fitted.alive), activation=activation)
     content = linear_sidecar(g, fitted.cfg, fitted.scene, store, fitted.photometry)
     write_json(sidecar, content)
-    if fitted.cfg.photometry.appearance is not None:
-        write_array(folder / CORRECTIONS, np.asarray(fitted.params.appearance))
+    kind = fitted.cfg.photometry.appearance
+    if kind is not None:
+        views = fitted.scene.training_views
+        write_appearance(folder / corrections_name(kind), fitted.params.appearance, views)
     return f"{count} Gaussians of linear radiance; {sidecar.name} says how to read them"
 
 

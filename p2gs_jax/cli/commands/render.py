@@ -36,6 +36,7 @@ from p2gs_jax.paths.pictures import (
     RunRenderer,
     comparison_frames,
     comparison_size,
+    metered_shots,
     shot_frames,
     wide_frames,
 )
@@ -43,6 +44,8 @@ from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.run.read import Run, load_run
 
 FPS = 24.0
+# A metered exposure follows what is seen within about this time, seconds.
+ADAPT_S = 0.5
 CAMERAS = "cameras.json"
 OTHER_FILES = (".mov", ".avi", ".mkv", ".webm", ".gif", ".png", ".jpg", ".exr", ".json")
 
@@ -153,6 +156,11 @@ def _check(options: Render) -> None:
         raise UserError(
             f"--path {path!r} is unknown.", fix="choose views, drive, orbit or a FILE.json"
         )
+    if options.exposure_of is not None and (options.panorama or ev == "own"):
+        raise UserError(
+            "--exposure-of meters pictures of single cameras, instead of --exposure-ev own.",
+            fix="leave one of them out",
+        )
     if isinstance(ev, float | int) and not abs(ev) <= MOST_STOPS:
         raise UserError(f"--exposure-ev {ev} is no number of stops.", fix="write 0, 1 or -2.5")
     if ev == "own" and (path not in ("views", "drive") or options.panorama):
@@ -199,7 +207,10 @@ def _display_transform(fitted: Run, options: Render, shot: Shot | None = None) -
     else:
         ev = None if shot is None else shot.exposure_ev
         transform = fitted.common_display(0.0 if ev is None else ev)
-    if isinstance(options.exposure_ev, float | int):
+    if options.exposure_of is not None and shot is not None and shot.exposure_ev is not None:
+        metered = fitted.common_display(shot.exposure_ev)  # with --exposure-ev already
+        transform = replace(transform, exposure=metered.exposure)
+    elif isinstance(options.exposure_ev, float | int):
         common = fitted.common_display(float(options.exposure_ev))
         transform = replace(common, gamma=transform.gamma, camera=transform.camera)
     if options.white_balance_of is not None:
@@ -251,6 +262,12 @@ def _shots(
                 notes = [circle.description()]
     if options.width is not None:
         shots = [shot.resized(options.width) for shot in shots]
+    if options.exposure_of is not None:
+        added = options.exposure_ev if isinstance(options.exposure_ev, float | int) else 0.0
+        frames_s = ADAPT_S * (options.fps or FPS) if options.path != "views" else 0.0
+        shots = metered_shots(renderer, shots, options.exposure_of, added, frames_s)
+        if options.exposure_of == "auto":
+            notes = [*notes, fitted.metering.sentence]
     size = (max(s.width for s in shots), max(s.height for s in shots))
     frames = shot_frames(
         renderer, shots, lambda shot: _display_transform(fitted, options, shot), photograph

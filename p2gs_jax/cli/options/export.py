@@ -37,6 +37,9 @@ class Export:
     """Folder to write into (default: RUN/exports)."""
     exposure_ev: float | None = None
     """Display colours: exposure in stops relative to the mean (default: 0)."""
+    exposure_of: Literal["auto", "log_average", "centre", "highlights", "protected"] | None = None
+    """Display colours: exposure metered in the training views, one for all: their mean of what the
+    rule of `p2gs-jax render` gives; --exposure-ev then adds stops."""
     gamma: float | None = None
     """Display colours: gamma (default: the run's mean)."""
     curve: Literal["power", "srgb", "spline", "linear"] | None = None
@@ -65,7 +68,7 @@ def check_export(args: Export) -> None:
     gamma = args.gamma
     check(gamma is None or (math.isfinite(gamma) and gamma > 0), "--gamma must be positive")
     check(args.bake_steps is None or args.bake_steps >= 0, "--bake-steps must be 0 or more")
-    display = ("exposure_ev", "gamma", "curve", "white_balance_of", "bake_steps")
+    display = ("exposure_ev", "exposure_of", "gamma", "curve", "white_balance_of", "bake_steps")
     given = [n for n in display if getattr(args, n) is not None]
     if given and not set(args.format) & set(DISPLAY):
         raise UserError(

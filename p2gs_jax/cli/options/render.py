@@ -40,6 +40,10 @@ class Render:
     exposure_ev: float | Literal["own"] | None = None
     """Exposure in stops from the geometric mean of the training exposures; own: as photographed
     (on a drive interpolated). Default: own for views, 0 for other paths."""
+    exposure_of: Literal["auto", "log_average", "centre", "highlights", "protected"] | None = None
+    """Exposure metered from each picture, smoothly along a path: auto: as the camera would have
+    chosen it, where a rule explains the photographs; log_average, centre: to mid-grey; highlights:
+    to just below white; protected: mid-grey, highlights kept. --exposure-ev then adds stops."""
     gamma: float | None = None
     """Gamma; default: each view's own, or the training views' mean for other paths."""
     curve: Literal["run", "srgb", "power", "linear", "spline"] = "run"

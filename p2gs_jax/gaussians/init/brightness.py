@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import lru_cache
+from typing import Any
 
 import cv2
+import jax
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
@@ -15,7 +17,7 @@ from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import Response, base_log, log_exposed
 from p2gs_jax.photometry.spline_curve import spline_of
 from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.types import GAMMA_SRGB, Scene
+from p2gs_jax.types import GAMMA_SRGB, Photometry, Scene
 
 TABLE = 1024
 LUMINANCE = np.array([0.25, 0.6, 0.15], np.float32)
@@ -44,6 +46,18 @@ class Tones:
     formation: PhotometryConfig = field(default_factory=PhotometryConfig)
     white_balance: Float[np.ndarray, "v 3"] | None = None
     cameras: tuple[int, ...] | None = None
+
+    @classmethod
+    def of(cls, photometry: Photometry, formation: PhotometryConfig) -> Tones:
+        """Return the tones of a fit.
+
+        Args:
+            photometry: of the training views.
+            formation: tone curve and cameras.
+        """
+        taken: Any = jax.tree.map(np.asarray, photometry)
+        logs = taken.raw_exposures if taken.parameterization == "log" else np.log(taken.exposures)
+        return cls(logs, taken.gammas, formation, taken.white_balance, taken.cameras)
 
     def log_radiance(
         self,

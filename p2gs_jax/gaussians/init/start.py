@@ -62,13 +62,11 @@ def match_photographs(
         limit: number of seeds at most.
         on_view: receives progress.
     """
-    taken: Photometry = jax.tree.map(np.asarray, photometry)
     most_views, budget = MOST_VIEWS, cfg.train.budget_s
     if budget is not None:
         affordable = int(DENSE_TIME * budget / DENSE_SECONDS)
         most_views = min(most_views, max(affordable, FEWEST_DENSE_VIEWS))
-    logs = taken.raw_exposures if taken.parameterization == "log" else np.log(taken.raw_exposures)
-    tones = Tones(logs, taken.gammas, cfg.photometry, taken.white_balance, taken.cameras)
+    tones = Tones.of(photometry, cfg.photometry)
     return dense_seeds(
         scene,
         store,

@@ -14,7 +14,7 @@ REGION = 1 / 3
 
 
 def clusters(observations: Observations, row: Int[np.ndarray, " o"]) -> Int[np.ndarray, " o"]:
-    """Return the cluster of each observation: the region of an image that its point is first seen in.
+    """Return the cluster of each observation: the region of an image its point is first seen in.
 
     Points side by side share texture, gloss and what is not modelled; each by itself would count
     their common error as often as there are points.

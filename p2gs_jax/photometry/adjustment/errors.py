@@ -11,7 +11,8 @@ from jaxtyping import Float, Int
 
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.photometry.adjustment.clusters import small_sample
-from p2gs_jax.photometry.adjustment.linear import DENSE, Balanced
+from p2gs_jax.photometry.adjustment.linear import Balanced, one_thread
+from p2gs_jax.photometry.adjustment.matrices import is_small
 from p2gs_jax.photometry.adjustment.normal import scores
 from p2gs_jax.photometry.adjustment.parameters import Parameters
 from p2gs_jax.photometry.adjustment.solve import Fit
@@ -23,8 +24,8 @@ CANCELLED = 1e-6
 # so does what keeps points without observations finite (`system.EMPTY`).
 HELD = 1e-11
 # Draws from the errors where unknowns are too many for their covariance: a standard error is then
-# known to 9 %.
-DRAWS = 64
+# known to 12 %.
+DRAWS = 32
 
 # What is asked, of changes of all parameters (columns) about the solution.
 Asked = Callable[[Parameters], Float[np.ndarray, "n c"]]
@@ -70,32 +71,38 @@ def uncertainty(fit: Fit, system: System, clusters: Int[np.ndarray, " o"]) -> Un
     each = scores(fit.model, fit.theta, fit.at, clusters)
     seen = rows.weight.any(1)
     few = small_sample(clusters[seen], rows.views[seen], rows.view_count)
-    bread = sp.csr_array(fit.normal * fit.at.curvature + system.priors.normal)
-    bread = bread + gauge_strength(bread, system.unknowns) * system.anchors.normal
-    if system.basis.shape[1] > DENSE:
-        drawn = _drawn(bread, each, system)
-        return Uncertainty(drawn, np.zeros((bread.shape[0], 0)), few, system)
+    bread = fit.normal * fit.at.curvature + system.priors.normal
+    gauges = np.sqrt(gauge_strength(bread, system.unknowns)) * system.anchors.rows
+    if not is_small(system.directions):
+        drawn = _drawn(bread, gauges, each, system)
+        return Uncertainty(drawn, np.zeros((len(drawn), 0)), few, system)
     # A prior is itself an observation with variance 1 / precision: it is its own meat.
     meat = each.T @ each + system.priors.normal
-    return Uncertainty(*_whole(bread, meat, system.basis), few, system)
+    with one_thread():
+        whole = _array(bread + gauges.T @ gauges)
+        return Uncertainty(*_whole(whole, meat, system.basis), few, system)
 
 
 def _whole(bread, meat, basis) -> tuple[Float[np.ndarray, "d r"], Float[np.ndarray, "d k"]]:
-    if not basis.shape[1]:
-        return np.zeros((basis.shape[0], 1)), np.zeros((basis.shape[0], 0))
+    if not basis.nnz:
+        return np.zeros((len(bread), 1)), np.zeros((len(bread), 0))
     # Exposures that are known say so much more than pixels that only ratios can be compared.
     diagonal = (basis.T @ bread @ basis).diagonal()
     g = basis @ sp.diags_array(1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)))
-    value, direction = np.linalg.eigh((g.T @ bread @ g).toarray())
+    value, direction = np.linalg.eigh(_array(g.T @ bread @ g))
     held = value > HELD
     inverse = (direction[:, held] / value[held]) @ direction[:, held].T
-    size, across = np.linalg.eigh((g.T @ meat @ g).toarray())
+    size, across = np.linalg.eigh(_array(g.T @ meat @ g))
     roots = inverse @ (across * np.sqrt(np.maximum(size, 0)))
     unknown = g @ direction[:, ~held]
     return g @ roots, unknown / np.linalg.norm(unknown, axis=0)
 
 
-def _drawn(bread, each, system: System) -> Float[np.ndarray, "d r"]:
+def _array(matrix) -> Float[np.ndarray, "n n"]:
+    return matrix.toarray() if sp.issparse(matrix) else matrix
+
+
+def _drawn(bread, gauges, each, system: System) -> Float[np.ndarray, "d r"]:
     """Return solutions for clusters and priors with random signs (wild bootstrap)."""
     rng = generator(0, Stream.SCORE_SIGNS)
 
@@ -105,4 +112,4 @@ def _drawn(bread, each, system: System) -> Float[np.ndarray, "d r"]:
     priors = system.priors
     right = each.T @ signs(each.shape[0])
     right += priors.rows.T @ (np.sqrt(priors.precisions)[:, None] * signs(len(priors.targets)))
-    return Balanced(bread, system.basis).solve(right) / np.sqrt(DRAWS)
+    return Balanced(bread, gauges, system.basis).solve(right) / np.sqrt(DRAWS)

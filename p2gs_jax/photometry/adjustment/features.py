@@ -10,10 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse as sp
 from jaxtyping import Float
 
 from p2gs_jax.config import VignettingKind
+from p2gs_jax.photometry.adjustment.matrices import Terms
 from p2gs_jax.photometry.adjustment.rows import Rows
 from p2gs_jax.photometry.models import VIGNETTING_POWERS
 
@@ -51,32 +51,22 @@ class Features:
         polynomials = self.cameras * self.vignetting_rows
         return self.balance_count + polynomials * len(VIGNETTING_POWERS)
 
-    def matrix(self, rows: Rows) -> sp.csr_array:
-        """Return the features of every value: (3 o, count), channels running fastest."""
-        camera = rows.cameras[rows.views]
-        size = 3 * len(camera)
-        blocks = []
+    def terms(self, rows: Rows) -> Terms:
+        """Return the features of every value."""
+        camera = rows.cameras[rows.views][:, None]
+        shape = (len(camera), 3)
+        index, factor = [], []
         if self.balance:
-            for channel_of in CHROMA:
-                values = np.broadcast_to(channel_of, (len(camera), 3))
-                blocks.append((values, np.broadcast_to(camera[:, None], values.shape)))
-        columns, width = [], self.cameras
-        for k, (values, at) in enumerate(blocks):
-            columns.append((values.ravel(), (at + k * width).ravel()))
-        base = self.balance_count
+            for direction, of_channel in enumerate(CHROMA):
+                index.append(np.broadcast_to(camera + direction * self.cameras, shape))
+                factor.append(np.broadcast_to(of_channel, shape))
         if self.vignetting:
             of_channel = np.arange(3) if self.vignetting == "channel" else np.zeros(3, int)
-            polynomial = camera[:, None] * self.vignetting_rows + of_channel
-            powers = len(VIGNETTING_POWERS)
+            polynomial = camera * self.vignetting_rows + of_channel
             for k, power in enumerate(VIGNETTING_POWERS):
-                values = np.broadcast_to(rows.radius2[:, None] ** (power // 2), polynomial.shape)
-                columns.append((values.ravel(), (base + polynomial * powers + k).ravel()))
-        if not columns:
-            return sp.csr_array((size, 0))
-        values = np.stack([v for v, _ in columns], 1).ravel()
-        at = np.stack([a for _, a in columns], 1).ravel()
-        starts = len(columns) * np.arange(size + 1)
-        return sp.csr_array((values, at, starts), shape=(size, self.count))
+                index.append(self.balance_count + polynomial * len(VIGNETTING_POWERS) + k)
+                factor.append(np.broadcast_to(rows.radius2[:, None] ** (power // 2), shape))
+        return Terms(np.stack(index, -1), np.stack(factor, -1), self.count)
 
     def balance_of(self, k: Float[np.ndarray, " k"]) -> Float[np.ndarray, "c 3"]:
         """Return the log factors of each camera on the channels."""

@@ -8,10 +8,12 @@ from jaxtyping import Float
 from p2gs_jax.config import ResponseKind
 from p2gs_jax.photometry.adjustment.clusters import clusters
 from p2gs_jax.photometry.adjustment.errors import uncertainty
+from p2gs_jax.photometry.adjustment.explained import explain
+from p2gs_jax.photometry.adjustment.linear import one_thread
 from p2gs_jax.photometry.adjustment.problem import Problem
 from p2gs_jax.photometry.adjustment.result import solution_of
-from p2gs_jax.photometry.adjustment.rows import Layout, make_rows
-from p2gs_jax.photometry.adjustment.solve import Fit, complete, solve
+from p2gs_jax.photometry.adjustment.rows import make_rows
+from p2gs_jax.photometry.adjustment.solve import Fit, solve
 from p2gs_jax.photometry.adjustment.system import System, make_system
 from p2gs_jax.photometry.models import Form, ModelName
 from p2gs_jax.photometry.response import Response
@@ -21,6 +23,8 @@ from p2gs_jax.photometry.solution import PhotometricSolution
 TOLERANCE, TOLERANCE_TO_COMPARE = 1e-5, 1e-3
 # Points by which a view is solved; more only repeat them (BUILD_NOTES, "Exposures from a part").
 PER_VIEW = 1000
+# Of all views together, and what each has nevertheless.
+MOST_SOLVED, LEAST_PER_VIEW = 1_500_000, 200
 
 
 def solve_model(
@@ -47,7 +51,8 @@ def solve_model(
         problem.observations, problem.layout, weight, response, problem.log_pivot, splines or "all"
     )
     system = make_system(problem, form, splines)
-    return solve(rows, system, tolerance), system
+    with one_thread():
+        return solve(rows, system, tolerance), system
 
 
 def fit_model(
@@ -64,16 +69,14 @@ def fit_model(
     """
     response = response or Response()
     form = Form(form) if isinstance(form, str) else form
-    pick = problem.observations.thinned(PER_VIEW, 0)
-    if pick.all():
-        fit, system = solve_model(problem, form, response)
-        known = uncertainty(fit, system, clusters(problem.observations, problem.layout.row))
-        return solution_of(problem, form, response, fit, known)
-    some = problem.observations.picked(pick)
-    few = problem._replace(observations=some, layout=Layout(some), usable=problem.usable[pick])
+    o = problem.observations
+    pick = o.thinned(_per_view(o.view_count), 0)
+    few = problem if pick.all() else problem.part(pick)
     fit, system = solve_model(few, form, response)
-    known = uncertainty(fit, system, clusters(some, few.layout.row))
-    rows = make_rows(
-        problem.observations, problem.layout, problem.usable, response, problem.log_pivot
-    )
-    return solution_of(problem, form, response, complete(fit, rows), known)
+    known = uncertainty(fit, system, clusters(few.observations, few.layout.row))
+    return solution_of(problem, form, response, fit, explain(fit, problem, response), known)
+
+
+def _per_view(views: int) -> int:
+    """Return how many points of a view are solved from: fewer, where views are thousands."""
+    return int(np.clip(MOST_SOLVED / max(views, 1), LEAST_PER_VIEW, PER_VIEW))

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import scipy.sparse as sp
 from jaxtyping import Float
 
+from p2gs_jax.photometry.adjustment.matrices import Terms
 from p2gs_jax.photometry.adjustment.parameters import Unknowns
 from p2gs_jax.photometry.adjustment.rows import Rows
 
@@ -24,16 +24,16 @@ class Forward(NamedTuple):
 
     rows: Rows
     unknowns: Unknowns
-    features: sp.csr_array | None
-    basis: sp.csr_array | None
+    features: Terms | None
+    basis: Terms | None
 
     @classmethod
     def of(cls, rows: Rows, unknowns: Unknowns) -> Forward:
         """Return the model with its features laid out."""
         u = unknowns
-        features = u.features.matrix(rows) if u.features.count else None
-        return cls(rows, u, features, u.splines.matrix(rows) if u.splines.count else None)
+        features = u.features.terms(rows) if u.features.count else None
+        return cls(rows, u, features, u.splines.terms(rows) if u.splines.count else None)
 
     def of_cameras(self, k: Float[np.ndarray, " k"]) -> Float[np.ndarray, "o 3"] | float:
         """Return what cameras add to the log radiance of every value."""
-        return 0.0 if self.features is None else (self.features @ k).reshape(-1, 3)
+        return 0.0 if self.features is None else self.features.of(k)

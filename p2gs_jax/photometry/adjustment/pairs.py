@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import scipy.sparse as sp
 from jaxtyping import Float, Int
+
+from p2gs_jax.photometry.adjustment.matrices import Entries
 
 # Pairs whose products are formed at once: they stay in the cache.
 CHUNK = 1 << 15
@@ -46,7 +47,7 @@ class Pairs:
         factors: list[Float[np.ndarray, "o f"]],
         shared: list[list[tuple[int, int]]],
         kind: type[np.floating] = np.float64,
-    ) -> sp.csr_array:
+    ) -> Entries:
         """Return the sum over rows of outer products of per-view vectors: (x V, x V).
 
         Args:
@@ -78,9 +79,11 @@ class Pairs:
                 total += np.bincount(place, products, len(total))
         at_row = [self._rows + k // count * views for k in used]
         at_column = [self._columns + k % count * views for k in used]
-        size = count * views
-        once = sp.csr_array(
-            (totals.ravel(), (np.concatenate(at_row), np.concatenate(at_column))),
-            shape=(size, size),
+        rows, columns = np.concatenate(at_row), np.concatenate(at_column)
+        totals = totals.ravel()
+        # The other order of each pair.
+        return Entries(
+            np.concatenate([rows, columns]),
+            np.concatenate([columns, rows]),
+            np.concatenate([totals, totals]),
         )
-        return sp.csr_array(once + once.T)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple
+import functools
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from p2gs_jax.photometry.adjustment.rows import Layout
 from p2gs_jax.photometry.observations import Observations
@@ -25,24 +25,33 @@ class KnownExposures:
     deviation_ev: float = 0.0
 
 
-class Problem(NamedTuple):
+@dataclass(frozen=True)
+class Problem:
     """Observations laid out once, for any number of models.
 
     Attributes:
         observations: the colours.
-        layout: where each lies.
-        usable: 1 where a value can be used.
+        usable: which values can be used.
         component: label of each view.
         log_pivot: log of the value that gamma leaves alone.
         known: exposures known beforehand, or None.
     """
 
     observations: Observations
-    layout: Layout
-    usable: Float[np.ndarray, "o 3"]
+    usable: Bool[np.ndarray, "o 3"]
     component: Int[np.ndarray, " v"]
     log_pivot: float
     known: KnownExposures | None
+
+    @functools.cached_property
+    def layout(self) -> Layout:
+        """Where each observation lies."""
+        return Layout(self.observations)
+
+    def part(self, pick: np.ndarray | slice) -> Problem:
+        """Return some of the observations, chosen by a mask or their rows."""
+        some = self.observations.picked(pick)
+        return replace(self, observations=some, usable=self.usable[pick])
 
 
 def make_problem(
@@ -65,7 +74,6 @@ def make_problem(
     usable = observations.usable(black, saturation)
     return Problem(
         observations,
-        Layout(observations),
         usable,
         observations.components(usable),
         float(np.log(pivot)),

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from p2gs_jax.config import CameraFormation
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.photometry.adjustment.errors import Uncertainty
+from p2gs_jax.photometry.adjustment.explained import Explained
 from p2gs_jax.photometry.adjustment.parameters import Parameters
 from p2gs_jax.photometry.adjustment.problem import Problem
 from p2gs_jax.photometry.adjustment.solve import Fit
@@ -19,12 +20,14 @@ from p2gs_jax.photometry.response import Response
 from p2gs_jax.photometry.solution import MIN_OBSERVATIONS, PhotometricSolution
 from p2gs_jax.types import GAMMA_SRGB
 
-# Observations that count less than this share of what their noise alone would give are ignored.
-IGNORED = 0.25
-
 
 def solution_of(
-    problem: Problem, form: Form, response: Response, fit: Fit, known: Uncertainty
+    problem: Problem,
+    form: Form,
+    response: Response,
+    fit: Fit,
+    explained: Explained,
+    known: Uncertainty,
 ) -> PhotometricSolution:
     """Return exposures in their gauge, with errors and warnings.
 
@@ -32,7 +35,8 @@ def solution_of(
         problem: all observations.
         form: what varies.
         response: what decoded the colours.
-        fit: the parameters; radiances and residuals of all observations.
+        fit: the parameters.
+        explained: radiances and residuals of all observations.
         known: how sure the parameters are.
     """
     o, component = problem.observations, problem.component
@@ -71,11 +75,8 @@ def solution_of(
     shifts = shift[:, None] + color.shift(_broad(light, 3) - _broad(light, 3).mean(1)[:, None])
     h = np.where(active, h - shift, 0.0)
 
-    used = problem.usable > 0
-    residual = fit.at.residual / a[o.views][:, None]
+    used, residual = problem.usable, explained.residual
     view_residual, tint = _per_view_ev(o.views, residual, used, o.view_count)
-    ideal = 1 / o.decoded(response)[1] ** 2
-    ignored = (fit.at.weight / ideal)[used] < IGNORED
     cameras, corner_errors = camera_formations(fit, response, known, o)
     return PhotometricSolution(
         model=form.model,
@@ -86,11 +87,11 @@ def solution_of(
         gamma_errors=np.where(seen, gamma / a * a_errors, np.inf),
         observations_per_view=per_view,
         component=component,
-        point_log_radiance=_point_radiance(problem, fit, shifts),
+        point_log_radiance=_point_radiance(problem, explained, shifts),
         residual_ev=_spread_ev(residual[used]) if used.any() else 0.0,
         view_residual_ev=view_residual,
         view_balance_ev=tint,
-        outliers=float(ignored.mean()) if ignored.size else 0.0,
+        outliers=explained.outliers,
         rounds=fit.rounds,
         moved=fit.moved,
         converged=fit.converged,
@@ -189,21 +190,14 @@ def camera_formations(
 
 
 def _point_radiance(
-    problem: Problem, fit: Fit, shifts: Float[np.ndarray, "v 3"]
+    problem: Problem, explained: Explained, shifts: Float[np.ndarray, "v 3"]
 ) -> Float[np.ndarray, "p 3"]:
-    """Combine the rows of each point; the gauge shift of its views goes the other way."""
-    o, layout = problem.observations, problem.layout
-    precision, level = fit.at.precision, fit.at.radiance
-    total = np.zeros((o.point_count, 3))
-    weight = np.zeros((o.point_count, 3))
-    np.add.at(total, layout.point_of_row, precision * level)
-    np.add.at(weight, layout.point_of_row, precision)
-    moved = np.zeros((o.point_count, 3))
+    """Return log radiance in the gauge: the shift of a point's views goes the other way."""
+    o = problem.observations
     seen = problem.usable.any(1)
-    moved[o.points[seen]] = shifts[o.views[seen]]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        level = total / weight + moved + problem.log_pivot
-    return np.where(weight > 0, level, np.nan)
+    some_view = np.zeros(o.point_count, int)
+    some_view[o.points[seen]] = o.views[seen]
+    return explained.log_radiance + shifts[some_view] + problem.log_pivot
 
 
 def _spread_ev(residual: Float[np.ndarray, " n"]) -> float:

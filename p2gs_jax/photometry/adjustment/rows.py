@@ -106,9 +106,9 @@ class Layout:
         return Pairs(self.row, self._views, self._view_count)
 
     @functools.cached_property
-    def by_row_and_channel(self) -> sp.csr_array:
-        """Sums values over the rows of their observations, channels apart: (3 r, 3 o)."""
-        return sp.csr_array(sp.kron(self.by_row, sp.eye_array(3), format="csr"))
+    def by_view(self) -> Int[np.ndarray, " o"]:
+        """Observations sorted by view."""
+        return np.argsort(self._views, kind="stable")
 
 
 def make_rows(

@@ -10,11 +10,11 @@ import functools
 from typing import NamedTuple
 
 import numpy as np
-import scipy.sparse as sp
 from jaxtyping import Float
 
 from p2gs_jax.photometry.adjustment.forward import Forward
 from p2gs_jax.photometry.adjustment.linear import Balanced
+from p2gs_jax.photometry.adjustment.matrices import Matrix
 from p2gs_jax.photometry.adjustment.normal import normal_equations
 from p2gs_jax.photometry.adjustment.parameters import Parameters
 from p2gs_jax.photometry.adjustment.robust import Loss, Weighted, noise_weight, weigh
@@ -43,7 +43,7 @@ class Fit(NamedTuple):
     theta: Parameters
     at: Weighted
     model: Forward
-    normal: sp.csr_array
+    normal: Matrix
     rounds: int
     moved: float
     left: float
@@ -71,8 +71,8 @@ def _next(model: Forward, system: System, last: _Round, loss: Loss) -> _Round:
     theta, u = last.theta, system.unknowns
     at = weigh(model, theta, last.weight, loss)
     normal, right = normal_equations(model, theta, at, np.float32)
-    normal, right = with_priors(system, theta, normal, right)
-    step = u.split(Balanced(normal, system.basis).solve(right))
+    normal, gauges, right = with_priors(system, theta, normal, right)
+    step = u.split(Balanced(normal, gauges, system.basis).solve(right))
     new = Parameters(
         theta.b + step.b,
         np.clip(theta.a + step.a, *A_RANGE),
@@ -115,18 +115,3 @@ def solve(rows: Rows, system: System, tolerance: float) -> Fit:
         left=moved**2 / (before - moved) if moved < before else np.inf if moved else 0.0,
         converged=moved < tolerance,
     )
-
-
-def complete(fit: Fit, rows: Rows) -> Fit:
-    """Return the solution of some observations with radiances and residuals of all of them.
-
-    Args:
-        fit: from `solve`, on some of the observations; its parameters and errors stay.
-        rows: all observations.
-    """
-    rest: tuple[Loss, ...] = ("l1", "geman_mcclure", "geman_mcclure")
-    model = Forward.of(rows, fit.model.unknowns)
-    at = weigh(model, fit.theta, noise_weight(rows), "l1")
-    for loss in rest:
-        at = weigh(model, fit.theta, at.weight, loss)
-    return fit._replace(at=at)

@@ -9,6 +9,7 @@ import scipy.sparse as sp
 from jaxtyping import Float
 
 from p2gs_jax.config import ResponseKind
+from p2gs_jax.photometry.adjustment.matrices import Terms
 from p2gs_jax.photometry.adjustment.rows import Rows
 from p2gs_jax.photometry.response import FLOOR, HELD, KNOTS, SMALLEST_SLOPE, free_knots
 
@@ -49,17 +50,14 @@ class Splines:
         full[:, self.free] = c.reshape(self.groups, -1)
         return full
 
-    def matrix(self, rows: Rows) -> sp.csr_array:
-        """Return the basis at every value, free knots only: (3 o, count), channels fastest."""
-        size = rows.knot.size
-        knot, fraction = rows.knot.ravel(), rows.fraction.ravel()
-        values = np.stack([1 - fraction, fraction], 1).ravel()
-        left = rows.group.ravel() * len(KNOTS) + knot
-        columns = np.stack([left, left + 1], 1).ravel()
-        shape = (size, self.groups * len(KNOTS))
-        whole = sp.csr_array((values, columns, 2 * np.arange(size + 1)), shape=shape)
-        kept = (len(KNOTS) * np.arange(self.groups)[:, None] + self.free).ravel()
-        return sp.csr_array(whole[:, kept])
+    def terms(self, rows: Rows) -> Terms:
+        """Return the basis at every value; knots that are held are no parameters."""
+        place = np.full(len(KNOTS), -1)
+        place[self.free] = np.arange(len(self.free))
+        knots = np.stack([rows.knot, rows.knot + 1], -1)
+        index = rows.group[..., None] * len(self.free) + place[knots]
+        index = np.where(place[knots] < 0, self.count, index)
+        return Terms(index, np.stack([1 - rows.fraction, rows.fraction], -1), self.count)
 
     def decode(
         self, rows: Rows, c: Float[np.ndarray, " k"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 import scipy.sparse as sp
@@ -12,6 +13,7 @@ from jaxtyping import Float
 from p2gs_jax.config import Level, ResponseKind
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.photometry.adjustment.features import Features
+from p2gs_jax.photometry.adjustment.matrices import Matrix
 from p2gs_jax.photometry.adjustment.parameters import Parameters, Unknowns
 from p2gs_jax.photometry.adjustment.problem import Problem
 from p2gs_jax.photometry.adjustment.spline import Splines
@@ -75,6 +77,11 @@ class System:
     priors: Held
     log_exposure: Float[np.ndarray, " v"]
     smoothness: Float[np.ndarray, "k k"]
+
+    @property
+    def directions(self) -> int:
+        """Number of free directions."""
+        return cast(tuple[int, int], self.basis.shape)[1]
 
     @property
     def start(self) -> Parameters:
@@ -182,7 +189,7 @@ def _priors(u: Unknowns, log_exposure, precision) -> Held:
     exposures = sp.csr_array(
         (values, (np.tile(at, u.channels + 1), columns)), shape=(len(given), u.count)
     )
-    whole = sp.eye_array(u.count, format="csr")
+    whole = sp.csr_array(sp.eye_array(u.count))
     of_a = whole[u.of_a.start + views] if u.gammas else whole[:0]
     lenses = np.arange(u.of_k.start + u.features.balance_count, u.of_k.stop)
     rows = sp.vstack([exposures, of_a, whole[lenses]])
@@ -208,7 +215,7 @@ def _smoothness(splines: Splines) -> Float[np.ndarray, "k k"]:
     return np.kron(np.eye(splines.groups), SMOOTHNESS * second.T @ second)
 
 
-def gauge_strength(normal: sp.csr_array, unknowns: Unknowns) -> float:
+def gauge_strength(normal: Matrix, unknowns: Unknowns) -> float:
     """Return how hard the anchors hold, on the scale of the exposures' information.
 
     Args:
@@ -220,9 +227,11 @@ def gauge_strength(normal: sp.csr_array, unknowns: Unknowns) -> float:
 
 
 def with_priors(
-    system: System, theta: Parameters, normal: sp.csr_array, right: Float[np.ndarray, " d"]
-) -> tuple[sp.csr_array, Float[np.ndarray, " d"]]:
-    """Return normal equations with priors and gauges.
+    system: System, theta: Parameters, normal: Matrix, right: Float[np.ndarray, " d"]
+) -> tuple[Matrix, sp.csr_array, Float[np.ndarray, " d"]]:
+    """Return normal equations with priors, the rows of the gauges, and the right side of both.
+
+    A gauge is a mean over views: of thousands, its normal matrix would not be sparse.
 
     Args:
         system: priors and gauges.
@@ -234,12 +243,11 @@ def with_priors(
     normal = normal + system.priors.normal
     right = right + system.priors.pull(vector)
     strength = gauge_strength(normal, u)
-    normal = normal + strength * system.anchors.normal
     right = right + strength * system.anchors.pull(vector)
     if theta.c.size:
         stiffness = float(np.mean(normal.diagonal()[u.of_c]))
-        smooth = sp.csr_array(stiffness * system.smoothness)
+        smooth = stiffness * system.smoothness
         before = sp.csr_array((u.of_c.start,) * 2)
         normal = normal + sp.block_diag([before, smooth], format="csr")
         right = right - np.concatenate([np.zeros(u.of_c.start), smooth @ theta.c])
-    return sp.csr_array(normal), right
+    return normal, np.sqrt(strength) * system.anchors.rows, right

@@ -1,0 +1,131 @@
+"""What the comparisons with learned cameras share: one look for held-out views, and what was found.
+
+Methods keep what cameras do to the light in different places: `Photometry` and the configuration
+(ours), a matrix or grid per view (3dgs_affine, 3dgs_bilateral), or PPISP's own parameters.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+import p2gs_jax
+from p2gs_jax.config import FitConfig
+from p2gs_jax.core.numerics import LN2
+from p2gs_jax.photometry.ppisp.homography import recolored
+from p2gs_jax.photometry.ppisp.parameters import Ppisp
+from p2gs_jax.photometry.ppisp.vignetting import falloff
+
+# Grey that a colour correction is applied to, where it is no factor per channel.
+GREY = 0.18
+
+
+def configs(names: Sequence[str], **train: Any) -> dict[str, FitConfig]:
+    """Return presets under a budget; those that this version has not are named on stderr.
+
+    Args:
+        names: of presets.
+        train: fields of `TrainConfig`.
+    """
+    found = {}
+    for name in names:
+        try:
+            cfg = p2gs_jax.preset(name)  # pyright: ignore[reportArgumentType]
+        except p2gs_jax.UserError as error:
+            print(f"{name} is skipped: {error}", file=sys.stderr, flush=True)
+            continue
+        found[name] = dataclasses.replace(cfg, train=dataclasses.replace(cfg.train, **train))
+    return found
+
+
+def mean_of_rows(run: p2gs_jax.Run, rows: Sequence[int]) -> p2gs_jax.Run:
+    """Return a run all of whose training views have the mean parameters of some of them.
+
+    Args:
+        run: the run.
+        rows: of the training views that are averaged: exposures as logarithms, where the run has
+            them so.
+    """
+    taken = jnp.asarray(rows)
+
+    def mean(values):
+        return jnp.broadcast_to(jnp.asarray(values)[taken].mean(0), np.shape(values))
+
+    photometry, appearance = jax.tree.map(mean, run.params.photometry), run.params.appearance
+    if isinstance(appearance, Ppisp):
+        # All else is the cameras'.
+        per_view = {k: mean(getattr(appearance, k)) for k in ("exposures", "colors")}
+        appearance = dataclasses.replace(appearance, **per_view)
+    elif appearance is not None:
+        appearance = mean(appearance)
+    params = dataclasses.replace(run.params, photometry=photometry, appearance=appearance)
+    return dataclasses.replace(run, params=params)
+
+
+def common_display(
+    run: p2gs_jax.Run, rows: Sequence[int]
+) -> Callable[[int], p2gs_jax.DisplayTransform]:
+    """Return how any view is shown under the mean parameters of some training views.
+
+    Args:
+        run: the run.
+        rows: of the training views.
+    """
+    averaged, views = mean_of_rows(run, rows), run.scene.views
+    of_camera = {views[i].camera: i for i in reversed(run.scene.train_indices)}
+    return lambda index: averaged.own_display(of_camera[views[index].camera])
+
+
+class Found(NamedTuple):
+    """What a method found of the cameras; None where it has no such part.
+
+    Attributes:
+        exposures_ev: of every training view.
+        balance_ev: of red, green and blue beside the exposure.
+        corners: share of the light that reaches the corners of each camera's images.
+    """
+
+    exposures_ev: Float[np.ndarray, " v"] | None
+    balance_ev: Float[np.ndarray, "v 3"] | None
+    corners: dict[str, float] | None
+
+
+def found_by(run: p2gs_jax.Run) -> Found:
+    """Return what a run found of exposures, white balances and vignetting."""
+    appearance = run.params.appearance
+    if isinstance(appearance, Ppisp):
+        return _found_by_ppisp(run, appearance)
+    p, cameras = run.params.photometry, run.cfg.photometry.cameras
+    exposures = np.log2(np.asarray(p.exposures, np.float64))
+    if appearance is not None or run.cfg.photometry.curve == "linear":
+        varies = np.ptp(exposures) > 0
+        return Found(exposures if varies else None, None, None)
+    balance = p.white_balance
+    zeros = np.zeros((len(exposures), 3))
+    corners = {view.camera: 1.0 for view in run.scene.views}
+    corners |= {
+        c.name: float(np.exp(np.sum(c.vignetting, 1)).mean()) for c in cameras if c.vignetting
+    }
+    return Found(exposures, zeros if balance is None else np.asarray(balance) / LN2, corners)
+
+
+def _found_by_ppisp(run: p2gs_jax.Run, learned: Ppisp) -> Found:
+    """Return PPISP's parameters; its colour correction as the factors that it has on grey."""
+    grey = jnp.full(3, GREY)
+    colored = jax.vmap(lambda color: recolored(grey, color))(jnp.asarray(learned.colors))
+    stops = np.log2(np.maximum(np.asarray(colored), 1e-6) / GREY)
+    mean = stops.mean(1, keepdims=True)
+    corners = {}
+    for name, parameters in zip(learned.names, learned.vignettings, strict=True):
+        view = next(v for v in run.scene.views if v.camera == name)
+        light = np.asarray(falloff(jnp.asarray(parameters), view.height, view.width))
+        corners[name] = float(light[[0, 0, -1, -1], [0, -1, 0, -1]].mean())
+    exposures = np.asarray(learned.exposures, np.float64) + mean[:, 0]
+    return Found(exposures, stops - mean, corners)

@@ -1,0 +1,262 @@
+"""One scene photographed in several exposures: what each method makes of the mixture.
+
+python experiments/lom_mixtures.py LOM_SCENE... [--groups low high] [--budget-min 3] --out DIR
+
+Every view of a LOM scene draws one of the groups of exposures (`mixtures.py`); all methods are
+fitted to this mixture for equal steps and, with --budget-min, for equal minutes. The table has
+
+- the spread of solved exposures within each group (in truth 0), from `calibrate` and after the fit;
+- PSNR of held-out views under their own exposure, fitted to each photograph: exposure alone, and
+  everything that the method has per view (dark photographs score high by their darkness);
+- PSNR of held-out views under one common exposure against the `high` photographs. One transform
+  serves all of them: for methods with parameters per view (exposure, gamma, white balance, colour
+  correction) their mean over the training views of the group `high`, and nothing where a method
+  has none. No held-out or reference photograph is used to find it.
+
+No photograph of these scenes may be in this project: keep --out outside of it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from judging import common_display, configs, found_by
+from mixtures import GROUPS, REFERENCE, read_groups, spread_by_group, write_mixture
+
+import p2gs_jax
+from p2gs_jax.config import FitConfig
+from p2gs_jax.core.atomic import write_json, write_text
+from p2gs_jax.evaluate.metrics import psnr
+from p2gs_jax.evaluate.references import load_reference
+from p2gs_jax.formats.png import write_png
+from p2gs_jax.paths.captioned_images import CaptionedImage, stacked
+
+METHODS = ("robust", "ppisp", "ppisp_solved", "3dgs", "3dgs_affine", "3dgs_bilateral")
+# Contact sheet: methods shown between the photograph and the reference, and held-out views.
+SHOWN, SHEET_ROWS = ("robust", "3dgs_affine"), 3
+# Scores of held-out views that fit the exposure alone, or nothing.
+NOT_ALL = frozenset({"averaged", "exposure_fitted"})
+
+
+# ------------------------------------------------------------------ the common exposure
+
+
+def rows_of_group(run: p2gs_jax.Run, groups: dict[str, str], group: str) -> list[int]:
+    """Return the rows of the training views that drew a group.
+
+    Raises:
+        SystemExit: there are none.
+    """
+    names = [Path(view.name).stem for view in run.scene.training_views]
+    rows = [row for row, name in enumerate(names) if groups[name] == group]
+    if not rows:
+        raise SystemExit(f"no training view of {run.folder} is in the group {group}")
+    return rows
+
+
+class Common(NamedTuple):
+    """Held-out views under the common exposure.
+
+    Attributes:
+        run: the fit.
+        psnr: mean over them.
+        pictures: display values by row of the view.
+    """
+
+    run: p2gs_jax.Run
+    psnr: float
+    pictures: dict[int, np.ndarray]
+
+
+def under_common_exposure(run: p2gs_jax.Run, groups: dict[str, str]) -> Common:
+    """Render held-out views under the exposure of the reference photographs and compare."""
+    scene = run.scene
+    display = common_display(run, rows_of_group(run, groups, REFERENCE))
+    reference = load_reference(scene.root / "reference", scene, run.cfg)
+    scores, pictures = [], {}
+    for index in scene.test_indices:
+        ldr = p2gs_jax.develop(run.render(run.camera(index)).linear, display(index))
+        target, (_, mask) = reference(index), run.store.get(index, 1)
+        assert target is not None
+        scores.append(float(psnr(ldr, target, mask)))
+        pictures[index] = ldr
+    return Common(run, float(np.mean(scores)), pictures)
+
+
+# ------------------------------------------------------------------ rows
+
+
+def calibrated(scene: Path, out: Path) -> dict[str, Any]:
+    """Return the row of `calibrate`: exposures without any fit."""
+    if not (out / "photometry.json").is_file():
+        p2gs_jax.calibrate(scene, out)
+    views = json.loads((out / "photometry.json").read_text())["views"]
+    evs = {v["image"]: v["exposure_ev"] for v in views if v["exposure_ev"] is not None}
+    return {"method": "calibrate", "spread_ev": spread_by_group(evs, read_groups(scene))}
+
+
+def spreads(run: p2gs_jax.Run, groups: dict[str, str]) -> dict[str, float]:
+    """Return the spread within every group, EV; nothing where a run has no exposures."""
+    evs = found_by(run).exposures_ev
+    if evs is None:
+        return {}
+    names = (view.name for view in run.scene.training_views)
+    return spread_by_group(dict(zip(names, evs, strict=True)), groups)
+
+
+def judged(method: str, folder: Path, scene: Path) -> tuple[dict[str, Any], Common]:
+    """Return a finished run's row and its pictures."""
+    groups = read_groups(scene)
+    run = p2gs_jax.load_run(folder)
+    common = under_common_exposure(run, groups)
+    metrics = json.loads((folder / "metrics.json").read_text())
+    test = metrics["test"]
+    all_fitted = [v["psnr"] for k, v in test.items() if k not in NOT_ALL and "psnr" in v]
+    row = {
+        "method": method,
+        "spread_ev": spreads(run, groups),
+        "own_exposure": test["exposure_fitted"]["psnr"],
+        # The protocol that fits most comes last.
+        "own_all": all_fitted[-1] if all_fitted else test["exposure_fitted"]["psnr"],
+        "common": common.psnr,
+        "steps": metrics["counts"]["steps"],
+        "seconds": metrics["seconds"]["optimisation"],
+    }
+    return row, common
+
+
+def measure(
+    scene: Path, out: Path, under: dict[str, FitConfig]
+) -> tuple[list[dict[str, Any]], dict[str, Common]]:
+    """Fit all methods to a mixture and judge them; finished fits are kept.
+
+    Args:
+        scene: the mixture.
+        out: folder of the runs.
+        under: configuration of each method.
+    """
+    result = p2gs_jax.sweep.sweep(
+        scene,
+        out,
+        under,
+        reference=scene / "reference",
+        report=lambda line: print(f"{scene.name} {line}", file=sys.stderr, flush=True),
+    )
+    rows, shown = [], {}
+    for found in result.rows:
+        name = found["name"]
+        if found["status"] != "done":
+            rows.append({"method": name, "failed": found["reason"]})
+            continue
+        row, shown[name] = judged(name, Path(found["run"]), scene)
+        rows.append(row)
+    return rows, shown
+
+
+# ------------------------------------------------------------------ what is written
+
+
+def to_markdown(rows: list[dict[str, Any]], groups: Sequence[str]) -> str:
+    """Return the table of one mixture and budget."""
+    header = [
+        "method",
+        *(f"spread {g}, EV" for g in groups),
+        "held out, exposure fitted, dB",
+        "held out, all fitted, dB",
+        "held out, common exposure, dB",
+        "steps",
+        "seconds of steps",
+    ]
+    lines = ["| " + " | ".join(header) + " |", "|---|" + "---:|" * (len(header) - 1)]
+
+    def number(value: float | None, digits: int) -> str:
+        return "" if value is None else f"{value:.{digits}f}"
+
+    for row in rows:
+        if "failed" in row:
+            lines.append(
+                f"| {row['method']} | failed: {row['failed']} |" + " |" * (len(header) - 2)
+            )
+            continue
+        cells = [row["method"], *(number(row["spread_ev"].get(g), 3) for g in groups)]
+        cells += [number(row.get(k), 2) for k in ("own_exposure", "own_all", "common")]
+        cells += [number(row.get(k), 0) for k in ("steps", "seconds")]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def contact_sheet(path: Path, scene: Path, shown: dict[str, Common]) -> None:
+    """Write held-out views: as photographed, under the common exposure, and the reference.
+
+    Args:
+        path: PNG file.
+        scene: the mixture.
+        shown: pictures of the methods.
+    """
+    run, groups = next(iter(shown.values())).run, read_groups(scene)
+    reference = load_reference(scene / "reference", run.scene, run.cfg)
+    held = run.scene.test_indices
+    picked = sorted({held[round(k)] for k in np.linspace(0, len(held) - 1, SHEET_ROWS)})
+    rows = []
+    for index in picked:
+        name = Path(run.scene.views[index].name).stem
+        columns = [("as photographed", run.photograph(index))]
+        columns += [(m, c.pictures[index]) for m, c in shown.items()]
+        target = reference(index)
+        assert target is not None
+        columns.append((f"photographed as {REFERENCE}", target))
+        width = columns[0][1].shape[1]
+        captions = [(text, k * width, (k + 1) * width) for k, (text, _) in enumerate(columns)]
+        picture = np.concatenate([image for _, image in columns], axis=1)
+        title = f"{scene.name}, view {name}: drew {groups[name]}; methods under the common exposure"
+        rows.append(CaptionedImage(title, picture, captions))
+    write_png(path, stacked(rows))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scenes", type=Path, nargs="+", help="LOM scene folders")
+    parser.add_argument("--out", type=Path, default=Path(tempfile.gettempdir(), "lom_mixtures"))
+    parser.add_argument("--groups", nargs="+", default=list(GROUPS), choices=GROUPS)
+    parser.add_argument("--methods", nargs="+", default=list(METHODS), help="presets")
+    parser.add_argument("--steps", type=int, default=600)
+    parser.add_argument("--budget-min", type=float, help="equal minutes as well")
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
+    if args.out.resolve().is_relative_to(Path(__file__).resolve().parents[1]):
+        raise SystemExit("--out is inside this project, where no picture of these scenes may be.")
+    if REFERENCE not in args.groups:
+        raise SystemExit(f"--groups needs {REFERENCE}: the common exposure is that of this group.")
+    budgets: dict[str, dict[str, Any]] = {f"steps_{args.steps}": {"steps": args.steps}}
+    if args.budget_min:
+        budgets[f"minutes_{args.budget_min:g}"] = {"budget_s": 60 * args.budget_min}
+    tables, text = {}, []
+    for lom in args.scenes:
+        scene = args.out / f"{lom.name}_{'_'.join(args.groups)}"
+        if not scene.exists():
+            write_mixture(lom, scene, args.groups)
+        of_calibrate = calibrated(scene, args.out / "calibrations" / scene.name)
+        for name, train in budgets.items():
+            out = args.out / "runs" / scene.name / name
+            under = configs(args.methods, seed=args.seed, **train)
+            rows, shown = measure(scene, out, under)
+            rows.insert(0, of_calibrate)
+            tables[f"{scene.name}/{name}"] = rows
+            text.append(f"### {scene.name}, {name}\n\n{to_markdown(rows, args.groups)}")
+            print(text[-1], flush=True)
+            kept = {m: shown[m] for m in SHOWN if m in shown}
+            if kept:
+                contact_sheet(args.out / f"{scene.name}_{name}.png", scene, kept)
+    write_json(args.out / "lom_mixtures.json", tables)
+    write_text(args.out / "lom_mixtures.md", "\n".join(text))
+
+
+if __name__ == "__main__":
+    main()

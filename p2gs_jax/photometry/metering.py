@@ -1,0 +1,345 @@
+"""Metering: an exposure for a picture nobody took, from the radiance that it shows.
+
+A meter reads one number from linear radiance; a rule turns readings into an exposure. Given rules
+are what cameras print in their manuals (mid-grey for the log average, white for the highlights);
+the fitted one is whichever of them predicts the exposures that the camera itself chose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from jaxtyping import Float
+
+from p2gs_jax.config import PhotometryConfig
+from p2gs_jax.core.numerics import LN2
+from p2gs_jax.photometry.formation import inverse_tone_map
+from p2gs_jax.types import Render
+
+MeterName = Literal[
+    "log_average",
+    "display_average",
+    "average",
+    "centre_log_average",
+    "centre_average",
+    "highlights",
+]
+METERS: tuple[MeterName, ...] = get_args(MeterName)
+WORDS: dict[str, str] = {
+    "log_average": "log average",
+    "display_average": "average of display values",
+    "average": "average",
+    "centre_log_average": "centre-weighted log average",
+    "centre_average": "centre-weighted average",
+    "highlights": "highlights (99th percentile)",
+}
+GivenRule = Literal["log_average", "centre", "highlights", "protected"]
+ExposureOf = Literal["auto"] | GivenRule
+Readings = Mapping[str, float]
+
+# Weights of linear red, green and blue in luminance (BT.709).
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+HIGHLIGHT = 99.0
+# Standard deviation of the weights about the centre, half diagonals.
+CENTRE = 0.4
+# Luminance this far below the mean counts as that: nothing that a picture shows is darker.
+DARKEST = 2.0**-12
+# Less opaque pixels than this share of the picture are no picture.
+LEAST_SEEN = 0.01
+MID_GREY, BELOW_WHITE = 0.18, 0.98
+# More pixels than about this many tell no more.
+PIXELS = 100_000
+# Views are left out in at most this many stretches: neighbours in a video know each other's answer.
+FOLDS = 12
+FEWEST_VIEWS = 6
+# A rule explains the camera if it leaves at most this share of what a constant leaves, left out.
+EXPLAINS = 0.8
+# Exposures that vary less, stops, are constant whatever predicts them.
+NEGLIGIBLE_EV = 0.05
+# A rule with more free numbers must leave less than this share of what a simpler one leaves.
+WORTH_A_NUMBER = 0.85
+
+
+def meter(linear: Float[np.ndarray, "h w 3"], alpha: Float[np.ndarray, "h w"]) -> dict[str, float]:
+    """Return what every meter reads, natural logarithm of luminance; NaN where nothing is seen.
+
+    Args:
+        linear: radiance, premultiplied by `alpha`.
+        alpha: opacity.
+    """
+    step = max(1, int(np.sqrt(alpha.size / PIXELS)))
+    weight = np.asarray(alpha[::step, ::step], np.float64)
+    light = np.asarray(linear[::step, ::step], np.float64) @ LUMINANCE
+    seen = (weight > 0) & np.isfinite(light)
+    if weight[seen].sum() < LEAST_SEEN * weight.size:
+        return dict.fromkeys(METERS, float("nan"))
+    height, width = weight.shape
+    y, x = np.mgrid[:height, :width] + 0.5
+    squared = ((x - width / 2) ** 2 + (y - height / 2) ** 2) / ((width**2 + height**2) / 4)
+    central = (weight * np.exp(-squared / (2 * CENTRE**2)))[seen]
+    weight, light = weight[seen], np.maximum(light[seen] / weight[seen], 0.0)
+    floor = max(DARKEST * float(np.average(light, weights=weight)), np.finfo(float).tiny)
+    light = np.maximum(light, floor)
+    logs = np.log(light)
+    order = np.argsort(light)
+    below = np.cumsum(weight[order])
+    top = order[np.searchsorted(below, HIGHLIGHT / 100 * below[-1])]
+    return {
+        "log_average": float(np.average(logs, weights=weight)),
+        "display_average": 2.2 * float(np.log(np.average(light ** (1 / 2.2), weights=weight))),
+        "average": float(np.log(np.average(light, weights=weight))),
+        "centre_log_average": float(np.average(logs, weights=central)),
+        "centre_average": float(np.log(np.average(light, weights=central))),
+        "highlights": float(logs[top]),
+    }
+
+
+def white_level(gamma: float, cfg: PhotometryConfig) -> float:
+    """Return the exposed radiance that is shown just below white.
+
+    Args:
+        gamma: of the display.
+        cfg: its tone curve.
+    """
+    shown = np.array(BELOW_WHITE, np.float32)
+    return float(inverse_tone_map(shown, np.float32(gamma), cfg))
+
+
+@dataclass(frozen=True)
+class Rule:
+    """log e = offset - sum of slope times reading.
+
+    Attributes:
+        meters: what is read; none: a constant exposure.
+        slopes: of each meter: 1 keeps its reading constant, 0 ignores it.
+        offset: natural logarithm.
+        residual_ev: RMS of the exposures about it, stops.
+        left_out_ev: the same where each was predicted by a rule that was fitted without it.
+    """
+
+    meters: tuple[str, ...]
+    slopes: tuple[float, ...]
+    offset: float
+    residual_ev: float = float("nan")
+    left_out_ev: float = float("nan")
+
+    def log_exposure(self, readings: Readings) -> float:
+        """Return the natural logarithm of the exposure; NaN where a meter read nothing."""
+        taken = zip(self.slopes, self.meters, strict=True)
+        return self.offset - sum(slope * readings[name] for slope, name in taken)
+
+    @property
+    def words(self) -> str:
+        """What people call it."""
+        if not self.meters:
+            return "constant"
+        parts = [
+            WORDS.get(name, name) + ("" if slope == 1 else f" (slope {slope:.2f})")
+            for name, slope in zip(self.meters, self.slopes, strict=True)
+        ]
+        return " and ".join(parts)
+
+
+@dataclass(frozen=True)
+class Metering:
+    """How exposures of new pictures are chosen, and what explains those of the photographs.
+
+    Attributes:
+        rule: what `auto` follows: the rule that explains the photographs, or a constant.
+        candidates: all rules that were compared, best first.
+        white: exposed radiance that is shown just below white.
+        names: of the training views.
+        readings: of their renders, a row a view, a column for each of `METERS`.
+    """
+
+    rule: Rule
+    candidates: tuple[Rule, ...]
+    white: float
+    names: tuple[str, ...]
+    readings: Float[np.ndarray, "v k"]
+
+    @property
+    def constant(self) -> Rule:
+        """The rule that reads nothing: the geometric mean of the training exposures."""
+        return next(rule for rule in self.candidates if not rule.meters)
+
+    def log_exposure(self, readings: Readings, of: ExposureOf = "auto") -> float:
+        """Return the natural logarithm of the exposure of a picture.
+
+        Args:
+            readings: from `meter`; where nothing was seen the exposure is the mean.
+            of: `auto` follows `rule`; `log_average` and `centre` bring that to mid-grey;
+                `highlights` brings the 99th percentile just below white; `protected` is the log
+                average, or `highlights` where that would clip them.
+        """
+        grey, white = np.log(MID_GREY), np.log(self.white)
+        if of == "auto":
+            found = self.rule.log_exposure(readings)
+        elif of == "highlights":
+            found = white - readings["highlights"]
+        else:
+            found = grey - readings["centre_log_average" if of == "centre" else "log_average"]
+            if of == "protected":
+                found = min(found, white - readings["highlights"])
+        return float(found) if np.isfinite(found) else self.constant.offset
+
+    def typical_log_exposure(self, of: ExposureOf = "auto") -> float:
+        """Return the mean over the training views: one exposure for all of a scene."""
+        rows: list[dict[str, float]] = [
+            {str(name): value for name, value in zip(METERS, row, strict=True)}
+            for row in self.readings.tolist()
+        ]
+        return float(np.mean([self.log_exposure(row, of) for row in rows]))
+
+    @property
+    def telling(self) -> bool:
+        """Whether exposures vary in enough views for a rule to explain them or not."""
+        return len(self.candidates) > 1 and self.constant.left_out_ev >= NEGLIGIBLE_EV
+
+    @property
+    def sentence(self) -> str:
+        """Which rule explains the camera's exposures, or that none does."""
+        constant = self.constant.left_out_ev
+        rules = [rule for rule in self.candidates if rule.meters]
+        if not rules:
+            return f"Metering: {len(self.names)} training view(s) are too few to tell a rule."
+        if constant < NEGLIGIBLE_EV:
+            return f"Metering: exposures hardly vary ({constant:.2f} EV): constant."
+        if not self.rule.meters:
+            best = rules[0]
+            return (
+                f"Metering: none of {len(rules)} rules explains the exposures (the best, "
+                f"{best.words}, leaves {best.left_out_ev:.2f} EV of views left out; a constant "
+                f"{constant:.2f}): constant is used."
+            )
+        return (
+            f"Metering: {self.rule.words} explains the exposures; it leaves "
+            f"{self.rule.left_out_ev:.2f} EV of views left out, a constant would leave "
+            f"{constant:.2f}."
+        )
+
+
+def fit_metering(
+    names: Sequence[str],
+    readings: Sequence[Readings],
+    log_exposures: Float[np.ndarray, " v"],
+    white: float = 1.0,
+) -> Metering:
+    """Find the metering rule that predicts the exposures of the training views best.
+
+    Every meter competes with slope 1 (the camera kept it constant) and with a free slope, and the
+    log average together with the highlights. Each stretch of views is predicted by rules that were
+    fitted to the others. A constant stays unless a rule leaves clearly less.
+
+    Args:
+        names: of the training views, in order.
+        readings: of their renders, from `meter`.
+        log_exposures: natural logarithm, as fitted.
+        white: exposed radiance that is shown just below white.
+    """
+    table = np.array([[r[name] for name in METERS] for r in readings]).reshape(-1, len(METERS))
+    taken = np.isfinite(table).all(1)
+    x, y = table[taken], np.asarray(log_exposures, np.float64)[taken]
+    constant, alone = _fitted((), None, x, y)
+    if len(y) < FEWEST_VIEWS:
+        mean = Rule((), (), float(np.mean(log_exposures)), constant.residual_ev)
+        return Metering(mean, (mean,), white, tuple(names), table)
+    tried = [_fitted((m,), (1.0,), x, y) for m in METERS]
+    tried += [_fitted((m,), None, x, y) for m in METERS]
+    tried.append(_fitted(("log_average", "highlights"), None, x, y))
+    tried.sort(key=lambda pair: pair[0].left_out_ev)
+    best, errors = tried[0]
+    simple = [pair for pair in tried if pair[0].slopes == (1.0,)]
+    if simple and WORTH_A_NUMBER * simple[0][0].left_out_ev < best.left_out_ev:
+        best, errors = simple[0]
+    rule = best if _explains(best, errors, constant, alone) else constant
+    candidates = sorted([constant, *(r for r, _ in tried)], key=lambda r: r.left_out_ev)
+    return Metering(rule, tuple(candidates), white, tuple(names), table)
+
+
+def meter_views(
+    names: Sequence[str],
+    rendered: Iterable[Render],
+    exposures: Float[np.ndarray, " v"],
+    gamma: float,
+    cfg: PhotometryConfig,
+) -> Metering:
+    """Render, read and fit: `fit_metering` from pictures.
+
+    Args:
+        names: of the training views.
+        rendered: one for each.
+        exposures: of each.
+        gamma: of new views.
+        cfg: tone curve.
+    """
+    readings = [meter(np.asarray(r.linear), np.asarray(r.alpha)) for r in rendered]
+    logs = np.log(np.asarray(exposures, np.float64))
+    return fit_metering(names, readings, logs, white_level(gamma, cfg))
+
+
+def _folds(count: int) -> list[np.ndarray]:
+    return [fold for fold in np.array_split(np.arange(count), min(count, FOLDS)) if len(fold)]
+
+
+def _fitted(
+    meters: tuple[str, ...],
+    slopes: tuple[float, ...] | None,
+    x: Float[np.ndarray, "v k"],
+    y: Float[np.ndarray, " v"],
+) -> tuple[Rule, Float[np.ndarray, " f"]]:
+    """Return a rule fitted to all views, and its mean squared error on every stretch left out."""
+    read = x[:, [METERS.index(m) for m in meters]]  # pyright: ignore[reportArgumentType]
+
+    def solve(rows) -> tuple[np.ndarray, float]:
+        if slopes is not None:
+            taken = np.asarray(slopes)
+        else:
+            middle = read[rows].mean(0)
+            taken = -np.linalg.lstsq(read[rows] - middle, y[rows] - y[rows].mean(), rcond=1e-6)[0]
+        return taken, float((y[rows] + read[rows] @ taken).mean())
+
+    if not len(y):
+        return Rule(meters, (0.0,) * len(meters), 0.0), np.zeros(0)
+    everything = np.arange(len(y))
+    taken, offset = solve(everything)
+    residual = y - offset + read @ taken
+    left = np.zeros(len(y))
+    errors = []
+    for fold in _folds(len(y)) if len(y) > 1 else []:
+        s, o = solve(np.setdiff1d(everything, fold))
+        left[fold] = y[fold] - o + read[fold] @ s
+        errors.append(np.mean(left[fold] ** 2))
+    rms = (float(np.sqrt(np.mean(r**2))) / LN2 for r in (residual, left))
+    return Rule(meters, tuple(map(float, taken)), offset, *rms), np.array(errors)
+
+
+def _explains(best: Rule, errors: np.ndarray, constant: Rule, alone: np.ndarray) -> bool:
+    """Return whether a rule predicts clearly better than a constant."""
+    if constant.left_out_ev < NEGLIGIBLE_EV or best.left_out_ev > EXPLAINS * constant.left_out_ev:
+        return False
+    gain = alone - errors
+    return bool(gain.mean() > 2 * gain.std(ddof=1) / np.sqrt(len(gain)))
+
+
+def adapted(
+    log_exposures: Float[np.ndarray, " f"], frames: float, closed: bool = False
+) -> Float[np.ndarray, " f"]:
+    """Return exposures along a path that follow those metered as slowly as cameras adapt.
+
+    An exponential filter to both sides, so that a path played backwards looks the same.
+
+    Args:
+        log_exposures: metered, frame by frame.
+        frames: after how many the filter has fallen to 1/e.
+        closed: whether the last frame is followed by the first one.
+    """
+    count = len(log_exposures)
+    away = np.abs(np.arange(count)[:, None] - np.arange(count))
+    if closed:
+        away = np.minimum(away, count - away)
+    weight = np.exp(-away / max(frames, 1e-6))
+    return weight @ np.asarray(log_exposures, np.float64) / weight.sum(1)
