@@ -24,6 +24,11 @@ from p2gs_jax.report.charts import (
     panels_chart,
     response_chart,
 )
+from p2gs_jax.report.formation_sections import (
+    responses_section,
+    vignetting_section,
+    white_balance_section,
+)
 from p2gs_jax.report.page import Section, figure, folded, listed, paragraph, table
 from p2gs_jax.report.run_files import RunFiles
 from p2gs_jax.report.scene_measurements import SceneMeasurements, true_stops
@@ -262,6 +267,9 @@ def camera_sections(run: RunFiles, scene: SceneMeasurements) -> Sequence[Section
     return (
         model_section(run),
         exposure_section(run, scene),
+        white_balance_section(run, _groups),
         gamma_section(run),
         response_section(run),
+        responses_section(run),
+        vignetting_section(run),
     )

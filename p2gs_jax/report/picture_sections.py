@@ -48,7 +48,7 @@ def seam_section(scene: SceneMeasurements) -> Section:
         f"by {after:.2f} once each photograph is decoded, divided by its exposure and developed "
         f"alike (medians over {run_summary.count(len(scene.seams), 'pair')}). Of what is left, "
         f"{said} stops are a step that runs through the whole pair; the rest is texture that "
-        "does not meet exactly, shine, vignetting and colour balance."
+        "does not meet exactly, shine, and what the formation model leaves out."
     )
     if scene.picture is not None and scene.shown is not None:
         body += _seam_picture(scene)

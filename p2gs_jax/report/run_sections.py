@@ -23,8 +23,8 @@ PROTOCOLS = (
     ("held out", "exposure fitted to each photograph", ("test", "exposure_fitted")),
     (
         "held out",
-        "exposure and gamma fitted to each photograph",
-        ("test", "exposure_and_gamma_fitted"),
+        "all that varies per view fitted to each photograph",
+        ("test", "photometry_fitted"),
     ),
     ("held out", "exposure metered, as the camera would", ("test", "metered")),
     ("all", "reference photographs, mean exposure", ("reference", "averaged")),

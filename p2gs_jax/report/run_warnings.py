@@ -119,8 +119,8 @@ def _without_exposure(run: RunFiles) -> RunWarning | None:
 
 def _fitted(run: RunFiles) -> str:
     """Return the protocol that fits most of a held-out view's photometry."""
-    both = "exposure_and_gamma_fitted"
-    return both if run.part("test", both) else "exposure_fitted"
+    richer = "photometry_fitted"
+    return richer if run.part("test", richer) else "exposure_fitted"
 
 
 def _generalisation(run: RunFiles) -> RunWarning | None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from p2gs_jax.core.clock import whole_run
 from p2gs_jax.evaluate.alignment import exposure_error
+from p2gs_jax.run.old_metrics import as_today
 from p2gs_jax.synth.exposures import read_true_exposures
 
 # Name of the column, path in metrics.json, digits.
@@ -24,7 +25,7 @@ COLUMNS: tuple[tuple[str, tuple[str, ...], int], ...] = (
     ("test_psnr_averaged", ("test", "averaged", "psnr"), 2),
     ("test_lpips_averaged", ("test", "averaged", "lpips"), 4),
     ("test_psnr_fitted", ("test", "exposure_fitted", "psnr"), 2),
-    ("test_psnr_both_fitted", ("test", "exposure_and_gamma_fitted", "psnr"), 2),
+    ("test_psnr_all_fitted", ("test", "photometry_fitted", "psnr"), 2),
     ("reference_psnr_averaged", ("reference", "averaged", "psnr"), 2),
     ("reference_psnr", ("reference", "scale_aligned", "psnr"), 2),
     ("reference_lpips", ("reference", "scale_aligned", "lpips"), 4),
@@ -43,7 +44,7 @@ def read_row(run: Path, scene: Path) -> dict[str, Any]:
         run: its folder.
         scene: where `truth/exposures.csv` may lie.
     """
-    metrics = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
+    metrics = as_today(json.loads((run / "metrics.json").read_text(encoding="utf-8")))
     row: dict[str, Any] = {}
     for name, path, _ in COLUMNS:
         value = metrics
@@ -75,7 +76,7 @@ MEANING = {
     "train_": "training views, each under its own exposure and gamma",
     "test_psnr_averaged": "held-out views under the mean exposure and gamma (as in the paper)",
     "test_psnr_fitted": "held-out views, exposure fitted to each photograph: the one to trust",
-    "test_psnr_both_fitted": "likewise, exposure and gamma fitted",
+    "test_psnr_all_fitted": "likewise, all fitted that varies per view",
     "reference_psnr": "all views against photographs of one exposure, one scale for all",
     "reference_psnr_averaged": "likewise under the mean exposure",
     "reference_test_": "likewise, held-out views only",

@@ -113,6 +113,9 @@ class FrameCache:
             depth_limits=self.depth_limits,
             photograph=self._photograph_here() if settings.mode == "split" else None,
             split=settings.split,
+            taken_by=None
+            if settings.taken_as is None
+            else camera_of(self._store, settings.taken_as),
         )
 
     @property

@@ -96,6 +96,7 @@ class Panel:
             hint="2.2 is the curve itself; middle grey stays where it is.",
             marks=((low, f"{low:g}"), (2.2, "2.2"), (high, f"{high:g}")),
         )
+        self._add_camera_effects()
         self._curves: dict[str, ChosenCurve] = {f"run's ({info.curve})": "run"}
         self._curves |= {c: c for c in get_args(ChosenCurve) if c not in ("run", info.curve)}
         self._curve = gui.add_dropdown(
@@ -104,7 +105,7 @@ class Panel:
         self._match = gui.add_dropdown(
             "Match photo",
             [MEAN, *info.names],
-            hint="Sets exposure, gamma, curve and correction as a photograph was taken.",
+            hint="Sets all of this as a photograph was taken.",
         )
         self._renderer = gui.add_dropdown(
             "Renderer",
@@ -117,6 +118,33 @@ class Panel:
         for handle in (self._mode, self._renderer):
             self._when_chosen(handle, lambda _: actions.mode_changed())
         self._when_chosen(self._match, lambda name: actions.take_display_of(self._index(name)))
+
+    def _add_camera_effects(self) -> None:
+        """Add white balance and vignetting, where the run models them."""
+        gui, info, changed = self._gui, self._info, self._actions.display_changed
+        self._balance: tuple[viser.GuiInputHandle[float], ...] = ()
+        if info.most_balance_ev is not None:
+            most = float(max(2, math.ceil(info.most_balance_ev) + 1))
+            self._balance = tuple(
+                gui.add_slider(
+                    name,
+                    -most,
+                    most,
+                    0.01,
+                    0.0,
+                    hint="White balance: gain over green in stops (EV).",
+                    marks=((-most, f"{-most:+g}"), (0.0, "0"), (most, f"{most:+g}")),
+                )
+                for name in ("Red / green", "Blue / green")
+            )
+        self._vignetting = gui.add_checkbox(
+            "Vignetting",
+            True,
+            visible=info.vignetting,
+            hint="Darkens towards the corners as the camera of the matched photo does.",
+        )
+        for handle in (*self._balance, self._vignetting):
+            self._when_chosen(handle, lambda _: changed())
 
     def _add_camera(self) -> None:
         gui, info, actions = self._gui, self._info, self._actions
@@ -232,11 +260,19 @@ class Panel:
             exposure_ev=self._exposure.value,
             curve=self._curves[self._curve.value],
             taken_as=self._taken_as,
+            balance_ev=self._balance_ev(),
+            vignetting=self._vignetting.value,
             mode=MODES[self._mode.value],
             split=self._split.value,
             splats=self._renderer.value == SPLATS,
             metered=self._metered.value,
         )
+
+    def _balance_ev(self) -> tuple[float, float] | None:
+        if not self._balance:
+            return None
+        red, blue = self._balance
+        return red.value, blue.value
 
     def put(self, settings: Settings) -> None:
         """Set the controls to a display transform; the mode stays."""
@@ -244,6 +280,8 @@ class Panel:
         self._metered.value = settings.metered
         self._exposure.value = settings.exposure_ev
         self._gamma.value = settings.gamma
+        for handle, ev in zip(self._balance, settings.balance_ev or (), strict=False):
+            handle.value = ev
         names = {value: name for name, value in self._curves.items()}
         self._curve.value = names.get(settings.curve, names["run"])
         index = settings.taken_as

@@ -21,7 +21,7 @@ class PanelActions(Protocol):
         ...
 
     def take_display_of(self, index: int | None) -> None:
-        """Take the exposure, gamma and correction of a view, or the mean."""
+        """Take all that a view was taken with, or the mean."""
         ...
 
     def mode_changed(self) -> None:
@@ -65,6 +65,9 @@ class RunInfo:
         gammas: all that occur.
         curve: of the run.
         camera_legend: legend of the cameras' colours, HTML.
+        most_balance_ev: largest gain of red or blue over green, stops; None where the run models
+            no white balance.
+        vignetting: whether any camera has it.
     """
 
     names: Sequence[str]
@@ -74,3 +77,5 @@ class RunInfo:
     gammas: Sequence[float]
     curve: str
     camera_legend: str
+    most_balance_ev: float | None = None
+    vignetting: bool = False

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, UInt8
 
 from p2gs_jax.formats.false_color import clipping_overlay, depth_color, false_color
+from p2gs_jax.photometry.cameras import places
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.types import Camera
 
@@ -64,6 +65,7 @@ def picture_of(
     depth_limits: tuple[float, float] | None = None,
     photograph: WarpedPhotograph | None = None,
     split: float = 0.5,
+    taken_by: Camera | None = None,
 ) -> Float32[np.ndarray, "h w 3"]:
     """Return display values of a frame in one of the modes.
 
@@ -76,17 +78,38 @@ def picture_of(
             frame's own.
         photograph: for `split`.
         split: share of the photograph's width that is shown, from the left.
+        taken_by: the camera whose vignetting the transform has; None: that of the frame.
     """
     if mode == "stops":
         return false_color(np.asarray(frame.linear), MIDDLE_GREY / transform.exposure)
     if mode == "depth":
         return depth_color(frame.depth, frame.alpha, depth_limits or limits_of_depth(frame))
-    ldr = develop(frame.linear, transform)
+    positions = None
+    if taken_by is not None and transform.vignetting:
+        positions = places_in(taken_by, frame.camera)
+    ldr = develop(frame.linear, transform, positions)
     if mode == "clipping":
         return clipping_overlay(ldr)
     if mode == "split" and photograph is not None:
         return split_picture(photograph, ldr, split)
     return ldr
+
+
+def places_in(taken_by: Camera, frame: Camera) -> Float32[np.ndarray, "h w 2"]:
+    """Return where a camera in the frame's place would have the frame's pixels in its own image.
+
+    Beyond that image they count as its corners, where its vignetting ends.
+
+    Args:
+        taken_by: a photograph's camera.
+        frame: whose pixels.
+    """
+    K, k = np.asarray(taken_by.K, float), np.asarray(frame.K, float)
+    x, y = ((np.arange(n) + 0.5) for n in (frame.width, frame.height))
+    u = (x - k[0, 2]) / k[0, 0] * K[0, 0] + K[0, 2]
+    v = (y - k[1, 2]) / k[1, 1] * K[1, 1] + K[1, 2]
+    at = places(np.stack(np.meshgrid(u, v), -1), taken_by.width, taken_by.height)
+    return (at / np.maximum(np.linalg.norm(at, axis=-1, keepdims=True), 1)).astype(np.float32)
 
 
 def split_picture(

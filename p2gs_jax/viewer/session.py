@@ -115,7 +115,7 @@ class BrowserSession:
         self._render_loop.camera_moved()
 
     def take_display_of(self, index: int | None) -> None:
-        """Take the exposure, gamma and correction of a view, or the mean."""
+        """Take all that a view was taken with, or the mean."""
         before = self._panel.settings()
         if index is None:
             self._panel.put(common_settings(self._run, before))
@@ -212,7 +212,8 @@ class BrowserSession:
             cache.render(self._render_loop.camera(view, size), wait=True)
             if kind == "exr":
                 assert cache.frame is not None
-                content = exr_bytes(cache.frame, cache.transform(settings))
+                shown = cache.transform(settings).without_place()
+                content = exr_bytes(cache.frame, shown)
             else:
                 content = png_bytes(cache.develop(settings))
         name = f"{self._run.folder.resolve().name}_{time.strftime('%Y%m%d_%H%M%S')}.{kind}"

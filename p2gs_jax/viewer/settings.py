@@ -23,7 +23,10 @@ class Settings:
         exposure_ev: stops from the geometric mean of the training exposures, or from the metered
             exposure.
         curve: `run` is what the fit chose.
-        taken_as: row in `scene.views` of the view whose correction applies, or None for the mean.
+        taken_as: row in `scene.views` of the view whose correction and whose camera's vignetting
+            and response apply, or None for the mean and no camera.
+        balance_ev: gains of red and of blue over green, stops; None where the run models none.
+        vignetting: whether that camera's vignetting is shown.
         mode: what is shown.
         split: share of the photograph in `split`.
         splats: whether the browser draws splats itself, instead of the renderer's pictures.
@@ -34,6 +37,8 @@ class Settings:
     exposure_ev: float = 0.0
     curve: ChosenCurve = "run"
     taken_as: int | None = None
+    balance_ev: tuple[float, float] | None = None
+    vignetting: bool = True
     mode: Mode = "display"
     split: float = 0.5
     splats: bool = False
@@ -41,20 +46,26 @@ class Settings:
 
 
 def common_settings(run: Run, before: Settings | None = None) -> Settings:
-    """Return settings with the mean exposure and gamma.
+    """Return settings with the mean exposure, gamma and white balance.
 
     Args:
         run: the run.
         before: settings that all other fields are kept from.
     """
-    gamma = run.mean.gamma
-    if before is None:
-        return Settings(gamma)
-    return replace(before, gamma=gamma, exposure_ev=0.0, curve="run", taken_as=None, metered=False)
+    common = run.common_display()
+    return replace(
+        before or Settings(common.gamma),
+        gamma=common.gamma,
+        exposure_ev=0.0,
+        curve="run",
+        taken_as=None,
+        metered=False,
+        balance_ev=_balance_of(common),
+    )
 
 
 def settings_of_view(run: Run, index: int, before: Settings) -> Settings:
-    """Return settings with the exposure, gamma and correction of a view.
+    """Return settings with all that a view was taken with.
 
     Args:
         run: the run.
@@ -64,8 +75,18 @@ def settings_of_view(run: Run, index: int, before: Settings) -> Settings:
     own = run.own_display(index)
     ev = float(np.log2(own.exposure / run.mean.exposure_geometric))
     return replace(
-        before, gamma=own.gamma, exposure_ev=ev, curve="run", taken_as=index, metered=False
+        before,
+        gamma=own.gamma,
+        exposure_ev=ev,
+        curve="run",
+        taken_as=index,
+        metered=False,
+        balance_ev=_balance_of(own),
     )
+
+
+def _balance_of(transform: DisplayTransform) -> tuple[float, float] | None:
+    return None if transform.white_balance is None else transform.white_balance_ev
 
 
 def same_display(a: Settings, b: Settings) -> bool:
@@ -77,8 +98,13 @@ def display_of(run: Run, settings: Settings) -> DisplayTransform:
     """Return the display transform of settings; corrections apply under the run's curve only."""
     transform = run.common_display(settings.exposure_ev)
     if settings.taken_as is not None:
-        transform = replace(transform, correction=run.own_display(settings.taken_as).correction)
+        own = run.own_display(settings.taken_as)
+        transform = replace(transform, correction=own.correction, camera=own.camera)
     transform = replace(transform, gamma=settings.gamma)
+    if settings.balance_ev is not None and transform.white_balance is not None:
+        transform = transform.with_white_balance_ev(*settings.balance_ev)
+    if not settings.vignetting:
+        transform = transform.without_place()
     return transform if settings.curve == "run" else transform.with_curve(settings.curve)
 
 

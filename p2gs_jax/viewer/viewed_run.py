@@ -10,8 +10,9 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from p2gs_jax.core.numerics import evenly_spaced
+from p2gs_jax.core.numerics import LN2, evenly_spaced
 from p2gs_jax.errors import UserError
+from p2gs_jax.photometry.cameras import darkens
 from p2gs_jax.photometry.display import develop
 from p2gs_jax.run.read import Run
 from p2gs_jax.scene.images import size_at
@@ -154,7 +155,16 @@ class ViewedRun:
             gammas=[float(g) for g in np.asarray(run.params.photometry.gammas)],
             curve=run.cfg.photometry.curve,
             camera_legend=exposure_legend(min(evs.values()), max(evs.values())),
+            most_balance_ev=self._most_balance_ev(),
+            vignetting=darkens(run.cfg.photometry),
         )
+
+    def _most_balance_ev(self) -> float | None:
+        balance = self.run.params.photometry.white_balance
+        if balance is None:
+            return None
+        stops = np.asarray(balance) / LN2
+        return float(np.abs(stops[:, ::2] - stops[:, 1:2]).max())
 
     @cached_property
     def camera_size(self) -> float:

@@ -70,7 +70,7 @@ def test_every_comparison_gets_it_where_there_are_weights(weights, tmp_path, cap
         (metrics["train"]["averaged"], 2),
         (metrics["test"]["averaged"], 1),
         (metrics["test"]["exposure_fitted"], 1),
-        (metrics["test"]["exposure_and_gamma_fitted"], 1),
+        (metrics["test"]["photometry_fitted"], 1),
     ]
     for part in metrics["reference"].values():
         parts += [(part, 3), (part["train"], 2), (part["test"], 1)]

@@ -44,8 +44,8 @@ def print_metrics(metrics: dict, out: Path) -> None:
     row("training", "mean parameters", metrics["train"]["averaged"])
     row("held out", "mean parameters", metrics["test"]["averaged"])
     row("held out", "exposure fitted to each photograph", metrics["test"]["exposure_fitted"])
-    both = metrics["test"].get("exposure_and_gamma_fitted")
-    row("held out", "exposure and gamma fitted to each photograph", both)
+    everything = metrics["test"].get("photometry_fitted")
+    row("held out", "all that varies per view fitted to each photograph", everything)
     row("held out", "metered, as the camera would", metrics["test"].get("metered"))
     for name, part in metrics.get("reference", {}).items():
         row("all", f"reference photographs, {name.replace('_', ' ')}", part)
