@@ -1,6 +1,7 @@
 """White balance is learned like exposures where it varies per view, and nowhere else."""
 
 import dataclasses
+import itertools
 import json
 
 import cv2
@@ -133,7 +134,7 @@ def test_a_fit_finds_white_balance_and_vignetting_and_removes_seams(tmp_path):
         name = run.scene.views[index].name
         found_ev = [fitted[name][key] for key in ("red_green_ev", "blue_green_ev")]
         np.testing.assert_allclose(found_ev, expected[::2] - expected[1], atol=0.05)
-    seams = [_seam(run, a, b) for a, b in zip(rows, rows[1:], strict=False)]
+    seams = [_seam(run, a, b) for a, b in itertools.pairwise(rows)]
     assert np.median([s.before_ev for s in seams]) > 0.1
     assert np.median([s.after_ev for s in seams]) < 0.03
 
