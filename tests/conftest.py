@@ -128,6 +128,34 @@ def finished_run(made_once) -> Path:
     return made_once("finished", _fit_small_scene) / "run"
 
 
+@pytest.fixture(scope="session")
+def camera_run(made_once, finished_run) -> Path:
+    """Return that run as if its camera had vignetting and every view a white balance; only read it.
+
+    By its row k a training view has gains of 2^(k/10), 1 and 2^(-k/10) over green.
+    """
+    return made_once("camera", lambda root: _with_cameras(finished_run, root / "run")) / "run"
+
+
+def _with_cameras(finished: Path, run: Path) -> None:
+    import json
+
+    shutil.copytree(finished, run)
+    saved = json.loads((run / "photometry.json").read_text())
+    rows = [[-0.5, 0.1, 0.0], [-0.4, 0.0, 0.0], [-0.3, 0.0, 0.05]]
+    for k, view in enumerate(v for v in saved["views"] if v["split"] == "train"):
+        view["white_balance"] = [2 ** (k / 10), 1.0, 2 ** (-k / 10)]
+        view["white_balance_ev_error"] = [0.01, 0.02, 0.01]
+    name = saved["views"][0]["camera"]
+    shade = {"vignetting": rows, "corner": [0.67, 0.67, 0.78], "corner_ev_error": [0.02] * 3}
+    saved["cameras"] = [{"name": name, **shade, "splines": None}]
+    (run / "photometry.json").write_text(json.dumps(saved))
+    decided = json.loads((run / "decisions.json").read_text())
+    decided |= {"white_balance": "view", "vignetting": "channel"}
+    decided["cameras"] = [{"name": name, "vignetting": rows, "splines": []}]
+    (run / "decisions.json").write_text(json.dumps(decided))
+
+
 def _fit_small_scene(root: Path) -> None:
     from tiny_scene import make_scene
 

@@ -63,7 +63,8 @@ def likely(cfg: FitConfig, kept: Decisions | None, *, matched: bool) -> Decision
     if p.known is not None or cfg.loss.relative_exposure.weight is not None or not slots_known:
         return None
     # What cameras do enters the programs, and is not solved yet.
-    if kept is None and not p.select and (p.vignetting is not None or p.responses != "all"):
+    solved = p.start == "tracks" and (p.vignetting is not None or p.responses != "all")
+    if kept is None and not p.select and solved:
         return None
     decided = Decisions.as_asked(cfg)
     if kept is not None:

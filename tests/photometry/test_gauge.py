@@ -1,5 +1,7 @@
 """Recentring is exact: the same photographs, mean log exposure 0."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -39,3 +41,21 @@ def test_photographs_stay_and_the_mean_goes(activation, parameterization):
 def test_softplus_is_left_alone():
     p = params("log")
     assert recentre(p, "softplus") is p
+
+
+@pytest.mark.parametrize("activation", ["exp", "linear"])
+def test_a_common_tint_goes_into_the_radiance(activation):
+    p = params("log")
+    balance = np.random.default_rng(1).normal(0.3, 0.2, (9, 3)).astype(np.float32)
+    photometry = replace(p.photometry, raw_white_balance=jnp.asarray(balance))
+    p = replace(p, photometry=photometry)
+    q = recentre(p, activation)
+    assert p.photometry.white_balance is not None
+    assert q.photometry.white_balance is not None
+    assert float(jnp.abs(p.photometry.white_balance.mean(0)).max()) > 0.02
+    np.testing.assert_allclose(q.photometry.white_balance.mean(0), 0, atol=1e-6)
+    np.testing.assert_allclose(q.photometry.white_balance.mean(1), 0, atol=1e-6)
+    before, after = (
+        exposed(x, activation) * jnp.exp(x.photometry.white_balance)[:, None] for x in (p, q)
+    )
+    np.testing.assert_allclose(after, before, rtol=4e-6)

@@ -14,7 +14,8 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.core.progress import TerminalReporter
 from p2gs_jax.errors import UserError
-from p2gs_jax.photometry.solution import WEAK_GAMMA
+from p2gs_jax.photometry.cameras import corner
+from p2gs_jax.photometry.solution import WEAK_GAMMA, PhotometricSolution
 from p2gs_jax.pipeline.calibrate import calibrate
 from p2gs_jax.pipeline.calibrate_run import calibrate_run
 from p2gs_jax.pipeline.calibrate_stack import calibrate_stack
@@ -42,6 +43,8 @@ def run(options: Calibrate) -> int:
             result = calibrate(scene, out, cfg, compare_with=compare_with, reporter=reporter)
     s, seconds = result.solution, result.seconds
     _print_table(result, _tone_columns(result))
+    for line in _camera_lines(s):
+        stdout().print(line)
     stdout().print(
         f"{result.observations} observations, {100 * s.outliers:.0f} % ignored as outliers; "
         f"residual {s.residual_ev:.2f} EV; {seconds['reading']:.1f} s reading, "
@@ -128,4 +131,32 @@ def _tone_columns(result: CalibrationResult) -> dict[str, list[str]]:
         for i in rows
     ]
     residuals = [f"{s.view_residual_ev[i]:.2f}" if known[i] else "" for i in rows]
-    return {"gamma": gammas, "residual": residuals}
+    return {"gamma": gammas, **_balance_column(s), "residual": residuals}
+
+
+def _camera_lines(s: PhotometricSolution) -> list[str]:
+    """Return a sentence on the vignetting of each camera that has any."""
+    said = []
+    for camera, errors in zip(s.cameras, s.corner_errors, strict=False):
+        if camera.vignetting:
+            lost = ", ".join(
+                f"{np.log2(left):+.2f} +- {error / LN2:.2f}"
+                for left, error in zip(corner(camera), errors, strict=True)
+            )
+            said.append(f"Camera {camera.name}: {lost} EV in the corners (vignetting).")
+    return said
+
+
+def _balance_column(s: PhotometricSolution) -> dict[str, list[str]]:
+    """Return gains of red, green and blue, stops, with the largest of their standard errors."""
+    if s.white_balance_level is None:
+        return {}
+    stops, errors = s.white_balance / LN2, s.white_balance_errors.max(1) / LN2
+    known = np.isfinite(errors) & np.isfinite(s.exposure_errors)
+    said = [" ".join(f"{ev:+.2f}" for ev in row) for row in stops]
+    return {
+        "white balance (R G B)": [
+            f"{text} +- {error:.2f}" if seen else "unknown"
+            for text, error, seen in zip(said, errors, known, strict=True)
+        ]
+    }

@@ -1,0 +1,236 @@
+"""A run whose views differ in white balance and whose camera has vignetting, through its files."""
+
+import csv
+import dataclasses
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+from p2gs_jax.cli import main
+from p2gs_jax.config import CameraFormation, FitConfig, from_dict, to_dict
+from p2gs_jax.errors import UserError
+from p2gs_jax.formats.exr import read_exr
+from p2gs_jax.photometry.display import DisplayTransform, develop
+from p2gs_jax.run.decisions import Decisions
+from p2gs_jax.run.photometry_file import read_photometry
+from p2gs_jax.run.read import load_run
+from p2gs_jax.viewer.settings import common_settings, display_of, settings_of_view
+
+CAMERAS = (
+    CameraFormation("left", ((-0.3, 0.1, 0.0),), ((0.1, 0.2), (0.0, 0.0), (0.3, 0.1))),
+    CameraFormation("right"),
+)
+
+
+def run_command(capsys, *argv):
+    with pytest.raises(SystemExit) as stop:
+        main([str(a) for a in argv])
+    out = capsys.readouterr()
+    assert "Traceback" not in out.err + out.out
+    return stop.value.code, out.err + out.out
+
+
+def picture(path):
+    return cv2.imread(str(path))[..., ::-1] / 255.0
+
+
+def test_options_and_decisions_survive_json(tmp_path):
+    photometry = dataclasses.replace(
+        FitConfig().photometry, white_balance="view", vignetting="channel", cameras=CAMERAS
+    )
+    cfg = dataclasses.replace(FitConfig(), photometry=photometry)
+    assert from_dict(json.loads(json.dumps(to_dict(cfg)))) == cfg
+    decided = dataclasses.replace(Decisions.as_asked(cfg), responses="channel")
+    saved = json.loads(json.dumps(decided.to_dict()))
+    assert Decisions.from_dict(saved) == decided
+    found = decided.resolve(FitConfig()).photometry
+    assert (found.white_balance, found.vignetting, found.responses) == (
+        "view",
+        "channel",
+        "channel",
+    )
+    assert found.cameras == CAMERAS
+    decided.require_same(saved, tmp_path)
+    saved["cameras"][0]["vignetting"][0][0] = -0.31
+    with pytest.raises(UserError, match="cameras was"):
+        decided.require_same(saved, tmp_path)
+
+
+def test_decisions_of_older_versions_had_no_cameras(tmp_path):
+    decided = Decisions.as_asked(FitConfig())
+    new = ("white_balance", "vignetting", "responses", "cameras")
+    old = {k: v for k, v in decided.to_dict().items() if k not in new}
+    assert Decisions.from_dict(old) == decided
+    decided.require_same(old, tmp_path)
+    with pytest.raises(UserError, match="white_balance was None"):
+        dataclasses.replace(decided, white_balance="view").require_same(old, tmp_path)
+
+
+def test_a_run_is_read_back_with_its_cameras(camera_run):
+    run = load_run(camera_run)
+    balances = np.asarray(run.params.photometry.white_balance) / np.log(2)
+    np.testing.assert_allclose(balances[:, 0], np.arange(len(balances)) / 10, atol=1e-6)
+    np.testing.assert_allclose(balances[:, 1], 0, atol=1e-6)
+    assert set(run.params.photometry.cameras) == {0}
+    own = run.own_display(run.scene.train_indices[2])
+    np.testing.assert_allclose(own.white_balance_ev, (0.2, -0.2), atol=1e-6)
+    assert len(own.vignetting) == 3
+    held_out = run.own_display(run.scene.test_indices[0])
+    assert held_out.camera == 0
+    np.testing.assert_allclose(held_out.white_balance_ev, balances.mean(0)[::2], atol=1e-6)
+    assert run.common_display().vignetting == ()
+
+
+def test_files_without_a_version_are_read(finished_run, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(finished_run, folder)
+    path = folder / "photometry.json"
+    saved = json.loads(path.read_text())
+    assert saved["version"] == 2
+    assert saved["cameras"] == []
+    del saved["version"], saved["cameras"]
+    for view in saved["views"]:
+        del view["white_balance"], view["white_balance_ev_error"]
+    path.write_text(json.dumps(saved))
+    assert read_photometry(path) == saved
+    old, new = load_run(folder), load_run(finished_run)
+    assert old.params.photometry.white_balance is None
+    assert old.own_display(0) == new.own_display(0)
+    path.write_text(json.dumps({**saved, "version": 3}))
+    with pytest.raises(UserError, match="version is 3"):
+        load_run(folder)
+
+
+def test_a_missing_white_balance_is_said(camera_run, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(camera_run, folder)
+    path = folder / "photometry.json"
+    saved = json.loads(path.read_text())
+    train = [view for view in saved["views"] if view["split"] == "train"]
+    train[1]["white_balance"] = None
+    path.write_text(json.dumps(saved))
+    with pytest.raises(UserError, match="lacks the white balance"):
+        load_run(folder)
+
+
+def test_render_shows_them_and_leaves_them_out_where_asked(camera_run, tmp_path, capsys):
+    run = load_run(camera_run)
+    rows = run.scene.train_indices
+    first, last = (run.scene.views[i].name for i in (rows[0], rows[-1]))
+
+    def rendered(folder, *options):
+        out = tmp_path / folder
+        code, text = run_command(
+            capsys, "render", camera_run, "--split", "train", "--out", out, *options
+        )
+        assert code == 0, text
+        stem = first.removesuffix(".png")
+        linear, header = read_exr(out / f"{stem}.exr")
+        return picture(out / f"{stem}.render.png"), linear, header
+
+    own = run.own_display(rows[0])
+    shown, linear, header = rendered("own")
+    np.testing.assert_allclose(shown, develop(linear, own), atol=0.51 / 255 + 2e-3)
+    assert {"p2gsWhiteBalance", "p2gsVignettingBlue"} <= set(header)
+    flat, _, header = rendered("flat", "--no-vignetting")
+    assert "p2gsVignettingBlue" not in header
+    assert flat[0, 0].mean() > shown[0, 0].mean() + 0.02
+    middle = tuple(n // 2 for n in shown.shape[:2])
+    np.testing.assert_allclose(flat[middle], shown[middle], atol=2 / 255)
+    warm, _, header = rendered("warm", "--white-balance-of", last)
+    balance = np.exp(run.white_balance_of(last))
+    np.testing.assert_allclose(header["p2gsWhiteBalance"], balance, rtol=1e-5)
+    assert (warm / np.maximum(shown, 0.05))[..., 0].mean() > 1.05
+    code, text = run_command(
+        capsys, "render", camera_run, "--white-balance-of", "nobody.png", "--out", tmp_path / "no"
+    )
+    assert code == 2
+    assert "no view 'nobody.png'" in text
+
+
+def test_a_run_without_white_balance_has_none_to_show(finished_run, tmp_path, capsys):
+    name = load_run(finished_run).scene.views[0].name
+    argv = ("render", finished_run, "--white-balance-of", name, "--out", tmp_path / "no")
+    code, text = run_command(capsys, *argv)
+    assert code == 2
+    assert "models no white balance" in text
+
+
+def test_exports_carry_them(camera_run, tmp_path, capsys):
+    run = load_run(camera_run)
+    rows = run.scene.train_indices
+    last = run.scene.views[rows[-1]].name
+    formats = ("linear-ply", "display-ply", "colmap", "exr")
+    argv = ["export", camera_run, "--format", *formats, "--out", tmp_path]
+    code, text = run_command(capsys, *argv, "--bake-steps", 0, "--white-balance-of", last)
+    assert code == 0, text
+    said = json.loads((tmp_path / "linear.json").read_text())
+    assert len(said["tone"]["cameras"][0]["vignetting"]) == 3
+    view = said["views"][rows[1]]
+    factors = np.array(view["white_balance"])
+    np.testing.assert_allclose(factors, np.exp(run.own_display(rows[1]).white_balance), rtol=1e-6)
+    # The formula of linear.json, followed to the letter, gives the picture.
+    linear, header = read_exr((tmp_path / "exr" / view["image"]).with_suffix(".exr"))
+    height, width = linear.shape[:2]
+    y, x = np.mgrid[:height, :width] + 0.5
+    r2 = ((x - width / 2) ** 2 + (y - height / 2) ** 2) / ((width**2 + height**2) / 4)
+    k = np.array(said["tone"]["cameras"][0]["vignetting"])
+    vignetting = np.exp(sum(k[:, n] * r2[..., None] ** (n + 1) for n in range(3)))
+    pivot = said["tone"]["pivot"]
+    light = view["exposure"] * factors * vignetting * linear
+    bent = pivot * (np.maximum(light, 1e-6) / pivot) ** (2.2 / view["gamma"])
+    base = said["tone"]["base"]
+    by_hand = np.interp(bent, base["linear"], base["display"])
+    own = run.own_display(rows[1])
+    np.testing.assert_allclose(by_hand.clip(0, 1), develop(linear, own), atol=2e-3)
+    np.testing.assert_allclose(header["p2gsWhiteBalance"], factors, rtol=1e-5)
+    display = json.loads((tmp_path / "display.ply.json").read_text())
+    np.testing.assert_allclose(display["white_balance"], np.exp(run.white_balance_of(last)))
+    with (tmp_path / "colmap" / "exposures.csv").open() as file:
+        table = {row["image"]: row for row in csv.DictReader(file)}
+    np.testing.assert_allclose(float(table[view["image"]]["red"]), factors[0])
+    held_out = run.scene.views[run.scene.test_indices[0]].name
+    assert table[held_out]["red"] == ""
+
+
+def test_the_viewer_s_settings_hold_them(camera_run):
+    run = load_run(camera_run)
+    index = run.scene.train_indices[2]
+    plain = common_settings(run)
+    assert plain.balance_ev is not None
+    seen = settings_of_view(run, index, plain)
+    own, shown = run.own_display(index), display_of(run, seen)
+    np.testing.assert_allclose(shown.white_balance, own.white_balance, atol=1e-6)
+    assert shown.camera == own.camera
+    assert display_of(run, plain).vignetting == ()
+    assert display_of(run, dataclasses.replace(seen, vignetting=False)).vignetting == ()
+    bluer = display_of(run, dataclasses.replace(seen, balance_ev=(0.0, 1.0)))
+    np.testing.assert_allclose(bluer.white_balance_ev, (0.0, 1.0), atol=1e-6)
+
+
+def test_the_report_shows_them_and_nothing_of_the_kind_elsewhere(
+    camera_run, finished_run, tmp_path, capsys
+):
+    def headings(folder, name):
+        out = tmp_path / name
+        code, text = run_command(capsys, "report", folder, "--no-render", "--out", out)
+        assert code == 0, text
+        return out.read_text()
+
+    page = headings(camera_run, "a.html")
+    assert "<h2>White balance" in page
+    assert "<h2>Vignetting" in page
+    assert "33 %" in page, "of red, in the corners: 1 - exp(-0.4)"
+    other = headings(finished_run, "b.html")
+    assert "<h2>White balance" not in other
+    assert "<h2>Vignetting" not in other
+
+
+def test_a_transform_equals_another_of_the_same_values():
+    cfg = dataclasses.replace(FitConfig().photometry, cameras=CAMERAS)
+    a = DisplayTransform(1.0, 2.2, cfg, None, (0.1, 0.0, -0.1), 0)
+    assert a == dataclasses.replace(a)
+    assert a.vignetting == CAMERAS[0].vignetting

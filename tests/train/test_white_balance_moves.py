@@ -1,0 +1,150 @@
+"""White balance is learned like exposures where it varies per view, and nowhere else."""
+
+import dataclasses
+import itertools
+import json
+
+import cv2
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tiny_scene import make_scene
+
+from p2gs_jax.cli import main
+from p2gs_jax.config import CameraFormation, FitConfig
+from p2gs_jax.evaluate.seams import Photographed, measure_seam
+from p2gs_jax.photometry.cameras import corner, squared_radii
+from p2gs_jax.pipeline.decide import decide, likely, unsolved
+from p2gs_jax.render.warp import surface_depth
+from p2gs_jax.run.decisions import Decisions
+from p2gs_jax.run.read import load_run
+from p2gs_jax.sweep.fields import with_fields
+from p2gs_jax.train.advance import _recentered, finite_names
+from p2gs_jax.train.optimizer import learning_rates, make_optimizer
+from p2gs_jax.train.step import Step
+from p2gs_jax.types import Gaussians, Params, Photometry
+
+GAUSSIANS = Gaussians(
+    jnp.zeros((4, 3)), jnp.ones((4, 4)), jnp.zeros((4, 3)), jnp.zeros(4), jnp.zeros((4, 1, 3))
+)
+
+
+def params(balance):
+    return Params(GAUSSIANS, Photometry(jnp.zeros(2), jnp.zeros(2), "log", balance))
+
+
+@pytest.mark.parametrize("level", ["view", "camera"])
+@pytest.mark.parametrize("progress", [0.3, 0.9])
+def test_rates(level, progress):
+    cfg = with_fields(FitConfig(), {"photometry.white_balance": level})
+    like = params(jnp.zeros((2, 3)))
+    found = learning_rates(jnp.float32(progress), 1.0, like, cfg, 1).photometry
+    moves = level == "view" and progress > cfg.photometry.freeze_until
+    expected = float(found.raw_exposures) if moves else 0.0
+    assert float(found.raw_white_balance) == expected
+    assert (expected > 0) == moves
+    plain = learning_rates(jnp.float32(progress), 1.0, params(None), FitConfig(), 1)
+    assert plain.photometry.raw_white_balance is None
+
+
+def test_the_gauge_of_every_channel_is_kept():
+    raw = np.random.default_rng(0).normal(0.3, 0.2, (5, 3)).astype(np.float32)
+    photometry = Photometry(jnp.ones(5), jnp.zeros(5), "log", jnp.asarray(raw))
+    for weight in (0.01, None):
+        cfg = with_fields(FitConfig(), {"loss.regularizers.log_exposure_mean": weight})
+        found = _recentered(photometry, cfg)
+        np.testing.assert_allclose(np.mean(found.raw_white_balance, 0), 0, atol=1e-6)
+        assert (float(jnp.mean(found.raw_exposures)) == 0) == (weight is not None)
+
+
+def test_faults_name_what_there_is():
+    assert finite_names({"l1": 0}, params(None))[-1] == "gradient of gammas"
+    names = finite_names({"l1": 0}, params(jnp.zeros((2, 3))))
+    assert names[-1] == "gradient of white balances"
+    assert len(names) == len(finite_names({"l1": 0}, params(None))) + 1
+
+
+def test_programs_know_what_photometry_consists_of():
+    """A program that was compiled ahead must not be taken for another structure."""
+    plain = FitConfig()
+    balanced = with_fields(plain, {"photometry.white_balance": "view"})
+    photometry = dataclasses.replace(plain.photometry, cameras=(CameraFormation("a"),))
+    shaded = dataclasses.replace(plain, photometry=photometry)
+    steps = [Step(cfg, make_optimizer(cfg), 1.0) for cfg in (plain, balanced, shaded)]
+    for name in ("differentiate", "advance"):
+        settings = [step.settings(name)["cfg"] for step in steps]
+        assert len(set(settings)) == 3, name
+
+
+def test_without_a_solution_only_views_learn():
+    asked = {
+        "photometry.select": False,
+        "photometry.start": "random",
+        "photometry.white_balance": "view",
+        "photometry.vignetting": "camera",
+    }
+    cfg = with_fields(FitConfig(), asked)
+    decided = decide(cfg, None, matched=False)
+    assert (decided.white_balance, decided.vignetting) == ("view", None)
+    assert likely(cfg, None, matched=False) == dataclasses.replace(decided, correspondence="depth")
+    by_camera = with_fields(cfg, {"photometry.white_balance": "camera"})
+    assert unsolved(Decisions.as_asked(by_camera)).white_balance is None
+
+
+def photographed_by_a_camera(root, views=8):
+    """Write the small scene with a white balance per view and vignetting; return log W."""
+    scene = make_scene(root, views=views)
+    balance = np.random.default_rng(0).normal(0, 0.2, (views, 3))
+    balance -= balance.mean(1, keepdims=True)
+    for view in range(views):
+        path = str(scene / "images" / f"{view}.png")
+        linear = (cv2.imread(path)[..., ::-1] / 255.0) ** 2.2 * np.exp(balance[view])
+        linear *= np.exp(-0.5 * squared_radii(*linear.shape[:2]))[..., None]
+        encoded = np.rint(255 * np.clip(linear, 0, 1) ** (1 / 2.2))
+        cv2.imwrite(path, encoded.astype(np.uint8)[..., ::-1])
+    return balance
+
+
+@pytest.mark.slow
+def test_a_fit_finds_white_balance_and_vignetting_and_removes_seams(tmp_path):
+    true = photographed_by_a_camera(tmp_path / "scene")
+    argv = [
+        *("fit", tmp_path / "scene", "--out", tmp_path / "run", "--steps", 60, "--test-every", 4),
+        *("--densify.max-gaussians", 400, "--render.sh-degree", 1, "--init.shell", "off"),
+        *("--train.coarse-to-fine", "--photometry.no-select", "--photometry.curve", "power"),
+        *("--photometry.white-balance", "view", "--photometry.vignetting", "camera"),
+        *("--photometry.freeze-until", 0.0),
+    ]
+    with pytest.raises(SystemExit) as stop:
+        main([str(a) for a in argv])
+    assert stop.value.code == 0
+    run = load_run(tmp_path / "run")
+    rows = list(run.scene.train_indices)
+    found = np.asarray(run.params.photometry.white_balance)
+    np.testing.assert_allclose(found.mean(0), 0, atol=1e-5)
+    assert np.abs(found - (true[rows] - true[rows].mean(0))).max() < 0.02
+    (camera,) = run.cfg.photometry.cameras
+    assert corner(camera)[0] == pytest.approx(np.exp(-0.5), abs=0.05)
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    test = metrics["test"]
+    assert test["photometry_fitted"]["psnr"] > test["exposure_fitted"]["psnr"] + 0.5
+    fitted = test["photometry_fitted"]["per_view"]
+    for index in run.scene.test_indices:
+        expected = (true[index] - true[rows].mean(0)) / np.log(2)
+        name = run.scene.views[index].name
+        found_ev = [fitted[name][key] for key in ("red_green_ev", "blue_green_ev")]
+        np.testing.assert_allclose(found_ev, expected[::2] - expected[1], atol=0.05)
+    seams = [_seam(run, a, b) for a, b in itertools.pairwise(rows)]
+    assert np.median([s.before_ev for s in seams]) > 0.1
+    assert np.median([s.after_ev for s in seams]) < 0.03
+
+
+def _seam(run, a, b):
+    def photographed(index):
+        ldr, mask = run.store.get(index)
+        depth = np.asarray(surface_depth(run.render(run.camera(index))))
+        return Photographed(ldr, mask, run.camera(index), depth, run.own_display(index))
+
+    seam = measure_seam(photographed(a), photographed(b), run.common_display(), run.cfg.loss)
+    assert seam is not None
+    return seam
