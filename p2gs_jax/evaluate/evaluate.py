@@ -168,24 +168,19 @@ def evaluate(
         """Return how a view is shown by the mean parameters."""
         return usual_display(small, taken_by, scene.views[index].camera, tone)
 
-    def fitted(index, linear, photograph, mask) -> DisplayTransform:
-        """Solve the exposure of a view that has none of its own."""
-        plain = usual(index)
-        how = (plain.capture, tone, plain.correction)
-        return replace(plain, exposure=float(fit_exposure(linear, photograph, mask, *how)))
-
     row_of = {index: row for row, index in enumerate(scene.train_indices)}
 
     def judged(index: int) -> _Judged:
         photograph, mask = store.get(index, 1)
         result = render(gaussians, living, camera_of(store, index))
         linear = np.asarray(result.linear)
-        ldr_mean = develop(linear, replace(usual(index), exposure=mean.exposure))
+        shown = usual(index)
+        ldr_mean = develop(linear, replace(shown, exposure=mean.exposure))
         extra, everything = {}, None
         if scene.views[index].split == "train":
             transform = display_of_view(small, row_of[index], tone)
         else:
-            transform = fitted(index, linear, photograph, mask)
+            transform = _exposure_fitted(shown, linear, photograph, mask)
             extra = {"exposure": transform.exposure}
             everything = _all_fitted(linear, photograph, mask, transform, score)
         ldr = develop(linear, transform)
@@ -260,9 +255,15 @@ def evaluate(
             metrics["radiance"] = scores.summary(exposed / typical)
         if reference_views:
             metrics["reference"] = _against_reference(
-                reference_views, scene, mean, usual, fitted, score
+                reference_views, scene, mean, usual_display(small, (), None, tone), score
             )
         return metrics
+
+
+def _exposure_fitted(shown: DisplayTransform, linear, photograph, mask) -> DisplayTransform:
+    """Return the display transform with the exposure solved that fits a photograph best."""
+    how = (shown.capture, shown.formation, shown.correction)
+    return replace(shown, exposure=float(fit_exposure(linear, photograph, mask, *how)))
 
 
 def _all_fitted(
@@ -288,22 +289,29 @@ def _lookup(reference, index: int):
     return reference(index) if callable(reference) else reference.get(index)
 
 
-def _against_reference(views, scene: Scene, mean: MeanParameters, usual, fitted, score) -> dict:
+def _against_reference(
+    views, scene: Scene, mean: MeanParameters, shown: DisplayTransform, score
+) -> dict:
     """Score all views against photographs of one common exposure.
+
+    Those are taken to be what no camera in particular sees: without vignetting, and of mean white
+    balance.
 
     Args:
         views: row of each; linear radiance, reference photograph and mask, kept.
         scene: their names and splits.
         mean: exposures to show them at.
-        usual: row -> how a view is shown by the mean parameters.
-        fitted: (row, linear, photograph, mask) -> that with the exposure that fits best.
+        shown: how all are shown, but for the exposure.
         score: (display image, photograph, mask) -> scores by name.
     """
 
     def images(view):
         return (kept.read() for kept in view[1])
 
-    scales = list(map_in_order(lambda view: fitted(view[0], *images(view)).exposure, views))
+    def scale(view) -> float:
+        return _exposure_fitted(shown, *images(view)).exposure
+
+    scales = list(map_in_order(scale, views))
     common = float(np.exp(np.median(np.log(scales))))
     protocols = {
         "averaged": mean.exposure,
@@ -313,7 +321,6 @@ def _against_reference(views, scene: Scene, mean: MeanParameters, usual, fitted,
 
     def judged(view):
         linear, truth, mask = images(view)
-        shown = usual(view[0])
         return {
             name: score(develop(linear, replace(shown, exposure=exposure)), truth, mask)
             for name, exposure in protocols.items()
