@@ -27,7 +27,7 @@ def test_scores_are_under_the_metered_exposure(metered):
         views.add_held_out("new.png", meter(linear, mask), linear, linear, mask)
         exposures = KEY / levels if metered else drawn
         found = views.fit(exposures, 2.2, PhotometryConfig())
-        scores = views.scores(found, lambda image, e, *_: {"level": float(image.mean() * e)})
+        scores = views.scores(found, lambda name, image, e, *_: {"level": float(image.mean() * e)})
     if metered:
         assert scores["new.png"]["level"] == pytest.approx(KEY, rel=1e-4)
         assert scores["new.png"]["exposure"] == pytest.approx(KEY / 0.4, rel=1e-4)
