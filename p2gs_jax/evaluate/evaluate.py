@@ -31,7 +31,7 @@ from p2gs_jax.evaluate.metrics import psnr, ssim
 from p2gs_jax.evaluate.parallel import map_in_order
 from p2gs_jax.evaluate.radiance import RadianceScores, Truth
 from p2gs_jax.photometry.display import DisplayTransform, develop, display_of_view, with_capture
-from p2gs_jax.photometry.formation import inverse_tone_map
+from p2gs_jax.photometry.formation import exposed_at
 from p2gs_jax.photometry.mean import MeanParameters, mean_parameters, usual_display
 from p2gs_jax.photometry.metering import Metering, Readings, meter
 from p2gs_jax.photometry.models import MODELS
@@ -250,8 +250,7 @@ def evaluate(
         metrics["train"]["per_view"] = metrics["train"].pop("per_view", {})
         metrics["consistency"] = {name: video.summary() for name, video in videos.items()}
         if scores.views:
-            gamma, saturated = np.float32(mean.gamma), np.array(cfg.loss.saturation, np.float32)
-            exposed = float(inverse_tone_map(saturated, gamma, cfg.photometry))
+            exposed = exposed_at(cfg.loss.saturation, mean.gamma, cfg.photometry)
             typical = float(np.median(small.photometry.exposures))
             metrics["radiance"] = scores.summary(exposed / typical)
         if reference_views:

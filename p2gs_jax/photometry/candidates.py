@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from p2gs_jax.photometry.adjustment.clusters import clusters
+from p2gs_jax.photometry.adjustment.clusters import side_by_side
 from p2gs_jax.photometry.adjustment.fit import TOLERANCE_TO_COMPARE, solve_model
 from p2gs_jax.photometry.adjustment.problem import Problem
 from p2gs_jax.photometry.adjustment.solve import Fit
@@ -102,7 +102,7 @@ class Comparison:
         self._use, self._where = (~held).astype(np.float64), np.flatnonzero(held)
         o = problem.observations
         self._views = o.views[self._where]
-        self._regions = clusters(o, problem.layout.row)[self._where]
+        self._regions = side_by_side(o, problem.layout.row)[self._where]
         self._predicted: dict[Choice, Predicted] = {}
         self._scale = np.inf
 

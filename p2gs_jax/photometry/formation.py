@@ -159,6 +159,19 @@ def inverse_tone_map(
     return xp.exp(log_pivot + (log_linear - log_pivot) * (gamma / GAMMA_SRGB))
 
 
+def exposed_at(level: float, gamma: float, cfg: PhotometryConfig) -> float:
+    """Return the exposed radiance that is shown as one display value; the least of several curves.
+
+    Args:
+        level: display value of all channels.
+        gamma: > 0.
+        cfg: base curve, pivot, cameras.
+    """
+    shown = np.full(3, level, np.float32)
+    rows = range(-1, len(cfg.cameras)) if cfg.cameras else (None,)
+    return min(float(inverse_tone_map(shown, np.float32(gamma), cfg, row).min()) for row in rows)
+
+
 def formation(
     linear: Values,
     capture: Capture,

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.core.numerics import LN2
-from p2gs_jax.photometry.formation import inverse_tone_map
+from p2gs_jax.photometry.formation import exposed_at
 from p2gs_jax.types import Render
 
 MeterName = Literal[
@@ -104,8 +104,7 @@ def white_level(gamma: float, cfg: PhotometryConfig) -> float:
         gamma: of the display.
         cfg: its tone curve.
     """
-    shown = np.array(BELOW_WHITE, np.float32)
-    return float(inverse_tone_map(shown, np.float32(gamma), cfg))
+    return exposed_at(BELOW_WHITE, gamma, cfg)
 
 
 @dataclass(frozen=True)

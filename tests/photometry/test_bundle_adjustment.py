@@ -34,8 +34,7 @@ def ev(solved, truth):
 
 
 def reorder(o, order):
-    picked = {k: getattr(o, k)[order] for k in ("views", "points", "colors", "spread")}
-    return dataclasses.replace(o, **picked)
+    return o.picked(order)
 
 
 @pytest.mark.parametrize(("outliers", "limit"), [(0.0, 0.01), (0.1, 0.01), (0.3, 0.02)])

@@ -62,7 +62,7 @@ def test_what_no_observation_holds_is_unknown_and_said():
     problem = make_problem(o, **LIMITS)
     form = Form("view_exposure")
     fit, system = solve_model(problem, form, Response())
-    known = uncertainty(fit, system, fit.model.rows.row)
+    known = uncertainty(fit, system, o)
     assert known.unknown.shape[1] == 1
     explained = explain(fit, problem, Response())
     s = solution_of(problem, form, Response(), fit, explained, known)

@@ -243,9 +243,11 @@ def test_an_error_is_said_and_the_next_picture_comes(setup, monkeypatch):
     setup.loop.start()
     setup.client.wait(sharp)
     develop = setup.loop.frame_cache.develop
-    monkeypatch.setattr(
-        setup.loop.frame_cache, "develop", lambda s: (_ for _ in ()).throw(UserError("no photo"))
-    )
+
+    def fail(*_, **__):
+        raise UserError("no photo")
+
+    monkeypatch.setattr(setup.loop.frame_cache, "develop", fail)
     setup.loop.display_changed()
     end = time.monotonic() + PATIENCE_S
     while not setup.client.said and time.monotonic() < end:

@@ -13,7 +13,7 @@ from p2gs_jax.photometry.observations import Observations
 REGION = 1 / 3
 
 
-def clusters(observations: Observations, row: Int[np.ndarray, " o"]) -> Int[np.ndarray, " o"]:
+def side_by_side(observations: Observations, row: Int[np.ndarray, " o"]) -> Int[np.ndarray, " o"]:
     """Return the cluster of each observation: the region of an image its point is first seen in.
 
     Points side by side share texture, gloss and what is not modelled; each by itself would count

@@ -7,16 +7,18 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from p2gs_jax.core.streams import Stream, generator
-from p2gs_jax.photometry.adjustment.clusters import small_sample
+from p2gs_jax.photometry.adjustment.clusters import side_by_side, small_sample
 from p2gs_jax.photometry.adjustment.linear import Balanced, one_thread
 from p2gs_jax.photometry.adjustment.matrices import is_small
 from p2gs_jax.photometry.adjustment.normal import scores
 from p2gs_jax.photometry.adjustment.parameters import Parameters
+from p2gs_jax.photometry.adjustment.shared import regions, shared_deviation, shared_scores
 from p2gs_jax.photometry.adjustment.solve import Fit
 from p2gs_jax.photometry.adjustment.system import System, gauge_strength
+from p2gs_jax.photometry.observations import Observations
 
 # Relative size of what a difference of equal numbers leaves of them.
 CANCELLED = 1e-6
@@ -56,19 +58,27 @@ class Uncertainty(NamedTuple):
         return np.where(lost, np.inf, deviation)
 
 
-def uncertainty(fit: Fit, system: System, clusters: Int[np.ndarray, " o"]) -> Uncertainty:
+def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncertainty:
     """Return the robust covariance of all parameters: bread, meat, bread (Huber; White).
 
     Residuals of the three channels of an observation, of a point, and of its neighbours are not
-    independent: the meat is summed over clusters, and counts them once.
+    independent: the meat is summed over clusters, and counts them once. What regions of an image
+    share besides is added to it.
 
     Args:
         fit: the solution.
         system: what it was solved with.
-        clusters: what each observation is counted with.
+        observations: that it was solved from.
     """
     rows = fit.model.rows
+    clusters = side_by_side(observations, rows.row)
     each = scores(fit.model, fit.theta, fit.at, clusters)
+    if observations.positions is not None and len(rows.row):
+        labels = regions(observations)
+        deviation = shared_deviation(fit.model, fit.at, labels)
+        if deviation > 0:
+            shared = deviation * shared_scores(fit.model, fit.theta, fit.at, labels)
+            each = sp.csr_array(sp.vstack([each, shared]))
     seen = rows.weight.any(1)
     few = small_sample(clusters[seen], rows.views[seen], rows.view_count)
     bread = fit.normal * fit.at.curvature + system.priors.normal

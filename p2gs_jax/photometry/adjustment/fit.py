@@ -6,7 +6,6 @@ import numpy as np
 from jaxtyping import Float
 
 from p2gs_jax.config import ResponseKind
-from p2gs_jax.photometry.adjustment.clusters import clusters
 from p2gs_jax.photometry.adjustment.errors import uncertainty
 from p2gs_jax.photometry.adjustment.explained import explain
 from p2gs_jax.photometry.adjustment.linear import one_thread
@@ -73,7 +72,7 @@ def fit_model(
     pick = o.thinned(_per_view(o.view_count), 0)
     few = problem if pick.all() else problem.part(pick)
     fit, system = solve_model(few, form, response)
-    known = uncertainty(fit, system, clusters(few.observations, few.layout.row))
+    known = uncertainty(fit, system, few.observations)
     return solution_of(problem, form, response, fit, explain(fit, problem, response), known)
 
 

@@ -17,7 +17,7 @@ from p2gs_jax.photometry.adjustment.rows import Rows
 from p2gs_jax.photometry.adjustment.system import EMPTY
 
 
-class _OfView(NamedTuple):
+class OfView(NamedTuple):
     """A parameter that every view has.
 
     Attributes:
@@ -47,42 +47,43 @@ def normal_equations(
     w, pull = at.weight, at.weight * at.residual
     coupling = w * theta.a[rows.views][:, None] / np.sqrt(at.precision + EMPTY)[rows.row]
     parts, right = [], []
-    of_views = _of_views(model, at)
+    per_view = of_views(model, at)
     views = np.arange(u.views)
-    for x, one in enumerate(of_views):
+    for x, one in enumerate(per_view):
         right.append(_per_view(rows, pull * one.derivative, one.channels))
-        for y, other in enumerate(of_views):
+        for y, other in enumerate(per_view):
             if common := [c for c in one.channels if c in other.channels]:
                 values = _per_view(rows, w * one.derivative * other.derivative, common)
                 parts.append(Entries(x * u.views + views, y * u.views + views, values))
     coupled = rows.layout.pairs.sums(
-        [(coupling * p.derivative)[:, p.channels] for p in of_views],
+        [(coupling * p.derivative)[:, p.channels] for p in per_view],
         [
             [(p.channels.index(c), q.channels.index(c)) for c in p.channels if c in q.channels]
-            for p in of_views
-            for q in of_views
+            for p in per_view
+            for q in per_view
         ],
         kind,
     )
     parts.append(coupled._replace(values=-coupled.values))
     # Without gammas, a keeps its place in the vector.
     right += [] if u.gammas else [np.zeros(u.views)]
-    if (terms := _others(model, theta)) is not None:
-        more, pulled = _with_others(model, at, terms, of_views, coupling)
+    if (terms := others(model, theta)) is not None:
+        more, pulled = _with_others(model, at, terms, per_view, coupling)
         parts += more
         right.append(pulled)
     return assembled(parts, u.count), np.concatenate(right)
 
 
-def _of_views(model: Forward, at: Weighted) -> list[_OfView]:
+def of_views(model: Forward, at: Weighted) -> list[OfView]:
+    """Return the parameters that every view has."""
     one = np.ones_like(at.level)
     every = [0, 1, 2]
     channels = [[c] for c in every] if model.unknowns.channels == 3 else [every]
-    of_b = [_OfView(one, c) for c in channels]
-    return [*of_b, _OfView(at.level, every)] if model.unknowns.gammas else of_b
+    of_b = [OfView(one, c) for c in channels]
+    return [*of_b, OfView(at.level, every)] if model.unknowns.gammas else of_b
 
 
-def _others(model: Forward, theta: Parameters) -> Terms | None:
+def others(model: Forward, theta: Parameters) -> Terms | None:
     """Return the derivatives of predictions by k and c."""
     features, basis = model.features, model.basis
     if features is not None:
@@ -102,7 +103,7 @@ def _per_view(rows: Rows, values: Float[np.ndarray, "o 3"], channels: list[int])
 
 
 def _with_others(
-    model: Forward, at: Weighted, terms: Terms, of_views: list[_OfView], coupling
+    model: Forward, at: Weighted, terms: Terms, per_view: list[OfView], coupling
 ) -> tuple[list[Entries], Float[np.ndarray, " k"]]:
     """Return what k and c add to the equations: entries, and their right side."""
     rows, u = model.rows, model.unknowns
@@ -111,7 +112,7 @@ def _with_others(
     first = u.per_view
     parts = []
     at_view = np.broadcast_to(rows.views[:, None], at.weight.shape)
-    for x, one in enumerate(of_views):
+    for x, one in enumerate(per_view):
         acting = np.isin(np.arange(3), one.channels)
         side = terms.sums(at.weight * one.derivative * acting, at_view, u.views)
         side -= _at_views(rows, coupling * one.derivative, one.channels) @ through
@@ -136,6 +137,23 @@ def _at_views(rows: Rows, values: Float[np.ndarray, "o 3"], channels: list[int])
     return sp.csr_array((values[order][:, channels].ravel(), at.ravel(), starts), shape=shape)
 
 
+def at_places(
+    rows: Rows, values: Float[np.ndarray, "o 3"], places: Int[np.ndarray, " o"], count: int
+) -> sp.csr_array:
+    """Return the matrix that holds values at places and points: (count, 3 rows).
+
+    Args:
+        rows: observations.
+        values: of each channel.
+        places: of each observation.
+        count: number of places.
+    """
+    at = 3 * rows.row[:, None] + np.arange(3)
+    where = np.broadcast_to(places[:, None], values.shape)
+    shape = (count, 3 * rows.count)
+    return sp.csr_array((values.ravel(), (where.ravel(), at.ravel())), shape=shape)
+
+
 def scores(
     model: Forward, theta: Parameters, at: Weighted, clusters: Int[np.ndarray, " o"]
 ) -> sp.csr_array:
@@ -155,11 +173,11 @@ def scores(
         sp.csr_array(
             ((pull * p.derivative)[:, p.channels].sum(1), (clusters, rows.views)), shape=shape
         )
-        for p in _of_views(model, at)
+        for p in of_views(model, at)
     ]
     if not u.gammas:
         parts.append(sp.csr_array(shape))
-    if (terms := _others(model, theta)) is not None:
+    if (terms := others(model, theta)) is not None:
         place = np.broadcast_to(clusters[:, None], pull.shape)
         parts.append(sp.csr_array(terms.sums(pull, place, count)))
     return sp.csr_array(sp.hstack(parts))

@@ -15,10 +15,14 @@ from p2gs_jax.photometry.adjustment.problem import Problem
 from p2gs_jax.photometry.adjustment.solve import Fit
 from p2gs_jax.photometry.adjustment.warnings import observation_warnings, solver_warnings
 from p2gs_jax.photometry.models import Form
+from p2gs_jax.photometry.neighbourhood import neighbourhood_warnings
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import Response
 from p2gs_jax.photometry.solution import MIN_OBSERVATIONS, PhotometricSolution
 from p2gs_jax.types import GAMMA_SRGB
+
+# Points of a view from which is told what is not modelled.
+PER_VIEW = 2000
 
 
 def solution_of(
@@ -99,6 +103,7 @@ def solution_of(
         warnings=(
             *solver_warnings(fit, h_errors[seen], np.flatnonzero(lost), o.names),
             *observation_warnings(per_view, component, active, tint, o.names),
+            *_unmodelled(problem, residual),
         ),
         white_balance_level=form.white_balance,
         white_balance=balance,
@@ -106,6 +111,17 @@ def solution_of(
         vignetting=form.vignetting,
         cameras=cameras,
         corner_errors=corner_errors,
+    )
+
+
+def _unmodelled(problem: Problem, residual: Float[np.ndarray, "o 3"]) -> list[str]:
+    """Say what depends on the place or the surroundings; of many observations, of a part."""
+    o = problem.observations
+    if o.positions is None or not len(o.points):
+        return []
+    pick = o.thinned(PER_VIEW, 0)
+    return neighbourhood_warnings(
+        o.picked(pick), residual[pick] / LN2, problem.usable[pick], o.names
     )
 
 

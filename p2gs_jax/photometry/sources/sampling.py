@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
 from p2gs_jax.photometry.observations import COARSEST, Observations
+from p2gs_jax.photometry.sources.surroundings import surroundings
 from p2gs_jax.photometry.srgb import srgb_decode, srgb_encode
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.scene.visibility import project_points
@@ -143,17 +144,19 @@ def point_colors(
     coarsest = np.zeros(len(scene.points))
     for mine, footprint, kept in zip(points, footprints, keep, strict=True):
         np.maximum.at(coarsest, mine[kept], footprint[kept])
-    views, seen, colors, spreads, places = [], [], [], [], []
+    views, seen, colors, spreads, places, around = [], [], [], [], [], []
     for row, (index, kept) in enumerate(zip(scene.train_indices, keep, strict=True)):
         mine = points[row][kept]
         if len(mine):
             view, (_, _, width, height) = scene.views[index], store.camera(index)
             there = xy[row][kept] * [width / view.width, height / view.height]
-            found = sample(*store.get(index), there, coarsest[mine] / footprints[row][kept])
+            ldr, mask = store.get(index)
+            found = sample(ldr, mask, there, coarsest[mine] / footprints[row][kept])
             views.append(np.full(int(found.valid.sum()), row))
             seen.append(mine[found.valid])
             colors.append(found.colors[found.valid])
             spreads.append(found.spread[found.valid])
+            around.append(surroundings(ldr, there[found.valid]))
             centred = there[found.valid] - [width / 2, height / 2]
             places.append((centred / np.hypot(width / 2, height / 2)).astype(np.float32))
         on_view(row + 1, len(scene.train_indices))
@@ -169,6 +172,7 @@ def point_colors(
         too_coarse=int(sum((~kept).sum() for kept in keep)),
         names=tuple(scene.views[i].name for i in scene.train_indices),
         positions=np.concatenate([np.zeros((0, 2), np.float32), *places]),
+        surroundings=np.concatenate([np.zeros(0, np.float32), *around]),
         camera_names=tuple(sorted({scene.views[i].camera for i in scene.train_indices})),
     )
 

@@ -1,0 +1,110 @@
+"""Errors that neighbouring pixels of a photograph share: how large they are, and what they move.
+
+Gloss, haze, moving shade and what else is not modelled err alike over a region of an image. Points
+average such errors out between views, never within one: counted as independent they left standard
+errors of photographs of known exposure 2 times too small, and of drives with simulated ones 3 to 7
+times (BUILD_NOTES, "The camera as it is").
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Int
+
+from p2gs_jax.photometry.adjustment.forward import Forward
+from p2gs_jax.photometry.adjustment.normal import at_places, of_views, others
+from p2gs_jax.photometry.adjustment.parameters import Parameters
+from p2gs_jax.photometry.adjustment.robust import Weighted
+from p2gs_jax.photometry.adjustment.system import EMPTY
+from p2gs_jax.photometry.observations import Observations
+
+# Side of a region, in units of half an image's diagonal.
+REGION = 2 / 3
+# Regions that hold fewer observations, or the weight of fewer, say nothing of what they share.
+FEWEST, FEWEST_EFFECTIVE = 4, 3.0
+
+
+def regions(observations: Observations) -> Int[np.ndarray, " o"]:
+    """Return a label for the region of its image that each observation lies in.
+
+    Args:
+        observations: with positions.
+    """
+    assert observations.positions is not None
+    x, y = np.floor((observations.positions + 1) / REGION).astype(np.int64).T
+    across = int(np.ceil(2 / REGION)) + 1
+    labels = (observations.views * np.int64(across) + x) * across + y
+    return np.unique(labels, return_inverse=True)[1]
+
+
+def shared_deviation(model: Forward, at: Weighted, labels: Int[np.ndarray, " o"]) -> float:
+    """Return the standard deviation of what observations of a region share, log units.
+
+    Means of regions vary by more than their own observations explain. Exposures and radiances take
+    a part of that away, which is put back. Medians: a region may show something that moved.
+
+    Args:
+        model: observations.
+        at: residuals and weights at the solution.
+        labels: region of each observation.
+    """
+    rows = model.rows
+    weight = at.weight.sum(1)
+    count = int(labels.max(initial=-1)) + 1
+
+    def total(values):
+        return np.bincount(labels, values, count)
+
+    of_pixel = (at.weight * at.residual).sum(1) / np.maximum(weight, EMPTY)
+    size, members = total(weight), total((weight > 0).astype(float))
+    effective = size**2 / np.maximum(total(weight**2), EMPTY)
+    good = (members >= FEWEST) & (effective >= FEWEST_EFFECTIVE)
+    if not good.any():
+        return 0.0
+    mean = total(weight * of_pixel) / np.maximum(size, EMPTY)
+    spread = total(weight * (of_pixel - mean[labels]) ** 2) / np.maximum(size, EMPTY)
+    own = (spread / np.maximum(effective - 1, 1))[good]
+    excess = (1.4826 * np.median(np.abs(mean[good]))) ** 2 - np.median(own)
+    used = weight > 0
+    seen_by = np.bincount(rows.row[used])
+    per_view = good.sum() / max(len(np.unique(rows.views[used])), 1)
+    kept = (1 - 1 / np.mean(seen_by[seen_by > 0])) * (1 - 1 / max(per_view, 2))
+    return float(np.sqrt(max(excess, 0.0) / kept))
+
+
+def shared_scores(
+    model: Forward, theta: Parameters, at: Weighted, labels: Int[np.ndarray, " o"]
+) -> sp.csr_array:
+    """Return how the right side moves with a unit error of each region: (regions, d).
+
+    Points are eliminated: of an error, they take their part.
+
+    Args:
+        model: observations.
+        theta: parameters.
+        at: residuals and weights at these.
+        labels: region of each observation.
+    """
+    rows, u = model.rows, model.unknowns
+    w, count = at.weight, int(labels.max(initial=-1)) + 1
+    root = np.sqrt(at.precision + EMPTY)[rows.row]
+    a = theta.a[rows.views][:, None]
+    of_points = at_places(rows, w * a / root, labels, count)
+    parts = []
+    for one in of_views(model, at):
+        direct = sp.csr_array(
+            ((w * one.derivative)[:, one.channels].sum(1), (labels, rows.views)),
+            shape=(count, u.views),
+        )
+        acting = np.isin(np.arange(3), one.channels)
+        taken = at_places(rows, w * a / root * one.derivative * acting, rows.views, u.views)
+        parts.append(direct - of_points @ taken.T)
+    if not u.gammas:
+        parts.append(sp.csr_array((count, u.views)))
+    if (terms := others(model, theta)) is not None:
+        place = 3 * rows.row[:, None] + np.arange(3)
+        through = terms.sums(w * a / root, place, 3 * rows.count)
+        direct = terms.sums(w, np.broadcast_to(labels[:, None], w.shape), count)
+        parts.append(sp.csr_array(direct - of_points @ through))
+    return sp.csr_array(sp.hstack(parts))
