@@ -122,15 +122,16 @@ def develop(
     Args:
         linear: radiance; an image where there is a correction or vignetting.
         transform: how to show it.
+        positions: where vignetting takes the pixels to be, if not where they are in `linear`
+            (photometry/cameras.py:places).
     """
-    return np.asarray(
-        _develop(linear, transform.capture, transform.correction, transform.formation)
-    )
+    how = (transform.capture, transform.correction, positions, transform.formation)
+    return np.asarray(_develop(linear, *how))
 
 
 @functools.partial(jax.jit, static_argnames="cfg")
-def _develop(linear, capture, correction, cfg: PhotometryConfig):
-    return display(formation(linear, capture, cfg, correction))
+def _develop(linear, capture, correction, positions, cfg: PhotometryConfig):
+    return display(formation(linear, capture, cfg, correction, positions))
 
 
 def undevelop(

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from p2gs_jax.config import PhotometryConfig
+from p2gs_jax.config import CameraFormation, PhotometryConfig
 from p2gs_jax.formats.false_color import OVER, clipping_overlay, depth_color, false_color
+from p2gs_jax.photometry.cameras import squared_radii
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.types import Camera
 from p2gs_jax.viewer.picture_modes import (
@@ -15,6 +16,7 @@ from p2gs_jax.viewer.picture_modes import (
     WarpedPhotograph,
     limits_of_depth,
     picture_of,
+    places_in,
     split_picture,
     to_uint8_fast,
     warp_photograph,
@@ -152,3 +154,26 @@ def test_codes_are_rounded_and_kept_in_range():
         to_uint8_fast(np.array([[[0.0, 1.4 / 255, 1.6 / 255], [1.0, 1.2, 0.5]]], np.float32))[0],
         [[0, 1, 2], [255, 255, 128]],
     )
+
+
+def test_vignetting_is_where_the_photograph_has_it():
+    """The window's shape is not the photograph's; beyond its corners nothing darkens further."""
+    K = np.array([[50.0, 0, 40], [0, 50.0, 30], [0, 0, 1]], np.float32)
+    taken_by = Camera(np.eye(4, dtype=np.float32), K, 80, 60)
+    np.testing.assert_allclose(
+        (places_in(taken_by, taken_by) ** 2).sum(-1), squared_radii(60, 80), atol=1e-6
+    )
+    wide = Camera(taken_by.viewmat, K + np.array([[0, 0, 40], [0, 0, 0], [0, 0, 0]]), 160, 60)
+    seen = places_in(taken_by, wide)
+    np.testing.assert_allclose(seen[:, 40:120], places_in(taken_by, taken_by), atol=1e-6)
+    assert np.linalg.norm(seen, axis=-1).max() <= 1 + 1e-6
+    shaded = PhotometryConfig(cameras=(CameraFormation("a", ((-0.5, 0.0, 0.0),)),))
+    transform = DisplayTransform(1.0, 2.2, shaded, camera=0)
+    grey = np.full((60, 160, 3), 0.2, np.float32)
+    window = RenderedFrame(grey, np.ones((60, 160)), np.ones((60, 160)), wide)
+    shown = picture_of(window, "display", transform, taken_by=taken_by)
+    photograph = develop(grey[:, :80], transform)
+    np.testing.assert_allclose(shown[:, 40:120], photograph, atol=1e-5)
+    flat = picture_of(window, "display", transform.without_place(), taken_by=taken_by)
+    assert np.ptp(flat) < 1e-6
+    assert np.ptp(shown) > 0.1
