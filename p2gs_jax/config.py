@@ -34,6 +34,19 @@ PhotometricModel = Literal[
     "view_exposure_camera_gamma",
     "view_exposure_gamma",
 ]
+SceneFormat = Literal[
+    "colmap",
+    "transforms",
+    "rig",
+    "pandaset",
+    "nuscenes",
+    "waymo",
+    "argoverse",
+    "kitti_raw",
+    "kitti_odometry",
+    "kitti_360",
+    "images",
+]
 # Per what it varies: one physical camera, or one photograph.
 Level = Literal["camera", "view"]
 # Vignetting per camera: the same for all channels, or one for each.
@@ -56,8 +69,13 @@ class DataConfig:
     """Shrink images to at most this many pixels across; None keeps them as they are."""
     images: str | None = None
     """Image folder, where it is not `images/` beside the model."""
-    format: Literal["colmap", "transforms", "rig", "images"] | None = None
+    format: SceneFormat | None = None
     """How to read the scene; None takes the first of these that the folder holds."""
+    cameras: tuple[str, ...] = ()
+    """Only these cameras of a drive: their names, or what is left of them without `camera`, `cam`
+    and `ring`; none named: all."""
+    frames: str | None = None
+    """Only these frames of a drive, as Python slices them: FIRST:END[:STEP]."""
     allow_missing: bool = False
     """Skip frames whose image file is missing instead of stopping."""
     cache_mb: int = 2048

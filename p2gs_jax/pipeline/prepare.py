@@ -21,6 +21,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.init.brightness import Tones, rough_tones
 from p2gs_jax.gaussians.init.dense import DenseSeeds
 from p2gs_jax.gaussians.init.dense_bound import coverage_of, dense_limit, wants_dense
+from p2gs_jax.gaussians.init.photographed import photographed_radiance, with_colors
 from p2gs_jax.gaussians.init.seeds import merge, scene_extent, subsample
 from p2gs_jax.gaussians.init.shell import find_shell
 from p2gs_jax.gaussians.init.start import (
@@ -198,6 +199,8 @@ def prepare(
         )
         covering = np.concatenate([scene.points, added.points])
         shell = find_shell(views, covering, extent, cfg.init)
+    if scene.point_colors is None:
+        scene = with_colors(scene, photographed_radiance(scene, store, photometry, resolved))
     radiance = point_radiance(scene, solution, resolved)[seeds.keep]
     gaussians = gaussians_of(scene.points[seeds.keep], radiance, added, views, resolved)
     if shell is not None:
