@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Int
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.evaluate.alignment import fit_capture, fit_exposure
@@ -124,6 +124,7 @@ def evaluate(
     render: RenderView,
     cfg: FitConfig,
     *,
+    owner: Int[np.ndarray, " n"] | None = None,
     reference: Mapping[int, Float32[np.ndarray, "h w 3"]] | Callable | None = None,
     radiance: Truth | None = None,
     lpips_weights: LpipsWeights | None = None,
@@ -140,6 +141,7 @@ def evaluate(
         store: photographs.
         render: from `make_renderer`.
         cfg: formation model.
+        owner: the moving object that each Gaussian belongs to, or None.
         reference: view row -> photograph under the common exposure, or None where there is none.
         radiance: view row -> true linear radiance at the size of the photographs, or None.
         lpips_weights: adds `lpips` wherever a view is compared with a photograph; None leaves it
@@ -159,6 +161,7 @@ def evaluate(
     small = jax.tree.map(np.asarray, replace(params, gaussians=None))
     gaussians = jax.device_put(params.gaussians)
     living = jax.device_put(np.asarray(alive))
+    owner_there = None if owner is None else jax.device_put(np.asarray(owner))
     score = functools.partial(_score, lpips_weights)
     taken_by = [view.camera for view in scene.training_views]
 
@@ -172,7 +175,7 @@ def evaluate(
 
     def judged(index: int) -> _Judged:
         photograph, mask = store.get(index, 1)
-        result = render(gaussians, living, camera_of(store, index))
+        result = render(gaussians, living, camera_of(store, index), owner_there)
         linear = np.asarray(result.linear)
         shown = usual(index)
         ldr_mean = develop(linear, replace(shown, exposure=mean.exposure))
