@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.losses.image import photometric_loss
+from p2gs_jax.losses.lidar import lidar_loss
 from p2gs_jax.losses.regularizers import photometry_regularizers, population_terms
 from p2gs_jax.losses.relative_exposure import (
     ColorPairs,
@@ -150,11 +151,13 @@ def image_loss(
     through_depth = through_depth and relative.weight is not None
     cameras = (batch.camera, *partner_cameras(partner, cfg))
     renders = []
+    measured = batch.measured if cfg.loss.lidar is not None else None
     for (splats, radiance), camera in zip(shown, cameras, strict=True):
         if renders and through_depth:
             splats, radiance = lax.stop_gradient((splats, radiance))
+        deep = through_depth or (measured is not None and not renders)
         renders.append(
-            render_splats(splats, radiance, camera, cfg.render, capacity, with_depth=through_depth)
+            render_splats(splats, radiance, camera, cfg.render, capacity, with_depth=deep)
         )
     render, *others = renders
     entries, overflow = render.count, render.overflow
@@ -163,6 +166,8 @@ def image_loss(
     photograph, mask = decoded(batch)
     ldr = formation(render.linear, photometry.capture(i), cfg.photometry, correction)
     terms = dict(photometric_loss(ldr, photograph, mask, cfg.loss))
+    if measured is not None:
+        terms["lidar"] = cfg.loss.lidar * lidar_loss(render, measured)
 
     if relative.weight is not None:
         other, pairs = next(iter(others), None), partner.pairs
