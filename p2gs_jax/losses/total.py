@@ -151,11 +151,12 @@ def image_loss(
     through_depth = through_depth and relative.weight is not None
     cameras = (batch.camera, *partner_cameras(partner, cfg))
     renders = []
-    measured = batch.measured if cfg.loss.lidar is not None else None
+    measured, lidar_weight = batch.measured, cfg.loss.lidar
+    compares_depth = measured is not None and lidar_weight is not None
     for (splats, radiance), camera in zip(shown, cameras, strict=True):
         if renders and through_depth:
             splats, radiance = lax.stop_gradient((splats, radiance))
-        deep = through_depth or (measured is not None and not renders)
+        deep = through_depth or (compares_depth and not renders)
         renders.append(
             render_splats(splats, radiance, camera, cfg.render, capacity, with_depth=deep)
         )
@@ -166,8 +167,8 @@ def image_loss(
     photograph, mask = decoded(batch)
     ldr = formation(render.linear, photometry.capture(i), cfg.photometry, correction)
     terms = dict(photometric_loss(ldr, photograph, mask, cfg.loss))
-    if measured is not None:
-        terms["lidar"] = cfg.loss.lidar * lidar_loss(render, measured)
+    if measured is not None and lidar_weight is not None:
+        terms["lidar"] = lidar_weight * lidar_loss(render, measured)
 
     if relative.weight is not None:
         other, pairs = next(iter(others), None), partner.pairs

@@ -91,7 +91,9 @@ def test_views_get_what_stands_still_near_in_time_and_is_not_hidden():
     owner = np.repeat([-1, -1, 0], 500).astype(np.int32)
     scene = wall_scene(points=points, times=np.zeros(1500), objects=owner)
     cfg = FitConfig(loss=LossConfig(lidar=0.1))
-    first, second = measured_depths(scene, cfg)
+    found = measured_depths(scene, cfg)
+    assert found is not None
+    first, second = found
     depths = np.asarray(first.depths)
     assert depths.shape == (MOST_PER_VIEW,)
     seen = depths[depths > 0]
