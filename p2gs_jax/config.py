@@ -253,6 +253,9 @@ class LossConfig:
     quantization: float | None = None
     """Half the interval that a stored value stands for (0.5 / 255 for 8 bits): predictions within
     it are right and get no gradient. None compares with the stored value (ours: BUILD_NOTES)."""
+    lidar: float | None = None
+    """Weight of the error of log depth at laser measurements, of scenes that have them; None
+    leaves it out (ours)."""
     relative_exposure: RelativeExposureConfig = field(default_factory=RelativeExposureConfig)
     """The relative-exposure loss."""
     regularizers: RegularizerConfig = field(default_factory=RegularizerConfig)

@@ -242,6 +242,18 @@ class Population(eqx.Module):
     seen_count: Float[Array, " n"]
 
 
+class Measured(eqx.Module):
+    """Depths that a laser scanner measured in a view.
+
+    Attributes:
+        places: where in the image, as shares of its width and height.
+        depths: camera z, scene units; 0 fills the list up.
+    """
+
+    places: Float[Array, "k 2"]
+    depths: Float[Array, " k"]
+
+
 class Batch(eqx.Module):
     """One training view on the device.
 
@@ -250,12 +262,14 @@ class Batch(eqx.Module):
         ldr: the photograph, display-encoded: in [0, 1], or integers of which the largest is 1.
         mask: 1 = use, 0 = ignore.
         view_index: its row in `Photometry`.
+        measured: depths for the loss, or None where it asks for none.
     """
 
     camera: Camera
     ldr: Float[Array, "h w 3"] | UInt[Array, "h w 3"]
     mask: Float[Array, "h w"] | Bool[Array, "h w"]
     view_index: Int[Array, ""]
+    measured: Measured | None = None
 
 
 # ------------------------------------------------------------------ host records

@@ -44,7 +44,8 @@ from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.train.compared_photographs import color_pairs, overlaps
-from p2gs_jax.types import Gaussians, Params, Scene
+from p2gs_jax.train.measured_depths import measured_depths
+from p2gs_jax.types import Gaussians, Measured, Params, Scene
 
 
 @dataclass
@@ -59,6 +60,7 @@ class Prepared:
         selection: photometric model, exposures and their errors from the tracks, or None.
         pairs: corresponding observations, or None.
         overlaps: for every training view the ones that show the same surfaces, or None.
+        measured: of every training view the depths that the loss compares with, or None.
         coverage: how much of the scene the views show.
         decisions: what the scene settled.
         cfg: the options that the fit computes under: as asked, with `decisions` filled in.
@@ -72,6 +74,7 @@ class Prepared:
     selection: Selection | None
     pairs: ColorPairs | None
     overlaps: list[np.ndarray] | None
+    measured: list[Measured] | None
     coverage: Coverage
     decisions: Decisions
     cfg: FitConfig
@@ -89,6 +92,7 @@ class Expected(NamedTuple):
         decisions: what most scenes decide.
         cfg: the options under these.
         images: its tone curve is chosen.
+        measured: of every training view the depths that the loss compares with, or None.
     """
 
     store: ImageStore
@@ -98,6 +102,7 @@ class Expected(NamedTuple):
     decisions: Decisions
     cfg: FitConfig
     images: bool
+    measured: list[Measured] | None
 
 
 def load(scene_dir: Path, run_dir: Path, cfg: FitConfig, reporter: Reporter) -> Scene:
@@ -147,6 +152,7 @@ def prepare(
     taken_by = [view.camera for view in views]
     extent = scene_extent(views, scene.points)
     coverage = coverage_of(scene, store)
+    measured = measured_depths(scene, cfg)
     dense = wants_dense(scene, coverage, cfg)
     seeds = _choose_points(scene, cfg)
     # Dense seeds cover some of what the points do not.
@@ -161,7 +167,8 @@ def prepare(
             initial_appearance(views, cfg),
         )
         known = kept is not None or not cfg.photometry.select
-        expected = Expected(store, params, extent, coverage, guess, guess.resolve(cfg), known)
+        under = guess.resolve(cfg)
+        expected = Expected(store, params, extent, coverage, guess, under, known, measured)
         on_expected(expected)
 
     def chosen(form: Form, response: Response) -> None:
@@ -222,6 +229,7 @@ def prepare(
         selection,
         color_pairs(tracks, resolved),
         overlaps(tracks, resolved),
+        measured,
         coverage,
         decisions,
         resolved,

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from p2gs_jax.config import DataConfig, SceneFormat
+from p2gs_jax.scene.drives.pandaset import is_pandaset, read_pandaset
 from p2gs_jax.scene.drives.recording import Recording
 
 Report = Callable[[str], None]
@@ -28,7 +29,9 @@ class DriveFormat(NamedTuple):
     read: Callable[[Path, DataConfig, Report], Recording]
 
 
-FORMATS: dict[SceneFormat, DriveFormat] = {}
+FORMATS: dict[SceneFormat, DriveFormat] = {
+    "pandaset": DriveFormat(is_pandaset, read_pandaset),
+}
 
 
 def read_drive(
