@@ -71,6 +71,8 @@ class DataConfig:
     """Image folder, where it is not `images/` beside the model."""
     format: SceneFormat | None = None
     """How to read the scene; None takes the first of these that the folder holds."""
+    drive: str | None = None
+    """Which drive of a folder that holds several: its name in the data set, or how that begins."""
     cameras: tuple[str, ...] = ()
     """Only these cameras of a drive: their names, or what is left of them without `camera`, `cam`
     and `ring`; none named: all."""
