@@ -359,7 +359,7 @@ def test_what_is_missing_is_counted(made):
         "1 LiDAR sweeps are of frames without a pose: they are left out.",
     )
     # Within what the car drives in half a turn.
-    assert 0.1 < room_error(drive.sweeps[0].read().points).max() < 0.6
+    assert 0.1 < room_error(drive.sweeps[0].read().points).max() < 1.5
 
 
 def test_photographs_alone_are_enough(made):
