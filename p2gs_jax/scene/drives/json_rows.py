@@ -1,31 +1,33 @@
-"""Rows of large JSON tables: read one after the other, so that only those wanted are kept."""
+"""Rows of large JSON tables: only those wanted are decoded."""
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Container, Mapping
+from collections.abc import Container, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.drives.tables import missing_file
 
-_GAP = re.compile(r"[\s,]*")
-
 Row = dict[str, Any]
 Kinds = Mapping[str, type | tuple[type, ...]]
 
+_GAP = re.compile(r"[\s,]*")
+_DECODER = json.JSONDecoder()
+
 
 def read_rows(path: Path, needs: Kinds, column: str = "", among: Container[Any] = ()) -> list[Row]:
-    """Return the rows of a JSON list of objects.
+    """Return rows of a JSON list of objects.
 
-    nuScenes' tables of all drives are gigabytes as Python objects; of one drive they are small.
+    Tables of all of nuScenes' drives are millions of rows; those of one drive are found in the
+    text, which takes a fifth of the time that decoding all does. Rows should hold no objects.
 
     Args:
         path: the table.
         needs: columns that every row returned must have, and their types.
-        column: only rows whose value in it is `among` these; "": all rows.
+        column: only rows whose value in it, a text, is `among` these; "": all rows.
         among: values.
 
     Raises:
@@ -37,30 +39,47 @@ def read_rows(path: Path, needs: Kinds, column: str = "", among: Container[Any] 
         raise missing_file(path) from None
     except ValueError as error:
         raise _broken(path, str(error)) from None
-    decode = json.JSONDecoder().raw_decode
+    rows = list(_found(text, column, among)) if column and _closed(text) else []
+    # Where nothing is found, the table may be written otherwise, or be no table.
+    rows = rows or [row for row in _every(text, path) if not column or row.get(column) in among]
+    for row in rows:
+        for name, kind in needs.items():
+            if not isinstance(row.get(name), kind):
+                raise _broken(path, f"a row has no valid {name!r}: {json.dumps(row)[:200]}")
+    return rows
+
+
+def _closed(text: str) -> bool:
+    return bool(re.search(r"[}\[]\s*\]\s*$", text[-1000:]))
+
+
+def _found(text: str, column: str, among: Container[Any]) -> Iterator[Row]:
+    """Yield the rows that hold one of the values; rows are taken to hold no objects."""
+    for match in re.finditer(rf'"{re.escape(column)}"\s*:\s*"([^"]*)"', text):
+        if match[1] not in among:
+            continue
+        try:
+            row, end = _DECODER.raw_decode(text, text.rfind("{", 0, match.start()))
+        except (ValueError, RecursionError):
+            continue
+        if end > match.start() and isinstance(row, dict) and row.get(column) == match[1]:
+            yield row
+
+
+def _every(text: str, path: Path) -> Iterator[Row]:
     at = _skip(text, 0)
     if text[at : at + 1] != "[":
         raise _broken(path, "it should be a list of objects")
-    at += 1
-    rows: list[Row] = []
-    number = 0
-    while True:
-        at = _skip(text, at)
-        if text[at : at + 1] == "]":
-            return rows
+    at = _skip(text, at + 1)
+    while text[at : at + 1] != "]":
         try:
-            row, at = decode(text, at)
+            row, at = _DECODER.raw_decode(text, at)
         except (ValueError, RecursionError) as error:
             raise _broken(path, str(error)) from None
-        number += 1
         if not isinstance(row, dict):
-            raise _broken(path, f"entry {number} is no object")
-        if column and row.get(column) not in among:
-            continue
-        for name, kind in needs.items():
-            if not isinstance(row.get(name), kind):
-                raise _broken(path, f"entry {number} has no valid {name!r}")
-        rows.append(row)
+            raise _broken(path, "it should be a list of objects")
+        yield row
+        at = _skip(text, at)
 
 
 def _skip(text: str, at: int) -> int:
