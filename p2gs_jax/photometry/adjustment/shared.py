@@ -17,25 +17,11 @@ from p2gs_jax.photometry.adjustment.normal import at_places, of_views, others
 from p2gs_jax.photometry.adjustment.parameters import Parameters
 from p2gs_jax.photometry.adjustment.robust import Weighted
 from p2gs_jax.photometry.adjustment.system import EMPTY
-from p2gs_jax.photometry.observations import Observations
 
 # Side of a region, in units of half an image's diagonal.
-REGION = 2 / 3
+SHARED_REGION = 2 / 3
 # Regions that hold fewer observations, or the weight of fewer, say nothing of what they share.
 FEWEST, FEWEST_EFFECTIVE = 4, 3.0
-
-
-def regions(observations: Observations) -> Int[np.ndarray, " o"]:
-    """Return a label for the region of its image that each observation lies in.
-
-    Args:
-        observations: with positions.
-    """
-    assert observations.positions is not None
-    x, y = np.floor((observations.positions + 1) / REGION).astype(np.int64).T
-    across = int(np.ceil(2 / REGION)) + 1
-    labels = (observations.views * np.int64(across) + x) * across + y
-    return np.unique(labels, return_inverse=True)[1]
 
 
 def shared_deviation(model: Forward, at: Weighted, labels: Int[np.ndarray, " o"]) -> float:
