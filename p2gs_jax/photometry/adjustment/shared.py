@@ -13,7 +13,14 @@ import scipy.sparse as sp
 from jaxtyping import Int
 
 from p2gs_jax.photometry.adjustment.forward import Forward
-from p2gs_jax.photometry.adjustment.normal import at_places, of_views, others
+from p2gs_jax.photometry.adjustment.normal import (
+    at_places,
+    coupling,
+    of_views,
+    others,
+    over_all,
+    summed,
+)
 from p2gs_jax.photometry.adjustment.parameters import Parameters
 from p2gs_jax.photometry.adjustment.robust import Weighted
 from p2gs_jax.photometry.adjustment.system import EMPTY
@@ -73,24 +80,12 @@ def shared_scores(
         labels: region of each observation.
     """
     rows, u = model.rows, model.unknowns
-    w, count = at.weight, int(labels.max(initial=-1)) + 1
-    root = np.sqrt(at.precision + EMPTY)[rows.row]
-    a = theta.a[rows.views][:, None]
-    of_points = at_places(rows, w * a / root, labels, count)
-    parts = []
-    for one in of_views(model, at):
-        direct = sp.csr_array(
-            ((w * one.derivative)[:, one.channels].sum(1), (labels, rows.views)),
-            shape=(count, u.views),
-        )
-        acting = np.isin(np.arange(3), one.channels)
-        taken = at_places(rows, w * a / root * one.derivative * acting, rows.views, u.views)
-        parts.append(direct - of_points @ taken.T)
-    if not u.gammas:
-        parts.append(sp.csr_array((count, u.views)))
-    if (terms := others(model, theta)) is not None:
-        place = 3 * rows.row[:, None] + np.arange(3)
-        through = terms.sums(w * a / root, place, 3 * rows.count)
-        direct = terms.sums(w, np.broadcast_to(labels[:, None], w.shape), count)
-        parts.append(sp.csr_array(direct - of_points @ through))
-    return sp.csr_array(sp.hstack(parts))
+    coupled = coupling(rows, theta, at)
+    taken = [
+        at_places(rows, coupled * p.derivative, rows.views, u.views, p.channels).T
+        for p in of_views(model, at)
+    ]
+    terms, place = others(model, theta), 3 * rows.row[:, None] + np.arange(3)
+    more = None if terms is None else terms.sums(coupled, place, 3 * rows.count)
+    of_points = at_places(rows, coupled, labels, int(labels.max(initial=-1)) + 1)
+    return summed(model, theta, at, at.weight, labels) - of_points @ over_all(u, taken, more)
