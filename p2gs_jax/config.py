@@ -34,6 +34,19 @@ PhotometricModel = Literal[
     "view_exposure_camera_gamma",
     "view_exposure_gamma",
 ]
+SceneFormat = Literal[
+    "colmap",
+    "transforms",
+    "rig",
+    "pandaset",
+    "nuscenes",
+    "waymo",
+    "argoverse",
+    "kitti_raw",
+    "kitti_odometry",
+    "kitti_360",
+    "images",
+]
 # Per what it varies: one physical camera, or one photograph.
 Level = Literal["camera", "view"]
 # Vignetting per camera: the same for all channels, or one for each.
@@ -56,8 +69,15 @@ class DataConfig:
     """Shrink images to at most this many pixels across; None keeps them as they are."""
     images: str | None = None
     """Image folder, where it is not `images/` beside the model."""
-    format: Literal["colmap", "transforms", "rig", "images"] | None = None
+    format: SceneFormat | None = None
     """How to read the scene; None takes the first of these that the folder holds."""
+    drive: str | None = None
+    """Which drive of a folder that holds several: its name in the data set, or how that begins."""
+    cameras: tuple[str, ...] = ()
+    """Only these cameras of a drive: their names, or what is left of them without `camera`, `cam`
+    and `ring`; none named: all."""
+    frames: str | None = None
+    """Only these frames of a drive, as Python slices them: FIRST:END[:STEP]."""
     allow_missing: bool = False
     """Skip frames whose image file is missing instead of stopping."""
     cache_mb: int = 2048
@@ -233,6 +253,9 @@ class LossConfig:
     quantization: float | None = None
     """Half the interval that a stored value stands for (0.5 / 255 for 8 bits): predictions within
     it are right and get no gradient. None compares with the stored value (ours: BUILD_NOTES)."""
+    lidar: float | None = None
+    """Weight of the error of log depth at laser measurements, of scenes that have them; None
+    leaves it out (ours)."""
     relative_exposure: RelativeExposureConfig = field(default_factory=RelativeExposureConfig)
     """The relative-exposure loss."""
     regularizers: RegularizerConfig = field(default_factory=RegularizerConfig)

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Float32, Int, UInt, UInt8
+from jaxtyping import Array, Bool, Float, Float32, Float64, Int, UInt, UInt8
 
 Split = Literal["train", "test"]
 
@@ -242,6 +242,18 @@ class Population(eqx.Module):
     seen_count: Float[Array, " n"]
 
 
+class Measured(eqx.Module):
+    """Depths that a laser scanner measured in a view.
+
+    Attributes:
+        places: where in the image, as shares of its width and height.
+        depths: camera z, scene units; 0 fills the list up.
+    """
+
+    places: Float[Array, "k 2"]
+    depths: Float[Array, " k"]
+
+
 class Batch(eqx.Module):
     """One training view on the device.
 
@@ -250,12 +262,14 @@ class Batch(eqx.Module):
         ldr: the photograph, display-encoded: in [0, 1], or integers of which the largest is 1.
         mask: 1 = use, 0 = ignore.
         view_index: its row in `Photometry`.
+        measured: depths for the loss, or None where it asks for none.
     """
 
     camera: Camera
     ldr: Float[Array, "h w 3"] | UInt[Array, "h w 3"]
     mask: Float[Array, "h w"] | Bool[Array, "h w"]
     view_index: Int[Array, ""]
+    measured: Measured | None = None
 
 
 # ------------------------------------------------------------------ host records
@@ -263,9 +277,16 @@ class Batch(eqx.Module):
 
 @dataclass(frozen=True)
 class Distortion:
-    """Lens distortion in OpenCV's (k1, k2, p1, p2[, k3...]) order; all zero means pinhole."""
+    """Lens distortion; all zero means pinhole.
+
+    Attributes:
+        coefficients: OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]] (`radial`, rational from k4 on),
+            or its k1, k2, k3, k4 of the angle (`fisheye`).
+        model: which.
+    """
 
     coefficients: tuple[float, ...]
+    model: Literal["radial", "fisheye"] = "radial"
 
 
 @dataclass(frozen=True)
@@ -284,6 +305,8 @@ class View:
         mask_path: optional mask (0 = ignore).
         exif_ev: log2(time * ISO / N^2) from EXIF, or None where it is incomplete.
         split: `train` or `test`.
+        frame: its number in a drive, the same for all cameras, or None.
+        time: seconds on the clock of `Scene.objects` and `Scene.lidar`, or None.
     """
 
     name: str
@@ -297,6 +320,44 @@ class View:
     mask_path: Path | None = None
     exif_ev: float | None = None
     split: Split = "train"
+    frame: int | None = None
+    time: float | None = None
+
+
+@dataclass(frozen=True)
+class TrackedObject:
+    """A rigid thing that somebody followed through a drive, as a box.
+
+    Attributes:
+        name: of its track in the data set.
+        label: what it is, in the data set's words ("Car").
+        size: length (x, forward), width (y, left), height (z, up) of the box, scene units.
+        times: seconds, rising.
+        poses: box to world at these times; the origin is the middle of the box.
+        moving: it moves at some time.
+    """
+
+    name: str
+    label: str
+    size: tuple[float, float, float]
+    times: Float64[np.ndarray, " k"]
+    poses: Float64[np.ndarray, "k 4 4"]
+    moving: bool
+
+
+@dataclass(frozen=True)
+class Lidar:
+    """What laser scanners measured, as it was measured: not thinned to one point a place.
+
+    Attributes:
+        points: world coordinates at their own time.
+        times: seconds.
+        objects: row in `Scene.objects` of the moving object a point lies on, -1: on none.
+    """
+
+    points: Float32[np.ndarray, "l 3"]
+    times: Float64[np.ndarray, " l"]
+    objects: Int[np.ndarray, " l"]
 
 
 @dataclass(frozen=True)
@@ -323,18 +384,25 @@ class Scene:
         format: which reader produced it.
         views: sorted by name.
         points: seed points, scene units.
-        point_colors: their display-encoded colours.
+        point_colors: their display-encoded colours; None: photographs have to tell.
         tracks: observations of the points, or None.
         notes: messages of the reader for the user (skipped frames, unregistered images, ...).
+        objects: tracked things, moving or not.
+        lidar: measurements with their times, or None.
+        origin: position of our origin in the data set's world, scene units: float32 needs the
+            drive near it.
     """
 
     root: Path
     format: str
     views: tuple[View, ...]
     points: Float32[np.ndarray, "p 3"]
-    point_colors: UInt8[np.ndarray, "p 3"]
+    point_colors: UInt8[np.ndarray, "p 3"] | None
     tracks: Tracks | None = None
     notes: tuple[str, ...] = field(default_factory=tuple)
+    objects: tuple[TrackedObject, ...] = ()
+    lidar: Lidar | None = None
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def train_indices(self) -> tuple[int, ...]:

@@ -115,7 +115,10 @@ def _write_model(folder: Path, scene: Scene, store: ImageStore) -> None:
     for index, (_, points) in enumerate(observed):
         for slot, point in enumerate(points):
             tracks[point].add_element(index + 1, slot)
-    for xyz, track, color in zip(scene.points, tracks, scene.point_colors, strict=True):
+    colors = scene.point_colors
+    if colors is None:
+        colors = np.full(scene.points.shape, 128, np.uint8)
+    for xyz, track, color in zip(scene.points, tracks, colors, strict=True):
         model.add_point3D(xyz.astype(np.float64), track, color)
     # Mean distance of a point's projections from its observations: what COLMAP itself writes.
     model.update_point_3d_errors()

@@ -68,10 +68,11 @@ def point_radiance(
     """Return linear radiance of the scene's points: the solution's where it knows, else colours'.
 
     Args:
-        scene: points and their colours.
+        scene: points with colours.
         solution: of the bundle adjustment, or None.
         cfg: the tone curve.
     """
+    assert scene.point_colors is not None
     colors = scene.point_colors.astype(np.float32) / np.float32(255)
     radiance = inverse_tone_map(colors, np.float32(GAMMA_SRGB), cfg.photometry)
     if solution is not None:

@@ -76,6 +76,11 @@ class Response:
             return ()
         return self.splines or (self.spline,)
 
+    @property
+    def parts(self) -> tuple[Response, ...]:
+        """Its curves, one for all channels each: of every camera or channel with its own."""
+        return tuple(Response(self.base, spline) for spline in self.each) or (self,)
+
 
 def free_knots(by: ResponseKind) -> tuple[int, ...]:
     """Return the knots that are solved for: of several splines, the powers differ as well."""
@@ -183,16 +188,11 @@ def deviation(
 def monotone(response: Response) -> bool:
     """Return whether the response rises everywhere between its outer knots."""
     y = np.linspace(KNOTS[0], KNOTS[-1], 400)
-    return all(np.all(np.diff(log_exposed(y, one)[0]) > 0) for one in _apart(response))
+    return all(np.all(np.diff(log_exposed(y, one)[0]) > 0) for one in response.parts)
 
 
 def log_slope_minimum(response: Response) -> float:
     """Return the smallest d log exposure / d log value over mid tones; a collapse shows here."""
     y = np.linspace(0.06, 0.94, 90)
-    logs = [log_exposed(y, one)[0] for one in _apart(response)]
+    logs = [log_exposed(y, one)[0] for one in response.parts]
     return min(float(np.gradient(z, np.log(y)).min()) for z in logs)
-
-
-def _apart(response: Response) -> list[Response]:
-    """Return the curves of a response, one for all each."""
-    return [Response(response.base, s) for s in response.each] or [response]

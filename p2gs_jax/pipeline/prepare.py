@@ -21,6 +21,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.init.brightness import Tones, rough_tones
 from p2gs_jax.gaussians.init.dense import DenseSeeds
 from p2gs_jax.gaussians.init.dense_bound import coverage_of, dense_limit, wants_dense
+from p2gs_jax.gaussians.init.photographed import photographed_radiance, with_colors
 from p2gs_jax.gaussians.init.seeds import merge, scene_extent, subsample
 from p2gs_jax.gaussians.init.shell import find_shell
 from p2gs_jax.gaussians.init.start import (
@@ -43,7 +44,8 @@ from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.train.compared_photographs import color_pairs, overlaps
-from p2gs_jax.types import Gaussians, Params, Scene
+from p2gs_jax.train.measured_depths import measured_depths
+from p2gs_jax.types import Gaussians, Measured, Params, Scene
 
 
 @dataclass
@@ -58,6 +60,7 @@ class Prepared:
         selection: photometric model, exposures and their errors from the tracks, or None.
         pairs: corresponding observations, or None.
         overlaps: for every training view the ones that show the same surfaces, or None.
+        measured: of every training view the depths that the loss compares with, or None.
         coverage: how much of the scene the views show.
         decisions: what the scene settled.
         cfg: the options that the fit computes under: as asked, with `decisions` filled in.
@@ -71,6 +74,7 @@ class Prepared:
     selection: Selection | None
     pairs: ColorPairs | None
     overlaps: list[np.ndarray] | None
+    measured: list[Measured] | None
     coverage: Coverage
     decisions: Decisions
     cfg: FitConfig
@@ -88,6 +92,7 @@ class Expected(NamedTuple):
         decisions: what most scenes decide.
         cfg: the options under these.
         images: its tone curve is chosen.
+        measured: of every training view the depths that the loss compares with, or None.
     """
 
     store: ImageStore
@@ -97,6 +102,7 @@ class Expected(NamedTuple):
     decisions: Decisions
     cfg: FitConfig
     images: bool
+    measured: list[Measured] | None
 
 
 def load(scene_dir: Path, run_dir: Path, cfg: FitConfig, reporter: Reporter) -> Scene:
@@ -146,6 +152,7 @@ def prepare(
     taken_by = [view.camera for view in views]
     extent = scene_extent(views, scene.points)
     coverage = coverage_of(scene, store)
+    measured = measured_depths(scene, cfg)
     dense = wants_dense(scene, coverage, cfg)
     seeds = _choose_points(scene, cfg)
     # Dense seeds cover some of what the points do not.
@@ -160,7 +167,8 @@ def prepare(
             initial_appearance(views, cfg),
         )
         known = kept is not None or not cfg.photometry.select
-        expected = Expected(store, params, extent, coverage, guess, guess.resolve(cfg), known)
+        under = guess.resolve(cfg)
+        expected = Expected(store, params, extent, coverage, guess, under, known, measured)
         on_expected(expected)
 
     def chosen(form: Form, response: Response) -> None:
@@ -198,6 +206,8 @@ def prepare(
         )
         covering = np.concatenate([scene.points, added.points])
         shell = find_shell(views, covering, extent, cfg.init)
+    if scene.point_colors is None:
+        scene = with_colors(scene, photographed_radiance(scene, store, photometry, resolved))
     radiance = point_radiance(scene, solution, resolved)[seeds.keep]
     gaussians = gaussians_of(scene.points[seeds.keep], radiance, added, views, resolved)
     if shell is not None:
@@ -219,6 +229,7 @@ def prepare(
         selection,
         color_pairs(tracks, resolved),
         overlaps(tracks, resolved),
+        measured,
         coverage,
         decisions,
         resolved,

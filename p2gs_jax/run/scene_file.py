@@ -14,7 +14,7 @@ import numpy as np
 
 from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.errors import UserError
-from p2gs_jax.types import Distortion, Scene, Tracks, View
+from p2gs_jax.types import Distortion, Lidar, Scene, TrackedObject, Tracks, View
 
 SCENE_FILE = "scene.npz"
 
@@ -39,17 +39,32 @@ def write_scene(folder: Path, scene: Scene) -> None:
                 "image": _relative(v.image_path, base),
                 "mask": None if v.mask_path is None else _relative(v.mask_path, base),
                 "distortion": None if v.distortion is None else v.distortion.coefficients,
+                "lens": None if v.distortion is None else v.distortion.model,
+                "frame": v.frame,
+                "time": v.time,
             }
             for v in scene.views
         ],
+        "objects": [
+            {"name": o.name, "label": o.label, "size": o.size, "moving": o.moving}
+            for o in scene.objects
+        ],
+        "origin": scene.origin,
     }
     arrays = {
         "viewmats": np.stack([v.viewmat for v in scene.views]),
         "Ks": np.stack([v.K for v in scene.views]),
         "sizes": np.array([(v.width, v.height) for v in scene.views], np.int32),
         "points": scene.points,
-        "point_colors": scene.point_colors,
     }
+    if scene.point_colors is not None:
+        arrays["point_colors"] = scene.point_colors
+    for row, thing in enumerate(scene.objects):
+        arrays[f"object_{row}_times"], arrays[f"object_{row}_poses"] = thing.times, thing.poses
+    if scene.lidar is not None:
+        arrays["lidar_points"] = scene.lidar.points
+        arrays["lidar_times"] = scene.lidar.times
+        arrays["lidar_objects"] = scene.lidar.objects
     if scene.tracks is not None:
         arrays["track_views"] = scene.tracks.view_indices
         arrays["track_points"] = scene.tracks.point_indices
@@ -85,10 +100,12 @@ def read_scene(folder: Path, root: Path) -> Scene | None:
                 K=a["Ks"][i],
                 width=int(a["sizes"][i, 0]),
                 height=int(a["sizes"][i, 1]),
-                distortion=None if v["distortion"] is None else Distortion(tuple(v["distortion"])),
+                distortion=_distortion(v),
                 mask_path=None if v["mask"] is None else base / v["mask"],
                 exif_ev=v["exif_ev"],
                 split=v["split"],
+                frame=v.get("frame"),
+                time=v.get("time"),
             )
             for i, v in enumerate(said["views"])
         )
@@ -100,9 +117,14 @@ def read_scene(folder: Path, root: Path) -> Scene | None:
             format=said["format"],
             views=views,
             points=a["points"],
-            point_colors=a["point_colors"],
+            point_colors=a.get("point_colors"),
             tracks=tracks,
             notes=tuple(said["notes"]),
+            objects=_objects(said, a),
+            lidar=None
+            if "lidar_points" not in a
+            else Lidar(a["lidar_points"], a["lidar_times"], a["lidar_objects"]),
+            origin=tuple(said.get("origin", (0.0, 0.0, 0.0))),
         )
     except (OSError, ValueError, KeyError, TypeError, IndexError, zipfile.BadZipFile) as error:
         raise UserError(
@@ -125,3 +147,24 @@ def _relative(path: Path, base: Path) -> str:
         if Path(a).is_relative_to(b):
             return Path(a).relative_to(b).as_posix()
     return Path(os.path.abspath(path)).as_posix()
+
+
+def _distortion(view: dict) -> Distortion | None:
+    if view["distortion"] is None:
+        return None
+    return Distortion(tuple(view["distortion"]), view.get("lens", "radial"))
+
+
+def _objects(said: dict, arrays: dict[str, np.ndarray]) -> tuple[TrackedObject, ...]:
+    """Return the tracked things; runs of older versions have none."""
+    return tuple(
+        TrackedObject(
+            name=thing["name"],
+            label=thing["label"],
+            size=tuple(thing["size"]),
+            times=arrays[f"object_{row}_times"],
+            poses=arrays[f"object_{row}_poses"],
+            moving=thing["moving"],
+        )
+        for row, thing in enumerate(said.get("objects", ()))
+    )

@@ -9,6 +9,8 @@ from pathlib import Path
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.colmap import find_model, load_colmap
+from p2gs_jax.scene.drives import read_drive
+from p2gs_jax.scene.drives.assemble import assemble
 from p2gs_jax.scene.exif import read_exif_ev
 from p2gs_jax.scene.files import list_images
 from p2gs_jax.scene.images import ImageStore, camera_at, size_at
@@ -30,8 +32,9 @@ def load_scene(
 
     In this order, unless `cfg.format` names one: a COLMAP model in `sparse/0`, `sparse` or the
     folder itself; `transforms.json` in it, or `root` itself where that is a .json file; a rig with
-    KITTI's calib.txt and poses.txt; photographs in `images/` or the folder itself, whose cameras
-    are then found by structure from motion. Poses without points get theirs by triangulation.
+    KITTI's calib.txt and poses.txt; a drive as a data set lays it out (`drives`); photographs in
+    `images/` or the folder itself, whose cameras are then found by structure from motion. Poses
+    without points get theirs by triangulation.
 
     Args:
         root: folder, or .json file.
@@ -82,6 +85,9 @@ def _read(
         return load_transforms(root, root / "transforms.json", cfg)
     if is_rig(root) and cfg.format in (None, "rig"):
         return load_rig(root, cfg)
+    recording = read_drive(root, cfg, report)
+    if recording is not None:
+        return assemble(recording, cfg, work_dir, report)
     if cfg.format not in (None, "images"):
         raise UserError(
             f"{root} holds no scene in the format {cfg.format!r}",
@@ -99,8 +105,7 @@ def _read(
     raise UserError(
         f"no scene in {root}: there is no COLMAP model (cameras, images and points3D as .bin or "
         f".txt, in sparse/0, sparse or the folder itself), no transforms.json, no calib.txt with "
-        f"poses.txt, and no photographs "
-        f"(looked in {looked})",
+        f"poses.txt, no drive of a known data set, and no photographs (looked in {looked})",
         fix="name the folder that holds one of these",
     )
 

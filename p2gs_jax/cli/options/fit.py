@@ -18,6 +18,9 @@ Count = Annotated[str | None, tyro.conf.arg(metavar="N|auto")]
 Exposures = Annotated[str | None, tyro.conf.arg(metavar="FILE|exif")]
 Weights = Annotated[str | None, tyro.conf.arg(metavar="alex|vgg|FILE")]
 Folder = Annotated[Path, tyro.conf.arg(metavar="DIR")]
+Drive = Annotated[str | None, tyro.conf.arg(metavar="NAME")]
+Cameras = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME")]
+Frames = Annotated[str | None, tyro.conf.arg(metavar="SLICE")]
 Deviation = Annotated[float | None, tyro.conf.arg(metavar="STOPS")]
 
 
@@ -33,7 +36,8 @@ class Fit:
     """
 
     scene: Annotated[Path, tyro.conf.Positional]
-    """COLMAP model, transforms.json, a rig, or a folder of photographs (docs/scenes.md)."""
+    """COLMAP model, transforms.json, a rig, a drive of a data set (PandaSet, nuScenes, ...), or a
+    folder of photographs (docs/scenes.md)."""
     out: Folder
     """Run folder to create."""
     config: Annotated[configs.FitConfig, tyro.conf.arg(name="")]
@@ -57,6 +61,12 @@ class Fit:
     """Image folder, where it is not images/ beside the model."""
     allow_missing: bool = False
     """Skip frames whose image is missing."""
+    drive: Drive = None
+    """Which drive, where the folder holds several: its name, or how that begins."""
+    cameras: Cameras = ()
+    """Only these cameras of a drive: front, back_left, ...; default: all."""
+    frames: Frames = None
+    """Only these frames of a drive: FIRST:END or FIRST:END:STEP; default: all."""
     known_exposures: Exposures = None
     """Exposures to keep: a CSV file (image, exposure or ev), or exif."""
     known_deviation_ev: Deviation = None
@@ -100,6 +110,12 @@ class Calibrate:
     """The folder holds photographs from one fixed viewpoint at several exposures."""
     images: Annotated[str | None, tyro.conf.arg(metavar="DIR")] = None
     """Image folder, where it is not images/ beside the model."""
+    drive: Drive = None
+    """Which drive, where the folder holds several: its name, or how that begins."""
+    cameras: Cameras = ()
+    """Only these cameras of a drive: front, back_left, ...; default: all."""
+    frames: Frames = None
+    """Only these frames of a drive: FIRST:END or FIRST:END:STEP; default: all."""
     preset: Preset = "robust"
     """Where all values start; see `fit`."""
 
@@ -111,9 +127,11 @@ def resolve_calibration(args: Calibrate) -> configs.FitConfig:
         UserError: a value makes no sense.
     """
     data = args.config.data
-    for name in ("max_width", "images"):
+    for name in ("max_width", "images", "drive", "frames"):
         if getattr(args, name) is not None:
             data = dataclasses.replace(data, **{name: getattr(args, name)})
+    if args.cameras:
+        data = dataclasses.replace(data, cameras=args.cameras)
     check(data.max_width is None or data.max_width >= 16, "--max-width must be at least 16")
     return _known(dataclasses.replace(args.config, data=data), args)
 
@@ -126,9 +144,11 @@ def resolve_fit(args: Fit) -> configs.FitConfig:
     """
     cfg = args.config
     data, train, evaluation = cfg.data, cfg.train, cfg.evaluation
-    for name in ("max_width", "test_every", "images"):
+    for name in ("max_width", "test_every", "images", "drive", "frames"):
         if getattr(args, name) is not None:
             data = dataclasses.replace(data, **{name: getattr(args, name)})
+    if args.cameras:
+        data = dataclasses.replace(data, cameras=args.cameras)
     if args.allow_missing:
         data = dataclasses.replace(data, allow_missing=True)
     if args.seed is not None:

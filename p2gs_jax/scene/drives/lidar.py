@@ -1,0 +1,104 @@
+"""Laser points of a drive: on which moving thing each lies, and which become seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+from scipy.spatial import KDTree
+
+from p2gs_jax.scene.drives.poses import interpolated, inverse
+from p2gs_jax.types import Lidar, TrackedObject
+
+# Boxes are drawn tightly and scanners scatter: points this near to a box are in it, metres.
+BOX_MARGIN = 0.15
+# Kept of all sweeps together, evenly.
+MOST_MEASURED = 2_000_000
+# Seeds: one a voxel, whose side grows with the distance from the nearest camera.
+MOST_SEEDS, FINEST_VOXEL, VOXEL_ANGLE, VOXEL_GROWTH = 200_000, 0.05, 0.01, 1.3
+
+
+def owners(
+    points: Float[np.ndarray, "n 3"],
+    times: Float[np.ndarray, " n"],
+    objects: Sequence[TrackedObject],
+) -> Int[np.ndarray, " n"]:
+    """Return the row of the moving object whose box holds each point, -1 for none.
+
+    Args:
+        points: world coordinates at their own time.
+        times: seconds.
+        objects: only the moving ones count.
+    """
+    found = np.full(len(points), -1, np.int32)
+    if not len(points):
+        return found
+    tree = KDTree(points)
+    for row, thing in enumerate(objects):
+        if not thing.moving:
+            continue
+        half = np.asarray(thing.size) / 2 + BOX_MARGIN
+        first, last = times.min(), times.max()
+        inside = (thing.times >= first - 1) & (thing.times <= last + 1)
+        if not inside.any():
+            continue
+        reach = float(np.linalg.norm(half)) + 2.0
+        centres = thing.poses[inside, :3, 3]
+        balls = tree.query_ball_point(centres, reach)
+        near = np.unique(np.concatenate([np.asarray(ball, int) for ball in balls]))
+        if not len(near):
+            continue
+        poses, covered = interpolated(thing.times, thing.poses, times[near])
+        local = np.einsum("nij,nj->ni", inverse(poses)[:, :3, :3], points[near] - poses[:, :3, 3])
+        found[near[covered & (np.abs(local) <= half).all(1)]] = row
+    return found
+
+
+def thinned(lidar: Lidar, most: int, rng: np.random.Generator) -> Lidar:
+    """Return at most `most` measurements, drawn evenly."""
+    if len(lidar.points) <= most:
+        return lidar
+    keep = np.sort(rng.choice(len(lidar.points), most, replace=False))
+    return Lidar(lidar.points[keep], lidar.times[keep], lidar.objects[keep])
+
+
+def seeds(
+    lidar: Lidar, cameras: Float[np.ndarray, "v 3"], most: int = MOST_SEEDS
+) -> tuple[Float32[np.ndarray, "s 3"], float]:
+    """Return points of what does not move: one a voxel, near the cameras' path finer than far off.
+
+    Args:
+        lidar: all measurements.
+        cameras: centres.
+        most: voxels grow until no more are left.
+
+    Returns:
+        Points, and the side of a voxel over its distance from the nearest camera.
+    """
+    points = lidar.points[lidar.objects < 0]
+    angle = VOXEL_ANGLE
+    if not len(points):
+        return points, angle
+    distance, _ = KDTree(cameras).query(points)
+    while True:
+        kept = _one_per_voxel(points, np.maximum(FINEST_VOXEL, angle * np.asarray(distance)))
+        if len(kept) <= most:
+            return points[kept], angle
+        angle *= VOXEL_GROWTH
+
+
+def _one_per_voxel(points: Float32[np.ndarray, "n 3"], side: Float[np.ndarray, " n"]):
+    """Return rows of the first point in every voxel; sides are rounded to powers of 2."""
+    level = np.clip(np.rint(np.log2(side / FINEST_VOXEL)), 0, 15).astype(np.uint64)
+    cell = np.floor((points - points.min(0)) / np.ldexp(FINEST_VOXEL, level.astype(int))[:, None])
+    # Four bits of level, twenty of each axis: 52 km at the finest.
+    key = level
+    for axis in range(3):
+        key = (key << np.uint64(20)) | np.minimum(cell[:, axis], 2**20 - 1).astype(np.uint64)
+    return np.sort(np.unique(key, return_index=True)[1])
+
+
+def static(lidar: Lidar) -> Bool[np.ndarray, " l"]:
+    """Return which measurements lie on nothing that moves."""
+    return lidar.objects < 0
