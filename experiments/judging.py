@@ -166,5 +166,7 @@ def _found_by_ppisp(run: p2gs_jax.Run, learned: Ppisp) -> Found:
         view = next(v for v in run.scene.views if v.camera == name)
         light = np.asarray(falloff(jnp.asarray(parameters), view.height, view.width))
         corners[name] = float(light[[0, 0, -1, -1], [0, -1, 0, -1]].mean())
-    exposures = np.asarray(learned.exposures, np.float64) + mean[:, 0]
+    # A finished run has its exposures where all others have theirs (`exposures_apart`).
+    apart = np.log2(np.asarray(run.params.photometry.exposures, np.float64))
+    exposures = apart + np.asarray(learned.exposures, np.float64) + mean[:, 0]
     return Found(exposures, stops - mean, corners)
