@@ -17,6 +17,7 @@ Sweeps are moved to where the car was at their first point, which is their time;
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -49,7 +50,7 @@ def is_argoverse(root: Path) -> bool:
     return (root / POSES).is_file() or bool(_logs(root))
 
 
-def read_argoverse(root: Path, cfg: DataConfig, report) -> Recording:
+def read_argoverse(root: Path, cfg: DataConfig, report: Callable[[str], None]) -> Recording:
     """Read a log.
 
     Args:

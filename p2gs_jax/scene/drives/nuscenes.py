@@ -15,7 +15,7 @@ turn begins and ends at azimuth 180 degrees of the scanner's axes (x right, y fo
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -46,7 +46,7 @@ def is_nuscenes(root: Path) -> bool:
     return bool(_versions(root))
 
 
-def read_nuscenes(root: Path, cfg: DataConfig, report) -> Recording:
+def read_nuscenes(root: Path, cfg: DataConfig, report: Callable[[str], None]) -> Recording:
     """Read one drive ("scene") of the set.
 
     Args:

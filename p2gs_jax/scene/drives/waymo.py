@@ -19,6 +19,7 @@ the set's velocities carry it there.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -77,7 +78,7 @@ def is_waymo(root: Path) -> bool:
     return bool(_segments(root))
 
 
-def read_waymo(root: Path, cfg: DataConfig, report) -> Recording:
+def read_waymo(root: Path, cfg: DataConfig, report: Callable[[str], None]) -> Recording:
     """Read a segment.
 
     Args:

@@ -380,7 +380,7 @@ def test_real_laser_points_land_in_the_images_when_those_were_taken(real):
         # Cameras are triggered as the scanner passes the middle of their images.
         middle = np.abs(xy[:, 0] / camera.width - 0.5) < 0.05
         passed = np.median(times[front][inside & middle])
-        assert photograph.time - passed == pytest.approx(0.002, abs=0.002)
+        assert photograph.time - passed == pytest.approx(0.002, abs=0.0006)
 
 
 def test_real_pictures_have_edges_where_depth_jumps(real):
