@@ -31,14 +31,14 @@ def pose(frame: int, turned: float) -> np.ndarray:
     out = np.eye(4)
     out[0, 0] = out[2, 2] = np.cos(turned)
     out[0, 2], out[2, 0] = np.sin(turned), -np.sin(turned)
-    out[:3, 3] = FAR + (0, 0, frame)
+    out[:3, 3] = FAR + np.array([0, 0, frame])
     return out
 
 
 def car(moving: bool = True, name: str = "a") -> TrackedObject:
     times = np.arange(FRAMES) / 10
     poses = np.tile(np.eye(4), (FRAMES, 1, 1))
-    poses[:, :3, 3] = FAR + (2, 0, 0) + np.arange(FRAMES)[:, None] * [0, 1.0, 0]
+    poses[:, :3, 3] = FAR + np.array([2, 0, 0]) + np.arange(FRAMES)[:, None] * [0, 1.0, 0]
     return TrackedObject(name, "Car", (4.0, 2.0, 1.5), times, poses, moving)
 
 
@@ -81,9 +81,9 @@ def test_a_drive_becomes_views_with_frames_and_times_near_the_origin(drive):
     assert front.time == pytest.approx(0.3)
     assert np.abs(scene.origin - FAR).max() <= 3.5
     centre = -front.viewmat[:3, :3].T @ front.viewmat[:3, 3]
-    np.testing.assert_allclose(centre + scene.origin, FAR + (0, 0, 3), atol=1e-4)
+    np.testing.assert_allclose(centre + scene.origin, FAR + np.array([0, 0, 3]), atol=1e-4)
     moved = scene.objects[0].poses[2, :3, 3] + scene.origin
-    np.testing.assert_allclose(moved, FAR + (2, 2, 0), atol=1e-9)
+    np.testing.assert_allclose(moved, FAR + np.array([2, 2, 0]), atol=1e-9)
 
 
 def test_laser_points_are_told_apart_by_what_they_lie_on(drive):
@@ -220,7 +220,10 @@ def test_what_is_no_rotation_is_refused():
 
 def test_seeds_are_dense_near_the_path_and_sparse_far_from_it():
     rng = np.random.default_rng(1)
-    near, far = rng.uniform(-5, 5, (20_000, 3)), rng.uniform(-5, 5, (20_000, 3)) + (80, 0, 0)
+    near, far = (
+        rng.uniform(-5, 5, (20_000, 3)),
+        rng.uniform(-5, 5, (20_000, 3)) + np.array([80, 0, 0]),
+    )
     points = np.concatenate([near, far]).astype(np.float32)
     lidar = Lidar(points, np.zeros(40_000), np.full(40_000, -1))
     kept, _ = seeds(lidar, np.zeros((1, 3)))
