@@ -103,7 +103,9 @@ def assemble(
         )
     views.sort(key=lambda v: v.name)
     objects = tuple(_moved(thing, origin) for thing in recording.objects)
-    lidar, said = _read_sweeps(recording, taken, objects, origin, report)
+    lidar, said = None, ["Laser measurements are not used (--data.no-lidar)."]
+    if cfg.lidar:
+        lidar, said = _read_sweeps(recording, taken, objects, origin, report)
     points = np.zeros((0, 3), np.float32)
     if lidar is not None:
         points, angle = seeds(lidar, np.stack([p.pose[:3, 3] - origin for p in taken]))
