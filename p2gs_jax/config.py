@@ -71,11 +71,18 @@ class DataConfig:
     """Image folder, where it is not `images/` beside the model."""
     format: SceneFormat | None = None
     """How to read the scene; None takes the first of these that the folder holds."""
+    drive: str | None = None
+    """Which drive of a folder that holds several: its name in the data set, or how that begins."""
     cameras: tuple[str, ...] = ()
     """Only these cameras of a drive: their names, or what is left of them without `camera`, `cam`
     and `ring`; none named: all."""
     frames: str | None = None
     """Only these frames of a drive, as Python slices them: FIRST:END[:STEP]."""
+    lidar: bool = True
+    """Use the laser measurements of a drive: seeds, and depth to judge by. Without them seeds are
+    triangulated from matches between the photographs."""
+    own_car: bool = True
+    """Leave out what of a drive's photographs shows the car itself: what never moves in them."""
     allow_missing: bool = False
     """Skip frames whose image file is missing instead of stopping."""
     cache_mb: int = 2048
@@ -254,6 +261,9 @@ class LossConfig:
     quantization: float | None = None
     """Half the interval that a stored value stands for (0.5 / 255 for 8 bits): predictions within
     it are right and get no gradient. None compares with the stored value (ours: BUILD_NOTES)."""
+    lidar: float | None = None
+    """Weight of the error of log depth at laser measurements, of scenes that have them; None
+    leaves it out (ours)."""
     relative_exposure: RelativeExposureConfig = field(default_factory=RelativeExposureConfig)
     """The relative-exposure loss."""
     regularizers: RegularizerConfig = field(default_factory=RegularizerConfig)

@@ -266,6 +266,18 @@ class Population(eqx.Module):
     owner: Int[Array, " n"] | None = None
 
 
+class Measured(eqx.Module):
+    """Depths that a laser scanner measured in a view.
+
+    Attributes:
+        places: where in the image, as shares of its width and height.
+        depths: camera z, scene units; 0 fills the list up.
+    """
+
+    places: Float[Array, "k 2"]
+    depths: Float[Array, " k"]
+
+
 class Batch(eqx.Module):
     """One training view on the device.
 
@@ -274,12 +286,14 @@ class Batch(eqx.Module):
         ldr: the photograph, display-encoded: in [0, 1], or integers of which the largest is 1.
         mask: 1 = use, 0 = ignore.
         view_index: its row in `Photometry`.
+        measured: depths for the loss, or None where it asks for none.
     """
 
     camera: Camera
     ldr: Float[Array, "h w 3"] | UInt[Array, "h w 3"]
     mask: Float[Array, "h w"] | Bool[Array, "h w"]
     view_index: Int[Array, ""]
+    measured: Measured | None = None
 
 
 # ------------------------------------------------------------------ host records
@@ -317,6 +331,8 @@ class View:
         split: `train` or `test`.
         frame: its number in a drive, the same for all cameras, or None.
         time: seconds on the clock of `Scene.objects` and `Scene.lidar`, or None.
+        own_car: where the photograph shows the car that carries the camera, at any resolution; the
+            same for all photographs of a camera; None: nowhere that is known of.
     """
 
     name: str
@@ -332,6 +348,7 @@ class View:
     split: Split = "train"
     frame: int | None = None
     time: float | None = None
+    own_car: Bool[np.ndarray, "a b"] | None = None
 
 
 @dataclass(frozen=True)

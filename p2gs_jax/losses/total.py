@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.losses.image import photometric_loss
+from p2gs_jax.losses.lidar import lidar_loss
 from p2gs_jax.losses.regularizers import photometry_regularizers, population_terms, pose_terms
 from p2gs_jax.losses.relative_exposure import (
     ColorPairs,
@@ -151,11 +152,14 @@ def image_loss(
     through_depth = through_depth and relative.weight is not None
     cameras = (batch.camera, *partner_cameras(partner, cfg))
     renders = []
+    measured, lidar_weight = batch.measured, cfg.loss.lidar
+    compares_depth = measured is not None and lidar_weight is not None
     for (splats, radiance), camera in zip(shown, cameras, strict=True):
         if renders and through_depth:
             splats, radiance = lax.stop_gradient((splats, radiance))
+        deep = through_depth or (compares_depth and not renders)
         renders.append(
-            render_splats(splats, radiance, camera, cfg.render, capacity, with_depth=through_depth)
+            render_splats(splats, radiance, camera, cfg.render, capacity, with_depth=deep)
         )
     render, *others = renders
     entries, overflow = render.count, render.overflow
@@ -164,6 +168,8 @@ def image_loss(
     photograph, mask = decoded(batch)
     ldr = formation(render.linear, photometry.capture(i), cfg.photometry, correction)
     terms = dict(photometric_loss(ldr, photograph, mask, cfg.loss))
+    if measured is not None and lidar_weight is not None:
+        terms["lidar"] = lidar_weight * lidar_loss(render, measured)
 
     if relative.weight is not None:
         other, pairs = next(iter(others), None), partner.pairs

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from p2gs_jax.config import Level, VignettingKind
+from p2gs_jax.config import Level, ResponseKind, VignettingKind
 from p2gs_jax.config import PhotometricModel as ModelName
 from p2gs_jax.photometry.response import Response
 
@@ -37,6 +37,11 @@ MODELS: dict[ModelName, Model] = {
 
 # Powers of the radius in log V(r) = k1 r^2 + k2 r^4 + k3 r^6.
 VIGNETTING_POWERS = (2, 4, 6)
+
+
+def polynomials(vignetting: VignettingKind | None) -> int:
+    """Return the polynomials of a camera: none, one for all channels, or one for each."""
+    return {None: 0, "camera": 1, "channel": 3}[vignetting]
 
 
 class Form(NamedTuple):
@@ -90,12 +95,24 @@ def parameter_count(form: Form, response: Response, cameras: int, views: int) ->
         views: number of views.
     """
     size = {None: 0, "camera": cameras - 1, "view": views - 1}
-    rows = {None: 0, "camera": 1, "channel": 3}[form.vignetting]
     varies = MODELS[form.model]
     return (
         size[varies.exposure]
         + size[varies.gamma]
         + 2 * size[form.white_balance]
-        + cameras * rows * len(VIGNETTING_POWERS)
+        + cameras * polynomials(form.vignetting) * len(VIGNETTING_POWERS)
         + response.extra_parameters
+        - channel_powers(form, response.by)
     )
+
+
+def channel_powers(form: Form, by: ResponseKind | None) -> int:
+    """Return how many powers of channels are gauges beside that of responses by themselves.
+
+    Where every channel has exposures of its own, no photograph tells its power.
+
+    Args:
+        form: what varies.
+        by: what has a response of its own, or None.
+    """
+    return 2 if by == "channel" and form.white_balance == "view" else 0

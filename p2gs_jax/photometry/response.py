@@ -67,12 +67,7 @@ class Response:
     @property
     def extra_parameters(self) -> int:
         """Parameters besides those of the base curve."""
-        if self.spline is None:
-            return 0
-        if self.by == "all":
-            return len(FREE)
-        # Of a power and a shape each, one power is a gauge.
-        return len(self.splines) * len(FREE_OF_EACH) - 1
+        return spline_parameters(None if self.spline is None else self.by, len(self.splines))
 
     @property
     def each(self) -> tuple[tuple[float, ...], ...]:
@@ -81,10 +76,33 @@ class Response:
             return ()
         return self.splines or (self.spline,)
 
+    @property
+    def parts(self) -> tuple[Response, ...]:
+        """Its curves, one for all channels each: of every camera or channel with its own."""
+        return tuple(Response(self.base, spline) for spline in self.each) or (self,)
+
 
 def free_knots(by: ResponseKind) -> tuple[int, ...]:
     """Return the knots that are solved for: of several splines, the powers differ as well."""
     return FREE if by == "all" else FREE_OF_EACH
+
+
+def spline_count(by: ResponseKind | None, cameras: int) -> int:
+    """Return how many splines there are.
+
+    Args:
+        by: what has one of its own; None: nothing.
+        cameras: number of physical cameras.
+    """
+    return {None: 0, "all": 1, "camera": cameras, "channel": 3}[by]
+
+
+def spline_parameters(by: ResponseKind | None, cameras: int) -> int:
+    """Return the number of free parameters of all splines; arguments as for `spline_count`."""
+    if by is None:
+        return 0
+    # Of several, each with a power and a shape, one power is a gauge.
+    return spline_count(by, cameras) * len(free_knots(by)) - (by != "all")
 
 
 def spline_groups(
@@ -170,16 +188,11 @@ def deviation(
 def monotone(response: Response) -> bool:
     """Return whether the response rises everywhere between its outer knots."""
     y = np.linspace(KNOTS[0], KNOTS[-1], 400)
-    return all(np.all(np.diff(log_exposed(y, one)[0]) > 0) for one in _apart(response))
+    return all(np.all(np.diff(log_exposed(y, one)[0]) > 0) for one in response.parts)
 
 
 def log_slope_minimum(response: Response) -> float:
     """Return the smallest d log exposure / d log value over mid tones; a collapse shows here."""
     y = np.linspace(0.06, 0.94, 90)
-    logs = [log_exposed(y, one)[0] for one in _apart(response)]
+    logs = [log_exposed(y, one)[0] for one in response.parts]
     return min(float(np.gradient(z, np.log(y)).min()) for z in logs)
-
-
-def _apart(response: Response) -> list[Response]:
-    """Return the curves of a response, one for all each."""
-    return [Response(response.base, s) for s in response.each] or [response]

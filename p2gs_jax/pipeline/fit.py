@@ -60,7 +60,11 @@ def optimise(
     """
     cfg = prepared.cfg
     views = TrainingViews(
-        prepared.fitted, prepared.scene.train_indices, cfg.train.seed, prepared.overlaps
+        prepared.fitted,
+        prepared.scene.train_indices,
+        cfg.train.seed,
+        prepared.overlaps,
+        prepared.measured,
     )
 
     def say(text: str) -> None:
@@ -94,7 +98,9 @@ def optimise(
 
 def _begin(programs: StepPrograms, known: Expected, scene: Scene, folder: RunFolder) -> None:
     """Begin to compile steps while the exposures are solved, mostly on one core."""
-    views = TrainingViews(known.store, scene.train_indices, known.cfg.train.seed)
+    views = TrainingViews(
+        known.store, scene.train_indices, known.cfg.train.seed, measured=known.measured
+    )
     trainer = Trainer(
         known.cfg,
         views,

@@ -50,7 +50,8 @@ from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.train.compared_photographs import color_pairs, overlaps
-from p2gs_jax.types import Gaussians, Params, Scene, View
+from p2gs_jax.train.measured_depths import measured_depths
+from p2gs_jax.types import Gaussians, Measured, Params, Scene, View
 
 
 @dataclass
@@ -67,6 +68,7 @@ class Prepared:
         selection: photometric model, exposures and their errors from the tracks, or None.
         pairs: corresponding observations, or None.
         overlaps: for every training view the ones that show the same surfaces, or None.
+        measured: of every training view the depths that the loss compares with, or None.
         coverage: how much of the scene the views show.
         decisions: what the scene settled.
         cfg: the options that the fit computes under: as asked, with `decisions` filled in.
@@ -82,6 +84,7 @@ class Prepared:
     selection: Selection | None
     pairs: ColorPairs | None
     overlaps: list[np.ndarray] | None
+    measured: list[Measured] | None
     coverage: Coverage
     decisions: Decisions
     cfg: FitConfig
@@ -100,6 +103,7 @@ class Expected(NamedTuple):
         decisions: what most scenes decide.
         cfg: the options under these.
         images: its tone curve is chosen.
+        measured: of every training view the depths that the loss compares with, or None.
     """
 
     store: ImageStore
@@ -110,6 +114,7 @@ class Expected(NamedTuple):
     decisions: Decisions
     cfg: FitConfig
     images: bool
+    measured: list[Measured] | None
 
 
 def load(scene_dir: Path, run_dir: Path, cfg: FitConfig, reporter: Reporter) -> Scene:
@@ -161,6 +166,7 @@ def prepare(
     taken_by = [view.camera for view in views]
     extent = scene_extent(views, scene.points)
     coverage = coverage_of(scene, store)
+    measured = measured_depths(scene, cfg)
     dense = wants_dense(scene, coverage, cfg)
     seeds = _choose_points(scene, cfg)
     # Dense seeds cover some of what the points do not.
@@ -182,7 +188,7 @@ def prepare(
         )
         known = kept is not None or not cfg.photometry.select
         under = guess.resolve(cfg)
-        expected = Expected(fitted, params, owner, extent, coverage, guess, under, known)
+        expected = Expected(fitted, params, owner, extent, coverage, guess, under, known, measured)
         on_expected(expected)
 
     def chosen(form: Form, response: Response) -> None:
@@ -255,6 +261,7 @@ def prepare(
         selection,
         color_pairs(tracks, resolved),
         overlaps(tracks, resolved),
+        measured,
         coverage,
         decisions,
         resolved,

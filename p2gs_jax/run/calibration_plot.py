@@ -15,6 +15,7 @@ from p2gs_jax.types import GAMMA_SRGB
 
 MARKERS = "osD^vPX*"
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
+CHANNELS = ("red", "green", "blue")
 MOST_CURVES = 12
 
 
@@ -77,11 +78,10 @@ def write_calibration_plot(
     if len(names) <= 12:
         top.legend(fontsize=7)
     y = np.linspace(0.02, 1, 300)
-    base = log_exposed(y, s.response)[0] - np.log(pivot)
-    distinct = np.unique(np.round(s.gammas, 3))
-    for gamma in distinct[:: max(1, len(distinct) // MOST_CURVES)]:
+    for label, response, gamma in curves_to_draw(s):
+        base = log_exposed(y, response)[0] - np.log(pivot)
         stops = (base * gamma / GAMMA_SRGB + np.log(pivot)) / LN2
-        right.plot(stops, y, lw=0.9, label=f"gamma {gamma:.2f}")
+        right.plot(stops, y, lw=0.9, label=label)
     srgb = log_exposed(y, Response())[0] / LN2
     right.plot(srgb, y, "k--", lw=0.9, label="sRGB")
     right.set_title(f"Tone curve: {s.response.name}", loc="left", fontsize=10)
@@ -92,3 +92,15 @@ def write_calibration_plot(
     right.legend(fontsize=7)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=110, format="png")
+
+
+def curves_to_draw(s: PhotometricSolution) -> list[tuple[str, Response, float]]:
+    """Return the tone curves to draw: name, response and gamma of each."""
+    distinct = np.unique(np.round(s.gammas, 3))
+    if len(s.response.parts) == 1:
+        shown = distinct[:: max(1, len(distinct) // MOST_CURVES)]
+        return [(f"gamma {gamma:.2f}", s.response, float(gamma)) for gamma in shown]
+    names = CHANNELS if s.response.by == "channel" else [c.name for c in s.cameras]
+    middle = float(np.median(s.gammas))
+    shown = zip(names, s.response.parts, strict=True)
+    return [(name, part, middle) for name, part in shown][:MOST_CURVES]

@@ -155,6 +155,10 @@ def _prepare(view: View, width: int, height: int) -> Decoded:
         )
     if view.mask_path is not None:
         valid &= _decode_mask(view)
+    if view.own_car is not None:
+        # Any pixel that takes part in interpolation counts: the outline is known roughly.
+        covered = view.own_car.astype(np.float32)
+        valid &= cv2.resize(covered, (view.width, view.height)) == 0
     shrunk = (width, height) != (view.width, view.height)
     if view.distortion is not None or shrunk:
         ldr = floats(pixels)

@@ -10,7 +10,7 @@ from jaxtyping import Int
 from p2gs_jax.core.numerics import on_host
 from p2gs_jax.core.streams import Stream, generator, view_order
 from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.types import Batch, Camera
+from p2gs_jax.types import Batch, Camera, Measured
 
 
 class TrainingViews:
@@ -21,6 +21,7 @@ class TrainingViews:
         rows: rows of the training views in the scene, in the order of `Photometry`.
         seed: decides the order of every epoch.
         overlaps: for every training view the ones that show the same surfaces; None: all others.
+        measured: of every training view the depths that the loss compares with, or None.
     """
 
     def __init__(
@@ -29,11 +30,13 @@ class TrainingViews:
         rows: Sequence[int],
         seed: int,
         overlaps: Sequence[Int[np.ndarray, " k"]] | None = None,
+        measured: Sequence[Measured] | None = None,
     ):
         self.store = store
         self.rows = tuple(rows)
         self.seed = seed
         self.overlaps = overlaps
+        self.measured = measured
         self._orders: dict[int, np.ndarray] = {}
         self.leave_out(())
 
@@ -84,4 +87,5 @@ class TrainingViews:
     def batch(self, index: int, shrink: int) -> Batch:
         """Return a training view, on the host: a compiled step takes it from there."""
         ldr, mask = self.store.stored(self.rows[index], shrink)
-        return on_host(Batch, self.camera(index, shrink), ldr, mask, np.int32(index))
+        measured = None if self.measured is None else self.measured[index]
+        return on_host(Batch, self.camera(index, shrink), ldr, mask, np.int32(index), measured)

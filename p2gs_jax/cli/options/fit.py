@@ -18,6 +18,7 @@ Count = Annotated[str | None, tyro.conf.arg(metavar="N|auto")]
 Exposures = Annotated[str | None, tyro.conf.arg(metavar="FILE|exif")]
 Weights = Annotated[str | None, tyro.conf.arg(metavar="alex|vgg|FILE")]
 Folder = Annotated[Path, tyro.conf.arg(metavar="DIR")]
+Drive = Annotated[str | None, tyro.conf.arg(metavar="NAME")]
 Cameras = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME")]
 Frames = Annotated[str | None, tyro.conf.arg(metavar="SLICE")]
 Deviation = Annotated[float | None, tyro.conf.arg(metavar="STOPS")]
@@ -60,6 +61,8 @@ class Fit:
     """Image folder, where it is not images/ beside the model."""
     allow_missing: bool = False
     """Skip frames whose image is missing."""
+    drive: Drive = None
+    """Which drive, where the folder holds several: its name, or how that begins."""
     cameras: Cameras = ()
     """Only these cameras of a drive: front, back_left, ...; default: all."""
     frames: Frames = None
@@ -107,6 +110,8 @@ class Calibrate:
     """The folder holds photographs from one fixed viewpoint at several exposures."""
     images: Annotated[str | None, tyro.conf.arg(metavar="DIR")] = None
     """Image folder, where it is not images/ beside the model."""
+    drive: Drive = None
+    """Which drive, where the folder holds several: its name, or how that begins."""
     cameras: Cameras = ()
     """Only these cameras of a drive: front, back_left, ...; default: all."""
     frames: Frames = None
@@ -122,7 +127,7 @@ def resolve_calibration(args: Calibrate) -> configs.FitConfig:
         UserError: a value makes no sense.
     """
     data = args.config.data
-    for name in ("max_width", "images", "frames"):
+    for name in ("max_width", "images", "drive", "frames"):
         if getattr(args, name) is not None:
             data = dataclasses.replace(data, **{name: getattr(args, name)})
     if args.cameras:
@@ -139,7 +144,7 @@ def resolve_fit(args: Fit) -> configs.FitConfig:
     """
     cfg = args.config
     data, train, evaluation = cfg.data, cfg.train, cfg.evaluation
-    for name in ("max_width", "test_every", "images", "frames"):
+    for name in ("max_width", "test_every", "images", "drive", "frames"):
         if getattr(args, name) is not None:
             data = dataclasses.replace(data, **{name: getattr(args, name)})
     if args.cameras:

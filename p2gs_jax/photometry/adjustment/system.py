@@ -18,7 +18,7 @@ from p2gs_jax.photometry.adjustment.parameters import Parameters, Unknowns
 from p2gs_jax.photometry.adjustment.problem import Problem
 from p2gs_jax.photometry.adjustment.spline import Splines
 from p2gs_jax.photometry.models import MODELS, Form
-from p2gs_jax.photometry.response import KNOTS
+from p2gs_jax.photometry.response import KNOTS, spline_count
 
 # How hard gauges are held, relative to the mean diagonal of the normal matrix.
 ANCHOR = 10.0
@@ -104,13 +104,12 @@ def make_system(problem: Problem, form: Form, splines: ResponseKind | None = Non
     cameras, views = problem.observations.cameras, problem.observations.view_count
     camera_count = int(cameras.max(initial=0)) + 1
     model = MODELS[form.model]
-    groups = {None: 0, "all": 1, "camera": camera_count, "channel": 3}[splines]
     unknowns = Unknowns(
         views,
         3 if form.white_balance == "view" else 1,
         model.gamma is not None,
         Features(camera_count, form.white_balance == "camera", form.vignetting),
-        Splines(splines or "all", groups),
+        Splines(splines or "all", spline_count(splines, camera_count)),
     )
     of_b, of_a = _directions(model.exposure, cameras), _directions(model.gamma, cameras)
     others = sp.eye_array(unknowns.count - unknowns.per_view)
@@ -174,8 +173,13 @@ def _anchors(problem: Problem, u: Unknowns, log_exposure, precision) -> Held:
         for direction in range(u.features.balance_count // u.features.cameras):
             at = u.of_k.start + direction * u.features.cameras + np.arange(u.features.cameras)
             hold(at, views_of / views_of.sum())
-    if u.splines.powers.size:
-        hold(u.of_c.start + u.splines.powers, 1 / u.splines.groups)
+    powers = u.of_c.start + u.splines.powers
+    if u.splines.by == "channel" and u.channels == 3:
+        # Of a channel with exposures of its own no photograph tells the power.
+        for power in powers:
+            hold(power, 1.0)
+    elif powers.size:
+        hold(powers, 1 / u.splines.groups)
     return Held(sp.csr_array(sp.vstack(rows)), np.array(targets), np.ones(len(targets)))
 
 

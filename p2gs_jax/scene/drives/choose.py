@@ -1,14 +1,46 @@
-"""Which cameras and frames of a drive are used."""
+"""Which drive, and which of its cameras and frames are used."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from pathlib import Path
 
 from p2gs_jax.errors import UserError
 
 # Words that data sets put around the names of their cameras.
 _AROUND = re.compile(r"(?:^|_)(?:camera|cam|ring)(?=_|$)")
+
+
+# As many drives are listed in a complaint.
+LISTED = 5
+
+
+def chosen_drive(asked: str | None, there: Sequence[str], root: Path) -> str:
+    """Return the drive that was asked for; nothing asked: the only one.
+
+    Args:
+        asked: its name, or how that begins.
+        there: names of all drives.
+        root: folder that holds them, for complaints.
+
+    Raises:
+        UserError: none is so named, or several could be meant.
+    """
+    fits = [name for name in there if name == asked] or [
+        name for name in there if asked is None or name.startswith(asked)
+    ]
+    if len(fits) == 1:
+        return fits[0]
+    listed = sorted(fits or there)
+    names = ", ".join(listed[:LISTED]) + (", ..." if len(listed) > LISTED else "")
+    if asked is None:
+        message = f"{root} holds {len(there)} drives: {names}"
+    elif fits:
+        message = f"{len(fits)} drives of {root} begin with {asked!r}: {names}"
+    else:
+        message = f"{root} holds no drive {asked!r}; there are {names or 'none'}"
+    raise UserError(message, fix="name one of them: --drive NAME")
 
 
 def short_name(camera: str) -> str:
