@@ -29,6 +29,7 @@ from p2gs_jax.evaluate.drives import DriveScores, is_drive
 from p2gs_jax.evaluate.lpips import LpipsWeights, lpips
 from p2gs_jax.evaluate.metered import MeteredViews
 from p2gs_jax.evaluate.metrics import psnr, ssim
+from p2gs_jax.evaluate.moving import still_mask
 from p2gs_jax.evaluate.parallel import map_in_order
 from p2gs_jax.evaluate.radiance import RadianceScores, Truth
 from p2gs_jax.evaluate.unexplained import Unexplained
@@ -189,9 +190,10 @@ def evaluate(
         if scene.views[index].split == "train":
             transform = display_of_view(small, row_of[index], tone)
         else:
-            transform = _exposure_fitted(shown, linear, photograph, mask)
+            still = still_mask(scene, index, mask)
+            transform = _exposure_fitted(shown, linear, photograph, still)
             extra = {"exposure": transform.exposure}
-            everything = _all_fitted(linear, photograph, mask, transform, score)
+            everything = _all_fitted(linear, photograph, (still, mask), transform, score)
         ldr = develop(linear, transform)
         depth, alpha = np.asarray(result.depth), np.asarray(result.alpha)
         return _Judged(
@@ -282,14 +284,23 @@ def _exposure_fitted(shown: DisplayTransform, linear, photograph, mask) -> Displ
 
 
 def _all_fitted(
-    linear, photograph, mask, start: DisplayTransform, score
+    linear, photograph, masks, start: DisplayTransform, score
 ) -> dict[str, float] | None:
-    """Score a held-out view with all solved that varies per view; None: that is one scalar."""
+    """Score a held-out view with all solved that varies per view; None: that is one scalar.
+
+    Args:
+        linear: the render.
+        photograph: display values.
+        masks: what it is solved from, and what is scored.
+        start: with the exposure alone.
+        score: (display image, photograph, mask) -> scores by name.
+    """
     tone = start.formation
     gamma, balance = MODELS[tone.model].gamma == "view", tone.white_balance == "view"
     if not (gamma or balance):
         return None
-    given, how = (linear, photograph, mask), (start.capture, tone, start.correction)
+    still, mask = masks
+    given, how = (linear, photograph, still), (start.capture, tone, start.correction)
     found = fit_capture(*given, *how, gamma=gamma, white_balance=balance)
     transform = with_capture(start, found)
     row = {**score(develop(linear, transform), photograph, mask), "exposure": transform.exposure}
