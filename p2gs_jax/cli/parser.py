@@ -50,6 +50,8 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "Your shell": ("completion",),
 }
 WITH_PRESET = ("fit", "calibrate")
+# Their `--help` is short, and `--help-all` is not.
+WITH_CONFIGURATION = (*WITH_PRESET, "scene")
 HELP, HELP_ALL, VERSION = ("-h", "--help"), "--help-all", ("-V", "--version")
 
 
@@ -109,7 +111,7 @@ def _options(name: str, argv: list[str]) -> Any:
         return answer()
     text = help_text.captured(answer)
     _print_and_exit(
-        help_text.with_prose(text, COMMANDS[name], brief and name in WITH_PRESET, name), 0
+        help_text.with_prose(text, COMMANDS[name], brief and name in WITH_CONFIGURATION, name), 0
     )
 
 

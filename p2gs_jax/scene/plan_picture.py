@@ -38,7 +38,8 @@ class _Plane:
         way = longest[-1] - longest[0]
         way -= up * (up @ way)
         if np.linalg.norm(way) < 1e-6:
-            way = viewmats[0, 2, :3] - up * (up @ viewmats[0, 2, :3])
+            ahead = next((k for k, v in enumerate(views) if "front" in v.camera.lower()), 0)
+            way = viewmats[ahead, 2, :3] - up * (up @ viewmats[ahead, 2, :3])
         along = way / max(np.linalg.norm(way), 1e-12)
         self.axes = np.stack([along, np.cross(up, along)])
         self.start = longest[0]
@@ -102,7 +103,7 @@ def draw_plan(path: Path, survey: Survey) -> None:
 
 def _title(survey: Survey) -> str:
     said = f"{survey.root.resolve().name} from above"
-    if survey.way is not None:
+    if survey.way:
         said += f": {survey.way:.1f} {survey.unit} to the right"
         said += "" if survey.seconds is None else f" in {survey.seconds:.1f} s"
     return said

@@ -13,6 +13,7 @@ import numpy as np
 from p2gs_jax.config import DataConfig
 from p2gs_jax.scene import PhotographsAlone, find_scene, with_what_lies_beside
 from p2gs_jax.scene.drives.assemble import SWEEP_SLACK_S, assemble
+from p2gs_jax.scene.drives.choose import chosen_frames
 from p2gs_jax.scene.drives.recording import Recording
 from p2gs_jax.scene.exif import read_exif_ev
 from p2gs_jax.scene.files import image_size
@@ -102,22 +103,23 @@ def survey(
     found = find_scene(root, cfg, report)
     if isinstance(found, PhotographsAlone):
         return Survey(Path(root), "images", _sizes(found), lacks=("cameras", "points"))
-    sweeps = None
+    sweeps, frames = None, None
     if isinstance(found, Recording):
         scene = assemble(found, cfg, None, report, write_embedded=False)
+        every = sorted({photograph.frame for photograph in found.photographs})
+        frames = len(chosen_frames(cfg.frames, every))
         times = [view.time for view in scene.views if view.time is not None]
         first, last = min(times) - SWEEP_SLACK_S, max(times) + SWEEP_SLACK_S
         sweeps = sum(first <= sweep.time <= last for sweep in found.sweeps)
     else:
         scene = found
     scene = with_what_lies_beside(scene, cfg)
-    return _of_scene(scene, sweeps)
+    return _of_scene(scene, frames, sweeps)
 
 
-def _of_scene(scene: Scene, sweeps: int | None) -> Survey:
+def _of_scene(scene: Scene, frames: int | None, sweeps: int | None) -> Survey:
     views = scene.views
     by_camera = {name: [v for v in views if v.camera == name] for name in cameras_of(scene)}
-    frames = {view.frame for view in views if view.frame is not None}
     times = [view.time for view in views if view.time is not None]
     most = max(by_camera.values(), key=len)
     lacks = []
@@ -134,10 +136,10 @@ def _of_scene(scene: Scene, sweeps: int | None) -> Survey:
         scene.format,
         tuple(_camera(name, taken) for name, taken in by_camera.items()),
         scene,
-        len(frames) or None,
+        frames,
         max(times) - min(times) if times else None,
         way_of(most) if frames else None,
-        len(frames) * len(by_camera) - len(views) if frames else 0,
+        frames * len(by_camera) - len(views) if frames else 0,
         sweeps,
         tuple(lacks),
     )

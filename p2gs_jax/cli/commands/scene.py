@@ -43,21 +43,25 @@ def run(options: Options) -> int:
 
 
 def _head(found: Survey) -> list[str]:
-    said = f"{found.photographs} photographs"
+    said = _count(found.photographs, "photograph")
     if found.scene is None:
         return [
             f"{found.root}: {said}, and nothing else. Their cameras are found by structure from "
             "motion when a fit starts."
         ]
-    cameras = "1 camera" if len(found.cameras) == 1 else f"{len(found.cameras)} cameras"
+    cameras = _count(len(found.cameras), "camera")
     said = f"{found.root} ({found.format}): {said} of {cameras}"
     if found.frames is not None:
-        said += f" in {found.frames} frames"
+        said += f" in {_count(found.frames, 'frame')}"
     if found.seconds is not None:
         said += f", {found.seconds:.1f} s"
     if found.way is not None:
         said += f", {found.way:.1f} {found.unit} driven"
     return [said + "."]
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
 def _cameras(found: Survey) -> Table:
@@ -91,9 +95,9 @@ def _measurements(found: Survey) -> list[str]:
         return []
     said = []
     if found.missing:
-        said.append(f"{found.missing} photographs are missing in these frames.")
+        said.append(f"{_count(found.missing, 'photograph')} missing in these frames.")
     if found.sweeps:
-        said.append(f"{found.sweeps} LiDAR sweeps.")
+        said.append(f"{_count(found.sweeps, 'LiDAR sweep')}.")
     elif len(scene.points):
         said.append(f"{len(scene.points):,} points.")
     if scene.tracks is not None:
