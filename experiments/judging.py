@@ -58,7 +58,7 @@ def measured(
     """Fit all methods to a scene and judge them; finished fits are kept.
 
     Args:
-        scene: with photographs of one exposure in `reference`.
+        scene: photographs of one exposure, if there are any, are in its folder `reference`.
         out: folder of the runs.
         under: configuration of each method.
         judge: returns what is to be said of a method, from its name, its run and its scores
@@ -67,11 +67,12 @@ def measured(
     Returns:
         A row of each method; of one that failed, why.
     """
+    reference = scene / "reference"
     result = p2gs_jax.sweep.sweep(
         scene,
         out,
         under,
-        reference=scene / "reference",
+        reference=reference if reference.is_dir() else None,
         report=lambda line: print(f"{scene.name} {line}", file=sys.stderr, flush=True),
     )
     rows = []
