@@ -117,23 +117,28 @@ def _set_cameras(database: Path, views: Sequence[View]) -> pycolmap.Reconstructi
 
 
 def _camera(view: View, camera_id: int) -> pycolmap.Camera:
-    k1, k2, p1, p2, *higher = _coefficients(view)
+    model, coefficients = _lens(view)
     K = view.K.astype(np.float64)
-    params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], k1, k2, p1, p2]
-    if higher:
-        params += [*higher, 0.0, 0.0, 0.0]
     return pycolmap.Camera(
         camera_id=camera_id,
-        model="FULL_OPENCV" if higher else "OPENCV",
+        model=model,
         width=view.width,
         height=view.height,
-        params=params,
+        params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2], *coefficients],
         has_prior_focal_length=True,
     )
 
 
-def _coefficients(view: View) -> tuple[float, ...]:
-    return view.distortion.coefficients if view.distortion else (0.0, 0.0, 0.0, 0.0)
+def _lens(view: View) -> tuple[str, tuple[float, ...]]:
+    """Return COLMAP's name of the lens model, and as many coefficients as it has."""
+    if view.distortion is None:
+        return "OPENCV", (0.0,) * 4
+    held = view.distortion.coefficients
+    if view.distortion.model == "fisheye":
+        return "OPENCV_FISHEYE", held
+    if len(held) == 4:
+        return "OPENCV", held
+    return "FULL_OPENCV", (*held, 0.0, 0.0, 0.0)[:8]
 
 
 def _image_folder(view: View) -> Path:
