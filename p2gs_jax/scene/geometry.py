@@ -20,6 +20,8 @@ from p2gs_jax.types import Distortion
 # iteration does not converge for strong rational lenses.
 _TABLE, _POLISHING = 4096, 3
 _MOST_ROUNDS, _SETTLED = 20, 1e-10
+# Smaller leading coefficients do nothing within any picture.
+_NOTHING = 1e-14
 
 
 def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, "3 3"]:
@@ -66,12 +68,12 @@ def undistort_points(
     points = np.asarray(xy, np.float64).reshape(-1, 2)
     focal, center = np.asarray(K, np.float64)[[0, 1], [0, 1]], np.asarray(K, np.float64)[:2, 2]
     distorted = (points - center) / focal
-    straight = _radially_undone(distorted, distortion)
-    if distortion.model == "radial":
+    untilted = distorted
+    if distortion.model == "radial" and any(distortion.coefficients[2:4]):
         p1, p2 = distortion.coefficients[2:4]
         # Tangential terms are small: taken off where they were found last, they settle at once.
-        for _ in range(_MOST_ROUNDS if p1 or p2 else 0):
-            before, (x, y) = straight, straight.T
+        for _ in range(_MOST_ROUNDS):
+            before, (x, y) = untilted, _radially_undone(untilted, distortion, rough=True).T
             square = x * x + y * y
             tangential = np.stack(
                 [
@@ -80,9 +82,10 @@ def undistort_points(
                 ],
                 axis=1,
             )
-            straight = _radially_undone(distorted - tangential, distortion)
-            if not np.nanmax(np.abs(straight - before), initial=0.0) > _SETTLED:
+            untilted = distorted - tangential
+            if np.abs(untilted - before).max() < _SETTLED:
                 break
+    straight = _radially_undone(untilted, distortion)
     return (straight * focal + center).astype(np.float32)
 
 
@@ -109,9 +112,7 @@ def undistortion_maps(
             shifted, lens, np.eye(3), shifted, size, cv2.CV_32FC1
         )
     else:
-        map_x, map_y = cv2.initUndistortRectifyMap(
-            shifted, lens, None, shifted, size, cv2.CV_32FC1
-        )
+        map_x, map_y = cv2.initUndistortRectifyMap(shifted, lens, None, shifted, size, cv2.CV_32FC1)
     limit = _fold_radius(distortion)
     if np.isfinite(limit):
         x = (np.arange(width) - shifted[0, 2]) / shifted[0, 0]
@@ -145,7 +146,7 @@ def _profile(distortion: Distortion) -> _Profile:
 
 def _first_root(polynomial: Polynomial) -> float:
     """Return the smallest positive root, infinite where there is none."""
-    roots = polynomial.trim().roots()
+    roots = polynomial.trim(_NOTHING).roots()
     found = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
     return float(found.min(initial=np.inf))
 
@@ -159,21 +160,31 @@ def _fold_radius(distortion: Distortion) -> float:
 
 
 def _radially_undone(
-    distorted: Float[np.ndarray, "n 2"], distortion: Distortion
+    distorted: Float[np.ndarray, "n 2"], distortion: Distortion, *, rough: bool = False
 ) -> Float[np.ndarray, "n 2"]:
-    """Return normalised positions without the radial part of a lens, NaN where there are none."""
+    """Return normalised positions without the radial part of a lens.
+
+    Args:
+        distorted: normalised positions.
+        distortion: the lens.
+        rough: as the table has it, and positions without a ray are put at the last one; else
+            exactly, and these are NaN.
+    """
     n, d, limit = _profile(distortion)
     fisheye = distortion.model == "fisheye"
     last = min(limit, np.pi / 2) if fisheye else np.arctan(limit)
     table = np.linspace(0.0, last, _TABLE)[:-1]
     x = table if fisheye else np.tan(table)
+    grown = n(x) / d(x)
     radius = np.linalg.norm(distorted, axis=1)
-    found = np.interp(radius, n(x) / d(x), x, right=np.nan)
+    within = radius <= grown[-1]
+    found = np.interp(radius, grown, x, right=None if rough else np.nan)
     dn, dd = n.deriv(), d.deriv()
-    for _ in range(_POLISHING):
-        above, below = n(found), d(found)
-        slope = (dn(found) * below - above * dd(found)) / below**2
-        found = found - (above / below - radius) / slope
+    for _ in range(0 if rough else _POLISHING):
+        at = found[within]
+        above, below = n(at), d(at)
+        slope = (dn(at) * below - above * dd(at)) / below**2
+        found[within] = at - (above / below - radius[within]) / slope
     straight = np.tan(found) if fisheye else found
-    grown = np.divide(straight, radius, out=np.ones_like(radius), where=radius > 0)
-    return distorted * grown[:, None]
+    ratio = np.divide(straight, radius, out=np.ones_like(radius), where=radius > 0)
+    return distorted * ratio[:, None]
