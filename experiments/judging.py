@@ -1,4 +1,4 @@
-"""What the comparisons with learned cameras share: one look for held-out views, and what was found.
+"""What the comparisons with learned cameras share: fits, a look for held-out views, what is found.
 
 Methods keep what cameras do to the light in different places: `Photometry` and the configuration
 (ours), a matrix or grid per view (3dgs_affine, 3dgs_bilateral), or PPISP's own parameters.
@@ -7,8 +7,10 @@ Methods keep what cameras do to the light in different places: `Photometry` and 
 from __future__ import annotations
 
 import dataclasses
+import json
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -43,6 +45,43 @@ def configs(names: Sequence[str], **train: Any) -> dict[str, FitConfig]:
             continue
         found[name] = dataclasses.replace(cfg, train=dataclasses.replace(cfg.train, **train))
     return found
+
+
+def measured(
+    scene: Path,
+    out: Path,
+    under: dict[str, FitConfig],
+    judge: Callable[[str, p2gs_jax.Run, dict[str, Any]], dict[str, Any]],
+) -> list[dict[str, Any]]:
+    """Fit all methods to a scene and judge them; finished fits are kept.
+
+    Args:
+        scene: with photographs of one exposure in `reference`.
+        out: folder of the runs.
+        under: configuration of each method.
+        judge: returns what is to be said of a method, from its name, its run and its scores
+            (`metrics.json`).
+
+    Returns:
+        A row of each method; of one that failed, why.
+    """
+    result = p2gs_jax.sweep.sweep(
+        scene,
+        out,
+        under,
+        reference=scene / "reference",
+        report=lambda line: print(f"{scene.name} {line}", file=sys.stderr, flush=True),
+    )
+    rows = []
+    for found in result.rows:
+        name = found["name"]
+        if found["status"] != "done":
+            rows.append({"method": name, "failed": found["reason"]})
+            continue
+        folder = Path(found["run"])
+        metrics = json.loads((folder / "metrics.json").read_text())
+        rows.append({"method": name, **judge(name, p2gs_jax.load_run(folder), metrics)})
+    return rows
 
 
 def mean_of_rows(run: p2gs_jax.Run, rows: Sequence[int]) -> p2gs_jax.Run:
@@ -127,5 +166,7 @@ def _found_by_ppisp(run: p2gs_jax.Run, learned: Ppisp) -> Found:
         view = next(v for v in run.scene.views if v.camera == name)
         light = np.asarray(falloff(jnp.asarray(parameters), view.height, view.width))
         corners[name] = float(light[[0, 0, -1, -1], [0, -1, 0, -1]].mean())
-    exposures = np.asarray(learned.exposures, np.float64) + mean[:, 0]
+    # A finished run has its exposures where all others have theirs (`exposures_apart`).
+    apart = np.log2(np.asarray(run.params.photometry.exposures, np.float64))
+    exposures = apart + np.asarray(learned.exposures, np.float64) + mean[:, 0]
     return Found(exposures, stops - mean, corners)

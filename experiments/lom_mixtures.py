@@ -20,14 +20,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from judging import common_display, configs, found_by
+from judging import common_display, configs, found_by, measured
 from mixtures import GROUPS, REFERENCE, read_groups, spread_by_group, write_mixture
 
 import p2gs_jax
@@ -111,53 +110,33 @@ def spreads(run: p2gs_jax.Run, groups: dict[str, str]) -> dict[str, float]:
     return spread_by_group(dict(zip(names, evs, strict=True)), groups)
 
 
-def judged(method: str, folder: Path, scene: Path) -> tuple[dict[str, Any], Common]:
-    """Return a finished run's row and its pictures."""
-    groups = read_groups(scene)
-    run = p2gs_jax.load_run(folder)
-    common = under_common_exposure(run, groups)
-    metrics = json.loads((folder / "metrics.json").read_text())
-    test = metrics["test"]
-    all_fitted = [v["psnr"] for k, v in test.items() if k not in NOT_ALL and "psnr" in v]
-    row = {
-        "method": method,
-        "spread_ev": spreads(run, groups),
-        "own_exposure": test["exposure_fitted"]["psnr"],
-        # The protocol that fits most comes last.
-        "own_all": all_fitted[-1] if all_fitted else test["exposure_fitted"]["psnr"],
-        "common": common.psnr,
-        "steps": metrics["counts"]["steps"],
-        "seconds": metrics["seconds"]["optimisation"],
-    }
-    return row, common
-
-
 def measure(
     scene: Path, out: Path, under: dict[str, FitConfig]
 ) -> tuple[list[dict[str, Any]], dict[str, Common]]:
-    """Fit all methods to a mixture and judge them; finished fits are kept.
+    """Return the rows of all methods, fitted to a mixture, and the pictures of those that ended.
 
     Args:
         scene: the mixture.
         out: folder of the runs.
         under: configuration of each method.
     """
-    result = p2gs_jax.sweep.sweep(
-        scene,
-        out,
-        under,
-        reference=scene / "reference",
-        report=lambda line: print(f"{scene.name} {line}", file=sys.stderr, flush=True),
-    )
-    rows, shown = [], {}
-    for found in result.rows:
-        name = found["name"]
-        if found["status"] != "done":
-            rows.append({"method": name, "failed": found["reason"]})
-            continue
-        row, shown[name] = judged(name, Path(found["run"]), scene)
-        rows.append(row)
-    return rows, shown
+    groups, shown = read_groups(scene), dict[str, Common]()
+
+    def judge(method: str, run: p2gs_jax.Run, metrics: dict[str, Any]) -> dict[str, Any]:
+        common = shown[method] = under_common_exposure(run, groups)
+        test = metrics["test"]
+        all_fitted = [v["psnr"] for k, v in test.items() if k not in NOT_ALL and "psnr" in v]
+        return {
+            "spread_ev": spreads(run, groups),
+            "own_exposure": test["exposure_fitted"]["psnr"],
+            # The protocol that fits most comes last.
+            "own_all": all_fitted[-1] if all_fitted else test["exposure_fitted"]["psnr"],
+            "common": common.psnr,
+            "steps": metrics["counts"]["steps"],
+            "seconds": metrics["seconds"]["optimisation"],
+        }
+
+    return measured(scene, out, under, judge), shown
 
 
 # ------------------------------------------------------------------ what is written

@@ -21,14 +21,12 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from judging import common_display, configs, found_by
+from judging import common_display, configs, found_by, measured
 from scipy.optimize import minimize
 
 import p2gs_jax
@@ -156,32 +154,14 @@ def town(folder: Path, sensor: Sensor, args: argparse.Namespace) -> Path:
     return folder
 
 
-def measure(scene: Path, out: Path, under: dict[str, p2gs_jax.FitConfig]) -> list[dict[str, Any]]:
-    """Fit all methods to a town and judge them; finished fits are kept."""
-    result = p2gs_jax.sweep.sweep(
-        scene,
-        out,
-        under,
-        reference=scene / "reference",
-        report=lambda line: print(f"{scene.name} {line}", file=sys.stderr, flush=True),
-    )
-    rows = []
-    for found in result.rows:
-        if found["status"] != "done":
-            rows.append({"method": found["name"], "failed": found["reason"]})
-            continue
-        folder = Path(found["run"])
-        metrics, run = json.loads((folder / "metrics.json").read_text()), p2gs_jax.load_run(folder)
-        rows.append(
-            {
-                "method": found["name"],
-                **errors(run),
-                "own": metrics["test"]["exposure_fitted"]["psnr"],
-                "iso_8": at_iso_8(run),
-                "seconds": metrics["seconds"]["optimisation"],
-            }
-        )
-    return rows
+def judge(method: str, run: p2gs_jax.Run, metrics: dict[str, Any]) -> dict[str, Any]:
+    """Return the scores of a finished run."""
+    return {
+        **errors(run),
+        "own": metrics["test"]["exposure_fitted"]["psnr"],
+        "iso_8": at_iso_8(run),
+        "seconds": metrics["seconds"]["optimisation"],
+    }
 
 
 def to_markdown(rows: list[dict[str, Any]]) -> str:
@@ -219,7 +199,8 @@ def main() -> None:
         size = f"{args.width}_{args.frames}x3_seed_{args.seed}"
         scene = town(args.out / "towns" / f"{name}_{size}", SENSORS[name], args)
         under = configs(args.methods, steps=args.steps)
-        rows = measure(scene, args.out / "runs" / scene.name / f"steps_{args.steps}", under)
+        out = args.out / "runs" / scene.name / f"steps_{args.steps}"
+        rows = measured(scene, out, under, judge)
         tables[scene.name] = {"sensor": dataclasses.asdict(SENSORS[name]), "rows": rows}
         text.append(f"### {scene.name}, {args.steps} steps\n\n{to_markdown(rows)}")
         print(text[-1], flush=True)

@@ -78,6 +78,11 @@ class DataConfig:
     and `ring`; none named: all."""
     frames: str | None = None
     """Only these frames of a drive, as Python slices them: FIRST:END[:STEP]."""
+    lidar: bool = True
+    """Use the laser measurements of a drive: seeds, and depth to judge by. Without them seeds are
+    triangulated from matches between the photographs."""
+    own_car: bool = True
+    """Leave out what of a drive's photographs shows the car itself: what never moves in them."""
     allow_missing: bool = False
     """Skip frames whose image file is missing instead of stopping."""
     cache_mb: int = 2048

@@ -307,6 +307,8 @@ class View:
         split: `train` or `test`.
         frame: its number in a drive, the same for all cameras, or None.
         time: seconds on the clock of `Scene.objects` and `Scene.lidar`, or None.
+        own_car: where the photograph shows the car that carries the camera, at any resolution; the
+            same for all photographs of a camera; None: nowhere that is known of.
     """
 
     name: str
@@ -322,6 +324,7 @@ class View:
     split: Split = "train"
     frame: int | None = None
     time: float | None = None
+    own_car: Bool[np.ndarray, "a b"] | None = None
 
 
 @dataclass(frozen=True)

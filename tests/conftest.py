@@ -92,6 +92,24 @@ def shared_data():
     return find
 
 
+@pytest.fixture
+def run_command(capsys):
+    """Return a function from the words of a command line to its exit status and what it printed.
+
+    Whatever happens, users see no traceback.
+    """
+    from p2gs_jax.cli import main
+
+    def run(*argv):
+        with pytest.raises(SystemExit) as stop:
+            main([str(a) for a in argv])
+        out = capsys.readouterr()
+        assert "Traceback" not in out.err + out.out
+        return stop.value.code, out.err + out.out
+
+    return run
+
+
 @pytest.fixture(scope="session")
 def made_once(tmp_path_factory, request):
     """Return a function that makes a folder once for all processes of a test run.

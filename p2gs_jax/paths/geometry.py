@@ -8,8 +8,6 @@ from scipy.spatial.transform import Rotation
 
 Pose = Float[np.ndarray, "4 4"]
 Poses = Float[np.ndarray, "n 4 4"]
-# The right-hand axes of cameras must span a plane this well before its normal counts as up.
-PLANE_RATIO = 0.1
 
 
 def rigid(rotation: Float[np.ndarray, "... 3 3"], translation: Float[np.ndarray, "... 3"]):
@@ -52,21 +50,3 @@ def look_at(
     x /= np.linalg.norm(x)
     R = np.stack([x, np.cross(z, x), z])
     return rigid(R, -R @ center)
-
-
-def up_direction(viewmats: Poses) -> Float[np.ndarray, " 3"]:
-    """Return up: what level cameras that look different ways have in common.
-
-    That is the normal of the plane that their right-hand axes span; pitch does not disturb it.
-    Where all look the same way, it is the mean of their own up axes.
-
-    Args:
-        viewmats: world-to-camera.
-    """
-    own = -np.mean(viewmats[:, 1, :3], axis=0)
-    _, sizes, axes = np.linalg.svd(viewmats[:, 0, :3], full_matrices=True)
-    sizes = np.append(sizes, np.zeros(3))[:3] / np.sqrt(len(viewmats))
-    normal = axes[2] * np.sign(axes[2] @ own)
-    if sizes[1] < PLANE_RATIO or sizes[2] > 0.5 * sizes[1] or not normal.any():
-        normal = own
-    return normal / max(np.linalg.norm(normal), 1e-12)

@@ -39,6 +39,11 @@ MODELS: dict[ModelName, Model] = {
 VIGNETTING_POWERS = (2, 4, 6)
 
 
+def polynomials(vignetting: VignettingKind | None) -> int:
+    """Return the polynomials of a camera: none, one for all channels, or one for each."""
+    return {None: 0, "camera": 1, "channel": 3}[vignetting]
+
+
 class Form(NamedTuple):
     """Everything that may vary: a model of exposures and gammas, and what cameras do besides.
 
@@ -90,12 +95,11 @@ def parameter_count(form: Form, response: Response, cameras: int, views: int) ->
         views: number of views.
     """
     size = {None: 0, "camera": cameras - 1, "view": views - 1}
-    rows = {None: 0, "camera": 1, "channel": 3}[form.vignetting]
     varies = MODELS[form.model]
     return (
         size[varies.exposure]
         + size[varies.gamma]
         + 2 * size[form.white_balance]
-        + cameras * rows * len(VIGNETTING_POWERS)
+        + cameras * polynomials(form.vignetting) * len(VIGNETTING_POWERS)
         + response.extra_parameters
     )

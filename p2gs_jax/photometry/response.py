@@ -67,12 +67,7 @@ class Response:
     @property
     def extra_parameters(self) -> int:
         """Parameters besides those of the base curve."""
-        if self.spline is None:
-            return 0
-        if self.by == "all":
-            return len(FREE)
-        # Of a power and a shape each, one power is a gauge.
-        return len(self.splines) * len(FREE_OF_EACH) - 1
+        return spline_parameters(None if self.spline is None else self.by, len(self.splines))
 
     @property
     def each(self) -> tuple[tuple[float, ...], ...]:
@@ -90,6 +85,24 @@ class Response:
 def free_knots(by: ResponseKind) -> tuple[int, ...]:
     """Return the knots that are solved for: of several splines, the powers differ as well."""
     return FREE if by == "all" else FREE_OF_EACH
+
+
+def spline_count(by: ResponseKind | None, cameras: int) -> int:
+    """Return how many splines there are.
+
+    Args:
+        by: what has one of its own; None: nothing.
+        cameras: number of physical cameras.
+    """
+    return {None: 0, "all": 1, "camera": cameras, "channel": 3}[by]
+
+
+def spline_parameters(by: ResponseKind | None, cameras: int) -> int:
+    """Return the number of free parameters of all splines; arguments as for `spline_count`."""
+    if by is None:
+        return 0
+    # Of several, each with a power and a shape, one power is a gauge.
+    return spline_count(by, cameras) * len(free_knots(by)) - (by != "all")
 
 
 def spline_groups(

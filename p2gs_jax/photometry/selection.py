@@ -27,7 +27,7 @@ from p2gs_jax.photometry.candidates import Candidate, Comparison, choose
 from p2gs_jax.photometry.choices import Choice, Curve, Scope, neighbours
 from p2gs_jax.photometry.models import MODELS, Form, parameter_count
 from p2gs_jax.photometry.observations import Observations
-from p2gs_jax.photometry.response import BASES, KNOTS, Response
+from p2gs_jax.photometry.response import BASES, Response, spline_parameters
 from p2gs_jax.photometry.solution import PhotometricSolution
 
 HELD_OUT = 0.2
@@ -150,11 +150,10 @@ class _Search:
         return self._fitted[key]
 
     def parameters(self, choice: Choice) -> int:
-        """Return the number of free parameters of a choice; of its curve as if it were fitted."""
-        curve, views = choice.curve, self.comparison.problem.observations.view_count
-        groups = {None: 0, "all": 1, "camera": self.scope.cameras, "channel": 3}[curve.splines]
-        count = parameter_count(choice.form, Response(), self.scope.cameras, views)
-        return count + groups * len(KNOTS)
+        """Return the number of free parameters of a choice, its curve not fitted yet."""
+        views, cameras = self.comparison.problem.observations.view_count, self.scope.cameras
+        count = parameter_count(choice.form, Response(), cameras, views)
+        return count + spline_parameters(choice.curve.splines, cameras)
 
     def solve(self, choices: Iterable[Choice]) -> bool:
         """Solve choices that are possible and not solved yet; return whether there were any."""

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.core.numerics import Values, namespace
+from p2gs_jax.photometry.cameras import UNKNOWN
 from p2gs_jax.photometry.response import DARKEST, KNOTS, Response, log_exposed
 
 TABLE = 1024
@@ -60,17 +61,12 @@ def tables(cfg: PhotometryConfig) -> Tables:
     Raises:
         ValueError: there is no spline.
     """
-    if not by_camera(cfg):
-        if cfg.spline is None:
-            raise ValueError("the curve 'spline' needs the values of its spline")
-        splines, channels = [cfg.spline], 1
-    else:
-        channels = max(len(camera.splines) for camera in cfg.cameras)
-        own = [_rows(camera.splines, channels) for camera in cfg.cameras if camera.splines]
-        mean = tuple(tuple(map(float, row)) for row in np.mean(own, 0))
-        common = mean if cfg.spline is None else (cfg.spline,) * channels
-        rows = [_rows(camera.splines, channels) or common for camera in cfg.cameras]
-        splines = [row for camera in (*rows, common) for row in camera]
+    if cfg.spline is None and not by_camera(cfg):
+        raise ValueError("the curve 'spline' needs the values of its spline")
+    cameras = range(len(cfg.cameras)) if by_camera(cfg) else ()
+    each = [spline_of(cfg, camera) for camera in (*cameras, UNKNOWN)]
+    channels = max(map(len, each))
+    splines = [row for rows in each for row in _rows(rows, channels)]
     first, step, values = zip(*map(_table, splines), strict=True)
     return Tables(np.array(first), np.array(step), np.array(values), channels)
 

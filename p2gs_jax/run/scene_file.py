@@ -27,6 +27,7 @@ def write_scene(folder: Path, scene: Scene) -> None:
         scene: as it was read.
     """
     base = _base(scene.root)
+    own_cars = {v.camera: v.own_car for v in scene.views if v.own_car is not None}
     said = {
         "format": scene.format,
         "notes": scene.notes,
@@ -50,6 +51,7 @@ def write_scene(folder: Path, scene: Scene) -> None:
             for o in scene.objects
         ],
         "origin": scene.origin,
+        "own_cars": list(own_cars),
     }
     arrays = {
         "viewmats": np.stack([v.viewmat for v in scene.views]),
@@ -59,6 +61,8 @@ def write_scene(folder: Path, scene: Scene) -> None:
     }
     if scene.point_colors is not None:
         arrays["point_colors"] = scene.point_colors
+    for row, mask in enumerate(own_cars.values()):
+        arrays[f"own_car_{row}"] = mask
     for row, thing in enumerate(scene.objects):
         arrays[f"object_{row}_times"], arrays[f"object_{row}_poses"] = thing.times, thing.poses
     if scene.lidar is not None:
@@ -91,6 +95,7 @@ def read_scene(folder: Path, root: Path) -> Scene | None:
             a = dict(file)
         said = json.loads(str(a["json"]))
         base = _base(root)
+        own_cars = {c: a[f"own_car_{k}"] for k, c in enumerate(said.get("own_cars", ()))}
         views = tuple(
             View(
                 name=v["name"],
@@ -106,6 +111,7 @@ def read_scene(folder: Path, root: Path) -> Scene | None:
                 split=v["split"],
                 frame=v.get("frame"),
                 time=v.get("time"),
+                own_car=own_cars.get(v["camera"]),
             )
             for i, v in enumerate(said["views"])
         )

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, UInt
+from jaxtyping import Bool, Float32, UInt, UInt8
 from PIL import Image
 
 from p2gs_jax.config import DataConfig
@@ -182,6 +182,18 @@ class ImageStore:
         return entry
 
 
+def decode_grey(data: bytes, shrink: int) -> UInt8[np.ndarray, "h w"] | None:
+    """Return a photograph in grey as stored, or None where it is none.
+
+    Args:
+        data: of its file.
+        shrink: by up to this factor, where that saves time; JPEG does.
+    """
+    flags = {2: cv2.IMREAD_REDUCED_GRAYSCALE_2, 4: cv2.IMREAD_REDUCED_GRAYSCALE_4}
+    flag = flags.get(2 ** min(int(np.log2(max(shrink, 1))), 2), cv2.IMREAD_GRAYSCALE)
+    return cv2.imdecode(np.frombuffer(data, np.uint8), flag | cv2.IMREAD_IGNORE_ORIENTATION)
+
+
 def _prepare(view: View, width: int, height: int) -> _Entry:
     """Decode, undistort and shrink one photograph."""
     pixels, valid = _decode(view.image_path)
@@ -193,6 +205,10 @@ def _prepare(view: View, width: int, height: int) -> _Entry:
         )
     if view.mask_path is not None:
         valid &= _decode_mask(view)
+    if view.own_car is not None:
+        # Any pixel that takes part in interpolation counts: the outline is known roughly.
+        covered = view.own_car.astype(np.float32)
+        valid &= cv2.resize(covered, (view.width, view.height)) == 0
     shrunk = (width, height) != (view.width, view.height)
     if view.distortion is not None or shrunk:
         ldr = _floats(pixels)

@@ -7,20 +7,11 @@ import cv2
 import numpy as np
 import pytest
 
-from p2gs_jax.cli import main
 from p2gs_jax.cli.options.parse import parse_duration
 from p2gs_jax.config import preset, to_dict
 from p2gs_jax.core.atomic import no_empty_folders
 from p2gs_jax.errors import UserError
 from p2gs_jax.pipeline.preflight import check_run_dir
-
-
-def run(capsys, *argv):
-    with pytest.raises(SystemExit) as stop:
-        main([str(a) for a in argv])
-    out = capsys.readouterr()
-    assert "Traceback" not in out.err + out.out
-    return stop.value.code, out.err + out.out
 
 
 def images(folder, count=3, size=(40, 30)):
@@ -40,33 +31,33 @@ def transforms(root, frames=4, **extra):
     (root / "transforms.json").write_text(json.dumps(data | extra))
 
 
-def test_no_such_scene(capsys, tmp_path):
-    code, text = run(capsys, "fit", tmp_path / "nowhere", "--out", tmp_path / "run")
+def test_no_such_scene(run_command, tmp_path):
+    code, text = run_command("fit", tmp_path / "nowhere", "--out", tmp_path / "run")
     assert code == 2
     assert "nowhere" in text
 
 
-def test_empty_scene(capsys, tmp_path):
+def test_empty_scene(run_command, tmp_path):
     (tmp_path / "scene").mkdir()
-    code, text = run(capsys, "fit", tmp_path / "scene", "--out", tmp_path / "run")
+    code, text = run_command("fit", tmp_path / "scene", "--out", tmp_path / "run")
     assert code == 2
     assert "scene" in text
 
 
-def test_missing_frames_are_listed(capsys, tmp_path):
+def test_missing_frames_are_listed(run_command, tmp_path):
     images(tmp_path / "images", 3)
     transforms(tmp_path, 5)
-    code, text = run(capsys, "fit", tmp_path, "--out", tmp_path / "run")
+    code, text = run_command("fit", tmp_path, "--out", tmp_path / "run")
     assert code == 2
     assert "003.png" in text
     assert "--allow-missing" in text
 
 
-def test_existing_run_is_not_overwritten(capsys, tmp_path):
+def test_existing_run_is_not_overwritten(run_command, tmp_path):
     run_dir = tmp_path / "run"
     run_dir.mkdir()
     (run_dir / "config.json").write_text("{}")
-    code, text = run(capsys, "fit", tmp_path, "--out", run_dir)
+    code, text = run_command("fit", tmp_path, "--out", run_dir)
     assert code == 2
     assert "--resume" in text
     assert (run_dir / "config.json").read_text() == "{}"
@@ -83,8 +74,8 @@ def test_existing_run_is_not_overwritten(capsys, tmp_path):
         ("--preset", "best"),
     ],
 )
-def test_senseless_options(capsys, tmp_path, option):
-    code, text = run(capsys, "fit", tmp_path, "--out", tmp_path / "run", *option)
+def test_senseless_options(run_command, tmp_path, option):
+    code, text = run_command("fit", tmp_path, "--out", tmp_path / "run", *option)
     assert code == 2
     assert option[0] in text or "preset" in text
 
@@ -145,7 +136,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("words", "way_on"), WRONG)
-def test_wrong_words_are_answered_with_a_way_on(capsys, tmp_path, monkeypatch, words, way_on):
+def test_wrong_words_are_answered_with_a_way_on(run_command, tmp_path, monkeypatch, words, way_on):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "100")
     images(tmp_path / "castle", 1)
@@ -153,7 +144,7 @@ def test_wrong_words_are_answered_with_a_way_on(capsys, tmp_path, monkeypatch, w
     (tmp_path / "junk").mkdir()
     for name in ("a.jpg", "b.jpg"):
         (tmp_path / "junk" / name).write_text("not a photograph")
-    code, text = run(capsys, *words.split())
+    code, text = run_command(*words.split())
     assert code == 2
     assert way_on in text
     for folder in ("new", "run"):
@@ -179,10 +170,10 @@ def test_folders_that_were_there_before_a_failure_stay(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["radiance.ply", "photometry.json"])
-def test_a_damaged_run_is_named(capsys, tmp_path, finished_run, name):
+def test_a_damaged_run_is_named(run_command, tmp_path, finished_run, name):
     copy = shutil.copytree(finished_run, tmp_path / "run")
     (copy / name).write_bytes((copy / name).read_bytes()[:500])
-    code, text = run(capsys, "render", copy)
+    code, text = run_command("render", copy)
     assert code == 2
     assert name in text
     assert "restore it from a copy" in text
@@ -190,7 +181,7 @@ def test_a_damaged_run_is_named(capsys, tmp_path, finished_run, name):
 
 
 @pytest.mark.parametrize("content", ["half", "object", "newer"])
-def test_a_damaged_configuration_says_what_mends_it(capsys, tmp_path, finished_run, content):
+def test_a_damaged_configuration_says_what_mends_it(run_command, tmp_path, finished_run, content):
     copy = shutil.copytree(finished_run, tmp_path / "run")
     path = copy / "config.json"
     saved = json.loads(path.read_text())
@@ -198,43 +189,43 @@ def test_a_damaged_configuration_says_what_mends_it(capsys, tmp_path, finished_r
     path.write_text(
         {"half": path.read_text()[:300], "object": "{}", "newer": json.dumps(saved)}[content]
     )
-    code, text = run(capsys, "eval", copy)
+    code, text = run_command("eval", copy)
     assert code == 2
     assert "config.json" in text
     assert ("with the version that made it" if content == "newer" else "--resume") in text
     if content == "half":
-        code, text = run(capsys, "fit", tmp_path, "--out", copy, "--resume")
+        code, text = run_command("fit", tmp_path, "--out", copy, "--resume")
         assert code == 2
         assert "remove it and repeat the options" in text
 
 
 @pytest.mark.parametrize("command", ["render", "eval"])
-def test_not_a_run_folder(capsys, tmp_path, command):
-    code, text = run(capsys, command, tmp_path)
+def test_not_a_run_folder(run_command, tmp_path, command):
+    code, text = run_command(command, tmp_path)
     assert code == 2
     assert "config.json" in text
 
 
-def test_unfinished_run(capsys, tmp_path):
+def test_unfinished_run(run_command, tmp_path):
     (tmp_path / "config.json").write_text("{}")
-    code, text = run(capsys, "eval", tmp_path)
+    code, text = run_command("eval", tmp_path)
     assert code == 2
     assert "--resume" in text
 
 
-def test_demo_does_not_overwrite_strangers(capsys, tmp_path):
+def test_demo_does_not_overwrite_strangers(run_command, tmp_path):
     (tmp_path / "thesis.tex").write_text("precious")
-    code, text = run(capsys, "demo", "--out", tmp_path)
+    code, text = run_command("demo", "--out", tmp_path)
     assert code == 2
     assert "other files" in text
     assert (tmp_path / "thesis.tex").read_text() == "precious"
 
 
-def test_resuming_under_other_options_is_refused(capsys, tmp_path):
+def test_resuming_under_other_options_is_refused(run_command, tmp_path):
     cfg = to_dict(preset("robust"))
     cfg["train"]["seed"] = 7
     (tmp_path / "config.json").write_text(json.dumps({"scene": "s", "fit": cfg}))
-    code, text = run(capsys, "fit", tmp_path, "--out", tmp_path, "--resume")
+    code, text = run_command("fit", tmp_path, "--out", tmp_path, "--resume")
     assert code == 2
     assert "train.seed was 7, now 0" in text
 
@@ -286,8 +277,8 @@ def test_durations():
             parse_duration(text)
 
 
-def test_every_configuration_field_is_an_option(capsys):
-    code, text = run(capsys, "fit", "--help-all")
+def test_every_configuration_field_is_an_option(run_command):
+    code, text = run_command("fit", "--help-all")
     assert code == 0
     for option in ("--loss.dssim-weight", "--densify.method", "--render.tile", "--train.log-every"):
         assert option in text

@@ -24,14 +24,6 @@ C0 = 0.28209479177387814
 STEPS = ("--bake-steps", "12")
 
 
-def run(capsys, *argv):
-    with pytest.raises(SystemExit) as stop:
-        main([str(a) for a in argv])
-    out = capsys.readouterr()
-    assert "Traceback" not in out.err + out.out
-    return stop.value.code, out.err + out.out
-
-
 @pytest.fixture(scope="module")
 def exported(finished_run, tmp_path_factory):
     """Return a run and a folder with every format that needs no extra package."""
@@ -141,7 +133,7 @@ def test_the_splat_file_was_measured_as_it_is(exported):
     assert 10 < said["baking_error"]["train"]["psnr_median"] < 60
 
 
-def test_the_colmap_folder_is_the_scene_and_can_be_calibrated(exported, capsys, tmp_path):
+def test_the_colmap_folder_is_the_scene_and_can_be_calibrated(exported, run_command, tmp_path):
     fitted, out = exported
     after = load_scene(out / "colmap", DataConfig(test_every=3))
     assert [v.name for v in after.views] == [v.name for v in fitted.scene.views]
@@ -150,8 +142,8 @@ def test_the_colmap_folder_is_the_scene_and_can_be_calibrated(exported, capsys, 
         np.testing.assert_allclose(a.viewmat, b.viewmat, atol=1e-6)
         np.testing.assert_allclose(a.K, b.K, rtol=1e-6)
     known = out / "colmap" / "exposures.csv"
-    code, text = run(
-        capsys, "calibrate", out / "colmap", "--out", tmp_path / "c", "--known-exposures", known
+    code, text = run_command(
+        "calibrate", out / "colmap", "--out", tmp_path / "c", "--known-exposures", known
     )
     assert code == 0, text
     found = json.loads((tmp_path / "c" / "photometry.json").read_text())["views"]
@@ -173,10 +165,10 @@ def test_exr_renders_carry_each_views_own_exposure(exported):
     assert len({read_exr(p)[1]["p2gsExposure"] for p in (out / "exr").iterdir()}) > 3
 
 
-def test_a_look_changes_the_display_colours(finished_run, capsys, tmp_path):
+def test_a_look_changes_the_display_colours(finished_run, run_command, tmp_path):
     def base(name, *options):
         argv = ("export", finished_run, "--format", "display-ply", "--out", tmp_path / name)
-        code, text = run(capsys, *argv, "--bake-steps", "0", *options)
+        code, text = run_command(*argv, "--bake-steps", "0", *options)
         assert code == 0, text
         said = json.loads((tmp_path / name / "display.ply.json").read_text())
         return 0.5 + C0 * np.asarray(read_ply(tmp_path / name / "display.ply").sh[:, 0]), said
@@ -191,10 +183,10 @@ def test_a_look_changes_the_display_colours(finished_run, capsys, tmp_path):
     assert linear.mean() < plain.mean() - 0.05
 
 
-def test_spz_holds_the_display_colours(finished_run, capsys, tmp_path):
+def test_spz_holds_the_display_colours(finished_run, run_command, tmp_path):
     pytest.importorskip("gsply", reason="the extra `spz` is not installed")
     argv = ("export", finished_run, "--format", "display-ply", "spz", "--out", tmp_path)
-    code, text = run(capsys, *argv, "--bake-steps", "5")
+    code, text = run_command(*argv, "--bake-steps", "5")
     assert code == 0, text
     from p2gs_jax.formats.spz import read_spz
 
@@ -225,49 +217,49 @@ def test_spz_holds_the_display_colours(finished_run, capsys, tmp_path):
         (("--format", "exr", "colmap", "--gamma", "2"), "--gamma says nothing"),
     ],
 )
-def test_senseless_options(finished_run, capsys, tmp_path, options, said):
-    code, text = run(capsys, "export", finished_run, *options, "--out", tmp_path / "out")
+def test_senseless_options(finished_run, run_command, tmp_path, options, said):
+    code, text = run_command("export", finished_run, *options, "--out", tmp_path / "out")
     assert code == 2
     assert said in text
     assert not (tmp_path / "out").exists()
 
 
-def test_what_is_there_is_replaced_only_when_asked(finished_run, capsys, tmp_path):
+def test_what_is_there_is_replaced_only_when_asked(finished_run, run_command, tmp_path):
     (tmp_path / "linear.json").write_text("mine")
     argv = ("export", finished_run, "--format", "linear-ply", "--out", tmp_path)
-    code, text = run(capsys, *argv)
+    code, text = run_command(*argv)
     assert code == 2
     assert "linear.json exists" in text
     assert "--overwrite" in text
     assert (tmp_path / "linear.json").read_text() == "mine"
     assert not (tmp_path / "linear.ply").exists()
-    code, _ = run(capsys, *argv, "--overwrite")
+    code, _ = run_command(*argv, "--overwrite")
     assert code == 0
     assert json.loads((tmp_path / "linear.json").read_text())["version"] == 2
 
 
-def test_exports_lie_in_the_run_unless_told_otherwise(finished_run, capsys, tmp_path):
+def test_exports_lie_in_the_run_unless_told_otherwise(finished_run, run_command, tmp_path):
     copied = tmp_path / "run"
     shutil.copytree(finished_run, copied)
-    code, text = run(capsys, "export", copied, "--format", "linear-ply", "linear-ply")
+    code, text = run_command("export", copied, "--format", "linear-ply", "linear-ply")
     assert code == 0, text
     assert sorted(p.name for p in (copied / "exports").iterdir()) == ["linear.json", "linear.ply"]
-    code, text = run(capsys, "export", copied, "--format", "exr", "--out", copied / "config.json")
+    code, text = run_command("export", copied, "--format", "exr", "--out", copied / "config.json")
     assert code == 2
     assert "is a file" in text
 
 
-def test_no_run_and_an_unfinished_one(capsys, tmp_path):
-    code, text = run(capsys, "export", tmp_path, "--format", "exr")
+def test_no_run_and_an_unfinished_one(run_command, tmp_path):
+    code, text = run_command("export", tmp_path, "--format", "exr")
     assert code == 2
     assert "config.json" in text
     (tmp_path / "config.json").write_text("{}")
-    code, text = run(capsys, "export", tmp_path, "--format", "exr")
+    code, text = run_command("export", tmp_path, "--format", "exr")
     assert code == 2
     assert "--resume" in text
 
 
-def test_names_that_lead_outside_are_refused(finished_run, capsys, tmp_path, monkeypatch):
+def test_names_that_lead_outside_are_refused(finished_run, run_command, tmp_path, monkeypatch):
     from dataclasses import replace
 
     from p2gs_jax.cli.commands import export
@@ -279,13 +271,13 @@ def test_names_that_lead_outside_are_refused(finished_run, capsys, tmp_path, mon
 
     monkeypatch.setattr(export, "load_run", outside)
     for name in ("exr", "colmap"):
-        code, text = run(capsys, "export", finished_run, "--format", name, "--out", tmp_path / name)
+        code, text = run_command("export", finished_run, "--format", name, "--out", tmp_path / name)
         assert code == 2
         assert "../0.png" in text
     assert list(tmp_path.iterdir()) == []
 
 
-def test_corrections_travel_with_the_linear_ply(finished_run, capsys, tmp_path, monkeypatch):
+def test_corrections_travel_with_the_linear_ply(finished_run, run_command, tmp_path, monkeypatch):
     from dataclasses import replace
 
     from p2gs_jax.cli.commands import export
@@ -301,7 +293,7 @@ def test_corrections_travel_with_the_linear_ply(finished_run, capsys, tmp_path, 
         )
 
     monkeypatch.setattr(export, "load_run", corrected)
-    code, text = run(capsys, "export", finished_run, "--format", "linear-ply", "--out", tmp_path)
+    code, text = run_command("export", finished_run, "--format", "linear-ply", "--out", tmp_path)
     assert code == 0, text
     said = json.loads((tmp_path / "linear.json").read_text())
     kept = np.load(tmp_path / said["tone"]["correction"]["file"])

@@ -1,5 +1,6 @@
 """`render` from end to end, on a small run and on a rig that photographed its field."""
 
+import functools
 import json
 import re
 import shutil
@@ -10,7 +11,6 @@ import cv2
 import numpy as np
 import pytest
 
-from p2gs_jax.cli import main
 from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.paths import Shot, covering, find_rig, view_shots
 from p2gs_jax.paths.pictures import RunRenderer
@@ -22,12 +22,9 @@ YAWS = {"left": -22.0, "right": 22.0}
 STOPS = {("left", 0): 0.0, ("left", 1): -2.5, ("right", 0): 0.0, ("right", 1): 0.5}
 
 
-def run(capsys, *argv):
-    with pytest.raises(SystemExit) as stop:
-        main(["render", *(str(a) for a in argv)])
-    out = capsys.readouterr()
-    assert "Traceback" not in out.err + out.out
-    return stop.value.code, out.err + out.out
+@pytest.fixture
+def render(run_command):
+    return functools.partial(run_command, "render")
 
 
 def picture(path):
@@ -101,8 +98,8 @@ def rig_run(finished_run, tmp_path_factory) -> Path:
     return root / "run"
 
 
-def test_views_come_with_their_photographs_and_a_file_of_their_cameras(capsys, own_run, tmp_path):
-    code, text = run(capsys, own_run, "--out", tmp_path / "all", "--split", "test")
+def test_views_come_with_their_photographs_and_a_file_of_their_cameras(render, own_run, tmp_path):
+    code, text = render(own_run, "--out", tmp_path / "all", "--split", "test")
     assert code == 0
     assert "2 frames" in text
     for name in ("0", "3"):
@@ -112,13 +109,13 @@ def test_views_come_with_their_photographs_and_a_file_of_their_cameras(capsys, o
     assert [c["name"] for c in cameras] == ["0", "3"]
 
 
-def test_a_file_of_cameras_renders_what_the_views_rendered(capsys, own_run, tmp_path):
-    run(capsys, own_run, "--out", tmp_path / "a", "--exposure-ev", "0", "--gamma", "2.2")
+def test_a_file_of_cameras_renders_what_the_views_rendered(render, own_run, tmp_path):
+    render(own_run, "--out", tmp_path / "a", "--exposure-ev", "0", "--gamma", "2.2")
     cameras = tmp_path / "a" / "cameras.json"
     data = json.loads(cameras.read_text())[:2]
     data[1].update(exposure_ev=1.0, name="far/brighter")
     cameras.write_text(json.dumps(data))
-    code, _ = run(capsys, own_run, "--path", cameras, "--out", tmp_path / "b", "--gamma", "2.2")
+    code, _ = render(own_run, "--path", cameras, "--out", tmp_path / "b", "--gamma", "2.2")
     assert code == 0
     first = picture(tmp_path / "a" / "0.render.png")
     np.testing.assert_allclose(picture(tmp_path / "b" / "0.png"), first, atol=1 / 255)
@@ -130,10 +127,10 @@ def test_a_file_of_cameras_renders_what_the_views_rendered(capsys, own_run, tmp_
     assert ratio == pytest.approx(2, rel=1e-5)
 
 
-def test_one_stop_doubles_the_linear_picture_and_leaves_the_radiance(capsys, own_run, tmp_path):
+def test_one_stop_doubles_the_linear_picture_and_leaves_the_radiance(render, own_run, tmp_path):
     for ev in ("-3", "-2"):
         argv = ("--path", "drive", "--frames", "2", "--curve", "linear", "--gamma", "2.2")
-        code, _ = run(capsys, own_run, *argv, "--exposure-ev", ev, "--out", tmp_path / ev)
+        code, _ = render(own_run, *argv, "--exposure-ev", ev, "--out", tmp_path / ev)
         assert code == 0
     dark, bright = (picture(tmp_path / ev / "00001.png") for ev in ("-3", "-2"))
     assert dark.mean() > 0.01
@@ -143,10 +140,10 @@ def test_one_stop_doubles_the_linear_picture_and_leaves_the_radiance(capsys, own
     np.testing.assert_array_equal(*linear)
 
 
-def test_a_drive_becomes_a_video(capsys, own_run, tmp_path):
+def test_a_drive_becomes_a_video(render, own_run, tmp_path):
     out = tmp_path / "new" / "drive.mp4"
-    code, _ = run(
-        capsys, own_run, "--path", "drive", "--frames", 7, "--out", out, "--fps", 12, "--width", 80
+    code, _ = render(
+        own_run, "--path", "drive", "--frames", 7, "--out", out, "--fps", 12, "--width", 80
     )
     assert code == 0
     assert [p.name for p in out.parent.iterdir()] == ["drive.mp4"]
@@ -156,10 +153,10 @@ def test_a_drive_becomes_a_video(capsys, own_run, tmp_path):
     assert np.abs(frames[0] - frames[-1]).mean() > 0.01
 
 
-def test_a_drive_can_be_exposed_as_photographed(capsys, own_run, tmp_path):
+def test_a_drive_can_be_exposed_as_photographed(render, own_run, tmp_path):
     fitted = load_run(own_run)
     argv = ("--path", "drive", "--frames", "6", "--split", "all")
-    code, _ = run(capsys, own_run, *argv, "--exposure-ev", "own", "--out", tmp_path)
+    code, _ = render(own_run, *argv, "--exposure-ev", "own", "--out", tmp_path)
     assert code == 0
     first, last = (json.loads((tmp_path / "cameras.json").read_text())[k] for k in (0, -1))
     for entry, index in ((first, 0), (last, 5)):
@@ -169,11 +166,11 @@ def test_a_drive_can_be_exposed_as_photographed(capsys, own_run, tmp_path):
         assert entry["gamma"] == pytest.approx(transform.gamma, rel=1e-6)
 
 
-def test_a_drive_can_be_metered(capsys, own_run, tmp_path):
+def test_a_drive_can_be_metered(render, own_run, tmp_path):
     bare = ["--path", "drive", "--frames", 5, "--width", 64]
     for name, more in (("of", []), ("more", ["--exposure-ev", 1])):
         argv = [own_run, *bare, "--exposure-of", "log_average", *more, "--out", tmp_path / name]
-        code, said = run(capsys, *argv)
+        code, said = render(*argv)
         assert code == 0, said
     metered, brighter = (
         [shot["exposure_ev"] for shot in json.loads((tmp_path / n / "cameras.json").read_text())]
@@ -184,13 +181,13 @@ def test_a_drive_can_be_metered(capsys, own_run, tmp_path):
     light = linear @ [0.2126, 0.7152, 0.0722]
     exposed = load_run(own_run).common_display(metered[2]).exposure * light
     assert np.exp(np.log(exposed[exposed > 0]).mean()) == pytest.approx(0.18, rel=0.3)
-    code, said = run(capsys, own_run, *bare, "--exposure-of", "auto", "--out", tmp_path / "auto")
+    code, said = render(own_run, *bare, "--exposure-of", "auto", "--out", tmp_path / "auto")
     assert code == 0, said
     assert "Metering:" in said
 
 
-def test_an_orbit_says_what_it_does(capsys, own_run, tmp_path):
-    code, text = run(capsys, own_run, "--path", "orbit", "--frames", "3", "--out", tmp_path)
+def test_an_orbit_says_what_it_does(render, own_run, tmp_path):
+    code, text = render(own_run, "--path", "orbit", "--frames", "3", "--out", tmp_path)
     assert code == 0
     assert "orbit sways" in " ".join(text.split())
     assert len(list(tmp_path.glob("*.png"))) == 3
@@ -206,8 +203,8 @@ def rows_of(fitted, image):
     return [image[t : t + cylinder.height] for t in tops]
 
 
-def test_a_panorama_shows_seams_as_taken_and_none_at_one_exposure(capsys, rig_run, tmp_path):
-    code, _ = run(capsys, rig_run, "--panorama", "--out", tmp_path, "--split", "train")
+def test_a_panorama_shows_seams_as_taken_and_none_at_one_exposure(render, rig_run, tmp_path):
+    code, _ = render(rig_run, "--panorama", "--out", tmp_path, "--split", "train")
     assert code == 0
     assert [p.name for p in tmp_path.glob("*.png")] == ["001.png"]
     taken, same, field = rows_of(load_run(rig_run), picture(tmp_path / "001.png"))
@@ -221,9 +218,9 @@ def test_a_panorama_shows_seams_as_taken_and_none_at_one_exposure(capsys, rig_ru
         assert np.abs(same - field)[:, side][there].mean() < 0.03
 
 
-def test_a_wide_drive(capsys, rig_run, tmp_path):
+def test_a_wide_drive(render, rig_run, tmp_path):
     out = tmp_path / "wide.mp4"
-    code, _ = run(capsys, rig_run, "--path", "drive", "--panorama", "--frames", 3, "--out", out)
+    code, _ = render(rig_run, "--path", "drive", "--panorama", "--frames", 3, "--out", out)
     assert code == 0
     frames = video(out)
     assert len(frames) == 3
@@ -255,25 +252,25 @@ def test_a_wide_drive(capsys, rig_run, tmp_path):
         (("--split", "best"), "--split"),
     ],
 )
-def test_senseless_requests_end_with_one_message(capsys, own_run, argv, words):
+def test_senseless_requests_end_with_one_message(render, own_run, argv, words):
     before = sorted(own_run.rglob("*"))
-    code, text = run(capsys, own_run, *argv)
+    code, text = render(own_run, *argv)
     assert code == 2
     assert words in " ".join(text.split())
     assert sorted(own_run.rglob("*")) == before
 
 
-def test_what_is_there_is_replaced_only_when_asked_for(capsys, own_run, tmp_path):
+def test_what_is_there_is_replaced_only_when_asked_for(render, own_run, tmp_path):
     for out in (tmp_path / "a", tmp_path / "a.mp4"):
         argv = (own_run, "--path", "drive", "--frames", "2", "--width", "48", "--out", out)
-        assert run(capsys, *argv)[0] == 0
+        assert render(*argv)[0] == 0
         written = [p for p in (out.iterdir() if out.is_dir() else [out])]
         before = [p.stat().st_mtime_ns for p in written]
-        code, text = run(capsys, *argv)
+        code, text = render(*argv)
         assert code == 2
         assert "--overwrite" in text
         assert [p.stat().st_mtime_ns for p in written] == before
-        code, text = run(capsys, *argv, "--overwrite")
+        code, text = render(*argv, "--overwrite")
         assert code == 0
         assert [p.stat().st_mtime_ns for p in written] != before
         # Where the seconds went adds up.
@@ -284,12 +281,12 @@ def test_what_is_there_is_replaced_only_when_asked_for(capsys, own_run, tmp_path
         assert sum(parts) == pytest.approx(total, abs=0.3)
 
 
-def test_a_folder_in_place_of_a_video_is_kept(capsys, own_run, tmp_path):
+def test_a_folder_in_place_of_a_video_is_kept(render, own_run, tmp_path):
     (tmp_path / "v.mp4").mkdir()
-    code, text = run(capsys, own_run, "--out", tmp_path / "v.mp4")
+    code, text = render(own_run, "--out", tmp_path / "v.mp4")
     assert code == 2
     assert "is a folder" in text
     (tmp_path / "notes").write_text("mine")
-    code, text = run(capsys, own_run, "--out", tmp_path / "notes")
+    code, text = render(own_run, "--out", tmp_path / "notes")
     assert code == 2
     assert (tmp_path / "notes").read_text() == "mine"

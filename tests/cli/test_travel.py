@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from tiny_scene import make_scene
 
-from p2gs_jax.cli import main
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.run.places import candidates, find, remembered
@@ -16,12 +15,15 @@ from p2gs_jax.run.scene_file import SCENE_FILE, read_scene, write_scene
 from p2gs_jax.scene import load_scene
 
 
-def run(capsys, *argv):
-    with pytest.raises(SystemExit) as stop:
-        main([str(a) for a in argv])
-    out = capsys.readouterr()
-    assert "Traceback" not in out.err + out.out
-    return stop.value.code, " ".join((out.err + out.out).split())
+@pytest.fixture
+def run_command(run_command):
+    """Return the same with its words on one line: names of folders are long, and wrapped."""
+
+    def run(*argv):
+        code, text = run_command(*argv)
+        return code, " ".join(text.split())
+
+    return run
 
 
 @pytest.fixture
@@ -96,14 +98,14 @@ def test_a_run_opens_from_another_directory(tmp_path, monkeypatch, finished_run)
     assert saved["scene_from_run"] == "../scene"
 
 
-def test_a_run_without_its_scene_renders_and_exports(capsys, tmp_path, alone):
-    code, text = run(capsys, "render", alone, "--split", "test", "--out", tmp_path / "r")
+def test_a_run_without_its_scene_renders_and_exports(run_command, tmp_path, alone):
+    code, text = run_command("render", alone, "--split", "test", "--out", tmp_path / "r")
     assert code == 0
     assert "Views without their photographs are NAME.png alone" in text
     files = {p.name for p in (tmp_path / "r").iterdir()}
     assert files == {"0.exr", "0.png", "3.exr", "3.png", "cameras.json"}
     formats = ("linear-ply", "exr")
-    code, _ = run(capsys, "export", alone, "--format", *formats, "--out", tmp_path / "e")
+    code, _ = run_command("export", alone, "--format", *formats, "--out", tmp_path / "e")
     assert code == 0
     assert len(list((tmp_path / "e" / "exr").iterdir())) == 6
 
@@ -112,36 +114,36 @@ def test_a_run_without_its_scene_renders_and_exports(capsys, tmp_path, alone):
     "argv",
     [("eval",), ("export", "--format", "colmap"), ("calibrate", "--out", "new")],
 )
-def test_what_needs_photographs_says_so(capsys, tmp_path, monkeypatch, alone, argv):
+def test_what_needs_photographs_says_so(run_command, tmp_path, monkeypatch, alone, argv):
     monkeypatch.chdir(tmp_path)
-    code, text = run(capsys, argv[0], alone, *argv[1:])
+    code, text = run_command(argv[0], alone, *argv[1:])
     assert code == 2
     assert f"{tmp_path / 'gone'}, is not there" in text
     assert "--scene" in text
     assert not (tmp_path / "new").exists()
 
 
-def test_the_scene_can_be_named(capsys, tmp_path, alone, finished_run):
+def test_the_scene_can_be_named(run_command, tmp_path, alone, finished_run):
     scene = finished_run.parent / "scene"
     argv = ("--split", "test", "--scene", scene, "--out", tmp_path / "r")
-    code, text = run(capsys, "render", alone, *argv)
+    code, text = run_command("render", alone, *argv)
     assert code == 0
     assert (tmp_path / "r" / "0.photograph.png").is_file()
-    code, text = run(capsys, "view", alone, "--scene", tmp_path / "nowhere", "--port", "0")
+    code, text = run_command("view", alone, "--scene", tmp_path / "nowhere", "--port", "0")
     assert code == 2
     assert "nowhere does not exist" in text
 
 
 def test_a_broken_training_photograph_does_not_keep_held_out_views(
-    capsys, tmp_path, alone, finished_run
+    run_command, tmp_path, alone, finished_run
 ):
     scene = shutil.copytree(finished_run.parent / "scene", tmp_path / "scene")
     (scene / "images" / "1.png").write_bytes(b"broken")
     argv = ("--scene", scene, "--out", tmp_path / "r")
-    code, _ = run(capsys, "render", alone, "--split", "test", *argv)
+    code, _ = run_command("render", alone, "--split", "test", *argv)
     assert code == 0
     assert (tmp_path / "r" / "0.photograph.png").is_file()
-    code, text = run(capsys, "render", alone, *argv, "--overwrite")
+    code, text = run_command("render", alone, *argv, "--overwrite")
     assert code == 0
     assert "cannot decode the image" in text
     assert (tmp_path / "r" / "2.photograph.png").is_file()

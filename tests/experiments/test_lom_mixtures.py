@@ -15,6 +15,7 @@ import judging
 import lom_mixtures
 
 from p2gs_jax.config import CameraFormation, FitConfig, preset
+from p2gs_jax.photometry.appearance import exposures_apart
 from p2gs_jax.photometry.ppisp.parameters import OneView, identity
 from p2gs_jax.run.read import Run
 from p2gs_jax.types import Params, Photometry, Scene, View
@@ -70,7 +71,11 @@ def test_a_learned_camera_keeps_what_is_the_cameras():
     assert isinstance(shown, OneView)
     assert float(shown.exposure) == 1.5
     np.testing.assert_array_equal(shown.vignetting, learned.vignettings[0])
-    found = judging.found_by(run)
+    # As a finished run has it: the exposures are where all others have theirs.
+    photometry = dataclasses.replace(run.params.photometry, raw_exposures=jnp.zeros(4))
+    params = exposures_apart(dataclasses.replace(run.params, photometry=photometry))
+    assert not np.asarray(params.appearance.exposures).any()
+    found = judging.found_by(dataclasses.replace(run, params=params))
     assert found.exposures_ev is not None
     assert found.balance_ev is not None
     np.testing.assert_allclose(found.exposures_ev[1:], [-3, 2, -2], atol=1e-3)

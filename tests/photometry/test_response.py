@@ -8,6 +8,7 @@ import pytest
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.photometry.adjustment.curve import fit_response
 from p2gs_jax.photometry.adjustment.problem import make_problem
+from p2gs_jax.photometry.adjustment.spline import Splines
 from p2gs_jax.photometry.formation import eotf, inverse_tone_map, tone_map
 from p2gs_jax.photometry.response import (
     FREE,
@@ -19,6 +20,8 @@ from p2gs_jax.photometry.response import (
     log_exposed,
     log_slope_minimum,
     monotone,
+    spline_count,
+    spline_parameters,
 )
 from p2gs_jax.synth.drive import make_drive, make_exposures, observe
 from p2gs_jax.synth.sensor import encode
@@ -42,6 +45,17 @@ def test_knots_and_held_ones():
     falling = Response("srgb", tuple(np.where(KNOTS > 0.6, -3.0, 0.0)))
     assert not monotone(falling)
     assert log_slope_minimum(falling) < 0
+
+
+@pytest.mark.parametrize("by", ["all", "camera", "channel"])
+def test_parameters_of_splines_are_those_that_are_solved_for(by):
+    solved = Splines(by, spline_count(by, 4))
+    gauges = bool(solved.powers.size)
+    assert spline_parameters(by, 4) == solved.count - gauges
+    each = ((0.1,) * len(KNOTS),) * solved.groups
+    response = Response("srgb", each[0], by, () if by == "all" else each)
+    assert response.extra_parameters == solved.count - gauges
+    assert spline_parameters(None, 4) == Response().extra_parameters == 0
 
 
 def test_values_below_the_first_code_are_clamped():

@@ -8,21 +8,12 @@ import numpy as np
 import pytest
 
 from p2gs_jax import calibrate
-from p2gs_jax.cli import main
 from p2gs_jax.config import preset
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.alignment import exposure_error
 from p2gs_jax.photometry.sources.stack import read_stack
 from p2gs_jax.pipeline.calibrate_stack import calibrate_stack
 from p2gs_jax.run.photometry_file import read_photometry
-
-
-def run(capsys, *argv):
-    with pytest.raises(SystemExit) as stop:
-        main([str(a) for a in argv])
-    out = capsys.readouterr()
-    assert "Traceback" not in out.err + out.out
-    return stop.value.code, out.err + out.out
 
 
 def read_truth(root):
@@ -46,19 +37,19 @@ def test_street(noisy_street, tmp_path):
     assert max(c["codes"] for c in candidates) > 1
 
 
-def test_command_keeps_known_exposures(noisy_street, tmp_path, capsys):
+def test_command_keeps_known_exposures(noisy_street, tmp_path, run_command):
     truth = read_truth(noisy_street)
     path = tmp_path / "known.csv"
     path.write_text("image,exposure\n" + "\n".join(f"{k},{5 * v}" for k, v in truth.items()))
     argv = ("calibrate", noisy_street, "--out", tmp_path / "out", "--known-exposures", path)
-    code, text = run(capsys, *argv)
+    code, text = run_command(*argv)
     assert code == 0
     assert "Chosen:" in text
     for view in read_photometry(tmp_path / "out" / "photometry.json")["views"]:
         assert view["exposure"] == pytest.approx(5 * truth[view["image"]], rel=1e-3)
 
 
-def test_fit_refuses_known_exposures_it_would_ignore(noisy_street, tmp_path, capsys):
+def test_fit_refuses_known_exposures_it_would_ignore(noisy_street, tmp_path, run_command):
     path = tmp_path / "known.csv"
     path.write_text("image,exposure\n" + "\n".join(f"{k},1" for k in read_truth(noisy_street)))
     argv = (
@@ -71,7 +62,7 @@ def test_fit_refuses_known_exposures_it_would_ignore(noisy_street, tmp_path, cap
         "--known-exposures",
         path,
     )
-    code, text = run(capsys, *argv)
+    code, text = run_command(*argv)
     assert code == 2
     assert "starts exposures at random" in text
 
@@ -86,16 +77,16 @@ def test_castle_says_that_exif_and_pixels_disagree(shared_data, tmp_path):
     assert any("disagrees with the pixels" in m for m in result.messages)
 
 
-def test_wrong_input(capsys, tmp_path):
-    code, text = run(capsys, "calibrate", tmp_path / "nowhere", "--out", tmp_path / "o")
+def test_wrong_input(run_command, tmp_path):
+    code, text = run_command("calibrate", tmp_path / "nowhere", "--out", tmp_path / "o")
     assert code == 2
     assert "nowhere" in text
-    code, text = run(
-        capsys, "calibrate", tmp_path, "--out", tmp_path / "o", "--known-deviation-ev", "1"
+    code, text = run_command(
+        "calibrate", tmp_path, "--out", tmp_path / "o", "--known-deviation-ev", "1"
     )
     assert code == 2
     assert "--known-exposures" in text
-    code, text = run(capsys, "calibrate", tmp_path, "--out", tmp_path / "o", "--static")
+    code, text = run_command("calibrate", tmp_path, "--out", tmp_path / "o", "--static")
     assert code == 2
     assert "a stack needs two" in text
 
@@ -130,15 +121,15 @@ def test_stack_exposures(tmp_path, response):
     assert result.one_response
 
 
-def test_the_command_writes_what_a_stack_says(tmp_path, capsys):
+def test_the_command_writes_what_a_stack_says(tmp_path, run_command):
     times = 2.0 ** np.arange(2, -3, -1)
     stack(tmp_path / "s", times)
     listed = tmp_path / "times.csv"
     rows = (f"{i:02d}.png,{t}" for i, t in enumerate(times))
     listed.write_text("image,exposure_time_s\n" + "\n".join(rows))
     out = tmp_path / "out"
-    code, text = run(
-        capsys, "calibrate", tmp_path / "s", "--static", "--out", out, "--compare-with", listed
+    code, text = run_command(
+        "calibrate", tmp_path / "s", "--static", "--out", out, "--compare-with", listed
     )
     assert code == 0
     assert all(word in text for word in ("00.png", "stated", "signal", "Response: "))

@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import pytest
 
-from p2gs_jax.cli import main
 from p2gs_jax.config import CameraFormation, FitConfig, from_dict, to_dict
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.exr import read_exr
@@ -23,14 +22,6 @@ CAMERAS = (
     CameraFormation("left", ((-0.3, 0.1, 0.0),), ((0.1, 0.2), (0.0, 0.0), (0.3, 0.1))),
     CameraFormation("right"),
 )
-
-
-def run_command(capsys, *argv):
-    with pytest.raises(SystemExit) as stop:
-        main([str(a) for a in argv])
-    out = capsys.readouterr()
-    assert "Traceback" not in out.err + out.out
-    return stop.value.code, out.err + out.out
 
 
 def picture(path):
@@ -116,16 +107,14 @@ def test_a_missing_white_balance_is_said(camera_run, tmp_path):
         load_run(folder)
 
 
-def test_render_shows_them_and_leaves_them_out_where_asked(camera_run, tmp_path, capsys):
+def test_render_shows_them_and_leaves_them_out_where_asked(camera_run, tmp_path, run_command):
     run = load_run(camera_run)
     rows = run.scene.train_indices
     first, last = (run.scene.views[i].name for i in (rows[0], rows[-1]))
 
     def rendered(folder, *options):
         out = tmp_path / folder
-        code, text = run_command(
-            capsys, "render", camera_run, "--split", "train", "--out", out, *options
-        )
+        code, text = run_command("render", camera_run, "--split", "train", "--out", out, *options)
         assert code == 0, text
         stem = first.removesuffix(".png")
         linear, header = read_exr(out / f"{stem}.exr")
@@ -145,27 +134,27 @@ def test_render_shows_them_and_leaves_them_out_where_asked(camera_run, tmp_path,
     np.testing.assert_allclose(header["p2gsWhiteBalance"], balance, rtol=1e-5)
     assert (warm / np.maximum(shown, 0.05))[..., 0].mean() > 1.05
     code, text = run_command(
-        capsys, "render", camera_run, "--white-balance-of", "nobody.png", "--out", tmp_path / "no"
+        "render", camera_run, "--white-balance-of", "nobody.png", "--out", tmp_path / "no"
     )
     assert code == 2
     assert "no view 'nobody.png'" in text
 
 
-def test_a_run_without_white_balance_has_none_to_show(finished_run, tmp_path, capsys):
+def test_a_run_without_white_balance_has_none_to_show(finished_run, tmp_path, run_command):
     name = load_run(finished_run).scene.views[0].name
     argv = ("render", finished_run, "--white-balance-of", name, "--out", tmp_path / "no")
-    code, text = run_command(capsys, *argv)
+    code, text = run_command(*argv)
     assert code == 2
     assert "models no white balance" in text
 
 
-def test_exports_carry_them(camera_run, tmp_path, capsys):
+def test_exports_carry_them(camera_run, tmp_path, run_command):
     run = load_run(camera_run)
     rows = run.scene.train_indices
     last = run.scene.views[rows[-1]].name
     formats = ("linear-ply", "display-ply", "colmap", "exr")
     argv = ["export", camera_run, "--format", *formats, "--out", tmp_path]
-    code, text = run_command(capsys, *argv, "--bake-steps", 0, "--white-balance-of", last)
+    code, text = run_command(*argv, "--bake-steps", 0, "--white-balance-of", last)
     assert code == 0, text
     said = json.loads((tmp_path / "linear.json").read_text())
     assert len(said["tone"]["cameras"][0]["vignetting"]) == 3
@@ -212,11 +201,11 @@ def test_the_viewer_s_settings_hold_them(camera_run):
 
 
 def test_the_report_shows_them_and_nothing_of_the_kind_elsewhere(
-    camera_run, finished_run, tmp_path, capsys
+    camera_run, finished_run, tmp_path, run_command
 ):
     def headings(folder, name):
         out = tmp_path / name
-        code, text = run_command(capsys, "report", folder, "--no-render", "--out", out)
+        code, text = run_command("report", folder, "--no-render", "--out", out)
         assert code == 0, text
         return out.read_text()
 

@@ -10,24 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from p2gs_jax.cli import main
-
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def run(capsys, *argv):
-    with pytest.raises(SystemExit) as stop:
-        main(["view", *map(str, argv)])
-    out = capsys.readouterr()
-    assert "Traceback" not in out.err + out.out
-    return stop.value.code, out.err + out.out
-
-
-def test_without_viser_it_says_how_to_get_it(capsys, monkeypatch, tmp_path):
+def test_without_viser_it_says_how_to_get_it(run_command, monkeypatch, tmp_path):
     for name in [n for n in sys.modules if n.startswith("p2gs_jax.viewer")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "viser", None)
-    code, text = run(capsys, tmp_path)
+    code, text = run_command("view", tmp_path)
     assert code == 2
     assert "pip install 'p2gs-jax[viewer]'" in text
 
@@ -37,17 +27,17 @@ class TestWithViser:
     def _viser(self):
         pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 
-    def test_no_run(self, capsys, tmp_path):
-        code, text = run(capsys, tmp_path, "--port", "0")
+    def test_no_run(self, run_command, tmp_path):
+        code, text = run_command("view", tmp_path, "--port", "0")
         assert code == 2
         assert str(tmp_path) in text.replace("\n", "")
 
-    def test_busy_port(self, capsys, tmp_path):
+    def test_busy_port(self, run_command, tmp_path):
         with socket.socket() as taken:
             taken.bind(("127.0.0.1", 0))
             taken.listen()
             port = taken.getsockname()[1]
-            code, text = run(capsys, tmp_path, "--port", port)
+            code, text = run_command("view", tmp_path, "--port", port)
         assert code == 2
         assert str(port) in text
         assert "--port" in text
@@ -55,8 +45,8 @@ class TestWithViser:
     @pytest.mark.parametrize(
         "option", [("--port", "70000"), ("--host", "no.such.host.invalid"), ("--max-width", "3")]
     )
-    def test_senseless_options(self, capsys, tmp_path, option):
-        code, text = run(capsys, tmp_path, *option)
+    def test_senseless_options(self, run_command, tmp_path, option):
+        code, text = run_command("view", tmp_path, *option)
         assert code == 2
         assert option[0] in text
 

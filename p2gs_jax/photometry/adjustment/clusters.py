@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from p2gs_jax.photometry.observations import Observations
 
@@ -11,6 +11,21 @@ from p2gs_jax.photometry.observations import Observations
 # known exposure: 2.1 where every point counts by itself, 1.6 in regions of this size, and no better
 # in larger ones (BUILD_NOTES, "The camera as it is").
 REGION = 1 / 3
+
+
+def regions(
+    positions: Float[np.ndarray, "n 2"], views: Int[np.ndarray, " n"], side: float
+) -> Int[np.ndarray, " n"]:
+    """Return labels 0, 1, ... of the regions of images that positions lie in.
+
+    Args:
+        positions: from the image's centre in units of half its diagonal.
+        views: whose image.
+        side: of a region, in the same units.
+    """
+    x, y = np.floor((positions + 1) / side).astype(np.int64).T
+    across = int(np.ceil(2 / side)) + 1
+    return np.unique((views * np.int64(across) + x) * across + y, return_inverse=True)[1]
 
 
 def side_by_side(observations: Observations, row: Int[np.ndarray, " o"]) -> Int[np.ndarray, " o"]:
@@ -27,11 +42,8 @@ def side_by_side(observations: Observations, row: Int[np.ndarray, " o"]) -> Int[
         return row
     order = np.lexsort((observations.views, row))
     first = order[np.flatnonzero(np.diff(row[order], prepend=-1))]
-    x, y = np.floor((observations.positions[first] + 1) / REGION).astype(np.int64).T
-    across = int(np.ceil(2 / REGION)) + 1
-    region = (observations.views[first] * across + x) * across + y
     label = np.zeros(int(row.max()) + 1, int)
-    label[row[first]] = np.unique(region, return_inverse=True)[1]
+    label[row[first]] = regions(observations.positions[first], observations.views[first], REGION)
     return label[row]
 
 

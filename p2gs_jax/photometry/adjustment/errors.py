@@ -10,12 +10,16 @@ import scipy.sparse as sp
 from jaxtyping import Float
 
 from p2gs_jax.core.streams import Stream, generator
-from p2gs_jax.photometry.adjustment.clusters import side_by_side, small_sample
+from p2gs_jax.photometry.adjustment.clusters import regions, side_by_side, small_sample
 from p2gs_jax.photometry.adjustment.linear import Balanced, one_thread
 from p2gs_jax.photometry.adjustment.matrices import is_small
-from p2gs_jax.photometry.adjustment.normal import scores
+from p2gs_jax.photometry.adjustment.normal import summed
 from p2gs_jax.photometry.adjustment.parameters import Parameters
-from p2gs_jax.photometry.adjustment.shared import regions, shared_deviation, shared_scores
+from p2gs_jax.photometry.adjustment.shared import (
+    SHARED_REGION,
+    shared_deviation,
+    shared_scores,
+)
 from p2gs_jax.photometry.adjustment.solve import Fit
 from p2gs_jax.photometry.adjustment.system import System, gauge_strength
 from p2gs_jax.photometry.observations import Observations
@@ -72,9 +76,9 @@ def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncerta
     """
     rows = fit.model.rows
     clusters = side_by_side(observations, rows.row)
-    each = scores(fit.model, fit.theta, fit.at, clusters)
+    each = summed(fit.model, fit.theta, fit.at, fit.at.weight * fit.at.residual, clusters)
     if observations.positions is not None and len(rows.row):
-        labels = regions(observations)
+        labels = regions(observations.positions, observations.views, SHARED_REGION)
         deviation = shared_deviation(fit.model, fit.at, labels)
         if deviation > 0:
             shared = deviation * shared_scores(fit.model, fit.theta, fit.at, labels)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Float, Float32
 
 from p2gs_jax.photometry.adjustment.forward import Forward
 from p2gs_jax.photometry.adjustment.problem import Problem
@@ -47,12 +48,10 @@ def explain(fit: Fit, problem: Problem, response: Response) -> Explained:
     radiance = np.full((o.point_count, 3), np.nan)
     residual = np.zeros((len(o.points), 3), np.float32)
     ignored = 0
-    for pick in _blocks(o.points):
-        part = problem.part(pick)
+    for pick, points, part in _blocks(problem):
         at = _weighed(fit, part, response)
         mine, usable = part.observations, part.usable
-        points = np.unique(mine.points)
-        radiance[points] = _of_points(part, at)[points]
+        radiance[points] = _of_points(part, at)
         of_exposure = at.residual / fit.theta.a[mine.views][:, None]
         residual[pick] = np.where(usable, of_exposure, 0.0)
         ideal = 1 / mine.decoded(response)[1] ** 2
@@ -60,17 +59,36 @@ def explain(fit: Fit, problem: Problem, response: Response) -> Explained:
     return Explained(radiance, residual, ignored / max(int(problem.usable.sum()), 1))
 
 
-def _blocks(points: Int[np.ndarray, " o"]) -> Iterator[np.ndarray | slice]:
-    """Return observations by blocks of whole points."""
+class _Block(NamedTuple):
+    """Some points with all their observations.
+
+    Attributes:
+        observations: which of the whole.
+        points: likewise.
+        problem: these alone.
+    """
+
+    observations: np.ndarray | slice
+    points: np.ndarray | slice
+    problem: Problem
+
+
+def _blocks(problem: Problem) -> Iterator[_Block]:
+    """Return the problem by blocks of whole points."""
+    points = problem.observations.points
     if len(points) <= BLOCK:
-        yield slice(None)
+        yield _Block(slice(None), slice(None), problem)
         return
     order = np.argsort(points, kind="stable")
     place = 0
     while place < len(order):
         last = points[order[min(place + BLOCK, len(order)) - 1]]
         end = int(np.searchsorted(points, last, side="right", sorter=order))
-        yield order[place:end]
+        pick = order[place:end]
+        own, label = np.unique(points[pick], return_inverse=True)
+        part = problem.part(pick)
+        few = replace(part.observations, points=label, point_count=len(own))
+        yield _Block(pick, own, replace(part, observations=few))
         place = end
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from p2gs_jax.config import VignettingKind
 from p2gs_jax.photometry.adjustment.matrices import Terms
 from p2gs_jax.photometry.adjustment.rows import Rows
-from p2gs_jax.photometry.models import VIGNETTING_POWERS
+from p2gs_jax.photometry.models import VIGNETTING_POWERS, polynomials
 
 # Two directions that change the ratios of red, green and blue, and not their mean.
 CHROMA = np.array([[2.0, -1.0, -1.0], [0.0, 1.0, -1.0]]) / np.sqrt([[6.0], [2.0]])
@@ -37,8 +37,8 @@ class Features:
 
     @property
     def vignetting_rows(self) -> int:
-        """Polynomials of a camera: none, one for all channels, or three."""
-        return {None: 0, "camera": 1, "channel": 3}[self.vignetting]
+        """Polynomials of a camera."""
+        return polynomials(self.vignetting)
 
     @property
     def balance_count(self) -> int:
@@ -48,8 +48,7 @@ class Features:
     @property
     def count(self) -> int:
         """Number of parameters."""
-        polynomials = self.cameras * self.vignetting_rows
-        return self.balance_count + polynomials * len(VIGNETTING_POWERS)
+        return self.balance_count + self.cameras * self.vignetting_rows * len(VIGNETTING_POWERS)
 
     def terms(self, rows: Rows) -> Terms:
         """Return the features of every value."""

@@ -19,7 +19,7 @@ from p2gs_jax.photometry.response import Response
 from p2gs_jax.photometry.solution import PhotometricSolution
 
 # Change of a parameter, log units, at which rounds end: of what is kept, and of what is compared.
-TOLERANCE, TOLERANCE_TO_COMPARE = 1e-5, 1e-3
+TOLERANCE, TOLERANCE_TO_COMPARE = 1e-5, 5e-3
 # Points by which a view is solved; more only repeat them (BUILD_NOTES, "Exposures from a part").
 PER_VIEW = 1000
 # Of all views together, and what each has nevertheless.

@@ -99,10 +99,13 @@ class Terms:
     def products(self, values: Float[np.ndarray, "o 3"]) -> Float[np.ndarray, "k k"]:
         """Return the sum of values times the outer products of factors."""
         width, terms = self.count + 1, range(self.index.shape[-1])
-        total = np.zeros(width**2)
+        own, mixed = np.zeros(width**2), np.zeros(width**2)
         for x in terms:
             left = values * self.factor[..., x]
-            for y in terms:
+            for y in range(x + 1):
                 at = self.index[..., x] * width + self.index[..., y]
-                total += np.bincount(at.ravel(), (left * self.factor[..., y]).ravel(), width**2)
-        return total.reshape(width, width)[:-1, :-1]
+                found = np.bincount(at.ravel(), (left * self.factor[..., y]).ravel(), width**2)
+                total = own if x == y else mixed
+                total += found
+        half = mixed.reshape(width, width)
+        return (own.reshape(width, width) + half + half.T)[:-1, :-1]

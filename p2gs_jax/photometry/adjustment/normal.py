@@ -1,9 +1,10 @@
-"""Normal equations, points eliminated: the Schur complement and the scores of its rows."""
+"""Normal equations, points eliminated: the Schur complement, and sums over its rows."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 import scipy.sparse as sp
@@ -11,7 +12,7 @@ from jaxtyping import Float, Int
 
 from p2gs_jax.photometry.adjustment.forward import Forward
 from p2gs_jax.photometry.adjustment.matrices import Entries, Matrix, Terms, assembled, block
-from p2gs_jax.photometry.adjustment.parameters import Parameters
+from p2gs_jax.photometry.adjustment.parameters import Parameters, Unknowns
 from p2gs_jax.photometry.adjustment.robust import Weighted
 from p2gs_jax.photometry.adjustment.rows import Rows
 from p2gs_jax.photometry.adjustment.system import EMPTY
@@ -45,7 +46,7 @@ def normal_equations(
     """
     rows, u = model.rows, model.unknowns
     w, pull = at.weight, at.weight * at.residual
-    coupling = w * theta.a[rows.views][:, None] / np.sqrt(at.precision + EMPTY)[rows.row]
+    coupled = coupling(rows, theta, at)
     parts, right = [], []
     per_view = of_views(model, at)
     views = np.arange(u.views)
@@ -55,8 +56,8 @@ def normal_equations(
             if common := [c for c in one.channels if c in other.channels]:
                 values = _per_view(rows, w * one.derivative * other.derivative, common)
                 parts.append(Entries(x * u.views + views, y * u.views + views, values))
-    coupled = rows.layout.pairs.sums(
-        [(coupling * p.derivative)[:, p.channels] for p in per_view],
+    of_pairs = rows.layout.pairs.sums(
+        [(coupled * p.derivative)[:, p.channels] for p in per_view],
         [
             [(p.channels.index(c), q.channels.index(c)) for c in p.channels if c in q.channels]
             for p in per_view
@@ -64,14 +65,25 @@ def normal_equations(
         ],
         kind,
     )
-    parts.append(coupled._replace(values=-coupled.values))
+    parts.append(of_pairs._replace(values=-of_pairs.values))
     # Without gammas, a keeps its place in the vector.
     right += [] if u.gammas else [np.zeros(u.views)]
     if (terms := others(model, theta)) is not None:
-        more, pulled = _with_others(model, at, terms, per_view, coupling)
+        more, pulled = _with_others(model, at, terms, per_view, coupled)
         parts += more
         right.append(pulled)
     return assembled(parts, u.count), np.concatenate(right)
+
+
+def coupling(rows: Rows, theta: Parameters, at: Weighted) -> Float[np.ndarray, "o 3"]:
+    """Return what couples the observations of a point once it is eliminated: its own derivatives.
+
+    Args:
+        rows: observations.
+        theta: parameters.
+        at: weights at these.
+    """
+    return at.weight * theta.a[rows.views][:, None] / np.sqrt(at.precision + EMPTY)[rows.row]
 
 
 def of_views(model: Forward, at: Weighted) -> list[OfView]:
@@ -103,19 +115,20 @@ def _per_view(rows: Rows, values: Float[np.ndarray, "o 3"], channels: list[int])
 
 
 def _with_others(
-    model: Forward, at: Weighted, terms: Terms, per_view: list[OfView], coupling
+    model: Forward, at: Weighted, terms: Terms, per_view: list[OfView], coupled
 ) -> tuple[list[Entries], Float[np.ndarray, " k"]]:
     """Return what k and c add to the equations: entries, and their right side."""
     rows, u = model.rows, model.unknowns
     place = 3 * rows.row[:, None] + np.arange(3)
-    through = terms.sums(coupling, place, 3 * rows.count)
+    through = terms.sums(coupled, place, 3 * rows.count)
     first = u.per_view
     parts = []
     at_view = np.broadcast_to(rows.views[:, None], at.weight.shape)
     for x, one in enumerate(per_view):
         acting = np.isin(np.arange(3), one.channels)
         side = terms.sums(at.weight * one.derivative * acting, at_view, u.views)
-        side -= _at_views(rows, coupling * one.derivative, one.channels) @ through
+        mine = at_places(rows, coupled * one.derivative, rows.views, u.views, one.channels)
+        side -= mine @ through
         across = block(x * u.views, first, side)
         parts += [across, Entries(across.columns, across.rows, across.values)]
     corner = terms.products(at.weight) - through.T @ through
@@ -128,17 +141,12 @@ def _with_others(
     return [*parts, block(first, first, corner)], pulled
 
 
-def _at_views(rows: Rows, values: Float[np.ndarray, "o 3"], channels: list[int]) -> sp.csr_array:
-    """Return the matrix that holds values at their views and points: (v, 3 rows)."""
-    order = rows.layout.by_view
-    at = 3 * rows.row[order][:, None] + np.array(channels)
-    starts = len(channels) * np.searchsorted(rows.views[order], np.arange(rows.view_count + 1))
-    shape = (rows.view_count, 3 * rows.count)
-    return sp.csr_array((values[order][:, channels].ravel(), at.ravel(), starts), shape=shape)
-
-
 def at_places(
-    rows: Rows, values: Float[np.ndarray, "o 3"], places: Int[np.ndarray, " o"], count: int
+    rows: Rows,
+    values: Float[np.ndarray, "o 3"],
+    places: Int[np.ndarray, " o"],
+    count: int,
+    channels: Sequence[int] = (0, 1, 2),
 ) -> sp.csr_array:
     """Return the matrix that holds values at places and points: (count, 3 rows).
 
@@ -147,37 +155,59 @@ def at_places(
         values: of each channel.
         places: of each observation.
         count: number of places.
+        channels: whose values it holds.
     """
-    at = 3 * rows.row[:, None] + np.arange(3)
-    where = np.broadcast_to(places[:, None], values.shape)
+    at = 3 * rows.row[:, None] + np.array(channels)
+    where = np.broadcast_to(places[:, None], at.shape)
     shape = (count, 3 * rows.count)
-    return sp.csr_array((values.ravel(), (where.ravel(), at.ravel())), shape=shape)
+    return sp.csr_array((values[:, channels].ravel(), (where.ravel(), at.ravel())), shape=shape)
 
 
-def scores(
-    model: Forward, theta: Parameters, at: Weighted, clusters: Int[np.ndarray, " o"]
+def summed(
+    model: Forward,
+    theta: Parameters,
+    at: Weighted,
+    values: Float[np.ndarray, "o 3"],
+    places: Int[np.ndarray, " o"],
 ) -> sp.csr_array:
-    """Return the scores of clusters of observations over all parameters: (clusters, d).
+    """Return sums over places of values times derivatives by all parameters: (places, d).
+
+    Of the pull of observations, weight times residual, these are the scores of clusters.
 
     Args:
         model: observations, and what explains them.
         theta: parameters.
-        at: residuals and weights at these.
-        clusters: what each observation is counted with.
+        at: weights at these.
+        values: what is summed.
+        places: of each observation: 0, 1, ...
     """
     rows, u = model.rows, model.unknowns
-    pull = at.weight * at.residual
-    count = int(clusters.max(initial=-1)) + 1
-    shape = (count, u.views)
-    parts = [
+    count = int(places.max(initial=-1)) + 1
+    per_view = [
         sp.csr_array(
-            ((pull * p.derivative)[:, p.channels].sum(1), (clusters, rows.views)), shape=shape
+            ((values * p.derivative)[:, p.channels].sum(1), (places, rows.views)),
+            shape=(count, u.views),
         )
         for p in of_views(model, at)
     ]
+    terms, place = others(model, theta), np.broadcast_to(places[:, None], values.shape)
+    more = None if terms is None else terms.sums(values, place, count)
+    return over_all(u, per_view, more)
+
+
+def over_all(
+    u: Unknowns, per_view: list[sp.csr_array], more: Float[np.ndarray, "n k"] | None
+) -> sp.csr_array:
+    """Return columns for all parameters; without gammas, a keeps its place.
+
+    Args:
+        u: the parameters.
+        per_view: columns of those that every view has.
+        more: columns of k and c; None where there are none.
+    """
+    parts = [*per_view]
     if not u.gammas:
-        parts.append(sp.csr_array(shape))
-    if (terms := others(model, theta)) is not None:
-        place = np.broadcast_to(clusters[:, None], pull.shape)
-        parts.append(sp.csr_array(terms.sums(pull, place, count)))
+        parts.append(sp.csr_array((cast(tuple[int, int], parts[0].shape)[0], u.views)))
+    if more is not None:
+        parts.append(sp.csr_array(more))
     return sp.csr_array(sp.hstack(parts))

@@ -55,6 +55,8 @@ def solution_of(
     scale, color = _Gauge(component, active & free_scale), _Gauge(component, active)
     a, light = fit.theta.a, _light(fit)
     h, balance = light.mean(1), light - light.mean(1, keepdims=True)
+    shift = scale.shift(h)
+    shifts = shift[:, None] + color.shift(balance)
 
     def of_light(change: Parameters):
         return (change.b - light[..., None] * change.a[:, None]) / a[:, None, None]
@@ -75,13 +77,11 @@ def solution_of(
         balance = balance + _balance_of_views(fit, fit.theta.k[:, None])[..., 0]
     balance = np.where(active[:, None], color.centred(np.broadcast_to(balance, (len(h), 3))), 0.0)
     balance_errors = known.few[:, None] * known.of(of_balance).reshape(-1, 3)
-    shift = scale.shift(h)
-    shifts = shift[:, None] + color.shift(_broad(light, 3) - _broad(light, 3).mean(1)[:, None])
     h = np.where(active, h - shift, 0.0)
 
     used, residual = problem.usable, explained.residual
     view_residual, tint = _per_view_ev(o.views, residual, used, o.view_count)
-    cameras, corner_errors = camera_formations(fit, response, known, o)
+    cameras, corner_errors = _cameras(fit, response, known, o)
     return PhotometricSolution(
         model=form.model,
         response=response,
@@ -159,10 +159,6 @@ def _light(fit: Fit) -> Float[np.ndarray, "v x"]:
     return fit.theta.b / fit.theta.a[:, None]
 
 
-def _broad(values: Float[np.ndarray, "v x"], width: int) -> Float[np.ndarray, "v 3"]:
-    return np.broadcast_to(values, (len(values), width))
-
-
 def _balance_of_views(fit: Fit, k: Float[np.ndarray, "k c"]) -> Float[np.ndarray, "v 3 c"]:
     """Return the white balance of each view's camera."""
     features, cameras = fit.model.unknowns.features, fit.model.rows.cameras
@@ -170,17 +166,10 @@ def _balance_of_views(fit: Fit, k: Float[np.ndarray, "k c"]) -> Float[np.ndarray
     return np.stack(each, -1)[cameras]
 
 
-def camera_formations(
+def _cameras(
     fit: Fit, response: Response, known: Uncertainty, o: Observations
 ) -> tuple[tuple[CameraFormation, ...], Float[np.ndarray, "c j"]]:
-    """Return what each physical camera does, and standard errors of log V in its corners.
-
-    Args:
-        fit: the parameters.
-        response: what decoded the colours.
-        known: how sure the parameters are.
-        o: for the names of cameras.
-    """
+    """Return what each physical camera does, and standard errors of log V in its corners."""
     features = fit.model.unknowns.features
     if features.vignetting is None and not response.splines:
         return (), np.zeros((0, 0))
@@ -206,7 +195,7 @@ def camera_formations(
 
 
 def _point_radiance(
-    problem: Problem, explained: Explained, shifts: Float[np.ndarray, "v 3"]
+    problem: Problem, explained: Explained, shifts: Float[np.ndarray, "v x"]
 ) -> Float[np.ndarray, "p 3"]:
     """Return log radiance in the gauge: the shift of a point's views goes the other way."""
     o = problem.observations

@@ -105,11 +105,6 @@ class Layout:
         """Every pair of observations in a row once, themselves included."""
         return Pairs(self.row, self._views, self._view_count)
 
-    @functools.cached_property
-    def by_view(self) -> Int[np.ndarray, " o"]:
-        """Observations sorted by view."""
-        return np.argsort(self._views, kind="stable")
-
 
 def make_rows(
     observations: Observations,

@@ -13,29 +13,22 @@ import scipy.sparse as sp
 from jaxtyping import Int
 
 from p2gs_jax.photometry.adjustment.forward import Forward
-from p2gs_jax.photometry.adjustment.normal import at_places, of_views, others
+from p2gs_jax.photometry.adjustment.normal import (
+    at_places,
+    coupling,
+    of_views,
+    others,
+    over_all,
+    summed,
+)
 from p2gs_jax.photometry.adjustment.parameters import Parameters
 from p2gs_jax.photometry.adjustment.robust import Weighted
 from p2gs_jax.photometry.adjustment.system import EMPTY
-from p2gs_jax.photometry.observations import Observations
 
 # Side of a region, in units of half an image's diagonal.
-REGION = 2 / 3
+SHARED_REGION = 2 / 3
 # Regions that hold fewer observations, or the weight of fewer, say nothing of what they share.
 FEWEST, FEWEST_EFFECTIVE = 4, 3.0
-
-
-def regions(observations: Observations) -> Int[np.ndarray, " o"]:
-    """Return a label for the region of its image that each observation lies in.
-
-    Args:
-        observations: with positions.
-    """
-    assert observations.positions is not None
-    x, y = np.floor((observations.positions + 1) / REGION).astype(np.int64).T
-    across = int(np.ceil(2 / REGION)) + 1
-    labels = (observations.views * np.int64(across) + x) * across + y
-    return np.unique(labels, return_inverse=True)[1]
 
 
 def shared_deviation(model: Forward, at: Weighted, labels: Int[np.ndarray, " o"]) -> float:
@@ -87,24 +80,12 @@ def shared_scores(
         labels: region of each observation.
     """
     rows, u = model.rows, model.unknowns
-    w, count = at.weight, int(labels.max(initial=-1)) + 1
-    root = np.sqrt(at.precision + EMPTY)[rows.row]
-    a = theta.a[rows.views][:, None]
-    of_points = at_places(rows, w * a / root, labels, count)
-    parts = []
-    for one in of_views(model, at):
-        direct = sp.csr_array(
-            ((w * one.derivative)[:, one.channels].sum(1), (labels, rows.views)),
-            shape=(count, u.views),
-        )
-        acting = np.isin(np.arange(3), one.channels)
-        taken = at_places(rows, w * a / root * one.derivative * acting, rows.views, u.views)
-        parts.append(direct - of_points @ taken.T)
-    if not u.gammas:
-        parts.append(sp.csr_array((count, u.views)))
-    if (terms := others(model, theta)) is not None:
-        place = 3 * rows.row[:, None] + np.arange(3)
-        through = terms.sums(w * a / root, place, 3 * rows.count)
-        direct = terms.sums(w, np.broadcast_to(labels[:, None], w.shape), count)
-        parts.append(sp.csr_array(direct - of_points @ through))
-    return sp.csr_array(sp.hstack(parts))
+    coupled = coupling(rows, theta, at)
+    taken = [
+        at_places(rows, coupled * p.derivative, rows.views, u.views, p.channels).T
+        for p in of_views(model, at)
+    ]
+    terms, place = others(model, theta), 3 * rows.row[:, None] + np.arange(3)
+    more = None if terms is None else terms.sums(coupled, place, 3 * rows.count)
+    of_points = at_places(rows, coupled, labels, int(labels.max(initial=-1)) + 1)
+    return summed(model, theta, at, at.weight, labels) - of_points @ over_all(u, taken, more)

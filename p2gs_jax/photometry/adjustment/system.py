@@ -18,7 +18,7 @@ from p2gs_jax.photometry.adjustment.parameters import Parameters, Unknowns
 from p2gs_jax.photometry.adjustment.problem import Problem
 from p2gs_jax.photometry.adjustment.spline import Splines
 from p2gs_jax.photometry.models import MODELS, Form
-from p2gs_jax.photometry.response import KNOTS
+from p2gs_jax.photometry.response import KNOTS, spline_count
 
 # How hard gauges are held, relative to the mean diagonal of the normal matrix.
 ANCHOR = 10.0
@@ -104,13 +104,12 @@ def make_system(problem: Problem, form: Form, splines: ResponseKind | None = Non
     cameras, views = problem.observations.cameras, problem.observations.view_count
     camera_count = int(cameras.max(initial=0)) + 1
     model = MODELS[form.model]
-    groups = {None: 0, "all": 1, "camera": camera_count, "channel": 3}[splines]
     unknowns = Unknowns(
         views,
         3 if form.white_balance == "view" else 1,
         model.gamma is not None,
         Features(camera_count, form.white_balance == "camera", form.vignetting),
-        Splines(splines or "all", groups),
+        Splines(splines or "all", spline_count(splines, camera_count)),
     )
     of_b, of_a = _directions(model.exposure, cameras), _directions(model.gamma, cameras)
     others = sp.eye_array(unknowns.count - unknowns.per_view)

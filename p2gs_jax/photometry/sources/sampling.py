@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
+from p2gs_jax.photometry.cameras import places
 from p2gs_jax.photometry.observations import COARSEST, Observations
 from p2gs_jax.photometry.sources.surroundings import surroundings
 from p2gs_jax.photometry.srgb import srgb_decode, srgb_encode
@@ -144,7 +145,7 @@ def point_colors(
     coarsest = np.zeros(len(scene.points))
     for mine, footprint, kept in zip(points, footprints, keep, strict=True):
         np.maximum.at(coarsest, mine[kept], footprint[kept])
-    views, seen, colors, spreads, places, around = [], [], [], [], [], []
+    views, seen, colors, spreads, positions, around = [], [], [], [], [], []
     for row, (index, kept) in enumerate(zip(scene.train_indices, keep, strict=True)):
         mine = points[row][kept]
         if len(mine):
@@ -157,8 +158,7 @@ def point_colors(
             colors.append(found.colors[found.valid])
             spreads.append(found.spread[found.valid])
             around.append(surroundings(ldr, there[found.valid]))
-            centred = there[found.valid] - [width / 2, height / 2]
-            places.append((centred / np.hypot(width / 2, height / 2)).astype(np.float32))
+            positions.append(places(there[found.valid], width, height).astype(np.float32))
         on_view(row + 1, len(scene.train_indices))
     empty = np.zeros((0, 3), np.float32)
     return Observations(
@@ -171,7 +171,7 @@ def point_colors(
         cameras=camera_rows(scene),
         too_coarse=int(sum((~kept).sum() for kept in keep)),
         names=tuple(scene.views[i].name for i in scene.train_indices),
-        positions=np.concatenate([np.zeros((0, 2), np.float32), *places]),
+        positions=np.concatenate([np.zeros((0, 2), np.float32), *positions]),
         surroundings=np.concatenate([np.zeros(0, np.float32), *around]),
         camera_names=tuple(sorted({scene.views[i].camera for i in scene.train_indices})),
     )

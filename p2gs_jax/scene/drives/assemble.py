@@ -17,6 +17,7 @@ from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.drives.choose import chosen_cameras, chosen_frames
 from p2gs_jax.scene.drives.lidar import MOST_MEASURED, owners, seeds, thinned
+from p2gs_jax.scene.drives.own_car import find_own_cars
 from p2gs_jax.scene.drives.poses import inverse
 from p2gs_jax.scene.drives.recording import Photograph, Recording
 from p2gs_jax.scene.files import check_missing
@@ -74,6 +75,10 @@ def assemble(
     taken = [p for p in taken if f"{p.camera}/{p.path.name}" not in gone]
     notes += _incomplete(taken, names, frames)
     notes += _rolling(recording, names)
+    own_cars = {}
+    if cfg.own_car:
+        own_cars, said = find_own_cars(recording, names, work_dir, report)
+        notes += said
     origin = _origin(taken)
     folder = _embedded_folder(recording.root, work_dir)
     views = []
@@ -93,11 +98,14 @@ def assemble(
                 distortion=camera.distortion,
                 frame=photograph.frame,
                 time=photograph.time,
+                own_car=own_cars.get(photograph.camera),
             )
         )
     views.sort(key=lambda v: v.name)
     objects = tuple(_moved(thing, origin) for thing in recording.objects)
-    lidar, said = _read_sweeps(recording, taken, objects, origin, report)
+    lidar, said = None, ["Laser measurements are not used (--data.no-lidar)."]
+    if cfg.lidar:
+        lidar, said = _read_sweeps(recording, taken, objects, origin, report)
     points = np.zeros((0, 3), np.float32)
     if lidar is not None:
         points, angle = seeds(lidar, np.stack([p.pose[:3, 3] - origin for p in taken]))
