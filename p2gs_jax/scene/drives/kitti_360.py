@@ -38,7 +38,7 @@ from p2gs_jax.scene.drives.kitti_files import (
 )
 from p2gs_jax.scene.drives.poses import inverse, rigid
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sweep, SweepPoints
-from p2gs_jax.scene.drives.tables import missing_file, numbered
+from p2gs_jax.scene.drives.tables import finite_numbers, missing_file, numbered
 from p2gs_jax.scene.drives.unified_lens import as_opencv
 from p2gs_jax.scene.files import image_size
 from p2gs_jax.scene.geometry import intrinsics
@@ -180,17 +180,14 @@ def _fisheye(path: Path, name: str, size: tuple[int, int]) -> RigCamera | None:
     """Return a fisheye; None where OpenCV's model cannot express it."""
     if not path.is_file():
         raise missing_file(path)
-    held = {
-        key: float(value)
-        for key, value in re.findall(
-            r"^\s*(\w+)\s*:\s*([-+.\deE]+)\s*$", path.read_text(errors="replace"), re.MULTILINE
-        )
-    }
-    try:
-        xi, k1, k2 = (held[key] for key in ("xi", "k1", "k2"))
-        gamma1, gamma2, u0, v0 = (held[key] for key in ("gamma1", "gamma2", "u0", "v0"))
-    except KeyError as error:
-        raise UserError(f"{path} has no {error}", fix="get the calibration again") from None
+    held = dict(re.findall(r"^\s*(\w+)\s*:\s*(\S+)\s*$", path.read_text(errors="replace"), re.M))
+    names = ("xi", "k1", "k2", "gamma1", "gamma2", "u0", "v0")
+    absent = [name for name in names if name not in held]
+    if absent:
+        raise UserError(f"{path} has no {', '.join(absent)}", fix="get the calibration again")
+    xi, k1, k2, gamma1, gamma2, u0, v0 = map(
+        float, finite_numbers((held[name] for name in names), path, ", ".join(names))
+    )
     # Their own projection leaves out the file's p1 and p2 as well.
     lens = as_opencv(xi, k1, k2)
     if not max(gamma1, gamma2) * lens.error < WORST_FISHEYE:

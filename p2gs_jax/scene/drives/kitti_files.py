@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ TURN_S = 0.1
 # forward. KITTI's readme says counterclockwise; the authors' own correction of moving scans
 # (kitti360scripts/helpers/curlVelodyneData_impl.c) takes points on the left as the earlier ones.
 BACK = np.pi
+_STAMP = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(\.\d+)?")
 
 
 def read_named(path: Path) -> dict[str, Float64[np.ndarray, " n"]]:
@@ -95,11 +97,14 @@ def read_stamps(path: Path) -> Float64[np.ndarray, " n"]:
         lines.pop()
     times = []
     for number, line in enumerate(lines, 1):
+        text = line.strip()
         try:
-            stamp = np.datetime64(line.strip().replace(" ", "T") or "NaT", "ns")
+            if text and not _STAMP.fullmatch(text):
+                raise ValueError(text)
+            stamp = np.datetime64(text.replace(" ", "T") or "NaT", "ns")
         except ValueError:
             raise UserError(
-                f"{path}, line {number}: {line.strip()!r} is no date and time",
+                f"{path}, line {number}: {text!r} is no date and time",
                 fix="get the file again",
             ) from None
         times.append(np.nan if np.isnat(stamp) else stamp.astype(np.int64) * 1e-9)

@@ -1,10 +1,14 @@
 """Small recordings in KITTI's layouts, written from the formulas of its readmes."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
+
+from p2gs_jax.errors import UserError
+from p2gs_jax.scene.drives.recording import Recording
 
 WIDTH, HEIGHT = 64, 48
 EARTH = 6378137.0
@@ -168,3 +172,41 @@ def tracklets(*items: str) -> str:
         f'<tracklets class_id="0" tracking_level="0" version="0"><count>{len(items)}</count>'
         f"<item_version>1</item_version>{''.join(items)}</tracklets></boost_serialization>\n"
     )
+
+
+def read_damaged(top: Path, read: Callable[[], Recording | None], times: int = 60) -> int:
+    """Read a drive again and again, each time with a file cut, changed or gone.
+
+    Returns how often that ended in a complaint; anything else has to be a sound recording.
+    """
+    rng = np.random.default_rng(1)
+    files = sorted(p for p in top.rglob("*") if p.is_file() and p.suffix not in (".png", ".jpg"))
+    complaints = 0
+    for _ in range(times):
+        path = files[rng.integers(len(files))]
+        whole = path.read_bytes()
+        damaged = bytearray(whole)
+        at = rng.integers(len(whole))
+        match rng.integers(4):
+            case 0:
+                damaged = damaged[:at]
+            case 1:
+                damaged[at] = rng.integers(256)
+            case 2:
+                del damaged[at : at + rng.integers(1, 30)]
+            case _:
+                damaged = damaged.replace(b"0", b"nan", 2)
+        path.write_bytes(damaged)
+        try:
+            recording = read()
+            for sweep in recording.sweeps if recording else ():
+                sweep.read()
+            for photograph in recording.photographs if recording else ():
+                assert np.isfinite(photograph.pose).all()
+            for thing in recording.objects if recording else ():
+                assert np.isfinite(thing.poses).all()
+                assert (np.diff(thing.times) > 0).all()
+        except UserError:
+            complaints += 1
+        path.write_bytes(whole)
+    return complaints

@@ -9,6 +9,7 @@ import pytest
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene import load_scene
+from p2gs_jax.scene.drives import read_drive
 from p2gs_jax.scene.drives.kitti_360 import is_kitti_360, read_kitti_360
 from p2gs_jax.scene.drives.unified_lens import as_opencv
 from p2gs_jax.scene.geometry import undistort_points
@@ -288,3 +289,8 @@ def test_a_lens_that_ours_cannot_express_is_left_out(root):
     recording = read(root)
     assert [c.name for c in recording.cameras] == ["image_00", "image_01"]
     assert any("image_02: no fisheye of ours" in note for note in recording.notes)
+
+
+def test_damaged_files_end_in_a_recording_or_a_complaint(root):
+    write_boxes(root, box(1, "car", 1, -1, np.eye(4)), box(2, "car", 2, 2, np.eye(4)))
+    assert made.read_damaged(root, lambda: read_drive(root, CFG)) > 10

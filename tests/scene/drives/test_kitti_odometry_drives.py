@@ -9,6 +9,7 @@ import pytest
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene import load_scene
+from p2gs_jax.scene.drives import read_drive
 from p2gs_jax.scene.drives.kitti_odometry import is_kitti_odometry, read_kitti_odometry
 from p2gs_jax.scene.rig import load_rig
 
@@ -176,3 +177,7 @@ def test_broken_sequences_name_the_file(sequence, case):
     change(sequence)
     with pytest.raises(UserError, match=message):
         read(sequence)
+
+
+def test_damaged_files_end_in_a_recording_or_a_complaint(sequence):
+    assert made.read_damaged(sequence.parent.parent, lambda: read_drive(sequence, CFG)) > 10

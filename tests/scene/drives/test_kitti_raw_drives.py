@@ -258,3 +258,10 @@ def test_real_scans_agree_with_the_disparity_of_the_real_photographs(shared_data
         assert len(ratio) > 1000
         assert np.median(ratio) == pytest.approx(1.0, abs=0.01)
         assert np.mean(np.abs(ratio - 1) < 0.05) > 0.75
+
+
+def test_damaged_files_end_in_a_recording_or_a_complaint(tmp_path):
+    drive = made.write_raw(tmp_path, frames=3)
+    text = made.tracklets(made.tracklet("Car", 0, [[5, 2, 0, 0]] * 3))
+    (drive / "tracklet_labels.xml").write_text(text)
+    assert made.read_damaged(drive.parent, lambda: read_drive(drive, CFG)) > 10

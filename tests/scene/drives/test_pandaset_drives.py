@@ -7,6 +7,7 @@ import shutil
 import time
 
 import cv2
+import made_kitti as made
 import numpy as np
 import pandas as pd
 import pytest
@@ -349,3 +350,7 @@ def test_boxes_are_where_the_forward_scanner_saw_them_at_another_time(real):
     assert len(ours) > 20
     assert np.median(ours) < 0.12
     assert np.median(unmoved) > 2 * np.median(ours)
+
+
+def test_damaged_files_end_in_a_recording_or_a_complaint(root):
+    assert made.read_damaged(root, lambda: read_drive(root, CFG)) > 10
