@@ -25,11 +25,13 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.evaluate.alignment import fit_capture, fit_exposure
 from p2gs_jax.evaluate.array_store import ArrayStore, StoredArray
 from p2gs_jax.evaluate.consistency import VideoScores
+from p2gs_jax.evaluate.drives import DriveScores, is_drive
 from p2gs_jax.evaluate.lpips import LpipsWeights, lpips
 from p2gs_jax.evaluate.metered import MeteredViews
 from p2gs_jax.evaluate.metrics import psnr, ssim
 from p2gs_jax.evaluate.parallel import map_in_order
 from p2gs_jax.evaluate.radiance import RadianceScores, Truth
+from p2gs_jax.evaluate.unexplained import Unexplained
 from p2gs_jax.photometry.display import DisplayTransform, develop, display_of_view, with_capture
 from p2gs_jax.photometry.formation import exposed_at
 from p2gs_jax.photometry.mean import MeanParameters, mean_parameters, usual_display
@@ -129,6 +131,7 @@ def evaluate(
     lpips_weights: LpipsWeights | None = None,
     on_view: Callable[[ViewResult], None] = lambda result: None,
     on_metering: Callable[[Metering], None] = lambda metering: None,
+    on_unexplained: Callable[[dict[int, Unexplained]], None] = lambda found: None,
     on_progress: Callable[[int, int], None] = lambda done, count: None,
 ) -> dict:
     """Render and judge all views.
@@ -146,10 +149,12 @@ def evaluate(
             out.
         on_view: receives every rendered view.
         on_metering: receives the metering rule that explains the training views, once.
+        on_unexplained: of a drive: receives what no static scene explains in the training views.
         on_progress: views done, views in all.
 
     Returns:
-        The `train`, `test`, `consistency`, `reference` and `radiance` parts of `metrics.json`.
+        The `train`, `test`, `consistency`, `reference` and `radiance` parts of `metrics.json`, and
+        those of drives.
 
     Raises:
         UserError: an image is too small for LPIPS.
@@ -168,6 +173,7 @@ def evaluate(
         """Return how a view is shown by the mean parameters."""
         return usual_display(small, taken_by, scene.views[index].camera, tone)
 
+    drive = DriveScores(scene, store) if is_drive(scene) else None
     row_of = {index: row for row, index in enumerate(scene.train_indices)}
 
     def judged(index: int) -> _Judged:
@@ -225,6 +231,9 @@ def evaluate(
                 images = (linear, result.photograph, found.mask)
                 metered.add_held_out(view.name, found.readings, *images)
             on_view(result)
+            if drive is not None:
+                images = (result.ldr, result.photograph, found.mask)
+                drive.add(index, *images, result.depth, result.alpha)
             videos["per_view"].add(view.camera, result.ldr, result.transform.exposure)
             videos["averaged"].add(view.camera, found.ldr_averaged, mean.exposure)
             videos["photographs"].add(view.camera, result.photograph, result.transform.exposure)
@@ -253,6 +262,9 @@ def evaluate(
             exposed = exposed_at(cfg.loss.saturation, mean.gamma, cfg.photometry)
             typical = float(np.median(small.photometry.exposures))
             metrics["radiance"] = scores.summary(exposed / typical)
+        if drive is not None:
+            metrics |= drive.summary()
+            on_unexplained(drive.unexplained)
         if reference_views:
             metrics["reference"] = _against_reference(
                 reference_views, scene, mean, usual_display(small, (), None, tone), score

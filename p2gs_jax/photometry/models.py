@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from p2gs_jax.config import Level, VignettingKind
+from p2gs_jax.config import Level, ResponseKind, VignettingKind
 from p2gs_jax.config import PhotometricModel as ModelName
 from p2gs_jax.photometry.response import Response
 
@@ -102,4 +102,17 @@ def parameter_count(form: Form, response: Response, cameras: int, views: int) ->
         + 2 * size[form.white_balance]
         + cameras * polynomials(form.vignetting) * len(VIGNETTING_POWERS)
         + response.extra_parameters
+        - channel_powers(form, response.by)
     )
+
+
+def channel_powers(form: Form, by: ResponseKind | None) -> int:
+    """Return how many powers of channels are gauges beside that of responses by themselves.
+
+    Where every channel has exposures of its own, no photograph tells its power.
+
+    Args:
+        form: what varies.
+        by: what has a response of its own, or None.
+    """
+    return 2 if by == "channel" and form.white_balance == "view" else 0

@@ -25,7 +25,7 @@ from p2gs_jax.photometry.adjustment.problem import KnownExposures, Problem, make
 from p2gs_jax.photometry.adjustment.solve import MOST_ROUNDS
 from p2gs_jax.photometry.candidates import Candidate, Comparison, choose
 from p2gs_jax.photometry.choices import Choice, Curve, Scope, neighbours
-from p2gs_jax.photometry.models import MODELS, Form, parameter_count
+from p2gs_jax.photometry.models import MODELS, Form, channel_powers, parameter_count
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import BASES, Response, spline_parameters
 from p2gs_jax.photometry.solution import PhotometricSolution
@@ -153,7 +153,8 @@ class _Search:
         """Return the number of free parameters of a choice, its curve not fitted yet."""
         views, cameras = self.comparison.problem.observations.view_count, self.scope.cameras
         count = parameter_count(choice.form, Response(), cameras, views)
-        return count + spline_parameters(choice.curve.splines, cameras)
+        by = choice.curve.splines
+        return count + spline_parameters(by, cameras) - channel_powers(choice.form, by)
 
     def solve(self, choices: Iterable[Choice]) -> bool:
         """Solve choices that are possible and not solved yet; return whether there were any."""

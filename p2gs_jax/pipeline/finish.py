@@ -18,6 +18,7 @@ from p2gs_jax.photometry.metering import Metering
 from p2gs_jax.pipeline.prepare import Prepared
 from p2gs_jax.render.host import make_renderer
 from p2gs_jax.run.layout import RunFolder
+from p2gs_jax.run.unexplained_pictures import write_unexplained
 from p2gs_jax.run.write import summary_rows, write_results, write_view
 from p2gs_jax.types import Params
 
@@ -92,6 +93,7 @@ def finish(
             lpips_weights=lpips_weights,
             on_view=on_view,
             on_metering=metering.append,
+            on_unexplained=lambda found: write_unexplained(folder.unexplained, scene, store, found),
             on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
         )
     if metering[0].telling:

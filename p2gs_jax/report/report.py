@@ -6,6 +6,7 @@ from pathlib import Path
 
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.report import run_summary
+from p2gs_jax.report.drive_sections import unexplained_section
 from p2gs_jax.report.page import (
     Section,
     check_place,
@@ -78,12 +79,14 @@ def report_page(run: RunFiles, scene: SceneMeasurements) -> str:
     comparisons = held_out_comparisons(run, MOST_COMPARED, problems) or list(scene.comparisons)
     found = run_warnings(run, scene)
     model, *camera = camera_sections(run, scene)
+    unexplained = unexplained_section(run, problems)
     sections = [
         _warning_section(found, run, scene, problems),
         model,
         *camera,
         seam_section(scene),
         comparison_section(comparisons, len(run.held_out)),
+        unexplained,
         hdr_section(run, comparisons),
         score_section(run),
         training_section(run),

@@ -80,3 +80,8 @@ class RunFolder:
     def renders(self) -> Path:
         """Folder of the held-out views."""
         return self.root / "renders"
+
+    @property
+    def unexplained(self) -> Path:
+        """Folder of photographs of a drive with what no static scene explains."""
+        return self.root / "unexplained"

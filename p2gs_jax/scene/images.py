@@ -11,7 +11,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, UInt, UInt8
+from jaxtyping import Bool, Float32, UInt
 from PIL import Image
 
 from p2gs_jax.config import DataConfig
@@ -180,18 +180,6 @@ class ImageStore:
                 _, dropped = self._cache.popitem(last=False)
                 self._bytes -= dropped.nbytes
         return entry
-
-
-def decode_grey(data: bytes, shrink: int) -> UInt8[np.ndarray, "h w"] | None:
-    """Return a photograph in grey as stored, or None where it is none.
-
-    Args:
-        data: of its file.
-        shrink: by up to this factor, where that saves time; JPEG does.
-    """
-    flags = {2: cv2.IMREAD_REDUCED_GRAYSCALE_2, 4: cv2.IMREAD_REDUCED_GRAYSCALE_4}
-    flag = flags.get(2 ** min(int(np.log2(max(shrink, 1))), 2), cv2.IMREAD_GRAYSCALE)
-    return cv2.imdecode(np.frombuffer(data, np.uint8), flag | cv2.IMREAD_IGNORE_ORIENTATION)
 
 
 def _prepare(view: View, width: int, height: int) -> _Entry:

@@ -9,7 +9,7 @@ from p2gs_jax.photometry.adjustment.fit import fit_model, solve_model
 from p2gs_jax.photometry.adjustment.problem import make_problem
 from p2gs_jax.photometry.choices import Choice, Curve, Scope, neighbours
 from p2gs_jax.photometry.models import Form, parameter_count, possible
-from p2gs_jax.photometry.response import Response, log_exposed
+from p2gs_jax.photometry.response import FREE, HELD, Response, log_exposed
 from p2gs_jax.synth.drive import make_drive, make_exposures, observe
 
 LIMITS = {"black": 4 / 255, "saturation": 250 / 255, "pivot": 0.18}
@@ -129,6 +129,23 @@ def test_errors_hold_where_neighbours_err_alike(shared):
         gap = s.log_exposures - np.log(truth)
         ratios.append((gap - gap.mean()) / s.exposure_errors)
     assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.4
+
+
+def test_channels_with_exposures_of_their_own_have_no_powers_of_their_own():
+    # Dark photographs are bluer; a power per channel would explain that as well, and any tint of
+    # a view with it: the mean of the white balances would be no white balance.
+    o = observe(DRIVE, ISO4[:, None] * np.exp(DARK), seed=2)
+    form = Form("view_exposure", "view")
+    problem = make_problem(o, **LIMITS)
+    response = fit_response(problem, Response(), form=form, by="channel")
+    assert response is not None
+    knots = np.array(response.splines)[:, HELD[1]]
+    np.testing.assert_allclose(knots, 0, atol=1e-3)
+    truth = of_balance(DARK)
+    s = fit_model(problem, form, response)
+    assert np.sqrt(np.mean((s.white_balance - truth) ** 2)) / np.log(2) < 0.02
+    apart = parameter_count(form, response, 3, 36) - parameter_count(form, Response(), 3, 36)
+    assert apart == 3 * len(FREE)
 
 
 def test_choices_one_step_apart():

@@ -18,6 +18,7 @@ from p2gs_jax.render.host import make_renderer
 from p2gs_jax.run.layout import RunFolder
 from p2gs_jax.run.metering_file import write_metering
 from p2gs_jax.run.read import load_run
+from p2gs_jax.run.unexplained_pictures import write_unexplained
 
 
 def run(options: Eval) -> int:
@@ -29,8 +30,9 @@ def run(options: Eval) -> int:
     weights = None if left_out else read_lpips_weights(lpips_weights)
     if weights is not None:
         weights.require_sizes(fitted.scene.views, fitted.cfg.data.max_width)
-    folder = options.reference or fitted.reference
-    truth = None if folder is None else load_reference(folder, fitted.scene, fitted.cfg)
+    reference = options.reference or fitted.reference
+    truth = None if reference is None else load_reference(reference, fitted.scene, fitted.cfg)
+    folder = RunFolder(options.run)
     store = fitted.store
     with TerminalReporter() as reporter:
         metrics = evaluate(
@@ -43,10 +45,13 @@ def run(options: Eval) -> int:
             reference=truth,
             radiance=find_radiance(fitted.scene, store),
             lpips_weights=weights,
-            on_metering=lambda found: write_metering(RunFolder(options.run).metering, found),
+            on_metering=lambda found: write_metering(folder.metering, found),
+            on_unexplained=lambda found: write_unexplained(
+                folder.unexplained, fitted.scene, store, found
+            ),
             on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
         )
-    path = RunFolder(options.run).metrics
+    path = folder.metrics
     kept = _kept_metrics(path)
     write_json(path, {**metrics, **kept})
     print_metrics({**metrics, **kept}, options.run)

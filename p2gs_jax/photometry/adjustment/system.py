@@ -173,8 +173,13 @@ def _anchors(problem: Problem, u: Unknowns, log_exposure, precision) -> Held:
         for direction in range(u.features.balance_count // u.features.cameras):
             at = u.of_k.start + direction * u.features.cameras + np.arange(u.features.cameras)
             hold(at, views_of / views_of.sum())
-    if u.splines.powers.size:
-        hold(u.of_c.start + u.splines.powers, 1 / u.splines.groups)
+    powers = u.of_c.start + u.splines.powers
+    if u.splines.by == "channel" and u.channels == 3:
+        # Of a channel with exposures of its own no photograph tells the power.
+        for power in powers:
+            hold(power, 1.0)
+    elif powers.size:
+        hold(powers, 1 / u.splines.groups)
     return Held(sp.csr_array(sp.vstack(rows)), np.array(targets), np.ones(len(targets)))
 
 

@@ -143,7 +143,7 @@ def _rolling(recording: Recording, names: Sequence[str]) -> list[str]:
     longest = max(abs(s) for s in rolling.values())
     return [
         f"{len(rolling)} cameras have rolling shutters (up to {1000 * longest:.0f} ms from the "
-        "first row to the last): each photograph is taken as of one moment."
+        "first row or column to the last): each photograph is taken as of one moment."
     ]
 
 

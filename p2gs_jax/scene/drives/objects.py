@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
@@ -40,3 +41,48 @@ def tracked(
         moving = bool(away.max() > STANDS_WITHIN_M)
     length, width, height = (float(side) for side in size)
     return TrackedObject(name, label, (length, width, height), at, ordered, moving)
+
+
+class Box(NamedTuple):
+    """One box around a thing, at one time.
+
+    Attributes:
+        track: name of the thing.
+        label: what it is.
+        size: length (x), width (y), height (z), metres.
+        time: seconds.
+        pose: box to world.
+        moving: what the set says of this moment, or None.
+    """
+
+    track: str
+    label: str
+    size: tuple[float, float, float]
+    time: float
+    pose: Float64[np.ndarray, "4 4"]
+    moving: bool | None = None
+
+
+def tracks(boxes: Iterable[Box]) -> tuple[TrackedObject, ...]:
+    """Return the things that boxes belong to, by their names.
+
+    The size of a thing is the median of its boxes. It moves if it does in one of them.
+    """
+    of: dict[str, list[Box]] = {}
+    for box in boxes:
+        of.setdefault(box.track, []).append(box)
+    things = []
+    for name, own in sorted(of.items()):
+        told = [box.moving for box in own if box.moving is not None]
+        length, width, height = np.median([box.size for box in own], axis=0)
+        things.append(
+            tracked(
+                name,
+                own[0].label,
+                (length, width, height),
+                [box.time for box in own],
+                [box.pose for box in own],
+                any(told) if told else None,
+            )
+        )
+    return tuple(things)

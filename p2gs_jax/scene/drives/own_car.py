@@ -23,9 +23,8 @@ from p2gs_jax.scene.drives.unmoving import (
     often_apart,
     weigh,
 )
-from p2gs_jax.scene.files import undecodable
+from p2gs_jax.scene.files import decode_grey, undecodable
 from p2gs_jax.scene.geometry import scale_intrinsics
-from p2gs_jax.scene.images import decode_grey
 
 # Photographs of a camera that are looked at, spread evenly over its way; fewer say too little.
 MOST_LOOKED_AT, FEWEST_LOOKED_AT = 24, 6

@@ -65,6 +65,28 @@ def from_quaternion(
     return rigid(Rotation.from_quat(np.roll(wxyz, -1)).as_matrix(), position, source, what)
 
 
+def from_quaternions(
+    wxyz: Float[np.ndarray, "n 4"], positions: Float[np.ndarray, "n 3"], source: Path, what: str
+) -> Float64[np.ndarray, "n 4 4"]:
+    """Return the matrices of many quaternions (w x y z) and positions.
+
+    Raises:
+        UserError: a quaternion is not of length 1 within a hundredth, or something not finite.
+    """
+    wxyz = np.asarray(wxyz, np.float64)
+    bad = ~(np.abs(np.linalg.norm(wxyz, axis=1) - 1) < 1e-2) | ~np.isfinite(positions).all(1)
+    if bad.any():
+        raise UserError(
+            f"{source}: {what} number {np.argmax(bad) + 1} is no unit quaternion and position",
+            fix="get the file again; it is damaged, or written by another version of the data set",
+        )
+    out = np.tile(np.eye(4), (len(wxyz), 1, 1))
+    if len(wxyz):
+        out[:, :3, :3] = Rotation.from_quat(np.roll(wxyz, -1, axis=1)).as_matrix()
+        out[:, :3, 3] = positions
+    return out
+
+
 def inverse(poses: Float64[np.ndarray, "*n 4 4"]) -> Float64[np.ndarray, "*n 4 4"]:
     """Return the inverse of rigid matrices."""
     out = np.zeros_like(poses)

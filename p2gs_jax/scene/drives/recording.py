@@ -23,8 +23,8 @@ class RigCamera:
         width: pixels.
         height: pixels.
         distortion: what to remove on load, or None.
-        readout_s: seconds from the first row's exposure to the last one's, where the set states
-            a rolling shutter; else None.
+        readout_s: seconds from the exposure of the first row, or column, to that of the last,
+            where the set states a rolling shutter; else None.
     """
 
     name: str
