@@ -20,8 +20,8 @@ from p2gs_jax.types import Distortion
 # iteration does not converge for strong rational lenses.
 _TABLE, _POLISHING = 4096, 3
 _MOST_ROUNDS, _SETTLED = 20, 1e-10
-# Smaller leading coefficients do nothing within any picture.
-_NOTHING = 1e-14
+# No picture reaches further from its middle, focal lengths; terms that are smaller there are none.
+_FARTHEST, _NOTHING = 100.0, 1e-9
 
 
 def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, "3 3"]:
@@ -145,10 +145,12 @@ def _profile(distortion: Distortion) -> _Profile:
 
 
 def _first_root(polynomial: Polynomial) -> float:
-    """Return the smallest positive root, infinite where there is none."""
-    roots = polynomial.trim(_NOTHING).roots()
+    """Return the smallest positive root, infinite where there is none within pictures."""
+    scaled = Polynomial(polynomial.coef * _FARTHEST ** np.arange(len(polynomial.coef)))
+    roots = scaled.trim(_NOTHING).roots() * _FARTHEST
     found = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
-    return float(found.min(initial=np.inf))
+    first = float(found.min(initial=np.inf))
+    return first if first < _FARTHEST else float("inf")
 
 
 def _fold_radius(distortion: Distortion) -> float:
@@ -172,7 +174,7 @@ def _radially_undone(
     """
     n, d, limit = _profile(distortion)
     fisheye = distortion.model == "fisheye"
-    last = min(limit, np.pi / 2) if fisheye else np.arctan(limit)
+    last = min(limit, np.pi / 2) if fisheye else np.arctan(min(limit, _FARTHEST))
     table = np.linspace(0.0, last, _TABLE)[:-1]
     x = table if fisheye else np.tan(table)
     grown = n(x) / d(x)
