@@ -146,8 +146,9 @@ def _profile(distortion: Distortion) -> _Profile:
 
 def _first_root(polynomial: Polynomial) -> float:
     """Return the smallest positive root, infinite where there is none within pictures."""
-    scaled = Polynomial(polynomial.coef * _FARTHEST ** np.arange(len(polynomial.coef)))
-    roots = scaled.trim(_NOTHING).roots() * _FARTHEST
+    terms = np.asarray(polynomial.coef)
+    scaled = Polynomial(terms * _FARTHEST ** np.arange(len(terms)))
+    roots = np.asarray(scaled.trim(_NOTHING).roots()) * _FARTHEST
     found = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
     first = float(found.min(initial=np.inf))
     return first if first < _FARTHEST else float("inf")
