@@ -17,6 +17,7 @@ from p2gs_jax.cli.options.pages import Compare, Report
 from p2gs_jax.cli.options.render import Render
 from p2gs_jax.cli.options.results import Eval
 from p2gs_jax.cli.options.setup import Completion, Doctor
+from p2gs_jax.cli.options.survey import Survey
 from p2gs_jax.cli.options.view import View
 from p2gs_jax.cli.synonyms import check_option_names
 from p2gs_jax.cli.tyro_rules import registry
@@ -26,6 +27,7 @@ from p2gs_jax.errors import UserError
 COMMANDS: dict[str, type] = {
     "fit": Fit,
     "calibrate": Calibrate,
+    "scene": Survey,
     "render": Render,
     "eval": Eval,
     "export": Export,
@@ -42,12 +44,14 @@ COMMANDS: dict[str, type] = {
 # The order of `p2gs-jax --help`: as a new user needs them.
 GROUPS: dict[str, tuple[str, ...]] = {
     "First": ("doctor", "demo"),
-    "From photographs": ("fit", "calibrate"),
+    "From photographs": ("scene", "fit", "calibrate"),
     "With a finished run": ("view", "report", "render", "export", "eval", "compare"),
     "Data with truth, and measurements": ("synth", "sweep", "bench"),
     "Your shell": ("completion",),
 }
 WITH_PRESET = ("fit", "calibrate")
+# Their `--help` is short, and `--help-all` is not.
+WITH_CONFIGURATION = (*WITH_PRESET, "scene")
 HELP, HELP_ALL, VERSION = ("-h", "--help"), "--help-all", ("-V", "--version")
 
 
@@ -107,7 +111,7 @@ def _options(name: str, argv: list[str]) -> Any:
         return answer()
     text = help_text.captured(answer)
     _print_and_exit(
-        help_text.with_prose(text, COMMANDS[name], brief and name in WITH_PRESET, name), 0
+        help_text.with_prose(text, COMMANDS[name], brief and name in WITH_CONFIGURATION, name), 0
     )
 
 

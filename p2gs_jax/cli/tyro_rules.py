@@ -30,7 +30,7 @@ from tyro.constructors import (
     StructTypeInfo,
 )
 
-from p2gs_jax.config import FitConfig
+from p2gs_jax.config import DataConfig, FitConfig
 
 PLACEHOLDERS = {int: "N", float: "X", str: "TEXT", Path: "PATH"}
 
@@ -50,6 +50,8 @@ def registry(brief: bool) -> ConstructorRegistry:
             return None
         if kind is FitConfig:
             return _configuration(info, brief)
+        if kind is DataConfig and brief:
+            return StructConstructorSpec(DataConfig, ())
         return StructConstructorSpec(kind, tuple(_fields(kind, info.default)))
 
     rules.primitive_rule(_number_rule)

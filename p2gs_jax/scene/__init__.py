@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
@@ -12,6 +13,7 @@ from p2gs_jax.scene.colmap import find_model, load_colmap
 from p2gs_jax.scene.drives import read_drive
 from p2gs_jax.scene.drives.assemble import assemble
 from p2gs_jax.scene.drives.kitti_odometry import is_kitti_odometry
+from p2gs_jax.scene.drives.recording import Recording
 from p2gs_jax.scene.exif import read_exif_ev
 from p2gs_jax.scene.files import list_images
 from p2gs_jax.scene.images import ImageStore, camera_at, size_at
@@ -49,15 +51,30 @@ def load_scene(
     Raises:
         UserError: there is no scene, or it is broken; the message names the file.
     """
-    root = Path(root)
-    if not root.exists():
-        raise UserError(f"{root} does not exist", fix="check the path of the scene")
-    scene = _read(root, cfg, work_dir, report)
+    found = find_scene(root, cfg, report)
+    if isinstance(found, Recording):
+        scene = assemble(found, cfg, work_dir, report)
+    elif isinstance(found, PhotographsAlone):
+        # Imported here as below: scenes with cameras and points do not need COLMAP.
+        from p2gs_jax.scene.structure_from_motion import load_images
+
+        folder, paths = found
+        scene = load_images(Path(root), folder, paths, cfg, work_dir, report)
+    else:
+        scene = found
     if len(scene.points) == 0:
-        # Imported here as below: scenes with points do not need COLMAP.
         from p2gs_jax.scene.triangulate import triangulate
 
         scene = triangulate(scene, work_dir, report)
+    return with_what_lies_beside(scene, cfg)
+
+
+def with_what_lies_beside(scene: Scene, cfg: DataConfig) -> Scene:
+    """Return a scene with masks, EXIF exposures and split.
+
+    Raises:
+        UserError: so many views cannot be held out.
+    """
     views, mask_notes = _attach_masks(scene.views)
     views = tuple(
         dataclasses.replace(view, exif_ev=read_exif_ev(view.image_path)) for view in views
@@ -69,9 +86,29 @@ def load_scene(
     )
 
 
-def _read(
-    root: Path, cfg: DataConfig, work_dir: Path | None, report: Callable[[str], None]
-) -> Scene:
+class PhotographsAlone(NamedTuple):
+    """Photographs of which nothing else is known.
+
+    Attributes:
+        folder: that their names are relative to.
+        paths: of them, sorted.
+    """
+
+    folder: Path
+    paths: list[Path]
+
+
+def find_scene(
+    root: Path, cfg: DataConfig, report: Callable[[str], None] = lambda message: None
+) -> Scene | Recording | PhotographsAlone:
+    """Return what a folder holds, as `load_scene` finds it; nothing long is computed.
+
+    Raises:
+        UserError: there is no scene, or it is broken; the message names the file.
+    """
+    root = Path(root)
+    if not root.exists():
+        raise UserError(f"{root} does not exist", fix="check the path of the scene")
     if root.is_file():
         if root.suffix.lower() != ".json":
             raise UserError(
@@ -91,7 +128,7 @@ def _read(
         return load_rig(root, cfg)
     recording = read_drive(root, cfg, report)
     if recording is not None:
-        return assemble(recording, cfg, work_dir, report)
+        return recording
     if cfg.format not in (None, "images"):
         raise UserError(
             f"{root} holds no scene in the format {cfg.format!r}",
@@ -102,9 +139,7 @@ def _read(
         # Subfolders of the root itself may hold anything: masks, or the results of other runs.
         paths = list_images(folder, recursive=folder != root)
         if paths:
-            from p2gs_jax.scene.structure_from_motion import load_images
-
-            return load_images(root, folder, paths, cfg, work_dir, report)
+            return PhotographsAlone(folder, paths)
     looked = ", ".join(str(folder) for folder in folders)
     raise UserError(
         f"no scene in {root}: there is no COLMAP model (cameras, images and points3D as .bin or "

@@ -146,9 +146,9 @@ def _profile(distortion: Distortion) -> _Profile:
 
 def _first_root(polynomial: Polynomial) -> float:
     """Return the smallest positive root, infinite where there is none within pictures."""
-    terms = np.asarray(polynomial.coef)
+    terms = np.array(polynomial.coef, np.float64)
     scaled = Polynomial(terms * _FARTHEST ** np.arange(len(terms)))
-    roots = np.asarray(scaled.trim(_NOTHING).roots()) * _FARTHEST
+    roots = np.array(scaled.trim(_NOTHING).roots(), np.complex128) * _FARTHEST
     found = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
     first = float(found.min(initial=np.inf))
     return first if first < _FARTHEST else float("inf")

@@ -34,6 +34,8 @@ def assemble(
     cfg: DataConfig,
     work_dir: Path | None = None,
     report: Callable[[str], None] = lambda message: None,
+    *,
+    write_embedded: bool = True,
 ) -> Scene:
     """Return the scene of a recording: the chosen photographs, laser points, tracked things.
 
@@ -44,6 +46,7 @@ def assemble(
         cfg: cameras and frames, and whether photographs may be missing.
         work_dir: embedded photographs are written below it; None: below the user's cache folder.
         report: receives progress.
+        write_embedded: False only names the files of embedded photographs: they cannot be read.
 
     Raises:
         UserError: a camera or frame is not there, photographs are missing, a sweep is broken.
@@ -89,7 +92,7 @@ def assemble(
         views.append(
             View(
                 name=f"{photograph.camera}/{photograph.path.name}",
-                image_path=_file_of(photograph, folder),
+                image_path=_file_of(photograph, folder, write_embedded),
                 camera=photograph.camera,
                 viewmat=inverse(pose).astype(np.float32),
                 K=camera.K.astype(np.float32),
@@ -166,12 +169,12 @@ def _embedded_folder(root: Path, work_dir: Path | None) -> Path:
     return platformdirs.user_cache_path("p2gs-jax") / "photographs" / drive
 
 
-def _file_of(photograph: Photograph, folder: Path) -> Path:
-    """Return the file of a photograph; an embedded one is written once."""
+def _file_of(photograph: Photograph, folder: Path, write_embedded: bool) -> Path:
+    """Return the file of a photograph; an embedded one is written once, if at all."""
     if photograph.embedded is None:
         return photograph.path
     path = folder / photograph.camera / photograph.path.name
-    if not path.is_file():
+    if write_embedded and not path.is_file():
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(path) as temporary:
             temporary.write_bytes(photograph.embedded())

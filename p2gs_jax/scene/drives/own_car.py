@@ -83,8 +83,8 @@ def find_own_cars(
         notes.append(f"{_SAID}: not seen by {', '.join(without)}")
     if standing:
         notes.append(
-            f"{_SAID}: {', '.join(standing)} hardly moved, so nothing can be told"
-            " from the photographs; give masks if they show it"
+            f"{_SAID}: {', '.join(standing)} took too few photographs, or hardly moved, so "
+            "nothing can be told from them; give masks if they show it"
         )
     return masks, notes
 
