@@ -301,7 +301,7 @@ class Batch(eqx.Module):
 
 @dataclass(frozen=True)
 class Distortion:
-    """Lens distortion; all zero means pinhole.
+    """Lens distortion; a `radial` lens of all zeros is a pinhole.
 
     Attributes:
         coefficients: OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]] (`radial`, rational from k4 on),
