@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float32
 
+from p2gs_jax.evaluate.moving import MovingScores
 from p2gs_jax.evaluate.unexplained import Residuals, Unexplained
 from p2gs_jax.render.warp import OPAQUE
 from p2gs_jax.scene.images import ImageStore
@@ -32,6 +33,7 @@ class DriveScores:
         """
         self._scene, self._store = scene, store
         self._residuals = Residuals(scene.views)
+        self._moving = MovingScores(scene)
         self.unexplained: dict[int, Unexplained] = {}
 
     def add(
@@ -53,6 +55,7 @@ class DriveScores:
             depth: alpha-weighted camera z.
             alpha: opacity.
         """
+        self._moving.add(index, ldr, photograph, mask)
         surface = np.where(alpha > OPAQUE, depth / np.maximum(alpha, OPAQUE), 0)
         if self._scene.views[index].split == "train":
             K = self._store.camera(index)[1]
@@ -61,7 +64,7 @@ class DriveScores:
     def summary(self) -> dict:
         """Return the parts of `metrics.json`."""
         self.unexplained = self._residuals.find()
-        return {"unexplained": self._shares()}
+        return {"unexplained": self._shares(), **self._moving.summary()}
 
     def _shares(self) -> dict:
         """Return shares of pixels by view, and their mean."""
