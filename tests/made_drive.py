@@ -9,7 +9,7 @@ from p2gs_jax.types import TrackedObject
 
 WIDTH, HEIGHT, FOCAL = 96, 64, 48.0
 K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1.0]])
-AZIMUTHS = {"front": 0.0, "left": 90.0, "back": 180.0, "right": -90.0}
+AZIMUTHS = {"front": 0.0, "front_left": 45.0, "left": 90.0, "back": 180.0, "right": -90.0}
 SPEED, PERIOD, FAR = 10.0, 0.1, np.array([3000.0, 500.0, 20.0])
 # OpenCV's axes (x right, y down, z forward) in those of cars (x forward, y left, z up).
 FORWARD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])

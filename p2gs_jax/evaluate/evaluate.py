@@ -15,7 +15,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -25,13 +25,14 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.evaluate.alignment import fit_capture, fit_exposure
 from p2gs_jax.evaluate.array_store import ArrayStore, StoredArray
 from p2gs_jax.evaluate.consistency import VideoScores
-from p2gs_jax.evaluate.drives import DriveScores, is_drive
+from p2gs_jax.evaluate.drives import DriveScores, is_drive, masks_of_parts
 from p2gs_jax.evaluate.lpips import LpipsWeights, lpips
 from p2gs_jax.evaluate.metered import MeteredViews
 from p2gs_jax.evaluate.metrics import psnr, ssim
 from p2gs_jax.evaluate.moving import still_mask
 from p2gs_jax.evaluate.parallel import map_in_order
 from p2gs_jax.evaluate.radiance import RadianceScores, Truth
+from p2gs_jax.evaluate.region_scores import PARTS, mean_of_parts, region_scores
 from p2gs_jax.evaluate.unexplained import Unexplained
 from p2gs_jax.photometry.display import DisplayTransform, develop, display_of_view, with_capture
 from p2gs_jax.photometry.formation import exposed_at
@@ -68,12 +69,21 @@ class ViewResult:
     transform: DisplayTransform
 
 
-def _score(lpips_weights: LpipsWeights | None, ldr, target, mask) -> dict[str, float]:
-    """Return PSNR and SSIM of an image; LPIPS if there are weights for it."""
-    row = {"psnr": float(psnr(ldr, target, mask)), "ssim": float(ssim(ldr, target, mask))}
+def _score(
+    lpips_weights: LpipsWeights | None,
+    ldr,
+    target,
+    mask,
+    parts: Mapping[str, Float32[np.ndarray, "h w"]] | None = None,
+) -> dict[str, Any]:
+    """Return PSNR and SSIM of an image; LPIPS if there are weights for it; the same of parts."""
+    row: dict[str, Any] = {
+        "psnr": float(psnr(ldr, target, mask)),
+        "ssim": float(ssim(ldr, target, mask)),
+    }
     if lpips_weights is not None:
         row["lpips"] = float(lpips(lpips_weights, ldr, target, mask))
-    return row
+    return row if parts is None else {**row, **region_scores(lpips_weights, ldr, target, parts)}
 
 
 class _Judged(NamedTuple):
@@ -94,29 +104,30 @@ class _Judged(NamedTuple):
     result: ViewResult
     ldr_averaged: Float32[np.ndarray, "h w 3"]
     mask: Float32[np.ndarray, "h w"]
-    scores: dict[str, float]
-    scores_averaged: dict[str, float]
-    scores_all: dict[str, float] | None
+    scores: dict[str, Any]
+    scores_averaged: dict[str, Any]
+    scores_all: dict[str, Any] | None
     radiance: np.ndarray | None
     reference: np.ndarray | None
     readings: Readings
 
 
 class _Collector:
-    """Per-view scores and their means."""
+    """Per-view scores, of drives also of parts of the views, and their means."""
 
-    def __init__(self, rows: dict[str, dict[str, float]] | None = None):
+    def __init__(self, rows: dict[str, dict[str, Any]] | None = None):
         self.rows = {} if rows is None else rows
 
-    def add(self, name: str, row: dict[str, float]) -> None:
+    def add(self, name: str, row: dict[str, Any]) -> None:
         self.rows[name] = row
 
     def summary(self) -> dict:
         if not self.rows:
             return {}
-        keys = next(iter(self.rows.values())).keys()
-        means = {k: float(np.mean([r[k] for r in self.rows.values()])) for k in keys}
-        return {**means, "per_view": self.rows}
+        rows = list(self.rows.values())
+        keys = [k for k in rows[0] if k not in PARTS]
+        means = {k: float(np.mean([r[k] for r in rows])) for k in keys}
+        return {**means, **mean_of_parts(rows), "per_view": self.rows}
 
 
 def evaluate(
@@ -165,7 +176,6 @@ def evaluate(
     small = jax.tree.map(np.asarray, replace(params, gaussians=None))
     gaussians = jax.device_put(params.gaussians)
     living = jax.device_put(np.asarray(alive))
-    score = functools.partial(_score, lpips_weights)
     taken_by = [view.camera for view in scene.training_views]
 
     tone = cfg.photometry
@@ -174,11 +184,15 @@ def evaluate(
         """Return how a view is shown by the mean parameters."""
         return usual_display(small, taken_by, scene.views[index].camera, tone)
 
-    drive = DriveScores(scene, store) if is_drive(scene) else None
+    drive = None
+    if is_drive(scene):
+        drive = DriveScores(scene, store, lambda camera: render(gaussians, living, camera))
     row_of = {index: row for row, index in enumerate(scene.train_indices)}
 
     def judged(index: int) -> _Judged:
         photograph, mask = store.get(index, 1)
+        parts = None if drive is None else masks_of_parts(scene, index, mask)
+        score = functools.partial(_score, lpips_weights, parts=parts)
         result = render(gaussians, living, camera_of(store, index))
         linear = np.asarray(result.linear)
         shown = usual(index)
@@ -253,8 +267,10 @@ def evaluate(
         row_of_name = {view.name: index for index, view in enumerate(scene.views)}
 
         def under_rule(name, linear, exposure, photograph, mask):
-            shown = develop(linear, replace(usual(row_of_name[name]), exposure=exposure))
-            return score(shown, photograph, mask)
+            row = row_of_name[name]
+            shown = develop(linear, replace(usual(row), exposure=exposure))
+            parts = None if drive is None else masks_of_parts(scene, row, mask)
+            return _score(lpips_weights, shown, photograph, mask, parts)
 
         if metered_scores := metered.scores(metering, under_rule):
             metrics["test"]["metered"] = _Collector(metered_scores).summary()
@@ -269,7 +285,11 @@ def evaluate(
             on_unexplained(drive.unexplained)
         if reference_views:
             metrics["reference"] = _against_reference(
-                reference_views, scene, mean, usual_display(small, (), None, tone), score
+                reference_views,
+                scene,
+                mean,
+                usual_display(small, (), None, tone),
+                functools.partial(_score, lpips_weights),
             )
         return metrics
 
@@ -280,9 +300,7 @@ def _exposure_fitted(shown: DisplayTransform, linear, photograph, mask) -> Displ
     return replace(shown, exposure=float(fit_exposure(linear, photograph, mask, *how)))
 
 
-def _all_fitted(
-    linear, photograph, masks, start: DisplayTransform, score
-) -> dict[str, float] | None:
+def _all_fitted(linear, photograph, masks, start: DisplayTransform, score) -> dict[str, Any] | None:
     """Score a held-out view with all solved that varies per view; None: that is one scalar.
 
     Args:

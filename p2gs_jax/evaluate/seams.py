@@ -30,6 +30,7 @@ from p2gs_jax.photometry.cameras import places
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import inverse_formation, inverse_tone_map
 from p2gs_jax.render.warp import sample_bilinear, warp
+from p2gs_jax.scene.moments import moment_of
 from p2gs_jax.scene.visibility import project_points, unoccluded
 from p2gs_jax.types import Camera, Scene
 
@@ -82,8 +83,9 @@ class Seam(NamedTuple):
 def neighbouring_pairs(scene: Scene, most: int) -> list[tuple[int, int]]:
     """Return pairs of training views that should show the same surfaces, rows of `scene.views`.
 
-    On a rig these are different cameras at the same time: files of the same name in different
-    folders that share points. Elsewhere every view is paired with the one it shares most with.
+    On a rig these are different cameras at the same time that share points: of a drive, in the
+    same frame; else, files of the same name in different folders. Elsewhere every view is paired
+    with the one it shares most with.
 
     Args:
         scene: with tracks, or points to project.
@@ -91,7 +93,7 @@ def neighbouring_pairs(scene: Scene, most: int) -> list[tuple[int, int]]:
     """
     train = scene.train_indices
     shared = _shared_points(scene)
-    moments = [scene.views[i].name.rsplit("/", 1)[-1].rsplit(".", 1)[0] for i in train]
+    moments = [moment_of(scene.views[i]) for i in train]
     cameras = [scene.views[i].camera for i in train]
     together = [
         (a, b)

@@ -17,9 +17,10 @@ from typing import NamedTuple
 import cv2
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float16, Float32
 
 from p2gs_jax.core.numerics import on_host
+from p2gs_jax.evaluate.novel_views import Surface
 from p2gs_jax.render.warp import warp
 from p2gs_jax.scene.geometry import scale_intrinsics
 from p2gs_jax.types import Camera, View
@@ -57,11 +58,11 @@ class Unexplained(NamedTuple):
 
 @dataclass(frozen=True)
 class _Seen:
-    """A training view, reduced."""
+    """A training view, reduced; in half precision, for there may be thousands."""
 
-    residual: Float32[np.ndarray, "h w"]
+    residual: Float16[np.ndarray, "h w"]
     valid: Bool[np.ndarray, "h w"]
-    depth: Float32[np.ndarray, "h w"]
+    depth: Float16[np.ndarray, "h w"]
     K: Float32[np.ndarray, "3 3"]
 
 
@@ -150,9 +151,9 @@ class Residuals:
         small = [cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p in (render, photograph)]
         valid = cv2.resize(mask, size, interpolation=cv2.INTER_AREA) > 0.99
         self._seen[index] = _Seen(
-            residual_over_noise(small[0], small[1], valid),
+            residual_over_noise(small[0], small[1], valid).astype(np.float16),
             valid,
-            cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST),
+            cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST).astype(np.float16),
             scale_intrinsics(K, size[0] / width, size[1] / height).astype(np.float32),
         )
 
@@ -168,9 +169,17 @@ class Residuals:
         for done, (index, others) in enumerate(self._compared()):
             on_progress(done, len(self._seen))
             seen = self._seen[index]
-            mask = regions(seen.residual, self._usual(index, others)) & seen.valid
+            residual = seen.residual.astype(np.float32)
+            mask = regions(residual, self._usual(index, others)) & seen.valid
             found[index] = Unexplained(mask, float(mask.sum() / max(int(seen.valid.sum()), 1)))
         return found
+
+    def surfaces(self) -> list[Surface]:
+        """Return what the views show, reduced."""
+        return [
+            Surface(seen.depth.astype(np.float32), self._views[index].viewmat, seen.K)
+            for index, seen in self._seen.items()
+        ]
 
     def _compared(self) -> Iterator[tuple[int, list[int]]]:
         """Yield views with those of the same camera at other times."""
@@ -188,10 +197,12 @@ class Residuals:
         values = np.full((len(others) + 1, *here.residual.shape), np.nan, np.float32)
         for k, other in enumerate(others):
             there = self._seen[other]
-            to = _warp(here.depth, self._camera(index), there.depth, self._camera(other))
+            depths = [seen.depth.astype(np.float32) for seen in (here, there)]
+            to = _warp(depths[0], self._camera(index), depths[1], self._camera(other))
             xy = np.asarray(to.xy) - np.float32(0.5)
             # The worst nearby: depth is off by a pixel at edges.
-            worst = cv2.dilate(there.residual, np.ones((SQUARE, SQUARE), np.uint8))
+            residual = there.residual.astype(np.float32)
+            worst = cv2.dilate(residual, np.ones((SQUARE, SQUARE), np.uint8))
             carried = cv2.remap(worst, xy[..., 0], xy[..., 1], cv2.INTER_NEAREST)
             counts = cv2.remap(
                 there.valid.astype(np.uint8), xy[..., 0], xy[..., 1], cv2.INTER_NEAREST

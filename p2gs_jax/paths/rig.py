@@ -1,7 +1,7 @@
 """Rigs: cameras that move together, and which of their photographs were taken at the same time.
 
-Photographs of different cameras belong to the same time step where their file names agree
-(`front/000003.png`, `front_left/000003.png`).
+Photographs of different cameras belong to the same time step in the same frame of a drive, and
+elsewhere where their file names agree (`front/000003.png`, `front_left/000003.png`).
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import PurePosixPath
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.paths.geometry import Pose, Poses, angles, inverse, mean_pose, rigid
 from p2gs_jax.paths.shots import Shot
 from p2gs_jax.scene.directions import up_direction
+from p2gs_jax.scene.moments import moment_of
 from p2gs_jax.types import View
 
 # Largest median angle between the cameras' relative rotations over time.
@@ -28,7 +28,7 @@ class TimeStep:
     """One time step.
 
     Attributes:
-        name: what its file names have in common.
+        name: what its file names have in common, or the number of the frame.
         pose: rig-to-world.
         shots: by camera; some may be missing.
     """
@@ -74,7 +74,9 @@ def find_rig(shots: Sequence[Shot], views: Sequence[View]) -> Rig:
     steps: dict[str, dict[str, Shot]] = defaultdict(dict)
     for shot in shots:
         if shot.view is not None:
-            steps[PurePosixPath(shot.name).name][views[shot.view].camera] = shot
+            moment = moment_of(views[shot.view])
+            name = moment if isinstance(moment, str) else f"{moment:06d}"
+            steps[name][views[shot.view].camera] = shot
     common = {name: found for name, found in sorted(steps.items()) if len(found) > 1}
     if len(cameras) < 2 or not common:
         have = "one camera" if len(cameras) < 2 else "cameras whose file names never agree"

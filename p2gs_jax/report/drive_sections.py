@@ -9,6 +9,105 @@ from p2gs_jax.report.run_files import RunFiles, number_at
 from p2gs_jax.report.view_comparisons import read_png
 from p2gs_jax.run.layout import RunFolder
 
+PROTOCOLS = (
+    ("training", "own exposure and gamma", ("train",)),
+    ("held out", "mean exposure and gamma", ("test", "averaged")),
+    ("held out", "exposure fitted to each photograph", ("test", "exposure_fitted")),
+    ("held out", "exposure metered, as the camera would", ("test", "metered")),
+)
+PARTS = (("whole", "all"), ("static", "what stands"), ("moving", "what moves"))
+SPLITS = (("all", "all"), ("held_out", "held out"))
+
+
+def parts_section(run: RunFiles) -> Section:
+    """Scores over static pixels and over those of moving objects."""
+    title = "What stands, and what moves"
+    rows = []
+    for views, protocol, path in PROTOCOLS:
+        for part, said in PARTS:
+            values = [run.number(*path, part, name) for name in ("psnr", "ssim", "lpips")]
+            count = run.number(*path, part, "views")
+            if values[0] is not None and count is not None:
+                digits = zip(values, (2, 4, 4), strict=True)
+                scores = ["" if v is None else f"{v:.{d}f}" for v, d in digits]
+                rows.append([views, protocol, said, *scores, f"{count:.0f}"])
+    if not rows:
+        return Section("parts", title, "")
+    names = ["views", "shown with", "pixels", "PSNR, dB", "SSIM", "LPIPS", "views that show any"]
+    if not any(r[5] for r in rows):
+        names, rows = names[:5] + names[6:], [r[:5] + r[6:] for r in rows]
+    said = (
+        "Moving: within the boxes of what moves at some time. SSIM is the mean of the whole "
+        "image's map over the part."
+    )
+    return Section(
+        "parts", title, table(names, rows, numbers=range(3, len(names))) + paragraph(said, "note")
+    )
+
+
+def depth_section(run: RunFiles) -> Section:
+    """Rendered depth against LiDAR."""
+    title = "Depth against LiDAR"
+    rows = []
+    for split, views in SPLITS:
+        for part, said in PARTS[1:]:
+            at = ("depth", split, part)
+            values = [run.number(*at, name) for name in DEPTH]
+            points = run.number(*at, "points")
+            if points is not None:
+                shown = [_depth(n, v) for n, v in zip(DEPTH, values, strict=True)]
+                rows.append([views, said, *shown, f"{points:,.0f}"])
+    if not rows:
+        return Section("depth", title, "")
+    names = ["views", "points", "median error", "relative", "within 10 %", "no surface", "count"]
+    said = (
+        "Rendered depth at the points of the sweep nearest in time to each view, without those "
+        "that nearer points hide; points on moving boxes are carried to the time of the view. "
+        "Where the render shows no surface, the error counts as infinite."
+    )
+    body = table(names, rows, numbers=range(2, len(names))) + paragraph(said, "note")
+    return Section("depth", title, body)
+
+
+DEPTH = ("median_m", "median_relative", "within_10_percent", "missing")
+
+
+def _depth(name: str, value: float | None) -> str:
+    if value is None:  # infinite: more than half of the points have no surface
+        return "none"
+    return f"{value:.2f} m" if name == "median_m" else f"{value:.1%}"
+
+
+def novel_section(run: RunFiles) -> Section:
+    """Views from beside the way."""
+    title = "From beside the way"
+    found = run.metrics.get("novel_views")
+    if not isinstance(found, list) or not found:
+        return Section("novel", title, "")
+    rows, with_depth = [], False
+    for item in sorted(found, key=lambda i: -(number_at(i, "shift_m") or 0.0)):
+        metres, unseen = number_at(item, "shift_m"), number_at(item, "unseen")
+        if metres is None or unseen is None:
+            continue
+        points = number_at(item, "depth", "static", "points")
+        depth = ["", ""]
+        if points is not None:
+            with_depth = True
+            names = ("median_m", "within_10_percent")
+            depth = [_depth(n, number_at(item, "depth", "static", n)) for n in names]
+        side = "left" if metres > 0 else "right"
+        rows.append([f"{abs(metres):g} m to the {side}", f"{unseen:.1%}", *depth])
+    names = ["camera", "pixels that no training view shows"]
+    names += ["median depth error", "depth within 10 %"] if with_depth else []
+    rows = rows if with_depth else [r[:2] for r in rows]
+    said = (
+        "Some views moved sideways, seen from the driving direction. There are no photographs to "
+        "compare with: the first number is what must be invented there, by the rendered depth; "
+        "depth is held against LiDAR as above, what stands only."
+    )
+    body = table(names, rows, numbers=range(1, len(names))) + paragraph(said, "note")
+    return Section("novel", title, body)
+
 
 def unexplained_section(run: RunFiles, problems: list[str]) -> Section:
     """Pixels of training views that no static scene explains.

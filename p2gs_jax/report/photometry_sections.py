@@ -24,6 +24,7 @@ from p2gs_jax.report.charts import (
     panels_chart,
     response_chart,
 )
+from p2gs_jax.report.drive_charts import CameraOverTime, over_time_chart
 from p2gs_jax.report.formation_sections import (
     responses_section,
     vignetting_section,
@@ -35,6 +36,8 @@ from p2gs_jax.report.scene_measurements import SceneMeasurements, true_stops
 from p2gs_jax.report.svg import FIRST, INK, SECOND
 from p2gs_jax.run.photometry_file import ViewPhotometry
 from p2gs_jax.run.read import resolved
+from p2gs_jax.run.scene_file import read_times
+from p2gs_jax.scene.drives.choose import short_name
 from p2gs_jax.types import GAMMA_SRGB
 
 # More cameras than this, or cameras with fewer views than this, share one panel.
@@ -82,8 +85,41 @@ def exposure_section(run: RunFiles, scene: SceneMeasurements) -> Section:
         band=0.0,
     )
     body = figure(chart, " ".join(_exposure_caption(run, scene)))
+    times = read_times(run.folder)
+    if times:
+        body = _over_time(run, times, center) + folded("Each camera by itself", body)
     body += folded("Every photograph in numbers", _exposure_table(run, scene, center))
     return Section("exposures", "Exposures", body)
+
+
+def _over_time(run: RunFiles, times: dict[str, float], center: float) -> str:
+    """Return exposures of a drive over its seconds, a line a camera."""
+    start = min(times.values())
+    cameras = []
+    for name in run.cameras:
+        rows = [v for v in run.views if v["camera"] == name and v["image"] in times]
+        rows.sort(key=lambda v: times[v["image"]])
+        if not rows:
+            continue
+        found = _column(v["exposure_ev"] for v in rows) - center
+        with np.errstate(divide="ignore"):
+            fitted = np.log2(_column(v["exposure_fitted"] for v in rows)) - center
+        cameras.append(
+            CameraOverTime(
+                short_name(name),
+                np.array([times[v["image"]] - start for v in rows]),
+                found,
+                2 * _column(v.get("exposure_ev_error") for v in rows),
+                np.where(np.isfinite(found), np.nan, fitted),
+            )
+        )
+    chart = over_time_chart(
+        cameras,
+        title="exposure, stops from the mean",
+        label="Exposures of every camera over the seconds of the drive, in stops",
+    )
+    said = "A line a camera; error bars: two standard errors; empty marks: held-out photographs."
+    return figure(chart, said)
 
 
 def _groups(run: RunFiles) -> list[tuple[str, list[ViewPhotometry]]]:

@@ -6,7 +6,12 @@ from pathlib import Path
 
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.report import run_summary
-from p2gs_jax.report.drive_sections import unexplained_section
+from p2gs_jax.report.drive_sections import (
+    depth_section,
+    novel_section,
+    parts_section,
+    unexplained_section,
+)
 from p2gs_jax.report.page import (
     Section,
     check_place,
@@ -89,6 +94,9 @@ def report_page(run: RunFiles, scene: SceneMeasurements) -> str:
         unexplained,
         hdr_section(run, comparisons),
         score_section(run),
+        parts_section(run),
+        depth_section(run),
+        novel_section(run),
         training_section(run),
         timing_section(run),
         configuration_section(run),

@@ -139,6 +139,20 @@ def read_scene(folder: Path, root: Path) -> Scene | None:
         ) from error
 
 
+def read_times(folder: Path) -> dict[str, float]:
+    """Return the times of a drive's views by name, seconds; empty where there are none to read.
+
+    Args:
+        folder: the run folder.
+    """
+    try:
+        with np.load(folder / SCENE_FILE, allow_pickle=False) as file:
+            views = json.loads(str(file["json"]))["views"]
+        return {v["name"]: float(v["time"]) for v in views if v.get("time") is not None}
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
+        return {}
+
+
 def _base(root: Path) -> Path:
     """Return the folder that photographs are named from; a scene may be a transforms.json."""
     return root.parent if root.suffix.lower() == ".json" else root

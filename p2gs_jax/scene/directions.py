@@ -7,10 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from p2gs_jax.types import View
+
 # The right-hand axes of cameras must span a plane this well before its normal counts as up.
 PLANE_RATIO = 0.1
 # Of a shorter way than this the direction is noise, metres.
 SHORTEST_WAY = 0.3
+# Directions are those over this way, where it is so long, metres.
+HEADING_WAY = 2.0
 
 
 def up_direction(viewmats: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, " 3"]:
@@ -50,3 +54,55 @@ def up_of_drive(
     if sizes[0] / np.sqrt(len(centers)) > SHORTEST_WAY / 4 and sizes[1] < sizes[0] / 3:
         up = up - axes[0] * (axes[0] @ up)
     return up / np.linalg.norm(up)
+
+
+def headings(
+    centers: Float[np.ndarray, "n 3"],
+    up: Float[np.ndarray, " 3"],
+    otherwise: Float[np.ndarray, " 3"],
+) -> Float[np.ndarray, "n 3"]:
+    """Return the level direction in which a camera drives at each of its places, of length 1.
+
+    Over at least `HEADING_WAY` where the way is so long: at a stop poses jitter.
+
+    Args:
+        centers: of one camera, in the order of time.
+        up: away from the road, of length 1.
+        otherwise: level direction of a camera that goes nowhere.
+    """
+    level = centers - np.outer(centers @ up, up)
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(level, axis=0), axis=1))])
+    first = np.searchsorted(way, way - HEADING_WAY / 2, side="right") - 1
+    last = np.searchsorted(way, way + HEADING_WAY / 2)
+    first, last = np.maximum(first, 0), np.minimum(last, len(way) - 1)
+    out = level[last] - level[first]
+    lengths = np.linalg.norm(out, axis=1)
+    far = lengths > SHORTEST_WAY / 2
+    if not far.any():
+        return np.tile(otherwise / np.linalg.norm(otherwise), (len(centers), 1))
+    out[far] /= lengths[far, None]
+    # Where it stands, the direction of the nearest place where it moves.
+    moving = np.flatnonzero(far)
+    nearest = moving[np.abs(np.arange(len(way))[:, None] - moving).argmin(1)]
+    return out[nearest]
+
+
+def left_of_way(views: Sequence[View]) -> Float[np.ndarray, "v 3"]:
+    """Return left of the driving direction at each view, level, of length 1.
+
+    Args:
+        views: of a drive or a rig; the order of each camera's names or frames is that of time.
+    """
+    viewmats = np.stack([view.viewmat for view in views]).astype(np.float64)
+    cameras = [view.camera for view in views]
+    up = up_of_drive(viewmats, cameras)
+    centers = -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
+    # Of a rig that stands, where the first camera or one called "front" looks is ahead.
+    ahead = next((k for k, name in enumerate(cameras) if "front" in name.lower()), 0)
+    otherwise = viewmats[ahead, 2, :3] - up * (up @ viewmats[ahead, 2, :3])
+    out = np.zeros((len(views), 3))
+    for name in set(cameras):
+        rows = [k for k, camera in enumerate(cameras) if camera == name]
+        rows.sort(key=lambda k: (-1 if (f := views[k].frame) is None else f, views[k].name))
+        out[rows] = np.cross(up, headings(centers[rows], up, otherwise))
+    return out

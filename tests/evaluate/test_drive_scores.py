@@ -1,0 +1,229 @@
+"""What is judged of drives only: parts of the views, depth against LiDAR, views from beside."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from made_drive import FAR, SPEED, WALL, make_recording
+
+from p2gs_jax.config import DataConfig, FitConfig
+from p2gs_jax.core.atomic import plain
+from p2gs_jax.evaluate import seams
+from p2gs_jax.evaluate.evaluate import evaluate
+from p2gs_jax.evaluate.lidar_depth import at_time, depth_errors, summary
+from p2gs_jax.evaluate.novel_views import Surface, picked, shifted, unseen_share
+from p2gs_jax.evaluate.region_scores import mean_of_parts, parts_of, region_scores
+from p2gs_jax.scene.directions import headings, left_of_way, up_of_drive
+from p2gs_jax.scene.drives.assemble import assemble
+from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.moments import moment_of
+from p2gs_jax.scene.split import assign_split
+from p2gs_jax.types import Gaussians, Lidar, Params, Photometry, Render, View
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """A drive between two walls; frames 0 and 4 are held out."""
+    recording = make_recording(tmp_path_factory.mktemp("drive"))
+    scene = assemble(recording, DataConfig(own_car=False))
+    return dataclasses.replace(scene, views=assign_split(scene.views, 4))
+
+
+def corridor(camera):
+    """Depth and alpha of the two walls, the sky above 5 m and the road below."""
+    height, width = camera.height, camera.width
+    viewmat, K = np.asarray(camera.viewmat, np.float64), np.asarray(camera.K, np.float64)
+    y, x = np.mgrid[:height, :width] + 0.5
+    local = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], -1)
+    rays = local @ viewmat[:3, :3]
+    center = -viewmat[:3, :3].T @ viewmat[:3, 3] + ORIGIN - FAR
+    with np.errstate(divide="ignore"):
+        to_wall = np.where(rays[..., 1] > 0, WALL - center[1], -WALL - center[1]) / rays[..., 1]
+        to_road = np.where(rays[..., 2] < 0, -center[2] / rays[..., 2], np.inf)
+    depth = np.minimum(to_wall, to_road)
+    sky = (center[2] + depth * rays[..., 2] > 5) | (depth > 200)
+    return np.where(sky, 0, depth).astype(np.float32), (~sky).astype(np.float32)
+
+
+ORIGIN = np.zeros(3)
+
+
+@pytest.fixture(scope="module")
+def metrics(scene):
+    """Metrics of a fit that shows both walls in one grey."""
+    global ORIGIN
+    ORIGIN = np.array(scene.origin)
+
+    def render(gaussians, alive, camera, *args):
+        depth, alpha = corridor(camera)
+        linear = 0.16 * np.ones((*depth.shape, 3), np.float32)
+        arrays = map(jnp.asarray, (linear, alpha, depth))
+        return Render(*arrays, jnp.int32(0), jnp.bool_(False), alive)
+
+    shapes = ((0, 3), (0, 4), (0, 3), (0,), (0, 1, 3))
+    train = len(scene.train_indices)
+    params = Params(
+        Gaussians(*(jnp.zeros(s, jnp.float32) for s in shapes)),
+        Photometry(jnp.zeros(train), jnp.zeros(train), "log"),
+        None,
+    )
+    found = {}
+    cfg = FitConfig()
+    store = ImageStore(scene.views, cfg.data)
+    out = evaluate(
+        params,
+        np.zeros(0, bool),
+        scene,
+        store,
+        render,
+        cfg,
+        on_unexplained=found.update,
+    )
+    store.close()
+    assert set(found) == set(scene.train_indices)
+    return plain(out)
+
+
+def test_old_keys_stay_and_parts_stand_beside_them(scene, metrics):
+    for part in (metrics["train"], metrics["test"]["exposure_fitted"], metrics["test"]["averaged"]):
+        assert part["whole"]["psnr"] == pytest.approx(part["psnr"])
+        assert set(part["static"]) == {"psnr", "ssim", "views"}
+        rows = part["per_view"].values()
+        moving = [row["moving"]["psnr"] for row in rows if "moving" in row]
+        assert 0 < len(moving) < len(rows)
+        assert part["moving"]["views"] == len(moving)
+        assert part["moving"]["psnr"] == pytest.approx(np.mean(moving))
+    seen = {name.split("/")[0] for name, row in metrics["train"]["per_view"].items()
+            if "moving" in row}  # fmt: skip
+    assert "left" in seen
+    assert "right" not in seen
+
+
+def test_depth_agrees_with_the_walls_and_not_with_what_moves(metrics):
+    for split in ("all", "held_out"):
+        depth = metrics["depth"][split]
+        assert depth["static"]["median_m"] < 0.1
+        assert depth["static"]["within_10_percent"] > 0.9
+        # The fit shows the wall behind the car.
+        assert depth["moving"]["within_10_percent"] < 0.5
+        assert depth["moving"]["median_m"] > 0.5
+    assert metrics["depth"]["held_out"]["views"] < metrics["depth"]["all"]["views"]
+
+
+def test_views_from_beside_the_way_are_judged(metrics):
+    rows = {row["shift_m"]: row for row in metrics["novel_views"]}
+    assert set(rows) == {-3, -2, -1, 1, 2, 3}
+    for row in rows.values():
+        assert 0 <= row["unseen"] < 0.5
+        assert row["depth"]["static"]["median_m"] < 0.2
+    assert 0 <= metrics["unexplained"]["share"] < 1
+    assert len(metrics["unexplained"]["per_view"]) == 24
+
+
+def test_points_on_moving_boxes_go_along(scene):
+    lidar = scene.lidar
+    rows = np.flatnonzero((lidar.objects >= 0) & (np.abs(lidar.times - 0.2) < 1e-6))
+    assert len(rows) > 20
+    later = at_time(lidar, scene.objects, rows, 0.25)
+    np.testing.assert_allclose(later - lidar.points[rows], [[1.5 * SPEED * 0.05, 0, 0]] * len(rows),
+                               atol=1e-4)  # fmt: skip
+    still = np.flatnonzero(lidar.objects < 0)[:10]
+    np.testing.assert_array_equal(at_time(lidar, (), still, 9.0), lidar.points[still])
+
+
+def test_what_shows_no_surface_is_infinitely_wrong():
+    points = np.array([[0, 0, 5.0], [0, 0.1, 5.0]], np.float32)
+    lidar = Lidar(points, np.zeros(2), np.full(2, -1))
+    K = np.array([[10.0, 0, 8], [0, 10, 6], [0, 0, 1]], np.float32)
+    view = View("a", None, "a", np.eye(4, dtype=np.float32), K, 16, 12, time=0.01)
+    nothing = np.zeros((12, 16), np.float32)
+    found = depth_errors(lidar, (), view, nothing, nothing)
+    assert np.isinf(found.error).all()
+    assert summary([found])["static"]["missing"] == 1.0
+    right = depth_errors(lidar, (), view, nothing + 5.2, nothing + 1)
+    assert summary([right])["static"]["median_m"] == pytest.approx(0.2, abs=1e-5)
+    assert summary([right])["static"]["median_relative"] == pytest.approx(0.04, abs=1e-5)
+    assert not len(
+        depth_errors(lidar, (), dataclasses.replace(view, time=1.0), nothing, nothing)[0]
+    )
+    assert summary([]) == {}
+    masked = depth_errors(lidar, (), view, nothing, nothing, nothing)
+    assert not len(masked.error)
+
+
+def plane(z=5.0, viewmat=None):
+    K = np.array([[20.0, 0, 16], [0, 20, 12], [0, 0, 1]])
+    return Surface(np.full((24, 32), z, np.float32), np.eye(4) if viewmat is None else viewmat, K)
+
+
+def test_unseen_is_what_no_other_view_shows():
+    assert unseen_share(plane(), [plane()]) == 0.0
+    assert unseen_share(plane(), []) == 1.0
+    # A wall 5 away is 8 wide in this view: moved by 2, a quarter is new.
+    moved = shifted(np.eye(4), np.array([-1.0, 0, 0]), 2.0)
+    assert unseen_share(plane(viewmat=moved), [plane()]) == pytest.approx(0.25, abs=0.05)
+    # Nearer or farther than what is known: not seen.
+    assert unseen_share(plane(4.0), [plane(5.0)]) == 1.0
+    assert unseen_share(plane(6.0), [plane(5.0)]) == 1.0
+    # Sky is seen where the other sees none either.
+    assert unseen_share(plane(0.0), [plane(0.0)]) == 0.0
+    assert unseen_share(plane(0.0), [plane(5.0)]) == 1.0
+    assert list(picked(3)) == [0, 1, 2]
+    assert list(picked(60, 3)) == [10, 30, 50]
+
+
+def test_parts_with_too_few_pixels_are_left_out():
+    mask, moving = np.ones((20, 20), np.float32), np.zeros((20, 20), bool)
+    assert set(parts_of(mask, moving)) == {"whole", "static"}
+    moving[:, 10:] = True
+    parts = parts_of(mask, moving)
+    target = np.full((20, 20, 3), 0.5, np.float32)
+    wrong = target.copy()
+    wrong[:, 10:] += 0.1
+    scores = region_scores(None, wrong, target, parts)
+    assert scores["moving"]["psnr"] == pytest.approx(20, abs=0.01)
+    assert scores["static"]["psnr"] > 100
+    assert scores["moving"]["ssim"] < scores["static"]["ssim"]
+    assert region_scores(None, wrong, target, {}) == {}
+    mean = mean_of_parts([scores, {"whole": scores["whole"]}])
+    assert mean["whole"]["views"] == 2
+    assert mean["moving"]["views"] == 1
+
+
+def test_left_is_left_of_the_way(scene):
+    viewmats = np.stack([view.viewmat for view in scene.views])
+    up = up_of_drive(viewmats, [view.camera for view in scene.views])
+    np.testing.assert_allclose(up, UP, atol=1e-6)
+    np.testing.assert_allclose(left_of_way(scene.views), [[0, 1, 0]] * len(scene.views), atol=1e-5)
+    viewmat = shifted(scene.views[0].viewmat, np.array([0, 1.0, 0]), 2.0)
+    moved = -viewmat[:3, :3].T @ viewmat[:3, 3]
+    before = scene.views[0].viewmat
+    np.testing.assert_allclose(moved + before[:3, :3].T @ before[:3, 3], [0, 2, 0], atol=1e-4)
+
+
+def test_a_car_that_stands_keeps_its_heading():
+    there = np.array([[0.0, 0, 0]] * 5 + [[1.0, 0, 0], [2.0, 0, 0], [2.0, 1, 0.5], [2, 2, 1.0]])
+    found = headings(there, UP, np.array([0.0, 1, 0]))
+    np.testing.assert_allclose(found[:5], [[1, 0, 0]] * 5, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1)
+    assert found[-1] @ [0, 1, 0] > 0.9
+    still = headings(np.zeros((3, 3)), UP, np.array([0.0, 2, 0]))
+    np.testing.assert_allclose(still, [[0, 1, 0]] * 3)
+
+
+def test_cameras_are_paired_by_frame(tmp_path, monkeypatch):
+    # Few points are seen by both: the walls are sparse, and hide each other.
+    monkeypatch.setattr(seams, "FEWEST_SHARED", 1)
+    recording = make_recording(tmp_path, ("front", "front_left"))
+    scene = assemble(recording, DataConfig(own_car=False))
+    # Files of one moment have different names.
+    pairs = seams.neighbouring_pairs(scene, 100)
+    assert pairs
+    for a, b in pairs:
+        assert scene.views[a].frame == scene.views[b].frame
+        assert scene.views[a].camera != scene.views[b].camera
+    assert moment_of(scene.views[2]) == 2
+    assert moment_of(dataclasses.replace(scene.views[2], frame=None)) == "000200"
