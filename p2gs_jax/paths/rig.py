@@ -37,6 +37,12 @@ class TimeStep:
     pose: Pose
     shots: dict[str, Shot]
 
+    @property
+    def time(self) -> float | None:
+        """The mean of the shots' times, seconds; None where one has none."""
+        known = [shot.time for shot in self.shots.values() if shot.time is not None]
+        return float(np.mean(known)) if len(known) == len(self.shots) else None
+
 
 @dataclass(frozen=True)
 class Rig:

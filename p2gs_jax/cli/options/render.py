@@ -53,6 +53,16 @@ class Render:
     view's own; neutral where an exposure is given, and for other paths)."""
     no_vignetting: bool = False
     """Leave out the darkening towards the corners that the cameras of this run have."""
+    without_objects: bool = False
+    """Leave out what moves."""
+    only_objects: bool = False
+    """Show only what moves."""
+    move_object: Annotated[
+        tuple[tuple[str, float, float, float], ...],
+        tyro.conf.arg(metavar="NAME X Y Z [NAME X Y Z ...]"),
+    ] = ()
+    """Show objects this far forward, left and up of where they are (metres, in the frame of their
+    box); of a track's name its beginning will do."""
     frames: int | None = None
     """Frames of a drive (default: 8 from one view to the next) or an orbit (default: 120)."""
     width: int | None = None
