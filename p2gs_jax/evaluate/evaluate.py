@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float32, Int
+from jaxtyping import Bool, Float32
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.evaluate.alignment import fit_capture, fit_exposure
@@ -138,7 +138,6 @@ def evaluate(
     render: RenderView,
     cfg: FitConfig,
     *,
-    owner: Int[np.ndarray, " n"] | None = None,
     reference: Mapping[int, Float32[np.ndarray, "h w 3"]] | Callable | None = None,
     radiance: Truth | None = None,
     lpips_weights: LpipsWeights | None = None,
@@ -154,9 +153,8 @@ def evaluate(
         alive: which Gaussians exist.
         scene: views and their splits.
         store: photographs.
-        render: from `make_renderer`.
+        render: from `make_renderer`; it knows which Gaussians belong to moving objects.
         cfg: formation model.
-        owner: the moving object that each Gaussian belongs to, or None.
         reference: view row -> photograph under the common exposure, or None where there is none.
         radiance: view row -> true linear radiance at the size of the photographs, or None.
         lpips_weights: adds `lpips` wherever a view is compared with a photograph; None leaves it
@@ -178,7 +176,6 @@ def evaluate(
     small = jax.tree.map(np.asarray, replace(params, gaussians=None))
     gaussians = jax.device_put(params.gaussians)
     living = jax.device_put(np.asarray(alive))
-    owner_there = None if owner is None else jax.device_put(np.asarray(owner))
     taken_by = [view.camera for view in scene.training_views]
 
     tone = cfg.photometry
@@ -189,16 +186,14 @@ def evaluate(
 
     drive = None
     if is_drive(scene):
-        drive = DriveScores(
-            scene, store, lambda camera: render(gaussians, living, camera, owner_there)
-        )
+        drive = DriveScores(scene, store, lambda camera: render(gaussians, living, camera))
     row_of = {index: row for row, index in enumerate(scene.train_indices)}
 
     def judged(index: int) -> _Judged:
         photograph, mask = store.get(index, 1)
         parts = None if drive is None else masks_of_parts(scene, index, mask)
         score = functools.partial(_score, lpips_weights, parts=parts)
-        result = render(gaussians, living, camera_of(store, index), owner_there)
+        result = render(gaussians, living, camera_of(store, index))
         linear = np.asarray(result.linear)
         shown = usual(index)
         ldr_mean = develop(linear, replace(shown, exposure=mean.exposure))

@@ -43,7 +43,6 @@ class Account:
 
 def finish(
     params: Params,
-    owner: np.ndarray | None,
     prepared: Prepared,
     folder: RunFolder,
     account: Account,
@@ -52,12 +51,12 @@ def finish(
     truth: Reference | None,
     lpips_weights: LpipsWeights | None,
     true_ev: np.ndarray | None = None,
+    owner: np.ndarray | None = None,
 ) -> dict:
     """Evaluate, export and return what `metrics.json` holds.
 
     Args:
         params: live Gaussians and photometry.
-        owner: the moving object that each Gaussian belongs to, or None.
         prepared: scene and photographs.
         folder: of the run.
         account: of the fit.
@@ -65,6 +64,7 @@ def finish(
         truth: photographs under one common exposure, or None.
         lpips_weights: for LPIPS, or None to leave it out.
         true_ev: true exposures of the training views for the plot, or None.
+        owner: the moving object that each Gaussian belongs to, or None.
     """
     watch = Stopwatch()
     _import_ahead("matplotlib.figure")
@@ -91,9 +91,8 @@ def finish(
             np.ones(params.gaussians.capacity, bool),
             scene,
             store,
-            make_renderer(cfg.render),
+            make_renderer(cfg.render, owner),
             cfg,
-            owner=owner,
             reference=truth,
             radiance=find_radiance(scene, store),
             lpips_weights=lpips_weights,

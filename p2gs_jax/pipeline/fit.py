@@ -232,7 +232,6 @@ def fit(
     )
     metrics = finish(
         params,
-        owner,
         prepared,
         folder,
         account,
@@ -242,6 +241,7 @@ def fit(
         true_ev=None
         if true_exposures is None
         else np.log2([true_exposures[view.name] for view in scene.training_views]),
+        owner=owner,
     )
     return FitResult(params, scene, metrics, paths.run, prepared.selection, prepared.decisions)
 

@@ -6,9 +6,11 @@ import functools
 from typing import Any, Protocol
 
 import jax
+import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from p2gs_jax.config import RenderConfig
+from p2gs_jax.core.numerics import on_device
 from p2gs_jax.render import render_linear, required_capacity
 from p2gs_jax.render.capacity import TileCapacity, until_it_fits
 from p2gs_jax.render.xla_cpu import compiler_options
@@ -43,8 +45,14 @@ def compiled_renderer() -> Any:
     return jax.jit(render_linear, static_argnames=static, compiler_options=compiler_options())
 
 
-def make_renderer(cfg: RenderConfig) -> RenderView:
-    """Return a function that renders one view, and grows its tile lists after an overflow."""
+def make_renderer(cfg: RenderConfig, owners: Int[np.ndarray, " n"] | None = None) -> RenderView:
+    """Return a function that renders one view, and grows its tile lists after an overflow.
+
+    Args:
+        cfg: rendering options.
+        owners: what `owner` is where it is not given.
+    """
+    known = None if owners is None else on_device(owners, np.int32)
     capacities: dict[tuple[int, int], TileCapacity] = {}
 
     def render_view(
@@ -53,6 +61,7 @@ def make_renderer(cfg: RenderConfig) -> RenderView:
         camera: Camera,
         owner: Int[Array, " n"] | None = None,
     ) -> Render:
+        owner = known if owner is None else owner
         size = (camera.width, camera.height)
         if size not in capacities:
             needed = int(count_needed(gaussians, alive, camera, cfg=cfg, owner=owner))

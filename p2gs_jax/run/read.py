@@ -75,7 +75,7 @@ class Run:
 
     @cached_property
     def _renderer(self) -> RenderView:
-        return make_renderer(self.cfg.render)
+        return make_renderer(self.cfg.render, self.owner)
 
     def camera(self, index: int) -> Camera:
         """Return the camera of a view at the size of the fit; it sees what moves.
@@ -96,11 +96,7 @@ class Run:
         if time is not None and self.moving is not None:
             placement = self.moving.placement(np.asarray(camera.viewmat), time)
             camera = replace(camera, objects=placement)
-        return self._renderer(self.params.gaussians, self.alive, camera, self._owner)
-
-    @cached_property
-    def _owner(self) -> Int[Array, " n"] | None:
-        return None if self.owner is None else on_device(self.owner, np.int32)
+        return self._renderer(self.params.gaussians, self.alive, camera)
 
     def as_of(self, time: float | None = None) -> Gaussians:
         """Return all Gaussians in world coordinates, for programs that know no motion.

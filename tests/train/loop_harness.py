@@ -165,7 +165,7 @@ class Harness:
         monkeypatch.setattr(automatic.jnp, "copy", np.copy)
         monkeypatch.setattr(state, "_sum", np.sum)
         monkeypatch.setattr(automatic, "make_judge", lambda *a, **k: self.judge)
-        self.judge = lambda params, alive: 20.0
+        self.judge = lambda params, population: 20.0
 
     def _grown(self, state, slots):
         if slots <= state.params.gaussians.capacity:

@@ -35,9 +35,9 @@ SMALL = with_fields(
 )
 
 
-def population(params, alive):
+def population(params, living):
     """Stand in for a held-out PSNR to which every Gaussian adds."""
-    return 10 * math.log(float(alive.sum()))
+    return 10 * math.log(float(living.alive.sum()))
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +115,7 @@ def test_views_left_out_come_back():
 
 @pytest.mark.slow
 def test_growth_ends_where_it_gains_nothing(monkeypatch, tmp_path, scene, taken):
-    result, said = fit(monkeypatch, scene, tmp_path / "run", lambda params, alive: 20.0)
+    result, said = fit(monkeypatch, scene, tmp_path / "run", lambda params, population: 20.0)
     record = result.metrics["growth"]
     results, limit = record["looks"], record["limit"]
     assert len(results) == growth.PATIENCE

@@ -17,9 +17,9 @@ def harness(monkeypatch, tmp_path):
     return Harness(monkeypatch, tmp_path)
 
 
-def gains(params, alive):
+def gains(params, population):
     """Stand in for a held-out PSNR to which every Gaussian adds."""
-    return 10 * math.log(float(alive.sum()))
+    return 10 * math.log(float(population.alive.sum()))
 
 
 def begun_and_ended(harness):

@@ -1,0 +1,148 @@
+"""Seeds of things that move: which get any, where they are in their box, and of which colour."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from moving_box import FRAMES, SIZE, drive_format, make_world, write_photographs
+
+from p2gs_jax.config import DataConfig, DynamicsConfig, FitConfig
+from p2gs_jax.gaussians.init.nodes import find_nodes, node_gaussians, on_surface
+from p2gs_jax.gaussians.init.photographed import nodes_radiance
+from p2gs_jax.photometry.initial import initial_photometry
+from p2gs_jax.scene import ImageStore, drives, load_scene
+from p2gs_jax.scene.drives.poses import interpolated, inverse
+from p2gs_jax.types import Photometry
+
+CFG = DynamicsConfig()
+
+
+@pytest.fixture(scope="module")
+def folder(made_once):
+    return made_once("moving_box", write_photographs)
+
+
+@pytest.fixture
+def scene(folder, monkeypatch):
+    monkeypatch.setitem(drives.FORMATS, "pandaset", drive_format())
+    cfg = DataConfig(own_car=False, format="pandaset")
+    return load_scene(folder, cfg)
+
+
+def test_laser_points_of_all_sweeps_meet_in_the_box(scene):
+    nodes = find_nodes(scene, dataclasses.replace(CFG, few_points=1, voxel=0.02))
+    assert nodes is not None
+    assert [o.name for o in nodes.moving.objects] == ["box-1"]
+    assert not nodes.left
+    assert set(nodes.owner) == {0}
+    half = np.array(SIZE) / 2
+    assert (np.abs(nodes.points) <= half + 0.1).all()
+    # They were measured on the surface, with a deviation of 1 cm.
+    depth = (half - np.abs(nodes.points)).min(1)
+    assert np.percentile(np.abs(depth), 95) < 0.04
+    # Of one sweep there are 60; and no two lie in one cube.
+    assert len(nodes.points) > 200
+    cells = np.floor(nodes.points.astype(np.float64) / 0.02).astype(int)
+    assert len(np.unique(cells, axis=0)) > 0.99 * len(cells)
+    static = np.asarray(make_world().wall.means)
+    away = np.linalg.norm(scene.points[:, None] - static[None], axis=-1).min(1)
+    assert np.percentile(away, 99) < 0.1
+
+
+def test_the_frame_of_the_box(scene):
+    """x forward, y left, z up: what it drives towards, and what is above it."""
+    (box,) = scene.objects
+    forward = box.poses[-1, :3, 3] - box.poses[0, :3, 3]
+    assert box.poses[0, :3, 0] @ forward > 0.9 * np.linalg.norm(forward)
+    assert box.poses[0, 1, 2] < -0.99
+    poses, _ = interpolated(box.times, box.poses, np.array([0.25]))
+    above = poses[0] @ [0, 0, 1, 1]
+    np.testing.assert_allclose(inverse(poses)[0] @ above, [0, 0, 1, 1], atol=1e-9)
+
+
+def test_boxes_with_few_points_are_filled_and_said(scene):
+    few = dataclasses.replace(scene.lidar, objects=np.full(len(scene.lidar.objects), -1))
+    nodes = find_nodes(dataclasses.replace(scene, lidar=None), CFG)
+    assert nodes is not None
+    assert len(nodes.points) == pytest.approx(CFG.few_points, rel=0.2)
+    assert "1 of them have few laser points" in nodes.notes[0]
+    left = find_nodes(dataclasses.replace(scene, lidar=few), CFG)
+    assert left is not None
+    assert [o.name for o in left.left] == ["box-1"]
+    assert "1 are seen too little" in left.notes[0]
+    assert not len(left.points)
+
+
+def test_a_filled_box_has_points_on_all_sides_but_its_bottom():
+    points = on_surface((4.0, 2.0, 1.5), 500)
+    half = np.array([2.0, 1.0, 0.75])
+    assert len(points) == pytest.approx(500, rel=0.15)
+    on_side = np.isclose(np.abs(points), half)
+    assert on_side.any(1).all()
+    assert not np.isclose(points[:, 2], -0.75).any()
+    for axis, sign in [(0, 1), (0, -1), (1, 1), (1, -1), (2, 1)]:
+        assert np.isclose(points[:, axis], sign * half[axis]).sum() > 20
+
+
+def test_what_few_views_show_is_left_to_the_mask(scene):
+    views = tuple(
+        dataclasses.replace(v, split="train" if v.frame < 2 else "test") for v in scene.views
+    )
+    nodes = find_nodes(dataclasses.replace(scene, views=views), CFG)
+    assert nodes is not None
+    assert nodes.left == ()
+    nodes = find_nodes(
+        dataclasses.replace(scene, views=views), dataclasses.replace(CFG, least_views=5)
+    )
+    assert nodes is not None
+    assert len(nodes.left) == 1
+
+
+@pytest.mark.parametrize("method", ["mask", "off"])
+def test_other_methods_have_no_nodes(scene, method):
+    assert find_nodes(scene, dataclasses.replace(CFG, method=method)) is None
+
+
+def test_nothing_that_moves_is_no_node(scene):
+    still = tuple(dataclasses.replace(o, moving=False) for o in scene.objects)
+    assert find_nodes(dataclasses.replace(scene, objects=still), CFG) is None
+    assert find_nodes(dataclasses.replace(scene, objects=()), CFG) is None
+
+
+def test_without_times_what_moves_is_masked(scene):
+    views = tuple(dataclasses.replace(v, time=None) for v in scene.views)
+    nodes = find_nodes(dataclasses.replace(scene, views=views), CFG)
+    assert nodes is not None
+    assert len(nodes.left) == 1
+    assert "no times" in nodes.notes[0]
+
+
+def test_points_get_the_colours_that_photographs_show(scene):
+    """Of radiance, whatever the exposures: those of the frames differ by a stop."""
+    cfg = FitConfig()
+    cfg = dataclasses.replace(
+        cfg, photometry=dataclasses.replace(cfg.photometry, model="view_exposure")
+    )
+    nodes = find_nodes(scene, CFG)
+    assert nodes is not None
+    taken_by = [v.camera for v in scene.training_views]
+    start = initial_photometry(None, taken_by, cfg)
+    logs = np.log(make_world().exposures)[[v.frame for v in scene.training_views]]
+    photometry = Photometry(logs.astype(np.float32), np.asarray(start.raw_gammas), "log")
+    store = ImageStore(scene.views, cfg.data)
+    radiance = nodes_radiance(nodes, scene, store, photometry, cfg)
+    checks = np.floor(nodes.points / 0.4 + 1e-6).astype(int).sum(1) % 2 == 1
+    within = np.abs(nodes.points / 0.4 - np.rint(nodes.points / 0.4)).min(1) > 0.2
+    towards = nodes.points[:, 1] < -0.55
+    # Patches of the small photographs mix neighbours.
+    yellow, blue = (np.median(radiance[s & within & towards], axis=0) for s in (checks, ~checks))
+    assert yellow[0] == pytest.approx(0.65, abs=0.15)
+    assert yellow[0] > 2.5 * yellow[2]
+    assert blue[2] == pytest.approx(0.45, abs=0.15)
+    assert blue[2] > 2 * blue[0]
+    g = node_gaussians(nodes, radiance, scene.training_views, cfg)
+    assert g.capacity == len(nodes.points)
+    np.testing.assert_allclose(g.means, nodes.points, atol=1e-6)
+    scales = np.exp(np.asarray(g.log_scales))
+    assert 0.01 < np.median(scales) < 0.2
+    assert FRAMES == 16
