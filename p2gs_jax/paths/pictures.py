@@ -20,6 +20,7 @@ from p2gs_jax.paths.panorama import Layers
 from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
 from p2gs_jax.photometry.metering import ExposureOf, adapted, meter
 from p2gs_jax.run.read import Run
+from p2gs_jax.scene.drives.choose import short_name
 from p2gs_jax.scene.images import ImageStore
 
 # Pictures are metered at this width, pixels.
@@ -184,7 +185,7 @@ def comparison_frames(
         stops = [float(np.log2(own.exposure / mean)) for own in transforms]
         cameras = [name for name in names if name in step.shots]
         captions = [
-            (f"{cameras[k]} {stops[k]:+.1f} EV".replace("-", "−"), start, end)
+            (f"{short_name(cameras[k])} {stops[k]:+.1f} EV".replace("-", "−"), start, end)
             for k, start, end in borders(taken.source[cylinder.height // 2])
         ]
         field = renderer.develop(wide.linear, transform)
