@@ -382,7 +382,7 @@ class DynamicsConfig:
     """Its points are thinned to one in a cube of this side, scene units (ours)."""
     most_points: int = 8000
     """Of one thing; the cubes grow until no more are left (ours)."""
-    correct_poses: bool = True
+    correct_poses: bool = False
     """Learn small corrections of the boxes' poses."""
 
 

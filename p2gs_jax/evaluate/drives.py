@@ -113,7 +113,7 @@ class DriveScores:
             for index in (pool[k] for k in picked(len(pool))):
                 view = self._view(index)
                 viewmat = shifted(view.viewmat, left[index], metres)
-                result = self._render(self._camera(index, view, viewmat))
+                result = self._render(self._camera(view, viewmat))
                 depth, alpha = np.asarray(result.depth), np.asarray(result.alpha)
                 surface = Surface(_surface(depth, alpha), viewmat, view.K)
                 shares.append(unseen_share(surface, known))
@@ -130,16 +130,11 @@ class DriveScores:
         _, K, width, height = self._store.camera(index)
         return sized(self._scene.views[index], K, width, height)
 
-    def _camera(self, index: int, view: View, viewmat: Float32[np.ndarray, "4 4"]) -> Camera:
-        """Return a view's camera moved elsewhere, without being turned; things stay in place."""
-        objects = self._store.placement(index)
-        if objects is not None:
-            viewmats = np.array(objects.viewmats)
-            there = viewmats[:, :3, :3].any((1, 2))
-            viewmats[there, :3, 3] += viewmat[:3, 3] - view.viewmat[:3, 3]
-            objects = dataclasses.replace(objects, viewmats=on_device(viewmats))
-        size = view.width, view.height
-        return Camera(on_device(viewmat), on_device(view.K), *size, objects)
+    def _camera(self, view: View, viewmat: Float32[np.ndarray, "4 4"]) -> Camera:
+        moving, objects = self._store.moving, None
+        if moving is not None and view.time is not None:
+            objects = moving.placement(viewmat, view.time)
+        return Camera(on_device(viewmat), on_device(view.K), view.width, view.height, objects)
 
 
 def _surface(
