@@ -21,6 +21,8 @@ from jaxtyping import Float
 import p2gs_jax
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import LN2
+from p2gs_jax.formats.png import write_png
+from p2gs_jax.paths.captioned_images import CaptionedImage, stacked
 from p2gs_jax.photometry.ppisp.homography import recolored
 from p2gs_jax.photometry.ppisp.parameters import Ppisp
 from p2gs_jax.photometry.ppisp.vignetting import falloff
@@ -56,7 +58,7 @@ def measured(
     """Fit all methods to a scene and judge them; finished fits are kept.
 
     Args:
-        scene: with photographs of one exposure in `reference`.
+        scene: photographs of one exposure, if there are any, are in its folder `reference`.
         out: folder of the runs.
         under: configuration of each method.
         judge: returns what is to be said of a method, from its name, its run and its scores
@@ -65,11 +67,12 @@ def measured(
     Returns:
         A row of each method; of one that failed, why.
     """
+    reference = scene / "reference"
     result = p2gs_jax.sweep.sweep(
         scene,
         out,
         under,
-        reference=scene / "reference",
+        reference=reference if reference.is_dir() else None,
         report=lambda line: print(f"{scene.name} {line}", file=sys.stderr, flush=True),
     )
     rows = []
@@ -82,6 +85,22 @@ def measured(
         metrics = json.loads((folder / "metrics.json").read_text())
         rows.append({"method": name, **judge(name, p2gs_jax.load_run(folder), metrics)})
     return rows
+
+
+def contact_sheet(path: Path, rows: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]]) -> None:
+    """Write pictures of one size in rows.
+
+    Args:
+        path: PNG file.
+        rows: of each its title, and its pictures, display values, with what they are.
+    """
+    images = []
+    for title, columns in rows:
+        width = columns[0][1].shape[1]
+        captions = [(text, k * width, (k + 1) * width) for k, (text, _) in enumerate(columns)]
+        picture = np.concatenate([image for _, image in columns], axis=1)
+        images.append(CaptionedImage(title, picture, captions))
+    write_png(path, stacked(images))
 
 
 def mean_of_rows(run: p2gs_jax.Run, rows: Sequence[int]) -> p2gs_jax.Run:

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from judging import common_display, configs, found_by, measured
+from judging import common_display, configs, contact_sheet, found_by, measured
 from mixtures import GROUPS, REFERENCE, read_groups, spread_by_group, write_mixture
 
 import p2gs_jax
@@ -34,8 +34,6 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import write_json, write_text
 from p2gs_jax.evaluate.metrics import psnr
 from p2gs_jax.evaluate.references import load_reference
-from p2gs_jax.formats.png import write_png
-from p2gs_jax.paths.captioned_images import CaptionedImage, stacked
 
 METHODS = ("robust", "ppisp", "ppisp_solved", "3dgs", "3dgs_affine", "3dgs_bilateral")
 # Contact sheet: methods shown between the photograph and the reference, and held-out views.
@@ -171,7 +169,7 @@ def to_markdown(rows: list[dict[str, Any]], groups: Sequence[str]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def contact_sheet(path: Path, scene: Path, shown: dict[str, Common]) -> None:
+def write_sheet(path: Path, scene: Path, shown: dict[str, Common]) -> None:
     """Write held-out views: as photographed, under the common exposure, and the reference.
 
     Args:
@@ -191,12 +189,9 @@ def contact_sheet(path: Path, scene: Path, shown: dict[str, Common]) -> None:
         target = reference(index)
         assert target is not None
         columns.append((f"photographed as {REFERENCE}", target))
-        width = columns[0][1].shape[1]
-        captions = [(text, k * width, (k + 1) * width) for k, (text, _) in enumerate(columns)]
-        picture = np.concatenate([image for _, image in columns], axis=1)
         title = f"{scene.name}, view {name}: drew {groups[name]}; methods under the common exposure"
-        rows.append(CaptionedImage(title, picture, captions))
-    write_png(path, stacked(rows))
+        rows.append((title, columns))
+    contact_sheet(path, rows)
 
 
 def main() -> None:
@@ -232,7 +227,7 @@ def main() -> None:
             print(text[-1], flush=True)
             kept = {m: shown[m] for m in SHOWN if m in shown}
             if kept:
-                contact_sheet(args.out / f"{scene.name}_{name}.png", scene, kept)
+                write_sheet(args.out / f"{scene.name}_{name}.png", scene, kept)
     write_json(args.out / "lom_mixtures.json", tables)
     write_text(args.out / "lom_mixtures.md", "\n".join(text))
 

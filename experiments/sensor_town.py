@@ -23,10 +23,10 @@ import argparse
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from judging import common_display, configs, found_by, measured
+from judging import common_display, configs, contact_sheet, found_by, measured
 from scipy.optimize import minimize
 
 import p2gs_jax
@@ -58,6 +58,8 @@ HEADER = (
 )
 # The factors per channel are searched on every n-th pixel along each axis, to this many stops.
 STRIDE, TOLERANCE_EV = 2, 1e-3
+# Held-out views on the contact sheet.
+SHEET_ROWS = 3
 
 
 def errors(run: p2gs_jax.Run) -> dict[str, float | None]:
@@ -81,8 +83,22 @@ def errors(run: p2gs_jax.Run) -> dict[str, float | None]:
     return row
 
 
-def at_iso_8(run: p2gs_jax.Run) -> float:
-    """Return the PSNR of held-out views against photographs at ISO 8, one factor per channel."""
+class AtIso8(NamedTuple):
+    """Held-out views against photographs at ISO 8, one factor per channel.
+
+    Attributes:
+        run: the fit.
+        psnr: mean over them.
+        pictures: display values, as shown and as photographed, by row of the view.
+    """
+
+    run: p2gs_jax.Run
+    psnr: float
+    pictures: dict[int, tuple[np.ndarray, np.ndarray]]
+
+
+def at_iso_8(run: p2gs_jax.Run) -> AtIso8:
+    """Show held-out views as photographs at ISO 8 and compare."""
     scene = run.scene
     display = common_display(run, range(len(scene.train_indices)))
     reference = load_reference(scene.root / "reference", scene, run.cfg)
@@ -100,12 +116,10 @@ def at_iso_8(run: p2gs_jax.Run) -> float:
         factors = np.exp2(stops).astype(np.float32)
         return [p2gs_jax.develop(linear * factors, how) for linear, how in shown]
 
-    factors = _fitted_factors(pictures, targets, masks)
-    scores = [
-        float(psnr(ldr, target, mask))
-        for ldr, target, mask in zip(pictures(factors), targets, masks, strict=True)
-    ]
-    return float(np.mean(scores))
+    found = pictures(_fitted_factors(pictures, targets, masks))
+    scores = [float(psnr(*three)) for three in zip(found, targets, masks, strict=True)]
+    pairs = zip(scene.test_indices, zip(found, targets, strict=True), strict=True)
+    return AtIso8(run, float(np.mean(scores)), dict(pairs))
 
 
 def without_corners(transform: p2gs_jax.DisplayTransform) -> p2gs_jax.DisplayTransform:
@@ -154,14 +168,37 @@ def town(folder: Path, sensor: Sensor, args: argparse.Namespace) -> Path:
     return folder
 
 
-def judge(method: str, run: p2gs_jax.Run, metrics: dict[str, Any]) -> dict[str, Any]:
-    """Return the scores of a finished run."""
-    return {
+def judged(run: p2gs_jax.Run, metrics: dict[str, Any]) -> tuple[dict[str, Any], AtIso8]:
+    """Return the scores of a finished run, and its pictures."""
+    found = at_iso_8(run)
+    row = {
         **errors(run),
         "own": metrics["test"]["exposure_fitted"]["psnr"],
-        "iso_8": at_iso_8(run),
+        "iso_8": found.psnr,
         "seconds": metrics["seconds"]["optimisation"],
     }
+    return row, found
+
+
+def write_sheet(path: Path, shown: dict[str, AtIso8]) -> None:
+    """Write held-out views: as photographed, by each method at ISO 8, and the photograph at ISO 8.
+
+    Args:
+        path: PNG file.
+        shown: by method.
+    """
+    run = next(iter(shown.values())).run
+    held, shots = run.scene.test_indices, read_true_shots(run.scene.root)
+    rows = []
+    for index in (held[round(k)] for k in np.linspace(0, len(held) - 1, SHEET_ROWS)):
+        view = run.scene.views[index]
+        columns = [("as photographed", np.asarray(run.photograph(index)))]
+        columns += [(method, at.pictures[index][0]) for method, at in shown.items()]
+        columns.append(("at ISO 8", next(iter(shown.values())).pictures[index][1]))
+        exposure = np.log2(shots[view.name].exposure)
+        title = f"{view.name}, held out, exposure {exposure:+.1f} EV; methods at ISO 8"
+        rows.append((title, columns))
+    contact_sheet(path, rows)
 
 
 def to_markdown(rows: list[dict[str, Any]]) -> str:
@@ -200,7 +237,15 @@ def main() -> None:
         scene = town(args.out / "towns" / f"{name}_{size}", SENSORS[name], args)
         under = configs(args.methods, steps=args.steps)
         out = args.out / "runs" / scene.name / f"steps_{args.steps}"
+        shown: dict[str, AtIso8] = {}
+
+        def judge(method: str, run: p2gs_jax.Run, metrics: dict[str, Any], shown=shown):
+            row, shown[method] = judged(run, metrics)
+            return row
+
         rows = measured(scene, out, under, judge)
+        if shown:
+            write_sheet(args.out / f"{scene.name}.png", shown)
         tables[scene.name] = {"sensor": dataclasses.asdict(SENSORS[name]), "rows": rows}
         text.append(f"### {scene.name}, {args.steps} steps\n\n{to_markdown(rows)}")
         print(text[-1], flush=True)

@@ -241,6 +241,9 @@ class RegularizerConfig:
     at our populations it empties the scene within some thousand steps, BUILD_NOTES)."""
     scale: float | None = None
     """Mean scale in units of the scene extent (3DGS-MCMC: 0.01; ours: likewise)."""
+    object_poses: float | None = 1e-5
+    """Squares of the corrections of the poses of moving objects, over the 1 degree and 0.1 m that
+    boxes are drawn to (ours)."""
 
 
 @dataclass(frozen=True)
@@ -297,6 +300,10 @@ class OptimizerConfig:
     """They decay exponentially to this fraction (3DGS: 0.1)."""
     appearance_warmup: float = 0.0
     """Fraction of the run in which they rise from a hundredth (PPISP: 500 of 30,000 steps)."""
+    object_rotations: float = 1e-3
+    """Rotations that correct the poses of moving objects, radians (ours)."""
+    object_translations: float = 5e-3
+    """Likewise translations, scene units (ours)."""
     photometry_final: float = 0.01
     """Exposure and gamma rates decay exponentially to this fraction (ours)."""
     final: float = 0.1
@@ -352,6 +359,31 @@ class DensifyConfig:
     spread: float = 0.5
     """How far apart MCMC puts Gaussians that come to share a place, in standard deviations; 0: not
     at all (3DGS-MCMC; ours: they would stay twins, BUILD_NOTES)."""
+
+
+@dataclass(frozen=True)
+class DynamicsConfig:
+    """What is done about things that move, in scenes with boxes that follow them."""
+
+    method: Literal["rigid", "mask", "off"] = "rigid"
+    """`rigid`: each moves as one piece, with Gaussians of its own; `mask`: their pixels are left
+    out of the fit; `off`: the fit knows no boxes. Exposures are solved from what stands still in
+    any case."""
+    margin: float = 0.15
+    """Boxes whose pixels are left out are widened by this much to every side, scene units."""
+    least_views: int = 4
+    """Of a thing that fewer training views show, the pixels are left out."""
+    least_points: int = 10
+    """Likewise of one on which fewer laser points lie, where the scene has any (ours)."""
+    few_points: int = 300
+    """Where fewer points than this were measured on a thing, the surface of its box gets as many
+    (ours)."""
+    voxel: float = 0.08
+    """Its points are thinned to one in a cube of this side, scene units (ours)."""
+    most_points: int = 8000
+    """Of one thing; the cubes grow until no more are left (ours)."""
+    correct_poses: bool = True
+    """Learn small corrections of the boxes' poses."""
 
 
 @dataclass(frozen=True)
@@ -421,6 +453,7 @@ class FitConfig:
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     densify: DensifyConfig = field(default_factory=DensifyConfig)
     init: InitConfig = field(default_factory=InitConfig)
+    dynamics: DynamicsConfig = field(default_factory=DynamicsConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
 

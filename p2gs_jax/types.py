@@ -132,38 +132,59 @@ class Params(eqx.Module):
     photometry: Photometry
     appearance: Any = None
     """Corrections of all training views (`Corrections` of photometry/appearance.py), or None."""
+    poses: Float[Array, "t k 6"] | None = None
+    """Corrections of the poses of moving objects at key times: a rotation vector, radians, and a
+    translation, scene units, both in the axes of the box; None: poses are as they were tracked."""
+
+
+class Placement(eqx.Module):
+    """Where the moving objects are in one view.
+
+    Attributes:
+        viewmats: box-to-camera of each, OpenCV axes; what is not there is behind the camera.
+        key: row of `Params.poses` at the key time before.
+        share: of the way from there to the next one.
+    """
+
+    viewmats: Float[Array, "k 4 4"]
+    key: Int[Array, ""]
+    share: Float[Array, ""]
 
 
 class Camera(eqx.Module):
     """A pinhole camera.
 
     Attributes:
-        viewmat: world-to-camera, OpenCV axes.
+        viewmat: world-to-camera, OpenCV axes; or of each Gaussian its own, from `camera_of_each`.
         K: intrinsics in pixels, pixel centres at +0.5.
         width: pixels, static.
         height: pixels, static.
+        objects: where moving objects are; None: it shows none of them.
     """
 
-    viewmat: Float[Array, "4 4"]
+    viewmat: Float[Array, "4 4"] | Float[Array, "4 4 n"]
     K: Float[Array, "3 3"]
     width: int = eqx.field(static=True)
     height: int = eqx.field(static=True)
+    objects: Placement | None = None
 
 
 class Frustum(eqx.Module):
     """A camera whose image size is data: what is done per Gaussian is compiled once for all sizes.
 
     Attributes:
-        viewmat: world-to-camera, OpenCV axes.
+        viewmat: world-to-camera, OpenCV axes; or of each Gaussian its own, from `camera_of_each`.
         K: intrinsics in pixels, pixel centres at +0.5.
         width: pixels.
         height: pixels.
+        objects: where moving objects are; None: it shows none of them.
     """
 
-    viewmat: Float[Array, "4 4"]
+    viewmat: Float[Array, "4 4"] | Float[Array, "4 4 n"]
     K: Float[Array, "3 3"]
     width: Float[Array, ""]
     height: Float[Array, ""]
+    objects: Placement | None = None
 
 
 class Splats2D(eqx.Module):
@@ -235,11 +256,14 @@ class Population(eqx.Module):
         alive: slots in use.
         grad2d_sum: summed norms of the screen-space mean gradients, in units of half the image.
         seen_count: number of views that contributed to `grad2d_sum`.
+        owner: row of the moving object in whose box frame a Gaussian lives, -1: in the world; None
+            where nothing moves.
     """
 
     alive: Bool[Array, " n"]
     grad2d_sum: Float[Array, " n"]
     seen_count: Float[Array, " n"]
+    owner: Int[Array, " n"] | None = None
 
 
 class Measured(eqx.Module):
@@ -277,7 +301,7 @@ class Batch(eqx.Module):
 
 @dataclass(frozen=True)
 class Distortion:
-    """Lens distortion; all zero means pinhole.
+    """Lens distortion; a `radial` lens of all zeros is a pinhole.
 
     Attributes:
         coefficients: OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]] (`radial`, rational from k4 on),

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Int
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.evaluate.alignment import fit_capture, fit_exposure
@@ -29,6 +29,7 @@ from p2gs_jax.evaluate.drives import DriveScores, is_drive, masks_of_parts
 from p2gs_jax.evaluate.lpips import LpipsWeights, lpips
 from p2gs_jax.evaluate.metered import MeteredViews
 from p2gs_jax.evaluate.metrics import psnr, ssim
+from p2gs_jax.evaluate.moving import still_mask
 from p2gs_jax.evaluate.parallel import map_in_order
 from p2gs_jax.evaluate.radiance import RadianceScores, Truth
 from p2gs_jax.evaluate.region_scores import PARTS, mean_of_parts, region_scores
@@ -137,6 +138,7 @@ def evaluate(
     render: RenderView,
     cfg: FitConfig,
     *,
+    owner: Int[np.ndarray, " n"] | None = None,
     reference: Mapping[int, Float32[np.ndarray, "h w 3"]] | Callable | None = None,
     radiance: Truth | None = None,
     lpips_weights: LpipsWeights | None = None,
@@ -154,6 +156,7 @@ def evaluate(
         store: photographs.
         render: from `make_renderer`.
         cfg: formation model.
+        owner: the moving object that each Gaussian belongs to, or None.
         reference: view row -> photograph under the common exposure, or None where there is none.
         radiance: view row -> true linear radiance at the size of the photographs, or None.
         lpips_weights: adds `lpips` wherever a view is compared with a photograph; None leaves it
@@ -175,6 +178,7 @@ def evaluate(
     small = jax.tree.map(np.asarray, replace(params, gaussians=None))
     gaussians = jax.device_put(params.gaussians)
     living = jax.device_put(np.asarray(alive))
+    owner_there = None if owner is None else jax.device_put(np.asarray(owner))
     taken_by = [view.camera for view in scene.training_views]
 
     tone = cfg.photometry
@@ -185,14 +189,16 @@ def evaluate(
 
     drive = None
     if is_drive(scene):
-        drive = DriveScores(scene, store, lambda camera: render(gaussians, living, camera))
+        drive = DriveScores(
+            scene, store, lambda camera: render(gaussians, living, camera, owner_there)
+        )
     row_of = {index: row for row, index in enumerate(scene.train_indices)}
 
     def judged(index: int) -> _Judged:
         photograph, mask = store.get(index, 1)
         parts = None if drive is None else masks_of_parts(scene, index, mask)
         score = functools.partial(_score, lpips_weights, parts=parts)
-        result = render(gaussians, living, camera_of(store, index))
+        result = render(gaussians, living, camera_of(store, index), owner_there)
         linear = np.asarray(result.linear)
         shown = usual(index)
         ldr_mean = develop(linear, replace(shown, exposure=mean.exposure))
@@ -200,9 +206,10 @@ def evaluate(
         if scene.views[index].split == "train":
             transform = display_of_view(small, row_of[index], tone)
         else:
-            transform = _exposure_fitted(shown, linear, photograph, mask)
+            still = still_mask(scene, index, mask)
+            transform = _exposure_fitted(shown, linear, photograph, still)
             extra = {"exposure": transform.exposure}
-            everything = _all_fitted(linear, photograph, mask, transform, score)
+            everything = _all_fitted(linear, photograph, (still, mask), transform, score)
         ldr = develop(linear, transform)
         depth, alpha = np.asarray(result.depth), np.asarray(result.alpha)
         return _Judged(
@@ -298,13 +305,22 @@ def _exposure_fitted(shown: DisplayTransform, linear, photograph, mask) -> Displ
     return replace(shown, exposure=float(fit_exposure(linear, photograph, mask, *how)))
 
 
-def _all_fitted(linear, photograph, mask, start: DisplayTransform, score) -> dict[str, Any] | None:
-    """Score a held-out view with all solved that varies per view; None: that is one scalar."""
+def _all_fitted(linear, photograph, masks, start: DisplayTransform, score) -> dict[str, Any] | None:
+    """Score a held-out view with all solved that varies per view; None: that is one scalar.
+
+    Args:
+        linear: the render.
+        photograph: display values.
+        masks: what it is solved from, and what is scored.
+        start: with the exposure alone.
+        score: (display image, photograph, mask) -> scores by name.
+    """
     tone = start.formation
     gamma, balance = MODELS[tone.model].gamma == "view", tone.white_balance == "view"
     if not (gamma or balance):
         return None
-    given, how = (linear, photograph, mask), (start.capture, tone, start.correction)
+    still, mask = masks
+    given, how = (linear, photograph, still), (start.capture, tone, start.correction)
     found = fit_capture(*given, *how, gamma=gamma, white_balance=balance)
     transform = with_capture(start, found)
     row = {**score(develop(linear, transform), photograph, mask), "exposure": transform.exposure}

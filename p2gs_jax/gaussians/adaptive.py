@@ -90,9 +90,13 @@ def apply(
         means=jnp.where(s, first, gaussians.means),
         log_scales=jnp.where(s, shrunk, gaussians.log_scales),
     )
-    gaussians = jax.tree.map(lambda a, b: a.at[slot].set(b, mode="drop"), parent, child)
+    gaussians, owner = jax.tree.map(
+        lambda a, b: a.at[slot].set(b, mode="drop"),
+        (parent, population.owner),
+        (child, population.owner),
+    )
     born = jnp.zeros_like(alive).at[slot].set(True, mode="drop")
-    return Outcome(gaussians, fresh_population(alive | born), born | split, refused)
+    return Outcome(gaussians, fresh_population(alive | born, owner), born | split, refused)
 
 
 def reset_opacities(gaussians: Gaussians) -> Gaussians:

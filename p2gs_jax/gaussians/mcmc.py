@@ -106,9 +106,9 @@ def relocate_and_grow(
     away = away - pushed / jnp.maximum(arrivals, 1)[:, None]
     gaussians = _apart(gaussians, away, movers | shared, cfg.spread)
     refused = births - jnp.sum(newborn)
-    return Outcome(
-        gaussians, fresh_population(population.alive | (newborn & movers)), movers | shared, refused
-    )
+    owner = None if population.owner is None else population.owner[source]
+    population = fresh_population(population.alive | (newborn & movers), owner)
+    return Outcome(gaussians, population, movers | shared, refused)
 
 
 def _apart(

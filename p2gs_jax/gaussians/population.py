@@ -31,10 +31,22 @@ class Outcome(NamedTuple):
     """Requests for which there was no slot: counted, never silent."""
 
 
-def fresh_population(alive: Bool[Array, " n"]) -> Population:
-    """Return a population with empty statistics."""
+def fresh_population(alive: Bool[Array, " n"], owner: Int[Array, " n"] | None = None) -> Population:
+    """Return a population with empty statistics.
+
+    Args:
+        alive: slots in use.
+        owner: the moving object that each Gaussian belongs to, or None.
+    """
     # Two arrays, not one twice: the step donates its input, and a buffer can be donated once only.
-    return Population(alive, *(jnp.zeros(alive.shape, jnp.float32) for _ in range(2)))
+    none = [jnp.zeros(alive.shape, jnp.float32) for _ in range(2)]
+    return Population(alive, *none, owner=owner)
+
+
+def empty_population(count: int, like: Population) -> Population:
+    """Return the population of `count` empty slots, which are nobody's."""
+    owner = None if like.owner is None else jnp.full(count, -1, like.owner.dtype)
+    return fresh_population(jnp.zeros(count, bool), owner)
 
 
 def empty_gaussians(count: int, like: Gaussians) -> Gaussians:

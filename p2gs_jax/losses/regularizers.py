@@ -7,7 +7,11 @@ from jaxtyping import Array, Bool, Float
 
 from p2gs_jax.config import FitConfig, RegularizerConfig
 from p2gs_jax.gaussians.population import opacities
-from p2gs_jax.types import GAMMA_SRGB, Gaussians, Photometry
+from p2gs_jax.render.objects import correction_at
+from p2gs_jax.types import GAMMA_SRGB, Gaussians, Photometry, Placement
+
+# Boxes are drawn about as well as this: radians, and metres.
+ROTATION_DEVIATION, TRANSLATION_DEVIATION = 0.02, 0.1
 
 
 def variance(x: Float[Array, " v"]) -> Float[Array, ""]:
@@ -86,3 +90,22 @@ def population_terms(
     if reg.scale is not None:
         terms["scale"] = reg.scale * scale_regularizer(gaussians, alive, extent, over)
     return terms
+
+
+def pose_terms(
+    poses: Float[Array, "t k 6"] | None, objects: Placement | None, cfg: RegularizerConfig
+) -> dict[str, Float[Array, ""]]:
+    """Return the weighted prior on corrections of poses: boxes are where they were drawn.
+
+    Args:
+        poses: corrections at key times.
+        objects: those of the view; what is not there does not count.
+        cfg: a weight of None keeps the term out of the trace.
+    """
+    if poses is None or objects is None or cfg.object_poses is None:
+        return {}
+    deviations = jnp.repeat(jnp.array([ROTATION_DEVIATION, TRANSLATION_DEVIATION]), 3)
+    apart = correction_at(poses, objects.key, objects.share) / deviations
+    there = jnp.any(objects.viewmats[:, :3, :3] != 0, axis=(1, 2))
+    each = jnp.where(there, jnp.sum(apart**2, -1), 0.0)
+    return {"object_poses": cfg.object_poses * jnp.sum(each)}

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from p2gs_jax.config import FitConfig
 from p2gs_jax.losses.image import photometric_loss
 from p2gs_jax.losses.lidar import lidar_loss
-from p2gs_jax.losses.regularizers import photometry_regularizers, population_terms
+from p2gs_jax.losses.regularizers import photometry_regularizers, population_terms, pose_terms
 from p2gs_jax.losses.relative_exposure import (
     ColorPairs,
     ExposurePairs,
@@ -25,6 +25,7 @@ from p2gs_jax.photometry.cameras import darkens, places
 from p2gs_jax.photometry.formation import formation
 from p2gs_jax.render import render_splats
 from p2gs_jax.render.blocks import Shown, splat
+from p2gs_jax.render.objects import with_corrections
 from p2gs_jax.render.warp import sample_bilinear, surface_depth, warp
 from p2gs_jax.types import Batch, Camera, Params, Photometry, Render
 
@@ -202,6 +203,7 @@ def total_loss(
     capacity: int,
     active_degree: Int[Array, ""] | int,
     extent: float,
+    owner: Int[Array, " n"] | None = None,
 ) -> tuple[Float[Array, ""], LossAux]:
     """Return the loss of one view and its terms, as one function of the parameters.
 
@@ -216,12 +218,15 @@ def total_loss(
         capacity: tile-list entries.
         active_degree: spherical-harmonics degree in use.
         extent: scene extent, scene units.
+        owner: the moving object that each Gaussian belongs to, or None.
     """
     cameras = (batch.camera, *partner_cameras(partner, cfg))
-    shown = splat(params.gaussians, alive, cameras, cfg.render, active_degree)
+    cameras = with_corrections(cameras, params.poses)
+    shown = splat(params.gaussians, alive, cameras, cfg.render, active_degree, owner)
     loss, aux = image_loss(
         shown, params.photometry, params.appearance, batch, partner, cfg, capacity
     )
     own = population_terms(params.gaussians, alive, cfg, extent)
+    own |= pose_terms(params.poses, batch.camera.objects, cfg.loss.regularizers)
     total = jax.tree.reduce(jnp.add, own, loss)
     return total, aux._replace(terms=aux.terms | own)

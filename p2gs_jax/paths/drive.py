@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
@@ -67,8 +66,8 @@ def frame_count(knots: int, frames: int | None) -> int:
 def drive(knots: Sequence[Shot], frames: int | None = None) -> list[Shot]:
     """Return a smooth path through shots, with their commonest lens.
 
-    Exposures (in stops) and gammas (their logarithms) are interpolated linearly where all shots
-    have them.
+    Exposures (in stops), gammas (their logarithms) and times are interpolated linearly where all
+    shots have them.
 
     Args:
         knots: in the order of the ride.
@@ -89,9 +88,10 @@ def drive(knots: Sequence[Shot], frames: int | None = None) -> list[Shot]:
     gammas = [
         None if g is None else float(np.exp(g)) for g in _interpolated(path.times, logs, times)
     ]
+    clock = _interpolated(path.times, [s.time for s in knots], times)
     K, width, height = common_lens(knots)
     return [
-        replace(Shot(f"{k:05d}", viewmat, K, width, height), exposure_ev=evs[k], gamma=gammas[k])
+        Shot(f"{k:05d}", viewmat, K, width, height, evs[k], gammas[k], time=clock[k])
         for k, viewmat in enumerate(inverse(path(times)))
     ]
 

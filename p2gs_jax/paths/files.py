@@ -21,7 +21,7 @@ from p2gs_jax.paths.geometry import inverse
 from p2gs_jax.paths.pinhole import LARGEST, as_matrix, checked_lens, orthonormal
 from p2gs_jax.paths.shots import Shot
 
-FIELDS = ("name", "viewmat", "K", "width", "height", "exposure_ev", "gamma")
+FIELDS = ("name", "viewmat", "K", "width", "height", "exposure_ev", "gamma", "time")
 MOST_STOPS = 60.0
 _FIX = "correct the file; docs/rendering.md has the format"
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -94,6 +94,7 @@ def _entry(values: dict, index: int) -> Shot:
         if "exposure_ev" in values
         else None,
         _number(values, "gamma", 1e-3, 1e3) if "gamma" in values else None,
+        time=_number(values, "time", -math.inf, math.inf) if "time" in values else None,
     )
 
 

@@ -19,7 +19,6 @@ from p2gs_jax.paths.geometry import Poses, inverse
 from p2gs_jax.paths.panorama import Layers
 from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
 from p2gs_jax.photometry.metering import ExposureOf, adapted, meter
-from p2gs_jax.render.host import make_renderer
 from p2gs_jax.run.read import Run
 from p2gs_jax.scene.drives.choose import short_name
 from p2gs_jax.scene.images import ImageStore
@@ -46,7 +45,6 @@ class RunRenderer:
         self.run = run
         self.render_seconds: list[float] = []
         self.develop_seconds: list[float] = []
-        self._render = make_renderer(run.cfg.render)
 
     def linear(self, shot: Shot) -> Layers:
         """Return linear radiance, alpha and alpha-weighted depth of a pinhole camera."""
@@ -63,7 +61,7 @@ class RunRenderer:
         return wide
 
     def _layers(self, shot: Shot) -> Layers:
-        result = self._render(self.run.params.gaussians, self.run.alive, shot.camera())
+        result = self.run.render(shot.camera(), shot.time)
         return np.asarray(result.linear), np.asarray(result.alpha), np.asarray(result.depth)
 
     def develop(self, linear: Float32[np.ndarray, "h w 3"], transform: DisplayTransform):
@@ -94,7 +92,7 @@ def metered_shots(
     logs = []
     for shot in shots:
         small = shot.resized(METERED_WIDTH) if shot.width > METERED_WIDTH else shot
-        rendered = run.render(small.camera())
+        rendered = run.render(small.camera(), small.time)
         readings = meter(np.asarray(rendered.linear), np.asarray(rendered.alpha))
         logs.append(run.metering.log_exposure(readings, of))
     if frames > 0:

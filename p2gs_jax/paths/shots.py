@@ -30,6 +30,7 @@ class Shot:
         exposure_ev: stops from the geometric mean of the training exposures, or None.
         gamma: > 0, or None.
         view: row in `Scene.views` of the photograph taken there, or None.
+        time: seconds: what moves is where it was then; None: it is not shown.
     """
 
     name: str
@@ -40,6 +41,7 @@ class Shot:
     exposure_ev: float | None = None
     gamma: float | None = None
     view: int | None = None
+    time: float | None = None
 
     def resized(self, width: int) -> Shot:
         """Return the shot with `width` pixels across; the height follows, rounded."""
@@ -65,7 +67,8 @@ def view_shots(views: Sequence[View], max_width: int | None = None) -> list[Shot
         K, width, height = camera_at(view, max_width)
         name = PurePosixPath(view.name).with_suffix("").as_posix()
         viewmat = np.asarray(view.viewmat, np.float64)
-        out.append(Shot(name, viewmat, np.asarray(K, np.float64), width, height, view=row))
+        K = np.asarray(K, np.float64)
+        out.append(Shot(name, viewmat, K, width, height, view=row, time=view.time))
     return out
 
 

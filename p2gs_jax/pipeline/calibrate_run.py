@@ -9,6 +9,7 @@ from pathlib import Path
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
+from p2gs_jax.gaussians.posed import standing
 from p2gs_jax.photometry.calibrate import calibrate_observations, options_of
 from p2gs_jax.photometry.sources.rendered import rendered_colors
 from p2gs_jax.pipeline.calibration import Calibration, with_stated
@@ -46,10 +47,11 @@ def calibrate_run(
     photometry = photometry or PhotometryConfig()
     cfg = dataclasses.replace(run.cfg, photometry=photometry)
     run.require_photographs(run.scene.train_indices)
+    # Of what stands still: the same pixel of something that moves is elsewhere in another view.
     observations = rendered_colors(
-        run.params.gaussians,
+        standing(run.params.gaussians, run.owner),
         run.scene,
-        run.store,
+        run.store.leaving_out(run.scene.objects),
         cfg.render,
         cfg.train.seed,
         lambda i, n: reporter.stage("Rendering depth", i, n),

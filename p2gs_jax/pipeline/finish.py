@@ -20,6 +20,7 @@ from p2gs_jax.render.host import make_renderer
 from p2gs_jax.run.layout import RunFolder
 from p2gs_jax.run.unexplained_pictures import write_unexplained
 from p2gs_jax.run.write import summary_rows, write_results, write_view
+from p2gs_jax.scene.drives.moving import fitted_objects
 from p2gs_jax.types import Params
 
 
@@ -42,6 +43,7 @@ class Account:
 
 def finish(
     params: Params,
+    owner: np.ndarray | None,
     prepared: Prepared,
     folder: RunFolder,
     account: Account,
@@ -55,6 +57,7 @@ def finish(
 
     Args:
         params: live Gaussians and photometry.
+        owner: the moving object that each Gaussian belongs to, or None.
         prepared: scene and photographs.
         folder: of the run.
         account: of the fit.
@@ -65,7 +68,9 @@ def finish(
     """
     watch = Stopwatch()
     _import_ahead("matplotlib.figure")
-    scene, store, cfg = prepared.scene, prepared.store, prepared.cfg
+    scene, cfg = prepared.scene, prepared.cfg
+    moving = fitted_objects(prepared.store.moving, params)
+    store = prepared.store.placing(moving)
     fitted: dict[int, float] = {}
     shown: dict[int, ViewResult] = {}
     picks = summary_rows(scene)
@@ -88,6 +93,7 @@ def finish(
             store,
             make_renderer(cfg.render),
             cfg,
+            owner=owner,
             reference=truth,
             radiance=find_radiance(scene, store),
             lpips_weights=lpips_weights,
@@ -108,6 +114,8 @@ def finish(
             params,
             scene,
             cfg,
+            owner=owner,
+            moving=moving,
             fitted=fitted,
             solution=None if prepared.selection is None else prepared.selection.solution,
             shown=[shown[i] for i in picks],

@@ -60,7 +60,7 @@ def optimise(
     """
     cfg = prepared.cfg
     views = TrainingViews(
-        prepared.store,
+        prepared.fitted,
         prepared.scene.train_indices,
         cfg.train.seed,
         prepared.overlaps,
@@ -86,7 +86,14 @@ def optimise(
         own_exposures=prepared.selection is not None,
     )
     alive = np.ones(prepared.params.gaussians.capacity, bool)
-    return trainer.run(prepared.params, alive, resume=resume, spent_s=spent_s, finish_s=reserve_s)
+    return trainer.run(
+        prepared.params,
+        alive,
+        prepared.owner,
+        resume=resume,
+        spent_s=spent_s,
+        finish_s=reserve_s,
+    )
 
 
 def _begin(programs: StepPrograms, known: Expected, scene: Scene, folder: RunFolder) -> None:
@@ -104,15 +111,16 @@ def _begin(programs: StepPrograms, known: Expected, scene: Scene, folder: RunFol
         programs,
         known.decisions,
     )
-    trainer.expect(known.params, known.images)
+    trainer.expect(known.params, known.owner, known.images)
 
 
-def compact(result: TrainResult) -> Params:
-    """Return the parameters with only the live Gaussians, in slot order."""
-    alive = np.flatnonzero(np.asarray(result.state.population.alive))
-    params = result.state.params
+def compact(result: TrainResult) -> tuple[Params, np.ndarray | None]:
+    """Return the parameters with only the live Gaussians, in slot order, and whose they are."""
+    population, params = result.state.population, result.state.params
+    alive = np.flatnonzero(np.asarray(population.alive))
     gaussians = jax.tree.map(lambda a: jax.device_put(np.asarray(a)[alive]), params.gaussians)
-    return dataclasses.replace(params, gaussians=gaussians)
+    owner = None if population.owner is None else np.asarray(population.owner)[alive]
+    return dataclasses.replace(params, gaussians=gaussians), owner
 
 
 @dataclass(frozen=True)
@@ -198,7 +206,8 @@ def fit(
                     scene, cfg, lpips_weights, reference=views.truth is not None
                 ),
             )
-    params = exposures_apart(compact(result))
+    params, owner = compact(result)
+    params = exposures_apart(params)
     if cfg.photometry.parameterization == "log" and cfg.photometry.known is None:
         params = recentre(params, cfg.render.radiance)
     account = Account(
@@ -223,6 +232,7 @@ def fit(
     )
     metrics = finish(
         params,
+        owner,
         prepared,
         folder,
         account,

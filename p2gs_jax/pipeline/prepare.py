@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Array
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.clock import Stopwatch
@@ -21,7 +22,12 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.init.brightness import Tones, rough_tones
 from p2gs_jax.gaussians.init.dense import DenseSeeds
 from p2gs_jax.gaussians.init.dense_bound import coverage_of, dense_limit, wants_dense
-from p2gs_jax.gaussians.init.photographed import photographed_radiance, with_colors
+from p2gs_jax.gaussians.init.nodes import Nodes, find_nodes, node_gaussians
+from p2gs_jax.gaussians.init.photographed import (
+    nodes_radiance,
+    photographed_radiance,
+    with_colors,
+)
 from p2gs_jax.gaussians.init.seeds import merge, scene_extent, subsample
 from p2gs_jax.gaussians.init.shell import find_shell
 from p2gs_jax.gaussians.init.start import (
@@ -45,7 +51,7 @@ from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.train.compared_photographs import color_pairs, overlaps
 from p2gs_jax.train.measured_depths import measured_depths
-from p2gs_jax.types import Gaussians, Measured, Params, Scene
+from p2gs_jax.types import Gaussians, Measured, Params, Scene, View
 
 
 @dataclass
@@ -54,8 +60,10 @@ class Prepared:
 
     Attributes:
         scene: views, points, tracks.
-        store: photographs.
+        store: photographs, whole; its cameras see what moves.
+        fitted: the same photographs without the pixels that are left out of the fit.
         params: initial parameters.
+        owner: the moving object that each Gaussian belongs to (`Population.owner`), or None.
         extent: scene extent, scene units.
         selection: photometric model, exposures and their errors from the tracks, or None.
         pairs: corresponding observations, or None.
@@ -69,7 +77,9 @@ class Prepared:
 
     scene: Scene
     store: ImageStore
+    fitted: ImageStore
     params: Params
+    owner: np.ndarray | None
     extent: float
     selection: Selection | None
     pairs: ColorPairs | None
@@ -87,6 +97,7 @@ class Expected(NamedTuple):
     Attributes:
         store: photographs.
         params: of the right shapes; the Gaussians are the scene's points, without colours.
+        owner: the moving object that each belongs to, or None.
         extent: scene extent, scene units.
         coverage: how much of the scene the views show.
         decisions: what most scenes decide.
@@ -97,6 +108,7 @@ class Expected(NamedTuple):
 
     store: ImageStore
     params: Params
+    owner: np.ndarray | None
     extent: float
     coverage: Coverage
     decisions: Decisions
@@ -147,7 +159,9 @@ def prepare(
     """
     clock = clock or Stopwatch()
     begin = time.monotonic()
-    store = ImageStore(scene.views, cfg.data)
+    nodes = find_nodes(scene, cfg.dynamics)
+    store = ImageStore(scene.views, cfg.data, moving=None if nodes is None else nodes.moving)
+    fitted, still = _without_what_moves(scene, store, nodes, cfg)
     views = scene.training_views
     taken_by = [view.camera for view in views]
     extent = scene_extent(views, scene.points)
@@ -161,14 +175,20 @@ def prepare(
     guess = likely(cfg, kept, matched=has_tracks(scene) or dense)
     expected: Expected | None = None
     if guess is not None:
+        black = black_gaussians(scene.points[seeds.keep], shell, views, cfg)
+        owner = None
+        if nodes is not None:
+            colors = np.zeros_like(nodes.points)
+            black, owner = _with_nodes(black, nodes, colors, views, cfg)
         params = Params(
-            black_gaussians(scene.points[seeds.keep], shell, views, cfg),
+            black,
             initial_photometry(None, taken_by, guess.resolve(cfg)),
             initial_appearance(views, cfg),
+            _initial_poses(nodes, cfg),
         )
         known = kept is not None or not cfg.photometry.select
         under = guess.resolve(cfg)
-        expected = Expected(store, params, extent, coverage, guess, under, known, measured)
+        expected = Expected(fitted, params, owner, extent, coverage, guess, under, known, measured)
         on_expected(expected)
 
     def chosen(form: Form, response: Response) -> None:
@@ -181,7 +201,7 @@ def prepare(
         params = dataclasses.replace(expected.params, photometry=start)
         on_expected(expected._replace(params=params, decisions=told, cfg=under, images=True))
 
-    tracks, selection, notes = _solve(scene, store, cfg, reporter, chosen, dense=dense, kept=kept)
+    tracks, selection, notes = _solve(scene, still, cfg, reporter, chosen, dense=dense, kept=kept)
     matched = tracks is not None and len(tracks.points) > 0
     decisions = decide(cfg, selection, matched=matched, kept=kept)
     resolved = decisions.resolve(cfg)
@@ -194,7 +214,7 @@ def prepare(
     if dense:
         added = match_photographs(
             scene,
-            store,
+            still,
             rough_tones(tracks, len(views))
             if solution is None
             else Tones.of(photometry, resolved.photometry),
@@ -207,14 +227,19 @@ def prepare(
         covering = np.concatenate([scene.points, added.points])
         shell = find_shell(views, covering, extent, cfg.init)
     if scene.point_colors is None:
-        scene = with_colors(scene, photographed_radiance(scene, store, photometry, resolved))
+        scene = with_colors(scene, photographed_radiance(scene, still, photometry, resolved))
     radiance = point_radiance(scene, solution, resolved)[seeds.keep]
     gaussians = gaussians_of(scene.points[seeds.keep], radiance, added, views, resolved)
     if shell is not None:
-        far = shell_gaussians(shell, scene, store, photometry, views, resolved)
+        far = shell_gaussians(shell, scene, still, photometry, views, resolved)
         gaussians = merge(gaussians, far)
-    gaussians, thinned = _bounded(gaussians, cfg)
+    owner = None
+    if nodes is not None:
+        found = nodes_radiance(nodes, scene, fitted, photometry, resolved)
+        gaussians, owner = _with_nodes(gaussians, nodes, found, views, resolved)
+    gaussians, owner, thinned = _bounded(gaussians, owner, cfg)
     notes = [*scene.notes, *notes, *seeds.notes]
+    notes += [] if nodes is None else nodes.notes
     notes += [] if added is None else [added.note()]
     notes += [] if shell is None else [shell.note()]
     notes += thinned
@@ -224,7 +249,14 @@ def prepare(
     return Prepared(
         scene,
         store,
-        Params(gaussians, photometry, initial_appearance(views, resolved)),
+        fitted,
+        Params(
+            gaussians,
+            photometry,
+            initial_appearance(views, resolved),
+            _initial_poses(nodes, resolved),
+        ),
+        owner,
         extent,
         selection,
         color_pairs(tracks, resolved),
@@ -235,6 +267,42 @@ def prepare(
         resolved,
         notes,
     )
+
+
+def _without_what_moves(
+    scene: Scene, store: ImageStore, nodes: Nodes | None, cfg: FitConfig
+) -> tuple[ImageStore, ImageStore]:
+    """Return the photographs that are fitted, and those of what stands still.
+
+    Exposures and seeds come from the latter.
+    """
+    still = store.leaving_out(scene.objects, cfg.dynamics.margin)
+    if cfg.dynamics.method == "mask":
+        return still, still
+    left = () if nodes is None else nodes.left
+    return store.leaving_out(left, cfg.dynamics.margin), still
+
+
+def _with_nodes(
+    gaussians: Gaussians,
+    nodes: Nodes,
+    radiance: np.ndarray,
+    views: list[View],
+    cfg: FitConfig,
+) -> tuple[Gaussians, np.ndarray | None]:
+    """Return Gaussians with those of moving objects behind them, and to what each belongs."""
+    if not len(nodes.moving):
+        return gaussians, None
+    world = np.full(gaussians.capacity, -1, np.int32)
+    owner = np.concatenate([world, nodes.owner])
+    return merge(gaussians, node_gaussians(nodes, radiance, views, cfg)), owner
+
+
+def _initial_poses(nodes: Nodes | None, cfg: FitConfig) -> Array | None:
+    """Return corrections of poses before the first step; None where none are learned."""
+    if nodes is None or not len(nodes.moving) or not cfg.dynamics.correct_poses:
+        return None
+    return on_device(np.zeros((nodes.moving.keys.count, len(nodes.moving), 6)))
 
 
 class _Seeds(NamedTuple):
@@ -291,11 +359,14 @@ def _solve(
     return tracks, selection, [*notes, *selection.reasons, *selection.solution.warnings]
 
 
-def _bounded(gaussians: Gaussians, cfg: FitConfig) -> tuple[Gaussians, list[str]]:
-    """Return at most as many Gaussians as the options allow, and what to say of it."""
+def _bounded(
+    gaussians: Gaussians, owner: np.ndarray | None, cfg: FitConfig
+) -> tuple[Gaussians, np.ndarray | None, list[str]]:
+    """Return at most as many Gaussians as the options allow, whose they are, and what to say."""
     bound = cfg.densify.max_gaussians
     if not isinstance(bound, int) or gaussians.capacity <= bound:
-        return gaussians, []
+        return gaussians, owner, []
     kept = subsample(gaussians.capacity, bound, cfg.train.seed, Stream.SEED_GAUSSIANS)
     said = f"{gaussians.capacity} Gaussians were thinned to {bound} (--gaussians)."
-    return jax.tree.map(lambda a: on_device(np.asarray(a)[kept]), gaussians), [said]
+    gaussians = jax.tree.map(lambda a: on_device(np.asarray(a)[kept]), gaussians)
+    return gaussians, None if owner is None else owner[kept], [said]

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render.binning import bin_tiles, count_entries
 from p2gs_jax.render.cutoff import with_cutoffs
+from p2gs_jax.render.objects import camera_of_each
 from p2gs_jax.render.project import project, view_radiance
 from p2gs_jax.render.rasterize_reference import rasterize_reference
 from p2gs_jax.render.rasterize_tiles import TileImplementation, rasterize_tiles
@@ -88,6 +89,7 @@ def render_linear(
     cfg: RenderConfig,
     capacity: int,
     *,
+    owner: Int[Array, " n"] | None = None,
     active_degree: Int[Array, ""] | int | None = None,
     with_depth: bool = True,
 ) -> Render:
@@ -99,6 +101,7 @@ def render_linear(
         camera: the view.
         cfg: rendering options.
         capacity: tile-list entries; see `required_capacity`.
+        owner: the moving object that each Gaussian belongs to (`Population.owner`), or None.
         active_degree: highest spherical-harmonics degree in use, None for all.
         with_depth: see `rasterize`.
 
@@ -107,8 +110,9 @@ def render_linear(
     """
     if gaussians.capacity == 0:
         return _nothing(camera, with_depth)
-    splats = project(gaussians, alive, camera, cfg)
-    radiance = view_radiance(gaussians, camera, cfg, active_degree)
+    of_each = camera_of_each(camera, owner)
+    splats = project(gaussians, alive, of_each, cfg)
+    radiance = view_radiance(gaussians, of_each, cfg, active_degree)
     return render_splats(splats, radiance, camera, cfg, capacity, with_depth=with_depth)
 
 
@@ -152,11 +156,16 @@ def render_splats(
 
 
 def required_capacity(
-    gaussians: Gaussians, alive: Bool[Array, " n"], camera: Camera, cfg: RenderConfig
+    gaussians: Gaussians,
+    alive: Bool[Array, " n"],
+    camera: Camera,
+    cfg: RenderConfig,
+    owner: Int[Array, " n"] | None = None,
 ) -> Int[Array, ""]:
-    """Return the exact tile-list capacity one view needs."""
+    """Return the exact tile-list capacity one view needs; arguments as of `render_linear`."""
     if gaussians.capacity == 0:
         return jnp.int32(0)
+    camera = camera_of_each(camera, owner)
     splats = project(gaussians, alive, camera, cfg)
     if cfg.cutoff_rule == "radiance":
         splats = with_cutoffs(splats, view_radiance(gaussians, camera, cfg), cfg)

@@ -15,6 +15,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from p2gs_jax.config import RenderConfig
+from p2gs_jax.render.objects import camera_of_each
 from p2gs_jax.render.project import project, view_radiance
 from p2gs_jax.types import Camera, Frustum, Gaussians, Splats2D
 
@@ -90,12 +91,18 @@ def splat(
     cameras: Sequence[Camera | Frustum],
     cfg: RenderConfig,
     active_degree: Int[Array, ""] | int | None = None,
+    owner: Int[Array, " v"] | None = None,
 ) -> tuple[Shown, ...]:
     """Return the splats and the radiance of Gaussians in each of some views."""
     return tuple(
         (project(gaussians, alive, c, cfg), view_radiance(gaussians, c, cfg, active_degree))
-        for c in cameras
+        for c in (camera_of_each(camera, owner) for camera in cameras)
     )
+
+
+def owners_at(owner: Int[Array, " n"] | None, ids: Int[Array, " v"]) -> Int[Array, " v"] | None:
+    """Return whose some Gaussians are; those out of bounds are nobody's."""
+    return None if owner is None else owner.at[ids].get(mode="fill", fill_value=-1)
 
 
 def splat_listed(
@@ -107,6 +114,7 @@ def splat_listed(
     cfg: RenderConfig,
     active_degree: Int[Array, ""] | int,
     bands: int,
+    owner: Int[Array, " n"] | None = None,
 ) -> tuple[Shown, ...]:
     """Return the splats and the radiance of the listed Gaussians in each of some views.
 
@@ -119,6 +127,7 @@ def splat_listed(
         cfg: rendering options.
         active_degree: spherical-harmonics degree in use.
         bands: number of coefficients in use.
+        owner: see `render_linear`.
     """
 
     length = ids.shape[0]
@@ -127,7 +136,8 @@ def splat_listed(
     def block(k):
         here = slice_of(ids, k, size)
         shown = alive.at[here].get(mode="fill", fill_value=False)
-        return splat(take_rows(gaussians, here, bands), shown, cameras, cfg, active_degree)
+        block = take_rows(gaussians, here, bands)
+        return splat(block, shown, cameras, cfg, active_degree, owners_at(owner, here))
 
     def body(k, out):
         return jax.tree.map(

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 import jax
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Int
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render import render_linear, required_capacity
@@ -15,7 +14,20 @@ from p2gs_jax.render.capacity import TileCapacity, until_it_fits
 from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.types import Camera, Gaussians, Render
 
-RenderView = Callable[[Gaussians, Bool[Array, " n"], Camera], Render]
+
+class RenderView(Protocol):
+    """Render one view; arguments as of `render_linear`."""
+
+    def __call__(
+        self,
+        gaussians: Gaussians,
+        alive: Bool[Array, " n"],
+        camera: Camera,
+        owner: Int[Array, " n"] | None = None,
+    ) -> Render:
+        """Return the render."""
+        ...
+
 
 count_needed = jax.jit(required_capacity, static_argnames="cfg")
 """`required_capacity`, compiled."""
@@ -35,15 +47,20 @@ def make_renderer(cfg: RenderConfig) -> RenderView:
     """Return a function that renders one view, and grows its tile lists after an overflow."""
     capacities: dict[tuple[int, int], TileCapacity] = {}
 
-    def render_view(gaussians: Gaussians, alive: Bool[Array, " n"], camera: Camera) -> Render:
+    def render_view(
+        gaussians: Gaussians,
+        alive: Bool[Array, " n"],
+        camera: Camera,
+        owner: Int[Array, " n"] | None = None,
+    ) -> Render:
         size = (camera.width, camera.height)
         if size not in capacities:
-            needed = int(count_needed(gaussians, alive, camera, cfg=cfg))
+            needed = int(count_needed(gaussians, alive, camera, cfg=cfg, owner=owner))
             capacities[size] = TileCapacity.allocate(needed)
 
         def draw(entries: int) -> tuple[Render, Array, Array]:
             render = compiled_renderer()
-            result = render(gaussians, alive, camera, cfg=cfg, capacity=entries)
+            result = render(gaussians, alive, camera, cfg=cfg, capacity=entries, owner=owner)
             return result, result.count, result.overflow
 
         result, capacities[size] = until_it_fits(draw, capacities[size])

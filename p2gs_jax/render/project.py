@@ -119,7 +119,9 @@ def view_radiance(
     active_degree: Int[Array, ""] | int | None = None,
 ) -> Float[Array, "n 3"]:
     """Return each Gaussian's linear HDR radiance towards the camera, >= 0."""
-    center = -camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3]
+    R, t = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
+    # One centre, or one for each Gaussian in its own axes.
+    center = -R.T @ t if R.ndim == 2 else [-sum(R[i, k] * t[i] for i in range(3)) for k in range(3)]
     offset = [m - c for m, c in zip(columns(gaussians.means), center, strict=True)]
     inverse = jax.lax.rsqrt(jnp.maximum(sum(o * o for o in offset), 1e-20))
     x, y, z = (o * inverse for o in offset)

@@ -12,7 +12,6 @@ from p2gs_jax.evaluate.metrics import psnr
 from p2gs_jax.evaluate.seam_picture import SeamPicture, seam_picture
 from p2gs_jax.evaluate.seams import Photographed, Seam, measure_seam, neighbouring_pairs
 from p2gs_jax.photometry.display import develop
-from p2gs_jax.render.host import make_renderer
 from p2gs_jax.render.warp import surface_depth
 from p2gs_jax.report.run_files import RunFiles
 from p2gs_jax.report.view_comparisons import ViewComparison, spread
@@ -98,12 +97,7 @@ def measure_scene(files: RunFiles, reporter: Reporter, *, render: bool = True) -
 def _rendered(
     run: Run, files: RunFiles, reporter: Reporter, truth: dict[str, float], missing: list[str]
 ) -> SceneMeasurements:
-    store = ImageStore(run.scene.views, run.cfg.data)
-    render = make_renderer(run.cfg.render)
-
-    def render_camera(camera):
-        return render(run.params.gaussians, run.alive, camera)
-
+    store, render_camera = run.store, run.render
     pairs: list[SeamPair] = []
     tried: list[tuple[int, int]] = []
     shown, picture = None, None
@@ -114,7 +108,7 @@ def _rendered(
         )
     else:
         tried = neighbouring_pairs(run.scene, MOST_PAIRS)
-        photographed = _Photographs(run, store, render_camera)
+        photographed = _Photographs(run, store.leaving_out(run.scene.objects), render_camera)
         found: dict[tuple[int, int], Seam] = {}
         for done, (i, j) in enumerate(tried):
             reporter.stage("Measuring seams", done, len(tried))

@@ -49,6 +49,11 @@ class RunFolder:
         return self.root / "splats.ply"
 
     @property
+    def objects(self) -> Path:
+        """Which Gaussians belong to which moving object."""
+        return self.root / "objects.npz"
+
+    @property
     def photometry(self) -> Path:
         """Exposures, gammas, tone curve."""
         return self.root / "photometry.json"

@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Array, Bool, Float32
+from jaxtyping import Array, Bool, Float32, Int
 
 from p2gs_jax.config import FitConfig, PhotometryConfig, from_dict
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.ply import read_ply
+from p2gs_jax.gaussians.posed import posed
 from p2gs_jax.photometry.cameras import camera_rows
 from p2gs_jax.photometry.display import DisplayTransform, display_of_view
 from p2gs_jax.photometry.mean import MeanParameters, mean_parameters, usual_display
@@ -26,13 +27,15 @@ from p2gs_jax.run.appearance_file import read_appearance
 from p2gs_jax.run.decisions import read_decisions
 from p2gs_jax.run.layout import RunFolder
 from p2gs_jax.run.metering_file import read_metering
+from p2gs_jax.run.objects_file import read_objects
 from p2gs_jax.run.photometry_file import AGAIN, PhotometryFile, read_photometry
 from p2gs_jax.run.places import candidates, find
 from p2gs_jax.run.scene_file import read_scene
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.device import camera_of
+from p2gs_jax.scene.drives.moving import MovingObjects, middle_time
 from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.types import GAMMA_SRGB, Camera, Params, Photometry, Render, Scene
+from p2gs_jax.types import GAMMA_SRGB, Camera, Gaussians, Params, Photometry, Render, Scene
 
 CONFIG_AGAIN = (
     "restore it from a copy; or remove it and repeat the `p2gs-jax fit` that made it, with "
@@ -52,6 +55,8 @@ class Run:
         reference: photographs under one common exposure, or None.
         photometry: `photometry.json`, with what `params` does not hold: standard errors, EXIF,
             exposures fitted to held-out photographs.
+        owner: the moving object that each Gaussian belongs to, -1: none; None: nothing moves.
+        moving: these objects, with their corrected poses.
     """
 
     folder: Path
@@ -60,31 +65,53 @@ class Run:
     scene: Scene
     reference: Path | None
     photometry: PhotometryFile
+    owner: Int[np.ndarray, " n"] | None = None
+    moving: MovingObjects | None = None
 
     @cached_property
     def store(self) -> ImageStore:
         """The photographs, and the cameras at the size of the fit."""
-        return ImageStore(self.scene.views, self.cfg.data)
+        return ImageStore(self.scene.views, self.cfg.data, moving=self.moving)
 
     @cached_property
     def _renderer(self) -> RenderView:
         return make_renderer(self.cfg.render)
 
     def camera(self, index: int) -> Camera:
-        """Return the camera of a view at the size of the fit.
+        """Return the camera of a view at the size of the fit; it sees what moves.
 
         Args:
             index: row in `scene.views`.
         """
         return camera_of(self.store, index)
 
-    def render(self, camera: Camera) -> Render:
+    def render(self, camera: Camera, time: float | None = None) -> Render:
         """Return linear radiance, opacity and depth that a camera sees.
 
         Args:
             camera: of a view, or one's own (`make_camera`).
+            time: seconds; what moves is shown where it was then. None: where the camera says; one's
+                own says nothing and shows nothing that moves.
         """
-        return self._renderer(self.params.gaussians, self.alive, camera)
+        if time is not None and self.moving is not None:
+            placement = self.moving.placement(np.asarray(camera.viewmat), time)
+            camera = replace(camera, objects=placement)
+        return self._renderer(self.params.gaussians, self.alive, camera, self._owner)
+
+    @cached_property
+    def _owner(self) -> Int[Array, " n"] | None:
+        return None if self.owner is None else on_device(self.owner, np.int32)
+
+    def as_of(self, time: float | None = None) -> Gaussians:
+        """Return all Gaussians in world coordinates, for programs that know no motion.
+
+        Args:
+            time: what moves is where it was then, seconds; None: the middle of the drive.
+        """
+        if self.owner is None or self.moving is None:
+            return self.params.gaussians
+        at = middle_time(self.scene) if time is None else time
+        return posed(self.params.gaussians, self.owner, *self.moving.poses(at))
 
     def photograph(self, index: int) -> Float32[np.ndarray, "h w 3"]:
         """Return a photograph at the size of the fit, display values.
@@ -246,6 +273,7 @@ def load_run(folder: str | Path, scene: str | Path | None = None) -> Run:
     saved, asked = _read_config(files.config)
     found = _load_scene(saved, None if scene is None else Path(scene), asked, files.root)
     gaussians = read_ply(files.radiance)
+    owner, moving = read_objects(files.objects, found, gaussians.capacity)
     photometry_file = read_photometry(files.photometry)
     decisions = read_decisions(files.decisions)
     if decisions is None:
@@ -262,6 +290,8 @@ def load_run(folder: str | Path, scene: str | Path | None = None) -> Run:
         found,
         find(saved, "reference", files.root),
         photometry_file,
+        owner,
+        moving,
     )
 
 

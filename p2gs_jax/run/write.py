@@ -18,6 +18,7 @@ from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.formats.ply import write_ply, write_radiance
 from p2gs_jax.formats.png import write_png
 from p2gs_jax.gaussians.bake import bake, display_comments, display_of_splats
+from p2gs_jax.gaussians.posed import posed
 from p2gs_jax.photometry.display import develop
 from p2gs_jax.photometry.mean import MeanParameters, mean_parameters, usual_display
 from p2gs_jax.photometry.metering import Metering
@@ -27,6 +28,7 @@ from p2gs_jax.run.appearance_file import write_appearance
 from p2gs_jax.run.decisions import Decisions, write_decisions
 from p2gs_jax.run.layout import RunFolder
 from p2gs_jax.run.metering_file import write_metering
+from p2gs_jax.run.objects_file import write_objects
 from p2gs_jax.run.photometry_file import (
     ViewPhotometry,
     balance_of,
@@ -37,6 +39,7 @@ from p2gs_jax.run.places import remembered
 from p2gs_jax.run.scene_file import write_scene
 from p2gs_jax.run.summary import write_summary
 from p2gs_jax.scene.device import camera_of
+from p2gs_jax.scene.drives.moving import MovingObjects, middle_time
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Params, Photometry, Scene
 
@@ -76,6 +79,8 @@ def write_results(
     scene: Scene,
     cfg: FitConfig,
     *,
+    owner: np.ndarray | None = None,
+    moving: MovingObjects | None = None,
     fitted: dict[int, float],
     solution: PhotometricSolution | None,
     shown: Sequence[ViewResult],
@@ -89,6 +94,8 @@ def write_results(
         params: live Gaussians and photometry.
         scene: its views.
         cfg: what the fit computed under.
+        owner: the moving object that each Gaussian belongs to, or None.
+        moving: these objects, with their corrected poses.
         fitted: exposures solved for held-out views, by row.
         solution: what the fit started from, or None.
         shown: views of the summary.
@@ -96,7 +103,9 @@ def write_results(
         true_ev: true exposures of the training views for the plot, or None.
     """
     write_scene(folder.root, scene)
-    _write_models(folder, params, cfg)
+    if owner is not None and moving is not None:
+        write_objects(folder.objects, owner, moving, scene)
+    _write_models(folder, params, owner, moving, scene, cfg)
     model, curve, gauge = _photometry_model(params, cfg)
     mean = mean_parameters(params.photometry)
     write_photometry(
@@ -143,11 +152,21 @@ def summary_rows(scene: Scene) -> list[int]:
     return [pool[i] for i in evenly_spaced(len(pool), SUMMARY_VIEWS)]
 
 
-def _write_models(folder: RunFolder, params: Params, cfg: FitConfig) -> None:
+def _write_models(
+    folder: RunFolder,
+    params: Params,
+    owner: np.ndarray | None,
+    moving: MovingObjects | None,
+    scene: Scene,
+    cfg: FitConfig,
+) -> None:
     """Write `splats.ply` (display colours) and `radiance.ply` (linear)."""
     alive = np.ones(params.gaussians.capacity, bool)
     transform = display_of_splats(usual_display(params, (), None, cfg.photometry))
-    shown = bake(params.gaussians, transform, cfg.render.radiance, MAX_DEGREE)
+    placed = params.gaussians
+    if owner is not None and moving is not None:
+        placed = posed(placed, owner, *moving.poses(middle_time(scene)))
+    shown = bake(placed, transform, cfg.render.radiance, MAX_DEGREE)
     write_ply(folder.splats, shown, display_comments(transform))
     write_radiance(folder.radiance, params.gaussians, alive, activation=cfg.render.radiance)
 

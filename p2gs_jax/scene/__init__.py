@@ -12,6 +12,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.scene.colmap import find_model, load_colmap
 from p2gs_jax.scene.drives import read_drive
 from p2gs_jax.scene.drives.assemble import assemble
+from p2gs_jax.scene.drives.kitti_odometry import is_kitti_odometry
 from p2gs_jax.scene.drives.recording import Recording
 from p2gs_jax.scene.exif import read_exif_ev
 from p2gs_jax.scene.files import list_images
@@ -120,7 +121,10 @@ def find_scene(
         return load_colmap(root, model, cfg)
     if (root / "transforms.json").is_file() and cfg.format in (None, "transforms"):
         return load_transforms(root, root / "transforms.json", cfg)
-    if is_rig(root) and cfg.format in (None, "rig"):
+    # SemanticKITTI's sequences have a poses.txt, too.
+    if is_rig(root) and (
+        cfg.format == "rig" or (cfg.format is None and not is_kitti_odometry(root))
+    ):
         return load_rig(root, cfg)
     recording = read_drive(root, cfg, report)
     if recording is not None:

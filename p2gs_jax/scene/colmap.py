@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -125,9 +126,12 @@ def tracks_of(model: Model, views: Sequence[View]) -> Tracks | None:
         at = np.searchsorted(model.point_ids, image.point_ids).clip(max=len(model.point_ids) - 1)
         known = (model.point_ids[at] == image.point_ids) & (np.abs(image.xy) < _HUGE).all(axis=1)
         scale = (view.width / camera.width, view.height / camera.height)
-        positions.append(undistort_points(image.xy[known] * scale, view.K, view.distortion))
-        point_rows.append(at[known])
-        view_rows.append(np.full(int(known.sum()), row))
+        xy = undistort_points(image.xy[known] * scale, view.K, view.distortion)
+        # What a wide lens sees at its sides is in no pinhole picture.
+        seen = np.isfinite(xy).all(axis=1)
+        positions.append(xy[seen])
+        point_rows.append(at[known][seen])
+        view_rows.append(np.full(int(seen.sum()), row))
     if not positions:
         return None
     return Tracks(
@@ -208,8 +212,9 @@ def _viewmat(image: ImageRecord, path: Path) -> Float[np.ndarray, "4 4"]:
 
 
 def _lens(path: Path, camera: CameraRecord) -> tuple[Float[np.ndarray, "3 3"], Distortion | None]:
-    """Return K and distortion; COLMAP's radial and tangential terms are OpenCV's."""
+    """Return K and distortion; COLMAP's terms are OpenCV's."""
     p = camera.params
+    model: Literal["radial", "fisheye"] = "fisheye" if "FISHEYE" in camera.model else "radial"
     match camera.model:
         case "SIMPLE_PINHOLE":
             fx, fy, cx, cy, *lens = p[0], p[0], p[1], p[2]
@@ -219,8 +224,12 @@ def _lens(path: Path, camera: CameraRecord) -> tuple[Float[np.ndarray, "3 3"], D
             fx, fy, cx, cy, *lens = p[0], p[0], p[1], p[2], p[3], 0.0, 0.0, 0.0
         case "RADIAL":
             fx, fy, cx, cy, *lens = p[0], p[0], p[1], p[2], p[3], p[4], 0.0, 0.0
-        case "OPENCV":
+        case "OPENCV" | "FULL_OPENCV" | "OPENCV_FISHEYE":
             fx, fy, cx, cy, *lens = p
+        case "SIMPLE_RADIAL_FISHEYE":
+            fx, fy, cx, cy, *lens = p[0], p[0], p[1], p[2], p[3], 0.0, 0.0, 0.0
+        case "RADIAL_FISHEYE":
+            fx, fy, cx, cy, *lens = p[0], p[0], p[1], p[2], p[3], p[4], 0.0, 0.0
         case _:
             raise unsupported_camera(path, camera.model)
     if not ((np.abs(p) < _HUGE).all() and fx > 0 and fy > 0 and camera.width and camera.height):
@@ -229,4 +238,4 @@ def _lens(path: Path, camera: CameraRecord) -> tuple[Float[np.ndarray, "3 3"], D
             f"impossible parameters {p}",
             fix=_FIX,
         )
-    return intrinsics(fx, fy, cx, cy), make_distortion(tuple(lens))
+    return intrinsics(fx, fy, cx, cy), make_distortion(tuple(lens), model)

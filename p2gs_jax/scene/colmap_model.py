@@ -298,9 +298,10 @@ def _malformed(path: Path, line: int, what: object) -> UserError:
 
 
 def unsupported_camera(path: Path, model: str) -> UserError:
-    """Return the error for a camera model that no pinhole with k1, k2, p1, p2 can express."""
+    """Return the error for a camera model that `Distortion` cannot express."""
     return UserError(
         f"{path} uses the camera model {model}; supported are PINHOLE, SIMPLE_PINHOLE, "
-        "SIMPLE_RADIAL, RADIAL and OPENCV",
+        "SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV, OPENCV_FISHEYE, RADIAL_FISHEYE and "
+        "SIMPLE_RADIAL_FISHEYE",
         fix="run `colmap image_undistorter` and use the folder it writes",
     )

@@ -7,14 +7,21 @@ not depend on where centres lie, so points need no shift; only OpenCV's *rasters
 
 from __future__ import annotations
 
+from typing import Literal, NamedTuple
+
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32
+from numpy.polynomial import Polynomial
 
 from p2gs_jax.types import Distortion
 
-# OpenCV's default, 5 iterations, leaves errors of tenths of a pixel in the corners of wide lenses.
-_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-10)
+# Lenses are inverted by a table of this many angles and Newton steps from there. OpenCV's
+# iteration does not converge for strong rational lenses.
+_TABLE, _POLISHING = 4096, 3
+_MOST_ROUNDS, _SETTLED = 20, 1e-10
+# No picture reaches further from its middle, focal lengths; terms that are smaller there are none.
+_FARTHEST, _NOTHING = 100.0, 1e-9
 
 
 def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, "3 3"]:
@@ -27,13 +34,19 @@ def scale_intrinsics(K: Float[np.ndarray, "3 3"], sx: float, sy: float) -> Float
     return np.diag([sx, sy, 1.0]) @ np.asarray(K, np.float64)
 
 
-def make_distortion(coefficients: tuple[float, ...]) -> Distortion | None:
-    """Return the distortion, or None where every coefficient is zero.
+def make_distortion(
+    coefficients: tuple[float, ...], model: Literal["radial", "fisheye"] = "radial"
+) -> Distortion | None:
+    """Return the distortion, or None where a lens of all zeros is a pinhole.
 
     Args:
-        coefficients: OpenCV's k1, k2, p1, p2[, k3].
+        coefficients: as in `Distortion`.
+        model: which.
     """
-    return Distortion(tuple(map(float, coefficients))) if any(coefficients) else None
+    # A fisheye without coefficients still maps angles, not tangents, to distances.
+    if model == "radial" and not any(coefficients):
+        return None
+    return Distortion(tuple(map(float, coefficients)), model)
 
 
 def undistort_points(
@@ -45,14 +58,35 @@ def undistort_points(
         xy: positions in the photograph, pixels, centres at +0.5.
         K: intrinsics, pixels.
         distortion: the lens, or None.
+
+    Returns:
+        Positions; NaN where no pinhole ray comes: beyond where the lens model is monotonic, and at
+        the sides of a fisheye.
     """
     if distortion is None or len(xy) == 0:
         return np.asarray(xy, np.float32).reshape(-1, 2)
-    points = np.asarray(xy, np.float64).reshape(-1, 1, 2)
-    matrix = np.asarray(K, np.float64)
-    lens = np.array(distortion.coefficients)
-    moved = cv2.undistortPoints(points, matrix, lens, P=matrix, criteria=_CRITERIA)
-    return moved.reshape(-1, 2).astype(np.float32)
+    points = np.asarray(xy, np.float64).reshape(-1, 2)
+    focal, center = np.asarray(K, np.float64)[[0, 1], [0, 1]], np.asarray(K, np.float64)[:2, 2]
+    distorted = (points - center) / focal
+    untilted = distorted
+    if distortion.model == "radial" and any(distortion.coefficients[2:4]):
+        p1, p2 = distortion.coefficients[2:4]
+        # Tangential terms are small: taken off where they were found last, they settle at once.
+        for _ in range(_MOST_ROUNDS):
+            before, (x, y) = untilted, _radially_undone(untilted, distortion, rough=True).T
+            square = x * x + y * y
+            tangential = np.stack(
+                [
+                    2 * p1 * x * y + p2 * (square + 2 * x * x),
+                    p1 * (square + 2 * y * y) + 2 * p2 * x * y,
+                ],
+                axis=1,
+            )
+            untilted = distorted - tangential
+            if np.abs(untilted - before).max() < _SETTLED:
+                break
+    straight = _radially_undone(untilted, distortion)
+    return (straight * focal + center).astype(np.float32)
 
 
 def undistortion_maps(
@@ -72,9 +106,13 @@ def undistortion_maps(
     shifted = np.asarray(K, np.float64).copy()
     shifted[:2, 2] -= 0.5
     lens = np.array(distortion.coefficients)
-    map_x, map_y = cv2.initUndistortRectifyMap(
-        shifted, lens, None, shifted, (width, height), cv2.CV_32FC1
-    )
+    size = (width, height)
+    if distortion.model == "fisheye":
+        map_x, map_y = cv2.fisheye.initUndistortRectifyMap(
+            shifted, lens, np.eye(3), shifted, size, cv2.CV_32FC1
+        )
+    else:
+        map_x, map_y = cv2.initUndistortRectifyMap(shifted, lens, None, shifted, size, cv2.CV_32FC1)
     limit = _fold_radius(distortion)
     if np.isfinite(limit):
         x = (np.arange(width) - shifted[0, 2]) / shifted[0, 0]
@@ -84,10 +122,72 @@ def undistortion_maps(
     return map_x, map_y
 
 
+class _Profile(NamedTuple):
+    """A lens along a radius: n(x) / d(x), of x = r or the angle, and up to which x it grows."""
+
+    n: Polynomial
+    d: Polynomial
+    limit: float
+
+
+def _profile(distortion: Distortion) -> _Profile:
+    x, one = Polynomial([0.0, 1.0]), Polynomial([1.0])
+    if distortion.model == "fisheye":
+        k1, k2, k3, k4 = distortion.coefficients
+        n, d = x * Polynomial([1.0, 0.0, k1, 0.0, k2, 0.0, k3, 0.0, k4]), one
+    else:
+        c = np.zeros(8)
+        c[: len(distortion.coefficients)] = distortion.coefficients
+        n = x * Polynomial([1.0, 0.0, c[0], 0.0, c[1], 0.0, c[4]])
+        d = Polynomial([1.0, 0.0, c[5], 0.0, c[6], 0.0, c[7]])
+    # The slope's sign is that of its numerator; where d vanishes the radius is infinite.
+    return _Profile(n, d, min(_first_root(n.deriv() * d - n * d.deriv()), _first_root(d)))
+
+
+def _first_root(polynomial: Polynomial) -> float:
+    """Return the smallest positive root, infinite where there is none within pictures."""
+    terms = np.array(polynomial.coef, np.float64)
+    scaled = Polynomial(terms * _FARTHEST ** np.arange(len(terms)))
+    roots = np.array(scaled.trim(_NOTHING).roots(), np.complex128) * _FARTHEST
+    found = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
+    first = float(found.min(initial=np.inf))
+    return first if first < _FARTHEST else float("inf")
+
+
 def _fold_radius(distortion: Distortion) -> float:
-    """Return the undistorted radius at which r (1 + k1 r^2 + k2 r^4 + k3 r^6) stops growing."""
-    c = (*distortion.coefficients, 0.0, 0.0, 0.0, 0.0, 0.0)
-    k1, k2, k3 = c[0], c[1], c[4]
-    squares = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
-    squares = squares.real[(np.abs(squares.imag) < 1e-9) & (squares.real > 0)]
-    return float(np.sqrt(squares.min())) if len(squares) else float("inf")
+    """Return the undistorted radius at which the distorted one stops growing."""
+    limit = _profile(distortion).limit
+    if distortion.model == "radial":
+        return limit
+    return float(np.tan(limit)) if limit < np.pi / 2 else float("inf")
+
+
+def _radially_undone(
+    distorted: Float[np.ndarray, "n 2"], distortion: Distortion, *, rough: bool = False
+) -> Float[np.ndarray, "n 2"]:
+    """Return normalised positions without the radial part of a lens.
+
+    Args:
+        distorted: normalised positions.
+        distortion: the lens.
+        rough: as the table has it, and positions without a ray are put at the last one; else
+            exactly, and these are NaN.
+    """
+    n, d, limit = _profile(distortion)
+    fisheye = distortion.model == "fisheye"
+    last = min(limit, np.pi / 2) if fisheye else np.arctan(min(limit, _FARTHEST))
+    table = np.linspace(0.0, last, _TABLE)[:-1]
+    x = table if fisheye else np.tan(table)
+    grown = n(x) / d(x)
+    radius = np.linalg.norm(distorted, axis=1)
+    within = radius <= grown[-1]
+    found = np.interp(radius, grown, x, right=None if rough else np.nan)
+    dn, dd = n.deriv(), d.deriv()
+    for _ in range(0 if rough else _POLISHING):
+        at = found[within]
+        above, below = n(at), d(at)
+        slope = (dn(at) * below - above * dd(at)) / below**2
+        found[within] = at - (above / below - radius[within]) / slope
+    straight = np.tan(found) if fisheye else found
+    ratio = np.divide(straight, radius, out=np.ones_like(radius), where=radius > 0)
+    return distorted * ratio[:, None]

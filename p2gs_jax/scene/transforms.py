@@ -25,6 +25,7 @@ from p2gs_jax.scene.geometry import intrinsics, make_distortion, scale_intrinsic
 from p2gs_jax.types import Distortion, Scene, View
 
 _PINHOLES = frozenset({"PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"})
+_FISHEYE = "OPENCV_FISHEYE"
 _FIX = "correct the file, or write it again with the tool that made it"
 
 
@@ -170,10 +171,11 @@ def _lens(
     path: Path, values: dict, name: str, width: int, height: int
 ) -> tuple[Float[np.ndarray, "3 3"], Distortion | None]:
     model = str(values.get("camera_model", "OPENCV")).upper()
-    if model not in _PINHOLES or values.get("is_fisheye"):
+    fisheye = model == _FISHEYE or bool(values.get("is_fisheye"))
+    if model not in (*_PINHOLES, _FISHEYE):
         raise UserError(
-            f"{path} uses the camera model {'OPENCV_FISHEYE' if model in _PINHOLES else model}; "
-            f"supported are {', '.join(sorted(_PINHOLES))}",
+            f"{path} uses the camera model {model}; "
+            f"supported are {', '.join(sorted((*_PINHOLES, _FISHEYE)))}",
             fix="undistort the images to pinhole ones (colmap image_undistorter) and use those",
         )
 
@@ -190,7 +192,7 @@ def _lens(
     def focal(key: str, angle_key: str, size: int) -> float | None:
         if key in values:
             return number(key, 0.0)
-        if angle_key in values:
+        if angle_key in values and not fisheye:
             return 0.5 * size / math.tan(0.5 * number(angle_key, 0.0) or math.nan)
         return None
 
@@ -202,16 +204,20 @@ def _lens(
         fy = fx
     if fx is None or fy is None or not (fx > 0 and fy > 0):
         raise UserError(
-            f"{path}: no focal length for {name}: it needs a positive fl_x or camera_angle_x",
+            f"{path}: no focal length for {name}: it needs a positive fl_x"
+            + ("" if fisheye else " or camera_angle_x"),
             fix=_FIX,
         )
+    cx, cy = number("cx", width / 2), number("cy", height / 2)
+    if fisheye:
+        lens = tuple(number(key, 0.0) for key in ("k1", "k2", "k3", "k4"))
+        return intrinsics(fx, fy, cx, cy), make_distortion(lens, "fisheye")
     lens = tuple(number(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3"))
     if number("k4", 0.0) != 0.0:
         raise UserError(
             f"{path}: {name} has a k4, which no supported lens model knows",
             fix="undistort the images to pinhole ones (colmap image_undistorter) and use those",
         )
-    cx, cy = number("cx", width / 2), number("cy", height / 2)
     return intrinsics(fx, fy, cx, cy), make_distortion(lens if lens[4] else lens[:4])
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -19,13 +20,14 @@ from p2gs_jax.types import Scene, View
 # Photographs with at least this many pixels along their longer side are not enlarged for SIFT
 # (nerf_fox: 53 s and 12,017 points become 15 s and 5,449); exposures and dense seeds need no more.
 LONG_ENOUGH = 800
+LINKS = "photographs"
 
 
 def triangulate(scene: Scene, work_dir: Path | None, report: Callable[[str], None]) -> Scene:
     """Return the scene with points and tracks; poses and intrinsics stay as they are.
 
     Args:
-        scene: its views' names must be relative to one folder.
+        scene: posed views.
         work_dir: keeps the result under `triangulated/`.
         report: receives progress.
 
@@ -39,8 +41,7 @@ def triangulate(scene: Scene, work_dir: Path | None, report: Callable[[str], Non
         "pycolmap": pycolmap.__version__,
         "files": file_fingerprints([view.image_path for view in views]),
         "cameras": [
-            [view.name, view.viewmat.tolist(), view.K.tolist(), _coefficients(view)]
-            for view in views
+            [view.name, view.viewmat.tolist(), view.K.tolist(), *_lens(view)] for view in views
         ],
     }
 
@@ -69,7 +70,7 @@ def _failed(root: Path) -> UserError:
 def _build(folder: Path, views: Sequence[View], report: Callable[[str], None]) -> None:
     quiet_colmap()
     names = [view.name for view in views]
-    image_folder = _image_folder(views[0])
+    image_folder = _image_folder(views, folder)
     database = folder / "database.db"
     report(f"no seed points: detecting features in {len(views)} images")
     # Intrinsics are held fixed, so it does not matter that every image has its own camera.
@@ -93,6 +94,7 @@ def _build(folder: Path, views: Sequence[View], report: Callable[[str], None]) -
     )
     model.write(folder)
     database.unlink()  # large, and not needed again
+    shutil.rmtree(folder / LINKS, ignore_errors=True)
 
 
 def _set_cameras(database: Path, views: Sequence[View]) -> pycolmap.Reconstruction:
@@ -117,24 +119,41 @@ def _set_cameras(database: Path, views: Sequence[View]) -> pycolmap.Reconstructi
 
 
 def _camera(view: View, camera_id: int) -> pycolmap.Camera:
-    k1, k2, p1, p2, *higher = _coefficients(view)
+    model, coefficients = _lens(view)
     K = view.K.astype(np.float64)
-    params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], k1, k2, p1, p2]
-    if higher:
-        params += [*higher, 0.0, 0.0, 0.0]
     return pycolmap.Camera(
         camera_id=camera_id,
-        model="FULL_OPENCV" if higher else "OPENCV",
+        model=model,
         width=view.width,
         height=view.height,
-        params=params,
+        params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2], *coefficients],
         has_prior_focal_length=True,
     )
 
 
-def _coefficients(view: View) -> tuple[float, ...]:
-    return view.distortion.coefficients if view.distortion else (0.0, 0.0, 0.0, 0.0)
+def _lens(view: View) -> tuple[str, tuple[float, ...]]:
+    """Return COLMAP's name of the lens model, and as many coefficients as it has."""
+    if view.distortion is None:
+        return "OPENCV", (0.0,) * 4
+    held = view.distortion.coefficients
+    if view.distortion.model == "fisheye":
+        return "OPENCV_FISHEYE", held
+    if len(held) == 4:
+        return "OPENCV", held
+    return "FULL_OPENCV", (*held, 0.0, 0.0, 0.0)[:8]
 
 
-def _image_folder(view: View) -> Path:
-    return Path(str(view.image_path)[: -len(view.name)] or ".")
+def _image_folder(views: Sequence[View], folder: Path) -> Path:
+    """Return the folder that the names of photographs are relative to.
+
+    Where there is none (KITTI's `image_02/data` belongs to camera `image_02`), one of links is
+    made.
+    """
+    before = {str(view.image_path).removesuffix(view.name) for view in views}
+    if len(before) == 1:
+        return Path(before.pop() or ".")
+    for view in views:
+        link = folder / LINKS / view.name
+        link.parent.mkdir(parents=True, exist_ok=True)
+        link.symlink_to(view.image_path.resolve())
+    return folder / LINKS

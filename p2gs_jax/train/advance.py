@@ -22,6 +22,7 @@ from p2gs_jax.losses.regularizers import population_terms
 from p2gs_jax.render.blocks import splat
 from p2gs_jax.render.spherical_harmonics import coefficient_count
 from p2gs_jax.train.image_gradient import ImageGradient, differentiable
+from p2gs_jax.train.object_poses import move_poses, placed_by, seen_by
 from p2gs_jax.train.optimizer import Optimizer, OptState, learning_rates, means_rate
 from p2gs_jax.train.state import FAULT_NONE, FAULT_NONFINITE, FAULT_OVERFLOW, Fault, FitState
 from p2gs_jax.train.update import update_listed
@@ -75,6 +76,7 @@ def finite_names(terms: dict, params: Params) -> tuple[str, ...]:
     given = {
         "gradient of white balances": params.photometry.raw_white_balance,
         "gradient of appearance": params.appearance,
+        "gradient of object poses": params.poses,
     }
     rest = (name for name, value in given.items() if value is not None)
     return (*(f"loss term {k}" for k in terms), *GRADIENT_NAMES, *rest)
@@ -125,8 +127,8 @@ def advance(
         count,
         healthy,
         bands=bands,
-        seen=lambda block, on: differentiable(
-            splat(block, on, frusta, cfg.render, controls.active_degree)
+        seen=lambda block, on, owner, placed: differentiable(
+            splat(block, on, seen_by(frusta, placed), cfg.render, controls.active_degree, owner)
         ),
         v_seen=gradient.v_shown,
         own=lambda block, on: population_terms(block, on, cfg, extent, listed),
@@ -134,6 +136,17 @@ def advance(
         rates=rates.gaussians,
         key=noise_key(cfg.train.seed, state.step),
         noise_rate=cfg.densify.noise * means_rate(controls.progress, extent, cfg) if mcmc else None,
+        owner=population.owner,
+        placed=placed_by(frusta, state.params.poses),
+    )
+    objects = move_poses(
+        state.params.poses,
+        state.opt_state.poses,
+        updated.v_placed,
+        frusta,
+        optimizer.gaussians,
+        rates.poses,
+        cfg.loss.regularizers,
     )
     old_rest = (state.params.photometry, state.params.appearance)
     rest, rest_moments = _rest_updated(
@@ -149,11 +162,14 @@ def advance(
         population = _observed(population, where, gradient, frusta[0])
 
     # In the order of `finite_names`.
-    terms = gradient.terms | updated.value
+    own = updated.value | objects.terms
+    terms = gradient.terms | own
     v_photometry, v_appearance = gradient.v_rest
     checked = [_finite(terms), updated.finite, _finite(v_photometry)]
     if v_appearance is not None:
         checked.append(jnp.all(_finite(v_appearance))[None])
+    if objects.finite is not None:
+        checked.append(objects.finite)
     checked = jnp.concatenate(checked)
     broken = FAULT_NONFINITE * ~jnp.all(checked)
     kind = jnp.where(fits, broken, FAULT_OVERFLOW).astype(jnp.int32)
@@ -163,19 +179,19 @@ def advance(
         Fault(kind, gradient.entries, count, term),
         state.fault,
     )
-    rest, rest_moments = jax.tree.map(
+    (photometry, appearance), rest_moments, poses, pose_moments = jax.tree.map(
         lambda new, old: jnp.where(healthy, new, old),
-        (rest, rest_moments),
-        (old_rest, state.opt_state.rest),
+        (rest, rest_moments, objects.poses, objects.moments),
+        (old_rest, state.opt_state.rest, state.params.poses, state.opt_state.poses),
     )
     state = FitState(
-        Params(updated.gaussians, *rest),
-        OptState((updated.moments, optax.EmptyState()), rest_moments),
+        Params(updated.gaussians, photometry, appearance, poses),
+        OptState((updated.moments, optax.EmptyState()), rest_moments, pose_moments),
         population,
         state.step + (fault.kind == FAULT_NONE),
         fault,
     )
-    loss = jax.tree.reduce(jnp.add, updated.value, gradient.loss)
+    loss = jax.tree.reduce(jnp.add, own, gradient.loss)
     return state, StepReport(loss, terms, gradient.psnr, gradient.entries, count)
 
 

@@ -13,6 +13,7 @@ from p2gs_jax.config import FitConfig, RenderConfig
 from p2gs_jax.losses.total import Partner, decoded, image_loss
 from p2gs_jax.photometry.appearance import Corrections
 from p2gs_jax.render.blocks import Shown, splat_listed, whole_blocks
+from p2gs_jax.render.objects import camera_of_each, with_corrections
 from p2gs_jax.render.spherical_harmonics import coefficient_count
 from p2gs_jax.render.visible import compact, in_view
 from p2gs_jax.types import Batch, Frustum, Gaussians, Photometry
@@ -61,6 +62,8 @@ def show(
     alive: Bool[Array, " n"],
     frusta: tuple[Frustum, ...],
     active_degree: Int[Array, ""],
+    owner: Int[Array, " n"] | None = None,
+    poses: Float[Array, "t k 6"] | None = None,
     *,
     cfg: RenderConfig,
     visible_only: bool,
@@ -74,20 +77,24 @@ def show(
         alive: slots in use.
         frusta: the views.
         active_degree: spherical-harmonics degree in use.
+        owner: the moving object that each Gaussian belongs to, or None.
+        poses: corrections of the objects' poses, or None.
         cfg: rendering options.
         visible_only: leave out what no view may show (`OptimizerConfig.visible_only`).
         room: length of the list; what finds no place is counted, not listed.
         degree: highest spherical-harmonics degree that is evaluated.
     """
     n = gaussians.capacity
+    frusta = with_corrections(frusta, poses)
     if visible_only:
-        may = functools.reduce(jnp.logical_or, (in_view(gaussians, alive, f, cfg) for f in frusta))
+        views = (camera_of_each(f, owner) for f in frusta)
+        may = functools.reduce(jnp.logical_or, (in_view(gaussians, alive, v, cfg) for v in views))
         ids, count = compact(may, whole_blocks(min(room, n)))
     else:
         index = jnp.arange(whole_blocks(n), dtype=jnp.int32)
         ids, count = jnp.minimum(index, n), jnp.int32(n)
     bands = coefficient_count(degree)
-    shown = splat_listed(gaussians, alive, ids, count, frusta, cfg, active_degree, bands)
+    shown = splat_listed(gaussians, alive, ids, count, frusta, cfg, active_degree, bands, owner)
     return Listed(ids, count, shown)
 
 

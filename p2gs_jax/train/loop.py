@@ -133,6 +133,7 @@ class Trainer:
         self,
         params: Params,
         alive,
+        owner=None,
         *,
         resume: bool = False,
         spent_s: float = 0.0,
@@ -143,6 +144,7 @@ class Trainer:
         Args:
             params: initial parameters.
             alive: which Gaussians exist.
+            owner: the moving object that each belongs to, or None.
             resume: continue from the newest checkpoint, if there is one.
             spent_s: seconds of a time budget that are gone.
             finish_s: seconds of it to leave for what follows, on an unloaded machine.
@@ -152,7 +154,7 @@ class Trainer:
             UserError: no Gaussian is left, or checkpoints cannot be continued from.
         """
         strategy = make_strategy(self.context, int(np.sum(np.asarray(alive))))
-        state = initial_state(params, alive, self.optimizer, strategy.slots)
+        state = initial_state(params, alive, self.optimizer, strategy.slots, owner)
         pace = Pace.from_config(self.cfg.train, spent_s + finish_s)
         host = HostState(pace=pace.per_step)
         restored = self.checkpoints.restore(state) if resume else None
@@ -165,7 +167,8 @@ class Trainer:
         strategy.begin(host)
         full_step_s = STEP_SECONDS_PER_PIXEL * self.coverage.pixels
         session = Session(pace, host, finish_s=finish_s, full_step_s=full_step_s)
-        self._allocate(state.params.gaussians, state.population.alive, host, strategy)
+        population = state.population
+        self._allocate(state.params.gaussians, population.alive, population.owner, host, strategy)
         self._expect(state, host, strategy)
         state, host = self._loop(state, host, session, strategy)
         strategy.end(state, host)
@@ -178,20 +181,21 @@ class Trainer:
             {"compiling": self.programs.waited_s, **self.clock.seconds},
         )
 
-    def expect(self, params: Params, images: bool) -> None:
+    def expect(self, params: Params, owner, images: bool) -> None:
         """Begin to compile the steps of a run before its colours and exposures are known.
 
         Args:
             params: as the run will have them, as far as they are known.
+            owner: see `run`.
             images: the tone curve is known.
         """
         seeds = params.gaussians.capacity
         strategy = make_strategy(self.context, seeds)
         alive, host = np.ones(seeds, bool), HostState(rooms=dict(self.programs.rooms))
-        self._allocate(params.gaussians, alive, host, strategy)
+        self._allocate(params.gaussians, alive, owner, host, strategy)
         self.programs.rooms = dict(host.rooms)
         start = functools.partial(initial_state, optimizer=self.optimizer, slots=strategy.slots)
-        self._expect(jax.eval_shape(start, params, alive), host, strategy, images)
+        self._expect(jax.eval_shape(start, params, alive, owner=owner), host, strategy, images)
 
     def _loop(
         self, state: FitState, host: HostState, session: Session, strategy: Strategy
@@ -231,7 +235,7 @@ class Trainer:
             self.checkpoints.save(state, host)
 
     def _allocate(
-        self, gaussians: Gaussians, alive: Bool, host: HostState, strategy: Strategy
+        self, gaussians: Gaussians, alive: Bool, owner, host: HostState, strategy: Strategy
     ) -> None:
         """Make room for the image sizes to come."""
         host.rooms = room.allocate(
@@ -243,6 +247,7 @@ class Trainer:
             alive,
             strategy.most,
             self.cfg.render,
+            owner,
         )
 
     def _expect(

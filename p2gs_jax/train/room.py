@@ -9,13 +9,14 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.render.capacity import Room
 from p2gs_jax.render.cutoff import smallest_cutoff
+from p2gs_jax.render.objects import camera_of_each
 from p2gs_jax.render.project import LOG_SCALE_RANGE, TANGENT_LIMIT
 from p2gs_jax.render.visible import in_view
 from p2gs_jax.train.views import TrainingViews
@@ -26,7 +27,11 @@ SAMPLED_VIEWS = 32
 
 
 def count_view(
-    gaussians: Gaussians, alive: Bool[np.ndarray, " n"], camera: Camera, cfg: RenderConfig
+    gaussians: Gaussians,
+    alive: Bool[np.ndarray, " n"],
+    camera: Camera,
+    cfg: RenderConfig,
+    owner: Int[np.ndarray, " n"] | None = None,
 ) -> tuple[int, int]:
     """Return (tile-list entries, visible Gaussians) that a view needs at most, up to rounding.
 
@@ -37,11 +42,19 @@ def count_view(
         alive: slots in use.
         camera: the view, on the host.
         cfg: near plane, blur, cutoffs, tile size.
+        owner: the moving object that each Gaussian belongs to, or None.
     """
+    camera = camera_of_each(camera, owner)  # pyright: ignore[reportArgumentType]
     seen = in_view(gaussians, alive, camera, cfg)  # pyright: ignore[reportArgumentType]
     shown = jax.tree.map(lambda a: a[seen], gaussians)
-    R, t = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
-    x, y, z = (shown.means @ R.T + t).T
+    viewmat = np.asarray(camera.viewmat)
+    R, t = viewmat[:3, :3], viewmat[:3, 3]
+    if owner is None:
+        local = shown.means @ R.T + t
+    else:
+        R, t = np.moveaxis(R[..., seen], -1, 0), t[..., seen].T
+        local = np.einsum("nij,nj->ni", R, shown.means) + t
+    x, y, z = local.T
     axes = R @ rotations(shown.quats)
     axes *= np.exp(np.clip(shown.log_scales, *LOG_SCALE_RANGE))[:, None]
     reach = -np.logaddexp(0, -shown.opacity_logits) - np.log(smallest_cutoff(cfg))
@@ -72,6 +85,7 @@ def room_for(
     cameras: Sequence[Camera],
     limit: int,
     cfg: RenderConfig,
+    owner: Int[np.ndarray, " n"] | None = None,
 ) -> Room:
     """Return room for all views of one image size, to the end of a run.
 
@@ -81,9 +95,10 @@ def room_for(
         cameras: the views, on the host; some of them are counted.
         limit: the largest population to come; the share that a view shows is taken to stay.
         cfg: see `count_view`.
+        owner: likewise.
     """
     picks = evenly_spaced(len(cameras), SAMPLED_VIEWS)
-    counts = [count_view(gaussians, alive, cameras[i], cfg) for i in picks]
+    counts = [count_view(gaussians, alive, cameras[i], cfg, owner) for i in picks]
     entries, visible = (max(c[k] for c in counts) for k in (0, 1))
     growth = max(max(limit, 1) / max(int(alive.sum()), 1), 1.0)
     return Room.allocate(entries, visible, growth, limit)
@@ -116,6 +131,7 @@ def allocate(
     alive: Bool[np.ndarray, " n"],
     limit: int,
     cfg: RenderConfig,
+    owner: Int[np.ndarray, " n"] | None = None,
 ) -> Rooms:
     """Return rooms for every image size to come.
 
@@ -128,14 +144,15 @@ def allocate(
         alive: slots in use.
         limit: the largest population to come.
         cfg: see `count_view`.
+        owner: likewise.
     """
     found = dict(rooms)
-    gaussians, alive = jax.tree.map(np.asarray, gaussians), np.asarray(alive)
+    gaussians, alive, owner = jax.tree.map(np.asarray, (gaussians, alive, owner))
     for shrink in shrinks:
         for size, cameras in cameras_by_size(views, shrink).items():
             name = size_name(size)
             if name not in found:
-                room = room_for(gaussians, alive, cameras, limit, cfg)
+                room = room_for(gaussians, alive, cameras, limit, cfg, owner)
                 made = begun.get(name, room)
                 found[name] = made if made.holds(room) else room
     return _sharing_visible(found)

@@ -10,7 +10,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
-from p2gs_jax.gaussians.population import empty_gaussians, fresh_population, grow
+from p2gs_jax.gaussians.population import (
+    empty_gaussians,
+    empty_population,
+    fresh_population,
+    grow,
+)
 from p2gs_jax.train.optimizer import Optimizer, OptState, grow_moments
 from p2gs_jax.types import Gaussians, Params, Population
 
@@ -56,7 +61,13 @@ class FitState(eqx.Module):
     fault: Fault
 
 
-def initial_state(params: Params, alive: Array, optimizer: Optimizer, slots: int = 0) -> FitState:
+def initial_state(
+    params: Params,
+    alive: Array,
+    optimizer: Optimizer,
+    slots: int = 0,
+    owner: Int[Array, " n"] | None = None,
+) -> FitState:
     """Return the state before the first step.
 
     Args:
@@ -64,16 +75,22 @@ def initial_state(params: Params, alive: Array, optimizer: Optimizer, slots: int
         alive: which Gaussians exist.
         optimizer: from `make_optimizer`.
         slots: room of the population, at least what `params` holds.
+        owner: the moving object that each Gaussian belongs to, or None.
     """
     # The step donates its state: the caller keeps its parameters.
-    return jax.tree.map(jnp.asarray, _initial_state(params, alive, optimizer, slots))
+    return jax.tree.map(jnp.asarray, _initial_state(params, alive, optimizer, slots, owner))
 
 
 @functools.partial(jax.jit, static_argnames=("optimizer", "slots"))
-def _initial_state(params: Params, alive: Array, optimizer: Optimizer, slots: int) -> FitState:
-    state = FitState(
-        params, optimizer.init(params), fresh_population(alive), jnp.int32(0), Fault.none()
-    )
+def _initial_state(
+    params: Params,
+    alive: Array,
+    optimizer: Optimizer,
+    slots: int,
+    owner: Int[Array, " n"] | None,
+) -> FitState:
+    population = fresh_population(alive, owner)
+    state = FitState(params, optimizer.init(params), population, jnp.int32(0), Fault.none())
     return grow_state(state, slots)
 
 
@@ -96,7 +113,7 @@ def grow_state(state: FitState, capacity: int) -> FitState:
         state,
         params=dataclasses.replace(state.params, gaussians=grow(gaussians, empty)),
         opt_state=grow_moments(state.opt_state, empty),
-        population=grow(state.population, fresh_population(jnp.zeros(extra, bool))),
+        population=grow(state.population, empty_population(extra, state.population)),
     )
 
 

@@ -85,7 +85,7 @@ class Step:
 
         def step(state: FitState, batch: Batch, partner: Partner, controls: Controls):
             params, frusta = state.params, self._frusta(batch, partner)
-            listed = show(params.gaussians, state.population.alive, frusta, controls.active_degree)
+            listed = show(*_per_gaussian(state, frusta, controls))
             gradient = differentiate(
                 listed.shown, params.photometry, params.appearance, batch, partner
             )
@@ -130,7 +130,7 @@ class Step:
         program = {name: _compiled(name) for name in PARTS}
         static = {name: self._static(name, room, degree) for name in PARTS}
         params, frusta = state.params, self._frusta(batch, partner)
-        per_gaussian = (params.gaussians, state.population.alive, frusta, controls.active_degree)
+        per_gaussian = _per_gaussian(state, frusta, controls)
         if name == "show":
             return program[name].lower(*per_gaussian, **static[name])
         listed = program["show"].eval_shape(*per_gaussian, **static["show"])
@@ -153,9 +153,16 @@ class Step:
     def _frusta(self, batch: Batch, partner: Partner) -> tuple[Frustum, ...]:
         """Return the views of a step, for the programs that know no image size."""
         return tuple(
-            on_host(Frustum, c.viewmat, c.K, np.float32(c.width), np.float32(c.height))
+            on_host(Frustum, c.viewmat, c.K, np.float32(c.width), np.float32(c.height), c.objects)
             for c in (batch.camera, *partner_cameras(partner, self.cfg))
         )
+
+
+def _per_gaussian(state: FitState, frusta: tuple[Frustum, ...], controls: Controls) -> tuple:
+    """Return the arguments of `show`."""
+    params, population = state.params, state.population
+    degree = controls.active_degree
+    return params.gaussians, population.alive, frusta, degree, population.owner, params.poses
 
 
 def compilations() -> int:

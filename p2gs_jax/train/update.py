@@ -17,7 +17,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from p2gs_jax.gaussians.mcmc import exploration_noise
-from p2gs_jax.render.blocks import block_size, put_rows, slice_of, take_rows
+from p2gs_jax.render.blocks import block_size, owners_at, put_rows, slice_of, take_rows
 from p2gs_jax.train.optimizer import AdamState
 from p2gs_jax.types import Gaussians
 
@@ -30,12 +30,14 @@ class Updated(NamedTuple):
         moments: likewise.
         value: of the loss that belongs to the Gaussians, summed over the blocks.
         finite: whether the gradient of each field is finite, in the order of `Gaussians`.
+        v_placed: gradient of the loss by `placed`, summed over the blocks.
     """
 
     gaussians: Gaussians
     moments: AdamState
     value: Any
     finite: Bool[Array, " 5"]
+    v_placed: Any
 
 
 def update_listed(
@@ -54,6 +56,8 @@ def update_listed(
     rates: Gaussians,
     key: Array,
     noise_rate: Float[Array, ""] | None,
+    owner: Int[Array, " n"] | None = None,
+    placed: Any = None,
 ) -> Updated:
     """Move the listed Gaussians by one step.
 
@@ -65,7 +69,8 @@ def update_listed(
         count: how many are listed.
         healthy: otherwise nothing is written.
         bands: spherical-harmonics coefficients that are looked at and moved.
-        seen: (Gaussians, alive) of a block -> what the image is made of, per Gaussian.
+        seen: (Gaussians, alive, owner) of a block and `placed` -> what the image is made of, per
+            Gaussian.
         v_seen: gradient of the loss to that, for the whole list.
         own: (Gaussians, alive) of a block -> the block's share of the loss terms on the Gaussians
             themselves, as a dictionary.
@@ -73,21 +78,24 @@ def update_listed(
         rates: learning rates.
         key: for the noise.
         noise_rate: scale of the noise on the means, or None for none.
+        owner: the moving object that each Gaussian belongs to, or None.
+        placed: what else `seen` depends on and a gradient is wanted of, or None.
     """
     n, size = gaussians.capacity, block_size(ids.shape[0])
 
     def body(k, state: Updated) -> Updated:
         here = slice_of(ids, k, size)
         shown = alive.at[here].get(mode="fill", fill_value=False)
+        mine = owners_at(owner, here)
         old = take_rows(state.gaussians, here, bands)
 
-        def objective(block):
+        def objective(block, placed):
             terms = own(block, shown)
             total = jax.tree.reduce(jnp.add, terms, jnp.float32(0))
-            return (seen(block, shown), total), terms
+            return (seen(block, shown, mine, placed), total), terms
 
-        _, pull, terms = jax.vjp(objective, old, has_aux=True)
-        (grads,) = pull((slice_of(v_seen, k, size), jnp.float32(1)))
+        _, pull, terms = jax.vjp(objective, old, placed, has_aux=True)
+        grads, v_placed = pull((slice_of(v_seen, k, size), jnp.float32(1)))
         finite = jnp.stack([jnp.all(jnp.isfinite(g)) for g in jax.tree.leaves(grads)])
         adam = AdamState(
             state.moments.counts.at[here].get(mode="clip"),
@@ -113,6 +121,7 @@ def update_listed(
             ),
             jax.tree.map(jnp.add, state.value, terms),
             state.finite & finite,
+            jax.tree.map(jnp.add, state.v_placed, v_placed),
         )
 
     values = jax.eval_shape(
@@ -125,6 +134,7 @@ def update_listed(
         moments,
         jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), values),
         jnp.ones(len(jax.tree.leaves(gaussians)), bool),
+        jax.tree.map(jnp.zeros_like, placed),
     )
     used = jnp.minimum(count, ids.shape[0])
     return lax.fori_loop(0, -(-used // size), body, start)

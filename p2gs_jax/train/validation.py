@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 
 import jax
 import numpy as np
-from jaxtyping import Array, Bool
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
@@ -16,14 +15,15 @@ from p2gs_jax.evaluate.metrics import psnr
 from p2gs_jax.photometry.display import develop, display_of_view
 from p2gs_jax.photometry.mean import usual_display
 from p2gs_jax.render.host import make_renderer
+from p2gs_jax.render.objects import with_corrections
 from p2gs_jax.train.views import TrainingViews
-from p2gs_jax.types import Params
+from p2gs_jax.types import Params, Population
 
 FEWEST_VIEWS = 8
 VIEWS_PER_PICK = 12
 FEWEST_PICKS, MOST_PICKS = 2, 8
 
-Judge = Callable[[Params, Bool[Array, " n"]], float]
+Judge = Callable[[Params, Population], float]
 
 
 def pick_validation(cameras: Sequence[str]) -> tuple[int, ...]:
@@ -80,13 +80,14 @@ def make_judge(
     """
     render, tone = make_renderer(cfg.render), cfg.photometry
 
-    def judge(params: Params, alive: Bool[Array, " n"]) -> float:
+    def judge(params: Params, population: Population) -> float:
         small = jax.tree.map(np.asarray, dataclasses.replace(params, gaussians=None))
         taken_by = [views.store.views[i].camera for i in views.rows]
         scores = []
         for row in rows:
             photograph, mask = views.store.get(views.rows[row])
-            linear = render(params.gaussians, alive, views.camera(row, 1)).linear
+            (camera,) = with_corrections((views.camera(row, 1),), params.poses)
+            linear = render(params.gaussians, population.alive, camera, population.owner).linear
             transform = usual_display(small, taken_by, taken_by[row], tone)
             if own_exposures:
                 own = display_of_view(small, row, tone)

@@ -81,7 +81,8 @@ class TrainingViews:
 
     def camera(self, index: int, shrink: int) -> Camera:
         """Return the camera of a training view at a level, on the host."""
-        return on_host(Camera, *self.store.camera(self.rows[index], shrink))
+        row = self.rows[index]
+        return on_host(Camera, *self.store.camera(row, shrink), self.store.placement(row))
 
     def batch(self, index: int, shrink: int) -> Batch:
         """Return a training view, on the host: a compiled step takes it from there."""

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from p2gs_jax.core.numerics import LN2, evenly_spaced
+from p2gs_jax.core.numerics import LN2, evenly_spaced, on_device
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.cameras import darkens
 from p2gs_jax.photometry.display import develop
@@ -63,14 +63,17 @@ class ViewedRun:
         self._thumbnails: dict[int, UInt8[np.ndarray, "h w 3"]] = {}
         self._distances: dict[int, float] = {}
         self.store = run.store
+        # The programs of a viewer know no time.
+        self._gaussians = run.as_of()
+        self._alive = on_device(np.ones(self._gaussians.capacity), bool)
         self._points = run.scene.points
         if not len(self._points):
-            self._points = np.asarray(run.params.gaussians.means)
+            self._points = np.asarray(self._gaussians.means)
         self.space = make_viewer_space(run.scene, self._points)
         rows = evenly_spaced(len(run.scene.views), PROBES)
         self.programs = Programs(
-            run.params.gaussians,
-            run.alive,
+            self._gaussians,
+            self._alive,
             run.cfg.render,
             [self._probe(int(row)) for row in rows],
             self._notify,
@@ -204,8 +207,8 @@ class ViewedRun:
         run = self.run
         middle = np.mean([camera_center(view.viewmat) for view in run.scene.views], axis=0)
         return browser_splats(
-            run.params.gaussians,
-            np.asarray(run.alive),
+            self._gaussians,
+            np.asarray(self._alive),
             run.cfg.render,
             seen_from=middle,
             unit=self.space.unit,

@@ -239,3 +239,45 @@ def test_noise_reaches_only_the_transparent_and_has_their_shape():
     solid = dataclasses.replace(g, opacity_logits=jnp.full((2000,), 2.0))
     quiet = exploration_noise(jax.random.key(0), solid, alive, jnp.float32(1.0))
     assert float(jnp.abs(quiet).max()) < 1e-6
+
+
+def owned(g, alive):
+    """Return a population whose Gaussians belong to objects, in turn."""
+    owner = np.where(np.asarray(alive), np.arange(g.capacity) % 4 - 1, -1)
+    return fresh_population(jnp.asarray(alive), jnp.asarray(owner, jnp.int32)), owner
+
+
+def test_relocated_and_newborn_gaussians_belong_to_what_their_parents_did():
+    """Colours tell who the parent was: each object has its own."""
+    n = 120
+    g = made(n)
+    alive = np.arange(n) < 90
+    population, owner = owned(g, alive)
+    sh = jnp.asarray(np.where(alive, owner, -9), jnp.float32)[:, None, None] * jnp.ones((1, 1, 3))
+    opacity = jnp.where(jnp.arange(n) % 5 == 0, -9.0, 2.0)
+    g = dataclasses.replace(g, sh=sh, opacity_logits=opacity)
+    outcome = relocate_and_grow(jax.random.key(0), g, population, jnp.int32(20), CFG)
+    living = np.asarray(outcome.population.alive)
+    assert living.sum() == 110
+    got = np.asarray(outcome.population.owner)
+    np.testing.assert_array_equal(got[living], np.asarray(outcome.gaussians.sh)[living, 0, 0])
+    moved = np.asarray(outcome.reset_moments)
+    assert (got[moved] >= 0).any()
+
+
+def test_clones_and_splits_belong_to_what_their_parents_did():
+    n = 60
+    g = made(n)
+    alive = np.arange(n) < 30
+    population, owner = owned(g, alive)
+    sh = jnp.asarray(np.where(alive, owner, -9), jnp.float32)[:, None, None] * jnp.ones((1, 1, 3))
+    g = dataclasses.replace(g, sh=sh)
+    hot = jnp.asarray(alive & (np.arange(n) % 3 == 0))
+    clone = hot & (jnp.arange(n) % 2 == 0)
+    none = jnp.zeros(n, bool)
+    proposal = adaptive.Proposal(none, clone, hot & ~clone, jnp.int32(40))
+    outcome = apply(jax.random.key(0), g, population, proposal)
+    living = np.asarray(outcome.population.alive)
+    assert living.sum() == 40
+    got = np.asarray(outcome.population.owner)
+    np.testing.assert_array_equal(got[living], np.asarray(outcome.gaussians.sh)[living, 0, 0])

@@ -118,8 +118,8 @@ SINGULAR = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1]]
         ({"w": "wide"}, "impossible size"),
         ({"cx": float("nan")}, "cx of a.png is nan"),
         ({"k4": 0.1}, "k4"),
-        ({"camera_model": "OPENCV_FISHEYE"}, "camera model OPENCV_FISHEYE"),
-        ({"is_fisheye": True}, "camera model OPENCV_FISHEYE"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "camera model EQUIRECTANGULAR"),
+        ({"is_fisheye": True, "fl_x": 0, "camera_angle_x": 2.0}, "it needs a positive fl_x\n"),
     ],
 )
 def test_broken_files(tmp_path, change, message):

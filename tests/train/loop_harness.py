@@ -156,7 +156,9 @@ class Harness:
         for module in (burst, loop, session):
             monkeypatch.setattr(module, "time", stopped)
         monkeypatch.setattr(checkpoints, "CheckpointStore", lambda folder: self.checkpoints)
-        monkeypatch.setattr(loop, "initial_state", lambda p, a, o, slots: state_of(SEEDS, slots))
+        monkeypatch.setattr(
+            loop, "initial_state", lambda p, a, o, slots, owner: state_of(SEEDS, slots)
+        )
         monkeypatch.setattr(automatic, "grow_state", self._grown)
         monkeypatch.setattr(mcmc.Mcmc, "relocated", self._relocated)
         # Copies and sums on the host compile nothing.

@@ -42,6 +42,7 @@ def run(options: Eval) -> int:
             store,
             make_renderer(fitted.cfg.render),
             fitted.cfg,
+            owner=fitted.owner,
             reference=truth,
             radiance=find_radiance(fitted.scene, store),
             lpips_weights=weights,

@@ -145,10 +145,10 @@ def _check_names(fitted: Run, formats: Sequence[Format]) -> None:
 
 
 def _linear_ply(folder: Path, fitted: Run, store: ImageStore) -> str:
-    g = fitted.params.gaussians
+    g = fitted.as_of()
     ply, sidecar = (folder / place for place in PLACES["linear-ply"])
     activation = fitted.cfg.render.radiance
-    count = write_radiance(ply, g, np.asarray(fitted.alive), activation=activation)
+    count = write_radiance(ply, g, np.ones(g.capacity, bool), activation=activation)
     content = linear_sidecar(g, fitted.cfg, fitted.scene, store, fitted.photometry)
     write_json(sidecar, content)
     kind = fitted.cfg.photometry.appearance
@@ -172,11 +172,11 @@ def _colmap(folder: Path, fitted: Run, store: ImageStore, reporter: Reporter) ->
 
 
 def _exr(folder: Path, fitted: Run, store: ImageStore, reporter: Reporter) -> str:
-    render, views = make_renderer(fitted.cfg.render), fitted.scene.views
+    views = fitted.scene.views
     with atomic_folder(folder / PLACES["exr"][0]) as temporary:
         for index, view in enumerate(views):
             camera, transform = camera_of(store, index), fitted.own_display(index)
-            result = render(fitted.params.gaussians, fitted.alive, camera)
+            result = fitted.render(camera)
             write_exr(
                 (temporary / view.name).with_suffix(".exr"),
                 np.asarray(result.linear),
@@ -224,7 +224,7 @@ class _Display:
         reporter: Reporter,
     ):
         self.fitted, self.transform, self.reporter = fitted, transform, reporter
-        scene = fitted.scene
+        self.gaussians, scene = fitted.as_of(), fitted.scene
         self.steps = max(STEPS, len(scene.train_indices)) if steps is None else steps
         self.baked: dict[int, Gaussians] = {}
         render = make_renderer(fitted.cfg.render)
@@ -234,7 +234,7 @@ class _Display:
         for done, index in enumerate(rows):
             self.targets[index] = true_target(
                 scene.views[index].name,
-                fitted.params.gaussians,
+                self.gaussians,
                 camera_of(store, index),
                 transform,
                 render,
@@ -261,7 +261,7 @@ class _Display:
             sidecar,
             {
                 "file": path.name,
-                "gaussians": self.fitted.params.gaussians.capacity,
+                "gaussians": self.gaussians.capacity,
                 "exposure": self.transform.exposure,
                 "exposure_ev_from_mean": float(
                     np.log2(self.transform.exposure / self.fitted.mean.exposure_geometric)
@@ -276,10 +276,10 @@ class _Display:
                 "baking_error": error,
             },
         )
-        return "; ".join([f"{self.fitted.params.gaussians.capacity} Gaussians", *_sentences(error)])
+        return "; ".join([f"{self.gaussians.capacity} Gaussians", *_sentences(error)])
 
     def _bake(self, degree: int) -> Gaussians:
-        cfg, g = self.fitted.cfg, self.fitted.params.gaussians
+        cfg, g = self.fitted.cfg, self.gaussians
         if degree not in self.baked:
             self.reporter.stage("Baking")
             start = bake(g, self.transform, cfg.render.radiance, degree)

@@ -24,10 +24,12 @@ from jaxtyping import Float, Float64
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
+from p2gs_jax.scene.drives.choose import chosen_drive
 from p2gs_jax.scene.drives.objects import tracked
 from p2gs_jax.scene.drives.pickled_tables import read_table
 from p2gs_jax.scene.drives.poses import from_quaternion, inverse
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sweep, SweepPoints
+from p2gs_jax.scene.drives.spin import turned
 from p2gs_jax.scene.drives.tables import (
     finite_numbers,
     missing_file,
@@ -50,21 +52,31 @@ SIZE = ("dimensions.y", "dimensions.x", "dimensions.z")
 
 
 def is_pandaset(root: Path) -> bool:
-    """Return whether a folder is a sequence of PandaSet."""
-    return any((root / "camera").glob("*/intrinsics.json"))
+    """Return whether a folder is a sequence of PandaSet, or holds some."""
+    return _is_sequence(root) or bool(_sequences(root))
+
+
+def _is_sequence(folder: Path) -> bool:
+    return any((folder / "camera").glob("*/intrinsics.json"))
+
+
+def _sequences(root: Path) -> list[str]:
+    return sorted({p.parts[-4] for p in root.glob("*/camera/*/intrinsics.json")})
 
 
 def read_pandaset(root: Path, cfg: DataConfig, report) -> Recording:
     """Read a sequence.
 
     Args:
-        root: the folder of the sequence, with `camera` and `lidar` in it.
-        cfg: not used.
+        root: the folder of the sequence, with `camera` and `lidar` in it, or one of sequences.
+        cfg: `drive` may name the sequence.
         report: receives progress.
 
     Raises:
         UserError: a table is missing, broken or holds no pose; the message names the file.
     """
+    if not _is_sequence(root):
+        root = root / chosen_drive(cfg.drive, _sequences(root), root)
     report(f"Reading the tables of {root.name}")
     cameras, photographs, notes = [], [], []
     for folder in sorted(p.parent for p in (root / "camera").glob("*/intrinsics.json")):
@@ -194,11 +206,12 @@ def _objects(root: Path) -> tuple[list[TrackedObject], list[str]]:
         raise missing_file(path)
     scanner = read_json_list(path)
     tracks: dict[str, _Track] = {}
+    nameless = 0
     known = min(len(times), len(scanner))
     used = [frame for frame in files if frame < known]
     for frame in used:
         pose = _pose(scanner[frame], path, frame)
-        _add_boxes(tracks, files[frame], times[frame], pose)
+        nameless += _add_boxes(tracks, files[frame], times[frame], pose)
     doubled = _doubled(tracks)
     alone = [t for name, t in tracks.items() if t.forward and name not in doubled]
     objects = [t.finished(name) for name, t in tracks.items() if name not in doubled]
@@ -207,6 +220,8 @@ def _objects(root: Path) -> tuple[list[TrackedObject], list[str]]:
         notes.append(f"{known - len(used)} of {known} frames have no boxes.")
     if len(used) < len(files):
         notes.append(f"{len(files) - len(used)} tables of boxes are of frames without a time.")
+    if nameless:
+        notes.append(f"{nameless} boxes belong to no track: they are left out.")
     if alone:
         notes.append(
             f"{len(alone)} moving things have boxes of the forward scanner only, whose times are "
@@ -232,7 +247,8 @@ class _Track:
 
 def _add_boxes(
     tracks: dict[str, _Track], path: Path, time: float, scanner: Float64[np.ndarray, "4 4"]
-) -> None:
+) -> int:
+    """Add the boxes of a frame to their tracks; return how many have none."""
     table = read_table(path)
     names, labels = _column(table, "uuid", path), _column(table, "label", path)
     position = np.stack([_numbers(table, name, path) for name in POSITION], 1)
@@ -249,7 +265,9 @@ def _add_boxes(
             fix="get the file again",
         )
     passed = time + _since_end(position, scanner)
-    for row, name in enumerate(map(str, names)):
+    named = [row for row, name in enumerate(names) if isinstance(name, str) and name]
+    for row in named:
+        name = names[row]
         length, width, height = map(float, size[row])
         track = tracks.setdefault(
             name,
@@ -260,6 +278,7 @@ def _add_boxes(
         track.siblings.add(str(sibling[row]))
         track.times.append(float(passed[row]))
         track.poses.append(_upright(yaw[row], position[row]))
+    return len(names) - len(named)
 
 
 def _since_end(
@@ -271,7 +290,7 @@ def _since_end(
     """
     local = (position - scanner[:3, 3]) @ inverse(scanner)[:3, :3].T
     azimuth = np.arctan2(local[:, 1], local[:, 0])
-    return TURN_S * (np.mod(-np.pi / 2 - azimuth, 2 * np.pi) / (2 * np.pi) - 1)
+    return TURN_S * (turned(azimuth, start=-np.pi / 2) - 1)
 
 
 def _upright(yaw: float, position: Float[np.ndarray, " 3"]) -> Float64[np.ndarray, "4 4"]:

@@ -154,4 +154,4 @@ class Automatic(Mcmc):
     def _score(self, state: FitState) -> float:
         """Return the mean PSNR of the held-out views, dB."""
         with self.run.clock("densification"):
-            return self.judge(state.params, state.population.alive)
+            return self.judge(state.params, state.population)

@@ -1,0 +1,86 @@
+"""Gaussians of moving objects in world coordinates, as of one moment: for files and viewers."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial.transform import Rotation
+
+from p2gs_jax.core.numerics import fibonacci_sphere, on_device
+from p2gs_jax.render.spherical_harmonics import basis, degree_of
+from p2gs_jax.types import Gaussians
+
+# Twice as many as coefficients of degree 3, and more: the least squares are exact.
+DIRECTIONS = 64
+
+
+def standing(gaussians: Gaussians, owner: Int[np.ndarray, " n"] | None) -> Gaussians:
+    """Return only what stands still.
+
+    Args:
+        gaussians: the scene.
+        owner: the moving object that each belongs to, -1: none; None: there are none.
+    """
+    return gaussians if owner is None else chosen(gaussians, np.asarray(owner) < 0)
+
+
+def chosen(gaussians: Gaussians, which: Bool[np.ndarray, " n"]) -> Gaussians:
+    """Return some Gaussians, in their order."""
+    return jax.tree.map(lambda a: on_device(np.asarray(a)[which]), gaussians)
+
+
+def posed(
+    gaussians: Gaussians,
+    owner: Int[np.ndarray, " n"] | None,
+    poses: Float[np.ndarray, "k 4 4"],
+    there: Bool[np.ndarray, " k"],
+) -> Gaussians:
+    """Return Gaussians in world coordinates; those of objects that are not there are left out.
+
+    Args:
+        gaussians: the scene, those of objects in the frames of their boxes.
+        owner: the moving object that each belongs to, -1: none; None: there are none.
+        poses: box to world.
+        there: which objects are.
+    """
+    if owner is None:
+        return gaussians
+    owner = np.asarray(owner)
+    shown = (owner < 0) | there[owner]
+    owner = owner[shown]
+    host = jax.tree.map(lambda a: np.array(np.asarray(a)[shown]), gaussians)
+    for row in np.unique(owner[owner >= 0]):
+        mine, R = owner == row, poses[row, :3, :3]
+        host.means[mine] = host.means[mine] @ R.T + poses[row, :3, 3]
+        host.quats[mine] = _turned(host.quats[mine], R)
+        host.sh[mine] = np.einsum("ij,njc->nic", turning(R, host.sh.shape[1]), host.sh[mine])
+    return jax.tree.map(on_device, host)
+
+
+def turning(R: Float[np.ndarray, "3 3"], count: int) -> Float[np.ndarray, "k k"]:
+    """Return the matrix that turns spherical-harmonics coefficients.
+
+    Args:
+        R: a function of directions d becomes one of R^T d.
+        count: of coefficients.
+    """
+    directions = fibonacci_sphere(DIRECTIONS)
+    degree = degree_of(count)
+    return np.linalg.lstsq(_table(directions, degree), _table(directions @ R, degree))[0]
+
+
+_basis = jax.jit(basis, static_argnums=1)
+
+
+def _table(directions: Float[np.ndarray, "d 3"], degree: int) -> Float[np.ndarray, "d k"]:
+    axes = tuple(directions.astype(np.float32).T)
+    return np.stack([np.asarray(column, np.float64) for column in _basis(axes, degree)], 1)
+
+
+def _turned(
+    quats: Float[np.ndarray, "n 4"], R: Float[np.ndarray, "3 3"]
+) -> Float[np.ndarray, "n 4"]:
+    zero = ~np.any(quats, axis=1, keepdims=True)
+    own = Rotation.from_quat(np.where(zero, np.eye(1, 4), quats), scalar_first=True)
+    return (Rotation.from_matrix(R) * own).as_quat(scalar_first=True).astype(np.float32)

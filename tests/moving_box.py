@@ -1,0 +1,178 @@
+"""A drive past a wall before which a box crosses: photographs, laser points and a track."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from p2gs_jax.config import RenderConfig
+from p2gs_jax.render.host import make_renderer
+from p2gs_jax.scene.drives import DriveFormat
+from p2gs_jax.scene.drives.recording import (
+    Photograph,
+    Recording,
+    RigCamera,
+    Sweep,
+    SweepPoints,
+)
+from p2gs_jax.types import Camera, Gaussians, TrackedObject
+
+WIDTH, HEIGHT, FOCAL = 160, 96, 110.0
+FRAMES, INTERVAL, STEREO = 16, 0.1, 0.6
+SIZE = (2.0, 1.2, 1.0)
+# World: x right, y down, z forward, as of the first camera. Boxes: x forward, y left, z up.
+BOX_TO_WORLD = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+RENDER = RenderConfig(sh_degree=0)
+
+
+class World(NamedTuple):
+    """What is there.
+
+    Attributes:
+        wall: Gaussians in the world.
+        box: Gaussians in the frame of the box.
+        track: of the box.
+        exposures: of the photographs, by frame.
+    """
+
+    wall: Gaussians
+    box: Gaussians
+    track: TrackedObject
+    exposures: np.ndarray
+
+
+def splats(means, log_scales, radiance) -> Gaussians:
+    """Return opaque Gaussians of degree 0."""
+    n = len(means)
+    sh = np.log(np.asarray(radiance))[:, None] / 0.28209479177387814
+    values = (means, np.tile(np.eye(1, 4), (n, 1)), log_scales, np.full(n, 4.0), sh)
+    return Gaussians(*(jnp.asarray(a, jnp.float32) for a in values))
+
+
+def pose_at(time: float) -> np.ndarray:
+    """Return where the box is: it crosses to the right, and turns a little."""
+    # Never along an axis: depths that are equal have no order.
+    turn, out = 0.1 + 0.15 * time, np.eye(4)
+    c, s = np.cos(turn), np.sin(turn)
+    out[:3, :3] = BOX_TO_WORLD @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    out[:3, 3] = [-2.6 + 3.5 * time, 0.5, 6.0 - 0.4 * time]
+    return out
+
+
+def make_world(seed: int = 0) -> World:
+    """Return a wall with ground before it, and a box with a pattern of its own."""
+    rng = np.random.default_rng(seed)
+    u, v = np.meshgrid(np.arange(-8, 8, 0.4), np.arange(-4, 1.2, 0.4))
+    wall = np.stack([u.ravel(), v.ravel(), np.full(u.size, 10.0)], 1)
+    u, w = np.meshgrid(np.arange(-7, 7, 0.4), np.arange(3.5, 10, 0.4))
+    ground = np.stack([u.ravel(), np.full(u.size, 1.2), w.ravel()], 1)
+    means = np.concatenate([wall, ground])
+    radiance = rng.uniform(0.05, 0.5, (len(means), 3))
+    still = splats(means, np.full(means.shape, np.log(0.17)), radiance)
+    half = np.array(SIZE) / 2
+    faces = []
+    for axis in range(3):
+        for sign in (-1, 1):
+            lines = [np.arange(-h + 0.1, h, 0.2) for h in np.delete(half, axis)]
+            flat = np.stack(np.meshgrid(*lines), -1).reshape(-1, 2)
+            faces.append(np.insert(flat, axis, sign * half[axis], axis=1))
+    means = np.concatenate(faces)
+    checks = np.floor(means / 0.4 + 1e-6).astype(int).sum(1) % 2
+    color = np.where(checks[:, None], [0.75, 0.7, 0.1], [0.05, 0.12, 0.5])
+    box = splats(means, np.full(means.shape, np.log(0.09)), color)
+    times = np.arange(FRAMES) * INTERVAL
+    poses = np.stack([pose_at(t) for t in times])
+    track = TrackedObject("box-1", "Car", SIZE, times, poses, moving=True)
+    return World(still, box, track, np.exp2(rng.normal(0, 0.4, FRAMES)))
+
+
+def moved(gaussians: Gaussians, pose: np.ndarray) -> Gaussians:
+    """Return isotropic Gaussians of degree 0 at a pose."""
+    means = np.asarray(gaussians.means) @ pose[:3, :3].T + pose[:3, 3]
+    return Gaussians(jnp.asarray(means, jnp.float32), *jax.tree.leaves(gaussians)[1:])
+
+
+def camera_pose(frame: int, camera: int) -> np.ndarray:
+    """Return camera-to-world of one of two cameras that drive forward."""
+    pose = np.eye(4)
+    pose[:3, 3] = [STEREO * (camera - 0.5), 0, 0.04 * frame]
+    return pose
+
+
+def photograph_of(world: World, frame: int, camera: int, render) -> np.ndarray:
+    """Return 8-bit display values: sRGB of exposed radiance."""
+    box = moved(world.box, pose_at(frame * INTERVAL))
+    both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), world.wall, box)
+    viewmat = np.linalg.inv(camera_pose(frame, camera)).astype(np.float32)
+    view = Camera(jnp.asarray(viewmat), jnp.asarray(lens(), jnp.float32), WIDTH, HEIGHT)
+    shown = render(both, jnp.ones(both.capacity, bool), view)
+    exposed = np.asarray(shown.linear) * world.exposures[frame]
+    encoded = np.where(
+        exposed < 0.0031308, 12.92 * exposed, 1.055 * np.maximum(exposed, 1e-9) ** (1 / 2.4) - 0.055
+    )
+    return np.rint(255 * np.clip(encoded, 0, 1)).astype(np.uint8)
+
+
+def lens() -> np.ndarray:
+    """Return K of both cameras."""
+    return np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+
+
+def write_photographs(root: Path, seed: int = 0) -> None:
+    """Write the photographs of the drive."""
+    world, render = make_world(seed), make_renderer(RENDER)
+    for camera in range(2):
+        (root / f"cam{camera}").mkdir(parents=True)
+        for frame in range(FRAMES):
+            pixels = photograph_of(world, frame, camera, render)
+            cv2.imwrite(str(root / f"cam{camera}" / f"{frame:03d}.png"), pixels[..., ::-1])
+
+
+def recording(root: Path, seed: int = 0, points: bool = True) -> Recording:
+    """Return the drive as a reader gives it; the box stays in sight.
+
+    Args:
+        root: where the photographs are.
+        seed: of the world.
+        points: laser points, too.
+    """
+    world = make_world(seed)
+    cameras = tuple(RigCamera(f"cam{k}", lens(), WIDTH, HEIGHT) for k in range(2))
+    photographs = tuple(
+        Photograph(
+            f"cam{k}",
+            frame,
+            frame * INTERVAL,
+            root / f"cam{k}" / f"{frame:03d}.png",
+            camera_pose(frame, k),
+        )
+        for k in range(2)
+        for frame in range(FRAMES)
+    )
+
+    def sweep(frame: int) -> SweepPoints:
+        rng = np.random.default_rng((seed, frame))
+        time = frame * INTERVAL
+        box = np.asarray(moved(world.box, pose_at(time)).means)
+        still = np.asarray(world.wall.means)
+        found = np.concatenate([still, box[rng.permutation(len(box))[:60]]])
+        found = found + rng.normal(0, 0.01, found.shape)
+        return SweepPoints(found.astype(np.float64), np.full(len(found), time))
+
+    sweeps = tuple(Sweep(f, f * INTERVAL, lambda f=f: sweep(f)) for f in range(FRAMES))
+    return Recording(
+        root, "pandaset", cameras, photographs, sweeps if points else (), (world.track,)
+    )
+
+
+def drive_format(seed: int = 0, points: bool = True) -> DriveFormat:
+    """Return a reader of such drives, to put in the place of a data set's."""
+    return DriveFormat(
+        lambda root: (root / "cam0").is_dir(),
+        lambda root, cfg, report: recording(root, seed, points),
+    )

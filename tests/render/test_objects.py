@@ -1,0 +1,211 @@
+"""Gaussians that move with the camera of their box, against Gaussians that are moved themselves."""
+
+import dataclasses
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from splats import random_splats
+
+from p2gs_jax.config import RenderConfig
+from p2gs_jax.core.numerics import fibonacci_sphere
+from p2gs_jax.gaussians.posed import posed, turning
+from p2gs_jax.render import project, render_linear, required_capacity, view_radiance
+from p2gs_jax.render.blocks import BLOCK, splat, splat_listed
+from p2gs_jax.render.objects import HIDDEN, camera_of_each, corrected
+from p2gs_jax.render.spherical_harmonics import evaluate
+from p2gs_jax.render.visible import compact, in_view
+from p2gs_jax.scene.drives.moving import KeyTimes, MovingObjects
+from p2gs_jax.train.room import count_view
+from p2gs_jax.types import Camera, Placement, TrackedObject
+
+WIDTH, HEIGHT, CAPACITY = 48, 40, 2**14
+CFG = RenderConfig(sh_degree=3, stop_error=None)
+COUNT = 60
+
+
+def pose(seed: int, at=(0.0, 0.0, 4.0)) -> np.ndarray:
+    out = np.eye(4)
+    out[:3, :3] = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
+    out[:3, 3] = at
+    return out
+
+
+POSES = np.stack([pose(1, (0.4, 0.2, 4.0)), pose(2, (-0.6, -0.3, 5.0)), pose(3)])
+THERE = np.array([True, True, False])
+
+
+def scene():
+    """Return Gaussians near the origins of world and boxes, and whose each is."""
+    g = random_splats(COUNT, degree=3)
+    owner = np.arange(COUNT) % 4 - 1
+    means = np.array(g.means) * 0.5
+    means[owner < 0, 2] += 5
+    g = dataclasses.replace(
+        g, means=jnp.asarray(means, jnp.float32), log_scales=g.log_scales * 0.3 - 2
+    )
+    return g, owner.astype(np.int32)
+
+
+def view(objects: bool = True) -> Camera:
+    K = jnp.array([[40.0, 0, WIDTH / 2], [0, 42.0, HEIGHT / 2], [0, 0, 1]])
+    viewmat = pose(0, (0.1, -0.2, 0.3)).astype(np.float32)
+    viewmat[:3, :3] = Rotation.from_euler("xyz", [0.05, -0.1, 0.2]).as_matrix()
+    placement = None
+    if objects:
+        viewmats = (viewmat.astype(np.float64) @ POSES).astype(np.float32)
+        viewmats[~THERE] = HIDDEN
+        placement = Placement(jnp.asarray(viewmats), jnp.int32(0), jnp.float32(0))
+    return Camera(jnp.asarray(viewmat), K, WIDTH, HEIGHT, placement)
+
+
+draw = jax.jit(render_linear, static_argnames=("cfg", "capacity"))
+
+
+def picture(g, alive, camera, owner=None):
+    return draw(g, alive, camera, cfg=CFG, capacity=CAPACITY, owner=owner)
+
+
+def test_a_camera_in_the_frame_of_the_box_sees_what_moved_gaussians_show():
+    g, owner = scene()
+    ours = picture(g, jnp.ones(COUNT, bool), view(), jnp.asarray(owner))
+    explicit = posed(g, owner, POSES, THERE)
+    assert explicit.capacity == (owner < 2).sum()
+    theirs = picture(explicit, jnp.ones(explicit.capacity, bool), view(objects=False))
+    for name in ("linear", "alpha", "depth"):
+        a, b = np.asarray(getattr(ours, name)), np.asarray(getattr(theirs, name))
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-5 * max(1.0, np.abs(b).max()))
+    assert float(ours.alpha.max()) > 0.5
+    np.testing.assert_array_equal(np.asarray(ours.visible)[owner < 2], theirs.visible)
+    assert not np.asarray(ours.visible)[owner == 2].any()
+
+
+def test_a_box_at_the_origin_is_no_box():
+    g, owner = scene()
+    camera = view()
+    at_origin = Placement(jnp.tile(camera.viewmat, (3, 1, 1)), jnp.int32(0), jnp.float32(0))
+    camera = dataclasses.replace(camera, objects=at_origin)
+    alive = jnp.ones(COUNT, bool)
+    ours, plain = picture(g, alive, camera, jnp.asarray(owner)), picture(g, alive, view(False))
+    for name in ("linear", "alpha", "depth"):
+        a, b = np.asarray(getattr(ours, name)), np.asarray(getattr(plain, name))
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-5 * max(1.0, np.abs(b).max()))
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_what_is_not_there_leaves_the_picture_as_if_it_were_removed(known):
+    """Tracked, but not now; and a camera that knows no time."""
+    g, owner = scene()
+    gone = owner == 2 if known else owner >= 0
+    camera = view(known)
+    ours = picture(g, jnp.ones(COUNT, bool), camera, jnp.asarray(owner))
+    removed = picture(g, jnp.asarray(~gone), camera, jnp.asarray(owner))
+    np.testing.assert_array_equal(ours.linear, removed.linear)
+    if not known:
+        return
+    gradient = jax.grad(
+        lambda g: picture(g, jnp.ones(COUNT, bool), camera, jnp.asarray(owner)).linear.sum()
+    )(g)
+    for leaf in jax.tree.leaves(gradient):
+        assert np.isfinite(leaf).all()
+        assert not np.asarray(leaf)[gone].any()
+
+
+def test_bounds_and_capacities_know_where_objects_are():
+    g, owner = scene()
+    alive = jnp.ones(COUNT, bool)
+    camera = view()
+    each = camera_of_each(camera, jnp.asarray(owner))
+    seen = np.asarray(in_view(g, alive, each, CFG))
+    shown = np.asarray(picture(g, alive, camera, jnp.asarray(owner)).visible)
+    assert seen.any()
+    assert not seen[owner == 2].any()
+    entries, visible = count_view(
+        *jax.tree.map(np.asarray, (g, alive, camera)), CFG, np.asarray(owner)
+    )
+    assert visible == seen.sum()
+    needed = int(required_capacity(g, alive, camera, CFG, jnp.asarray(owner)))
+    assert 0 < needed <= 1.01 * entries + 8
+    assert shown.sum() >= seen.sum() > 0
+
+
+def test_blocks_take_each_gaussian_to_its_own_box():
+    g, owner = scene()
+    alive = jnp.ones(COUNT, bool)
+    camera = view()
+    ids, count = compact(alive, BLOCK)
+    (listed,) = splat_listed(g, alive, ids, count, (camera,), CFG, 3, 16, jnp.asarray(owner))
+    (whole,) = splat(g, alive, (camera,), CFG, 3, jnp.asarray(owner))
+    for a, b in zip(jax.tree.leaves(listed), jax.tree.leaves(whole), strict=True):
+        np.testing.assert_allclose(np.asarray(a)[:COUNT], b, rtol=1e-5, atol=1e-5)
+    assert not np.asarray(listed[0].visible)[COUNT:].any()
+
+
+def test_other_places_of_objects_compile_nothing():
+    g, owner = scene()
+    traced = chex.assert_max_traces(project, n=1)
+    projected = jax.jit(lambda g, on, c, owner: traced(g, on, camera_of_each(c, owner), CFG))
+    camera = view()
+    assert camera.objects is not None
+    for shift in (0.0, 0.3):
+        viewmats = camera.objects.viewmats.at[:, 0, 3].add(shift)
+        moved = dataclasses.replace(
+            camera, objects=dataclasses.replace(camera.objects, viewmats=viewmats)
+        )
+        projected(g, jnp.ones(COUNT, bool), moved, jnp.asarray(owner))
+
+
+def test_coefficients_turn_with_the_box():
+    rng = np.random.default_rng(0)
+    R = Rotation.random(rng=rng).as_matrix()
+    sh = rng.normal(size=(5, 16, 3)).astype(np.float32)
+    turned = np.einsum("ij,njc->nic", turning(R, 16), sh).astype(np.float32)
+    directions = fibonacci_sphere(5).astype(np.float32)
+    here = tuple(map(jnp.asarray, directions.T))
+    there = tuple(map(jnp.asarray, (directions @ R).T.astype(np.float32)))
+    np.testing.assert_allclose(evaluate(turned, here), evaluate(sh, there), atol=2e-5)
+
+
+def test_corrections_move_in_the_frame_of_the_box():
+    """On the device as on the host, and both as matrices say."""
+    rng = np.random.default_rng(0)
+    times = np.array([0.0, 1.0])
+    objects = tuple(
+        TrackedObject(str(k), "Car", (1, 1, 1), times, np.stack([POSES[k]] * 2), True)
+        for k in range(3)
+    )
+    poses = rng.normal(0, 0.05, (2, 3, 6)).astype(np.float32)
+    keys = KeyTimes(0.0, 1.0, 2)
+    plain, learned = MovingObjects(objects, keys), MovingObjects(objects, keys, poses)
+    viewmat = np.asarray(view().viewmat)
+    device = corrected(plain.placement(viewmat, 0.3), jnp.asarray(poses))
+    host = learned.placement(viewmat, 0.3)
+    np.testing.assert_allclose(device.viewmats, host.viewmats, atol=1e-5)
+    small = 0.7 * poses[0] + 0.3 * poses[1]
+    move = np.tile(np.eye(4), (3, 1, 1))
+    move[:, :3, :3] = Rotation.from_rotvec(small[:, :3]).as_matrix()
+    move[:, :3, 3] = small[:, 3:]
+    np.testing.assert_allclose(host.viewmats, viewmat @ POSES @ move, atol=2e-4)
+    assert np.abs(host.viewmats - plain.placement(viewmat, 0.3).viewmats).max() > 0.01
+
+
+def test_corrections_leave_hidden_what_is_not_there():
+    camera = view()
+    assert camera.objects is not None
+    found = corrected(camera.objects, jnp.full((1, 3, 6), 0.1))
+    np.testing.assert_array_equal(found.viewmats[2], HIDDEN)
+
+
+def test_radiance_is_seen_from_the_frame_of_the_box():
+    g, owner = scene()
+    each = camera_of_each(view(), jnp.asarray(owner))
+    got = view_radiance(g, each, CFG)
+    explicit = posed(g, owner, POSES, np.ones(3, bool))
+    wanted = view_radiance(explicit, view(objects=False), CFG)
+    there = owner < 2
+    np.testing.assert_allclose(np.asarray(got)[there], np.asarray(wanted)[there], rtol=2e-4)
+    splats = project(g, jnp.ones(COUNT, bool), each, CFG)
+    assert not np.asarray(splats.visible)[owner == 2].any()

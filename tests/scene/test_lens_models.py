@@ -1,0 +1,201 @@
+"""Lenses: OpenCV's formulas forwards, ours backwards, in rasters and through the readers."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scene.helpers import write_tiny_model
+
+from p2gs_jax.config import DataConfig
+from p2gs_jax.scene import ImageStore, load_scene
+from p2gs_jax.scene.geometry import (
+    _fold_radius,
+    intrinsics,
+    make_distortion,
+    undistort_points,
+    undistortion_maps,
+)
+from p2gs_jax.scene.transforms import load_transforms
+from p2gs_jax.scene.triangulate import _camera
+from p2gs_jax.types import Distortion, View
+
+K = intrinsics(400.0, 410.0, 500.0, 300.0)
+ZERO = np.zeros(3)
+terms = st.floats(-0.3, 0.3)
+small = st.floats(-0.003, 0.003)
+radial = st.one_of(
+    st.tuples(terms, terms, small, small),
+    st.tuples(terms, terms, small, small, terms),
+    st.tuples(terms, terms, small, small, terms, terms, terms, terms),
+)
+fisheye = st.tuples(*[st.floats(-0.1, 0.1)] * 4)
+
+
+def rays(limit: float) -> np.ndarray:
+    """Return rays through all of a picture, up to a radius at depth 1."""
+    rng = np.random.default_rng(0)
+    radius, angle = np.linspace(0, limit, 300), rng.uniform(0, 2 * np.pi, 300)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.ones(300)], 1)
+
+
+def photographed(X: np.ndarray, lens: Distortion) -> np.ndarray:
+    """Return where OpenCV sees points."""
+    c = np.array(lens.coefficients)
+    if lens.model == "fisheye":
+        return cv2.fisheye.projectPoints(X[:, None], ZERO, ZERO, K, c)[0][:, 0]
+    return cv2.projectPoints(X, ZERO, ZERO, K, c)[0][:, 0]
+
+
+@settings(max_examples=60, deadline=None)
+@given(radial)
+def test_radial_lenses_are_undone(coefficients):
+    lens = Distortion(coefficients)
+    X = rays(0.9 * min(_fold_radius(lens), 1.3))
+    np.testing.assert_allclose(
+        undistort_points(photographed(X, lens), K, lens), (X @ K.T)[:, :2], atol=0.02
+    )
+
+
+@settings(max_examples=60, deadline=None)
+@given(fisheye)
+def test_fisheyes_are_undone(coefficients):
+    lens = Distortion(coefficients, "fisheye")
+    X = rays(0.98 * min(_fold_radius(lens), 15.0))
+    np.testing.assert_allclose(
+        undistort_points(photographed(X, lens), K, lens), (X @ K.T)[:, :2], rtol=2e-5, atol=0.02
+    )
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.one_of(radial.map(Distortion), fisheye.map(lambda c: Distortion(c, "fisheye"))))
+def test_lenses_grow_up_to_their_fold_and_no_further(lens):
+    limit = _fold_radius(lens)
+    radii = np.linspace(0, min(limit, 20.0), 400)[:-1]
+    X = np.stack([radii, np.zeros_like(radii), np.ones_like(radii)], 1)
+    straight = Distortion(
+        tuple(0.0 if k in (2, 3) and lens.model == "radial" else c for k, c in
+              enumerate(lens.coefficients)), lens.model
+    )  # fmt: skip
+    seen = photographed(X, straight)[:, 0]
+    assert (np.diff(seen) > -1e-9).all()
+    if np.isfinite(limit) and limit < 20:
+        x = np.array([[limit * 0.999, 0, 1.0], [limit * 1.001, 0, 1]])
+        before, after = photographed(x, straight)[:, 0]
+        # Either the radius falls, or it jumps through infinity.
+        assert after - before < 1e-3 * abs(before)
+
+
+def test_positions_beyond_the_fold_have_no_ray():
+    lens = Distortion((-0.3, 0.0, 0.0, 0.0))
+    r = _fold_radius(lens)
+    outermost = 500 + 400 * r * (1 - 0.3 * r**2)
+    xy = undistort_points(np.array([[outermost - 1, 300], [outermost + 1, 300]]), K, lens)
+    assert np.isfinite(xy[0]).all()
+    assert np.isnan(xy[1]).all()
+
+
+def test_what_a_fisheye_sees_at_its_side_has_no_ray():
+    lens = Distortion((0.0, 0.0, 0.0, 0.0), "fisheye")
+    side = 500 + 400 * np.pi / 2
+    xy = undistort_points(np.array([[500, 300], [side - 1, 300], [side + 1, 300]]), K, lens)
+    np.testing.assert_allclose(xy[0], [500, 300])
+    assert xy[1, 0] > 1e5
+    assert np.isnan(xy[2]).all()
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        Distortion((-0.25, 0.05, 0.001, -0.002)),
+        Distortion((0.3, 0.1, 0.001, -0.002, 0.02, 0.6, 0.2, 0.05)),
+        Distortion((0.05, -0.02, 0.01, -0.004), "fisheye"),
+    ],
+    ids=["radial", "rational", "fisheye"],
+)
+def test_maps_are_where_points_come_from(lens):
+    map_x, map_y = undistortion_maps(K, lens, 1000, 600)
+    valid = map_x > -5
+    assert valid.mean() > 0.9
+    rows, columns = np.nonzero(valid)
+    at = np.stack([map_x[valid], map_y[valid]], 1) + 0.5
+    expected = np.stack([columns, rows], 1) + 0.5
+    np.testing.assert_allclose(undistort_points(at, K, lens), expected, atol=0.01)
+
+
+def test_pixels_beyond_a_rational_fold_are_masked():
+    lens = Distortion((-0.5, 0.0, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0))
+    map_x, _ = undistortion_maps(K, lens, 2000, 600)
+    x = (np.arange(2000) - 499.5) / 400
+    y = (np.arange(600) - 299.5) / 410
+    outside = np.hypot(x[None], y[:, None]) >= _fold_radius(lens)
+    assert 0.1 < outside.mean() < 0.9
+    assert ((map_x == -10) == outside).mean() > 0.999
+
+
+def test_a_fisheye_photograph_is_undistorted(tmp_path):
+    """Stripes painted in undistorted coordinates, photographed through a fisheye, come back."""
+    lens = Distortion((0.04, -0.01, 0.0, 0.0), "fisheye")
+    width, height, f = 160, 120, 80.0
+    small = intrinsics(f, f, width / 2, height / 2)
+    ys, xs = np.mgrid[:height, :width] + 0.5
+    straight = undistort_points(np.stack([xs.ravel(), ys.ravel()], 1), small, lens)
+    scene = np.where(np.isfinite(straight), straight, 0.0).reshape(height, width, 2)
+
+    def paint(x, y):
+        return np.stack([128 + 100 * np.sin(x / 9), 128 + 100 * np.cos(y / 7), 128 + 0 * x], -1)
+
+    image = np.rint(paint(scene[..., 0], scene[..., 1])).astype(np.uint8)[..., ::-1]
+    path = tmp_path / "a.png"
+    assert cv2.imwrite(str(path), image)
+    view = View("a.png", path, "0", np.eye(4, dtype=np.float32), small, width, height, lens)
+    ldr, valid = ImageStore((view,), DataConfig()).get(0, 1)
+    inside = valid > 0.5
+    assert inside.mean() > 0.5
+    np.testing.assert_allclose(ldr[inside], paint(xs, ys)[inside] / 255, atol=0.03)
+
+
+@pytest.mark.parametrize(
+    ("camera", "model", "coefficients"),
+    [
+        ("OPENCV_FISHEYE 40 30 50 51 20 15 0.1 -0.02 0.003 0", "fisheye", (0.1, -0.02, 0.003, 0)),
+        ("OPENCV_FISHEYE 40 30 50 51 20 15 0 0 0 0", "fisheye", (0, 0, 0, 0)),
+        ("RADIAL_FISHEYE 40 30 50 20 15 0.1 -0.02", "fisheye", (0.1, -0.02, 0, 0)),
+        ("SIMPLE_RADIAL_FISHEYE 40 30 50 20 15 0.1", "fisheye", (0.1, 0, 0, 0)),
+        (
+            "FULL_OPENCV 40 30 50 51 20 15 0.1 0.02 0.001 -0.002 0.01 0.2 0.03 0.004",
+            "radial",
+            (0.1, 0.02, 0.001, -0.002, 0.01, 0.2, 0.03, 0.004),
+        ),
+    ],
+)
+def test_colmap_lenses(tmp_path, camera, model, coefficients):
+    write_tiny_model(tmp_path, cameras=f"1 {camera}\n")
+    view = load_scene(tmp_path, DataConfig()).views[0]
+    assert view.distortion == Distortion(coefficients, model)
+    # COLMAP projects with its own model to where ours comes from.
+    back = _camera(view, 1)
+    xy = back.img_from_cam(np.array([[0.2, -0.1, 1.0]]))
+    np.testing.assert_allclose(
+        undistort_points(xy, view.K, view.distortion)[0], (view.K @ [0.2, -0.1, 1.0])[:2], atol=1e-3
+    )
+
+
+@pytest.mark.parametrize("extra", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}])
+def test_transforms_with_fisheyes(tmp_path, extra):
+    pose = np.eye(4)
+    for k in range(2):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), np.full((30, 40, 3), 99, np.uint8))
+    lens = {"k1": 0.1, "k2": 0.02, "k3": -0.01, "k4": 0.003}
+    frames = [{"file_path": f"{k}.png", "transform_matrix": pose.tolist()} for k in range(2)]
+    data = {"fl_x": 50, "fl_y": 51, "w": 40, "h": 30, **lens, **extra, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(data))
+    scene = load_transforms(tmp_path, tmp_path / "transforms.json", DataConfig())
+    assert scene.views[0].distortion == Distortion((0.1, 0.02, -0.01, 0.003), "fisheye")
+
+
+def test_a_fisheye_of_zeros_is_no_pinhole():
+    assert make_distortion((0.0,) * 4) is None
+    assert make_distortion((0.0,) * 4, "fisheye") == Distortion((0.0,) * 4, "fisheye")
