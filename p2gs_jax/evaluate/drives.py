@@ -131,7 +131,11 @@ class DriveScores:
         return sized(self._scene.views[index], K, width, height)
 
     def _camera(self, view: View, viewmat: Float32[np.ndarray, "4 4"]) -> Camera:
-        return Camera(on_device(viewmat), on_device(view.K), view.width, view.height)
+        """Return a camera elsewhere at the time of a view."""
+        moving, objects = self._store.moving, None
+        if moving is not None and view.time is not None:
+            objects = moving.placement(viewmat, view.time)
+        return Camera(on_device(viewmat), on_device(view.K), view.width, view.height, objects)
 
 
 def _surface(
