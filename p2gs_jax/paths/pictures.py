@@ -53,10 +53,15 @@ class RunRenderer:
         self.render_seconds.append(time.perf_counter() - begin)
         return layers
 
-    def wide(self, cylinder: Cylinder) -> Wide:
-        """Return a wide view of the field."""
+    def wide(self, cylinder: Cylinder, at: float | None = None) -> Wide:
+        """Return a wide view of the field.
+
+        Args:
+            cylinder: the view.
+            at: seconds: what moves is where it was then; None: it is not shown.
+        """
         begin = time.perf_counter()
-        wide = render_wide(self._layers, cylinder)
+        wide = render_wide(lambda shot: self._layers(replace(shot, time=at)), cylinder)
         self.render_seconds.append(time.perf_counter() - begin)
         return wide
 
@@ -125,7 +130,11 @@ def shot_frames(
 
 
 def wide_frames(
-    renderer: RunRenderer, cylinder: Cylinder, poses: Poses, transform: DisplayTransform
+    renderer: RunRenderer,
+    cylinder: Cylinder,
+    poses: Poses,
+    transform: DisplayTransform,
+    times: Sequence[float | None],
 ) -> Iterator[OutputFrame]:
     """Yield wide views of the field.
 
@@ -134,9 +143,10 @@ def wide_frames(
         cylinder: the view from a rig: its viewmat is rig-to-camera.
         poses: rig-to-world.
         transform: how to develop all.
+        times: of the poses, seconds; None: what moves is not shown.
     """
-    for k, pose in enumerate(poses):
-        wide = renderer.wide(_placed(cylinder, pose))
+    for k, (pose, at) in enumerate(zip(poses, times, strict=True)):
+        wide = renderer.wide(_placed(cylinder, pose), at)
         ldr = renderer.develop(wide.linear, transform)
         yield OutputFrame(f"{k:05d}", wide.linear, wide.alpha, ldr, transform)
 
@@ -172,7 +182,7 @@ def comparison_frames(
     mean = renderer.run.mean.exposure_geometric
     for step in steps:
         placed = _placed(cylinder, step.pose)
-        wide = renderer.wide(placed)
+        wide = renderer.wide(placed, step.time)
         shots = [step.shots[name] for name in names if name in step.shots]
         rows = [shot.view for shot in shots if shot.view is not None]
         transforms = [renderer.run.own_display(row) for row in rows]

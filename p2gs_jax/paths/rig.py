@@ -39,6 +39,12 @@ class TimeStep:
     pose: Pose
     shots: dict[str, Shot]
 
+    @property
+    def time(self) -> float | None:
+        """The middle of its photographs' times, seconds, or None where they have none."""
+        times = [shot.time for shot in self.shots.values() if shot.time is not None]
+        return float(np.median(times)) if times else None
+
 
 @dataclass(frozen=True)
 class Rig:

@@ -30,7 +30,7 @@ from p2gs_jax.paths import (
     view_shots,
     write_cameras,
 )
-from p2gs_jax.paths.drive import frame_count
+from p2gs_jax.paths.drive import frame_count, interpolated
 from p2gs_jax.paths.files import LARGEST, MOST_STOPS
 from p2gs_jax.paths.pictures import (
     RunRenderer,
@@ -329,11 +329,13 @@ def _panoramas(options: Render, renderer: RunRenderer) -> Job:
                 "A drive needs at least two time steps; the rig has one.", fix="use --path views"
             )
         path = PosePath(rig.poses)
-        poses = path(path.evenly(frame_count(len(rig.steps), options.frames)))
+        along = path.evenly(frame_count(len(rig.steps), options.frames))
+        poses = path(along)
+        times = interpolated(path.times, [step.time for step in rig.steps], along)
         if options.shift is not None:
             poses = beside(poses, views, options.shift)
         size = (cylinder.width, cylinder.height)
-        return Job(wide_frames(renderer, cylinder, poses, transform), len(poses), size)
+        return Job(wide_frames(renderer, cylinder, poses, transform, times), len(poses), size)
     allowed = {shot.view for shot in _chosen(options, fitted)}
     steps = []
     for step in rig.steps:
