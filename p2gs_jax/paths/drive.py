@@ -83,12 +83,12 @@ def drive(knots: Sequence[Shot], frames: int | None = None) -> list[Shot]:
         )
     path = PosePath(inverse(np.stack([s.viewmat for s in knots])))
     times = path.evenly(frame_count(len(knots), frames))
-    evs = _interpolated(path.times, [s.exposure_ev for s in knots], times)
+    evs = interpolated(path.times, [s.exposure_ev for s in knots], times)
     logs = [None if s.gamma is None else float(np.log(s.gamma)) for s in knots]
     gammas = [
-        None if g is None else float(np.exp(g)) for g in _interpolated(path.times, logs, times)
+        None if g is None else float(np.exp(g)) for g in interpolated(path.times, logs, times)
     ]
-    clock = _interpolated(path.times, [s.time for s in knots], times)
+    clock = interpolated(path.times, [s.time for s in knots], times)
     K, width, height = common_lens(knots)
     return [
         Shot(f"{k:05d}", viewmat, K, width, height, evs[k], gammas[k], time=clock[k])
@@ -96,7 +96,8 @@ def drive(knots: Sequence[Shot], frames: int | None = None) -> list[Shot]:
     ]
 
 
-def _interpolated(at, values: list[float | None], times) -> list[float | None]:
+def interpolated(at, values: Sequence[float | None], times) -> list[float | None]:
+    """Return values at times, linear between those given `at` some; None unless all are known."""
     known = [v for v in values if v is not None]
     if len(known) < len(values):
         return [None] * len(times)

@@ -20,6 +20,7 @@ from p2gs_jax.paths.panorama import Layers
 from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
 from p2gs_jax.photometry.metering import ExposureOf, adapted, meter
 from p2gs_jax.run.read import Run
+from p2gs_jax.scene.drives.choose import short_name
 from p2gs_jax.scene.images import ImageStore
 
 # Pictures are metered at this width, pixels.
@@ -52,10 +53,15 @@ class RunRenderer:
         self.render_seconds.append(time.perf_counter() - begin)
         return layers
 
-    def wide(self, cylinder: Cylinder) -> Wide:
-        """Return a wide view of the field."""
+    def wide(self, cylinder: Cylinder, at: float | None = None) -> Wide:
+        """Return a wide view of the field.
+
+        Args:
+            cylinder: the view.
+            at: seconds: what moves is where it was then; None: it is not shown.
+        """
         begin = time.perf_counter()
-        wide = render_wide(self._layers, cylinder)
+        wide = render_wide(lambda shot: self._layers(replace(shot, time=at)), cylinder)
         self.render_seconds.append(time.perf_counter() - begin)
         return wide
 
@@ -124,7 +130,11 @@ def shot_frames(
 
 
 def wide_frames(
-    renderer: RunRenderer, cylinder: Cylinder, poses: Poses, transform: DisplayTransform
+    renderer: RunRenderer,
+    cylinder: Cylinder,
+    poses: Poses,
+    transform: DisplayTransform,
+    times: Sequence[float | None],
 ) -> Iterator[OutputFrame]:
     """Yield wide views of the field.
 
@@ -133,9 +143,10 @@ def wide_frames(
         cylinder: the view from a rig: its viewmat is rig-to-camera.
         poses: rig-to-world.
         transform: how to develop all.
+        times: of the poses, seconds; None: what moves is not shown.
     """
-    for k, pose in enumerate(poses):
-        wide = renderer.wide(_placed(cylinder, pose))
+    for k, (pose, at) in enumerate(zip(poses, times, strict=True)):
+        wide = renderer.wide(_placed(cylinder, pose), at)
         ldr = renderer.develop(wide.linear, transform)
         yield OutputFrame(f"{k:05d}", wide.linear, wide.alpha, ldr, transform)
 
@@ -171,7 +182,7 @@ def comparison_frames(
     mean = renderer.run.mean.exposure_geometric
     for step in steps:
         placed = _placed(cylinder, step.pose)
-        wide = renderer.wide(placed)
+        wide = renderer.wide(placed, step.time)
         shots = [step.shots[name] for name in names if name in step.shots]
         rows = [shot.view for shot in shots if shot.view is not None]
         transforms = [renderer.run.own_display(row) for row in rows]
@@ -184,7 +195,7 @@ def comparison_frames(
         stops = [float(np.log2(own.exposure / mean)) for own in transforms]
         cameras = [name for name in names if name in step.shots]
         captions = [
-            (f"{cameras[k]} {stops[k]:+.1f} EV".replace("-", "−"), start, end)
+            (f"{short_name(cameras[k])} {stops[k]:+.1f} EV".replace("-", "−"), start, end)
             for k, start, end in borders(taken.source[cylinder.height // 2])
         ]
         field = renderer.develop(wide.linear, transform)
