@@ -135,7 +135,7 @@ def _draw_points(axes, plane: _Plane, scene: Scene, low, high) -> None:
     flat = plane(points)
     inside = np.flatnonzero(((flat >= low) & (flat <= high)).all(1))
     if len(inside) > MOST_POINTS:
-        inside = generator(0, Stream.LIDAR).choice(inside, MOST_POINTS, replace=False)
+        inside = generator(0, Stream.PLAN_POINTS).choice(inside, MOST_POINTS, replace=False)
     what = "points" if scene.lidar is None else "LiDAR"
     for mine, color, label in (
         (inside[~moving[inside]], POINT, what),
