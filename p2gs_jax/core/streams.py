@@ -53,6 +53,8 @@ class Stream(IntEnum):
     """Laser measurements that are kept."""
     MEASURED_DEPTHS = 59
     """Laser measurements that a view is compared with."""
+    PLAN_POINTS = 61
+    """Points that a plan from above shows."""
     SCORE_SIGNS = 47
     """Signs of residuals, from which standard errors of many views are drawn."""
 

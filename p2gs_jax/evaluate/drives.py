@@ -131,6 +131,7 @@ class DriveScores:
         return sized(self._scene.views[index], K, width, height)
 
     def _camera(self, view: View, viewmat: Float32[np.ndarray, "4 4"]) -> Camera:
+        """Return a camera elsewhere at the time of a view."""
         moving, objects = self._store.moving, None
         if moving is not None and view.time is not None:
             objects = moving.placement(viewmat, view.time)

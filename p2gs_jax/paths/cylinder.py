@@ -104,8 +104,8 @@ def covering(shots: Iterable[Shot], viewmat: Pose) -> Cylinder:
     """Return the cylinder that cameras cover, at the finest of their resolutions.
 
     From side to side it spans all cameras, less what is seen in less than three quarters of their
-    height; up and down it is cut to what is seen in all columns that are covered. Distances between
-    the cameras are neglected.
+    height, or the full circle where they see something all around; up and down it is cut to what is
+    seen in all columns that are covered. Distances between the cameras are neglected.
 
     Args:
         shots: the cameras.
@@ -118,7 +118,7 @@ def covering(shots: Iterable[Shot], viewmat: Pose) -> Cylinder:
     covered = np.any([project(shot, rays).inside for shot in shots], axis=0)
     counts = covered.sum(0)
     good = counts >= FULL_COLUMN * counts.max()
-    start, count = _without_largest_gap(good)
+    start, count = (0, around) if counts.all() else _without_largest_gap(good)
     columns = (start + np.arange(count)) % around
     rows = covered[:, columns[good[columns]]].all(1)
     if not rows.any():

@@ -96,16 +96,8 @@ def drive(knots: Sequence[Shot], frames: int | None = None) -> list[Shot]:
     ]
 
 
-def interpolated(
-    at: Float[np.ndarray, " k"], values: Sequence[float | None], times: Float[np.ndarray, " n"]
-) -> list[float | None]:
-    """Return values between knots, linearly; None for all where one is not known.
-
-    Args:
-        at: where the knots are.
-        values: there.
-        times: where values are wanted.
-    """
+def interpolated(at, values: Sequence[float | None], times) -> list[float | None]:
+    """Return values at times, linear between those given `at` some; None unless all are known."""
     known = [v for v in values if v is not None]
     if len(known) < len(values):
         return [None] * len(times)

@@ -20,6 +20,7 @@ from p2gs_jax.paths.panorama import Layers
 from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
 from p2gs_jax.photometry.metering import ExposureOf, adapted, meter
 from p2gs_jax.run.read import Run
+from p2gs_jax.scene.drives.choose import short_name
 from p2gs_jax.scene.images import ImageStore
 
 # Pictures are metered at this width, pixels.
@@ -57,7 +58,7 @@ class RunRenderer:
 
         Args:
             cylinder: the view.
-            at: time at which what moves is shown, seconds; None: it is not.
+            at: seconds: what moves is where it was then; None: it is not shown.
         """
         begin = time.perf_counter()
         wide = render_wide(lambda shot: self._layers(replace(shot, time=at)), cylinder)
@@ -132,8 +133,8 @@ def wide_frames(
     renderer: RunRenderer,
     cylinder: Cylinder,
     poses: Poses,
-    times: Sequence[float | None],
     transform: DisplayTransform,
+    times: Sequence[float | None],
 ) -> Iterator[OutputFrame]:
     """Yield wide views of the field.
 
@@ -141,8 +142,8 @@ def wide_frames(
         renderer: renders.
         cylinder: the view from a rig: its viewmat is rig-to-camera.
         poses: rig-to-world.
-        times: of each, seconds; None: what moves is not shown.
         transform: how to develop all.
+        times: of the poses, seconds; None: what moves is not shown.
     """
     for k, (pose, at) in enumerate(zip(poses, times, strict=True)):
         wide = renderer.wide(_placed(cylinder, pose), at)
@@ -194,7 +195,7 @@ def comparison_frames(
         stops = [float(np.log2(own.exposure / mean)) for own in transforms]
         cameras = [name for name in names if name in step.shots]
         captions = [
-            (f"{cameras[k]} {stops[k]:+.1f} EV".replace("-", "−"), start, end)
+            (f"{short_name(cameras[k])} {stops[k]:+.1f} EV".replace("-", "−"), start, end)
             for k, start, end in borders(taken.source[cylinder.height // 2])
         ]
         field = renderer.develop(wide.linear, transform)

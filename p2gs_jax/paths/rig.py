@@ -21,6 +21,8 @@ from p2gs_jax.types import View
 
 # Largest median angle between the cameras' relative rotations over time.
 LEAST_RIGID = np.deg2rad(5)
+# The mean of the directions in which cameras look is shorter than this where they look all around.
+ALL_AROUND = 0.5
 
 
 @dataclass(frozen=True)
@@ -39,9 +41,9 @@ class TimeStep:
 
     @property
     def time(self) -> float | None:
-        """The mean of the shots' times, seconds; None where one has none."""
-        known = [shot.time for shot in self.shots.values() if shot.time is not None]
-        return float(np.mean(known)) if len(known) == len(self.shots) else None
+        """The middle of its photographs' times, seconds, or None where they have none."""
+        times = [shot.time for shot in self.shots.values() if shot.time is not None]
+        return float(np.median(times)) if times else None
 
 
 @dataclass(frozen=True)
@@ -127,20 +129,29 @@ def _mounts(cameras: list[str], steps: dict[str, dict[str, Shot]]) -> dict[str, 
                 "common rig.",
                 fix="leave out --panorama",
             )
-    to_rig = inverse(_level(np.stack(list(from_anchor.values()))))
+    to_rig = inverse(_level(np.stack(list(from_anchor.values())), list(from_anchor)))
     return {
         c: replace(lenses[c], name=c, viewmat=from_anchor[c] @ inverse(to_rig), view=None)
         for c in cameras
     }
 
 
-def _level(viewmats: Poses) -> Pose:
-    """Return rig-to-anchor: the origin amid the cameras, z where they look on average, x level."""
+def _level(viewmats: Poses, names: Sequence[str]) -> Pose:
+    """Return rig-to-anchor: the origin amid the cameras, z where they look on average, x level.
+
+    Where they look all around, z is where the one called "front" looks, else the first one.
+
+    Args:
+        viewmats: anchor-to-camera.
+        names: of the cameras.
+    """
     up = up_direction(viewmats)
     axes = viewmats[:, 2, :3]
     forward = axes.mean(0) - (axes.mean(0) @ up) * up
-    if np.linalg.norm(forward) < 0.1:  # cameras all around
-        forward = axes[0] - (axes[0] @ up) * up
+    fronts = [k for k, name in enumerate(names) if "front" in name.lower()]
+    if np.linalg.norm(forward) < ALL_AROUND and (fronts or np.linalg.norm(forward) < 0.1):
+        first = min(fronts, key=lambda k: len(names[k])) if fronts else 0
+        forward = axes[first] - (axes[first] @ up) * up
     z = forward / np.linalg.norm(forward)
     rotation = np.stack([np.cross(z, up), -up, z], axis=1)
     return rigid(rotation, inverse(viewmats)[:, :3, 3].mean(0))

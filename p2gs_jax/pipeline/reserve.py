@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from p2gs_jax.config import FitConfig
+from p2gs_jax.evaluate.drives import is_drive
 from p2gs_jax.evaluate.lpips import LpipsWeights
 from p2gs_jax.scene.images import size_at
 from p2gs_jax.types import Scene
@@ -27,7 +28,11 @@ def seconds_to_finish(
         pixels += width * height
     # Measured (BUILD_NOTES, "Reserve for evaluation"): programs, then every view, and every pixel.
     per_view, per_pixel = (0.13, 0.35e-6) if reference else (0.09, 0.25e-6)
+    start, times = 6.0, 5 if reference else 2
+    if is_drive(scene):
+        # Parts of every view, and views from beside the way; LPIPS of static and moving pixels.
+        start, per_view, times = start + 6.0, per_view + 0.1, 3 * times
     if lpips_weights is not None:
         # Under two protocols (three where views have gammas), and three more against a reference.
-        per_pixel += (5 if reference else 2) * lpips_weights.network.seconds_per_pixel
-    return min(6.0 + per_view * len(scene.views) + per_pixel * pixels, 0.25 * cfg.train.budget_s)
+        per_pixel += times * lpips_weights.network.seconds_per_pixel
+    return min(start + per_view * len(scene.views) + per_pixel * pixels, 0.25 * cfg.train.budget_s)

@@ -78,7 +78,9 @@ class Run:
         return make_renderer(self.cfg.render, self.owner)
 
     def camera(self, index: int) -> Camera:
-        """Return the camera of a view at the size of the fit; it sees what moves.
+        """Return the camera of a view at the size of the fit.
+
+        It sees what moves, where this run has it.
 
         Args:
             index: row in `scene.views`.

@@ -97,12 +97,17 @@ def left_of_way(views: Sequence[View]) -> Float[np.ndarray, "v 3"]:
     cameras = [view.camera for view in views]
     up = up_of_drive(viewmats, cameras)
     centers = -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
-    # Of a rig that stands, where the first camera or one called "front" looks is ahead.
-    ahead = next((k for k, name in enumerate(cameras) if "front" in name.lower()), 0)
-    otherwise = viewmats[ahead, 2, :3] - up * (up @ viewmats[ahead, 2, :3])
+    otherwise = level_ahead(views, up)
     out = np.zeros((len(views), 3))
     for name in set(cameras):
         rows = [k for k, camera in enumerate(cameras) if camera == name]
         rows.sort(key=lambda k: (-1 if (f := views[k].frame) is None else f, views[k].name))
         out[rows] = np.cross(up, headings(centers[rows], up, otherwise))
     return out
+
+
+def level_ahead(views: Sequence[View], up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
+    """Return where the first camera, or one called "front", looks, without up and down."""
+    ahead = next((view for view in views if "front" in view.camera.lower()), views[0])
+    axis = ahead.viewmat[2, :3].astype(np.float64)
+    return axis - up * (up @ axis)

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.core.streams import Stream, generator
-from p2gs_jax.scene.directions import up_of_drive
+from p2gs_jax.scene.directions import level_ahead, up_of_drive
 from p2gs_jax.scene.drives.poses import interpolated
 from p2gs_jax.scene.survey import Survey, cameras_of, centers_of
 from p2gs_jax.types import Scene, TrackedObject, View
@@ -38,8 +38,7 @@ class _Plane:
         way = longest[-1] - longest[0]
         way -= up * (up @ way)
         if np.linalg.norm(way) < 1e-6:
-            ahead = next((k for k, v in enumerate(views) if "front" in v.camera.lower()), 0)
-            way = viewmats[ahead, 2, :3] - up * (up @ viewmats[ahead, 2, :3])
+            way = level_ahead(views, up)
         along = way / max(np.linalg.norm(way), 1e-12)
         self.axes = np.stack([along, np.cross(up, along)])
         self.start = longest[0]
@@ -136,7 +135,7 @@ def _draw_points(axes, plane: _Plane, scene: Scene, low, high) -> None:
     flat = plane(points)
     inside = np.flatnonzero(((flat >= low) & (flat <= high)).all(1))
     if len(inside) > MOST_POINTS:
-        inside = generator(0, Stream.LIDAR).choice(inside, MOST_POINTS, replace=False)
+        inside = generator(0, Stream.PLAN_POINTS).choice(inside, MOST_POINTS, replace=False)
     what = "points" if scene.lidar is None else "LiDAR"
     for mine, color, label in (
         (inside[~moving[inside]], POINT, what),

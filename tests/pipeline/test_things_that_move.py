@@ -8,13 +8,21 @@ import pytest
 from moving_box import FRAMES, INTERVAL, SIZE, drive_format, pose_at, write_photographs
 
 from p2gs_jax import FitConfig, UserError, fit, load_run, make_camera, with_fields
-from p2gs_jax.cli import main
+from p2gs_jax.cli import main as cli
 from p2gs_jax.core.progress import Silent
 from p2gs_jax.formats.ply import read_ply
 from p2gs_jax.photometry.display import develop
 from p2gs_jax.scene import drives
 from p2gs_jax.scene.drives.object_masks import object_mask
 from p2gs_jax.types import Camera
+
+
+def main(argv: list[str]) -> int:
+    """Run a command and return its exit code."""
+    with pytest.raises(SystemExit) as end:
+        cli(argv)
+    return end.value.code
+
 
 SHORT = with_fields(
     FitConfig(),
@@ -118,7 +126,8 @@ def test_only_objects_and_moved_ones(run):
     assert alpha[inside].max() > 0.5
     assert alpha[~inside].mean() < 0.02
     # Forward is to the right of these cameras.
-    moved = np.asarray(alone.with_moved("box", (1.0, 0, 0)).render(camera).alpha)
+    elsewhere = alone.with_moved("box", (1.0, 0, 0))
+    moved = np.asarray(elsewhere.render(elsewhere.camera(4)).alpha)
     columns = np.arange(camera.width) + 0.5
     shift = np.average(columns, weights=moved.sum(0)) - np.average(columns, weights=alpha.sum(0))
     depth = pose_at(run.scene.views[4].time)[2, 3]
@@ -162,8 +171,10 @@ def test_the_command_renders_what_moves(run, tmp_path):
     path = str(tmp_path / "drive" / "cameras.json")
     assert main(["render", str(run.folder), "--path", path, "--out", str(again)]) == 0
     assert [p.read_bytes() for p in sorted(again.rglob("*.exr"))] == contents["drive"]
-    with pytest.raises(SystemExit):
-        main([*base, "--without-objects", "--only-objects", "--out", str(tmp_path / "x")])
+    both = ("--without-objects", "--only-objects")
+    assert main([*base, *both, "--out", str(tmp_path / "x")]) == 2
+    nowhere = ("--move-object", "box-1", "nan", "0", "0")
+    assert main([*base, *nowhere, "--out", str(tmp_path / "x")]) == 2
 
 
 def test_panoramas_show_what_moves(run, tmp_path):

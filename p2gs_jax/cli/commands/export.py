@@ -16,6 +16,7 @@ from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.core.progress import Reporter, TerminalReporter
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.colmap_folder import write_colmap_folder
+from p2gs_jax.export.drive_table import drive_table, write_drive
 from p2gs_jax.export.sidecar import corrections_name, linear_sidecar
 from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.formats.ply import write_ply, write_radiance
@@ -51,6 +52,7 @@ PLACES: dict[Format, tuple[str, ...]] = {
     "spz": ("display.spz", "display.spz.json"),
     "colmap": ("colmap",),
     "exr": ("exr",),
+    "drive": ("drive.csv", "drive.json"),
 }
 
 
@@ -82,6 +84,8 @@ def run(options: Export) -> int:
                 said = _colmap(folder, fitted, store, reporter)
             elif name == "exr":
                 said = _exr(folder, fitted, store, reporter)
+            elif name == "drive":
+                said = _drive(folder, fitted)
             else:
                 assert display is not None
                 said = display.write(name, folder)
@@ -201,6 +205,13 @@ WRITERS = {
     "splat": _Writer(write_splat, read_splat, 0),
     "spz": _Writer(write_spz, read_spz, MAX_DEGREE),
 }
+
+
+def _drive(folder: Path, fitted: Run) -> str:
+    table = drive_table(fitted.scene, fitted.photometry)
+    csv_name, json_name = PLACES["drive"]
+    write_drive(folder / csv_name, folder / json_name, table)
+    return f"{len(table['views'])} photographs of {len(table['cameras'])} cameras"
 
 
 class _Display:

@@ -40,6 +40,7 @@ from p2gs_jax.paths.pictures import (
     shot_frames,
     wide_frames,
 )
+from p2gs_jax.paths.shift import beside, beside_shots
 from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.run.read import Run, load_run
 
@@ -47,6 +48,8 @@ FPS = 24.0
 # A metered exposure follows what is seen within about this time, seconds.
 ADAPT_S = 0.5
 CAMERAS = "cameras.json"
+# Sideways, scene units.
+MOST_SHIFT = 100.0
 OTHER_FILES = (".mov", ".avi", ".mkv", ".webm", ".gif", ".png", ".jpg", ".exr", ".json")
 
 
@@ -160,6 +163,8 @@ def _default_name(options: Render) -> str:
     if options.path == "views":
         return "panorama" if options.panorama else "all"
     name = options.path if options.path in PATHS else Path(options.path).stem
+    if options.shift:
+        name += f"_{abs(options.shift):g}_{'left' if options.shift > 0 else 'right'}"
     return f"{name}_panorama" if options.panorama else name
 
 
@@ -195,6 +200,10 @@ def _check(options: Render) -> None:
         )
     if options.frames is not None and path not in ("drive", "orbit"):
         raise UserError("--frames is for --path drive and orbit.", fix="leave it out")
+    if options.shift is not None and path != "drive":
+        raise UserError("--shift is for --path drive.", fix="leave it out")
+    if options.shift is not None and not abs(options.shift) <= MOST_SHIFT:
+        raise UserError(f"--shift must be at most {MOST_SHIFT:g} to either side.")
     if options.frames is not None and options.frames < 2:
         raise UserError("--frames must be 2 or more.")
     if options.width is not None and not 16 <= options.width <= LARGEST:
@@ -276,6 +285,8 @@ def _shots(
             own = of_camera(chosen, views, options.camera)
             if options.path == "drive":
                 shots = drive(_recorded(own, options, fitted), options.frames)
+                if options.shift is not None:
+                    shots = beside_shots(shots, views, options.shift)
             else:
                 circle = find_orbit(chosen, own, np.asarray(fitted.scene.points, np.float64))
                 shots = orbit(circle, own, options.frames)
@@ -339,9 +350,12 @@ def _panoramas(options: Render, renderer: RunRenderer) -> Job:
             )
         path = PosePath(rig.poses)
         along = path.evenly(frame_count(len(rig.steps), options.frames))
-        poses, times = path(along), interpolated(path.times, [s.time for s in rig.steps], along)
+        poses = path(along)
+        times = interpolated(path.times, [step.time for step in rig.steps], along)
+        if options.shift is not None:
+            poses = beside(poses, views, options.shift)
         size = (cylinder.width, cylinder.height)
-        return Job(wide_frames(renderer, cylinder, poses, times, transform), len(poses), size)
+        return Job(wide_frames(renderer, cylinder, poses, transform, times), len(poses), size)
     allowed = {shot.view for shot in _chosen(options, fitted)}
     steps = []
     for step in rig.steps:

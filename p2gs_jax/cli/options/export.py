@@ -13,7 +13,7 @@ from p2gs_jax.cli.options.parse import check
 from p2gs_jax.cli.options.scene import SceneFolder
 from p2gs_jax.errors import UserError
 
-Format = Literal["linear-ply", "display-ply", "splat", "spz", "colmap", "exr"]
+Format = Literal["linear-ply", "display-ply", "splat", "spz", "colmap", "exr", "drive"]
 FORMATS: tuple[Format, ...] = get_args(Format)
 # The formats that hold display colours and therefore one display transform.
 DISPLAY: tuple[Format, ...] = ("display-ply", "splat", "spz")
@@ -32,7 +32,8 @@ class Export:
     format: tuple[Format, ...]
     """One or more: linear-ply (radiance, with a JSON file that explains it), display-ply, splat and
     spz (display colours, for viewers), colmap (undistorted photographs, model, exposures), exr
-    (linear renders of all views)."""
+    (linear renders of all views), drive (CSV and JSON: poses in the data set's world, exposures
+    with errors)."""
     out: Path | None = None
     """Folder to write into (default: RUN/exports)."""
     exposure_ev: float | None = None

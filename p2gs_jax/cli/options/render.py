@@ -10,6 +10,7 @@ import tyro
 
 from p2gs_jax.cli.options.scene import SceneFolder
 
+Metres = Annotated[float | None, tyro.conf.arg(metavar="METRES")]
 PATHS = ("views", "drive", "orbit")
 
 
@@ -19,6 +20,7 @@ class Render:
 
     p2gs-jax render runs/street --exposure-ev 1 --gamma 2.2 --out brighter
     p2gs-jax render runs/street --path drive --out drive.mp4
+    p2gs-jax render runs/street --path drive --shift 2 --out left_lane.mp4
     p2gs-jax render runs/street --panorama --split test --width 1400 --out wide
     """
 
@@ -63,6 +65,9 @@ class Render:
     ] = ()
     """Show objects this far forward, left and up of where they are (metres, in the frame of their
     box); of a track's name its beginning will do."""
+    shift: Metres = None
+    """Move a drive sideways, seen from the driving direction: so many metres (scene units) to the
+    left; negative ones to the right."""
     frames: int | None = None
     """Frames of a drive (default: 8 from one view to the next) or an orbit (default: 120)."""
     width: int | None = None
