@@ -42,6 +42,7 @@ class Protocol:
     step_m: float = 1.2
     points: int = 8000
     steps: int = 600
+    # None: as many as the preset thinks right.
     gaussians: int | None = 10_000
 
     @property
@@ -56,6 +57,8 @@ class Protocol:
 
 
 FULL = Protocol()
+# The paper's drive at a quarter of its width; hours.
+AT_SIZE = Protocol(towns=(0,), frames=100, width=480, points=60_000, steps=7000, gaussians=None)
 QUICK = Protocol(towns=(0,), frames=6, width=128, points=3000, steps=150, gaussians=4000)
 
 # Presets by the names that the paper's tables use.
@@ -65,6 +68,7 @@ METHODS: dict[str, PresetName] = {
     "3DGS + AT": "3dgs_affine",
     "3DGS + bilateral grid": "3dgs_bilateral",
     "3DGS + curve (as Luminance-GS)": "3dgs_curve",
+    "PPISP": "ppisp",
     "P2GS as printed": "paper",
     "P2GS, appendix weights": "paper_appendix",
     "robust (ours)": "robust",
@@ -103,21 +107,23 @@ def options(description: str | None, name: str) -> Options:
     parser.add_argument("--out", type=Path, default=Path("runs/paper"))
     parser.add_argument("--towns", type=int, nargs="+")
     parser.add_argument("--steps", type=int)
-    parser.add_argument("--quick", action="store_true", help="one small town, few steps")
+    size = parser.add_mutually_exclusive_group()
+    size.add_argument("--quick", action="store_true", help="one small town, few steps")
+    size.add_argument("--at-size", action="store_true", help="3 x 100 of 480x325, 7,000 steps")
     parser.add_argument("--max-parallel", type=int, default=1, help="fits at a time")
     parser.add_argument("--lpips-weights", help="alex, vgg or a file; without them LPIPS is n/a")
     args = parser.parse_args()
-    protocol = QUICK if args.quick else FULL
+    protocol = QUICK if args.quick else AT_SIZE if args.at_size else FULL
     if args.towns:
         protocol = dataclasses.replace(protocol, towns=tuple(args.towns))
     if args.steps:
         protocol = dataclasses.replace(protocol, steps=args.steps)
     command = f"python experiments/{name}.py"
-    for flag in ("towns", "steps", "quick"):
+    for flag in ("towns", "steps", "quick", "at_size"):
         value = getattr(args, flag)
         if value:
             shown = "" if value is True else " " + " ".join(map(str, np.atleast_1d(value)))
-            command += f" --{flag}{shown}"
+            command += f" --{flag.replace('_', '-')}{shown}"
     return Options(args.out, protocol, args.max_parallel, args.lpips_weights, command)
 
 

@@ -96,6 +96,7 @@ def draw_shots(sensor: Sensor, frames: int, cameras: int, seed: int) -> Shots:
     phase = 2 * np.pi * rng.random(cameras)
     turn = 2 * np.pi * DRIFT_PERIODS * np.arange(frames) / max(frames, 1)
     stops = gain[:, None] + sensor.drift_ev * np.sin(turn + phase[:, None])
+    stops += sensor.compensation_ev
     balance = np.exp2(np.stack([tint[:, 0], np.zeros(cameras), tint[:, 1]], 1))
     optics = generator(seed, SceneStream.OPTICS)
     lost = sensor.vignetting + sensor.vignetting_spread * optics.standard_normal(cameras)

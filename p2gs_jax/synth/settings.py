@@ -24,6 +24,8 @@ class Sensor:
     """Standard deviation of a fixed gain per camera, stops."""
     drift_ev: float = 0.0
     """Amplitude of a slow automatic exposure, each camera at its own phase, stops."""
+    compensation_ev: float = 0.0
+    """Added to the exposure of all photographs, not to that of references, stops."""
     vignetting: float = 0.0
     """Share of the light lost in the corners."""
     vignetting_spread: float = 0.0

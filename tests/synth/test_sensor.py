@@ -40,6 +40,15 @@ def test_gain_drift_and_tint_are_each_cameras_own():
     assert np.abs(drift[0] - drift[1]).max() > 0.3
 
 
+def test_compensation_moves_all_photographs():
+    base = Sensor(iso_std=2, drift_ev=1.0)
+    plain, darker = (
+        draw_shots(dataclasses.replace(base, compensation_ev=ev), 10, 3, seed=1).exposures
+        for ev in (0.0, -2.0)
+    )
+    np.testing.assert_allclose(darker, plain / 4)
+
+
 def test_vignetting_spares_the_centre():
     light = vignette(65, 97, 0.4)[..., 0]
     assert light[32, 48] == pytest.approx(1, abs=1e-3)
