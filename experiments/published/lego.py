@@ -14,7 +14,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from rows import Key, fitted, measure, of_fit
+from published_rows import Key, fitted, measure, of_fit
 
 # Of each method its options; the presets densify by `mcmc`.
 METHODS = {

@@ -31,7 +31,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rows import HERE, Key, measure, of_fit
+from published_rows import HERE, Key, measure, of_fit
 
 import p2gs_jax
 from p2gs_jax.evaluate.alignment import fit_capture, with_fitted_exposure

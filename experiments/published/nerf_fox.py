@@ -12,7 +12,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from rows import Key, fitted, measure, of_fit
+from published_rows import Key, fitted, measure, of_fit
 
 METHODS = ("robust", "3dgs")
 

@@ -22,6 +22,8 @@ from p2gs_jax.types import Scene
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
 # Where pictures by name lie below the folder given: here, nerfstudio's `ns-render dataset`, others.
 PLACES = (".", "rgb", "test/rgb", "renders", "test/renders", "test")
+# Luminance-GS, whose views are in that order as well; beside these pictures are dark ones.
+LUMINANCE_GS = re.compile(r"val_(\d+)_enh")
 # gsplat's trainer writes photograph and render side by side, in the order of held-out views.
 GSPLAT = re.compile(r"(?:val|test)_step(\d+)_(\d+)")
 
@@ -122,8 +124,8 @@ def find_renders(folder: str | Path, scene: Scene) -> OtherRenders:
     """Return which files of a folder show which held-out views.
 
     Looked for in this order: pictures with the names of views, here or in one of `PLACES`; those
-    of the 3DGS code (`test/ours_N/renders`, the largest N), of gsplat's trainer, or bare numbers
-    here: these are the held-out views in the order of their names.
+    of the 3DGS code (`test/ours_N/renders`, the largest N; before pictures by name), of gsplat's
+    trainer or Luminance-GS, or bare numbers here: all the held-out views in the order of names.
 
     Args:
         folder: of the renders.
@@ -147,7 +149,7 @@ def find_renders(folder: str | Path, scene: Scene) -> OtherRenders:
         found = next(filter(None, by_name), None)
         if found is not None:
             return found
-        numbered = _of_gsplat(folder) or _of_numbers(folder)
+        numbered = _of_gsplat(folder) or _of_luminance_gs(folder) or _of_numbers(folder)
     if numbered is None:
         raise UserError(
             f"{folder} holds no render of a held-out view (for example "
@@ -248,6 +250,16 @@ def _of_gsplat(folder: Path) -> _Numbered | None:
         return None
     last = max(steps)
     return f"gsplat, step {last}", [path for _, path in sorted(steps[last])], True
+
+
+def _of_luminance_gs(folder: Path) -> _Numbered | None:
+    """Return the enhanced pictures of the authors' trainer, if it wrote any."""
+    for place in (folder, folder / "renders"):
+        found = [(LUMINANCE_GS.fullmatch(p.stem), p) for p in place.glob("*.png")]
+        files = sorted((int(match[1]), path) for match, path in found if match)
+        if files:
+            return "Luminance-GS, enhanced", [path for _, path in files], False
+    return None
 
 
 def _of_numbers(folder: Path) -> _Numbered | None:

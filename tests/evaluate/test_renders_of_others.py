@@ -107,3 +107,14 @@ def test_pictures_by_name_may_lie_where_programs_put_them(tmp_path):
         found = find_renders(folder, scene)
         assert [p.name for p in found.files.values()] == ["a.jpg"]
         assert not found.missing
+
+
+def test_the_enhanced_pictures_of_luminance_gs_are_taken(tmp_path):
+    scene, store = made_scene(tmp_path / "scene", ("a.png", "b.png"))
+    folder = tmp_path / "bike" / "renders"
+    folder.mkdir(parents=True)
+    for k, name in enumerate(("a.png", "b.png")):
+        cv2.imwrite(str(folder / f"val_{k:04d}_enh.png"), photograph(scene, name))
+        cv2.imwrite(str(folder / f"val_{k:04d}_low.png"), photograph(scene, name) // 2)
+    found = check_renders(find_renders(tmp_path / "bike", scene), scene, store)
+    assert [p.name for p in found.files.values()] == ["val_0000_enh.png", "val_0001_enh.png"]

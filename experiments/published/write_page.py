@@ -1,6 +1,6 @@
 """Write experiments/PUBLISHED.md from what was measured (`rows.json`) and published.
 
-python experiments/published/table.py
+python experiments/published/write_page.py
 """
 
 from __future__ import annotations
@@ -9,14 +9,14 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from rows import HERE, Key, read_rows
+from published_rows import HERE, Key, read_rows
 
 from p2gs_jax.core.atomic import write_text
 
 OUT = HERE.parent / "PUBLISHED.md"
 HEAD = """# Beside published figures
 
-Written by `python experiments/published/table.py` from [rows.json](published/rows.json) and
+Written by `python experiments/published/write_page.py` from [rows.json](published/rows.json) and
 [published.json](published/published.json): each figure beside the published one, with the command,
 the seconds of the whole fit, and the commit. Scripts, and what is not run here:
 [published](published/README.md). A row is one run and one seed. Machine: that of
