@@ -31,7 +31,7 @@ AXES_UNIT, BIAS_UNIT = 0.2, 0.1
 POWER_UNIT, TURN_UNIT, BEND_UNIT = 0.1, 0.002, 0.002
 DARKEST = 1e-3
 # Least rise of a curve from one entry to the next where it is inverted.
-LEAST_RISE = 1e-4
+LEAST_RISE = 1e-5
 
 
 class Curves(eqx.Module):
@@ -127,7 +127,8 @@ def as_photographed(ldr: Float[Array, "*p 3"], view: Curves) -> Float[Array, "*p
     """
     count = view.curve.shape[0]
     even = jnp.linspace(0.0, 1.0, count, dtype=view.curve.dtype)
-    rising = lax.cummax(view.curve) + LEAST_RISE * jnp.arange(count, dtype=view.curve.dtype)
+    rise = LEAST_RISE * (count - 1)
+    rising = (lax.cummax(view.curve) + rise * even) / (1.0 + rise)
     return _along_axes(ldr, view.axes, lambda t: jnp.interp(t, rising, even))
 
 
