@@ -47,6 +47,16 @@ def test_at_the_start_nothing_changes():
     np.testing.assert_allclose(pseudo_curve(jnp.zeros(3)), np.linspace(0, 1, ENTRIES), atol=2.1e-3)
 
 
+def test_new_views_get_the_mean_also_of_host_arrays():
+    at = noisy(0.05)
+    each = [at.view(k).curve for k in range(2)]
+    on_host = jax.tree.map(np.asarray, at)
+    for found in (at.mean(), on_host.mean()):
+        np.testing.assert_allclose(found.curve, (each[0] + each[1]) / 2, atol=1e-6)
+        np.testing.assert_allclose(found.axes @ found.axes.T, np.eye(3), atol=1e-6)
+    np.testing.assert_allclose(on_host.view(1).curve, each[1], atol=1e-6)
+
+
 def test_curves_stay_in_bounds_whatever_is_learned():
     for size in (0.3, 3.0, 100.0):
         view = noisy(size).view(0)

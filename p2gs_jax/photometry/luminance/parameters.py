@@ -10,7 +10,6 @@ image and the camera's pose; the curve is interpolated, where theirs takes the e
 from __future__ import annotations
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -71,18 +70,23 @@ class Luminance(eqx.Module):
 
     def view(self, row: Int[Array, ""] | int) -> Curves:
         """Return what holds for a training view."""
-        seen = lax.stop_gradient(self.statistics[row])
-        inner = jnp.tanh(seen @ self.hidden + self.hidden_bias)
-        found = inner @ self.out + self.out_bias
-        curve = jnp.clip(self.curve + BIAS_UNIT * found[:ENTRIES], 0.0, 1.0)
-        return Curves(curve, axes_of(AXES_UNIT * self.axes[row]), found[ENTRIES:])
+        curve, shape = self._predicted(self.statistics[row])
+        return Curves(curve, axes_of(AXES_UNIT * jnp.asarray(self.axes[row])), shape)
 
     def mean(self) -> Curves:
         """Return the mean over the training views: of curves, and of raw axes."""
-        rows = jnp.arange(self.axes.shape[0])
-        each = jax.vmap(self.view)(rows)
-        axes = axes_of(AXES_UNIT * self.axes.mean(0))
-        return Curves(each.curve.mean(0), axes, each.shape.mean(0))
+        curves, shapes = self._predicted(self.statistics)
+        axes = axes_of(AXES_UNIT * jnp.asarray(self.axes).mean(0))
+        return Curves(curves.mean(0), axes, shapes.mean(0))
+
+    def _predicted(
+        self, statistics: Float[Array, "*v s"]
+    ) -> tuple[Float[Array, "*v k"], Float[Array, "*v 3"]]:
+        """Return the curves of photographs and the shapes of their pseudo curves."""
+        seen = lax.stop_gradient(jnp.asarray(statistics))
+        inner = jnp.tanh(seen @ self.hidden + self.hidden_bias)
+        found = inner @ self.out + self.out_bias
+        return jnp.clip(self.curve + BIAS_UNIT * found[..., :ENTRIES], 0, 1), found[..., ENTRIES:]
 
 
 def identity(views: int) -> Luminance:
