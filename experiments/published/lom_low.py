@@ -82,13 +82,13 @@ class Aligned:
         reference = load_reference(run.scene.root / "reference", run.scene, run.cfg)
         self.target = lambda row: np.asarray(reference(row))
         self._training = [
-            (
-                np.asarray(run.render(run.camera(row)).linear),
-                self.target(row),
-                run.store.get(row)[1],
-            )
+            (self.linear(row), self.target(row), run.store.get(row)[1])
             for row in run.scene.train_indices
         ]
+
+    def linear(self, row: int) -> np.ndarray:
+        """Return the radiance that a view shows."""
+        return np.asarray(self.run.render(self.run.camera(row)).linear)
 
     def displays(self) -> dict[str, p2gs_jax.DisplayTransform]:
         """Return the transform of each score; `enhanced` where corrections enhance."""
@@ -105,7 +105,8 @@ class Aligned:
         out["exposure"] = dataclasses.replace(
             self._plain, exposure=_middle([t.exposure for t in exposed])
         )
-        red, green, blue = np.median([t.white_balance for t in taken], axis=0)
+        balances = np.array([t.white_balance or (0.0, 0.0, 0.0) for t in taken])
+        red, green, blue = np.median(balances, axis=0)
         out["all"] = dataclasses.replace(
             self._plain,
             exposure=_middle([t.exposure for t in taken]),

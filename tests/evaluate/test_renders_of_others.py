@@ -1,6 +1,9 @@
 """Which file shows which view, and which pixels count."""
 
+from typing import Any, cast
+
 import cv2
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -39,13 +42,15 @@ def made_scene(folder, held_out, masked=False):
 
 
 def judge(scene, store):
-    one = np.ones(1, "f4")
-    photometry = Photometry(one * 0, one * 0, "log")
-    return Judge(scene, store, Params(None, photometry), FitConfig())
+    photometry = Photometry(jnp.zeros(1), jnp.zeros(1), "log")
+    # Renders are judged without any Gaussians.
+    return Judge(scene, store, Params(cast(Any, None), photometry), FitConfig())
 
 
 def photograph(scene, name):
-    return cv2.imread(str(scene.root / name))
+    image = cv2.imread(str(scene.root / name))
+    assert image is not None
+    return image
 
 
 def test_numbered_renders_follow_the_order_that_fits_the_photographs(tmp_path):
