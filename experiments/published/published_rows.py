@@ -99,7 +99,10 @@ def fitted(scene: Path, run: Path, options: Sequence[str]) -> dict[str, Any]:
 
 
 def measure(
-    wanted: Sequence[Key], row_of: Callable[[Key], dict[str, Any]], again: bool = False
+    wanted: Sequence[Key],
+    row_of: Callable[[Key], dict[str, Any]],
+    again: bool = False,
+    path: Path = ROWS,
 ) -> None:
     """Measure rows one after another and keep each; those that are there are left.
 
@@ -107,12 +110,13 @@ def measure(
         wanted: which.
         row_of: measures one.
         again: measure also what is there.
+        path: where they are kept.
     """
     for key in wanted:
-        if key in read_rows() and not again:
+        if key in read_rows(path) and not again:
             print(f"{' '.join(map(str, key))}: there already", file=sys.stderr, flush=True)
             continue
         begin = time.monotonic()
-        add_row(key, row_of(key))
+        add_row(key, row_of(key), path)
         took = time.monotonic() - begin
         print(f"{' '.join(map(str, key))}: {took:.0f} s", file=sys.stderr, flush=True)
