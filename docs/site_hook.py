@@ -25,6 +25,8 @@ OUTSIDE = (
     "CONTRIBUTING.md",
     "experiments/README.md",
     "experiments/RESULTS.md",
+    "experiments/PUBLISHED.md",
+    "experiments/published/README.md",
     *sorted(p.relative_to(ROOT).as_posix() for p in (ROOT / "experiments/results").glob("*.md")),
 )
 FENCED = re.compile(r"(^```.*?^```)", re.M | re.S)

@@ -23,6 +23,7 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.formats.png import write_png
 from p2gs_jax.paths.captioned_images import CaptionedImage, stacked
+from p2gs_jax.photometry.luminance.parameters import Luminance
 from p2gs_jax.photometry.ppisp.homography import recolored
 from p2gs_jax.photometry.ppisp.parameters import Ppisp
 from p2gs_jax.photometry.ppisp.vignetting import falloff
@@ -120,6 +121,10 @@ def mean_of_rows(run: p2gs_jax.Run, rows: Sequence[int]) -> p2gs_jax.Run:
     if isinstance(appearance, Ppisp):
         # All else is the cameras'.
         per_view = {k: mean(getattr(appearance, k)) for k in ("exposures", "colors")}
+        appearance = dataclasses.replace(appearance, **per_view)
+    elif isinstance(appearance, Luminance):
+        # The curve of mean statistics stands for the mean curve.
+        per_view = {k: mean(getattr(appearance, k)) for k in ("axes", "statistics")}
         appearance = dataclasses.replace(appearance, **per_view)
     elif appearance is not None:
         appearance = mean(appearance)

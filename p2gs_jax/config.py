@@ -13,7 +13,7 @@ from typing import Literal, get_args
 
 from p2gs_jax.errors import UserError
 
-Appearance = Literal["affine", "bilateral", "curve", "ppisp"]
+Appearance = Literal["affine", "bilateral", "curve", "ppisp", "luminance"]
 PresetName = Literal[
     "paper",
     "paper_appendix",
@@ -25,6 +25,7 @@ PresetName = Literal[
     "3dgs_curve",
     "ppisp",
     "ppisp_solved",
+    "luminance_gs",
 ]
 PhotometricModel = Literal[
     "constant",
@@ -195,8 +196,9 @@ class PhotometryConfig:
     """Standard deviation of the random start (paper, Exposure modeling)."""
     appearance: Appearance | None = None
     """A learned correction of display values per view, as baselines have: a colour matrix (3DGS's
-    exposure compensation), a bilateral grid of them, or a curve (photometry/appearance.py); or, in
-    place of a tone curve, a whole camera (`ppisp`, photometry/ppisp)."""
+    exposure compensation), a bilateral grid of them, or a curve (photometry/appearance.py); in
+    place of a tone curve, a whole camera (`ppisp`, photometry/ppisp); or a curve that enhances
+    every photograph (`luminance`, photometry/luminance)."""
     freeze_until: float = 0.6
     """Fraction of the run during which exposure and gamma stay at their start, where that start
     comes from tracks (ours: docs/photometry.md, 4)."""
@@ -579,6 +581,18 @@ def _ppisp_solved() -> FitConfig:
     return dataclasses.replace(robust, preset="ppisp_solved", photometry=photometry)
 
 
+def _luminance_gs() -> FitConfig:
+    """Return Luminance-GS's curves under the schedule, renderer and budget of `robust`.
+
+    Published: 10,000 steps, rates that decay to a hundredth. The rate is ours: ten times the
+    published one of the curve, for fits of some hundred to some thousand steps.
+    """
+    base = _ldr("luminance_gs", appearance="luminance")
+    return dataclasses.replace(
+        base, optimizer=dataclasses.replace(base.optimizer, appearance_final=0.01)
+    )
+
+
 def preset(name: PresetName) -> FitConfig:
     """Return the configuration of a preset.
 
@@ -586,7 +600,8 @@ def preset(name: PresetName) -> FitConfig:
         name: `robust`; `paper` (as printed, lambda_exp 0.01) or `paper_appendix` (0.1); baselines
             that splat display values: `3dgs`, with a gain per view `3dgs_gain`, or with a learned
             correction per view `3dgs_affine`, `3dgs_bilateral`, `3dgs_curve`; `ppisp`, a camera
-            learned beside the splats, and `ppisp_solved`, about the same camera solved before.
+            learned beside the splats, and `ppisp_solved`, about the same camera solved before;
+            `luminance_gs`, a curve that enhances every photograph.
 
     Raises:
         UserError: there is no such preset.
@@ -602,6 +617,7 @@ def preset(name: PresetName) -> FitConfig:
         "3dgs_curve": lambda: _ldr("3dgs_curve", appearance="curve"),
         "ppisp": _ppisp,
         "ppisp_solved": _ppisp_solved,
+        "luminance_gs": _luminance_gs,
     }
     if name not in known:
         raise UserError(

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.photometry.appearance import Correction
+from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.photometry.formation import display, formation
 from p2gs_jax.types import Capture
 
@@ -109,6 +110,20 @@ def fit_exposure(
         throw=False,
     )
     return jnp.exp2(low + found.value)
+
+
+def with_fitted_exposure(shown: DisplayTransform, linear, photograph, mask) -> DisplayTransform:
+    """Return the display transform with the exposure solved that fits a photograph best.
+
+    Args:
+        shown: all but the exposure.
+        linear: radiance.
+        photograph: display values.
+        mask: 1 = use.
+    """
+    how = (shown.capture, shown.formation, shown.correction)
+    found = float(fit_exposure(linear, photograph, mask, *how))
+    return dataclasses.replace(shown, exposure=found)
 
 
 @functools.partial(jax.jit, static_argnames=("cfg", "gamma", "white_balance"))

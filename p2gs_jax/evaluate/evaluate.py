@@ -22,18 +22,17 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from p2gs_jax.config import FitConfig
-from p2gs_jax.evaluate.alignment import fit_capture, fit_exposure
+from p2gs_jax.evaluate.alignment import fit_capture, with_fitted_exposure
 from p2gs_jax.evaluate.array_store import ArrayStore, StoredArray
 from p2gs_jax.evaluate.consistency import VideoScores
 from p2gs_jax.evaluate.drives import DriveScores, is_drive, masks_of_parts
-from p2gs_jax.evaluate.lpips import LpipsWeights, lpips
+from p2gs_jax.evaluate.lpips import LpipsWeights
 from p2gs_jax.evaluate.metered import MeteredViews
-from p2gs_jax.evaluate.metrics import psnr, ssim
 from p2gs_jax.evaluate.moving import still_mask
 from p2gs_jax.evaluate.parallel import map_in_order
 from p2gs_jax.evaluate.radiance import RadianceScores, Truth
-from p2gs_jax.evaluate.region_scores import PARTS, mean_of_parts, region_scores
 from p2gs_jax.evaluate.unexplained import Unexplained
+from p2gs_jax.evaluate.view_scores import Collector, view_scores
 from p2gs_jax.photometry.display import DisplayTransform, develop, display_of_view, with_capture
 from p2gs_jax.photometry.formation import exposed_at
 from p2gs_jax.photometry.mean import MeanParameters, mean_parameters, usual_display
@@ -69,23 +68,6 @@ class ViewResult:
     transform: DisplayTransform
 
 
-def _score(
-    lpips_weights: LpipsWeights | None,
-    ldr,
-    target,
-    mask,
-    parts: Mapping[str, Float32[np.ndarray, "h w"]] | None = None,
-) -> dict[str, Any]:
-    """Return PSNR and SSIM of an image; LPIPS if there are weights for it; the same of parts."""
-    row: dict[str, Any] = {
-        "psnr": float(psnr(ldr, target, mask)),
-        "ssim": float(ssim(ldr, target, mask)),
-    }
-    if lpips_weights is not None:
-        row["lpips"] = float(lpips(lpips_weights, ldr, target, mask))
-    return row if parts is None else {**row, **region_scores(lpips_weights, ldr, target, parts)}
-
-
 class _Judged(NamedTuple):
     """A view with its scores, and the references that need all views to compare with.
 
@@ -110,24 +92,6 @@ class _Judged(NamedTuple):
     radiance: np.ndarray | None
     reference: np.ndarray | None
     readings: Readings
-
-
-class _Collector:
-    """Per-view scores, of drives also of parts of the views, and their means."""
-
-    def __init__(self, rows: dict[str, dict[str, Any]] | None = None):
-        self.rows = {} if rows is None else rows
-
-    def add(self, name: str, row: dict[str, Any]) -> None:
-        self.rows[name] = row
-
-    def summary(self) -> dict:
-        if not self.rows:
-            return {}
-        rows = list(self.rows.values())
-        keys = [k for k in rows[0] if k not in PARTS]
-        means = {k: float(np.mean([r[k] for r in rows])) for k in keys}
-        return {**means, **mean_of_parts(rows), "per_view": self.rows}
 
 
 def evaluate(
@@ -192,7 +156,7 @@ def evaluate(
     def judged(index: int) -> _Judged:
         photograph, mask = store.get(index, 1)
         parts = None if drive is None else masks_of_parts(scene, index, mask)
-        score = functools.partial(_score, lpips_weights, parts=parts)
+        score = functools.partial(view_scores, lpips_weights, parts=parts)
         result = render(gaussians, living, camera_of(store, index))
         linear = np.asarray(result.linear)
         shown = usual(index)
@@ -202,7 +166,7 @@ def evaluate(
             transform = display_of_view(small, row_of[index], tone)
         else:
             still = still_mask(scene, index, mask)
-            transform = _exposure_fitted(shown, linear, photograph, still)
+            transform = with_fitted_exposure(shown, linear, photograph, still)
             extra = {"exposure": transform.exposure}
             everything = _all_fitted(linear, photograph, (still, mask), transform, score)
         ldr = develop(linear, transform)
@@ -219,8 +183,8 @@ def evaluate(
             meter(linear, alpha),
         )
 
-    own, averaged = _Collector(), _Collector()
-    test_averaged, test_fitted, test_all = _Collector(), _Collector(), _Collector()
+    own, averaged = Collector(), Collector()
+    test_averaged, test_fitted, test_all = Collector(), Collector(), Collector()
     videos = {name: VideoScores() for name in ("per_view", "averaged", "photographs")}
     with ArrayStore() as arrays:
         scores, metered = RadianceScores(arrays), MeteredViews(arrays)
@@ -270,10 +234,10 @@ def evaluate(
             row = row_of_name[name]
             shown = develop(linear, replace(usual(row), exposure=exposure))
             parts = None if drive is None else masks_of_parts(scene, row, mask)
-            return _score(lpips_weights, shown, photograph, mask, parts)
+            return view_scores(lpips_weights, shown, photograph, mask, parts)
 
         if metered_scores := metered.scores(metering, under_rule):
-            metrics["test"]["metered"] = _Collector(metered_scores).summary()
+            metrics["test"]["metered"] = Collector(metered_scores).summary()
         metrics["train"]["per_view"] = metrics["train"].pop("per_view", {})
         metrics["consistency"] = {name: video.summary() for name, video in videos.items()}
         if scores.views:
@@ -289,15 +253,9 @@ def evaluate(
                 scene,
                 mean,
                 usual_display(small, (), None, tone),
-                functools.partial(_score, lpips_weights),
+                functools.partial(view_scores, lpips_weights),
             )
         return metrics
-
-
-def _exposure_fitted(shown: DisplayTransform, linear, photograph, mask) -> DisplayTransform:
-    """Return the display transform with the exposure solved that fits a photograph best."""
-    how = (shown.capture, shown.formation, shown.correction)
-    return replace(shown, exposure=float(fit_exposure(linear, photograph, mask, *how)))
 
 
 def _all_fitted(linear, photograph, masks, start: DisplayTransform, score) -> dict[str, Any] | None:
@@ -350,7 +308,7 @@ def _against_reference(
         return (kept.read() for kept in view[1])
 
     def scale(view) -> float:
-        return _exposure_fitted(shown, *images(view)).exposure
+        return with_fitted_exposure(shown, *images(view)).exposure
 
     scales = list(map_in_order(scale, views))
     common = float(np.exp(np.median(np.log(scales))))
@@ -367,7 +325,7 @@ def _against_reference(
             for name, exposure in protocols.items()
         }
 
-    parts = {name: {part: _Collector() for part in ("all", "train", "test")} for name in protocols}
+    parts = {name: {part: Collector() for part in ("all", "train", "test")} for name in protocols}
     for (index, *_), rows in zip(views, map_in_order(judged, views), strict=True):
         view = scene.views[index]
         for name, row in rows.items():

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.evaluate.array_store import ArrayStore, StoredArray
 from p2gs_jax.evaluate.metrics import ssim
+from p2gs_jax.evaluate.mu_law import mu_law_psnr
 from p2gs_jax.evaluate.parallel import map_in_order
 
 Truth = Callable[[int], Float[np.ndarray, "h w 3"] | None]
@@ -106,7 +107,7 @@ class RadianceScores:
 
         Returns:
             `stops_median` and `stops_rms` after one common scale, `stops_rms_power` after scale
-            and power, `pu21_psnr`, `pu21_ssim`, `delta_e_itp`; and the alignment.
+            and power, `pu21_psnr`, `pu21_ssim`, `delta_e_itp`, `mu_law_psnr`; and the alignment.
         """
         if not self.views:
             return {}
@@ -129,6 +130,7 @@ class RadianceScores:
                 "pu21_psnr": pu21_psnr(linear * scale, truth, mask, white),
                 "pu21_ssim": pu21_ssim(linear * scale, truth, mask, white),
                 "delta_e_itp": delta_e_itp(linear * scale, truth, mask, white),
+                "mu_law_psnr": mu_law_psnr(linear * scale, truth, mask),
             }
 
         found = map_in_order(judged, self.views)

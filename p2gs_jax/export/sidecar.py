@@ -52,7 +52,8 @@ DARKEST_EV, BRIGHTEST_EV, SAMPLES = -14.0, 4.0, 433
 
 def corrections_name(kind: Appearance) -> str:
     """Return the name of the file beside it that holds learned corrections."""
-    return "linear.ppisp.json" if kind == "ppisp" else "linear.appearance.npy"
+    names = {"ppisp": "linear.ppisp.json", "luminance": "linear.luminance.json"}
+    return names.get(kind, "linear.appearance.npy")
 
 
 def linear_sidecar(

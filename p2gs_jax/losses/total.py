@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from p2gs_jax.config import FitConfig
 from p2gs_jax.losses.image import photometric_loss
 from p2gs_jax.losses.lidar import lidar_loss
+from p2gs_jax.losses.luminance import luminance_terms
 from p2gs_jax.losses.regularizers import photometry_regularizers, population_terms, pose_terms
 from p2gs_jax.losses.relative_exposure import (
     ColorPairs,
@@ -23,6 +24,7 @@ from p2gs_jax.losses.relative_exposure import (
 from p2gs_jax.photometry.appearance import Corrections, correction_of, regularisation
 from p2gs_jax.photometry.cameras import darkens, places
 from p2gs_jax.photometry.formation import formation
+from p2gs_jax.photometry.luminance.parameters import Curves
 from p2gs_jax.render import render_splats
 from p2gs_jax.render.blocks import Shown, splat
 from p2gs_jax.render.objects import with_corrections
@@ -168,6 +170,9 @@ def image_loss(
     photograph, mask = decoded(batch)
     ldr = formation(render.linear, photometry.capture(i), cfg.photometry, correction)
     terms = dict(photometric_loss(ldr, photograph, mask, cfg.loss))
+    if isinstance(correction, Curves):
+        light = formation(render.linear, photometry.capture(i), cfg.photometry)
+        terms |= luminance_terms(light, photograph, mask, correction, cfg.loss)
     if measured is not None and lidar_weight is not None:
         terms["lidar"] = lidar_weight * lidar_loss(render, measured)
 

@@ -4,7 +4,8 @@
 of such matrices over the image and luminance (bilateral-guided radiance fields). `curve`: one
 rising curve per view for all channels (in the manner of Luminance-GS). Their parameters are
 deviations: zeros change nothing. `ppisp` takes the place of the tone curve and has parameters of
-cameras as well: `ppisp/`.
+cameras as well: `ppisp/`. `luminance` maps photographs to an enhanced scene, as Luminance-GS does:
+`luminance/`; renders are shown through its inverse.
 """
 
 from __future__ import annotations
@@ -14,19 +15,22 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float, Int
 
 from p2gs_jax.config import Appearance
 from p2gs_jax.core.numerics import LN2, on_device
+from p2gs_jax.photometry.luminance import parameters as luminance
+from p2gs_jax.photometry.luminance.parameters import Curves, Luminance
 from p2gs_jax.photometry.ppisp import parameters as isp
 from p2gs_jax.photometry.ppisp.parameters import OneView, Ppisp
 from p2gs_jax.photometry.ppisp.regularisation import regularisation as ppisp_regularisation
 from p2gs_jax.types import LUMINANCE, Params
 
-# Of all training views: a row for each, or what PPISP learns of views and cameras.
-Corrections = Float[Array, "v ..."] | Ppisp
+# Of all training views: a row for each, or what PPISP or Luminance-GS learns.
+Corrections = Float[Array, "v ..."] | Ppisp | Luminance
 # Of one view.
-Correction = Float[Array, "..."] | OneView
+Correction = Float[Array, "..."] | OneView | Curves
 
 # Luminance levels, rows and columns of a bilateral grid, as its authors use.
 GRID = (8, 16, 16)
@@ -42,13 +46,15 @@ def identity(kind: Appearance, cameras: Sequence[str]) -> Corrections:
     """
     if kind == "ppisp":
         return isp.identity(cameras)
+    if kind == "luminance":
+        return luminance.identity(len(cameras))
     shapes = {"affine": (3, 4), "bilateral": (12, *GRID), "curve": (CURVE_KNOTS,)}
     return on_device(np.zeros((len(cameras), *shapes[kind])))
 
 
 def correction_of(appearance: Corrections | None, row: Int[Array, ""] | int) -> Correction | None:
     """Return the correction of the training view in a row of `Photometry`, or None."""
-    if isinstance(appearance, Ppisp):
+    if isinstance(appearance, Ppisp | Luminance):
         return appearance.view(row)
     return None if appearance is None else appearance[row]
 
@@ -62,6 +68,8 @@ def mean_correction(appearance: Corrections | None, camera: str | None = None) -
     """
     if isinstance(appearance, Ppisp):
         return appearance.mean(camera)
+    if isinstance(appearance, Luminance):
+        return appearance.mean()
     return None if appearance is None else appearance.mean(axis=0)
 
 
@@ -102,6 +110,9 @@ def corrected(
     """
     if isinstance(parameters, OneView):
         return isp.applied(ldr, parameters)
+    if isinstance(parameters, Curves):
+        # The Gaussians learn through it; it is learned from photographs alone.
+        return luminance.as_photographed(ldr, lax.stop_gradient(parameters))
     if kind == "affine":
         return ldr + ldr @ parameters[:, :3].T + parameters[:, 3]
     if kind == "curve":
@@ -149,6 +160,8 @@ def regularisation(parameters: Corrections, kind: Appearance) -> Float[Array, ""
     """
     if isinstance(parameters, Ppisp):
         return ppisp_regularisation(parameters)
+    if isinstance(parameters, Luminance):
+        return None
     if kind != "bilateral":
         return None
     return sum((jnp.mean(jnp.diff(parameters, axis=k) ** 2) for k in (2, 3, 4)), jnp.zeros(()))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Callable, Sequence
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -13,6 +15,8 @@ from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.photometry.appearance import Corrections, identity
 from p2gs_jax.photometry.cameras import camera_rows
 from p2gs_jax.photometry.formation import inverse_tone_map
+from p2gs_jax.photometry.luminance.parameters import Luminance
+from p2gs_jax.photometry.luminance.statistics import statistics_of
 from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.types import GAMMA_SRGB, Photometry, Scene, View
 
@@ -51,15 +55,27 @@ def initial_photometry(
     return Photometry(on_device(exposures), on_device(gammas), p.parameterization, balance, rows)
 
 
-def initial_appearance(views: Sequence[View], cfg: FitConfig) -> Corrections | None:
+def initial_appearance(
+    views: Sequence[View],
+    cfg: FitConfig,
+    photograph: Callable[[int], tuple[np.ndarray, np.ndarray]] | None = None,
+) -> Corrections | None:
     """Return corrections that change nothing; None: the fit has none.
 
     Args:
         views: training views.
         cfg: their kind.
+        photograph: place in `views` -> display values and mask, for corrections that depend on
+            photographs; None: these do not know them yet.
     """
     kind = cfg.photometry.appearance
-    return None if kind is None else identity(kind, [view.camera for view in views])
+    if kind is None:
+        return None
+    start = identity(kind, [view.camera for view in views])
+    if isinstance(start, Luminance) and photograph is not None:
+        seen = [statistics_of(*map(jnp.asarray, photograph(k))) for k in range(len(views))]
+        return dataclasses.replace(start, statistics=on_device(np.stack(seen)))
+    return start
 
 
 def point_radiance(

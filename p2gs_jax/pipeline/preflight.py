@@ -124,6 +124,12 @@ def check_start(p: PhotometryConfig, preset: str) -> None:
             f"ppisp learns a whole camera: the curve {p.curve!r} would come before it.",
             fix="use --preset ppisp, or add --photometry.curve linear --photometry.start random",
         )
+    if p.appearance == "luminance" and p.curve != "linear":
+        raise UserError(
+            f"Luminance-GS maps display values to display values: it knows no curve {p.curve!r}.",
+            fix="use --preset luminance_gs, or add --photometry.curve linear --photometry.start "
+            "random",
+        )
     if p.curve == "linear" and p.start == "tracks":
         raise UserError(
             "the curve 'linear' splats display values; the tracks' bundle adjustment does not know "

@@ -253,7 +253,7 @@ def prepare(
         Params(
             gaussians,
             photometry,
-            initial_appearance(views, resolved),
+            initial_appearance(views, resolved, lambda k: fitted.get(scene.train_indices[k])),
             _initial_poses(nodes, resolved),
         ),
         owner,

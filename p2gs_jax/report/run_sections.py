@@ -78,6 +78,7 @@ def _radiance(run: RunFiles) -> str:
         ("pu21_psnr", "PU21 PSNR {:.2f} dB"),
         ("pu21_ssim", "PU21 SSIM {:.4f}"),
         ("delta_e_itp", "colour difference {:.1f} ΔE ITP"),
+        ("mu_law_psnr", "mu-law PSNR {:.2f} dB"),
     ]
     for name, form in rest:
         value = run.number("radiance", name)

@@ -89,6 +89,7 @@ def _modelled(run: RunFiles) -> str:
 def _correction(run: RunFiles) -> str:
     kind = run.option("photometry", "appearance")
     kinds = {"affine": "a colour matrix", "bilateral": "a bilateral grid", "curve": "a curve"}
+    kinds["luminance"] = "colour axes and an enhancing curve"
     return "" if kind is None else f", with {kinds.get(kind, kind)} learned for every view"
 
 

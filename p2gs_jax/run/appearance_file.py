@@ -1,4 +1,4 @@
-"""Learned corrections in a file: `appearance.npy`, or `ppisp.json` (docs/files.md)."""
+"""Learned corrections: `appearance.npy`, `ppisp.json` or `luminance.json` (docs/files.md)."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from p2gs_jax.core.atomic import write_array, write_json
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.appearance import Corrections, identity
+from p2gs_jax.photometry.luminance.parameters import Luminance
 from p2gs_jax.photometry.ppisp.parameters import Ppisp
 from p2gs_jax.types import View
 
@@ -23,11 +24,13 @@ def write_appearance(path: Path, appearance: Corrections, views: Sequence[View])
 
     Args:
         path: of the file.
-        appearance: a row for each view, or PPISP's parameters.
+        appearance: a row for each view, or the parameters of PPISP or Luminance-GS.
         views: the training views.
     """
     if isinstance(appearance, Ppisp):
         write_json(path, _ppisp_values(appearance, views))
+    elif isinstance(appearance, Luminance):
+        write_json(path, _luminance_values(appearance, views))
     else:
         write_array(path, np.asarray(appearance))
 
@@ -47,6 +50,8 @@ def read_appearance(path: Path, kind: Appearance, views: Sequence[View]) -> Corr
     try:
         if isinstance(like, Ppisp):
             return _read_ppisp(json.loads(path.read_text(encoding="utf-8")), like, views)
+        if isinstance(like, Luminance):
+            return _read_luminance(json.loads(path.read_text(encoding="utf-8")), like, views)
         corrections = np.load(path, allow_pickle=False)
     except (OSError, ValueError) as error:
         raise UserError(
@@ -94,3 +99,35 @@ def _read_ppisp(saved: dict[str, Any], like: Ppisp, views: Sequence[View]) -> Pp
         like.names,
         like.cameras,
     )
+
+
+# Parameters of all views, and those of single ones, as they are called in the file.
+_SHARED = ("curve", "hidden", "hidden_bias", "out", "out_bias")
+_OF_VIEWS = ("axes", "statistics")
+
+
+def _luminance_values(p: Luminance, views: Sequence[View]) -> dict[str, Any]:
+    return {
+        **{name: np.asarray(getattr(p, name)) for name in _SHARED},
+        "views": {
+            view.name: {name: np.asarray(getattr(p, name)[k]) for name in _OF_VIEWS}
+            for k, view in enumerate(views)
+        },
+    }
+
+
+def _read_luminance(saved: dict[str, Any], like: Luminance, views: Sequence[View]) -> Luminance:
+    """Return the parameters in the order of the views.
+
+    Raises:
+        KeyError: a view or a parameter is missing.
+        ValueError: a parameter has another shape.
+    """
+    of_views = [saved["views"][view.name] for view in views]
+    values = {name: saved[name] for name in _SHARED}
+    values |= {name: [row[name] for row in of_views] for name in _OF_VIEWS}
+
+    def shaped(name: str):
+        return on_device(np.array(values[name], np.float32).reshape(getattr(like, name).shape))
+
+    return Luminance(**{name: shaped(name) for name in values})

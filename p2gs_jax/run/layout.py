@@ -62,9 +62,10 @@ class RunFolder:
         """Corrections that a baseline learns.
 
         Args:
-            kind: which; PPISP's parameters are of views and of cameras.
+            kind: which; PPISP's and Luminance-GS's parameters are not of views alone.
         """
-        return self.root / ("ppisp.json" if kind == "ppisp" else "appearance.npy")
+        names = {"ppisp": "ppisp.json", "luminance": "luminance.json"}
+        return self.root / names.get(kind, "appearance.npy")
 
     @property
     def metering(self) -> Path:
@@ -75,6 +76,11 @@ class RunFolder:
     def metrics(self) -> Path:
         """Scores, counts, seconds."""
         return self.root / "metrics.json"
+
+    @property
+    def against(self) -> Path:
+        """Scores of other programs on the held-out views, beside the run's."""
+        return self.root / "against.json"
 
     @property
     def summary(self) -> Path:

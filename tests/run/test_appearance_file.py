@@ -29,10 +29,13 @@ def learned(kind):
     return replace(noisy, exposures=start.exposures) if kind == "ppisp" else noisy
 
 
-@pytest.mark.parametrize("kind", ["affine", "ppisp"])
+JSON = ("ppisp", "luminance")
+
+
+@pytest.mark.parametrize("kind", ["affine", *JSON])
 def test_they_come_back_bit_for_bit(tmp_path, kind):
     path, saved = tmp_path / "file", learned(kind)
-    path = path.with_suffix(".json" if kind == "ppisp" else ".npy")
+    path = path.with_suffix(".json" if kind in JSON else ".npy")
     write_appearance(path, saved, views())
     again = read_appearance(path, kind, views())
     assert jax.tree.structure(again) == jax.tree.structure(saved)
@@ -52,9 +55,9 @@ def test_a_file_says_which_view_and_which_camera(tmp_path):
     np.testing.assert_array_equal(one.responses[0], saved.responses[1])
 
 
-@pytest.mark.parametrize("kind", ["affine", "ppisp"])
+@pytest.mark.parametrize("kind", ["affine", *JSON])
 def test_what_cannot_belong_is_refused(tmp_path, kind):
-    path = tmp_path / ("a.json" if kind == "ppisp" else "a.npy")
+    path = tmp_path / ("a.json" if kind in JSON else "a.npy")
     with pytest.raises(UserError, match="cannot be read"):
         read_appearance(path, kind, views())
     path.write_text("{]", encoding="utf-8")

@@ -75,7 +75,10 @@ def test_every_reading_runs(tmp_path, form, correspondence):
 
 # Of 30,000 steps: factor on the rate (arXiv 2601.18336, C.1).
 RATES = {0: 0.01, 250: 0.505, 500: 1.0, 15_500: 0.1, 30_000: 0.01 ** (1 - 1 / 60)}
-BASELINES = ("3dgs", "3dgs_gain", "3dgs_affine", "3dgs_bilateral", "3dgs_curve", "ppisp")
+BASELINES = (
+    *("3dgs", "3dgs_gain", "3dgs_affine", "3dgs_bilateral", "3dgs_curve"),
+    *("luminance_gs", "ppisp"),
+)
 
 
 @pytest.mark.slow
@@ -94,7 +97,8 @@ def test_baselines_run_and_come_back_as_they_were_saved(tmp_path, name):
         assert (np.ptp(exposures) > 1e-3) == (name == "3dgs_gain")
     else:
         assert jax.tree.structure(again.appearance) == jax.tree.structure(saved)
-        start = identity(name.removeprefix("3dgs_"), ["1"] * len(exposures))
+        kind = "luminance" if name == "luminance_gs" else name.removeprefix("3dgs_")
+        start = identity(kind, ["1"] * len(exposures))
         jax.tree.map(np.testing.assert_array_equal, again.appearance, saved)
         moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), saved, start)
         if name == "ppisp":

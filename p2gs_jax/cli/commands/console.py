@@ -53,10 +53,11 @@ def print_metrics(metrics: dict, out: Path) -> None:
     console.print(table)
     hdr = metrics.get("radiance")
     if hdr:
+        mu_law = f"; mu-law PSNR {hdr['mu_law_psnr']:.2f} dB" if "mu_law_psnr" in hdr else ""
         console.print(
             f"Radiance against HDR truth: {hdr['stops_median']:.3f} stops median, "
             f"{hdr['stops_rms']:.3f} RMS; PU21 {hdr['pu21_psnr']:.2f} dB / {hdr['pu21_ssim']:.4f}; "
-            f"colour difference {hdr['delta_e_itp']:.1f} Delta E ITP."
+            f"colour difference {hdr['delta_e_itp']:.1f} Delta E ITP{mu_law}."
         )
     counts = metrics.get("counts", {})
     if counts:

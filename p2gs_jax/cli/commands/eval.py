@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
+from p2gs_jax.cli.commands import against
 from p2gs_jax.cli.commands.console import print_metrics
 from p2gs_jax.cli.options.results import Eval
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.progress import TerminalReporter
+from p2gs_jax.evaluate.against import Judge
 from p2gs_jax.evaluate.evaluate import evaluate
 from p2gs_jax.evaluate.lpips_weights import read_lpips_weights
 from p2gs_jax.evaluate.references import find_radiance, load_reference
@@ -34,6 +36,7 @@ def run(options: Eval) -> int:
     truth = None if reference is None else load_reference(reference, fitted.scene, fitted.cfg)
     folder = RunFolder(options.run)
     store = fitted.store
+    others = against.find_all(options.against, fitted.scene, store)
     with TerminalReporter() as reporter:
         metrics = evaluate(
             fitted.params,
@@ -51,10 +54,16 @@ def run(options: Eval) -> int:
             ),
             on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
         )
+        judge = Judge(fitted.scene, store, fitted.params, fitted.cfg, weights, truth)
+        beside = against.judge_all(
+            others, judge, metrics, lambda done, count: reporter.stage("Judging", done, count)
+        )
     path = folder.metrics
     kept = _kept_metrics(path)
     write_json(path, {**metrics, **kept})
     print_metrics({**metrics, **kept}, options.run)
+    if others:
+        against.report(folder.against, beside, others, options.run, metrics)
     return 0
 
 

@@ -26,7 +26,7 @@ class Demo:
     """Folder for the street and the run."""
     preset: Annotated[str, tyro.conf.arg(metavar="NAME")] = "robust"
     """A preset of `fit`: robust, paper, paper_appendix, 3dgs, 3dgs_gain, 3dgs_affine,
-    3dgs_bilateral, 3dgs_curve, ppisp or ppisp_solved."""
+    3dgs_bilateral, 3dgs_curve, luminance_gs, ppisp or ppisp_solved."""
     budget: Annotated[str, tyro.conf.arg(metavar="TIME")] = "125s"
     """Wall-clock limit of the fit: 90s, 20m or 1h30m."""
     frames: int = 10

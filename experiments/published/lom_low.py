@@ -1,0 +1,189 @@
+"""The low-light protocol of Aleth-NeRF on LOM scenes: fitted to `low` alone, judged against `high`.
+
+python experiments/published/lom_low.py LOM_SCENE... --out DIR [--methods robust 3dgs luminance_gs]
+    [--steps 600]
+
+Its authors never align: their method brightens by itself (with a degree and a gain that they chose
+for each scene), and PSNR is of the picture as it comes out. Methods without a notion of "well lit"
+cannot be compared so; what each score gives the method is said by its name:
+
+- `unaligned`: the held-out view as the dark photographs show it; what plain NeRF is published for;
+- `enhanced`: of `luminance_gs`, the enhanced view as it comes out: the authors' protocol;
+- `mean_half`: one exposure for all views that brings the mean of the training renders to half of
+  the display range; no `high` photograph is looked at;
+- `exposure`: one exposure for all views, solved from the `high` photographs of the training views;
+- `all`: likewise exposure, gamma and white balance.
+
+The authors hold out views 1, 9, 17 and 25 by name (`transforms_test.json`); here every eighth is,
+which is one more, and those of theirs are judged. No photograph of these scenes may be in this
+project: keep --out outside of it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from published_rows import HERE, Key, measure, of_fit
+
+import p2gs_jax
+from p2gs_jax.evaluate.alignment import fit_capture, with_fitted_exposure
+from p2gs_jax.evaluate.metrics import psnr, ssim
+from p2gs_jax.evaluate.references import load_reference
+from p2gs_jax.photometry.display import with_capture
+
+sys.path.insert(0, str(HERE.parent))
+
+from judging import configs
+from mixtures import write_mixture
+
+METHODS = ("robust", "3dgs", "luminance_gs")
+MEAN, STOPS, HALVINGS = 0.5, 12.0, 30
+
+
+def their_test_views(lom: Path) -> list[str]:
+    """Return the stems of the views that the authors hold out."""
+    frames = json.loads((lom / "transforms_test.json").read_text())["frames"]
+    return [Path(frame["file_path"]).stem for frame in frames]
+
+
+def judged_rows(run: p2gs_jax.Run, stems: Sequence[str]) -> list[int]:
+    """Return the rows of the authors' held-out views.
+
+    Raises:
+        SystemExit: this run was fitted to one of them.
+    """
+    rows = {Path(run.scene.views[row].name).stem: row for row in run.scene.test_indices}
+    if missing := sorted(set(stems) - set(rows)):
+        raise SystemExit(f"views {', '.join(missing)} were not held out by {run.folder}")
+    return [rows[stem] for stem in stems]
+
+
+class Aligned:
+    """How a run's views are shown, after each alignment."""
+
+    def __init__(self, run: p2gs_jax.Run):
+        """Render the training views once.
+
+        Args:
+            run: fitted to the dark photographs.
+        """
+        self.run = run
+        self._usual = dataclasses.replace(run.common_display(), exposure=run.mean.exposure)
+        # What is compared with `high` is the field, not how dark photographs show it.
+        self._plain = dataclasses.replace(self._usual, correction=None)
+        reference = load_reference(run.scene.root / "reference", run.scene, run.cfg)
+        self.target = lambda row: np.asarray(reference(row))
+        self._training = [
+            (self.linear(row), self.target(row), run.store.get(row)[1])
+            for row in run.scene.train_indices
+        ]
+
+    def linear(self, row: int) -> np.ndarray:
+        """Return the radiance that a view shows."""
+        return np.asarray(self.run.render(self.run.camera(row)).linear)
+
+    def displays(self) -> dict[str, p2gs_jax.DisplayTransform]:
+        """Return the transform of each score; `enhanced` where corrections enhance."""
+        exposed = [with_fitted_exposure(self._plain, *images) for images in self._training]
+        found = [
+            fit_capture(*images, start.capture, start.formation, gamma=True, white_balance=True)
+            for start, images in zip(exposed, self._training, strict=True)
+        ]
+        taken = [with_capture(self._plain, capture) for capture in found]
+        out = {"unaligned": self._usual}
+        if self.run.cfg.photometry.appearance == "luminance":
+            out["enhanced"] = self._plain
+        out["mean_half"] = self._of_mean(MEAN)
+        out["exposure"] = dataclasses.replace(
+            self._plain, exposure=_middle([t.exposure for t in exposed])
+        )
+        balances = np.array([t.white_balance or (0.0, 0.0, 0.0) for t in taken])
+        red, green, blue = np.median(balances, axis=0)
+        out["all"] = dataclasses.replace(
+            self._plain,
+            exposure=_middle([t.exposure for t in taken]),
+            gamma=_middle([t.gamma for t in taken]),
+            white_balance=(float(red), float(green), float(blue)),
+        )
+        return out
+
+    def _of_mean(self, level: float) -> p2gs_jax.DisplayTransform:
+        low, high = -STOPS, STOPS
+        for _ in range(HALVINGS):
+            ev = (low + high) / 2
+            shown = dataclasses.replace(self._plain, exposure=2.0**ev)
+            mean = np.mean(
+                [p2gs_jax.develop(x[::4, ::4], shown).mean() for x, *_ in self._training]
+            )
+            low, high = (ev, high) if mean < level else (low, ev)
+        return dataclasses.replace(self._plain, exposure=2.0**low)
+
+
+def _middle(values: Sequence[float]) -> float:
+    return float(np.exp(np.median(np.log(values))))
+
+
+def figures(run: p2gs_jax.Run, stems: Sequence[str]) -> dict[str, float]:
+    """Return PSNR and SSIM against `high` under each alignment, means over the authors' views."""
+    aligned, rows = Aligned(run), judged_rows(run, stems)
+    linear = {row: aligned.linear(row) for row in rows}
+    out = {}
+    for name, display in aligned.displays().items():
+        scores = []
+        for row in rows:
+            ldr, mask = p2gs_jax.develop(linear[row], display), run.store.get(row)[1]
+            target = aligned.target(row)
+            scores.append((float(psnr(ldr, target, mask)), float(ssim(ldr, target, mask))))
+        out[name], out[f"{name}_ssim"] = (float(v) for v in np.mean(scores, axis=0))
+    return out
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scenes", type=Path, nargs="+", help="LOM scene folders")
+    parser.add_argument("--out", type=Path, default=Path(tempfile.gettempdir(), "published_lom"))
+    parser.add_argument("--methods", nargs="+", default=list(METHODS), help="presets")
+    parser.add_argument("--steps", type=int, nargs="+", default=[600])
+    parser.add_argument("--again", action="store_true", help="measure also what is there")
+    args = parser.parse_args()
+    if args.out.resolve().is_relative_to(HERE.parents[1].resolve()):
+        raise SystemExit("--out is inside this project, where no picture of these scenes may be.")
+    folders = {lom.resolve().name.removeprefix("lom_"): lom for lom in args.scenes}
+
+    def row(key: Key) -> dict[str, Any]:
+        lom = folders[key.scene]
+        scene = args.out / key.scene
+        if not scene.exists():
+            write_mixture(lom, scene, ["low"])
+        run = args.out / "runs" / f"{key.scene}_{key.method}_{key.steps}"
+        if not (run / "metrics.json").is_file():
+            cfg = configs([key.method], steps=key.steps)[key.method]
+            p2gs_jax.fit(
+                scene,
+                run,
+                cfg,
+                reference=scene / "reference",
+                resume=(run / "config.json").is_file(),
+            )
+        metrics = json.loads((run / "metrics.json").read_text())
+        command = (
+            f"python experiments/published/lom_low.py LOM_{key.scene.upper()} "
+            f"--methods {key.method} --steps {key.steps}"
+        )
+        found = figures(p2gs_jax.load_run(run), their_test_views(lom))
+        return {"figures": found, **of_fit(metrics, command)}
+
+    wanted = [Key("lom_low", n, m, s) for s in args.steps for n in folders for m in args.methods]
+    measure(wanted, row, args.again)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,44 @@
+"""nerf_fox as it stands: 50 frames of a phone's video, every eighth held out.
+
+python experiments/published/nerf_fox.py SCENE --out DIR [--methods robust 3dgs] [--steps 7000]
+
+No paper prints a figure for it; the rows say where we are. One at a time, resumable.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from published_rows import Key, fitted, measure, of_fit
+
+METHODS = ("robust", "3dgs")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scene", type=Path, help="nerf_fox")
+    parser.add_argument("--out", type=Path, default=Path(tempfile.gettempdir(), "published_fox"))
+    parser.add_argument("--methods", nargs="+", default=list(METHODS), help="presets")
+    parser.add_argument("--steps", type=int, nargs="+", default=[7_000])
+    parser.add_argument("--again", action="store_true", help="measure also what is there")
+    args = parser.parse_args()
+
+    def row(key: Key) -> dict[str, Any]:
+        options = ("--preset", key.method, "--steps", str(key.steps))
+        metrics = fitted(args.scene, args.out / f"{key.method}_{key.steps}", options)
+        test = metrics["test"]
+        figures = {
+            "psnr": test["averaged"]["psnr"],
+            "psnr_exposure_fitted": test["exposure_fitted"]["psnr"],
+        }
+        return {"figures": figures, **of_fit(metrics, f"p2gs-jax fit FOX {' '.join(options)}")}
+
+    wanted = [Key("nerf_fox", "fox", m, s) for s in args.steps for m in args.methods]
+    measure(wanted, row, args.again)
+
+
+if __name__ == "__main__":
+    main()

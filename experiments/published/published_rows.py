@@ -1,0 +1,122 @@
+"""Rows of published benchmarks: kept one by one, so that an interrupted call goes on where it was.
+
+`rows.json` beside this file holds what was measured. A row is told by its benchmark, scene, method
+and steps; measured again, it replaces the old one.
+"""
+
+from __future__ import annotations
+
+import datetime
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from p2gs_jax.core.atomic import write_json
+
+HERE = Path(__file__).parent
+ROWS = HERE / "rows.json"
+
+
+class Key(NamedTuple):
+    """What a row is of.
+
+    Attributes:
+        benchmark: as in `published.json`.
+        scene: of the benchmark.
+        method: preset, with what differs from it.
+        steps: of the fit.
+    """
+
+    benchmark: str
+    scene: str
+    method: str
+    steps: int
+
+
+def read_rows(path: Path = ROWS) -> dict[Key, dict[str, Any]]:
+    """Return the rows that were measured; none where there is no file."""
+    rows = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
+    return {Key(*(row[name] for name in Key._fields)): row for row in rows}
+
+
+def add_row(key: Key, row: dict[str, Any], path: Path = ROWS) -> None:
+    """Write a row to the others at once."""
+    rows = read_rows(path) | {key: {**key._asdict(), **row}}
+    write_json(path, [rows[k] for k in sorted(rows)])
+
+
+def commit() -> str:
+    """Return what is checked out, and whether it was changed."""
+
+    def git(*words: str) -> str:
+        done = subprocess.run(
+            ["git", *words], capture_output=True, text=True, check=False, cwd=HERE
+        )
+        return done.stdout.strip()
+
+    changed = " and changes" if git("status", "--porcelain", "--untracked-files=no") else ""
+    return (git("rev-parse", "--short", "HEAD") or "unknown") + changed
+
+
+def of_fit(metrics: dict[str, Any], command: str) -> dict[str, Any]:
+    """Return what every row says of its fit.
+
+    Args:
+        metrics: as `metrics.json`.
+        command: that measures the row, without folders of this machine.
+    """
+    seconds = metrics["seconds"]
+    return {
+        "gaussians": metrics["counts"]["gaussians"],
+        "seconds": round(seconds["total_until_evaluation"] + seconds["evaluation_and_files"]),
+        "seconds_of_steps": round(seconds["optimisation"]),
+        "date": datetime.date.today().isoformat(),
+        "commit": commit(),
+        "command": command,
+    }
+
+
+def fitted(scene: Path, run: Path, options: Sequence[str]) -> dict[str, Any]:
+    """Fit by the command line, or go on with what was interrupted; return its `metrics.json`.
+
+    Raises:
+        SystemExit: the fit failed.
+    """
+    found = run / "metrics.json"
+    if not found.is_file():
+        resumed = ["--resume"] if (run / "config.json").is_file() else []
+        words = ["fit", str(scene), "--out", str(run), *options, *resumed]
+        code = subprocess.run(
+            [sys.executable, "-m", "p2gs_jax.cli", *words], check=False
+        ).returncode
+        if code:
+            raise SystemExit(f"p2gs-jax {' '.join(words)} ended with {code}")
+    return json.loads(found.read_text(encoding="utf-8"))
+
+
+def measure(
+    wanted: Sequence[Key],
+    row_of: Callable[[Key], dict[str, Any]],
+    again: bool = False,
+    path: Path = ROWS,
+) -> None:
+    """Measure rows one after another and keep each; those that are there are left.
+
+    Args:
+        wanted: which.
+        row_of: measures one.
+        again: measure also what is there.
+        path: where they are kept.
+    """
+    for key in wanted:
+        if key in read_rows(path) and not again:
+            print(f"{' '.join(map(str, key))}: there already", file=sys.stderr, flush=True)
+            continue
+        begin = time.monotonic()
+        add_row(key, row_of(key), path)
+        took = time.monotonic() - begin
+        print(f"{' '.join(map(str, key))}: {took:.0f} s", file=sys.stderr, flush=True)

@@ -1,0 +1,111 @@
+"""Write experiments/PUBLISHED.md from what was measured (`rows.json`) and published.
+
+python experiments/published/write_page.py
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from published_rows import HERE, Key, read_rows
+
+from p2gs_jax.core.atomic import write_text
+
+OUT = HERE.parent / "PUBLISHED.md"
+HEAD = """# Beside published figures
+
+Written by `python experiments/published/write_page.py` from [rows.json](published/rows.json) and
+[published.json](published/published.json): each figure beside the published one, with the command,
+the seconds of the whole fit, and the commit. Scripts, and what is not run here:
+[published](published/README.md). A row is one run and one seed. Machine: that of
+[results](results/README.md).
+"""
+NOT_RUN = "Not run yet."
+
+
+def table(header: list[str], rows: list[list[str]]) -> list[str]:
+    """Return the lines of a Markdown table."""
+    lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
+    return [*lines, *("| " + " | ".join(row) + " |" for row in rows)]
+
+
+def section(
+    name: str, benchmark: Mapping[str, Any], rows: Mapping[Key, Mapping[str, Any]]
+) -> list[str]:
+    """Return the lines of a benchmark: published figures, ours, and how they came about.
+
+    Args:
+        name: of the benchmark.
+        benchmark: from `published.json`.
+        rows: of all benchmarks.
+    """
+    lines = [f"## {benchmark['title']}", ""]
+    if benchmark["published"]:
+        lines += ["Published:", ""]
+        lines += table(
+            ["scene", "method", "PSNR, dB", "source"],
+            [
+                [p["scene"], p["method"], f"{p['psnr']:.2f}", p["source"]]
+                for p in benchmark["published"]
+            ],
+        )
+        lines += [""]
+    own = {key: row for key, row in sorted(rows.items()) if key.benchmark == name}
+    figures = benchmark["figures"]
+    if own:
+        lines += ["Ours:", ""]
+        header = ["scene", "method", "steps", *figures.values(), "beside published, dB"]
+        header += ["Gaussians", "seconds", "commit", "command"]
+        lines += table(header, [_cells(key, row, benchmark) for key, row in own.items()])
+    else:
+        lines += [NOT_RUN]
+    lines += [""]
+    for note in benchmark["notes"]:
+        lines += [f"- {note}"]
+    return [*lines, ""] if benchmark["notes"] else lines
+
+
+def _cells(key: Key, row: Mapping[str, Any], benchmark: Mapping[str, Any]) -> list[str]:
+    found = row["figures"]
+    cells = []
+    for figure in benchmark["figures"]:
+        digits = 3 if figure == "ssim" else 2
+        cells.append(f"{found[figure]:.{digits}f}" if figure in found else "")
+    beside = ""
+    compared = benchmark["compared"]
+    known = [p["psnr"] for p in benchmark["published"] if p["scene"] == key.scene]
+    if known and compared in found:
+        beside = ", ".join(f"{found[compared] - value:+.2f}" for value in known)
+    return [
+        *(key.scene, key.method, str(key.steps), *cells, beside),
+        *(str(row["gaussians"]), str(row["seconds"]), row["commit"], f"`{row['command']}`"),
+    ]
+
+
+def page(published: Mapping[str, Any], rows: Mapping[Key, Mapping[str, Any]]) -> str:
+    """Return the whole page.
+
+    Args:
+        published: as `published.json`.
+        rows: from `read_rows`.
+
+    Raises:
+        SystemExit: a row belongs to no benchmark.
+    """
+    if unknown := {key.benchmark for key in rows} - set(published):
+        raise SystemExit(f"rows.json has rows of {', '.join(sorted(unknown))}: not published.json")
+    lines = [HEAD]
+    for name, benchmark in published.items():
+        lines += section(name, benchmark, rows)
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def main() -> None:
+    published = json.loads((HERE / "published.json").read_text(encoding="utf-8"))
+    write_text(OUT, page(published, read_rows()))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,125 @@
+"""Which file shows which view, and which pixels count."""
+
+from typing import Any, cast
+
+import cv2
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.errors import UserError
+from p2gs_jax.evaluate.against import Judge, check_renders, judge_renders
+from p2gs_jax.evaluate.renders_of_others import find_renders, orders
+from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.types import Params, Photometry, Scene, View
+
+SIZE = (40, 34)
+
+
+def made_scene(folder, held_out, masked=False):
+    """Return a training view and some held out, of noise."""
+    rng = np.random.default_rng(0)
+    folder.mkdir()
+    views = []
+    for name in ("train.png", *held_out):
+        path = folder / name
+        cv2.imwrite(str(path), rng.integers(0, 256, (*SIZE[::-1], 3), np.uint8))
+        mask = None
+        if masked:
+            mask = folder / f"{name}.mask.png"
+            shown = np.full(SIZE[::-1], 255, np.uint8)
+            shown[:, :20] = 0
+            cv2.imwrite(str(mask), shown)
+        K = np.array([[40, 0, 20], [0, 40, 17], [0, 0, 1]], "f4")
+        split = "train" if name == "train.png" else "test"
+        pose = np.eye(4, dtype="f4")
+        view = View(name, path, "0", pose, K, *SIZE, split=split, mask_path=mask)
+        views.append(view)
+    points = np.zeros((0, 3), "f4")
+    scene = Scene(folder, "colmap", tuple(views), points, points.astype(np.uint8))
+    return scene, ImageStore(scene.views, FitConfig().data)
+
+
+def judge(scene, store):
+    photometry = Photometry(jnp.zeros(1), jnp.zeros(1), "log")
+    # Renders are judged without any Gaussians.
+    return Judge(scene, store, Params(cast(Any, None), photometry), FitConfig())
+
+
+def photograph(scene, name):
+    image = cv2.imread(str(scene.root / name))
+    assert image is not None
+    return image
+
+
+def test_numbered_renders_follow_the_order_that_fits_the_photographs(tmp_path):
+    names = ("r_2.png", "r_10.png", "r_30.png")
+    scene, store = made_scene(tmp_path / "scene", names)
+    as_text, counted = ([scene.views[row].name for row in order] for order in orders(scene))
+    assert as_text == ["r_10.png", "r_2.png", "r_30.png"]
+    assert counted == ["r_2.png", "r_10.png", "r_30.png"]
+    for label, order in (("text", as_text), ("counted", counted)):
+        folder = tmp_path / label
+        folder.mkdir()
+        for k, name in enumerate(order):
+            cv2.imwrite(str(folder / f"{k:05d}.png"), photograph(scene, name))
+        found = check_renders(find_renders(folder, scene), scene, store)
+        shown = {scene.views[row].name: path.name for row, path in found.files.items()}
+        assert shown == {name: f"{k:05d}.png" for k, name in enumerate(order)}
+
+
+def test_masked_pixels_do_not_count(tmp_path):
+    scene, store = made_scene(tmp_path / "scene", ("a.png",), masked=True)
+    image = photograph(scene, "a.png")
+    image[:, :20] = 255 - image[:, :20]
+    (tmp_path / "other").mkdir()
+    cv2.imwrite(str(tmp_path / "other" / "a.png"), image)
+    found = find_renders(tmp_path / "other", scene)
+    scores = judge_renders(found, judge(scene, store))
+    assert scores["as_rendered"]["psnr"] > 100
+    whole, everywhere = made_scene(tmp_path / "whole", ("a.png",))
+    found = find_renders(tmp_path / "other", whole)
+    assert judge_renders(found, judge(whole, everywhere))["as_rendered"]["psnr"] < 20
+
+
+def test_16_bits_and_grey_are_display_values_too(tmp_path):
+    scene, store = made_scene(tmp_path / "scene", ("a.png", "b.png"))
+    folder = tmp_path / "other"
+    folder.mkdir()
+    cv2.imwrite(str(folder / "a.png"), photograph(scene, "a.png").astype(np.uint16) * 257)
+    cv2.imwrite(str(folder / "b.png"), np.full(SIZE[::-1], 51, np.uint8))
+    found = find_renders(folder, scene)
+    scores = judge_renders(found, judge(scene, store))["as_rendered"]["per_view"]
+    assert scores["a.png"]["psnr"] > 100
+    grey, linear = found.read(2, SIZE)
+    assert not linear
+    np.testing.assert_allclose(grey, 0.2, atol=1e-6)
+
+
+def test_a_scene_without_held_out_views_cannot_be_compared(tmp_path):
+    scene, _ = made_scene(tmp_path / "scene", ())
+    with pytest.raises(UserError, match="holds no view out"):
+        find_renders(tmp_path, scene)
+
+
+def test_pictures_by_name_may_lie_where_programs_put_them(tmp_path):
+    scene, _ = made_scene(tmp_path / "scene", ("a.png",))
+    for place in ("test/rgb", "renders"):
+        folder = tmp_path / place.replace("/", "_")
+        (folder / place).mkdir(parents=True)
+        cv2.imwrite(str(folder / place / "a.jpg"), photograph(scene, "a.png"))
+        found = find_renders(folder, scene)
+        assert [p.name for p in found.files.values()] == ["a.jpg"]
+        assert not found.missing
+
+
+def test_the_enhanced_pictures_of_luminance_gs_are_taken(tmp_path):
+    scene, store = made_scene(tmp_path / "scene", ("a.png", "b.png"))
+    folder = tmp_path / "bike" / "renders"
+    folder.mkdir(parents=True)
+    for k, name in enumerate(("a.png", "b.png")):
+        cv2.imwrite(str(folder / f"val_{k:04d}_enh.png"), photograph(scene, name))
+        cv2.imwrite(str(folder / f"val_{k:04d}_low.png"), photograph(scene, name) // 2)
+    found = check_renders(find_renders(tmp_path / "bike", scene), scene, store)
+    assert [p.name for p in found.files.values()] == ["val_0000_enh.png", "val_0001_enh.png"]
