@@ -11,6 +11,7 @@ import numpy as np
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.clock import CompileCounter, Stopwatch, over_budget
 from p2gs_jax.core.progress import Reporter
+from p2gs_jax.core.runtime import return_freed_memory
 from p2gs_jax.evaluate.evaluate import ViewResult, evaluate
 from p2gs_jax.evaluate.lpips import LpipsWeights
 from p2gs_jax.evaluate.references import Reference, find_radiance
@@ -67,6 +68,7 @@ def finish(
         owner: the moving object that each Gaussian belongs to, or None.
     """
     watch = Stopwatch()
+    return_freed_memory()
     _import_ahead("matplotlib.figure")
     scene, cfg = prepared.scene, prepared.cfg
     moving = fitted_objects(prepared.store.moving, params)
