@@ -9,9 +9,11 @@ SCRIPT = """
 import numpy as np
 from p2gs_jax.core.runtime import keep_freed_memory, return_freed_memory
 
+import resource
+
 def resident_mb():
     pages = int(open("/proc/self/statm").read().split()[1])
-    return pages * 4096 / 2**20
+    return pages * resource.getpagesize() / 2**20
 
 assert keep_freed_memory()
 begin = resident_mb()
