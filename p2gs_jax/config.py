@@ -37,6 +37,8 @@ PhotometricModel = Literal[
 SceneFormat = Literal[
     "colmap",
     "transforms",
+    "blender",
+    "llff",
     "rig",
     "pandaset",
     "nuscenes",
@@ -64,7 +66,12 @@ class DataConfig:
 
     test_every: int = 8
     """Hold out every n-th view of each camera, sorted by name; 0 holds out none
-    (paper, Experiments: 1/8 of the frames)."""
+    (paper, Experiments: 1/8 of the frames). Where the data set says what is held out, that counts
+    instead; 0 still holds out none."""
+    split: str | None = None
+    """File that says what is held out: .json with the lists `train` and `test`, or text with the
+    names of the held-out photographs, a line each; `every` goes by `test_every` even where the data
+    set says otherwise."""
     max_width: int | None = None
     """Shrink images to at most this many pixels across; None keeps them as they are."""
     images: str | None = None

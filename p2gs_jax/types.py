@@ -418,6 +418,10 @@ class Scene:
         lidar: measurements with their times, or None.
         origin: position of our origin in the data set's world, scene units: float32 needs the
             drive near it.
+        split_by: what decided which views are held out, in words; readers name the file where the
+            data set decides, or None.
+        random_seeds: the points were drawn at random: they say nothing of surfaces.
+        depths: nearest and farthest camera z that the data set states, scene units, or None.
     """
 
     root: Path
@@ -430,6 +434,9 @@ class Scene:
     objects: tuple[TrackedObject, ...] = ()
     lidar: Lidar | None = None
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    split_by: str | None = None
+    random_seeds: bool = False
+    depths: tuple[float, float] | None = None
 
     @property
     def train_indices(self) -> tuple[int, ...]:

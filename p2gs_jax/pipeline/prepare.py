@@ -135,6 +135,8 @@ def load(scene_dir: Path, run_dir: Path, cfg: FitConfig, reporter: Reporter) -> 
             f"{scene_dir} has no seed points.",
             fix="check the poses and that the photographs overlap",
         )
+    held = len(scene.test_indices)
+    reporter.message(f"Held out: {held} of {len(scene.views)} views ({scene.split_by}).")
     return scene
 
 
@@ -339,6 +341,9 @@ def _solve(
     if not (has_tracks(scene) or from_tracks or dense):
         return None, None, []
     notes = []
+    if scene.random_seeds:
+        notes = ["Seeds at random show nothing twice: exposures start at 1 and are learned."]
+        return None, None, notes if from_tracks else []
     if not has_tracks(scene):
         notes.append("No tracks: seed points are projected into the views instead.")
     tracks = surface_colors(

@@ -51,6 +51,8 @@ def write_scene(folder: Path, scene: Scene) -> None:
             for o in scene.objects
         ],
         "origin": scene.origin,
+        "split_by": scene.split_by,
+        "random_seeds": scene.random_seeds,
         "own_cars": list(own_cars),
     }
     arrays = {
@@ -131,6 +133,8 @@ def read_scene(folder: Path, root: Path) -> Scene | None:
             if "lidar_points" not in a
             else Lidar(a["lidar_points"], a["lidar_times"], a["lidar_objects"]),
             origin=tuple(said.get("origin", (0.0, 0.0, 0.0))),
+            split_by=said.get("split_by"),
+            random_seeds=said.get("random_seeds", False),
         )
     except (OSError, ValueError, KeyError, TypeError, IndexError, zipfile.BadZipFile) as error:
         raise UserError(

@@ -56,7 +56,11 @@ class Fit:
     """Upper bound on the Gaussians: a whole number, or auto (grow while held-out training views
     gain by it); default: from the seeds and the pixels."""
     test_every: int | None = None
-    """Hold out every n-th view of each camera for evaluation; 0 holds out none; default: 8."""
+    """Hold out every n-th view of each camera for evaluation; 0 holds out none; default: 8, or as
+    the data set says."""
+    split: Annotated[str | None, tyro.conf.arg(metavar="FILE|every")] = None
+    """Names of the held-out photographs, a line each, or a .json with the lists train and test;
+    every: by --test-every though the data set says otherwise (docs/scenes.md)."""
     images: Annotated[str | None, tyro.conf.arg(metavar="DIR")] = None
     """Image folder, where it is not images/ beside the model."""
     allow_missing: bool = False
@@ -144,7 +148,7 @@ def resolve_fit(args: Fit) -> configs.FitConfig:
     """
     cfg = args.config
     data, train, evaluation = cfg.data, cfg.train, cfg.evaluation
-    for name in ("max_width", "test_every", "images", "drive", "frames"):
+    for name in ("max_width", "test_every", "split", "images", "drive", "frames"):
         if getattr(args, name) is not None:
             data = dataclasses.replace(data, **{name: getattr(args, name)})
     if args.cameras:
