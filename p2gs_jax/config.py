@@ -49,6 +49,8 @@ SceneFormat = Literal[
     "kitti_360",
     "images",
 ]
+# What the alpha channel of photographs means.
+AlphaUse = Literal["background", "mask", "ignore"]
 # Per what it varies: one physical camera, or one photograph.
 Level = Literal["camera", "view"]
 # Vignetting per camera: the same for all channels, or one for each.
@@ -78,6 +80,12 @@ class DataConfig:
     """Image folder, where it is not `images/` beside the model."""
     format: SceneFormat | None = None
     """How to read the scene; None takes the first of these that the folder holds."""
+    alpha: AlphaUse = "background"
+    """What the alpha channel of photographs means: they and their renders are shown over
+    `background`; or `mask`: transparent pixels are left out; or `ignore`: nothing."""
+    background: str = "white"
+    """Of photographs with alpha, display values in fit and evaluation alike: white (3DGS), black or
+    R,G,B from 0 to 1; `random` draws a colour for every step, and white is judged."""
     drive: str | None = None
     """Which drive of a folder that holds several: its name in the data set, or how that begins."""
     cameras: tuple[str, ...] = ()
@@ -268,6 +276,9 @@ class LossConfig:
     quantization: float | None = None
     """Half the interval that a stored value stands for (0.5 / 255 for 8 bits): predictions within
     it are right and get no gradient. None compares with the stored value (ours: BUILD_NOTES)."""
+    alpha: float | None = None
+    """Weight of the mean difference between the render's opacity and the alpha channel of
+    photographs shown over a background; None leaves it out (ours)."""
     lidar: float | None = None
     """Weight of the error of log depth at laser measurements, of scenes that have them; None
     leaves it out (ours)."""

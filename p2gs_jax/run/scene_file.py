@@ -43,6 +43,7 @@ def write_scene(folder: Path, scene: Scene) -> None:
                 "lens": None if v.distortion is None else v.distortion.model,
                 "frame": v.frame,
                 "time": v.time,
+                "alpha": v.alpha,
             }
             for v in scene.views
         ],
@@ -114,6 +115,7 @@ def read_scene(folder: Path, root: Path) -> Scene | None:
                 frame=v.get("frame"),
                 time=v.get("time"),
                 own_car=own_cars.get(v["camera"]),
+                alpha=v.get("alpha", "mask"),
             )
             for i, v in enumerate(said["views"])
         )

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
+from p2gs_jax.scene.backdrop import with_alpha
 from p2gs_jax.scene.colmap import find_model, load_colmap
 from p2gs_jax.scene.drives import read_drive
 from p2gs_jax.scene.drives.assemble import assemble
@@ -79,7 +80,7 @@ def load_scene(
 
 
 def with_what_lies_beside(scene: Scene, cfg: DataConfig) -> Scene:
-    """Return a scene with masks, EXIF exposures and split.
+    """Return a scene with masks, EXIF exposures, split, and what alpha channels mean.
 
     Raises:
         UserError: so many views cannot be held out, or a list of those that are is wrong.
@@ -89,7 +90,7 @@ def with_what_lies_beside(scene: Scene, cfg: DataConfig) -> Scene:
         dataclasses.replace(view, exif_ev=read_exif_ev(view.image_path)) for view in views
     )
     scene = dataclasses.replace(scene, views=views, notes=(*scene.notes, *mask_notes))
-    return split_scene(scene, cfg)
+    return with_alpha(split_scene(scene, cfg), cfg)
 
 
 class PhotographsAlone(NamedTuple):

@@ -61,6 +61,9 @@ class Fit:
     split: Annotated[str | None, tyro.conf.arg(metavar="FILE|every")] = None
     """Names of the held-out photographs, a line each, or a .json with the lists train and test;
     every: by --test-every though the data set says otherwise (docs/scenes.md)."""
+    background: Annotated[str | None, tyro.conf.arg(metavar="COLOR")] = None
+    """What photographs with alpha and their renders are put over: white, black, random (another for
+    every step) or R,G,B from 0 to 1; default: white."""
     images: Annotated[str | None, tyro.conf.arg(metavar="DIR")] = None
     """Image folder, where it is not images/ beside the model."""
     allow_missing: bool = False
@@ -148,7 +151,7 @@ def resolve_fit(args: Fit) -> configs.FitConfig:
     """
     cfg = args.config
     data, train, evaluation = cfg.data, cfg.train, cfg.evaluation
-    for name in ("max_width", "test_every", "split", "images", "drive", "frames"):
+    for name in ("max_width", "test_every", "split", "background", "images", "drive", "frames"):
         if getattr(args, name) is not None:
             data = dataclasses.replace(data, **{name: getattr(args, name)})
     if args.cameras:
