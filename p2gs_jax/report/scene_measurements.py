@@ -138,7 +138,7 @@ def _rendered(
         len(tried),
         shown,
         picture,
-        _clipped(run, store),
+        _clipped(run, store.only_opaque()),
         tuple(comparisons),
         tuple(missing),
     )

@@ -36,8 +36,8 @@ class Fit:
     """
 
     scene: Annotated[Path, tyro.conf.Positional]
-    """COLMAP model, transforms.json, a rig, a drive of a data set (PandaSet, nuScenes, ...), or a
-    folder of photographs (docs/scenes.md)."""
+    """COLMAP model, transforms.json, Blender's or LLFF's folder, a rig, a drive of a data set
+    (PandaSet, nuScenes, ...), or a folder of photographs (docs/scenes.md)."""
     out: Folder
     """Run folder to create."""
     config: Annotated[configs.FitConfig, tyro.conf.arg(name="")]
