@@ -54,9 +54,9 @@ class MeteredViews:
         alpha: Float32[np.ndarray, "h w"] | None = None,
     ) -> None:
         """Keep a held-out view; its opacity where it is put over a background."""
-        images = map(self._arrays.put, (linear, photograph, mask))
-        opacity = None if alpha is None else self._arrays.put(alpha)
-        self._kept.append(_Kept(name, readings, *images, opacity))
+        put = self._arrays.put
+        opacity = None if alpha is None else put(alpha)
+        self._kept.append(_Kept(name, readings, put(linear), put(photograph), put(mask), opacity))
 
     def fit(
         self, exposures: Float[np.ndarray, " v"], gamma: float, tone: PhotometryConfig

@@ -158,7 +158,7 @@ def _prepare(view: View, width: int, height: int) -> Decoded:
             fix="do not change the photographs during a run; start the run again",
         )
     valid = np.ones(pixels.shape[:2], bool)
-    matted = opacity is not None and view.alpha == "background"
+    matte = opacity if view.alpha == "background" else None
     if opacity is not None and view.alpha == "mask":
         valid = opacity >= _ALPHA_VALID * np.iinfo(opacity.dtype).max
     if view.mask_path is not None:
@@ -169,11 +169,11 @@ def _prepare(view: View, width: int, height: int) -> Decoded:
         valid &= cv2.resize(covered, (view.width, view.height)) == 0
     shrunk = (width, height) != (view.width, view.height)
     alpha = None
-    if view.distortion is not None or shrunk or matted:
+    if view.distortion is not None or shrunk or matte is not None:
         ldr = floats(pixels)
-        if matted:
+        if matte is not None:
             # What is transparent must not colour its neighbours: all four are resampled together.
-            opaque = floats(opacity)[..., None]
+            opaque = floats(matte)[..., None]
             ldr = np.concatenate([ldr * opaque, opaque], axis=2)
         if view.distortion is not None:
             maps = undistortion_maps(view.K, view.distortion, view.width, view.height)
@@ -186,7 +186,7 @@ def _prepare(view: View, width: int, height: int) -> Decoded:
                 valid, lambda v: cv2.resize(v, size, interpolation=cv2.INTER_AREA)
             )
         pixels = np.rint(ldr * np.float32(np.iinfo(np.uint16).max)).astype(np.uint16)
-        if matted:
+        if matte is not None:
             pixels, alpha = np.ascontiguousarray(pixels[..., :3]), pixels[..., 3].copy()
             alpha.flags.writeable = False
     pixels.flags.writeable = valid.flags.writeable = False
