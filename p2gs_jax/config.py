@@ -38,6 +38,8 @@ PhotometricModel = Literal[
 SceneFormat = Literal[
     "colmap",
     "transforms",
+    "blender",
+    "llff",
     "rig",
     "pandaset",
     "nuscenes",
@@ -48,6 +50,8 @@ SceneFormat = Literal[
     "kitti_360",
     "images",
 ]
+# What the alpha channel of photographs means.
+AlphaUse = Literal["background", "mask", "ignore"]
 # Per what it varies: one physical camera, or one photograph.
 Level = Literal["camera", "view"]
 # Vignetting per camera: the same for all channels, or one for each.
@@ -65,13 +69,24 @@ class DataConfig:
 
     test_every: int = 8
     """Hold out every n-th view of each camera, sorted by name; 0 holds out none
-    (paper, Experiments: 1/8 of the frames)."""
+    (paper, Experiments: 1/8 of the frames). Where the data set says what is held out, that counts
+    instead; 0 still holds out none."""
+    split: str | None = None
+    """File that says what is held out: .json with the lists `train` and `test`, or text with the
+    names of the held-out photographs, a line each; `every` goes by `test_every` even where the data
+    set says otherwise."""
     max_width: int | None = None
     """Shrink images to at most this many pixels across; None keeps them as they are."""
     images: str | None = None
     """Image folder, where it is not `images/` beside the model."""
     format: SceneFormat | None = None
     """How to read the scene; None takes the first of these that the folder holds."""
+    alpha: AlphaUse = "background"
+    """What the alpha channel of photographs means: they and their renders are shown over
+    `background`; or `mask`: transparent pixels are left out; or `ignore`: nothing."""
+    background: str = "white"
+    """Of photographs with alpha, display values in fit and evaluation alike: white (3DGS), black or
+    R,G,B from 0 to 1; `random` draws a colour for every step, and white is judged."""
     drive: str | None = None
     """Which drive of a folder that holds several: its name in the data set, or how that begins."""
     cameras: tuple[str, ...] = ()
@@ -263,6 +278,9 @@ class LossConfig:
     quantization: float | None = None
     """Half the interval that a stored value stands for (0.5 / 255 for 8 bits): predictions within
     it are right and get no gradient. None compares with the stored value (ours: BUILD_NOTES)."""
+    alpha: float | None = None
+    """Weight of the mean difference between the render's opacity and the alpha channel of
+    photographs shown over a background; None leaves it out (ours)."""
     lidar: float | None = None
     """Weight of the error of log depth at laser measurements, of scenes that have them; None
     leaves it out (ours)."""

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, Float64, Int, UInt, UInt8
 
 Split = Literal["train", "test"]
+AlphaUse = Literal["background", "mask", "ignore"]
 
 
 def _namespace(values) -> Any:
@@ -287,6 +288,9 @@ class Batch(eqx.Module):
         mask: 1 = use, 0 = ignore.
         view_index: its row in `Photometry`.
         measured: depths for the loss, or None where it asks for none.
+        alpha: opacity of the photograph, stored as `ldr`, which is then premultiplied by it; None:
+            the scene is shown over no background.
+        backdrop: display values of that background, or None.
     """
 
     camera: Camera
@@ -294,6 +298,8 @@ class Batch(eqx.Module):
     mask: Float[Array, "h w"] | Bool[Array, "h w"]
     view_index: Int[Array, ""]
     measured: Measured | None = None
+    alpha: Float[Array, "h w"] | UInt[Array, "h w"] | None = None
+    backdrop: Float[Array, " 3"] | None = None
 
 
 # ------------------------------------------------------------------ host records
@@ -333,6 +339,7 @@ class View:
         time: seconds on the clock of `Scene.objects` and `Scene.lidar`, or None.
         own_car: where the photograph shows the car that carries the camera, at any resolution; the
             same for all photographs of a camera; None: nowhere that is known of.
+        alpha: what its alpha channel means, if it has one (`DataConfig.alpha`).
     """
 
     name: str
@@ -349,6 +356,7 @@ class View:
     frame: int | None = None
     time: float | None = None
     own_car: Bool[np.ndarray, "a b"] | None = None
+    alpha: AlphaUse = "mask"
 
 
 @dataclass(frozen=True)
@@ -418,6 +426,10 @@ class Scene:
         lidar: measurements with their times, or None.
         origin: position of our origin in the data set's world, scene units: float32 needs the
             drive near it.
+        split_by: what decided which views are held out, in words; readers name the file where the
+            data set decides, or None.
+        random_seeds: the points were drawn at random: they say nothing of surfaces.
+        depths: nearest and farthest camera z that the data set states, scene units, or None.
     """
 
     root: Path
@@ -430,6 +442,9 @@ class Scene:
     objects: tuple[TrackedObject, ...] = ()
     lidar: Lidar | None = None
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    split_by: str | None = None
+    random_seeds: bool = False
+    depths: tuple[float, float] | None = None
 
     @property
     def train_indices(self) -> tuple[int, ...]:

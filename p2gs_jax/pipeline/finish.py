@@ -142,6 +142,7 @@ def _accounted(account: Account, watch: Stopwatch, prepared: Prepared, reporter:
         reporter.message(late)
     steps = max(int(account.counts.get("steps", 0)), 1)
     said = {
+        "split": prepared.scene.split_by,
         "counts": {**account.counts, "programs": account.compiler.programs},
         "seconds": seconds,
         "seconds_per_step": account.seconds.get("optimisation", 0.0) / steps,

@@ -135,6 +135,8 @@ def load(scene_dir: Path, run_dir: Path, cfg: FitConfig, reporter: Reporter) -> 
             f"{scene_dir} has no seed points.",
             fix="check the poses and that the photographs overlap",
         )
+    held = len(scene.test_indices)
+    reporter.message(f"Held out: {held} of {len(scene.views)} views ({scene.split_by}).")
     return scene
 
 
@@ -169,8 +171,12 @@ def prepare(
     measured = measured_depths(scene, cfg)
     dense = wants_dense(scene, coverage, cfg)
     seeds = _choose_points(scene, cfg)
+    init = cfg.init
+    if store.backdrop is not None and init.shell == "auto":
+        # What lies behind everything is the background.
+        init = dataclasses.replace(init, shell="off")
     # Dense seeds cover some of what the points do not.
-    shell = None if dense else find_shell(views, scene.points, extent, cfg.init)
+    shell = None if dense else find_shell(views, scene.points, extent, init)
 
     guess = likely(cfg, kept, matched=has_tracks(scene) or dense)
     expected: Expected | None = None
@@ -225,7 +231,7 @@ def prepare(
             on_view=lambda i, n: reporter.stage("Matching photographs", i, n),
         )
         covering = np.concatenate([scene.points, added.points])
-        shell = find_shell(views, covering, extent, cfg.init)
+        shell = find_shell(views, covering, extent, init)
     if scene.point_colors is None:
         scene = with_colors(scene, photographed_radiance(scene, still, photometry, resolved))
     radiance = point_radiance(scene, solution, resolved)[seeds.keep]
@@ -272,15 +278,15 @@ def prepare(
 def _without_what_moves(
     scene: Scene, store: ImageStore, nodes: Nodes | None, cfg: FitConfig
 ) -> tuple[ImageStore, ImageStore]:
-    """Return the photographs that are fitted, and those of what stands still.
+    """Return the photographs that are fitted, and those of what stands still and is opaque.
 
     Exposures and seeds come from the latter.
     """
     still = store.leaving_out(scene.objects, cfg.dynamics.margin)
     if cfg.dynamics.method == "mask":
-        return still, still
+        return still, still.only_opaque()
     left = () if nodes is None else nodes.left
-    return store.leaving_out(left, cfg.dynamics.margin), still
+    return store.leaving_out(left, cfg.dynamics.margin), still.only_opaque()
 
 
 def _with_nodes(
@@ -339,6 +345,9 @@ def _solve(
     if not (has_tracks(scene) or from_tracks or dense):
         return None, None, []
     notes = []
+    if scene.random_seeds:
+        notes = ["Seeds at random show nothing twice: exposures start at 1 and are learned."]
+        return None, None, notes if from_tracks else []
     if not has_tracks(scene):
         notes.append("No tracks: seed points are projected into the views instead.")
     tracks = surface_colors(

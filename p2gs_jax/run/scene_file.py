@@ -43,6 +43,7 @@ def write_scene(folder: Path, scene: Scene) -> None:
                 "lens": None if v.distortion is None else v.distortion.model,
                 "frame": v.frame,
                 "time": v.time,
+                "alpha": v.alpha,
             }
             for v in scene.views
         ],
@@ -51,6 +52,8 @@ def write_scene(folder: Path, scene: Scene) -> None:
             for o in scene.objects
         ],
         "origin": scene.origin,
+        "split_by": scene.split_by,
+        "random_seeds": scene.random_seeds,
         "own_cars": list(own_cars),
     }
     arrays = {
@@ -112,6 +115,7 @@ def read_scene(folder: Path, root: Path) -> Scene | None:
                 frame=v.get("frame"),
                 time=v.get("time"),
                 own_car=own_cars.get(v["camera"]),
+                alpha=v.get("alpha", "mask"),
             )
             for i, v in enumerate(said["views"])
         )
@@ -131,6 +135,8 @@ def read_scene(folder: Path, root: Path) -> Scene | None:
             if "lidar_points" not in a
             else Lidar(a["lidar_points"], a["lidar_times"], a["lidar_objects"]),
             origin=tuple(said.get("origin", (0.0, 0.0, 0.0))),
+            split_by=said.get("split_by"),
+            random_seeds=said.get("random_seeds", False),
         )
     except (OSError, ValueError, KeyError, TypeError, IndexError, zipfile.BadZipFile) as error:
         raise UserError(

@@ -247,13 +247,15 @@ def _write_summary(
     true_ev: np.ndarray | None,
 ) -> None:
     common = usual_display(params, (), None, cfg.photometry)
+    if shown:
+        common = dataclasses.replace(common, backdrop=shown[0].transform.backdrop)
     train = scene.training_views
     exif = [v.exif_ev for v in train]
     write_summary(
         path,
         photographs=[v.photograph for v in shown],
         rendered=[v.ldr for v in shown],
-        linear_tonemapped=[develop(v.linear, common) for v in shown],
+        linear_tonemapped=[develop(v.linear, common, alpha=v.alpha) for v in shown],
         names=[f"{scene.views[v.index].name} ({scene.views[v.index].split})" for v in shown],
         exposures_ev=np.log2(jax.tree.map(np.asarray, params.photometry).exposures),
         cameras=[v.camera for v in train],

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float32, Int
 
 from p2gs_jax.core.numerics import on_host
 from p2gs_jax.core.streams import Stream, generator, view_order
@@ -84,8 +84,21 @@ class TrainingViews:
         row = self.rows[index]
         return on_host(Camera, *self.store.camera(row, shrink), self.store.placement(row))
 
-    def batch(self, index: int, shrink: int) -> Batch:
-        """Return a training view, on the host: a compiled step takes it from there."""
-        ldr, mask = self.store.stored(self.rows[index], shrink)
+    def batch(self, index: int, shrink: int, step: int = 0) -> Batch:
+        """Return a training view, on the host: a compiled step takes it from there.
+
+        Args:
+            index: row in `Photometry`.
+            shrink: factor by which images are shrunk.
+            step: draws the background, where every step has another.
+        """
+        row = self.rows[index]
+        ldr, mask = self.store.stored(row, shrink)
         measured = None if self.measured is None else self.measured[index]
-        return on_host(Batch, self.camera(index, shrink), ldr, mask, np.int32(index), measured)
+        given = (self.camera(index, shrink), ldr, mask, np.int32(index), measured)
+        return on_host(Batch, *given, self.store.alpha(row, shrink), self._backdrop(step))
+
+    def _backdrop(self, step: int) -> Float32[np.ndarray, " 3"] | None:
+        if not self.store.random_backdrop:
+            return self.store.backdrop
+        return generator(self.seed, Stream.BACKDROP, step).random(3).astype(np.float32)

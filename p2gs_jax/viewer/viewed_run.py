@@ -77,7 +77,7 @@ class ViewedRun:
             run.cfg.render,
             [self._probe(int(row)) for row in rows],
             self._notify,
-            lambda result: develop(result.linear, run.common_display()),
+            lambda result: develop(result.linear, run.common_display(), alpha=result.alpha),
         )
 
     def _notify(self) -> None:

@@ -36,8 +36,8 @@ class Fit:
     """
 
     scene: Annotated[Path, tyro.conf.Positional]
-    """COLMAP model, transforms.json, a rig, a drive of a data set (PandaSet, nuScenes, ...), or a
-    folder of photographs (docs/scenes.md)."""
+    """COLMAP model, transforms.json, Blender's or LLFF's folder, a rig, a drive of a data set
+    (PandaSet, nuScenes, ...), or a folder of photographs (docs/scenes.md)."""
     out: Folder
     """Run folder to create."""
     config: Annotated[configs.FitConfig, tyro.conf.arg(name="")]
@@ -57,7 +57,14 @@ class Fit:
     """Upper bound on the Gaussians: a whole number, or auto (grow while held-out training views
     gain by it); default: from the seeds and the pixels."""
     test_every: int | None = None
-    """Hold out every n-th view of each camera for evaluation; 0 holds out none; default: 8."""
+    """Hold out every n-th view of each camera for evaluation; 0 holds out none; default: 8, or as
+    the data set says."""
+    split: Annotated[str | None, tyro.conf.arg(metavar="FILE|every")] = None
+    """Names of the held-out photographs, a line each, or a .json with the lists train and test;
+    every: by --test-every though the data set says otherwise (docs/scenes.md)."""
+    background: Annotated[str | None, tyro.conf.arg(metavar="COLOR")] = None
+    """What photographs with alpha and their renders are put over: white, black, random (another for
+    every step) or R,G,B from 0 to 1; default: white."""
     images: Annotated[str | None, tyro.conf.arg(metavar="DIR")] = None
     """Image folder, where it is not images/ beside the model."""
     allow_missing: bool = False
@@ -145,7 +152,7 @@ def resolve_fit(args: Fit) -> configs.FitConfig:
     """
     cfg = args.config
     data, train, evaluation = cfg.data, cfg.train, cfg.evaluation
-    for name in ("max_width", "test_every", "images", "drive", "frames"):
+    for name in ("max_width", "test_every", "split", "background", "images", "drive", "frames"):
         if getattr(args, name) is not None:
             data = dataclasses.replace(data, **{name: getattr(args, name)})
     if args.cameras:
