@@ -384,6 +384,11 @@ class DynamicsConfig:
     """Of one thing; the cubes grow until no more are left (ours)."""
     correct_poses: bool = False
     """Learn small corrections of the boxes' poses."""
+    unexplained: Literal["fit", "mask"] = "fit"
+    """`mask`: pixels that no static explanation fits, found by their residuals over time and
+    without boxes, are left out of later steps; `fit`: they are fitted like all others."""
+    unexplained_at: tuple[float, ...] = (0.3, 0.6)
+    """When they are looked for, as fractions of the run; each look starts afresh (ours)."""
 
 
 @dataclass(frozen=True)
