@@ -86,7 +86,9 @@ class LeftOut:
         dynamics = self._cfg.dynamics
         if dynamics.unexplained == "fit":
             return False
-        return any(host.looked_at < at <= host.progress < 1 for at in dynamics.unexplained_at)
+        # Up to half a step: progress is a sum.
+        now = host.progress + 0.5 * host.pace
+        return any(host.looked_at < at <= now < 1 for at in dynamics.unexplained_at)
 
     def look(self, state: FitState, host: HostState) -> None:
         """Hold every training view against its render; leave out what nothing static explains.
@@ -97,7 +99,7 @@ class LeftOut:
         """
         with self._clock("looking"):
             looked = look(state, self._views, self._cfg, max(host.shrink, 1))
-            host.looked_at, host.looked_step = host.progress, host.step
+            host.looked_at, host.looked_step = host.progress + 0.5 * host.pace, host.step
             self._file.write(host.step, looked.found, looked.whole)
         self._leave(looked, host.step)
 
