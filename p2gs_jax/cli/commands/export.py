@@ -64,6 +64,8 @@ def run(options: Export) -> int:
     if "spz" in formats:
         require_gsply()
     fitted = load_run(options.run, options.scene)
+    if options.without_objects:
+        fitted = fitted.without_objects()
     transform = _display_transform(fitted, options)
     folder = options.out or options.run / "exports"
     _check_places(folder, formats, options.overwrite)
