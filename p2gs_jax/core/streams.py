@@ -55,6 +55,8 @@ class Stream(IntEnum):
     """Laser measurements that a view is compared with."""
     PLAN_POINTS = 61
     """Points that a plan from above shows."""
+    VIBRATING = 67
+    """Laser points that start as Gaussians that vibrate."""
     SCORE_SIGNS = 47
     """Signs of residuals, from which standard errors of many views are drawn."""
 

@@ -17,7 +17,7 @@ from p2gs_jax.config import FitConfig, PhotometryConfig, from_dict
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.ply import read_ply
-from p2gs_jax.gaussians.posed import posed
+from p2gs_jax.gaussians.posed import chosen, posed, standing
 from p2gs_jax.photometry.cameras import camera_rows
 from p2gs_jax.photometry.display import DisplayTransform, display_of_view
 from p2gs_jax.photometry.mean import MeanParameters, mean_parameters, usual_display
@@ -78,7 +78,9 @@ class Run:
         return make_renderer(self.cfg.render, self.owner)
 
     def camera(self, index: int) -> Camera:
-        """Return the camera of a view at the size of the fit; it sees what moves.
+        """Return the camera of a view at the size of the fit.
+
+        It sees what moves, where this run has it.
 
         Args:
             index: row in `scene.views`.
@@ -97,6 +99,46 @@ class Run:
             placement = self.moving.placement(np.asarray(camera.viewmat), time)
             camera = replace(camera, objects=placement)
         return self._renderer(self.params.gaussians, self.alive, camera)
+
+    def without_objects(self) -> Run:
+        """Return the run without anything that moves."""
+        return self._of(standing(self.params.gaussians, self.owner), None)
+
+    def only_objects(self) -> Run:
+        """Return the run with nothing but what moves.
+
+        Raises:
+            UserError: nothing does.
+        """
+        self._require_objects()
+        assert self.owner is not None
+        mine = self.owner >= 0
+        return self._of(chosen(self.params.gaussians, mine), self.owner[mine])
+
+    def with_moved(self, name: str, offset: Sequence[float]) -> Run:
+        """Return the run with one object elsewhere, at all times.
+
+        Args:
+            name: of its track (`Scene.objects`), or how that begins.
+            offset: forward, left and up in the frame of its box, scene units.
+
+        Raises:
+            UserError: nothing moves, or no object has this name.
+        """
+        self._require_objects()
+        assert self.moving is not None
+        return replace(self, moving=self.moving.moved(name, offset))
+
+    def _of(self, gaussians: Gaussians, owner: Int[np.ndarray, " n"] | None) -> Run:
+        return replace(self, params=replace(self.params, gaussians=gaussians), owner=owner)
+
+    def _require_objects(self) -> None:
+        if self.owner is None:
+            raise UserError(
+                f"{self.folder} has no object with Gaussians of its own.",
+                fix="leave the option out; a drive with boxes has some, fitted with "
+                "--dynamics.method rigid",
+            )
 
     def as_of(self, time: float | None = None) -> Gaussians:
         """Return all Gaussians in world coordinates, for programs that know no motion.

@@ -1,12 +1,16 @@
-"""A drive whose boxes are not used: what no static scene explains is left out of the fit."""
+"""A drive without boxes: what moves vibrates, and what is still unexplained is left out."""
 
 import shutil
 
+import numpy as np
 import pytest
 from moving_box import drive_format, write_photographs
 
 import p2gs_jax
 from p2gs_jax.core.atomic import read_jsonl
+from p2gs_jax.formats.exr import read_exr
+from p2gs_jax.formats.ply import read_ply
+from p2gs_jax.render.vibration import STILL, at_time
 from p2gs_jax.report.report import write_report
 from p2gs_jax.scene import drives
 from p2gs_jax.sweep import with_fields
@@ -17,7 +21,8 @@ CFG = with_fields(
     {
         "data.format": "pandaset",
         "data.own_car": False,
-        "dynamics.method": "off",
+        "dynamics.method": "vibration",
+        "dynamics.vibrating": 600,
         "dynamics.unexplained": "mask",
         "dynamics.unexplained_at": [0.5],
         "photometry.select": False,
@@ -59,6 +64,25 @@ def test_what_was_left_out_is_said_and_shown(fitted):
     write_report(fitted.run_dir)
     page = (fitted.run_dir / "report.html").read_text()
     assert "What the fit left out" in page
+
+
+def test_gaussians_have_moved_and_a_run_shows_them_at_the_time_of_each_view(fitted):
+    run = p2gs_jax.load_run(fitted.run_dir)
+    moves = run.params.gaussians.vibration
+    still = np.asarray(moves.log_lives) > np.log(STILL) - 1e-3
+    assert 0.2 < still.mean() < 0.9
+    assert not np.any(np.asarray(moves.velocities)[still])
+    assert np.abs(np.asarray(moves.velocities)[~still]).max() > 0.5
+    index = run.scene.test_indices[0]
+    shown = np.asarray(run.render(run.camera(index)).linear)
+    name = run.scene.views[index].name.rsplit(".", 1)[0]
+    stored, _ = read_exr(fitted.run_dir / "renders" / f"{name}.exr")
+    np.testing.assert_allclose(stored, shown, atol=2e-3)
+    later = np.asarray(run.render(run.camera(index), run.scene.views[index].time + 0.5).linear)
+    assert np.abs(later - shown).max() > 0.02
+    # Files for other programs are of one moment.
+    assert read_ply(fitted.run_dir / "splats.ply").vibration is None
+    assert at_time(run.as_of(), None).vibration is None
 
 
 def test_it_resumes_after_a_look_as_if_nothing_had_happened(fitted, folder, tmp_path, monkeypatch):

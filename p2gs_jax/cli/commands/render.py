@@ -81,6 +81,7 @@ def run(options: Render) -> int:
     _check_place(out, options.overwrite)
     given = read_cameras(Path(options.path)) if options.path not in PATHS else None
     fitted = load_run(options.run, options.scene)
+    fitted = _with_objects(fitted, options)
     if options.curve == "spline" and fitted.cfg.photometry.curve != "spline":
         raise UserError(
             f"--curve spline: {options.run} has none; its curve is {fitted.cfg.photometry.curve}.",
@@ -114,6 +115,19 @@ def run(options: Render) -> int:
         f"{_median_ms(renderer.develop_seconds)} to expose and encode, whatever exposure and gamma."
     )
     return 0
+
+
+def _with_objects(fitted: Run, options: Render) -> Run:
+    """Return the run with what moves as the options want it.
+
+    Raises:
+        UserError: it has none of these objects.
+    """
+    for name, *offset in options.move_object:
+        fitted = fitted.with_moved(name, offset)
+    if options.without_objects:
+        return fitted.without_objects()
+    return fitted.only_objects() if options.only_objects else fitted
 
 
 def _spent(total: float, reading: float, compiling: float) -> str:
@@ -173,6 +187,12 @@ def _check(options: Render) -> None:
             "--exposure-ev own is for views and drives, and not for panoramas.",
             fix="write a number of stops, or leave it out",
         )
+    if options.without_objects and (options.only_objects or options.move_object):
+        raise UserError(
+            "--without-objects leaves nothing to show or to move.", fix="leave one of them out"
+        )
+    if not np.isfinite([x for _, *offset in options.move_object for x in offset]).all():
+        raise UserError("--move-object wants finite numbers of metres.")
     if options.gamma is not None and not 0 < options.gamma < math.inf:
         raise UserError(
             "--gamma must be positive.",

@@ -50,6 +50,8 @@ class Export:
     bake_steps: int | None = None
     """Display colours: steps that bring a viewer's pictures closer to the true ones; 0 takes every
     Gaussian by itself (default: 240, or one for every training view if that is more)."""
+    without_objects: bool = False
+    """Leave out what moves; files of Gaussians otherwise hold it as of the middle of the drive."""
     scene: SceneFolder = None
     """Where the run's scene lies now, if it is not where it was."""
     overwrite: bool = False

@@ -55,6 +55,16 @@ class Render:
     view's own; neutral where an exposure is given, and for other paths)."""
     no_vignetting: bool = False
     """Leave out the darkening towards the corners that the cameras of this run have."""
+    without_objects: bool = False
+    """Leave out what moves."""
+    only_objects: bool = False
+    """Show only what moves."""
+    move_object: Annotated[
+        tuple[tuple[str, float, float, float], ...],
+        tyro.conf.arg(metavar="NAME X Y Z [NAME X Y Z ...]"),
+    ] = ()
+    """Show objects this far forward, left and up of where they are (metres, in the frame of their
+    box); of a track's name its beginning will do."""
     shift: Metres = None
     """Move a drive sideways, seen from the driving direction: so many metres (scene units) to the
     left; negative ones to the right."""

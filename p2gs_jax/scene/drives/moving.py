@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Float64
 from scipy.spatial.transform import Rotation
 
 from p2gs_jax.core.numerics import on_host
+from p2gs_jax.errors import UserError
 from p2gs_jax.render.objects import HIDDEN
 from p2gs_jax.scene.drives.poses import interpolated
 from p2gs_jax.types import Params, Placement, Scene, TrackedObject
@@ -20,6 +21,7 @@ from p2gs_jax.types import Params, Placement, Scene, TrackedObject
 POSES_PER_KEY = 2
 # Where no track has two poses.
 DEFAULT_SPACING_S = 0.2
+MOST_LISTED = 12
 
 
 @dataclass(frozen=True)
@@ -52,11 +54,15 @@ class MovingObjects:
         keys: of the rows of `corrections`.
         corrections: `Params.poses` of a finished fit; None: poses are as they were tracked, or the
             fit that learns them is not finished.
+        offsets: by which somebody moved them, in the frame of each box, scene units; None: nobody.
+        middle: of the drive, where Gaussians vibrate: the zero of `Placement.time`, seconds.
     """
 
     objects: tuple[TrackedObject, ...]
     keys: KeyTimes
     corrections: Float[np.ndarray, "t k 6"] | None = None
+    offsets: Float[np.ndarray, "k 3"] | None = None
+    middle: float | None = None
 
     def __len__(self) -> int:
         return len(self.objects)
@@ -70,7 +76,34 @@ class MovingObjects:
             out[row], there[row] = poses[0], covered[0]
         if self.corrections is not None:
             out = out @ _moves(self.corrections, *self.keys.at(time))
+        if self.offsets is not None:
+            out[:, :3, 3] += np.einsum("kij,kj->ki", out[:, :3, :3], self.offsets)
         return out, there
+
+    def moved(self, name: str, offset: Sequence[float]) -> MovingObjects:
+        """Return the objects with one of them moved.
+
+        Args:
+            name: of its track, or how that begins.
+            offset: forward, left and up in the frame of its box, scene units.
+
+        Raises:
+            UserError: no object has this name, or several.
+        """
+        names = [thing.name for thing in self.objects]
+        exact = [row for row, known in enumerate(names) if known == name]
+        found = exact or [row for row, known in enumerate(names) if known.startswith(name)]
+        if len(found) != 1 or not name:
+            what = "no object" if not found else f"{len(found)} objects"
+            listed = ", ".join(f"{o.name} ({o.label})" for o in self.objects[:MOST_LISTED])
+            rest = len(self.objects) - MOST_LISTED
+            raise UserError(
+                f"{what} with Gaussians of its own has a name that begins with {name!r}.",
+                fix=f"choose of {listed}" + (f" and {rest} others" if rest > 0 else ""),
+            )
+        offsets = np.zeros((len(self), 3)) if self.offsets is None else self.offsets.copy()
+        offsets[found[0]] += np.asarray(offset, float)
+        return dataclasses.replace(self, offsets=offsets)
 
     def placement(self, viewmat: Float[np.ndarray, "4 4"], time: float) -> Placement:
         """Return where the objects are in a view, on the host.
@@ -83,7 +116,8 @@ class MovingObjects:
         viewmats = (np.asarray(viewmat, np.float64) @ poses).astype(np.float32)
         viewmats[~there] = HIDDEN
         key, share = self.keys.at(time)
-        return on_host(Placement, viewmats, np.int32(key), np.float32(share))
+        since = None if self.middle is None else np.float32(time - self.middle)
+        return on_host(Placement, viewmats, np.int32(key), np.float32(share), since)
 
 
 def key_times(objects: Sequence[TrackedObject], times: Sequence[float]) -> KeyTimes:
