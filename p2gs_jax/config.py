@@ -324,6 +324,12 @@ class OptimizerConfig:
     """Rotations that correct the poses of moving objects, radians (ours)."""
     object_translations: float = 5e-3
     """Likewise translations, scene units (ours)."""
+    velocities: float = 0.3
+    """Of Gaussians that vibrate, scene units per second (ours: BUILD_NOTES)."""
+    peaks: float = 0.03
+    """Times at which they are most opaque, seconds (ours)."""
+    lives: float = 0.05
+    """Log seconds that they live (ours)."""
     photometry_final: float = 0.01
     """Exposure and gamma rates decay exponentially to this fraction (ours)."""
     final: float = 0.1
@@ -385,10 +391,11 @@ class DensifyConfig:
 class DynamicsConfig:
     """What is done about things that move, in scenes with boxes that follow them."""
 
-    method: Literal["rigid", "mask", "off"] = "rigid"
+    method: Literal["rigid", "mask", "vibration", "off"] = "rigid"
     """`rigid`: each moves as one piece, with Gaussians of its own; `mask`: their pixels are left
-    out of the fit; `off`: the fit knows no boxes. Exposures are solved from what stands still in
-    any case."""
+    out of the fit; `off`: the fit knows no boxes; nor does `vibration`: Gaussians that come, move
+    and go are learned (PVG, arXiv 2311.18561). Exposures are solved from what stands still in any
+    case."""
     margin: float = 0.15
     """Boxes whose pixels are left out are widened by this much to every side, scene units."""
     least_views: int = 4
@@ -404,6 +411,15 @@ class DynamicsConfig:
     """Of one thing; the cubes grow until no more are left (ours)."""
     correct_poses: bool = False
     """Learn small corrections of the boxes' poses."""
+    vibrating: int = 30_000
+    """`vibration`: this many Gaussians begin as something that may move (ours)."""
+    vibration_life: float = 0.3
+    """And live for this long, seconds, before and after their peak (ours)."""
+    unexplained: Literal["fit", "mask"] = "fit"
+    """`mask`: pixels that no static explanation fits, found by their residuals over time and
+    without boxes, are left out of later steps; `fit`: they are fitted like all others."""
+    unexplained_at: tuple[float, ...] = (0.3, 0.6)
+    """When they are looked for, as fractions of the run; each look starts afresh (ours)."""
 
 
 @dataclass(frozen=True)

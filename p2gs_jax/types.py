@@ -32,6 +32,20 @@ GAMMA_SRGB = 2.2
 LUMINANCE = (0.299, 0.587, 0.114)
 
 
+class Vibration(eqx.Module):
+    """How Gaussians come, move and go (render/vibration.py).
+
+    Attributes:
+        velocities: at the peak, scene units per second.
+        peaks: when each is most opaque, seconds from the middle of the drive.
+        log_lives: log standard deviations of the opacity over time, log seconds.
+    """
+
+    velocities: Float[Array, "n 3"]
+    peaks: Float[Array, " n"]
+    log_lives: Float[Array, " n"]
+
+
 class Gaussians(eqx.Module):
     """The scene: N anisotropic Gaussians carrying linear HDR radiance.
 
@@ -41,6 +55,7 @@ class Gaussians(eqx.Module):
         log_scales: log standard deviations along the rotated axes, log scene units.
         opacity_logits: logits of the peak opacity.
         sh: spherical-harmonics coefficients, K = (degree + 1)^2, of pre-activation radiance.
+        vibration: how they change with time; None: they do not, and nothing is paid for it.
     """
 
     means: Float[Array, "n 3"]
@@ -48,6 +63,7 @@ class Gaussians(eqx.Module):
     log_scales: Float[Array, "n 3"]
     opacity_logits: Float[Array, " n"]
     sh: Float[Array, "n k 3"]
+    vibration: Vibration | None = eqx.field(kw_only=True, default=None)
 
     @property
     def capacity(self) -> int:
@@ -145,11 +161,13 @@ class Placement(eqx.Module):
         viewmats: box-to-camera of each, OpenCV axes; what is not there is behind the camera.
         key: row of `Params.poses` at the key time before.
         share: of the way from there to the next one.
+        time: of the view, seconds from the middle of the drive, where Gaussians vibrate.
     """
 
     viewmats: Float[Array, "k 4 4"]
     key: Int[Array, ""]
     share: Float[Array, ""]
+    time: Float[Array, ""] | None = None
 
 
 class Camera(eqx.Module):

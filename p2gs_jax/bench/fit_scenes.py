@@ -122,7 +122,8 @@ def along_a_fit(
     leaves["means"] += way * 0.5 * np.exp(near)[:, None] * rng.normal(size=(count, 3))
     size = end.sh[0] * np.exp(rng.normal(0, end.sh[1], (count, 1, 1)))
     leaves["sh"][:, 1:] = way * size * rng.normal(size=leaves["sh"][:, 1:].shape)
-    return Gaussians(**{k: jnp.asarray(v, jnp.float32) for k, v in leaves.items()})
+    arrays = {k: jnp.asarray(v, jnp.float32) for k, v in leaves.items()}
+    return Gaussians(**arrays)  # pyright: ignore[reportArgumentType]
 
 
 def _drive_views(width: int) -> list[View]:

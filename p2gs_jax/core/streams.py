@@ -59,6 +59,8 @@ class Stream(IntEnum):
     """Seeds of scenes without points and matches."""
     BACKDROP = 71
     """What a step composites a photograph with alpha over."""
+    VIBRATING = 73
+    """Laser points that start as Gaussians that vibrate."""
     SCORE_SIGNS = 47
     """Signs of residuals, from which standard errors of many views are drawn."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import threading
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,6 +16,7 @@ from p2gs_jax.core.runtime import return_freed_memory
 from p2gs_jax.evaluate.evaluate import ViewResult, evaluate
 from p2gs_jax.evaluate.lpips import LpipsWeights
 from p2gs_jax.evaluate.references import Reference, find_radiance
+from p2gs_jax.evaluate.unexplained import Unexplained, shares_by_view
 from p2gs_jax.photometry.metering import Metering
 from p2gs_jax.pipeline.prepare import Prepared
 from p2gs_jax.render.host import make_renderer
@@ -34,12 +36,15 @@ class Account:
         seconds: times, by name.
         compiler: counts what was compiled for this fit.
         growth: the history of automatic growth, or None.
+        left_out: what no static scene explains and the last steps left out, by row of the scene;
+            None where it was not looked for.
     """
 
     counts: dict[str, int]
     seconds: dict[str, float]
     compiler: CompileCounter = field(default_factory=CompileCounter)
     growth: dict | None = None
+    left_out: Mapping[int, Unexplained] | None = None
 
 
 def finish(
@@ -123,6 +128,9 @@ def finish(
             metering=metering[0],
             true_ev=true_ev,
         )
+        if account.left_out is not None:
+            write_unexplained(folder.left_out, scene, store, account.left_out)
+            metrics["left_out"] = shares_by_view(scene, account.left_out)
     metrics |= _accounted(account, watch, prepared, reporter)
     write_json(folder.metrics, metrics)
     return metrics

@@ -36,6 +36,7 @@ from p2gs_jax.gaussians.init.start import (
     match_photographs,
     shell_gaussians,
 )
+from p2gs_jax.gaussians.init.vibration import clock_of, vibrates, with_vibration
 from p2gs_jax.gaussians.population import Coverage
 from p2gs_jax.losses.relative_exposure import ColorPairs
 from p2gs_jax.photometry.calibrate import calibrate_observations, options_of
@@ -162,7 +163,9 @@ def prepare(
     clock = clock or Stopwatch()
     begin = time.monotonic()
     nodes = find_nodes(scene, cfg.dynamics)
-    store = ImageStore(scene.views, cfg.data, moving=None if nodes is None else nodes.moving)
+    vibrating = vibrates(scene, cfg)
+    moving = clock_of(scene) if vibrating else None if nodes is None else nodes.moving
+    store = ImageStore(scene.views, cfg.data, moving=moving)
     fitted, still = _without_what_moves(scene, store, nodes, cfg)
     views = scene.training_views
     taken_by = [view.camera for view in views]
@@ -182,6 +185,8 @@ def prepare(
     expected: Expected | None = None
     if guess is not None:
         black = black_gaussians(scene.points[seeds.keep], shell, views, cfg)
+        if vibrating:
+            black = with_vibration(black, scene, cfg)
         owner = None
         if nodes is not None:
             colors = np.zeros_like(nodes.points)
@@ -239,6 +244,8 @@ def prepare(
     if shell is not None:
         far = shell_gaussians(shell, scene, still, photometry, views, resolved)
         gaussians = merge(gaussians, far)
+    if vibrating:
+        gaussians = with_vibration(gaussians, scene, resolved)
     owner = None
     if nodes is not None:
         found = nodes_radiance(nodes, scene, fitted, photometry, resolved)
@@ -249,6 +256,8 @@ def prepare(
     notes += [] if added is None else [added.note()]
     notes += [] if shell is None else [shell.note()]
     notes += thinned
+    if cfg.dynamics.method == "vibration" and not vibrating:
+        notes.append("Views have no times: everything is fitted as if it stood still.")
     for note in notes:
         reporter.message(note)
     clock.add("seeds", time.monotonic() - solved)

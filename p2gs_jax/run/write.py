@@ -24,6 +24,7 @@ from p2gs_jax.photometry.mean import MeanParameters, mean_parameters, usual_disp
 from p2gs_jax.photometry.metering import Metering
 from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.render.spherical_harmonics import MAX_DEGREE
+from p2gs_jax.render.vibration import at_time
 from p2gs_jax.run.appearance_file import write_appearance
 from p2gs_jax.run.decisions import Decisions, write_decisions
 from p2gs_jax.run.layout import RunFolder
@@ -103,7 +104,7 @@ def write_results(
         true_ev: true exposures of the training views for the plot, or None.
     """
     write_scene(folder.root, scene)
-    if owner is not None and moving is not None:
+    if moving is not None and (owner is not None or moving.middle is not None):
         write_objects(folder.objects, owner, moving, scene)
     _write_models(folder, params, owner, moving, scene, cfg)
     model, curve, gauge = _photometry_model(params, cfg)
@@ -166,6 +167,7 @@ def _write_models(
     placed = params.gaussians
     if owner is not None and moving is not None:
         placed = posed(placed, owner, *moving.poses(middle_time(scene)))
+    placed = at_time(placed, None)
     shown = bake(placed, transform, cfg.render.radiance, MAX_DEGREE)
     write_ply(folder.splats, shown, display_comments(transform))
     write_radiance(folder.radiance, params.gaussians, alive, activation=cfg.render.radiance)

@@ -35,6 +35,7 @@ from p2gs_jax.gaussians.bake import (
 from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.render.host import make_renderer
 from p2gs_jax.render.spherical_harmonics import MAX_DEGREE
+from p2gs_jax.render.vibration import at_time
 from p2gs_jax.run.appearance_file import write_appearance
 from p2gs_jax.run.read import Run, load_run
 from p2gs_jax.scene.device import camera_of
@@ -147,7 +148,7 @@ def _check_names(fitted: Run, formats: Sequence[Format]) -> None:
 
 
 def _linear_ply(folder: Path, fitted: Run, store: ImageStore) -> str:
-    g = fitted.as_of()
+    g = at_time(fitted.as_of(), None)
     ply, sidecar = (folder / place for place in PLACES["linear-ply"])
     activation = fitted.cfg.render.radiance
     count = write_radiance(ply, g, np.ones(g.capacity, bool), activation=activation)
@@ -226,7 +227,7 @@ class _Display:
         reporter: Reporter,
     ):
         self.fitted, self.transform, self.reporter = fitted, transform, reporter
-        self.gaussians, scene = fitted.as_of(), fitted.scene
+        self.gaussians, scene = at_time(fitted.as_of(), None), fitted.scene
         self.steps = max(STEPS, len(scene.train_indices)) if steps is None else steps
         self.baked: dict[int, Gaussians] = {}
         render = make_renderer(fitted.cfg.render)
