@@ -33,7 +33,7 @@ SCRIPTS = ("decode", "shaders", "renderer", "camera", "link", "marks", "hands", 
 JUDGED, WEIGHED = 12, 60
 MEGABYTE = 1_000_000
 # Bytes kept for sentences and for what says how to read the Gaussians.
-RESERVE = 6000
+RESERVE = 4000
 Say = Callable[[str], None]
 
 
@@ -124,7 +124,7 @@ def page_text(title: str, known: Mapping[str, Any], data: bytes) -> str:
     script = '(() => {\n"use strict";\n' + "\n".join(map(_source, SCRIPTS)) + "})();\n"
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     policy = (
-        f"default-src 'none'; script-src 'sha256-{digest}' blob:; worker-src blob:; "
+        f"default-src 'none'; script-src 'sha256-{digest}'; worker-src blob:; "
         "style-src 'unsafe-inline'; img-src data:"
     )
     parts = {
@@ -198,8 +198,8 @@ def _sentences(splats: PageSplats, fitted: Run, size_mb: float) -> list[str]:
     kind = fitted.cfg.photometry.appearance
     if kind is not None:
         said.append(
-            f"The learned correction of display values ({kind}) is left out: the page has exposure, "
-            "white balance, gamma, curve and vignetting."
+            f"The learned correction of display values ({kind}) is left out: the page has "
+            "exposure, white balance, gamma, curve and vignetting."
         )
     return said
 

@@ -24,7 +24,8 @@ function linkOf(state) {
 }
 
 function numbers(text, count) {
-  const values = (text || "").split(",").map(Number);
+  if (!text) return null;
+  const values = text.split(",").map(Number);
   return values.length === count && values.every(Number.isFinite) ? values : null;
 }
 
@@ -33,7 +34,7 @@ function followLink(hash, state, scene, curves) {
   const said = new URLSearchParams(hash.slice(1));
   for (const [name, [low, high]] of Object.entries(LIMITS)) {
     const value = numbers(said.get(name), 1);
-    if (value && said.get(name) !== "") state.look[name] = clamp(value[0], low, high);
+    if (value) state.look[name] = clamp(value[0], low, high);
   }
   if (curves.includes(said.get("curve"))) state.look.curve = said.get("curve");
   if (SHOWS.includes(said.get("show"))) state.show = said.get("show");
@@ -44,7 +45,7 @@ function followLink(hash, state, scene, curves) {
   const line = numbers(said.get("line"), 1);
   if (line) state.look.split = clamp(line[0], 0, 1);
   const at = numbers(said.get("at"), 1);
-  if (at && said.get("at") !== "" && scene.views[at[0]]) {
+  if (at && scene.views[at[0]]) {
     state.at = at[0];
     state.camera = cameraOf(scene.views[at[0]]);
     return;
