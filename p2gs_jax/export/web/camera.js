@@ -37,6 +37,12 @@ function turn(axis, angle) {
     y * z * k - x * s, x * z * k - y * s, y * z * k + x * s, z * z * k + c];
 }
 
+// The point at a depth that a pixel shows.
+function pointAt({ R, c, lens: [fx, fy, cx, cy] }, x, y, depth) {
+  const ray = [((x - cx) / fx) * depth, ((y - cy) / fy) * depth, depth];
+  return plus(c, [0, 1, 2].map((k) => R[k] * ray[0] + R[3 + k] * ray[1] + R[6 + k] * ray[2]));
+}
+
 // Turn a camera about a point by a rotation of the world.
 function turned(camera, M, about) {
   const R = [0, 1, 2].flatMap((i) => times(M, row(camera.R, i)));
@@ -83,10 +89,15 @@ function between(a, b, share) {
 // How far the first thing is that a pixel shows, from the Gaussians whose centres fall near it.
 function depthAt(splats, camera, x, y) {
   const found = [], opacities = splats.triples[3], reach = 24;
+  const { means } = splats, { R, c } = camera, [fx, fy, cx, cy] = camera.lens;
   for (let i = 0; i < splats.count; i++) {
     if (opacities[3 * i] < 0) continue;
-    const [px, py, z] = projectPoint(camera, splats.means.subarray(3 * i, 3 * i + 3));
-    if (z > 0.05 && Math.abs(px - x) < reach && Math.abs(py - y) < reach) found.push(z);
+    const dx = means[3 * i] - c[0], dy = means[3 * i + 1] - c[1], dz = means[3 * i + 2] - c[2];
+    const z = R[6] * dx + R[7] * dy + R[8] * dz;
+    if (!(z > 0.05)) continue;
+    const px = (fx * (R[0] * dx + R[1] * dy + R[2] * dz)) / z + cx;
+    const py = (fy * (R[3] * dx + R[4] * dy + R[5] * dz)) / z + cy;
+    if (Math.abs(px - x) < reach && Math.abs(py - y) < reach) found.push(z);
   }
   return found.length ? found.sort((a, b) => a - b)[Math.floor(found.length / 4)] : null;
 }

@@ -5,8 +5,8 @@ const TURN = 0.005, KEYS_TURN = 0.9, KEYS_STEP = 0.5, FAST = 4;
 const MOVES = ["KeyW", "KeyA", "KeyS", "KeyD", "KeyQ", "KeyE", "ShiftLeft", "ShiftRight",
   "ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown"];
 
-const typing = (e) => e.ctrlKey || e.metaKey || e.altKey ||
-  e.target.matches("input:not([type=checkbox]), select");
+const typing = (e) => e.ctrlKey || e.metaKey || e.altKey || e.target.matches("select, [type=number]") ||
+  (e.target.matches("[type=range]") && e.code.startsWith("Arrow"));
 
 class Hands {
   // `page` has camera, pivot, up, depth and fly, and is told through moved() and clicked().

@@ -33,7 +33,7 @@ class Page {
     followLink(location.hash, this.state, scene, this.curves);
     this.choosePhotograph();
     this.show();
-    addEventListener("resize", () => this.wake(true));
+    addEventListener("resize", () => this.wake());
     addEventListener("hashchange", () => {
       if (location.hash === this.written) return;
       followLink(location.hash, this.state, scene, this.curves);
@@ -43,7 +43,7 @@ class Page {
     // The first picture waits for its order.
     this.ready = this.renderer.sort(this.windowCamera()).then((row) => {
       this.sortedFor = row;
-      this.wake(true);
+      this.wake();
       return new Promise(requestAnimationFrame);
     });
   }
@@ -72,10 +72,9 @@ class Page {
   // What the hands ask for.
   grabbed(x, y) {
     $("hands").focus({ preventScroll: true });
-    if (this.fly) return;
-    const depth = depthAt(this.splats, this.windowCamera(1 / devicePixelRatio), x, y);
-    const { R, c } = this.state.camera;
-    this.pivot = plus(c, row(R, 2), depth || this.depthOfPivot());
+    const camera = this.windowCamera(1 / devicePixelRatio);
+    const depth = depthAt(this.splats, camera, x, y);
+    if (depth) this.pivot = pointAt(camera, x, y, depth);
   }
 
   clicked(x, y) {
@@ -87,7 +86,7 @@ class Page {
     this.state.camera = camera;
     this.state.at = null;
     this.stop();
-    this.wake(true);
+    this.wake();
   }
 
   // Stand where a photograph was taken, and take its exposure unless asked not to.
@@ -181,16 +180,17 @@ class Page {
 
   driveControls(change) {
     const names = [...new Set(this.scene.views.map((v) => v.camera))];
-    this.drives = names.map((name) => this.scene.views.flatMap((v, i) => (v.camera === name ? [i] : [])));
-    fill($("along"), names.map((name, k) => [k, name]));
-    $("along-line").hidden = names.length < 2;
-    $("drive").hidden = this.drives.every((d) => d.length < 2);
-    const first = this.drives.findIndex((d) => d.length > 1);
+    this.drives = names
+      .map((name) => this.scene.views.flatMap((v, i) => (v.camera === name ? [i] : [])))
+      .filter((rows) => rows.length > 1);
+    fill($("along"), this.drives.map((rows, k) => [k, this.scene.views[rows[0]].camera]));
+    $("along-line").hidden = this.drives.length < 2;
+    $("drive").hidden = !this.drives.length;
+    if (!this.drives.length) return;
     const along = () => {
       $("place").max = this.drives[$("along").value].length - 1;
       $("place").value = 0;
     };
-    $("along").value = Math.max(first, 0);
     along();
     change("along", "change", () => { along(); this.drive(0); });
     change("place", "input", (e) => { this.stop(); this.drive(Number(e.value)); });
@@ -201,7 +201,7 @@ class Page {
     if ($("drive").hidden) return;
     this.playing = true;
     $("play").textContent = "❚❚ pause";
-    this.wake(true);
+    this.wake();
   }
 
   stop() {
@@ -282,11 +282,10 @@ class Page {
     $("at").value = at === null ? "" : at;
     $("cameras").checked = this.marksShown;
     $("fly").checked = this.fly;
-    this.wake(true);
+    this.wake();
   }
 
-  wake(moved = false) {
-    if (moved) this.dirty = true;
+  wake() {
     if (this.asleep === false) return;
     this.asleep = false;
     requestAnimationFrame((now) => this.frame(now / 1000));
@@ -294,8 +293,8 @@ class Page {
 
   frame(now) {
     this.asleep = true;
-    const passed = Math.min(now - (this.lastFrame ?? now), 0.2);
-    this.lastFrame = now;
+    // After a rest nothing is known of the speed.
+    const passed = this.lastFrame ? Math.min(now - this.lastFrame, 0.5) : 0;
     const steered = this.hands.steer(passed || 0.016);
     if (this.playing) {
       const last = this.drives[$("along").value].length - 1;
@@ -316,9 +315,14 @@ class Page {
     this.draw();
     this.say(now, moved || this.newOrder);
     this.newOrder = false;
-    if (resting) this.writeLink();
-    if (steered || this.playing || !resting) this.wake();
-    else this.frames = [];
+    const goesOn = steered || this.playing || !resting;
+    this.lastFrame = goesOn ? now : null;
+    if (goesOn) this.wake();
+    else {
+      this.frames = [];
+      clearTimeout(this.linking);
+      this.linking = setTimeout(() => this.writeLink(), 250);
+    }
   }
 
   // Smaller pictures where the device cannot keep up, larger ones where it can.
@@ -394,7 +398,7 @@ class Page {
     if (!linear) this.renderer.develop(this.state.look, frame, target, this.renderer.measured);
     const out = this.renderer.read(linear ? target : this.renderer.measured);
     this.sortedFor = null;
-    this.wake(true);
+    this.wake();
     return out;
   }
 

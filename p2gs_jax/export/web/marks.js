@@ -26,9 +26,8 @@ class Marks {
       if (index === here) return;
       const { R, c, lens } = taken, d = this.size;
       const corners = [[0, 0], [1, 0], [1, 1], [0, 1]].map(([u, v]) => {
-        const ray = [(u * lens.width - lens.cx) / lens.fx, (v * lens.height - lens.cy) / lens.fy, 1];
-        const back = [0, 1, 2].map((k) => R[k] * ray[0] + R[3 + k] * ray[1] + R[6 + k] * ray[2]);
-        return projectPoint(camera, plus(c, back, d / length(ray)));
+        const own = { R, c, lens: [lens.fx, lens.fy, lens.cx, lens.cy] };
+        return projectPoint(camera, pointAt(own, u * lens.width, v * lens.height, d));
       });
       const tip = projectPoint(camera, c);
       if ([tip, ...corners].some((p) => !(p[2] > 0.05))) return;

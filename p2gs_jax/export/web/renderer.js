@@ -16,6 +16,7 @@ class Renderer {
     if (!float && !gl.getExtension("EXT_color_buffer_half_float"))
       throw new Error("This device cannot render to floating-point textures.");
     this.half = precision === 16 || !blends;
+    canvas.addEventListener("webglcontextlost", () => complain("the graphics device was lost; reload"));
     Object.assign(this, { gl, canvas, scene, count: splats.count, order: null, waiting: null });
     this.extended = this.extendRange();
     this.project = this.program(FULL_SCREEN, PROJECT);
