@@ -86,7 +86,7 @@ class Page {
     this.state.camera = camera;
     this.state.at = null;
     this.stop();
-    this.wake();
+    this.show();
   }
 
   // Stand where a photograph was taken, and take its exposure unless asked not to.
@@ -300,7 +300,6 @@ class Page {
       const last = this.drives[$("along").value].length - 1;
       const pace = clamp(Number($("pace").value) || 1, 0.1, 30);
       this.drive((Number($("place").value) + passed * pace) % last);
-      this.playing = true;
     }
     const pose = JSON.stringify([this.state.camera, innerWidth, innerHeight, devicePixelRatio]);
     const moved = pose !== this.pose;
@@ -431,6 +430,7 @@ function fill(select, options) {
 
 function complain(error) {
   $("status").className = "wrong";
+  $("status").setAttribute("role", "alert");
   $("status").textContent = `This page cannot show its scene: ${error.message || error}`;
   throw error;
 }
