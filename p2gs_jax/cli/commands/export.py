@@ -10,13 +10,14 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from p2gs_jax.cli.commands.console import stdout
-from p2gs_jax.cli.options.export import DISPLAY, Export, Format, check_export
+from p2gs_jax.cli.options.export import DISPLAY, SIZE_MB, Export, Format, check_export
 from p2gs_jax.core.atomic import atomic_folder, write_json
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.core.progress import Reporter, TerminalReporter
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.colmap_folder import write_colmap_folder
 from p2gs_jax.export.drive_table import drive_table, write_drive
+from p2gs_jax.export.page import MEGABYTE, write_page
 from p2gs_jax.export.sidecar import corrections_name, linear_sidecar
 from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.formats.ply import write_ply, write_radiance
@@ -54,6 +55,7 @@ PLACES: dict[Format, tuple[str, ...]] = {
     "colmap": ("colmap",),
     "exr": ("exr",),
     "drive": ("drive.csv", "drive.json"),
+    "html": ("scene.html",),
 }
 
 
@@ -87,6 +89,8 @@ def run(options: Export) -> int:
                 said = _exr(folder, fitted, store, reporter)
             elif name == "drive":
                 said = _drive(folder, fitted)
+            elif name == "html":
+                said = _html(folder, fitted, transform, options, reporter)
             else:
                 assert display is not None
                 said = display.write(name, folder)
@@ -213,6 +217,20 @@ def _drive(folder: Path, fitted: Run) -> str:
     csv_name, json_name = PLACES["drive"]
     write_drive(folder / csv_name, folder / json_name, table)
     return f"{len(table['views'])} photographs of {len(table['cameras'])} cameras"
+
+
+def _html(
+    folder: Path, fitted: Run, look: DisplayTransform, options: Export, reporter: Reporter
+) -> str:
+    page = write_page(
+        folder / PLACES["html"][0],
+        fitted,
+        look,
+        size_mb=SIZE_MB if options.size_mb is None else options.size_mb,
+        photographs=options.photographs or 0,
+        say=reporter.stage,
+    )
+    return " ".join([f"{page.size / MEGABYTE:.1f} MB.", *page.sentences])
 
 
 class _Display:
