@@ -418,6 +418,8 @@ class Scene:
         lidar: measurements with their times, or None.
         origin: position of our origin in the data set's world, scene units: float32 needs the
             drive near it.
+        known_response: what the photographs are, where display values are known to be light encoded
+            as sRGB (`camera raw`); None: a camera's own curve is in them.
     """
 
     root: Path
@@ -430,6 +432,7 @@ class Scene:
     objects: tuple[TrackedObject, ...] = ()
     lidar: Lidar | None = None
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    known_response: str | None = None
 
     @property
     def train_indices(self) -> tuple[int, ...]:

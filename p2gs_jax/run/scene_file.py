@@ -51,6 +51,7 @@ def write_scene(folder: Path, scene: Scene) -> None:
             for o in scene.objects
         ],
         "origin": scene.origin,
+        "known_response": scene.known_response,
         "own_cars": list(own_cars),
     }
     arrays = {
@@ -131,6 +132,7 @@ def read_scene(folder: Path, root: Path) -> Scene | None:
             if "lidar_points" not in a
             else Lidar(a["lidar_points"], a["lidar_times"], a["lidar_objects"]),
             origin=tuple(said.get("origin", (0.0, 0.0, 0.0))),
+            known_response=said.get("known_response"),
         )
     except (OSError, ValueError, KeyError, TypeError, IndexError, zipfile.BadZipFile) as error:
         raise UserError(
