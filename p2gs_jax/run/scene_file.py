@@ -1,6 +1,7 @@
 """`scene.npz`: the cameras, points and tracks of a fit, so that a run opens without its scene.
 
-Photographs are not in it; where they lie is kept relative to the scene's folder.
+Photographs are not in it; where they lie is kept relative to the scene's folder, or to the run's
+where its cache holds them (frames of a video, developed raw files).
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ def write_scene(folder: Path, scene: Scene) -> None:
                 "camera": v.camera,
                 "split": v.split,
                 "exif_ev": v.exif_ev,
-                "image": _relative(v.image_path, base),
+                "image": _relative(v.image_path, folder if _below(v.image_path, folder) else base),
+                "in_run": _below(v.image_path, folder),
                 "mask": None if v.mask_path is None else _relative(v.mask_path, base),
                 "distortion": None if v.distortion is None else v.distortion.coefficients,
                 "lens": None if v.distortion is None else v.distortion.model,
@@ -100,7 +102,7 @@ def read_scene(folder: Path, root: Path) -> Scene | None:
         views = tuple(
             View(
                 name=v["name"],
-                image_path=base / v["image"],
+                image_path=(folder if v.get("in_run") else base) / v["image"],
                 camera=v["camera"],
                 viewmat=a["viewmats"][i],
                 K=a["Ks"][i],
@@ -158,6 +160,10 @@ def read_times(folder: Path) -> dict[str, float]:
 def _base(root: Path) -> Path:
     """Return the folder that photographs are named from; a scene may be a transforms.json."""
     return root.parent if root.suffix.lower() == ".json" else root
+
+
+def _below(path: Path, folder: Path) -> bool:
+    return path.resolve().is_relative_to(folder.resolve())
 
 
 def _relative(path: Path, base: Path) -> str:

@@ -21,6 +21,10 @@ PARALLAX, DISPLACEMENT, LOST = 0.012, 0.10, 0.5
 _CANDIDATE = 0.6
 # Among at most so many the sharpest is chosen: a camera that hovers must not fill the memory.
 _MOST_CANDIDATES = 48
+# Where all candidates are blurred, frames up to this share of the way are waited for.
+_LATEST = 1.5
+# Blurred: below this share of the sharpness of the frame chosen before.
+_BLURRED = 0.7
 # The first photograph is one of the first frames.
 _FIRST = 6
 
@@ -69,6 +73,9 @@ def choose_frames(frames: Iterable[tuple[int, UInt8[np.ndarray, "h w"]]]) -> lis
             consider(begun, frame.number, frame.grey, frame.sharpness)
         return begun
 
+    def sharp_enough() -> bool:
+        return max(one.sharpness for one in waiting) >= _BLURRED * chosen[-1].sharpness
+
     def consider(tracker: Tracker, number: int, grey: np.ndarray, sharp: float) -> float:
         way = tracker.follow(grey)
         share = progress(way)
@@ -83,7 +90,9 @@ def choose_frames(frames: Iterable[tuple[int, UInt8[np.ndarray, "h w"]]]) -> lis
             waiting.append(_Candidate(number, grey, sharp))
             if len(waiting) == _FIRST:
                 tracker = take()
-        elif consider(tracker, number, grey, sharp) >= 1 or len(waiting) >= _MOST_CANDIDATES:
+            continue
+        share = consider(tracker, number, grey, sharp)
+        if share >= _LATEST or (share >= 1 and sharp_enough()) or len(waiting) >= _MOST_CANDIDATES:
             tracker = take()
     if waiting:
         take()
