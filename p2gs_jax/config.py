@@ -94,6 +94,10 @@ class DataConfig:
     and `ring`; none named: all."""
     frames: str | None = None
     """Only these frames of a drive, as Python slices them: FIRST:END[:STEP]."""
+    every: int | None = None
+    """Take every n-th frame of a video; None takes sharp ones, each from a new place."""
+    max_frames: int = 150
+    """Most frames of a video that are used; more are thinned evenly."""
     lidar: bool = True
     """Use the laser measurements of a drive: seeds, and depth to judge by. Without them seeds are
     triangulated from matches between the photographs."""

@@ -448,6 +448,8 @@ class Scene:
             data set decides, or None.
         random_seeds: the points were drawn at random: they say nothing of surfaces.
         depths: nearest and farthest camera z that the data set states, scene units, or None.
+        known_response: what the photographs are, where display values are known to be light encoded
+            as sRGB (`camera raw`); None: a camera's own curve is in them.
     """
 
     root: Path
@@ -463,6 +465,7 @@ class Scene:
     split_by: str | None = None
     random_seeds: bool = False
     depths: tuple[float, float] | None = None
+    known_response: str | None = None
 
     @property
     def train_indices(self) -> tuple[int, ...]:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from p2gs_jax.bench.oracle import Truth
-from p2gs_jax.photometry.srgb import srgb_encode
+from p2gs_jax.core.srgb import srgb_encode
 from p2gs_jax.types import Gaussians
 
 FIELDS = tuple(f.name for f in dataclasses.fields(Gaussians))

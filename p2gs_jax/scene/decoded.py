@@ -18,6 +18,7 @@ from PIL import Image
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.files import undecodable
 from p2gs_jax.scene.geometry import undistortion_maps
+from p2gs_jax.scene.photographs.profiles import applied
 from p2gs_jax.types import View
 
 _FULL = 0.999  # a pixel is valid only where all of its sources are
@@ -204,7 +205,7 @@ def _decode(path: Path) -> tuple[np.ndarray, UInt[np.ndarray, "h w"] | None]:
 
     EXIF rotation is ignored, as COLMAP does: poses belong to the stored raster.
     """
-    raw = _read_raster(path)
+    raw = _read_raster(path, colours=True)
     if raw.dtype not in (np.uint8, np.uint16):
         raise UserError(
             f"{path} has {raw.dtype} pixels; photographs need 8 or 16 bits per channel",
@@ -240,7 +241,8 @@ def _decode_mask(view: View) -> Bool[np.ndarray, "h w"]:
     )
 
 
-def _read_raster(path: Path) -> np.ndarray:
+def _read_raster(path: Path, *, colours: bool = False) -> np.ndarray:
+    """Return what a file holds; `colours`: with its colour profile applied."""
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -255,7 +257,7 @@ def _read_raster(path: Path) -> np.ndarray:
         raw = None
     if raw is None or not _complete(path, data):
         raise undecodable(path)
-    return raw
+    return applied(data, raw) if colours else raw
 
 
 def _complete(path: Path, data: bytes) -> bool:
