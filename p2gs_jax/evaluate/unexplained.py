@@ -164,7 +164,9 @@ class Residuals:
         self._seen[index] = _Seen(
             residual_over_noise(small[0], small[1], valid).astype(np.float16),
             valid,
-            cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST).astype(np.float16),
+            np.minimum(
+                cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST), np.finfo(np.float16).max
+            ).astype(np.float16),
             scale_intrinsics(K, size[0] / width, size[1] / height).astype(np.float32),
         )
 
