@@ -107,7 +107,7 @@ def _counted(
 ) -> Picture:
     # Infinite light is saturated; what is not a number is nothing.
     broken = np.isnan(light).any(2)
-    light = np.nan_to_num(light, nan=0.0, posinf=np.finfo(np.float32).max, neginf=0.0)
+    light = np.nan_to_num(light, nan=0.0, posinf=float(np.finfo(np.float32).max), neginf=0.0)
     return Picture(light=light, alpha=alpha, exif=exif, invalid=int(broken.sum()))
 
 

@@ -11,6 +11,7 @@ from typing import Any, cast
 import av
 import cv2
 import numpy as np
+from av.stream import Disposition
 from jaxtyping import Float, UInt, UInt8
 
 from p2gs_jax.core.srgb import srgb_decode
@@ -191,7 +192,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
 
 
 def _is_cover(stream: Any) -> bool:
-    return bool(int(stream.disposition) & int(av.stream.Disposition.attached_pic))
+    return bool(int(stream.disposition) & int(Disposition.attached_pic))
 
 
 def _signal(frame: av.VideoFrame) -> Float[np.ndarray, "h w 3"]:

@@ -68,8 +68,12 @@ class Tracker:
     def follow(self, grey: UInt8[np.ndarray, "h w"]) -> Way:
         """Return how far the next frame is, normalised as the reference."""
         if len(self._now) >= _FEWEST:
-            there, found, _ = cv2.calcOpticalFlowPyrLK(self._last, grey, self._now, None)
-            back, found_back, _ = cv2.calcOpticalFlowPyrLK(grey, self._last, there, None)
+            there, found, _ = cv2.calcOpticalFlowPyrLK(
+                self._last, grey, self._now, np.empty_like(self._now)
+            )
+            back, found_back, _ = cv2.calcOpticalFlowPyrLK(
+                grey, self._last, there, np.empty_like(there)
+            )
             missed = np.linalg.norm(back - self._now, axis=1)
             good = (found[:, 0] == 1) & (found_back[:, 0] == 1) & (missed < _BACK)
             height, width = grey.shape

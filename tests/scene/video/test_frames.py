@@ -71,10 +71,11 @@ def test_transfer_functions(transfer, signal, light) -> None:
 
 @pytest.mark.parametrize(("coding", "name"), [(HLG, "hlg"), (PQ, "pq")])
 def test_hdr_video_becomes_light(tmp_path: Path, coding, name) -> None:
-    path = tmp_path / "a.mp4"
+    path = tmp_path / "a.mkv"
     grey = np.repeat(np.repeat(np.linspace(6000, 46000, 8)[None, :, None], 64, 0), 40, 1)
     card = np.repeat(grey, 3, 2).astype(np.uint16)
-    write_video(path, [card] * 2, codec="libx265", layout="yuv420p10le", coding=coding, quality=1)
+    # Without loss: x265 is not the same twice on a busy machine.
+    write_video(path, [card] * 2, codec="ffv1", layout="yuv422p10le", coding=coding)
     frame = next(iter(frames_of(path)))
     assert frame.transfer == name
     light = srgb_decode(frame.codes()[32, 20::40] / 65535)
