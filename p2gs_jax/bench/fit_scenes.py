@@ -107,6 +107,7 @@ def along_a_fit(
     leaves = {
         f.name: np.asarray(getattr(start, f.name), np.float64)[np.r_[: len(xyz), clones]]
         for f in dataclasses.fields(start)
+        if getattr(start, f.name) is not None
     }
     count, near = len(xyz) + len(clones), leaves["log_scales"][:, 0].copy()
     logit = rng.normal(*end.logit, count)

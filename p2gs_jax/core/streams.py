@@ -61,6 +61,8 @@ class Stream(IntEnum):
     """What a step composites a photograph with alpha over."""
     VIBRATING = 73
     """Laser points that start as Gaussians that vibrate."""
+    NETWORK = 79
+    """First weights of the network that reads photographs (Luminance-GS)."""
     SCORE_SIGNS = 47
     """Signs of residuals, from which standard errors of many views are drawn."""
 

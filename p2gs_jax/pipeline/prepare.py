@@ -17,6 +17,7 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.core.progress import Reporter
+from p2gs_jax.core.runtime import return_freed_memory
 from p2gs_jax.core.streams import Stream
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.init.brightness import Tones, rough_tones
@@ -218,6 +219,7 @@ def prepare(
     resolved = decisions.resolve(cfg)
     solution = None if selection is None else selection.solution
     photometry = initial_photometry(solution, taken_by, resolved)
+    return_freed_memory()
     solved = time.monotonic()
     clock.add("photometry", solved - begin)
 

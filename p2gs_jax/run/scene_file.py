@@ -18,6 +18,8 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.types import Distortion, Lidar, Scene, TrackedObject, Tracks, View
 
 SCENE_FILE = "scene.npz"
+# Of a run: what was developed lies there.
+CACHE = "cache"
 
 
 def write_scene(folder: Path, scene: Scene) -> None:
@@ -38,8 +40,10 @@ def write_scene(folder: Path, scene: Scene) -> None:
                 "camera": v.camera,
                 "split": v.split,
                 "exif_ev": v.exif_ev,
-                "image": _relative(v.image_path, folder if _below(v.image_path, folder) else base),
-                "in_run": _below(v.image_path, folder),
+                "image": _relative(
+                    v.image_path, folder if _below(v.image_path, folder / CACHE) else base
+                ),
+                "in_run": _below(v.image_path, folder / CACHE),
                 "mask": None if v.mask_path is None else _relative(v.mask_path, base),
                 "distortion": None if v.distortion is None else v.distortion.coefficients,
                 "lens": None if v.distortion is None else v.distortion.model,

@@ -76,9 +76,10 @@ def load_scene(
         scene = with_originals(scene, photographs)
     else:
         scene = found
-    scene = developed_views(scene, work_dir, report)
     listed = scene.split_by is not None or cfg.split is not None
-    scene = with_what_lies_beside(scene, cfg)
+    # Masks and EXIF are those of the photographs as they were taken, alpha is that of what is read.
+    scene = developed_views(with_what_lies_beside(scene, cfg), work_dir, report)
+    scene = with_alpha(scene, cfg)
     if len(scene.points) == 0:
         from p2gs_jax.scene.triangulate import triangulate
 
@@ -90,7 +91,7 @@ def load_scene(
 
 
 def with_what_lies_beside(scene: Scene, cfg: DataConfig) -> Scene:
-    """Return a scene with masks, EXIF exposures, split, and what alpha channels mean.
+    """Return a scene with masks, EXIF exposures and split.
 
     Raises:
         UserError: so many views cannot be held out, or a list of those that are is wrong.
@@ -101,7 +102,7 @@ def with_what_lies_beside(scene: Scene, cfg: DataConfig) -> Scene:
     )
     notes = (*scene.notes, *mask_notes, *colour_notes(v.image_path for v in views))
     scene = dataclasses.replace(scene, views=views, notes=notes)
-    return with_alpha(split_scene(scene, cfg), cfg)
+    return split_scene(scene, cfg)
 
 
 class PhotographsAlone(NamedTuple):

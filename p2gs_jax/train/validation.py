@@ -79,9 +79,9 @@ def make_judge(
             that fits best, as for test views.
     """
     render, tone = make_renderer(cfg.render), cfg.photometry
-    backdrop = views.store.backdrop_values
 
     def judge(params: Params, population: Population) -> float:
+        backdrop = views.store.backdrop_values
         small = jax.tree.map(np.asarray, dataclasses.replace(params, gaussians=None))
         taken_by = [views.store.views[i].camera for i in views.rows]
         scores = []
