@@ -21,7 +21,7 @@ from p2gs_jax.types import Gaussians
 
 CHUNK = 256
 # Bits of each coordinate of centres, lengths, rotations and of opacity; of the harmonics of degree
-# 0 and of the others. Errors they cause: BUILD_NOTES, "A page that is the scene".
+# 0 and of the others (ours; a page states the error they cause).
 MEANS, SCALES, ROTATIONS, OPACITY, BASE, BANDS = 16, 10, 11, 10, 12, 8
 # Columns before the harmonics: 3 of centres, lengths and rotations each, 1 of opacity.
 GEOMETRY = 10
