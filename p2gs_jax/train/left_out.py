@@ -149,7 +149,9 @@ def look(state: FitState, views: TrainingViews, cfg: FitConfig, shrink: int) -> 
         photograph, mask = store.get(views.rows[row], shrink)
         (camera,) = with_corrections((views.camera(row, shrink),), params.poses)
         result = render(params.gaussians, population.alive, camera, population.owner)
-        ldr = develop(result.linear, display_of_view(small, row, cfg.photometry))
+        own = display_of_view(small, row, cfg.photometry)
+        own = dataclasses.replace(own, backdrop=store.backdrop_values)
+        ldr = develop(result.linear, own, alpha=result.alpha)
         depth = np.asarray(surface_depth(result))
         return row, np.asarray(ldr), photograph, mask, depth, np.asarray(camera.K)
 
