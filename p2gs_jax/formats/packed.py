@@ -145,7 +145,7 @@ def _columns(g: Gaussians) -> Float32[np.ndarray, "c n"]:
         np.clip(np.asarray(g.log_scales, np.float32), *LOG_SCALE_RANGE).T,
         _small_rotations(np.asarray(g.quats)).T,
         np.clip(np.asarray(g.opacity_logits, np.float32), -LOGIT_LIMIT, LOGIT_LIMIT)[None],
-        sh.transpose(1, 2, 0).reshape(-1, len(sh)),
+        sh.transpose(1, 2, 0).reshape(3 * sh.shape[1], len(sh)),
     )
     return np.ascontiguousarray(np.concatenate(parts))
 
