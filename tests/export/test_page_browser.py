@@ -93,7 +93,7 @@ def open_page(browser, file):
 
 
 def decibels(a, b):
-    return float(-10 * np.log10(np.mean((a - b) ** 2)))
+    return float(-10 * np.log10(max(np.mean((a - b) ** 2), 1e-12)))
 
 
 @pytest.mark.parametrize("link", ["", "?half"])
