@@ -61,7 +61,7 @@ def page_scene(
         },
         "tone": _tone(fitted),
         "views": [_view(fitted, index, mean) for index in range(len(fitted.scene.views))],
-        "start": fitted.scene.train_indices[len(fitted.scene.train_indices) // 2],
+        "start": _start(fitted),
         "up": _up(fitted),
         "stopColors": false_color(np.exp2(STEPS)[None, :, None] * np.ones(3), 1.0)[0],
         "photographs": {str(index): url for index, url in photographs.items()},
@@ -165,6 +165,13 @@ def _view(fitted: Run, index: int, mean: float) -> dict[str, Any]:
 def _balance(transform: DisplayTransform) -> list[float]:
     """Return the log factors of the channels."""
     return list(transform.white_balance or (0.0, 0.0, 0.0))
+
+
+def _start(fitted: Run) -> int:
+    """Return the row of the view that the page opens at: the middle one of the first camera."""
+    views, train = fitted.scene.views, fitted.scene.train_indices
+    own = [row for row in train if views[row].camera == views[train[0]].camera]
+    return own[len(own) // 2]
 
 
 def _up(fitted: Run) -> list[float]:

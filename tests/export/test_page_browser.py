@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from p2gs_jax.export.page import write_page
+from p2gs_jax.export.page_scene import embedded_photographs
 from p2gs_jax.photometry.display import develop
 from p2gs_jax.run.read import load_run
 
@@ -15,6 +16,7 @@ from p2gs_jax.run.read import load_run
 pytestmark = pytest.mark.slow
 
 PATIENCE_S = 120
+PHOTOGRAPHS = 3
 HOSTILE = "run<img src=x onerror=hacked=1>"
 
 
@@ -29,7 +31,7 @@ def fitted(finished_run, tmp_path_factory):
 @pytest.fixture(scope="module")
 def file(fitted):
     path = fitted.folder / "scene.html"
-    write_page(path, fitted, fitted.common_display(), size_mb=5, photographs=3)
+    write_page(path, fitted, fitted.common_display(), size_mb=5, photographs=PHOTOGRAPHS)
     return path
 
 
@@ -91,7 +93,7 @@ def open_page(browser, file):
 
 
 def decibels(a, b):
-    return float(-10 * np.log10(np.mean((a - b) ** 2)))
+    return float(-10 * np.log10(max(np.mean((a - b) ** 2), 1e-12)))
 
 
 @pytest.mark.parametrize("link", ["", "?half"])
@@ -166,9 +168,12 @@ def test_split_shows_the_photograph_on_the_left(open_page, fitted):
     index = int(page("Object.keys(p.scene.photographs)[1]"))
     page(f"(p.go({index}), p.choosePhotograph())")
     page('(p.state.look.split = 0.99, p.choose("split"))')
-    shown, photo = page.canvas() / 255, fitted.photograph(index)
-    left = slice(0, int(0.9 * photo.shape[1]))
-    assert decibels(shown[:, left], photo[:, left]) > 28
+    url = embedded_photographs(fitted, PHOTOGRAPHS)[index]
+    codes = np.frombuffer(base64.b64decode(url.split(",")[1]), np.uint8)
+    embedded = cv2.imdecode(codes, cv2.IMREAD_COLOR)[..., ::-1].astype(float) / 255
+    shown, left = page.canvas() / 255, slice(0, int(0.9 * embedded.shape[1]))
+    assert decibels(shown[:, left], embedded[:, left]) > 40
+    assert decibels(embedded, fitted.photograph(index)) > 22
 
 
 def test_clicking_a_camera_goes_there_and_takes_its_exposure(open_page):

@@ -43,6 +43,7 @@ class Page {
     // The first picture waits for its order.
     this.ready = this.renderer.sort(this.windowCamera()).then((row) => {
       this.sortedFor = row;
+      this.newOrder = true;
       this.wake();
       return new Promise(requestAnimationFrame);
     });
@@ -334,12 +335,13 @@ class Page {
     const camera = this.windowCamera(share);
     this.renderer.render(camera, ...camera.size);
     this.drawn = share;
-    const sorting = this.renderer.sort(camera);
+    const sorting = this.renderer.sort(camera), asked = this.pose;
     if (sorting)
       sorting.then((row) => {
         const same = this.sortedFor && row.every((v, k) => v === this.sortedFor[k]);
         this.sortedFor = row;
-        if (same) return;
+        // The camera may have gone on while the worker was busy.
+        if (same && asked === this.pose) return;
         this.newOrder = true;
         this.wake();
       });
