@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from p2gs_jax.core.srgb import srgb_encode
 from p2gs_jax.photometry.observations import Observations
-from p2gs_jax.photometry.srgb import srgb_encode
 
 CAMERAS = 6
 # Frames that see a point, and after how many the next camera takes over.

@@ -38,6 +38,8 @@ PhotometricModel = Literal[
 SceneFormat = Literal[
     "colmap",
     "transforms",
+    "blender",
+    "llff",
     "rig",
     "pandaset",
     "nuscenes",
@@ -48,6 +50,8 @@ SceneFormat = Literal[
     "kitti_360",
     "images",
 ]
+# What the alpha channel of photographs means.
+AlphaUse = Literal["background", "mask", "ignore"]
 # Per what it varies: one physical camera, or one photograph.
 Level = Literal["camera", "view"]
 # Vignetting per camera: the same for all channels, or one for each.
@@ -65,13 +69,24 @@ class DataConfig:
 
     test_every: int = 8
     """Hold out every n-th view of each camera, sorted by name; 0 holds out none
-    (paper, Experiments: 1/8 of the frames)."""
+    (paper, Experiments: 1/8 of the frames). Where the data set says what is held out, that counts
+    instead; 0 still holds out none."""
+    split: str | None = None
+    """File that says what is held out: .json with the lists `train` and `test`, or text with the
+    names of the held-out photographs, a line each; `every` goes by `test_every` even where the data
+    set says otherwise."""
     max_width: int | None = None
     """Shrink images to at most this many pixels across; None keeps them as they are."""
     images: str | None = None
     """Image folder, where it is not `images/` beside the model."""
     format: SceneFormat | None = None
     """How to read the scene; None takes the first of these that the folder holds."""
+    alpha: AlphaUse = "background"
+    """What the alpha channel of photographs means: they and their renders are shown over
+    `background`; or `mask`: transparent pixels are left out; or `ignore`: nothing."""
+    background: str = "white"
+    """Of photographs with alpha, display values in fit and evaluation alike: white (3DGS), black or
+    R,G,B from 0 to 1; `random` draws a colour for every step, and white is judged."""
     drive: str | None = None
     """Which drive of a folder that holds several: its name in the data set, or how that begins."""
     cameras: tuple[str, ...] = ()
@@ -79,6 +94,10 @@ class DataConfig:
     and `ring`; none named: all."""
     frames: str | None = None
     """Only these frames of a drive, as Python slices them: FIRST:END[:STEP]."""
+    every: int | None = None
+    """Take every n-th frame of a video; None takes sharp ones, each from a new place."""
+    max_frames: int = 150
+    """Most frames of a video that are used; more are thinned evenly."""
     lidar: bool = True
     """Use the laser measurements of a drive: seeds, and depth to judge by. Without them seeds are
     triangulated from matches between the photographs."""
@@ -263,6 +282,9 @@ class LossConfig:
     quantization: float | None = None
     """Half the interval that a stored value stands for (0.5 / 255 for 8 bits): predictions within
     it are right and get no gradient. None compares with the stored value (ours: BUILD_NOTES)."""
+    alpha: float | None = None
+    """Weight of the mean difference between the render's opacity and the alpha channel of
+    photographs shown over a background; None leaves it out (ours)."""
     lidar: float | None = None
     """Weight of the error of log depth at laser measurements, of scenes that have them; None
     leaves it out (ours)."""
@@ -306,6 +328,12 @@ class OptimizerConfig:
     """Rotations that correct the poses of moving objects, radians (ours)."""
     object_translations: float = 5e-3
     """Likewise translations, scene units (ours)."""
+    velocities: float = 0.3
+    """Of Gaussians that vibrate, scene units per second (ours: BUILD_NOTES)."""
+    peaks: float = 0.03
+    """Times at which they are most opaque, seconds (ours)."""
+    lives: float = 0.05
+    """Log seconds that they live (ours)."""
     photometry_final: float = 0.01
     """Exposure and gamma rates decay exponentially to this fraction (ours)."""
     final: float = 0.1
@@ -367,10 +395,11 @@ class DensifyConfig:
 class DynamicsConfig:
     """What is done about things that move, in scenes with boxes that follow them."""
 
-    method: Literal["rigid", "mask", "off"] = "rigid"
+    method: Literal["rigid", "mask", "vibration", "off"] = "rigid"
     """`rigid`: each moves as one piece, with Gaussians of its own; `mask`: their pixels are left
-    out of the fit; `off`: the fit knows no boxes. Exposures are solved from what stands still in
-    any case."""
+    out of the fit; `off`: the fit knows no boxes; nor does `vibration`: Gaussians that come, move
+    and go are learned (PVG, arXiv 2311.18561). Exposures are solved from what stands still in any
+    case."""
     margin: float = 0.15
     """Boxes whose pixels are left out are widened by this much to every side, scene units."""
     least_views: int = 4
@@ -386,6 +415,15 @@ class DynamicsConfig:
     """Of one thing; the cubes grow until no more are left (ours)."""
     correct_poses: bool = False
     """Learn small corrections of the boxes' poses."""
+    vibrating: int = 30_000
+    """`vibration`: this many Gaussians begin as something that may move (ours)."""
+    vibration_life: float = 0.3
+    """And live for this long, seconds, before and after their peak (ours)."""
+    unexplained: Literal["fit", "mask"] = "fit"
+    """`mask`: pixels that no static explanation fits, found by their residuals over time and
+    without boxes, are left out of later steps; `fit`: they are fitted like all others."""
+    unexplained_at: tuple[float, ...] = (0.3, 0.6)
+    """When they are looked for, as fractions of the run; each look starts afresh (ours)."""
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, Float64, Int, UInt, UInt8
 
 Split = Literal["train", "test"]
+AlphaUse = Literal["background", "mask", "ignore"]
 
 
 def _namespace(values) -> Any:
@@ -31,6 +32,20 @@ GAMMA_SRGB = 2.2
 LUMINANCE = (0.299, 0.587, 0.114)
 
 
+class Vibration(eqx.Module):
+    """How Gaussians come, move and go (render/vibration.py).
+
+    Attributes:
+        velocities: at the peak, scene units per second.
+        peaks: when each is most opaque, seconds from the middle of the drive.
+        log_lives: log standard deviations of the opacity over time, log seconds.
+    """
+
+    velocities: Float[Array, "n 3"]
+    peaks: Float[Array, " n"]
+    log_lives: Float[Array, " n"]
+
+
 class Gaussians(eqx.Module):
     """The scene: N anisotropic Gaussians carrying linear HDR radiance.
 
@@ -40,6 +55,7 @@ class Gaussians(eqx.Module):
         log_scales: log standard deviations along the rotated axes, log scene units.
         opacity_logits: logits of the peak opacity.
         sh: spherical-harmonics coefficients, K = (degree + 1)^2, of pre-activation radiance.
+        vibration: how they change with time; None: they do not, and nothing is paid for it.
     """
 
     means: Float[Array, "n 3"]
@@ -47,6 +63,7 @@ class Gaussians(eqx.Module):
     log_scales: Float[Array, "n 3"]
     opacity_logits: Float[Array, " n"]
     sh: Float[Array, "n k 3"]
+    vibration: Vibration | None = eqx.field(kw_only=True, default=None)
 
     @property
     def capacity(self) -> int:
@@ -144,11 +161,13 @@ class Placement(eqx.Module):
         viewmats: box-to-camera of each, OpenCV axes; what is not there is behind the camera.
         key: row of `Params.poses` at the key time before.
         share: of the way from there to the next one.
+        time: of the view, seconds from the middle of the drive, where Gaussians vibrate.
     """
 
     viewmats: Float[Array, "k 4 4"]
     key: Int[Array, ""]
     share: Float[Array, ""]
+    time: Float[Array, ""] | None = None
 
 
 class Camera(eqx.Module):
@@ -287,6 +306,9 @@ class Batch(eqx.Module):
         mask: 1 = use, 0 = ignore.
         view_index: its row in `Photometry`.
         measured: depths for the loss, or None where it asks for none.
+        alpha: opacity of the photograph, stored as `ldr`, which is then premultiplied by it; None:
+            the scene is shown over no background.
+        backdrop: display values of that background, or None.
     """
 
     camera: Camera
@@ -294,6 +316,8 @@ class Batch(eqx.Module):
     mask: Float[Array, "h w"] | Bool[Array, "h w"]
     view_index: Int[Array, ""]
     measured: Measured | None = None
+    alpha: Float[Array, "h w"] | UInt[Array, "h w"] | None = None
+    backdrop: Float[Array, " 3"] | None = None
 
 
 # ------------------------------------------------------------------ host records
@@ -333,6 +357,7 @@ class View:
         time: seconds on the clock of `Scene.objects` and `Scene.lidar`, or None.
         own_car: where the photograph shows the car that carries the camera, at any resolution; the
             same for all photographs of a camera; None: nowhere that is known of.
+        alpha: what its alpha channel means, if it has one (`DataConfig.alpha`).
     """
 
     name: str
@@ -349,6 +374,7 @@ class View:
     frame: int | None = None
     time: float | None = None
     own_car: Bool[np.ndarray, "a b"] | None = None
+    alpha: AlphaUse = "mask"
 
 
 @dataclass(frozen=True)
@@ -418,6 +444,12 @@ class Scene:
         lidar: measurements with their times, or None.
         origin: position of our origin in the data set's world, scene units: float32 needs the
             drive near it.
+        split_by: what decided which views are held out, in words; readers name the file where the
+            data set decides, or None.
+        random_seeds: the points were drawn at random: they say nothing of surfaces.
+        depths: nearest and farthest camera z that the data set states, scene units, or None.
+        known_response: what the photographs are, where display values are known to be light encoded
+            as sRGB (`camera raw`); None: a camera's own curve is in them.
     """
 
     root: Path
@@ -430,6 +462,10 @@ class Scene:
     objects: tuple[TrackedObject, ...] = ()
     lidar: Lidar | None = None
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    split_by: str | None = None
+    random_seeds: bool = False
+    depths: tuple[float, float] | None = None
+    known_response: str | None = None
 
     @property
     def train_indices(self) -> tuple[int, ...]:

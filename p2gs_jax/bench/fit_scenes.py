@@ -107,6 +107,7 @@ def along_a_fit(
     leaves = {
         f.name: np.asarray(getattr(start, f.name), np.float64)[np.r_[: len(xyz), clones]]
         for f in dataclasses.fields(start)
+        if getattr(start, f.name) is not None
     }
     count, near = len(xyz) + len(clones), leaves["log_scales"][:, 0].copy()
     logit = rng.normal(*end.logit, count)
@@ -122,7 +123,8 @@ def along_a_fit(
     leaves["means"] += way * 0.5 * np.exp(near)[:, None] * rng.normal(size=(count, 3))
     size = end.sh[0] * np.exp(rng.normal(0, end.sh[1], (count, 1, 1)))
     leaves["sh"][:, 1:] = way * size * rng.normal(size=leaves["sh"][:, 1:].shape)
-    return Gaussians(**{k: jnp.asarray(v, jnp.float32) for k, v in leaves.items()})
+    arrays = {k: jnp.asarray(v, jnp.float32) for k, v in leaves.items()}
+    return Gaussians(**arrays)  # pyright: ignore[reportArgumentType]
 
 
 def _drive_views(width: int) -> list[View]:

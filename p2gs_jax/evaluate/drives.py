@@ -12,7 +12,7 @@ from p2gs_jax.core.numerics import on_device
 from p2gs_jax.evaluate.lidar_depth import DepthErrors, depth_errors, sized, summary
 from p2gs_jax.evaluate.novel_views import SHIFTS, Surface, picked, shifted, unseen_share
 from p2gs_jax.evaluate.region_scores import parts_of
-from p2gs_jax.evaluate.unexplained import Residuals, Unexplained
+from p2gs_jax.evaluate.unexplained import Residuals, Unexplained, shares_by_view
 from p2gs_jax.render.warp import OPAQUE
 from p2gs_jax.scene.directions import left_of_way
 from p2gs_jax.scene.drives.object_masks import object_mask
@@ -90,17 +90,12 @@ class DriveScores:
     def summary(self) -> dict:
         """Return the parts of `metrics.json`."""
         self.unexplained = self._residuals.find()
-        out = {"unexplained": self._shares(), "novel_views": self._novel()}
+        shares = shares_by_view(self._scene, self.unexplained)
+        out = {"unexplained": shares, "novel_views": self._novel()}
         views = self._scene.views
         held_out = [d for row, d in self._depths.items() if views[row].split == "test"]
         depth = {"all": summary(list(self._depths.values())), "held_out": summary(held_out)}
         return out if not depth["all"] else {**out, "depth": depth}
-
-    def _shares(self) -> dict:
-        """Return shares of pixels by view, and their mean."""
-        views = self._scene.views
-        shares = {views[row].name: found.share for row, found in self.unexplained.items()}
-        return {"share": float(np.mean(list(shares.values()))), "per_view": shares}
 
     def _novel(self) -> list[dict]:
         """Return what views from beside the way show, a row for every distance."""

@@ -7,7 +7,8 @@ held-out view has none of its own; `photometry_fitted` solves all that the model
 where that is more than an exposure; `metered` takes the exposure that the rule gives its render
 that explains the training exposures, where there is one (photometry/metering.py); against
 reference photographs of one common exposure, `scale_aligned` solves one scalar for all of them.
-Vignetting and responses are the camera's in all.
+Vignetting and responses are the camera's in all. Where photographs have alpha, they and the renders
+are put over the same background (photometry/matte.py).
 """
 
 from __future__ import annotations
@@ -144,9 +145,12 @@ def evaluate(
 
     tone = cfg.photometry
 
+    def over(transform: DisplayTransform) -> DisplayTransform:
+        return replace(transform, backdrop=store.backdrop_values)
+
     def usual(index: int) -> DisplayTransform:
         """Return how a view is shown by the mean parameters."""
-        return usual_display(small, taken_by, scene.views[index].camera, tone)
+        return over(usual_display(small, taken_by, scene.views[index].camera, tone))
 
     drive = None
     if is_drive(scene):
@@ -158,19 +162,19 @@ def evaluate(
         parts = None if drive is None else masks_of_parts(scene, index, mask)
         score = functools.partial(view_scores, lpips_weights, parts=parts)
         result = render(gaussians, living, camera_of(store, index))
-        linear = np.asarray(result.linear)
+        linear, alpha = np.asarray(result.linear), np.asarray(result.alpha)
         shown = usual(index)
-        ldr_mean = develop(linear, replace(shown, exposure=mean.exposure))
+        ldr_mean = develop(linear, replace(shown, exposure=mean.exposure), alpha=alpha)
         extra, everything = {}, None
         if scene.views[index].split == "train":
-            transform = display_of_view(small, row_of[index], tone)
+            transform = over(display_of_view(small, row_of[index], tone))
         else:
             still = still_mask(scene, index, mask)
-            transform = with_fitted_exposure(shown, linear, photograph, still)
+            transform = with_fitted_exposure(shown, linear, photograph, still, alpha)
             extra = {"exposure": transform.exposure}
-            everything = _all_fitted(linear, photograph, (still, mask), transform, score)
-        ldr = develop(linear, transform)
-        depth, alpha = np.asarray(result.depth), np.asarray(result.alpha)
+            everything = _all_fitted(linear, photograph, (still, mask), transform, score, alpha)
+        ldr = develop(linear, transform, alpha=alpha)
+        depth = np.asarray(result.depth)
         return _Judged(
             ViewResult(index, linear, alpha, depth, ldr, photograph, transform),
             ldr_mean,
@@ -204,12 +208,14 @@ def evaluate(
                 scores.add(view.name, view.split, linear, found.radiance, found.mask)
             if found.reference is not None:
                 images = (linear, found.reference, found.mask)
+                images = images if store.backdrop is None else (*images, result.alpha)
                 reference_views.append((index, tuple(map(arrays.put, images))))
             if training:
                 metered.add_training(view.name, found.readings)
             else:
                 images = (linear, result.photograph, found.mask)
-                metered.add_held_out(view.name, found.readings, *images)
+                alpha = None if store.backdrop is None else result.alpha
+                metered.add_held_out(view.name, found.readings, *images, alpha)
             on_view(result)
             if drive is not None:
                 images = (result.ldr, result.photograph, found.mask)
@@ -230,9 +236,9 @@ def evaluate(
 
         row_of_name = {view.name: index for index, view in enumerate(scene.views)}
 
-        def under_rule(name, linear, exposure, photograph, mask):
+        def under_rule(name, linear, exposure, photograph, mask, alpha):
             row = row_of_name[name]
-            shown = develop(linear, replace(usual(row), exposure=exposure))
+            shown = develop(linear, replace(usual(row), exposure=exposure), alpha=alpha)
             parts = None if drive is None else masks_of_parts(scene, row, mask)
             return view_scores(lpips_weights, shown, photograph, mask, parts)
 
@@ -252,13 +258,15 @@ def evaluate(
                 reference_views,
                 scene,
                 mean,
-                usual_display(small, (), None, tone),
+                over(usual_display(small, (), None, tone)),
                 functools.partial(view_scores, lpips_weights),
             )
         return metrics
 
 
-def _all_fitted(linear, photograph, masks, start: DisplayTransform, score) -> dict[str, Any] | None:
+def _all_fitted(
+    linear, photograph, masks, start: DisplayTransform, score, alpha
+) -> dict[str, Any] | None:
     """Score a held-out view with all solved that varies per view; None: that is one scalar.
 
     Args:
@@ -267,16 +275,19 @@ def _all_fitted(linear, photograph, masks, start: DisplayTransform, score) -> di
         masks: what it is solved from, and what is scored.
         start: with the exposure alone.
         score: (display image, photograph, mask) -> scores by name.
+        alpha: opacity of the render.
     """
     tone = start.formation
     gamma, balance = MODELS[tone.model].gamma == "view", tone.white_balance == "view"
     if not (gamma or balance):
         return None
     still, mask = masks
-    given, how = (linear, photograph, still), (start.capture, tone, start.correction)
+    given = (linear, photograph, still)
+    how = (start.capture, tone, start.correction, start.matte(alpha))
     found = fit_capture(*given, *how, gamma=gamma, white_balance=balance)
     transform = with_capture(start, found)
-    row = {**score(develop(linear, transform), photograph, mask), "exposure": transform.exposure}
+    ldr = develop(linear, transform, alpha=alpha)
+    row = {**score(ldr, photograph, mask), "exposure": transform.exposure}
     if gamma:
         row["gamma"] = transform.gamma
     if balance:
@@ -297,7 +308,8 @@ def _against_reference(
     balance.
 
     Args:
-        views: row of each; linear radiance, reference photograph and mask, kept.
+        views: row of each; linear radiance, reference photograph and mask, kept; over a background
+            also the opacity.
         scene: their names and splits.
         mean: exposures to show them at.
         shown: how all are shown, but for the exposure.
@@ -319,9 +331,12 @@ def _against_reference(
     }
 
     def judged(view):
-        linear, truth, mask = images(view)
+        linear, truth, mask, *alpha = images(view)
+        opacity = next(iter(alpha), None)
         return {
-            name: score(develop(linear, replace(shown, exposure=exposure)), truth, mask)
+            name: score(
+                develop(linear, replace(shown, exposure=exposure), alpha=opacity), truth, mask
+            )
             for name, exposure in protocols.items()
         }
 

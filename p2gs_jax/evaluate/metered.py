@@ -22,6 +22,7 @@ class _Kept(NamedTuple):
     linear: StoredArray
     photograph: StoredArray
     mask: StoredArray
+    alpha: StoredArray | None
 
 
 class MeteredViews:
@@ -50,9 +51,12 @@ class MeteredViews:
         linear: np.ndarray | StoredArray,
         photograph: Float32[np.ndarray, "h w 3"],
         mask: Float32[np.ndarray, "h w"],
+        alpha: Float32[np.ndarray, "h w"] | None = None,
     ) -> None:
-        """Keep a held-out view."""
-        self._kept.append(_Kept(name, readings, *map(self._arrays.put, (linear, photograph, mask))))
+        """Keep a held-out view; its opacity where it is put over a background."""
+        put = self._arrays.put
+        opacity = None if alpha is None else put(alpha)
+        self._kept.append(_Kept(name, readings, put(linear), put(photograph), put(mask), opacity))
 
     def fit(
         self, exposures: Float[np.ndarray, " v"], gamma: float, tone: PhotometryConfig
@@ -74,15 +78,16 @@ class MeteredViews:
 
         Args:
             metering: from `fit`.
-            score: (name, linear, exposure, photograph, mask) -> scores by name.
+            score: (name, linear, exposure, photograph, mask, alpha) -> scores by name.
         """
         if not metering.rule.meters:
             return {}
 
         def judged(view: _Kept) -> dict[str, float]:
             exposure = float(np.exp(metering.log_exposure(view.readings)))
-            images = (view.linear.read(), exposure, view.photograph.read(), view.mask.read())
-            return {**score(view.name, *images), "exposure": exposure}
+            given = (view.linear.read(), exposure, view.photograph.read(), view.mask.read())
+            alpha = None if view.alpha is None else view.alpha.read()
+            return {**score(view.name, *given, alpha), "exposure": exposure}
 
         names = [view.name for view in self._kept]
         return dict(zip(names, map_in_order(judged, self._kept), strict=True))

@@ -10,7 +10,7 @@ times, and against the usual one where no other photograph shows it.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -23,7 +23,7 @@ from p2gs_jax.core.numerics import on_host
 from p2gs_jax.evaluate.novel_views import Surface
 from p2gs_jax.render.warp import warp
 from p2gs_jax.scene.geometry import scale_intrinsics
-from p2gs_jax.types import Camera, View
+from p2gs_jax.types import Camera, Scene, View
 
 # Photographs are compared at this width; lengths below are in its pixels.
 WIDTH = 480
@@ -114,6 +114,17 @@ def _morphology(mask: Bool[np.ndarray, "h w"], kind: int, side: int) -> Bool[np.
     return cv2.morphologyEx(mask.astype(np.uint8), kind, disc) > 0
 
 
+def shares_by_view(scene: Scene, found: Mapping[int, Unexplained]) -> dict:
+    """Return the mean share of pixels (`share`), and that of each view by name (`per_view`).
+
+    Args:
+        scene: its views.
+        found: by row of the view.
+    """
+    shares = {scene.views[row].name: one.share for row, one in found.items()}
+    return {"share": float(np.mean(list(shares.values()))), "per_view": shares}
+
+
 class Residuals:
     """Collects renders of training views, and finds what no static scene explains in them."""
 
@@ -153,24 +164,31 @@ class Residuals:
         self._seen[index] = _Seen(
             residual_over_noise(small[0], small[1], valid).astype(np.float16),
             valid,
-            cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST).astype(np.float16),
+            np.minimum(
+                cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST), np.finfo(np.float16).max
+            ).astype(np.float16),
             scale_intrinsics(K, size[0] / width, size[1] / height).astype(np.float32),
         )
 
     def find(
-        self, on_progress: Callable[[int, int], None] = lambda done, count: None
+        self,
+        on_progress: Callable[[int, int], None] = lambda done, count: None,
+        *,
+        known_only: bool = False,
     ) -> dict[int, Unexplained]:
         """Return what is unexplained, by row of the view.
 
         Args:
             on_progress: views done, views in all.
+            known_only: nothing of surfaces that no other photograph shows.
         """
+        unknown = np.inf if known_only else 0.0
         found = {}
         for done, (index, others) in enumerate(self._compared()):
             on_progress(done, len(self._seen))
             seen = self._seen[index]
             residual = seen.residual.astype(np.float32)
-            mask = regions(residual, self._usual(index, others)) & seen.valid
+            mask = regions(residual, self._usual(index, others, unknown)) & seen.valid
             found[index] = Unexplained(mask, float(mask.sum() / max(int(seen.valid.sum()), 1)))
         return found
 
@@ -191,8 +209,10 @@ class Residuals:
                 there = [k + step for step in COMPARED if 0 <= k + step < len(rows)]
                 yield index, [rows[j] for j in there]
 
-    def _usual(self, index: int, others: Sequence[int]) -> Float32[np.ndarray, "h w"]:
-        """Return the median residual that the surfaces of a view have in others, 0: unknown."""
+    def _usual(
+        self, index: int, others: Sequence[int], unknown: float
+    ) -> Float32[np.ndarray, "h w"]:
+        """Return the median residual of a view's surfaces in others, or `unknown`."""
         here = self._seen[index]
         values = np.full((len(others) + 1, *here.residual.shape), np.nan, np.float32)
         for k, other in enumerate(others):
@@ -208,7 +228,7 @@ class Residuals:
                 there.valid.astype(np.uint8), xy[..., 0], xy[..., 1], cv2.INTER_NEAREST
             )
             values[k] = np.where(np.asarray(to.seen) & (counts > 0), carried, np.nan)
-        values[-1] = np.where(np.isnan(values[:-1]).all(0), 0, np.nan)
+        values[-1] = np.where(np.isnan(values[:-1]).all(0), unknown, np.nan)
         return np.nanmedian(values, axis=0)
 
     def _camera(self, index: int) -> Camera:

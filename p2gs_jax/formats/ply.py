@@ -11,14 +11,14 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.errors import UserError
 from p2gs_jax.render.radiance import RadianceKind
-from p2gs_jax.types import Gaussians
+from p2gs_jax.types import Gaussians, Vibration
 
 
 def field_names(coefficients: int) -> list[str]:
@@ -31,6 +31,10 @@ def field_names(coefficients: int) -> list[str]:
         *(f"scale_{i}" for i in range(3)),
         *(f"rot_{i}" for i in range(4)),
     ]
+
+
+# Behind the fields of the reference implementation, where Gaussians vibrate.
+VIBRATION = ("velocity_x", "velocity_y", "velocity_z", "peak_time", "log_life")
 
 
 def _live(gaussians: Gaussians, alive: Bool[np.ndarray, " n"]) -> Gaussians:
@@ -50,6 +54,7 @@ def write_ply(path: Path, gaussians: Gaussians, comments: Sequence[str]) -> int:
     count, coefficients = g.sh.shape[:2]
     # All coefficients of red, then green, then blue.
     rest = g.sh[:, 1:].transpose(0, 2, 1).reshape(count, 3 * (coefficients - 1))
+    moves = [] if g.vibration is None else [_columns_of(g.vibration)]
     columns = np.concatenate(
         [
             g.means,
@@ -59,10 +64,11 @@ def write_ply(path: Path, gaussians: Gaussians, comments: Sequence[str]) -> int:
             g.opacity_logits[:, None],
             g.log_scales,
             g.quats,
+            *moves,
         ],
         axis=1,
     ).astype("<f4")
-    names = field_names(coefficients)
+    names = [*field_names(coefficients), *(VIBRATION if moves else ())]
     table = np.ascontiguousarray(columns).view([(n, "<f4") for n in names]).reshape(count)
     lines = [c.encode("unicode_escape").decode() for c in comments]
     data = PlyData([PlyElement.describe(table, "vertex")], byte_order="<", comments=lines)
@@ -93,6 +99,11 @@ def read_ply(path: Path) -> Gaussians:
         names = vertex.dtype.names or ()
         coefficients = 1 + sum(n.startswith("f_rest_") for n in names) // 3
         columns = np.stack([vertex[n] for n in field_names(coefficients)], 1).astype(np.float32)
+        moves = None
+        if VIBRATION[0] in names:
+            found = [np.asarray(vertex[n], np.float32) for n in VIBRATION]
+            velocities = np.stack(found[:3], 1)
+            moves = Vibration(*(on_device(a) for a in (velocities, *found[3:])))
     except (OSError, PlyParseError, KeyError, ValueError) as error:
         raise UserError(
             f"{path} is no PLY of Gaussians: {error}.",
@@ -107,4 +118,10 @@ def read_ply(path: Path) -> Gaussians:
         log_scales=on_device(tail[:, 1:4]),
         opacity_logits=on_device(tail[:, 0]),
         sh=on_device(sh),
+        vibration=moves,
     )
+
+
+def _columns_of(moves: Vibration) -> Float[np.ndarray, "n 5"]:
+    parts = moves.velocities, moves.peaks[:, None], moves.log_lives[:, None]
+    return np.concatenate([np.asarray(part) for part in parts], axis=1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -9,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from p2gs_jax.core.numerics import fibonacci_sphere, on_device
 from p2gs_jax.render.spherical_harmonics import basis, degree_of
+from p2gs_jax.render.vibration import STILL
 from p2gs_jax.types import Gaussians
 
 # Twice as many as coefficients of degree 3, and more: the least squares are exact.
@@ -22,6 +25,10 @@ def standing(gaussians: Gaussians, owner: Int[np.ndarray, " n"] | None) -> Gauss
         gaussians: the scene.
         owner: the moving object that each belongs to, -1: none; None: there are none.
     """
+    moves = gaussians.vibration
+    if moves is not None:
+        stands = np.asarray(moves.log_lives) > np.log(STILL) - 1
+        return chosen(dataclasses.replace(gaussians, vibration=None), stands)
     return gaussians if owner is None else chosen(gaussians, np.asarray(owner) < 0)
 
 

@@ -15,6 +15,7 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.losses.image import photometric_loss
 from p2gs_jax.losses.lidar import lidar_loss
 from p2gs_jax.losses.luminance import luminance_terms
+from p2gs_jax.losses.matte import matted_loss, unit
 from p2gs_jax.losses.regularizers import photometry_regularizers, population_terms, pose_terms
 from p2gs_jax.losses.relative_exposure import (
     ColorPairs,
@@ -74,10 +75,23 @@ class LossAux(NamedTuple):
 
 
 def decoded(batch: Batch) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"]]:
-    """Return a photograph in [0, 1] and its mask as floats; they travel as they are stored."""
+    """Return a photograph in [0, 1] and its mask as floats; they travel as they are stored.
+
+    One with alpha is put over its backdrop.
+    """
     ldr = batch.ldr.astype(jnp.float32)
     scale = float(np.iinfo(batch.ldr.dtype).max) if batch.ldr.dtype.kind == "u" else 1.0
-    return ldr / scale, batch.mask.astype(jnp.float32)
+    ldr = ldr / scale
+    if batch.alpha is not None and batch.backdrop is not None:
+        ldr = ldr + (1 - unit(batch.alpha)[..., None]) * batch.backdrop
+    return ldr, batch.mask.astype(jnp.float32)
+
+
+def _there(batch: Batch, mask: Float[Array, "h w"]) -> Float[Array, "h w"]:
+    """Return a mask without the pixels that a background shows through."""
+    if batch.alpha is None:
+        return mask
+    return jnp.where(unit(batch.alpha) > ALL_UNMASKED, mask, 0.0)
 
 
 def depth_pairs(
@@ -94,6 +108,7 @@ def depth_pairs(
     """
     there = warp(surface_depth(render), batch.camera, surface_depth(other), other_batch.camera)
     (ldr, mask), (other_ldr, other_mask) = decoded(batch), decoded(other_batch)
+    mask, other_mask = _there(batch, mask), _there(other_batch, other_mask)
     both = jnp.concatenate([other_ldr, other_mask[..., None]], -1)
     seen = sample_bilinear(both, there.xy)
     valid = there.seen & (mask > 0) & (seen[..., 3] > ALL_UNMASKED)
@@ -167,12 +182,15 @@ def image_loss(
     entries, overflow = render.count, render.overflow
     i, j = batch.view_index, partner.view_index
     correction = correction_of(appearance, i)
-    photograph, mask = decoded(batch)
-    ldr = formation(render.linear, photometry.capture(i), cfg.photometry, correction)
-    terms = dict(photometric_loss(ldr, photograph, mask, cfg.loss))
-    if isinstance(correction, Curves):
-        light = formation(render.linear, photometry.capture(i), cfg.photometry)
-        terms |= luminance_terms(light, photograph, mask, correction, cfg.loss)
+    if batch.alpha is None:
+        photograph, mask = decoded(batch)
+        ldr = formation(render.linear, photometry.capture(i), cfg.photometry, correction)
+        terms = dict(photometric_loss(ldr, photograph, mask, cfg.loss))
+        if isinstance(correction, Curves):
+            light = formation(render.linear, photometry.capture(i), cfg.photometry)
+            terms |= luminance_terms(light, photograph, mask, correction, cfg.loss)
+    else:
+        ldr, terms = matted_loss(render, batch, photometry.capture(i), correction, cfg)
     if measured is not None and lidar_weight is not None:
         terms["lidar"] = lidar_weight * lidar_loss(render, measured)
 

@@ -69,10 +69,15 @@ class RunRenderer:
         result = self.run.render(shot.camera(), shot.time)
         return np.asarray(result.linear), np.asarray(result.alpha), np.asarray(result.depth)
 
-    def develop(self, linear: Float32[np.ndarray, "h w 3"], transform: DisplayTransform):
-        """Return display values."""
+    def develop(
+        self,
+        linear: Float32[np.ndarray, "h w 3"],
+        transform: DisplayTransform,
+        alpha: Float32[np.ndarray, "h w"],
+    ):
+        """Return display values, over the background if the transform has one."""
         begin = time.perf_counter()
-        ldr = develop(linear, transform)
+        ldr = develop(linear, transform, alpha=alpha)
         self.develop_seconds.append(time.perf_counter() - begin)
         return ldr
 
@@ -124,7 +129,7 @@ def shot_frames(
     for shot in shots:
         linear, alpha, depth = renderer.linear(shot)
         transform = display_of(shot)
-        ldr = renderer.develop(linear, transform)
+        ldr = renderer.develop(linear, transform, alpha)
         taken = None if photograph is None or shot.view is None else photograph(shot.view)
         yield OutputFrame(shot.name, linear, alpha, ldr, transform, depth, shot.camera(), taken)
 
@@ -147,7 +152,7 @@ def wide_frames(
     """
     for k, (pose, at) in enumerate(zip(poses, times, strict=True)):
         wide = renderer.wide(_placed(cylinder, pose), at)
-        ldr = renderer.develop(wide.linear, transform)
+        ldr = renderer.develop(wide.linear, transform, wide.alpha)
         yield OutputFrame(f"{k:05d}", wide.linear, wide.alpha, ldr, transform)
 
 
@@ -198,7 +203,7 @@ def comparison_frames(
             (f"{short_name(cameras[k])} {stops[k]:+.1f} EV".replace("-", "−"), start, end)
             for k, start, end in borders(taken.source[cylinder.height // 2])
         ]
-        field = renderer.develop(wide.linear, transform)
+        field = renderer.develop(wide.linear, transform, wide.alpha)
         picture = stacked(
             [
                 CaptionedImage(

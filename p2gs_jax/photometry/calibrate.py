@@ -39,6 +39,8 @@ class CalibrationOptions:
         choice: what varies, and the curve: those that predict held-out colours, an exposure per
             view under one fitted response (stacks), or given ones; of a kind of curve, the splines
             are fitted.
+        known_response: what the photographs are, where their curve is known to be sRGB's
+            (`Scene.known_response`): no other is compared with held-out colours.
     """
 
     black: float
@@ -47,6 +49,7 @@ class CalibrationOptions:
     known: KnownExposures | None = None
     seed: int = 0
     choice: Choice = "held_out"
+    known_response: str | None = None
 
     def problem(self, observations: Observations) -> Problem:
         """Lay observations out for the adjustment."""
@@ -81,6 +84,7 @@ def options_of(cfg: FitConfig, scene: Scene) -> CalibrationOptions:
         known=known,
         seed=cfg.train.seed,
         choice="held_out" if p.select else _given(p),
+        known_response=scene.known_response,
     )
 
 
@@ -129,6 +133,7 @@ def _solved(observations: Observations, options: CalibrationOptions, on_chosen) 
             saturation=options.saturation,
             pivot=options.pivot,
             known=options.known,
+            known_response=options.known_response,
             seed=options.seed,
             on_chosen=on_chosen,
         )

@@ -56,15 +56,19 @@ class Scope(NamedTuple):
         cameras: number of physical cameras.
         places: positions in the images are known: vignetting can be told.
         curves: exposures differ enough to tell a curve by.
+        known: the curve is known, and sRGB's: no other is compared.
     """
 
     cameras: int
     places: bool
     curves: bool
+    known: bool = False
 
     def allows(self, choice: Choice) -> bool:
         """Return whether a choice differs from simpler ones and can be solved."""
         by = choice.curve.splines
+        if self.known and choice.curve != Curve():
+            return False
         told = by is None or self.curves
         several = by != "camera" or self.cameras > 1
         seen = choice.form.vignetting is None or self.places

@@ -17,6 +17,7 @@ from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.core.numerics import LN2, on_host
 from p2gs_jax.photometry.appearance import Correction, correction_of, without_place
 from p2gs_jax.photometry.formation import display, formation, inverse_formation
+from p2gs_jax.photometry.matte import Matte, composited, uncovered
 from p2gs_jax.photometry.spline_curve import by_camera
 from p2gs_jax.types import Capture, Params
 
@@ -35,6 +36,7 @@ class DisplayTransform:
         correction: of display values (photometry/appearance.py), or None.
         white_balance: log factors on red, green, blue beside the exposure; None: all 1.
         camera: row in `formation.cameras`, whose vignetting and response it has; None: no camera's.
+        backdrop: display values that pictures are put over, after all else; None: nothing.
     """
 
     exposure: float
@@ -43,6 +45,7 @@ class DisplayTransform:
     correction: Correction | None = None
     white_balance: tuple[float, float, float] | None = None
     camera: int | None = None
+    backdrop: tuple[float, float, float] | None = None
 
     @property
     def capture(self) -> Capture:
@@ -73,6 +76,12 @@ class DisplayTransform:
         """Gains of red and of blue over green, stops."""
         red, green, blue = (0.0, 0.0, 0.0) if self.white_balance is None else self.white_balance
         return (red - green) / LN2, (blue - green) / LN2
+
+    def matte(self, alpha: Float[Array, "h w"] | Float[np.ndarray, "h w"] | None) -> Matte | None:
+        """Return what a render of this opacity is put over; None: nothing, or it is not known."""
+        if alpha is None or self.backdrop is None:
+            return None
+        return Matte(alpha, np.asarray(self.backdrop, np.float32))
 
     def with_white_balance_ev(self, red: float, blue: float) -> DisplayTransform:
         """Return the transform with gains of red and blue over green; the exposure stays.
@@ -114,6 +123,7 @@ def develop(
     linear: Float[Array, "... 3"] | Float[np.ndarray, "... 3"],
     transform: DisplayTransform,
     positions: Float[np.ndarray, "... 2"] | None = None,
+    alpha: Float[Array, "h w"] | Float[np.ndarray, "h w"] | None = None,
 ) -> Float32[np.ndarray, "... 3"]:
     """Return display values in [0, 1] of linear radiance.
 
@@ -124,14 +134,16 @@ def develop(
         transform: how to show it.
         positions: where vignetting takes the pixels to be, if not where they are in `linear`
             (photometry/cameras.py:places).
+        alpha: opacity of the render, for the backdrop of the transform; None puts it over nothing.
     """
-    how = (transform.capture, transform.correction, positions, transform.formation)
-    return np.asarray(_develop(linear, *how))
+    how = (transform.capture, transform.correction, positions, transform.matte(alpha))
+    return np.asarray(_develop(linear, *how, transform.formation))
 
 
 @functools.partial(jax.jit, static_argnames="cfg")
-def _develop(linear, capture, correction, positions, cfg: PhotometryConfig):
-    return display(formation(linear, capture, cfg, correction, positions))
+def _develop(linear, capture, correction, positions, matte, cfg: PhotometryConfig):
+    own = formation(uncovered(linear, matte), capture, cfg, correction, positions)
+    return composited(display(own), matte)
 
 
 def undevelop(

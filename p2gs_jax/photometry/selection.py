@@ -77,6 +77,7 @@ def select(
     saturation: float,
     pivot: float,
     known: KnownExposures | None = None,
+    known_response: str | None = None,
     seed: int = 0,
     on_chosen: Callable[[Form, Response], None] = lambda form, response: None,
 ) -> Selection:
@@ -88,6 +89,8 @@ def select(
         saturation: values from here on say nothing.
         pivot: linear value that gamma leaves alone.
         known: exposures known beforehand; used in the final solution only.
+        known_response: what the photographs are, where they are light encoded as sRGB: the curve is
+            then not chosen. None: a camera's own curve is in them.
         seed: which observations are held out.
         on_chosen: receives the choice before it is solved on all observations.
     """
@@ -95,8 +98,15 @@ def select(
     small = make(_subset(observations, seed, MOST_OBSERVATIONS))
     held = generator(seed, Stream.HELD_OUT).random(len(small.observations.points)) < HELD_OUT
     training = make(_subset(small.observations.picked(~held), seed, SPLINE_OBSERVATIONS))
-    search = _Search(comparison := Comparison(small, held), training)
+    search = _Search(
+        comparison := Comparison(small, held), training, known=known_response is not None
+    )
     notes = search.first()
+    if known_response is not None:
+        notes = [
+            f"The tone curve is known ({known_response}): none was fitted, and of light encoded as "
+            "sRGB it is sRGB's."
+        ]
     chosen = search.rest()
     on_chosen(chosen.form, chosen.response)
     candidates = sorted(comparison.judged(), key=lambda c: -c.density)
@@ -115,6 +125,7 @@ class _Search:
     Args:
         comparison: what was compared so far.
         training: some of the observations that are not held out, for the splines.
+        known: the curve is known, and sRGB's.
 
     Attributes:
         comparison: as given.
@@ -122,7 +133,7 @@ class _Search:
         scope: what there is to choose from.
     """
 
-    def __init__(self, comparison: Comparison, training: Problem):
+    def __init__(self, comparison: Comparison, training: Problem, *, known: bool = False):
         self.comparison, self._training = comparison, training
         o = comparison.problem.observations
         cameras = int(o.cameras.max(initial=0)) + 1
@@ -130,7 +141,7 @@ class _Search:
         exposures = comparison.solve(Choice(EXPOSURES), Response()).theta.b
         self.spread = float(np.std(exposures))
         told = self.spread / LN2 >= SPLINE_SPREAD_EV
-        self.scope = Scope(cameras, o.positions is not None, told)
+        self.scope = Scope(cameras, o.positions is not None, told, known)
 
     def response(self, choice: Choice) -> Response | None:
         """Return the curve of a choice, fitted beside what cameras do; None: it collapsed."""

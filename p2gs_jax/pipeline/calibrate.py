@@ -50,7 +50,7 @@ def calibrate(
     reporter.stage("Reading the scene")
     with no_empty_folders(out):
         scene = load_scene(Path(scene_dir), cfg.data, out / "cache", reporter.message)
-        store = ImageStore(scene.views, cfg.data, scene.objects)
+        store = ImageStore(scene.views, cfg.data, scene.objects).only_opaque()
         if not (has_tracks(scene) or len(scene.points)):
             raise UserError(
                 f"{scene_dir} has neither tracks nor points: which pixels show the same surface is "

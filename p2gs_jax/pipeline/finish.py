@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import threading
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,9 +12,11 @@ import numpy as np
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.clock import CompileCounter, Stopwatch, over_budget
 from p2gs_jax.core.progress import Reporter
+from p2gs_jax.core.runtime import return_freed_memory
 from p2gs_jax.evaluate.evaluate import ViewResult, evaluate
 from p2gs_jax.evaluate.lpips import LpipsWeights
 from p2gs_jax.evaluate.references import Reference, find_radiance
+from p2gs_jax.evaluate.unexplained import Unexplained, shares_by_view
 from p2gs_jax.photometry.metering import Metering
 from p2gs_jax.pipeline.prepare import Prepared
 from p2gs_jax.render.host import make_renderer
@@ -33,12 +36,15 @@ class Account:
         seconds: times, by name.
         compiler: counts what was compiled for this fit.
         growth: the history of automatic growth, or None.
+        left_out: what no static scene explains and the last steps left out, by row of the scene;
+            None where it was not looked for.
     """
 
     counts: dict[str, int]
     seconds: dict[str, float]
     compiler: CompileCounter = field(default_factory=CompileCounter)
     growth: dict | None = None
+    left_out: Mapping[int, Unexplained] | None = None
 
 
 def finish(
@@ -67,6 +73,7 @@ def finish(
         owner: the moving object that each Gaussian belongs to, or None.
     """
     watch = Stopwatch()
+    return_freed_memory()
     _import_ahead("matplotlib.figure")
     scene, cfg = prepared.scene, prepared.cfg
     moving = fitted_objects(prepared.store.moving, params)
@@ -121,6 +128,9 @@ def finish(
             metering=metering[0],
             true_ev=true_ev,
         )
+        if account.left_out is not None:
+            write_unexplained(folder.left_out, scene, store, account.left_out)
+            metrics["left_out"] = shares_by_view(scene, account.left_out)
     metrics |= _accounted(account, watch, prepared, reporter)
     write_json(folder.metrics, metrics)
     return metrics
@@ -140,6 +150,7 @@ def _accounted(account: Account, watch: Stopwatch, prepared: Prepared, reporter:
         reporter.message(late)
     steps = max(int(account.counts.get("steps", 0)), 1)
     said = {
+        "split": prepared.scene.split_by,
         "counts": {**account.counts, "programs": account.compiler.programs},
         "seconds": seconds,
         "seconds_per_step": account.seconds.get("optimisation", 0.0) / steps,

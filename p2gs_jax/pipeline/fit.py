@@ -229,6 +229,7 @@ def fit(
         },
         compiler=compiler,
         growth=result.growth,
+        left_out=result.left_out,
     )
     metrics = finish(
         params,

@@ -17,6 +17,7 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.core.progress import Reporter
+from p2gs_jax.core.runtime import return_freed_memory
 from p2gs_jax.core.streams import Stream
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.init.brightness import Tones, rough_tones
@@ -36,6 +37,7 @@ from p2gs_jax.gaussians.init.start import (
     match_photographs,
     shell_gaussians,
 )
+from p2gs_jax.gaussians.init.vibration import clock_of, vibrates, with_vibration
 from p2gs_jax.gaussians.population import Coverage
 from p2gs_jax.losses.relative_exposure import ColorPairs
 from p2gs_jax.photometry.calibrate import calibrate_observations, options_of
@@ -135,6 +137,8 @@ def load(scene_dir: Path, run_dir: Path, cfg: FitConfig, reporter: Reporter) -> 
             f"{scene_dir} has no seed points.",
             fix="check the poses and that the photographs overlap",
         )
+    held = len(scene.test_indices)
+    reporter.message(f"Held out: {held} of {len(scene.views)} views ({scene.split_by}).")
     return scene
 
 
@@ -160,7 +164,9 @@ def prepare(
     clock = clock or Stopwatch()
     begin = time.monotonic()
     nodes = find_nodes(scene, cfg.dynamics)
-    store = ImageStore(scene.views, cfg.data, moving=None if nodes is None else nodes.moving)
+    vibrating = vibrates(scene, cfg)
+    moving = clock_of(scene) if vibrating else None if nodes is None else nodes.moving
+    store = ImageStore(scene.views, cfg.data, moving=moving)
     fitted, still = _without_what_moves(scene, store, nodes, cfg)
     views = scene.training_views
     taken_by = [view.camera for view in views]
@@ -169,13 +175,19 @@ def prepare(
     measured = measured_depths(scene, cfg)
     dense = wants_dense(scene, coverage, cfg)
     seeds = _choose_points(scene, cfg)
+    init = cfg.init
+    if store.backdrop is not None and init.shell == "auto":
+        # What lies behind everything is the background.
+        init = dataclasses.replace(init, shell="off")
     # Dense seeds cover some of what the points do not.
-    shell = None if dense else find_shell(views, scene.points, extent, cfg.init)
+    shell = None if dense else find_shell(views, scene.points, extent, init)
 
     guess = likely(cfg, kept, matched=has_tracks(scene) or dense)
     expected: Expected | None = None
     if guess is not None:
         black = black_gaussians(scene.points[seeds.keep], shell, views, cfg)
+        if vibrating:
+            black = with_vibration(black, scene, cfg)
         owner = None
         if nodes is not None:
             colors = np.zeros_like(nodes.points)
@@ -207,6 +219,7 @@ def prepare(
     resolved = decisions.resolve(cfg)
     solution = None if selection is None else selection.solution
     photometry = initial_photometry(solution, taken_by, resolved)
+    return_freed_memory()
     solved = time.monotonic()
     clock.add("photometry", solved - begin)
 
@@ -225,7 +238,7 @@ def prepare(
             on_view=lambda i, n: reporter.stage("Matching photographs", i, n),
         )
         covering = np.concatenate([scene.points, added.points])
-        shell = find_shell(views, covering, extent, cfg.init)
+        shell = find_shell(views, covering, extent, init)
     if scene.point_colors is None:
         scene = with_colors(scene, photographed_radiance(scene, still, photometry, resolved))
     radiance = point_radiance(scene, solution, resolved)[seeds.keep]
@@ -233,6 +246,8 @@ def prepare(
     if shell is not None:
         far = shell_gaussians(shell, scene, still, photometry, views, resolved)
         gaussians = merge(gaussians, far)
+    if vibrating:
+        gaussians = with_vibration(gaussians, scene, resolved)
     owner = None
     if nodes is not None:
         found = nodes_radiance(nodes, scene, fitted, photometry, resolved)
@@ -243,6 +258,8 @@ def prepare(
     notes += [] if added is None else [added.note()]
     notes += [] if shell is None else [shell.note()]
     notes += thinned
+    if cfg.dynamics.method == "vibration" and not vibrating:
+        notes.append("Views have no times: everything is fitted as if it stood still.")
     for note in notes:
         reporter.message(note)
     clock.add("seeds", time.monotonic() - solved)
@@ -272,15 +289,15 @@ def prepare(
 def _without_what_moves(
     scene: Scene, store: ImageStore, nodes: Nodes | None, cfg: FitConfig
 ) -> tuple[ImageStore, ImageStore]:
-    """Return the photographs that are fitted, and those of what stands still.
+    """Return the photographs that are fitted, and those of what stands still and is opaque.
 
     Exposures and seeds come from the latter.
     """
     still = store.leaving_out(scene.objects, cfg.dynamics.margin)
     if cfg.dynamics.method == "mask":
-        return still, still
+        return still, still.only_opaque()
     left = () if nodes is None else nodes.left
-    return store.leaving_out(left, cfg.dynamics.margin), still
+    return store.leaving_out(left, cfg.dynamics.margin), still.only_opaque()
 
 
 def _with_nodes(
@@ -339,6 +356,9 @@ def _solve(
     if not (has_tracks(scene) or from_tracks or dense):
         return None, None, []
     notes = []
+    if scene.random_seeds:
+        notes = ["Seeds at random show nothing twice: exposures start at 1 and are learned."]
+        return None, None, notes if from_tracks else []
     if not has_tracks(scene):
         notes.append("No tracks: seed points are projected into the views instead.")
     tracks = surface_colors(

@@ -15,6 +15,7 @@ from p2gs_jax.render.objects import camera_of_each
 from p2gs_jax.render.project import project, view_radiance
 from p2gs_jax.render.rasterize_reference import rasterize_reference
 from p2gs_jax.render.rasterize_tiles import TileImplementation, rasterize_tiles
+from p2gs_jax.render.vibration import at_time
 from p2gs_jax.types import Camera, Gaussians, Render, Splats2D, TileList
 
 # The oldest NVIDIA GPUs that Pallas supports through Triton.
@@ -110,6 +111,7 @@ def render_linear(
     """
     if gaussians.capacity == 0:
         return _nothing(camera, with_depth)
+    gaussians = at_time(gaussians, camera.objects)
     of_each = camera_of_each(camera, owner)
     splats = project(gaussians, alive, of_each, cfg)
     radiance = view_radiance(gaussians, of_each, cfg, active_degree)
@@ -165,6 +167,7 @@ def required_capacity(
     """Return the exact tile-list capacity one view needs; arguments as of `render_linear`."""
     if gaussians.capacity == 0:
         return jnp.int32(0)
+    gaussians = at_time(gaussians, camera.objects)
     camera = camera_of_each(camera, owner)
     splats = project(gaussians, alive, camera, cfg)
     if cfg.cutoff_rule == "radiance":

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render.objects import camera_of_each
 from p2gs_jax.render.project import project, view_radiance
+from p2gs_jax.render.vibration import at_time
 from p2gs_jax.types import Camera, Frustum, Gaussians, Splats2D
 
 BLOCK = 4096
@@ -47,6 +48,7 @@ def take_rows(gaussians: Gaussians, ids: Int[Array, " v"], bands: int) -> Gaussi
         log_scales=rows(gaussians.log_scales),
         opacity_logits=rows(gaussians.opacity_logits),
         sh=gaussians.sh.at[ids, :bands].get(mode="clip"),
+        vibration=jax.tree.map(rows, gaussians.vibration),
     )
 
 
@@ -69,6 +71,7 @@ def put_rows(gaussians: Gaussians, ids: Int[Array, " v"], new: Gaussians) -> Gau
         log_scales=rows(gaussians.log_scales, new.log_scales),
         opacity_logits=rows(gaussians.opacity_logits, new.opacity_logits),
         sh=gaussians.sh.at[ids, :bands].set(new.sh, mode="drop", unique_indices=True),
+        vibration=jax.tree.map(rows, gaussians.vibration, new.vibration),
     )
 
 
@@ -94,10 +97,12 @@ def splat(
     owner: Int[Array, " v"] | None = None,
 ) -> tuple[Shown, ...]:
     """Return the splats and the radiance of Gaussians in each of some views."""
-    return tuple(
-        (project(gaussians, alive, c, cfg), view_radiance(gaussians, c, cfg, active_degree))
-        for c in (camera_of_each(camera, owner) for camera in cameras)
-    )
+
+    def seen_by(camera: Camera | Frustum) -> Shown:
+        now, of_each = at_time(gaussians, camera.objects), camera_of_each(camera, owner)
+        return project(now, alive, of_each, cfg), view_radiance(now, of_each, cfg, active_degree)
+
+    return tuple(map(seen_by, cameras))
 
 
 def owners_at(owner: Int[Array, " n"] | None, ids: Int[Array, " v"]) -> Int[Array, " v"] | None:

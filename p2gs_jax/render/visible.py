@@ -15,6 +15,7 @@ from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.numerics import namespace
 from p2gs_jax.render.cutoff import smallest_cutoff
 from p2gs_jax.render.project import LOG_SCALE_RANGE, TANGENT_LIMIT
+from p2gs_jax.render.vibration import at_time
 from p2gs_jax.render.xla_cpu import compiled_loop
 from p2gs_jax.types import Camera, Frustum, Gaussians
 
@@ -36,6 +37,7 @@ def in_view(
         camera: the view.
         cfg: near plane, blur and cutoffs.
     """
+    gaussians = at_time(gaussians, camera.objects)
     xp = namespace(gaussians.means, camera.viewmat)
     R, t = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
     x, y, z = (sum(gaussians.means[:, k] * R[i, k] for k in range(3)) + t[i] for i in range(3))

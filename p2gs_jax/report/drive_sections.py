@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from p2gs_jax.errors import UserError
 from p2gs_jax.report.page import Section, folded, paragraph, row, table
 from p2gs_jax.report.pictures import jpeg
@@ -125,9 +127,34 @@ def unexplained_section(run: RunFiles, problems: list[str]) -> Section:
         "more than the noise of that view, and more than the same surfaces do at other times. "
         "That is what moves where nothing follows it, its shadow and its mirror image."
     )
-    folder = RunFolder(run.folder).unexplained
-    cells = []
-    by_view = run.part("unexplained", "per_view")
+    body += _marked(run, "unexplained", RunFolder(run.folder).unexplained, problems)
+    return Section("unexplained", title, body)
+
+
+def left_out_section(run: RunFiles, problems: list[str]) -> Section:
+    """Pixels of training views that the fit left out, because no static scene explains them.
+
+    Args:
+        run: the folder.
+        problems: receives a sentence for every picture that could not be read.
+    """
+    title = "What the fit left out"
+    share = run.number("left_out", "share")
+    if share is None:
+        return Section("left_out", title, "")
+    body = paragraph(
+        f"On average {share:.1%} of the pixels of a training view took no part in the last steps: "
+        "the fit so far showed them far worse than the same surfaces at other times. Scores count "
+        "these pixels like all others."
+    )
+    body += _marked(run, "left_out", RunFolder(run.folder).left_out, problems)
+    return Section("left_out", title, body)
+
+
+def _marked(run: RunFiles, key: str, folder: Path, problems: list[str]) -> str:
+    """Return the photographs of a folder with pixels marked, and the share of every view."""
+    cells, body = [], ""
+    by_view = run.part(key, "per_view")
     shares = {name: number_at(by_view, name) or 0.0 for name in by_view}
     for path in sorted(folder.rglob("*.png")):
         name = path.relative_to(folder).with_suffix("").as_posix()
@@ -145,4 +172,4 @@ def unexplained_section(run: RunFiles, problems: list[str]) -> Section:
         body += folded(
             "Every training view", table(["view", "share"], rows, numbers=(1,), tall=True)
         )
-    return Section("unexplained", title, body)
+    return body

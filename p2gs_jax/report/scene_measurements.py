@@ -138,7 +138,7 @@ def _rendered(
         len(tried),
         shown,
         picture,
-        _clipped(run, store),
+        _clipped(run, store.only_opaque()),
         tuple(comparisons),
         tuple(missing),
     )
@@ -173,8 +173,9 @@ def _widest(found: dict[tuple[int, int], Seam]) -> tuple[int, int] | None:
 
 def _comparison(run: Run, store: ImageStore, render, index: int) -> ViewComparison:
     photograph, mask = store.get(index)
-    linear = np.asarray(render(camera_of(store, index)).linear)
-    shown = develop(linear, run.own_display(index))
+    rendered = render(camera_of(store, index))
+    linear = np.asarray(rendered.linear)
+    shown = develop(linear, run.own_display(index), alpha=rendered.alpha)
     score = float(psnr(shown, photograph, mask))
     view = run.scene.views[index]
     return ViewComparison(view.name, view.split, photograph, shown, linear, score)

@@ -93,6 +93,16 @@ class RunFolder:
         return self.root / "renders"
 
     @property
+    def left_out(self) -> Path:
+        """Folder of photographs with what no static scene explains and the fit leaves out."""
+        return self.root / "left_out"
+
+    @property
+    def left_out_masks(self) -> Path:
+        """What every look of the fit left out of the steps that followed it."""
+        return self.root / "left_out.npz"
+
+    @property
     def unexplained(self) -> Path:
         """Folder of photographs of a drive with what no static scene explains."""
         return self.root / "unexplained"

@@ -18,24 +18,26 @@ from p2gs_jax.types import Scene, TrackedObject
 
 
 def write_objects(
-    path: Path, owner: Int[np.ndarray, " n"], moving: MovingObjects, scene: Scene
+    path: Path, owner: Int[np.ndarray, " n"] | None, moving: MovingObjects, scene: Scene
 ) -> None:
     """Write the owners of a run's Gaussians.
 
     Args:
         path: of the file.
-        owner: of each Gaussian, a row of `moving`, -1: none.
+        owner: of each Gaussian, a row of `moving`, -1: none; None: nothing has a box.
         moving: some of the scene's objects.
         scene: with all of them.
     """
     keys, corrections = moving.keys, moving.corrections
     arrays = {
-        "owner": np.asarray(owner, np.int32),
+        "owner": np.asarray([] if owner is None else owner, np.int32),
         "rows": np.array([_row(thing, scene) for thing in moving.objects], np.int32),
         "key_times": keys.first + keys.spacing * np.arange(keys.count),
     }
     if corrections is not None:
         arrays["corrections"] = np.asarray(corrections, np.float32)
+    if moving.middle is not None:
+        arrays["middle"] = np.asarray(moving.middle, np.float64)
     with atomic_write(path) as temporary:
         np.savez_compressed(temporary, **arrays)
 
@@ -62,6 +64,8 @@ def read_objects(
         times, owner = a["key_times"], a["owner"]
         spacing = float(times[1] - times[0]) if len(times) > 1 else 1.0
         keys = KeyTimes(float(times[0]), spacing, len(times))
+        if "middle" in a:
+            return None, MovingObjects((), keys, middle=float(a["middle"]))
         fits = len(owner) == count and owner.max(initial=-1) < len(objects)
         corrections = a.get("corrections")
         if corrections is not None:

@@ -207,7 +207,8 @@ class Run:
         """
         if index in self.scene.train_indices:
             row = self.scene.train_indices.index(index)
-            return display_of_view(self.params, row, self.cfg.photometry)
+            own = display_of_view(self.params, row, self.cfg.photometry)
+            return replace(own, backdrop=self.store.backdrop_values)
         view = self.scene.views[index]
         usual = self._usual(view.camera)
         fitted = {v["image"]: v["exposure_fitted"] for v in self.photometry["views"]}.get(view.name)
@@ -244,7 +245,8 @@ class Run:
 
     def _usual(self, camera: str | None) -> DisplayTransform:
         taken_by = [view.camera for view in self.scene.training_views]
-        return usual_display(self.params, taken_by, camera, self.cfg.photometry)
+        usual = usual_display(self.params, taken_by, camera, self.cfg.photometry)
+        return replace(usual, backdrop=self.store.backdrop_values)
 
     @cached_property
     def metering(self) -> Metering:

@@ -1,6 +1,7 @@
 """`scene.npz`: the cameras, points and tracks of a fit, so that a run opens without its scene.
 
-Photographs are not in it; where they lie is kept relative to the scene's folder.
+Photographs are not in it; where they lie is kept relative to the scene's folder, or to the run's
+where its cache holds them (frames of a video, developed raw files).
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.types import Distortion, Lidar, Scene, TrackedObject, Tracks, View
 
 SCENE_FILE = "scene.npz"
+# Of a run: what was developed lies there.
+CACHE = "cache"
 
 
 def write_scene(folder: Path, scene: Scene) -> None:
@@ -37,12 +40,16 @@ def write_scene(folder: Path, scene: Scene) -> None:
                 "camera": v.camera,
                 "split": v.split,
                 "exif_ev": v.exif_ev,
-                "image": _relative(v.image_path, base),
+                "image": _relative(
+                    v.image_path, folder if _below(v.image_path, folder / CACHE) else base
+                ),
+                "in_run": _below(v.image_path, folder / CACHE),
                 "mask": None if v.mask_path is None else _relative(v.mask_path, base),
                 "distortion": None if v.distortion is None else v.distortion.coefficients,
                 "lens": None if v.distortion is None else v.distortion.model,
                 "frame": v.frame,
                 "time": v.time,
+                "alpha": v.alpha,
             }
             for v in scene.views
         ],
@@ -51,6 +58,9 @@ def write_scene(folder: Path, scene: Scene) -> None:
             for o in scene.objects
         ],
         "origin": scene.origin,
+        "split_by": scene.split_by,
+        "random_seeds": scene.random_seeds,
+        "known_response": scene.known_response,
         "own_cars": list(own_cars),
     }
     arrays = {
@@ -99,7 +109,7 @@ def read_scene(folder: Path, root: Path) -> Scene | None:
         views = tuple(
             View(
                 name=v["name"],
-                image_path=base / v["image"],
+                image_path=(folder if v.get("in_run") else base) / v["image"],
                 camera=v["camera"],
                 viewmat=a["viewmats"][i],
                 K=a["Ks"][i],
@@ -112,6 +122,7 @@ def read_scene(folder: Path, root: Path) -> Scene | None:
                 frame=v.get("frame"),
                 time=v.get("time"),
                 own_car=own_cars.get(v["camera"]),
+                alpha=v.get("alpha", "mask"),
             )
             for i, v in enumerate(said["views"])
         )
@@ -131,6 +142,9 @@ def read_scene(folder: Path, root: Path) -> Scene | None:
             if "lidar_points" not in a
             else Lidar(a["lidar_points"], a["lidar_times"], a["lidar_objects"]),
             origin=tuple(said.get("origin", (0.0, 0.0, 0.0))),
+            split_by=said.get("split_by"),
+            random_seeds=said.get("random_seeds", False),
+            known_response=said.get("known_response"),
         )
     except (OSError, ValueError, KeyError, TypeError, IndexError, zipfile.BadZipFile) as error:
         raise UserError(
@@ -156,6 +170,10 @@ def read_times(folder: Path) -> dict[str, float]:
 def _base(root: Path) -> Path:
     """Return the folder that photographs are named from; a scene may be a transforms.json."""
     return root.parent if root.suffix.lower() == ".json" else root
+
+
+def _below(path: Path, folder: Path) -> bool:
+    return path.resolve().is_relative_to(folder.resolve())
 
 
 def _relative(path: Path, base: Path) -> str:

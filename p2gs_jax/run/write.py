@@ -24,6 +24,7 @@ from p2gs_jax.photometry.mean import MeanParameters, mean_parameters, usual_disp
 from p2gs_jax.photometry.metering import Metering
 from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.render.spherical_harmonics import MAX_DEGREE
+from p2gs_jax.render.vibration import at_time
 from p2gs_jax.run.appearance_file import write_appearance
 from p2gs_jax.run.decisions import Decisions, write_decisions
 from p2gs_jax.run.layout import RunFolder
@@ -103,7 +104,7 @@ def write_results(
         true_ev: true exposures of the training views for the plot, or None.
     """
     write_scene(folder.root, scene)
-    if owner is not None and moving is not None:
+    if moving is not None and (owner is not None or moving.middle is not None):
         write_objects(folder.objects, owner, moving, scene)
     _write_models(folder, params, owner, moving, scene, cfg)
     model, curve, gauge = _photometry_model(params, cfg)
@@ -166,6 +167,7 @@ def _write_models(
     placed = params.gaussians
     if owner is not None and moving is not None:
         placed = posed(placed, owner, *moving.poses(middle_time(scene)))
+    placed = at_time(placed, None)
     shown = bake(placed, transform, cfg.render.radiance, MAX_DEGREE)
     write_ply(folder.splats, shown, display_comments(transform))
     write_radiance(folder.radiance, params.gaussians, alive, activation=cfg.render.radiance)
@@ -247,13 +249,15 @@ def _write_summary(
     true_ev: np.ndarray | None,
 ) -> None:
     common = usual_display(params, (), None, cfg.photometry)
+    if shown:
+        common = dataclasses.replace(common, backdrop=shown[0].transform.backdrop)
     train = scene.training_views
     exif = [v.exif_ev for v in train]
     write_summary(
         path,
         photographs=[v.photograph for v in shown],
         rendered=[v.ldr for v in shown],
-        linear_tonemapped=[develop(v.linear, common) for v in shown],
+        linear_tonemapped=[develop(v.linear, common, alpha=v.alpha) for v in shown],
         names=[f"{scene.views[v.index].name} ({scene.views[v.index].split})" for v in shown],
         exposures_ev=np.log2(jax.tree.map(np.asarray, params.photometry).exposures),
         cameras=[v.camera for v in train],

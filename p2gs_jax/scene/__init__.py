@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
+from p2gs_jax.scene.backdrop import with_alpha
 from p2gs_jax.scene.colmap import find_model, load_colmap
 from p2gs_jax.scene.drives import read_drive
 from p2gs_jax.scene.drives.assemble import assemble
@@ -17,10 +18,17 @@ from p2gs_jax.scene.drives.recording import Recording
 from p2gs_jax.scene.exif import read_exif_ev
 from p2gs_jax.scene.files import list_images
 from p2gs_jax.scene.images import ImageStore, camera_at, size_at
+from p2gs_jax.scene.llff import is_llff, load_llff
+from p2gs_jax.scene.masks import attach_masks
+from p2gs_jax.scene.photographs.colours import colour_notes
+from p2gs_jax.scene.photographs.develop import develop, developed_views, with_originals
+from p2gs_jax.scene.random_seeds import with_random_seeds
 from p2gs_jax.scene.rig import is_rig, load_rig
-from p2gs_jax.scene.split import assign_split
-from p2gs_jax.scene.transforms import load_transforms
-from p2gs_jax.types import Scene, View
+from p2gs_jax.scene.split import split_scene
+from p2gs_jax.scene.split_lists import lists_beside, split_as_listed
+from p2gs_jax.scene.transforms import is_blender, load_blender, load_transforms
+from p2gs_jax.scene.video.read import is_video, read_video
+from p2gs_jax.types import Scene
 
 __all__ = ["ImageStore", "camera_at", "load_scene", "size_at"]
 
@@ -34,13 +42,14 @@ def load_scene(
     """Read a scene; the format is found from what lies in the folder.
 
     In this order, unless `cfg.format` names one: a COLMAP model in `sparse/0`, `sparse` or the
-    folder itself; `transforms.json` in it, or `root` itself where that is a .json file; a rig with
-    KITTI's calib.txt and poses.txt; a drive as a data set lays it out (`drives`); photographs in
-    `images/` or the folder itself, whose cameras are then found by structure from motion. Poses
-    without points get theirs by triangulation.
+    folder itself; `transforms.json` in it, or `root` itself where that is a .json file;
+    `transforms_train.json` with those of the other parts of the split; LLFF's `poses_bounds.npy`; a
+    rig with KITTI's calib.txt and poses.txt; a drive as a data set lays it out (`drives`);
+    photographs in `images/` or the folder itself, whose cameras are then found by structure from
+    motion. Poses without points get theirs by triangulation, or at random where nothing matches.
 
     Args:
-        root: folder, or .json file.
+        root: folder, .json file, or video.
         cfg: which photographs are used, and how.
         work_dir: results of long computations are kept here for a resume; None keeps nothing.
         report: receives progress, a line at a time.
@@ -54,36 +63,46 @@ def load_scene(
     found = find_scene(root, cfg, report)
     if isinstance(found, Recording):
         scene = assemble(found, cfg, work_dir, report)
-    elif isinstance(found, PhotographsAlone):
+    elif isinstance(found, PhotographsAlone | Video):
         # Imported here as below: scenes with cameras and points do not need COLMAP.
         from p2gs_jax.scene.structure_from_motion import load_images
 
-        folder, paths = found
+        if isinstance(found, Video):
+            photographs = read_video(found.path, cfg, work_dir, report)
+        else:
+            photographs = develop(*found, work_dir, report)
+        folder, paths = photographs.folder, photographs.paths
         scene = load_images(Path(root), folder, paths, cfg, work_dir, report)
+        scene = with_originals(scene, photographs)
     else:
         scene = found
+    listed = scene.split_by is not None or cfg.split is not None
+    # Masks and EXIF are those of the photographs as they were taken, alpha is that of what is read.
+    scene = developed_views(with_what_lies_beside(scene, cfg), work_dir, report)
+    scene = with_alpha(scene, cfg)
     if len(scene.points) == 0:
         from p2gs_jax.scene.triangulate import triangulate
 
-        scene = triangulate(scene, work_dir, report)
-    return with_what_lies_beside(scene, cfg)
+        # Where somebody says what is held out, it gives no seeds either.
+        scene = triangulate(scene, work_dir, report, only_training=listed)
+        if len(scene.points) == 0:
+            scene = with_random_seeds(scene)
+    return scene
 
 
 def with_what_lies_beside(scene: Scene, cfg: DataConfig) -> Scene:
     """Return a scene with masks, EXIF exposures and split.
 
     Raises:
-        UserError: so many views cannot be held out.
+        UserError: so many views cannot be held out, or a list of those that are is wrong.
     """
-    views, mask_notes = _attach_masks(scene.views)
+    views, mask_notes = attach_masks(scene.views)
     views = tuple(
         dataclasses.replace(view, exif_ev=read_exif_ev(view.image_path)) for view in views
     )
-    return dataclasses.replace(
-        scene,
-        views=assign_split(views, cfg.test_every),
-        notes=(*scene.notes, *mask_notes),
-    )
+    notes = (*scene.notes, *mask_notes, *colour_notes(v.image_path for v in views))
+    scene = dataclasses.replace(scene, views=views, notes=notes)
+    return split_scene(scene, cfg)
 
 
 class PhotographsAlone(NamedTuple):
@@ -98,9 +117,19 @@ class PhotographsAlone(NamedTuple):
     paths: list[Path]
 
 
+class Video(NamedTuple):
+    """A video of which nothing else is known.
+
+    Attributes:
+        path: of the file.
+    """
+
+    path: Path
+
+
 def find_scene(
     root: Path, cfg: DataConfig, report: Callable[[str], None] = lambda message: None
-) -> Scene | Recording | PhotographsAlone:
+) -> Scene | Recording | PhotographsAlone | Video:
     """Return what a folder holds, as `load_scene` finds it; nothing long is computed.
 
     Raises:
@@ -110,17 +139,27 @@ def find_scene(
     if not root.exists():
         raise UserError(f"{root} does not exist", fix="check the path of the scene")
     if root.is_file():
+        if is_video(root):
+            return Video(root)
         if root.suffix.lower() != ".json":
             raise UserError(
-                f"{root} is a file, but no transforms.json",
-                fix="name the folder of the scene, or its transforms.json",
+                f"{root} is a file, but no transforms.json and no video",
+                fix="name the folder of the scene, its transforms.json, or a video",
             )
         return load_transforms(root, root, cfg)
     model = find_model(root)
     if model is not None and cfg.format in (None, "colmap"):
-        return load_colmap(root, model, cfg)
+        scene = load_colmap(root, model, cfg)
+        lists = lists_beside(model, root) if cfg.split is None and cfg.test_every else None
+        if lists is None:
+            return scene
+        return split_as_listed(scene, lists, allow_missing=cfg.allow_missing)
     if (root / "transforms.json").is_file() and cfg.format in (None, "transforms"):
         return load_transforms(root, root / "transforms.json", cfg)
+    if is_blender(root) and cfg.format in (None, "blender"):
+        return load_blender(root, cfg)
+    if is_llff(root) and cfg.format in (None, "llff"):
+        return load_llff(root, cfg)
     # SemanticKITTI's sequences have a poses.txt, too.
     if is_rig(root) and (
         cfg.format == "rig" or (cfg.format is None and not is_kitti_odometry(root))
@@ -143,32 +182,8 @@ def find_scene(
     looked = ", ".join(str(folder) for folder in folders)
     raise UserError(
         f"no scene in {root}: there is no COLMAP model (cameras, images and points3D as .bin or "
-        f".txt, in sparse/0, sparse or the folder itself), no transforms.json, no calib.txt with "
-        f"poses.txt, no drive of a known data set, and no photographs (looked in {looked})",
+        f".txt, in sparse/0, sparse or the folder itself), no transforms.json or "
+        f"transforms_train.json, no poses_bounds.npy, no calib.txt with poses.txt, no drive of a "
+        f"known data set, and no photographs (looked in {looked})",
         fix="name the folder that holds one of these",
     )
-
-
-def _attach_masks(views: tuple[View, ...]) -> tuple[tuple[View, ...], list[str]]:
-    """Find masks in `masks/` beside the image folder or in it, where a reader named none."""
-    masked = tuple(
-        view if view.mask_path else dataclasses.replace(view, mask_path=_mask_of(view))
-        for view in views
-    )
-    without = [view.name for view in masked if view.mask_path is None]
-    if not without or len(without) == len(masked):
-        return masked, []
-    listed = ", ".join(without[:5]) + (", ..." if len(without) > 5 else "")
-    return masked, [f"{len(without)} of {len(masked)} views have no mask: {listed}"]
-
-
-def _mask_of(view: View) -> Path | None:
-    image_folder = view.image_path
-    for _ in Path(view.name).parts:
-        image_folder = image_folder.parent
-    for folder in (image_folder.parent / "masks", image_folder / "masks"):
-        path = folder / view.name
-        for p in (path, path.with_suffix(".png"), path.with_name(path.name + ".png")):
-            if p.is_file():
-                return p
-    return None

@@ -18,6 +18,7 @@ from PIL import Image
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.files import undecodable
 from p2gs_jax.scene.geometry import undistortion_maps
+from p2gs_jax.scene.photographs.profiles import applied
 from p2gs_jax.types import View
 
 _FULL = 0.999  # a pixel is valid only where all of its sources are
@@ -46,15 +47,19 @@ class Decoded:
     Attributes:
         pixels: unsigned integers; the largest is 1.0.
         valid: where it shows something.
+        alpha: opacity of a photograph that is shown over a background, whose pixels are then
+            premultiplied by it; None: it is shown over none.
     """
 
     pixels: UInt[np.ndarray, "h w 3"]
     valid: Bool[np.ndarray, "h w"]
+    alpha: UInt[np.ndarray, "h w"] | None = None
 
     @property
     def nbytes(self) -> int:
-        """Bytes of both."""
-        return self.pixels.nbytes + self.valid.nbytes
+        """Bytes of all."""
+        opacity = 0 if self.alpha is None else self.alpha.nbytes
+        return self.pixels.nbytes + self.valid.nbytes + opacity
 
 
 class DecodedPhotographs:
@@ -139,20 +144,24 @@ class DecodedPhotographs:
         return entry
 
 
-def floats(pixels: UInt[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
+def floats(pixels: UInt[np.ndarray, "..."]) -> Float32[np.ndarray, "..."]:
     """Return stored values in [0, 1]."""
     return pixels.astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
 
 
 def _prepare(view: View, width: int, height: int) -> Decoded:
     """Decode, undistort and shrink one photograph."""
-    pixels, valid = _decode(view.image_path)
+    pixels, opacity = _decode(view.image_path)
     if pixels.shape[:2] != (view.height, view.width):
         raise UserError(
             f"{view.image_path} is {pixels.shape[1]}x{pixels.shape[0]} pixels, but was "
             f"{view.width}x{view.height} when the scene was read",
             fix="do not change the photographs during a run; start the run again",
         )
+    valid = np.ones(pixels.shape[:2], bool)
+    matte = opacity if view.alpha == "background" else None
+    if opacity is not None and view.alpha == "mask":
+        valid = opacity >= _ALPHA_VALID * np.iinfo(opacity.dtype).max
     if view.mask_path is not None:
         valid &= _decode_mask(view)
     if view.own_car is not None:
@@ -160,8 +169,13 @@ def _prepare(view: View, width: int, height: int) -> Decoded:
         covered = view.own_car.astype(np.float32)
         valid &= cv2.resize(covered, (view.width, view.height)) == 0
     shrunk = (width, height) != (view.width, view.height)
-    if view.distortion is not None or shrunk:
+    alpha = None
+    if view.distortion is not None or shrunk or matte is not None:
         ldr = floats(pixels)
+        if matte is not None:
+            # What is transparent must not colour its neighbours: all four are resampled together.
+            opaque = floats(matte)[..., None]
+            ldr = np.concatenate([ldr * opaque, opaque], axis=2)
         if view.distortion is not None:
             maps = undistortion_maps(view.K, view.distortion, view.width, view.height)
             ldr = cv2.remap(ldr, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -173,8 +187,11 @@ def _prepare(view: View, width: int, height: int) -> Decoded:
                 valid, lambda v: cv2.resize(v, size, interpolation=cv2.INTER_AREA)
             )
         pixels = np.rint(ldr * np.float32(np.iinfo(np.uint16).max)).astype(np.uint16)
+        if matte is not None:
+            pixels, alpha = np.ascontiguousarray(pixels[..., :3]), pixels[..., 3].copy()
+            alpha.flags.writeable = False
     pixels.flags.writeable = valid.flags.writeable = False
-    return Decoded(pixels, valid)
+    return Decoded(pixels, valid, alpha)
 
 
 def _resample_valid(
@@ -183,25 +200,23 @@ def _resample_valid(
     return np.asarray(resample(valid.astype(np.float32))) >= _FULL
 
 
-def _decode(path: Path) -> tuple[np.ndarray, Bool[np.ndarray, "h w"]]:
-    """Return pixels as stored, [h w 3] uint8 or uint16 in RGB order, and where they are opaque.
+def _decode(path: Path) -> tuple[np.ndarray, UInt[np.ndarray, "h w"] | None]:
+    """Return pixels as stored, [h w 3] uint8 or uint16 in RGB order, and alpha if there is any.
 
     EXIF rotation is ignored, as COLMAP does: poses belong to the stored raster.
     """
-    raw = _read_raster(path)
+    raw = _read_raster(path, colours=True)
     if raw.dtype not in (np.uint8, np.uint16):
         raise UserError(
             f"{path} has {raw.dtype} pixels; photographs need 8 or 16 bits per channel",
             fix="export it as PNG or JPEG",
         )
-    valid = np.ones(raw.shape[:2], bool)
     channels = 1 if raw.ndim == 2 else raw.shape[2]
-    if channels in (2, 4):
-        valid = raw[..., -1] >= _ALPHA_VALID * np.iinfo(raw.dtype).max
+    opacity = raw[..., -1] if channels in (2, 4) else None
     if channels <= 2:
         raw = raw[..., None] if raw.ndim == 2 else raw[..., :1]
         raw = np.repeat(raw, 3, axis=2)
-    return np.ascontiguousarray(raw[..., 2::-1]), valid
+    return np.ascontiguousarray(raw[..., 2::-1]), opacity
 
 
 def _decode_mask(view: View) -> Bool[np.ndarray, "h w"]:
@@ -226,7 +241,8 @@ def _decode_mask(view: View) -> Bool[np.ndarray, "h w"]:
     )
 
 
-def _read_raster(path: Path) -> np.ndarray:
+def _read_raster(path: Path, *, colours: bool = False) -> np.ndarray:
+    """Return what a file holds; `colours`: with its colour profile applied."""
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -241,7 +257,7 @@ def _read_raster(path: Path) -> np.ndarray:
         raw = None
     if raw is None or not _complete(path, data):
         raise undecodable(path)
-    return raw
+    return applied(data, raw) if colours else raw
 
 
 def _complete(path: Path, data: bytes) -> bool:

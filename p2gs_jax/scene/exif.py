@@ -10,6 +10,8 @@ from pathlib import Path
 
 from PIL import ExifTags, Image
 
+from p2gs_jax.scene.photographs.sizes import exif_of
+
 _EXPOSURE_TIME, _F_NUMBER, _TAKEN = 0x829A, 0x829D, 0x9003
 # PhotographicSensitivity is 16 bits: 65535 there means "see the others".
 _SENSITIVITIES = (0x8827, 0x8833, 0x8832, 0x8831)
@@ -69,6 +71,8 @@ def read_exif_camera(path: Path) -> str:
 
 
 def _exif_tags(path: Path) -> dict:
+    if (own := exif_of(path)) is not None:
+        return {**own, **own.get_ifd(ExifTags.IFD.Exif)}
     # PIL raises many kinds of errors on malformed EXIF (struct, Syntax, Value, OS, ...).
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(path) as image:

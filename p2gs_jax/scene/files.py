@@ -12,8 +12,12 @@ from PIL import Image
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
+from p2gs_jax.scene.photographs.kinds import DEVELOPED_SUFFIXES
+from p2gs_jax.scene.photographs.sizes import size_of
 
-IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".ppm"})
+IMAGE_SUFFIXES = DEVELOPED_SUFFIXES | {
+    *(".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".ppm")
+}
 _ASPECT_TOLERANCE = 0.01
 
 
@@ -37,8 +41,10 @@ def image_size(path: Path) -> tuple[int, int]:
     """Return (width, height) as stored, before any EXIF rotation.
 
     Raises:
-        UserError: the file is no image.
+        UserError: the file is no image, or a package that opens it is missing.
     """
+    if (size := size_of(path)) is not None:
+        return size
     try:
         with Image.open(path) as image:
             return image.size

@@ -9,11 +9,15 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt
 
 from p2gs_jax.config import DataConfig
+from p2gs_jax.scene.backdrop import RANDOM, backdrop_of
 from p2gs_jax.scene.decoded import Decoded, DecodedPhotographs, Key, floats
 from p2gs_jax.scene.drives.moving import MovingObjects
 from p2gs_jax.scene.drives.object_masks import MARGIN, outlines, painted
 from p2gs_jax.scene.geometry import scale_intrinsics
 from p2gs_jax.types import Placement, TrackedObject, View
+
+# A background shows through what is less opaque.
+OPAQUE = 0.999
 
 
 def size_at(view: View, max_width: int | None, shrink: float = 1.0) -> tuple[int, int]:
@@ -46,6 +50,11 @@ class ImageStore:
 
     Decoded images are kept up to `cfg.cache_mb` (`scene/decoded.py`). All methods may be called
     from any thread.
+
+    Attributes:
+        backdrop: display values of the background that photographs with alpha are shown over; None:
+            none is shown over any.
+        random_backdrop: training draws another for every step.
     """
 
     def __init__(
@@ -59,13 +68,17 @@ class ImageStore:
 
         Args:
             views: of the scene.
-            cfg: `max_width` and `cache_mb`.
+            cfg: `max_width`, `cache_mb` and `background`.
             objects: pixels in the boxes of those that move are left out.
             moving: objects that Gaussians belong to, for the cameras.
         """
         self.views = tuple(views)
         self.moving = moving
         self._max_width = cfg.max_width
+        matted = any(view.alpha == "background" for view in views)
+        self.backdrop = backdrop_of(cfg) if matted else None
+        self.random_backdrop = matted and cfg.background == RANDOM
+        self._only_opaque = False
         self._photographs = DecodedPhotographs(views, cfg.cache_mb * 2**20)
         self._placements: dict[int, Placement] = {}
         self._leave_out(objects, MARGIN)
@@ -88,6 +101,25 @@ class ImageStore:
         return other
 
     @property
+    def backdrop_values(self) -> tuple[float, float, float] | None:
+        """The backdrop as a display transform has it."""
+        if self.backdrop is None:
+            return None
+        red, green, blue = map(float, self.backdrop)
+        return red, green, blue
+
+    def only_opaque(self) -> ImageStore:
+        """Return a store of the same photographs that leaves out where a background shows through.
+
+        Exposures and seeds come from what is there.
+        """
+        if self.backdrop is None:
+            return self
+        other = copy.copy(self)
+        other._only_opaque = True
+        return other
+
+    @property
     def cached_bytes(self) -> int:
         """Bytes of decoded photographs held now."""
         return self._photographs.cached_bytes
@@ -102,27 +134,52 @@ class ImageStore:
             shrink: factor >= 1 below the full size.
 
         Returns:
-            Display-encoded colours in [0, 1], and the mask: 1 = use, 0 = ignore (masked,
-            transparent, of an object that is left out, or outside the photograph after
-            undistortion).
+            Display-encoded colours in [0, 1], with alpha over the backdrop, and the mask: 1 = use,
+            0 = ignore (masked, transparent, of an object that is left out, or outside the
+            photograph after undistortion).
 
         Raises:
             UserError: the file or its mask is missing, broken or of another size than the model's.
         """
         pixels, valid = self.stored(index, shrink)
-        return floats(pixels), valid.astype(np.float32)
+        ldr, alpha = floats(pixels), self._alpha(index, shrink)
+        if alpha is not None and self.backdrop is not None:
+            ldr += (1 - floats(alpha)[..., None]) * self.backdrop
+        return ldr, valid.astype(np.float32)
 
     def stored(
         self, index: int, shrink: float = 1.0
     ) -> tuple[UInt[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-        """Return a photograph as it is cached, read-only: integers whose maximum stands for 1."""
+        """Return a photograph as it is cached, read-only: integers whose maximum stands for 1.
+
+        One with alpha is premultiplied by it.
+        """
         key = self._key(index, shrink)
         entry: Decoded = self._photographs.get(key)
+        valid = entry.valid
+        if self._only_opaque and entry.alpha is not None:
+            valid = valid & (entry.alpha >= OPAQUE * np.iinfo(entry.alpha.dtype).max)
         covered = self._covered(index)
         if not covered:
-            return entry.pixels, entry.valid
+            return entry.pixels, valid
         boxes = painted(covered, self.views[index], key.width, key.height)
-        return entry.pixels, entry.valid & ~boxes
+        return entry.pixels, valid & ~boxes
+
+    def alpha(self, index: int, shrink: float = 1.0) -> UInt[np.ndarray, "h w"] | None:
+        """Return the opacity of a photograph as it is cached.
+
+        None: the scene is shown over no background. Photographs without alpha are opaque.
+        """
+        if self.backdrop is None:
+            return None
+        found = self._alpha(index, shrink)
+        if found is None:
+            key = self._key(index, shrink)
+            found = np.full((key.height, key.width), np.iinfo(np.uint16).max, np.uint16)
+        return found
+
+    def _alpha(self, index: int, shrink: float) -> UInt[np.ndarray, "h w"] | None:
+        return self._photographs.get(self._key(index, shrink)).alpha
 
     def camera(
         self, index: int, shrink: float = 1.0

@@ -24,7 +24,7 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.files import check_missing, image_size, list_images
 from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.scene.split import assign_split
+from p2gs_jax.scene.split import split_scene
 from p2gs_jax.scene.visibility import project_points, unoccluded
 from p2gs_jax.types import Scene, View
 
@@ -88,7 +88,8 @@ def load_rig(root: Path, cfg: DataConfig) -> Scene:
     scans = sorted((root / SCANS).glob("*.bin"))
     if scans and lidar is not None:
         points, voxel = _read_scans(scans, lidar)
-        points, colors, unseen = _colored(points, assign_split(tuple(views), cfg.test_every), cfg)
+        without = Scene(root, "rig", tuple(views), points, None)
+        points, colors, unseen = _colored(points, split_scene(without, cfg).views, cfg)
         notes.append(
             f"LiDAR: {len(scans)} scans thinned to {len(points)} points, one per {voxel:.2f} m; "
             f"{unseen} more are seen by no training view."

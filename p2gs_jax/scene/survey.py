@@ -11,12 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from p2gs_jax.config import DataConfig
-from p2gs_jax.scene import PhotographsAlone, find_scene, with_what_lies_beside
+from p2gs_jax.scene import PhotographsAlone, Video, find_scene, with_what_lies_beside
 from p2gs_jax.scene.drives.assemble import SWEEP_SLACK_S, assemble
 from p2gs_jax.scene.drives.choose import chosen_frames
 from p2gs_jax.scene.drives.recording import Recording
 from p2gs_jax.scene.exif import read_exif_ev
 from p2gs_jax.scene.files import image_size
+from p2gs_jax.scene.video.frames import expected_frames, video_size
 from p2gs_jax.types import Scene, View
 
 
@@ -103,6 +104,9 @@ def survey(
     found = find_scene(root, cfg, report)
     if isinstance(found, PhotographsAlone):
         return Survey(Path(root), "images", _sizes(found), lacks=("cameras", "points"))
+    if isinstance(found, Video):
+        of_video = SurveyedCamera("", expected_frames(found.path) or 0, video_size(found.path))
+        return Survey(Path(root), "video", (of_video,), lacks=("cameras", "points"))
     sweeps, frames = None, None
     if isinstance(found, Recording):
         scene = assemble(found, cfg, None, report, write_embedded=False)

@@ -1,7 +1,9 @@
-"""nerfstudio's and instant-ngp's `transforms.json`: known poses, no points.
+"""nerfstudio's and instant-ngp's `transforms.json`, and Blender's, one for each part of the split.
 
 Poses are camera-to-world with OpenGL axes (x right, y up, z backwards); intrinsics follow COLMAP
-(pixel centres at +0.5), from which both tools take them.
+(pixel centres at +0.5), from which both tools take them. Of nerfstudio's other fields
+`ply_file_path` names seed points in the axes of the poses, `train_filenames`, `test_filenames` and
+`val_filenames` the split; `aabb_scale` means nothing to splats.
 """
 
 from __future__ import annotations
@@ -10,8 +12,8 @@ import json
 import math
 import os
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,23 +24,41 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.scene.colmap import subfolder
 from p2gs_jax.scene.files import IMAGE_SUFFIXES, check_missing, check_size, image_size
 from p2gs_jax.scene.geometry import intrinsics, make_distortion, scale_intrinsics
-from p2gs_jax.types import Distortion, Scene, View
+from p2gs_jax.scene.point_cloud import read_points
+from p2gs_jax.scene.split_lists import lists_in, split_as_listed
+from p2gs_jax.types import Distortion, Scene, Split, View
 
 _PINHOLES = frozenset({"PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"})
 _FISHEYE = "OPENCV_FISHEYE"
 _FIX = "correct the file, or write it again with the tool that made it"
+_LISTS = {"train": "train_filenames", "test": "test_filenames", "val": "val_filenames"}
+_ASPECT = 0.01
 
 
 @dataclass(frozen=True)
 class _Frame:
-    """A frame before its image has been looked at: path relative to the json's folder."""
+    """A frame before its image has been looked at.
+
+    Attributes:
+        path: relative to the json's folder.
+        values: of the frame, over those of its file.
+        source: the file.
+        split: of all frames of the file.
+    """
 
     path: Path
     values: Mapping
+    source: Path
+    split: Split
+
+
+def is_blender(root: Path) -> bool:
+    """Return whether a folder carries one transforms.json for each part of the split."""
+    return (root / "transforms_train.json").is_file()
 
 
 def load_transforms(root: Path, json_path: Path, cfg: DataConfig) -> Scene:
-    """Read the poses and intrinsics; the scene has no points and no tracks yet.
+    """Read the poses and intrinsics; the scene has no tracks yet, and points if the file names any.
 
     Args:
         root: what the user named.
@@ -47,11 +67,45 @@ def load_transforms(root: Path, json_path: Path, cfg: DataConfig) -> Scene:
 
     Raises:
         UserError: the file is malformed (the line or the frame is named), its lens model is not
-            supported, or images are missing or of another size.
+            supported, images are missing or of another size, or it lists views that it has not.
     """
     data = _parse(json_path)
-    frames = _frames(json_path, data)
-    folder = json_path.parent
+    scene = _assembled(root, "transforms", _frames(json_path, data), cfg)
+    points = data.get("ply_file_path")
+    if isinstance(points, str) and points:
+        scene = replace(scene, **read_points(json_path.parent / points)._asdict())
+    lists = lists_in(json_path, data, _LISTS)
+    if lists is None or cfg.split is not None or not cfg.test_every:
+        return scene
+    return split_as_listed(scene, lists, allow_missing=cfg.allow_missing)
+
+
+def load_blender(root: Path, cfg: DataConfig) -> Scene:
+    """Read the views of NeRF's synthetic scenes, and of all that are laid out as they are.
+
+    `transforms_train.json` is trained on and `transforms_test.json` held out;
+    `transforms_val.json` takes its place where there is none. All views are of one camera.
+
+    Args:
+        root: the folder with these files.
+        cfg: the image folder, and whether images may be missing.
+
+    Raises:
+        UserError: as of `load_transforms`; or a photograph is listed in both.
+    """
+    train = root / "transforms_train.json"
+    others = [root / f"transforms_{name}.json" for name in ("test", "val")]
+    test = next((path for path in others if path.is_file()), None)
+    frames = _frames(train, _parse(train))
+    if test is not None:
+        frames += _frames(test, _parse(test), "test")
+    scene = _assembled(root, "blender", frames, cfg)
+    return scene if test is None else replace(scene, split_by=test.name)
+
+
+def _assembled(root: Path, name: str, frames: Sequence[_Frame], cfg: DataConfig) -> Scene:
+    """Return a scene of frames; those of Blender's scenes are all of one camera."""
+    folder = frames[0].source.parent
     # Names are relative to the deepest folder that holds all images, as `images/` for COLMAP.
     common = Path(os.path.commonpath([frame.path.parent for frame in frames]))
     image_folder = folder / common
@@ -63,36 +117,68 @@ def load_transforms(root: Path, json_path: Path, cfg: DataConfig) -> Scene:
                 fix="correct the option --images",
             )
     found: list[tuple[str, _Frame]] = []
-    missing: list[str] = []
-    for frame in frames:
-        name = _with_suffix(image_folder, frame.path.relative_to(common))
-        if name is None:
-            missing.append(frame.path.as_posix())
-        else:
-            found.append((name, frame))
-    notes = check_missing(missing, len(frames), json_path, cfg)
-    twice = [name for name, n in Counter(name for name, _ in found).items() if n > 1]
-    if twice:
-        raise UserError(f"{json_path} lists {twice[0]} more than once", fix=_FIX)
-
+    notes: list[str] = []
+    for source in dict.fromkeys(frame.source for frame in frames):
+        own = [frame for frame in frames if frame.source == source]
+        missing = []
+        for frame in own:
+            where = _with_suffix(image_folder, frame.path.relative_to(common))
+            if where is None:
+                missing.append(frame.path.as_posix())
+            else:
+                found.append((where, frame))
+        notes += check_missing(missing, len(own), source, cfg)
+    _require_once(found)
     views, resized = [], 0
-    for name, frame in sorted(found, key=lambda item: item[0]):
-        view, differs = _view(json_path, {**data, **frame.values}, image_folder, name)
-        views.append(view)
+    for where, frame in sorted(found, key=lambda item: item[0]):
+        view, differs = _view(frame, image_folder, where)
+        views.append(replace(view, camera="0") if name == "blender" else view)
         resized += differs
     if resized:
+        said = " and ".join(dict.fromkeys(frame.source.name for frame in frames))
         notes.append(
-            f"{resized} images have another size than {json_path.name} says: intrinsics were "
-            "rescaled"
+            f"{resized} images have another size than {said} says: intrinsics were rescaled"
         )
+    _require_one_shape(views, dict(found))
     return Scene(
         root=root,
-        format="transforms",
+        format=name,
         views=tuple(views),
         points=np.zeros((0, 3), np.float32),
         point_colors=np.zeros((0, 3), np.uint8),
         notes=tuple(notes),
     )
+
+
+def _require_once(found: Sequence[tuple[str, _Frame]]) -> None:
+    """Refuse photographs that are listed twice."""
+    twice = [name for name, n in Counter(name for name, _ in found).items() if n > 1]
+    if not twice:
+        return
+    sources = [frame.source for name, frame in found if name == twice[0]]
+    if len(set(sources)) == 1:
+        raise UserError(f"{sources[0]} lists {twice[0]} more than once", fix=_FIX)
+    raise UserError(
+        f"{sources[0]} and {sources[1].name} both list {twice[0]}: it cannot be both trained "
+        "on and held out",
+        fix=f"take it out of one of them, or name {sources[0]} itself for every 8th view",
+    )
+
+
+def _require_one_shape(views: Sequence[View], frames: Mapping[str, _Frame]) -> None:
+    """Refuse photographs of several shapes where only the photographs say which is right."""
+    free = [v for v in views if not {"w", "h"} <= set(frames[v.name].values)]
+    for view in free:
+        first = free[0]
+        shapes = (view.width / view.height) / (first.width / first.height)
+        if abs(shapes - 1) > _ASPECT:
+            raise UserError(
+                f"wrong size: {view.image_path} is {view.width}x{view.height}, {first.name} "
+                f"{first.width}x{first.height}, and {frames[view.name].source} gives all of them "
+                "one lens",
+                fix="use the photographs that belong to the poses, neither cropped nor rotated, or "
+                'give frames their own "w", "h" and "fl_x"',
+            )
 
 
 def _parse(path: Path) -> dict:
@@ -112,7 +198,7 @@ def _parse(path: Path) -> dict:
     return data
 
 
-def _frames(path: Path, data: dict) -> list[_Frame]:
+def _frames(path: Path, data: dict, split: Split = "train") -> list[_Frame]:
     frames = []
     for i, values in enumerate(data["frames"]):
         name = values.get("file_path") if isinstance(values, dict) else None
@@ -121,7 +207,7 @@ def _frames(path: Path, data: dict) -> list[_Frame]:
         normal = os.path.normpath(name.replace("\\", "/"))
         if os.path.isabs(normal):
             normal = os.path.relpath(normal, path.parent.resolve())
-        frames.append(_Frame(Path(normal), values))
+        frames.append(_Frame(Path(normal), {**data, **values}, path, split))
     return frames
 
 
@@ -137,7 +223,8 @@ def _with_suffix(folder: Path, relative: Path) -> str | None:
     return None
 
 
-def _view(path: Path, values: dict, image_folder: Path, name: str) -> tuple[View, bool]:
+def _view(frame: _Frame, image_folder: Path, name: str) -> tuple[View, bool]:
+    path, values = frame.source, frame.values
     image_path = image_folder / name
     try:
         width, height = int(values["w"]), int(values["h"])
@@ -163,12 +250,13 @@ def _view(path: Path, values: dict, image_folder: Path, name: str) -> tuple[View
         height=h,
         distortion=distortion,
         mask_path=mask_path,
+        split=frame.split,
     )
     return view, differs
 
 
 def _lens(
-    path: Path, values: dict, name: str, width: int, height: int
+    path: Path, values: Mapping, name: str, width: int, height: int
 ) -> tuple[Float[np.ndarray, "3 3"], Distortion | None]:
     model = str(values.get("camera_model", "OPENCV")).upper()
     fisheye = model == _FISHEYE or bool(values.get("is_fisheye"))

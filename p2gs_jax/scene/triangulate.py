@@ -23,18 +23,27 @@ LONG_ENOUGH = 800
 LINKS = "photographs"
 
 
-def triangulate(scene: Scene, work_dir: Path | None, report: Callable[[str], None]) -> Scene:
+def triangulate(
+    scene: Scene,
+    work_dir: Path | None,
+    report: Callable[[str], None],
+    *,
+    only_training: bool = False,
+) -> Scene:
     """Return the scene with points and tracks; poses and intrinsics stay as they are.
+
+    Where nothing matches there are none.
 
     Args:
         scene: posed views.
         work_dir: keeps the result under `triangulated/`.
         report: receives progress.
+        only_training: leave held-out views out.
 
     Raises:
-        UserError: no point could be triangulated.
+        UserError: there is only one view.
     """
-    views = scene.views
+    views = tuple(scene.training_views) if only_training else scene.views
     if len(views) < 2:
         raise _failed(scene.root)
     key = {
@@ -50,9 +59,9 @@ def triangulate(scene: Scene, work_dir: Path | None, report: Callable[[str], Non
 
     with cached_folder(work_dir, "triangulated", key, build) as folder:
         model = read_model(folder)
-        tracks = tracks_of(model, views)
+        tracks = tracks_of(model, scene.views)
     if tracks is None:
-        raise _failed(scene.root)
+        return scene
     report(f"triangulated {len(model.xyz)} points with {len(tracks.xy)} observations")
     return dataclasses.replace(
         scene, points=model.xyz.astype(np.float32), point_colors=model.rgb, tracks=tracks

@@ -26,7 +26,7 @@ from p2gs_jax.train.object_poses import move_poses, placed_by, seen_by
 from p2gs_jax.train.optimizer import Optimizer, OptState, learning_rates, means_rate
 from p2gs_jax.train.state import FAULT_NONE, FAULT_NONFINITE, FAULT_OVERFLOW, Fault, FitState
 from p2gs_jax.train.update import update_listed
-from p2gs_jax.types import Frustum, Gaussians, Params, Photometry, Population
+from p2gs_jax.types import Frustum, Gaussians, Params, Photometry, Population, Vibration
 
 
 class Controls(eqx.Module):
@@ -59,11 +59,8 @@ class StepReport(NamedTuple):
     visible: Int[Array, ""]
 
 
-GRADIENT_NAMES = (
-    *(f"gradient of {f.name}" for f in dataclasses.fields(Gaussians)),
-    "gradient of exposures",
-    "gradient of gammas",
-)
+OF_GAUSSIANS = tuple(f.name for f in dataclasses.fields(Gaussians) if f.name != "vibration")
+OF_VIBRATION = tuple(f.name for f in dataclasses.fields(Vibration))
 
 
 def finite_names(terms: dict, params: Params) -> tuple[str, ...]:
@@ -79,7 +76,10 @@ def finite_names(terms: dict, params: Params) -> tuple[str, ...]:
         "gradient of object poses": params.poses,
     }
     rest = (name for name, value in given.items() if value is not None)
-    return (*(f"loss term {k}" for k in terms), *GRADIENT_NAMES, *rest)
+    vibration = () if params.gaussians.vibration is None else OF_VIBRATION
+    always = (*OF_GAUSSIANS, *vibration, "exposures", "gammas")
+    of = (f"gradient of {name}" for name in always)
+    return (*(f"loss term {k}" for k in terms), *of, *rest)
 
 
 def advance(

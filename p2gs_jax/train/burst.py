@@ -7,6 +7,7 @@ import time
 
 from p2gs_jax.config import TrainConfig
 from p2gs_jax.core.clock import Stopwatch
+from p2gs_jax.core.runtime import return_freed_memory
 from p2gs_jax.errors import DivergenceError
 from p2gs_jax.train import room, schedule
 from p2gs_jax.train.advance import StepReport, finite_names
@@ -65,6 +66,7 @@ class Bursts:
         shrink = schedule.shrink_at(host.progress, self.levels)
         if shrink != host.shrink:
             host.shrink, host.step_s = shrink, 0.0
+            return_freed_memory()
         begin, waited = time.monotonic(), self.steps.programs.waited_s
         state, reports, sizes = self._dispatched(state, host)
         kind = int(state.fault.kind)

@@ -26,6 +26,8 @@ class HostState:
         step_s: running estimate of the seconds a step takes at this level, compiling apart; 0:
             none was timed yet.
         growth: how far automatic growth has come.
+        looked_at: progress of the last look for what no static scene explains.
+        looked_step: the step after which it was, 0: there was none.
     """
 
     step: int = 0
@@ -40,6 +42,8 @@ class HostState:
     shrink: int = 0
     step_s: float = 0.0
     growth: Growth = field(default_factory=Growth)
+    looked_at: float = 0.0
+    looked_step: int = 0
 
     @classmethod
     def from_dict(cls, values: dict) -> HostState:

@@ -58,7 +58,7 @@ class InputSource:
         """
         degree = schedule.sh_degree_at(progress, self.cfg.train, self.cfg.render.sh_degree)
         return Inputs(
-            self.views.batch(self.views.index_at(step), shrink),
+            self.views.batch(self.views.index_at(step), shrink, step),
             partner_at(step, shrink, self.views, self.pairs, self.cfg),
             on_host(Controls, np.float32(progress), np.int32(degree)),
         )

@@ -23,14 +23,18 @@ from jaxtyping import Bool
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.core.progress import LogRecord
+from p2gs_jax.evaluate.unexplained import Unexplained
 from p2gs_jax.gaussians.population import STEP_SECONDS_PER_PIXEL, Coverage
 from p2gs_jax.losses.relative_exposure import ColorPairs
 from p2gs_jax.run.decisions import Decisions
+from p2gs_jax.run.layout import RunFolder
+from p2gs_jax.run.left_out_file import LeftOutFile
 from p2gs_jax.train import room, schedule
 from p2gs_jax.train.burst import Bursts
 from p2gs_jax.train.checkpoints import RunCheckpoints
 from p2gs_jax.train.host import HostState
 from p2gs_jax.train.inputs import InputSource
+from p2gs_jax.train.left_out import LeftOut
 from p2gs_jax.train.level_programs import LevelPrograms
 from p2gs_jax.train.log import RunLog, record_of
 from p2gs_jax.train.optimizer import make_optimizer
@@ -57,6 +61,8 @@ class TrainResult:
         growth: the history of automatic growth, as JSON values; None where it was not asked for.
         seconds: of this session, by name: compiling (waited for), steps, densification,
             checkpoints.
+        left_out: what no static scene explains and the last steps left out, by row of the scene;
+            None where it was not looked for.
     """
 
     state: FitState
@@ -64,6 +70,7 @@ class TrainResult:
     max_gaussians: int
     growth: dict | None = None
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
+    left_out: dict[int, Unexplained] | None = None
 
 
 class Trainer:
@@ -107,6 +114,8 @@ class Trainer:
         self.clock = Stopwatch()
         self.log = RunLog(run_dir, on_log)
         self.checkpoints = RunCheckpoints(run_dir, cfg, decided, on_message)
+        masks = LeftOutFile(RunFolder(run_dir).left_out_masks)
+        self.left_out = LeftOut(cfg, views, masks, self.clock, on_message)
         self.optimizer = make_optimizer(cfg)
         self.source = InputSource(cfg, views, pairs)
         step = Step(cfg, self.optimizer, extent)
@@ -165,6 +174,7 @@ class Trainer:
             self.log.truncate(host.step)
             pace = dataclasses.replace(pace, per_step=host.pace)
         strategy.begin(host)
+        self.left_out.begin(host)
         full_step_s = STEP_SECONDS_PER_PIXEL * self.coverage.pixels
         session = Session(pace, host, finish_s=finish_s, full_step_s=full_step_s)
         population = state.population
@@ -179,6 +189,7 @@ class Trainer:
             strategy.limit or state.params.gaussians.capacity,
             strategy.summary(host),
             {"compiling": self.programs.waited_s, **self.clock.seconds},
+            self.left_out.summary(),
         )
 
     def expect(self, params: Params, owner, images: bool) -> None:
@@ -206,6 +217,9 @@ class Trainer:
             state, stepped = self._take_burst(state, host, session)
             if stepped:
                 state, host = strategy.update(state, host, session)
+            if self.left_out.due(host):
+                self.left_out.look(state, host)
+                session.tick(host)
             session.replan(host)
             if session.over(host):
                 if host.progress < NEARLY_DONE:

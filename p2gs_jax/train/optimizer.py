@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 from p2gs_jax.config import FitConfig
 from p2gs_jax.gaussians.population import grow
 from p2gs_jax.photometry.models import MODELS
-from p2gs_jax.types import Gaussians, Params, Photometry
+from p2gs_jax.types import Gaussians, Params, Photometry, Vibration
 
 # For exposures, gammas and corrections (Kingma and Ba).
 B1, B2 = 0.9, 0.999
@@ -192,6 +192,9 @@ def learning_rates(
             log_scales=o.scales * decay,
             opacity_logits=o.opacities * decay,
             sh=sh,
+            vibration=None
+            if like.gaussians.vibration is None
+            else Vibration(o.velocities * decay, o.peaks * decay, o.lives * decay),
         ),
         photometry=Photometry(
             o.exposures * gate * (varies.exposure == "view"),

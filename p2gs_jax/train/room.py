@@ -18,6 +18,7 @@ from p2gs_jax.render.capacity import Room
 from p2gs_jax.render.cutoff import smallest_cutoff
 from p2gs_jax.render.objects import camera_of_each
 from p2gs_jax.render.project import LOG_SCALE_RANGE, TANGENT_LIMIT
+from p2gs_jax.render.vibration import at_time
 from p2gs_jax.render.visible import in_view
 from p2gs_jax.train.views import TrainingViews
 from p2gs_jax.types import Camera, Gaussians
@@ -44,6 +45,7 @@ def count_view(
         cfg: near plane, blur, cutoffs, tile size.
         owner: the moving object that each Gaussian belongs to, or None.
     """
+    gaussians = at_time(gaussians, camera.objects)
     camera = camera_of_each(camera, owner)  # pyright: ignore[reportArgumentType]
     seen = in_view(gaussians, alive, camera, cfg)  # pyright: ignore[reportArgumentType]
     shown = jax.tree.map(lambda a: a[seen], gaussians)

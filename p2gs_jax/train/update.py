@@ -29,14 +29,14 @@ class Updated(NamedTuple):
         gaussians: with the listed ones moved.
         moments: likewise.
         value: of the loss that belongs to the Gaussians, summed over the blocks.
-        finite: whether the gradient of each field is finite, in the order of `Gaussians`.
+        finite: whether the gradient of each array is finite, in the order of `Gaussians`.
         v_placed: gradient of the loss by `placed`, summed over the blocks.
     """
 
     gaussians: Gaussians
     moments: AdamState
     value: Any
-    finite: Bool[Array, " 5"]
+    finite: Bool[Array, " f"]
     v_placed: Any
 
 

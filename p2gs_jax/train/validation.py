@@ -81,22 +81,26 @@ def make_judge(
     render, tone = make_renderer(cfg.render), cfg.photometry
 
     def judge(params: Params, population: Population) -> float:
+        backdrop = views.store.backdrop_values
         small = jax.tree.map(np.asarray, dataclasses.replace(params, gaussians=None))
         taken_by = [views.store.views[i].camera for i in views.rows]
         scores = []
         for row in rows:
             photograph, mask = views.store.get(views.rows[row])
             (camera,) = with_corrections((views.camera(row, 1),), params.poses)
-            linear = render(params.gaussians, population.alive, camera, population.owner).linear
+            shown = render(params.gaussians, population.alive, camera, population.owner)
+            linear, alpha = shown.linear, shown.alpha
             transform = usual_display(small, taken_by, taken_by[row], tone)
             if own_exposures:
                 own = display_of_view(small, row, tone)
                 transform = dataclasses.replace(own, correction=transform.correction)
             else:
-                how = (transform.capture, tone, transform.correction)
+                matte = dataclasses.replace(transform, backdrop=backdrop).matte(alpha)
+                how = (transform.capture, tone, transform.correction, matte)
                 exposure = float(fit_exposure(linear, photograph, mask, *how))
                 transform = dataclasses.replace(transform, exposure=exposure)
-            ldr = develop(linear, transform)
+            transform = dataclasses.replace(transform, backdrop=backdrop)
+            ldr = develop(linear, transform, alpha=alpha)
             scores.append(float(psnr(ldr, photograph, mask)))
         return float(np.mean(scores))
 

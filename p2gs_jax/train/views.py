@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
+import cv2
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Float32, Int
 
 from p2gs_jax.core.numerics import on_host
 from p2gs_jax.core.streams import Stream, generator, view_order
@@ -38,6 +39,7 @@ class TrainingViews:
         self.overlaps = overlaps
         self.measured = measured
         self._orders: dict[int, np.ndarray] = {}
+        self._hidden: dict[int, Bool[np.ndarray, "a b"]] = {}
         self.leave_out(())
 
     def __len__(self) -> int:
@@ -51,6 +53,15 @@ class TrainingViews:
         """
         self._kept = np.setdiff1d(np.arange(len(self.rows)), np.asarray(without, int))
         self._orders = {}
+
+    def hide(self, masks: Mapping[int, Bool[np.ndarray, "a b"]]) -> None:
+        """Leave pixels out of all batches from here on, and take back those left out before.
+
+        Args:
+            masks: which, at any resolution, by row in `Photometry`; views that are missing are
+                shown whole.
+        """
+        self._hidden = {row: mask for row, mask in masks.items() if mask.any()}
 
     def index_at(self, step: int) -> int:
         """Return the row in `Photometry` of the view of a step; every epoch is a permutation."""
@@ -84,8 +95,41 @@ class TrainingViews:
         row = self.rows[index]
         return on_host(Camera, *self.store.camera(row, shrink), self.store.placement(row))
 
-    def batch(self, index: int, shrink: int) -> Batch:
-        """Return a training view, on the host: a compiled step takes it from there."""
-        ldr, mask = self.store.stored(self.rows[index], shrink)
+    def batch(self, index: int, shrink: int, step: int = 0) -> Batch:
+        """Return a training view, on the host: a compiled step takes it from there.
+
+        Args:
+            index: row in `Photometry`.
+            shrink: factor by which images are shrunk.
+            step: draws the background, where every step has another.
+        """
+        row = self.rows[index]
+        ldr, mask = self.store.stored(row, shrink)
         measured = None if self.measured is None else self.measured[index]
-        return on_host(Batch, self.camera(index, shrink), ldr, mask, np.int32(index), measured)
+        if index in self._hidden:
+            hidden = self._hidden[index]
+            mask = mask & ~resized(hidden, mask.shape[1], mask.shape[0])
+            measured = None if measured is None else _outside(measured, hidden)
+        given = (self.camera(index, shrink), ldr, mask, np.int32(index), measured)
+        return on_host(Batch, *given, self.store.alpha(row, shrink), self._backdrop(step))
+
+    def _backdrop(self, step: int) -> Float32[np.ndarray, " 3"] | None:
+        if not self.store.random_backdrop:
+            return self.store.backdrop
+        return generator(self.seed, Stream.BACKDROP, step).random(3).astype(np.float32)
+
+
+def resized(
+    mask: Bool[np.ndarray, "a b"], width: int, height: int
+) -> Bool[np.ndarray, "height width"]:
+    """Return a mask at another size: at each pixel what is nearest to it."""
+    small = mask.astype(np.uint8)
+    return cv2.resize(small, (width, height), interpolation=cv2.INTER_NEAREST) > 0
+
+
+def _outside(measured: Measured, hidden: Bool[np.ndarray, "a b"]) -> Measured:
+    """Return depths without those where pixels are left out."""
+    places, size = np.asarray(measured.places), np.array(hidden.shape[::-1])
+    column, row = np.clip((places * size).astype(int), 0, size - 1).T
+    depths = np.where(hidden[row, column], np.float32(0), measured.depths)
+    return on_host(Measured, places, depths)

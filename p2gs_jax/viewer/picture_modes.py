@@ -87,7 +87,7 @@ def picture_of(
     positions = None
     if taken_by is not None and transform.vignetting:
         positions = places_in(taken_by, frame.camera)
-    ldr = develop(frame.linear, transform, positions)
+    ldr = develop(frame.linear, transform, positions, frame.alpha)
     if mode == "clipping":
         return clipping_overlay(ldr)
     if mode == "split" and photograph is not None:

@@ -14,6 +14,7 @@ from p2gs_jax.core.numerics import LN2, evenly_spaced, on_device
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.cameras import darkens
 from p2gs_jax.photometry.display import develop
+from p2gs_jax.render.vibration import at_time
 from p2gs_jax.run.read import Run
 from p2gs_jax.scene.images import size_at
 from p2gs_jax.types import Camera
@@ -64,7 +65,7 @@ class ViewedRun:
         self._distances: dict[int, float] = {}
         self.store = run.store
         # The programs of a viewer know no time.
-        self._gaussians = run.as_of()
+        self._gaussians = at_time(run.as_of(), None)
         self._alive = on_device(np.ones(self._gaussians.capacity), bool)
         self._points = run.scene.points
         if not len(self._points):
@@ -77,7 +78,7 @@ class ViewedRun:
             run.cfg.render,
             [self._probe(int(row)) for row in rows],
             self._notify,
-            lambda result: develop(result.linear, run.common_display()),
+            lambda result: develop(result.linear, run.common_display(), alpha=result.alpha),
         )
 
     def _notify(self) -> None:

@@ -85,8 +85,8 @@ def test_common_options_come_first_and_the_rest_on_request(capsys, monkeypatch):
 
 def test_a_preset_decides_the_defaults_that_help_names(capsys, monkeypatch):
     _, text = shown(capsys, monkeypatch, "fit", "--preset", "paper", "--help-all")
-    assert "(default: 30000)" in text
-    assert "(default: 30000)" not in shown(capsys, monkeypatch, "fit", "--help-all")[1]
+    of_robust = shown(capsys, monkeypatch, "fit", "--help-all")[1]
+    assert text.count("(default: 30000)") == of_robust.count("(default: 30000)") + 1
 
 
 def test_a_preset_decides_the_values():

@@ -118,7 +118,7 @@ def test_features_say_what_to_install(monkeypatch):
     assert not found["view"].ready
     assert "p2gs-jax[viewer]" in found["view"].remark
     assert "Chromium" in found["report --pdf"].remark
-    assert not found["videos (render --out x.mp4)"].ready
+    assert not found["videos (fit x.mp4, render --out x.mp4)"].ready
 
 
 def test_pycolmap_is_only_for_photographs_without_poses():

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import DataConfig, DensifyConfig, FitConfig, InitConfig, preset
+from p2gs_jax.core.srgb import srgb_encode
 from p2gs_jax.gaussians.init.brightness import MatchImages, Tones, at_common_exposure, rough_tones
 from p2gs_jax.gaussians.init.dense import MATCH_SIDE, dense_seeds
 from p2gs_jax.gaussians.init.dense_bound import coverage_of, dense_limit, wants_dense
@@ -14,7 +15,6 @@ from p2gs_jax.gaussians.init.flow import CHECKS, Flows, depth_map
 from p2gs_jax.gaussians.init.pairs import neighbours, visibility
 from p2gs_jax.gaussians.population import Coverage
 from p2gs_jax.photometry.observations import Observations
-from p2gs_jax.photometry.srgb import srgb_encode
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Scene, View
 

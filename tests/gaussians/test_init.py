@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import FitConfig, InitConfig, preset
+from p2gs_jax.core.srgb import srgb_encode
 from p2gs_jax.gaussians.init.seeds import gaussians_from_points, scene_extent, subsample
 from p2gs_jax.gaussians.init.shell import find_shell
 from p2gs_jax.photometry.observations import Observations, overlapping_views, sample_pairs
 from p2gs_jax.photometry.sources.sampling import sample
-from p2gs_jax.photometry.srgb import srgb_encode
 from p2gs_jax.render import view_radiance
 from p2gs_jax.types import Camera, View
 

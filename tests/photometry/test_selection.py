@@ -35,6 +35,18 @@ def test_what_varies_is_found(exposures, curve, gamma, model, response):
         assert any("too little to tell the shape" in r for r in s.reasons)
 
 
+def test_a_known_curve_is_not_chosen():
+    # A filmic camera would get a spline: here it is said to be none.
+    truth = make_exposures(DRIVE, "iso2")
+    seen = observe(DRIVE, truth, curve="filmic")
+    s = select(seen, **LIMITS, known_response="camera raw")
+    assert s.solution.response == Response("srgb")
+    assert {c.response.name for c in s.candidates} == {"srgb"}
+    assert "The tone curve is known (camera raw)" in s.reasons[0]
+    free = select(seen, **LIMITS)
+    assert free.solution.response.name == "spline over srgb"
+
+
 def candidate(model, parameters, density, deficit, error, difference=9.0):
     return Candidate(
         Choice(Form(model)), Response(), parameters, density, deficit, error, difference

@@ -26,9 +26,9 @@ def test_nothing_there(tmp_path):
         assert expected in str(info.value)
     with pytest.raises(UserError, match="does not exist"):
         load_scene(tmp_path / "nowhere", CFG)
-    file = tmp_path / "video.mp4"
+    file = tmp_path / "notes.txt"
     file.write_bytes(b"")
-    with pytest.raises(UserError, match=r"video.mp4 is a file"):
+    with pytest.raises(UserError, match=r"notes.txt is a file"):
         load_scene(file, CFG)
 
 

@@ -11,8 +11,8 @@ from PIL import Image
 from scipy.ndimage import map_coordinates
 
 from p2gs_jax.config import DataConfig
+from p2gs_jax.core.srgb import srgb_decode, srgb_encode
 from p2gs_jax.errors import UserError
-from p2gs_jax.photometry.srgb import srgb_decode, srgb_encode
 from p2gs_jax.scene.colmap import load_colmap
 from p2gs_jax.synth.build_town import build_town
 from p2gs_jax.synth.rig import MOUNTS, camera_viewmat, carla_rotation, image_height, intrinsics

@@ -56,7 +56,7 @@ class Views:
         K = np.diag([400.0 / shrink, 400.0 / shrink, 1.0]).astype(np.float32)
         return on_host(Camera, np.eye(4, dtype=np.float32), K, 400 // shrink, 300 // shrink)
 
-    def batch(self, index, shrink):
+    def batch(self, index, shrink, step=0):
         nothing = np.zeros((1, 1, 3), np.uint8), np.ones((1, 1), bool)
         return on_host(Batch, self.camera(index, shrink), *nothing, np.int32(index))
 

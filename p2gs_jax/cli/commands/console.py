@@ -17,6 +17,7 @@ PARTS = {
     "compiling": "waiting for the compiler",
     "steps": "steps",
     "densification": "densification",
+    "looking": "looking for what moves",
     "checkpoints": "checkpoints",
     "evaluation": "evaluation",
     "files": "files",

@@ -10,13 +10,14 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from p2gs_jax.cli.commands.console import stdout
-from p2gs_jax.cli.options.export import DISPLAY, Export, Format, check_export
+from p2gs_jax.cli.options.export import DISPLAY, SIZE_MB, Export, Format, check_export
 from p2gs_jax.core.atomic import atomic_folder, write_json
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.core.progress import Reporter, TerminalReporter
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.colmap_folder import write_colmap_folder
 from p2gs_jax.export.drive_table import drive_table, write_drive
+from p2gs_jax.export.page import MEGABYTE, write_page
 from p2gs_jax.export.sidecar import corrections_name, linear_sidecar
 from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.formats.ply import write_ply, write_radiance
@@ -35,6 +36,7 @@ from p2gs_jax.gaussians.bake import (
 from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.render.host import make_renderer
 from p2gs_jax.render.spherical_harmonics import MAX_DEGREE
+from p2gs_jax.render.vibration import at_time
 from p2gs_jax.run.appearance_file import write_appearance
 from p2gs_jax.run.read import Run, load_run
 from p2gs_jax.scene.device import camera_of
@@ -53,6 +55,7 @@ PLACES: dict[Format, tuple[str, ...]] = {
     "colmap": ("colmap",),
     "exr": ("exr",),
     "drive": ("drive.csv", "drive.json"),
+    "html": ("scene.html",),
 }
 
 
@@ -86,6 +89,8 @@ def run(options: Export) -> int:
                 said = _exr(folder, fitted, store, reporter)
             elif name == "drive":
                 said = _drive(folder, fitted)
+            elif name == "html":
+                said = _html(folder, fitted, transform, options, reporter)
             else:
                 assert display is not None
                 said = display.write(name, folder)
@@ -147,7 +152,7 @@ def _check_names(fitted: Run, formats: Sequence[Format]) -> None:
 
 
 def _linear_ply(folder: Path, fitted: Run, store: ImageStore) -> str:
-    g = fitted.as_of()
+    g = at_time(fitted.as_of(), None)
     ply, sidecar = (folder / place for place in PLACES["linear-ply"])
     activation = fitted.cfg.render.radiance
     count = write_radiance(ply, g, np.ones(g.capacity, bool), activation=activation)
@@ -214,6 +219,20 @@ def _drive(folder: Path, fitted: Run) -> str:
     return f"{len(table['views'])} photographs of {len(table['cameras'])} cameras"
 
 
+def _html(
+    folder: Path, fitted: Run, look: DisplayTransform, options: Export, reporter: Reporter
+) -> str:
+    page = write_page(
+        folder / PLACES["html"][0],
+        fitted,
+        look,
+        size_mb=SIZE_MB if options.size_mb is None else options.size_mb,
+        photographs=options.photographs or 0,
+        say=reporter.stage,
+    )
+    return " ".join([f"{page.size / MEGABYTE:.1f} MB.", *page.sentences])
+
+
 class _Display:
     """Display colours under one display transform, baked once per degree, with their error."""
 
@@ -226,7 +245,7 @@ class _Display:
         reporter: Reporter,
     ):
         self.fitted, self.transform, self.reporter = fitted, transform, reporter
-        self.gaussians, scene = fitted.as_of(), fitted.scene
+        self.gaussians, scene = at_time(fitted.as_of(), None), fitted.scene
         self.steps = max(STEPS, len(scene.train_indices)) if steps is None else steps
         self.baked: dict[int, Gaussians] = {}
         render = make_renderer(fitted.cfg.render)

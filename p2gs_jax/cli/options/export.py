@@ -13,10 +13,12 @@ from p2gs_jax.cli.options.parse import check
 from p2gs_jax.cli.options.scene import SceneFolder
 from p2gs_jax.errors import UserError
 
-Format = Literal["linear-ply", "display-ply", "splat", "spz", "colmap", "exr", "drive"]
+Format = Literal["linear-ply", "display-ply", "splat", "spz", "colmap", "exr", "drive", "html"]
 FORMATS: tuple[Format, ...] = get_args(Format)
 # The formats that hold display colours and therefore one display transform.
 DISPLAY: tuple[Format, ...] = ("display-ply", "splat", "spz")
+# What the option --size-mb is where it is not given: a page that a mail or a wiki takes.
+SIZE_MB = 20.0
 
 
 @dataclass(frozen=True)
@@ -33,25 +35,32 @@ class Export:
     """One or more: linear-ply (radiance, with a JSON file that explains it), display-ply, splat and
     spz (display colours, for viewers), colmap (undistorted photographs, model, exposures), exr
     (linear renders of all views), drive (CSV and JSON: poses in the data set's world, exposures
-    with errors)."""
+    with errors), html (one page that is the scene: linear light, developed in the browser)."""
     out: Path | None = None
     """Folder to write into (default: RUN/exports)."""
     exposure_ev: float | None = None
-    """Display colours: exposure in stops relative to the mean (default: 0)."""
+    """Display colours, and what html opens with: exposure in stops relative to the mean (default:
+    0)."""
     exposure_of: Literal["auto", "log_average", "centre", "highlights", "protected"] | None = None
-    """Display colours: exposure metered in the training views, one for all: their mean of what the
+    """The same: exposure metered in the training views, one for all: their mean of what the
     rule of `p2gs-jax render` gives; --exposure-ev then adds stops."""
     gamma: float | None = None
-    """Display colours: gamma (default: the run's mean)."""
+    """The same: gamma (default: the run's mean)."""
     curve: Literal["power", "srgb", "spline", "linear"] | None = None
-    """Display colours: base tone curve (default: the run's)."""
+    """The same: base tone curve (default: the run's)."""
     white_balance_of: str | None = None
-    """Display colours: white balance of this view (default: neutral), where views differ in it."""
+    """The same: white balance of this view (default: neutral), where views differ in it."""
     bake_steps: int | None = None
     """Display colours: steps that bring a viewer's pictures closer to the true ones; 0 takes every
     Gaussian by itself (default: 240, or one for every training view if that is more)."""
     without_objects: bool = False
     """Leave out what moves; files of Gaussians otherwise hold it as of the middle of the drive."""
+    size_mb: float | None = None
+    """html: largest size of the page, millions of bytes (default: 20). What does not fit is left
+    out, least visible first, and the page says what that costs."""
+    photographs: int | None = None
+    """html: how many photographs to embed, evenly spread, for the split view (default: none;
+    whoever has the page has them, with all they show)."""
     scene: SceneFolder = None
     """Where the run's scene lies now, if it is not where it was."""
     overwrite: bool = False
@@ -71,11 +80,23 @@ def check_export(args: Export) -> None:
     gamma = args.gamma
     check(gamma is None or (math.isfinite(gamma) and gamma > 0), "--gamma must be positive")
     check(args.bake_steps is None or args.bake_steps >= 0, "--bake-steps must be 0 or more")
-    display = ("exposure_ev", "exposure_of", "gamma", "curve", "white_balance_of", "bake_steps")
-    given = [n for n in display if getattr(args, n) is not None]
-    if given and not set(args.format) & set(DISPLAY):
+    size = args.size_mb
+    check(size is None or (math.isfinite(size) and size > 0), "--size-mb must be positive")
+    check(args.photographs is None or args.photographs >= 0, "--photographs must be 0 or more")
+    look = ("exposure_ev", "exposure_of", "gamma", "curve", "white_balance_of")
+    _require_a_use(args, look, (*DISPLAY, "html"), "a format that is developed")
+    _require_a_use(args, ("bake_steps",), DISPLAY, "a format that holds display colours")
+    _require_a_use(args, ("size_mb", "photographs"), ("html",), "the format html")
+
+
+def _require_a_use(
+    args: Export, names: tuple[str, ...], formats: tuple[Format, ...], what: str
+) -> None:
+    """Reject options that none of the requested formats heeds."""
+    given = [n for n in names if getattr(args, n) is not None]
+    if given and not set(args.format) & set(formats):
+        which = formats[0] if len(formats) == 1 else f"one of {', '.join(formats)}"
         raise UserError(
-            f"--{given[0].replace('_', '-')} says nothing without a format that holds display "
-            "colours.",
-            fix=f"leave it out, or add one of {', '.join(DISPLAY)} to --format",
+            f"--{given[0].replace('_', '-')} says nothing without {what}.",
+            fix=f"leave it out, or add {which} to --format",
         )

@@ -36,8 +36,8 @@ class Fit:
     """
 
     scene: Annotated[Path, tyro.conf.Positional]
-    """COLMAP model, transforms.json, a rig, a drive of a data set (PandaSet, nuScenes, ...), or a
-    folder of photographs (docs/scenes.md)."""
+    """COLMAP model, transforms.json, Blender's or LLFF's folder, a rig, a drive of a data set
+    (PandaSet, nuScenes, ...), a folder of photographs, or a video (docs/scenes.md)."""
     out: Folder
     """Run folder to create."""
     config: Annotated[configs.FitConfig, tyro.conf.arg(name="")]
@@ -57,7 +57,14 @@ class Fit:
     """Upper bound on the Gaussians: a whole number, or auto (grow while held-out training views
     gain by it); default: from the seeds and the pixels."""
     test_every: int | None = None
-    """Hold out every n-th view of each camera for evaluation; 0 holds out none; default: 8."""
+    """Hold out every n-th view of each camera for evaluation; 0 holds out none; default: 8, or as
+    the data set says."""
+    split: Annotated[str | None, tyro.conf.arg(metavar="FILE|every")] = None
+    """Names of the held-out photographs, a line each, or a .json with the lists train and test;
+    every: by --test-every though the data set says otherwise (docs/scenes.md)."""
+    background: Annotated[str | None, tyro.conf.arg(metavar="COLOR")] = None
+    """What photographs with alpha and their renders are put over: white, black, random (another for
+    every step) or R,G,B from 0 to 1; default: white."""
     images: Annotated[str | None, tyro.conf.arg(metavar="DIR")] = None
     """Image folder, where it is not images/ beside the model."""
     allow_missing: bool = False
@@ -68,6 +75,10 @@ class Fit:
     """Only these cameras of a drive: front, back_left, ...; default: all."""
     frames: Frames = None
     """Only these frames of a drive: FIRST:END or FIRST:END:STEP; default: all."""
+    every: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Take every N-th frame of a video; default: sharp ones, each from a new place."""
+    max_frames: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Most frames of a video that are used; default: 150."""
     known_exposures: Exposures = None
     """Exposures to keep: a CSV file (image, exposure or ev), or exif."""
     known_deviation_ev: Deviation = None
@@ -94,7 +105,7 @@ class Calibrate:
     """
 
     scene: Annotated[Path, tyro.conf.Positional]
-    """COLMAP model, transforms.json, a rig, a folder of photographs (docs/scenes.md), or a
+    """COLMAP model, transforms.json, a rig, a folder of photographs, a video (docs/scenes.md), or a
     finished run (correspondences then go through its rendered depth)."""
     out: Folder
     """Folder for photometry.json and calibration.png."""
@@ -117,6 +128,10 @@ class Calibrate:
     """Only these cameras of a drive: front, back_left, ...; default: all."""
     frames: Frames = None
     """Only these frames of a drive: FIRST:END or FIRST:END:STEP; default: all."""
+    every: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Take every N-th frame of a video; default: sharp ones, each from a new place."""
+    max_frames: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Most frames of a video that are used; default: 150."""
     preset: Preset = "robust"
     """Where all values start; see `fit`."""
 
@@ -128,12 +143,14 @@ def resolve_calibration(args: Calibrate) -> configs.FitConfig:
         UserError: a value makes no sense.
     """
     data = args.config.data
-    for name in ("max_width", "images", "drive", "frames"):
+    for name in ("max_width", "images", "drive", "frames", "every", "max_frames"):
         if getattr(args, name) is not None:
             data = dataclasses.replace(data, **{name: getattr(args, name)})
     if args.cameras:
         data = dataclasses.replace(data, cameras=args.cameras)
     check(data.max_width is None or data.max_width >= 16, "--max-width must be at least 16")
+    check(data.every is None or data.every >= 1, "--every must be at least 1")
+    check(data.max_frames >= 2, "--max-frames must be at least 2")
     return _known(dataclasses.replace(args.config, data=data), args)
 
 
@@ -145,7 +162,8 @@ def resolve_fit(args: Fit) -> configs.FitConfig:
     """
     cfg = args.config
     data, train, evaluation = cfg.data, cfg.train, cfg.evaluation
-    for name in ("max_width", "test_every", "images", "drive", "frames"):
+    fields = ("max_width", "test_every", "split", "background", "images", "drive", "frames")
+    for name in (*fields, "every", "max_frames"):
         if getattr(args, name) is not None:
             data = dataclasses.replace(data, **{name: getattr(args, name)})
     if args.cameras:
@@ -165,6 +183,8 @@ def resolve_fit(args: Fit) -> configs.FitConfig:
         most = parse_gaussians(args.gaussians)
         densify = dataclasses.replace(densify, max_gaussians=most)
     check(data.max_width is None or data.max_width >= 16, "--max-width must be at least 16")
+    check(data.every is None or data.every >= 1, "--every must be at least 1")
+    check(data.max_frames >= 2, "--max-frames must be at least 2")
     check(data.test_every >= 0, "--test-every must be 0 or more")
     check(train.steps >= 1, "--steps must be at least 1")
     cfg = dataclasses.replace(cfg, data=data, train=train, evaluation=evaluation, densify=densify)

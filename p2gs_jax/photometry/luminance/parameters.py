@@ -16,6 +16,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from p2gs_jax.core.numerics import on_device
+from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.photometry.luminance.axes import PARAMETERS, axes_of, spans
 from p2gs_jax.photometry.luminance.statistics import STATISTICS
 
@@ -96,7 +97,7 @@ def identity(views: int) -> Luminance:
         views: how many training views there are.
     """
     # Drawn once for all fits: a network of zeros would never learn.
-    weights = np.random.default_rng(0).normal(0, STATISTICS**-0.5, (STATISTICS, HIDDEN))
+    weights = generator(0, Stream.NETWORK).normal(0, STATISTICS**-0.5, (STATISTICS, HIDDEN))
     outputs = ENTRIES + 3
     return Luminance(
         on_device(np.linspace(0.0, 1.0, ENTRIES)),

@@ -55,12 +55,14 @@ class MovingObjects:
         corrections: `Params.poses` of a finished fit; None: poses are as they were tracked, or the
             fit that learns them is not finished.
         offsets: by which somebody moved them, in the frame of each box, scene units; None: nobody.
+        middle: of the drive, where Gaussians vibrate: the zero of `Placement.time`, seconds.
     """
 
     objects: tuple[TrackedObject, ...]
     keys: KeyTimes
     corrections: Float[np.ndarray, "t k 6"] | None = None
     offsets: Float[np.ndarray, "k 3"] | None = None
+    middle: float | None = None
 
     def __len__(self) -> int:
         return len(self.objects)
@@ -114,7 +116,8 @@ class MovingObjects:
         viewmats = (np.asarray(viewmat, np.float64) @ poses).astype(np.float32)
         viewmats[~there] = HIDDEN
         key, share = self.keys.at(time)
-        return on_host(Placement, viewmats, np.int32(key), np.float32(share))
+        since = None if self.middle is None else np.float32(time - self.middle)
+        return on_host(Placement, viewmats, np.int32(key), np.float32(share), since)
 
 
 def key_times(objects: Sequence[TrackedObject], times: Sequence[float]) -> KeyTimes:

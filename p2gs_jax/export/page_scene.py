@@ -1,0 +1,193 @@
+"""What a page knows of a run besides its Gaussians: views, how each was taken, curves, a look."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import jax
+import numpy as np
+
+from p2gs_jax.core.numerics import evenly_spaced, on_device
+from p2gs_jax.formats.false_color import false_color
+from p2gs_jax.photometry.display import DisplayTransform
+from p2gs_jax.photometry.spline_curve import by_camera, tables
+from p2gs_jax.render import project, view_radiance
+from p2gs_jax.render.cutoff import smallest_cutoff
+from p2gs_jax.run.read import Run
+from p2gs_jax.types import Gaussians
+
+# Steps of false colour: whole stops from -6 to 6 about middle grey (formats/false_color.py).
+STEPS = np.arange(-6, 6) + 0.5
+# Views whose mean log radiance stands for that of the window, under the cutoff rule `radiance`.
+METERED = 8
+# Longer side of embedded photographs, pixels, and their quality.
+LONGEST, QUALITY = 960, 80
+# Digits of numbers in the page: those of float32.
+DIGITS = 7
+
+
+def uncorrected(transform: DisplayTransform) -> DisplayTransform:
+    """Return the transform without a learned correction: the page has none."""
+    return replace(transform, correction=None)
+
+
+def page_scene(
+    fitted: Run,
+    gaussians: Gaussians,
+    look: DisplayTransform,
+    photographs: Mapping[int, str],
+) -> dict[str, Any]:
+    """Return what the page reads besides the Gaussians, as plain values or arrays.
+
+    Args:
+        fitted: the run.
+        gaussians: of the run, as of one time.
+        look: what it opens with.
+        photographs: data URLs, by row of the view.
+    """
+    mean = fitted.mean.exposure_geometric
+    return {
+        "render": _rendering(fitted, gaussians),
+        "look": {
+            "exposure": mean,
+            "ev": float(np.log2(look.exposure / mean)),
+            "gamma": look.gamma,
+            "balance": _balance(look),
+            "curve": look.formation.curve,
+        },
+        "tone": _tone(fitted),
+        "views": [_view(fitted, index, mean) for index in range(len(fitted.scene.views))],
+        "start": _start(fitted),
+        "up": _up(fitted),
+        "stopColors": false_color(np.exp2(STEPS)[None, :, None] * np.ones(3), 1.0)[0],
+        "photographs": {str(index): url for index, url in photographs.items()},
+    }
+
+
+def embedded_photographs(fitted: Run, count: int) -> dict[int, str]:
+    """Return undistorted photographs as data URLs, by row of the view, evenly spread.
+
+    Args:
+        fitted: the run.
+        count: how many at most.
+
+    Raises:
+        UserError: they are gone or broken.
+    """
+    rows = [int(i) for i in evenly_spaced(len(fitted.scene.views), count)] if count else []
+    fitted.require_photographs(rows)
+    return {row: _webp(fitted.photograph(row)) for row in rows}
+
+
+def _webp(picture: np.ndarray) -> str:
+    codes = np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8)[..., ::-1]
+    share = LONGEST / max(codes.shape[:2])
+    if share < 1:
+        codes = cv2.resize(codes, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
+    done, data = cv2.imencode(
+        ".webp", np.ascontiguousarray(codes), [cv2.IMWRITE_WEBP_QUALITY, QUALITY]
+    )
+    assert done
+    return "data:image/webp;base64," + base64.b64encode(data.tobytes()).decode()
+
+
+def _rendering(fitted: Run, gaussians: Gaussians) -> dict[str, Any]:
+    cfg = fitted.cfg.render
+    follows = cfg.cutoff_rule == "radiance"
+    return {
+        "radiance": cfg.radiance,
+        "near": cfg.near,
+        "blur": cfg.blur,
+        "alphaMax": cfg.alpha_max,
+        "logCutoff": float(np.log(cfg.alpha_cutoff)),
+        "smallestLog": float(np.log(smallest_cutoff(cfg))),
+        # No radiance is above that: the cutoff is the same for all.
+        "logMean": _log_mean_radiance(fitted, gaussians) if follows else 1e30,
+    }
+
+
+def _log_mean_radiance(fitted: Run, gaussians: Gaussians) -> float:
+    """Return the mean over views of what render/cutoff.py takes for each."""
+    alive = on_device(np.ones(gaussians.capacity), bool)
+    cfg, means = fitted.cfg.render, []
+    seen = jax.jit(lambda camera: project(gaussians, alive, camera, cfg).visible)
+    light = jax.jit(lambda camera: view_radiance(gaussians, camera, cfg).max(-1))
+    train = fitted.scene.train_indices
+    for k in evenly_spaced(len(train), METERED):
+        camera = fitted.camera(train[k])
+        brightest = np.asarray(light(camera))[np.asarray(seen(camera))]
+        if brightest.size:
+            means.append(np.log(np.maximum(brightest, 1e-30)).mean())
+    return float(np.mean(means)) if means else 0.0
+
+
+def _tone(fitted: Run) -> dict[str, Any]:
+    cfg = fitted.cfg.photometry
+    own = None
+    if cfg.curve == "spline" and (cfg.spline is not None or by_camera(cfg)):
+        found = tables(cfg)
+        own = {
+            "first": found.first,
+            "step": found.step,
+            "values": found.values.astype(np.float32),
+            "channels": found.channels,
+        }
+    return {
+        "pivot": cfg.pivot,
+        "tables": own,
+        "cameras": [camera.vignetting for camera in cfg.cameras],
+    }
+
+
+def _view(fitted: Run, index: int, mean: float) -> dict[str, Any]:
+    view, taken = fitted.scene.views[index], fitted.own_display(index)
+    camera = fitted.camera(index)
+    K = np.asarray(camera.K)
+    return {
+        "name": view.name,
+        "camera": view.camera,
+        "split": view.split,
+        "ev": float(np.log2(taken.exposure / mean)),
+        "gamma": taken.gamma,
+        "balance": _balance(taken),
+        "row": -1 if taken.camera is None else taken.camera,
+        "width": camera.width,
+        "height": camera.height,
+        "K": [K[0, 0], K[1, 1], K[0, 2], K[1, 2]],
+        "viewmat": np.asarray(camera.viewmat)[:3].reshape(-1),
+    }
+
+
+def _balance(transform: DisplayTransform) -> list[float]:
+    """Return the log factors of the channels."""
+    return list(transform.white_balance or (0.0, 0.0, 0.0))
+
+
+def _start(fitted: Run) -> int:
+    """Return the row of the view that the page opens at: the middle one of the first camera."""
+    views, train = fitted.scene.views, fitted.scene.train_indices
+    own = [row for row in train if views[row].camera == views[train[0]].camera]
+    return own[len(own) // 2]
+
+
+def _up(fitted: Run) -> list[float]:
+    """Return the mean of where the cameras have their top, a unit vector."""
+    up = -np.mean([view.viewmat[1, :3] for view in fitted.scene.views], 0, dtype=float)
+    length = np.linalg.norm(up)
+    return [float(v) for v in (up / length if length > 1e-6 else (0.0, -1.0, 0.0))]
+
+
+def rounded(value: Any) -> Any:
+    """Return plain values with as many digits as float32 has."""
+    if isinstance(value, dict):
+        return {key: rounded(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [rounded(item) for item in value]
+    if isinstance(value, float):
+        short = float(f"{value:.{DIGITS}g}")
+        return int(short) if short.is_integer() and abs(short) < 1e6 else short
+    return value

@@ -1,0 +1,187 @@
+"""Which Gaussians a page holds: all that can be seen, or the weightiest that fit."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from p2gs_jax.config import RenderConfig
+from p2gs_jax.core.numerics import on_device
+from p2gs_jax.errors import UserError
+from p2gs_jax.export.page_error import PageError
+from p2gs_jax.formats.packed import Packed, pack, unpack
+from p2gs_jax.gaussians.posed import chosen
+from p2gs_jax.render import render_linear
+from p2gs_jax.render.capacity import TileCapacity, until_it_fits
+from p2gs_jax.render.cutoff import smallest_cutoff
+from p2gs_jax.render.host import count_needed
+from p2gs_jax.render.spherical_harmonics import C0, coefficient_count, degree_of
+from p2gs_jax.render.xla_cpu import compiler_options
+from p2gs_jax.types import Camera, Gaussians
+
+# A page whose Gaussians would be fewer than this share is refused rather than shown.
+LEAST_SHARE = 0.02
+# Attempts to meet a size from below, and how far below the first aims.
+ATTEMPTS, MARGIN = 6, 0.985
+
+
+@dataclass(frozen=True)
+class PageSplats:
+    """The Gaussians of a page.
+
+    Attributes:
+        packed: as it holds them.
+        error: against the run.
+        of: how many the run has.
+        degree: of the run's harmonics.
+        unseen: of the run's, never drawn by any renderer with our rules; nothing is lost with them.
+    """
+
+    packed: Packed
+    error: PageError
+    of: int
+    degree: int
+    unseen: int
+
+    @property
+    def dropped(self) -> int:
+        """Gaussians left out for the sake of the size."""
+        return self.of - self.unseen - self.packed.count
+
+    @property
+    def kept_degree(self) -> int:
+        """Degree of the page's harmonics."""
+        return degree_of(self.packed.coefficients)
+
+    @property
+    def whole(self) -> bool:
+        """Whether nothing was left out that could be seen."""
+        return self.dropped == 0 and self.kept_degree == self.degree
+
+
+def fit_into(
+    room: int,
+    gaussians: Gaussians,
+    cfg: RenderConfig,
+    cameras: Sequence[Camera],
+    judge: Callable[[Gaussians], PageError],
+    say: Callable[[str], None] = lambda text: None,
+) -> PageSplats:
+    """Return the Gaussians of a page, packed to at most `room` bytes.
+
+    If all do not fit, as many as do are kept at every degree of the harmonics, those first that
+    weigh most in the pictures of `cameras`; of these the one with the highest median PSNR is taken.
+
+    Args:
+        room: bytes.
+        gaussians: of the run, all of them.
+        cfg: rendering options of the run.
+        cameras: of the views that say what weighs most.
+        judge: returns the error of some Gaussians.
+        say: is told what is going on.
+
+    Raises:
+        UserError: hardly any would fit, or there are none.
+    """
+    seen = ever_drawn(gaussians, cfg)
+    unseen, degree = int((~seen).sum()), degree_of(gaussians.sh.shape[1])
+    whole = chosen(gaussians, seen)
+    if whole.capacity == 0:
+        raise UserError("the run has no Gaussian that can be seen.", fix="fit it for longer")
+    say("Packing")
+    packed = pack(whole)
+    if len(packed.data) <= room:
+        error = judge(unpack(packed))
+        return PageSplats(packed, error, gaussians.capacity, degree, unseen)
+    say("Weighing Gaussians")
+    order = np.argsort(-weights(whole, cameras, cfg), kind="stable")
+    found = []
+    for kept in range(degree, -1, -1):
+        say(f"Trying harmonics of degree {kept}")
+        smaller = _largest_that_fits(room, of_degree(whole, kept), order)
+        if smaller is not None:
+            error = judge(unpack(smaller))
+            found.append(PageSplats(smaller, error, gaussians.capacity, degree, unseen))
+    if not found:
+        raise UserError(
+            f"of {whole.capacity} Gaussians less than {LEAST_SHARE:.0%} would fit into the page.",
+            fix="allow a larger page with --size-mb, or embed fewer --photographs",
+        )
+    return max(found, key=lambda splats: splats.error.psnr_median)
+
+
+def ever_drawn(gaussians: Gaussians, cfg: RenderConfig) -> Bool[np.ndarray, " n"]:
+    """Return which Gaussians any camera can see: finite, and less transparent than the cutoff."""
+    finite = np.ones(gaussians.capacity, bool)
+    for value in (gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.sh):
+        finite &= np.isfinite(np.asarray(value).reshape(gaussians.capacity, -1)).all(1)
+    logits = np.asarray(gaussians.opacity_logits, np.float64)
+    with np.errstate(invalid="ignore"):
+        return finite & (-np.logaddexp(0, -logits) > np.log(smallest_cutoff(cfg)))
+
+
+def of_degree(gaussians: Gaussians, degree: int) -> Gaussians:
+    """Return Gaussians whose harmonics end at a degree."""
+    return replace(gaussians, sh=gaussians.sh[:, : coefficient_count(degree)])
+
+
+def weights(
+    gaussians: Gaussians, cameras: Sequence[Camera], cfg: RenderConfig
+) -> Float[np.ndarray, " n"]:
+    """Return the sum of each Gaussian's blending weights over the pixels of some views.
+
+    Where all radiance is 1 that is the gradient of the pictures' sum by log radiance.
+
+    Args:
+        gaussians: all of them.
+        cameras: of the views.
+        cfg: rendering options of the run.
+    """
+    plain = replace(cfg, radiance="exp", cutoff_rule="opacity")
+    alive = on_device(np.ones(gaussians.capacity), bool)
+    sh = on_device(np.zeros((gaussians.capacity, 1, 3)))
+    needed = max(int(count_needed(gaussians, alive, camera, cfg=plain)) for camera in cameras)
+    capacity, total = TileCapacity.allocate(needed), np.zeros(gaussians.capacity)
+
+    @functools.partial(jax.jit, static_argnames="capacity", compiler_options=compiler_options())
+    def gradient(g: Gaussians, camera: Camera, *, capacity: int) -> tuple[Array, Array, Array]:
+        def light(sh):
+            shown = replace(g, sh=sh)
+            result = render_linear(shown, alive, camera, plain, capacity, with_depth=False)
+            return jnp.sum(result.linear[..., 0]), result
+
+        slope, result = jax.grad(light, has_aux=True)(g.sh)
+        return slope[:, 0, 0] / C0, result.count, result.overflow
+
+    grey = replace(gaussians, sh=sh)
+    for camera in cameras:
+        weight, capacity = until_it_fits(
+            lambda entries, camera=camera: gradient(grey, camera, capacity=entries), capacity
+        )
+        total += np.asarray(weight, np.float64)
+    return total
+
+
+def _largest_that_fits(room: int, gaussians: Gaussians, order: np.ndarray) -> Packed | None:
+    """Return as many of the first Gaussians as fit, but for a percent or two; None: hardly any."""
+    full = pack(gaussians)
+    if len(full.data) <= room:
+        return full
+    count = gaussians.capacity
+    keep = int(count * room / len(full.data) * MARGIN)
+    for _ in range(ATTEMPTS):
+        if keep < LEAST_SHARE * count:
+            return None
+        mask = np.zeros(count, bool)
+        mask[order[:keep]] = True
+        packed = pack(chosen(gaussians, mask))
+        if len(packed.data) <= room:
+            return packed
+        keep = int(keep * room / len(packed.data) * MARGIN)
+    return None

@@ -1,0 +1,1 @@
+"""Videos as scenes: which frames are worth keeping, and these as photographs."""

@@ -1,0 +1,195 @@
+"""The page: what it holds, what it leaves out where room is short, and that names stay text."""
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from p2gs_jax.core.numerics import on_device
+from p2gs_jax.errors import UserError
+from p2gs_jax.export.page import MEGABYTE, RESERVE, page_text, write_page
+from p2gs_jax.export.page_scene import embedded_photographs, page_scene
+from p2gs_jax.export.page_splats import ever_drawn, fit_into, weights
+from p2gs_jax.formats.packed import pack
+from p2gs_jax.render import project
+from p2gs_jax.render.rasterize_reference import rasterize_reference
+from p2gs_jax.run.read import load_run
+
+HOSTILE = '</script><script>window.hacked=1</script><img src=x onerror="hacked=1">{{scene}}'
+
+
+@pytest.fixture(scope="module")
+def fitted(finished_run):
+    return load_run(finished_run)
+
+
+@pytest.fixture(scope="module")
+def whole(fitted, tmp_path_factory):
+    """Return the page of a run that fits, and what was said about it."""
+    path = tmp_path_factory.mktemp("page") / "scene.html"
+    return path, write_page(path, fitted, fitted.common_display(), size_mb=5)
+
+
+def element(text, name):
+    return re.search(rf'<script type="[^"]*" id="{name}">(.*?)</script>', text, re.S)[1]
+
+
+def test_the_file_is_as_large_as_said_and_holds_every_visible_gaussian(whole, fitted):
+    path, page = whole
+    assert path.stat().st_size == page.size < 5 * MEGABYTE
+    assert page.splats.whole
+    assert page.splats.packed.count == ever_drawn(fitted.params.gaussians, fitted.cfg.render).sum()
+    scene = json.loads(element(path.read_text(), "scene"))
+    assert len(scene["views"]) == len(fitted.scene.views)
+    assert scene["about"][: len(page.sentences)] == list(page.sentences)
+    e = np.exp2([v["ev"] for v in scene["views"]]) * scene["look"]["exposure"]
+    rows = fitted.scene.train_indices
+    np.testing.assert_allclose(e[list(rows)], fitted.params.photometry.exposures, rtol=1e-5)
+
+
+def test_its_error_is_small_and_said(whole):
+    _, page = whole
+    error = page.splats.error
+    assert error.psnr_worst > 40
+    assert error.stops_median < 0.01
+    assert error.stops_median <= error.stops_p99 <= error.stops_max
+    assert any(f"{error.psnr_median:.1f} dB" in s for s in page.sentences)
+    assert any(f"{error.stops_max:.2f}" in s for s in page.sentences)
+
+
+def test_nothing_is_loaded_from_elsewhere(whole):
+    path, _ = whole
+    text = path.read_text()
+    assert not re.search(r"https?://", text)
+    assert not re.search(r'\b(src|href)="(?!data:)', text)
+    assert "default-src 'none'" in text
+
+
+def test_a_page_that_is_too_small_drops_what_weighs_least_and_says_the_cost(
+    whole, fitted, tmp_path
+):
+    _, all_of_it = whole
+    size = all_of_it.size + RESERVE - 2 * len(all_of_it.splats.packed.data) // 3
+    page = write_page(tmp_path / "s.html", fitted, fitted.common_display(), size_mb=size / MEGABYTE)
+    assert page.size <= size
+    assert not page.splats.whole
+    assert page.splats.error.psnr_median < all_of_it.splats.error.psnr_median
+    said = page.sentences[0]
+    assert said.startswith("Left out to stay within")
+    assert f"{page.splats.packed.count} Gaussians remain" in said
+    if page.splats.dropped:
+        assert str(page.splats.dropped) in said
+
+
+def test_a_size_that_holds_no_gaussians_is_refused(whole, fitted, tmp_path):
+    _, all_of_it = whole
+    for size in (0.01, (all_of_it.size - 4 / 3 * len(all_of_it.splats.packed.data)) / MEGABYTE):
+        with pytest.raises(UserError, match=r"--size-mb|would fit"):
+            write_page(tmp_path / "s.html", fitted, fitted.common_display(), size_mb=size)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_of_all_degrees_that_fit_the_best_is_taken(fitted):
+    g, cfg = fitted.params.gaussians, fitted.cfg.render
+    cameras = [fitted.camera(i) for i in fitted.scene.train_indices]
+    asked = []
+
+    class Judged:
+        def __init__(self, degree):
+            self.psnr_median = {1: 20.0, 0: 30.0}[degree]
+
+    def judge(shown):
+        asked.append(shown)
+        return Judged(0 if shown.sh.shape[1] == 1 else 1)
+
+    room = len(pack(g).data) // 2
+    found = fit_into(room, g, cfg, cameras, judge)
+    assert found.kept_degree == 0
+    assert {s.sh.shape[1] for s in asked} == {1, 4}
+    assert len(found.packed.data) <= room
+
+
+def test_weights_are_sums_of_blending_weights(fitted):
+    g, cfg, camera = fitted.params.gaussians, fitted.cfg.render, fitted.camera(0)
+    found = weights(g, [camera], cfg)
+    splats = project(g, on_device(np.ones(g.capacity), bool), camera, cfg)
+    one = int(np.argmax(found))
+    light = on_device(np.eye(g.capacity)[one][:, None] * np.ones(3))
+    linear, _, _ = rasterize_reference(splats, light, camera.width, camera.height, cfg)
+    assert found[one] == pytest.approx(float(linear[..., 0].sum()), rel=0.01)
+
+
+def test_gaussians_that_nobody_can_see_are_left_out_and_counted(fitted):
+    g = fitted.params.gaussians
+    logits = g.opacity_logits.at[0].set(-6.0)
+    broken = replace(g, opacity_logits=logits, means=g.means.at[1, 0].set(np.nan))
+    drawn = ever_drawn(broken, fitted.cfg.render)
+    assert not drawn[0]
+    assert not drawn[1]
+    found = fit_into(10**9, broken, fitted.cfg.render, [], lambda shown: None)  # pyright: ignore
+    assert found.unseen == (~drawn).sum() >= 2
+    assert found.whole
+
+
+def test_hostile_names_stay_text(fitted):
+    views = tuple(replace(v, name=HOSTILE + v.name) for v in fitted.scene.views)
+    named = replace(fitted, scene=replace(fitted.scene, views=views))
+    known = page_scene(named, fitted.params.gaussians, fitted.common_display(), {})
+    text = page_text(HOSTILE, known, b"")
+    assert text.count("<script") == 4
+    assert "<img" not in text
+    assert json.loads(element(text, "scene"))["views"][0]["name"] == views[0].name
+
+
+def test_photographs_are_embedded_only_when_asked_for(fitted, whole):
+    assert embedded_photographs(fitted, 0) == {}
+    found = embedded_photographs(fitted, 2)
+    assert len(found) == 2
+    assert all(url.startswith("data:image/webp;base64,") for url in found.values())
+    assert "data:image/webp" not in whole[0].read_text()
+
+
+def test_photographs_that_are_gone_are_an_error(fitted):
+    views = tuple(
+        replace(v, image_path=v.image_path.with_name("gone.png")) for v in fitted.scene.views
+    )
+    gone = replace(fitted, scene=replace(fitted.scene, views=views))
+    with pytest.raises(UserError, match="missing"):
+        embedded_photographs(gone, 1)
+
+
+def test_the_command_writes_it(finished_run, run_command, tmp_path):
+    argv = ("export", finished_run, "--format", "html", "--out", tmp_path)
+    status, said = run_command(*argv)
+    assert status == 0
+    assert "dB" in said
+    assert (tmp_path / "scene.html").stat().st_size < 20 * MEGABYTE
+    status, said = run_command(*argv)
+    assert (status, "--overwrite" in said) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (("--format", "html", "--size-mb", "0"), "--size-mb"),
+        (("--format", "html", "--size-mb", "0.02"), "--size-mb"),
+        (("--format", "html", "--photographs", "-1"), "--photographs"),
+        (("--format", "html", "--bake-steps", "3"), "--bake-steps"),
+        (("--format", "splat", "--size-mb", "3"), "--size-mb"),
+        (("--format", "drive", "--photographs", "3"), "--photographs"),
+    ],
+)
+def test_options_that_make_no_sense_are_refused(finished_run, run_command, tmp_path, words, named):
+    status, said = run_command("export", finished_run, *words, "--out", tmp_path)
+    assert status == 2
+    assert named in said
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_scripts_lie_in_the_package():
+    from importlib import resources
+
+    web = resources.files("p2gs_jax.export").joinpath("web")
+    assert {"page.html", "page.css", "main.js"} <= {entry.name for entry in web.iterdir()}

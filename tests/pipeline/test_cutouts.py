@@ -1,0 +1,83 @@
+"""A fit of photographs with alpha, from the folder to the scores."""
+
+import dataclasses
+import json
+
+import cv2
+import numpy as np
+import pytest
+from scene.posed import around, blender
+
+from p2gs_jax import load_run
+from p2gs_jax.config import preset
+from p2gs_jax.formats.exr import read_exr
+from p2gs_jax.pipeline.fit import fit
+
+SIZE, COLOR = 48, np.array([0.8, 0.3, 0.2])
+
+
+def write_ball(root, count, part):
+    """Write views of a ball of one colour and radius 1 around the origin, seen from 4 away."""
+    data = blender(around(count), part, angle=0.7)
+    (root / part).mkdir(parents=True)
+    (root / f"transforms_{part}.json").write_text(json.dumps(data))
+    fine = 4 * SIZE
+    focal = 0.5 * fine / np.tan(0.35)
+    y, x = np.mgrid[:fine, :fine] + 0.5 - fine / 2
+    # A ray meets the ball where its angle to the axis has a sine of less than 1 / 4.
+    inside = np.sin(np.arctan(np.hypot(x, y) / focal)) < 0.25
+    alpha = inside.reshape(SIZE, 4, SIZE, 4).mean((1, 3))
+    rgba = np.concatenate([np.broadcast_to(COLOR, (SIZE, SIZE, 3)), alpha[..., None]], 2)
+    image = np.rint(255 * rgba).astype(np.uint8)[..., [2, 1, 0, 3]]
+    for k in range(count):
+        assert cv2.imwrite(str(root / part / f"r_{k}.png"), image)
+
+
+@pytest.fixture(scope="module", params=["3dgs", "robust"])
+def ball(request, tmp_path_factory):
+    """Return the run of a ball over green, 200 steps from seeds at random."""
+    root = tmp_path_factory.mktemp("ball")
+    write_ball(root, 12, "train")
+    write_ball(root, 4, "test")
+    cfg = preset(request.param)
+    cfg = dataclasses.replace(
+        cfg,
+        data=dataclasses.replace(cfg.data, background="0.1,0.9,0.1"),
+        init=dataclasses.replace(cfg.init, dense="off"),
+        densify=dataclasses.replace(cfg.densify, max_gaussians=1500),
+        train=dataclasses.replace(cfg.train, steps=200, coarse_to_fine=()),
+    )
+    result = fit(root, root / "run", cfg)
+    return result, load_run(root / "run")
+
+
+def test_what_is_held_out_is_what_the_data_set_says(ball):
+    result, _ = ball
+    assert result.metrics["split"] == "transforms_test.json"
+    assert sorted(result.metrics["test"]["averaged"]["per_view"]) == [
+        f"test/r_{k}.png" for k in range(4)
+    ]
+    assert any("over 0.1,0.9,0.1" in note for note in result.metrics["notes"])
+
+
+def test_scores_are_over_the_background(ball):
+    result, run = ball
+    # The bare background scores 9.5 dB.
+    assert result.metrics["test"]["averaged"]["psnr"] > 20
+    store = run.store
+    photograph, mask = store.get(0)
+    assert mask.min() == 1.0
+    assert np.allclose(photograph[0, 0], [0.1, 0.9, 0.1], atol=1e-4)
+    assert np.allclose(photograph[SIZE // 2, SIZE // 2], COLOR, atol=3e-3)
+
+
+def test_pictures_show_the_background_and_exr_files_do_not(ball):
+    _, run = ball
+    stem = run.folder / "renders" / "test" / "r_0"
+    shown = cv2.imread(f"{stem}.render.png")[..., ::-1] / 255
+    taken = cv2.imread(f"{stem}.photograph.png")[..., ::-1] / 255
+    assert np.abs(shown[:3, :3] - [0.1, 0.9, 0.1]).max() < 0.1
+    assert np.abs(taken[0, 0] - [0.1, 0.9, 0.1]).max() < 0.01
+    linear, _ = read_exr(stem.with_suffix(".exr"))
+    assert np.abs(linear[:3, :3]).max() < 0.1
+    assert run.own_display(0).backdrop == pytest.approx((0.1, 0.9, 0.1))

@@ -1,0 +1,162 @@
+"""Photographs as cameras write them, made byte by byte where no library writes them."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+from PIL import ExifTags, Image
+
+# Linear sRGB to the made camera's colours, which are XYZ: LibRaw inverts this itself.
+_XYZ_TO_CAMERA = (
+    *(3.2404542, -1.5371385, -0.4985314),
+    *(-0.9692660, 1.8760108, 0.0415560),
+    *(0.0556434, -0.2040259, 1.0572252),
+)
+DISPLAY_P3_XYZ = (
+    (0.51512, 0.2412, -0.00105),
+    (0.29198, 0.69225, 0.04189),
+    (0.1571, 0.06657, 0.78407),
+)
+ADOBE_RGB_XYZ = (
+    (0.60974, 0.31111, 0.01947),
+    (0.20528, 0.62567, 0.06087),
+    (0.14919, 0.06322, 0.74457),
+)
+
+
+def write_dng(
+    path: Path,
+    light: np.ndarray,
+    *,
+    balance: tuple[float, float, float] = (2.0, 1.0, 1.5),
+    black: int = 512,
+    white: int = 16383,
+    model: str = "Made One",
+    orientation: int = 1,
+    time: tuple[int, int] = (1, 60),
+    iso: int = 200,
+) -> None:
+    """Write the light of a scene as a sensor with an RGGB filter would have seen it."""
+    h, w = light.shape[:2]
+    camera = np.minimum(light / balance, 1)
+    channel = np.array([[0, 1], [1, 2]])[np.indices((h, w))[0] % 2, np.indices((h, w))[1] % 2]
+    seen = np.take_along_axis(camera, channel[..., None], 2)[..., 0]
+    data = np.rint(black + seen * (white - black)).astype("<u2").tobytes()
+
+    def of(*values: float) -> list[tuple[int, int]]:
+        return [(round(v * 1_000_000), 1_000_000) for v in values]
+
+    main = [
+        (254, "I", [0]), (256, "I", [w]), (257, "I", [h]), (258, "H", [16]), (259, "H", [1]),
+        (262, "H", [32803]), (271, "s", "Made"), (272, "s", model), (273, "I", [0]),
+        (274, "H", [orientation]), (277, "H", [1]), (278, "I", [h]), (279, "I", [len(data)]),
+        (284, "H", [1]), (33421, "H", [2, 2]), (33422, "B", [0, 1, 1, 2]), (34665, "I", [0]),
+        (50706, "B", [1, 4, 0, 0]), (50708, "s", model), (50714, "H", [black]),
+        (50717, "I", [white]), (50721, "ii", of(*_XYZ_TO_CAMERA)),
+        (50728, "II", of(*(1 / b for b in balance))), (50778, "H", [21]),
+    ]  # fmt: skip
+    shot = [
+        (33434, "II", [time]),
+        (33437, "II", of(2.8)),
+        (34855, "H", [iso]),
+        (37386, "II", of(50)),
+    ]
+    places, first = _laid_out(main, 8)
+    shot_places, second = _laid_out(shot, first)
+    main = [
+        (tag, kind, [second] if tag == 273 else [first] if tag == 34665 else values)
+        for tag, kind, values in main
+    ]
+    body = _directory(main, places) + _directory(shot, shot_places)
+    path.write_bytes(b"II*\0" + struct.pack("<I", 8) + body + data)
+
+
+def _packed(kind: str, values) -> tuple[int, int, bytes]:
+    if kind == "s":
+        data = values.encode() + b"\0"
+        return 2, len(data), data
+    flat = [v if isinstance(v, tuple) else (v,) for v in values]
+    code = {"B": 1, "H": 3, "I": 4, "II": 5, "ii": 10}[kind]
+    return code, len(flat), b"".join(struct.pack("<" + kind, *v) for v in flat)
+
+
+def _laid_out(entries, start: int) -> tuple[dict[int, int], int]:
+    """Return where the long values of a directory go, and where it ends."""
+    at, places = start + 2 + 12 * len(entries) + 4, {}
+    for tag, kind, values in entries:
+        size = len(_packed(kind, values)[2])
+        if size > 4:
+            places[tag] = at
+            at += size + size % 2
+    return places, at
+
+
+def _directory(entries, places: dict[int, int]) -> bytes:
+    rows, body = struct.pack("<H", len(entries)), b""
+    for tag, kind, values in entries:
+        code, count, data = _packed(kind, values)
+        rows += struct.pack("<HHI", tag, code, count)
+        if tag in places:
+            rows += struct.pack("<I", places[tag])
+            body += data + b"\0" * (len(data) % 2)
+        else:
+            rows += data.ljust(4, b"\0")
+    return rows + struct.pack("<I", 0) + body
+
+
+def icc_profile(name: str, columns, curve: bytes) -> bytes:
+    """Return a profile of a matrix and one curve for all channels."""
+
+    def xyz(values) -> bytes:
+        return b"XYZ \0\0\0\0" + struct.pack(">3i", *(round(v * 65536) for v in values))
+
+    said = name.encode("utf-16-be")
+    mluc = b"mluc\0\0\0\0" + struct.pack(">II", 1, 12) + b"enUS" + struct.pack(">II", len(said), 28)
+    tags = {
+        b"desc": mluc + said,
+        b"wtpt": xyz((0.9642, 1.0, 0.8249)),
+        **{key: xyz(c) for key, c in zip((b"rXYZ", b"gXYZ", b"bXYZ"), columns, strict=True)},
+        **dict.fromkeys((b"rTRC", b"gTRC", b"bTRC"), curve),
+    }
+    at, table, body = 128 + 4 + 12 * len(tags), struct.pack(">I", len(tags)), b""
+    for key, data in tags.items():
+        data += b"\0" * (-len(data) % 4)
+        table += struct.pack(">4sII", key, at + len(body), len(data))
+        body += data
+    header = bytearray(128)
+    header[:4] = struct.pack(">I", at + len(body))
+    header[8:24] = b"\x04\x30\0\0mntrRGB XYZ "
+    header[36:40] = b"acsp"
+    header[68:80] = struct.pack(">3i", 63190, 65536, 54061)
+    return bytes(header) + table + body
+
+
+def parametric(*values: float) -> bytes:
+    """Return the curve (a x + b)^g where x >= d, else c x; or x^g."""
+    kind = 0 if len(values) == 1 else 3
+    fixed = (round(v * 65536) for v in values)
+    return b"para\0\0\0\0" + struct.pack(">HH", kind, 0) + struct.pack(f">{len(values)}i", *fixed)
+
+
+SRGB_CURVE = parametric(2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)
+DISPLAY_P3 = icc_profile("Display P3", DISPLAY_P3_XYZ, SRGB_CURVE)
+ADOBE_RGB = icc_profile("Adobe RGB (1998)", ADOBE_RGB_XYZ, parametric(563 / 256))
+
+
+def settings(time: float = 1 / 60, aperture: float = 2.8, iso: int = 200) -> Image.Exif:
+    """Return EXIF with exposure time, f-number and ISO."""
+    exif = Image.Exif()
+    exif[0x010F], exif[0x0110] = "Made", "One"
+    exif.get_ifd(ExifTags.IFD.Exif).update({0x829A: time, 0x829D: aperture, 0x8827: iso})
+    return exif
+
+
+def patches(size: tuple[int, int] = (96, 64), *, seed: int = 0) -> np.ndarray:
+    """Return a smooth coloured picture, float in [0, 1]."""
+    rng = np.random.default_rng(seed)
+    small = rng.random((4, 6, 3)).astype(np.float32)
+
+    return np.clip(cv2.resize(small, size, interpolation=cv2.INTER_CUBIC), 0, 1)
