@@ -40,7 +40,7 @@ from p2gs_jax.scene.images import ImageStore
 PAPER = {
     "3DGS": "146 / .928 / 33.62 / .102 / .041",
     "3DGS + AT": "145 / .927 / 31.45 / .097 / .035",
-    "3DGS + curve (as Luminance-GS)": "- / .863 / 17.68 / .497 / .047",
+    "Luminance-GS": "- / .863 / 17.68 / .497 / .047",
     "P2GS as printed": "90 / .939 / 31.02 / .092 / .034",
 }
 QUALITY: tuple[Column, ...] = (

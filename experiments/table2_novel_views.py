@@ -34,7 +34,7 @@ from towns import (
 PAPER = {
     "3DGS": ".893 / 30.39 / .258",
     "3DGS + AT": ".890 / 28.89 / .263",
-    "3DGS + curve (as Luminance-GS)": ".630 / 16.44 / .427",
+    "Luminance-GS": ".630 / 16.44 / .427",
     "P2GS as printed": ".896 / 28.34 / .246",
 }
 PROTOCOLS = {

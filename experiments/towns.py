@@ -57,8 +57,6 @@ class Protocol:
 
 
 FULL = Protocol()
-# The paper's drive at a quarter of its width; hours.
-AT_SIZE = Protocol(towns=(0,), frames=100, width=480, points=60_000, steps=7000, gaussians=None)
 QUICK = Protocol(towns=(0,), frames=6, width=128, points=3000, steps=150, gaussians=4000)
 
 # Presets by the names that the paper's tables use.
@@ -67,7 +65,8 @@ METHODS: dict[str, PresetName] = {
     "3DGS + gain": "3dgs_gain",
     "3DGS + AT": "3dgs_affine",
     "3DGS + bilateral grid": "3dgs_bilateral",
-    "3DGS + curve (as Luminance-GS)": "3dgs_curve",
+    "3DGS + curve": "3dgs_curve",
+    "Luminance-GS": "luminance_gs",
     "PPISP": "ppisp",
     "P2GS as printed": "paper",
     "P2GS, appendix weights": "paper_appendix",
@@ -75,8 +74,8 @@ METHODS: dict[str, PresetName] = {
 }
 WITH_EXPOSURES = frozenset({"P2GS as printed", "P2GS, appendix weights", "robust (ours)"})
 NOT_BUILT = """Not built here: Difix3D needs its diffusion weights; PVG, StreetGS, OmniRe and
-DeSIRE-GS are dynamic systems (these towns stand still). Luminance-GS itself learns curves per view
-with a network; the row here is its idea, a monotone curve per view, under our renderer."""
+DeSIRE-GS are dynamic systems (these towns stand still). Luminance-GS is the preset `luminance_gs`:
+its curve per view under our renderer; a monotone curve per view is the row above it."""
 
 # A column of a table: its title, where metrics.json has its value, digits shown.
 Column = tuple[str, tuple[str, ...], int]
@@ -107,23 +106,21 @@ def options(description: str | None, name: str) -> Options:
     parser.add_argument("--out", type=Path, default=Path("runs/paper"))
     parser.add_argument("--towns", type=int, nargs="+")
     parser.add_argument("--steps", type=int)
-    size = parser.add_mutually_exclusive_group()
-    size.add_argument("--quick", action="store_true", help="one small town, few steps")
-    size.add_argument("--at-size", action="store_true", help="3 x 100 of 480x325, 7,000 steps")
+    parser.add_argument("--quick", action="store_true", help="one small town, few steps")
     parser.add_argument("--max-parallel", type=int, default=1, help="fits at a time")
     parser.add_argument("--lpips-weights", help="alex, vgg or a file; without them LPIPS is n/a")
     args = parser.parse_args()
-    protocol = QUICK if args.quick else AT_SIZE if args.at_size else FULL
+    protocol = QUICK if args.quick else FULL
     if args.towns:
         protocol = dataclasses.replace(protocol, towns=tuple(args.towns))
     if args.steps:
         protocol = dataclasses.replace(protocol, steps=args.steps)
     command = f"python experiments/{name}.py"
-    for flag in ("towns", "steps", "quick", "at_size"):
+    for flag in ("towns", "steps", "quick"):
         value = getattr(args, flag)
         if value:
             shown = "" if value is True else " " + " ".join(map(str, np.atleast_1d(value)))
-            command += f" --{flag.replace('_', '-')}{shown}"
+            command += f" --{flag}{shown}"
     return Options(args.out, protocol, args.max_parallel, args.lpips_weights, command)
 
 

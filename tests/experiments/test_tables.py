@@ -8,6 +8,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "experiments"))
 
+import at_size
 import table1_reconstruction
 import table2_novel_views
 import table3_iso_robustness
@@ -127,3 +128,22 @@ def test_wrong_options_end_with_two(argv, monkeypatch):
     with pytest.raises(SystemExit) as stop:
         towns.options("x", "x")
     assert stop.value.code == 2
+
+
+def test_rows_at_size_are_sorted_and_exposures_are_only_said_where_there_are_some():
+    key = at_size.Key(at_size.BENCHMARK, "ISO std 4", "3dgs", 7000)
+    rest = {"gaussians": 1000, "seconds": 60, "commit": "abc"}
+    rows = {
+        key: {"figures": at_size.figures(metrics(20.0), None), **rest},
+        key._replace(method="robust"): {"figures": at_size.figures(metrics(25.0), 0.01), **rest},
+        key._replace(scene="ISO-Const"): {"figures": at_size.figures(metrics(22.0), None), **rest},
+    }
+    lines = [line for line in at_size.to_markdown(rows).splitlines() if line.startswith("| ")]
+    assert [line.split(" | ")[:2] for line in lines[1:]] == [
+        ["| robust (ours)", "ISO std 4"],
+        ["| 3DGS", "ISO-Const"],
+        ["| 3DGS", "ISO std 4"],
+    ]
+    assert "| 25.00 | 24.00 | 25.00 | 24.00 | 0.800 | 0.0100 | 1000 | 60 | abc |" in lines[1]
+    assert "| n/a | 1000 |" in lines[2]
+    assert set(at_size.ORDER) <= set(at_size.NAMES)

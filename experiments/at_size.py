@@ -1,0 +1,121 @@
+"""The paper's comparison of spreads of ISO at a real size and length; resumable, row by row.
+
+python experiments/at_size.py [--out DIR] [--methods robust 3dgs ...] [--stds 4 2 0]
+
+One town, three cameras with 100 photographs of 480x325 each, 7,000 steps, population by need. Rows
+are kept in `experiments/at_size.json`, with the commit and seconds of each; called again, it goes
+on where it was interrupted. `experiments/at_size.md` is written from all that are there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parent / "published"))
+
+from published_rows import Key, fitted, measure, of_fit, read_rows
+from towns import METHODS, STD_NAMES, WITH_EXPOSURES, Options, Protocol, number, scene, table
+
+from p2gs_jax.core.atomic import write_text
+from p2gs_jax.sweep.rows import read_row
+
+# The paper's drive at a quarter of its width; hours.
+AT_SIZE = Protocol(towns=(0,), frames=100, width=480, points=60_000, steps=7000, gaussians=None)
+ROWS = Path(__file__).with_name("at_size.json")
+BENCHMARK = "towns at size"
+ORDER = (
+    *("robust", "3dgs", "3dgs_affine", "ppisp", "3dgs_bilateral", "3dgs_curve", "luminance_gs"),
+    "paper",
+)
+NAMES = {preset: name for name, preset in METHODS.items()}
+# Title, key in a row's figures, digits.
+COLUMNS = (
+    ("photographs, training, dB", "train", 2),
+    ("photographs, novel, dB", "novel", 2),
+    ("ISO 8, training, dB", "iso_8_train", 2),
+    ("ISO 8, novel, dB", "iso_8_novel", 2),
+    ("ISO 8, novel, SSIM", "iso_8_novel_ssim", 3),
+    ("EV error", "ev", 4),
+)
+HEAD = """Photographs: under the mean exposure and gamma of the training views, as in the paper.
+ISO 8: against photographs of the same views at one exposure without noise, one scale for all.
+
+"""
+
+
+def figures(metrics: Mapping[str, Any], ev: float | None) -> dict[str, float]:
+    """Return a row's figures.
+
+    Args:
+        metrics: as `metrics.json`.
+        ev: RMS error of the exposures, stops; None where the method has none.
+    """
+    iso_8 = metrics["reference"]["scale_aligned"]
+    found = {
+        "train": metrics["train"]["averaged"]["psnr"],
+        "novel": metrics["test"]["averaged"]["psnr"],
+        "iso_8_train": iso_8["train"]["psnr"],
+        "iso_8_novel": iso_8["test"]["psnr"],
+        "iso_8_novel_ssim": iso_8["test"]["ssim"],
+    }
+    return found if ev is None else {**found, "ev": ev}
+
+
+def to_markdown(rows: Mapping[Key, Mapping[str, Any]]) -> str:
+    """Return the table of all rows: methods in `ORDER`, spreads rising."""
+    header = ["method", "trained on", *(title for title, _, _ in COLUMNS)]
+    header += ["Gaussians", "seconds", "commit"]
+
+    def place(key: Key) -> tuple[int, int]:
+        return ORDER.index(key.method), list(STD_NAMES.values()).index(key.scene)
+
+    lines = [
+        [
+            *(NAMES[key.method], key.scene),
+            *(number(row["figures"].get(name, float("nan")), d) for _, name, d in COLUMNS),
+            *(str(row["gaussians"]), str(row["seconds"]), row["commit"]),
+        ]
+        for key, row in sorted(rows.items(), key=lambda item: place(item[0]))
+    ]
+    return HEAD + table(header, lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("runs/paper"))
+    parser.add_argument("--methods", nargs="+", default=list(ORDER), choices=ORDER)
+    parser.add_argument("--stds", type=float, nargs="+", default=[4.0, 2.0, 0.0])
+    parser.add_argument("--steps", type=int, default=AT_SIZE.steps)
+    parser.add_argument("--again", action="store_true", help="measure also what is there")
+    args = parser.parse_args()
+    protocol = dataclasses.replace(AT_SIZE, steps=args.steps)
+    options = Options(args.out, protocol, 1, None, "python experiments/at_size.py")
+
+    def row(key: Key) -> dict[str, Any]:
+        std = next(s for s, name in STD_NAMES.items() if name == key.scene)
+        street = scene(options, 0, std)
+        said = ("--preset", key.method, "--steps", str(key.steps))
+        run = options.folder / street.name / key.method
+        metrics = fitted(street, run, (*said, "--reference", str(street / "reference")))
+        known = std != 0 and NAMES[key.method] in WITH_EXPOSURES
+        found = figures(metrics, read_row(run, street)["ev"] if known else None)
+        command = f"{options.command} --methods {key.method} --stds {std:g} --steps {key.steps}"
+        return {"figures": found, **of_fit(metrics, command)}
+
+    wanted = [
+        Key(BENCHMARK, STD_NAMES[std], method, args.steps)
+        for std in args.stds
+        for method in args.methods
+    ]
+    for key in wanted:
+        measure([key], row, args.again, ROWS)
+        write_text(ROWS.with_suffix(".md"), to_markdown(read_rows(ROWS)))
+
+
+if __name__ == "__main__":
+    main()
