@@ -57,7 +57,9 @@ def _what(run: RunFiles) -> str:
     if not train:
         return f"A fit of {name} with the preset {run.preset}; it left no list of its views."
     by = f" by {count(cameras, 'camera')}" if cameras else ""
-    rest = f" ({held_out} more were held out)" if held_out else ""
+    decided = run.metrics.get("split")
+    by_whom = f": {decided}" if isinstance(decided, str) else ""
+    rest = f" ({held_out} more were held out{by_whom})" if held_out else ""
     gaussians = run.number("counts", "gaussians")
     made = "" if gaussians is None else f" with {count(gaussians, 'Gaussian')}"
     took = seconds_of(run)

@@ -100,7 +100,8 @@ def test_every_section_is_there_and_nothing_is_fetched(page):
 def test_the_page_says_what_the_run_says(page, run):
     text = words_of(page.read_text())
     files = read_run(run)
-    assert "4 photographs of scene by 1 camera (2 more were held out) were fitted" in text
+    held_out = f"2 more were held out: {files.metrics['split']}"
+    assert f"4 photographs of scene by 1 camera ({held_out}) were fitted" in text
     assert f"{files.number('test', 'exposure_fitted', 'psnr'):.1f} dB" in text
     assert f"{files.number('train', 'psnr'):.2f}" in text
     assert f"{int(files.number('counts', 'gaussians')):,}" in text

@@ -160,7 +160,9 @@ def test_many_names_are_counted(run):
 
 def test_the_summary_is_three_sentences(run):
     what, model, good = summary_sentences(run, SceneMeasurements())
-    assert what.startswith("4 photographs of scene by 1 camera (2 more were held out)")
+    split = run.metrics.pop("split")
+    assert what.startswith(f"4 photographs of scene by 1 camera (2 more were held out: {split})")
+    assert "(2 more were held out)" in summary_sentences(run, SceneMeasurements())[0]
     assert "an exposure per view under the sRGB tone curve" in model
     assert "simplest" in model
     assert good == "Held-out photographs are met at 28.0 dB (training photographs at 30.0 dB)."
