@@ -338,6 +338,10 @@ class OptimizerConfig:
     """Exposure and gamma rates decay exponentially to this fraction (ours)."""
     final: float = 0.1
     """All other rates decay exponentially to this fraction (3DGS: no decay; ours: BUILD_NOTES)."""
+    settled: float | None = 600.0
+    """How often a fit may update a Gaussian before these rates are too high: one that does it more
+    often takes all rates of Gaussians times the root of the ratio. None: never (ours: BUILD_NOTES,
+    "Length")."""
     eps: float = 1e-15
     """Adam's epsilon (3DGS: 1e-15)."""
     b1: float = 0.6
@@ -544,6 +548,7 @@ def _paper(exposure_weight: float, name: PresetName) -> FitConfig:
             opacities=5e-2,
             quats=1e-3,
             final=1.0,
+            settled=None,
             exposures=1e-3,
             gammas=1e-3,
             photometry_final=1.0,

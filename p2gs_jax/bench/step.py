@@ -72,7 +72,7 @@ def whole_step(scene: BenchScene, cfg: FitConfig, batch: Batch, entries: int) ->
     optimizer = make_optimizer(cfg)
     # The step donates its state: the scene keeps its own copy.
     holder = [jax.tree.map(jnp.copy, initial_state(params, alive, optimizer))]
-    controls = Controls(jnp.float32(0.5), jnp.int32(cfg.render.sh_degree))
+    controls = Controls(jnp.float32(0.5), jnp.int32(cfg.render.sh_degree), jnp.float32(1))
     partner = Partner(jnp.int32(0))
     step, before = Step(cfg, optimizer, 1.0), compilations()
     room, degree = Room(entries, whole_blocks(scene.gaussians.capacity)), cfg.render.sh_degree
@@ -141,7 +141,7 @@ def measure_step(scene: BenchScene, cfg: FitConfig, repeats: int = 7) -> StepCos
 
     def update(params, moments, grads):
         bands = params.gaussians.sh.shape[1]
-        rates = learning_rates(jnp.float32(0.5), 1.0, params, cfg, bands).gaussians
+        rates = learning_rates(jnp.float32(0.5), jnp.float32(1), 1.0, params, cfg, bands).gaussians
         rows = cast(Any, params.gaussians)
         updates, moments = optimizer.gaussians.update(cast(Any, grads), moments, rows, rates=rates)
         return optax.apply_updates(rows, updates), moments

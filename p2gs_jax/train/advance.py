@@ -35,10 +35,12 @@ class Controls(eqx.Module):
     Attributes:
         progress: fraction of the run completed.
         active_degree: spherical-harmonics degree in use.
+        rate: factor on the rates of Gaussians, from the length of the fit.
     """
 
     progress: Float[Array, ""]
     active_degree: Int[Array, ""]
+    rate: Float[Array, ""]
 
 
 class StepReport(NamedTuple):
@@ -117,7 +119,8 @@ def advance(
     first = state.fault.kind == FAULT_NONE
     healthy = first & fits & jnp.all(_finite((gradient.terms, gradient.v_rest)))
 
-    rates = learning_rates(controls.progress, extent, state.params, cfg, bands)
+    progress, rate = controls.progress, controls.rate
+    rates = learning_rates(progress, rate, extent, state.params, cfg, bands)
     listed = jnp.sum(alive.at[ids].get(mode="fill", fill_value=False))
     updated = update_listed(
         gaussians,
@@ -135,7 +138,7 @@ def advance(
         optimizer=optimizer.gaussians,
         rates=rates.gaussians,
         key=noise_key(cfg.train.seed, state.step),
-        noise_rate=cfg.densify.noise * means_rate(controls.progress, extent, cfg) if mcmc else None,
+        noise_rate=cfg.densify.noise * means_rate(progress, rate, extent, cfg) if mcmc else None,
         owner=population.owner,
         placed=placed_by(frusta, state.params.poses),
     )

@@ -100,7 +100,7 @@ class Bursts:
             if schedule.shrink_at(progress, self.levels) != host.shrink:
                 break
             self.source.prefetch(step + 1, host.shrink)
-            inputs = self.source.at(step, progress, host.shrink)
+            inputs = self.source.at(step, progress, host.pace, host.shrink)
             state, report = self.steps.get(state, inputs, host)(state, *inputs)
             reports.append(report)
             sizes.append(inputs.size)

@@ -43,24 +43,30 @@ class InputSource:
         cfg: everything.
         views: the training views.
         pairs: corresponding observations, for the relative-exposure readings that need them.
+        shown: share of the scene that a view shows.
     """
 
-    def __init__(self, cfg: FitConfig, views: TrainingViews, pairs: ColorPairs | None):
-        self.cfg, self.views, self.pairs = cfg, views, pairs
+    def __init__(
+        self, cfg: FitConfig, views: TrainingViews, pairs: ColorPairs | None, shown: float
+    ):
+        self.cfg, self.views, self.pairs, self.shown = cfg, views, pairs, shown
 
-    def at(self, step: int, progress: float, shrink: int) -> Inputs:
+    def at(self, step: int, progress: float, pace: float, shrink: int) -> Inputs:
         """Return the inputs of a step.
 
         Args:
             step: its number.
             progress: fraction of the run completed before it.
+            pace: progress of one step.
             shrink: factor by which images are shrunk.
         """
-        degree = schedule.sh_degree_at(progress, self.cfg.train, self.cfg.render.sh_degree)
+        cfg = self.cfg
+        degree = schedule.sh_degree_at(progress, cfg.train, cfg.render.sh_degree)
+        rate = schedule.rate_factor(pace, self.shown, cfg.optimizer.settled)
         return Inputs(
             self.views.batch(self.views.index_at(step), shrink, step),
-            partner_at(step, shrink, self.views, self.pairs, self.cfg),
-            on_host(Controls, np.float32(progress), np.int32(degree)),
+            partner_at(step, shrink, self.views, self.pairs, cfg),
+            on_host(Controls, np.float32(progress), np.int32(degree), np.float32(rate)),
         )
 
     def prefetch(self, step: int, shrink: int) -> None:

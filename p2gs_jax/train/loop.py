@@ -117,7 +117,7 @@ class Trainer:
         masks = LeftOutFile(RunFolder(run_dir).left_out_masks)
         self.left_out = LeftOut(cfg, views, masks, self.clock, on_message)
         self.optimizer = make_optimizer(cfg)
-        self.source = InputSource(cfg, views, pairs)
+        self.source = InputSource(cfg, views, pairs, coverage.shown)
         step = Step(cfg, self.optimizer, extent)
         self.steps = LevelPrograms(cfg, step, programs, self.levels)
         self.bursts = Bursts(
@@ -278,7 +278,7 @@ class Trainer:
         if not strategy.slots_stay:
             return
         for number, shrink in enumerate(self.steps.ahead(host.progress, self.views)):
-            inputs = self.source.at(host.step, 0.0, shrink)
+            inputs = self.source.at(host.step, 0.0, host.pace, shrink)
             self.steps.expect(state, inputs, host, shrink, images)
             if number == 0:
                 strategy.expect(state)  # wanted soon after the first step

@@ -137,10 +137,10 @@ def _adam_with_rates(b1: float, b2: float, eps: float) -> Optimizer:
     )
 
 
-def means_rate(progress: Array, extent: float, cfg: FitConfig) -> Float[Array, ""]:
+def means_rate(progress: Array, rate: Array, extent: float, cfg: FitConfig) -> Float[Array, ""]:
     """Return the learning rate of the means, scene units per step (3DGS: exponential decay)."""
     o = cfg.optimizer
-    return extent * o.means * (o.means_final / o.means) ** progress
+    return rate * extent * o.means * (o.means_final / o.means) ** progress
 
 
 def photometry_gate(progress: Array, cfg: FitConfig) -> Float[Array, ""]:
@@ -168,26 +168,27 @@ def appearance_rate(progress: Array, cfg: FitConfig) -> Float[Array, ""]:
 
 
 def learning_rates(
-    progress: Array, extent: float, like: Params, cfg: FitConfig, bands: int
+    progress: Array, rate: Array, extent: float, like: Params, cfg: FitConfig, bands: int
 ) -> Params:
     """Return the rate of every parameter, shaped to broadcast against `like`.
 
     Args:
         progress: fraction of the run completed.
+        rate: factor on those of Gaussians (`schedule.rate_factor`).
         extent: scene extent, scene units.
         like: the parameters, for their structure.
         cfg: rates and schedules.
         bands: spherical-harmonics coefficients in use.
     """
     o = cfg.optimizer
-    decay = o.final**progress
+    decay = rate * o.final**progress
     sh = jnp.full((bands, 1), o.sh_rest).at[0].set(o.sh_dc) * decay
     gate = photometry_gate(progress, cfg)
     varies, balance = MODELS[cfg.photometry.model], like.photometry.raw_white_balance
     by_view = cfg.photometry.white_balance == "view"
     return Params(
         gaussians=Gaussians(
-            means=means_rate(progress, extent, cfg),
+            means=means_rate(progress, rate, extent, cfg),
             quats=o.quats * decay,
             log_scales=o.scales * decay,
             opacity_logits=o.opacities * decay,

@@ -62,6 +62,22 @@ def sh_degree_at(progress: float, cfg: TrainConfig, highest: int) -> int:
     return min(highest, int(progress / cfg.sh_every + 1e-9))
 
 
+def rate_factor(per_step: float, shown: float, settled: float | None) -> float:
+    """Return the factor on the rates of Gaussians in a fit of this length, at most 1.
+
+    Near an optimum the noise of Adam's steps adds up as their number times the squared rate: so
+    long fits take rates lower by the root of their length (ours: BUILD_NOTES, "Length").
+
+    Args:
+        per_step: progress of one step.
+        shown: share of the Gaussians that one step updates, about.
+        settled: updates of a Gaussian up to which the configured rates hold; None: any number.
+    """
+    if settled is None:
+        return 1.0
+    return min(1.0, (settled * per_step / shown) ** 0.5)
+
+
 @dataclass(frozen=True)
 class Pace:
     """How much progress a step makes, and what is known about its cost.

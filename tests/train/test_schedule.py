@@ -44,3 +44,13 @@ def test_without_a_budget_the_pace_is_fixed():
     pace = Pace.from_config(TrainConfig(steps=400), reserve_s=9.0)
     assert pace.per_step == 1 / 400
     assert pace.replan(0.1, 1.0, 1.0) is pace
+
+
+def test_long_fits_take_lower_rates():
+    settled = 600.0
+    assert schedule.rate_factor(1 / 600, 1.0, settled) == 1.0
+    assert schedule.rate_factor(1 / 100, 1.0, settled) == 1.0
+    assert schedule.rate_factor(1 / 2400, 1.0, settled) == pytest.approx(0.5)
+    # A Gaussian that every fourth view shows is updated as often in four times the steps.
+    assert schedule.rate_factor(1 / 9600, 0.25, settled) == pytest.approx(0.5)
+    assert schedule.rate_factor(1 / 30_000, 1.0, None) == 1.0

@@ -26,7 +26,7 @@ from p2gs_jax.types import Batch, Camera, Gaussians, Params, Photometry
 
 COUNT, HIDDEN = 6000, 600
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
-EXTENT, DEGREE, PROGRESS = 2.0, 1, 0.3
+EXTENT, DEGREE, PROGRESS, RATE = 2.0, 1, 0.3, 0.7
 FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
 
 
@@ -72,7 +72,7 @@ def made():
     params, batch, partner = start(), photograph(), Partner(jnp.int32(0))
     # A tenth of the slots are empty.
     alive = jnp.arange(COUNT) % 10 != 0
-    controls = Controls(jnp.float32(PROGRESS), jnp.int32(DEGREE))
+    controls = Controls(jnp.float32(PROGRESS), jnp.int32(DEGREE), jnp.float32(RATE))
     cfg = config(True)
 
     def steps(cfg):
@@ -136,7 +136,9 @@ def test_one_step_is_an_adam_update_of_the_gradient_of_the_total_loss(made, whic
     assert int(state.step) == 1
     assert float(report.loss) == pytest.approx(made.loss, rel=1e-6)
     assert int(report.visible) == (made.seen.sum() if which == "after" else COUNT)
-    rates = learning_rates(jnp.float32(PROGRESS), EXTENT, made.params, made.cfg, (DEGREE + 1) ** 2)
+    rates = learning_rates(
+        jnp.float32(PROGRESS), jnp.float32(RATE), EXTENT, made.params, made.cfg, (DEGREE + 1) ** 2
+    )
     o = made.cfg.optimizer
     adam = optax.scale_by_adam(o.b1, o.b2, o.eps)
     updates, _ = adam.update(made.gradient, adam.init(made.params))

@@ -38,12 +38,12 @@ def params(balance):
 def test_rates(level, progress):
     cfg = with_fields(FitConfig(), {"photometry.white_balance": level})
     like = params(jnp.zeros((2, 3)))
-    found = learning_rates(jnp.float32(progress), 1.0, like, cfg, 1).photometry
+    found = learning_rates(jnp.float32(progress), jnp.float32(1), 1.0, like, cfg, 1).photometry
     moves = level == "view" and progress > cfg.photometry.freeze_until
     expected = float(found.raw_exposures) if moves else 0.0
     assert float(found.raw_white_balance) == expected
     assert (expected > 0) == moves
-    plain = learning_rates(jnp.float32(progress), 1.0, params(None), FitConfig(), 1)
+    plain = learning_rates(jnp.float32(progress), jnp.float32(1), 1.0, params(None), FitConfig(), 1)
     assert plain.photometry.raw_white_balance is None
 
 
