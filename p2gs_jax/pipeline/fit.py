@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -192,6 +193,7 @@ def fit(
             clock,
             lambda known: _begin(programs, known, scene, folder),
             kept=kept_choice(cfg, folder) if resume else None,
+            pixels=folder.pixels,
         )
         with _lock(folder, paths, cfg, prepared.decisions):
             result = optimise(
@@ -244,6 +246,8 @@ def fit(
         else np.log2([true_exposures[view.name] for view in scene.training_views]),
         owner=owner,
     )
+    prepared.store.close()
+    shutil.rmtree(folder.pixels, ignore_errors=True)
     return FitResult(params, scene, metrics, paths.run, prepared.selection, prepared.decisions)
 
 
