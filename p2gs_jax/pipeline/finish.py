@@ -38,6 +38,7 @@ class Account:
         growth: the history of automatic growth, or None.
         left_out: what no static scene explains and the last steps left out, by row of the scene;
             None where it was not looked for.
+        of: scores of the model that was converted, as it was; None: this is a fit.
     """
 
     counts: dict[str, int]
@@ -45,6 +46,7 @@ class Account:
     compiler: CompileCounter = field(default_factory=CompileCounter)
     growth: dict | None = None
     left_out: Mapping[int, Unexplained] | None = None
+    of: dict | None = None
 
 
 def finish(
@@ -163,6 +165,8 @@ def _accounted(account: Account, watch: Stopwatch, prepared: Prepared, reporter:
         said["photometry"] = prepared.selection.solution.state
     if account.growth is not None:
         said["growth"] = account.growth
+    if account.of is not None:
+        said["of"] = account.of
     return said
 
 
