@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -224,6 +225,7 @@ def _fit(
             clock,
             lambda known: _begin(programs, known, scene, folder),
             kept=kept_choice(cfg, folder) if resume else None,
+            pixels=folder.pixels,
         )
         lock.require()
         with _begun(folder, paths, cfg, prepared.decisions):
@@ -279,6 +281,8 @@ def _fit(
         owner=owner,
         still_ours=lock.require,
     )
+    prepared.store.close()
+    shutil.rmtree(folder.pixels, ignore_errors=True)
     return FitResult(params, scene, metrics, paths.run, prepared.selection, prepared.decisions)
 
 
