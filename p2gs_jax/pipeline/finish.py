@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -60,6 +60,7 @@ def finish(
     lpips_weights: LpipsWeights | None,
     true_ev: np.ndarray | None = None,
     owner: np.ndarray | None = None,
+    still_ours: Callable[[], None] = lambda: None,
 ) -> dict:
     """Evaluate, export and return what `metrics.json` holds.
 
@@ -73,6 +74,7 @@ def finish(
         lpips_weights: for LPIPS, or None to leave it out.
         true_ev: true exposures of the training views for the plot, or None.
         owner: the moving object that each Gaussian belongs to, or None.
+        still_ours: raises where the run folder is no longer this run's.
     """
     watch = Stopwatch()
     return_freed_memory()
@@ -134,6 +136,7 @@ def finish(
             write_unexplained(folder.left_out, scene, store, account.left_out)
             metrics["left_out"] = shares_by_view(scene, account.left_out)
     metrics |= _accounted(account, watch, prepared, reporter)
+    still_ours()
     write_json(folder.metrics, metrics)
     return metrics
 
