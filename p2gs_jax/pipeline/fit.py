@@ -11,16 +11,19 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 
 from p2gs_jax.config import FitConfig, require_config
 from p2gs_jax.core.atomic import no_empty_folders
 from p2gs_jax.core.clock import CompileCounter, Stopwatch
+from p2gs_jax.core.devices import Devices
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.appearance import exposures_apart
 from p2gs_jax.photometry.gauge import recentre
 from p2gs_jax.photometry.selection import Selection
 from p2gs_jax.pipeline.decide import kept_choice
+from p2gs_jax.pipeline.devices import mesh_of
 from p2gs_jax.pipeline.finish import Account, finish
 from p2gs_jax.pipeline.preflight import Paths, check_scene, preflight
 from p2gs_jax.pipeline.prepare import Expected, Prepared, load, prepare
@@ -45,6 +48,7 @@ def optimise(
     validation: Sequence[int] = (),
     spent_s: float = 0.0,
     reserve_s: float = 0.0,
+    mesh: Mesh | None = None,
 ) -> TrainResult:
     """Run the optimisation, from the start or from the newest checkpoint.
 
@@ -57,6 +61,7 @@ def optimise(
         validation: training views that automatic growth is judged by.
         spent_s: seconds of the budget that are already gone.
         reserve_s: seconds of the budget to keep for evaluation and files.
+        mesh: the devices of a step of several views; None: the default one.
     """
     cfg = prepared.cfg
     views = TrainingViews(
@@ -84,6 +89,7 @@ def optimise(
         on_message=say,
         validation=validation,
         own_exposures=prepared.selection is not None,
+        mesh=mesh,
     )
     alive = np.ones(prepared.params.gaussians.capacity, bool)
     return trainer.run(
@@ -96,7 +102,9 @@ def optimise(
     )
 
 
-def _begin(programs: StepPrograms, known: Expected, scene: Scene, folder: RunFolder) -> None:
+def _begin(
+    programs: StepPrograms, known: Expected, scene: Scene, folder: RunFolder, mesh: Mesh | None
+) -> None:
     """Begin to compile steps while the exposures are solved, mostly on one core."""
     views = TrainingViews(
         known.store, scene.train_indices, known.cfg.train.seed, measured=known.measured
@@ -110,6 +118,7 @@ def _begin(programs: StepPrograms, known: Expected, scene: Scene, folder: RunFol
         folder.root,
         programs,
         known.decisions,
+        mesh=mesh,
     )
     trainer.expect(known.params, known.owner, known.images)
 
@@ -154,6 +163,7 @@ def fit(
     reporter: Reporter | None = None,
     true_exposures: Mapping[str, float] | None = None,
     spent_s: float = 0.0,
+    devices: Devices | None = None,
 ) -> FitResult:
     """Fit a scene and write a run folder.
 
@@ -166,6 +176,7 @@ def fit(
         reporter: receives progress.
         true_exposures: image name -> true exposure, where it is known, for the plot.
         spent_s: seconds of the budget that were gone before the call.
+        devices: which to take, and what is divided among them; None: one.
 
     Raises:
         UserError: something the user can mend.
@@ -177,6 +188,7 @@ def fit(
     begin = time.monotonic() - spent_s
     clock, compiler = Stopwatch(), CompileCounter()
     lpips_weights = preflight(cfg, paths, resume=resume)
+    mesh = mesh_of(cfg, devices)
     with no_empty_folders(paths.run):
         reading = time.monotonic()
         scene = load(paths.scene, paths.run, cfg, reporter)
@@ -190,7 +202,7 @@ def fit(
             cfg,
             reporter,
             clock,
-            lambda known: _begin(programs, known, scene, folder),
+            lambda known: _begin(programs, known, scene, folder, mesh),
             kept=kept_choice(cfg, folder) if resume else None,
         )
         with _lock(folder, paths, cfg, prepared.decisions):
@@ -201,6 +213,7 @@ def fit(
                 programs,
                 resume=resume,
                 validation=views.validation,
+                mesh=mesh,
                 spent_s=time.monotonic() - begin,
                 reserve_s=seconds_to_finish(
                     scene, cfg, lpips_weights, reference=views.truth is not None

@@ -71,13 +71,14 @@ class Bursts:
         state, reports, sizes = self._dispatched(state, host)
         kind = int(state.fault.kind)
         done = int(state.step) - host.step
+        taken = done // self.train.batch
         seconds = time.monotonic() - begin - (self.steps.programs.waited_s - waited)
         self.clock.add("steps", seconds)
         if kind == FAULT_NONFINITE:
-            self._diverged(state, host.step + done, reports[done])
+            self._diverged(state, host.step + done, reports[taken])
         if kind == FAULT_OVERFLOW:
             needed, visible = int(state.fault.needed), int(state.fault.visible)
-            host.rooms = room.grown(host.rooms, sizes[done], needed, visible)
+            host.rooms = room.grown(host.rooms, sizes[taken], needed, visible)
             host.overflows += 1
             state = dataclasses.replace(state, fault=Fault.none())
         elif done:
@@ -86,25 +87,27 @@ class Bursts:
         host.step += done
         for _ in range(done):
             host.progress += host.pace
-        return state, reports[:done]
+        return state, reports[:taken]
 
     def _dispatched(
         self, state: FitState, host: HostState
     ) -> tuple[FitState, list[StepReport], list[tuple[int, int]]]:
         """Dispatch the steps of a burst; return the state, and report and image size of each."""
         progress, reports, sizes = host.progress, [], []
-        every = self.train.log_every
-        for step in range(host.step, host.step + min(every - host.step % every, MAX_BURST)):
+        every, views = self.train.log_every, self.train.batch
+        end = host.step + min(every - host.step % every, MAX_BURST)
+        for step in range(host.step, end, views):
             if schedule.is_over(progress, host.pace):
                 break
             if schedule.shrink_at(progress, self.levels) != host.shrink:
                 break
-            self.source.prefetch(step + 1, host.shrink)
+            self.source.prefetch(step + views, host.shrink)
             inputs = self.source.at(step, progress, host.pace, host.shrink)
             state, report = self.steps.get(state, inputs, host)(state, *inputs)
             reports.append(report)
             sizes.append(inputs.size)
-            progress = progress + host.pace
+            for _ in range(views):
+                progress = progress + host.pace
         return state, reports, sizes
 
     def _diverged(self, state: FitState, step: int, report: StepReport) -> None:

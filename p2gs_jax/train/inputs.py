@@ -12,6 +12,7 @@ from p2gs_jax.losses.relative_exposure import ColorPairs
 from p2gs_jax.losses.total import Partner
 from p2gs_jax.train import schedule
 from p2gs_jax.train.advance import Controls
+from p2gs_jax.train.batches import stacked
 from p2gs_jax.train.partner import partner_at
 from p2gs_jax.train.views import TrainingViews
 from p2gs_jax.types import Batch
@@ -21,7 +22,7 @@ class Inputs(NamedTuple):
     """Arguments of a step, all on the host.
 
     Attributes:
-        batch: the view and its photograph.
+        batch: the view and its photograph; of several views, stacked.
         partner: what the relative-exposure loss compares it with.
         controls: of the schedule.
     """
@@ -63,12 +64,19 @@ class InputSource:
         cfg = self.cfg
         degree = schedule.sh_degree_at(progress, cfg.train, cfg.render.sh_degree)
         rate = schedule.rate_factor(pace, self.shown, cfg.optimizer.settled)
-        return Inputs(
-            self.views.batch(self.views.index_at(step), shrink, step),
-            partner_at(step, shrink, self.views, self.pairs, cfg),
-            on_host(Controls, np.float32(progress), np.int32(degree), np.float32(rate)),
-        )
+        controls = on_host(Controls, np.float32(progress), np.int32(degree), np.float32(rate))
+        rows = self.views.indices_at(step, cfg.train.batch)
+        each = [self._of_view(step + k, row, shrink) for k, row in enumerate(rows)]
+        if len(each) == 1:
+            return Inputs(*each[0], controls)
+        batches, partners = zip(*each, strict=True)
+        return Inputs(stacked(batches), stacked(partners), controls)
+
+    def _of_view(self, step: int, row: int, shrink: int) -> tuple[Batch, Partner]:
+        batch = self.views.batch(row, shrink, step)
+        return batch, partner_at(step, row, shrink, self.views, self.pairs, self.cfg)
 
     def prefetch(self, step: int, shrink: int) -> None:
-        """Begin decoding the photograph of a step in the background."""
-        self.views.prefetch(self.views.index_at(step), shrink)
+        """Begin decoding the photographs of a step in the background."""
+        for row in self.views.indices_at(step, self.cfg.train.batch):
+            self.views.prefetch(row, shrink)

@@ -18,10 +18,12 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 from jaxtyping import Bool
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.clock import Stopwatch
+from p2gs_jax.core.devices import Devices
 from p2gs_jax.core.progress import LogRecord
 from p2gs_jax.evaluate.unexplained import Unexplained
 from p2gs_jax.gaussians.population import STEP_SECONDS_PER_PIXEL, Coverage
@@ -37,7 +39,9 @@ from p2gs_jax.train.inputs import InputSource
 from p2gs_jax.train.left_out import LeftOut
 from p2gs_jax.train.level_programs import LevelPrograms
 from p2gs_jax.train.log import RunLog, record_of
-from p2gs_jax.train.optimizer import make_optimizer
+from p2gs_jax.train.mesh.spread import OnMesh, OnOneDevice, Spread
+from p2gs_jax.train.mesh.step import MeshStep
+from p2gs_jax.train.optimizer import Optimizer, make_optimizer
 from p2gs_jax.train.programs import StepPrograms
 from p2gs_jax.train.schedule import Pace
 from p2gs_jax.train.session import Session
@@ -89,6 +93,7 @@ class Trainer:
         on_message: called with everything the user must know.
         validation: training views that automatic growth is judged by.
         own_exposures: their exposures come from tracks, so they may be judged under these.
+        mesh: the devices of a step of several views; None: the default one.
     """
 
     def __init__(
@@ -105,6 +110,7 @@ class Trainer:
         on_message: Callable[[str], None] = lambda text: None,
         validation: Sequence[int] = (),
         own_exposures: bool = False,
+        mesh: Mesh | None = None,
     ):
         self.cfg, self.views, self.coverage = cfg, views, coverage
         self.programs, self.on_message = programs, on_message
@@ -118,7 +124,7 @@ class Trainer:
         self.left_out = LeftOut(cfg, views, masks, self.clock, on_message)
         self.optimizer = make_optimizer(cfg)
         self.source = InputSource(cfg, views, pairs, coverage.shown)
-        step = Step(cfg, self.optimizer, extent)
+        step, self.spread = _step_and_spread(cfg, self.optimizer, extent, mesh)
         self.steps = LevelPrograms(cfg, step, programs, self.levels)
         self.bursts = Bursts(
             cfg.train, self.levels, self.source, self.steps, self.checkpoints, self.clock
@@ -132,6 +138,7 @@ class Trainer:
             validation=validation,
             own_exposures=own_exposures,
             programs=programs,
+            spread=self.spread,
             log=self.log,
             clock=self.clock,
             take_burst=self._take_burst,
@@ -163,7 +170,8 @@ class Trainer:
             UserError: no Gaussian is left, or checkpoints cannot be continued from.
         """
         strategy = make_strategy(self.context, int(np.sum(np.asarray(alive))))
-        state = initial_state(params, alive, self.optimizer, strategy.slots, owner)
+        slots = self.spread.padded(strategy.slots)
+        state = initial_state(params, alive, self.optimizer, slots, owner)
         pace = Pace.from_config(self.cfg.train, spent_s + finish_s)
         host = HostState(pace=pace.per_step)
         restored = self.checkpoints.restore(state) if resume else None
@@ -180,7 +188,9 @@ class Trainer:
         population = state.population
         self._allocate(state.params.gaussians, population.alive, population.owner, host, strategy)
         self._expect(state, host, strategy)
+        state = self.spread.spread(state)
         state, host = self._loop(state, host, session, strategy)
+        state = self.spread.whole(state)
         strategy.end(state, host)
         self._save(state, host)
         return TrainResult(
@@ -205,7 +215,8 @@ class Trainer:
         alive, host = np.ones(seeds, bool), HostState(rooms=dict(self.programs.rooms))
         self._allocate(params.gaussians, alive, owner, host, strategy)
         self.programs.rooms = dict(host.rooms)
-        start = functools.partial(initial_state, optimizer=self.optimizer, slots=strategy.slots)
+        slots = self.spread.padded(strategy.slots)
+        start = functools.partial(initial_state, optimizer=self.optimizer, slots=slots)
         self._expect(jax.eval_shape(start, params, alive, owner=owner), host, strategy, images)
 
     def _loop(
@@ -218,7 +229,7 @@ class Trainer:
             if stepped:
                 state, host = strategy.update(state, host, session)
             if self.left_out.due(host):
-                self.left_out.look(state, host)
+                self.left_out.look(self.spread.whole(state), host)
                 session.tick(host)
             session.replan(host)
             if session.over(host):
@@ -229,7 +240,7 @@ class Trainer:
                     )
                 break
             if time.monotonic() - saved > self.cfg.train.checkpoint_every_s:
-                self._save(state, host)
+                self._save(self.spread.whole(state), host)
                 saved = time.monotonic()
         return state, host
 
@@ -282,3 +293,13 @@ class Trainer:
             self.steps.expect(state, inputs, host, shrink, images)
             if number == 0:
                 strategy.expect(state)  # wanted soon after the first step
+
+
+def _step_and_spread(
+    cfg: FitConfig, optimizer: Optimizer, extent: float, mesh: Mesh | None
+) -> tuple[Step | MeshStep, Spread]:
+    """Return the step of a fit, and how its state lies on the devices."""
+    if cfg.train.batch == 1 and (mesh is None or mesh.size == 1):
+        return Step(cfg, optimizer, extent), OnOneDevice()
+    mesh = mesh or Devices().mesh()
+    return MeshStep(cfg, optimizer, extent, mesh), OnMesh(mesh)

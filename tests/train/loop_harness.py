@@ -46,6 +46,9 @@ class Views:
     def leave_out(self, rows):
         self.out = tuple(rows)
 
+    def indices_at(self, step, count):
+        return tuple((step + k) % VIEWS for k in range(count))
+
     def index_at(self, step):
         return step % VIEWS
 

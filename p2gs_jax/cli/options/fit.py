@@ -11,6 +11,7 @@ import tyro
 
 from p2gs_jax import config as configs
 from p2gs_jax.cli.options.parse import check, parse_duration, parse_gaussians
+from p2gs_jax.core.devices import Devices
 
 Preset = Annotated[configs.PresetName, tyro.conf.arg(metavar="NAME")]
 Duration = Annotated[str | None, tyro.conf.arg(metavar="TIME")]
@@ -90,6 +91,11 @@ class Fit:
     weights."""
     seed: int | None = None
     """Seeds every random choice; default: 0."""
+    devices: Annotated[str, tyro.conf.arg(metavar="N|all")] = "1"
+    """Devices of a step, each with its own views (--train.batch; default then: one view each)."""
+    shard: Annotated[str, tyro.conf.arg(metavar="views|gaussians|VxG")] = "views"
+    """Where Gaussians lie: all on every device (views), divided among all devices (gaussians), or
+    in each of V groups among its G devices, such as 2x2 (docs/scaling.md)."""
 
 
 @dataclass(frozen=True)
@@ -187,8 +193,25 @@ def resolve_fit(args: Fit) -> configs.FitConfig:
     check(data.max_frames >= 2, "--max-frames must be at least 2")
     check(data.test_every >= 0, "--test-every must be 0 or more")
     check(train.steps >= 1, "--steps must be at least 1")
+    check(train.batch >= 1, "--train.batch must be at least 1")
     cfg = dataclasses.replace(cfg, data=data, train=train, evaluation=evaluation, densify=densify)
     return _known(cfg, args)
+
+
+def resolve_devices(args: Fit) -> Devices:
+    """Return the devices of a fit.
+
+    Raises:
+        UserError: the number is none.
+    """
+    if args.devices == "all":
+        return Devices("all", args.shard)
+    check(
+        args.devices.isdecimal() and int(args.devices) >= 1,
+        f"--devices {args.devices} is no number of devices",
+        fix="give 1 or more, or all",
+    )
+    return Devices(int(args.devices), args.shard)
 
 
 def _known(cfg: configs.FitConfig, args: Fit | Calibrate) -> configs.FitConfig:
