@@ -161,6 +161,7 @@ def fitted(folder: Path) -> dict:
         },
     )
     run = RunFolder(folder / "run")
+    run.root.mkdir()
     scene = load(make_scene(folder / "scene"), run.root, cfg, Silent())
     prepared = prepare(scene, cfg, Silent(), Stopwatch())
 
