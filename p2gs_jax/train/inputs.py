@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
@@ -45,12 +46,18 @@ class InputSource:
         views: the training views.
         pairs: corresponding observations, for the relative-exposure readings that need them.
         shown: share of the scene that a view shows.
+        own: which views of a batch this process composites, and therefore decodes.
     """
 
     def __init__(
-        self, cfg: FitConfig, views: TrainingViews, pairs: ColorPairs | None, shown: float
+        self,
+        cfg: FitConfig,
+        views: TrainingViews,
+        pairs: ColorPairs | None,
+        shown: float,
+        own: Collection[int],
     ):
-        self.cfg, self.views, self.pairs, self.shown = cfg, views, pairs, shown
+        self.cfg, self.views, self.pairs, self.shown, self.own = cfg, views, pairs, shown, own
 
     def at(self, step: int, progress: float, pace: float, shrink: int) -> Inputs:
         """Return the inputs of a step.
@@ -66,17 +73,18 @@ class InputSource:
         rate = schedule.rate_factor(pace, self.shown, cfg.optimizer.settled)
         controls = on_host(Controls, np.float32(progress), np.int32(degree), np.float32(rate))
         rows = self.views.indices_at(step, cfg.train.batch)
-        each = [self._of_view(step + k, row, shrink) for k, row in enumerate(rows)]
+        each = [self._of_view(step + k, row, shrink, k in self.own) for k, row in enumerate(rows)]
         if len(each) == 1:
             return Inputs(*each[0], controls)
         batches, partners = zip(*each, strict=True)
         return Inputs(stacked(batches), stacked(partners), controls)
 
-    def _of_view(self, step: int, row: int, shrink: int) -> tuple[Batch, Partner]:
-        batch = self.views.batch(row, shrink, step)
+    def _of_view(self, step: int, row: int, shrink: int, own: bool) -> tuple[Batch, Partner]:
+        batch = self.views.batch(row, shrink, step, decoded=own)
         return batch, partner_at(step, row, shrink, self.views, self.pairs, self.cfg)
 
     def prefetch(self, step: int, shrink: int) -> None:
         """Begin decoding the photographs of a step in the background."""
-        for row in self.views.indices_at(step, self.cfg.train.batch):
-            self.views.prefetch(row, shrink)
+        rows = self.views.indices_at(step, self.cfg.train.batch)
+        for k in self.own:
+            self.views.prefetch(rows[k], shrink)

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +24,7 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core import interrupts
 from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.core.devices import Devices
+from p2gs_jax.core.processes import from_first, gathered
 from p2gs_jax.core.progress import LogRecord
 from p2gs_jax.evaluate.unexplained import Unexplained
 from p2gs_jax.gaussians.population import STEP_SECONDS_PER_PIXEL, Coverage
@@ -125,11 +125,19 @@ class Trainer:
         self.left_out = LeftOut(cfg, views, masks, self.clock, on_message)
         self.asked = interrupts.Held()
         self.optimizer = make_optimizer(cfg)
-        self.source = InputSource(cfg, views, pairs, coverage.shown)
         step, self.spread = _step_and_spread(cfg, self.optimizer, extent, mesh)
+        self.source = InputSource(
+            cfg, views, pairs, coverage.shown, self.spread.own(cfg.train.batch)
+        )
         self.steps = LevelPrograms(cfg, step, programs, self.levels)
         self.bursts = Bursts(
-            cfg.train, self.levels, self.source, self.steps, self.checkpoints, self.clock
+            cfg.train,
+            self.levels,
+            self.source,
+            self.steps,
+            self.spread,
+            self.checkpoints,
+            self.clock,
         )
         self.context = RunContext(
             cfg=cfg,
@@ -190,8 +198,8 @@ class Trainer:
         session = Session(pace, host, finish_s=finish_s, full_step_s=full_step_s)
         population = state.population
         self._allocate(state.params.gaussians, population.alive, population.owner, host, strategy)
-        self._expect(state, host, strategy)
         state = self.spread.spread(state)
+        self._expect(state, host, strategy)
         with interrupts.held() as self.asked:
             state, host = self._loop(state, host, session, strategy)
             state = self.spread.whole(state)
@@ -227,14 +235,14 @@ class Trainer:
         self, state: FitState, host: HostState, session: Session, strategy: Strategy
     ) -> tuple[FitState, HostState]:
         """Take bursts until the run is complete, or its time over."""
-        saved = time.monotonic()
+        saved = host.elapsed_s
         while not schedule.is_over(host.progress, host.pace):
             state, stepped = self._take_burst(state, host, session)
             if stepped:
                 state, host = strategy.update(state, host, session)
             if self.left_out.due(host):
                 self.left_out.look(self.spread.whole(state), host)
-                session.tick(host)
+                self._tick(session, host)
             session.replan(host)
             if session.over(host):
                 if host.progress < NEARLY_DONE:
@@ -243,10 +251,10 @@ class Trainer:
                         "again with a longer --budget; what was compiled now is kept."
                     )
                 break
-            asked = self.asked.arrived
-            if asked is not None or time.monotonic() - saved > self.cfg.train.checkpoint_every_s:
+            asked = self._asked()
+            if asked is not None or host.elapsed_s - saved > self.cfg.train.checkpoint_every_s:
                 self._save(self.spread.whole(state), host)
-                saved = time.monotonic()
+                saved = host.elapsed_s
             if asked is not None:
                 self.on_message(
                     f"{interrupts.name_of(asked)}: the run stops after step {host.step} "
@@ -260,13 +268,25 @@ class Trainer:
     ) -> tuple[FitState, bool]:
         """Take a burst of steps and log it; see `strategies.base.TakeBurst`."""
         state, reports = self.bursts.take(state, host)
-        session.tick(host)
+        self._tick(session, host)
         if reports:
             record = record_of(reports, host, count_alive(state), host.shrink, trial=trial)
             self.log.append(record)
             # From here on a signal waits for the next place to continue from.
             self.asked.begin()
         return state, bool(reports)
+
+    def _tick(self, session: Session, host: HostState) -> None:
+        """Write down the time; of several processes that of the first, so that all plan alike."""
+        session.tick(host)
+        host.elapsed_s, host.step_s = from_first((host.elapsed_s, host.step_s))
+
+    def _asked(self) -> int | None:
+        """Return the signal that asks for the end, whichever process it reached."""
+        if jax.process_count() > 1:
+            arrived = [number for number in gathered(self.asked.arrived) if number is not None]
+            self.asked.arrived = max(arrived, default=None)
+        return self.asked.arrived
 
     def _take_burst_of_stage(
         self, state: FitState, host: HostState, session: Session, *, trial: bool = False

@@ -125,15 +125,18 @@ class TrainingViews:
         row = self.rows[index]
         return on_host(Camera, *self.store.camera(row, shrink), self.store.placement(row))
 
-    def batch(self, index: int, shrink: int, step: int = 0) -> Batch:
+    def batch(self, index: int, shrink: int, step: int = 0, *, decoded: bool = True) -> Batch:
         """Return a training view, on the host: a compiled step takes it from there.
 
         Args:
             index: row in `Photometry`.
             shrink: factor by which images are shrunk.
             step: draws the background, where every step has another.
+            decoded: off: with black pixels, where another process composites it.
         """
         row = self.rows[index]
+        if not decoded:
+            return self._elsewhere(index, shrink, step)
         ldr, mask = self.store.stored(row, shrink)
         measured = None if self.measured is None else self.measured[index]
         if index in self._hidden:
@@ -142,6 +145,15 @@ class TrainingViews:
             measured = None if measured is None else _outside(measured, hidden)
         given = (self.camera(index, shrink), ldr, mask, np.int32(index), measured)
         return on_host(Batch, *given, self.store.alpha(row, shrink), self._backdrop(step))
+
+    def _elsewhere(self, index: int, shrink: int, step: int) -> Batch:
+        camera = self.camera(index, shrink)
+        size = camera.height, camera.width
+        measured = None if self.measured is None else self.measured[index]
+        alpha = None if self.store.backdrop is None else np.zeros(size, np.uint16)
+        pixels = np.zeros((*size, 3), np.uint16), np.zeros(size, bool)
+        given = (camera, *pixels, np.int32(index), measured, alpha)
+        return on_host(Batch, *given, self._backdrop(step))
 
     def _backdrop(self, step: int) -> Float32[np.ndarray, " 3"] | None:
         if not self.store.random_backdrop:

@@ -14,7 +14,7 @@ from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
 from p2gs_jax.core.devices import GAUSSIANS
-from p2gs_jax.train.state import FitState, grow_state
+from p2gs_jax.train.state import Fault, FitState, grow_state
 
 
 class Spread(Protocol):
@@ -22,6 +22,10 @@ class Spread(Protocol):
 
     def padded(self, slots: int) -> int:
         """Return the room for a population, at least `slots`."""
+        ...
+
+    def own(self, batch: int) -> tuple[int, ...]:
+        """Return which views of a batch the devices of this process composite."""
         ...
 
     def spread(self, state: FitState) -> FitState:
@@ -32,6 +36,10 @@ class Spread(Protocol):
         """Return a state of steps as a whole, for what looks at all Gaussians."""
         ...
 
+    def healed(self, state: FitState) -> FitState:
+        """Return a state of steps without its fault."""
+        ...
+
 
 class OnOneDevice:
     """Nothing is moved."""
@@ -40,6 +48,10 @@ class OnOneDevice:
         """See `Spread`."""
         return slots
 
+    def own(self, batch: int) -> tuple[int, ...]:
+        """See `Spread`."""
+        return tuple(range(batch))
+
     def spread(self, state: FitState) -> FitState:
         """See `Spread`."""
         return state
@@ -47,6 +59,10 @@ class OnOneDevice:
     def whole(self, state: FitState) -> FitState:
         """See `Spread`."""
         return state
+
+    def healed(self, state: FitState) -> FitState:
+        """See `Spread`."""
+        return dataclasses.replace(state, fault=Fault.none())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,6 +87,13 @@ class OnMesh:
         """See `Spread`."""
         return -(-slots // self.parts) * self.parts
 
+    def own(self, batch: int) -> tuple[int, ...]:
+        """See `Spread`."""
+        each = batch // self.mesh.size
+        processes = [device.process_index for device in self.mesh.devices.flat]
+        here = jax.process_index()
+        return tuple(k for k in range(batch) if processes[k // each] == here)
+
     def spread(self, state: FitState) -> FitState:
         """See `Spread`."""
         slots = self.padded(state.params.gaussians.capacity)
@@ -85,6 +108,12 @@ class OnMesh:
         else:
             host = jax.tree.map(np.asarray, state)
         return jax.tree.map(jnp.asarray, _of_gaussians(host, self._collected))
+
+    def healed(self, state: FitState) -> FitState:
+        """See `Spread`."""
+        none = jax.tree.map(np.asarray, Fault.none())
+        fault = jax.tree.map(lambda a: placed(a, self.mesh, P()), none)
+        return dataclasses.replace(state, fault=fault)
 
     def _dealt(self, a: np.ndarray) -> np.ndarray:
         split = a.reshape(-1, self.parts, *a.shape[1:])
