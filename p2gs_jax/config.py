@@ -106,7 +106,8 @@ class DataConfig:
     allow_missing: bool = False
     """Skip frames whose image file is missing instead of stopping."""
     cache_mb: int = 2048
-    """Decoded photographs kept in memory, MB; the rest is decoded again when needed."""
+    """Decoded photographs kept in memory, MB. A fit with more decodes each once, into files of the
+    run folder that are gone when it has finished; elsewhere they are decoded again when needed."""
 
 
 @dataclass(frozen=True)

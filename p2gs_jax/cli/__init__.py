@@ -9,6 +9,7 @@ import os
 import sys
 from importlib import import_module
 
+from p2gs_jax.core import interrupts
 from p2gs_jax.errors import UserError
 
 # Silence the native libraries before they load.
@@ -41,24 +42,30 @@ def _run(argv: list[str]) -> int:
 def main(argv: list[str] | None = None) -> None:
     """Run the command line and exit.
 
-    Codes: 0 done, 1 worse than a baseline or something needed is broken, 2 bad input, 130
-    interrupted.
+    Codes: 0 done, 1 worse than a baseline or something needed is broken, 2 bad input, 128 + the
+    signal's number where one asked for the end (130 Ctrl-C, 143 SIGTERM).
     """
     argv = sys.argv[1:] if argv is None else argv
     command = argv[0] if argv else ""
     try:
-        code = _run(argv)
+        with interrupts.raised():
+            code = _run(argv)
     except UserError as error:
         code = _complain(error)
     except ImportError as error:
         code = _missing(error, argv)
     except OSError as error:
         code = _from_the_system(error)
-    except KeyboardInterrupt:
-        resume = "; --resume continues from the last checkpoint" if command == "fit" else ""
-        print(f"p2gs-jax: interrupted{resume}", file=sys.stderr)
-        code = 130
+    except KeyboardInterrupt as error:
+        print(f"p2gs-jax: interrupted{_CONTINUED.get(command, '')}", file=sys.stderr)
+        code = interrupts.exit_code(error)
     sys.exit(code)
+
+
+_CONTINUED = {
+    "fit": "; --resume continues from the last checkpoint",
+    "sweep": "; the same command continues it",
+}
 
 
 def _complain(error: UserError) -> int:

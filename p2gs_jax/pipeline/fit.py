@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,17 +18,19 @@ from p2gs_jax.core.atomic import no_empty_folders
 from p2gs_jax.core.clock import CompileCounter, Stopwatch
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
+from p2gs_jax.evaluate.lpips import LpipsWeights
 from p2gs_jax.photometry.appearance import exposures_apart
 from p2gs_jax.photometry.gauge import recentre
 from p2gs_jax.photometry.selection import Selection
 from p2gs_jax.pipeline.decide import kept_choice
 from p2gs_jax.pipeline.finish import Account, finish
-from p2gs_jax.pipeline.preflight import Paths, check_scene, preflight
+from p2gs_jax.pipeline.preflight import Paths, check_run_dir, check_scene, preflight
 from p2gs_jax.pipeline.prepare import Expected, Prepared, load, prepare
 from p2gs_jax.pipeline.reserve import seconds_to_finish
 from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.run.layout import RunFolder
+from p2gs_jax.run.lock import RunLock, locked, require_free
 from p2gs_jax.run.write import write_start
 from p2gs_jax.train.loop import Trainer, TrainResult
 from p2gs_jax.train.programs import StepPrograms
@@ -169,21 +172,51 @@ def fit(
 
     Raises:
         UserError: something the user can mend.
+        Interrupted: Ctrl-C, SIGTERM or SIGHUP came; once there are steps, after a checkpoint.
+        OSError: something cannot be read or written; `filename` names it.
     """
     cfg = require_config(cfg)
     reporter = reporter or Silent()
     paths = Paths(Path(scene_dir), Path(run_dir), None if reference is None else Path(reference))
-    folder = RunFolder(paths.run)
     begin = time.monotonic() - spent_s
-    clock, compiler = Stopwatch(), CompileCounter()
+    require_free(paths.run)
     lpips_weights = preflight(cfg, paths, resume=resume)
-    with no_empty_folders(paths.run):
-        reading = time.monotonic()
-        scene = load(paths.scene, paths.run, cfg, reporter)
-        # Without a model, nearly all of it is finding and matching features.
-        found = scene.format in ("images", "transforms")
-        clock.add("structure_from_motion" if found else "reading", time.monotonic() - reading)
-        views = check_scene(scene, cfg, paths, lpips_weights)
+    with no_empty_folders(paths.run), locked(paths.run) as lock:
+        check_run_dir(paths.run, resume, cfg)  # another may have ended since
+        return _fit(
+            paths,
+            cfg,
+            lock,
+            reporter,
+            lpips_weights,
+            begin,
+            resume=resume,
+            true_exposures=true_exposures,
+            spent_s=spent_s,
+        )
+
+
+def _fit(
+    paths: Paths,
+    cfg: FitConfig,
+    lock: RunLock,
+    reporter: Reporter,
+    lpips_weights: LpipsWeights | None,
+    begin: float,
+    *,
+    resume: bool,
+    true_exposures: Mapping[str, float] | None,
+    spent_s: float,
+) -> FitResult:
+    """Fit into a folder that is locked; see `fit`."""
+    folder = RunFolder(paths.run)
+    clock, compiler = Stopwatch(), CompileCounter()
+    reading = time.monotonic()
+    scene = load(paths.scene, paths.run, cfg, reporter)
+    # Without a model, nearly all of it is finding and matching features.
+    found = scene.format in ("images", "transforms")
+    clock.add("structure_from_motion" if found else "reading", time.monotonic() - reading)
+    views = check_scene(scene, cfg, paths, lpips_weights)
     with contextlib.closing(StepPrograms()) as programs:
         prepared = prepare(
             scene,
@@ -192,8 +225,10 @@ def fit(
             clock,
             lambda known: _begin(programs, known, scene, folder),
             kept=kept_choice(cfg, folder) if resume else None,
+            pixels=folder.pixels,
         )
-        with _lock(folder, paths, cfg, prepared.decisions):
+        lock.require()
+        with _begun(folder, paths, cfg, prepared.decisions):
             result = optimise(
                 prepared,
                 folder,
@@ -231,6 +266,7 @@ def fit(
         growth=result.growth,
         left_out=result.left_out,
     )
+    lock.require()
     metrics = finish(
         params,
         prepared,
@@ -243,12 +279,15 @@ def fit(
         if true_exposures is None
         else np.log2([true_exposures[view.name] for view in scene.training_views]),
         owner=owner,
+        still_ours=lock.require,
     )
+    prepared.store.close()
+    shutil.rmtree(folder.pixels, ignore_errors=True)
     return FitResult(params, scene, metrics, paths.run, prepared.selection, prepared.decisions)
 
 
 @contextlib.contextmanager
-def _lock(folder: RunFolder, paths: Paths, cfg: FitConfig, decisions: Decisions) -> Iterator[None]:
+def _begun(folder: RunFolder, paths: Paths, cfg: FitConfig, decisions: Decisions) -> Iterator[None]:
     """Make the folder a run's while its steps are taken, and keep it where they left something.
 
     A run that failed before its first checkpoint leaves nothing to continue or to overwrite.

@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
+from p2gs_jax.core.disk import naming
 from p2gs_jax.errors import UserError
 
 Tree = TypeVar("Tree")
@@ -116,6 +117,7 @@ class CheckpointStore:
 
         Raises:
             TypeError: `meta` holds something else.
+            OSError: it cannot be written, for example because the disk is full.
         """
         import orbax.checkpoint as ocp
 
@@ -124,13 +126,14 @@ class CheckpointStore:
             return
         data, table = _pack(tree)
         saved = json.loads(json.dumps({"meta": meta, "leaves": table}, default=_plain_scalar))
-        manager.save(
-            step,
-            args=ocp.args.Composite(
-                leaves=ocp.args.PyTreeSave({"data": data}), meta=ocp.args.JsonSave(saved)
-            ),
-        )
-        manager.wait_until_finished()
+        with naming(self.folder, size=data.nbytes):
+            manager.save(
+                step,
+                args=ocp.args.Composite(
+                    leaves=ocp.args.PyTreeSave({"data": data}), meta=ocp.args.JsonSave(saved)
+                ),
+            )
+            manager.wait_until_finished()
 
     def read_meta(self, step: int) -> dict:
         """Return the plain values saved with a checkpoint.

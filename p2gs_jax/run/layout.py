@@ -39,6 +39,11 @@ class RunFolder:
         return self.root / "checkpoints"
 
     @property
+    def pixels(self) -> Path:
+        """Folder of decoded photographs while a fit runs whose memory does not hold them."""
+        return self.root / "cache" / "pixels"
+
+    @property
     def radiance(self) -> Path:
         """The Gaussians, with linear radiance."""
         return self.root / "radiance.ply"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
-import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -18,6 +18,8 @@ from p2gs_jax.config import FitConfig, to_dict
 from p2gs_jax.core.atomic import write_json, write_text
 from p2gs_jax.errors import UserError
 from p2gs_jax.pipeline.preflight import check_run_dir
+from p2gs_jax.run.lock import locked
+from p2gs_jax.sweep.processes import Processes
 from p2gs_jax.sweep.rows import read_row, to_markdown
 from p2gs_jax.sweep.worker import REASON
 
@@ -29,8 +31,9 @@ class SweepResult:
     """Result of a sweep.
 
     Attributes:
-        rows: one dict per configuration and seed: name, seed, status (`done` or `failed`), run, the
-            reason of a failure, and the columns of `rows.COLUMNS` that the run has.
+        rows: one dict per configuration and seed: name, seed, status (`done` or `failed`; in the
+            table of a sweep that was stopped also `waiting` and `interrupted`), run, the reason of
+            a failure, and the columns of `rows.COLUMNS` that the run has.
         out: the folder, with sweep.json and sweep.md.
     """
 
@@ -72,7 +75,9 @@ def sweep(
         report: receives a line per run.
 
     Raises:
-        UserError: nothing to do, names that would share a folder, or a folder of other options.
+        UserError: nothing to do, names that would share a folder, a folder of other options, or
+            one that another sweep is writing to.
+        Interrupted: a signal asked for the end; the runs under way write their checkpoints first.
     """
     scene, out = Path(scene), Path(out)
     if not configs or not seeds:
@@ -102,25 +107,44 @@ def sweep(
         for j in jobs
     ]
 
-    def one(k: int) -> None:
-        job, row = jobs[k], rows[k]
-        begin = time.monotonic()
-        kept = (job["run"] / "metrics.json").exists()
-        if not kept:
-            _run(job, scene, reference, out / JOBS / f"{slug(job['name'])}_{job['seed']}.json")
-        if (job["run"] / "metrics.json").exists():
-            row.update(status="done", **read_row(job["run"], scene))
-            took = row.get("seconds", time.monotonic() - begin)
-            said = "kept" if kept else f"{took:.0f} s"
-        else:
-            row.update(status="failed", reason=_reason(job["run"]))
-            said = f"failed: {row['reason']}"
-        report(f"[{k + 1}/{len(jobs)}] {job['name']}, seed {job['seed']}: {said}")
-        _write_table(out, rows)
+    processes, writing = Processes(), threading.Lock()
 
-    with ThreadPoolExecutor(max_parallel) as pool:
-        list(pool.map(one, range(len(jobs))))
+    def one(k: int) -> None:
+        begin = time.monotonic()
+        job, kept = jobs[k], (jobs[k]["run"] / "metrics.json").exists()
+        if not kept:
+            job_path = out / JOBS / f"{slug(job['name'])}_{job['seed']}.json"
+            _run(job, scene, reference, job_path, processes)
+        found = _outcome(job["run"], scene, stopped=processes.stopped)
+        if found["status"] == "done":
+            said = "kept" if kept else f"{found.get('seconds', time.monotonic() - begin):.0f} s"
+        else:
+            said = f"{found['status']}: {found['reason']}"
+        with writing:  # others write the same table
+            rows[k].update(found)
+            report(f"[{k + 1}/{len(jobs)}] {job['name']}, seed {job['seed']}: {said}")
+            _write_table(out, rows)
+
+    with locked(out), ThreadPoolExecutor(max_parallel) as pool:
+        try:
+            list(pool.map(one, range(len(jobs))))
+        except BaseException:
+            processes.stop()
+            raise
     return SweepResult(rows, out)
+
+
+def _outcome(run: Path, scene: Path, *, stopped: bool) -> dict[str, Any]:
+    """Return the status of a run that has ended, with its columns or the reason."""
+    if not (run / "metrics.json").exists():
+        if stopped and not (run / REASON).exists():
+            return {"status": "interrupted", "reason": "the same sweep continues it"}
+        return {"status": "failed", "reason": _reason(run)}
+    try:
+        return {"status": "done", **read_row(run, scene)}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        reason = f"its files cannot be read ({error}): remove {run} and repeat"
+        return {"status": "failed", "reason": reason}
 
 
 def _write_table(out: Path, rows: list[dict[str, Any]]) -> None:
@@ -128,10 +152,11 @@ def _write_table(out: Path, rows: list[dict[str, Any]]) -> None:
     write_text(out / TABLE_TEXT, to_markdown(rows))
 
 
-def _run(job: dict[str, Any], scene: Path, reference, job_path: Path) -> None:
+def _run(job: dict[str, Any], scene: Path, reference, job_path: Path, processes: Processes) -> None:
     """Run one fit in a process of its own and wait for it."""
     run: Path = job["run"]
     run.mkdir(parents=True, exist_ok=True)
+    (run / REASON).unlink(missing_ok=True)  # of an earlier try
     write_json(
         job_path,
         {
@@ -141,12 +166,9 @@ def _run(job: dict[str, Any], scene: Path, reference, job_path: Path) -> None:
             "fit": to_dict(job["cfg"]),
         },
     )
-    command = [sys.executable, "-m", "p2gs_jax.sweep.worker", str(job_path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode and not (run / REASON).exists():
-        tail = (done.stderr.strip().splitlines() or ["no message"])[-1]
-        reason = f"the process ended with code {done.returncode}: {tail}"
-        write_json(run / REASON, {"reason": reason})
+    failed = processes.run([sys.executable, "-m", "p2gs_jax.sweep.worker", str(job_path)])
+    if failed is not None and not (run / REASON).exists():
+        write_json(run / REASON, {"reason": failed})
 
 
 def _reason(run: Path) -> str:

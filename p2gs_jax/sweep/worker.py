@@ -9,6 +9,7 @@ import traceback
 from pathlib import Path
 
 from p2gs_jax.config import from_dict
+from p2gs_jax.core import interrupts
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.compile_cache import use_compile_cache
 from p2gs_jax.core.runtime import tune_process
@@ -22,22 +23,25 @@ REASON = "failure.json"
 def main(job_path: Path) -> int:
     """Run the fit that a job file describes; 0 where it succeeded.
 
-    A failure leaves its reason in the run folder.
+    A failure leaves its reason in the run folder; a signal that asks for the end does not.
     """
     job = json.loads(job_path.read_text(encoding="utf-8"))
     run = Path(job["run"])
     use_compile_cache()
     tune_process()
     try:
-        fit(
-            job["scene"],
-            run,
-            from_dict(job["fit"]),
-            reference=job["reference"],
-            resume=RunFolder(run).config.exists(),
-            # As for `p2gs-jax fit`: starting the interpreter counts.
-            spent_s=time.process_time(),
-        )
+        with interrupts.raised():
+            fit(
+                job["scene"],
+                run,
+                from_dict(job["fit"]),
+                reference=job["reference"],
+                resume=RunFolder(run).config.exists(),
+                # As for `p2gs-jax fit`: starting the interpreter counts.
+                spent_s=time.process_time(),
+            )
+    except KeyboardInterrupt as error:
+        return interrupts.exit_code(error)
     except UserError as error:
         write_json(run / REASON, {"reason": str(error)})
         return 2

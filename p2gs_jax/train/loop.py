@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from p2gs_jax.config import FitConfig
+from p2gs_jax.core import interrupts
 from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.core.progress import LogRecord
 from p2gs_jax.evaluate.unexplained import Unexplained
@@ -116,6 +117,7 @@ class Trainer:
         self.checkpoints = RunCheckpoints(run_dir, cfg, decided, on_message)
         masks = LeftOutFile(RunFolder(run_dir).left_out_masks)
         self.left_out = LeftOut(cfg, views, masks, self.clock, on_message)
+        self.asked = interrupts.Held()
         self.optimizer = make_optimizer(cfg)
         self.source = InputSource(cfg, views, pairs, coverage.shown)
         step = Step(cfg, self.optimizer, extent)
@@ -134,7 +136,7 @@ class Trainer:
             programs=programs,
             log=self.log,
             clock=self.clock,
-            take_burst=self._take_burst,
+            take_burst=self._take_burst_of_stage,
             on_message=on_message,
         )
 
@@ -161,6 +163,7 @@ class Trainer:
         Raises:
             DivergenceError: a loss term or gradient is not finite.
             UserError: no Gaussian is left, or checkpoints cannot be continued from.
+            Interrupted: a signal asked for the end; a checkpoint is written first.
         """
         strategy = make_strategy(self.context, int(np.sum(np.asarray(alive))))
         state = initial_state(params, alive, self.optimizer, strategy.slots, owner)
@@ -180,9 +183,10 @@ class Trainer:
         population = state.population
         self._allocate(state.params.gaussians, population.alive, population.owner, host, strategy)
         self._expect(state, host, strategy)
-        state, host = self._loop(state, host, session, strategy)
-        strategy.end(state, host)
-        self._save(state, host)
+        with interrupts.held() as self.asked:
+            state, host = self._loop(state, host, session, strategy)
+            strategy.end(state, host)
+            self._save(state, host)
         return TrainResult(
             state,
             host,
@@ -228,9 +232,16 @@ class Trainer:
                         "again with a longer --budget; what was compiled now is kept."
                     )
                 break
-            if time.monotonic() - saved > self.cfg.train.checkpoint_every_s:
+            asked = self.asked.arrived
+            if asked is not None or time.monotonic() - saved > self.cfg.train.checkpoint_every_s:
                 self._save(state, host)
                 saved = time.monotonic()
+            if asked is not None:
+                self.on_message(
+                    f"{interrupts.name_of(asked)}: the run stops after step {host.step} "
+                    f"({host.progress:.0%}), where a checkpoint is written; --resume continues it."
+                )
+                self.asked.deliver()
         return state, host
 
     def _take_burst(
@@ -242,7 +253,22 @@ class Trainer:
         if reports:
             record = record_of(reports, host, count_alive(state), host.shrink, trial=trial)
             self.log.append(record)
+            # From here on a signal waits for the next place to continue from.
+            self.asked.begin()
         return state, bool(reports)
+
+    def _take_burst_of_stage(
+        self, state: FitState, host: HostState, session: Session, *, trial: bool = False
+    ) -> tuple[FitState, bool]:
+        """Take a burst where no checkpoint can be written; signals end the run after it."""
+        taken = self._take_burst(state, host, session, trial=trial)
+        if self.asked.arrived is not None:
+            self.on_message(
+                f"{interrupts.name_of(self.asked.arrived)}: the run stops within a stage of "
+                f"growth; {self.checkpoints.last_good()}."
+            )
+            self.asked.deliver()
+        return taken
 
     def _save(self, state: FitState, host: HostState) -> None:
         with self.clock("checkpoints"):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 from types import SimpleNamespace
 
 import jax
@@ -201,3 +202,16 @@ class Harness:
 
     def log(self, name="log.jsonl"):
         return read_jsonl(self.folder / name)
+
+
+def signalled(harness, *numbers, at):
+    """Return programs during whose step of that number signals come."""
+
+    def step_s(width):
+        if len(programs.taken) == at:
+            for number in numbers:
+                os.kill(os.getpid(), number)
+        return 0.1
+
+    programs = Programs(harness.clock, step_s=step_s)
+    return programs

@@ -102,6 +102,7 @@ class Calibrate:
         p2gs-jax calibrate castle --out photometry
         p2gs-jax calibrate castle --out photometry --known-exposures exif
         p2gs-jax calibrate stack --out photometry --static
+        p2gs-jax calibrate castle --out runs/relit --of splats.ply
     """
 
     scene: Annotated[Path, tyro.conf.Positional]
@@ -120,6 +121,11 @@ class Calibrate:
     """Stated exposures to compare with; default: EXIF."""
     static: bool = False
     """The folder holds photographs from one fixed viewpoint at several exposures."""
+    of: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Somebody's splats of the scene (.ply, .splat, .spz; display colours): exposures are solved by
+    its surfaces, and it is written as linear radiance into --out, a run folder."""
+    steps: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """With --of: steps in which its colours and opacities are fitted again; default: 600."""
     images: Annotated[str | None, tyro.conf.arg(metavar="DIR")] = None
     """Image folder, where it is not images/ beside the model."""
     drive: Drive = None
@@ -148,6 +154,11 @@ def resolve_calibration(args: Calibrate) -> configs.FitConfig:
             data = dataclasses.replace(data, **{name: getattr(args, name)})
     if args.cameras:
         data = dataclasses.replace(data, cameras=args.cameras)
+    check(
+        not (args.static and args.of), "--static and --of exclude each other", fix="leave one out"
+    )
+    check(args.steps is None or args.of is not None, "--steps says nothing without --of")
+    check(args.steps is None or args.steps >= 1, "--steps must be at least 1")
     check(data.max_width is None or data.max_width >= 16, "--max-width must be at least 16")
     check(data.every is None or data.every >= 1, "--every must be at least 1")
     check(data.max_frames >= 2, "--max-frames must be at least 2")

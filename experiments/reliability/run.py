@@ -1,0 +1,119 @@
+"""What the program survived: families of trials, a dated record, and docs/reliability.md.
+
+python experiments/reliability/run.py [--quick] [--only FAMILY...] [--out DIR] [--page]
+
+A family is a module `families/NAME.py` with
+
+    NAME    its name, as the module's
+    ABOUT   what is tried, and what counts as survived, in one or two sentences
+    run     run(quick: bool, out: Path, report: Callable[[str], None]) -> Family
+
+`out` is an empty folder of its own; `Family` is in `family.py`. Trials follow from a fixed seed, so
+that a second run tries the same. Faults that were mended stay in the module's `MENDED`, each
+with the test of the ordinary suite that guards it. `NAME` of a module that begins with `_` is no
+family: others share what is in it.
+
+`YYYY-MM-DD.json` beside this file holds one entry a family, with the commit it was measured at; a
+family that runs again replaces its entry, and `--quick` never replaces a whole run. The page shows
+the newest entry of every family; `--page` writes only that. Both are written after every family.
+Ends with 1 where a trial failed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import importlib
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from reliability.family import COMMAND, Failure, Family
+from reliability.page import write_page
+from reliability.record import Entry, write_entry
+
+HERE = Path(__file__).resolve().parent
+PAGE = HERE.parents[1] / "docs" / "reliability.md"
+
+
+def families() -> dict[str, ModuleType]:
+    """Return the modules of all families by name."""
+    names = sorted(p.stem for p in (HERE / "families").glob("[!_]*.py"))
+    return {name: importlib.import_module(f"reliability.families.{name}") for name in names}
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run families; return 1 where a trial failed."""
+    known = families()
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--quick", action="store_true", help="a part of every family, minutes")
+    parser.add_argument("--only", nargs="+", choices=known, metavar="FAMILY", help=", ".join(known))
+    parser.add_argument("--out", type=Path, help="keep here what the trials leave behind")
+    parser.add_argument("--page", action="store_true", help="try nothing, write the page")
+    args = parser.parse_args(argv)
+    about = {name: module.ABOUT for name, module in known.items()}
+    if args.page:
+        write_page(PAGE, HERE, about)
+        return 0
+    scratch = args.out or Path(tempfile.mkdtemp(prefix="reliability-"))
+    failed = 0
+    try:
+        for name in args.only or known:
+            found = one(known[name], args.quick, scratch / name)
+            failed += len(found.failures)
+            write_entry(HERE, Entry(found, today(), commit(), args.quick))
+            write_page(PAGE, HERE, about)
+            print(f"{name}: {found.survived} of {found.tried} survived, {found.seconds:.0f} s")
+            for failure in found.failures:
+                print(f"  {failure.name}: {failure.reason}")
+    finally:
+        if args.out is None:
+            shutil.rmtree(scratch, ignore_errors=True)
+    return 1 if failed else 0
+
+
+def one(module: ModuleType, quick: bool, out: Path) -> Family:
+    """Run a family; one that breaks down itself is a failure."""
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    start = time.perf_counter()
+    try:
+        found = module.run(quick, out, lambda line: print(line, file=sys.stderr))
+    except Exception as error:
+        traceback.print_exc()
+        reason = f"{type(error).__name__}: {error}"
+        found = Family(module.NAME, 0, 0, (Failure("the family itself", reason),))
+    return replace(
+        found,
+        command=found.command or f"{COMMAND} {module.NAME}",
+        seconds=found.seconds or time.perf_counter() - start,
+    )
+
+
+def today() -> str:
+    """Return the date in UTC."""
+    return datetime.datetime.now(datetime.UTC).date().isoformat()
+
+
+def commit() -> str:
+    """Return the short commit of this checkout; with + where files differ from it."""
+    git = ("git", "-C", str(HERE))
+    head = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True)
+    changed = subprocess.run(
+        [*git, "status", "--porcelain", "-uno"], capture_output=True, text=True
+    )
+    return head.stdout.strip() + ("+" if changed.stdout.strip() else "")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
