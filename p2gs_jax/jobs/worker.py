@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import os
-import signal
 import sys
 import threading
 import traceback
 from pathlib import Path
 
+from p2gs_jax.core import interrupts
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.errors import UserError
 from p2gs_jax.jobs.job import REASON, JobFiles, read_job
 from p2gs_jax.jobs.progress import ProgressFile
-
-STOPPED = 128 + signal.SIGTERM
 
 
 def main(job_path: Path) -> int:
@@ -23,15 +21,15 @@ def main(job_path: Path) -> int:
 
     A failure leaves its reason in the job's folder; a signal that asks for the end does not.
     """
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     job = read_job(job_path)
     progress = ProgressFile(JobFiles(job_path).progress)
     progress.stage("Starting")
     try:
-        job.task(job.folder, job.arguments, progress)
-    except KeyboardInterrupt:
-        return STOPPED
+        with interrupts.raised():
+            job.task(job.folder, job.arguments, progress)
+    except KeyboardInterrupt as error:
+        return interrupts.exit_code(error)
     except UserError as error:
         _leave(job.folder, {"reason": str(error)})
         return 2
