@@ -139,8 +139,8 @@ class Calibrate:
     static: bool = False
     """The folder holds photographs from one fixed viewpoint at several exposures."""
     of: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Somebody's splats of the scene (.ply, .splat, .spz; display colours): exposures are solved by
-    its surfaces, and it is written as linear radiance into --out, a run folder."""
+    """Somebody's splats of the scene (.ply, .splat, .spz; display colours): exposures are
+    solved, and it is written as linear radiance into --out, a run folder."""
     steps: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """With --of: steps in which its colours and opacities are fitted again; default: 600."""
     images: Annotated[str | None, tyro.conf.arg(metavar="DIR")] = None
