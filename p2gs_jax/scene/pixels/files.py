@@ -63,10 +63,14 @@ class PixelFiles:
         self._names = tuple(_digest(view, cars) for view in views)
         self._remove_stale()
 
+    def has(self, key: Key) -> bool:
+        """Whether there is a file of a photograph; it may be damaged."""
+        return self.path(key).exists()
+
     def read(self, key: Key) -> Decoded | None:
         """Return a photograph, mapped; None: it is not there."""
         try:
-            with self._path(key).open("rb") as file:
+            with self.path(key).open("rb") as file:
                 data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         except (OSError, ValueError):
             return None
@@ -79,11 +83,7 @@ class PixelFiles:
             UserError: the disk is full, or cannot be written.
         """
         try:
-            with (
-                atomic_write(self._path(key), durable=False) as temporary,
-                temporary.open("wb") as file,
-            ):
-                file.writelines(_parts(photograph))
+            write_photograph(self.path(key), photograph)
         except OSError as error:
             raise UserError(
                 f"decoded photographs cannot be written to {self.folder}: "
@@ -113,7 +113,8 @@ class PixelFiles:
                 f"{_mb(needed)}, if there is so much memory, or a smaller --max-width",
             )
 
-    def _path(self, key: Key) -> Path:
+    def path(self, key: Key) -> Path:
+        """Return where a photograph is, or goes."""
         return self.folder / f"{key.width}x{key.height}" / f"{self._names[key.view]}.px"
 
     def _remove_stale(self) -> None:
@@ -122,6 +123,16 @@ class PixelFiles:
         for path in self.folder.glob("*/*"):
             if path.name not in known:
                 path.unlink(missing_ok=True)
+
+
+def write_photograph(path: Path, photograph: Decoded) -> None:
+    """Write a file of a decoded photograph.
+
+    Raises:
+        OSError: the disk is full, or cannot be written.
+    """
+    with atomic_write(path, durable=False) as temporary, temporary.open("wb") as file:
+        file.writelines(_parts(photograph))
 
 
 def file_bytes(view: View, size: tuple[int, int]) -> int:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import threading
+import weakref
 from collections import OrderedDict
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 
+from p2gs_jax.scene.pixels.ahead import DecodersAhead
 from p2gs_jax.scene.pixels.decode import Decoded, decode
 from p2gs_jax.scene.pixels.files import Key, PixelFiles
 from p2gs_jax.types import View
@@ -24,7 +26,7 @@ class DecodedPhotographs:
 
     Attributes:
         views: of the scene.
-        decodings: photographs decoded so far.
+        decodings: sizes of photographs decoded so far in this process.
     """
 
     def __init__(self, views: Sequence[View], limit: int, files: PixelFiles | None = None):
@@ -42,6 +44,8 @@ class DecodedPhotographs:
         self._bytes = 0
         self._pending: dict[Key, Future[Decoded]] = {}
         self._lock = threading.Lock()
+        self._expected: tuple[tuple[Key, ...], ...] = tuple(() for _ in self.views)
+        self._ahead: DecodersAhead | None = None
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="decode")
 
     @property
@@ -78,8 +82,22 @@ class DecodedPhotographs:
                 return
             self._pending[key] = self._worker.submit(self._load_pending, key)
 
+    def expect(self, keys: Sequence[Sequence[Key]]) -> None:
+        """Begin to decode what will be asked for into the files; without files nothing happens.
+
+        Args:
+            keys: of every view its sizes.
+        """
+        if self._files is None:
+            return
+        self._expected = tuple(map(tuple, keys))
+        self._ahead = DecodersAhead(self.views, self._files, self._expected)
+        weakref.finalize(self, self._ahead.close)
+
     def close(self) -> None:
-        """Stop the background thread and drop everything that is held; files stay."""
+        """Stop what decodes in the background and drop everything that is held; files stay."""
+        if self._ahead is not None:
+            self._ahead.close()
         self._worker.shutdown(wait=True, cancel_futures=True)
         with self._lock:
             self._cache.clear()
@@ -94,13 +112,7 @@ class DecodedPhotographs:
                 self._pending.pop(key, None)
 
     def _load(self, key: Key) -> Decoded:
-        entry = None if self._files is None else self._files.read(key)
-        if entry is None:
-            (entry,) = decode(self.views[key.view], [(key.width, key.height)])
-            with self._lock:
-                self.decodings += 1
-            if self._files is not None:
-                entry = self._files.write(key, entry)
+        entry = self._decoded(key) if self._files is None else self._filed(key, self._files)
         with self._lock:
             if key not in self._cache:
                 self._cache[key] = entry
@@ -108,4 +120,24 @@ class DecodedPhotographs:
             while self._bytes > self._limit and len(self._cache) > 1:
                 _, dropped = self._cache.popitem(last=False)
                 self._bytes -= dropped.nbytes
+        return entry
+
+    def _decoded(self, *keys: Key) -> Decoded:
+        """Return a photograph; further sizes of it go into the files."""
+        found = decode(self.views[keys[0].view], [(key.width, key.height) for key in keys])
+        with self._lock:
+            self.decodings += len(keys)
+        if self._files is None:
+            return found[0]
+        mapped = [self._files.write(key, one) for key, one in zip(keys, found, strict=True)]
+        return mapped[0]
+
+    def _filed(self, key: Key, files: PixelFiles) -> Decoded:
+        entry = files.read(key)
+        if entry is None and self._ahead is not None:
+            self._ahead.claim(key.view)
+            entry = files.read(key)
+        if entry is None:
+            others = (k for k in self._expected[key.view] if k != key and not files.has(k))
+            entry = self._decoded(key, *others)
         return entry
