@@ -23,6 +23,7 @@ from p2gs_jax.photometry.gauge import recentre
 from p2gs_jax.photometry.selection import Selection
 from p2gs_jax.pipeline.decide import kept_choice
 from p2gs_jax.pipeline.finish import Account, finish
+from p2gs_jax.pipeline.memory_needed import memory_named
 from p2gs_jax.pipeline.preflight import Paths, check_run_dir, check_scene, preflight
 from p2gs_jax.pipeline.prepare import Expected, Prepared, load, prepare
 from p2gs_jax.pipeline.reserve import seconds_to_finish
@@ -180,7 +181,7 @@ def fit(
     begin = time.monotonic() - spent_s
     require_free(paths.run)
     lpips_weights = preflight(cfg, paths, resume=resume)
-    with no_empty_folders(paths.run), locked(paths.run) as lock:
+    with no_empty_folders(paths.run), locked(paths.run) as lock, memory_named():
         check_run_dir(paths.run, resume, cfg)  # another may have ended since
         return _fit(
             paths,
@@ -226,7 +227,7 @@ def _fit(
             kept=kept_choice(cfg, folder) if resume else None,
         )
         lock.require()
-        with _begun(folder, paths, cfg, prepared.decisions):
+        with _begun(folder, paths, cfg, prepared.decisions), memory_named():
             result = optimise(
                 prepared,
                 folder,
