@@ -19,12 +19,14 @@ from p2gs_jax.errors import UserError
 
 
 @contextlib.contextmanager
-def atomic_write(path: Path) -> Iterator[Path]:
+def atomic_write(path: Path, *, durable: bool = True) -> Iterator[Path]:
     """Yield a temporary path beside `path`; it replaces `path`, or is deleted after an error.
 
     Args:
         path: the file to write; its folder is created. The temporary name keeps the suffix, for
             writers that choose a format by it.
+        durable: wait until it is on the disk, so that a power failure leaves no half of it. Not for
+            what is checked when it is read, and can be made again.
 
     Raises:
         OSError: it cannot be written; `filename` names it, whatever the writer said.
@@ -37,8 +39,9 @@ def atomic_write(path: Path) -> Iterator[Path]:
     try:
         with naming(path, begun=temporary):
             yield temporary
-            with temporary.open("rb") as file:
-                os.fsync(file.fileno())
+            if durable:
+                with temporary.open("rb") as file:
+                    os.fsync(file.fileno())
             temporary.chmod(0o644)
             os.replace(temporary, path)
     finally:

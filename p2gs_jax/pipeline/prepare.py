@@ -55,6 +55,7 @@ from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.train.compared_photographs import color_pairs, overlaps
 from p2gs_jax.train.measured_depths import measured_depths
+from p2gs_jax.train.schedule import shrinks
 from p2gs_jax.types import Gaussians, Measured, Params, Scene, View
 
 
@@ -152,6 +153,7 @@ def prepare(
     on_expected: Callable[[Expected], None] = lambda expected: None,
     *,
     kept: Decisions | None = None,
+    pixels: Path | None = None,
 ) -> Prepared:
     """Start exposures, radiances and Gaussians from what the scene offers.
 
@@ -162,16 +164,19 @@ def prepare(
         clock: receives the seconds of `photometry` and `seeds`.
         on_expected: receives what can be told before the exposures are solved, where that is much.
         kept: what the checkpoints of a run that is resumed remember: its model and curve stay.
+        pixels: folder for decoded photographs that are more than memory holds, or None.
 
     Raises:
-        UserError: there is not the memory for it, or nothing to see.
+        UserError: there is not the memory for it, nothing to see, or no room on the disk for
+            decoded photographs.
     """
     clock = clock or Stopwatch()
     begin = time.monotonic()
     nodes = find_nodes(scene, cfg.dynamics)
     vibrating = vibrates(scene, cfg)
     moving = clock_of(scene) if vibrating else None if nodes is None else nodes.moving
-    store = ImageStore(scene.views, cfg.data, moving=moving)
+    store = ImageStore(scene.views, cfg.data, moving=moving, folder=pixels)
+    store.expect(shrinks(cfg.train))
     fitted, still = _without_what_moves(scene, store, nodes, cfg)
     _require_something_to_see(scene, fitted)
     views = scene.training_views
