@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from p2gs_jax.paths.pinhole import make_camera
     from p2gs_jax.photometry.display import DisplayTransform, develop
     from p2gs_jax.pipeline.calibrate import calibrate
+    from p2gs_jax.pipeline.calibrate_of import calibrate_of
     from p2gs_jax.pipeline.calibrate_run import calibrate_run
     from p2gs_jax.pipeline.calibrate_stack import calibrate_stack
     from p2gs_jax.pipeline.fit import fit
@@ -38,6 +39,7 @@ __all__ = [
     "Scene",
     "UserError",
     "calibrate",
+    "calibrate_of",
     "calibrate_run",
     "calibrate_stack",
     "develop",
@@ -58,6 +60,7 @@ _LAZY = {
     "DisplayTransform": "p2gs_jax.photometry.display",
     "Run": "p2gs_jax.run.read",
     "calibrate": "p2gs_jax.pipeline.calibrate",
+    "calibrate_of": "p2gs_jax.pipeline.calibrate_of",
     "calibrate_run": "p2gs_jax.pipeline.calibrate_run",
     "calibrate_stack": "p2gs_jax.pipeline.calibrate_stack",
     "develop": "p2gs_jax.photometry.display",

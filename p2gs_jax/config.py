@@ -106,7 +106,8 @@ class DataConfig:
     allow_missing: bool = False
     """Skip frames whose image file is missing instead of stopping."""
     cache_mb: int = 2048
-    """Decoded photographs kept in memory, MB; the rest is decoded again when needed."""
+    """Decoded photographs kept in memory, MB. A fit with more decodes each once, into files of the
+    run folder that are gone when it has finished; elsewhere they are decoded again when needed."""
 
 
 @dataclass(frozen=True)
@@ -458,7 +459,10 @@ class TrainConfig:
     """The run."""
 
     steps: int = 2000
-    """Optimisation steps, one view each."""
+    """Optimisation steps, counted in views: with a batch of B, every B of them are one update."""
+    batch: int = 1
+    """Views of an update. With B of them all learning rates take the root of B (as Grendel-GS); on
+    several devices, B is shared out among them (docs/scaling.md)."""
     budget_s: float | None = None
     """Wall-clock seconds for the whole run; the number of steps then follows from the measured
     step time."""

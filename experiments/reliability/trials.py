@@ -40,7 +40,7 @@ class Trial:
         named: one of these words has to be in a refusal; empty: a path below the folder.
         refused: it has to be refused; None: may be read or refused.
         seconds: that it may take.
-        data: bytes of memory that it may ask for.
+        data: bytes of memory that it may ask for; resident it may have `BYTES`.
     """
 
     name: str
@@ -197,7 +197,7 @@ def _wrong(trial: Trial, outcome: Outcome, folder: Path) -> str | None:
         return f"traceback: {last}"
     if outcome.code not in (0, REFUSED):
         return f"code {outcome.code}: {last}"
-    if outcome.peak > trial.data:
+    if outcome.peak > BYTES:
         return f"took {outcome.peak / 2**20:.0f} MiB"
     if trial.refused is not None and trial.refused != (outcome.code == REFUSED):
         return "was refused: " + last if trial.refused is False else "was not refused"

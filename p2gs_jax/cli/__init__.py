@@ -9,6 +9,7 @@ import os
 import sys
 from importlib import import_module
 
+from p2gs_jax.core import interrupts
 from p2gs_jax.errors import UserError
 
 # Silence the native libraries before they load.
@@ -17,6 +18,9 @@ os.environ.setdefault("GLOG_minloglevel", "3")
 # Where Pillow refuses, too (scene/files.py): what a header says is not decoded to find out.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2 * 89_478_485))
 
+# Set for one of several processes of a fit, by the parent that watches it: the descriptor of a pipe
+# that ends with that parent.
+PARENT = "P2GS_JAX_PARENT_PIPE"
 # Commands that must work without JAX.
 WITHOUT_JAX = ("doctor", "completion")
 
@@ -31,6 +35,12 @@ def _run(argv: list[str]) -> int:
         print(script(options.shell), end="")
         return 0
     # Imported here so that --help answers at once.
+    if name == "fit":
+        from p2gs_jax.cli.options.fit import resolve_processes
+        from p2gs_jax.cli.supervise import is_child, supervise
+
+        if resolve_processes(options) is not None and not is_child():
+            return supervise(argv, options.out)
     if name not in WITHOUT_JAX:
         from p2gs_jax.core.compile_cache import use_compile_cache
         from p2gs_jax.core.runtime import tune_process
@@ -43,24 +53,35 @@ def _run(argv: list[str]) -> int:
 def main(argv: list[str] | None = None) -> None:
     """Run the command line and exit.
 
-    Codes: 0 done, 1 worse than a baseline or something needed is broken, 2 bad input, 130
-    interrupted.
+    Codes: 0 done, 1 worse than a baseline or something needed is broken, 2 bad input, 128 + the
+    signal's number where one asked for the end (130 Ctrl-C, 143 SIGTERM).
     """
     argv = sys.argv[1:] if argv is None else argv
     command = argv[0] if argv else ""
     try:
-        code = _run(argv)
+        with interrupts.raised():
+            code = _run(argv)
     except UserError as error:
         code = _complain(error)
     except ImportError as error:
         code = _missing(error, argv)
     except OSError as error:
         code = _from_the_system(error)
-    except KeyboardInterrupt:
-        resume = "; --resume continues from the last checkpoint" if command == "fit" else ""
-        print(f"p2gs-jax: interrupted{resume}", file=sys.stderr)
-        code = 130
+    except KeyboardInterrupt as error:
+        print(f"p2gs-jax: interrupted{_CONTINUED.get(command, '')}", file=sys.stderr)
+        code = interrupts.exit_code(error)
+    if code and PARENT in os.environ:
+        # At its own exit a process waits for the others, which may wait for it.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
     sys.exit(code)
+
+
+_CONTINUED = {
+    "fit": "; --resume continues from the last checkpoint",
+    "sweep": "; the same command continues it",
+}
 
 
 def _complain(error: UserError) -> int:

@@ -14,16 +14,22 @@ from typing import Any
 
 import numpy as np
 
+from p2gs_jax.core.disk import naming
 from p2gs_jax.errors import UserError
 
 
 @contextlib.contextmanager
-def atomic_write(path: Path) -> Iterator[Path]:
+def atomic_write(path: Path, *, durable: bool = True) -> Iterator[Path]:
     """Yield a temporary path beside `path`; it replaces `path`, or is deleted after an error.
 
     Args:
         path: the file to write; its folder is created. The temporary name keeps the suffix, for
             writers that choose a format by it.
+        durable: wait until it is on the disk, so that a power failure leaves no half of it. Not for
+            what is checked when it is read, and can be made again.
+
+    Raises:
+        OSError: it cannot be written; `filename` names it, whatever the writer said.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -31,11 +37,13 @@ def atomic_write(path: Path) -> Iterator[Path]:
     os.close(handle)
     temporary = Path(name)
     try:
-        yield temporary
-        with temporary.open("rb") as file:
-            os.fsync(file.fileno())
-        temporary.chmod(0o644)
-        os.replace(temporary, path)
+        with naming(path, begun=temporary):
+            yield temporary
+            if durable:
+                with temporary.open("rb") as file:
+                    os.fsync(file.fileno())
+            temporary.chmod(0o644)
+            os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -123,7 +131,9 @@ def append_jsonl(path: Path, record: dict) -> None:
             file.seek(end - 1)
             if file.read(1) != b"\n":
                 line = _mend(file) + line
-        file.write(line)
+        with naming(Path(path)):
+            while line:  # a disk that fills up takes a part
+                line = line[file.write(line) :]
 
 
 def _mend(file) -> bytes:

@@ -88,8 +88,15 @@ def write_radiance(
     )
 
 
-def read_ply(path: Path) -> Gaussians:
-    """Read Gaussians back, bit for bit.
+RESTORE = "restore it from a copy, or write it again with `p2gs-jax fit ... --resume`"
+
+
+def read_ply(path: Path, *, fix: str = RESTORE) -> Gaussians:
+    """Read Gaussians back, bit for bit. Normals, which mean nothing, may be missing.
+
+    Args:
+        path: the file.
+        fix: what to do about a file that is none.
 
     Raises:
         UserError: the file is no such PLY.
@@ -97,29 +104,29 @@ def read_ply(path: Path) -> Gaussians:
     try:
         vertex = PlyData.read(str(path))["vertex"].data
         names = vertex.dtype.names or ()
-        coefficients = 1 + sum(n.startswith("f_rest_") for n in names) // 3
-        columns = np.stack([vertex[n] for n in field_names(coefficients)], 1).astype(np.float32)
+
+        def columns(*wanted: str) -> np.ndarray:
+            return np.stack([np.asarray(vertex[n], np.float32) for n in wanted], 1)
+
+        bands = sum(n.startswith("f_rest_") for n in names) // 3
+        base = columns(*(f"f_dc_{i}" for i in range(3)))[:, None]
+        rest = columns(*(f"f_rest_{i}" for i in range(3 * bands))) if bands else base[:, :, :0]
+        rest = rest.reshape(len(base), 3, bands).transpose(0, 2, 1)
         moves = None
         if VIBRATION[0] in names:
             found = [np.asarray(vertex[n], np.float32) for n in VIBRATION]
             velocities = np.stack(found[:3], 1)
             moves = Vibration(*(on_device(a) for a in (velocities, *found[3:])))
+        return Gaussians(
+            means=on_device(columns("x", "y", "z")),
+            quats=on_device(columns(*(f"rot_{i}" for i in range(4)))),
+            log_scales=on_device(columns(*(f"scale_{i}" for i in range(3)))),
+            opacity_logits=on_device(np.asarray(vertex["opacity"], np.float32)),
+            sh=on_device(np.concatenate([base, rest], 1)),
+            vibration=moves,
+        )
     except (OSError, PlyParseError, KeyError, ValueError) as error:
-        raise UserError(
-            f"{path} is no PLY of Gaussians: {error}.",
-            fix="restore it from a copy, or write it again with `p2gs-jax fit ... --resume`",
-        ) from error
-    rest = columns[:, 9 : 9 + 3 * (coefficients - 1)].reshape(len(columns), 3, coefficients - 1)
-    sh = np.concatenate([columns[:, None, 6:9], rest.transpose(0, 2, 1)], 1)
-    tail = columns[:, 9 + 3 * (coefficients - 1) :]
-    return Gaussians(
-        means=on_device(columns[:, :3]),
-        quats=on_device(tail[:, 4:8]),
-        log_scales=on_device(tail[:, 1:4]),
-        opacity_logits=on_device(tail[:, 0]),
-        sh=on_device(sh),
-        vibration=moves,
-    )
+        raise UserError(f"{path} is no PLY of Gaussians: {error}.", fix=fix) from error
 
 
 def _columns_of(moves: Vibration) -> Float[np.ndarray, "n 5"]:

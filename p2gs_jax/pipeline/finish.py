@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -38,6 +38,7 @@ class Account:
         growth: the history of automatic growth, or None.
         left_out: what no static scene explains and the last steps left out, by row of the scene;
             None where it was not looked for.
+        of: scores of the model that was converted, as it was; None: this is a fit.
     """
 
     counts: dict[str, int]
@@ -45,6 +46,7 @@ class Account:
     compiler: CompileCounter = field(default_factory=CompileCounter)
     growth: dict | None = None
     left_out: Mapping[int, Unexplained] | None = None
+    of: dict | None = None
 
 
 def finish(
@@ -58,6 +60,7 @@ def finish(
     lpips_weights: LpipsWeights | None,
     true_ev: np.ndarray | None = None,
     owner: np.ndarray | None = None,
+    still_ours: Callable[[], None] = lambda: None,
 ) -> dict:
     """Evaluate, export and return what `metrics.json` holds.
 
@@ -71,6 +74,7 @@ def finish(
         lpips_weights: for LPIPS, or None to leave it out.
         true_ev: true exposures of the training views for the plot, or None.
         owner: the moving object that each Gaussian belongs to, or None.
+        still_ours: raises where the run folder is no longer this run's.
     """
     watch = Stopwatch()
     return_freed_memory()
@@ -132,6 +136,7 @@ def finish(
             write_unexplained(folder.left_out, scene, store, account.left_out)
             metrics["left_out"] = shares_by_view(scene, account.left_out)
     metrics |= _accounted(account, watch, prepared, reporter)
+    still_ours()
     write_json(folder.metrics, metrics)
     return metrics
 
@@ -160,6 +165,8 @@ def _accounted(account: Account, watch: Stopwatch, prepared: Prepared, reporter:
         said["photometry"] = prepared.selection.solution.state
     if account.growth is not None:
         said["growth"] = account.growth
+    if account.of is not None:
+        said["of"] = account.of
     return said
 
 

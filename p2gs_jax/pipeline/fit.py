@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,23 +12,30 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 
 from p2gs_jax.config import FitConfig, require_config
 from p2gs_jax.core.atomic import no_empty_folders
 from p2gs_jax.core.clock import CompileCounter, Stopwatch
+from p2gs_jax.core.devices import Devices
+from p2gs_jax.core.processes import first_alone, is_first
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
+from p2gs_jax.evaluate.lpips import LpipsWeights
 from p2gs_jax.photometry.appearance import exposures_apart
 from p2gs_jax.photometry.gauge import recentre
 from p2gs_jax.photometry.selection import Selection
+from p2gs_jax.pipeline.agreement import agree_on_options, same_start
 from p2gs_jax.pipeline.decide import kept_choice
+from p2gs_jax.pipeline.devices import mesh_of
 from p2gs_jax.pipeline.finish import Account, finish
-from p2gs_jax.pipeline.preflight import Paths, check_scene, preflight
+from p2gs_jax.pipeline.preflight import Paths, check_run_dir, check_scene, preflight
 from p2gs_jax.pipeline.prepare import Expected, Prepared, load, prepare
 from p2gs_jax.pipeline.reserve import seconds_to_finish
-from p2gs_jax.run.checkpoint import CheckpointStore
+from p2gs_jax.run.checkpoint import saved_steps
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.run.layout import RunFolder
+from p2gs_jax.run.lock import RunLock, locked, require_free
 from p2gs_jax.run.write import write_start
 from p2gs_jax.train.loop import Trainer, TrainResult
 from p2gs_jax.train.programs import StepPrograms
@@ -45,6 +53,7 @@ def optimise(
     validation: Sequence[int] = (),
     spent_s: float = 0.0,
     reserve_s: float = 0.0,
+    mesh: Mesh | None = None,
 ) -> TrainResult:
     """Run the optimisation, from the start or from the newest checkpoint.
 
@@ -57,6 +66,7 @@ def optimise(
         validation: training views that automatic growth is judged by.
         spent_s: seconds of the budget that are already gone.
         reserve_s: seconds of the budget to keep for evaluation and files.
+        mesh: the devices of a step of several views; None: the default one.
     """
     cfg = prepared.cfg
     views = TrainingViews(
@@ -84,6 +94,7 @@ def optimise(
         on_message=say,
         validation=validation,
         own_exposures=prepared.selection is not None,
+        mesh=mesh,
     )
     alive = np.ones(prepared.params.gaussians.capacity, bool)
     return trainer.run(
@@ -96,7 +107,9 @@ def optimise(
     )
 
 
-def _begin(programs: StepPrograms, known: Expected, scene: Scene, folder: RunFolder) -> None:
+def _begin(
+    programs: StepPrograms, known: Expected, scene: Scene, folder: RunFolder, mesh: Mesh | None
+) -> None:
     """Begin to compile steps while the exposures are solved, mostly on one core."""
     views = TrainingViews(
         known.store, scene.train_indices, known.cfg.train.seed, measured=known.measured
@@ -110,6 +123,7 @@ def _begin(programs: StepPrograms, known: Expected, scene: Scene, folder: RunFol
         folder.root,
         programs,
         known.decisions,
+        mesh=mesh,
     )
     trainer.expect(known.params, known.owner, known.images)
 
@@ -130,7 +144,7 @@ class FitResult:
     Attributes:
         params: the fit, live Gaussians only.
         scene: what it was fitted to.
-        metrics: what `metrics.json` holds.
+        metrics: what `metrics.json` holds; empty in all processes but the first.
         run_dir: the run folder.
         selection: what the bundle adjustment found, or None.
         decisions: what the scene settled.
@@ -154,6 +168,7 @@ def fit(
     reporter: Reporter | None = None,
     true_exposures: Mapping[str, float] | None = None,
     spent_s: float = 0.0,
+    devices: Devices | None = None,
 ) -> FitResult:
     """Fit a scene and write a run folder.
 
@@ -166,34 +181,77 @@ def fit(
         reporter: receives progress.
         true_exposures: image name -> true exposure, where it is known, for the plot.
         spent_s: seconds of the budget that were gone before the call.
+        devices: which to take, and what is divided among them; None: one. Of several processes
+            (`jax.distributed`) all must call this, and all of their devices be taken.
 
     Raises:
         UserError: something the user can mend.
+        Interrupted: Ctrl-C, SIGTERM or SIGHUP came; once there are steps, after a checkpoint.
+        OSError: something cannot be read or written; `filename` names it.
     """
     cfg = require_config(cfg)
     reporter = reporter or Silent()
     paths = Paths(Path(scene_dir), Path(run_dir), None if reference is None else Path(reference))
-    folder = RunFolder(paths.run)
     begin = time.monotonic() - spent_s
-    clock, compiler = Stopwatch(), CompileCounter()
+    if is_first():
+        require_free(paths.run)
     lpips_weights = preflight(cfg, paths, resume=resume)
-    with no_empty_folders(paths.run):
-        reading = time.monotonic()
+    mesh = mesh_of(cfg, devices)
+    # Before the first process writes anything that the others would refuse.
+    agree_on_options(cfg, devices, resume)
+    with _ours(paths.run) as lock:
+        if is_first():
+            check_run_dir(paths.run, resume, cfg)  # another may have ended since
+        return _fit(
+            paths,
+            cfg,
+            lock,
+            reporter,
+            lpips_weights,
+            begin,
+            mesh,
+            resume=resume,
+            true_exposures=true_exposures,
+            spent_s=spent_s,
+        )
+
+
+def _fit(
+    paths: Paths,
+    cfg: FitConfig,
+    lock: RunLock,
+    reporter: Reporter,
+    lpips_weights: LpipsWeights | None,
+    begin: float,
+    mesh: Mesh | None,
+    *,
+    resume: bool,
+    true_exposures: Mapping[str, float] | None,
+    spent_s: float,
+) -> FitResult:
+    """Fit into a folder that is locked; see `fit`."""
+    folder = RunFolder(paths.run)
+    clock, compiler = Stopwatch(), CompileCounter()
+    reading = time.monotonic()
+    with first_alone():
         scene = load(paths.scene, paths.run, cfg, reporter)
-        # Without a model, nearly all of it is finding and matching features.
-        found = scene.format in ("images", "transforms")
-        clock.add("structure_from_motion" if found else "reading", time.monotonic() - reading)
-        views = check_scene(scene, cfg, paths, lpips_weights)
+    # Without a model, nearly all of it is finding and matching features.
+    found = scene.format in ("images", "transforms")
+    clock.add("structure_from_motion" if found else "reading", time.monotonic() - reading)
+    views = check_scene(scene, cfg, paths, lpips_weights)
     with contextlib.closing(StepPrograms()) as programs:
         prepared = prepare(
             scene,
             cfg,
             reporter,
             clock,
-            lambda known: _begin(programs, known, scene, folder),
+            lambda known: _begin(programs, known, scene, folder, mesh),
             kept=kept_choice(cfg, folder) if resume else None,
+            pixels=folder.pixels_of(jax.process_index()),
         )
-        with _lock(folder, paths, cfg, prepared.decisions):
+        prepared = same_start(prepared)
+        lock.require()
+        with _begun(folder, paths, cfg, prepared.decisions):
             result = optimise(
                 prepared,
                 folder,
@@ -201,6 +259,7 @@ def fit(
                 programs,
                 resume=resume,
                 validation=views.validation,
+                mesh=mesh,
                 spent_s=time.monotonic() - begin,
                 reserve_s=seconds_to_finish(
                     scene, cfg, lpips_weights, reference=views.truth is not None
@@ -210,6 +269,9 @@ def fit(
     params = exposures_apart(params)
     if cfg.photometry.parameterization == "log" and cfg.photometry.known is None:
         params = recentre(params, cfg.render.radiance)
+    if not is_first():
+        _close_pixels(prepared, folder)
+        return FitResult(params, scene, {}, paths.run, prepared.selection, prepared.decisions)
     account = Account(
         counts={
             "gaussians": params.gaussians.capacity,
@@ -231,6 +293,7 @@ def fit(
         growth=result.growth,
         left_out=result.left_out,
     )
+    lock.require()
     metrics = finish(
         params,
         prepared,
@@ -243,21 +306,42 @@ def fit(
         if true_exposures is None
         else np.log2([true_exposures[view.name] for view in scene.training_views]),
         owner=owner,
+        still_ours=lock.require,
     )
+    _close_pixels(prepared, folder)
     return FitResult(params, scene, metrics, paths.run, prepared.selection, prepared.decisions)
 
 
+def _close_pixels(prepared: Prepared, folder: RunFolder) -> None:
+    """Forget the decoded photographs of this process."""
+    prepared.store.close()
+    shutil.rmtree(folder.pixels_of(jax.process_index()), ignore_errors=True)
+
+
 @contextlib.contextmanager
-def _lock(folder: RunFolder, paths: Paths, cfg: FitConfig, decisions: Decisions) -> Iterator[None]:
+def _ours(run_dir: Path) -> Iterator[RunLock]:
+    """Hold the folder of a run, which the first process alone writes to."""
+    if not is_first():
+        yield RunLock(run_dir, None)
+        return
+    with no_empty_folders(run_dir), locked(run_dir) as lock:
+        yield lock
+
+
+@contextlib.contextmanager
+def _begun(folder: RunFolder, paths: Paths, cfg: FitConfig, decisions: Decisions) -> Iterator[None]:
     """Make the folder a run's while its steps are taken, and keep it where they left something.
 
     A run that failed before its first checkpoint leaves nothing to continue or to overwrite.
     """
+    if not is_first():
+        yield
+        return
     write_start(folder, paths.scene, paths.reference, cfg, decisions)
     try:
         yield
     except UserError:
-        if CheckpointStore(folder.checkpoints).latest_step() is None:
+        if not saved_steps(folder.checkpoints):
             for path in (folder.config, folder.decisions):
                 path.unlink(missing_ok=True)
         raise

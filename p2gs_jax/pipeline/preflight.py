@@ -170,8 +170,8 @@ def check_sizes(views: Sequence[View], cfg: FitConfig) -> None:
 def check_run_dir(run_dir: Path, resume: bool, cfg: FitConfig) -> None:
     """Refuse to overwrite a run, and to continue one under other options.
 
-    Options of the evaluation may differ: they do not change the fit. An option that the run's own
-    version did not have counts as its default.
+    Options of the evaluation and the memory for photographs may differ: they do not change the fit.
+    An option that the run's own version did not have counts as its default.
 
     Raises:
         UserError: the folder holds a run and `resume` is not set, is not a folder, or holds a run
@@ -201,6 +201,7 @@ def check_run_dir(run_dir: Path, resume: bool, cfg: FitConfig) -> None:
     now = plain(config_to_dict(cfg))
     for options in (saved, now):
         options.pop("evaluation", None)
+        options.get("data", {}).pop("cache_mb", None)
     other = _differences(saved, now)
     if other:
         raise UserError(

@@ -53,6 +53,7 @@ from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.train.compared_photographs import color_pairs, overlaps
 from p2gs_jax.train.measured_depths import measured_depths
+from p2gs_jax.train.schedule import shrinks
 from p2gs_jax.types import Gaussians, Measured, Params, Scene, View
 
 
@@ -150,6 +151,7 @@ def prepare(
     on_expected: Callable[[Expected], None] = lambda expected: None,
     *,
     kept: Decisions | None = None,
+    pixels: Path | None = None,
 ) -> Prepared:
     """Start exposures, radiances and Gaussians from what the scene offers.
 
@@ -160,13 +162,18 @@ def prepare(
         clock: receives the seconds of `photometry` and `seeds`.
         on_expected: receives what can be told before the exposures are solved, where that is much.
         kept: what the checkpoints of a run that is resumed remember: its model and curve stay.
+        pixels: folder for decoded photographs that are more than memory holds, or None.
+
+    Raises:
+        UserError: the disk has no room for them.
     """
     clock = clock or Stopwatch()
     begin = time.monotonic()
     nodes = find_nodes(scene, cfg.dynamics)
     vibrating = vibrates(scene, cfg)
     moving = clock_of(scene) if vibrating else None if nodes is None else nodes.moving
-    store = ImageStore(scene.views, cfg.data, moving=moving)
+    store = ImageStore(scene.views, cfg.data, moving=moving, folder=pixels)
+    store.expect(shrinks(cfg.train))
     fitted, still = _without_what_moves(scene, store, nodes, cfg)
     views = scene.training_views
     taken_by = [view.camera for view in views]

@@ -39,6 +39,19 @@ class RunFolder:
         return self.root / "checkpoints"
 
     @property
+    def pixels(self) -> Path:
+        """Folder of decoded photographs while a fit runs whose memory does not hold them."""
+        return self.root / "cache" / "pixels"
+
+    def pixels_of(self, process: int) -> Path:
+        """Likewise of one of several processes; those of the first lie in `pixels`.
+
+        Args:
+            process: its number.
+        """
+        return self.pixels if process == 0 else self.root / "cache" / f"pixels-{process}"
+
+    @property
     def radiance(self) -> Path:
         """The Gaussians, with linear radiance."""
         return self.root / "radiance.ply"

@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import copy
+import shutil
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float32, UInt
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.scene.backdrop import RANDOM, backdrop_of
-from p2gs_jax.scene.decoded import Decoded, DecodedPhotographs, Key, floats
 from p2gs_jax.scene.drives.moving import MovingObjects
 from p2gs_jax.scene.drives.object_masks import MARGIN, outlines, painted
 from p2gs_jax.scene.geometry import scale_intrinsics
+from p2gs_jax.scene.pixels.decode import Decoded, floats
+from p2gs_jax.scene.pixels.files import Key, PixelFiles, file_bytes
+from p2gs_jax.scene.pixels.held import DecodedPhotographs
 from p2gs_jax.types import Placement, TrackedObject, View
 
+# All levels of a schedule together have this many pixels per pixel of the finest.
+_LEVELS = 4 / 3
 # A background shows through what is less opaque.
 OPAQUE = 0.999
 
@@ -48,8 +54,8 @@ def camera_at(
 class ImageStore:
     """The photographs of a scene, and where its moving objects are in them.
 
-    Decoded images are kept up to `cfg.cache_mb` (`scene/decoded.py`). All methods may be called
-    from any thread.
+    Decoded images are kept up to `cfg.cache_mb`, the rest in files where there is a folder for them
+    (`scene/pixels`). All methods may be called from any thread.
 
     Attributes:
         backdrop: display values of the background that photographs with alpha are shown over; None:
@@ -63,14 +69,21 @@ class ImageStore:
         cfg: DataConfig,
         objects: Sequence[TrackedObject] = (),
         moving: MovingObjects | None = None,
+        *,
+        folder: Path | None = None,
     ):
-        """Begin with an empty cache.
+        """Begin with nothing in memory.
 
         Args:
             views: of the scene.
             cfg: `max_width`, `cache_mb` and `background`.
             objects: pixels in the boxes of those that move are left out.
             moving: objects that Gaussians belong to, for the cameras.
+            folder: where decoded photographs go that are more than memory holds; None: they are
+                decoded again when they are needed.
+
+        Raises:
+            UserError: the disk of the folder has no room for them.
         """
         self.views = tuple(views)
         self.moving = moving
@@ -79,7 +92,9 @@ class ImageStore:
         self.backdrop = backdrop_of(cfg) if matted else None
         self.random_backdrop = matted and cfg.background == RANDOM
         self._only_opaque = False
-        self._photographs = DecodedPhotographs(views, cfg.cache_mb * 2**20)
+        limit = cfg.cache_mb * 2**20
+        files = _files_beyond(limit, views, cfg.max_width, folder)
+        self._photographs = DecodedPhotographs(views, limit, files)
         self._placements: dict[int, Placement] = {}
         self._leave_out(objects, MARGIN)
 
@@ -204,8 +219,22 @@ class ImageStore:
         """
         self._photographs.prefetch(self._key(index, shrink))
 
+    def expect(self, shrinks: Sequence[float]) -> None:
+        """Begin to decode photographs that memory does not hold, each at all these sizes.
+
+        Args:
+            shrinks: factors that will be asked for.
+        """
+        rows = range(len(self.views))
+        self._photographs.expect([[self._key(row, s) for s in shrinks] for row in rows])
+
+    @property
+    def decodings(self) -> int:
+        """How many photographs this process decoded so far, each size of each counted."""
+        return self._photographs.decodings
+
     def close(self) -> None:
-        """Stop the background thread and drop everything."""
+        """Stop the background thread and drop everything that is held; files stay."""
         self._photographs.close()
 
     def _key(self, index: int, shrink: float) -> Key:
@@ -222,3 +251,19 @@ class ImageStore:
         if index not in self._outlines:
             self._outlines[index] = outlines(self.views[index], self._objects, self._margin)
         return self._outlines[index]
+
+
+def _files_beyond(
+    limit: int, views: Sequence[View], max_width: int | None, folder: Path | None
+) -> PixelFiles | None:
+    """Return where photographs go that memory does not hold; None: it holds all, or nowhere."""
+    if folder is None:
+        return None
+    needed = sum(file_bytes(view, size_at(view, max_width)) for view in views)
+    if _LEVELS * needed <= limit:
+        # An earlier start had less memory.
+        shutil.rmtree(folder, ignore_errors=True)
+        return None
+    files = PixelFiles(folder, views)
+    files.require_room(needed)
+    return files

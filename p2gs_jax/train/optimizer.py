@@ -140,6 +140,8 @@ def _adam_with_rates(b1: float, b2: float, eps: float) -> Optimizer:
 def means_rate(progress: Array, rate: Array, extent: float, cfg: FitConfig) -> Float[Array, ""]:
     """Return the learning rate of the means, scene units per step (3DGS: exponential decay)."""
     o = cfg.optimizer
+    if o.means == 0:  # they stay where they are
+        return 0.0 * rate
     return rate * extent * o.means * (o.means_final / o.means) ** progress
 
 

@@ -104,7 +104,7 @@ def test_a_resumed_run_keeps_the_model_and_curve_of_its_checkpoints(tmp_path, sc
     CheckpointStore(run / "checkpoints").save(3, {"a": np.zeros(2)}, meta)
     given = []
 
-    def prepare(scene, cfg, reporter, clock, on_expected, *, kept):
+    def prepare(scene, cfg, reporter, clock, on_expected, *, kept, pixels):
         given.append((cfg, kept))
         raise KeyboardInterrupt
 

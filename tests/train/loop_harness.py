@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 from types import SimpleNamespace
 
 import jax
@@ -46,6 +47,9 @@ class Views:
     def leave_out(self, rows):
         self.out = tuple(rows)
 
+    def indices_at(self, step, count):
+        return tuple((step + k) % VIEWS for k in range(count))
+
     def index_at(self, step):
         return step % VIEWS
 
@@ -56,7 +60,7 @@ class Views:
         K = np.diag([400.0 / shrink, 400.0 / shrink, 1.0]).astype(np.float32)
         return on_host(Camera, np.eye(4, dtype=np.float32), K, 400 // shrink, 300 // shrink)
 
-    def batch(self, index, shrink, step=0):
+    def batch(self, index, shrink, step=0, decoded=True):
         nothing = np.zeros((1, 1, 3), np.uint8), np.ones((1, 1), bool)
         return on_host(Batch, self.camera(index, shrink), *nothing, np.int32(index))
 
@@ -153,7 +157,7 @@ class Harness:
         self.folder, self.checkpoints = folder, Checkpoints()
         self.said, self.records = [], []
         stopped = SimpleNamespace(monotonic=lambda: self.clock.now)
-        for module in (burst, loop, session):
+        for module in (burst, session):
             monkeypatch.setattr(module, "time", stopped)
         monkeypatch.setattr(checkpoints, "CheckpointStore", lambda folder: self.checkpoints)
         monkeypatch.setattr(
@@ -201,3 +205,16 @@ class Harness:
 
     def log(self, name="log.jsonl"):
         return read_jsonl(self.folder / name)
+
+
+def signalled(harness, *numbers, at):
+    """Return programs during whose step of that number signals come."""
+
+    def step_s(width):
+        if len(programs.taken) == at:
+            for number in numbers:
+                os.kill(os.getpid(), number)
+        return 0.1
+
+    programs = Programs(harness.clock, step_s=step_s)
+    return programs

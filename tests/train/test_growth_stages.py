@@ -1,11 +1,13 @@
 """A stage of automatic growth: both of its runs are logged, keep to the time, and take faults."""
 
 import math
+import signal
 
 import numpy as np
 import pytest
-from loop_harness import GROWING, SEEDS, Harness, Programs
+from loop_harness import GROWING, SEEDS, Harness, Programs, signalled
 
+from p2gs_jax.core.interrupts import Interrupted
 from p2gs_jax.errors import DivergenceError
 from p2gs_jax.sweep import with_fields
 from p2gs_jax.train import growth
@@ -126,3 +128,18 @@ def test_trials_of_steps_that_are_taken_again_leave_the_log(harness):
     assert harness.checkpoints.latest_step() <= begun
     harness.run(cut, resume=True)
     assert [line["step"] for line in harness.log("growth.jsonl")] == whole
+
+
+def test_a_signal_within_a_stage_of_growth_ends_the_run_at_its_last_checkpoint(harness):
+    harness.judge = gains
+    whole, _ = harness.run(GROWING)
+    begun, _ = begun_and_ended(harness)
+    harness.checkpoints.saved.clear()
+    cfg = with_fields(GROWING, {"train.checkpoint_every_s": 1e-9})
+    with pytest.raises(Interrupted):
+        harness.run(cfg, programs=signalled(harness, signal.SIGTERM, at=begun + 7))
+    assert harness.checkpoints.latest_step() < begun + 5
+    assert "within a stage of growth; the last good checkpoint is step" in harness.said[-1]
+    again, _ = harness.run(cfg, resume=True)
+    assert again.host.step == whole.host.step
+    assert again.growth == whole.growth

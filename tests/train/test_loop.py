@@ -1,10 +1,13 @@
 """What the host decides between bursts: paces, levels, faults, checkpoints."""
 
+import signal
+
 import jax
 import numpy as np
 import pytest
-from loop_harness import SHORT, Harness, Programs
+from loop_harness import SHORT, Harness, Programs, signalled
 
+from p2gs_jax.core.interrupts import Interrupted
 from p2gs_jax.errors import DivergenceError, UserError
 from p2gs_jax.run.decisions import KEY
 from p2gs_jax.sweep import with_fields
@@ -104,3 +107,35 @@ def test_a_run_without_steps_to_take_ends(harness):
     assert 0 < len(programs.taken) <= 10
     assert np.isclose(result.host.elapsed_s, harness.clock.now)
     assert any("The budget ended the run" in text for text in harness.said)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_run_after_a_checkpoint_and_it_goes_on_as_if_nothing_had_been(
+    harness, number
+):
+    with pytest.raises(Interrupted) as stop:
+        harness.run(programs=signalled(harness, number, at=52))
+    assert stop.value.number == number
+    assert harness.checkpoints.latest_step() == 55
+    assert "the run stops after step 55 (55%)" in harness.said[-1]
+    result, programs = harness.run(resume=True)
+    assert [step for step, *_ in programs.taken] == list(range(55, 100))
+    assert [line["step"] for line in harness.log()] == list(range(5, 101, 5))
+    assert result.host.step == 100
+
+
+def test_the_first_burst_and_a_second_signal_wait_for_nothing(harness):
+    twice = (signal.SIGTERM, signal.SIGINT)
+    for programs in (
+        signalled(harness, signal.SIGTERM, at=2),
+        signalled(harness, *twice, at=52),
+    ):
+        with pytest.raises(Interrupted):
+            harness.run(programs=programs)
+        assert harness.checkpoints.latest_step() is None
+
+
+def test_a_signal_in_the_last_burst_ends_a_run_that_is_complete(harness):
+    with pytest.raises(Interrupted):
+        harness.run(programs=signalled(harness, signal.SIGTERM, at=97))
+    assert harness.checkpoints.latest_step() == 100

@@ -83,6 +83,38 @@ def test_killed_three_times_and_resumed(tmp_path, method):
         assert a == b
 
 
+@pytest.mark.slow
+def test_asked_to_end_and_resumed(tmp_path):
+    """SIGTERM of a batch system: a checkpoint, and nothing is lost."""
+    scene = make_scene(tmp_path / "scene")
+    rarely = ("--train.checkpoint-every-s", "1000")
+    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
+    subprocess.run(command(scene, whole, *rarely), check=True, env=environment())
+    with subprocess.Popen(
+        command(scene, stopped, *rarely), env=environment(), stderr=subprocess.PIPE, text=True
+    ) as process:
+        log = stopped / "log.jsonl"
+        while not log.exists() or log.read_text().count("\n") < 2:
+            assert process.poll() is None, process.stderr.read()
+            time.sleep(0.005)
+        process.send_signal(signal.SIGTERM)
+        _, said = process.communicate()
+    assert process.returncode == 128 + signal.SIGTERM
+    assert "SIGTERM: the run stops after step" in said
+    assert "Traceback" not in said
+    final = subprocess.run(
+        command(scene, stopped, *rarely, "--resume"),
+        env=environment(),
+        capture_output=True,
+        text=True,
+    )
+    assert final.returncode == 0, final.stderr
+    assert "Resuming after step" in final.stderr
+    for a, b in zip(content(whole), content(stopped), strict=True):
+        assert a == b
+    assert not (stopped / ".lock").exists()
+
+
 def test_divergence_is_named(tmp_path, capsys):
     scene = make_scene(tmp_path / "scene")
     with pytest.raises(SystemExit) as stop:

@@ -23,14 +23,13 @@ from reliability.mutations import (
     wrong_values,
     wrong_words,
 )
-from reliability.reading import fit, read
+from reliability.reading import read
 from reliability.trials import Trial, run_trials
 
 NAME = "broken_models"
 ABOUT = """COLMAP models (binary and text), transforms.json, rigs, seed points, split lists and
 masks that are cut at fields, flipped, miscounted or out of range. Each is read whole, or refused
-with code 2 by a message that names file, fault and remedy, within 30 s and 2 GB; some are
-fitted."""
+with code 2 by a message that names file, fault and remedy, within 30 s and 2 GB."""
 _TRANSFORMS = "tests/scene/test_transforms.py"
 MENDED = (
     Mended(
@@ -56,22 +55,15 @@ MENDED = (
 )
 SEED = 20261123
 SPACING = 9
-FITTED = 60
 
 
 def run(quick: bool, out: Path, report: Report) -> Family:
     """Try all; `quick`: every ninth."""
-    trials = list(_trials())
-    fitted = [
-        Trial(f"fit: {t.name}", t.make, fit, t.named, t.refused, 120, 8 * 2**30)
-        for t in trials[:: FITTED * (8 if quick else 1)]
-    ]
-    return run_trials(
-        NAME, [*(trials[::SPACING] if quick else trials), *fitted], out, report, MENDED
-    )
+    return run_trials(NAME, list(trials())[:: SPACING if quick else 1], out, report, MENDED)
 
 
-def _trials() -> Iterator[Trial]:
+def trials() -> Iterator[Trial]:
+    """Yield all, in their order."""
     for text in (False, True):
         yield Trial(f"colmap whole ({text})", _whole(text), read, refused=False)
     yield Trial("transforms whole", _made(scenes.write_transforms), read, refused=False)

@@ -17,6 +17,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.cameras import corner
 from p2gs_jax.photometry.solution import WEAK_GAMMA, PhotometricSolution
 from p2gs_jax.pipeline.calibrate import calibrate
+from p2gs_jax.pipeline.calibrate_of import STEPS, calibrate_of
 from p2gs_jax.pipeline.calibrate_run import calibrate_run
 from p2gs_jax.pipeline.calibrate_stack import calibrate_stack
 from p2gs_jax.run.calibration_files import CalibrationResult, write_calibration
@@ -29,6 +30,13 @@ def run(options: Calibrate) -> int:
     if options.static:
         return _run_static(scene, out, cfg, compare_with)
     is_run = (scene / "config.json").is_file() and (scene / "radiance.ply").is_file()
+    if options.of is not None:
+        if is_run:
+            raise UserError(
+                f"{scene} is a finished run; --of needs the photographs with their poses.",
+                fix="name the scene that the run was fitted to",
+            )
+        return _run_of(options, options.of, cfg)
     with TerminalReporter() as reporter:
         if is_run:
             if cfg.data != FitConfig().data:
@@ -52,6 +60,39 @@ def run(options: Calibrate) -> int:
     )
     stdout().print(f"Results: {out} (open {out / 'calibration.png'} first)")
     return 0
+
+
+def _run_of(options: Calibrate, model: Path, cfg: FitConfig) -> int:
+    with TerminalReporter() as reporter:
+        found = calibrate_of(
+            model,
+            options.scene,
+            options.out,
+            cfg,
+            steps=STEPS if options.steps is None else options.steps,
+            compare_with=options.compare_with,
+            reporter=reporter,
+        )
+    _print_table(found.calibration, _tone_columns(found.calibration))
+    for line in _camera_lines(found.calibration.solution):
+        stdout().print(line)
+    for split, name in (("train", "training"), ("test", "held-out")):
+        if split in found.metrics["of"]:
+            stdout().print(_before_and_after(found.metrics, split, name))
+    stdout().print(f"Results: {options.out} (a run folder: view, render, export, report read it)")
+    return 0
+
+
+def _before_and_after(metrics: dict, split: str, name: str) -> str:
+    """Return a sentence on the photographs of a split, by the model and by what became of it."""
+    old, new = metrics["of"][split], metrics[split]
+    by_view = new["exposure_fitted"] if split == "test" else new
+    how = "fitted to each" if split == "test" else "as solved"
+    return (
+        f"PSNR of {name} views: {old['as_it_is']['psnr']:.2f} dB as the model was, "
+        f"{old['exposure_fitted']['psnr']:.2f} with a gain fitted to each; now "
+        f"{by_view['psnr']:.2f} with exposures {how}."
+    )
 
 
 def _run_static(folder: Path, out: Path, cfg: FitConfig, compare_with: str | None) -> int:

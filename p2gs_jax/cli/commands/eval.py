@@ -73,5 +73,6 @@ def _kept_metrics(path: Path) -> dict:
         old = parse_json(path.read_text())
     except (OSError, ValueError):
         return {}
-    kept = ("counts", "seconds", "seconds_per_step", "notes", "photometry", "growth", "exposures")
+    kept = ("counts", "seconds", "seconds_per_step", "notes", "photometry")
+    kept += ("growth", "exposures", "of")
     return {k: old[k] for k in kept if k in old}

@@ -84,7 +84,9 @@ class Sweep:
     out: Path | None = None
     """Folder of the runs and the table (default: the file's, or its name)."""
     max_parallel: int | None = None
-    """Fits at a time (default: the file's, or 1)."""
+    """Fits at a time on this machine (default: the file's, or 1)."""
+    engine: Annotated[str, tyro.conf.arg(metavar="NAME")] = "local"
+    """Where fits run: local, dask://HOST:PORT, or slurm:OPTION=VALUE,... (docs/sweeps.md)."""
 
 
 @dataclass(frozen=True)

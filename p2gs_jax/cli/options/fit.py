@@ -11,6 +11,9 @@ import tyro
 
 from p2gs_jax import config as configs
 from p2gs_jax.cli.options.parse import check, parse_duration, parse_gaussians
+from p2gs_jax.core.devices import Devices
+from p2gs_jax.core.processes import Processes, scheduled
+from p2gs_jax.errors import UserError
 
 Preset = Annotated[configs.PresetName, tyro.conf.arg(metavar="NAME")]
 Duration = Annotated[str | None, tyro.conf.arg(metavar="TIME")]
@@ -90,6 +93,20 @@ class Fit:
     weights."""
     seed: int | None = None
     """Seeds every random choice; default: 0."""
+    devices: Annotated[str, tyro.conf.arg(metavar="N|all")] = "1"
+    """Devices of a step, each with its own views (--train.batch; default then: one view each)."""
+    shard: Annotated[str, tyro.conf.arg(metavar="views|gaussians|VxG")] = "views"
+    """Where Gaussians lie: all on every device (views), divided among all devices (gaussians), or
+    in each of V groups among its G devices, such as 2x2 (docs/scaling.md)."""
+    coordinator: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT")] = None
+    """Several processes fit together, on one host or many: where process 0 listens. Under Slurm and
+    Open MPI --devices all finds all of it (docs/scaling.md)."""
+    processes: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """How many processes; all bring all of their devices."""
+    process: Annotated[int | None, tyro.conf.arg(metavar="I")] = None
+    """Which of them this one is, from 0."""
+    process_timeout: Annotated[int, tyro.conf.arg(metavar="SECONDS")] = 100
+    """Seconds after which a process that is not heard of is taken for dead, and all end."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +119,7 @@ class Calibrate:
         p2gs-jax calibrate castle --out photometry
         p2gs-jax calibrate castle --out photometry --known-exposures exif
         p2gs-jax calibrate stack --out photometry --static
+        p2gs-jax calibrate castle --out runs/relit --of splats.ply
     """
 
     scene: Annotated[Path, tyro.conf.Positional]
@@ -120,6 +138,11 @@ class Calibrate:
     """Stated exposures to compare with; default: EXIF."""
     static: bool = False
     """The folder holds photographs from one fixed viewpoint at several exposures."""
+    of: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Somebody's splats of the scene (.ply, .splat, .spz; display colours): exposures are
+    solved, and it is written as linear radiance into --out, a run folder."""
+    steps: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """With --of: steps in which its colours and opacities are fitted again; default: 600."""
     images: Annotated[str | None, tyro.conf.arg(metavar="DIR")] = None
     """Image folder, where it is not images/ beside the model."""
     drive: Drive = None
@@ -148,6 +171,11 @@ def resolve_calibration(args: Calibrate) -> configs.FitConfig:
             data = dataclasses.replace(data, **{name: getattr(args, name)})
     if args.cameras:
         data = dataclasses.replace(data, cameras=args.cameras)
+    check(
+        not (args.static and args.of), "--static and --of exclude each other", fix="leave one out"
+    )
+    check(args.steps is None or args.of is not None, "--steps says nothing without --of")
+    check(args.steps is None or args.steps >= 1, "--steps must be at least 1")
     check(data.max_width is None or data.max_width >= 16, "--max-width must be at least 16")
     check(data.every is None or data.every >= 1, "--every must be at least 1")
     check(data.max_frames >= 2, "--max-frames must be at least 2")
@@ -187,8 +215,56 @@ def resolve_fit(args: Fit) -> configs.FitConfig:
     check(data.max_frames >= 2, "--max-frames must be at least 2")
     check(data.test_every >= 0, "--test-every must be 0 or more")
     check(train.steps >= 1, "--steps must be at least 1")
+    check(train.batch >= 1, "--train.batch must be at least 1")
     cfg = dataclasses.replace(cfg, data=data, train=train, evaluation=evaluation, densify=densify)
     return _known(cfg, args)
+
+
+def resolve_processes(args: Fit) -> Processes | None:
+    """Return how this process finds the others of a fit; None where it is alone.
+
+    Raises:
+        UserError: some of it is missing, or makes no sense.
+    """
+    given = (args.coordinator, args.processes, args.process)
+    check(args.process_timeout >= 1, "--process-timeout must be at least 1")
+    if given == (None, None, None):
+        if args.devices != "all" or not scheduled():
+            return None
+        return Processes(None, None, None, args.process_timeout)
+    if args.coordinator is None or args.processes is None or args.process is None:
+        raise UserError(
+            "--coordinator, --processes and --process go together.",
+            fix="give every process all three: --coordinator HOST:PORT --processes N --process I",
+        )
+    host, _, port = args.coordinator.rpartition(":")
+    check(
+        bool(host) and port.isdecimal() and 0 < int(port) < 2**16,
+        f"--coordinator {args.coordinator} is no HOST:PORT",
+    )
+    check(args.processes >= 1, "--processes must be at least 1")
+    check(
+        0 <= args.process < args.processes,
+        f"--process {args.process} is none of {args.processes}",
+        fix="count them from 0",
+    )
+    return Processes(args.coordinator, args.process, args.processes, args.process_timeout)
+
+
+def resolve_devices(args: Fit) -> Devices:
+    """Return the devices of a fit; of several processes all of them.
+
+    Raises:
+        UserError: the number is none.
+    """
+    if args.devices == "all" or resolve_processes(args) is not None:
+        return Devices("all", args.shard)
+    check(
+        args.devices.isdecimal() and int(args.devices) >= 1,
+        f"--devices {args.devices} is no number of devices",
+        fix="give 1 or more, or all",
+    )
+    return Devices(int(args.devices), args.shard)
 
 
 def _known(cfg: configs.FitConfig, args: Fit | Calibrate) -> configs.FitConfig:

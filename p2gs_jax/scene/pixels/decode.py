@@ -1,14 +1,10 @@
-"""Decoded photographs: undistorted, shrunk, and kept within a memory bound."""
+"""From a photograph's file to its pixels: masked, undistorted, shrunk."""
 
 from __future__ import annotations
 
-import threading
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -23,21 +19,6 @@ from p2gs_jax.types import View
 
 _FULL = 0.999  # a pixel is valid only where all of its sources are
 _ALPHA_VALID = 0.5
-_MAX_PREFETCHED = 4
-
-
-class Key(NamedTuple):
-    """Which photograph, at which size.
-
-    Attributes:
-        view: row.
-        width: pixels.
-        height: pixels.
-    """
-
-    view: int
-    width: int
-    height: int
 
 
 @dataclass(frozen=True)
@@ -62,103 +43,39 @@ class Decoded:
         return self.pixels.nbytes + self.valid.nbytes + opacity
 
 
-class DecodedPhotographs:
-    """Photographs of some views, decoded on demand.
-
-    They are kept up to a limit, least recently used first out; the most recent one is always kept.
-    Beyond that only images being worked on take memory. All methods may be called from any thread.
-    """
-
-    def __init__(self, views: Sequence[View], limit: int):
-        """Begin with an empty cache.
-
-        Args:
-            views: of the scene.
-            limit: bytes.
-        """
-        self.views = tuple(views)
-        self._limit = limit
-        self._cache: OrderedDict[Key, Decoded] = OrderedDict()
-        self._bytes = 0
-        self._pending: dict[Key, Future[Decoded]] = {}
-        self._lock = threading.Lock()
-        self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="decode")
-
-    @property
-    def cached_bytes(self) -> int:
-        """Bytes held now."""
-        with self._lock:
-            return self._bytes
-
-    def get(self, key: Key) -> Decoded:
-        """Return a photograph.
-
-        Raises:
-            UserError: the file or its mask is missing, broken or of another size than the model's.
-        """
-        with self._lock:
-            entry = self._cache.get(key)
-            pending = self._pending.get(key)
-            if entry is not None:
-                self._cache.move_to_end(key)
-        if entry is None:
-            entry = self._load(key) if pending is None else pending.result()
-        return entry
-
-    def prefetch(self, key: Key) -> None:
-        """Start decoding in the background; `get` then waits only for what is left.
-
-        Requests beyond a short queue are dropped; errors are raised by `get`.
-        """
-        with self._lock:
-            if key in self._cache or key in self._pending:
-                return
-            if len(self._pending) >= _MAX_PREFETCHED:
-                return
-            self._pending[key] = self._worker.submit(self._load_pending, key)
-
-    def close(self) -> None:
-        """Stop the background thread and drop everything."""
-        self._worker.shutdown(wait=True, cancel_futures=True)
-        with self._lock:
-            self._cache.clear()
-            self._pending.clear()
-            self._bytes = 0
-
-    def _load_pending(self, key: Key) -> Decoded:
-        try:
-            return self._load(key)
-        finally:
-            with self._lock:
-                self._pending.pop(key, None)
-
-    def _load(self, key: Key) -> Decoded:
-        view = self.views[key.view]
-        try:
-            entry = _prepare(view, key.width, key.height)
-        except (MemoryError, cv2.error) as error:
-            raise UserError(
-                f"{view.image_path}: {view.width}x{view.height} pixels need more memory than there "
-                f"is ({error})",
-                fix="make the photographs smaller",
-            ) from None
-        with self._lock:
-            if key not in self._cache:
-                self._cache[key] = entry
-                self._bytes += entry.nbytes
-            while self._bytes > self._limit and len(self._cache) > 1:
-                _, dropped = self._cache.popitem(last=False)
-                self._bytes -= dropped.nbytes
-        return entry
-
-
 def floats(pixels: UInt[np.ndarray, "..."]) -> Float32[np.ndarray, "..."]:
     """Return stored values in [0, 1]."""
     return pixels.astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
 
 
-def _prepare(view: View, width: int, height: int) -> Decoded:
-    """Decode, undistort and shrink one photograph."""
+def resamples(view: View, size: tuple[int, int]) -> bool:
+    """Return whether a photograph has other pixels at (width, height) than in its file."""
+    matted = view.alpha == "background"
+    return view.distortion is not None or size != (view.width, view.height) or matted
+
+
+def decode(view: View, sizes: Sequence[tuple[int, int]]) -> list[Decoded]:
+    """Return a photograph at some sizes; its file is opened once.
+
+    Args:
+        view: whose.
+        sizes: width and height in pixels of each.
+
+    Raises:
+        UserError: the file or its mask is missing, broken or of another size than the model's; or
+            there is too little memory for it.
+    """
+    try:
+        return _decoded(view, sizes)
+    except (MemoryError, cv2.error) as error:
+        raise UserError(
+            f"{view.image_path}: {view.width}x{view.height} pixels need more memory than there is "
+            f"({error})",
+            fix="make the photographs smaller",
+        ) from None
+
+
+def _decoded(view: View, sizes: Sequence[tuple[int, int]]) -> list[Decoded]:
     pixels, opacity = _decode(view.image_path)
     if pixels.shape[:2] != (view.height, view.width):
         raise UserError(
@@ -176,29 +93,55 @@ def _prepare(view: View, width: int, height: int) -> Decoded:
         # Any pixel that takes part in interpolation counts: the outline is known roughly.
         covered = view.own_car.astype(np.float32)
         valid &= cv2.resize(covered, (view.width, view.height)) == 0
-    shrunk = (width, height) != (view.width, view.height)
-    alpha = None
-    if view.distortion is not None or shrunk or matte is not None:
-        ldr = floats(pixels)
-        if matte is not None:
-            # What is transparent must not colour its neighbours: all four are resampled together.
-            opaque = floats(matte)[..., None]
-            ldr = np.concatenate([ldr * opaque, opaque], axis=2)
-        if view.distortion is not None:
-            maps = undistortion_maps(view.K, view.distortion, view.width, view.height)
-            ldr = cv2.remap(ldr, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            valid = _resample_valid(valid, lambda v: cv2.remap(v, *maps, cv2.INTER_LINEAR))
-        if shrunk:
-            size = (width, height)
-            ldr = cv2.resize(ldr, size, interpolation=cv2.INTER_AREA)
-            valid = _resample_valid(
-                valid, lambda v: cv2.resize(v, size, interpolation=cv2.INTER_AREA)
-            )
-        pixels = np.rint(ldr * np.float32(np.iinfo(np.uint16).max)).astype(np.uint16)
-        if matte is not None:
-            pixels, alpha = np.ascontiguousarray(pixels[..., :3]), pixels[..., 3].copy()
-            alpha.flags.writeable = False
+    whole = (view.width, view.height)
+    as_stored = view.distortion is None and matte is None
+    if as_stored and all(size == whole for size in sizes):
+        return [_read_only(pixels, valid, None) for _ in sizes]
+    ldr, straight = _straightened(view, pixels, matte, valid)
+    return [
+        _read_only(pixels, valid, None)
+        if as_stored and size == whole
+        else _at_size(ldr, straight, size, matted=matte is not None)
+        for size in sizes
+    ]
+
+
+def _straightened(
+    view: View, pixels: np.ndarray, matte: np.ndarray | None, valid: np.ndarray
+) -> tuple[Float32[np.ndarray, "h w c"], Bool[np.ndarray, "h w"]]:
+    """Return colours, premultiplied by opacity and with it where there is any, undistorted."""
+    ldr = floats(pixels)
+    if matte is not None:
+        # What is transparent must not colour its neighbours: all four are resampled together.
+        opaque = floats(matte)[..., None]
+        ldr = np.concatenate([ldr * opaque, opaque], axis=2)
+    if view.distortion is None:
+        return ldr, valid
+    maps = undistortion_maps(view.K, view.distortion, view.width, view.height)
+    ldr = cv2.remap(ldr, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return ldr, _resample_valid(valid, lambda v: cv2.remap(v, *maps, cv2.INTER_LINEAR))
+
+
+def _at_size(
+    ldr: Float32[np.ndarray, "h w c"],
+    valid: Bool[np.ndarray, "h w"],
+    size: tuple[int, int],
+    *,
+    matted: bool,
+) -> Decoded:
+    if size != ldr.shape[1::-1]:
+        ldr = cv2.resize(ldr, size, interpolation=cv2.INTER_AREA)
+        valid = _resample_valid(valid, lambda v: cv2.resize(v, size, interpolation=cv2.INTER_AREA))
+    pixels = np.rint(ldr * np.float32(np.iinfo(np.uint16).max)).astype(np.uint16)
+    if not matted:
+        return _read_only(pixels, valid, None)
+    return _read_only(np.ascontiguousarray(pixels[..., :3]), valid, pixels[..., 3].copy())
+
+
+def _read_only(pixels: np.ndarray, valid: np.ndarray, alpha: np.ndarray | None) -> Decoded:
     pixels.flags.writeable = valid.flags.writeable = False
+    if alpha is not None:
+        alpha.flags.writeable = False
     return Decoded(pixels, valid, alpha)
 
 

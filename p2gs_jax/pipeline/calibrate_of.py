@@ -1,0 +1,228 @@
+"""Exposures of photographs against somebody else's splats, and these as linear radiance."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from p2gs_jax.config import FitConfig, require_config
+from p2gs_jax.core.atomic import no_empty_folders
+from p2gs_jax.core.clock import Stopwatch
+from p2gs_jax.core.progress import Reporter, Silent
+from p2gs_jax.errors import UserError
+from p2gs_jax.evaluate.foreign import score_foreign
+from p2gs_jax.formats.foreign import read_foreign
+from p2gs_jax.gaussians.bake import viewer_config
+from p2gs_jax.gaussians.init.dense_bound import coverage_of
+from p2gs_jax.gaussians.init.seeds import scene_extent
+from p2gs_jax.gaussians.relit import relit
+from p2gs_jax.photometry.calibrate import calibrate_observations, options_of
+from p2gs_jax.photometry.initial import initial_photometry
+from p2gs_jax.photometry.mean import usual_display
+from p2gs_jax.photometry.observations import Observations
+from p2gs_jax.photometry.selection import Selection
+from p2gs_jax.photometry.sources.rendered import rendered_colors
+from p2gs_jax.photometry.sources.tracks import has_tracks, track_colors
+from p2gs_jax.pipeline.calibration import Calibration, with_stated
+from p2gs_jax.pipeline.decide import decide
+from p2gs_jax.pipeline.finish import Account, finish
+from p2gs_jax.pipeline.fit import compact, optimise
+from p2gs_jax.pipeline.preflight import check_run_dir
+from p2gs_jax.pipeline.prepare import Prepared
+from p2gs_jax.run.calibration_files import write_calibration
+from p2gs_jax.run.layout import RunFolder
+from p2gs_jax.run.write import write_start
+from p2gs_jax.scene import load_scene
+from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.known_exposures import check_source
+from p2gs_jax.train.programs import StepPrograms
+from p2gs_jax.types import Gaussians, Params, Scene
+
+STEPS = 600
+# Below this correlation of renders with photographs a model belongs to other poses, most likely.
+LEAST_AGREEMENT = 0.5
+
+
+@dataclass(frozen=True)
+class CalibrationOf:
+    """What `calibrate --of` finds.
+
+    Attributes:
+        calibration: exposures of the training views.
+        metrics: what `metrics.json` holds; `of` has the scores of the model as it was.
+    """
+
+    calibration: Calibration
+    metrics: dict
+
+
+def calibrate_of(
+    model: str | Path,
+    scene_dir: str | Path,
+    out: str | Path,
+    cfg: FitConfig | None = None,
+    *,
+    steps: int = STEPS,
+    compare_with: str | None = None,
+    reporter: Reporter | None = None,
+) -> CalibrationOf:
+    """Solve exposures of a model's photographs, and refit its colours as linear radiance.
+
+    Exposures come from the scene's tracks, or, where it has none, through the model's depth.
+    Places, shapes and number of the Gaussians stay; colours and opacities are fitted under the
+    exposures found. `out` becomes a run folder that has the files of a calibration as well.
+
+    Args:
+        model: display colours, in the coordinates of the scene's poses.
+        scene_dir: see `fit`; the views that it holds out judge the result.
+        out: created; it must hold no run.
+        cfg: options (data, photometry, loss, rendering); default `robust`.
+        steps: of refitting colours and opacities, one view each.
+        compare_with: see `calibrate`.
+        reporter: receives progress.
+
+    Raises:
+        UserError: something the user can mend.
+    """
+    begin, cfg = time.monotonic(), converting(require_config(cfg), steps)
+    reporter, folder, clock = reporter or Silent(), RunFolder(Path(out)), Stopwatch()
+    check_run_dir(folder.root, False, cfg)
+    for source in (cfg.photometry.known, compare_with):
+        check_source(source)
+    reporter.stage("Reading the model")
+    foreign, dropped = read_foreign(Path(model))
+    with no_empty_folders(folder.root):
+        scene = load_scene(Path(scene_dir), cfg.data, folder.root / "cache", reporter.message)
+        if len(scene.train_indices) < 2:
+            raise UserError(
+                f"{scene_dir} has {len(scene.train_indices)} training view(s); exposures need two.",
+                fix="add photographs that were posed together with the model",
+            )
+        store = ImageStore(scene.views, cfg.data)
+        reporter.stage("Judging the model")
+        before = score_foreign(foreign, scene, store, viewer_config(cfg.render))
+        observations = _observations(foreign, scene, store, cfg, reporter)
+        _check(observations, before.agreement, Path(model), Path(scene_dir))
+    clock.add("reading", time.monotonic() - begin)
+    reporter.stage("Photometric bundle adjustment")
+    selection = calibrate_observations(observations, options_of(cfg, scene))
+    clock.add("photometry", time.monotonic() - begin - clock.seconds["reading"])
+    calibration = with_stated(
+        dataclasses.replace(scene, views=tuple(scene.training_views)),
+        selection,
+        cfg.photometry,
+        observations=len(observations.views),
+        seconds={"reading": clock.seconds["reading"], "adjustment": clock.seconds["photometry"]},
+        compare_with=compare_with,
+    )
+    prepared = _prepared(foreign, scene, store, selection, cfg)
+    prepared.notes += [*scene.notes, *selection.reasons, *selection.solution.warnings]
+    if dropped:
+        prepared.notes.append(f"{dropped} Gaussians of the model are not finite: left out.")
+    for note in prepared.notes:
+        reporter.message(note)
+    write_start(folder, Path(scene_dir), None, cfg, prepared.decisions)
+    with contextlib.closing(StepPrograms()) as programs:
+        result = optimise(prepared, folder, reporter, programs, resume=False)
+    params, _ = compact(result)
+    counts = {
+        "gaussians": params.gaussians.capacity,
+        "train_views": len(scene.train_indices),
+        "test_views": len(scene.test_indices),
+        "steps": result.host.step,
+    }
+    seconds = {**clock.seconds, **result.seconds, "optimisation": result.host.elapsed_s}
+    account = Account(counts=counts, seconds=seconds, of=before.summary)
+    metrics = finish(params, prepared, folder, account, reporter, truth=None, lpips_weights=None)
+    write_calibration(calibration, folder.root)
+    return CalibrationOf(calibration, metrics)
+
+
+def _observations(
+    foreign: Gaussians, scene: Scene, store: ImageStore, cfg: FitConfig, reporter: Reporter
+) -> Observations:
+    """Sample colours at tracks where the scene has any: what a model shows of depth is coarser."""
+    still = store.leaving_out(scene.objects).only_opaque()
+    if has_tracks(scene):
+        return track_colors(scene, still, lambda i, n: reporter.stage("Sampling colours", i, n))
+    return rendered_colors(
+        foreign,
+        scene,
+        still,
+        viewer_config(cfg.render),
+        cfg.train.seed,
+        lambda i, n: reporter.stage("Rendering depth", i, n),
+    )
+
+
+def converting(cfg: FitConfig, steps: int) -> FitConfig:
+    """Return the options under which colours and opacities move, and nothing else of a model.
+
+    Args:
+        cfg: as asked.
+        steps: one view each.
+    """
+    replace = dataclasses.replace
+    still = dict.fromkeys(("means", "scales", "quats"), 0.0)
+    return replace(
+        cfg,
+        optimizer=replace(cfg.optimizer, **still),
+        densify=replace(cfg.densify, method=None, max_gaussians=None),
+        dynamics=replace(cfg.dynamics, method="mask"),
+        train=replace(cfg.train, steps=steps, budget_s=None, coarse_to_fine=()),
+    )
+
+
+def _check(observations: Observations, agreement: float, model: Path, scene: Path) -> None:
+    """Refuse a model that does not show what the photographs do.
+
+    Raises:
+        UserError: no pixel is seen twice, or renders look like something else.
+    """
+    fix = "export the model in the coordinates of these poses (docs/photometry.md)"
+    if not len(observations.views):
+        raise UserError(
+            f"{model} has no surface that two photographs of {scene} see: its coordinates are not "
+            "those of the poses, or it is transparent everywhere.",
+            fix=fix,
+        )
+    if not agreement >= LEAST_AGREEMENT:
+        raise UserError(
+            f"renders of {model} do not look like the photographs of {scene} (correlation "
+            f"{agreement:.2f}, where {LEAST_AGREEMENT:g} is needed): its coordinates are not those "
+            "of the poses, most likely.",
+            fix=fix,
+        )
+
+
+def _prepared(
+    foreign: Gaussians, scene: Scene, store: ImageStore, selection: Selection, cfg: FitConfig
+) -> Prepared:
+    """Return what a fit starts from: the model's Gaussians as radiance, and exposures."""
+    decisions = decide(cfg, selection, matched=True)
+    resolved = decisions.resolve(cfg)
+    taken_by = [view.camera for view in scene.training_views]
+    photometry = initial_photometry(selection.solution, taken_by, resolved)
+    plain = Params(foreign, photometry)
+    shown = usual_display(plain, taken_by, None, resolved.photometry)
+    params = dataclasses.replace(plain, gaussians=relit(foreign, shown, resolved.render))
+    return Prepared(
+        scene=scene,
+        store=store,
+        fitted=store.leaving_out(scene.objects),
+        params=params,
+        owner=None,
+        extent=scene_extent(scene.training_views, np.asarray(foreign.means)),
+        selection=selection,
+        pairs=None,
+        overlaps=None,
+        measured=None,
+        coverage=coverage_of(scene, store),
+        decisions=decisions,
+        cfg=resolved,
+    )

@@ -1,0 +1,100 @@
+"""A write for which there is no room says so, names its file and leaves the old one as it was."""
+
+import contextlib
+import errno
+import json
+import resource
+
+import numpy as np
+import pytest
+
+from p2gs_jax.core.atomic import append_jsonl, atomic_write, read_jsonl, write_array, write_text
+from p2gs_jax.core.disk import naming
+from p2gs_jax.formats.exr import write_exr
+from p2gs_jax.formats.png import write_png
+from p2gs_jax.run.checkpoint import CheckpointStore
+
+
+@contextlib.contextmanager
+def room_for(size):
+    """Let no file of this process grow beyond so many bytes, as on a disk that is full."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+NOISE = np.random.default_rng(0).random((64, 64, 3), np.float32)
+WRITERS = {
+    "a.txt": lambda path: write_text(path, "x" * 9000),
+    "a.npy": lambda path: write_array(path, NOISE),
+    "a.png": lambda path: write_png(path, NOISE),
+    "a.exr": lambda path: write_exr(path, NOISE),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_full_disk_is_named_with_the_file(tmp_path, name):
+    path = tmp_path / name
+    path.write_text("before")
+    with room_for(4096), pytest.raises(OSError, match=r".") as error:
+        WRITERS[name](path)
+    assert error.value.errno == errno.EFBIG
+    assert error.value.filename == str(path)
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+    assert path.read_text() == "before"
+
+
+def test_a_checkpoint_without_room_is_named_and_the_one_before_it_stays(tmp_path):
+    small, large = np.arange(8.0), np.arange(50_000.0)
+    CheckpointStore(tmp_path / "checkpoints").save(1, {"a": small}, {})
+    store = CheckpointStore(tmp_path / "checkpoints")
+    with room_for(100_000), pytest.raises(OSError, match=r".") as error:
+        store.save(2, {"a": large}, {})
+    assert error.value.errno == errno.EFBIG
+    assert error.value.filename == str(tmp_path / "checkpoints")
+    again = CheckpointStore(tmp_path / "checkpoints")
+    assert again.latest_step() == 1
+    np.testing.assert_array_equal(again.restore(1, {"a": small})[0]["a"], small)
+    again.save(2, {"a": large}, {})
+    assert again.latest_step() == 2
+
+
+def test_a_log_without_room_is_named_and_mended(tmp_path):
+    path = tmp_path / "log.jsonl"
+    append_jsonl(path, {"step": 1})
+    with room_for(20), pytest.raises(OSError, match=r".") as error:
+        append_jsonl(path, {"step": 2, "said": "x" * 50})
+    assert (error.value.errno, error.value.filename) == (errno.EFBIG, str(path))
+    assert path.stat().st_size == 20, "what fits was written: the last line is torn"
+    append_jsonl(path, {"step": 3})
+    assert read_jsonl(path) == [{"step": 1}, {"step": 3}]
+
+
+def test_errors_that_have_nothing_to_do_with_room_stay_as_they_are(tmp_path):
+    def write():
+        with atomic_write(tmp_path / "a") as temporary:
+            temporary.write_text("half")
+            raise KeyError("b")
+
+    with pytest.raises(KeyError):
+        write()
+    with pytest.raises(RuntimeError, match="why"), naming(tmp_path / "a"):
+        raise RuntimeError("why")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_command_line_ends_with_the_reason_and_the_path(tmp_path, run_command, monkeypatch):
+    from p2gs_jax.cli.commands import synth
+
+    def run(options):
+        with room_for(100):
+            write_text(tmp_path / "out.json", json.dumps(list(range(999))))
+
+    monkeypatch.setattr(synth, "run", run)
+    code, text = run_command("synth", tmp_path / "new")
+    assert code == 2
+    assert f"{tmp_path / 'out.json'}: File too large" in text
+    assert "disk has room" in text

@@ -1,0 +1,85 @@
+"""One process writes to a run folder; a crash leaves no lock."""
+
+import os
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+from p2gs_jax.errors import UserError
+from p2gs_jax.run.lock import NAME, locked, require_free
+
+HOLD = """
+import os, sys
+from pathlib import Path
+from p2gs_jax.run.lock import locked
+with locked(Path(sys.argv[1])):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_a_second_holder_is_refused_and_told_who_the_first_is(tmp_path):
+    require_free(tmp_path)
+    with locked(tmp_path):
+        for attempt in (require_free, lambda folder: locked(folder).__enter__()):
+            with pytest.raises(UserError, match=rf"process {os.getpid()}\.") as error:
+                attempt(tmp_path)
+            assert "--out" in str(error.value)
+        assert (tmp_path / NAME).read_text().strip() == str(os.getpid())
+    assert list(tmp_path.iterdir()) == []
+    with locked(tmp_path):
+        pass
+
+
+def test_a_killed_process_leaves_no_lock(tmp_path):
+    command = [sys.executable, "-c", HOLD, str(tmp_path)]
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout.readline() == "held\n"
+        with pytest.raises(UserError, match=rf"process {process.pid}\."):
+            require_free(tmp_path)
+        process.kill()
+    assert (tmp_path / NAME).exists()
+    require_free(tmp_path)
+    with locked(tmp_path) as lock:
+        lock.require()
+    assert not (tmp_path / NAME).exists()
+
+
+@pytest.mark.parametrize("anew", [False, True])
+def test_a_folder_that_was_removed_underneath_is_named(tmp_path, anew):
+    run = tmp_path / "run"
+    run.mkdir()
+
+    def write():
+        with locked(run):
+            shutil.rmtree(run)
+            if anew:
+                run.mkdir()
+                (run / NAME).write_text("1")
+            (run / "checkpoints" / "3").stat()  # what the run meets first
+
+    with pytest.raises(UserError, match="was removed or replaced") as error:
+        write()
+    assert isinstance(error.value.__context__, FileNotFoundError)
+    assert run.exists() == anew
+
+
+def test_other_errors_of_the_system_stay_as_they_are(tmp_path):
+    with pytest.raises(FileNotFoundError), locked(tmp_path):
+        (tmp_path / "nowhere").stat()
+
+
+def test_a_fit_into_a_folder_in_use_is_refused(tmp_path, run_command):
+    (tmp_path / "scene").mkdir()
+    run = tmp_path / "run"
+    run.mkdir()
+    with locked(run):
+        for options in ((), ("--resume",)):
+            code, text = run_command("fit", tmp_path / "scene", "--out", run, *options)
+            assert code == 2
+            assert f"process {os.getpid()}" in text
+        assert [p.name for p in run.iterdir()] == [NAME]
