@@ -58,7 +58,7 @@ def plot(path: Path, tables: dict[float, list[dict[str, Any]]]) -> None:
         if points:
             axes.plot(*np.transpose(points), marker="o", label=method)
     axes.set_xlabel("spread of exposures, stops")
-    axes.set_ylabel("held-out views under one exposure, PSNR, dB")
+    axes.set_ylabel("PSNR of held-out views, dB")
     axes.legend(frameon=False)
     axes.grid(alpha=0.3)
     with atomic_write(path) as file:

@@ -10,12 +10,18 @@ import sys
 from importlib import import_module
 
 from p2gs_jax.core import interrupts
+from p2gs_jax.core.memory import ran_out
 from p2gs_jax.errors import UserError
 
 # Silence the native libraries before they load.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 os.environ.setdefault("GLOG_minloglevel", "3")
+# Where Pillow refuses, too (scene/files.py): what a header says is not decoded to find out.
+os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2 * 89_478_485))
 
+# Set for one of several processes of a fit, by the parent that watches it: the descriptor of a pipe
+# that ends with that parent.
+PARENT = "P2GS_JAX_PARENT_PIPE"
 # Commands that must work without JAX.
 WITHOUT_JAX = ("doctor", "completion")
 
@@ -30,6 +36,12 @@ def _run(argv: list[str]) -> int:
         print(script(options.shell), end="")
         return 0
     # Imported here so that --help answers at once.
+    if name == "fit":
+        from p2gs_jax.cli.options.fit import resolve_processes
+        from p2gs_jax.cli.supervise import is_child, supervise
+
+        if resolve_processes(options) is not None and not is_child():
+            return supervise(argv, options.out)
     if name not in WITHOUT_JAX:
         from p2gs_jax.core.compile_cache import use_compile_cache
         from p2gs_jax.core.runtime import tune_process
@@ -56,9 +68,19 @@ def main(argv: list[str] | None = None) -> None:
         code = _missing(error, argv)
     except OSError as error:
         code = _from_the_system(error)
+    except (MemoryError, RuntimeError) as error:
+        if not ran_out(error):
+            raise
+        fix = "end other programs, or ask for less: smaller pictures, fewer Gaussians"
+        code = _complain(UserError(f"memory ran out ({error}).", fix=fix))
     except KeyboardInterrupt as error:
         print(f"p2gs-jax: interrupted{_CONTINUED.get(command, '')}", file=sys.stderr)
         code = interrupts.exit_code(error)
+    if code and PARENT in os.environ:
+        # At its own exit a process waits for the others, which may wait for it.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
     sys.exit(code)
 
 
@@ -69,7 +91,9 @@ _CONTINUED = {
 
 
 def _complain(error: UserError) -> int:
-    print(f"p2gs-jax: error: {error}", file=sys.stderr)
+    from p2gs_jax.core.printable import printable
+
+    print(printable(f"p2gs-jax: error: {error}"), file=sys.stderr)
     return 2
 
 

@@ -152,9 +152,19 @@ def exploration_noise(
         alive: slots in use.
         rate: noise scale times the learning rate of the means.
     """
+    return shaped_noise(jax.random.normal(key, gaussians.means.shape), gaussians, alive, rate)
+
+
+def shaped_noise(
+    normal: Float[Array, "n 3"],
+    gaussians: Gaussians,
+    alive: Bool[Array, " n"],
+    rate: Float[Array, ""],
+) -> Float[Array, "n 3"]:
+    """Return the noise that independent normal numbers give; see `exploration_noise`."""
     gate = jax.nn.sigmoid(NOISE_STEEPNESS * (NOISE_OPACITY - opacities(gaussians)))
     R = rotation_matrices(gaussians.quats)
     variance = jnp.exp(2 * gaussians.log_scales)
-    raw = jax.random.normal(key, gaussians.means.shape) * (gate * alive * rate)[:, None]
+    raw = normal * (gate * alive * rate)[:, None]
     local = [sum(R[i][j] * raw[:, i] for i in range(3)) * variance[:, j] for j in range(3)]
     return _turned(R, jnp.stack(local, -1))

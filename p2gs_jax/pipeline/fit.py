@@ -12,22 +12,28 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 
 from p2gs_jax.config import FitConfig, require_config
 from p2gs_jax.core.atomic import no_empty_folders
 from p2gs_jax.core.clock import CompileCounter, Stopwatch
+from p2gs_jax.core.devices import Devices
+from p2gs_jax.core.processes import first_alone, is_first
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.lpips import LpipsWeights
 from p2gs_jax.photometry.appearance import exposures_apart
 from p2gs_jax.photometry.gauge import recentre
 from p2gs_jax.photometry.selection import Selection
+from p2gs_jax.pipeline.agreement import agree_on_options, same_start
 from p2gs_jax.pipeline.decide import kept_choice
+from p2gs_jax.pipeline.devices import mesh_of
 from p2gs_jax.pipeline.finish import Account, finish
+from p2gs_jax.pipeline.memory_needed import memory_named
 from p2gs_jax.pipeline.preflight import Paths, check_run_dir, check_scene, preflight
 from p2gs_jax.pipeline.prepare import Expected, Prepared, load, prepare
 from p2gs_jax.pipeline.reserve import seconds_to_finish
-from p2gs_jax.run.checkpoint import CheckpointStore
+from p2gs_jax.run.checkpoint import saved_steps
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.run.layout import RunFolder
 from p2gs_jax.run.lock import RunLock, locked, require_free
@@ -48,6 +54,7 @@ def optimise(
     validation: Sequence[int] = (),
     spent_s: float = 0.0,
     reserve_s: float = 0.0,
+    mesh: Mesh | None = None,
 ) -> TrainResult:
     """Run the optimisation, from the start or from the newest checkpoint.
 
@@ -60,6 +67,7 @@ def optimise(
         validation: training views that automatic growth is judged by.
         spent_s: seconds of the budget that are already gone.
         reserve_s: seconds of the budget to keep for evaluation and files.
+        mesh: the devices of a step of several views; None: the default one.
     """
     cfg = prepared.cfg
     views = TrainingViews(
@@ -87,6 +95,7 @@ def optimise(
         on_message=say,
         validation=validation,
         own_exposures=prepared.selection is not None,
+        mesh=mesh,
     )
     alive = np.ones(prepared.params.gaussians.capacity, bool)
     return trainer.run(
@@ -99,7 +108,9 @@ def optimise(
     )
 
 
-def _begin(programs: StepPrograms, known: Expected, scene: Scene, folder: RunFolder) -> None:
+def begin_programs(
+    programs: StepPrograms, known: Expected, scene: Scene, folder: RunFolder, mesh: Mesh | None
+) -> None:
     """Begin to compile steps while the exposures are solved, mostly on one core."""
     views = TrainingViews(
         known.store, scene.train_indices, known.cfg.train.seed, measured=known.measured
@@ -113,6 +124,7 @@ def _begin(programs: StepPrograms, known: Expected, scene: Scene, folder: RunFol
         folder.root,
         programs,
         known.decisions,
+        mesh=mesh,
     )
     trainer.expect(known.params, known.owner, known.images)
 
@@ -133,7 +145,7 @@ class FitResult:
     Attributes:
         params: the fit, live Gaussians only.
         scene: what it was fitted to.
-        metrics: what `metrics.json` holds.
+        metrics: what `metrics.json` holds; empty in all processes but the first.
         run_dir: the run folder.
         selection: what the bundle adjustment found, or None.
         decisions: what the scene settled.
@@ -157,6 +169,7 @@ def fit(
     reporter: Reporter | None = None,
     true_exposures: Mapping[str, float] | None = None,
     spent_s: float = 0.0,
+    devices: Devices | None = None,
 ) -> FitResult:
     """Fit a scene and write a run folder.
 
@@ -169,6 +182,8 @@ def fit(
         reporter: receives progress.
         true_exposures: image name -> true exposure, where it is known, for the plot.
         spent_s: seconds of the budget that were gone before the call.
+        devices: which to take, and what is divided among them; None: one. Of several processes
+            (`jax.distributed`) all must call this, and all of their devices be taken.
 
     Raises:
         UserError: something the user can mend.
@@ -179,10 +194,15 @@ def fit(
     reporter = reporter or Silent()
     paths = Paths(Path(scene_dir), Path(run_dir), None if reference is None else Path(reference))
     begin = time.monotonic() - spent_s
-    require_free(paths.run)
+    if is_first():
+        require_free(paths.run)
     lpips_weights = preflight(cfg, paths, resume=resume)
-    with no_empty_folders(paths.run), locked(paths.run) as lock:
-        check_run_dir(paths.run, resume, cfg)  # another may have ended since
+    mesh = mesh_of(cfg, devices)
+    # Before the first process writes anything that the others would refuse.
+    agree_on_options(cfg, devices, resume)
+    with _ours(paths.run) as lock, memory_named():
+        if is_first():
+            check_run_dir(paths.run, resume, cfg)  # another may have ended since
         return _fit(
             paths,
             cfg,
@@ -190,6 +210,7 @@ def fit(
             reporter,
             lpips_weights,
             begin,
+            mesh,
             resume=resume,
             true_exposures=true_exposures,
             spent_s=spent_s,
@@ -203,6 +224,7 @@ def _fit(
     reporter: Reporter,
     lpips_weights: LpipsWeights | None,
     begin: float,
+    mesh: Mesh | None,
     *,
     resume: bool,
     true_exposures: Mapping[str, float] | None,
@@ -212,7 +234,8 @@ def _fit(
     folder = RunFolder(paths.run)
     clock, compiler = Stopwatch(), CompileCounter()
     reading = time.monotonic()
-    scene = load(paths.scene, paths.run, cfg, reporter)
+    with first_alone():
+        scene = load(paths.scene, paths.run, cfg, reporter)
     # Without a model, nearly all of it is finding and matching features.
     found = scene.format in ("images", "transforms")
     clock.add("structure_from_motion" if found else "reading", time.monotonic() - reading)
@@ -223,12 +246,13 @@ def _fit(
             cfg,
             reporter,
             clock,
-            lambda known: _begin(programs, known, scene, folder),
+            lambda known: begin_programs(programs, known, scene, folder, mesh),
             kept=kept_choice(cfg, folder) if resume else None,
-            pixels=folder.pixels,
+            pixels=folder.pixels_of(jax.process_index()),
         )
+        prepared = same_start(prepared)
         lock.require()
-        with _begun(folder, paths, cfg, prepared.decisions):
+        with begun(folder, paths, cfg, prepared.decisions), memory_named():
             result = optimise(
                 prepared,
                 folder,
@@ -236,6 +260,7 @@ def _fit(
                 programs,
                 resume=resume,
                 validation=views.validation,
+                mesh=mesh,
                 spent_s=time.monotonic() - begin,
                 reserve_s=seconds_to_finish(
                     scene, cfg, lpips_weights, reference=views.truth is not None
@@ -245,6 +270,9 @@ def _fit(
     params = exposures_apart(params)
     if cfg.photometry.parameterization == "log" and cfg.photometry.known is None:
         params = recentre(params, cfg.render.radiance)
+    if not is_first():
+        _close_pixels(prepared, folder)
+        return FitResult(params, scene, {}, paths.run, prepared.selection, prepared.decisions)
     account = Account(
         counts={
             "gaussians": params.gaussians.capacity,
@@ -281,22 +309,40 @@ def _fit(
         owner=owner,
         still_ours=lock.require,
     )
-    prepared.store.close()
-    shutil.rmtree(folder.pixels, ignore_errors=True)
+    _close_pixels(prepared, folder)
     return FitResult(params, scene, metrics, paths.run, prepared.selection, prepared.decisions)
 
 
+def _close_pixels(prepared: Prepared, folder: RunFolder) -> None:
+    """Forget the decoded photographs of this process."""
+    prepared.store.close()
+    shutil.rmtree(folder.pixels_of(jax.process_index()), ignore_errors=True)
+
+
 @contextlib.contextmanager
-def _begun(folder: RunFolder, paths: Paths, cfg: FitConfig, decisions: Decisions) -> Iterator[None]:
+def _ours(run_dir: Path) -> Iterator[RunLock]:
+    """Hold the folder of a run, which the first process alone writes to."""
+    if not is_first():
+        yield RunLock(run_dir, None)
+        return
+    with no_empty_folders(run_dir), locked(run_dir) as lock:
+        yield lock
+
+
+@contextlib.contextmanager
+def begun(folder: RunFolder, paths: Paths, cfg: FitConfig, decisions: Decisions) -> Iterator[None]:
     """Make the folder a run's while its steps are taken, and keep it where they left something.
 
     A run that failed before its first checkpoint leaves nothing to continue or to overwrite.
     """
+    if not is_first():
+        yield
+        return
     write_start(folder, paths.scene, paths.reference, cfg, decisions)
     try:
         yield
     except UserError:
-        if CheckpointStore(folder.checkpoints).latest_step() is None:
+        if not saved_steps(folder.checkpoints):
             for path in (folder.config, folder.decisions):
                 path.unlink(missing_ok=True)
         raise

@@ -43,6 +43,14 @@ class RunFolder:
         """Folder of decoded photographs while a fit runs whose memory does not hold them."""
         return self.root / "cache" / "pixels"
 
+    def pixels_of(self, process: int) -> Path:
+        """Likewise of one of several processes; those of the first lie in `pixels`.
+
+        Args:
+            process: its number.
+        """
+        return self.pixels if process == 0 else self.root / "cache" / f"pixels-{process}"
+
     @property
     def radiance(self) -> Path:
         """The Gaussians, with linear radiance."""

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from p2gs_jax.core.atomic import atomic_write
+from p2gs_jax.core.processes import is_first
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.unexplained import Unexplained
 
@@ -18,7 +19,8 @@ Masks = dict[int, Unexplained]
 class LeftOutFile:
     """The looks of a run, by the step after which they were.
 
-    Checkpoints hold none of this: a run that is resumed from one reads here what was left out.
+    Checkpoints hold none of this: a run that is resumed from one reads here what was left out. Of
+    several processes the first writes the file.
 
     Args:
         path: of the file; there is none before the first look.
@@ -33,7 +35,7 @@ class LeftOutFile:
         Raises:
             UserError: the file cannot be read.
         """
-        if not self._path.exists():
+        if not is_first() or not self._path.exists():
             return
         if step == 0:
             self._path.unlink()
@@ -50,6 +52,8 @@ class LeftOutFile:
             found: by training view.
             whole: views that stay whole because too much of them would be left out.
         """
+        if not is_first():
+            return
         looks = self._looks() if self._path.exists() else {}
         self._write({**looks, step: (dict(found), whole)})
 

@@ -3,25 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
-import json
-import re
-import sys
-import threading
-import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from p2gs_jax.config import FitConfig, to_dict
+from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import write_json, write_text
 from p2gs_jax.errors import UserError
+from p2gs_jax.jobs import Job, JobState, open_engine, run_jobs
+from p2gs_jax.jobs.engines import LOCAL, check_engine
+from p2gs_jax.jobs.job import read_reason, slug
 from p2gs_jax.pipeline.preflight import check_run_dir
 from p2gs_jax.run.lock import locked
-from p2gs_jax.sweep.processes import Processes
 from p2gs_jax.sweep.rows import read_row, to_markdown
-from p2gs_jax.sweep.worker import REASON
+from p2gs_jax.sweep.task import fit_job
 
 TABLE, TABLE_TEXT, JOBS = "sweep.json", "sweep.md", "jobs"
 
@@ -45,11 +41,6 @@ class SweepResult:
         return to_markdown(self.rows)
 
 
-def slug(name: str) -> str:
-    """Return a folder name for a configuration's name."""
-    return re.sub(r"[^A-Za-z0-9.+-]+", "_", name).strip("_.") or "_"
-
-
 def sweep(
     scene: str | Path,
     out: str | Path,
@@ -58,7 +49,9 @@ def sweep(
     seeds: Sequence[int] = (0,),
     reference: str | Path | None = None,
     max_parallel: int = 1,
+    engine: str = LOCAL,
     report: Callable[[str], None] = lambda line: None,
+    on_look: Callable[[Sequence[JobState]], None] = lambda states: None,
 ) -> SweepResult:
     """Fit a scene under every configuration and seed.
 
@@ -72,11 +65,13 @@ def sweep(
         seeds: each replaces `train.seed`.
         reference: see `fit`.
         max_parallel: processes at a time; one uses all cores.
+        engine: where they run (`jobs.engines.open_engine`): local, dask://HOST:PORT or slurm.
         report: receives a line per run.
+        on_look: receives how far the unfinished runs are, twice a second.
 
     Raises:
-        UserError: nothing to do, names that would share a folder, a folder of other options, or
-            one that another sweep is writing to.
+        UserError: nothing to do, names that would share a folder, a folder of other options, one
+            that another sweep is writing to, or an engine that is not there.
         Interrupted: a signal asked for the end; the runs under way write their checkpoints first.
     """
     scene, out = Path(scene), Path(out)
@@ -94,52 +89,56 @@ def sweep(
             f"several configurations would share the folder {', '.join(twice)}.",
             fix="give them names that differ in letters or digits",
         )
+    check_engine(engine)
     out.mkdir(parents=True, exist_ok=True)
-    jobs = []
+    truth = None if reference is None else Path(reference)
+    jobs: list[Job] = []
+    rows: list[dict[str, Any]] = []
     for name, cfg in configs.items():
         for seed in seeds:
             seeded = dataclasses.replace(cfg, train=dataclasses.replace(cfg.train, seed=seed))
             run = out / slug(name) / f"seed_{seed}"
             check_run_dir(run, True, seeded)
-            jobs.append({"name": name, "seed": seed, "run": run, "cfg": seeded})
-    rows: list[dict[str, Any]] = [
-        {"name": j["name"], "seed": j["seed"], "run": str(j["run"]), "status": "waiting"}
-        for j in jobs
-    ]
+            jobs.append(fit_job(f"{name}, seed {seed}", scene, run, seeded, truth))
+            rows.append({"name": name, "seed": seed, "run": str(run), "status": "waiting"})
 
-    processes, writing = Processes(), threading.Lock()
-
-    def one(k: int) -> None:
-        begin = time.monotonic()
-        job, kept = jobs[k], (jobs[k]["run"] / "metrics.json").exists()
-        if not kept:
-            job_path = out / JOBS / f"{slug(job['name'])}_{job['seed']}.json"
-            _run(job, scene, reference, job_path, processes)
-        found = _outcome(job["run"], scene, stopped=processes.stopped)
-        if found["status"] == "done":
-            said = "kept" if kept else f"{found.get('seconds', time.monotonic() - begin):.0f} s"
+    def tell(number: int, state: JobState | None) -> None:
+        """Note what became of a run; None: it was there before."""
+        row = rows[number]
+        row.update(_outcome(jobs[number].folder, scene, state))
+        if row["status"] == "done":
+            took = 0.0 if state is None else state.seconds
+            said = "kept" if state is None else f"{row.get('seconds', took):.0f} s"
         else:
-            said = f"{found['status']}: {found['reason']}"
-        with writing:  # others write the same table
-            rows[k].update(found)
-            report(f"[{k + 1}/{len(jobs)}] {job['name']}, seed {job['seed']}: {said}")
-            _write_table(out, rows)
+            said = f"{row['status']}: {row['reason']}"
+        report(f"[{number + 1}/{len(jobs)}] {jobs[number].name}: {said}")
+        _write_table(out, rows)
 
-    with locked(out), ThreadPoolExecutor(max_parallel) as pool:
-        try:
-            list(pool.map(one, range(len(jobs))))
-        except BaseException:
-            processes.stop()
-            raise
+    with locked(out):
+        left = []
+        for number, job in enumerate(jobs):
+            if (job.folder / "metrics.json").exists():
+                tell(number, None)
+            else:
+                left.append(number)
+        if left:
+            with open_engine(engine, max_parallel, out / JOBS) as workers:
+                run_jobs(
+                    [jobs[number] for number in left],
+                    workers,
+                    out / JOBS,
+                    on_end=lambda k, state: tell(left[k], state),
+                    on_look=on_look,
+                )
     return SweepResult(rows, out)
 
 
-def _outcome(run: Path, scene: Path, *, stopped: bool) -> dict[str, Any]:
+def _outcome(run: Path, scene: Path, state: JobState | None) -> dict[str, Any]:
     """Return the status of a run that has ended, with its columns or the reason."""
+    if state is not None and state.status == "stopped":
+        return {"status": "interrupted", "reason": "the same sweep continues it"}
     if not (run / "metrics.json").exists():
-        if stopped and not (run / REASON).exists():
-            return {"status": "interrupted", "reason": "the same sweep continues it"}
-        return {"status": "failed", "reason": _reason(run)}
+        return {"status": "failed", "reason": (state and state.reason) or read_reason(run)}
     try:
         return {"status": "done", **read_row(run, scene)}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
@@ -150,29 +149,3 @@ def _outcome(run: Path, scene: Path, *, stopped: bool) -> dict[str, Any]:
 def _write_table(out: Path, rows: list[dict[str, Any]]) -> None:
     write_json(out / TABLE, rows)
     write_text(out / TABLE_TEXT, to_markdown(rows))
-
-
-def _run(job: dict[str, Any], scene: Path, reference, job_path: Path, processes: Processes) -> None:
-    """Run one fit in a process of its own and wait for it."""
-    run: Path = job["run"]
-    run.mkdir(parents=True, exist_ok=True)
-    (run / REASON).unlink(missing_ok=True)  # of an earlier try
-    write_json(
-        job_path,
-        {
-            "scene": str(scene.absolute()),
-            "run": str(run.absolute()),
-            "reference": None if reference is None else str(Path(reference).absolute()),
-            "fit": to_dict(job["cfg"]),
-        },
-    )
-    failed = processes.run([sys.executable, "-m", "p2gs_jax.sweep.worker", str(job_path)])
-    if failed is not None and not (run / REASON).exists():
-        write_json(run / REASON, {"reason": failed})
-
-
-def _reason(run: Path) -> str:
-    try:
-        return json.loads((run / REASON).read_text(encoding="utf-8"))["reason"]
-    except (OSError, ValueError, KeyError):
-        return "it left no metrics.json and no reason"

@@ -18,14 +18,15 @@ from jaxtyping import Array, Bool, Float, Int
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.streams import noise_key
+from p2gs_jax.gaussians.mcmc import exploration_noise
 from p2gs_jax.losses.regularizers import population_terms
 from p2gs_jax.render.blocks import splat
 from p2gs_jax.render.spherical_harmonics import coefficient_count
 from p2gs_jax.train.image_gradient import ImageGradient, differentiable
-from p2gs_jax.train.object_poses import move_poses, placed_by, seen_by
+from p2gs_jax.train.object_poses import MovedPoses, move_poses, placed_by, seen_by
 from p2gs_jax.train.optimizer import Optimizer, OptState, learning_rates, means_rate
 from p2gs_jax.train.state import FAULT_NONE, FAULT_NONFINITE, FAULT_OVERFLOW, Fault, FitState
-from p2gs_jax.train.update import update_listed
+from p2gs_jax.train.update import Updated, update_listed
 from p2gs_jax.types import Frustum, Gaussians, Params, Photometry, Population, Vibration
 
 
@@ -116,12 +117,17 @@ def advance(
     alive = population.alive
     n, bands = gaussians.capacity, coefficient_count(degree)
     fits = ~gradient.overflow & (count <= ids.shape[0])
-    first = state.fault.kind == FAULT_NONE
-    healthy = first & fits & jnp.all(_finite((gradient.terms, gradient.v_rest)))
+    healthy = is_healthy(state, gradient, fits)
 
     progress, rate = controls.progress, controls.rate
     rates = learning_rates(progress, rate, extent, state.params, cfg, bands)
     listed = jnp.sum(alive.at[ids].get(mode="fill", fill_value=False))
+    key = noise_key(cfg.train.seed, state.step)
+    noise_rate = cfg.densify.noise * means_rate(progress, rate, extent, cfg)
+
+    def noise(block, _, moved, on):
+        return exploration_noise(jax.random.fold_in(key, block), moved, on, noise_rate)
+
     updated = update_listed(
         gaussians,
         state.opt_state.gaussians[0],
@@ -137,8 +143,7 @@ def advance(
         own=lambda block, on: population_terms(block, on, cfg, extent, listed),
         optimizer=optimizer.gaussians,
         rates=rates.gaussians,
-        key=noise_key(cfg.train.seed, state.step),
-        noise_rate=cfg.densify.noise * means_rate(progress, rate, extent, cfg) if mcmc else None,
+        noise=noise if mcmc else None,
         owner=population.owner,
         placed=placed_by(frusta, state.params.poses),
     )
@@ -151,6 +156,61 @@ def advance(
         rates.poses,
         cfg.loss.regularizers,
     )
+    if not mcmc:
+        where = jnp.where(healthy, ids, n)
+        population = _observed(population, where, gradient, frusta[0])
+    moved = Moved(updated, objects, population)
+    return settled(state, moved, gradient, fits, count, rates, cfg=cfg, optimizer=optimizer)
+
+
+class Moved(NamedTuple):
+    """What a step did to everything that there is one of for each Gaussian or object.
+
+    Attributes:
+        updated: Gaussians.
+        objects: corrections of objects' poses.
+        population: with this step's statistics.
+    """
+
+    updated: Updated
+    objects: MovedPoses
+    population: Population
+
+
+def is_healthy(state: FitState, gradient: ImageGradient, fits: Array) -> Bool[Array, ""]:
+    """Return whether a step may write: no fault before it, room, and a finite loss."""
+    first = state.fault.kind == FAULT_NONE
+    return first & fits & jnp.all(_finite((gradient.terms, gradient.v_rest)))
+
+
+def settled(
+    state: FitState,
+    moved: Moved,
+    gradient: ImageGradient,
+    fits: Bool[Array, ""],
+    count: Int[Array, ""],
+    rates: Params,
+    *,
+    cfg: FitConfig,
+    optimizer: Optimizer,
+    views: int = 1,
+) -> tuple[FitState, StepReport]:
+    """Move the rest, and return the state after a step with what became of it.
+
+    Args:
+        state: before the step.
+        moved: what is done already.
+        gradient: of the images' loss.
+        fits: everything found room.
+        count: Gaussians that a view may show.
+        rates: learning rates.
+        cfg: the gauge of the exposures.
+        optimizer: from `make_optimizer`.
+        views: that the step took.
+    """
+    updated, objects, population = moved
+    first = state.fault.kind == FAULT_NONE
+    healthy = is_healthy(state, gradient, fits)
     old_rest = (state.params.photometry, state.params.appearance)
     rest, rest_moments = _rest_updated(
         optimizer,
@@ -160,9 +220,6 @@ def advance(
         (rates.photometry, rates.appearance),
         cfg,
     )
-    if not mcmc:
-        where = jnp.where(healthy, ids, n)
-        population = _observed(population, where, gradient, frusta[0])
 
     # In the order of `finite_names`.
     own = updated.value | objects.terms
@@ -191,7 +248,7 @@ def advance(
         Params(updated.gaussians, photometry, appearance, poses),
         OptState((updated.moments, optax.EmptyState()), rest_moments, pose_moments),
         population,
-        state.step + (fault.kind == FAULT_NONE),
+        state.step + views * (fault.kind == FAULT_NONE),
         fault,
     )
     loss = jax.tree.reduce(jnp.add, own, gradient.loss)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
 
 from p2gs_jax.config import TrainConfig
@@ -15,8 +14,9 @@ from p2gs_jax.train.checkpoints import RunCheckpoints
 from p2gs_jax.train.host import HostState
 from p2gs_jax.train.inputs import InputSource
 from p2gs_jax.train.level_programs import LevelPrograms
+from p2gs_jax.train.mesh.spread import Spread
 from p2gs_jax.train.schedule import Levels
-from p2gs_jax.train.state import FAULT_NONFINITE, FAULT_OVERFLOW, Fault, FitState
+from p2gs_jax.train.state import FAULT_NONFINITE, FAULT_OVERFLOW, FitState
 
 MAX_BURST = 50
 # Share of a new pace in its running estimate.
@@ -31,6 +31,7 @@ class Bursts:
         levels: of the schedule.
         source: of inputs.
         steps: compiled steps.
+        spread: how the state lies on the devices.
         checkpoints: named where a run diverges.
         clock: receives the seconds of steps.
     """
@@ -41,11 +42,12 @@ class Bursts:
         levels: Levels,
         source: InputSource,
         steps: LevelPrograms,
+        spread: Spread,
         checkpoints: RunCheckpoints,
         clock: Stopwatch,
     ):
         self.train, self.levels, self.source, self.steps = train, levels, source, steps
-        self.checkpoints, self.clock = checkpoints, clock
+        self.spread, self.checkpoints, self.clock = spread, checkpoints, clock
 
     def take(self, state: FitState, host: HostState) -> tuple[FitState, list[StepReport]]:
         """Dispatch steps up to the next line of the log, then read how they went.
@@ -71,40 +73,43 @@ class Bursts:
         state, reports, sizes = self._dispatched(state, host)
         kind = int(state.fault.kind)
         done = int(state.step) - host.step
+        taken = done // self.train.batch
         seconds = time.monotonic() - begin - (self.steps.programs.waited_s - waited)
         self.clock.add("steps", seconds)
         if kind == FAULT_NONFINITE:
-            self._diverged(state, host.step + done, reports[done])
+            self._diverged(state, host.step + done, reports[taken])
         if kind == FAULT_OVERFLOW:
             needed, visible = int(state.fault.needed), int(state.fault.visible)
-            host.rooms = room.grown(host.rooms, sizes[done], needed, visible)
+            host.rooms = room.grown(host.rooms, sizes[taken], needed, visible)
             host.overflows += 1
-            state = dataclasses.replace(state, fault=Fault.none())
+            state = self.spread.healed(state)
         elif done:
             pace, known = seconds / done, host.step_s > 0
             host.step_s = (1 - PACE_SHARE) * host.step_s + PACE_SHARE * pace if known else pace
         host.step += done
         for _ in range(done):
             host.progress += host.pace
-        return state, reports[:done]
+        return state, reports[:taken]
 
     def _dispatched(
         self, state: FitState, host: HostState
     ) -> tuple[FitState, list[StepReport], list[tuple[int, int]]]:
         """Dispatch the steps of a burst; return the state, and report and image size of each."""
         progress, reports, sizes = host.progress, [], []
-        every = self.train.log_every
-        for step in range(host.step, host.step + min(every - host.step % every, MAX_BURST)):
+        every, views = self.train.log_every, self.train.batch
+        end = host.step + min(every - host.step % every, MAX_BURST)
+        for step in range(host.step, end, views):
             if schedule.is_over(progress, host.pace):
                 break
             if schedule.shrink_at(progress, self.levels) != host.shrink:
                 break
-            self.source.prefetch(step + 1, host.shrink)
+            self.source.prefetch(step + views, host.shrink)
             inputs = self.source.at(step, progress, host.pace, host.shrink)
             state, report = self.steps.get(state, inputs, host)(state, *inputs)
             reports.append(report)
             sizes.append(inputs.size)
-            progress = progress + host.pace
+            for _ in range(views):
+                progress = progress + host.pace
         return state, reports, sizes
 
     def _diverged(self, state: FitState, step: int, report: StepReport) -> None:

@@ -13,7 +13,7 @@ class HostState:
     """What the host remembers between bursts; saved with every checkpoint.
 
     Attributes:
-        step: steps completed.
+        step: steps completed, a view each.
         progress: fraction of the run completed.
         pace: progress per step.
         elapsed_s: seconds of earlier sessions and of this one.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +13,7 @@ from p2gs_jax.losses.relative_exposure import ColorPairs
 from p2gs_jax.losses.total import Partner
 from p2gs_jax.train import schedule
 from p2gs_jax.train.advance import Controls
+from p2gs_jax.train.batches import stacked
 from p2gs_jax.train.partner import partner_at
 from p2gs_jax.train.views import TrainingViews
 from p2gs_jax.types import Batch
@@ -21,7 +23,7 @@ class Inputs(NamedTuple):
     """Arguments of a step, all on the host.
 
     Attributes:
-        batch: the view and its photograph.
+        batch: the view and its photograph; of several views, stacked.
         partner: what the relative-exposure loss compares it with.
         controls: of the schedule.
     """
@@ -44,12 +46,18 @@ class InputSource:
         views: the training views.
         pairs: corresponding observations, for the relative-exposure readings that need them.
         shown: share of the scene that a view shows.
+        own: which views of a batch this process composites, and therefore decodes.
     """
 
     def __init__(
-        self, cfg: FitConfig, views: TrainingViews, pairs: ColorPairs | None, shown: float
+        self,
+        cfg: FitConfig,
+        views: TrainingViews,
+        pairs: ColorPairs | None,
+        shown: float,
+        own: Collection[int],
     ):
-        self.cfg, self.views, self.pairs, self.shown = cfg, views, pairs, shown
+        self.cfg, self.views, self.pairs, self.shown, self.own = cfg, views, pairs, shown, own
 
     def at(self, step: int, progress: float, pace: float, shrink: int) -> Inputs:
         """Return the inputs of a step.
@@ -63,12 +71,20 @@ class InputSource:
         cfg = self.cfg
         degree = schedule.sh_degree_at(progress, cfg.train, cfg.render.sh_degree)
         rate = schedule.rate_factor(pace, self.shown, cfg.optimizer.settled)
-        return Inputs(
-            self.views.batch(self.views.index_at(step), shrink, step),
-            partner_at(step, shrink, self.views, self.pairs, cfg),
-            on_host(Controls, np.float32(progress), np.int32(degree), np.float32(rate)),
-        )
+        controls = on_host(Controls, np.float32(progress), np.int32(degree), np.float32(rate))
+        rows = self.views.indices_at(step, cfg.train.batch)
+        each = [self._of_view(step + k, row, shrink, k in self.own) for k, row in enumerate(rows)]
+        if len(each) == 1:
+            return Inputs(*each[0], controls)
+        batches, partners = zip(*each, strict=True)
+        return Inputs(stacked(batches), stacked(partners), controls)
+
+    def _of_view(self, step: int, row: int, shrink: int, own: bool) -> tuple[Batch, Partner]:
+        batch = self.views.batch(row, shrink, step, decoded=own)
+        return batch, partner_at(step, row, shrink, self.views, self.pairs, self.cfg)
 
     def prefetch(self, step: int, shrink: int) -> None:
-        """Begin decoding the photograph of a step in the background."""
-        self.views.prefetch(self.views.index_at(step), shrink)
+        """Begin decoding the photographs of a step in the background."""
+        rows = self.views.indices_at(step, self.cfg.train.batch)
+        for k in self.own:
+            self.views.prefetch(rows[k], shrink)

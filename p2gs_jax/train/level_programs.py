@@ -9,6 +9,7 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.train import schedule
 from p2gs_jax.train.host import HostState
 from p2gs_jax.train.inputs import Inputs
+from p2gs_jax.train.mesh.step import MeshStep
 from p2gs_jax.train.programs import Key, StepPrograms
 from p2gs_jax.train.room import cameras_by_size, size_name
 from p2gs_jax.train.schedule import Levels
@@ -27,7 +28,9 @@ class LevelPrograms:
         levels: of the schedule.
     """
 
-    def __init__(self, cfg: FitConfig, step: Step, programs: StepPrograms, levels: Levels):
+    def __init__(
+        self, cfg: FitConfig, step: Step | MeshStep, programs: StepPrograms, levels: Levels
+    ):
         self.cfg, self.step, self.programs, self.levels = cfg, step, programs, levels
 
     def get(self, state: FitState, inputs: Inputs, host: HostState) -> Callable[..., Any]:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from p2gs_jax.core.atomic import append_jsonl, read_jsonl, write_text
+from p2gs_jax.core.processes import is_first
 from p2gs_jax.core.progress import LogRecord
 from p2gs_jax.train.advance import StepReport
 from p2gs_jax.train.host import HostState
@@ -46,7 +47,8 @@ def record_of(
 class RunLog:
     """The two files, line by line.
 
-    Trials take the same steps as the run, so they have a file of their own.
+    Trials take the same steps as the run, so they have a file of their own. Of several processes
+    the first writes.
 
     Args:
         run_dir: the run folder.
@@ -59,20 +61,22 @@ class RunLog:
 
     def clear(self) -> None:
         """Begin anew."""
-        for path in (self.path, self.trial_path):
-            path.unlink(missing_ok=True)
+        if is_first():
+            for path in (self.path, self.trial_path):
+                path.unlink(missing_ok=True)
 
     def truncate(self, step: int) -> None:
         """Drop the lines after a step, which a resumed run takes again."""
         for path in (self.path, self.trial_path):
-            if path.exists():
+            if is_first() and path.exists():
                 _write(path, [line for line in read_jsonl(path) if line["step"] <= step])
 
     def append(self, record: LogRecord) -> None:
         """Write a record down and pass it on."""
         line = dataclasses.asdict(record)
         del line["trial"]
-        append_jsonl(self.trial_path if record.trial else self.path, line)
+        if is_first():
+            append_jsonl(self.trial_path if record.trial else self.path, line)
         self.on_record(record)
 
     def replace_by_trial(self, begun: int) -> None:

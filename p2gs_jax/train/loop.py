@@ -11,18 +11,20 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 from jaxtyping import Bool
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core import interrupts
 from p2gs_jax.core.clock import Stopwatch
+from p2gs_jax.core.devices import Devices
+from p2gs_jax.core.processes import from_first, gathered
 from p2gs_jax.core.progress import LogRecord
 from p2gs_jax.evaluate.unexplained import Unexplained
 from p2gs_jax.gaussians.population import STEP_SECONDS_PER_PIXEL, Coverage
@@ -38,7 +40,9 @@ from p2gs_jax.train.inputs import InputSource
 from p2gs_jax.train.left_out import LeftOut
 from p2gs_jax.train.level_programs import LevelPrograms
 from p2gs_jax.train.log import RunLog, record_of
-from p2gs_jax.train.optimizer import make_optimizer
+from p2gs_jax.train.mesh.spread import OnMesh, OnOneDevice, Spread
+from p2gs_jax.train.mesh.step import MeshStep
+from p2gs_jax.train.optimizer import Optimizer, make_optimizer
 from p2gs_jax.train.programs import StepPrograms
 from p2gs_jax.train.schedule import Pace
 from p2gs_jax.train.session import Session
@@ -90,6 +94,7 @@ class Trainer:
         on_message: called with everything the user must know.
         validation: training views that automatic growth is judged by.
         own_exposures: their exposures come from tracks, so they may be judged under these.
+        mesh: the devices of a step of several views; None: the default one.
     """
 
     def __init__(
@@ -106,6 +111,7 @@ class Trainer:
         on_message: Callable[[str], None] = lambda text: None,
         validation: Sequence[int] = (),
         own_exposures: bool = False,
+        mesh: Mesh | None = None,
     ):
         self.cfg, self.views, self.coverage = cfg, views, coverage
         self.programs, self.on_message = programs, on_message
@@ -119,11 +125,19 @@ class Trainer:
         self.left_out = LeftOut(cfg, views, masks, self.clock, on_message)
         self.asked = interrupts.Held()
         self.optimizer = make_optimizer(cfg)
-        self.source = InputSource(cfg, views, pairs, coverage.shown)
-        step = Step(cfg, self.optimizer, extent)
+        step, self.spread = _step_and_spread(cfg, self.optimizer, extent, mesh)
+        self.source = InputSource(
+            cfg, views, pairs, coverage.shown, self.spread.own(cfg.train.batch)
+        )
         self.steps = LevelPrograms(cfg, step, programs, self.levels)
         self.bursts = Bursts(
-            cfg.train, self.levels, self.source, self.steps, self.checkpoints, self.clock
+            cfg.train,
+            self.levels,
+            self.source,
+            self.steps,
+            self.spread,
+            self.checkpoints,
+            self.clock,
         )
         self.context = RunContext(
             cfg=cfg,
@@ -134,6 +148,7 @@ class Trainer:
             validation=validation,
             own_exposures=own_exposures,
             programs=programs,
+            spread=self.spread,
             log=self.log,
             clock=self.clock,
             take_burst=self._take_burst_of_stage,
@@ -166,7 +181,8 @@ class Trainer:
             Interrupted: a signal asked for the end; a checkpoint is written first.
         """
         strategy = make_strategy(self.context, int(np.sum(np.asarray(alive))))
-        state = initial_state(params, alive, self.optimizer, strategy.slots, owner)
+        slots = self.spread.padded(strategy.slots)
+        state = initial_state(params, alive, self.optimizer, slots, owner)
         pace = Pace.from_config(self.cfg.train, spent_s + finish_s)
         host = HostState(pace=pace.per_step)
         restored = self.checkpoints.restore(state) if resume else None
@@ -182,9 +198,11 @@ class Trainer:
         session = Session(pace, host, finish_s=finish_s, full_step_s=full_step_s)
         population = state.population
         self._allocate(state.params.gaussians, population.alive, population.owner, host, strategy)
+        state = self.spread.spread(state)
         self._expect(state, host, strategy)
         with interrupts.held() as self.asked:
             state, host = self._loop(state, host, session, strategy)
+            state = self.spread.whole(state)
             strategy.end(state, host)
             self._save(state, host)
         return TrainResult(
@@ -209,21 +227,22 @@ class Trainer:
         alive, host = np.ones(seeds, bool), HostState(rooms=dict(self.programs.rooms))
         self._allocate(params.gaussians, alive, owner, host, strategy)
         self.programs.rooms = dict(host.rooms)
-        start = functools.partial(initial_state, optimizer=self.optimizer, slots=strategy.slots)
+        slots = self.spread.padded(strategy.slots)
+        start = functools.partial(initial_state, optimizer=self.optimizer, slots=slots)
         self._expect(jax.eval_shape(start, params, alive, owner=owner), host, strategy, images)
 
     def _loop(
         self, state: FitState, host: HostState, session: Session, strategy: Strategy
     ) -> tuple[FitState, HostState]:
         """Take bursts until the run is complete, or its time over."""
-        saved = time.monotonic()
+        saved = host.elapsed_s
         while not schedule.is_over(host.progress, host.pace):
             state, stepped = self._take_burst(state, host, session)
             if stepped:
                 state, host = strategy.update(state, host, session)
             if self.left_out.due(host):
-                self.left_out.look(state, host)
-                session.tick(host)
+                self.left_out.look(self.spread.whole(state), host)
+                self._tick(session, host)
             session.replan(host)
             if session.over(host):
                 if host.progress < NEARLY_DONE:
@@ -232,10 +251,10 @@ class Trainer:
                         "again with a longer --budget; what was compiled now is kept."
                     )
                 break
-            asked = self.asked.arrived
-            if asked is not None or time.monotonic() - saved > self.cfg.train.checkpoint_every_s:
-                self._save(state, host)
-                saved = time.monotonic()
+            asked = self._asked()
+            if asked is not None or host.elapsed_s - saved > self.cfg.train.checkpoint_every_s:
+                self._save(self.spread.whole(state), host)
+                saved = host.elapsed_s
             if asked is not None:
                 self.on_message(
                     f"{interrupts.name_of(asked)}: the run stops after step {host.step} "
@@ -249,13 +268,25 @@ class Trainer:
     ) -> tuple[FitState, bool]:
         """Take a burst of steps and log it; see `strategies.base.TakeBurst`."""
         state, reports = self.bursts.take(state, host)
-        session.tick(host)
+        self._tick(session, host)
         if reports:
             record = record_of(reports, host, count_alive(state), host.shrink, trial=trial)
             self.log.append(record)
             # From here on a signal waits for the next place to continue from.
             self.asked.begin()
         return state, bool(reports)
+
+    def _tick(self, session: Session, host: HostState) -> None:
+        """Write down the time; of several processes that of the first, so that all plan alike."""
+        session.tick(host)
+        host.elapsed_s, host.step_s = from_first((host.elapsed_s, host.step_s))
+
+    def _asked(self) -> int | None:
+        """Return the signal that asks for the end, whichever process it reached."""
+        if jax.process_count() > 1:
+            arrived = [number for number in gathered(self.asked.arrived) if number is not None]
+            self.asked.arrived = max(arrived, default=None)
+        return self.asked.arrived
 
     def _take_burst_of_stage(
         self, state: FitState, host: HostState, session: Session, *, trial: bool = False
@@ -308,3 +339,13 @@ class Trainer:
             self.steps.expect(state, inputs, host, shrink, images)
             if number == 0:
                 strategy.expect(state)  # wanted soon after the first step
+
+
+def _step_and_spread(
+    cfg: FitConfig, optimizer: Optimizer, extent: float, mesh: Mesh | None
+) -> tuple[Step | MeshStep, Spread]:
+    """Return the step of a fit, and how its state lies on the devices."""
+    if cfg.train.batch == 1 and (mesh is None or mesh.size == 1):
+        return Step(cfg, optimizer, extent), OnOneDevice()
+    mesh = mesh or Devices().mesh()
+    return MeshStep(cfg, optimizer, extent, mesh), OnMesh(mesh)

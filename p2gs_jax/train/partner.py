@@ -16,12 +16,18 @@ PAIRS_PER_STEP = 4096
 
 
 def partner_at(
-    step: int, shrink: int, views: TrainingViews, pairs: ColorPairs | None, cfg: FitConfig
+    step: int,
+    index: int,
+    shrink: int,
+    views: TrainingViews,
+    pairs: ColorPairs | None,
+    cfg: FitConfig,
 ) -> Partner:
     """Return the partner of a step, as much of it as the reading of the loss needs.
 
     Args:
         step: its number.
+        index: row of its view.
         shrink: factor by which images are shrunk.
         views: the training views.
         pairs: corresponding observations; some of them are drawn for every step.
@@ -30,7 +36,7 @@ def partner_at(
     relative = cfg.loss.relative_exposure
     if relative.weight is None:
         return on_host(Partner, np.int32(0))
-    other = views.partner_at(step)
+    other = views.partner_at(step, index)
     camera, batch, drawn = None, None, None
     if relative.form in SECOND_RENDER_FORMS:
         camera = views.camera(other, shrink)

@@ -50,7 +50,7 @@ class FitState(eqx.Module):
         params: the differentiable pytree.
         opt_state: optax's.
         population: who is alive.
-        step: steps completed.
+        step: steps completed, a view each.
         fault: while it is set, steps leave the state as it is.
     """
 

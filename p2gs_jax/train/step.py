@@ -84,7 +84,7 @@ class Step:
         """Return the step made of its three programs, compiled or not."""
 
         def step(state: FitState, batch: Batch, partner: Partner, controls: Controls):
-            params, frusta = state.params, self._frusta(batch, partner)
+            params, frusta = state.params, self.frusta(batch, partner)
             listed = show(*_per_gaussian(state, frusta, controls))
             gradient = differentiate(
                 listed.shown, params.photometry, params.appearance, batch, partner
@@ -129,7 +129,7 @@ class Step:
         """Return one of the three programs, by its name, traced for arguments of these shapes."""
         program = {name: _compiled(name) for name in PARTS}
         static = {name: self._static(name, room, degree) for name in PARTS}
-        params, frusta = state.params, self._frusta(batch, partner)
+        params, frusta = state.params, self.frusta(batch, partner)
         per_gaussian = _per_gaussian(state, frusta, controls)
         if name == "show":
             return program[name].lower(*per_gaussian, **static[name])
@@ -150,7 +150,7 @@ class Step:
         }
         return self.settings(name) | sizes[name]
 
-    def _frusta(self, batch: Batch, partner: Partner) -> tuple[Frustum, ...]:
+    def frusta(self, batch: Batch, partner: Partner) -> tuple[Frustum, ...]:
         """Return the views of a step, for the programs that know no image size."""
         return tuple(
             on_host(Frustum, c.viewmat, c.K, np.float32(c.width), np.float32(c.height), c.objects)

@@ -14,9 +14,8 @@ import jax
 import jax.numpy as jnp
 import optax
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
-from p2gs_jax.gaussians.mcmc import exploration_noise
 from p2gs_jax.render.blocks import block_size, owners_at, put_rows, slice_of, take_rows
 from p2gs_jax.train.optimizer import AdamState
 from p2gs_jax.types import Gaussians
@@ -54,8 +53,7 @@ def update_listed(
     own: Callable,
     optimizer: optax.GradientTransformationExtraArgs,
     rates: Gaussians,
-    key: Array,
-    noise_rate: Float[Array, ""] | None,
+    noise: Callable | None,
     owner: Int[Array, " n"] | None = None,
     placed: Any = None,
 ) -> Updated:
@@ -76,8 +74,7 @@ def update_listed(
             themselves, as a dictionary.
         optimizer: from `make_optimizer`, for the Gaussians.
         rates: learning rates.
-        key: for the noise.
-        noise_rate: scale of the noise on the means, or None for none.
+        noise: (number of a block, ids, Gaussians, alive) -> what to add to their means, or None.
         owner: the moving object that each Gaussian belongs to, or None.
         placed: what else `seen` depends on and a gradient is wanted of, or None.
     """
@@ -108,9 +105,9 @@ def update_listed(
         )
         new = cast(Any, moved_state)[0]
         moved = cast(Gaussians, optax.apply_updates(cast(Any, old), cast(Any, updates)))
-        if noise_rate is not None:
-            noise = exploration_noise(jax.random.fold_in(key, k), moved, shown, noise_rate)
-            moved = dataclasses.replace(moved, means=moved.means + noise)
+        if noise is not None:
+            added = noise(k, here, moved, shown)
+            moved = dataclasses.replace(moved, means=moved.means + added)
         where = jnp.where(healthy & jnp.all(finite), here, n)
         return Updated(
             put_rows(state.gaussians, where, moved),

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float32, Int
 from p2gs_jax.core.numerics import on_host
 from p2gs_jax.core.streams import Stream, generator, view_order
 from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.train.batches import batches_of
 from p2gs_jax.types import Batch, Camera, Measured
 
 
@@ -53,6 +54,8 @@ class TrainingViews:
         """
         self._kept = np.setdiff1d(np.arange(len(self.rows)), np.asarray(without, int))
         self._orders = {}
+        self._per_epoch: dict[int, int] = {}
+        self._batched: tuple[int, int, list[tuple[int, ...]]] = (-1, 0, [])
 
     def hide(self, masks: Mapping[int, Bool[np.ndarray, "a b"]]) -> None:
         """Leave pixels out of all batches from here on, and take back those left out before.
@@ -71,12 +74,39 @@ class TrainingViews:
             self._orders = {epoch: order[np.isin(order, self._kept)]}
         return int(self._orders[epoch][position])
 
-    def partner_at(self, step: int) -> int:
+    def indices_at(self, step: int, count: int) -> tuple[int, ...]:
+        """Return the rows of the views that a step of so many takes; they have one size.
+
+        Args:
+            step: views taken before it.
+            count: views of a step.
+        """
+        if count == 1:
+            return (self.index_at(step),)
+        if count not in self._per_epoch:
+            self._per_epoch[count] = len(self._batches(0, count))
+        epoch, position = divmod(step // count, self._per_epoch[count])
+        return self._batches(epoch, count)[position]
+
+    def _batches(self, epoch: int, count: int) -> list[tuple[int, ...]]:
+        if self._batched[:2] != (epoch, count):
+            views = [self.store.views[row] for row in self.rows]
+            kinds = [(v.width, v.height) for v in views]
+            order = view_order(self.seed, epoch, len(self.rows))
+            order = order[np.isin(order, self._kept)]
+            self._batched = (epoch, count, batches_of(order, kinds, count))
+        return self._batched[2]
+
+    def partner_at(self, step: int, index: int) -> int:
         """Return a second view, different from that of the step where there are two.
 
         Drawn from those that overlap it, where it is known which do; never one that is left out.
+
+        Args:
+            step: draws it.
+            index: row of the step's view.
         """
-        rng, index = generator(self.seed, Stream.PARTNER, step), self.index_at(step)
+        rng = generator(self.seed, Stream.PARTNER, step)
         if self.overlaps is not None:
             overlapping = self.overlaps[index]
             overlapping = overlapping[np.isin(overlapping, self._kept)]
@@ -95,15 +125,18 @@ class TrainingViews:
         row = self.rows[index]
         return on_host(Camera, *self.store.camera(row, shrink), self.store.placement(row))
 
-    def batch(self, index: int, shrink: int, step: int = 0) -> Batch:
+    def batch(self, index: int, shrink: int, step: int = 0, *, decoded: bool = True) -> Batch:
         """Return a training view, on the host: a compiled step takes it from there.
 
         Args:
             index: row in `Photometry`.
             shrink: factor by which images are shrunk.
             step: draws the background, where every step has another.
+            decoded: off: with black pixels, where another process composites it.
         """
         row = self.rows[index]
+        if not decoded:
+            return self._elsewhere(index, shrink, step)
         ldr, mask = self.store.stored(row, shrink)
         measured = None if self.measured is None else self.measured[index]
         if index in self._hidden:
@@ -112,6 +145,15 @@ class TrainingViews:
             measured = None if measured is None else _outside(measured, hidden)
         given = (self.camera(index, shrink), ldr, mask, np.int32(index), measured)
         return on_host(Batch, *given, self.store.alpha(row, shrink), self._backdrop(step))
+
+    def _elsewhere(self, index: int, shrink: int, step: int) -> Batch:
+        camera = self.camera(index, shrink)
+        size = camera.height, camera.width
+        measured = None if self.measured is None else self.measured[index]
+        alpha = None if self.store.backdrop is None else np.zeros(size, np.uint16)
+        pixels = np.zeros((*size, 3), np.uint16), np.zeros(size, bool)
+        given = (camera, *pixels, np.int32(index), measured, alpha)
+        return on_host(Batch, *given, self._backdrop(step))
 
     def _backdrop(self, step: int) -> Float32[np.ndarray, " 3"] | None:
         if not self.store.random_backdrop:

@@ -47,6 +47,9 @@ class Views:
     def leave_out(self, rows):
         self.out = tuple(rows)
 
+    def indices_at(self, step, count):
+        return tuple((step + k) % VIEWS for k in range(count))
+
     def index_at(self, step):
         return step % VIEWS
 
@@ -57,7 +60,7 @@ class Views:
         K = np.diag([400.0 / shrink, 400.0 / shrink, 1.0]).astype(np.float32)
         return on_host(Camera, np.eye(4, dtype=np.float32), K, 400 // shrink, 300 // shrink)
 
-    def batch(self, index, shrink, step=0):
+    def batch(self, index, shrink, step=0, decoded=True):
         nothing = np.zeros((1, 1, 3), np.uint8), np.ones((1, 1), bool)
         return on_host(Batch, self.camera(index, shrink), *nothing, np.int32(index))
 
@@ -154,7 +157,7 @@ class Harness:
         self.folder, self.checkpoints = folder, Checkpoints()
         self.said, self.records = [], []
         stopped = SimpleNamespace(monotonic=lambda: self.clock.now)
-        for module in (burst, loop, session):
+        for module in (burst, session):
             monkeypatch.setattr(module, "time", stopped)
         monkeypatch.setattr(checkpoints, "CheckpointStore", lambda folder: self.checkpoints)
         monkeypatch.setattr(

@@ -9,6 +9,7 @@ from rich.text import Text
 
 from p2gs_jax.cli.commands.console import stdout
 from p2gs_jax.cli.options.experiments import Sweep
+from p2gs_jax.jobs.table import JobsTable
 from p2gs_jax.sweep import read_sweep, sweep
 from p2gs_jax.sweep.rows import brief, failures
 
@@ -17,15 +18,18 @@ def run(options: Sweep) -> int:
     """Run a sweep and print its table; 1 where a run failed."""
     console = stdout()
     wanted = read_sweep(options.file)
-    result = sweep(
-        wanted.scene,
-        options.out or wanted.out,
-        wanted.configs,
-        seeds=wanted.seeds,
-        reference=wanted.reference,
-        max_parallel=options.max_parallel or wanted.max_parallel,
-        report=lambda line: console.print(Text(line)),
-    )
+    with JobsTable(console) as table:
+        result = sweep(
+            wanted.scene,
+            options.out or wanted.out,
+            wanted.configs,
+            seeds=wanted.seeds,
+            reference=wanted.reference,
+            max_parallel=options.max_parallel or wanted.max_parallel,
+            engine=options.engine,
+            report=table.say,
+            on_look=table.show,
+        )
     console.print(_table(result.rows))
     for line in failures(result.rows):
         console.print(Text(f"Not finished: {line}"))

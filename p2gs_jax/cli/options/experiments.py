@@ -58,7 +58,8 @@ class Synth:
     width: int = 480
     """Image width, pixels (paper: 1920); the height follows as 1300 / 1920 of it."""
     layout: Layout = "town"
-    """town: with an underpass and a sun of its own for every seed; street: the demo's."""
+    """town: with an underpass and a sun of its own for every seed; street: the demo's; long:
+    streets one behind another, as long as the drive."""
     supersample: int = 2
     """Samples a pixel along each axis."""
     points: int = 60_000
@@ -84,7 +85,9 @@ class Sweep:
     out: Path | None = None
     """Folder of the runs and the table (default: the file's, or its name)."""
     max_parallel: int | None = None
-    """Fits at a time (default: the file's, or 1)."""
+    """Fits at a time on this machine (default: the file's, or 1)."""
+    engine: Annotated[str, tyro.conf.arg(metavar="NAME")] = "local"
+    """Where fits run: local, dask://HOST:PORT, or slurm:OPTION=VALUE,... (docs/sweeps.md)."""
 
 
 @dataclass(frozen=True)

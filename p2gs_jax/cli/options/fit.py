@@ -11,6 +11,9 @@ import tyro
 
 from p2gs_jax import config as configs
 from p2gs_jax.cli.options.parse import check, parse_duration, parse_gaussians
+from p2gs_jax.core.devices import Devices
+from p2gs_jax.core.processes import Processes, scheduled
+from p2gs_jax.errors import UserError
 
 Preset = Annotated[configs.PresetName, tyro.conf.arg(metavar="NAME")]
 Duration = Annotated[str | None, tyro.conf.arg(metavar="TIME")]
@@ -85,11 +88,33 @@ class Fit:
     """Treat known exposures as uncertain by this many stops instead of keeping them."""
     reference: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Photographs of the same views under one common exposure, for evaluation."""
+    blocks: Annotated[str | None, tyro.conf.arg(metavar="N|auto")] = None
+    """Cut the scene into N blocks that are fitted apart and merged; auto: into as few as memory
+    allows (docs/districts.md). Default: one fit."""
+    jobs: int = 1
+    """Blocks at a time on this machine."""
+    engine: Annotated[str, tyro.conf.arg(metavar="NAME")] = "local"
+    """Where blocks are fitted: local, dask://HOST:PORT, or slurm:OPTION=VALUE,...
+    (docs/sweeps.md)."""
     lpips_weights: Weights = None
     """Evaluate with LPIPS too: alex or vgg (pip install 'p2gs-jax[lpips]'), or a .npz of
     weights."""
     seed: int | None = None
     """Seeds every random choice; default: 0."""
+    devices: Annotated[str, tyro.conf.arg(metavar="N|all")] = "1"
+    """Devices of a step, each with its own views (--train.batch; default then: one view each)."""
+    shard: Annotated[str, tyro.conf.arg(metavar="views|gaussians|VxG")] = "views"
+    """Where Gaussians lie: all on every device (views), divided among all devices (gaussians), or
+    in each of V groups among its G devices, such as 2x2 (docs/scaling.md)."""
+    coordinator: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT")] = None
+    """Several processes fit together, on one host or many: where process 0 listens. Under Slurm and
+    Open MPI --devices all finds all of it (docs/scaling.md)."""
+    processes: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """How many processes; all bring all of their devices."""
+    process: Annotated[int | None, tyro.conf.arg(metavar="I")] = None
+    """Which of them this one is, from 0."""
+    process_timeout: Annotated[int, tyro.conf.arg(metavar="SECONDS")] = 100
+    """Seconds after which a process that is not heard of is taken for dead, and all end."""
 
 
 @dataclass(frozen=True)
@@ -122,8 +147,8 @@ class Calibrate:
     static: bool = False
     """The folder holds photographs from one fixed viewpoint at several exposures."""
     of: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Somebody's splats of the scene (.ply, .splat, .spz; display colours): exposures are solved by
-    its surfaces, and it is written as linear radiance into --out, a run folder."""
+    """Somebody's splats of the scene (.ply, .splat, .spz; display colours): exposures are
+    solved, and it is written as linear radiance into --out, a run folder."""
     steps: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """With --of: steps in which its colours and opacities are fitted again; default: 600."""
     images: Annotated[str | None, tyro.conf.arg(metavar="DIR")] = None
@@ -140,6 +165,35 @@ class Calibrate:
     """Most frames of a video that are used; default: 150."""
     preset: Preset = "robust"
     """Where all values start; see `fit`."""
+
+
+def resolve_blocks(args: Fit) -> int | str | None:
+    """Return how many blocks are asked for: a number, `auto`, or None for one fit.
+
+    Raises:
+        UserError: it is neither, or options of blocks are given without them.
+    """
+    words = args.blocks
+    if words is None:
+        check(
+            args.jobs == 1 and args.engine == "local",
+            "--jobs and --engine are of blocks",
+            fix="add --blocks auto, or a number",
+        )
+        return None
+    check(args.jobs >= 1, "--jobs must be at least 1")
+    alone = (args.devices, args.coordinator, args.processes, args.process)
+    check(
+        alone == ("1", None, None, None),
+        "--blocks fits every block on one device, in one process",
+        fix="leave out --devices and --coordinator; blocks have --jobs and --engine",
+    )
+    check(
+        words == "auto" or (words.isdigit() and int(words) >= 1),
+        f"--blocks {words!r} is no number of blocks",
+        fix="write a whole number from 1 on, or auto",
+    )
+    return words if words == "auto" else int(words)
 
 
 def resolve_calibration(args: Calibrate) -> configs.FitConfig:
@@ -198,8 +252,56 @@ def resolve_fit(args: Fit) -> configs.FitConfig:
     check(data.max_frames >= 2, "--max-frames must be at least 2")
     check(data.test_every >= 0, "--test-every must be 0 or more")
     check(train.steps >= 1, "--steps must be at least 1")
+    check(train.batch >= 1, "--train.batch must be at least 1")
     cfg = dataclasses.replace(cfg, data=data, train=train, evaluation=evaluation, densify=densify)
     return _known(cfg, args)
+
+
+def resolve_processes(args: Fit) -> Processes | None:
+    """Return how this process finds the others of a fit; None where it is alone.
+
+    Raises:
+        UserError: some of it is missing, or makes no sense.
+    """
+    given = (args.coordinator, args.processes, args.process)
+    check(args.process_timeout >= 1, "--process-timeout must be at least 1")
+    if given == (None, None, None):
+        if args.devices != "all" or not scheduled():
+            return None
+        return Processes(None, None, None, args.process_timeout)
+    if args.coordinator is None or args.processes is None or args.process is None:
+        raise UserError(
+            "--coordinator, --processes and --process go together.",
+            fix="give every process all three: --coordinator HOST:PORT --processes N --process I",
+        )
+    host, _, port = args.coordinator.rpartition(":")
+    check(
+        bool(host) and port.isdecimal() and 0 < int(port) < 2**16,
+        f"--coordinator {args.coordinator} is no HOST:PORT",
+    )
+    check(args.processes >= 1, "--processes must be at least 1")
+    check(
+        0 <= args.process < args.processes,
+        f"--process {args.process} is none of {args.processes}",
+        fix="count them from 0",
+    )
+    return Processes(args.coordinator, args.process, args.processes, args.process_timeout)
+
+
+def resolve_devices(args: Fit) -> Devices:
+    """Return the devices of a fit; of several processes all of them.
+
+    Raises:
+        UserError: the number is none.
+    """
+    if args.devices == "all" or resolve_processes(args) is not None:
+        return Devices("all", args.shard)
+    check(
+        args.devices.isdecimal() and int(args.devices) >= 1,
+        f"--devices {args.devices} is no number of devices",
+        fix="give 1 or more, or all",
+    )
+    return Devices(int(args.devices), args.shard)
 
 
 def _known(cfg: configs.FitConfig, args: Fit | Calibrate) -> configs.FitConfig:

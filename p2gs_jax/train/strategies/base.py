@@ -17,6 +17,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.population import Coverage, Outcome
 from p2gs_jax.train.host import HostState
 from p2gs_jax.train.log import RunLog
+from p2gs_jax.train.mesh.spread import Spread
 from p2gs_jax.train.optimizer import zero_moments
 from p2gs_jax.train.programs import StepPrograms
 from p2gs_jax.train.schedule import Levels
@@ -58,6 +59,7 @@ class RunContext:
         validation: those that automatic growth is judged by.
         own_exposures: their exposures come from tracks, so they may be judged under these.
         programs: compiles ahead.
+        spread: how the state lies on the devices between its changes.
         log: of the run.
         clock: receives seconds by name.
         take_burst: takes steps.
@@ -72,6 +74,7 @@ class RunContext:
     validation: Sequence[int]
     own_exposures: bool
     programs: StepPrograms
+    spread: Spread
     log: RunLog
     clock: Stopwatch
     take_burst: TakeBurst
@@ -138,7 +141,8 @@ class Strategy:
         with self.run.clock("densification"):
             if self.is_due(host):
                 host.densified_at = host.progress
-                state = self.densify(state, host)
+                spread = self.run.spread
+                state = spread.spread(self.densify(spread.whole(state), host))
         return state, host
 
     def densify(self, state: FitState, host: HostState) -> FitState:

@@ -1,0 +1,142 @@
+"""Engines by name: `local`, `dask://HOST:PORT`, `slurm` and `submitit-local`.
+
+Each is a `concurrent.futures.Executor`. Its machines have the package installed and see the same
+folders under the same paths.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Iterator
+from concurrent.futures import CancelledError, Executor, ThreadPoolExecutor
+from pathlib import Path
+
+from p2gs_jax.errors import UserError
+
+LOCAL = "local"
+KNOWN = "local, dask://HOST:PORT, slurm or slurm:OPTION=VALUE,..."
+# Seconds until a scheduler must have answered.
+ANSWER_S = 20
+# By their names, so that no engine is imported that is not used: a worker died, or its node.
+_LOST = ("KilledWorker", "UncompletedJobError", "FutureCancelledError", "CommClosedError")
+
+
+def is_lost(error: BaseException) -> bool:
+    """Return whether a job's worker was lost, rather than the job failed."""
+    cancelled = CancelledError | asyncio.CancelledError
+    return isinstance(error, cancelled) or type(error).__name__ in _LOST
+
+
+def check_engine(name: str) -> None:
+    """Refuse an engine that does not exist, or whose library is not installed.
+
+    Raises:
+        UserError: with what to write or install instead.
+    """
+    if name == LOCAL:
+        return
+    if name.startswith("dask://"):
+        if not name.removeprefix("dask://").rpartition(":")[2].isdigit():
+            raise UserError(
+                f"--engine {name} names no port.",
+                fix="write where the scheduler listens, as in dask://10.0.0.5:8786",
+            )
+        _require("distributed", "dask", name)
+        return
+    kind, _, options = name.partition(":")
+    if kind in ("slurm", "submitit-local"):
+        _options(name, options)
+        _require("submitit", "slurm", name)
+        return
+    raise UserError(f"there is no engine {name!r}.", fix=f"use {KNOWN}")
+
+
+@contextlib.contextmanager
+def open_engine(name: str, parallel: int, folder: Path) -> Iterator[Executor]:
+    """Yield an engine; when the block ends it waits for what still runs.
+
+    Args:
+        name: see `check_engine`; OPTIONs of Slurm are those of submitit's `update_parameters`
+            (timeout_min, slurm_partition, gpus_per_node, ...).
+        parallel: jobs at a time on this machine; a Dask scheduler and Slurm decide for themselves.
+        folder: for submitit's files; seen by all machines.
+
+    Raises:
+        UserError: there is no such engine, or it does not answer.
+    """
+    check_engine(name)
+    if parallel < 1:
+        raise UserError(f"{parallel} jobs at a time.", fix="let at least 1 run at a time")
+    if name == LOCAL:
+        with ThreadPoolExecutor(parallel) as threads:
+            yield threads
+    elif name.startswith("dask://"):
+        with _dask(name) as workers:
+            yield workers
+    else:
+        kind, _, options = name.partition(":")
+        with _submitit(kind, _options(name, options), folder) as cluster:
+            yield cluster
+
+
+@contextlib.contextmanager
+def _dask(name: str) -> Iterator[Executor]:
+    from dask.distributed import Client
+
+    address = f"tcp://{name.removeprefix('dask://')}"
+    try:
+        client = Client(address, timeout=ANSWER_S, set_as_default=False)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise UserError(
+            f"no Dask scheduler answers at {address} ({error}).",
+            fix="start one with `dask scheduler` and workers with `dask worker HOST:PORT "
+            "--nthreads 1`, each in this environment",
+        ) from error
+    with client:
+        if not client.scheduler_info()["workers"]:
+            raise UserError(
+                f"the Dask scheduler at {address} has no workers.",
+                fix="start some with `dask worker HOST:PORT --nthreads 1`",
+            )
+        yield client.get_executor(pure=False)
+
+
+@contextlib.contextmanager
+def _submitit(kind: str, options: dict[str, int | str], folder: Path) -> Iterator[Executor]:
+    import submitit
+
+    from p2gs_jax.jobs.submitit_engine import SubmititExecutor
+
+    cluster = "local" if kind == "submitit-local" else "slurm"
+    try:
+        executor = submitit.AutoExecutor(folder=folder / "submitit", cluster=cluster)
+        executor.update_parameters(name="p2gs-jax", **options)
+    except (RuntimeError, NameError, TypeError, ValueError) as error:
+        raise UserError(
+            f"--engine {kind} cannot be used here: {error}.",
+            fix="run this where `srun` is found, and name options as submitit does, for example "
+            "slurm:timeout_min=240,slurm_partition=gpu",
+        ) from error
+    with SubmititExecutor(executor) as jobs:
+        yield jobs
+
+
+def _options(name: str, text: str) -> dict[str, int | str]:
+    found: dict[str, int | str] = {}
+    for part in filter(None, text.split(",")):
+        key, equals, value = part.partition("=")
+        if not (key.isidentifier() and equals and value):
+            raise UserError(
+                f"--engine {name}: {part!r} is no OPTION=VALUE.",
+                fix="write slurm:timeout_min=240,slurm_partition=gpu",
+            )
+        found[key] = int(value) if value.isdigit() else value
+    return found
+
+
+def _require(module: str, extra: str, name: str) -> None:
+    from importlib.util import find_spec
+
+    if find_spec(module) is None:
+        raise UserError(f"--engine {name} needs {module}.", fix=f"pip install 'p2gs-jax[{extra}]'")

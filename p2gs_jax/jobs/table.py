@@ -1,0 +1,82 @@
+"""One live table of the progress of all jobs; where there is no terminal, lines now and then."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from p2gs_jax.core.progress import EVERY_S, clock
+from p2gs_jax.jobs.job import JobState
+
+# Rows that a terminal has room for; of more, those that run come first.
+MOST_ROWS = 20
+_ORDER = ("running", "waiting", "failed", "stopped", "done")
+
+
+class JobsTable:
+    """Shows the states of jobs. Use as a context manager.
+
+    Args:
+        console: where.
+        live: a display that is there already, which then shows the table; None: it has its own.
+    """
+
+    def __init__(self, console: Console, live: Live | None = None):
+        self.console = console
+        self._live = live
+        self._said_at = time.monotonic()
+
+    def __enter__(self) -> JobsTable:
+        if self.console.is_terminal:
+            self._live = Live(console=self.console, refresh_per_second=4, transient=True)
+            self._live.start()
+        return self
+
+    def __exit__(self, *error) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def show(self, states: Sequence[JobState]) -> None:
+        """Show how far all are."""
+        if self._live is not None:
+            self._live.update(table_of(states))
+        elif time.monotonic() - self._said_at >= EVERY_S:
+            self._said_at = time.monotonic()
+            self.console.print(Text(line_of(states)), soft_wrap=True)
+
+    def say(self, text: str) -> None:
+        """Print a line that stays."""
+        self.console.print(Text(text), soft_wrap=True)
+
+
+def table_of(states: Sequence[JobState]) -> Table:
+    """Return the table, those that run first."""
+    table = Table.grid(padding=(0, 2))
+    rows = sorted(states, key=lambda s: _ORDER.index(s.status))
+    for state in rows[:MOST_ROWS]:
+        table.add_row(Text(state.name), state.status, Text(_what(state)), clock(state.seconds))
+    if len(rows) > MOST_ROWS:
+        table.add_row(f"and {len(rows) - MOST_ROWS} more", "", line_of(rows[MOST_ROWS:]), "")
+    return table
+
+
+def line_of(states: Sequence[JobState]) -> str:
+    """Return counts, and what those that run do."""
+    counts = [(name, sum(s.status == name for s in states)) for name in _ORDER]
+    said = ", ".join(f"{count} {name}" for name, count in counts if count)
+    running = [f"{s.name}: {_what(s)}" for s in states if s.status == "running"]
+    return "; ".join([said, *running])
+
+
+def _what(state: JobState) -> str:
+    if state.status == "failed":
+        return (state.reason or "").splitlines()[0] if state.reason else ""
+    if state.status != "running":
+        return "begun again" if state.status == "waiting" and state.begun > 1 else ""
+    share = "" if state.progress is None else f"{state.progress:.0%} "
+    return f"{share}{state.doing}"

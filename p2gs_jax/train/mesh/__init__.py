@@ -1,0 +1,1 @@
+"""A step of several views, on one device or on a mesh of them: (views, Gaussians)."""

@@ -1,0 +1,204 @@
+"""Jobs end apart: what fails says why, what is killed is repeated, what is stopped goes on."""
+
+import io
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from job_tasks import count
+from rich.console import Console
+
+from p2gs_jax.errors import UserError
+from p2gs_jax.jobs import REASON, Job, JobState, open_engine, run_jobs
+from p2gs_jax.jobs.engines import check_engine
+from p2gs_jax.jobs.job import JobFiles, write_job
+from p2gs_jax.jobs.process import run_in_process
+from p2gs_jax.jobs.progress import ProgressFile, read_progress
+from p2gs_jax.jobs.table import line_of, table_of
+
+
+@pytest.fixture(autouse=True)
+def _tasks_are_found(monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), *sys.path]))
+
+
+def jobs_of(root, **todo):
+    return [Job(name, root / name, count, arguments) for name, arguments in todo.items()]
+
+
+def test_one_that_fails_leaves_its_reason_and_ends_nothing_else(tmp_path):
+    jobs = jobs_of(
+        tmp_path,
+        good={},
+        refused={"first": "refuse", "until": 9},
+        stumbled={"first": "stumble", "until": 9},
+        left={"first": "leave", "until": 9},
+        killed={"first": "kill"},
+        doomed={"first": "kill", "until": 9},
+    )
+    ended, looks = [], []
+    with open_engine("local", 2, tmp_path) as engine:
+        states = run_jobs(
+            jobs,
+            engine,
+            tmp_path / "jobs",
+            on_end=lambda number, state: ended.append(state.name),
+            on_look=lambda states: looks.append([s.status for s in states]),
+        )
+    assert sorted(ended) == sorted(job.name for job in jobs)
+    assert looks
+    found = {s.name: s for s in states}
+    statuses = {name: s.status for name, s in found.items()}
+    assert statuses == {
+        "good": "done",
+        "refused": "failed",
+        "stumbled": "failed",
+        "left": "failed",
+        "killed": "done",
+        "doomed": "failed",
+    }
+    begun = {name: len((tmp_path / name / "tries").read_text()) for name in found}
+    assert begun == {name: s.begun for name, s in found.items()}
+    assert begun == {"good": 1, "refused": 1, "stumbled": 1, "left": 1, "killed": 2, "doomed": 3}
+    assert "add photographs" in found["refused"].reason
+    assert found["stumbled"].reason == "ZeroDivisionError: by zero"
+    assert "with code 3: last words" in found["left"].reason
+    assert "memory ran out" in found["doomed"].reason
+    for name, state in found.items():
+        kept = tmp_path / name / REASON
+        assert kept.exists() == (state.status == "failed")
+        if kept.exists():
+            assert json.loads(kept.read_text())["reason"] == state.reason
+    assert (
+        "ZeroDivisionError" in json.loads((tmp_path / "stumbled" / REASON).read_text())["traceback"]
+    )
+
+
+def test_what_is_stopped_ends_and_the_same_call_goes_on(tmp_path):
+    jobs = jobs_of(tmp_path, running={"first": "wait"}, waiting={})
+
+    def interrupt(states):
+        if states[0].doing == "Counting":
+            raise KeyboardInterrupt
+
+    ended = {}
+    with (
+        pytest.raises(KeyboardInterrupt),
+        open_engine("local", 1, tmp_path) as engine,
+    ):
+        run_jobs(
+            jobs,
+            engine,
+            tmp_path / "jobs",
+            on_end=lambda number, state: ended.update({state.name: state.status}),
+            on_look=interrupt,
+        )
+    assert ended == {"running": "stopped", "waiting": "stopped"}
+    assert not list(tmp_path.rglob(REASON))
+    assert not (tmp_path / "waiting").exists()
+    with open_engine("local", 1, tmp_path) as engine:
+        states = run_jobs(jobs, engine, tmp_path / "jobs")
+    assert [s.status for s in states] == ["done", "done"]
+
+
+def test_a_job_ends_with_whoever_waits_for_it(tmp_path):
+    (job,) = jobs_of(tmp_path, orphan={"first": "wait"})
+    files = write_job(tmp_path / "jobs", job)
+    code = f"from p2gs_jax.jobs.process import run_in_process; run_in_process({str(files.path)!r})"
+    waiting = subprocess.Popen([sys.executable, "-c", code])
+    while (read_progress(files.progress) or {}).get("doing") != "Counting":
+        assert waiting.poll() is None
+        time.sleep(0.05)
+    child = read_progress(files.progress)["pid"]
+    waiting.kill()
+    waiting.wait()
+    while _lives(child):
+        time.sleep(0.05)
+    assert not (tmp_path / "orphan" / REASON).exists()
+
+
+def _lives(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def test_the_reason_is_of_the_last_try(tmp_path):
+    (job,) = jobs_of(tmp_path, one={"first": "stumble"})
+    files = write_job(tmp_path / "jobs", job)
+    assert run_in_process(str(files.path))[0] == "failed"
+    assert run_in_process(str(files.path)) == ("done", None)
+    assert not (tmp_path / "one" / REASON).exists()
+
+
+def test_progress_is_written_now_and_then_and_survives_a_torn_file(tmp_path):
+    path = JobFiles(tmp_path / "a.json").progress
+    assert read_progress(path) is None
+    reporter = ProgressFile(path)
+    reporter.stage("Reading", 0, 10)
+    reporter.stage("Reading", 1, 10)  # too soon after the first
+    assert read_progress(path)["progress"] == 0
+    reporter.stage("Fitting")
+    assert read_progress(path)["doing"] == "Fitting"
+    path.write_text('{"doing": "Fi')
+    assert read_progress(path) is None
+
+
+def test_the_table_names_every_job_that_runs():
+    states = [JobState(f"block {k}", "waiting") for k in range(30)]
+    states[17] = JobState("block 17", "running", 1, None, "step 12", 0.25, 70.0)
+    states[3] = JobState("block 3", "failed", 1, "no seeds\n  To fix it: add points")
+    states[4] = JobState("block 4", "waiting", 2, "killed")
+    line = line_of(states)
+    assert line == "1 running, 28 waiting, 1 failed; block 17: 25% step 12"
+    console = Console(width=100, file=io.StringIO())
+    console.print(table_of(states))
+    shown = console.file.getvalue().splitlines()
+    assert shown[0].split() == ["block", "17", "running", "25%", "step", "12", "1:10"]
+    assert any("block 4" in row and "begun again" in row for row in shown)
+    assert "and 10 more" in shown[-1]
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("ray://host:1", "there is no engine 'ray://host:1'"),
+        ("dask://host", "names no port"),
+        ("slurm:gpu", "'gpu' is no OPTION=VALUE"),
+    ],
+)
+def test_engines_that_are_not_there_are_refused(name, said):
+    with pytest.raises(UserError, match=said):
+        check_engine(name)
+
+
+def test_a_missing_library_is_named_with_its_extra(monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(UserError, match=r"p2gs-jax\[dask\]"):
+        check_engine("dask://host:8786")
+    with pytest.raises(UserError, match=r"p2gs-jax\[slurm\]"):
+        check_engine("slurm")
+    check_engine("local")
+
+
+def test_the_local_executor_of_submitit_runs_jobs(tmp_path):
+    pytest.importorskip("submitit")
+    jobs = jobs_of(tmp_path, good={}, killed={"first": "kill"}, refused={"first": "refuse"})
+    with open_engine("submitit-local:timeout_min=5", 1, tmp_path) as engine:
+        states = run_jobs(jobs, engine, tmp_path / "jobs")
+        assert [s.status for s in states] == ["done", "done", "failed"]
+        assert [s.begun for s in states] == [1, 2, 1]
+    with pytest.raises(RuntimeError, match="shut down"):
+        engine.submit(run_in_process, "")
+
+
+def test_slurm_where_there_is_none_is_refused(tmp_path, monkeypatch):
+    pytest.importorskip("submitit")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(UserError, match="srun"), open_engine("slurm", 1, tmp_path):
+        pass

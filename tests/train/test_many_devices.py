@@ -1,0 +1,128 @@
+"""A step of several views is one step, however many devices share its views and its Gaussians."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.core.devices import Devices
+from p2gs_jax.errors import UserError
+from p2gs_jax.pipeline.devices import mesh_of, with_a_view_each
+from p2gs_jax.sweep import with_fields
+from p2gs_jax.train.batches import batches_of, stacked
+from p2gs_jax.train.state import FAULT_NONE, FAULT_OVERFLOW
+
+HERE = Path(__file__).parent
+MESHES = ("views 1", "views 2", "views 4", "gaussians 4", "2x2 4")
+
+
+@pytest.fixture(scope="module")
+def found():
+    paths = [*map(str, (HERE, HERE.parent)), os.environ.get("PYTHONPATH", "")]
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=4"
+    env = {"PYTHONPATH": os.pathsep.join(paths), "JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags}
+    done = subprocess.run(
+        [sys.executable, str(HERE / "mesh_worker.py")],
+        env=os.environ | env,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize("mesh", MESHES)
+def test_loss_and_gradient_are_the_means_over_views_taken_one_by_one(found, mesh):
+    assert found[mesh]["fault"]["kind"] == FAULT_NONE
+    assert found[mesh]["losses"][0] == pytest.approx(found["one view"]["loss"], rel=1e-6)
+    assert found[mesh]["of one view"] < 1e-6
+
+
+@pytest.mark.parametrize("mesh", MESHES)
+def test_devices_change_neither_losses_nor_noise(found, mesh):
+    # Sums over views and the order of equally deep splats are all that may differ.
+    assert found[mesh]["of one device"] < 2e-7
+    assert found[mesh]["losses"] == pytest.approx(found["views 1"]["losses"], rel=1e-6)
+
+
+@pytest.mark.parametrize("mesh", MESHES)
+def test_a_step_counts_as_many_as_it_takes_views(found, mesh):
+    assert found[mesh]["step"] == 8
+
+
+def test_a_view_that_finds_no_room_stops_all_devices_until_there_is_some(found):
+    tight = found["tight"]
+    assert tight["fault"]["kind"] == FAULT_OVERFLOW
+    assert tight["fault"]["needed"] > 64
+    assert tight["moved"] == 0
+    assert tight["steps"] == [0, 4]
+    assert tight["loss"] == pytest.approx(found["one view"]["loss"], rel=1e-6)
+
+
+def test_a_fit_goes_on_on_another_number_of_devices(found):
+    fit = found["fit"]
+    assert fit["slots"] % 2 == 0  # 301, dealt out
+    assert fit["steps"] == [48, 48]
+    assert fit["gaussians"] == [301, 301]
+    whole, again = fit["losses"]
+    assert len(whole) == len(again)
+    assert again == pytest.approx(whole, rel=1e-4)
+    assert whole[-1] < 0.8 * whole[0]
+    assert fit["difference"] < 1e-3
+
+
+def test_every_view_of_an_epoch_is_in_a_batch_of_its_own_size():
+    order = np.random.default_rng(0).permutation(11)
+    kinds = ["wide" if view < 7 else "tall" for view in range(11)]
+    batches = batches_of(order, kinds, 3)
+    assert len(batches) == 3 + 2
+    assert {view for batch in batches for view in batch} == set(range(11))
+    assert all(len(batch) == 3 and len({kinds[v] for v in batch}) == 1 for batch in batches)
+    assert all(len(set(batch)) == 3 for batch in batches)
+
+
+def test_a_size_with_fewer_views_than_a_batch_repeats_them():
+    assert batches_of(np.array([1, 0]), ["a", "a"], 4) == [(1, 0, 1, 0)]
+
+
+def test_pixels_of_8_and_16_bits_become_one_type_of_the_same_values():
+    fine = stacked([np.array([0, 255], np.uint8), np.array([7, 65535], np.uint16)])
+    assert fine.dtype == np.uint16
+    assert fine.tolist() == [[0, 65535], [7, 65535]]
+
+
+def test_one_view_on_one_device_needs_no_mesh():
+    assert mesh_of(FitConfig(), Devices()) is None
+    assert with_a_view_each(FitConfig(), Devices()) == FitConfig()
+    assert mesh_of(with_fields(FitConfig(), {"train.batch": 3}), Devices()).size == 1
+
+
+@pytest.mark.parametrize(
+    ("devices", "fields", "words"),
+    [
+        (Devices(1000), {}, "asks for more"),
+        (Devices(0), {}, "no number"),
+        (Devices(1, "rows"), {}, "none that exists"),
+        (Devices(1, "0x1"), {}, "none that exists"),
+        (Devices(1, "2x2"), {}, "takes 4 devices"),
+        (Devices(1), {"train.batch": 0}, "--train.batch is 0"),
+        (Devices(1), {"train.batch": 2, "densify.max_gaussians": "auto"}, "--gaussians auto"),
+        (Devices(1), {"train.batch": 2, "dynamics.correct_poses": True}, "correct-poses"),
+    ],
+)
+def test_what_cannot_be_is_refused_by_name(devices, fields, words):
+    with pytest.raises(UserError, match=words) as refused:
+        mesh_of(with_fields(FitConfig(), fields), devices)
+    assert refused.value.fix
+
+
+def test_the_command_line_refuses_what_is_no_number(run_command, tmp_path):
+    code, said = run_command("fit", tmp_path, "--out", tmp_path / "run", "--devices", "two")
+    assert code == 2
+    assert "--devices two" in said
+    assert not (tmp_path / "run").exists()
