@@ -133,7 +133,7 @@ class RenderConfig:
     radiance: Literal["exp", "softplus", "linear"] = "exp"
     """Activation from spherical harmonics to radiance; `linear` is 3DGS's max(0, sh + 1/2)."""
     near: float = 0.05
-    """Near plane, scene units."""
+    """Near plane, scene units; nearer in scenes that it would cut (ours: pipeline/scale.py)."""
     blur: float = 0.3
     """Variance added to the 2D covariance, pixels^2 (3DGS: 0.3)."""
     tile: tuple[int, int] = (16, 8)

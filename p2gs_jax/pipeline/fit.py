@@ -29,6 +29,7 @@ from p2gs_jax.pipeline.agreement import agree_on_options, same_start
 from p2gs_jax.pipeline.decide import kept_choice
 from p2gs_jax.pipeline.devices import mesh_of
 from p2gs_jax.pipeline.finish import Account, finish
+from p2gs_jax.pipeline.memory_needed import memory_named
 from p2gs_jax.pipeline.preflight import Paths, check_run_dir, check_scene, preflight
 from p2gs_jax.pipeline.prepare import Expected, Prepared, load, prepare
 from p2gs_jax.pipeline.reserve import seconds_to_finish
@@ -199,7 +200,7 @@ def fit(
     mesh = mesh_of(cfg, devices)
     # Before the first process writes anything that the others would refuse.
     agree_on_options(cfg, devices, resume)
-    with _ours(paths.run) as lock:
+    with _ours(paths.run) as lock, memory_named():
         if is_first():
             check_run_dir(paths.run, resume, cfg)  # another may have ended since
         return _fit(
@@ -251,7 +252,7 @@ def _fit(
         )
         prepared = same_start(prepared)
         lock.require()
-        with _begun(folder, paths, cfg, prepared.decisions):
+        with _begun(folder, paths, cfg, prepared.decisions), memory_named():
             result = optimise(
                 prepared,
                 folder,

@@ -48,6 +48,8 @@ from p2gs_jax.photometry.response import Response
 from p2gs_jax.photometry.selection import Selection
 from p2gs_jax.photometry.sources import has_tracks, surface_colors
 from p2gs_jax.pipeline.decide import decide, likely, with_choice
+from p2gs_jax.pipeline.memory_needed import memory_needed, require_memory
+from p2gs_jax.pipeline.scale import near_depth, near_plane, scale_notes
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.images import ImageStore
@@ -165,7 +167,8 @@ def prepare(
         pixels: folder for decoded photographs that are more than memory holds, or None.
 
     Raises:
-        UserError: the disk has no room for them.
+        UserError: there is not the memory for it, nothing to see, or no room on the disk for
+            decoded photographs.
     """
     clock = clock or Stopwatch()
     begin = time.monotonic()
@@ -175,10 +178,12 @@ def prepare(
     store = ImageStore(scene.views, cfg.data, moving=moving, folder=pixels)
     store.expect(shrinks(cfg.train))
     fitted, still = _without_what_moves(scene, store, nodes, cfg)
+    _require_something_to_see(scene, fitted)
     views = scene.training_views
     taken_by = [view.camera for view in views]
     extent = scene_extent(views, scene.points)
     coverage = coverage_of(scene, store)
+    require_memory(memory_needed(scene, cfg, coverage))
     measured = measured_depths(scene, cfg)
     dense = wants_dense(scene, coverage, cfg)
     seeds = _choose_points(scene, cfg)
@@ -186,10 +191,13 @@ def prepare(
     if store.backdrop is not None and init.shell == "auto":
         # What lies behind everything is the background.
         init = dataclasses.replace(init, shell="off")
+    depth = near_depth(scene.points, views)
+    near = near_plane(depth, cfg)
     # Dense seeds cover some of what the points do not.
     shell = None if dense else find_shell(views, scene.points, extent, init)
 
     guess = likely(cfg, kept, matched=has_tracks(scene) or dense)
+    guess = None if guess is None else dataclasses.replace(guess, near=near)
     expected: Expected | None = None
     if guess is not None:
         black = black_gaussians(scene.points[seeds.keep], shell, views, cfg)
@@ -223,6 +231,7 @@ def prepare(
     tracks, selection, notes = _solve(scene, still, cfg, reporter, chosen, dense=dense, kept=kept)
     matched = tracks is not None and len(tracks.points) > 0
     decisions = decide(cfg, selection, matched=matched, kept=kept)
+    decisions = dataclasses.replace(decisions, near=near)
     resolved = decisions.resolve(cfg)
     solution = None if selection is None else selection.solution
     photometry = initial_photometry(solution, taken_by, resolved)
@@ -260,7 +269,7 @@ def prepare(
         found = nodes_radiance(nodes, scene, fitted, photometry, resolved)
         gaussians, owner = _with_nodes(gaussians, nodes, found, views, resolved)
     gaussians, owner, thinned = _bounded(gaussians, owner, cfg)
-    notes = [*scene.notes, *notes, *seeds.notes]
+    notes = [*scene.notes, *scale_notes(scene, near, cfg, depth), *notes, *seeds.notes]
     notes += [] if nodes is None else nodes.notes
     notes += [] if added is None else [added.note()]
     notes += [] if shell is None else [shell.note()]
@@ -291,6 +300,15 @@ def prepare(
         resolved,
         notes,
     )
+
+
+def _require_something_to_see(scene: Scene, store: ImageStore) -> None:
+    """Refuse masks that hide everything; of most scenes the first photograph is looked at."""
+    if not any(store.stored(index)[1].any() for index in scene.train_indices):
+        raise UserError(
+            f"the masks hide every pixel of all {len(scene.train_indices)} training views.",
+            fix="masks are black where pixels are to be ignored: invert them, or take them away",
+        )
 
 
 def _without_what_moves(
