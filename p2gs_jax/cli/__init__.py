@@ -10,6 +10,7 @@ import sys
 from importlib import import_module
 
 from p2gs_jax.core import interrupts
+from p2gs_jax.core.memory import ran_out
 from p2gs_jax.errors import UserError
 
 # Silence the native libraries before they load.
@@ -67,6 +68,11 @@ def main(argv: list[str] | None = None) -> None:
         code = _missing(error, argv)
     except OSError as error:
         code = _from_the_system(error)
+    except (MemoryError, RuntimeError) as error:
+        if not ran_out(error):
+            raise
+        fix = "end other programs, or ask for less: smaller pictures, fewer Gaussians"
+        code = _complain(UserError(f"memory ran out ({error}).", fix=fix))
     except KeyboardInterrupt as error:
         print(f"p2gs-jax: interrupted{_CONTINUED.get(command, '')}", file=sys.stderr)
         code = interrupts.exit_code(error)

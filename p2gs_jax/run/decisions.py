@@ -29,7 +29,13 @@ from p2gs_jax.errors import UserError
 # Under this name in the metadata of checkpoints.
 KEY = "decided"
 # What decisions said nothing of before versions that choose it.
-_OLDER = {"white_balance": None, "vignetting": None, "responses": "all", "cameras": []}
+_OLDER = {
+    "white_balance": None,
+    "vignetting": None,
+    "responses": "all",
+    "cameras": [],
+    "near": None,
+}
 
 
 @dataclass(frozen=True)
@@ -50,6 +56,7 @@ class Decisions:
         vignetting: whether cameras have it, and per what it varies, or None.
         responses: what has a spline of its own.
         cameras: what each physical camera does; empty: nothing of its own.
+        near: near plane, scene units, where the one asked for would cut the scene; None elsewhere.
     """
 
     model: PhotometricModel
@@ -65,6 +72,7 @@ class Decisions:
     vignetting: VignettingKind | None = None
     responses: ResponseKind = "all"
     cameras: tuple[CameraFormation, ...] = ()
+    near: float | None = None
 
     @classmethod
     def as_asked(cls, cfg: FitConfig) -> Decisions:
@@ -127,6 +135,7 @@ class Decisions:
                 ),
                 regularizers=replace(loss.regularizers, log_exposure_mean=self.log_exposure_mean),
             ),
+            render=cfg.render if self.near is None else replace(cfg.render, near=self.near),
             optimizer=replace(o, exposures=self.exposure_rate, gammas=self.gamma_rate),
         )
 

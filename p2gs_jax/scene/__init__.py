@@ -69,6 +69,8 @@ def load_scene(
 
         if isinstance(found, Video):
             photographs = read_video(found.path, cfg, work_dir, report)
+            if cfg.matching == "auto":
+                cfg = dataclasses.replace(cfg, matching="sequence")
         else:
             photographs = develop(*found, work_dir, report)
         folder, paths = photographs.folder, photographs.paths

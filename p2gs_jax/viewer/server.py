@@ -112,17 +112,26 @@ def _set_up_server(
     camera = server.initial_camera
     camera.position, camera.look_at, camera.fov = start.position, start.look_at, start.fov
     lock = threading.Lock()
+    # Browsers that left while their session was being made: viser calls from several threads.
+    gone: set[int] = set()
 
     @server.on_client_connect
     def _(client: viser.ClientHandle) -> None:
         session = BrowserSession(client, viewed)
         with lock:
-            sessions[client.client_id] = session
+            left = client.client_id in gone
+            gone.discard(client.client_id)
+            if not left:
+                sessions[client.client_id] = session
+        if left:
+            session.stop()
 
     @server.on_client_disconnect
     def _(client: viser.ClientHandle) -> None:
         with lock:
             session = sessions.pop(client.client_id, None)
+            if session is None:
+                gone.add(client.client_id)
         if session is not None:
             session.stop()
 
