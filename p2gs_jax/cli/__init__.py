@@ -10,11 +10,14 @@ import sys
 from importlib import import_module
 
 from p2gs_jax.core import interrupts
+from p2gs_jax.core.memory import ran_out
 from p2gs_jax.errors import UserError
 
 # Silence the native libraries before they load.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 os.environ.setdefault("GLOG_minloglevel", "3")
+# Where Pillow refuses, too (scene/files.py): what a header says is not decoded to find out.
+os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2 * 89_478_485))
 
 # Set for one of several processes of a fit, by the parent that watches it: the descriptor of a pipe
 # that ends with that parent.
@@ -65,6 +68,11 @@ def main(argv: list[str] | None = None) -> None:
         code = _missing(error, argv)
     except OSError as error:
         code = _from_the_system(error)
+    except (MemoryError, RuntimeError) as error:
+        if not ran_out(error):
+            raise
+        fix = "end other programs, or ask for less: smaller pictures, fewer Gaussians"
+        code = _complain(UserError(f"memory ran out ({error}).", fix=fix))
     except KeyboardInterrupt as error:
         print(f"p2gs-jax: interrupted{_CONTINUED.get(command, '')}", file=sys.stderr)
         code = interrupts.exit_code(error)
@@ -83,7 +91,9 @@ _CONTINUED = {
 
 
 def _complain(error: UserError) -> int:
-    print(f"p2gs-jax: error: {error}", file=sys.stderr)
+    from p2gs_jax.core.printable import printable
+
+    print(printable(f"p2gs-jax: error: {error}"), file=sys.stderr)
     return 2
 
 

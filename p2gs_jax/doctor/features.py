@@ -11,7 +11,7 @@ from pathlib import Path
 from p2gs_jax.doctor.libraries import Library
 
 # Distributions that only some features need.
-OPTIONAL = ("viser", "av", "gsply", "pyarrow", "pillow_heif", "rawpy", "playwright")
+OPTIONAL = ("viser", "av", "gsply", "usd-core", "pyarrow", "pillow_heif", "rawpy", "playwright")
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,10 @@ def list_features(libraries: Sequence[Library], backend: str | None) -> list[Fea
         _optional("view", "viser", "pip install 'p2gs-jax[viewer]'", broken),
         _browser(),
         _optional("videos (fit x.mp4, render --out x.mp4)", "av", "pip install av", broken),
-        _optional("export to .spz", "gsply", "pip install 'p2gs-jax[spz]'", broken),
+        _optional(
+            "export to .spz and compressed PLY", "gsply", "pip install 'p2gs-jax[spz]'", broken
+        ),
+        _optional("export to OpenUSD", "pxr", "pip install 'p2gs-jax[usd]'", broken),
         _optional(
             "drives of Argoverse 2 and Waymo",
             "pyarrow",

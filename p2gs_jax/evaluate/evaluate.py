@@ -33,6 +33,7 @@ from p2gs_jax.evaluate.moving import still_mask
 from p2gs_jax.evaluate.parallel import map_in_order
 from p2gs_jax.evaluate.radiance import RadianceScores, Truth
 from p2gs_jax.evaluate.unexplained import Unexplained
+from p2gs_jax.evaluate.untold import Untold
 from p2gs_jax.evaluate.view_scores import Collector, view_scores
 from p2gs_jax.photometry.display import DisplayTransform, develop, display_of_view, with_capture
 from p2gs_jax.photometry.formation import exposed_at
@@ -130,8 +131,8 @@ def evaluate(
         on_progress: views done, views in all.
 
     Returns:
-        The `train`, `test`, `consistency`, `reference` and `radiance` parts of `metrics.json`, and
-        those of drives.
+        The `train`, `test`, `consistency`, `reference` and `radiance` parts of `metrics.json`,
+        those of drives, and the views that have no scores or no exposure (`Untold`).
 
     Raises:
         UserError: an image is too small for LPIPS.
@@ -168,6 +169,8 @@ def evaluate(
         extra, everything = {}, None
         if scene.views[index].split == "train":
             transform = over(display_of_view(small, row_of[index], tone))
+        elif not mask.any():
+            transform = shown
         else:
             still = still_mask(scene, index, mask)
             transform = with_fitted_exposure(shown, linear, photograph, still, alpha)
@@ -187,6 +190,7 @@ def evaluate(
             meter(linear, alpha),
         )
 
+    untold, told = Untold(), []
     own, averaged = Collector(), Collector()
     test_averaged, test_fitted, test_all = Collector(), Collector(), Collector()
     videos = {name: VideoScores() for name in ("per_view", "averaged", "photographs")}
@@ -198,6 +202,10 @@ def evaluate(
             result = found.result
             index, view = result.index, scene.views[result.index]
             training = view.split == "train"
+            on_progress(index + 1, len(scene.views))
+            if not untold.add(view.name, result.photograph, found.mask, cfg.loss):
+                on_view(result)
+                continue
             (own if training else test_fitted).add(view.name, found.scores)
             (averaged if training else test_averaged).add(view.name, found.scores_averaged)
             if found.scores_all is not None:
@@ -211,6 +219,7 @@ def evaluate(
                 images = images if store.backdrop is None else (*images, result.alpha)
                 reference_views.append((index, tuple(map(arrays.put, images))))
             if training:
+                told.append(row_of[index])
                 metered.add_training(view.name, found.readings)
             else:
                 images = (linear, result.photograph, found.mask)
@@ -223,15 +232,15 @@ def evaluate(
             videos["per_view"].add(view.camera, result.ldr, result.transform.exposure)
             videos["averaged"].add(view.camera, found.ldr_averaged, mean.exposure)
             videos["photographs"].add(view.camera, result.photograph, result.transform.exposure)
-            on_progress(index + 1, len(scene.views))
 
         metrics = {
             "train": {**own.summary(), "averaged": averaged.summary()},
             "test": {"averaged": test_averaged.summary(), "exposure_fitted": test_fitted.summary()},
+            **untold.to_dict(),
         }
         if test_all.rows:
             metrics["test"]["photometry_fitted"] = test_all.summary()
-        metering = metered.fit(np.asarray(small.photometry.exposures), mean.gamma, tone)
+        metering = metered.fit(np.asarray(small.photometry.exposures)[told], mean.gamma, tone)
         on_metering(metering)
 
         row_of_name = {view.name: index for index, view in enumerate(scene.views)}

@@ -54,7 +54,7 @@ def write_colmap_folder(
         masks: dict[str, Bool[np.ndarray, "h w"]] = {}
         for index, view in enumerate(scene.views):
             ldr, mask = store.get(index)
-            _write_photograph(temporary / "images" / view.name, view, ldr)
+            write_photograph(temporary / "images" / view.name, view, ldr)
             masks[view.name] = mask > 0
             on_view(index + 1, len(scene.views))
         if not all(mask.all() for mask in masks.values()):
@@ -141,8 +141,17 @@ def _nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 
     return u @ vt
 
 
-def _write_photograph(path: Path, view: View, ldr: np.ndarray) -> None:
-    """Copy a photograph that is used as it is; encode a changed one again, EXIF included."""
+def write_photograph(path: Path, view: View, ldr: np.ndarray) -> None:
+    """Copy a photograph that is used as it is; encode a changed one again, EXIF included.
+
+    Args:
+        path: where to; its folder is created.
+        view: of the photograph.
+        ldr: its display values as the fit uses them.
+
+    Raises:
+        UserError: it cannot be written in its own format.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     height, width = ldr.shape[:2]
     if view.distortion is None and (width, height) == (view.width, view.height):

@@ -7,7 +7,6 @@ would clip them.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -16,10 +15,9 @@ import numpy as np
 
 from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.errors import UserError
-from p2gs_jax.render.spherical_harmonics import basis, degree_of
+from p2gs_jax.gaussians.half_turn import half_turn
 from p2gs_jax.types import Gaussians
 
-FLIP = (1.0, -1.0, -1.0)
 # Positions are integers of 24 bits with a sign; more than 24 fractional bits are not allowed.
 LARGEST_INTEGER, MOST_FRACTIONAL_BITS = 2**23 - 1, 24
 
@@ -34,7 +32,7 @@ def require_gsply() -> ModuleType:
         import gsply
     except ImportError as error:
         raise UserError(
-            f"--format spz needs the package gsply, which cannot be imported ({error}).",
+            f"SPZ and compressed PLY need the package gsply, which cannot be imported ({error}).",
             fix="pip install 'p2gs-jax[spz]', or convert display.ply with another tool "
             "(docs/exports.md)",
         ) from error
@@ -50,7 +48,7 @@ def write_spz(path: Path, gaussians: Gaussians) -> int:
     gsply = require_gsply()
     from gsply.spz import write_spz as write
 
-    g = _flipped(gaussians)
+    g = half_turn(gaussians)
     quats = np.asarray(g.quats, np.float32)
     data = gsply.GSData.from_arrays(
         means=np.asarray(g.means),
@@ -106,22 +104,4 @@ def read_spz(path: Path) -> Gaussians:
         opacity_logits=jnp.asarray(np.reshape(data.opacities, -1)),
         sh=jnp.asarray(sh),
     )
-    return _flipped(g)
-
-
-def _flipped(g: Gaussians) -> Gaussians:
-    """Return the Gaussians turned by 180 degrees about x; twice is nothing."""
-    flip = jnp.asarray(FLIP)
-    direction = np.array([[0.36, 0.48, 0.8]], np.float32)
-    degree = degree_of(g.sh.shape[1])
-    # A half turn about an axis only changes signs of the harmonics.
-    here, there = (
-        np.array([float(b[0]) for b in basis(tuple(jnp.asarray(d).T), degree)])
-        for d in (direction, direction * np.array(FLIP, np.float32))
-    )
-    return replace(
-        g,
-        means=g.means * flip,
-        quats=g.quats * jnp.asarray([1.0, *FLIP]),
-        sh=g.sh * jnp.asarray(np.sign(here * there), g.sh.dtype)[:, None],
-    )
+    return half_turn(g)

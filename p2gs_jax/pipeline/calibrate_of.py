@@ -27,6 +27,7 @@ from p2gs_jax.photometry.mean import usual_display
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.selection import Selection
 from p2gs_jax.photometry.sources.rendered import rendered_colors
+from p2gs_jax.photometry.sources.tracks import has_tracks, track_colors
 from p2gs_jax.pipeline.calibration import Calibration, with_stated
 from p2gs_jax.pipeline.decide import decide
 from p2gs_jax.pipeline.finish import Account, finish
@@ -70,8 +71,9 @@ def calibrate_of(
     compare_with: str | None = None,
     reporter: Reporter | None = None,
 ) -> CalibrationOf:
-    """Solve exposures by the surfaces of a model, and refit its colours as linear radiance.
+    """Solve exposures of a model's photographs, and refit its colours as linear radiance.
 
+    Exposures come from the scene's tracks, or, where it has none, through the model's depth.
     Places, shapes and number of the Gaussians stay; colours and opacities are fitted under the
     exposures found. `out` becomes a run folder that has the files of a calibration as well.
 
@@ -102,17 +104,9 @@ def calibrate_of(
                 fix="add photographs that were posed together with the model",
             )
         store = ImageStore(scene.views, cfg.data)
-        viewer = viewer_config(cfg.render)
         reporter.stage("Judging the model")
-        before = score_foreign(foreign, scene, store, viewer)
-        observations = rendered_colors(
-            foreign,
-            scene,
-            store.leaving_out(scene.objects).only_opaque(),
-            viewer,
-            cfg.train.seed,
-            lambda i, n: reporter.stage("Rendering depth", i, n),
-        )
+        before = score_foreign(foreign, scene, store, viewer_config(cfg.render))
+        observations = _observations(foreign, scene, store, cfg, reporter)
         _check(observations, before.agreement, Path(model), Path(scene_dir))
     clock.add("reading", time.monotonic() - begin)
     reporter.stage("Photometric bundle adjustment")
@@ -147,6 +141,23 @@ def calibrate_of(
     metrics = finish(params, prepared, folder, account, reporter, truth=None, lpips_weights=None)
     write_calibration(calibration, folder.root)
     return CalibrationOf(calibration, metrics)
+
+
+def _observations(
+    foreign: Gaussians, scene: Scene, store: ImageStore, cfg: FitConfig, reporter: Reporter
+) -> Observations:
+    """Sample colours at tracks where the scene has any: what a model shows of depth is coarser."""
+    still = store.leaving_out(scene.objects).only_opaque()
+    if has_tracks(scene):
+        return track_colors(scene, still, lambda i, n: reporter.stage("Sampling colours", i, n))
+    return rendered_colors(
+        foreign,
+        scene,
+        still,
+        viewer_config(cfg.render),
+        cfg.train.seed,
+        lambda i, n: reporter.stage("Rendering depth", i, n),
+    )
 
 
 def converting(cfg: FitConfig, steps: int) -> FitConfig:

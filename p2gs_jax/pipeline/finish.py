@@ -17,6 +17,7 @@ from p2gs_jax.evaluate.evaluate import ViewResult, evaluate
 from p2gs_jax.evaluate.lpips import LpipsWeights
 from p2gs_jax.evaluate.references import Reference, find_radiance
 from p2gs_jax.evaluate.unexplained import Unexplained, shares_by_view
+from p2gs_jax.evaluate.untold import untold_notes
 from p2gs_jax.photometry.metering import Metering
 from p2gs_jax.pipeline.prepare import Prepared
 from p2gs_jax.render.host import make_renderer
@@ -112,6 +113,11 @@ def finish(
             on_unexplained=lambda found: write_unexplained(folder.unexplained, scene, store, found),
             on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
         )
+    hidden = metrics.get("hidden", ())
+    fitted = {row: e for row, e in fitted.items() if scene.views[row].name not in hidden}
+    for note in untold_notes(metrics):
+        prepared.notes.append(note)
+        reporter.message(note)
     if metering[0].telling:
         prepared.notes.append(metering[0].sentence)
         reporter.message(metering[0].sentence)
@@ -127,6 +133,7 @@ def finish(
             owner=owner,
             moving=moving,
             fitted=fitted,
+            unknown=metrics.get("exposures_unknown", ()),
             solution=None if prepared.selection is None else prepared.selection.solution,
             shown=[shown[i] for i in picks],
             metering=metering[0],

@@ -29,6 +29,7 @@ from p2gs_jax.pipeline.agreement import agree_on_options, same_start
 from p2gs_jax.pipeline.decide import kept_choice
 from p2gs_jax.pipeline.devices import mesh_of
 from p2gs_jax.pipeline.finish import Account, finish
+from p2gs_jax.pipeline.memory_needed import memory_named
 from p2gs_jax.pipeline.preflight import Paths, check_run_dir, check_scene, preflight
 from p2gs_jax.pipeline.prepare import Expected, Prepared, load, prepare
 from p2gs_jax.pipeline.reserve import seconds_to_finish
@@ -107,7 +108,7 @@ def optimise(
     )
 
 
-def _begin(
+def begin_programs(
     programs: StepPrograms, known: Expected, scene: Scene, folder: RunFolder, mesh: Mesh | None
 ) -> None:
     """Begin to compile steps while the exposures are solved, mostly on one core."""
@@ -199,7 +200,7 @@ def fit(
     mesh = mesh_of(cfg, devices)
     # Before the first process writes anything that the others would refuse.
     agree_on_options(cfg, devices, resume)
-    with _ours(paths.run) as lock:
+    with _ours(paths.run) as lock, memory_named():
         if is_first():
             check_run_dir(paths.run, resume, cfg)  # another may have ended since
         return _fit(
@@ -245,13 +246,13 @@ def _fit(
             cfg,
             reporter,
             clock,
-            lambda known: _begin(programs, known, scene, folder, mesh),
+            lambda known: begin_programs(programs, known, scene, folder, mesh),
             kept=kept_choice(cfg, folder) if resume else None,
             pixels=folder.pixels_of(jax.process_index()),
         )
         prepared = same_start(prepared)
         lock.require()
-        with _begun(folder, paths, cfg, prepared.decisions):
+        with begun(folder, paths, cfg, prepared.decisions), memory_named():
             result = optimise(
                 prepared,
                 folder,
@@ -329,7 +330,7 @@ def _ours(run_dir: Path) -> Iterator[RunLock]:
 
 
 @contextlib.contextmanager
-def _begun(folder: RunFolder, paths: Paths, cfg: FitConfig, decisions: Decisions) -> Iterator[None]:
+def begun(folder: RunFolder, paths: Paths, cfg: FitConfig, decisions: Decisions) -> Iterator[None]:
     """Make the folder a run's while its steps are taken, and keep it where they left something.
 
     A run that failed before its first checkpoint leaves nothing to continue or to overwrite.

@@ -9,7 +9,6 @@ checkpoints say.
 from __future__ import annotations
 
 import dataclasses
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -24,12 +23,19 @@ from p2gs_jax.config import (
     camera_formations,
 )
 from p2gs_jax.core.atomic import plain, write_json
+from p2gs_jax.core.json_text import parse_json
 from p2gs_jax.errors import UserError
 
 # Under this name in the metadata of checkpoints.
 KEY = "decided"
 # What decisions said nothing of before versions that choose it.
-_OLDER = {"white_balance": None, "vignetting": None, "responses": "all", "cameras": []}
+_OLDER = {
+    "white_balance": None,
+    "vignetting": None,
+    "responses": "all",
+    "cameras": [],
+    "near": None,
+}
 
 
 @dataclass(frozen=True)
@@ -50,6 +56,7 @@ class Decisions:
         vignetting: whether cameras have it, and per what it varies, or None.
         responses: what has a spline of its own.
         cameras: what each physical camera does; empty: nothing of its own.
+        near: near plane, scene units, where the one asked for would cut the scene; None elsewhere.
     """
 
     model: PhotometricModel
@@ -65,6 +72,7 @@ class Decisions:
     vignetting: VignettingKind | None = None
     responses: ResponseKind = "all"
     cameras: tuple[CameraFormation, ...] = ()
+    near: float | None = None
 
     @classmethod
     def as_asked(cls, cfg: FitConfig) -> Decisions:
@@ -127,6 +135,7 @@ class Decisions:
                 ),
                 regularizers=replace(loss.regularizers, log_exposure_mean=self.log_exposure_mean),
             ),
+            render=cfg.render if self.near is None else replace(cfg.render, near=self.near),
             optimizer=replace(o, exposures=self.exposure_rate, gammas=self.gamma_rate),
         )
 
@@ -168,7 +177,7 @@ def read_decisions(path: Path) -> Decisions | None:
     if not path.exists():
         return None
     try:
-        return Decisions.from_dict(json.loads(path.read_text(encoding="utf-8")))
+        return Decisions.from_dict(parse_json(path.read_text(encoding="utf-8")))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(
             f"{path} cannot be read ({error}).",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NotRequired, TypedDict
@@ -12,6 +11,7 @@ from jaxtyping import Float
 
 from p2gs_jax.config import CameraFormation
 from p2gs_jax.core.atomic import write_json
+from p2gs_jax.core.json_text import parse_json
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.cameras import corner
@@ -25,6 +25,7 @@ VERSION = 2
 OPTIONAL = frozenset(
     {
         *("exposure_ev_error", "gamma_error", "exposure_ev_start", "observations"),
+        "exposure_unknown",
         *("version", "cameras", "white_balance", "white_balance_ev_error"),
     }
 )
@@ -42,6 +43,7 @@ class ViewPhotometry(TypedDict):
         exif_ev: log2(t ISO / N^2) from EXIF, or null.
         split: train or test.
         exposure_fitted: for a held-out view, the scalar solved from its photograph.
+        exposure_unknown: true where the photograph is black or saturated everywhere.
         exposure_ev_error: standard error of `exposure_ev` from the bundle adjustment, or null.
         gamma_error: standard error of `gamma`, or null.
         exposure_ev_start: `exposure_ev` before the first step, where a bundle adjustment gave it.
@@ -59,6 +61,7 @@ class ViewPhotometry(TypedDict):
     exif_ev: float | None
     split: str
     exposure_fitted: float | None
+    exposure_unknown: NotRequired[bool]
     exposure_ev_error: NotRequired[float | None]
     gamma_error: NotRequired[float | None]
     exposure_ev_start: NotRequired[float | None]
@@ -236,7 +239,7 @@ def read_photometry(path: Path) -> PhotometryFile:
         UserError: it is no such file.
     """
     try:
-        data = json.loads(Path(path).read_text(encoding="utf-8"))
+        data = parse_json(Path(path).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise UserError(f"{path} cannot be read: {error}.", fix=AGAIN) from error
     if problem := _problem(data):

@@ -83,6 +83,7 @@ def write_results(
     owner: np.ndarray | None = None,
     moving: MovingObjects | None = None,
     fitted: dict[int, float],
+    unknown: Sequence[str] = (),
     solution: PhotometricSolution | None,
     shown: Sequence[ViewResult],
     metering: Metering | None = None,
@@ -98,6 +99,7 @@ def write_results(
         owner: the moving object that each Gaussian belongs to, or None.
         moving: these objects, with their corrected poses.
         fitted: exposures solved for held-out views, by row.
+        unknown: names of photographs that tell no exposure.
         solution: what the fit started from, or None.
         shown: views of the summary.
         metering: what explains the exposures, or None.
@@ -115,7 +117,7 @@ def write_results(
         curve=curve,
         gauge=gauge,
         mean=mean_row(mean),
-        views=_photometry_views(params, scene, fitted, solution),
+        views=_photometry_views(params, scene, fitted, solution, unknown),
         cameras=camera_rows(
             cfg.photometry.cameras, None if solution is None else solution.corner_errors
         ),
@@ -178,6 +180,7 @@ def _photometry_views(
     scene: Scene,
     fitted: dict[int, float],
     solution: PhotometricSolution | None = None,
+    unknown: Sequence[str] = (),
 ) -> list[ViewPhotometry]:
     """Return the `views` of `photometry.json`; held-out views have no exposure of their own.
 
@@ -187,6 +190,7 @@ def _photometry_views(
         fitted: exposures solved for held-out views.
         solution: what the fit started from; it, its standard errors and its number of observations
             are passed on.
+        unknown: names of photographs that tell no exposure.
     """
     taken: Photometry = jax.tree.map(np.asarray, params.photometry)
     exposures, gammas, balances = taken.exposures, taken.gammas, taken.white_balance
@@ -210,6 +214,8 @@ def _photometry_views(
                 "white_balance_ev_error": None,
             }
         )
+        if view.name in unknown:
+            out[-1]["exposure_unknown"] = True
         if k is not None and solution is not None and np.isfinite(solution.exposure_errors[k]):
             out[-1]["exposure_ev_error"] = float(solution.exposure_errors[k] / LN2)
             out[-1]["gamma_error"] = float(solution.gamma_errors[k])

@@ -29,6 +29,7 @@ def exported(finished_run, tmp_path_factory):
     """Return a run and a folder with every format that needs no extra package."""
     out = tmp_path_factory.mktemp("exports")
     formats = ("linear-ply", "display-ply", "splat", "colmap", "exr", "drive")
+    formats += ("gltf", "gsplat", "nerfstudio", "cameras")
     argv = ["export", str(finished_run), "--format", *formats, "--out", str(out), *STEPS]
     with pytest.raises(SystemExit) as stop:
         main(argv)

@@ -188,7 +188,8 @@ def capture_help():
 # Commands that the overview has a place for, and that are not there yet.
 PLANNED = {name for group in GROUPS.values() for name in group} - set(COMMANDS)
 # Options of other programs that pages mention.
-OTHERS = {"--help", "--help-all", "--version"}
+OTHERS = {"--help", "--help-all", "--version", "--ckpt"}
+OTHERS |= {"--data", "--orientation-method", "--center-method", "--auto-scale-poses"}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=[str(p.relative_to(ROOT)) for p in PAGES])

@@ -137,44 +137,12 @@ def test_a_gpu_that_jax_does_not_use(monkeypatch):
     assert {f.name: f.ready for f in features.list_features([], "gpu")}["NVIDIA GPU"]
 
 
-@pytest.fixture
-def container(monkeypatch, tmp_path):
-    monkeypatch.setattr(machine, "CGROUP", tmp_path)
-    monkeypatch.setattr(machine, "MEMINFO", tmp_path / "meminfo")
-    monkeypatch.setattr(machine.sys, "platform", "linux")
-    lines = "MemTotal:  8000000 kB\nMemAvailable:  6000000 kB\nHugePages_Total:  0\n"
-    (tmp_path / "meminfo").write_text(lines)
-    return tmp_path
-
-
-def test_memory_of_the_system(container):
-    assert machine.memory() == (8_000_000 * 1024, 6_000_000 * 1024)
-
-
-def test_memory_of_a_container(container):
-    (container / "memory.max").write_text("1000000000\n")
-    (container / "memory.current").write_text("400000000\n")
-    assert machine.memory() == (1_000_000_000, 600_000_000)
-    (container / "memory.max").write_text("max\n")
-    assert machine.memory() == (8_000_000 * 1024, 6_000_000 * 1024)
-
-
-def test_memory_without_proc(container, monkeypatch):
-    (container / "meminfo").unlink()
-    monkeypatch.setattr(machine, "_pages", {"SC_PHYS_PAGES": 5}.get)
-    assert machine.memory() == (5, None)
-
-
-def test_windows_without_its_library(container, monkeypatch):
-    monkeypatch.setattr(machine.sys, "platform", "win32")
-    assert machine.memory() == (None, None)
-
-
-def test_cores_of_a_container(container):
+def test_cores_of_a_container(tmp_path, monkeypatch):
+    monkeypatch.setattr(machine.memory, "CGROUP", tmp_path)
     free = machine.cores()
-    (container / "cpu.max").write_text("100000 100000\n")
+    (tmp_path / "cpu.max").write_text("100000 100000\n")
     assert machine.cores() == 1
-    (container / "cpu.max").write_text("max 100000\n")
+    (tmp_path / "cpu.max").write_text("max 100000\n")
     assert machine.cores() == free
 
 

@@ -3,56 +3,49 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from p2gs_jax.cli.commands.console import stdout
+from p2gs_jax.cli.commands.export_display import DisplayFiles, named_cameras
 from p2gs_jax.cli.options.export import DISPLAY, SIZE_MB, Export, Format, check_export
 from p2gs_jax.core.atomic import atomic_folder, write_json
-from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.core.progress import Reporter, TerminalReporter
 from p2gs_jax.errors import UserError
+from p2gs_jax.export.cameras_json import cameras_table
 from p2gs_jax.export.colmap_folder import write_colmap_folder
 from p2gs_jax.export.drive_table import drive_table, write_drive
+from p2gs_jax.export.nerfstudio_folder import write_nerfstudio_folder
 from p2gs_jax.export.page import MEGABYTE, write_page
 from p2gs_jax.export.sidecar import corrections_name, linear_sidecar
 from p2gs_jax.formats.exr import write_exr
-from p2gs_jax.formats.ply import write_ply, write_radiance
-from p2gs_jax.formats.splat import read_splat, write_splat
-from p2gs_jax.formats.spz import read_spz, require_gsply, write_spz
-from p2gs_jax.gaussians.bake import (
-    Target,
-    bake,
-    baking_error,
-    display_comments,
-    display_of_splats,
-    error_summary,
-    refine,
-    true_target,
-)
+from p2gs_jax.formats.ply import write_radiance
+from p2gs_jax.formats.spz import require_gsply
+from p2gs_jax.formats.usd import require_pxr
+from p2gs_jax.gaussians.bake import display_of_splats
 from p2gs_jax.photometry.display import DisplayTransform
-from p2gs_jax.render.host import make_renderer
-from p2gs_jax.render.spherical_harmonics import MAX_DEGREE
 from p2gs_jax.render.vibration import at_time
 from p2gs_jax.run.appearance_file import write_appearance
 from p2gs_jax.run.read import Run, load_run
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.exif import read_exif_settings
 from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.types import Gaussians
 
-STEPS = 240
-# The baking error is measured on at most this many views of each split, evenly spread.
-MEASURED = 60
 PLACES: dict[Format, tuple[str, ...]] = {
     "linear-ply": ("linear.ply", "linear.json"),
     "display-ply": ("display.ply", "display.ply.json"),
     "splat": ("display.splat", "display.splat.json"),
     "spz": ("display.spz", "display.spz.json"),
+    "compressed-ply": ("display.compressed.ply", "display.compressed.ply.json"),
+    "gltf": ("display.glb", "display.glb.json"),
+    "usd": ("display.usdc", "display.usdc.json"),
+    "gsplat": ("display.pt", "display.pt.json"),
     "colmap": ("colmap",),
+    "nerfstudio": ("nerfstudio",),
+    "cameras": ("cameras.json",),
     "exr": ("exr",),
     "drive": ("drive.csv", "drive.json"),
     "html": ("scene.html",),
@@ -63,8 +56,10 @@ def run(options: Export) -> int:
     """Write every requested format."""
     check_export(options)
     formats = tuple(dict.fromkeys(options.format))
-    if "spz" in formats:
+    if {"spz", "compressed-ply"} & set(formats):
         require_gsply()
+    if "usd" in formats:
+        require_pxr()
     fitted = load_run(options.run, options.scene)
     if options.without_objects:
         fitted = fitted.without_objects()
@@ -72,19 +67,23 @@ def run(options: Export) -> int:
     folder = options.out or options.run / "exports"
     _check_places(folder, formats, options.overwrite)
     _check_names(fitted, formats)
-    if "colmap" in formats:
+    if {"colmap", "nerfstudio"} & set(formats):
         fitted.require_photographs()
     store = fitted.store
     with TerminalReporter() as reporter:
         display = None
         if set(formats) & set(DISPLAY):
-            display = _Display(fitted, store, transform, options.bake_steps, reporter)
+            display = DisplayFiles(fitted, store, transform, options.bake_steps, reporter)
         for name in formats:
             begin = time.monotonic()
             if name == "linear-ply":
                 said = _linear_ply(folder, fitted, store)
             elif name == "colmap":
                 said = _colmap(folder, fitted, store, reporter)
+            elif name == "nerfstudio":
+                said = _nerfstudio(folder, fitted, store, reporter)
+            elif name == "cameras":
+                said = _cameras(folder, fitted, store)
             elif name == "exr":
                 said = _exr(folder, fitted, store, reporter)
             elif name == "drive":
@@ -93,7 +92,7 @@ def run(options: Export) -> int:
                 said = _html(folder, fitted, transform, options, reporter)
             else:
                 assert display is not None
-                said = display.write(name, folder)
+                said = display.write(name, *(folder / place for place in PLACES[name]))
             seconds = time.monotonic() - begin
             stdout().print(f"{folder / PLACES[name][0]}: {said} ({seconds:.1f} s)", soft_wrap=True)
     return 0
@@ -140,7 +139,7 @@ def _check_places(folder: Path, formats: Sequence[Format], overwrite: bool) -> N
 
 def _check_names(fitted: Run, formats: Sequence[Format]) -> None:
     """Refuse names that would lead files out of the folder they are written to."""
-    if not set(formats) & {"colmap", "exr"}:
+    if not set(formats) & {"colmap", "nerfstudio", "exr"}:
         return
     for view in fitted.scene.views:
         name = PurePosixPath(view.name)
@@ -178,6 +177,23 @@ def _colmap(folder: Path, fitted: Run, store: ImageStore, reporter: Reporter) ->
     return f"{len(scene.views)} views, {len(scene.points)} points, exposures.csv"
 
 
+def _nerfstudio(folder: Path, fitted: Run, store: ImageStore, reporter: Reporter) -> str:
+    write_nerfstudio_folder(
+        folder / PLACES["nerfstudio"][0],
+        fitted.scene,
+        store,
+        fitted.photometry["views"],
+        on_view=lambda done, count: reporter.stage("Writing photographs", done, count),
+    )
+    return f"{len(fitted.scene.views)} views for `ns-train splatfacto --data`"
+
+
+def _cameras(folder: Path, fitted: Run, store: ImageStore) -> str:
+    cameras = named_cameras(fitted, store)
+    write_json(folder / PLACES["cameras"][0], cameras_table(cameras, fitted.photometry["views"]))
+    return f"{len(cameras)} cameras for Blender and Unreal"
+
+
 def _exr(folder: Path, fitted: Run, store: ImageStore, reporter: Reporter) -> str:
     views = fitted.scene.views
     with atomic_folder(folder / PLACES["exr"][0]) as temporary:
@@ -195,21 +211,6 @@ def _exr(folder: Path, fitted: Run, store: ImageStore, reporter: Reporter) -> st
             )
             reporter.stage("Rendering", index + 1, len(views))
     return f"{len(views)} linear renders"
-
-
-@dataclass(frozen=True)
-class _Writer:
-    """Writer and reader of a format with display colours."""
-
-    write: Callable[[Path, Gaussians], int]
-    read: Callable[[Path], Gaussians]
-    degree: int
-
-
-WRITERS = {
-    "splat": _Writer(write_splat, read_splat, 0),
-    "spz": _Writer(write_spz, read_spz, MAX_DEGREE),
-}
 
 
 def _drive(folder: Path, fitted: Run) -> str:
@@ -231,118 +232,3 @@ def _html(
         say=reporter.stage,
     )
     return " ".join([f"{page.size / MEGABYTE:.1f} MB.", *page.sentences])
-
-
-class _Display:
-    """Display colours under one display transform, baked once per degree, with their error."""
-
-    def __init__(
-        self,
-        fitted: Run,
-        store: ImageStore,
-        transform: DisplayTransform,
-        steps: int | None,
-        reporter: Reporter,
-    ):
-        self.fitted, self.transform, self.reporter = fitted, transform, reporter
-        self.gaussians, scene = at_time(fitted.as_of(), None), fitted.scene
-        self.steps = max(STEPS, len(scene.train_indices)) if steps is None else steps
-        self.baked: dict[int, Gaussians] = {}
-        render = make_renderer(fitted.cfg.render)
-        self.targets: dict[int, Target] = {}
-        wanted = scene.train_indices if self.steps else _spread(scene.train_indices)
-        rows = [*wanted, *_spread(scene.test_indices)]
-        for done, index in enumerate(rows):
-            self.targets[index] = true_target(
-                scene.views[index].name,
-                self.gaussians,
-                camera_of(store, index),
-                transform,
-                render,
-            )
-            reporter.stage("Rendering true pictures", done + 1, len(rows))
-
-    def write(self, name: Format, folder: Path) -> str:
-        """Write one format and its JSON; return sentences about it."""
-        path, sidecar = (folder / place for place in PLACES[name])
-        begin = time.monotonic()
-        if name == "display-ply":
-            shown = self._bake(MAX_DEGREE)
-            error = self._error(shown)
-            comments = [
-                *display_comments(self.transform),
-                *(f"p2gs-jax: {t}" for t in _sentences(error)),
-            ]
-            write_ply(path, shown, comments)
-        else:
-            writer = WRITERS[name]
-            writer.write(path, self._bake(writer.degree))
-            error = self._error(writer.read(path))
-        write_json(
-            sidecar,
-            {
-                "file": path.name,
-                "gaussians": self.gaussians.capacity,
-                "exposure": self.transform.exposure,
-                "exposure_ev_from_mean": float(
-                    np.log2(self.transform.exposure / self.fitted.mean.exposure_geometric)
-                ),
-                "gamma": self.transform.gamma,
-                "curve": self.transform.formation.curve,
-                "white_balance": None
-                if self.transform.white_balance is None
-                else np.exp(self.transform.white_balance).tolist(),
-                "bake_steps": self.steps,
-                "seconds": time.monotonic() - begin,
-                "baking_error": error,
-            },
-        )
-        return "; ".join([f"{self.gaussians.capacity} Gaussians", *_sentences(error)])
-
-    def _bake(self, degree: int) -> Gaussians:
-        cfg, g = self.fitted.cfg, self.gaussians
-        if degree not in self.baked:
-            self.reporter.stage("Baking")
-            start = bake(g, self.transform, cfg.render.radiance, degree)
-            train = self.fitted.scene.train_indices
-            self.baked[degree] = refine(
-                start,
-                [self.targets[i] for i in train if i in self.targets],
-                cfg.render,
-                steps=self.steps,
-                seed=cfg.train.seed,
-                on_step=lambda done, steps: self.reporter.stage("Baking", done, steps),
-            )
-        return self.baked[degree]
-
-    def _error(self, shown: Gaussians) -> dict:
-        """Return the baking error by split."""
-        self.reporter.stage("Measuring")
-        scene, render = self.fitted.scene, self.fitted.cfg.render
-        splits = {"train": scene.train_indices, "test": scene.test_indices}
-        return {
-            split: error_summary(
-                baking_error(shown, [self.targets[i] for i in _spread(rows)], render)
-            )
-            for split, rows in splits.items()
-        }
-
-
-def _spread(rows: Sequence[int]) -> list[int]:
-    """Return at most MEASURED of the rows, evenly spread."""
-    return [rows[i] for i in evenly_spaced(len(rows), MEASURED)]
-
-
-def _sentences(error: dict) -> list[str]:
-    """Return sentences on the baking error."""
-    said = []
-    for split, name in (("train", "training"), ("test", "held-out")):
-        s = error[split]
-        if s is not None:
-            said.append(
-                f"baking error over {s['views']} {name} views: median {s['psnr_median']:.2f} dB, "
-                f"worst {s['psnr_worst']:.2f} dB ({s['worst_view']}), mean {s['mean_codes']:.2f} "
-                f"and largest {s['max_codes']:.0f} 8-bit levels; median "
-                f"{s['psnr_on_white_median']:.2f} dB over white"
-            )
-    return said

@@ -13,10 +13,33 @@ from p2gs_jax.cli.options.parse import check
 from p2gs_jax.cli.options.scene import SceneFolder
 from p2gs_jax.errors import UserError
 
-Format = Literal["linear-ply", "display-ply", "splat", "spz", "colmap", "exr", "drive", "html"]
+Format = Literal[
+    "linear-ply",
+    "display-ply",
+    "splat",
+    "spz",
+    "compressed-ply",
+    "gltf",
+    "usd",
+    "gsplat",
+    "colmap",
+    "nerfstudio",
+    "cameras",
+    "exr",
+    "drive",
+    "html",
+]
 FORMATS: tuple[Format, ...] = get_args(Format)
 # The formats that hold display colours and therefore one display transform.
-DISPLAY: tuple[Format, ...] = ("display-ply", "splat", "spz")
+DISPLAY: tuple[Format, ...] = (
+    "display-ply",
+    "splat",
+    "spz",
+    "compressed-ply",
+    "gltf",
+    "usd",
+    "gsplat",
+)
 # What the option --size-mb is where it is not given: a page that a mail or a wiki takes.
 SIZE_MB = 20.0
 
@@ -27,15 +50,18 @@ class Export:
 
     p2gs-jax export runs/street --format display-ply
     p2gs-jax export runs/street --format linear-ply colmap exr --out for_others
+    p2gs-jax export runs/street --format usd cameras exr --out for_blender
     """
 
     run: Annotated[Path, tyro.conf.Positional]
     """Run folder."""
     format: tuple[Format, ...]
-    """One or more: linear-ply (radiance, with a JSON file that explains it), display-ply, splat and
-    spz (display colours, for viewers), colmap (undistorted photographs, model, exposures), exr
-    (linear renders of all views), drive (CSV and JSON: poses in the data set's world, exposures
-    with errors), html (one page that is the scene: linear light, developed in the browser)."""
+    """One or more: linear-ply (radiance, with a JSON file that explains it), display-ply, splat,
+    spz, compressed-ply, gltf, usd and gsplat (display colours, for viewers and other programs),
+    colmap and nerfstudio (undistorted photographs, model, exposures), cameras (JSON for Blender and
+    Unreal), exr (linear renders of all views), drive (CSV and JSON: poses in the data set's world,
+    exposures with errors), html (one page that is the scene: linear light, developed in the
+    browser)."""
     out: Path | None = None
     """Folder to write into (default: RUN/exports)."""
     exposure_ev: float | None = None

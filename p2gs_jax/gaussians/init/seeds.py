@@ -38,7 +38,7 @@ def scene_extent(views: list[View], points: Float[np.ndarray, "p 3"]) -> float:
     if len(points):
         distance = float(np.median(np.linalg.norm(points - middle, axis=1)))
         radius = max(radius, 0.05 * distance)
-    return max(radius, 1e-3)
+    return radius if radius > 0 else 1e-3
 
 
 def subsample(count: int, limit: int, seed: int, stream: Stream = Stream.SEED_POINTS) -> np.ndarray:

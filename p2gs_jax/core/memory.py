@@ -1,0 +1,118 @@
+"""Memory of the machine and of this process, and errors that say it ran out."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import sys
+from pathlib import Path
+
+try:
+    import resource
+except ImportError:  # systems without limits of processes
+    resource = None
+
+CGROUP = Path("/sys/fs/cgroup")
+MEMINFO = Path("/proc/meminfo")
+STATM = Path("/proc/self/statm")
+# How JAX names its errors, and what it says where memory ran out.
+_OF_JAX = ("XlaRuntimeError", "JaxRuntimeError")
+_SAID = ("RESOURCE_EXHAUSTED", "Out of memory", "out of memory")
+
+
+def memory() -> tuple[int | None, int | None]:
+    """Return (total, available) bytes of memory, each None where unknown."""
+    total, available = _system_memory()
+    limit, used = text_of(CGROUP / "memory.max"), text_of(CGROUP / "memory.current")
+    if limit.isdigit() and (total is None or int(limit) < total):
+        total = int(limit)
+        # What it holds of files goes when memory is wanted.
+        left = total - int(used) + _cached_files() if used.isdigit() else total
+        available = left if available is None else min(available, left)
+    return total, available
+
+
+def left_to_process() -> int | None:
+    """Return how many bytes more this process may take, or None where that is unknown.
+
+    What the machine has (swap included), or its container, or the limit of the process
+    (`ulimit -v`); the least counts.
+    """
+    _, available = memory()
+    found = [] if available is None else [available + _numbers(MEMINFO).get("SwapFree", 0)]
+    if resource is not None:
+        limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+        pages = text_of(STATM).split()
+        if limit != resource.RLIM_INFINITY and pages:
+            found.append(max(limit - int(pages[0]) * resource.getpagesize(), 0))
+    return min(found, default=None)
+
+
+def resident() -> int:
+    """Return the bytes of memory that this process holds; 0 where that is unknown."""
+    pages = text_of(STATM).split()
+    return int(pages[1]) * resource.getpagesize() if len(pages) > 1 and resource else 0
+
+
+def ran_out(error: BaseException) -> bool:
+    """Return whether an error says that memory ran out: Python's, or the device's through JAX."""
+    if isinstance(error, MemoryError):
+        return True
+    return type(error).__name__ in _OF_JAX and any(said in str(error) for said in _SAID)
+
+
+def text_of(path: Path) -> str:
+    """Return the text of a file of the system, empty where it cannot be read."""
+    try:
+        return path.read_text().strip()
+    except (OSError, UnicodeDecodeError):
+        return ""
+
+
+def _cached_files() -> int:
+    rows = dict(line.split(" ", 1) for line in text_of(CGROUP / "memory.stat").splitlines())
+    found = rows.get("inactive_file", "")
+    return int(found) if found.isdigit() else 0
+
+
+def _numbers(path: Path) -> dict[str, int]:
+    """Return bytes by name of lines such as "MemTotal: 8000000 kB"."""
+    rows = (line.split() for line in text_of(path).splitlines())
+    return {row[0].rstrip(":"): int(row[1]) * 1024 for row in rows if len(row) == 3}
+
+
+def _system_memory() -> tuple[int | None, int | None]:
+    if sys.platform == "win32":
+        return _windows_memory()
+    found = _numbers(MEMINFO)
+    if "MemTotal" in found:
+        return found["MemTotal"], found.get("MemAvailable")
+    return _pages("SC_PHYS_PAGES"), _pages("SC_AVPHYS_PAGES")
+
+
+def _pages(name: str) -> int | None:
+    """Return bytes from a count of pages; macOS has the total only."""
+    try:
+        return os.sysconf(name) * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, ValueError, OSError):
+        return None
+
+
+class _Status(ctypes.Structure):
+    """MEMORYSTATUSEX."""
+
+    _fields_ = (
+        ("length", ctypes.c_uint32),
+        ("load", ctypes.c_uint32),
+        ("total", ctypes.c_uint64),
+        ("available", ctypes.c_uint64),
+        ("rest", ctypes.c_uint64 * 5),
+    )
+
+
+def _windows_memory() -> tuple[int | None, int | None]:
+    status = _Status(length=ctypes.sizeof(_Status))
+    kernel = getattr(getattr(ctypes, "windll", None), "kernel32", None)
+    if kernel is None or not kernel.GlobalMemoryStatusEx(ctypes.byref(status)):
+        return None, None
+    return status.total, status.available

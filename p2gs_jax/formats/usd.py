@@ -1,0 +1,146 @@
+"""OpenUSD: a ParticleField3DGaussianSplat and a camera for every photograph, through Pixar's pxr.
+
+The stage is right-handed with y up, in units of the scene, which it calls metres. Cameras look
+along their -z with y up, as USD's do; their lengths are in tenths of a scene unit, as USD has them.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.special import expit
+
+from p2gs_jax.core.atomic import atomic_write
+from p2gs_jax.errors import UserError
+from p2gs_jax.gaussians.half_turn import FLIP, half_turn
+from p2gs_jax.render.spherical_harmonics import degree_of
+from p2gs_jax.types import Gaussians
+
+# Of a 35 mm film, which focal lengths are usually told for.
+APERTURE_MM = 36.0
+TENTHS_PER_MM = 0.01
+MODULES = ("Gf", "Usd", "UsdGeom", "UsdVol", "Vt")
+SPLATS, CAMERAS = "/scene/splats", "/scene/cameras"
+
+
+@dataclass(frozen=True)
+class NamedCamera:
+    """A pinhole camera of a photograph.
+
+    Attributes:
+        name: of the photograph.
+        viewmat: world-to-camera, OpenCV axes.
+        K: pixels, centres at +0.5.
+        width: pixels.
+        height: pixels.
+    """
+
+    name: str
+    viewmat: Float[np.ndarray, "4 4"]
+    K: Float[np.ndarray, "3 3"]
+    width: int
+    height: int
+
+
+def require_pxr() -> tuple[Any, ...]:
+    """Return what writes USD: pxr's Gf, Usd, UsdGeom, UsdVol and Vt; they have no types.
+
+    Raises:
+        UserError: it is not installed, or knows no splats.
+    """
+    try:
+        found = [importlib.import_module(f"pxr.{name}") for name in MODULES]
+    except ImportError as error:
+        raise UserError(
+            f"--format usd needs OpenUSD, which cannot be imported ({error}).",
+            fix="pip install 'p2gs-jax[usd]', or export gltf",
+        ) from error
+    if not hasattr(found[3], "ParticleField3DGaussianSplat"):
+        raise UserError(
+            "this OpenUSD knows no Gaussian splats; 26.03 was the first that does.",
+            fix="pip install --upgrade 'usd-core>=26.3'",
+        )
+    return tuple(found)
+
+
+def write_usd(path: Path, gaussians: Gaussians, cameras: Sequence[NamedCamera] = ()) -> int:
+    """Write Gaussians with display colours, and cameras; return how many Gaussians.
+
+    Args:
+        path: `.usdc`, `.usda` or `.usd`.
+        gaussians: COLMAP's axes.
+        cameras: of the photographs.
+
+    Raises:
+        UserError: OpenUSD is not installed.
+    """
+    _, Usd, UsdGeom, UsdVol, Vt = require_pxr()
+    g = half_turn(gaussians)
+    with atomic_write(path) as temporary:
+        temporary.unlink()
+        stage = Usd.Stage.CreateNew(str(temporary))
+        UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+        stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/scene").GetPrim())
+        field = UsdVol.ParticleField3DGaussianSplat.Define(stage, SPLATS)
+        means = np.asarray(g.means, np.float32)
+        scales = np.exp(np.asarray(g.log_scales, np.float32))
+        quats = np.asarray(g.quats, np.float32)
+        quats = quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12)
+        sh = np.asarray(g.sh, np.float32)
+        values = {
+            "positions": Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(means)),
+            "scales": Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(scales)),
+            # Gf keeps the imaginary part first.
+            "orientations": Vt.QuatfArray.FromNumpy(
+                np.ascontiguousarray(np.roll(quats, -1, axis=1))
+            ),
+            "opacities": Vt.FloatArray.FromNumpy(
+                np.ascontiguousarray(expit(np.asarray(g.opacity_logits, np.float32)))
+            ),
+            "radiance:sphericalHarmonicsDegree": degree_of(sh.shape[1]),
+            "radiance:sphericalHarmonicsCoefficients": Vt.Vec3fArray.FromNumpy(
+                np.ascontiguousarray(sh.reshape(-1, 3))
+            ),
+            "extent": Vt.Vec3fArray.FromNumpy(_extent(means, scales)),
+        }
+        for name, value in values.items():
+            field.GetPrim().GetAttribute(name).Set(value)
+        for index, camera in enumerate(cameras):
+            _define_camera(stage, f"{CAMERAS}/view_{index:04d}", camera)
+        stage.GetRootLayer().Save()
+    return gaussians.capacity
+
+
+def _extent(means: np.ndarray, scales: np.ndarray) -> np.ndarray:
+    """Return the box about all Gaussians up to three standard deviations."""
+    if not len(means):
+        return np.zeros((2, 3), np.float32)
+    reach = 3 * scales.max(1, keepdims=True)
+    return np.stack([(means - reach).min(0), (means + reach).max(0)]).astype(np.float32)
+
+
+def _define_camera(stage: Any, path: str, camera: NamedCamera) -> None:
+    Gf, _, UsdGeom, *_ = require_pxr()
+    turn = np.diag([*FLIP, 1.0])
+    # Both worlds and both cameras differ by the same half turn.
+    pose = turn @ np.linalg.inv(np.asarray(camera.viewmat, np.float64)) @ turn
+    K, width, height = camera.K, camera.width, camera.height
+    aperture = APERTURE_MM * TENTHS_PER_MM
+    across = aperture / width
+    along = across * K[0, 0] / K[1, 1]
+    prim = UsdGeom.Camera.Define(stage, path)
+    # USD multiplies row vectors.
+    prim.AddTransformOp().Set(Gf.Matrix4d(pose.T.tolist()))
+    prim.CreateFocalLengthAttr(float(K[0, 0] * across))
+    prim.CreateHorizontalApertureAttr(aperture)
+    prim.CreateVerticalApertureAttr(float(height * along))
+    prim.CreateHorizontalApertureOffsetAttr(float((width / 2 - K[0, 2]) * across))
+    prim.CreateVerticalApertureOffsetAttr(float((K[1, 2] - height / 2) * along))
+    prim.GetPrim().SetMetadata("comment", camera.name)

@@ -1,0 +1,83 @@
+"""How much memory there is, and which errors say that it ran out."""
+
+import resource
+
+import pytest
+
+from p2gs_jax.core import memory
+
+
+@pytest.fixture
+def container(monkeypatch, tmp_path):
+    monkeypatch.setattr(memory, "CGROUP", tmp_path)
+    monkeypatch.setattr(memory, "MEMINFO", tmp_path / "meminfo")
+    monkeypatch.setattr(memory.sys, "platform", "linux")
+    lines = "MemTotal:  8000000 kB\nMemAvailable:  6000000 kB\nHugePages_Total:  0\n"
+    (tmp_path / "meminfo").write_text(lines)
+    return tmp_path
+
+
+def test_memory_of_the_system(container):
+    assert memory.memory() == (8_000_000 * 1024, 6_000_000 * 1024)
+
+
+def test_memory_of_a_container(container):
+    (container / "memory.max").write_text("1000000000\n")
+    (container / "memory.current").write_text("400000000\n")
+    assert memory.memory() == (1_000_000_000, 600_000_000)
+    (container / "memory.max").write_text("max\n")
+    assert memory.memory() == (8_000_000 * 1024, 6_000_000 * 1024)
+
+
+def test_memory_without_proc(container, monkeypatch):
+    (container / "meminfo").unlink()
+    monkeypatch.setattr(memory, "_pages", {"SC_PHYS_PAGES": 5}.get)
+    assert memory.memory() == (5, None)
+
+
+def test_windows_without_its_library(container, monkeypatch):
+    monkeypatch.setattr(memory.sys, "platform", "win32")
+    assert memory.memory() == (None, None)
+
+
+def test_files_that_a_container_caches_can_go(container):
+    (container / "memory.max").write_text("1000000000\n")
+    (container / "memory.current").write_text("900000000\n")
+    (container / "memory.stat").write_text("anon 300000000\ninactive_file 500000000\n")
+    assert memory.memory() == (1_000_000_000, 600_000_000)
+
+
+def test_what_is_left_is_the_least_of_machine_and_limit(container, monkeypatch):
+    monkeypatch.setattr(memory, "STATM", container / "statm")
+    swap = (container / "meminfo").read_text() + "SwapFree: 1000 kB\n"
+    (container / "meminfo").write_text(swap)
+    free = 6_001_000 * 1024
+    assert memory.left_to_process() == free
+    (container / "statm").write_text("500 200 5 1 0 9 0")
+    page = resource.getpagesize()
+    assert memory.resident() == 200 * page
+    for limit, left in (
+        (700 * page, 200 * page),
+        (400 * page, 0),
+        (free + 600 * page, free),
+        (resource.RLIM_INFINITY, free),
+    ):
+        monkeypatch.setattr(memory.resource, "getrlimit", lambda what, limit=limit: (limit, limit))
+        assert memory.left_to_process() == left
+
+
+def test_nothing_is_known_without_the_system(container, monkeypatch):
+    monkeypatch.setattr(memory, "STATM", container / "statm")
+    (container / "meminfo").unlink()
+    monkeypatch.setattr(memory, "_pages", lambda name: None)
+    assert (memory.left_to_process(), memory.resident()) == (None, 0)
+
+
+def test_errors_that_say_memory_ran_out():
+    class JaxRuntimeError(RuntimeError):
+        pass
+
+    assert memory.ran_out(MemoryError())
+    assert memory.ran_out(JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 8 bytes."))
+    assert not memory.ran_out(JaxRuntimeError("INTERNAL: no"))
+    assert not memory.ran_out(ValueError("RESOURCE_EXHAUSTED"))
