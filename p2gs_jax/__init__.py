@@ -12,6 +12,8 @@ from p2gs_jax.errors import DivergenceError, UserError
 
 if TYPE_CHECKING:
     from p2gs_jax import sweep
+    from p2gs_jax.core.devices import Devices
+    from p2gs_jax.districts.fit import fit_blocks
     from p2gs_jax.evaluate.alignment import exposure_error
     from p2gs_jax.paths.pinhole import make_camera
     from p2gs_jax.photometry.display import DisplayTransform, develop
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Camera",
+    "Devices",
     "DisplayTransform",
     "DivergenceError",
     "FitConfig",
@@ -45,6 +48,7 @@ __all__ = [
     "develop",
     "exposure_error",
     "fit",
+    "fit_blocks",
     "load_run",
     "make_camera",
     "preset",
@@ -57,6 +61,7 @@ __all__ = [
 
 
 _LAZY = {
+    "Devices": "p2gs_jax.core.devices",
     "DisplayTransform": "p2gs_jax.photometry.display",
     "Run": "p2gs_jax.run.read",
     "calibrate": "p2gs_jax.pipeline.calibrate",
@@ -66,6 +71,7 @@ _LAZY = {
     "develop": "p2gs_jax.photometry.display",
     "exposure_error": "p2gs_jax.evaluate.alignment",
     "fit": "p2gs_jax.pipeline.fit",
+    "fit_blocks": "p2gs_jax.districts.fit",
     "load_run": "p2gs_jax.run.read",
     "make_camera": "p2gs_jax.paths.pinhole",
     "render_linear": "p2gs_jax.render",

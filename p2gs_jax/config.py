@@ -50,6 +50,9 @@ SceneFormat = Literal[
     "kitti_360",
     "images",
 ]
+# How structure from motion finds poses, and which photographs it matches with which.
+Mapper = Literal["incremental", "global"]
+Matching = Literal["auto", "all", "sequence"]
 # What the alpha channel of photographs means.
 AlphaUse = Literal["background", "mask", "ignore"]
 # Per what it varies: one physical camera, or one photograph.
@@ -98,6 +101,12 @@ class DataConfig:
     """Take every n-th frame of a video; None takes sharp ones, each from a new place."""
     max_frames: int = 150
     """Most frames of a video that are used; more are thinned evenly."""
+    mapper: Mapper = "incremental"
+    """Structure from motion: COLMAP's incremental mapper, or its global one (GLOMAP), which is
+    faster for many photographs and needs more matches."""
+    matching: Matching = "auto"
+    """Which photographs are matched: all pairs, or neighbours in the order of their names
+    (`sequence`); `auto`: all pairs of up to 60, else neighbours, and for videos a sequence."""
     lidar: bool = True
     """Use the laser measurements of a drive: seeds, and depth to judge by. Without them seeds are
     triangulated from matches between the photographs."""

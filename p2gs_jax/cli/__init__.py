@@ -16,6 +16,8 @@ from p2gs_jax.errors import UserError
 # Silence the native libraries before they load.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 os.environ.setdefault("GLOG_minloglevel", "3")
+# Where Pillow refuses, too (scene/files.py): what a header says is not decoded to find out.
+os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2 * 89_478_485))
 
 # Set for one of several processes of a fit, by the parent that watches it: the descriptor of a pipe
 # that ends with that parent.
@@ -89,7 +91,9 @@ _CONTINUED = {
 
 
 def _complain(error: UserError) -> int:
-    print(f"p2gs-jax: error: {error}", file=sys.stderr)
+    from p2gs_jax.core.printable import printable
+
+    print(printable(f"p2gs-jax: error: {error}"), file=sys.stderr)
     return 2
 
 

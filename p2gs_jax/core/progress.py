@@ -12,6 +12,8 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from p2gs_jax.core.terminal import PlainConsole
+
 # Seconds between lines of progress where there is no terminal.
 EVERY_S = 15.0
 
@@ -80,7 +82,7 @@ class TerminalReporter:
     """
 
     def __init__(self, console: Console | None = None):
-        self.console = console or Console(file=sys.stderr, highlight=False)
+        self.console = console or PlainConsole(file=sys.stderr)
         self.live: Live | None = None
         self._said_at = time.monotonic()
 

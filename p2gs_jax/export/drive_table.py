@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,6 +18,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from p2gs_jax.core.atomic import write_json, write_text
+from p2gs_jax.core.json_text import parse_json
 from p2gs_jax.errors import UserError
 from p2gs_jax.run.photometry_file import PhotometryFile, ViewPhotometry
 from p2gs_jax.types import Scene, View
@@ -141,7 +141,7 @@ def read_drive_table(path: Path) -> dict[str, Any]:
         UserError: it cannot be read, or is of another version.
     """
     try:
-        table = json.loads(path.read_text(encoding="utf-8"))
+        table = parse_json(path.read_text(encoding="utf-8"))
         known = table["format"] == FORMAT and table["version"] == VERSION
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(f"{path} cannot be read: {error}.", fix="export it again") from None

@@ -94,8 +94,8 @@ class _Watched:
         except (Exception, asyncio.CancelledError) as error:
             state.status = "lost" if is_lost(error) else "failed"
             state.reason = f"{type(error).__name__}: {error}"
-        if state.status == "lost" and engine is None:
-            state.status = "stopped"
+        if engine is None:
+            state.status = "stopped" if state.status == "lost" else state.status
         elif state.status == "lost" and state.begun < MOST_BEGUN:
             state.status = "waiting"
             try:

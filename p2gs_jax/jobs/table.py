@@ -23,11 +23,12 @@ class JobsTable:
 
     Args:
         console: where.
+        live: a display that is there already, which then shows the table; None: it has its own.
     """
 
-    def __init__(self, console: Console):
+    def __init__(self, console: Console, live: Live | None = None):
         self.console = console
-        self._live: Live | None = None
+        self._live = live
         self._said_at = time.monotonic()
 
     def __enter__(self) -> JobsTable:

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from p2gs_jax.core.atomic import write_json
+from p2gs_jax.core.json_text import parse_json
 from p2gs_jax.errors import UserError
 from p2gs_jax.paths.geometry import inverse
 from p2gs_jax.paths.pinhole import LARGEST, as_matrix, checked_lens, orthonormal
@@ -40,7 +41,7 @@ def read_cameras(path: Path) -> list[Shot]:
         UserError: the file is missing or no path; the message names the entry and the field.
     """
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = parse_json(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise UserError(
             f"{path} cannot be read: {error.strerror or error}.",

@@ -108,7 +108,7 @@ def optimise(
     )
 
 
-def _begin(
+def begin_programs(
     programs: StepPrograms, known: Expected, scene: Scene, folder: RunFolder, mesh: Mesh | None
 ) -> None:
     """Begin to compile steps while the exposures are solved, mostly on one core."""
@@ -246,13 +246,13 @@ def _fit(
             cfg,
             reporter,
             clock,
-            lambda known: _begin(programs, known, scene, folder, mesh),
+            lambda known: begin_programs(programs, known, scene, folder, mesh),
             kept=kept_choice(cfg, folder) if resume else None,
             pixels=folder.pixels_of(jax.process_index()),
         )
         prepared = same_start(prepared)
         lock.require()
-        with _begun(folder, paths, cfg, prepared.decisions), memory_named():
+        with begun(folder, paths, cfg, prepared.decisions), memory_named():
             result = optimise(
                 prepared,
                 folder,
@@ -330,7 +330,7 @@ def _ours(run_dir: Path) -> Iterator[RunLock]:
 
 
 @contextlib.contextmanager
-def _begun(folder: RunFolder, paths: Paths, cfg: FitConfig, decisions: Decisions) -> Iterator[None]:
+def begun(folder: RunFolder, paths: Paths, cfg: FitConfig, decisions: Decisions) -> Iterator[None]:
     """Make the folder a run's while its steps are taken, and keep it where they left something.
 
     A run that failed before its first checkpoint leaves nothing to continue or to overwrite.

@@ -11,6 +11,7 @@ from p2gs_jax.config import FitConfig, PhotometryConfig
 from p2gs_jax.config import from_dict as config_from_dict
 from p2gs_jax.config import to_dict as config_to_dict
 from p2gs_jax.core.atomic import plain
+from p2gs_jax.core.json_text import parse_json
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.lpips import LpipsWeights
 from p2gs_jax.evaluate.lpips_weights import read_lpips_weights
@@ -187,7 +188,7 @@ def check_run_dir(run_dir: Path, resume: bool, cfg: FitConfig) -> None:
             fix="add --resume to continue it, or name another folder with --out",
         )
     try:
-        saved = plain(config_to_dict(config_from_dict(json.loads(path.read_text())["fit"])))
+        saved = plain(config_to_dict(config_from_dict(parse_json(path.read_text())["fit"])))
     except json.JSONDecodeError as error:
         raise UserError(
             f"{path} cannot be read ({error}).",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -49,6 +49,7 @@ from p2gs_jax.photometry.selection import Selection
 from p2gs_jax.photometry.sources import has_tracks, surface_colors
 from p2gs_jax.pipeline.decide import decide, likely, with_choice
 from p2gs_jax.pipeline.memory_needed import memory_needed, require_memory
+from p2gs_jax.pipeline.part import Part
 from p2gs_jax.pipeline.scale import near_depth, near_plane, scale_notes
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.scene import load_scene
@@ -89,7 +90,7 @@ class Prepared:
     selection: Selection | None
     pairs: ColorPairs | None
     overlaps: list[np.ndarray] | None
-    measured: list[Measured] | None
+    measured: Sequence[Measured] | None
     coverage: Coverage
     decisions: Decisions
     cfg: FitConfig
@@ -119,7 +120,7 @@ class Expected(NamedTuple):
     decisions: Decisions
     cfg: FitConfig
     images: bool
-    measured: list[Measured] | None
+    measured: Sequence[Measured] | None
 
 
 def load(scene_dir: Path, run_dir: Path, cfg: FitConfig, reporter: Reporter) -> Scene:
@@ -154,6 +155,7 @@ def prepare(
     *,
     kept: Decisions | None = None,
     pixels: Path | None = None,
+    part: Part | None = None,
 ) -> Prepared:
     """Start exposures, radiances and Gaussians from what the scene offers.
 
@@ -165,6 +167,7 @@ def prepare(
         on_expected: receives what can be told before the exposures are solved, where that is much.
         kept: what the checkpoints of a run that is resumed remember: its model and curve stay.
         pixels: folder for decoded photographs that are more than memory holds, or None.
+        part: what was solved for a whole of which `scene` is a part, or None.
 
     Raises:
         UserError: there is not the memory for it, nothing to see, or no room on the disk for
@@ -194,10 +197,13 @@ def prepare(
     depth = near_depth(scene.points, views)
     near = near_plane(depth, cfg)
     # Dense seeds cover some of what the points do not.
-    shell = None if dense else find_shell(views, scene.points, extent, init)
+    sphere = None if part is None else part.shell
+    shell = None if dense else find_shell(views, scene.points, extent, init, sphere)
 
     guess = likely(cfg, kept, matched=has_tracks(scene) or dense)
     guess = None if guess is None else dataclasses.replace(guess, near=near)
+    if part is not None:
+        guess = part.decisions
     expected: Expected | None = None
     if guess is not None:
         black = black_gaussians(scene.points[seeds.keep], shell, views, cfg)
@@ -213,7 +219,7 @@ def prepare(
             initial_appearance(views, cfg),
             _initial_poses(nodes, cfg),
         )
-        known = kept is not None or not cfg.photometry.select
+        known = kept is not None or part is not None or not cfg.photometry.select
         under = guess.resolve(cfg)
         expected = Expected(fitted, params, owner, extent, coverage, guess, under, known, measured)
         on_expected(expected)
@@ -228,13 +234,20 @@ def prepare(
         params = dataclasses.replace(expected.params, photometry=start)
         on_expected(expected._replace(params=params, decisions=told, cfg=under, images=True))
 
-    tracks, selection, notes = _solve(scene, still, cfg, reporter, chosen, dense=dense, kept=kept)
-    matched = tracks is not None and len(tracks.points) > 0
-    decisions = decide(cfg, selection, matched=matched, kept=kept)
-    decisions = dataclasses.replace(decisions, near=near)
+    if part is None:
+        tracks, selection, notes = solve(
+            scene, still, cfg, reporter, chosen, dense=dense, kept=kept
+        )
+        matched = tracks is not None and len(tracks.points) > 0
+        decisions = decide(cfg, selection, matched=matched, kept=kept)
+        decisions = dataclasses.replace(decisions, near=near)
+    else:
+        tracks, selection, notes, decisions = None, None, [], part.decisions
     resolved = decisions.resolve(cfg)
     solution = None if selection is None else selection.solution
     photometry = initial_photometry(solution, taken_by, resolved)
+    if part is not None:
+        photometry = jax.tree.map(on_device, part.photometry)
     return_freed_memory()
     solved = time.monotonic()
     clock.add("photometry", solved - begin)
@@ -245,7 +258,7 @@ def prepare(
             scene,
             still,
             rough_tones(tracks, len(views))
-            if solution is None
+            if solution is None and part is None
             else Tones.of(photometry, resolved.photometry),
             scene.points[seeds.keep],
             photometry,
@@ -254,11 +267,11 @@ def prepare(
             on_view=lambda i, n: reporter.stage("Matching photographs", i, n),
         )
         covering = np.concatenate([scene.points, added.points])
-        shell = find_shell(views, covering, extent, init)
+        shell = find_shell(views, covering, extent, init, sphere)
     if scene.point_colors is None:
         scene = with_colors(scene, photographed_radiance(scene, still, photometry, resolved))
-    radiance = point_radiance(scene, solution, resolved)[seeds.keep]
-    gaussians = gaussians_of(scene.points[seeds.keep], radiance, added, views, resolved)
+    radiance = point_radiance(scene, solution, resolved) if part is None else part.radiance
+    gaussians = gaussians_of(scene.points[seeds.keep], radiance[seeds.keep], added, views, resolved)
     if shell is not None:
         far = shell_gaussians(shell, scene, still, photometry, views, resolved)
         gaussians = merge(gaussians, far)
@@ -366,7 +379,7 @@ def _choose_points(scene: Scene, cfg: FitConfig) -> _Seeds:
     return _Seeds(keep, [said])
 
 
-def _solve(
+def solve(
     scene: Scene,
     store: ImageStore,
     cfg: FitConfig,
@@ -376,7 +389,17 @@ def _solve(
     dense: bool,
     kept: Decisions | None,
 ) -> tuple[Observations | None, Selection | None, list[str]]:
-    """Sample colours of shared points, and solve the photometry from them; both where possible."""
+    """Sample colours of shared points, and solve the photometry from them; both where possible.
+
+    Args:
+        scene: views, points, tracks.
+        store: photographs of what stands still and is opaque.
+        cfg: as asked.
+        reporter: receives progress.
+        on_chosen: receives the choice before it is solved.
+        dense: the fit wants observations even where it starts from no exposures.
+        kept: see `prepare`.
+    """
     from_tracks = cfg.photometry.start == "tracks"
     if not (has_tracks(scene) or from_tracks or dense):
         return None, None, []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 
 from p2gs_jax.config import FitConfig, from_dict
 from p2gs_jax.core.atomic import read_jsonl
+from p2gs_jax.core.json_text import parse_json
 from p2gs_jax.errors import UserError
 from p2gs_jax.run.old_metrics import as_today
 from p2gs_jax.run.photometry_file import PhotometryFile, ViewPhotometry, read_photometry
@@ -203,7 +203,7 @@ def find_held_out(folder: Path, names: list[str]) -> tuple[HeldOutFiles, ...]:
 def _read_object(path: Path, what: str, missing: list[str]) -> dict[str, Any]:
     """Return a JSON object; `missing` receives why there is none."""
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
+        value = parse_json(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         missing.append(f"{path.name} is missing: {what} cannot be shown. The run is not finished.")
         return {}

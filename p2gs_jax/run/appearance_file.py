@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 
 from p2gs_jax.config import Appearance
 from p2gs_jax.core.atomic import write_array, write_json
+from p2gs_jax.core.json_text import parse_json
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.appearance import Corrections, identity
@@ -49,9 +49,9 @@ def read_appearance(path: Path, kind: Appearance, views: Sequence[View]) -> Corr
     like = identity(kind, [view.camera for view in views])
     try:
         if isinstance(like, Ppisp):
-            return _read_ppisp(json.loads(path.read_text(encoding="utf-8")), like, views)
+            return _read_ppisp(parse_json(path.read_text(encoding="utf-8")), like, views)
         if isinstance(like, Luminance):
-            return _read_luminance(json.loads(path.read_text(encoding="utf-8")), like, views)
+            return _read_luminance(parse_json(path.read_text(encoding="utf-8")), like, views)
         corrections = np.load(path, allow_pickle=False)
     except (OSError, ValueError) as error:
         raise UserError(

@@ -9,7 +9,6 @@ checkpoints say.
 from __future__ import annotations
 
 import dataclasses
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -24,6 +23,7 @@ from p2gs_jax.config import (
     camera_formations,
 )
 from p2gs_jax.core.atomic import plain, write_json
+from p2gs_jax.core.json_text import parse_json
 from p2gs_jax.errors import UserError
 
 # Under this name in the metadata of checkpoints.
@@ -177,7 +177,7 @@ def read_decisions(path: Path) -> Decisions | None:
     if not path.exists():
         return None
     try:
-        return Decisions.from_dict(json.loads(path.read_text(encoding="utf-8")))
+        return Decisions.from_dict(parse_json(path.read_text(encoding="utf-8")))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(
             f"{path} cannot be read ({error}).",

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 
 from p2gs_jax.core.atomic import write_json
+from p2gs_jax.core.json_text import parse_json
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.metering import METERS, Metering, Rule
 
@@ -37,7 +37,7 @@ def read_metering(path: Path) -> Metering | None:
     if not path.is_file():
         return None
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = parse_json(path.read_text(encoding="utf-8"))
         readings = data["readings"]
         values = [[row[name] for name in METERS] for row in readings.values()]
         table = np.array(values, np.float64).reshape(-1, len(METERS))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NotRequired, TypedDict
@@ -12,6 +11,7 @@ from jaxtyping import Float
 
 from p2gs_jax.config import CameraFormation
 from p2gs_jax.core.atomic import write_json
+from p2gs_jax.core.json_text import parse_json
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.cameras import corner
@@ -239,7 +239,7 @@ def read_photometry(path: Path) -> PhotometryFile:
         UserError: it is no such file.
     """
     try:
-        data = json.loads(Path(path).read_text(encoding="utf-8"))
+        data = parse_json(Path(path).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise UserError(f"{path} cannot be read: {error}.", fix=AGAIN) from error
     if problem := _problem(data):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -14,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float32, Int
 
 from p2gs_jax.config import FitConfig, PhotometryConfig, from_dict
+from p2gs_jax.core.json_text import parse_json
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.ply import read_ply
@@ -379,7 +379,7 @@ def _photometry(
 def _read_config(path: Path) -> tuple[dict[str, Any], FitConfig]:
     """Return `config.json` and the configuration in it."""
     try:
-        saved = json.loads(path.read_text(encoding="utf-8"))
+        saved = parse_json(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise UserError(f"{path} cannot be read: {error}.", fix=CONFIG_AGAIN) from error
     if not isinstance(saved, dict) or not isinstance(saved.get("fit"), dict):

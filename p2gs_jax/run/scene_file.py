@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from p2gs_jax.core.atomic import atomic_write
+from p2gs_jax.core.json_text import parse_json
 from p2gs_jax.errors import UserError
 from p2gs_jax.types import Distortion, Lidar, Scene, TrackedObject, Tracks, View
 
@@ -103,7 +104,7 @@ def read_scene(folder: Path, root: Path) -> Scene | None:
     try:
         with np.load(path, allow_pickle=False) as file:
             a = dict(file)
-        said = json.loads(str(a["json"]))
+        said = parse_json(str(a["json"]))
         base = _base(root)
         own_cars = {c: a[f"own_car_{k}"] for k, c in enumerate(said.get("own_cars", ()))}
         views = tuple(
@@ -161,7 +162,7 @@ def read_times(folder: Path) -> dict[str, float]:
     """
     try:
         with np.load(folder / SCENE_FILE, allow_pickle=False) as file:
-            views = json.loads(str(file["json"]))["views"]
+            views = parse_json(str(file["json"]))["views"]
         return {v["name"]: float(v["time"]) for v in views if v.get("time") is not None}
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
         return {}

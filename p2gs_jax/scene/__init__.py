@@ -16,7 +16,7 @@ from p2gs_jax.scene.drives.assemble import assemble
 from p2gs_jax.scene.drives.kitti_odometry import is_kitti_odometry
 from p2gs_jax.scene.drives.recording import Recording
 from p2gs_jax.scene.exif import read_exif_ev
-from p2gs_jax.scene.files import list_images
+from p2gs_jax.scene.files import image_size, list_images
 from p2gs_jax.scene.images import ImageStore, camera_at, size_at
 from p2gs_jax.scene.llff import is_llff, load_llff
 from p2gs_jax.scene.masks import attach_masks
@@ -69,6 +69,8 @@ def load_scene(
 
         if isinstance(found, Video):
             photographs = read_video(found.path, cfg, work_dir, report)
+            if cfg.matching == "auto":
+                cfg = dataclasses.replace(cfg, matching="sequence")
         else:
             photographs = develop(*found, work_dir, report)
         folder, paths = photographs.folder, photographs.paths
@@ -177,6 +179,8 @@ def find_scene(
     for folder in folders:
         # Subfolders of the root itself may hold anything: masks, or the results of other runs.
         paths = list_images(folder, recursive=folder != root)
+        for path in paths:
+            image_size(path)
         if paths:
             return PhotographsAlone(folder, paths)
     looked = ", ".join(str(folder) for folder in folders)

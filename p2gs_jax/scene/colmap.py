@@ -21,7 +21,7 @@ from p2gs_jax.scene.colmap_model import (
     read_model,
     unsupported_camera,
 )
-from p2gs_jax.scene.files import check_missing, check_size
+from p2gs_jax.scene.files import check_missing, check_size, require_inside
 from p2gs_jax.scene.geometry import (
     intrinsics,
     make_distortion,
@@ -31,7 +31,8 @@ from p2gs_jax.scene.geometry import (
 from p2gs_jax.types import Distortion, Scene, Tracks, View
 
 _FIX = "export the model again from COLMAP"
-_HUGE = 1e30  # no finite number in float32 arithmetic from here on
+# No finite number in float32 arithmetic from here on.
+HUGE = 1e30
 
 
 def find_model(root: Path) -> Path | None:
@@ -56,6 +57,8 @@ def load_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
     _check_model(model)
     images = sorted(model.images, key=lambda image: image.name)
     image_folder = _image_folder(root, folder, cfg, images)
+    for image in images:
+        require_inside(PurePosixPath(image.name), image_folder, model.images_path)
     missing = [image.name for image in images if not (image_folder / image.name).is_file()]
     notes = check_missing(missing, len(images), model.images_path, cfg)
     skipped = set(missing)
@@ -124,7 +127,7 @@ def tracks_of(model: Model, views: Sequence[View]) -> Tracks | None:
             continue
         view, camera = views[row], model.cameras[image.camera_id]
         at = np.searchsorted(model.point_ids, image.point_ids).clip(max=len(model.point_ids) - 1)
-        known = (model.point_ids[at] == image.point_ids) & (np.abs(image.xy) < _HUGE).all(axis=1)
+        known = (model.point_ids[at] == image.point_ids) & (np.abs(image.xy) < HUGE).all(axis=1)
         scale = (view.width / camera.width, view.height / camera.height)
         xy = undistort_points(image.xy[known] * scale, view.K, view.distortion)
         # What a wide lens sees at its sides is in no pinhole picture.
@@ -172,7 +175,7 @@ def _check_model(model: Model) -> None:
                 f"{model.cameras_path} does not have",
                 fix=_FIX,
             )
-    bad = int((~(np.abs(model.xyz) < _HUGE).all(axis=1)).sum())
+    bad = int((~(np.abs(model.xyz) < HUGE).all(axis=1)).sum())
     if bad:
         raise UserError(
             f"{model.points_path}: {bad} of {len(model.xyz)} points are not finite", fix=_FIX
@@ -201,7 +204,7 @@ def _image_folder(root: Path, folder: Path, cfg: DataConfig, images: Sequence[Im
 
 
 def _viewmat(image: ImageRecord, path: Path) -> Float[np.ndarray, "4 4"]:
-    finite = (np.abs([*image.qvec, *image.tvec]) < _HUGE).all()
+    finite = (np.abs([*image.qvec, *image.tvec]) < HUGE).all()
     norm = np.linalg.norm(image.qvec) if finite else 0.0
     if norm < 1e-6:
         raise UserError(f"{path}: the pose of {image.name} is not finite", fix=_FIX)
@@ -232,7 +235,7 @@ def _lens(path: Path, camera: CameraRecord) -> tuple[Float[np.ndarray, "3 3"], D
             fx, fy, cx, cy, *lens = p[0], p[0], p[1], p[2], p[3], p[4], 0.0, 0.0
         case _:
             raise unsupported_camera(path, camera.model)
-    if not ((np.abs(p) < _HUGE).all() and fx > 0 and fy > 0 and camera.width and camera.height):
+    if not ((np.abs(p) < HUGE).all() and fx > 0 and fy > 0 and camera.width and camera.height):
         raise UserError(
             f"{path}: a {camera.model} camera of {camera.width}x{camera.height} pixels has "
             f"impossible parameters {p}",

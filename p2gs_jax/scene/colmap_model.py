@@ -22,6 +22,7 @@ from p2gs_jax.errors import UserError
 
 _STEMS = ("cameras", "images", "points3D")
 _FIX = "copy the model again from where it was made, or export it again from COLMAP"
+_LARGEST_ID = 2**63 - 1
 # (name, number of parameters) by COLMAP's model id.
 _MODELS = (
     ("SIMPLE_PINHOLE", 3),
@@ -259,6 +260,8 @@ def _text_points(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             if len(fields) < 8:
                 raise ValueError("a point line needs at least 8 fields")
             ids.append(int(fields[0]))
+            if abs(ids[-1]) > _LARGEST_ID:
+                raise ValueError(f"{ids[-1]} is no id of a point")
             xyz.append([float(value) for value in fields[1:4]])
             rgb.append([int(value) & 255 for value in fields[4:7]])
         except ValueError as error:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 from jaxtyping import Float
 
+from p2gs_jax.config import Matching
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.colmap import subfolder
 
@@ -17,7 +19,7 @@ MAX_IMAGE_SIZE = 1600
 MAX_FEATURES = 4096
 EXHAUSTIVE_LIMIT = 60
 """Up to this many images every pair is matched."""
-_OVERLAP = 10
+_OVERLAP, _LOOPS_EVERY = 10, 5
 # With known poses (nerf_fox, 50 views of 540x960, processor time): the nearest 20 give 574 pairs in
 # 71 s and 11,961 points, the nearest 10 292 pairs in 53 s and 12,017 points.
 _NEIGHBOURS = 10
@@ -38,6 +40,7 @@ def extract(
     *,
     mode: pycolmap.CameraMode,
     enlarge: bool = True,
+    camera: int | None = None,
 ) -> None:
     """Detect SIFT features on the CPU and store them.
 
@@ -47,6 +50,7 @@ def extract(
         names: images to read.
         mode: how the images share cameras.
         enlarge: look for features in images of twice the size as well.
+        camera: of the database, which took them; None: a new one, or more.
 
     Raises:
         UserError: COLMAP failed.
@@ -56,12 +60,16 @@ def extract(
     options.sift.max_num_features = MAX_FEATURES
     if not enlarge:
         options.sift.first_octave = 0
+    reader = pycolmap.ImageReaderOptions()
+    if camera is not None:
+        reader.existing_camera_id = camera
     try:
         pycolmap.extract_features(
             database,
             image_folder,
             image_names=list(names),
             camera_mode=mode,
+            reader_options=reader,
             extraction_options=options,
             device=pycolmap.Device.cpu,
         )
@@ -84,8 +92,7 @@ def match(database: Path, pairs: Iterable[Pair] | None) -> None:
         pycolmap.match_exhaustive(database, device=cpu)
         return
     pairs = list(pairs)
-    if any(" " in name for pair in pairs for name in pair):
-        # COLMAP separates the names in a pair list by blanks and has no way to quote them.
+    if not quotable([name for pair in pairs for name in pair]):
         pycolmap.match_sequential(database, device=cpu)
         return
     listing = database.with_name("pairs.txt")
@@ -95,14 +102,24 @@ def match(database: Path, pairs: Iterable[Pair] | None) -> None:
     pycolmap.match_image_pairs(database, pairing_options=options, device=cpu)
 
 
-def pairs_by_name(names: Sequence[str]) -> list[Pair] | None:
+def quotable(names: Iterable[str]) -> bool:
+    """Whether COLMAP can read these names in a list of pairs: blanks separate them there."""
+    return not any(" " in name for name in names)
+
+
+def pairs_by_name(names: Sequence[str], matching: Matching = "auto") -> list[Pair] | None:
     """Return the pairs to match by their names alone; None means all.
 
-    Long lists count as sequences, one a top folder: each image meets the next 10 and those 16, 32,
-    ... 512 later; images of different folders meet at the same place in the sequence and next to it
+    Sequences, one a top folder: each image meets the next 10 and those 16, 32, ... 512 later; where
+    a sequence is asked for, every fifth also meets every other fifth, for who comes back to a
+    place; images of different folders meet at the same place in the sequence and next to it
     (COLMAP's sequential matching would never match `left/` with `right/`).
+
+    Args:
+        names: of the images.
+        matching: `sequence`, `all`, or `auto`: long lists are sequences.
     """
-    if len(names) <= EXHAUSTIVE_LIMIT:
+    if matching == "all" or (matching == "auto" and len(names) <= EXHAUSTIVE_LIMIT):
         return None
     sequences: dict[str | None, list[str]] = defaultdict(list)
     for name in sorted(names):
@@ -111,7 +128,9 @@ def pairs_by_name(names: Sequence[str]) -> list[Pair] | None:
     pairs: list[Pair] = []
     lists = list(sequences.values())
     for i, a in enumerate(lists):
-        pairs += [(a[k], a[k + s]) for s in steps for k in range(len(a) - s)]
+        near = [(k, k + s) for s in steps for k in range(len(a) - s)]
+        far = combinations(range(0, len(a), _LOOPS_EVERY), 2) if matching == "sequence" else ()
+        pairs += [(a[k], a[m]) for k, m in dict.fromkeys([*near, *far])]
         for b in lists[i + 1 :]:
             pairs += [
                 (a[k], b[k + s]) for s in (-1, 0, 1) for k in range(len(a)) if 0 <= k + s < len(b)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import warnings
 from collections.abc import Sequence
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import cv2
 import numpy as np
@@ -19,6 +21,8 @@ IMAGE_SUFFIXES = DEVELOPED_SUFFIXES | {
     *(".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".ppm")
 }
 _ASPECT_TOLERANCE = 0.01
+# Where Pillow takes a picture for an attack.
+MOST_PIXELS = 2 * (Image.MAX_IMAGE_PIXELS or 2**26)
 
 
 def list_images(folder: Path, *, recursive: bool = True) -> list[Path]:
@@ -37,22 +41,74 @@ def list_images(folder: Path, *, recursive: bool = True) -> list[Path]:
     return [folder / p for p in sorted(visible, key=lambda p: p.as_posix())]
 
 
+def require_inside(name: PurePath, folder: Path, source: Path) -> None:
+    """Refuse a name in a file that leads out of the folder it is relative to.
+
+    Links below the folder are followed: whoever made it put them there.
+
+    Args:
+        name: as the file has it.
+        folder: that it is relative to.
+        source: the file.
+
+    Raises:
+        UserError: it leads out.
+    """
+    normal = os.path.normpath(name.as_posix())
+    if os.path.isabs(normal) or normal.split("/")[0] == "..":
+        raise UserError(
+            f"{source} names {name}, which lies outside of {folder}",
+            fix="move it there; or name the folder of all photographs with --images, and give "
+            "names relative to it",
+        )
+
+
 def image_size(path: Path) -> tuple[int, int]:
     """Return (width, height) as stored, before any EXIF rotation.
 
     Raises:
-        UserError: the file is no image, or a package that opens it is missing.
+        UserError: the file is no image, or one that is too large; its name is not UTF-8; or a
+            package that opens it is missing.
     """
-    if (size := size_of(path)) is not None:
-        return size
+    size = size_of(_named_in_utf8(path)) or _size_in_header(path)
+    if size[0] * size[1] > MOST_PIXELS:
+        raise _too_large(path)
+    return size
+
+
+def _size_in_header(path: Path) -> tuple[int, int]:
     try:
-        with Image.open(path) as image:
+        with warnings.catch_warnings(action="ignore"), Image.open(path) as image:
             return image.size
+    except Image.DecompressionBombError:
+        raise _too_large(path) from None
     except Exception:  # PIL's error types are not a closed set
-        pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        if pixels is None:
-            raise undecodable(path) from None
-        return pixels.shape[1], pixels.shape[0]
+        pass
+    if not path.is_file():
+        raise undecodable(path)
+    try:
+        pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        pixels = None
+    if pixels is None:
+        raise undecodable(path)
+    return pixels.shape[1], pixels.shape[0]
+
+
+def _too_large(path: Path) -> UserError:
+    return UserError(
+        f"{path} has more than {MOST_PIXELS / 1e6:.0f} million pixels",
+        fix="make the photographs smaller, or remove that one from the scene",
+    )
+
+
+def _named_in_utf8(path: Path) -> Path:
+    """Return the path; no other can be written into the files of a run."""
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        raise UserError(f"the name of {path} is not UTF-8", fix="rename it") from None
+    return path
 
 
 def decode_grey(data: bytes, shrink: int) -> UInt8[np.ndarray, "h w"] | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,6 +11,9 @@ from jaxtyping import Float32, UInt8
 from plyfile import PlyData, PlyParseError
 
 from p2gs_jax.errors import UserError
+
+_MOST_HEADER = 65536
+_MOST_DIGITS = 18
 
 
 class PointCloud(NamedTuple):
@@ -35,6 +39,7 @@ def read_points(path: Path) -> PointCloud:
             f"the seed points {path} do not exist",
             fix="put the file there, or take its name out of the .json: seeds are then found",
         )
+    _check_counts(path)
     try:
         vertex = PlyData.read(str(path))["vertex"].data
         names = vertex.dtype.names or ()
@@ -56,3 +61,20 @@ def read_points(path: Path) -> PointCloud:
         scale = 255.0 if colors.dtype.kind == "f" else 1.0
         colors = np.rint(np.nan_to_num(colors * scale).clip(0, 255)).astype(np.uint8)
     return PointCloud(points, colors)
+
+
+def _check_counts(path: Path) -> None:
+    """Refuse counts that a file of this size cannot hold: plyfile takes memory for them at once.
+
+    Raises:
+        UserError: there is such a count.
+    """
+    with path.open("rb") as file:
+        header = file.read(_MOST_HEADER).split(b"end_header")[0]
+    size = path.stat().st_size
+    for count in re.findall(rb"^\s*element\s+\S+\s+(\d+)", header, re.MULTILINE):
+        if len(count) > _MOST_DIGITS or int(count) > size:
+            raise UserError(
+                f"{path} announces {count[:_MOST_DIGITS].decode()} records and has {size} bytes.",
+                fix="write it again with the tool that made it",
+            )

@@ -22,6 +22,7 @@ from scipy.ndimage import map_coordinates
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
+from p2gs_jax.scene.colmap import HUGE
 from p2gs_jax.scene.files import check_missing, image_size, list_images
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.scene.split import split_scene
@@ -33,6 +34,10 @@ CALIBRATION, POSES, LIDAR_POSES, SCANS = "calib.txt", "poses.txt", "lidar_poses.
 MOST_POINTS = 200_000
 SMALLEST_VOXEL = 0.05
 VOXEL_GROWTH = 1.3
+_ROTATION_TOLERANCE = 0.01
+_SINGULAR = 1e-9
+# Cells of the smallest voxels up to here are numbered by 64 bits.
+_FARTHEST = 5e4
 
 
 def is_rig(root: Path) -> bool:
@@ -171,7 +176,7 @@ def _read_scans(scans: list[Path], lidar: Float64[np.ndarray, "t 4 4"]):
                 fix="name scans 000000.bin, 000001.bin, ... in the order of the poses",
             )
         values = np.fromfile(path, "<f4")
-        if values.size % 4 or not np.isfinite(values).all():
+        if values.size % 4 or not (np.abs(values) < _FARTHEST).all():
             raise UserError(
                 f"{path} is no LiDAR scan: float32 x y z reflectance, all finite",
                 fix="write the scan again",
@@ -229,16 +234,43 @@ def _read_calibration(path: Path) -> dict[str, Float64[np.ndarray, "3 4"]]:
             continue
         name, _, rest = line.partition(":")
         if name.strip().startswith(("P", "Tr")):
-            out[name.strip()] = _twelve(rest, path, number)
+            matrix = _twelve(rest, path, number)
+            if name.strip().startswith("Tr"):
+                _require_rotation(matrix, path, number)
+            elif not (matrix[0, 0] > 0 and matrix[1, 1] > 0 and abs(_det(matrix)) > _SINGULAR):
+                raise UserError(
+                    f"{path}, line {number}: no projection of a camera",
+                    fix="write 3x4 projections with positive focal lengths, as KITTI does",
+                )
+            out[name.strip()] = matrix
     return out
 
 
 def _read_poses(path: Path) -> Float64[np.ndarray, "t 4 4"]:
     lines = path.read_text(errors="replace").splitlines()
-    rows = [_square(_twelve(line, path, k)) for k, line in enumerate(lines, 1) if line.strip()]
+    rows = []
+    for number, line in enumerate(lines, 1):
+        if line.strip():
+            pose = _twelve(line, path, number)
+            _require_rotation(pose, path, number)
+            rows.append(_square(pose))
     if not rows:
         raise UserError(f"{path} holds no pose", fix="write one row of 12 numbers per frame")
     return np.stack(rows)
+
+
+def _det(matrix: Float64[np.ndarray, "3 4"]) -> float:
+    return float(np.linalg.det(matrix[:, :3]))
+
+
+def _require_rotation(matrix: Float64[np.ndarray, "3 4"], path: Path, number: int) -> None:
+    """Refuse a pose whose left part neither turns nor keeps lengths."""
+    lengths = np.linalg.svd(matrix[:, :3], compute_uv=False)
+    if np.abs(lengths - 1).max() > _ROTATION_TOLERANCE or _det(matrix) < 0:
+        raise UserError(
+            f"{path}, line {number}: no rotation and translation",
+            fix="write 3x4 poses row by row, as KITTI does",
+        )
 
 
 def _twelve(text: str, path: Path, number: int) -> Float64[np.ndarray, "3 4"]:
@@ -246,7 +278,7 @@ def _twelve(text: str, path: Path, number: int) -> Float64[np.ndarray, "3 4"]:
         values = np.array([float(word) for word in text.split()])
     except ValueError:
         values = np.array([np.nan])
-    if values.size != 12 or not np.isfinite(values).all():
+    if values.size != 12 or not (np.abs(values) < HUGE).all():
         raise UserError(
             f"{path}, line {number}: not 12 finite numbers",
             fix="write 3x4 matrices row by row, as KITTI does",

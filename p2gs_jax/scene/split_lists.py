@@ -18,6 +18,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from p2gs_jax.core.json_text import parse_json
 from p2gs_jax.errors import UserError
 from p2gs_jax.types import Scene, Tracks, View
 
@@ -52,7 +53,7 @@ def read_split(path: Path) -> SplitLists:
     if path.suffix.lower() != ".json":
         return SplitLists(path.name, test=_lines(path))
     try:
-        said = json.loads(_text(path))
+        said = parse_json(_text(path))
     except json.JSONDecodeError as error:
         raise UserError(
             f"{path} is not valid JSON: {error.msg} in line {error.lineno}, column {error.colno}",

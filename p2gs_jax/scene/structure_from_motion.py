@@ -3,22 +3,30 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import shutil
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import pycolmap
 
-from p2gs_jax.config import DataConfig
+from p2gs_jax.config import DataConfig, Mapper
+from p2gs_jax.core.atomic import write_json
+from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.cache import cached_folder, file_fingerprints
 from p2gs_jax.scene.colmap import load_colmap, subfolder
 from p2gs_jax.scene.exif import read_exif_camera
-from p2gs_jax.scene.features import extract, match, pairs_by_name, quiet_colmap
+from p2gs_jax.scene.features import pairs_by_name, quiet_colmap
 from p2gs_jax.scene.files import image_size
+from p2gs_jax.scene.kept_features import kept_features, match_kept
+from p2gs_jax.scene.pace import Pace
+from p2gs_jax.scene.unregistered import reasons, sentence
 from p2gs_jax.types import Scene
 
+KEPT, ACCOUNT = "features", "account.json"
 _ADVICE = (
     "photographs register when they are sharp, textured and overlap by more than half with at "
     "least two others, taken from different places"
@@ -33,7 +41,7 @@ def load_images(
     work_dir: Path | None,
     report: Callable[[str], None],
 ) -> Scene:
-    """Run COLMAP's incremental structure from motion on the CPU and read the largest model.
+    """Run COLMAP's structure from motion on the CPU and read the largest model.
 
     Args:
         root: the folder the user named.
@@ -41,11 +49,13 @@ def load_images(
         paths: the photographs, in it or in its subfolders.
         cfg: passed on to the COLMAP reader.
         work_dir: keeps the result under `sfm/`; it is reused while names, sizes and modification
-            times of the photographs stay the same.
+            times of the photographs stay the same. Features and matches stay under `features/`
+            and serve what is done again with more photographs or another mapper.
         report: receives progress.
 
     Raises:
-        UserError: fewer than two photographs, one of them is no image, or none registered.
+        UserError: fewer than two photographs, one of them is no image, none registered, or pycolmap
+            lacks the mapper.
     """
     names = [path.relative_to(image_folder).as_posix() for path in paths]
     if len(paths) < 2:
@@ -56,68 +66,129 @@ def load_images(
     groups: dict[tuple, list[str]] = defaultdict(list)
     for path, name in zip(paths, names, strict=True):
         groups[(image_size(path), read_exif_camera(path), subfolder(name))].append(name)
-    key = {"pycolmap": pycolmap.__version__, "files": file_fingerprints(paths)}
+    key: dict[str, Any] = {"pycolmap": pycolmap.__version__, "files": file_fingerprints(paths)}
+    if cfg.mapper != "incremental":
+        key["mapper"] = cfg.mapper
+    require_mapper(cfg.mapper)
 
     def build(folder: Path) -> None:
-        _build(folder, image_folder, groups, report)
+        kept = (folder if work_dir is None else work_dir) / KEPT
+        _build(folder, kept, image_folder, groups, cfg, report)
 
     with cached_folder(work_dir, "sfm", key, build) as folder:
         scene = load_colmap(
             root, folder / "model", dataclasses.replace(cfg, images=str(image_folder.resolve()))
         )
+        why = _said_of(folder / ACCOUNT)
     registered = {view.name for view in scene.views}
     left_out = [name for name in names if name not in registered]
     notes = list(scene.notes)
     if left_out:
+        told = {name: why.get(name, "no reason is known") for name in left_out}
         notes.append(
             f"{len(left_out)} of {len(names)} images could not be registered and are not used: "
-            f"{', '.join(left_out)}; {_ADVICE}"
+            f"{sentence(told)}; {_ADVICE}"
         )
     report(f"registered {len(registered)} of {len(names)} images, {len(scene.points)} points")
     return dataclasses.replace(scene, format="images", notes=tuple(notes))
 
 
+def require_mapper(mapper: Mapper) -> None:
+    """Refuse a mapper that this pycolmap does not have.
+
+    Raises:
+        UserError: it has no global one.
+    """
+    if mapper == "global" and not hasattr(pycolmap, "global_mapping"):
+        raise UserError(
+            f"pycolmap {pycolmap.__version__} has no global mapper.",
+            fix="pip install --upgrade pycolmap, or leave out --data.mapper global",
+        )
+
+
+def _said_of(path: Path) -> dict[str, str]:
+    """Return why photographs did not register; nothing in results of older versions."""
+    try:
+        return json.loads(path.read_text())["left_out"]
+    except (OSError, ValueError, KeyError):
+        return {}
+
+
 def _build(
     folder: Path,
+    kept: Path,
     image_folder: Path,
     groups: Mapping[tuple, Sequence[str]],
+    cfg: DataConfig,
     report: Callable[[str], None],
 ) -> None:
+    """Fill the folder with the largest model and an account; the features are kept beside it."""
     quiet_colmap()
     names = [name for group in groups.values() for name in group]
-    database = folder / "database.db"
-    done = 0
-    for group in groups.values():
-        report(f"detecting features: {done} of {len(names)} images")
-        extract(database, image_folder, group, mode=pycolmap.CameraMode.SINGLE)
-        done += len(group)
-    pairs = pairs_by_name(names)
-    n = len(names) * (len(names) - 1) // 2 if pairs is None else len(pairs)
-    report(f"matching {n} image pairs")
-    match(database, pairs)
+    watch = Stopwatch()
+    with watch("features"):
+        database = kept_features(kept, image_folder, groups, report)
+    with watch("matching"):
+        pairs = match_kept(database, names, pairs_by_name(names, cfg.matching), report)
+    models_folder = folder / "models"
+    models_folder.mkdir()
+    with watch("mapping"):
+        run = _map_globally if cfg.mapper == "global" else _map
+        found = run(database, image_folder, models_folder, len(names), report)
+        models = sorted(found, key=lambda m: (m.num_reg_images(), m.num_points3D()), reverse=True)
+    why = reasons(database, names, models)
+    if not models:
+        raise UserError(
+            f"none of the {len(names)} images in {image_folder} could be registered: "
+            f"{sentence(why)}",
+            fix=_ADVICE,
+        )
+    (folder / "model").mkdir()
+    models[0].write(folder / "model")
+    spent = ", ".join(f"{stage} {seconds:.0f}" for stage, seconds in watch.seconds.items())
+    report(f"structure from motion of {len(names)} images and {pairs} pairs, seconds: {spent}")
+    write_json(
+        folder / ACCOUNT,
+        {"images": len(names), "pairs": pairs, "seconds": watch.seconds, "left_out": why},
+    )
+    shutil.rmtree(models_folder)
 
-    registered = 2
+
+def _map(
+    database: Path, image_folder: Path, output: Path, count: int, report: Callable[[str], None]
+) -> list[pycolmap.Reconstruction]:
+    registered, pace = 2, Pace(report, "mapping", count, "images")
 
     def on_next_image() -> None:
         nonlocal registered
         registered += 1
-        if registered % 5 == 0:
-            report(f"mapping: {registered} of {len(names)} images")
+        pace(registered)
 
-    report("mapping: looking for the first pair")
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = 0
-    output = folder / "models"
-    output.mkdir()
     models = pycolmap.incremental_mapping(
         database, image_folder, output, options=options, next_image_callback=on_next_image
     )
-    if not models:
+    return list(models.values())
+
+
+def _map_globally(
+    database: Path, image_folder: Path, output: Path, count: int, report: Callable[[str], None]
+) -> list[pycolmap.Reconstruction]:
+    """Map all photographs at once; focal lengths, which this does not find, come first."""
+    report(f"mapping {count} images at once")
+    # What it changes stays out of the matches that are kept.
+    own = output / database.name
+    shutil.copyfile(database, own)
+    calibration = pycolmap.ViewGraphCalibrationOptions()
+    calibration.random_seed = 0
+    options = pycolmap.GlobalPipelineOptions()
+    options.random_seed = 0
+    try:
+        pycolmap.calibrate_view_graph(own, calibration)
+        models = pycolmap.global_mapping(own, image_folder, output, options=options)
+    except (RuntimeError, ValueError) as error:
         raise UserError(
-            f"none of the {len(names)} images in {image_folder} could be registered", fix=_ADVICE
-        )
-    largest = max(models.values(), key=lambda m: (m.num_reg_images(), m.num_points3D()))
-    (folder / "model").mkdir()
-    largest.write(folder / "model")
-    database.unlink()  # large, and not needed again
-    shutil.rmtree(output)
+            f"the global mapper failed: {error}.", fix="leave out --data.mapper global"
+        ) from error
+    return list(models.values())

@@ -20,9 +20,16 @@ import numpy as np
 from jaxtyping import Float
 
 from p2gs_jax.config import DataConfig
+from p2gs_jax.core.json_text import parse_json
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene.colmap import subfolder
-from p2gs_jax.scene.files import IMAGE_SUFFIXES, check_missing, check_size, image_size
+from p2gs_jax.scene.colmap import HUGE, subfolder
+from p2gs_jax.scene.files import (
+    IMAGE_SUFFIXES,
+    check_missing,
+    check_size,
+    image_size,
+    require_inside,
+)
 from p2gs_jax.scene.geometry import intrinsics, make_distortion, scale_intrinsics
 from p2gs_jax.scene.point_cloud import read_points
 from p2gs_jax.scene.split_lists import lists_in, split_as_listed
@@ -73,7 +80,7 @@ def load_transforms(root: Path, json_path: Path, cfg: DataConfig) -> Scene:
     scene = _assembled(root, "transforms", _frames(json_path, data), cfg)
     points = data.get("ply_file_path")
     if isinstance(points, str) and points:
-        scene = replace(scene, **read_points(json_path.parent / points)._asdict())
+        scene = replace(scene, **read_points(_beside(json_path, points))._asdict())
     lists = lists_in(json_path, data, _LISTS)
     if lists is None or cfg.split is not None or not cfg.test_every:
         return scene
@@ -116,6 +123,9 @@ def _assembled(root: Path, name: str, frames: Sequence[_Frame], cfg: DataConfig)
                 f"the image folder {image_folder} does not exist",
                 fix="correct the option --images",
             )
+    for frame in frames:
+        relative = frame.path if cfg.images is None else frame.path.relative_to(common)
+        require_inside(relative, folder if cfg.images is None else image_folder, frame.source)
     found: list[tuple[str, _Frame]] = []
     notes: list[str] = []
     for source in dict.fromkeys(frame.source for frame in frames):
@@ -183,7 +193,7 @@ def _require_one_shape(views: Sequence[View], frames: Mapping[str, _Frame]) -> N
 
 def _parse(path: Path) -> dict:
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = parse_json(path.read_text(encoding="utf-8"))
     except json.JSONDecodeError as error:
         raise UserError(
             f"{path} is not valid JSON: {error.msg} in line {error.lineno}, column {error.colno}",
@@ -204,11 +214,23 @@ def _frames(path: Path, data: dict, split: Split = "train") -> list[_Frame]:
         name = values.get("file_path") if isinstance(values, dict) else None
         if not isinstance(name, str) or not name:
             raise UserError(f'{path}: frame {i} has no "file_path"', fix=_FIX)
-        normal = os.path.normpath(name.replace("\\", "/"))
-        if os.path.isabs(normal):
-            normal = os.path.relpath(normal, path.parent.resolve())
-        frames.append(_Frame(Path(normal), {**data, **values}, path, split))
+        frames.append(_Frame(_relative(path, name), {**data, **values}, path, split))
     return frames
+
+
+def _relative(source: Path, name: str) -> Path:
+    """Return a path in a file as one from its folder."""
+    normal = os.path.normpath(name.replace("\\", "/"))
+    if os.path.isabs(normal):
+        normal = os.path.relpath(normal, source.parent.resolve())
+    return Path(normal)
+
+
+def _beside(source: Path, name: str) -> Path:
+    """Return the path of something else that a file names; it lies in its folder."""
+    relative = _relative(source, name)
+    require_inside(relative, source.parent, source)
+    return source.parent / relative
 
 
 def _with_suffix(folder: Path, relative: Path) -> str | None:
@@ -237,7 +259,9 @@ def _view(frame: _Frame, image_folder: Path, name: str) -> tuple[View, bool]:
     K, distortion = _lens(path, values, name, width, height)
     w, h, sx, sy, differs = check_size(image_path, width, height, path)
     mask = values.get("mask_path")
-    mask_path = path.parent / mask if isinstance(mask, str) and mask else None
+    mask_path = None
+    if isinstance(mask, str) and mask:
+        mask_path = _beside(path, mask)
     if mask_path is not None and not mask_path.is_file():
         raise UserError(f"{path}: the mask {mask_path} of {name} does not exist", fix=_FIX)
     view = View(
@@ -269,11 +293,7 @@ def _lens(
 
     def number(key: str, default: float) -> float:
         value = values.get(key, default)
-        if (
-            isinstance(value, bool)
-            or not isinstance(value, int | float)
-            or not math.isfinite(value)
-        ):
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < HUGE:
             raise UserError(f"{path}: {key} of {name} is {value!r}, not a number", fix=_FIX)
         return float(value)
 
@@ -315,7 +335,7 @@ def _viewmat(path: Path, matrix: object, name: str) -> Float[np.ndarray, "4 4"]:
         c2w = np.array(matrix, np.float64)[:3]
     except (TypeError, ValueError, IndexError):
         c2w = np.zeros(0)
-    if c2w.shape != (3, 4) or not np.isfinite(c2w).all():
+    if c2w.shape != (3, 4) or not (np.abs(c2w) < HUGE).all():
         raise UserError(f"{path}: the transform_matrix of {name} is no finite 4x4 matrix", fix=_FIX)
     rotation = c2w[:, :3] * np.array([1.0, -1.0, -1.0])
     u, s, vt = np.linalg.svd(rotation)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from p2gs_jax.core.clock import whole_run
+from p2gs_jax.core.json_text import parse_json
 from p2gs_jax.evaluate.alignment import exposure_error
 from p2gs_jax.run.old_metrics import as_today
 from p2gs_jax.synth.exposures import read_true_exposures
@@ -44,7 +44,7 @@ def read_row(run: Path, scene: Path) -> dict[str, Any]:
         run: its folder.
         scene: where `truth/exposures.csv` may lie.
     """
-    metrics = as_today(json.loads((run / "metrics.json").read_text(encoding="utf-8")))
+    metrics = as_today(parse_json((run / "metrics.json").read_text(encoding="utf-8")))
     row: dict[str, Any] = {}
     for name, path, _ in COLUMNS:
         value = metrics
@@ -62,7 +62,7 @@ def _exposures(run: Path, scene: Path) -> dict[str, float]:
     truth = read_true_exposures(scene)
     if not truth:
         return {}
-    views = json.loads((run / "photometry.json").read_text(encoding="utf-8"))["views"]
+    views = parse_json((run / "photometry.json").read_text(encoding="utf-8"))["views"]
     pairs = [(v["exposure"], truth[v["image"]]) for v in views if v["exposure"] is not None]
     if len(pairs) < 2:
         return {}

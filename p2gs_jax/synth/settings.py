@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 Curve = Literal["srgb", "power", "filmic"]
-Layout = Literal["street", "town"]
+Layout = Literal["street", "town", "long"]
 
 
 @dataclass(frozen=True)

@@ -117,7 +117,8 @@ def write_street(
         points: seed points to sample; those seen once are dropped.
         hold_out: no points are sampled in every n-th frame, as they may be held out; 0: in all.
         sensor: what the cameras do to the light.
-        layout: `town` adds an underpass and draws the sun's place from the seed.
+        layout: `town` adds an underpass and draws the sun's place from the seed; `long` is as many
+            streets one behind another as the drive is long.
         lidar: write KITTI's files with a scan for every frame.
         report: receives a line of progress now and then.
 
@@ -128,7 +129,7 @@ def write_street(
     sensor = sensor or Sensor(iso_std=iso_std)
     _check(out, frames, width, height, sensor.iso_std, supersample)
     say = report or (lambda line: None)
-    town = build_town(seed, layout)
+    town = build_town(seed, layout, frames * step)
     names = tuple(f"{camera}/{f:06d}.png" for camera in sorted(MOUNTS) for f in range(frames))
     cameras = tuple(name.split("/")[0] for name in names)
     frame = np.tile(np.arange(frames), len(MOUNTS))

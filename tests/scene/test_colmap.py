@@ -139,6 +139,7 @@ def test_tiny_model_and_names_with_blanks(tmp_path):
         ({"n": 0}, "images.txt holds no registered images"),
         ({"pose": "1 0 0 0 nan 0 0"}, "images.txt: the pose of im 0.png is not finite"),
         ({"pose": "0 0 0 0 0 0 0"}, "images.txt: the pose of im 0.png is not finite"),
+        ({"points": f"{10**30} 0 0 4 1 2 3 0.5 1 0\n"}, "points3D.txt is malformed in line 1"),
         ({"points": "7 nan 0 4 1 2 3 0.5 1 0\n"}, "points3D.txt: 1 of 1 points are not finite"),
         (
             {"cameras": "1 FOV 40 30 50 50 20 15 0.1\n"},

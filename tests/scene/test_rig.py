@@ -130,6 +130,22 @@ def test_a_view_may_see_more_points_than_an_image_is_wide(tmp_path):
     np.testing.assert_allclose(colors[:, 0].astype(float), u.ravel() - 0.5, atol=1)
 
 
+@pytest.mark.parametrize(
+    ("file", "line", "message"),
+    [
+        ("poses.txt", "1 0 0 0 0 1 0 0 0 0 0 0", "poses.txt, line 1: no rotation"),
+        ("poses.txt", "2 0 0 0 0 2 0 0 0 0 2 0", "poses.txt, line 1: no rotation"),
+        ("poses.txt", "1 0 0 1e308 0 1 0 0 0 0 1 0", "poses.txt, line 1: not 12 finite numbers"),
+        ("calib.txt", "P0: 0 0 5 0 0 9 5 0 0 0 1 0", "calib.txt, line 1: no projection"),
+    ],
+)
+def test_matrices_that_have_no_inverse_are_named(copy, file, line, message):
+    rest = (copy / file).read_text().splitlines()[1:]
+    (copy / file).write_text("\n".join([line, *rest]) + "\n")
+    with pytest.raises(UserError, match=message):
+        load_rig(copy, DataConfig())
+
+
 def test_what_is_wrong_is_named(copy):
     calibration = (copy / "calib.txt").read_text()
     (copy / "calib.txt").write_text(calibration.replace("P1:", "Q1:"))

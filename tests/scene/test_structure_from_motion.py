@@ -1,3 +1,4 @@
+import dataclasses
 import shutil
 
 import numpy as np
@@ -26,7 +27,7 @@ def test_bare_folder_with_a_stranger_and_its_cache(shared_data, tmp_path):
     assert np.median(reprojection_errors(scene)) < 1.0
     assert len(scene.points) > 300
     note = next(note for note in scene.notes if "could not be registered" in note)
-    assert "stranger.jpg" in note
+    assert "stranger.jpg (looks like no other photograph)" in note
     assert "overlap" in note
     assert any("detecting" in line for line in said)
 
@@ -35,6 +36,15 @@ def test_bare_folder_with_a_stranger_and_its_cache(shared_data, tmp_path):
     assert not any("detecting" in line for line in said)
     assert np.array_equal(again.points, scene.points)
     assert again.notes == scene.notes
+
+    # Another mapper takes the features and matches that are there.
+    said.clear()
+    globally = dataclasses.replace(CFG, mapper="global")
+    other = load_scene(folder, globally, tmp_path / "work", said.append)
+    assert {v.name for v in other.views} == {v.name for v in scene.views}
+    assert np.median(reprojection_errors(other)) < 1.0
+    assert any("features of 10 images are kept" in line for line in said)
+    assert not any("detecting" in line for line in said)
 
 
 def test_cut_photograph_is_left_out_and_named(shared_data, tmp_path):
@@ -52,7 +62,7 @@ def test_nothing_registers(tmp_path):
 
     for i in range(3):
         Image.new("RGB", (64, 48), (i * 40, 0, 0)).save(tmp_path / f"{i}.png")
-    with pytest.raises(UserError, match="none of the 3 images") as info:
+    with pytest.raises(UserError, match=r"none of the 3 images.*no features") as info:
         load_scene(tmp_path, CFG)
     assert "overlap" in info.value.fix
 
@@ -101,6 +111,17 @@ def test_pairs_of_long_sequences():
     assert ("left/003.png", "right/003.png") in pairs
     assert ("left/003.png", "right/004.png") in pairs
     assert pairs_by_name(left) is None
+    assert pairs_by_name(left * 2, "all") is None
+
+
+def test_a_sequence_meets_its_neighbours_and_itself_later():
+    names = [f"{i:04d}.png" for i in range(40)]
+    pairs = pairs_by_name(names, "sequence")
+    assert len(pairs) == len(set(pairs))
+    assert ("0000.png", "0010.png") in pairs
+    assert ("0000.png", "0035.png") in pairs, "who comes back after a round is found"
+    assert ("0001.png", "0036.png") not in pairs
+    assert len(pairs) < 40 * 39 / 2
 
 
 def test_pairs_by_pose_prefer_neighbours_that_look_the_same_way():

@@ -113,6 +113,7 @@ SINGULAR = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1]]
         ),
         ({"frames": frames("images/a.png", "./images/a.png")}, "a.png more than once"),
         ({"frames": frames("images/a.png", mask_path="m.png")}, "mask .*m.png of a.png"),
+        ({"fl_x": 1e300}, "fl_x of a.png is 1e[+]300, not a number"),
         ({"fl_x": None}, "fl_x of a.png is None"),
         ({"fl_x": 0}, "no focal length for a.png"),
         ({"w": "wide"}, "impossible size"),
@@ -128,6 +129,24 @@ def test_broken_files(tmp_path, change, message):
     with pytest.raises(UserError, match=message) as info:
         read(path)
     assert "transforms.json" in str(info.value)
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"frames": ' + "1" * 10_000 + "}"])
+def test_what_python_will_not_parse_is_no_json(tmp_path, text):
+    path = write(tmp_path, {"frames": []})
+    path.write_text(text)
+    with pytest.raises(UserError, match=r"transforms.json is not valid JSON"):
+        read(path)
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
+def test_a_count_of_points_beyond_the_file_costs_no_memory(tmp_path, kind):
+    data = {"fl_x": 50, "frames": frames("images/a.png"), "ply_file_path": "points.ply"}
+    axes = "".join(f"property float {axis}\n" for axis in "xyz")
+    header = f"ply\nformat {kind} 1.0\nelement vertex 99999999999\n{axes}end_header\n0 0 1\n"
+    (tmp_path / "points.ply").write_text(header)
+    with pytest.raises(UserError, match=r"points.ply announces 99999999999 records"):
+        read(write(tmp_path, data))
 
 
 def test_nan_pose(tmp_path):

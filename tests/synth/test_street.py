@@ -14,9 +14,10 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.core.srgb import srgb_decode, srgb_encode
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.colmap import load_colmap
-from p2gs_jax.synth.build_town import build_town
+from p2gs_jax.synth.build_town import STREET_M, build_town
 from p2gs_jax.synth.rig import MOUNTS, camera_viewmat, carla_rotation, image_height, intrinsics
 from p2gs_jax.synth.sensor import draw_iso, photograph
+from p2gs_jax.synth.town import Material
 from p2gs_jax.synth.write import read_truth, write_street
 
 SIZE = {"frames": 3, "width": 192, "height": 128, "points": 4000, "seed": 3}
@@ -189,3 +190,16 @@ def test_card_and_refusals(street, tmp_path):
     with pytest.raises(UserError, match="cannot render"):
         write_street(tmp_path / "x", frames=0)
     assert not (tmp_path / "x").exists()
+
+
+def test_a_long_town_goes_on_as_far_as_the_drive():
+    short, long = build_town(3, "long", 50.0), build_town(3, "long", 300.0)
+    houses = np.asarray(long.material) == Material.FACADE
+    reached = np.sort(long.lo[houses, 0])
+    assert reached[-1] > 300
+    # No hole but the side streets.
+    assert np.diff(reached).max() < 25
+    assert short.size < long.size / 2
+    # No two streets are alike.
+    first = long.color[houses & (long.lo[:, 0] < STREET_M - 22)]
+    assert not np.array_equal(first, long.color[houses][len(first) : 2 * len(first)])

@@ -110,8 +110,8 @@ def first_moments(state):
     return state.opt_state.gaussians[0].mu, state.opt_state.rest[0].mu[0].raw_exposures
 
 
-def on_mesh(shard: str, count: int, batch: int, room=ROOM, steps: int = 2) -> dict:
-    """Losses, moments after the first step and parameters after the last."""
+def on_mesh(shard: str, count: int, batch: int) -> dict:
+    """Losses of two steps, moments after the first and parameters after the second."""
     cfg = config(batch)
     optimizer = make_optimizer(cfg)
     mesh = Devices(count, shard).mesh()
@@ -119,10 +119,10 @@ def on_mesh(shard: str, count: int, batch: int, room=ROOM, steps: int = 2) -> di
     slots = spread.padded(COUNT + 2)
     state = spread.spread(initial_state(start(), alive(), optimizer, slots))
     inputs = (*map(stacked, zip(*map(view, range(batch)), strict=True)), CONTROLS)
-    lowered = {n: step.lowered(n, state, *inputs, room=room, degree=DEGREE) for n in PARTS}
+    lowered = {n: step.lowered(n, state, *inputs, room=ROOM, degree=DEGREE) for n in PARTS}
     run = step.chained(*(lowered[name].compile() for name in PARTS))
     losses, first = [], None
-    for _ in range(steps):
+    for _ in range(2):
         state, report = run(state, *inputs)
         losses.append(float(report.loss))
         first = first or jax.tree.map(np.asarray, first_moments(spread.whole(state)))
@@ -131,6 +131,31 @@ def on_mesh(shard: str, count: int, batch: int, room=ROOM, steps: int = 2) -> di
     fault = {name: int(getattr(state.fault, name)) for name in ("kind", "needed", "visible")}
     taken = int(state.step)
     return {"losses": losses, "moments": first, "params": params, "fault": fault, "step": taken}
+
+
+def refused_then_taken() -> dict:
+    """A step without room, and the same with room after the fault: what it did, and its loss."""
+    optimizer, mesh = make_optimizer(config(4)), Devices(4, "2x2").mesh()
+    step, spread = MeshStep(config(4), optimizer, EXTENT, mesh), OnMesh(mesh)
+    before = initial_state(start(), alive(), optimizer, spread.padded(COUNT + 2))
+    state = spread.spread(before)
+    inputs = (*map(stacked, zip(*map(view, range(4)), strict=True)), CONTROLS)
+
+    def taken(state, room):
+        lowered = [step.lowered(n, state, *inputs, room=room, degree=DEGREE) for n in PARTS]
+        return step.chained(*(part.compile() for part in lowered))(state, *inputs)
+
+    state, _ = taken(state, Room(64, 4096))
+    fault = {name: int(getattr(state.fault, name)) for name in ("kind", "needed", "visible")}
+    moved = distance(spread.whole(state).params.gaussians, before.params.gaussians)
+    stopped = int(state.step)
+    state, report = taken(spread.healed(state), ROOM)
+    return {
+        "fault": fault,
+        "moved": moved,
+        "steps": [stopped, int(state.step)],
+        "loss": float(report.loss),
+    }
 
 
 def distance(tree, other) -> float:
@@ -212,9 +237,7 @@ def main() -> None:
             "step": made["step"],
             "fault": made["fault"],
         }
-    tight = on_mesh("2x2", 4, 4, Room(64, 4096), steps=1)
-    kept = distance(tight["params"].gaussians, start().gaussians)
-    found["tight"] = {"fault": tight["fault"], "step": tight["step"], "moved": kept}
+    found["tight"] = refused_then_taken()
     with tempfile.TemporaryDirectory() as folder:
         found["fit"] = fitted(Path(folder))
     json.dump(found, sys.stdout)

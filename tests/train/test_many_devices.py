@@ -55,12 +55,13 @@ def test_a_step_counts_as_many_as_it_takes_views(found, mesh):
     assert found[mesh]["step"] == 8
 
 
-def test_a_view_that_finds_no_room_stops_all_devices_and_is_told(found):
+def test_a_view_that_finds_no_room_stops_all_devices_until_there_is_some(found):
     tight = found["tight"]
     assert tight["fault"]["kind"] == FAULT_OVERFLOW
     assert tight["fault"]["needed"] > 64
-    assert tight["step"] == 0
     assert tight["moved"] == 0
+    assert tight["steps"] == [0, 4]
+    assert tight["loss"] == pytest.approx(found["one view"]["loss"], rel=1e-6)
 
 
 def test_a_fit_goes_on_on_another_number_of_devices(found):

@@ -13,6 +13,7 @@ from tiny_scene import make_scene
 
 from p2gs_jax.cli.supervise import where
 from p2gs_jax.core import processes
+from p2gs_jax.run.checkpoint import saved_steps
 
 ENOUGH_S = 240
 OPTIONS = (
@@ -145,6 +146,21 @@ def test_a_run_of_two_is_finished_by_the_first(tmp_path):
     metrics = json.loads((run / "metrics.json").read_text())
     assert metrics["counts"]["steps"] == 40
     assert (run / "radiance.ply").stat().st_size > 0
+
+
+@pytest.mark.slow
+def test_a_signal_at_one_stops_both_after_a_checkpoint(tmp_path):
+    scene, run = make_scene(tmp_path / "scene"), tmp_path / "run"
+    ranks = begin_two(scene, run)
+    try:
+        wait_for_lines(run, 3, ranks)
+        ranks[1].terminate()
+        said = [rank.communicate(timeout=ENOUGH_S)[1] for rank in ranks]
+    finally:
+        kill(*ranks)
+    assert [rank.returncode for rank in ranks] == [128 + signal.SIGTERM] * 2, said
+    assert max(saved_steps(run / "checkpoints")) == log_of(run)[-1]["step"]
+    assert "--resume continues" in said[0]
 
 
 @pytest.mark.parametrize(

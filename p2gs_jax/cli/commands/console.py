@@ -7,6 +7,8 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from p2gs_jax.core.terminal import PlainConsole
+
 # Parts of a fit, as metrics.json has them under "seconds", and what they are called in print.
 PARTS = {
     "starting": "starting",
@@ -26,7 +28,7 @@ PARTS = {
 
 def stdout() -> Console:
     """Return where results go; progress and messages go to stderr."""
-    return Console(highlight=False)
+    return PlainConsole()
 
 
 def print_metrics(metrics: dict, out: Path) -> None:

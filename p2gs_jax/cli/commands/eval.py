@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +10,7 @@ from p2gs_jax.cli.commands import against
 from p2gs_jax.cli.commands.console import print_metrics
 from p2gs_jax.cli.options.results import Eval
 from p2gs_jax.core.atomic import write_json
+from p2gs_jax.core.json_text import parse_json
 from p2gs_jax.core.progress import TerminalReporter
 from p2gs_jax.evaluate.against import Judge
 from p2gs_jax.evaluate.evaluate import evaluate
@@ -70,7 +70,7 @@ def run(options: Eval) -> int:
 def _kept_metrics(path: Path) -> dict:
     """Return the metrics that only a fit can measure: counts, times, notes."""
     try:
-        old = json.loads(path.read_text())
+        old = parse_json(path.read_text())
     except (OSError, ValueError):
         return {}
     kept = ("counts", "seconds", "seconds_per_step", "notes", "photometry")

@@ -58,7 +58,8 @@ class Synth:
     width: int = 480
     """Image width, pixels (paper: 1920); the height follows as 1300 / 1920 of it."""
     layout: Layout = "town"
-    """town: with an underpass and a sun of its own for every seed; street: the demo's."""
+    """town: with an underpass and a sun of its own for every seed; street: the demo's; long:
+    streets one behind another, as long as the drive."""
     supersample: int = 2
     """Samples a pixel along each axis."""
     points: int = 60_000

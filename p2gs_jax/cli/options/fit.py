@@ -88,6 +88,14 @@ class Fit:
     """Treat known exposures as uncertain by this many stops instead of keeping them."""
     reference: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Photographs of the same views under one common exposure, for evaluation."""
+    blocks: Annotated[str | None, tyro.conf.arg(metavar="N|auto")] = None
+    """Cut the scene into N blocks that are fitted apart and merged; auto: into as few as memory
+    allows (docs/districts.md). Default: one fit."""
+    jobs: int = 1
+    """Blocks at a time on this machine."""
+    engine: Annotated[str, tyro.conf.arg(metavar="NAME")] = "local"
+    """Where blocks are fitted: local, dask://HOST:PORT, or slurm:OPTION=VALUE,...
+    (docs/sweeps.md)."""
     lpips_weights: Weights = None
     """Evaluate with LPIPS too: alex or vgg (pip install 'p2gs-jax[lpips]'), or a .npz of
     weights."""
@@ -157,6 +165,35 @@ class Calibrate:
     """Most frames of a video that are used; default: 150."""
     preset: Preset = "robust"
     """Where all values start; see `fit`."""
+
+
+def resolve_blocks(args: Fit) -> int | str | None:
+    """Return how many blocks are asked for: a number, `auto`, or None for one fit.
+
+    Raises:
+        UserError: it is neither, or options of blocks are given without them.
+    """
+    words = args.blocks
+    if words is None:
+        check(
+            args.jobs == 1 and args.engine == "local",
+            "--jobs and --engine are of blocks",
+            fix="add --blocks auto, or a number",
+        )
+        return None
+    check(args.jobs >= 1, "--jobs must be at least 1")
+    alone = (args.devices, args.coordinator, args.processes, args.process)
+    check(
+        alone == ("1", None, None, None),
+        "--blocks fits every block on one device, in one process",
+        fix="leave out --devices and --coordinator; blocks have --jobs and --engine",
+    )
+    check(
+        words == "auto" or (words.isdigit() and int(words) >= 1),
+        f"--blocks {words!r} is no number of blocks",
+        fix="write a whole number from 1 on, or auto",
+    )
+    return words if words == "auto" else int(words)
 
 
 def resolve_calibration(args: Calibrate) -> configs.FitConfig:

@@ -55,6 +55,38 @@ class Shell:
         )
 
 
+@dataclass(frozen=True)
+class Sphere:
+    """Where a shell lies.
+
+    Attributes:
+        middle: scene units.
+        radius: scene units.
+    """
+
+    middle: Float[np.ndarray, " 3"]
+    radius: float
+
+
+def sphere_behind(
+    views: list[View], points: Float[np.ndarray, "p 3"], extent: float, cfg: InitConfig
+) -> Sphere:
+    """Return where the shell of a scene lies: behind its seeds.
+
+    Args:
+        views: training views.
+        points: seed points.
+        extent: scene extent, scene units.
+        cfg: radius.
+    """
+    middle = camera_centers(views).mean(0)
+    radius = cfg.shell_radius * extent
+    if len(points):
+        far = float(np.quantile(np.linalg.norm(points - middle, axis=1), 0.98))
+        radius = max(min(radius, 10 * far), BEHIND_SEEDS * far)
+    return Sphere(middle, radius)
+
+
 def _project(view: View, points: Float[np.ndarray, "p 3"]):
     """Return pixel positions [p 2] and which points are in front and inside the image."""
     xy, z = project_points(points.astype(np.float64), view)
@@ -78,7 +110,11 @@ def covered_cells(view: View, points: Float[np.ndarray, "p 3"]) -> Bool[np.ndarr
 
 
 def find_shell(
-    views: list[View], points: Float[np.ndarray, "p 3"], extent: float, cfg: InitConfig
+    views: list[View],
+    points: Float[np.ndarray, "p 3"],
+    extent: float,
+    cfg: InitConfig,
+    sphere: Sphere | None = None,
 ) -> Shell | None:
     """Return the shell a scene needs, or None.
 
@@ -87,14 +123,12 @@ def find_shell(
         points: seed points.
         extent: scene extent, scene units.
         cfg: number of directions, radius, and whether there is a shell.
+        sphere: where it lies; None: behind the points.
     """
     if cfg.shell == "off":
         return None
-    middle = camera_centers(views).mean(0)
-    radius = cfg.shell_radius * extent
-    if len(points):
-        far = float(np.quantile(np.linalg.norm(points - middle, axis=1), 0.98))
-        radius = max(min(radius, 10 * far), BEHIND_SEEDS * far)
+    sphere = sphere or sphere_behind(views, points, extent, cfg)
+    middle, radius = sphere.middle, sphere.radius
     directions = fibonacci_sphere(cfg.shell_count)
     candidates = middle + radius * directions
     covered = [covered_cells(v, points) for v in views]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from p2gs_jax.core.json_text import parse_json
 from p2gs_jax.errors import UserError
 
 
@@ -20,7 +20,7 @@ def read_json(path: Path) -> Any:
         UserError: it is missing or broken.
     """
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return parse_json(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise missing_file(path) from None
     except (ValueError, RecursionError) as error:

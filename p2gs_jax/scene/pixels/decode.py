@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float32, UInt
 from PIL import Image
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene.files import undecodable
+from p2gs_jax.scene.files import image_size, undecodable
 from p2gs_jax.scene.geometry import undistortion_maps
 from p2gs_jax.scene.photographs.profiles import applied
 from p2gs_jax.types import View
@@ -62,8 +62,20 @@ def decode(view: View, sizes: Sequence[tuple[int, int]]) -> list[Decoded]:
         sizes: width and height in pixels of each.
 
     Raises:
-        UserError: the file or its mask is missing, broken or of another size than the model's.
+        UserError: the file or its mask is missing, broken or of another size than the model's; or
+            there is too little memory for it.
     """
+    try:
+        return _decoded(view, sizes)
+    except (MemoryError, cv2.error) as error:
+        raise UserError(
+            f"{view.image_path}: {view.width}x{view.height} pixels need more memory than there is "
+            f"({error})",
+            fix="make the photographs smaller",
+        ) from None
+
+
+def _decoded(view: View, sizes: Sequence[tuple[int, int]]) -> list[Decoded]:
     pixels, opacity = _decode(view.image_path)
     if pixels.shape[:2] != (view.height, view.width):
         raise UserError(
@@ -161,17 +173,17 @@ def _decode(path: Path) -> tuple[np.ndarray, UInt[np.ndarray, "h w"] | None]:
 def _decode_mask(view: View) -> Bool[np.ndarray, "h w"]:
     """Return where the mask is not zero, at the view's size."""
     assert view.mask_path is not None
-    raw = _read_raster(view.mask_path)
-    # A mask may carry an opaque alpha channel beside its values.
-    colours = raw if raw.ndim == 2 else raw[..., : 3 if raw.shape[2] >= 3 else 1].max(axis=2)
-    mask = colours > 0
-    h, w = mask.shape
+    w, h = image_size(view.mask_path)
     if abs(w / h / (view.width / view.height) - 1.0) > 0.01:
         raise UserError(
             f"wrong size: the mask {view.mask_path} is {w}x{h}, its photograph "
             f"{view.width}x{view.height}",
             fix="make the mask at the size of the photograph",
         )
+    raw = _read_raster(view.mask_path)
+    # A mask may carry an opaque alpha channel beside its values.
+    colours = raw if raw.ndim == 2 else raw[..., : 3 if raw.shape[2] >= 3 else 1].max(axis=2)
+    mask = colours > 0
     if (w, h) == (view.width, view.height):
         return mask
     how = cv2.INTER_AREA if w > view.width else cv2.INTER_LINEAR

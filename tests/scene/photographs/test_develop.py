@@ -12,7 +12,7 @@ import numpy as np
 import OpenEXR
 import pillow_heif
 import pytest
-from PIL import Image
+from PIL import Image, features
 from scene.photographs.made import DISPLAY_P3, patches, settings, write_dng
 
 from p2gs_jax.core.srgb import srgb_decode, srgb_encode
@@ -208,6 +208,28 @@ def test_broken_heic(folder: Path) -> None:
     data = (folder / "a.heic").read_bytes()
     (folder / "a.heic").write_bytes(data[: len(data) - 60])
     with pytest.raises(UserError, match=r"a\.heic cannot be decoded"):
+        developed(folder)
+
+
+# --------------------------------------------------------------------- AVIF
+
+
+@pytest.mark.skipif(not features.check("avif"), reason="this Pillow knows no AVIF")
+def test_avif_keeps_its_values_profile_and_settings(folder: Path) -> None:
+    pixels = (40 + 150 * patches()).astype(np.uint8)
+    how = {"quality": 100, "subsampling": "4:4:4", "exif": settings().tobytes()}
+    Image.fromarray(pixels).save(folder / "a.avif", icc_profile=DISPLAY_P3, **how)
+    assert image_size(folder / "a.avif") == (96, 64)
+    result = developed(folder)
+    assert result.known is None
+    path = result.paths[0]
+    stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert np.abs(stored[..., ::-1].astype(int) - pixels).max() <= 4
+    with Image.open(path) as image:
+        assert image.info["icc_profile"] == DISPLAY_P3
+    assert read_exif_ev(path) == pytest.approx(np.log2(200 / 60 / 2.8**2), abs=1e-3)
+    (folder / "a.avif").write_bytes((folder / "a.avif").read_bytes()[:300])
+    with pytest.raises(UserError, match=r"a\.avif cannot be decoded"):
         developed(folder)
 
 

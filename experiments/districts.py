@@ -1,0 +1,202 @@
+"""A town in blocks against the same town in one fit: held-out views, seams, peak memory.
+
+python experiments/districts.py [--quick | --middle] [--out DIR] [--dask]
+
+Streets one behind another, photographed by three cameras: 300 photographs each over 600 m (quick:
+30 over 120 m), in four blocks (quick: two), one after another. Every fit has a process of its own,
+so that its peak memory is its own. With --dask the blocks are fitted once more by two workers of a
+scheduler on loopback, one of which is killed while it fits. Finished runs are kept.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import dataclasses
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from towns import table
+
+from p2gs_jax import write_street
+from p2gs_jax.synth.rig import image_height
+from p2gs_jax.synth.sensor import Sensor
+
+PEAK = re.compile(r"VmHWM:\s+(\d+)")
+
+
+@dataclasses.dataclass(frozen=True)
+class Size:
+    """How large everything is.
+
+    Attributes:
+        frames: of each of three cameras.
+        step_m: between them.
+        width: of the photographs, pixels.
+        points: sampled for the model.
+        steps: of one fit; blocks take their shares.
+        blocks: how many.
+    """
+
+    frames: int
+    step_m: float
+    width: int
+    points: int
+    steps: int
+    blocks: int
+
+    @property
+    def name(self) -> str:
+        """Folder of its data and runs."""
+        return f"{3 * self.frames}x{self.width}_{self.steps}"
+
+
+FULL = Size(300, 2.0, 480, 200_000, 12_000, 4)
+MIDDLE = Size(80, 4.0, 160, 40_000, 2400, 4)
+QUICK = Size(30, 4.0, 96, 8000, 600, 2)
+
+
+def main() -> None:
+    """Make the town, fit it both ways, print the comparison."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("runs/districts"))
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--middle", action="store_true")
+    parser.add_argument("--dask", action="store_true", help="once more by Dask, a worker killed")
+    args = parser.parse_args()
+    size = QUICK if args.quick else MIDDLE if args.middle else FULL
+    folder = args.out / size.name
+    town = folder / "town"
+    if not town.exists():
+        write_street(
+            town,
+            frames=size.frames,
+            step=size.step_m,
+            width=size.width,
+            height=image_height(size.width),
+            points=size.points,
+            supersample=1,
+            sensor=Sensor(iso_std=2.0),
+            layout="long",
+            report=lambda line: print(line, flush=True),
+        )
+    one = fitted(town, folder / "one", size, [])
+    blocks = fitted(town, folder / "blocks", size, ["--blocks", str(size.blocks)])
+    rows = [row("one fit", one), row(f"{size.blocks} blocks", blocks)]
+    found = [blocks]
+    if args.dask:
+        with cluster(folder) as (address, workers):
+            words = ["--blocks", str(size.blocks), "--engine", f"dask://{address}"]
+            killer = threading.Thread(target=kill_one, args=(folder / "dask", workers), daemon=True)
+            killer.start()
+            found.append(fitted(town, folder / "dask", size, words))
+        rows.append(row(f"{size.blocks} blocks, Dask, a worker killed", found[-1]))
+    print(table(HEADER, rows))
+    for run in found:
+        print(seams(run))
+
+
+HEADER = (
+    *("run", "held-out dB", "training dB", "Gaussians", "peak memory of a fit, GB"),
+    *("of merging and judging, GB", "seconds"),
+)
+
+
+def fitted(town: Path, run: Path, size: Size, words: list[str]) -> dict[str, Any]:
+    """Return what `metrics.json` says of a run, with the peak memory of its process; it is kept."""
+    said = run / "metrics.json"
+    kept = run / "peak.json"
+    if not kept.exists():
+        command = [sys.executable, "-m", "p2gs_jax.cli", "fit", str(town), "--out", str(run)]
+        command += ["--steps", str(size.steps), *words]
+        command += ["--resume"] if (run / "config.json").exists() else []
+        begin = time.monotonic()
+        peak = watched(command)
+        seconds = time.monotonic() - begin
+        kept.write_text(json.dumps({"peak_bytes": peak, "wall_s": seconds}))
+    return json.loads(said.read_text()) | json.loads(kept.read_text())
+
+
+def watched(command: list[str]) -> int:
+    """Run a command; return the most memory that it held, without that of its children.
+
+    Raises:
+        CalledProcessError: it failed.
+    """
+    process, peak = subprocess.Popen(command), 0
+    while process.poll() is None:
+        with contextlib.suppress(OSError):
+            found = PEAK.search(Path(f"/proc/{process.pid}/status").read_text())
+            peak = max(peak, int(found.group(1)) * 1024 if found else 0)
+        time.sleep(0.2)
+    if process.returncode:
+        raise subprocess.CalledProcessError(process.returncode, command)
+    return peak
+
+
+def row(name: str, run: dict[str, Any]) -> list[str]:
+    """Return the cells of a run."""
+    blocks = run.get("districts", {}).get("blocks")
+    fit = run["peak_bytes"] if blocks is None else max(b["peak_bytes"] for b in blocks)
+    return [
+        name,
+        f"{run['test']['exposure_fitted']['psnr']:.2f}",
+        f"{run['train']['psnr']:.2f}",
+        str(run["counts"]["gaussians"]),
+        f"{fit / 1e9:.2f}",
+        "" if blocks is None else f"{run['peak_bytes'] / 1e9:.2f}",
+        f"{run['wall_s']:.0f}",
+    ]
+
+
+def seams(run: dict[str, Any]) -> str:
+    """Return the table of seams of a run in blocks."""
+    rows = []
+    for seam in run["districts"]["seams"]:
+        values = [seam[k] for k in ("step_stops", "spread_stops", "step_depth", "spread_depth")]
+        cells = ["n/a" if v is None else f"{v:.4f}" for v in values]
+        rows.append([" and ".join(map(str, seam["blocks"])), str(seam["pixels"]), *cells])
+    header = ("seam", "pixels", "step, stops", "spread, stops", "step of depth", "spread of depth")
+    return table(header, rows)
+
+
+@contextlib.contextmanager
+def cluster(folder: Path) -> Iterator[tuple[str, list[subprocess.Popen]]]:
+    """Yield the address of a scheduler on loopback and its two workers."""
+    said = (folder / "scheduler.json").absolute()
+    said.unlink(missing_ok=True)
+    here = ["--scheduler-file", str(said), "--no-dashboard", "--host", "127.0.0.1"]
+    python = [sys.executable, "-m"]
+    begun = [subprocess.Popen([*python, "distributed.cli.dask_scheduler", "--port", "0", *here])]
+    try:
+        worker = [*python, "distributed.cli.dask_worker", "--no-nanny", "--nthreads", "1", *here]
+        begun += [subprocess.Popen(worker, cwd=folder) for _ in range(2)]
+        while not said.exists() or not said.read_text():
+            time.sleep(0.2)
+        time.sleep(5)
+        yield json.loads(said.read_text())["address"].removeprefix("tcp://"), begun[1:]
+    finally:
+        for process in begun:
+            process.kill()
+            process.wait()
+
+
+def kill_one(run: Path, workers: list[subprocess.Popen]) -> None:
+    """Kill the first worker (SIGKILL) once a block has left a checkpoint."""
+    while not any(p.name.isdigit() for p in run.glob("blocks/*/checkpoints/*")):
+        time.sleep(0.5)
+    print(f"killing worker {workers[0].pid}", flush=True)
+    os.kill(workers[0].pid, signal.SIGKILL)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,89 @@
+"""What trials do with a scene: read all of it, or fit it for a few steps."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+from reliability.trials import NONSENSE, REFUSED
+
+# Everything that reading needs, so that a forked child imports nothing.
+import p2gs_jax.cli.commands.scene
+import p2gs_jax.cli.parser
+import p2gs_jax.scene.structure_from_motion
+import p2gs_jax.scene.triangulate  # noqa: F401
+from p2gs_jax.cli import main
+from p2gs_jax.config import DataConfig
+from p2gs_jax.core.printable import printable
+from p2gs_jax.errors import UserError
+from p2gs_jax.scene import find_scene, with_what_lies_beside
+from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.types import Scene
+
+FIT = (
+    *("--steps", "4", "--densify.max-gaussians", "200", "--render.sh-degree", "0"),
+    *("--init.shell", "off", "--init.max-seeds", "100", "--max-width", "48"),
+)
+
+
+def command(*words: object) -> int:
+    """Run the command line; return its code."""
+    try:
+        main([str(word) for word in words])
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else 1
+    return 0
+
+
+def read(root: Path) -> int:
+    """Survey a scene on the command line, then read it as a fit does and decode every photograph.
+
+    Nothing is triangulated: what is read of scenes without points is poses and photographs.
+    """
+    code = command("scene", root)
+    if code:
+        return code
+    try:
+        return _whole(root)
+    except UserError as error:
+        print(printable(f"p2gs-jax: error: {error}"), file=sys.stderr)
+        return REFUSED
+
+
+def _whole(root: Path) -> int:
+    cfg = DataConfig()
+    found = find_scene(root, cfg)
+    if not isinstance(found, Scene):
+        return 0
+    scene = with_what_lies_beside(found, cfg)
+    store = ImageStore(scene.views, cfg)
+    for row in range(len(scene.views)):
+        pixels, mask = store.get(row)
+        if not (_finite(pixels, mask) and pixels.min() >= 0 and pixels.max() <= 1):
+            return _nonsense(f"pixels of {scene.views[row].name}")
+    store.close()
+    cameras = [a for view in scene.views for a in (view.viewmat, view.K)]
+    tracks = () if scene.tracks is None else (scene.tracks.xy,)
+    if not _finite(scene.points, *cameras, *tracks):
+        return _nonsense("cameras or points")
+    return 0
+
+
+def _finite(*arrays: np.ndarray) -> bool:
+    return all(bool(np.isfinite(array).all()) for array in arrays)
+
+
+def _nonsense(what: str) -> int:
+    print(f"not finite, or out of range: {what}", file=sys.stderr)
+    return NONSENSE
+
+
+def fit(root: Path) -> int:
+    """Fit a scene for a few steps, into a folder that is removed again."""
+    run = root.parent / "run"
+    try:
+        return command("fit", root, "--out", run, *FIT)
+    finally:
+        shutil.rmtree(run, ignore_errors=True)

@@ -1,0 +1,164 @@
+"""The fit of one block, as a job: exposures given, everything of the block and around it fitted."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import shutil
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from p2gs_jax.config import FitConfig, from_dict, to_dict
+from p2gs_jax.core.atomic import write_json
+from p2gs_jax.core.clock import Stopwatch
+from p2gs_jax.core.compile_cache import use_compile_cache
+from p2gs_jax.core.memory import text_of
+from p2gs_jax.core.progress import Reporter, Silent
+from p2gs_jax.core.runtime import tune_process
+from p2gs_jax.districts.cut import Cut
+from p2gs_jax.districts.part_of import BlockScene, block_scene
+from p2gs_jax.districts.shared import read_shared
+from p2gs_jax.formats.ply import write_radiance
+from p2gs_jax.jobs import Job
+from p2gs_jax.pipeline.devices import mesh_of
+from p2gs_jax.pipeline.fit import begin_programs, begun, compact, optimise
+from p2gs_jax.pipeline.preflight import Paths
+from p2gs_jax.pipeline.prepare import load, prepare
+from p2gs_jax.run.layout import RunFolder
+from p2gs_jax.run.lock import locked
+from p2gs_jax.train.programs import StepPrograms
+from p2gs_jax.train.validation import pick_validation
+
+STATUS = Path("/proc/self/status")
+
+
+def block_job(scene: Path, run: Path, folder: Path, cut: Cut, number: int, cfg: FitConfig) -> Job:
+    """Return the job of a block.
+
+    Args:
+        scene: what is fitted.
+        run: run folder of the whole; its cache is read.
+        folder: of the blocks, with what they share.
+        cut: of the scene.
+        number: of the block.
+        cfg: of the whole.
+    """
+    said = {
+        "scene": str(scene.absolute()),
+        "run": str(run.absolute()),
+        "shared": str(folder.absolute()),
+        "cut": cut.to_dict(),
+        "number": number,
+        "fit": to_dict(cfg),
+    }
+    return Job(f"block {number}", folder / str(number), fit_block, said)
+
+
+def block_config(cfg: FitConfig, cut: Cut, number: int, *, train_views: int) -> FitConfig:
+    """Return the options of a block: its share of the steps and of the Gaussians.
+
+    Args:
+        cfg: of the whole.
+        cut: of the scene.
+        number: of the block.
+        train_views: of the whole.
+    """
+    share = len(cut.blocks[number].views) / train_views
+    train, densify = cfg.train, cfg.densify
+    steps = max(1, round(share * train.steps))
+    budget = None
+    if train.budget_s is not None:
+        budget = train.budget_s * share / sum(len(b.views) / train_views for b in cut.blocks)
+    most = densify.max_gaussians
+    if isinstance(most, int):
+        most = max(1, round(share * most))
+    return dataclasses.replace(
+        cfg,
+        train=dataclasses.replace(train, steps=steps, budget_s=budget),
+        densify=dataclasses.replace(densify, max_gaussians=most),
+    )
+
+
+def fit_block(folder: Path, arguments: dict[str, Any], reporter: Reporter) -> None:
+    """Fit a block, or go on with it; leaves `radiance.ply` and `metrics.json`.
+
+    Args:
+        folder: of the block's run.
+        arguments: of a `block_job`.
+        reporter: receives progress.
+
+    Raises:
+        UserError: the scene cannot be read, or memory is short.
+    """
+    use_compile_cache()
+    tune_process()
+    begin = time.monotonic()
+    whole, cut = from_dict(arguments["fit"]), Cut.from_dict(arguments["cut"])
+    reporter.stage("Reading the scene")
+    scene = load(Path(arguments["scene"]), Path(arguments["run"]), whole, Silent())
+    shared, scene = read_shared(Path(arguments["shared"]), scene, whole)
+    number = arguments["number"]
+    cfg = block_config(whole, cut, number, train_views=len(scene.train_indices))
+    block = block_scene(scene, shared, cut, number)
+    del scene, shared
+    folder.mkdir(parents=True, exist_ok=True)
+    with locked(folder):
+        counts, seconds = _fit(RunFolder(folder), block, cfg, reporter, arguments["scene"])
+    seconds["total"] = time.monotonic() - begin
+    metrics = {"counts": counts, "seconds": seconds, "peak_bytes": peak_bytes()}
+    write_json(RunFolder(folder).metrics, metrics)
+
+
+def _fit(
+    folder: RunFolder, block: BlockScene, cfg: FitConfig, reporter: Reporter, scene: str
+) -> tuple[dict[str, int], dict[str, float]]:
+    """Fit a block's scene and write its Gaussians; return counts and seconds."""
+    clock, validation, mesh = Stopwatch(), (), mesh_of(cfg, None)
+    if cfg.densify.max_gaussians == "auto":
+        validation = pick_validation([view.camera for view in block.scene.views])
+    with contextlib.closing(StepPrograms()) as programs:
+        prepared = prepare(
+            block.scene,
+            cfg,
+            reporter,
+            clock,
+            lambda known: begin_programs(programs, known, block.scene, folder, mesh),
+            pixels=folder.pixels,
+            part=block.part,
+        )
+        with begun(folder, Paths(Path(scene), folder.root), cfg, prepared.decisions):
+            result = optimise(
+                prepared, folder, reporter, programs, resume=True, validation=validation, mesh=mesh
+            )
+    params, _ = compact(result)
+    count = params.gaussians.capacity
+    reporter.stage("Writing files")
+    write_radiance(
+        folder.radiance,
+        params.gaussians,
+        np.ones(count, bool),
+        activation=cfg.render.radiance,
+    )
+    prepared.store.close()
+    shutil.rmtree(folder.pixels, ignore_errors=True)
+    counts = {
+        "gaussians": count,
+        "seed_points": len(block.scene.points),
+        "seed_points_outside": len(block.scene.points) - block.own,
+        "train_views": len(block.scene.views),
+        "steps": result.host.step,
+    }
+    return counts, {**clock.seconds, **result.seconds, "optimisation": result.host.elapsed_s}
+
+
+def peak_bytes() -> int | None:
+    """Return the most memory that this process has held, or None where the system does not say.
+
+    From /proc: `getrusage` counts what the process was before it became this one.
+    """
+    rows = dict(line.split(":", 1) for line in text_of(STATUS).splitlines() if ":" in line)
+    found = rows.get("VmHWM", "").split()
+    return int(found[0]) * 1024 if found else None

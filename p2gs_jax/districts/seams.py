@@ -1,0 +1,143 @@
+"""Whether two blocks agree where they meet: the same views, rendered by each, along the boundary.
+
+Each block fitted the strip around the boundary by itself. What differs there in one direction is
+the step that the merged scene has; what differs both ways is what two fits of anything differ by.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from p2gs_jax.config import RenderConfig
+from p2gs_jax.core.numerics import evenly_spaced
+from p2gs_jax.districts.cut import Cut
+from p2gs_jax.render.host import RenderView, make_renderer
+from p2gs_jax.scene.device import camera_of
+from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.types import Gaussians, Scene
+
+# Views of a boundary that are rendered at most.
+MOST_VIEWS = 12
+# Where either block shows less, nothing is compared.
+OPAQUE = 0.9
+DARKEST = 1e-3
+# A view with fewer pixels of the strip says little.
+FEWEST_PIXELS = 50
+
+
+@dataclass(frozen=True)
+class Seam:
+    """How two blocks differ in the strip around their boundary.
+
+    Attributes:
+        blocks: their numbers.
+        views: that show the strip.
+        pixels: that were compared.
+        step_stops: median of the second's radiance over the first's, stops: what one sees as a
+            seam. None where nothing was compared.
+        spread_stops: median size of that ratio.
+        step_depth: median of the second's depth over the first's, less one.
+        spread_depth: median size of that.
+    """
+
+    blocks: tuple[int, int]
+    views: int
+    pixels: int
+    step_stops: float | None
+    spread_stops: float | None
+    step_depth: float | None
+    spread_depth: float | None
+
+
+def measure_seams(
+    scene: Scene, store: ImageStore, cut: Cut, fitted: Sequence[Gaussians], cfg: RenderConfig
+) -> list[Seam]:
+    """Compare neighbouring blocks in training views of both.
+
+    Args:
+        scene: the whole.
+        store: its photographs; only their cameras are used.
+        cut: of the scene.
+        fitted: all Gaussians of each block.
+        cfg: rendering options.
+    """
+    return [
+        _seam(scene, store, cut, (a, b), (fitted[a], fitted[b]), cfg) for a, b in cut.neighbours()
+    ]
+
+
+def _seam(
+    scene: Scene,
+    store: ImageStore,
+    cut: Cut,
+    pair: tuple[int, int],
+    fitted: tuple[Gaussians, Gaussians],
+    cfg: RenderConfig,
+) -> Seam:
+    first, second = (cut.blocks[k] for k in pair)
+    both = sorted(set(first.views) & set(second.views))
+    renderers = make_renderer(cfg), make_renderer(cfg)
+    stops, depths, views = [], [], 0
+    for row in (both[k] for k in evenly_spaced(len(both), MOST_VIEWS)):
+        index = scene.train_indices[row]
+        found = _compared(store, index, cut, pair, fitted, renderers)
+        if len(found[0]) >= FEWEST_PIXELS:
+            views += 1
+            stops.append(found[0])
+            depths.append(found[1])
+    if not views:
+        return Seam(pair, 0, 0, None, None, None, None)
+    ratio, depth = np.concatenate(stops), np.concatenate(depths)
+    return Seam(
+        pair,
+        views,
+        len(ratio),
+        float(np.median(ratio)),
+        float(np.median(np.abs(ratio))),
+        float(np.median(depth)),
+        float(np.median(np.abs(depth))),
+    )
+
+
+def _compared(
+    store: ImageStore,
+    index: int,
+    cut: Cut,
+    pair: tuple[int, int],
+    fitted: tuple[Gaussians, Gaussians],
+    renderers: tuple[RenderView, RenderView],
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+    """Return log2 ratios of radiance and relative ones of depth where a view shows the strip."""
+    camera = camera_of(store, index)
+    shown = []
+    for gaussians, render in zip(fitted, renderers, strict=True):
+        drawn = render(gaussians, jax.numpy.ones(gaussians.capacity, bool), camera)
+        linear, alpha = np.asarray(drawn.linear), np.asarray(drawn.alpha)
+        assert drawn.depth is not None
+        opaque = np.maximum(alpha, 1e-6)
+        shown.append((linear.mean(-1) / opaque, np.asarray(drawn.depth) / opaque, alpha))
+    (one, near, solid), (other, far, covered) = shown
+    points = unprojected(near, np.asarray(camera.K), np.asarray(camera.viewmat))
+    places = cut.ground.place(points.reshape(-1, 3))
+    strip = np.ones(len(places), bool)
+    for number in pair:
+        strip &= cut.blocks[number].holds(places, cut.margin)
+    good = strip.reshape(near.shape) & (solid > OPAQUE) & (covered > OPAQUE)
+    good &= (near > 0) & (far > 0)
+    ratio = np.log2(np.maximum(other[good], DARKEST) / np.maximum(one[good], DARKEST))
+    return ratio, far[good] / near[good] - 1
+
+
+def unprojected(
+    depth: Float[np.ndarray, "h w"], K: Float[np.ndarray, "3 3"], viewmat: Float[np.ndarray, "4 4"]
+) -> Float[np.ndarray, "h w 3"]:
+    """Return where in the world the pixels of a depth map lie."""
+    height, width = depth.shape
+    y, x = np.mgrid[:height, :width] + 0.5
+    rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], -1)
+    return (rays * depth[..., None] - viewmat[:3, 3]) @ viewmat[:3, :3]

@@ -1,0 +1,57 @@
+"""What a terminal is given holds nothing that commands it."""
+
+import io
+
+import pytest
+from rich.table import Table
+from rich.text import Text
+
+from p2gs_jax.core.printable import printable
+from p2gs_jax.core.terminal import PlainConsole
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("plain é 照片\n\ttwo", "plain é 照片\n\ttwo"),
+        ("\x1b[31mred", "\\x1b[31mred"),
+        ("a\rb\x07\x7f", "a\\rb\\x07\\x7f"),
+        ("\x9b31m", "\\x9b31m"),
+        ("\u202egnp", "\\u202egnp"),
+        ("\udcff", "\\udcff"),
+    ],
+)
+def test_control_characters_are_written_out(text, shown):
+    assert printable(text) == shown
+    assert printable(shown) == shown
+
+
+def printed(thing) -> str:
+    file = io.StringIO()
+    PlainConsole(file=file, force_terminal=True, color_system="truecolor", width=60).print(thing)
+    return file.getvalue()
+
+
+def test_a_terminal_gets_no_control_characters():
+    table = Table("\x1b]0;title\x07")
+    table.add_row(Text("\x1b[31mred", style="bold"))
+    for thing in ("\x1b[31mred", Text("\x1b[31mred"), table):
+        assert "\x1b[31m" not in printed(thing)
+        assert "\x1b]0" not in printed(thing)
+        assert "\\x1b" in printed(thing)
+
+
+def test_colours_stay():
+    assert "\x1b[1m" in printed(Text("bold", style="bold"))
+
+
+@pytest.mark.parametrize("name", ["[bold]x[/bold]", "[/nothing].png", ":smile:"])
+def test_brackets_are_no_markup(name):
+    assert printed(name).strip() == name
+
+
+def test_errors_are_printable(run_command, tmp_path):
+    code, text = run_command("scene", tmp_path / "\x1b[31mred")
+    assert code == 2
+    assert "\\x1b[31mred does not exist" in text
+    assert "\x1b" not in text
