@@ -17,6 +17,7 @@ import viser
 
 from p2gs_jax.errors import UserError
 from p2gs_jax.run.read import Run
+from p2gs_jax.viewer.guard import QUERY, guard_of, guarded, is_loopback
 from p2gs_jax.viewer.render_sizes import compilation_order, full_size, render_sizes
 from p2gs_jax.viewer.session import BrowserSession
 from p2gs_jax.viewer.viewed_run import ViewedRun
@@ -53,7 +54,7 @@ def check_address(host: str, port: int) -> None:
 
 @contextmanager
 def open_viewer(run: Run, *, host: str, port: int, max_width: int) -> Iterator[str]:
-    """Serve a run until the block ends; yield the address to open.
+    """Serve a run until the block ends; yield the address to open, with its token if it needs one.
 
     Args:
         run: the run to show.
@@ -68,7 +69,8 @@ def open_viewer(run: Run, *, host: str, port: int, max_width: int) -> Iterator[s
     # viser warns when a browser disconnects while a picture is being sent.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
     viewed = ViewedRun(run, max_width)
-    with contextlib.redirect_stdout(io.StringIO()):
+    guard = guard_of(host)
+    with guarded(guard), contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(
             host=host, port=port, label=f"p2gs-jax: {run.folder.name}", verbose=False
         )
@@ -81,7 +83,8 @@ def open_viewer(run: Run, *, host: str, port: int, max_width: int) -> Iterator[s
             compilation_order(render_sizes(full_size(LIKELY_CANVAS, max_width)))
         )
         shown = "localhost" if host in ("0.0.0.0", "::", "") else host
-        yield f"http://{f'[{shown}]' if ':' in shown else shown}:{server.get_port()}"
+        address = f"http://{f'[{shown}]' if ':' in shown else shown}:{server.get_port()}"
+        yield address if guard.token is None else f"{address}/?{QUERY}={guard.token}"
     finally:
         for session in tuple(sessions.values()):
             session.stop()
@@ -158,7 +161,11 @@ def serve(run: Run, *, host: str, port: int, max_width: int, say: Callable[[str]
     before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         with open_viewer(run, host=host, port=port, max_width=max_width) as address:
-            say(f"{run.params.gaussians.capacity} Gaussians at {address} (Ctrl-C ends)")
+            who = "only this machine" if is_loopback(host) else "any machine with this address"
+            say(
+                f"{run.params.gaussians.capacity} Gaussians at {address} (open to {who}; Ctrl-C "
+                "ends)"
+            )
             while not asked:
                 time.sleep(0.1)
             say("Ending, once what is being compiled is done.")

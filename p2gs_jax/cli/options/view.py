@@ -25,7 +25,7 @@ class View:
     port: int = 8080
     """Port to listen on; 0 takes any free one."""
     host: str = "127.0.0.1"
-    """Address to listen on. Anyone who reaches it may look: other machines do only where this is
-    changed, to 0.0.0.0 for instance."""
+    """Address to listen on. Other machines reach it only where this is changed, to 0.0.0.0 for
+    instance; whoever has the printed address with its token may then look, over plain HTTP."""
     max_width: int = 1920
     """Widest picture that is rendered, pixels; wider windows enlarge it."""
