@@ -31,6 +31,10 @@ MENDED = (
         "a table of exposures with a field beyond csv's limit: traceback",
         "tests/scene/test_known_exposures.py::test_a_field_beyond_the_limit_is_refused",
     ),
+    Mended(
+        "a run's scene.npz that is empty, or whose packed bytes are wrong: traceback",
+        "tests/run/test_scene_file.py::test_a_broken_scene_file_is_refused",
+    ),
 )
 SEED = 20261125
 SPACING = 5
