@@ -14,6 +14,16 @@ import numpy as np
 MOST_BYTES = 1 << 30
 
 
+def most_bytes(cache_mb: int, share: float = 0.5) -> int:
+    """Return how much may be held beside photographs that take `cache_mb` themselves.
+
+    Args:
+        cache_mb: `DataConfig.cache_mb`.
+        share: of it.
+    """
+    return min(MOST_BYTES, int(share * cache_mb * 2**20))
+
+
 @dataclass(frozen=True)
 class StoredArray:
     """An array in a store.

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from p2gs_jax.core.numerics import on_device
+from p2gs_jax.evaluate.array_store import ArrayStore
 from p2gs_jax.evaluate.lidar_depth import DepthErrors, depth_errors, sized, summary
 from p2gs_jax.evaluate.novel_views import SHIFTS, Surface, picked, shifted, unseen_share
 from p2gs_jax.evaluate.region_scores import parts_of
@@ -46,16 +47,23 @@ class DriveScores:
         unexplained: after `summary`: what no static scene explains, by row of the view.
     """
 
-    def __init__(self, scene: Scene, store: ImageStore, render: Callable[[Camera], Render]):
+    def __init__(
+        self,
+        scene: Scene,
+        store: ImageStore,
+        render: Callable[[Camera], Render],
+        arrays: ArrayStore | None = None,
+    ):
         """Begin empty.
 
         Args:
             scene: a drive.
             store: photographs.
             render: of a camera, with depth.
+            arrays: keeps what all views need to the end; None: memory does.
         """
         self._scene, self._store, self._render = scene, store, render
-        self._residuals = Residuals(scene.views)
+        self._residuals = Residuals(scene.views, arrays)
         self._depths: dict[int, DepthErrors] = {}
         self.unexplained: dict[int, Unexplained] = {}
 

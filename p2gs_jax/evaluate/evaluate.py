@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float32
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.evaluate.alignment import fit_capture, with_fitted_exposure
-from p2gs_jax.evaluate.array_store import ArrayStore, StoredArray
+from p2gs_jax.evaluate.array_store import ArrayStore, StoredArray, most_bytes
 from p2gs_jax.evaluate.consistency import VideoScores
 from p2gs_jax.evaluate.drives import DriveScores, is_drive, masks_of_parts
 from p2gs_jax.evaluate.lpips import LpipsWeights
@@ -153,9 +153,7 @@ def evaluate(
         """Return how a view is shown by the mean parameters."""
         return over(usual_display(small, taken_by, scene.views[index].camera, tone))
 
-    drive = None
-    if is_drive(scene):
-        drive = DriveScores(scene, store, lambda camera: render(gaussians, living, camera))
+    drive: DriveScores | None = None
     row_of = {index: row for row, index in enumerate(scene.train_indices)}
 
     def judged(index: int) -> _Judged:
@@ -194,7 +192,10 @@ def evaluate(
     own, averaged = Collector(), Collector()
     test_averaged, test_fitted, test_all = Collector(), Collector(), Collector()
     videos = {name: VideoScores() for name in ("per_view", "averaged", "photographs")}
-    with ArrayStore() as arrays:
+    with ArrayStore(most_bytes(cfg.data.cache_mb)) as arrays:
+        if is_drive(scene):
+            seen = functools.partial(render, gaussians, living)
+            drive = DriveScores(scene, store, seen, arrays)
         scores, metered = RadianceScores(arrays), MeteredViews(arrays)
         reference_views: list[tuple[int, tuple[StoredArray, ...]]] = []
         # In the order of names: the frames of a camera are then in sequence.

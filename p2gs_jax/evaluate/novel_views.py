@@ -13,6 +13,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
+from p2gs_jax.evaluate.array_store import StoredArray
+
 # Metres to the left of the driving direction; negative ones to the right.
 SHIFTS = (1.0, 2.0, 3.0, -1.0, -2.0, -3.0)
 # Views that are shifted, evenly over all; pixels of each that are looked up, about.
@@ -26,14 +28,19 @@ class Surface(NamedTuple):
     """The surface that a view shows.
 
     Attributes:
-        depth: camera z, 0 where there is none.
+        depth: camera z, 0 where there is none; perhaps kept.
         viewmat: world-to-camera.
         K: intrinsics in pixels, at the size of `depth`.
     """
 
-    depth: Float32[np.ndarray, "h w"]
+    depth: Float32[np.ndarray, "h w"] | StoredArray
     viewmat: Float[np.ndarray, "4 4"]
     K: Float[np.ndarray, "3 3"]
+
+    def depths(self) -> Float32[np.ndarray, "h w"]:
+        """Return `depth`, read."""
+        kept = self.depth
+        return (kept.read() if isinstance(kept, StoredArray) else kept).astype(np.float32)
 
     @property
     def center(self) -> Float[np.ndarray, " 3"]:
@@ -77,10 +84,11 @@ def unseen_share(view: Surface, known: Iterable[Surface]) -> float:
 
 def _points(view: Surface) -> Float[np.ndarray, "p 3"]:
     """Return world positions of evenly spaced pixels."""
-    height, width = view.depth.shape
+    depth = view.depths()
+    height, width = depth.shape
     step = max(1, round(np.sqrt(width * height / MOST_PIXELS)))
     y, x = np.mgrid[step // 2 : height : step, step // 2 : width : step]
-    z = view.depth[y, x].ravel().astype(np.float64)
+    z = depth[y, x].ravel().astype(np.float64)
     z = np.where(z > 0, z, FAR)
     xy = (np.stack([x.ravel(), y.ravel()], -1) + 0.5 - view.K[:2, 2]) / view.K[[0, 1], [0, 1]]
     local = np.concatenate([xy, np.ones((len(xy), 1))], 1) * z[:, None]
@@ -93,11 +101,12 @@ def _seen(points: Float[np.ndarray, "p 3"], view: Surface) -> Bool[np.ndarray, "
     z = local[:, 2]
     ahead = np.where(z > 1e-6, z, 1.0)
     xy = local[:, :2] / ahead[:, None] * view.K[[0, 1], [0, 1]] + view.K[:2, 2]
-    height, width = view.depth.shape
+    surface = view.depths()
+    height, width = surface.shape
     inside = (z > 1e-6) & (xy >= 0).all(1) & (xy < [width, height]).all(1)
     at = np.floor(xy[inside]).astype(int)
     square = np.ones((3, 3), np.uint8)
-    depth = np.where(view.depth > 0, view.depth, FAR).astype(np.float32)
+    depth = np.where(surface > 0, surface, FAR).astype(np.float32)
     nearest, farthest = cv2.erode(depth, square), cv2.dilate(depth, square)
     found = np.zeros(len(points), bool)
     near, far = nearest[at[:, 1], at[:, 0]], farthest[at[:, 1], at[:, 0]]

@@ -58,7 +58,8 @@ def load_reference(folder: str | Path, scene: Scene, cfg: FitConfig) -> Referenc
             fix="name the reference photographs as the scene's images",
         )
     order = sorted(rows)
-    store = ImageStore(tuple(rows[r] for r in order), cfg.data)
+    # Each is looked at once: none is kept beside the photographs.
+    store = ImageStore(tuple(rows[r] for r in order), dataclasses.replace(cfg.data, cache_mb=0))
     where = {r: i for i, r in enumerate(order)}
     return lambda row: store.get(where[row], 1)[0] if row in where else None
 

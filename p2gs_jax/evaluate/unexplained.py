@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float16, Float32
 
 from p2gs_jax.core.numerics import on_host
+from p2gs_jax.evaluate.array_store import ArrayStore, StoredArray
 from p2gs_jax.evaluate.novel_views import Surface
 from p2gs_jax.render.warp import warp
 from p2gs_jax.scene.geometry import scale_intrinsics
@@ -58,12 +59,23 @@ class Unexplained(NamedTuple):
 
 @dataclass(frozen=True)
 class _Seen:
-    """A training view, reduced; in half precision, for there may be thousands."""
+    """A training view, reduced; in half precision and perhaps on disk: there may be thousands."""
 
-    residual: Float16[np.ndarray, "h w"]
-    valid: Bool[np.ndarray, "h w"]
-    depth: Float16[np.ndarray, "h w"]
+    size: tuple[int, int]
+    kept: tuple[StoredArray, StoredArray, StoredArray]
     K: Float32[np.ndarray, "3 3"]
+
+    @property
+    def residual(self) -> Float16[np.ndarray, "h w"]:
+        return self.kept[0].read()
+
+    @property
+    def valid(self) -> Bool[np.ndarray, "h w"]:
+        return self.kept[1].read()
+
+    @property
+    def depth(self) -> StoredArray:
+        return self.kept[2]
 
 
 def residual_over_noise(
@@ -128,13 +140,15 @@ def shares_by_view(scene: Scene, found: Mapping[int, Unexplained]) -> dict:
 class Residuals:
     """Collects renders of training views, and finds what no static scene explains in them."""
 
-    def __init__(self, views: Sequence[View]):
+    def __init__(self, views: Sequence[View], arrays: ArrayStore | None = None):
         """Begin empty.
 
         Args:
             views: of the scene.
+            arrays: keeps what all views need to the end; None: memory does.
         """
         self._views = views
+        self._arrays = ArrayStore() if arrays is None else arrays
         self._seen: dict[int, _Seen] = {}
 
     def add(
@@ -161,12 +175,16 @@ class Residuals:
         size = (max(1, round(width / shrink)), max(1, round(height / shrink)))
         small = [cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p in (render, photograph)]
         valid = cv2.resize(mask, size, interpolation=cv2.INTER_AREA) > 0.99
-        self._seen[index] = _Seen(
+        nearest = cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST)
+        arrays = (
             residual_over_noise(small[0], small[1], valid).astype(np.float16),
             valid,
-            np.minimum(
-                cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST), np.finfo(np.float16).max
-            ).astype(np.float16),
+            np.minimum(nearest, np.finfo(np.float16).max).astype(np.float16),
+        )
+        first, second, third = map(self._arrays.put, arrays)
+        self._seen[index] = _Seen(
+            size,
+            (first, second, third),
             scale_intrinsics(K, size[0] / width, size[1] / height).astype(np.float32),
         )
 
@@ -187,15 +205,15 @@ class Residuals:
         for done, (index, others) in enumerate(self._compared()):
             on_progress(done, len(self._seen))
             seen = self._seen[index]
-            residual = seen.residual.astype(np.float32)
-            mask = regions(residual, self._usual(index, others, unknown)) & seen.valid
-            found[index] = Unexplained(mask, float(mask.sum() / max(int(seen.valid.sum()), 1)))
+            residual, valid = seen.residual.astype(np.float32), seen.valid
+            mask = regions(residual, self._usual(index, others, unknown)) & valid
+            found[index] = Unexplained(mask, float(mask.sum() / max(int(valid.sum()), 1)))
         return found
 
     def surfaces(self) -> list[Surface]:
         """Return what the views show, reduced."""
         return [
-            Surface(seen.depth.astype(np.float32), self._views[index].viewmat, seen.K)
+            Surface(seen.depth, self._views[index].viewmat, seen.K)
             for index, seen in self._seen.items()
         ]
 
@@ -214,10 +232,10 @@ class Residuals:
     ) -> Float32[np.ndarray, "h w"]:
         """Return the median residual of a view's surfaces in others, or `unknown`."""
         here = self._seen[index]
-        values = np.full((len(others) + 1, *here.residual.shape), np.nan, np.float32)
+        values = np.full((len(others) + 1, *here.size[::-1]), np.nan, np.float32)
         for k, other in enumerate(others):
             there = self._seen[other]
-            depths = [seen.depth.astype(np.float32) for seen in (here, there)]
+            depths = [seen.depth.read().astype(np.float32) for seen in (here, there)]
             to = _warp(depths[0], self._camera(index), depths[1], self._camera(other))
             xy = np.asarray(to.xy) - np.float32(0.5)
             # The worst nearby: depth is off by a pixel at edges.
@@ -232,5 +250,5 @@ class Residuals:
         return np.nanmedian(values, axis=0)
 
     def _camera(self, index: int) -> Camera:
-        height, width = self._seen[index].residual.shape
+        width, height = self._seen[index].size
         return on_host(Camera, self._views[index].viewmat, self._seen[index].K, width, height)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -90,7 +90,7 @@ class Prepared:
     selection: Selection | None
     pairs: ColorPairs | None
     overlaps: list[np.ndarray] | None
-    measured: list[Measured] | None
+    measured: Sequence[Measured] | None
     coverage: Coverage
     decisions: Decisions
     cfg: FitConfig
@@ -120,7 +120,7 @@ class Expected(NamedTuple):
     decisions: Decisions
     cfg: FitConfig
     images: bool
-    measured: list[Measured] | None
+    measured: Sequence[Measured] | None
 
 
 def load(scene_dir: Path, run_dir: Path, cfg: FitConfig, reporter: Reporter) -> Scene:

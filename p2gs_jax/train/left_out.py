@@ -18,6 +18,7 @@ import numpy as np
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.clock import Stopwatch
+from p2gs_jax.evaluate.array_store import ArrayStore, most_bytes
 from p2gs_jax.evaluate.parallel import map_in_order
 from p2gs_jax.evaluate.unexplained import Residuals, Unexplained
 from p2gs_jax.photometry.display import develop, display_of_view
@@ -155,10 +156,11 @@ def look(state: FitState, views: TrainingViews, cfg: FitConfig, shrink: int) -> 
         depth = np.asarray(surface_depth(result))
         return row, np.asarray(ldr), photograph, mask, depth, np.asarray(camera.K)
 
-    residuals = Residuals([store.views[row] for row in views.rows])
-    for given in map_in_order(shown, range(len(views))):
-        residuals.add(*given)
-    return bounded(residuals.find(known_only=True))
+    with ArrayStore(most_bytes(cfg.data.cache_mb)) as arrays:
+        residuals = Residuals([store.views[row] for row in views.rows], arrays)
+        for given in map_in_order(shown, range(len(views))):
+            residuals.add(*given)
+        return bounded(residuals.find(known_only=True))
 
 
 def bounded(found: Mapping[int, Unexplained]) -> Looked:

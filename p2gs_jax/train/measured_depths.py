@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import overload
+
 import numpy as np
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import on_host
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.errors import UserError
+from p2gs_jax.evaluate.array_store import ArrayStore, StoredArray, most_bytes
 from p2gs_jax.scene.drives.object_masks import object_mask
 from p2gs_jax.scene.visibility import project_points, unoccluded
 from p2gs_jax.types import Measured, Scene
@@ -16,9 +20,49 @@ from p2gs_jax.types import Measured, Scene
 MOST_PER_VIEW = 8192
 # Measurements this near in time tell what hides what; further off, things have moved.
 NEAR_S = 1.0
+# They may take this share of the memory that photographs may.
+DEPTHS_SHARE = 0.125
 
 
-def measured_depths(scene: Scene, cfg: FitConfig) -> list[Measured] | None:
+class KeptDepths(Sequence[Measured]):
+    """The measured depths of some views, in memory up to a bound and on disk beyond it."""
+
+    def __init__(self, most: int):
+        """Begin empty.
+
+        Args:
+            most: bytes held in memory.
+        """
+        self._arrays = ArrayStore(most)
+        self._kept: list[tuple[StoredArray, StoredArray]] = []
+
+    @property
+    def bytes_held(self) -> int:
+        """Bytes in memory."""
+        return self._arrays.bytes_held
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    @overload
+    def __getitem__(self, row: int) -> Measured: ...
+
+    @overload
+    def __getitem__(self, row: slice) -> list[Measured]: ...
+
+    def __getitem__(self, row: int | slice) -> Measured | list[Measured]:
+        if isinstance(row, slice):
+            return [self[k] for k in range(*row.indices(len(self)))]
+        places, depths = self._kept[row]
+        return on_host(Measured, places.read(), depths.read())
+
+    def add(self, measured: Measured) -> None:
+        """Keep those of one more view."""
+        put = self._arrays.put
+        self._kept.append((put(np.asarray(measured.places)), put(np.asarray(measured.depths))))
+
+
+def measured_depths(scene: Scene, cfg: FitConfig) -> Sequence[Measured] | None:
     """Return the measured depths of every training view; None where the loss asks for none.
 
     Only what stands still counts, so that every sweep serves all views; what a nearer measurement
@@ -41,7 +85,10 @@ def measured_depths(scene: Scene, cfg: FitConfig) -> list[Measured] | None:
     rng = generator(cfg.train.seed, Stream.MEASURED_DEPTHS)
     static = scene.lidar.objects < 0
     points, times = scene.lidar.points[static], scene.lidar.times[static]
-    return [_of_view(points, times, view, scene.objects, rng) for view in scene.training_views]
+    kept = KeptDepths(most_bytes(cfg.data.cache_mb, DEPTHS_SHARE))
+    for view in scene.training_views:
+        kept.add(_of_view(points, times, view, scene.objects, rng))
+    return kept
 
 
 def _of_view(points, times, view, objects, rng) -> Measured:

@@ -34,7 +34,7 @@ def shelves(monkeypatch):
     made = []
 
     def bound(most_bytes):
-        def make():
+        def make(usual):
             made.append(ArrayStore(most_bytes))
             return made[-1]
 

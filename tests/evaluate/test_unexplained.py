@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import DataConfig
+from p2gs_jax.evaluate.array_store import ArrayStore
 from p2gs_jax.evaluate.unexplained import Residuals, Unexplained, regions, residual_over_noise
 from p2gs_jax.run.unexplained_pictures import MOST_PICTURES, marked, worst_rows, write_unexplained
 from p2gs_jax.scene.images import ImageStore
@@ -51,8 +52,8 @@ def photographs(noise=0.01):
     return out
 
 
-def found_in(taken, skip=()):
-    residuals = Residuals(VIEWS)
+def found_in(taken, skip=(), arrays=None):
+    residuals = Residuals(VIEWS, arrays)
     depth = np.full((H, W), DEPTH, np.float32)
     mask = np.ones((H, W), np.float32)
     for k, (render, photograph) in enumerate(zip(renders(), taken, strict=True)):
@@ -70,6 +71,18 @@ def test_what_moves_is_found_and_a_bad_fit_is_not():
     assert found[7].share == pytest.approx(found[7].mask.mean())
     # The bad patch has left the picture of the last views, and they do not know better.
     assert all(found[k].share < 0.01 for k in range(len(VIEWS)) if k != 7)
+
+
+def test_views_that_wait_on_disk_are_judged_the_same():
+    taken = photographs()
+    held = found_in(taken)
+    with ArrayStore(0) as arrays:
+        kept = found_in(taken, arrays=arrays)
+        assert arrays.bytes_held == 0
+    assert list(kept) == list(held)
+    for row, found in held.items():
+        assert np.array_equal(kept[row].mask, found.mask)
+        assert kept[row].share == found.share
 
 
 def test_the_noise_of_a_view_is_its_own():

@@ -1,16 +1,18 @@
 """Rendered depth against laser measurements."""
 
+from dataclasses import replace
 from pathlib import Path
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from p2gs_jax.config import FitConfig, LossConfig
+from p2gs_jax.config import DataConfig, FitConfig, LossConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.losses.lidar import CLIP, lidar_loss
-from p2gs_jax.train.measured_depths import MOST_PER_VIEW, measured_depths
+from p2gs_jax.train.measured_depths import MOST_PER_VIEW, KeptDepths, measured_depths
 from p2gs_jax.types import Lidar, Measured, Render, Scene, View
 
 HEIGHT, WIDTH = 4, 6
@@ -102,6 +104,11 @@ def test_views_get_what_stands_still_near_in_time_and_is_not_hidden():
     assert np.mean(seen > 25) < 0.1
     assert ((np.asarray(first.places) >= 0) & (np.asarray(first.places) < 1)).all()
     assert (np.asarray(second.depths) > 0).sum() == len(seen)
+    # Beyond what memory may hold they wait on disk, and are the same.
+    waiting = measured_depths(scene, replace(cfg, data=DataConfig(cache_mb=0)))
+    assert isinstance(waiting, KeptDepths)
+    assert waiting.bytes_held == 0
+    chex.assert_trees_all_equal(waiting[:], found[:])
 
 
 def test_a_loss_without_measurements_is_refused():
