@@ -73,12 +73,12 @@ def licence_of(name: str) -> str | None:
         said = metadata.metadata(name.partition("[")[0])
     except metadata.PackageNotFoundError:
         return None
-    if said.get("License-Expression"):
-        return said["License-Expression"]
+    for expression in said.get_all("License-Expression", []):
+        return expression
     classified = [
         c.rsplit(" :: ", 1)[1] for c in said.get_all("Classifier", []) if c.startswith("License ::")
     ]
-    short = (said.get("License") or "").strip()
+    short = " ".join(said.get_all("License", [])).strip()
     if classified and (not short or len(short) > 40 or "\n" in short):
         return ", ".join(classified)
     return short if short and len(short) <= 40 else "see its files"
