@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import shutil
 import sys
+import sysconfig
 from pathlib import Path
 
 import nox
@@ -42,6 +43,13 @@ def slow(session: nox.Session) -> None:
 def docs(session: nox.Session) -> None:
     """Build the site; every warning is an error. `nox -s docs -- serve` shows it live."""
     session.run("mkdocs", *(session.posargs or ("build", "--strict")))
+
+
+@nox.session(venv_backend="venv")
+def audit(session: nox.Session) -> None:
+    """Look for known faults in what is installed here; needs the index's own JSON interface."""
+    session.install("pip-audit")
+    session.run("pip-audit", "--path", sysconfig.get_paths()["purelib"])
 
 
 @nox.session(venv_backend="venv")

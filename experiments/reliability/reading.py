@@ -19,6 +19,7 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.core.printable import printable
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene import find_scene, with_what_lies_beside
+from p2gs_jax.scene.drives.recording import Recording
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Scene
 
@@ -55,6 +56,8 @@ def read(root: Path) -> int:
 def _whole(root: Path) -> int:
     cfg = DataConfig()
     found = find_scene(root, cfg)
+    if isinstance(found, Recording):
+        return _swept(found)
     if not isinstance(found, Scene):
         return 0
     scene = with_what_lies_beside(found, cfg)
@@ -71,6 +74,15 @@ def _whole(root: Path) -> int:
     return 0
 
 
+def _swept(found: Recording) -> int:
+    """Read all that a survey of a drive leaves closed."""
+    for sweep in found.sweeps:
+        if not _finite(sweep.read().points):
+            return _nonsense("points of a sweep")
+    poses = [p.pose for p in found.photographs] + [o.poses for o in found.objects]
+    return 0 if _finite(*poses) else _nonsense("poses")
+
+
 def _finite(*arrays: np.ndarray) -> bool:
     return all(bool(np.isfinite(array).all()) for array in arrays)
 
@@ -84,6 +96,11 @@ def fit(root: Path) -> int:
     """Fit a scene for a few steps, into a folder that is removed again."""
     run = root.parent / "run"
     try:
-        return command("fit", root, "--out", run, *FIT)
+        return fit_into(root, run)
     finally:
         shutil.rmtree(run, ignore_errors=True)
+
+
+def fit_into(root: Path, run: Path) -> int:
+    """Fit a scene for a few steps, into a folder that stays."""
+    return command("fit", root, "--out", run, *FIT)

@@ -16,13 +16,13 @@ from pathlib import Path
 
 from p2gs_jax.cli import PARENT
 from p2gs_jax.core.atomic import read_jsonl
+from p2gs_jax.core.interrupts import SIGNALS
 from p2gs_jax.errors import UserError
 from p2gs_jax.run.checkpoint import saved_steps
 from p2gs_jax.run.layout import RunFolder
 
 # Exit code of a child that lost its partners.
 LOST = 70
-PASSED_ON = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def is_child() -> bool:
@@ -56,7 +56,7 @@ def supervise(argv: Sequence[str], run_dir: Path) -> int:
     env = os.environ | {PARENT: str(theirs)}
     child = subprocess.Popen(command, env=env, pass_fds=(theirs,))
     os.close(theirs)
-    before = {number: signal.signal(number, _passed_to(child)) for number in PASSED_ON}
+    before = {number: signal.signal(number, _passed_to(child)) for number in SIGNALS}
     try:
         code = child.wait()
     finally:

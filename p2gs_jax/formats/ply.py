@@ -19,6 +19,7 @@ from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.errors import UserError
 from p2gs_jax.render.radiance import RadianceKind
+from p2gs_jax.scene.point_cloud import check_counts
 from p2gs_jax.types import Gaussians, Vibration
 
 
@@ -115,6 +116,8 @@ def read_ply(path: Path, *, fix: str = RESTORE) -> Gaussians:
     Raises:
         UserError: the file is no such PLY.
     """
+    if path.is_file():
+        check_counts(path, fix=fix)
     try:
         # Mapped: what has been read may leave memory again.
         vertex = PlyData.read(str(path))["vertex"].data

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
+from p2gs_jax.core.array_files import BROKEN_ARRAYS
 from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.core.processes import is_first
 from p2gs_jax.errors import UserError
@@ -82,7 +82,7 @@ class LeftOutFile:
                         int(stored[f"{step}/whole"]),
                     )
                 return looks
-        except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        except BROKEN_ARRAYS as error:
             raise self._broken(str(error) or type(error).__name__) from error
 
     def _write(self, looks: Mapping[int, tuple[Mapping[int, Unexplained], int]]) -> None:

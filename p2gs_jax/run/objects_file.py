@@ -5,12 +5,12 @@ The objects themselves are in `scene.npz`. Runs in which nothing moves have no s
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Int
 
+from p2gs_jax.core.array_files import BROKEN_ARRAYS
 from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.drives.moving import KeyTimes, MovingObjects
@@ -70,7 +70,7 @@ def read_objects(
         corrections = a.get("corrections")
         if corrections is not None:
             fits &= corrections.shape == (len(times), len(objects), 6)
-    except (OSError, ValueError, KeyError, IndexError, zipfile.BadZipFile) as error:
+    except BROKEN_ARRAYS as error:
         raise UserError(
             f"{path} cannot be read: {error}.", fix="finish the fit again with --resume"
         ) from error

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import json
 import os
-import zipfile
 from pathlib import Path
 
 import numpy as np
 
+from p2gs_jax.core.array_files import BROKEN_ARRAYS
 from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.core.json_text import parse_json
 from p2gs_jax.errors import UserError
@@ -147,7 +147,7 @@ def read_scene(folder: Path, root: Path) -> Scene | None:
             random_seeds=said.get("random_seeds", False),
             known_response=said.get("known_response"),
         )
-    except (OSError, ValueError, KeyError, TypeError, IndexError, zipfile.BadZipFile) as error:
+    except BROKEN_ARRAYS as error:
         raise UserError(
             f"{path} cannot be read: {error}.",
             fix="restore it from a copy, or remove it: the scene is then read from its own folder",
@@ -164,7 +164,7 @@ def read_times(folder: Path) -> dict[str, float]:
         with np.load(folder / SCENE_FILE, allow_pickle=False) as file:
             views = parse_json(str(file["json"]))["views"]
         return {v["name"]: float(v["time"]) for v in views if v.get("time") is not None}
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
+    except BROKEN_ARRAYS:
         return {}
 
 

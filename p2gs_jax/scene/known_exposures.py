@@ -93,8 +93,12 @@ def _read(path: Path) -> dict[str, float]:
         ) from error
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     reader = csv.DictReader(lines)
-    names = [n.strip() for n in reader.fieldnames or []]
-    reader.fieldnames = names
+    try:
+        names = [n.strip() for n in reader.fieldnames or []]
+        reader.fieldnames = names
+        rows = list(reader)
+    except csv.Error as error:
+        raise UserError(f"{path} is no CSV file: {error}.", fix="write it again") from None
     kind = next((n for n in KINDS if n in names), None)
     name = next((n for n in ("image", "file") if n in names), None)
     if name is None or kind is None:
@@ -103,7 +107,7 @@ def _read(path: Path) -> dict[str, float]:
             fix=f"it needs `image` and one of {', '.join(KINDS)}",
         )
     out = {}
-    for number, row in enumerate(reader, 2):
+    for number, row in enumerate(rows, 2):
         if not (row[kind] or "").strip():
             continue
         try:

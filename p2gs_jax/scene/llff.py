@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from p2gs_jax.config import DataConfig
+from p2gs_jax.core.array_files import BROKEN_ARRAYS
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.files import check_size, list_images
 from p2gs_jax.scene.geometry import intrinsics, scale_intrinsics
@@ -93,7 +94,7 @@ def _read(path: Path) -> Float64[np.ndarray, "v 17"]:
     """Return the table; nothing in the file is run."""
     try:
         table = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+    except BROKEN_ARRAYS as error:
         raise UserError(f"{path} cannot be read: {error}", fix=_FIX) from None
     if not isinstance(table, np.ndarray) or table.dtype.kind not in "fiu":
         raise UserError(f"{path} holds no numbers", fix=_FIX)

@@ -12,6 +12,7 @@ from plyfile import PlyData, PlyParseError
 
 from p2gs_jax.errors import UserError
 
+_FIX = "write it again with the tool that made it"
 _MOST_HEADER = 65536
 _MOST_DIGITS = 18
 
@@ -39,7 +40,7 @@ def read_points(path: Path) -> PointCloud:
             f"the seed points {path} do not exist",
             fix="put the file there, or take its name out of the .json: seeds are then found",
         )
-    _check_counts(path)
+    check_counts(path)
     try:
         vertex = PlyData.read(str(path))["vertex"].data
         names = vertex.dtype.names or ()
@@ -48,14 +49,12 @@ def read_points(path: Path) -> PointCloud:
         if {"red", "green", "blue"} <= set(names):
             colors = np.stack([vertex[name] for name in ("red", "green", "blue")], 1)
     except (OSError, PlyParseError, KeyError, ValueError) as error:
-        raise UserError(
-            f"{path} is no PLY of points: {error}.", fix="write it again with the tool that made it"
-        ) from error
+        raise UserError(f"{path} is no PLY of points: {error}.", fix=_FIX) from error
     bad = int((~np.isfinite(points).all(axis=1)).sum())
     if bad:
         raise UserError(
             f"{path}: {bad} of {len(points)} points are not finite",
-            fix="write it again with the tool that made it",
+            fix=_FIX,
         )
     if colors is not None:
         scale = 255.0 if colors.dtype.kind == "f" else 1.0
@@ -63,8 +62,12 @@ def read_points(path: Path) -> PointCloud:
     return PointCloud(points, colors)
 
 
-def _check_counts(path: Path) -> None:
-    """Refuse counts that a file of this size cannot hold: plyfile takes memory for them at once.
+def check_counts(path: Path, *, fix: str = _FIX) -> None:
+    """Refuse counts that a PLY of this size cannot hold: plyfile takes memory for them at once.
+
+    Args:
+        path: the file.
+        fix: what to do about it.
 
     Raises:
         UserError: there is such a count.
@@ -76,5 +79,5 @@ def _check_counts(path: Path) -> None:
         if len(count) > _MOST_DIGITS or int(count) > size:
             raise UserError(
                 f"{path} announces {count[:_MOST_DIGITS].decode()} records and has {size} bytes.",
-                fix="write it again with the tool that made it",
+                fix=fix,
             )

@@ -83,7 +83,7 @@ def run(quick: bool, out: Path, report: Report) -> Family:
 def trials() -> Iterator[Trial]:
     """Yield all, in their order."""
     for name, odd in ODD.items():
-        yield Trial(f"photograph: {name}", _photograph(odd), read)
+        yield Trial(f"photograph: {name}", with_photograph(odd), read)
         yield Trial(f"camera: {name}", _camera(odd.removesuffix(".png")), read)
         yield Trial(f"scene folder: {name}", _folder(odd), read)
         yield Trial(f"of no photograph: {name}", _named_in_transforms(odd), read, refused=True)
@@ -103,7 +103,9 @@ def trials() -> Iterator[Trial]:
     yield Trial("the model is a pipe", _model_is_a_pipe, read, refused=True)
 
 
-def _photograph(odd: str) -> Callable[[Path], Path]:
+def with_photograph(odd: str) -> Callable[[Path], Path]:
+    """Return what makes a scene of which one photograph has a name."""
+
     def make(root: Path) -> Path:
         scenes.write_transforms(root)
         odd_path = root / "images" / odd

@@ -63,6 +63,10 @@ _NAMES = {
 }
 
 
+# A sweep of PandaSet takes 10 MB.
+_MOST_BYTES = 2**28
+
+
 class _Records(pickle.Unpickler):
     """Reads a pickle as a tree of plain values and records."""
 
@@ -85,7 +89,10 @@ def read_table(path: Path) -> dict[str, np.ndarray]:
     try:
         content = path.read_bytes()
         if content[:2] == b"\x1f\x8b":
-            content = gzip.decompress(content)
+            with gzip.open(io.BytesIO(content)) as packed:
+                content = packed.read(_MOST_BYTES + 1)
+            if len(content) > _MOST_BYTES:
+                raise ValueError(f"it unpacks to more than {_MOST_BYTES >> 20} MiB")
         columns = _columns(_Records(io.BytesIO(content)).load())
     except FileNotFoundError:
         raise UserError(f"{path} is missing", fix="get the data set's archive again") from None

@@ -4,7 +4,7 @@ Within a device everything is as in a step of one view, view by view. Between de
 their gradients travel along the Gaussians' axis (`exchange`), and sums of gradients by parameters
 along the views' axis. The loss is the mean over the views; learning rates are those of one view
 times the root of their number, so that as many views move a Gaussian about as far (Krizhevsky 2014;
-Grendel-GS, arXiv 2406.18533; BUILD_NOTES, "Many devices").
+Grendel-GS, arXiv 2406.18533; docs/scaling.md).
 """
 
 from __future__ import annotations

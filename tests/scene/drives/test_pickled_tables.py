@@ -35,6 +35,13 @@ VARIANTS = {
 }
 
 
+def test_a_bomb_is_not_unpacked(tmp_path):
+    path = tmp_path / "00.pkl.gz"
+    path.write_bytes(gzip.compress(bytes(2**28 + 1), 1))
+    with pytest.raises(UserError, match="unpacks to more than 256 MiB"):
+        read_table(path)
+
+
 def assert_same(columns, table):
     assert list(columns) == list(table.columns)
     for name, found in columns.items():
