@@ -50,6 +50,15 @@ PLACES: dict[Format, tuple[str, ...]] = {
     "drive": ("drive.csv", "drive.json"),
     "html": ("scene.html",),
 }
+# In place of display.spz, where it is cut.
+BLOCKS = "display_blocks"
+
+
+def _places(name: Format, options: Export) -> tuple[str, ...]:
+    """Return what a format writes."""
+    if name == "spz" and options.spz_blocks is not None:
+        return BLOCKS, PLACES["spz"][1]
+    return PLACES[name]
 
 
 def run(options: Export) -> int:
@@ -65,7 +74,8 @@ def run(options: Export) -> int:
         fitted = fitted.without_objects()
     transform = _display_transform(fitted, options)
     folder = options.out or options.run / "exports"
-    _check_places(folder, formats, options.overwrite)
+    places = [folder / place for name in formats for place in _places(name, options)]
+    _check_places(folder, places, options.overwrite)
     _check_names(fitted, formats)
     if {"colmap", "nerfstudio"} & set(formats):
         fitted.require_photographs()
@@ -92,9 +102,12 @@ def run(options: Export) -> int:
                 said = _html(folder, fitted, transform, options, reporter)
             else:
                 assert display is not None
-                said = display.write(name, *(folder / place for place in PLACES[name]))
+                path, sidecar = (folder / place for place in _places(name, options))
+                said = display.write(name, path, sidecar, blocks=options.spz_blocks)
             seconds = time.monotonic() - begin
-            stdout().print(f"{folder / PLACES[name][0]}: {said} ({seconds:.1f} s)", soft_wrap=True)
+            stdout().print(
+                f"{folder / _places(name, options)[0]}: {said} ({seconds:.1f} s)", soft_wrap=True
+            )
     return 0
 
 
@@ -125,10 +138,9 @@ def _display_transform(fitted: Run, options: Export) -> DisplayTransform:
     return display_of_splats(transform)
 
 
-def _check_places(folder: Path, formats: Sequence[Format], overwrite: bool) -> None:
+def _check_places(folder: Path, places: Sequence[Path], overwrite: bool) -> None:
     if folder.exists() and not folder.is_dir():
         raise UserError(f"{folder} is a file.", fix="name a folder with --out")
-    places = [folder / place for name in formats for place in PLACES[name]]
     there = [path for path in places if path.exists()]
     if there and not overwrite:
         raise UserError(

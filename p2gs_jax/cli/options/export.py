@@ -87,6 +87,9 @@ class Export:
     photographs: int | None = None
     """html: how many photographs to embed, evenly spread, for the split view (default: none;
     whoever has the page has them, with all they show)."""
+    spz_blocks: int | None = None
+    """spz: cut the scene in space into so many files of equally many Gaussians (default: one file),
+    for viewers that load what they show; positions are finer, too."""
     scene: SceneFolder = None
     """Where the run's scene lies now, if it is not where it was."""
     overwrite: bool = False
@@ -109,9 +112,12 @@ def check_export(args: Export) -> None:
     size = args.size_mb
     check(size is None or (math.isfinite(size) and size > 0), "--size-mb must be positive")
     check(args.photographs is None or args.photographs >= 0, "--photographs must be 0 or more")
+    blocks = args.spz_blocks
+    check(blocks is None or 1 <= blocks <= 999, "--spz-blocks must be a number from 1 to 999")
     look = ("exposure_ev", "exposure_of", "gamma", "curve", "white_balance_of")
     _require_a_use(args, look, (*DISPLAY, "html"), "a format that is developed")
     _require_a_use(args, ("bake_steps",), DISPLAY, "a format that holds display colours")
+    _require_a_use(args, ("spz_blocks",), ("spz",), "the format spz")
     _require_a_use(args, ("size_mb", "photographs"), ("html",), "the format html")
 
 
