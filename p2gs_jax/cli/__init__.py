@@ -66,13 +66,13 @@ def main(argv: list[str] | None = None) -> None:
         code = _complain(error)
     except ImportError as error:
         code = _missing(error, argv)
-    except OSError as error:
-        code = _from_the_system(error)
-    except (MemoryError, RuntimeError) as error:
-        if not ran_out(error):
+    except (OSError, MemoryError, RuntimeError) as error:
+        if ran_out(error):
+            code = _out_of_memory(error)
+        elif isinstance(error, OSError):
+            code = _from_the_system(error)
+        else:
             raise
-        fix = "end other programs, or ask for less: smaller pictures, fewer Gaussians"
-        code = _complain(UserError(f"memory ran out ({error}).", fix=fix))
     except KeyboardInterrupt as error:
         print(f"p2gs-jax: interrupted{_CONTINUED.get(command, '')}", file=sys.stderr)
         code = interrupts.exit_code(error)
@@ -107,6 +107,11 @@ def _missing(error: ImportError, argv: list[str]) -> int:
         return diagnose(as_json="--json" in argv)
     fix = "`p2gs-jax doctor` says what is missing for what"
     return _complain(UserError(f"a library cannot be imported: {error}.", fix=fix))
+
+
+def _out_of_memory(error: Exception) -> int:
+    fix = "end other programs, or ask for less: smaller pictures, fewer Gaussians"
+    return _complain(UserError(f"memory ran out ({error}).", fix=fix))
 
 
 def _from_the_system(error: OSError) -> int:

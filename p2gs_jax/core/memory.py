@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import errno
 import os
 import sys
 from pathlib import Path
@@ -55,9 +56,11 @@ def resident() -> int:
 
 
 def ran_out(error: BaseException) -> bool:
-    """Return whether an error says that memory ran out: Python's, or the device's through JAX."""
-    if isinstance(error, MemoryError):
+    """Return whether an error says that memory ran out: Python's, the system's, or JAX's."""
+    if isinstance(error, MemoryError) or "can't start new thread" in str(error):
         return True
+    if isinstance(error, OSError):
+        return error.errno == errno.ENOMEM
     return type(error).__name__ in _OF_JAX and any(said in str(error) for said in _SAID)
 
 

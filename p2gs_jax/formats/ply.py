@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from p2gs_jax.core.atomic import atomic_write
@@ -36,56 +37,69 @@ def field_names(coefficients: int) -> list[str]:
 
 # Behind the fields of the reference implementation, where Gaussians vibrate.
 VIBRATION = ("velocity_x", "velocity_y", "velocity_z", "peak_time", "log_life")
+# Rows that are written or read at a time: 16 MB of them, and a population may have gigabytes.
+CHUNK = 65536
 
 
-def _live(gaussians: Gaussians, alive: Bool[np.ndarray, " n"]) -> Gaussians:
-    rows = np.flatnonzero(np.asarray(alive))
-    return jax.tree.map(lambda a: np.asarray(a)[rows], gaussians)
-
-
-def write_ply(path: Path, gaussians: Gaussians, comments: Sequence[str]) -> int:
-    """Write all Gaussians as they are; return how many.
+def write_ply(
+    path: Path,
+    gaussians: Gaussians,
+    comments: Sequence[str],
+    rows: Int[np.ndarray, " k"] | None = None,
+) -> int:
+    """Write Gaussians as they are, some at a time; return how many.
 
     Args:
         path: the file.
         gaussians: what to write.
         comments: header lines; a PLY header is ASCII, other characters are escaped.
+        rows: which; None: all.
     """
     g = jax.tree.map(np.asarray, gaussians)
-    count, coefficients = g.sh.shape[:2]
-    # All coefficients of red, then green, then blue.
-    rest = g.sh[:, 1:].transpose(0, 2, 1).reshape(count, 3 * (coefficients - 1))
-    moves = [] if g.vibration is None else [_columns_of(g.vibration)]
-    columns = np.concatenate(
-        [
-            g.means,
-            np.zeros((count, 3), np.float32),
-            g.sh[:, 0],
-            rest,
-            g.opacity_logits[:, None],
-            g.log_scales,
-            g.quats,
-            *moves,
-        ],
-        axis=1,
-    ).astype("<f4")
-    names = [*field_names(coefficients), *(VIBRATION if moves else ())]
-    table = np.ascontiguousarray(columns).view([(n, "<f4") for n in names]).reshape(count)
+    names = [*field_names(g.sh.shape[1]), *(() if g.vibration is None else VIBRATION)]
+    count = g.capacity if rows is None else len(rows)
+    # Of the whole table only the header is asked, so one row stands for all.
+    row = np.zeros((), [(name, "<f4") for name in names])
+    table = PlyElement.describe(np.broadcast_to(row, count), "vertex")
     lines = [c.encode("unicode_escape").decode() for c in comments]
-    data = PlyData([PlyElement.describe(table, "vertex")], byte_order="<", comments=lines)
-    with atomic_write(path) as temporary:
-        data.write(str(temporary))
+    header = PlyData([table], byte_order="<", comments=lines).header
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
+        file.write(header.encode("ascii") + b"\n")
+        for first in range(0, count, CHUNK):
+            those = slice(first, first + CHUNK)
+            file.write(_columns(g, those if rows is None else rows[those]).tobytes())
     return count
+
+
+def _columns(g: Gaussians, rows: slice | Int[np.ndarray, " k"]) -> Float[np.ndarray, "k c"]:
+    """Return some Gaussians as rows of the table."""
+    sh = g.sh[rows]
+    count = len(sh)
+    moves = [] if g.vibration is None else [_vibration_of(g.vibration, rows)]
+    columns = [
+        g.means[rows],
+        np.zeros((count, 3), np.float32),
+        sh[:, 0],
+        # All coefficients of red, then green, then blue.
+        sh[:, 1:].transpose(0, 2, 1).reshape(count, -1),
+        g.opacity_logits[rows][:, None],
+        g.log_scales[rows],
+        g.quats[rows],
+        *moves,
+    ]
+    return np.concatenate(columns, axis=1).astype("<f4")
 
 
 def write_radiance(
     path: Path, gaussians: Gaussians, alive: Bool[np.ndarray, " n"], *, activation: RadianceKind
 ) -> int:
     """Write live Gaussians with their linear coefficients; return how many."""
+    alive = np.asarray(alive)
     return write_ply(
         path,
-        _live(gaussians, alive),
+        gaussians,
         ["p2gs-jax: linear HDR radiance", f"p2gs-jax: radiance activation {activation}"],
+        None if alive.all() else np.flatnonzero(alive),
     )
 
 
@@ -105,33 +119,40 @@ def read_ply(path: Path, *, fix: str = RESTORE) -> Gaussians:
     if path.is_file():
         check_counts(path, fix=fix)
     try:
+        # Mapped: what has been read may leave memory again.
         vertex = PlyData.read(str(path))["vertex"].data
-        names = vertex.dtype.names or ()
-
-        def columns(*wanted: str) -> np.ndarray:
-            return np.stack([np.asarray(vertex[n], np.float32) for n in wanted], 1)
-
-        bands = sum(n.startswith("f_rest_") for n in names) // 3
-        base = columns(*(f"f_dc_{i}" for i in range(3)))[:, None]
-        rest = columns(*(f"f_rest_{i}" for i in range(3 * bands))) if bands else base[:, :, :0]
-        rest = rest.reshape(len(base), 3, bands).transpose(0, 2, 1)
-        moves = None
-        if VIBRATION[0] in names:
-            found = [np.asarray(vertex[n], np.float32) for n in VIBRATION]
-            velocities = np.stack(found[:3], 1)
-            moves = Vibration(*(on_device(a) for a in (velocities, *found[3:])))
-        return Gaussians(
-            means=on_device(columns("x", "y", "z")),
-            quats=on_device(columns(*(f"rot_{i}" for i in range(4)))),
-            log_scales=on_device(columns(*(f"scale_{i}" for i in range(3)))),
-            opacity_logits=on_device(np.asarray(vertex["opacity"], np.float32)),
-            sh=on_device(np.concatenate([base, rest], 1)),
-            vibration=moves,
-        )
+        return _read(vertex)
     except (OSError, PlyParseError, KeyError, ValueError) as error:
         raise UserError(f"{path} is no PLY of Gaussians: {error}.", fix=fix) from error
 
 
-def _columns_of(moves: Vibration) -> Float[np.ndarray, "n 5"]:
-    parts = moves.velocities, moves.peaks[:, None], moves.log_lives[:, None]
-    return np.concatenate([np.asarray(part) for part in parts], axis=1)
+def _read(vertex: np.ndarray) -> Gaussians:
+    """Return the Gaussians of a table, which is gone through once, some rows at a time."""
+    names = vertex.dtype.names or ()
+    bands = sum(n.startswith("f_rest_") for n in names) // 3
+    harmonics = [[f"f_dc_{c}" for c in range(3)]]
+    harmonics += [[f"f_rest_{c * bands + k}" for c in range(3)] for k in range(bands)]
+    wanted: list[Any] = [
+        ["x", "y", "z"],
+        [f"rot_{i}" for i in range(4)],
+        [f"scale_{i}" for i in range(3)],
+        "opacity",
+        harmonics,
+    ]
+    if VIBRATION[0] in names:
+        wanted += [list(VIBRATION[:3]), *VIBRATION[3:]]
+    fields = [np.array(part) for part in wanted]
+    arrays = [np.empty((len(vertex), *part.shape), np.float32) for part in fields]
+    for first in range(0, len(vertex), CHUNK):
+        rows = slice(first, first + CHUNK)
+        for part, array in zip(fields, arrays, strict=True):
+            for place, name in np.ndenumerate(part):
+                array[(rows, *place)] = vertex[rows][str(name)]
+    # One after another: each is let go where the device has a copy.
+    found = [on_device(arrays.pop(0)) for _ in range(len(arrays))]
+    return Gaussians(*found[:5], vibration=Vibration(*found[5:]) if found[5:] else None)
+
+
+def _vibration_of(moves: Vibration, rows: slice | Int[np.ndarray, " k"]) -> np.ndarray:
+    parts = moves.velocities[rows], moves.peaks[rows][:, None], moves.log_lives[rows][:, None]
+    return np.concatenate(parts, axis=1)

@@ -128,7 +128,7 @@ class Comparison:
             if choice not in self._predicted:
                 predicted = predict_held_out(self.problem, fit, response, self._where, scale)
                 self._predicted[choice] = predicted
-        density = {k: float(np.nanmean(p.densities)) for k, p in self._predicted.items()}
+        density = {k: _mean(p.densities) for k, p in self._predicted.items()}
         best = self._predicted[max(density, key=lambda k: density[k])]
         o = self.problem.observations
         cameras = int(o.cameras.max(initial=0)) + 1
@@ -154,3 +154,8 @@ class Comparison:
 
         (deficit, of_views), (_, of_regions) = over(self._views), over(self._regions)
         return {"deficit": deficit, "deficit_error": max(of_views, of_regions)}
+
+
+def _mean(densities: Float[np.ndarray, " h"]) -> float:
+    """Return the mean of what is known; where nothing is, no solution predicts anything."""
+    return -np.inf if np.isnan(densities).all() else float(np.nanmean(densities))

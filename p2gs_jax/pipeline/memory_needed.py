@@ -108,7 +108,7 @@ def memory_named() -> Iterator[None]:
     """
     try:
         yield
-    except (MemoryError, RuntimeError) as error:
+    except (MemoryError, RuntimeError, OSError) as error:
         if not ran_out(error):
             raise
         said = str(error).splitlines()[0][:160] if str(error) else "an allocation failed"

@@ -68,6 +68,6 @@ def scale_notes(scene: Scene, near: float | None, cfg: FitConfig, depth: float |
         out.append(
             f"The cameras are up to {away:.2g} scene units from the origin, where float32 has "
             f"steps of {step:.1g}, {step / depth:.1%} of the way to the nearest surfaces: "
-            "these will jitter. Subtract a common offset from poses and points."
+            "these may jitter. Subtract a common offset from poses and points."
         )
     return out

@@ -112,7 +112,8 @@ class CheckpointStore:
         import orbax.checkpoint as ocp
 
         if self._opened is None:
-            logging.getLogger("absl").setLevel(logging.ERROR)
+            # What fails is raised to us as well; it logs pages of it.
+            logging.getLogger("absl").setLevel(logging.CRITICAL)
             options = ocp.CheckpointManagerOptions(
                 max_to_keep=self.keep,
                 create=True,

@@ -11,6 +11,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+from p2gs_jax.core.disk import naming
 from p2gs_jax.errors import UserError
 
 try:
@@ -102,8 +103,9 @@ def _acquire(folder: Path) -> int | None:
                 os.close(handle)
                 return None
             if _is_at(handle, path):
-                os.ftruncate(handle, 0)
-                os.write(handle, f"{os.getpid()}\n".encode())
+                with naming(path):
+                    os.ftruncate(handle, 0)
+                    os.write(handle, f"{os.getpid()}\n".encode())
                 return handle
         except BaseException:
             os.close(handle)

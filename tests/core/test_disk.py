@@ -47,7 +47,7 @@ def test_a_full_disk_is_named_with_the_file(tmp_path, name):
     assert path.read_text() == "before"
 
 
-def test_a_checkpoint_without_room_is_named_and_the_one_before_it_stays(tmp_path):
+def test_a_checkpoint_without_room_is_named_and_the_one_before_it_stays(tmp_path, caplog):
     small, large = np.arange(8.0), np.arange(50_000.0)
     CheckpointStore(tmp_path / "checkpoints").save(1, {"a": small}, {})
     store = CheckpointStore(tmp_path / "checkpoints")
@@ -55,6 +55,7 @@ def test_a_checkpoint_without_room_is_named_and_the_one_before_it_stays(tmp_path
         store.save(2, {"a": large}, {})
     assert error.value.errno == errno.EFBIG
     assert error.value.filename == str(tmp_path / "checkpoints")
+    assert caplog.records == [], "users see one line, not orbax's pages"
     again = CheckpointStore(tmp_path / "checkpoints")
     assert again.latest_step() == 1
     np.testing.assert_array_equal(again.restore(1, {"a": small})[0]["a"], small)

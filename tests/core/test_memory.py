@@ -1,5 +1,6 @@
 """How much memory there is, and which errors say that it ran out."""
 
+import errno
 import resource
 
 import pytest
@@ -79,5 +80,8 @@ def test_errors_that_say_memory_ran_out():
 
     assert memory.ran_out(MemoryError())
     assert memory.ran_out(JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 8 bytes."))
+    assert memory.ran_out(OSError(errno.ENOMEM, "Cannot allocate memory"))
+    assert memory.ran_out(RuntimeError("can't start new thread"))
+    assert not memory.ran_out(OSError(errno.ENOSPC, "No space left on device"))
     assert not memory.ran_out(JaxRuntimeError("INTERNAL: no"))
     assert not memory.ran_out(ValueError("RESOURCE_EXHAUSTED"))

@@ -101,6 +101,12 @@ def test_a_track_behind_its_camera_is_not_the_closest():
     assert found.too_coarse == 1
 
 
+def test_a_track_behind_all_of_its_cameras_is_left_out():
+    found = track_colors(seen_from([-1.0, -3.0]), Grey())
+    assert len(found.views) == 0
+    assert found.too_coarse == 2
+
+
 def encoded(linear):
     return srgb_encode(linear).astype(np.float32)
 

@@ -1,5 +1,7 @@
 """The model is as rich as the scene needs, and the user is told why."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -45,6 +47,17 @@ def test_a_known_curve_is_not_chosen():
     assert "The tone curve is known (camera raw)" in s.reasons[0]
     free = select(seen, **LIMITS)
     assert free.solution.response.name == "spline over srgb"
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("value", [0.0, 1.0])
+def test_photographs_that_tell_nothing_choose_something_and_know_no_exposure(value):
+    seen = observe(DRIVE, make_exposures(DRIVE, "constant"), curve="srgb")
+    seen = dataclasses.replace(seen, colors=np.full_like(seen.colors, value))
+    s = select(seen, **LIMITS)
+    assert np.isinf(s.solution.exposure_errors).all()
+    assert np.isfinite(s.solution.log_exposures).all()
+    assert (s.solution.observations_per_view == 0).all()
 
 
 def candidate(model, parameters, density, deficit, error, difference=9.0):

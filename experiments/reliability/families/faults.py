@@ -1,0 +1,291 @@
+"""Faults while a fit runs: it is killed, stopped, robbed of disk, folder, memory and clock."""
+
+from __future__ import annotations
+
+import os
+import random
+import re
+import resource
+import shutil
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from reliability.families import _fits as fits
+from reliability.families._fits import Trial
+from reliability.families._scenes import Made, write_scene
+from reliability.family import Failure, Family, Mended, Report
+
+NAME = "faults"
+ABOUT = """
+A fit is killed at random moments (also while it writes checkpoints and results), asked to end, and
+loses disk, folder, memory or clock. Survived: it ends with the exit code and the words that belong
+to the fault, without a traceback, and resumed it gives the run that was never interrupted, byte for
+byte (log, Gaussians, photometry, scores).
+"""
+MENDED = (
+    Mended("SIGTERM killed a fit without a checkpoint", "tests/train/test_loop.py"),
+    Mended("SIGTERM to a sweep left its runs behind", "tests/train/test_sweep_processes.py"),
+    Mended("two processes wrote into one run folder", "tests/run/test_lock.py"),
+    Mended(
+        "a full disk ended in a traceback of whatever library wrote",
+        "tests/core/test_disk.py::test_a_full_disk_is_named_with_the_file",
+    ),
+    Mended(
+        "a checkpoint without room printed pages of another library's tracebacks",
+        "tests/core/test_disk.py"
+        "::test_a_checkpoint_without_room_is_named_and_the_one_before_it_stays",
+    ),
+    Mended(
+        "a full disk tore the log silently",
+        "tests/core/test_disk.py::test_a_log_without_room_is_named_and_mended",
+    ),
+    Mended(
+        "a removed folder was made again, without what resuming needs",
+        "tests/run/test_lock.py::test_a_folder_that_was_removed_underneath_is_named",
+    ),
+    Mended(
+        "memory that could not suffice was noticed when it ran out",
+        "tests/pipeline/test_memory_needed.py",
+    ),
+)
+KILLS, KILLS_QUICK = 50, 4
+# Bytes that a file may have: from no room for the first file to none for the checkpoint.
+ROOMS = (0, 300, 1_000, 4_000, 20_000, 60_000)
+_CAP_DAC_OVERRIDE, _CAP_DAC_READ_SEARCH, _PR_CAPBSET_DROP = 1, 2, 24
+
+_CLOCK = """
+import sys, threading, time
+real, steps = time.time, iter(range(10**9))
+time.time = lambda: real() - 86400 * (next(steps) % 3)
+from p2gs_jax.cli import main
+main(sys.argv[1:])
+"""
+_MEMORY = """
+import pathlib, resource, sys, threading, time
+from p2gs_jax.cli import main
+log, wanted = pathlib.Path(sys.argv.pop(1)), int(sys.argv.pop(1))
+def shrink():
+    while not log.exists() or log.read_bytes().count(b"\\n") < wanted:
+        time.sleep(.002)
+    pages = int(open("/proc/self/statm").read().split()[0])
+    limit = pages * resource.getpagesize() + (1 << 20)
+    resource.setrlimit(resource.RLIMIT_AS, (limit, resource.RLIM_INFINITY))
+threading.Thread(target=shrink, daemon=True).start()
+main(sys.argv[1:])
+"""
+
+
+class Faults:
+    """The trials, on one scene and against one uninterrupted run."""
+
+    def __init__(self, out: Path):
+        self.out, self.env = out, fits.environment(out / "compiled")
+        self.scene = write_scene(out / "scene", Made())
+        self.whole = out / "whole"
+        fits.run(fits.command(self.scene, self.whole), self.env).require(0)
+        self.rng = random.Random(0)
+
+    def start(self, run: Path, *extra: str, **options):
+        """Start a fit into a folder, or continue the one that is there."""
+        if (run / "config.json").exists():
+            extra = ("--resume", *extra)
+        return fits.started(fits.command(self.scene, run, *extra), self.env, **options)
+
+    def finish(self, run: Path) -> None:
+        """Continue a run undisturbed and compare it with the uninterrupted one."""
+        extra = ("--resume",) if (run / "config.json").exists() else ()
+        fits.run(fits.command(self.scene, run, *extra), self.env).require(0)
+        fits.require_same(self.whole, run)
+
+    def killed(self, run: Path, kills: int, report: Report) -> list[tuple[str, str | None]]:
+        """Kill fits until there were enough kills; every run ends as the uninterrupted one."""
+        found: list[tuple[str, str | None]] = []
+        while len(found) < kills:
+            chain: list[str] = []
+            shutil.rmtree(run, ignore_errors=True)
+            reason = None
+            try:
+                while len(found) + len(chain) < kills and len(chain) < 6:
+                    moment = self._kill(run)
+                    if moment is None:
+                        break
+                    chain.append(moment)
+                self.finish(run)
+            except Trial as trial:
+                reason = str(trial)
+            found += [(f"killed {moment}", reason) for moment in chain]
+            report(f"faults: {len(found)} of {kills} kills, {chain[-1:]}: {reason or 'survived'}")
+        return found
+
+    def _kill(self, run: Path) -> str | None:
+        """Kill a fit and return when; None where it ended first."""
+        before = fits.lines(run)
+        with self.start(run) as process:
+            kind = self.rng.choice(("any", "step", "checkpoint", "writing", "step"))
+            if kind == "any":
+                delay = self.rng.uniform(0, 8)
+                fits.wait_for(process, _after(delay))
+                moment = f"{delay:.2f} s after its start"
+            elif kind == "step":
+                wanted = before + self.rng.randint(1, 4)
+                delay = self.rng.uniform(0, 0.1)
+                fits.wait_for(process, lambda: fits.lines(run) >= wanted)
+                fits.wait_for(process, _after(delay))
+                moment = "between steps"
+            elif kind == "checkpoint":
+                folder = run / "checkpoints"
+                fits.wait_for(process, lambda: any(folder.glob("*orbax-checkpoint-tmp*")))
+                moment = "while it wrote a checkpoint"
+            else:
+                fits.wait_for(process, lambda: (run / "renders").exists())
+                fits.wait_for(process, _after(self.rng.uniform(0, 0.5)))
+                moment = "while it wrote its results"
+            if process.poll() is not None:
+                return None
+            process.send_signal(signal.SIGKILL)
+            fits.end(process)
+        return moment
+
+    def asked(self, run: Path, number: int, word: str) -> None:
+        """Ask a fit to end between steps."""
+        with self.start(run, "--train.checkpoint-every-s", "1000") as process:
+            fits.wait_for(process, lambda: fits.lines(run) >= 3)
+            process.send_signal(number)
+            fits.end(process).require(128 + number, word, "--resume continues it")
+        # A frequent checkpoint is an option of the run: the same as it was begun with.
+        extra = ("--resume", "--train.checkpoint-every-s", "1000")
+        fits.run(fits.command(self.scene, run, *extra), self.env).require(0, "Resuming after step")
+        fits.require_same(self.whole, run)
+
+    def full(self, run: Path, room: int) -> None:
+        """Let no file grow beyond so many bytes."""
+
+        def limit() -> None:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (room, resource.RLIM_INFINITY))
+
+        with self.start(run, preexec_fn=limit) as process:
+            fits.end(process).require(2, str(run), "disk has room")
+        self.finish(run)
+
+    def read_only(self, run: Path) -> None:
+        """Make the folder read-only, before the fit and in the middle of it."""
+        run.mkdir()
+        run.chmod(0o555)
+        with self.start(run, preexec_fn=_without_rights) as process:
+            fits.end(process).require(2, str(run), "Permission denied")
+        run.chmod(0o755)
+        with self.start(run, preexec_fn=_without_rights) as process:
+            fits.wait_for(process, lambda: fits.lines(run) >= 2)
+            (run / "checkpoints").chmod(0o555)
+            fits.end(process).require(2, str(run), "Permission denied")
+        (run / "checkpoints").chmod(0o755)
+        self.finish(run)
+
+    def removed(self, run: Path) -> None:
+        """Remove the folder underneath."""
+        with self.start(run) as process:
+            fits.wait_for(process, lambda: fits.lines(run) >= 2)
+            while run.exists():
+                shutil.rmtree(run, ignore_errors=True)
+            fits.end(process).require(2, str(run), "was removed")
+        if (run / "config.json").exists():
+            raise Trial("it made the folder anew")
+        shutil.rmtree(run, ignore_errors=True)
+        self.finish(run)
+
+    def clock(self, run: Path) -> None:
+        """Set the clock back by days, again and again."""
+        argv = [sys.executable, "-c", _CLOCK, *fits.command(self.scene, run)[3:]]
+        fits.run(argv, self.env).require(0)
+        fits.require_same(self.whole, run)
+
+    def second(self, run: Path) -> None:
+        """Start another process in the same folder."""
+        with self.start(run) as process:
+            fits.wait_for(process, lambda: fits.lines(run) >= 1)
+            process.send_signal(signal.SIGSTOP)  # or it might end before the second one begins
+            for extra in ((), ("--resume",)):
+                second = fits.run(fits.command(self.scene, run, *extra), self.env)
+                second.require(2, f"process {process.pid}")
+            process.send_signal(signal.SIGCONT)
+            fits.end(process).require(0)
+        fits.require_same(self.whole, run)
+
+    def foretold(self, run: Path) -> None:
+        """Leave less memory than the fit will take."""
+
+        def limit() -> None:
+            resource.setrlimit(resource.RLIMIT_AS, (12 << 30, resource.RLIM_INFINITY))
+
+        argv = fits.command(self.scene, run, "--densify.max-gaussians", "90000000")
+        ended = fits.run(argv, self.env, preexec_fn=limit)
+        ended.require(2, "would take about", "--gaussians")
+        if (run / "config.json").exists():
+            raise Trial("it locked the folder")
+        if not re.search(r"add --gaussians \d+", " ".join(ended.said.split())):
+            raise Trial("it does not say how many Gaussians there is memory for")
+
+    def out_of_memory(self, run: Path) -> None:
+        """Take all memory away between steps: the fit says so or dies, and goes on later."""
+        given = fits.command(self.scene, run)[3:]
+        argv = [sys.executable, "-c", _MEMORY, str(run / "log.jsonl"), "3", *given]
+        ended = fits.run(argv, self.env)
+        if ended.code not in (0, 2) and ended.code >= 0:
+            raise Trial(f"exit code {ended.code}: {ended.said[-300:]}")
+        if ended.code == 2:
+            ended.require(2, "memory ran out")
+        self.finish(run)
+
+
+def run(quick: bool, out: Path, report: Report) -> Family:
+    """Try all faults."""
+    faults = Faults(out)
+    report("faults: the uninterrupted run is there")
+    trials: dict[str, Callable[[Path], None]] = {
+        "SIGTERM": lambda run: faults.asked(run, signal.SIGTERM, "SIGTERM"),
+        "Ctrl-C": lambda run: faults.asked(run, signal.SIGINT, "Ctrl-C"),
+        "SIGHUP": lambda run: faults.asked(run, signal.SIGHUP, "SIGHUP"),
+        **{
+            f"files of {room} bytes at most": lambda run, room=room: faults.full(run, room)
+            for room in ROOMS
+        },
+        "read-only folder": faults.read_only,
+        "folder removed": faults.removed,
+        "clock set back": faults.clock,
+        "a second process": faults.second,
+        "too little memory, foretold": faults.foretold,
+        "memory taken away": faults.out_of_memory,
+    }
+    if quick:
+        quickly = ("SIGTERM", f"files of {ROOMS[-2]} bytes at most", "folder removed")
+        quickly += ("a second process", "too little memory, foretold", "memory taken away")
+        trials = {name: trials[name] for name in quickly}
+    found = faults.killed(out / "killed", KILLS_QUICK if quick else KILLS, report)
+    for number, (name, trial) in enumerate(trials.items()):
+        reason = None
+        try:
+            trial(out / f"run_{number}")
+        except Trial as error:
+            reason = str(error)
+        report(f"faults: {name}: {reason or 'survived'}")
+        found.append((name, reason))
+    failures = tuple(Failure(name, reason) for name, reason in found if reason is not None)
+    return Family(NAME, len(found), len(found) - len(failures), failures, MENDED)
+
+
+def _after(seconds: float) -> Callable[[], bool]:
+    import time
+
+    end = time.monotonic() + seconds
+    return lambda: time.monotonic() >= end
+
+
+def _without_rights() -> None:
+    """Drop what lets root write everywhere (Linux)."""
+    if os.geteuid() == 0:
+        import ctypes
+
+        for capability in (_CAP_DAC_OVERRIDE, _CAP_DAC_READ_SEARCH):
+            ctypes.CDLL(None).prctl(_PR_CAPBSET_DROP, capability, 0, 0, 0)
