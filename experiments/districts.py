@@ -3,7 +3,7 @@
 python experiments/districts.py [--quick | --middle] [--out DIR] [--dask]
 
 Streets one behind another, photographed by three cameras: 300 photographs each over 600 m (quick:
-30 over 120 m), in four blocks (quick: two), one after another. Every fit has a process of its own,
+30 over 60 m), in four blocks (quick: two), one after another. Every fit has a process of its own,
 so that its peak memory is its own. With --dask the blocks are fitted once more by two workers of a
 scheduler on loopback, one of which is killed while it fits. Finished runs are kept.
 """
@@ -62,7 +62,7 @@ class Size:
 
 FULL = Size(300, 2.0, 480, 200_000, 12_000, 4)
 MIDDLE = Size(80, 4.0, 160, 40_000, 2400, 4)
-QUICK = Size(30, 4.0, 96, 8000, 600, 2)
+QUICK = Size(30, 2.0, 96, 12_000, 400, 2)
 
 
 def main() -> None:

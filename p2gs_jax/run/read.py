@@ -186,7 +186,7 @@ class Run:
             "and report; in Python load_run(folder, scene))",
         )
 
-    @property
+    @cached_property
     def alive(self) -> Bool[Array, " n"]:
         """All Gaussians: a finished run keeps no empty slots."""
         return on_device(np.ones(self.params.gaussians.capacity), bool)
