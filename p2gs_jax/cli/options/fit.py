@@ -5,15 +5,17 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from p2gs_jax import config as configs
 from p2gs_jax.cli.options.parse import check, parse_duration, parse_gaussians
-from p2gs_jax.core.devices import Devices
-from p2gs_jax.core.processes import Processes, scheduled
 from p2gs_jax.errors import UserError
+
+if TYPE_CHECKING:
+    from p2gs_jax.core.devices import Devices
+    from p2gs_jax.core.processes import Processes
 
 Preset = Annotated[configs.PresetName, tyro.conf.arg(metavar="NAME")]
 Duration = Annotated[str | None, tyro.conf.arg(metavar="TIME")]
@@ -263,6 +265,8 @@ def resolve_processes(args: Fit) -> Processes | None:
     Raises:
         UserError: some of it is missing, or makes no sense.
     """
+    from p2gs_jax.core.processes import Processes, scheduled
+
     given = (args.coordinator, args.processes, args.process)
     check(args.process_timeout >= 1, "--process-timeout must be at least 1")
     if given == (None, None, None):
@@ -294,6 +298,8 @@ def resolve_devices(args: Fit) -> Devices:
     Raises:
         UserError: the number is none.
     """
+    from p2gs_jax.core.devices import Devices
+
     if args.devices == "all" or resolve_processes(args) is not None:
         return Devices("all", args.shard)
     check(
