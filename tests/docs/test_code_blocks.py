@@ -188,7 +188,7 @@ def capture_help():
 # Commands that the overview has a place for, and that are not there yet.
 PLANNED = {name for group in GROUPS.values() for name in group} - set(COMMANDS)
 # Options of other programs that pages mention.
-OTHERS = {"--help", "--help-all", "--version", "--ckpt"}
+OTHERS = {"--help", "--help-all", "--version", "--ckpt", "--only", "--nthreads"}
 OTHERS |= {"--data", "--orientation-method", "--center-method", "--auto-scale-poses"}
 
 
