@@ -68,8 +68,13 @@ def test_nothing_registers(tmp_path):
 
 
 def test_too_few_or_broken_images(tmp_path):
-    (tmp_path / "a.png").write_bytes(b"nothing")
+    from PIL import Image
+
+    Image.new("RGB", (30, 20)).save(tmp_path / "a.png")
     with pytest.raises(UserError, match="holds 1 image"):
+        load_scene(tmp_path, CFG)
+    (tmp_path / "a.png").write_bytes(b"nothing")
+    with pytest.raises(UserError, match=r"cannot decode the image .*a.png"):
         load_scene(tmp_path, CFG)
     (tmp_path / "b.png").write_bytes(b"nothing")
     with pytest.raises(UserError, match=r"cannot decode the image .*a.png"):
