@@ -60,9 +60,7 @@ def write_colmap_folder(
         if not all(mask.all() for mask in masks.values()):
             for name, mask in masks.items():
                 # COLMAP's name of a mask: the photograph's, suffix included, and .png.
-                path = temporary / "masks" / f"{name}.png"
-                path.parent.mkdir(parents=True, exist_ok=True)
-                Image.fromarray(255 * mask.astype(np.uint8)).save(path)
+                write_mask(temporary / "masks" / f"{name}.png", mask)
 
 
 def exposure_table(photometry: Sequence[ViewPhotometry]) -> str:
@@ -139,6 +137,12 @@ def _nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 
     """Return the rotation that a float32 matrix was rounded from, orthonormal in float64."""
     u, _, vt = np.linalg.svd(matrix)
     return u @ vt
+
+
+def write_mask(path: Path, mask: Bool[np.ndarray, "h w"]) -> None:
+    """Write a mask, 255 where it is to be used; its folder is created."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(255 * mask.astype(np.uint8)).save(path)
 
 
 def write_photograph(path: Path, view: View, ldr: np.ndarray) -> None:

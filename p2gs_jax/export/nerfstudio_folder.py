@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 from plyfile import PlyData, PlyElement
 
 from p2gs_jax.core.atomic import atomic_folder, write_json, write_text
-from p2gs_jax.export.colmap_folder import exposure_table, write_photograph
+from p2gs_jax.export.colmap_folder import exposure_table, write_mask, write_photograph
 from p2gs_jax.run.photometry_file import ViewPhotometry
 from p2gs_jax.scene import ImageStore
 from p2gs_jax.types import Scene
@@ -55,8 +54,7 @@ def write_nerfstudio_folder(
             frames.append(_frame(store, index) | {"file_path": place.as_posix()})
             if not (mask > 0).all():
                 there = Path("masks") / f"{view.name}.png"
-                (temporary / there).parent.mkdir(parents=True, exist_ok=True)
-                Image.fromarray(255 * (mask > 0).astype(np.uint8)).save(temporary / there)
+                write_mask(temporary / there, mask > 0)
                 frames[-1]["mask_path"] = there.as_posix()
             on_view(index + 1, len(scene.views))
         names: dict[str, list[str]] = {"train": [], "test": []}

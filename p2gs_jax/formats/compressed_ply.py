@@ -12,7 +12,7 @@ import numpy as np
 
 from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.errors import UserError
-from p2gs_jax.formats.spz import require_gsply
+from p2gs_jax.formats.through_gsply import gsply_data, require_gsply
 from p2gs_jax.types import Gaussians
 
 # Chosen by gsply where a name ends so.
@@ -29,20 +29,10 @@ def write_compressed_ply(path: Path, gaussians: Gaussians) -> int:
     Raises:
         UserError: gsply is not installed.
     """
-    gsply, g = require_gsply(), gaussians
-    quats = np.asarray(g.quats, np.float32)
-    data = gsply.GSData.from_arrays(
-        means=np.asarray(g.means),
-        scales=np.asarray(g.log_scales),
-        quats=quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12),
-        opacities=np.asarray(g.opacity_logits),
-        sh0=np.asarray(g.sh[:, 0]),
-        shN=np.asarray(g.sh[:, 1:]) if g.sh.shape[1] > 1 else None,
-        format="ply",
-    )
+    gsply, data = require_gsply(), gsply_data(gaussians)
     with atomic_write(path) as temporary:
         temporary.write_bytes(gsply.compress_to_bytes(data))
-    return g.capacity
+    return gaussians.capacity
 
 
 def read_compressed_ply(path: Path) -> Gaussians:

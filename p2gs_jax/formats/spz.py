@@ -8,35 +8,18 @@ would clip them.
 from __future__ import annotations
 
 from pathlib import Path
-from types import ModuleType
 
 import jax.numpy as jnp
 import numpy as np
 
 from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.errors import UserError
+from p2gs_jax.formats.through_gsply import gsply_data, require_gsply
 from p2gs_jax.gaussians.half_turn import half_turn
 from p2gs_jax.types import Gaussians
 
 # Positions are integers of 24 bits with a sign; more than 24 fractional bits are not allowed.
 LARGEST_INTEGER, MOST_FRACTIONAL_BITS = 2**23 - 1, 24
-
-
-def require_gsply() -> ModuleType:
-    """Return the package that writes SPZ.
-
-    Raises:
-        UserError: it is not installed.
-    """
-    try:
-        import gsply
-    except ImportError as error:
-        raise UserError(
-            f"SPZ and compressed PLY need the package gsply, which cannot be imported ({error}).",
-            fix="pip install 'p2gs-jax[spz]', or convert display.ply with another tool "
-            "(docs/exports.md)",
-        ) from error
-    return gsply
 
 
 def write_spz(path: Path, gaussians: Gaussians) -> int:
@@ -45,22 +28,17 @@ def write_spz(path: Path, gaussians: Gaussians) -> int:
     Raises:
         UserError: gsply is not installed, or a position does not fit the format.
     """
-    gsply = require_gsply()
+    require_gsply()
     from gsply.spz import write_spz as write
 
     g = half_turn(gaussians)
-    quats = np.asarray(g.quats, np.float32)
-    data = gsply.GSData.from_arrays(
-        means=np.asarray(g.means),
-        scales=np.asarray(g.log_scales),
-        quats=quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12),
-        opacities=np.asarray(g.opacity_logits),
-        sh0=np.asarray(g.sh[:, 0]),
-        shN=np.asarray(g.sh[:, 1:]) if g.sh.shape[1] > 1 else None,
-        format="ply",
-    )
     with atomic_write(path) as temporary:
-        write(temporary, data, version=3, fractional_bits=fractional_bits(np.asarray(g.means)))
+        write(
+            temporary,
+            gsply_data(g),
+            version=3,
+            fractional_bits=fractional_bits(np.asarray(g.means)),
+        )
     return g.capacity
 
 

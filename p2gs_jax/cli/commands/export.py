@@ -23,7 +23,7 @@ from p2gs_jax.export.page import MEGABYTE, write_page
 from p2gs_jax.export.sidecar import corrections_name, linear_sidecar
 from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.formats.ply import write_radiance
-from p2gs_jax.formats.spz import require_gsply
+from p2gs_jax.formats.through_gsply import require_gsply
 from p2gs_jax.formats.usd import require_pxr
 from p2gs_jax.gaussians.bake import display_of_splats
 from p2gs_jax.photometry.display import DisplayTransform
