@@ -12,7 +12,6 @@ import functools
 from typing import Any
 
 import jax
-import numpy as np
 
 from p2gs_jax.config import FitConfig, PhotometryConfig, TrainConfig
 from p2gs_jax.core.numerics import on_host
@@ -152,9 +151,11 @@ class Step:
 
     def frusta(self, batch: Batch, partner: Partner) -> tuple[Frustum, ...]:
         """Return the views of a step, for the programs that know no image size."""
+        cameras = (batch.camera, *partner_cameras(partner, self.cfg))
+        sizes = (map(c.K.dtype.type, (c.width, c.height)) for c in cameras)
         return tuple(
-            on_host(Frustum, c.viewmat, c.K, np.float32(c.width), np.float32(c.height), c.objects)
-            for c in (batch.camera, *partner_cameras(partner, self.cfg))
+            on_host(Frustum, c.viewmat, c.K, width, height, c.objects)
+            for c, (width, height) in zip(cameras, sizes, strict=True)
         )
 
 
