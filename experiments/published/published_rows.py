@@ -58,7 +58,9 @@ def commit() -> str:
         )
         return done.stdout.strip()
 
-    changed = " and changes" if git("status", "--porcelain", "--untracked-files=no") else ""
+    # The rows themselves change with every row.
+    status = git("status", "--porcelain", "-uno", "--", ":/", ":(top,exclude)experiments/*.json")
+    changed = " and changes" if status else ""
     return (git("rev-parse", "--short", "HEAD") or "unknown") + changed
 
 

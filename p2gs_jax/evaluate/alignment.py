@@ -19,7 +19,8 @@ from p2gs_jax.photometry.formation import display, formation
 from p2gs_jax.photometry.matte import Matte, composited, uncovered
 from p2gs_jax.types import Capture
 
-SEARCH_STOPS, SEARCH_STEPS, GOLDEN_STEPS = 5.0, 41, 30
+# Photographs may be so much darker than what a scene is shown for (LOM `low`: 6.6 stops).
+SEARCH_STOPS, SEARCH_STEPS, GOLDEN_STEPS = 12.0, 49, 30
 REFINE_STEPS = 30
 # Stride of the coarse search over pixels, along each axis.
 SEARCH_STRIDE = 3
@@ -78,7 +79,7 @@ def fit_exposure(
 ) -> Float[Array, ""]:
     """Return the one exposure with which a render fits a photograph best, in squared LDR error.
 
-    A coarse search over +-5 stops around 1 followed by golden sections: the error of a clipped
+    A coarse search over +-12 stops around 1 followed by golden sections: the error of a clipped
     image has flat stretches where Newton's method stalls.
 
     Args:

@@ -98,9 +98,17 @@ def _build(folder: Path, views: Sequence[View], report: Callable[[str], None]) -
     report("triangulating")
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = 0
-    model = pycolmap.triangulate_points(
-        prior, database, image_folder, folder, refine_intrinsics=False, options=options
-    )
+
+    def triangulated() -> pycolmap.Reconstruction:
+        return pycolmap.triangulate_points(
+            prior, database, image_folder, folder, refine_intrinsics=False, options=options
+        )
+
+    model = triangulated()
+    if not model.points3D:
+        # COLMAP takes no point that two photographs alone show; of two there are no others.
+        options.triangulation.ignore_two_view_tracks = False
+        model = triangulated()
     model.write(folder)
     database.unlink()  # large, and not needed again
     shutil.rmtree(folder / LINKS, ignore_errors=True)

@@ -45,6 +45,16 @@ def test_fit_exposure_finds_the_exposure(true, curve):
     assert float(found) == pytest.approx(true, rel=2e-3)
 
 
+@pytest.mark.parametrize("stops", [-9.0, 6.6, 9.0])
+def test_fit_exposure_reaches_photographs_far_darker_and_brighter(stops):
+    cfg = PhotometryConfig(curve="srgb")
+    rng = np.random.default_rng(0)
+    shown = jnp.asarray(np.exp2(rng.normal(-3, 2, (20, 30, 3))), jnp.float32)
+    photo = display(formation(shown, USUAL, cfg))
+    found = fit_exposure(shown / 2**stops, photo, jnp.ones((20, 30)), USUAL, cfg)
+    assert np.log2(found) == pytest.approx(stops, abs=3e-3)
+
+
 @pytest.mark.parametrize(("true", "gamma"), [(0.3, 1.7), (1.0, 3.1), (4.0, 2.4)])
 def test_exposure_and_gamma_are_found_together(true, gamma):
     cfg = PhotometryConfig()

@@ -193,6 +193,25 @@ def test_triangulation_with_known_poses_and_its_cache(shared_data, tmp_path):
     assert np.array_equal(again.tracks.xy, scene.tracks.xy)
 
 
+def test_two_photographs_are_triangulated(tmp_path):
+    shift, focal, baseline = 12, 200.0, 0.3
+    rng = np.random.default_rng(0)
+    blocks = rng.integers(0, 256, (20, 30, 3), np.uint8)
+    wall = cv2.resize(blocks, (300, 200), interpolation=cv2.INTER_CUBIC)
+    (tmp_path / "images").mkdir()
+    found = []
+    for name, left in (("a", 0), ("b", shift)):
+        cv2.imwrite(str(tmp_path / f"images/{name}.png"), wall[:, left : left + 260])
+        pose = OPENGL.copy()
+        pose[0, 3] = baseline * left / shift
+        found.append({"file_path": f"images/{name}.png", "transform_matrix": pose.tolist()})
+    write(tmp_path, {"fl_x": focal, "w": 260, "h": 200, "frames": found}, names=())
+    scene = load_scene(tmp_path, CFG)
+    assert not scene.random_seeds
+    assert len(scene.points) > 50
+    assert np.median(scene.points[:, 2]) == pytest.approx(focal * baseline / shift, rel=0.02)
+
+
 @pytest.mark.slow
 def test_fox_triangulation(shared_data):
     scene = load_scene(shared_data("nerf_fox"), CFG)
