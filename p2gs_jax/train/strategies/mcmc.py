@@ -62,7 +62,7 @@ class Mcmc(Strategy):
         self._relocate = self.run.programs.ahead(
             ("relocate", *self._static.values(), slots),
             relocate,
-            compiled_key.eval_shape(self.run.cfg.train.seed, np.int32(0)),
+            compiled_key.eval_shape(np.uint32(0), np.int32(0)),
             state.params.gaussians,
             state.population,
             state.opt_state.gaussians[0],
