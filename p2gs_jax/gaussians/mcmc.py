@@ -152,7 +152,9 @@ def exploration_noise(
         alive: slots in use.
         rate: noise scale times the learning rate of the means.
     """
-    return shaped_noise(jax.random.normal(key, gaussians.means.shape), gaussians, alive, rate)
+    # The same numbers in any precision.
+    normal = jax.random.normal(key, gaussians.means.shape, jnp.float32)
+    return shaped_noise(normal, gaussians, alive, rate)
 
 
 def shaped_noise(

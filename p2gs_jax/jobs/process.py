@@ -16,6 +16,8 @@ from p2gs_jax.jobs.job import REASON, JobFiles, Status, read_job, read_reason
 
 # Seconds between looks at the file that asks for the end.
 LOOK_S = 0.2
+# How a job ends that was asked to, and left its checkpoint (`interrupts.exit_code`).
+ASKED = tuple(128 + int(number) for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM))
 
 
 def run_in_process(job_path: str) -> tuple[Status, str | None]:
@@ -25,7 +27,7 @@ def run_in_process(job_path: str) -> tuple[Status, str | None]:
         job_path: of the job file.
 
     Returns:
-        How it ended, and why it failed; `lost` where its process was killed.
+        How it ended, and why it failed; `lost` where a signal ended its process.
     """
     files = JobFiles(Path(job_path))
     folder = read_job(files.path).folder
@@ -50,7 +52,8 @@ def run_in_process(job_path: str) -> tuple[Status, str | None]:
     if stopped:
         return "stopped", None
     reason = _why(process.returncode, files.output)
-    if process.returncode < 0:
+    # Nobody here asked it to end: a batch system takes the node back, or its time is over.
+    if process.returncode < 0 or process.returncode in ASKED:
         return "lost", reason
     folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / REASON, {"reason": reason})

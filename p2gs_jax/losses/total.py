@@ -77,14 +77,15 @@ class LossAux(NamedTuple):
 def decoded(batch: Batch) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"]]:
     """Return a photograph in [0, 1] and its mask as floats; they travel as they are stored.
 
-    One with alpha is put over its backdrop.
+    One with alpha is put over its backdrop. Their precision is the camera's.
     """
-    ldr = batch.ldr.astype(jnp.float32)
+    kind = batch.camera.K.dtype
+    ldr = batch.ldr.astype(kind)
     scale = float(np.iinfo(batch.ldr.dtype).max) if batch.ldr.dtype.kind == "u" else 1.0
     ldr = ldr / scale
     if batch.alpha is not None and batch.backdrop is not None:
         ldr = ldr + (1 - unit(batch.alpha)[..., None]) * batch.backdrop
-    return ldr, batch.mask.astype(jnp.float32)
+    return ldr, batch.mask.astype(kind)
 
 
 def _there(batch: Batch, mask: Float[Array, "h w"]) -> Float[Array, "h w"]:

@@ -153,9 +153,9 @@ def forward(rows, ids_list, offsets, plan: Plan):
         slot,
         queue.starts[slot],
         jnp.ones(lanes, bool),
-        tuple(jnp.zeros((lanes, pixels), jnp.float32) for _ in range(plan.channels + 1)),
+        tuple(jnp.zeros((lanes, pixels), rows.dtype) for _ in range(plan.channels + 1)),
         tuple(
-            jnp.full((slots + lanes, pixels), float(k == plan.channels), jnp.float32)
+            jnp.full((slots + lanes, pixels), float(k == plan.channels), rows.dtype)
             for k in range(plan.channels + 1)
         ),
         jnp.concatenate([segments.starts, jnp.zeros(lanes, jnp.int32)]),
@@ -189,8 +189,8 @@ def backward(rows, ids_list, residuals, image, v_image, plan: Plan):
     local_x, local_y = plan.local_pixels()
     ids_list = _padded(ids_list, plan)
     queue = Queue.build(segments, stops, plan)
-    one = jnp.ones(pixels)
-    zero = jnp.zeros(pixels)
+    one = jnp.ones(pixels, rows.dtype)
+    zero = jnp.zeros(pixels, rows.dtype)
     # Eight columns, two of them zero, multiply faster than six.
     features = jnp.stack(
         [one, local_x, local_y, local_x**2, local_x * local_y, local_y**2, zero, zero], 1
@@ -281,7 +281,7 @@ def backward(rows, ids_list, residuals, image, v_image, plan: Plan):
         turn, slot, position = queue.advance(turn, slot, position, done)
         return turn, slot, position, done, transmittance, remaining, v_rows
 
-    blank = jnp.zeros((lanes, pixels), jnp.float32)
+    blank = jnp.zeros((lanes, pixels), rows.dtype)
     state = (
         jnp.int32(lanes),
         slot,
@@ -289,7 +289,7 @@ def backward(rows, ids_list, residuals, image, v_image, plan: Plan):
         jnp.ones(lanes, bool),
         blank,
         blank,
-        jnp.zeros((rows.shape[0], GEOMETRY + plan.channels), jnp.float32),
+        jnp.zeros((rows.shape[0], GEOMETRY + plan.channels), rows.dtype),
     )
     v_rows = lax.while_loop(lambda s: jnp.any(s[1] < queue.slots), body, state)[6]
     # A splat's own cutoff has no gradient.

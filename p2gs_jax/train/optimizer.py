@@ -77,8 +77,9 @@ def scale_by_adam(
         counts = state.counts + 1
         mu = jax.tree.map(lambda m, g: b1 * m + (1 - b1) * g, state.mu, updates)
         nu = jax.tree.map(lambda v, g: b2 * v + (1 - b2) * g * g, state.nu, updates)
-        first = 1 / (1 - b1 ** counts.astype(jnp.float32))
-        second = 1 / (1 - b2 ** counts.astype(jnp.float32))
+        kind = jax.tree.leaves(mu)[0].dtype
+        first = 1 / (1 - b1 ** counts.astype(kind))
+        second = 1 / (1 - b2 ** counts.astype(kind))
 
         def scaled(m, v):
             shape = counts.shape + (1,) * (m.ndim - counts.ndim) if by_row else ()

@@ -12,9 +12,8 @@ import functools
 from typing import Any
 
 import jax
-import numpy as np
 
-from p2gs_jax.config import FitConfig, PhotometryConfig, TrainConfig
+from p2gs_jax.config import FitConfig, PhotometryConfig
 from p2gs_jax.core.numerics import on_host
 from p2gs_jax.losses.total import Partner, partner_cameras
 from p2gs_jax.render.capacity import Room
@@ -117,7 +116,6 @@ class Step:
         known = dataclasses.replace(
             known,
             densify=cfg.densify,
-            train=TrainConfig(seed=cfg.train.seed),
             optimizer=cfg.optimizer,
             photometry=moving,
         )
@@ -152,9 +150,11 @@ class Step:
 
     def frusta(self, batch: Batch, partner: Partner) -> tuple[Frustum, ...]:
         """Return the views of a step, for the programs that know no image size."""
+        cameras = (batch.camera, *partner_cameras(partner, self.cfg))
+        sizes = (map(c.K.dtype.type, (c.width, c.height)) for c in cameras)
         return tuple(
-            on_host(Frustum, c.viewmat, c.K, np.float32(c.width), np.float32(c.height), c.objects)
-            for c in (batch.camera, *partner_cameras(partner, self.cfg))
+            on_host(Frustum, c.viewmat, c.K, width, height, c.objects)
+            for c, (width, height) in zip(cameras, sizes, strict=True)
         )
 
 

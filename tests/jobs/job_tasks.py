@@ -20,6 +20,9 @@ def count(folder, arguments, reporter):
         (folder / "done").touch()
     elif todo == "kill":
         os.kill(os.getpid(), signal.SIGKILL)
+    elif todo == "ask":
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(120)
     elif todo == "refuse":
         raise UserError("the scene is empty.", fix="add photographs")
     elif todo == "stumble":

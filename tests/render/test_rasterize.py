@@ -79,6 +79,21 @@ def test_values_and_gradients_match_oracle(oracle, tile, stop, implementation):
         assert error < (2e-4 if stop is None else 1e-3), (name, error)
 
 
+def test_the_lane_queue_computes_in_the_precision_that_it_is_given(oracle):
+    expected, v_expected, weights = oracle
+    # Nothing is left out and nothing approximated: what remains is rounding.
+    cfg = dataclasses.replace(CFG, implementation="xla", stop_error=None, exp_degree=None)
+    with jax.enable_x64(True):
+        g, cam = street(dtype=np.float64)
+        v, r = jax.jit(jax.grad(lambda g: scalar(g, cam, cfg, weights), has_aux=True))(g)
+        v, r = jax.tree.map(np.asarray, (v, r))
+    for name in ("linear", "alpha", "depth"):
+        np.testing.assert_allclose(getattr(r, name), getattr(expected, name), rtol=0, atol=1e-11)
+    for name in FIELDS:
+        a, b = getattr(v, name), getattr(v_expected, name)
+        assert np.linalg.norm(a - b) < 1e-11 * np.linalg.norm(b), name
+
+
 def test_oracle_gradient_matches_finite_differences():
     with jax.enable_x64(True):
         g, cam = street(n=40, width=20, height=15, seed=5, dtype=np.float64)

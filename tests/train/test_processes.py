@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 from tiny_scene import make_scene
@@ -146,6 +147,26 @@ def test_a_run_of_two_is_finished_by_the_first(tmp_path):
     metrics = json.loads((run / "metrics.json").read_text())
     assert metrics["counts"]["steps"] == 40
     assert (run / "radiance.ply").stat().st_size > 0
+
+
+@pytest.mark.slow
+def test_when_one_falls_silent_the_other_ends_after_the_time_out(tmp_path):
+    scene, run = make_scene(tmp_path / "scene"), tmp_path / "run"
+    ranks = begin_two(scene, run)
+    worker = None
+    try:
+        wait_for_lines(run, 5, ranks)
+        # The one that works, not the parent that watches it.
+        worker = int(Path(f"/proc/{ranks[1].pid}/task/{ranks[1].pid}/children").read_text())
+        os.kill(worker, signal.SIGSTOP)
+        said = ranks[0].communicate(timeout=ENOUGH_S)[1]
+    finally:
+        if worker is not None:
+            os.kill(worker, signal.SIGKILL)
+        kill(*ranks)
+    assert ranks[0].returncode == 2, said
+    assert where(run) in said
+    assert "--resume" in said
 
 
 @pytest.mark.slow

@@ -72,7 +72,7 @@ def made():
     params, batch, partner = start(), photograph(), Partner(jnp.int32(0))
     # A tenth of the slots are empty.
     alive = jnp.arange(COUNT) % 10 != 0
-    controls = Controls(jnp.float32(PROGRESS), jnp.int32(DEGREE), jnp.float32(RATE))
+    controls = Controls(jnp.float32(PROGRESS), jnp.int32(DEGREE), jnp.float32(RATE), jnp.uint32(0))
     cfg = config(True)
 
     def steps(cfg):
@@ -125,6 +125,24 @@ def made():
     )
 
 
+@pytest.fixture(scope="module")
+def wide(made):
+    """Return the step of `made.after`, all of it in float64."""
+
+    def widened(tree):
+        narrow = jax.tree.map(np.asarray, tree)
+        return jax.tree.map(lambda a: a.astype(np.float64) if a.dtype.kind == "f" else a, narrow)
+
+    optimizer = make_optimizer(made.cfg)
+    state = widened(initial_state(made.params, made.alive, optimizer))
+    controls = Controls(np.float64(PROGRESS), np.int32(DEGREE), np.float64(RATE))
+    given = widened((photograph(), Partner(np.int32(0))))
+    with jax.enable_x64(True):
+        state = jax.tree.map(jnp.asarray, state)
+        step = Step(made.cfg, optimizer, EXTENT)
+        return jax.device_get(step(state, *given, controls, room=made.room, degree=DEGREE))
+
+
 def rows_of(tree, name, rows):
     return np.asarray(getattr(tree, name))[rows]
 
@@ -170,6 +188,30 @@ def test_blocks_and_the_whole_population_agree(made):
         moved = rows_of(b, name, made.seen) - old
         apart = rows_of(a, name, made.seen) - rows_of(b, name, made.seen)
         assert np.linalg.norm(apart) <= 1e-3 * np.linalg.norm(moved), name
+
+
+def test_in_float64_nothing_becomes_narrow(wide):
+    state, report = wide
+    assert int(state.fault.kind) == FAULT_NONE
+    floats = jax.tree_util.tree_leaves_with_path((state, report))
+    for path, leaf in floats:
+        if leaf.dtype.kind == "f":
+            assert leaf.dtype == np.float64, jax.tree_util.keystr(path)
+
+
+def test_a_step_agrees_with_one_in_float64(made, wide):
+    (state, report), (exact, exact_report) = made.after, wide
+    assert float(report.loss) == pytest.approx(float(exact_report.loss), rel=1e-6)
+    assert float(report.loss) != float(exact_report.loss)  # it is computed otherwise
+    a, b = (s.opt_state.gaussians[0].mu for s in (state, exact))
+    pairs = {name: (getattr(a, name), getattr(b, name)) for name in FIELDS}
+    a, b = (s.opt_state.rest[0].mu[0] for s in (state, exact))
+    pairs |= {
+        name: (getattr(a, name), getattr(b, name)) for name in ("raw_exposures", "raw_gammas")
+    }
+    for name, (got, expected) in pairs.items():
+        assert np.any(expected), name
+        assert np.linalg.norm(got - expected) < 1e-4 * np.linalg.norm(expected), name
 
 
 def test_out_of_view_nothing_is_touched(made):

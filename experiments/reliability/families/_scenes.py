@@ -15,6 +15,19 @@ import numpy as np
 
 GAMMA = 2.2
 FOCAL = 60.0
+# Options of a fit that takes a second once its programs are compiled. The model is given: a curve
+# that is fitted is a constant of the programs, which are then compiled for every fit.
+SMALLEST_FIT = {
+    "train.steps": 20,
+    "train.coarse_to_fine": [],
+    "densify.max_gaussians": 300,
+    "densify.min_every_steps": 10,
+    "render.sh_degree": 0,
+    "init.shell": "off",
+    "init.dense": "off",
+    "photometry.select": False,
+    "photometry.curve": "srgb",
+}
 
 
 def in_a_row(count: int) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -37,7 +50,7 @@ class Made:
         origin: of the scene, scene units.
         develop: from (row, codes in [0, 1]) to the codes that are written.
         mask: from (row, height, width) to the mask, or None: none is written.
-        tracks: False writes points without tracks.
+        tracks: False writes points that no photograph is said to show.
     """
 
     views: int = 6
@@ -83,7 +96,8 @@ def write_scene(root: Path, made: Made, seed: int = 0) -> Path:
         t = -rotation @ (center * made.scale + np.array(made.origin))
         q = _quaternion(rotation)
         pose = " ".join(repr(float(x)) for x in (*q, *t))
-        lines += [f"{v + 1} {pose} {v + 1} {name}", " ".join(shown)]
+        observed = " ".join(shown) if made.tracks else ""
+        lines += [f"{v + 1} {pose} {v + 1} {name}", observed]
         f = FOCAL * width / 64
         cameras.append(f"{v + 1} PINHOLE {width} {height} {f} {f} {width / 2} {height / 2}")
     (model / "images.txt").write_text("\n".join(lines) + "\n")
