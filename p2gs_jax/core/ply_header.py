@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +20,7 @@ _MOST_DIGITS = 18
 _CODES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 _NAMES = ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")
 _SIZED = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64")
-_TYPES = dict(zip(_NAMES + _SIZED, _CODES + _CODES, strict=True))
+_TYPES: dict[str, str] = dict(zip(_NAMES + _SIZED, _CODES + _CODES, strict=True))
 _WRITTEN = {np.dtype(f"<{code}"): name for code, name in zip(_CODES, _NAMES, strict=True)}
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 
@@ -39,7 +40,8 @@ class Property(NamedTuple):
     length: np.dtype | None
 
 
-class Element(NamedTuple):
+@dataclass(frozen=True)
+class Element:
     """A table as a header announces it: rows, and properties by name in their order."""
 
     count: int
