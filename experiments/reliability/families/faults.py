@@ -46,6 +46,10 @@ MENDED = (
         "tests/run/test_lock.py::test_a_folder_that_was_removed_underneath_is_named",
     ),
     Mended(
+        "what a killed fit had begun to write stayed in its folder",
+        "tests/run/test_lock.py::test_what_a_killed_process_had_begun_to_write_is_removed",
+    ),
+    Mended(
         "memory that could not suffice was noticed when it ran out",
         "tests/pipeline/test_memory_needed.py",
     ),
