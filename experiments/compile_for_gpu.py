@@ -61,7 +61,7 @@ def shapes(args: argparse.Namespace, optimizer) -> tuple[Any, ...]:
         np.zeros((*every, *size), bool),
         np.zeros(every, np.int32),
     )
-    controls = on_host(Controls, np.float32(0), np.int32(DEGREE), np.float32(1))
+    controls = on_host(Controls, np.float32(0), np.int32(DEGREE), np.float32(1), np.uint32(0))
     given = (batch, on_host(Partner, np.zeros(every, np.int32)), controls)
     return jax.eval_shape(start, params, alive), *given
 

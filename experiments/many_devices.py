@@ -108,7 +108,7 @@ def measured(mesh: Mesh, args: argparse.Namespace) -> dict[str, Any]:
     room = room_for(params.gaussians, alive, cameras, len(alive), cfg.render)
     state = spread.spread(initial_state(params, jnp.asarray(alive), optimizer, slots))
     batches, partners = zip(*views, strict=True)
-    controls = on_host(Controls, np.float32(0.5), np.int32(DEGREE), np.float32(0.1))
+    controls = on_host(Controls, np.float32(0.5), np.int32(DEGREE), np.float32(0.1), np.uint32(0))
     given = (stacked(batches), stacked(partners), controls)
     made = {
         name: step.lowered(name, state, *given, room=room, degree=DEGREE).compile()

@@ -43,7 +43,7 @@ COUNT, VIEWS = 500, 4
 WIDTH, HEIGHT, FOCAL = 48, 32, 45.0
 EXTENT, DEGREE = 2.0, 1
 ROOM = Room(16_384, 4096)
-CONTROLS = on_host(Controls, np.float32(0.3), np.int32(DEGREE), np.float32(0.7))
+CONTROLS = on_host(Controls, np.float32(0.3), np.int32(DEGREE), np.float32(0.7), np.uint32(0))
 
 
 def config(batch: int, method: str | None = "mcmc") -> FitConfig:

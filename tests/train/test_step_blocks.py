@@ -135,7 +135,7 @@ def wide(made):
 
     optimizer = make_optimizer(made.cfg)
     state = widened(initial_state(made.params, made.alive, optimizer))
-    controls = Controls(np.float64(PROGRESS), np.int32(DEGREE), np.float64(RATE))
+    controls = Controls(np.float64(PROGRESS), np.int32(DEGREE), np.float64(RATE), np.uint32(0))
     given = widened((photograph(), Partner(np.int32(0))))
     with jax.enable_x64(True):
         state = jax.tree.map(jnp.asarray, state)
