@@ -60,8 +60,8 @@ class Size:
         return f"{3 * self.frames}x{self.width}_{self.steps}"
 
 
-FULL = Size(300, 2.0, 480, 200_000, 12_000, 4)
-MIDDLE = Size(80, 4.0, 160, 40_000, 2400, 4)
+FULL = Size(300, 2.0, 160, 100_000, 6_000, 4)
+MIDDLE = Size(80, 4.0, 160, 40_000, 2_400, 4)
 QUICK = Size(30, 2.0, 96, 12_000, 400, 2)
 
 

@@ -352,6 +352,10 @@ class OptimizerConfig:
     """How often a fit may update a Gaussian before these rates are too high: one that does it more
     often takes all rates of Gaussians times the root of the ratio. None: never (ours: BUILD_NOTES,
     "Length")."""
+    extent: Literal["cameras", "near"] = "near"
+    """What rates of the means and thresholds in scene extents are shares of: the radius of the
+    cameras (3DGS), or the depth of what is near them where that is smaller (ours: a long drive is
+    made of surfaces no larger than those of a short one; BUILD_NOTES, "Extent")."""
     eps: float = 1e-15
     """Adam's epsilon (3DGS: 1e-15)."""
     b1: float = 0.6
@@ -396,8 +400,9 @@ class DensifyConfig:
     """Gaussians less opaque than this are removed or relocated (3DGS)."""
     prune_scale: float = 0.1
     """Gaussians larger than this, in scene extents, are removed after the first reset (3DGS)."""
-    growth: float = 1.05
-    """Factor by which MCMC grows the population each time (3DGS-MCMC)."""
+    growth: float = 1.0
+    """Least factor by which MCMC grows the population each time (3DGS-MCMC: 1.05); 1: evenly, so
+    that the bound is reached at the last densification (ours: BUILD_NOTES, "Even growth")."""
     noise: float = 5e5
     """Scale of the MCMC noise on the means, times their learning rate (3DGS-MCMC)."""
     spread: float = 0.5
@@ -565,6 +570,7 @@ def _paper(exposure_weight: float, name: PresetName) -> FitConfig:
             exposures=1e-3,
             gammas=1e-3,
             photometry_final=1.0,
+            extent="cameras",
             b1=0.9,
             b2=0.999,
             visible_only=False,

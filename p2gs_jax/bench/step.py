@@ -72,7 +72,9 @@ def whole_step(scene: BenchScene, cfg: FitConfig, batch: Batch, entries: int) ->
     optimizer = make_optimizer(cfg)
     # The step donates its state: the scene keeps its own copy.
     holder = [jax.tree.map(jnp.copy, initial_state(params, alive, optimizer))]
-    controls = Controls(jnp.float32(0.5), jnp.int32(cfg.render.sh_degree), jnp.float32(1))
+    controls = Controls(
+        jnp.float32(0.5), jnp.int32(cfg.render.sh_degree), jnp.float32(1), jnp.uint32(0)
+    )
     partner = Partner(jnp.int32(0))
     step, before = Step(cfg, optimizer, 1.0), compilations()
     room, degree = Room(entries, whole_blocks(scene.gaussians.capacity)), cfg.render.sh_degree

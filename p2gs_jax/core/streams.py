@@ -15,7 +15,7 @@ from enum import IntEnum, unique
 
 import jax
 import numpy as np
-from jaxtyping import Array, Int, PRNGKeyArray
+from jaxtyping import Array, Int, PRNGKeyArray, UInt32
 
 
 @unique
@@ -97,11 +97,19 @@ def view_order(seed: int, epoch: int, count: int) -> Int[np.ndarray, " v"]:
     return np.random.default_rng((seed, epoch)).permutation(count)
 
 
-def noise_key(seed: int, step: Int[Array, ""]) -> PRNGKeyArray:
+def device_seed(seed: int) -> np.uint32:
+    """Return a seed as programs take it: an argument, so that every seed has the same program.
+
+    JAX uses the lowest 32 bits of a seed.
+    """
+    return np.uint32(seed & 0xFFFFFFFF)
+
+
+def noise_key(seed: UInt32[Array, ""], step: Int[Array, ""]) -> PRNGKeyArray:
     """Return the key of a step's exploration noise, on the device."""
     return jax.random.fold_in(jax.random.key(seed), step)
 
 
-def densification_key(seed: int, step: Int[Array, ""]) -> PRNGKeyArray:
+def densification_key(seed: UInt32[Array, ""], step: Int[Array, ""]) -> PRNGKeyArray:
     """Return the key of the densification after a step, on the device."""
     return jax.random.fold_in(jax.random.key(seed + 1), step)

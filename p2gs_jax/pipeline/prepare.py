@@ -50,7 +50,7 @@ from p2gs_jax.photometry.sources import has_tracks, surface_colors
 from p2gs_jax.pipeline.decide import decide, likely, with_choice
 from p2gs_jax.pipeline.memory_needed import memory_needed, require_memory
 from p2gs_jax.pipeline.part import Part
-from p2gs_jax.pipeline.scale import near_depth, near_plane, scale_notes
+from p2gs_jax.pipeline.scale import extent_of_rates, near_depth, near_plane, scale_notes
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.images import ImageStore
@@ -70,7 +70,7 @@ class Prepared:
         fitted: the same photographs without the pixels that are left out of the fit.
         params: initial parameters.
         owner: the moving object that each Gaussian belongs to (`Population.owner`), or None.
-        extent: scene extent, scene units.
+        extent: what rates of the means are shares of, scene units.
         selection: photometric model, exposures and their errors from the tracks, or None.
         pairs: corresponding observations, or None.
         overlaps: for every training view the ones that show the same surfaces, or None.
@@ -104,7 +104,7 @@ class Expected(NamedTuple):
         store: photographs.
         params: of the right shapes; the Gaussians are the scene's points, without colours.
         owner: the moving object that each belongs to, or None.
-        extent: scene extent, scene units.
+        extent: what rates of the means are shares of, scene units.
         coverage: how much of the scene the views show.
         decisions: what most scenes decide.
         cfg: the options under these.
@@ -185,6 +185,7 @@ def prepare(
     views = scene.training_views
     taken_by = [view.camera for view in views]
     extent = scene_extent(views, scene.points)
+    rated = extent_of_rates(extent, scene.points, views, cfg)
     coverage = coverage_of(scene, store)
     require_memory(memory_needed(scene, cfg, coverage))
     measured = measured_depths(scene, cfg)
@@ -221,7 +222,7 @@ def prepare(
         )
         known = kept is not None or part is not None or not cfg.photometry.select
         under = guess.resolve(cfg)
-        expected = Expected(fitted, params, owner, extent, coverage, guess, under, known, measured)
+        expected = Expected(fitted, params, owner, rated, coverage, guess, under, known, measured)
         on_expected(expected)
 
     def chosen(form: Form, response: Response) -> None:
@@ -303,7 +304,7 @@ def prepare(
             _initial_poses(nodes, resolved),
         ),
         owner,
-        extent,
+        rated,
         selection,
         color_pairs(tracks, resolved),
         overlaps(tracks, resolved),

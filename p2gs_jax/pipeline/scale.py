@@ -15,16 +15,23 @@ from p2gs_jax.types import Scene, View
 
 # The near plane is not farther than this share of the depth of near points (their percentile).
 NEAR_SHARE, NEAR_PERCENTILE = 0.2, 1.0
+# What a view shows near: this percentile of its points, many of which others hide.
+EXTENT_PERCENTILE = 10.0
 # Steps of float32 at the scene's place, as a share of that depth; beyond, surfaces jitter.
 COARSE = 1e-4
 
 
-def near_depth(points: Float[np.ndarray, "p 3"], views: Sequence[View]) -> float | None:
+def near_depth(
+    points: Float[np.ndarray, "p 3"],
+    views: Sequence[View],
+    percentile: float = NEAR_PERCENTILE,
+) -> float | None:
     """Return how deep the nearest points of the views lie, scene units; None where none is seen.
 
     Args:
         points: of the scene.
         views: some of them are looked at.
+        percentile: of the depths of the points in their frusta.
     """
     sample = points[:: max(1, len(points) // SHARE_POINTS)]
     depths = []
@@ -32,7 +39,24 @@ def near_depth(points: Float[np.ndarray, "p 3"], views: Sequence[View]) -> float
         xy, z = project_points(sample, views[row])
         depths.append(z[in_frame(xy, z, views[row].width, views[row].height)])
     found = np.concatenate(depths) if depths else np.zeros(0)
-    return float(np.percentile(found, NEAR_PERCENTILE)) if len(found) else None
+    return float(np.percentile(found, percentile)) if len(found) else None
+
+
+def extent_of_rates(
+    extent: float, points: Float[np.ndarray, "p 3"], views: Sequence[View], cfg: FitConfig
+) -> float:
+    """Return the length that rates of the means are shares of, scene units.
+
+    Args:
+        extent: radius of the cameras.
+        points: of the scene.
+        views: for training.
+        cfg: as asked.
+    """
+    if cfg.optimizer.extent == "cameras":
+        return extent
+    near = near_depth(points, views, EXTENT_PERCENTILE)
+    return extent if near is None else min(extent, near)
 
 
 def near_plane(depth: float | None, cfg: FitConfig) -> float | None:

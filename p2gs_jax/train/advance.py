@@ -14,7 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.streams import noise_key
@@ -31,17 +31,19 @@ from p2gs_jax.types import Frustum, Gaussians, Params, Photometry, Population, V
 
 
 class Controls(eqx.Module):
-    """What the schedule says about this step.
+    """What the host says about this step.
 
     Attributes:
         progress: fraction of the run completed.
         active_degree: spherical-harmonics degree in use.
         rate: factor on the rates of Gaussians, from the length of the fit.
+        seed: of the fit, from `device_seed`.
     """
 
     progress: Float[Array, ""]
     active_degree: Int[Array, ""]
     rate: Float[Array, ""]
+    seed: UInt32[Array, ""]
 
 
 class StepReport(NamedTuple):
@@ -107,7 +109,7 @@ def advance(
         gradient: of the images' loss.
         frusta: the views.
         controls: of the schedule.
-        cfg: rendering, the terms on the Gaussians, rates, noise and its seed.
+        cfg: rendering, the terms on the Gaussians, rates, noise.
         optimizer: from `make_optimizer`.
         extent: scene extent, scene units.
         degree: highest spherical-harmonics degree that moves.
@@ -122,7 +124,7 @@ def advance(
     progress, rate = controls.progress, controls.rate
     rates = learning_rates(progress, rate, extent, state.params, cfg, bands)
     listed = jnp.sum(alive.at[ids].get(mode="fill", fill_value=False))
-    key = noise_key(cfg.train.seed, state.step)
+    key = noise_key(controls.seed, state.step)
     noise_rate = cfg.densify.noise * means_rate(progress, rate, extent, cfg)
 
     def noise(block, _, moved, on):

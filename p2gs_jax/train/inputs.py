@@ -9,6 +9,7 @@ import numpy as np
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import on_host
+from p2gs_jax.core.streams import device_seed
 from p2gs_jax.losses.relative_exposure import ColorPairs
 from p2gs_jax.losses.total import Partner
 from p2gs_jax.train import schedule
@@ -71,7 +72,13 @@ class InputSource:
         cfg = self.cfg
         degree = schedule.sh_degree_at(progress, cfg.train, cfg.render.sh_degree)
         rate = schedule.rate_factor(pace, self.shown, cfg.optimizer.settled)
-        controls = on_host(Controls, np.float32(progress), np.int32(degree), np.float32(rate))
+        controls = on_host(
+            Controls,
+            np.float32(progress),
+            np.int32(degree),
+            np.float32(rate),
+            device_seed(cfg.train.seed),
+        )
         rows = self.views.indices_at(step, cfg.train.batch)
         each = [self._of_view(step + k, row, shrink, k in self.own) for k, row in enumerate(rows)]
         if len(each) == 1:

@@ -13,7 +13,7 @@ from typing import Any
 
 import jax
 
-from p2gs_jax.config import FitConfig, PhotometryConfig, TrainConfig
+from p2gs_jax.config import FitConfig, PhotometryConfig
 from p2gs_jax.core.numerics import on_host
 from p2gs_jax.losses.total import Partner, partner_cameras
 from p2gs_jax.render.capacity import Room
@@ -116,7 +116,6 @@ class Step:
         known = dataclasses.replace(
             known,
             densify=cfg.densify,
-            train=TrainConfig(seed=cfg.train.seed),
             optimizer=cfg.optimizer,
             photometry=moving,
         )

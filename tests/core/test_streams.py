@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -13,6 +14,7 @@ from p2gs_jax.core.streams import (
     SceneStream,
     Stream,
     densification_key,
+    device_seed,
     generator,
     noise_key,
     view_order,
@@ -59,7 +61,15 @@ def test_seeds_mean_what_they_meant():
 
 def test_a_step_and_its_densification_have_different_keys():
     made = [
-        jax.random.key_data(key(seed, step)).tobytes()
-        for key, seed, step in itertools.product((noise_key, densification_key), (3,), (0, 1))
+        jax.random.key_data(key(jnp.uint32(3), jnp.int32(step))).tobytes()
+        for key, step in itertools.product((noise_key, densification_key), (0, 1))
     ]
     assert len(set(made)) == 4
+
+
+@pytest.mark.parametrize("seed", [0, 7, 2**31, 2**32 - 1, 2**32 + 5])
+def test_a_seed_that_is_an_argument_draws_what_a_constant_draws(seed):
+    for key, constant in ((noise_key, seed), (densification_key, seed + 1)):
+        made = jax.jit(key)(device_seed(seed), np.int32(4))
+        known = jax.random.fold_in(jax.random.key(constant), 4)
+        np.testing.assert_array_equal(jax.random.key_data(made), jax.random.key_data(known))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import FitConfig
-from p2gs_jax.pipeline.scale import near_depth, near_plane, scale_notes
+from p2gs_jax.pipeline.scale import extent_of_rates, near_depth, near_plane, scale_notes
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.scene import load_scene
 from p2gs_jax.sweep import with_fields
@@ -75,3 +75,24 @@ def test_a_scene_far_from_the_origin_is_said_to_be_coarse(scene):
         assert bool(notes) == said
     assert "1e+05 scene units from the origin" in notes[0]
     assert "Subtract a common offset" in notes[0]
+
+
+def test_rates_of_a_long_drive_are_those_of_its_streets(scene):
+    cfg, views, points = FitConfig(), scene.training_views, scene.points
+    far = [np.array([60.0 * k, 0, 0]) for k in range(10)]
+    drive = [
+        dataclasses.replace(view, viewmat=_moved(view.viewmat, by)) for by in far for view in views
+    ]
+    street = np.concatenate([points + by for by in far]).astype(np.float32)
+    own = extent_of_rates(300.0, points, views, cfg)
+    assert 3 < own < 6
+    assert extent_of_rates(300.0, street, drive, cfg) == pytest.approx(own, rel=0.2)
+    assert extent_of_rates(0.5, points, views, cfg) == 0.5
+    cameras = with_fields(cfg, {"optimizer.extent": "cameras"})
+    assert extent_of_rates(300.0, street, drive, cameras) == 300.0
+
+
+def _moved(viewmat, by):
+    pose = viewmat.copy()
+    pose[:3, 3] -= pose[:3, :3] @ by
+    return pose

@@ -24,7 +24,7 @@ from p2gs_jax.types import Batch, Camera, Gaussians, Params, Photometry, Placeme
 COUNT = BLOCK + 500
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
 OBJECTS, KEYS, KEY, SHARE = 3, 4, 1, 0.3
-CONTROLS = Controls(jnp.float32(0.3), jnp.int32(1), jnp.float32(1))
+CONTROLS = Controls(jnp.float32(0.3), jnp.int32(1), jnp.float32(1), jnp.uint32(0))
 EXTENT = 2.0
 
 

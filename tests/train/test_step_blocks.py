@@ -72,7 +72,7 @@ def made():
     params, batch, partner = start(), photograph(), Partner(jnp.int32(0))
     # A tenth of the slots are empty.
     alive = jnp.arange(COUNT) % 10 != 0
-    controls = Controls(jnp.float32(PROGRESS), jnp.int32(DEGREE), jnp.float32(RATE))
+    controls = Controls(jnp.float32(PROGRESS), jnp.int32(DEGREE), jnp.float32(RATE), jnp.uint32(0))
     cfg = config(True)
 
     def steps(cfg):

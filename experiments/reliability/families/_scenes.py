@@ -37,7 +37,7 @@ class Made:
         origin: of the scene, scene units.
         develop: from (row, codes in [0, 1]) to the codes that are written.
         mask: from (row, height, width) to the mask, or None: none is written.
-        tracks: False writes points without tracks.
+        tracks: False writes points that no photograph is said to show.
     """
 
     views: int = 6
@@ -83,7 +83,8 @@ def write_scene(root: Path, made: Made, seed: int = 0) -> Path:
         t = -rotation @ (center * made.scale + np.array(made.origin))
         q = _quaternion(rotation)
         pose = " ".join(repr(float(x)) for x in (*q, *t))
-        lines += [f"{v + 1} {pose} {v + 1} {name}", " ".join(shown)]
+        observed = " ".join(shown) if made.tracks else ""
+        lines += [f"{v + 1} {pose} {v + 1} {name}", observed]
         f = FOCAL * width / 64
         cameras.append(f"{v + 1} PINHOLE {width} {height} {f} {f} {width / 2} {height / 2}")
     (model / "images.txt").write_text("\n".join(lines) + "\n")

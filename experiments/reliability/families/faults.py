@@ -77,6 +77,12 @@ main(sys.argv[1:])
 """
 
 
+def _as_in_a_terminal() -> None:
+    """Let signals arrive that nohup, or a shell in the background, tells its children to ignore."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
+
+
 class Faults:
     """The trials, on one scene and against one uninterrupted run."""
 
@@ -150,13 +156,14 @@ class Faults:
 
     def asked(self, run: Path, number: int, word: str) -> None:
         """Ask a fit to end between steps."""
-        with self.start(run, "--train.checkpoint-every-s", "1000") as process:
+        rare = ("--train.checkpoint-every-s", "1000")
+        with self.start(run, *rare, preexec_fn=_as_in_a_terminal) as process:
             fits.wait_for(process, lambda: fits.lines(run) >= 3)
             process.send_signal(number)
             fits.end(process).require(128 + number, word, "--resume continues it")
         # A frequent checkpoint is an option of the run: the same as it was begun with.
-        extra = ("--resume", "--train.checkpoint-every-s", "1000")
-        fits.run(fits.command(self.scene, run, *extra), self.env).require(0, "Resuming after step")
+        again = fits.run(fits.command(self.scene, run, "--resume", *rare), self.env)
+        again.require(0, "Resuming after step")
         fits.require_same(self.whole, run)
 
     def full(self, run: Path, room: int) -> None:

@@ -194,7 +194,7 @@ def advance(
         gradient: from `differentiate`.
         frusta: as in `show`.
         controls: of the schedule.
-        cfg: rendering, the terms on the Gaussians, rates, noise and its seed.
+        cfg: rendering, the terms on the Gaussians, rates, noise.
         optimizer: from `make_optimizer`.
         extent: scene extent, scene units.
         degree: highest spherical-harmonics degree that moves.
@@ -293,7 +293,7 @@ def _sums(state, ids, visible, gradient, frusta, controls, cfg, bands: int, part
 
 def _noise(state, controls, cfg: FitConfig, extent: float, views: int, parts: int):
     """Return the noise of `update_listed`; each Gaussian's is its own, whatever device has it."""
-    key = noise_key(cfg.train.seed, state.step)
+    key = noise_key(controls.seed, state.step)
     rate = cfg.densify.noise * means_rate(controls.progress, controls.rate, extent, cfg)
     rate = rate * views**0.5
     first = lax.axis_index(GAUSSIANS)

@@ -12,7 +12,7 @@ from jaxtyping import PRNGKeyArray
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.clock import Stopwatch
-from p2gs_jax.core.streams import densification_key
+from p2gs_jax.core.streams import densification_key, device_seed
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.population import Coverage, Outcome
 from p2gs_jax.train.host import HostState
@@ -25,7 +25,7 @@ from p2gs_jax.train.session import Session
 from p2gs_jax.train.state import FitState, count_alive, replace_gaussians
 from p2gs_jax.train.views import TrainingViews
 
-compiled_key = jax.jit(densification_key, static_argnums=0)
+compiled_key = jax.jit(densification_key)
 _zero_moments = jax.jit(zero_moments)
 
 
@@ -171,7 +171,7 @@ class Strategy:
 
     def key(self, host: HostState) -> PRNGKeyArray:
         """Return the randomness of the densification after this step."""
-        return compiled_key(self.run.cfg.train.seed, np.int32(host.step))
+        return compiled_key(device_seed(self.run.cfg.train.seed), np.int32(host.step))
 
     def settled(self, state: FitState, outcome: Outcome, host: HostState) -> FitState:
         """Return the state with a new population; moments of new Gaussians are zero.

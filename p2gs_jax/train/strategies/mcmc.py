@@ -62,7 +62,7 @@ class Mcmc(Strategy):
         self._relocate = self.run.programs.ahead(
             ("relocate", *self._static.values(), slots),
             relocate,
-            compiled_key.eval_shape(self.run.cfg.train.seed, np.int32(0)),
+            compiled_key.eval_shape(np.uint32(0), np.int32(0)),
             state.params.gaussians,
             state.population,
             state.opt_state.gaussians[0],
@@ -96,7 +96,7 @@ class Mcmc(Strategy):
         """Return the population after the next relocation."""
         limit = self._affordable(alive, host)
         room = max((limit or alive) / max(alive, 1), 1.0)
-        # A short run has few events: grow so that the limit is reached at the last of them.
+        # The limit is reached at the last event: what is born earlier costs more steps.
         events = (self.run.cfg.densify.stop - host.progress) / self.interval(host)
         factor = max(self.run.cfg.densify.growth, room ** (1 / max(events, 1.0)))
         return min(math.ceil(alive * factor), limit or alive)
