@@ -23,7 +23,6 @@ BUNDLED = {
     "opencv-contrib-python-headless": "FFmpeg: LGPL-2.1-or-later",
     "pillow-heif": "libheif and libde265: LGPL-3.0-or-later; x265: GPL-2.0-or-later",
     "rawpy": "LibRaw: LGPL-2.1 or CDDL-1.0",
-    "plyfile": "is under the GPL itself",
     "jax[cuda12]": "NVIDIA's libraries: proprietary, may be redistributed",
 }
 HEAD = """\
@@ -43,10 +42,11 @@ TAIL = """
 {parts}
 
 None of them is copied or changed here, and no file of this project is under the GPL.
+
+The tests hold PLY files against plyfile (GPL-3.0-or-later), which comes with the extra `test`; the
+program neither imports nor requires it.
 """
 WHY = {
-    "plyfile": "reads and writes PLY, imported wherever Gaussians or seed points are read or "
-    "written; needed by every fit",
     "av": "BSD itself, with x264 and x265 in its wheels; reads and writes videos, loaded only then",
     "pillow-heif": "BSD itself, with x265 in its wheels; reads HEIC, only with the extra `heic`",
 }

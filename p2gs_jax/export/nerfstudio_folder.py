@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from plyfile import PlyData, PlyElement
 
 from p2gs_jax.core.atomic import atomic_folder, write_json, write_text
+from p2gs_jax.core.ply_header import header_of
 from p2gs_jax.export.colmap_folder import exposure_table, write_mask, write_photograph
 from p2gs_jax.run.photometry_file import ViewPhotometry
 from p2gs_jax.scene import ImageStore
@@ -101,4 +101,4 @@ def _write_points(path: Path, scene: Scene) -> None:
         table[name] = scene.points[:, column]
     for column, name in enumerate(("red", "green", "blue")):
         table[name] = colors[:, column]
-    PlyData([PlyElement.describe(table, "vertex")], byte_order="<").write(str(path))
+    path.write_bytes(header_of("vertex", table.dtype, len(table)) + table.tobytes())

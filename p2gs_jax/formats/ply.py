@@ -13,13 +13,12 @@ from typing import Any
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from plyfile import PlyData, PlyElement, PlyParseError
 
 from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.core.numerics import on_device
-from p2gs_jax.errors import UserError
+from p2gs_jax.core.ply_header import header_of
+from p2gs_jax.core.ply_table import read_table, refusing
 from p2gs_jax.render.radiance import RadianceKind
-from p2gs_jax.scene.point_cloud import check_counts
 from p2gs_jax.types import Gaussians, Vibration
 
 
@@ -58,13 +57,9 @@ def write_ply(
     g = jax.tree.map(np.asarray, gaussians)
     names = [*field_names(g.sh.shape[1]), *(() if g.vibration is None else VIBRATION)]
     count = g.capacity if rows is None else len(rows)
-    # Of the whole table only the header is asked, so one row stands for all.
-    row = np.zeros((), [(name, "<f4") for name in names])
-    table = PlyElement.describe(np.broadcast_to(row, count), "vertex")
-    lines = [c.encode("unicode_escape").decode() for c in comments]
-    header = PlyData([table], byte_order="<", comments=lines).header
+    row = np.dtype([(name, "<f4") for name in names])
     with atomic_write(path) as temporary, temporary.open("wb") as file:
-        file.write(header.encode("ascii") + b"\n")
+        file.write(header_of("vertex", row, count, comments))
         for first in range(0, count, CHUNK):
             those = slice(first, first + CHUNK)
             file.write(_columns(g, those if rows is None else rows[those]).tobytes())
@@ -116,14 +111,8 @@ def read_ply(path: Path, *, fix: str = RESTORE) -> Gaussians:
     Raises:
         UserError: the file is no such PLY.
     """
-    if path.is_file():
-        check_counts(path, fix=fix)
-    try:
-        # Mapped: what has been read may leave memory again.
-        vertex = PlyData.read(str(path))["vertex"].data
-        return _read(vertex)
-    except (OSError, PlyParseError, KeyError, ValueError) as error:
-        raise UserError(f"{path} is no PLY of Gaussians: {error}.", fix=fix) from error
+    with refusing(path, "Gaussians", fix=fix):
+        return _read(read_table(path, "vertex"))
 
 
 def _read(vertex: np.ndarray) -> Gaussians:

@@ -1,6 +1,7 @@
 """docs/licences.md names what pyproject.toml declares, under the licences that are installed."""
 
 import importlib
+import re
 
 import pytest
 from pages import ROOT
@@ -19,14 +20,33 @@ def test_the_page_is_what_its_script_writes(licences):
         assert f"| {name} |" in text
 
 
-def test_what_is_under_the_gpl_is_named(licences):
-    marked = {
+def marked(licences):
+    return {
         name
         for name, (_, licence, carried) in licences.rows().items()
         if licences.is_gpl(licence) or licences.is_gpl(carried)
     }
-    assert marked == set(licences.WHY)
-    assert "plyfile" in marked
+
+
+def test_what_is_under_the_gpl_is_named(licences):
+    assert marked(licences) == set(licences.WHY)
+
+
+def test_nothing_that_users_install_is_under_the_gpl_itself(licences):
+    itself = [name for name, (_, said, _) in licences.rows().items() if licences.is_gpl(said)]
+    assert itself == []
+
+
+def test_a_requirement_under_the_gpl_would_be_found(licences, monkeypatch):
+    monkeypatch.setattr(licences, "declared", lambda: {"numpy": "everything", "plyfile": "all"})
+    assert marked(licences) == {"plyfile"}
+
+
+def test_the_program_imports_nothing_of_the_tests():
+    imported = re.compile(r"^\s*(?:from|import) plyfile\b", re.MULTILINE)
+    assert imported.search((ROOT / "tests/core/test_ply_table.py").read_text())
+    for path in (ROOT / "p2gs_jax").rglob("*.py"):
+        assert not imported.search(path.read_text(encoding="utf-8")), path
 
 
 @pytest.mark.parametrize(

@@ -52,6 +52,20 @@ def test_gradient_matches_autodiff_and_finite_differences():
         assert float(numeric) == pytest.approx(float(jnp.sum(g * d)), rel=1e-6)
 
 
+@pytest.mark.parametrize("apart", [1e-2, 1e-4])
+def test_what_is_fitted_well_keeps_its_digits(apart):
+    rng = np.random.default_rng(0)
+    bright = 0.8 + 0.02 * rng.uniform(size=(48, 64, 3))
+    inputs = [np.float32(a) for a in (bright + apart * rng.normal(size=bright.shape), bright)]
+    inputs.append(np.ones(bright.shape[:2], np.float32))
+    value, gradient = jax.value_and_grad(image.one_less_ssim)(*map(jnp.asarray, inputs))
+    with jax.enable_x64(True):
+        exact = [jnp.asarray(a, np.float64) for a in inputs]
+        true, slope = map(np.asarray, jax.value_and_grad(image.one_less_ssim)(*exact))
+    assert float(value) == pytest.approx(float(true), rel=1e-5)
+    assert np.linalg.norm(gradient - slope) < 2e-4 * np.linalg.norm(slope)
+
+
 def test_identical_images_and_empty_mask():
     x = pair(dtype=np.float32)[0].transpose(1, 2, 0)
     ones = jnp.ones(x.shape[:2])

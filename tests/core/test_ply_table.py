@@ -1,0 +1,310 @@
+"""PLY tables against plyfile, and whatever is no such file."""
+
+import contextlib
+import tracemalloc
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from plyfile import PlyData, PlyElement
+
+from p2gs_jax.core.ply_header import header_of, parse_header
+from p2gs_jax.core.ply_table import read_table, refusing
+from p2gs_jax.errors import UserError
+
+TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2"},
+    **{"int": "i4", "uint": "u4", "float": "f4", "double": "f8"},
+    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"},
+    **{"int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8"},
+}
+CODES = sorted(set(TYPES.values()))
+FORMATS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+AXES = [f"property float {axis}" for axis in "xyz"]
+FACES = ["element face 2", "property list uchar int vertex_indices"]
+
+
+def ply(kind, lines, data=b"", newline="\n"):
+    return newline.join(["ply", f"format {kind} 1.0", *lines, "end_header", ""]).encode() + data
+
+
+def written(path, data):
+    path.write_bytes(data)
+    return path
+
+
+def numbers(rng, code, shape):
+    """Draw any value of a type, those at its ends among them."""
+    kind = np.dtype(code)
+    if kind.kind == "f":
+        odd = np.array([np.nan, np.inf, -np.inf, -0.0, np.finfo(kind).max, np.finfo(kind).tiny])
+        drawn = rng.normal(size=shape) * 10.0 ** rng.integers(-30, 30, shape)
+        return np.where(rng.random(shape) < 0.2, rng.choice(odd, shape), drawn).astype(kind)
+    ends = np.iinfo(kind)
+    return rng.integers(ends.min, ends.max, shape, dtype=kind, endpoint=True)
+
+
+column = st.tuples(st.sampled_from(CODES), st.sampled_from([None, "u1", "i2", "u4"]))
+element = st.tuples(st.integers(0, 5), st.lists(column, min_size=1, max_size=4))
+seeds = st.integers(0, 2**32 - 1)
+
+
+def described(rng, name, count, columns):
+    """Return an element as plyfile has it."""
+    named = {f"{name}_{k}": column for k, column in enumerate(columns)}
+    fields = [(n, code if length is None else object) for n, (code, length) in named.items()]
+    table = np.empty(count, fields)
+    for n, (code, length) in named.items():
+        for row in range(count):
+            shape = () if length is None else rng.integers(0, 4)
+            table[n][row] = numbers(rng, code, shape)
+    lists = {n: (code, length) for n, (code, length) in named.items() if length is not None}
+    return PlyElement.describe(
+        table,
+        name,
+        val_types={n: code for n, (code, _) in lists.items()},
+        len_types={n: length for n, (_, length) in lists.items()},
+    )
+
+
+@given(st.lists(element, min_size=1, max_size=3), st.sampled_from(list(FORMATS)), seeds)
+def test_every_table_is_what_plyfile_reads(tmp_path_factory, elements, kind, seed):
+    rng = np.random.default_rng(seed)
+    path = tmp_path_factory.getbasetemp() / "drawn.ply"
+    tables = [described(rng, "abc"[k], *said) for k, said in enumerate(elements)]
+    notes = {"comments": ["of a test", "end_header"], "obj_info": ["1 2"]}
+    PlyData(tables, text=kind == "ascii", byte_order=FORMATS[kind], **notes).write(str(path))
+    theirs = PlyData.read(str(path))
+    for table in tables:
+        rows, expected = read_table(path, table.name), theirs[table.name].data
+        single = [n for n in expected.dtype.names if expected.dtype[n].kind != "O"]
+        assert list(rows.dtype.names or ()) == single
+        assert len(rows) == len(expected)
+        for name in single:
+            assert rows.dtype[name] == expected.dtype[name]
+            np.testing.assert_array_equal(rows[name], expected[name])
+
+
+comments = st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=20)
+
+
+@given(st.lists(st.sampled_from(CODES), min_size=1), st.integers(0, 9), st.lists(comments))
+def test_headers_are_those_of_plyfile(codes, count, lines):
+    assume(all(line and "\\" not in line for line in lines))
+    row = np.dtype([(f"p{k}", f"<{code}") for k, code in enumerate(codes)])
+    table = PlyElement.describe(np.zeros(count, row), "vertex")
+    theirs = PlyData([table], byte_order="<", comments=lines).header + "\n"
+    ours = header_of("vertex", row, count, lines)
+    assert ours == theirs.encode()
+    assert parse_header(ours, 10**6).elements["vertex"].row() == row
+
+
+def test_comments_are_one_line_of_ascii():
+    row = np.dtype([("x", "<f4")])
+    lines = header_of("vertex", row, 0, ["Straße\nend_header"]).splitlines()
+    assert lines[2] == rb"comment Stra\xdfe\nend_header"
+    with pytest.raises(KeyError):
+        header_of("vertex", np.dtype([("x", "<i8")]), 0)
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+@pytest.mark.parametrize("name", TYPES)
+def test_all_names_of_types(tmp_path, name, kind):
+    values = np.array([7, 100], FORMATS[kind] + TYPES[name])
+    data = b"7\n100\n" if kind == "ascii" else values.tobytes()
+    path = written(tmp_path / "a.ply", ply(kind, ["element e 2", f"property {name} x"], data))
+    rows = read_table(path, "e")
+    assert rows.dtype["x"] == values.dtype
+    np.testing.assert_array_equal(rows["x"], values)
+
+
+POINTS = np.array([[0, 0, 1], [0, 1, 0]], np.float32)
+TEXT = b"0 0 1\n0 1 0\n"
+VERTICES = ["element vertex 2", *AXES]
+
+
+def positions(rows):
+    return np.stack([rows[axis] for axis in "xyz"], 1)
+
+
+@pytest.mark.parametrize("newline", ["\n", "\r\n", "\r"])
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
+def test_lines_end_as_the_first_does(tmp_path, newline, kind):
+    # A first byte that looks like a line's end belongs to the data.
+    points = POINTS.copy()
+    points.view("<i4")[0, 0] = 10
+    data = TEXT.replace(b"\n", newline.encode()) if kind == "ascii" else points.tobytes()
+    path = written(tmp_path / "a.ply", ply(kind, VERTICES, data, newline))
+    expected = POINTS if kind == "ascii" else points
+    np.testing.assert_array_equal(positions(read_table(path, "vertex")), expected)
+
+
+def with_faces(kind, first):
+    """Return a mesh: a triangle and a square before or behind the vertices."""
+    if kind == "ascii":
+        faces, points = b"3 0 1 2\n4 0 1 2 3\n", TEXT
+    else:
+        order = FORMATS[kind]
+        corners = [np.arange(n, dtype=order + "i4").tobytes() for n in (3, 4)]
+        faces = b"\x03" + corners[0] + b"\x04" + corners[1]
+        points = POINTS.astype(order + "f4").tobytes()
+    if first == "face":
+        return ply(kind, [*FACES, *VERTICES], faces + points)
+    return ply(kind, [*VERTICES, *FACES], points + faces)
+
+
+@pytest.mark.parametrize("first", ["face", "vertex"])
+@pytest.mark.parametrize("kind", FORMATS)
+def test_a_mesh_and_every_part_of_it(tmp_path, kind, first):
+    path, data = tmp_path / "mesh.ply", with_faces(kind, first)
+    for end in range(len(data) + 1):
+        written(path, data[:end])
+        # Text may lack its last line's end.
+        if end < len(data) - (kind == "ascii"):
+            with pytest.raises(ValueError):  # noqa: PT011
+                read_table(path, "vertex")
+        else:
+            np.testing.assert_array_equal(positions(read_table(path, "vertex")), POINTS)
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
+@pytest.mark.parametrize("first", ["face", "vertex"])
+@given(seeds)
+def test_bytes_that_changed_are_read_or_refused(tmp_path_factory, kind, first, seed):
+    rng = np.random.default_rng(seed)
+    data = np.frombuffer(with_faces(kind, first), np.uint8).copy()
+    at = rng.integers(len(data), size=rng.integers(1, 4))
+    data[at] ^= (1 << rng.integers(0, 8, at.shape)).astype(np.uint8)
+    path = written(tmp_path_factory.getbasetemp() / "changed.ply", data.tobytes())
+    with contextlib.suppress(ValueError):
+        assert len(read_table(path, "vertex")) <= len(data)
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
+def test_lists_among_the_values_are_left_out(tmp_path, kind):
+    lines = ["element vertex 2", AXES[0], "property list char short seen", *AXES[1:]]
+    data = b"0 2 7 7 0 1\n0 0 1 0\n"
+    if kind != "ascii":
+        one, other = POINTS
+        seen = b"\x02" + np.array([7, 7], "<i2").tobytes()
+        data = one[:1].tobytes() + seen + one[1:].tobytes()
+        data += other[:1].tobytes() + b"\x00" + other[1:].tobytes()
+    path = written(tmp_path / "a.ply", ply(kind, lines, data))
+    np.testing.assert_array_equal(positions(read_table(path, "vertex")), POINTS)
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+@pytest.mark.parametrize("lines", [["element vertex 0", *AXES], ["element vertex 0", *FACES[1:]]])
+def test_no_rows_are_a_table_too(tmp_path, kind, lines):
+    path = written(tmp_path / "a.ply", ply(kind, ["element none 0", *lines]))
+    assert read_table(path, "vertex").shape == (0,)
+
+
+COLORED = [*VERTICES, "property uchar red"]
+LISTED = ["element e 1", "property list char int l", *VERTICES]
+# What stands behind "ply" and the format, and what is said of it.
+REFUSED = {
+    "no count": (["element vertex", *AXES], TEXT, r"line 3 of its header, 'element vertex', is"),
+    "no whole count": (["element vertex 2.0", *AXES], TEXT, r"'2.0' for a count"),
+    "a negative count": (["element vertex -2", *AXES], TEXT, r"'-2' for a count"),
+    "a type unknown": (["element vertex 2", "property flaot x"], TEXT, r"type 'flaot', which PLY"),
+    "a type too long": (["element vertex 2", "property int64 x"], TEXT, r"type 'int64', which PLY"),
+    "no name": (["element vertex 2", "property list uchar int"], TEXT, r"type 'list uchar'"),
+    "a length of float": ([*VERTICES, "property list float int l"], TEXT, r"'list float int'"),
+    "a property twice": ([*VERTICES, AXES[0]], TEXT, r"'property float x', is .*there twice"),
+    "an element twice": ([*VERTICES, *VERTICES], TEXT + TEXT, r"'element vertex 2', is .*twice"),
+    "a property of nothing": ([AXES[0], *VERTICES], TEXT, r"line 3 of its header.*misplaced"),
+    "a format twice": (["format ascii 1.0", *VERTICES], TEXT, r"'format ascii 1.0', is .*twice"),
+    "a line unknown": (["material 3", *VERTICES], TEXT, r"'material 3', is unknown"),
+    "an empty line": (["", *VERTICES], TEXT, r"line 3 of its header, '', is"),
+    "no ASCII": (["comment Straße", *VERTICES], TEXT, r"'ascii' codec can't decode"),
+    "no vertices": (["element points 2", *AXES], TEXT, r"it has no element 'vertex'"),
+    "an axis missing": (["element vertex 2", AXES[0]], b"1\n2\n", r"no field of name y"),
+    "a row short": (VERTICES, b"0 0 1\n0 1\n", r"row 1 of 'vertex' has 2 values instead of 3"),
+    "a row long": (VERTICES, b"0 0 1 5\n0 1 0\n", r"row 0 of 'vertex' has 4 values instead of 3"),
+    "a row empty": (VERTICES, b"0 0 1\n\n0 1 0\n", r"row 1 of 'vertex' has 0 values"),
+    "a row commented": (VERTICES, b"0 0 1 # c\n0 1 0\n", r"row 0 of 'vertex' has 5 values"),
+    "rows missing": (VERTICES, b"0 0 1\n", r"ends before the last of its 2 rows of 'vertex'"),
+    "a word": (VERTICES, b"0 0 x\n0 1 0\n", r"among its rows of 'vertex': .*'x' to float32"),
+    "no ASCII in rows": (VERTICES, b"0 0 \xb2\n0 1 0\n", r"'ascii' codec can't decode"),
+    "a colour of 256": (COLORED, b"0 0 1 256\n0 1 0 0\n", r"'256' to uint8"),
+    "a colour of -1": (COLORED, b"0 0 1 0\n0 1 0 -1\n", r"'-1' to uint8"),
+    "a list of -1": (LISTED, b"-1\n" + TEXT, r"it has a list of -1 values"),
+    "a list of words": (LISTED, b"x 1\n" + TEXT, r"invalid literal"),
+    "a list short": (LISTED, b"2 1\n" + TEXT, r"row 0 of 'e' has 2 values instead of 3"),
+    "a huge count": (["element vertex 99999999999", *AXES], TEXT, r"announces 99999999999 rec"),
+    "a count without end": (["element vertex " + "9" * 5000], TEXT, r"announces 9{18} records"),
+    "huge behind": ([*VERTICES, "element face 99999999"], TEXT, r"announces 99999999 records"),
+}
+
+
+def refused(path, message):
+    with pytest.raises(UserError, match=message) as said, refusing(path, "points", fix="write it"):
+        positions(read_table(path, "vertex"))
+    assert str(said.value).startswith(str(path))
+    assert said.value.fix == "write it"
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_is_wrong_is_said(tmp_path, case):
+    lines, data, message = REFUSED[case]
+    refused(written(tmp_path / "a.ply", ply("ascii", lines, data)), message)
+
+
+WHOLE = ply("ascii", VERTICES, TEXT)
+NO_PLY = {
+    "empty": (b"", r"is no PLY of points: it is empty"),
+    "text": (b"hello", r"its first line is not 'ply'"),
+    "a mark before": (b"\xef\xbb\xbf" + WHOLE, r"its first line is not 'ply'"),
+    "no end": (WHOLE.replace(b"end_header\n", b""), r"it has no line 'end_header'"),
+    "no format": (WHOLE.replace(b"format ascii 1.0\n", b""), r"line 2 of its header.*misplaced"),
+    "nothing at all": (b"ply\ncomment\nend_header\n", r"its header states no format"),
+    "version 2": (WHOLE.replace(b"1.0", b"2.0"), r"line 2 of its header, 'format ascii 2.0', is"),
+    "a list beyond the file": (
+        ply("binary_little_endian", LISTED, b"\x7f" + POINTS.tobytes()),
+        r"ends before the last of its 1 rows of 'e'",
+    ),
+    "a binary list of -1": (
+        ply("binary_little_endian", LISTED, b"\xff" + POINTS.tobytes()),
+        r"it has a list of -1 values",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", NO_PLY)
+def test_what_is_no_ply_is_said(tmp_path, case):
+    data, message = NO_PLY[case]
+    refused(written(tmp_path / "a.ply", data), message)
+
+
+def test_no_file_and_a_folder(tmp_path):
+    refused(tmp_path / "nowhere.ply", r"is no PLY of points: .*No such file")
+    refused(tmp_path, r"is no PLY of points: .*directory")
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
+def test_counts_take_no_memory(tmp_path, kind):
+    """400 MB are announced, by a count that is below the bytes of the file."""
+    lines = ["element vertex 100000", *(f"property double p{k}" for k in range(500))]
+    path = written(tmp_path / "a.ply", ply(kind, lines, bytes(100_000)))
+    tracemalloc.start()
+    try:
+        with pytest.raises(ValueError, match=r"values|ends before"):
+            read_table(path, "vertex")
+        assert tracemalloc.get_traced_memory()[1] < 4e6
+    finally:
+        tracemalloc.stop()
+
+
+def test_rows_are_mapped(tmp_path):
+    rows = np.zeros(10**6, [("x", "<f8")])
+    data = header_of("vertex", rows.dtype, len(rows)) + rows.tobytes()
+    path = written(tmp_path / "a.ply", data)
+    del data
+    tracemalloc.start()
+    try:
+        assert len(read_table(path, "vertex")) == len(rows)
+        assert tracemalloc.get_traced_memory()[1] < rows.nbytes / 4
+    finally:
+        tracemalloc.stop()
