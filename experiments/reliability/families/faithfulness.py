@@ -25,9 +25,10 @@ ABOUT = """
 What rounding does to a small fit in which exposures and gammas are learned and Gaussians are born.
 Float64: along 1,000 steps, every 50th is taken again from the same state in double precision, all
 of it but what is counted and sorted and the noise on the means. Survived: the loss is within 1e-5,
-and the gradient of every group of parameters within 1e-3 of its norm (of a tenth of its usual norm,
-where the step's is less); float32 has seven digits, and sums of some hundred terms that cancel
-leave four of them. Subnormals: starts with numbers below float32's normal range, which XLA takes
+and the gradient of every group of parameters within 1e-2 of its norm, in the median of all steps
+within 1e-4 (of a tenth of its usual norm, where the step's is less). Float32 has seven digits, and
+sums of some hundred terms cost two; where a pixel equals its photograph to the last bit, rounding
+chooses the sign of L1, which alone is up to 1e-3 of a gradient. Subnormals: starts with numbers below float32's normal range, which XLA takes
 for zero; survived: all stays finite, and the loss is within 1e-4 of that in float64, where they are
 normal. Last bit, order, vectors: the same fit from a start that differs in one last bit (1,000
 steps), with its Gaussians stored or the views of a step summed in another order, or compiled for
@@ -45,8 +46,13 @@ MENDED = (
         "range",
         "tests/photometry/test_gauge.py::test_exposures_below_the_normal_numbers_have_a_gauge",
     ),
+    Mended(
+        "1 - SSIM of what is fitted well was up to 9 % off in float32, and its gradient 1e-3: means "
+        "of squares cancelled",
+        "tests/losses/test_image.py::test_what_is_fitted_well_keeps_its_digits",
+    ),
 )
-GRADIENT, LOSS, SUBNORMAL_LOSS = 1e-3, 1e-5, 1e-4
+GRADIENT, USUAL, LOSS, SUBNORMAL_LOSS = 1e-2, 1e-4, 1e-5, 1e-4
 # Of a group's usual gradient, what the least is judged by: spheres have none by their rotation.
 LEAST = 0.1
 # Deviations of the difference of two seeds.
@@ -163,6 +169,9 @@ def against_float64(fit: SmallFit, size: Size) -> Part:
         failures += _beyond(f"{at}: loss", gap.loss, LOSS)
         for k in GROUPS:
             failures += _beyond(f"{at}: gradient of {k}", gap.gradient[k].over(least[k]), GRADIENT)
+    for k in GROUPS:
+        usual = statistics.median(gap.gradient[k].over(least[k]) for gap in gaps)
+        failures += _beyond(f"float64: gradient of {k}, median", usual, USUAL)
     name = "float64"
     rows = [row(name, "loss", [g.loss for g in gaps], LOSS)]
     rows += [
@@ -174,7 +183,7 @@ def against_float64(fit: SmallFit, size: Size) -> Part:
             row(name, f"{what} of {k}", [getattr(g, what)[k].over() for g in later]) for k in GROUPS
         ]
     rows += [row(f"{name}, first step", f"update of {k}", [first.update[k].over()]) for k in GROUPS]
-    return Part(len(gaps) * (1 + len(GROUPS)), failures, rows)
+    return Part(len(gaps) * (1 + len(GROUPS)) + len(GROUPS), failures, rows)
 
 
 def _gaps(
