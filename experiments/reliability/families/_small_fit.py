@@ -87,6 +87,7 @@ class Watched(StepPrograms):
 
     def get(self, step, key, *arguments):
         """Return a compiled step under watch."""
+        assert isinstance(step, Step)
         called = Called(step, key, super().get(step, key, *arguments))
         return lambda state, *inputs: self.watch(called, state, inputs)
 

@@ -30,10 +30,11 @@ within 1e-4 (of a tenth of its usual norm, where the step's is less). Float32 ha
 sums of some hundred terms cost two; where a pixel equals its photograph to the last bit, rounding
 chooses the sign of L1, which alone is up to 1e-3 of a gradient. Subnormals: starts with numbers
 below float32's normal range, which XLA takes for zero; survived: all stays finite, and the loss is
-within 1e-4 of that in float64, where they are normal. Last bit, order, vectors: the same fit from a start that differs in one last bit (1,000
-steps), with its Gaussians stored or the views of a step summed in another order, or compiled for
-narrower vectors (300 steps). Survived: held-out PSNR and exposures move no more than another seed
-moves them, three deviations of the difference of two seeds.
+within 1e-4 of that in float64, where they are normal. Last bit, order, vectors: the same fit from a
+start that differs in one last bit (1,000 steps), with its Gaussians stored or the views of a step
+summed in another order, or compiled for narrower vectors (300 steps). Survived: held-out PSNR and
+exposures move no more than another seed moves them, three deviations of the difference of two
+seeds.
 """
 MENDED = (
     Mended(
@@ -47,8 +48,8 @@ MENDED = (
         "tests/photometry/test_gauge.py::test_exposures_below_the_normal_numbers_have_a_gauge",
     ),
     Mended(
-        "1 - SSIM of what is fitted well was up to 9 % off in float32, and its gradient .1 %: means "
-        "of squares cancelled",
+        "1 - SSIM of what is fitted well was up to 9 % off in float32, its gradient .1 %: means of "
+        "squares cancelled",
         "tests/losses/test_image.py::test_what_is_fitted_well_keeps_its_digits",
     ),
 )
