@@ -17,6 +17,8 @@ import numpy as np
 from p2gs_jax.core.disk import naming
 from p2gs_jax.errors import UserError
 
+_BEGUN = ".writing-"
+
 
 @contextlib.contextmanager
 def atomic_write(path: Path, *, durable: bool = True) -> Iterator[Path]:
@@ -33,7 +35,7 @@ def atomic_write(path: Path, *, durable: bool = True) -> Iterator[Path]:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=".writing-", suffix=path.suffix)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=_BEGUN, suffix=path.suffix)
     os.close(handle)
     temporary = Path(name)
     try:
@@ -57,7 +59,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=".writing-"))
+    temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=_BEGUN))
     try:
         yield temporary
         temporary.chmod(0o755)
@@ -66,6 +68,26 @@ def atomic_folder(path: Path) -> Iterator[Path]:
         os.replace(temporary, path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def remove_begun(folder: Path, spare: str) -> None:
+    """Remove what a process that was killed had begun to write.
+
+    Args:
+        folder: in which nobody else writes; with its subfolders.
+        spare: subfolders that hold a file of this name are somebody else's.
+    """
+    for at, folders, files in os.walk(folder):
+        if spare in files and Path(at) != folder:
+            folders.clear()
+            continue
+        for name in [name for name in folders if name.startswith(_BEGUN)]:
+            folders.remove(name)
+            shutil.rmtree(Path(at, name), ignore_errors=True)
+        for name in files:
+            if name.startswith(_BEGUN):
+                with contextlib.suppress(OSError):
+                    Path(at, name).unlink()
 
 
 @contextlib.contextmanager

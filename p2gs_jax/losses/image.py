@@ -100,7 +100,7 @@ def _masked_sum_fwd(x, y, mask):
     always = opaque_true(mask[0, 0])
 
     def channel(pair):
-        p = _parts(*pair, always)
+        p = _parts(pair[0], pair[1], always)
         by_a, by_b = 1 - p.B, 1 - p.A
         # Derivatives to the blurred s and d, d^2 and s^2.
         d_m = by_a * (p.md * (2 - p.A) - p.ms * p.A) / p.b1

@@ -11,6 +11,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+from p2gs_jax.core.atomic import remove_begun
 from p2gs_jax.core.disk import naming
 from p2gs_jax.errors import UserError
 
@@ -57,13 +58,15 @@ def removed(folder: Path) -> UserError:
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[RunLock]:
-    """Hold the lock of a folder that exists.
+    """Hold the lock of a folder that exists; what a crash left half written in it is removed.
 
     Raises:
         UserError: another process holds it, or a write failed because the folder was removed.
     """
     handle = None if fcntl is None else _acquire(folder)
     lock = RunLock(folder, handle)
+    if handle is not None:
+        remove_begun(folder, spare=NAME)
     try:
         yield lock
     except OSError:

@@ -33,6 +33,19 @@ def test_a_second_holder_is_refused_and_told_who_the_first_is(tmp_path):
         pass
 
 
+def test_what_a_killed_process_had_begun_to_write_is_removed(tmp_path):
+    for name in (".writing-a.npz", "renders/.writing-b.png", ".writing-c/d", "blocks/.writing-e"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    (tmp_path / "kept.npz").touch()
+    with locked(tmp_path / "blocks"):
+        (tmp_path / "blocks" / ".writing-theirs").touch()
+        with locked(tmp_path):
+            pass
+    left = {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()}
+    assert left == {"kept.npz", "blocks/.writing-theirs"}
+
+
 def test_a_killed_process_leaves_no_lock(tmp_path):
     command = [sys.executable, "-c", HOLD, str(tmp_path)]
     with subprocess.Popen(
