@@ -115,6 +115,13 @@ class Photometry(eqx.Module):
         return xp.maximum(self.raw_exposures, 1e-3)
 
     @property
+    def log_exposures(self) -> Float[Array, " v"]:
+        """Logarithms of the exposures, also of those that are no normal numbers of float32."""
+        if self.parameterization == "log":
+            return self.raw_exposures
+        return _namespace(self.raw_exposures).log(self.exposures)
+
+    @property
     def gammas(self) -> Float[Array, " v"]:
         """Gammas > 0."""
         xp = _namespace(self.raw_gammas)

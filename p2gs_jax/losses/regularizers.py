@@ -36,7 +36,8 @@ def photometry_regularizers(
     if cfg.gamma_prior is not None:
         terms["gamma_prior"] = cfg.gamma_prior * jnp.mean((gamma - GAMMA_SRGB) ** 2)
     if cfg.log_exposure_mean is not None:
-        terms["log_exposure_mean"] = cfg.log_exposure_mean * jnp.mean(jnp.log(e)) ** 2
+        mean = jnp.mean(photometry.log_exposures)
+        terms["log_exposure_mean"] = cfg.log_exposure_mean * mean**2
     if cfg.gamma_mean_variance is not None:
         terms["gamma_mean_variance"] = cfg.gamma_mean_variance * (
             (jnp.mean(gamma) - GAMMA_SRGB) ** 2 + variance(gamma)

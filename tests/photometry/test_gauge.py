@@ -2,10 +2,13 @@
 
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from p2gs_jax.config import RegularizerConfig
+from p2gs_jax.losses.regularizers import photometry_regularizers
 from p2gs_jax.photometry.gauge import recentre
 from p2gs_jax.render.radiance import radiance_activation
 from p2gs_jax.types import Gaussians, Params, Photometry
@@ -59,3 +62,16 @@ def test_a_common_tint_goes_into_the_radiance(activation):
         exposed(x, activation) * jnp.exp(x.photometry.white_balance)[:, None] for x in (p, q)
     )
     np.testing.assert_allclose(after, before, rtol=4e-6)
+
+
+def test_exposures_below_the_normal_numbers_have_a_gauge():
+    raw = np.float32([-90, 1, 2])  # e^-90 is 8e-40, which XLA takes for zero
+    weight = RegularizerConfig().log_exposure_mean
+
+    def term(raw):
+        photometry = Photometry(raw, jnp.zeros(3))
+        return photometry_regularizers(photometry, RegularizerConfig())["log_exposure_mean"]
+
+    value, gradient = jax.value_and_grad(term)(raw)
+    assert float(value) == pytest.approx(weight * 29**2)
+    np.testing.assert_allclose(gradient, weight * 2 * -29 / 3, rtol=1e-6)
