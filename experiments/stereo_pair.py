@@ -33,7 +33,10 @@ def main() -> None:
     frames = []
     for k, photograph in enumerate(args.photographs):
         shutil.copyfile(photograph, images / photograph.name)
-        height, width = cv2.imread(str(photograph)).shape[:2]
+        picture = cv2.imread(str(photograph))
+        if picture is None:
+            raise SystemExit(f"{photograph} cannot be decoded.")
+        height, width = picture.shape[:2]
         pose = np.diag([1.0, -1.0, -1.0, 1.0])
         pose[0, 3] = k * BASELINE_M
         frames.append(
