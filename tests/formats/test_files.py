@@ -223,6 +223,21 @@ def test_summary_is_written_with_gaps_in_exif_and_long_names(tmp_path, columns):
     assert cv2.imread(str(tmp_path / "s.png")).shape[1] > 600
 
 
+def test_a_summary_of_hostile_names_is_written_in_silence(tmp_path, recwarn):
+    images = [np.full((24, 32, 3), 0.5, np.float32)] * 3
+    write_summary(
+        tmp_path / "s.png",
+        photographs=images,
+        rendered=images,
+        linear_tonemapped=images,
+        names=["\x1b[31mred.png", r"$\nothing$.png", "写真.png"],
+        exposures_ev=np.zeros(3),
+        cameras=[r"$\nothing$", "\x1b[31m", "写"],
+    )
+    assert (tmp_path / "s.png").stat().st_size > 0
+    assert not [str(w.message) for w in recwarn]
+
+
 def test_curves_of_the_summary_share_one_level():
     ev, cameras = np.array([1.0, 3.0, 2.0, 6.0]), ["a", "b", "a", "b"]
     exif = ev + 5
