@@ -1,6 +1,5 @@
 """Who may talk to the viewer."""
 
-import asyncio
 import urllib.error
 import urllib.request
 
@@ -9,6 +8,7 @@ import pytest
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 import viser
 import websockets
+import websockets.sync.client
 
 from p2gs_jax.viewer.guard import Guard, guard_of, guarded, is_loopback
 
@@ -59,22 +59,20 @@ def get(server, path="/", **headers):
 
 
 def connects(server, origin=None, **headers):
-    """Return whether a WebSocket is let in."""
+    """Return whether a WebSocket is let in.
 
-    async def attempt():
-        connection = websockets.connect(
+    Without an event loop: the session's browser keeps one running in this thread.
+    """
+    try:
+        with websockets.sync.client.connect(
             f"ws://127.0.0.1:{server.get_port()}",
             origin=origin,
             additional_headers=headers,
             subprotocols=[PROTOCOL],
-        )
-        try:
-            async with connection as socket:
-                return bool(await asyncio.wait_for(socket.recv(), 20))
-        except websockets.InvalidStatus as error:
-            return error.response.status_code != 403
-
-    return asyncio.run(attempt())
+        ) as socket:
+            return bool(socket.recv(20))
+    except websockets.InvalidStatus as error:
+        return error.response.status_code != 403
 
 
 def test_the_viewer_s_own_page_is_served(servers):
