@@ -8,7 +8,9 @@ import numpy as np
 from jaxtyping import Float
 
 from p2gs_jax.core.atomic import atomic_write
+from p2gs_jax.core.drawn_names import names_as_they_are
 from p2gs_jax.core.numerics import LN2
+from p2gs_jax.core.printable import printable
 from p2gs_jax.photometry.response import Response, log_exposed
 from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.types import GAMMA_SRGB
@@ -19,6 +21,7 @@ CHANNELS = ("red", "green", "blue")
 MOST_CURVES = 12
 
 
+@names_as_they_are()
 def write_calibration_plot(
     path: Path,
     solution: PhotometricSolution,
@@ -60,7 +63,7 @@ def write_calibration_plot(
             lw=0.8,
             capsize=2,
             color=color,
-            label=f"camera {name}" if len(names) > 1 else "recovered, 2 standard errors",
+            label=f"camera {printable(name)}" if len(names) > 1 else "recovered, 2 standard errors",
         )
         middle.plot(at, s.view_residual_ev[mine], marker, ms=4, color=color)
         if np.isfinite(stated_ev[mine]).any():
@@ -81,7 +84,7 @@ def write_calibration_plot(
     for label, response, gamma in curves_to_draw(s):
         base = log_exposed(y, response)[0] - np.log(pivot)
         stops = (base * gamma / GAMMA_SRGB + np.log(pivot)) / LN2
-        right.plot(stops, y, lw=0.9, label=label)
+        right.plot(stops, y, lw=0.9, label=printable(label))
     srgb = log_exposed(y, Response())[0] / LN2
     right.plot(srgb, y, "k--", lw=0.9, label="sRGB")
     right.set_title(f"Tone curve: {s.response.name}", loc="left", fontsize=10)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Float32
 
 from p2gs_jax.core.atomic import atomic_write
+from p2gs_jax.core.drawn_names import names_as_they_are
 from p2gs_jax.core.printable import printable
 
 ROWS = ("photograph", "render,\nits own\nexposure", "render,\none exposure\nfor all")
@@ -22,6 +22,7 @@ CHARACTER = 0.62
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 
 
+@names_as_they_are()
 def write_summary(
     path: Path,
     *,
@@ -74,15 +75,13 @@ def write_summary(
             axis.set_yticks([])
             axis.set_frame_on(False)
             if r == 0:
-                axis.set_title(_shown(_shorten(names[c], cell_w)), fontsize=TITLE_SIZE, pad=4)
+                axis.set_title(printable(_shorten(names[c], cell_w)), fontsize=TITLE_SIZE, pad=4)
             if c == 0:
                 position = ((LEFT - 0.1) / width, 1 - (top + cell_h / 2) / height)
                 figure.text(*position, ROWS[r], fontsize=TEXT_SIZE, ha="right", va="center")
     top = TOP + 3 * (cell_h + GAP) + legend_h
     _plot_exposures(place(LEFT, top, width - LEFT - RIGHT, PLOT), entries, per_line)
-    with atomic_write(path) as temporary, warnings.catch_warnings():
-        # Letters that the font lacks are boxes in the picture, and no matter for the terminal.
-        warnings.filterwarnings("ignore", message="Glyph", category=UserWarning)
+    with atomic_write(path) as temporary:
         # Packing tighter takes longer than drawing, for a tenth of the bytes.
         figure.savefig(temporary, format="png", pil_kwargs={"compress_level": 2})
 
@@ -91,11 +90,6 @@ def _shorten(name: str, inches: float) -> str:
     """Return the end of a name, as much as fits."""
     room = int(inches * 72 / (CHARACTER * TITLE_SIZE))
     return name if len(name) <= room else "…" + name[1 - room :]
-
-
-def _shown(text: str) -> str:
-    """Return the text of a name: no control characters, and no formula between dollars."""
-    return printable(text).replace("$", r"\$")
 
 
 def _curves(exposures_ev, cameras, true_ev, exif_ev) -> list[tuple]:
@@ -112,7 +106,7 @@ def _curves(exposures_ev, cameras, true_ev, exif_ev) -> list[tuple]:
             "markersize": 4.5,
             "linewidth": 1,
         }
-        out.append((rows, centered[rows], style, f"recovered, camera {_shown(camera)}"))
+        out.append((rows, centered[rows], style, f"recovered, camera {printable(camera)}"))
     for values, label, line in ((true_ev, "true", "--"), (exif_ev, "EXIF", ":")):
         if values is None:
             continue

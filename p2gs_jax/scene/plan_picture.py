@@ -9,7 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from p2gs_jax.core.atomic import atomic_write
+from p2gs_jax.core.drawn_names import names_as_they_are
 from p2gs_jax.core.numerics import evenly_spaced
+from p2gs_jax.core.printable import printable
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.scene.directions import level_ahead, up_of_drive
 from p2gs_jax.scene.drives.poses import interpolated
@@ -50,6 +52,7 @@ class _Plane:
         return np.asarray(directions, np.float64) @ self.axes.T
 
 
+@names_as_they_are()
 def draw_plan(path: Path, survey: Survey) -> None:
     """Write the picture.
 
@@ -101,7 +104,7 @@ def draw_plan(path: Path, survey: Survey) -> None:
 
 
 def _title(survey: Survey) -> str:
-    said = f"{survey.root.resolve().name} from above"
+    said = f"{printable(survey.root.resolve().name)} from above"
     if survey.way:
         said += f": {survey.way:.1f} {survey.unit} to the right"
         said += "" if survey.seconds is None else f" in {survey.seconds:.1f} s"
@@ -175,7 +178,7 @@ def _draw_camera(
     """Draw the way of a camera, and what it sees from some places of it."""
     views = sorted(views, key=lambda v: (v.frame if v.frame is not None else -1, v.name))
     places = plane(centers_of(views))
-    label = f"{name} ({len(views)})"
+    label = f"{printable(name)} ({len(views)})"
     axes.plot(*places.T, ".-", color=color, ms=3, lw=0.8, zorder=5, label=label)
     for k in evenly_spaced(len(views), MOST_DIRECTIONS):
         view = views[k]

@@ -80,6 +80,13 @@ def test_photographs_alone_start_no_structure_from_motion(tmp_path, run_command,
     assert "leave out --out" in said
 
 
+def test_names_in_a_picture_are_no_formulas(tmp_path, recwarn):
+    root = make_scene(tmp_path / r"$\nothing$ 写")
+    draw_plan(tmp_path / "plan.png", survey(root, DataConfig()))
+    assert cv2.imread(str(tmp_path / "plan.png")).std() > 5
+    assert not [str(w.message) for w in recwarn]
+
+
 def test_a_picture_needs_cameras(tmp_path):
     alone = surveys.Survey(tmp_path, "images", ())
     with pytest.raises(ValueError, match="no plan"):

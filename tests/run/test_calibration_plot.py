@@ -35,3 +35,16 @@ def test_responses_of_cameras_and_channels_are_drawn_each(tmp_path, by, names):
     path = tmp_path / "calibration.png"
     write_calibration_plot(path, solution, cameras=cameras, stated_ev=stated, pivot=PIVOT)
     assert path.stat().st_size > 10_000
+
+
+def test_names_of_cameras_are_no_formulas(tmp_path, recwarn):
+    gains = np.repeat(make_exposures(DRIVE, "iso4")[:, None], 3, 1)
+    problem = make_problem(observe(DRIVE, gains), black=4 / 255, saturation=250 / 255, pivot=PIVOT)
+    solution = fit_model(problem, Form("view_exposure"), Response("srgb"))
+    hostile = (r"$\nothing$", "\x1b[31m", "写")
+    cameras = [hostile[k % 3] for k in range(len(DRIVE.cameras))]
+    path = tmp_path / "calibration.png"
+    stated = np.full(len(cameras), np.nan)
+    write_calibration_plot(path, solution, cameras=cameras, stated_ev=stated, pivot=PIVOT)
+    assert path.stat().st_size > 10_000
+    assert not [str(w.message) for w in recwarn]
