@@ -12,7 +12,6 @@ import argparse
 import dataclasses
 import datetime
 import json
-import subprocess
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from checkout import commit
 from matplotlib.figure import Figure
 
 import p2gs_jax
@@ -246,17 +246,10 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def stamp(o: Options, seconds: float) -> dict[str, Any]:
     """Return where a table comes from."""
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=Path(__file__).parent,
-    ).stdout.strip()
     return {
         "command": o.command,
         "date": datetime.date.today().isoformat(),
-        "commit": commit or "unknown",
+        "commit": commit(),
         "protocol": dataclasses.asdict(o.protocol),
         "seed": 0,
         "seconds_of_this_call": round(seconds, 1),

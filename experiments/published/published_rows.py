@@ -15,6 +15,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from checkout import commit
+
 from p2gs_jax.core.atomic import write_json
 
 HERE = Path(__file__).parent
@@ -47,21 +51,6 @@ def add_row(key: Key, row: dict[str, Any], path: Path = ROWS) -> None:
     """Write a row to the others at once."""
     rows = read_rows(path) | {key: {**key._asdict(), **row}}
     write_json(path, [rows[k] for k in sorted(rows)])
-
-
-def commit() -> str:
-    """Return what is checked out, and whether it was changed."""
-
-    def git(*words: str) -> str:
-        done = subprocess.run(
-            ["git", *words], capture_output=True, text=True, check=False, cwd=HERE
-        )
-        return done.stdout.strip()
-
-    # The rows themselves change with every row.
-    status = git("status", "--porcelain", "-uno", "--", ":/", ":(top,exclude)experiments/*.json")
-    changed = " and changes" if status else ""
-    return (git("rev-parse", "--short", "HEAD") or "unknown") + changed
 
 
 def of_fit(metrics: dict[str, Any], command: str) -> dict[str, Any]:

@@ -19,7 +19,7 @@ class Entry:
     Attributes:
         family: what it found.
         date: YYYY-MM-DD.
-        commit: of the checkout; + behind it: with changes.
+        commit: of the checkout, and whether files differ from it.
         quick: only a part was tried.
     """
 

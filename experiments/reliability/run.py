@@ -25,7 +25,6 @@ import argparse
 import datetime
 import importlib
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
@@ -36,6 +35,7 @@ from types import ModuleType
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from checkout import commit
 from reliability.family import COMMAND, Failure, Family
 from reliability.page import write_page
 from reliability.record import Entry, write_entry
@@ -103,16 +103,6 @@ def one(module: ModuleType, quick: bool, out: Path) -> Family:
 def today() -> str:
     """Return the date in UTC."""
     return datetime.datetime.now(datetime.UTC).date().isoformat()
-
-
-def commit() -> str:
-    """Return the short commit of this checkout; with + where files differ from it."""
-    git = ("git", "-C", str(HERE))
-    head = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True)
-    changed = subprocess.run(
-        [*git, "status", "--porcelain", "-uno"], capture_output=True, text=True
-    )
-    return head.stdout.strip() + ("+" if changed.stdout.strip() else "")
 
 
 if __name__ == "__main__":
