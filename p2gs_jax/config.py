@@ -458,7 +458,7 @@ class InitConfig:
     shell_count: int = 4000
     """Directions on the whole sphere from which the shell is drawn."""
     shell_radius: float = 30.0
-    """Its distance, in scene extents."""
+    """Its distance, in radii of the cameras."""
     dense: Literal["auto", "on", "off"] = "auto"
     """Seeds from optical flow between photographs (after EDGS, arXiv 2504.13204): `auto` where the
     seeds are fewer than half of the bound on the population (ours: BUILD_NOTES)."""

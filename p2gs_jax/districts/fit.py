@@ -35,7 +35,7 @@ from p2gs_jax.districts.shared import (
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.ply import read_ply
 from p2gs_jax.gaussians.init.dense_bound import coverage_of
-from p2gs_jax.gaussians.init.seeds import scene_extent
+from p2gs_jax.gaussians.init.seeds import cameras_radius
 from p2gs_jax.jobs import JobState, open_engine, run_jobs
 from p2gs_jax.jobs.engines import LOCAL, check_engine
 from p2gs_jax.photometry.gauge import recentre
@@ -288,7 +288,7 @@ class _District:
             fitted=store,
             params=Params(None, shared.photometry),  # pyright: ignore[reportArgumentType]
             owner=None,
-            extent=scene_extent(scene.training_views, scene.points),
+            extent=cameras_radius(scene.training_views, scene.points),
             selection=solved.selection,
             pairs=None,
             overlaps=None,

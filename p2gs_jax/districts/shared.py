@@ -14,13 +14,13 @@ from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.core.progress import Reporter
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.init.photographed import photographed_radiance, with_colors
-from p2gs_jax.gaussians.init.seeds import scene_extent
+from p2gs_jax.gaussians.init.seeds import cameras_radius
 from p2gs_jax.gaussians.init.shell import Sphere, sphere_behind
 from p2gs_jax.photometry.initial import initial_photometry, point_radiance
 from p2gs_jax.photometry.selection import Selection
 from p2gs_jax.pipeline.decide import decide
 from p2gs_jax.pipeline.prepare import solve
-from p2gs_jax.pipeline.scale import near_depth, near_plane, scale_notes
+from p2gs_jax.pipeline.scale import near_depth, near_plane, scale_notes, seen_depths
 from p2gs_jax.run.decisions import Decisions, read_decisions, write_decisions
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Photometry, Scene
@@ -93,7 +93,7 @@ def solve_shared(
             fix="fit it without --blocks, or with a structure-from-motion model",
         )
     views = scene.training_views
-    depth = near_depth(scene.points, views)
+    depth = near_depth(seen_depths(scene.points, views))
     near = near_plane(depth, cfg)
     decisions = dataclasses.replace(
         decide(cfg, selection, matched=True, kept=kept),
@@ -111,7 +111,7 @@ def solve_shared(
         photometry=jax.tree.map(np.asarray, photometry),
         decisions=decisions,
         radiance=point_radiance(scene, selection.solution, resolved),
-        shell=sphere_behind(views, scene.points, scene_extent(views, scene.points), cfg.init),
+        shell=sphere_behind(views, scene.points, cameras_radius(views, scene.points), cfg.init),
     )
     return Solved(scene, shared, selection, tuple(notes))
 

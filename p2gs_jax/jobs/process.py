@@ -12,12 +12,13 @@ import sys
 from pathlib import Path
 
 from p2gs_jax.core.atomic import write_json
+from p2gs_jax.core.interrupts import SIGNALS, Interrupted, exit_code
 from p2gs_jax.jobs.job import REASON, JobFiles, Status, read_job, read_reason
 
 # Seconds between looks at the file that asks for the end.
 LOOK_S = 0.2
-# How a job ends that was asked to, and left its checkpoint (`interrupts.exit_code`).
-ASKED = tuple(128 + int(number) for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM))
+# How a job ends that was asked to, and left its checkpoint.
+ASKED = tuple(exit_code(Interrupted(number)) for number in SIGNALS)
 
 
 def run_in_process(job_path: str) -> tuple[Status, str | None]:

@@ -30,7 +30,7 @@ def recentre(params: Params, activation: RadianceKind) -> Params:
     # On the host: once a fit, and every operation would be a program of its own.
     photometry = jax.tree.map(np.asarray, params.photometry)
     sh = np.array(params.gaussians.sh)
-    log_scale = np.mean(np.log(photometry.exposures))
+    log_scale = np.mean(photometry.log_exposures)
     balance = photometry.white_balance
     tint = np.zeros(3, np.float32) if balance is None else balance.mean(0)
     log_scales = log_scale + tint

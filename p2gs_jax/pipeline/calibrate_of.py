@@ -19,7 +19,7 @@ from p2gs_jax.evaluate.foreign import score_foreign
 from p2gs_jax.formats.foreign import read_foreign
 from p2gs_jax.gaussians.bake import viewer_config
 from p2gs_jax.gaussians.init.dense_bound import coverage_of
-from p2gs_jax.gaussians.init.seeds import scene_extent
+from p2gs_jax.gaussians.init.seeds import cameras_radius
 from p2gs_jax.gaussians.relit import relit
 from p2gs_jax.photometry.calibrate import calibrate_observations, options_of
 from p2gs_jax.photometry.initial import initial_photometry
@@ -217,7 +217,7 @@ def _prepared(
         fitted=store.leaving_out(scene.objects),
         params=params,
         owner=None,
-        extent=scene_extent(scene.training_views, np.asarray(foreign.means)),
+        extent=cameras_radius(scene.training_views, np.asarray(foreign.means)),
         selection=selection,
         pairs=None,
         overlaps=None,

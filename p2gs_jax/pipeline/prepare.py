@@ -29,7 +29,7 @@ from p2gs_jax.gaussians.init.photographed import (
     photographed_radiance,
     with_colors,
 )
-from p2gs_jax.gaussians.init.seeds import merge, scene_extent, subsample
+from p2gs_jax.gaussians.init.seeds import cameras_radius, merge, subsample
 from p2gs_jax.gaussians.init.shell import find_shell
 from p2gs_jax.gaussians.init.start import (
     black_gaussians,
@@ -50,7 +50,13 @@ from p2gs_jax.photometry.sources import has_tracks, surface_colors
 from p2gs_jax.pipeline.decide import decide, likely, with_choice
 from p2gs_jax.pipeline.memory_needed import memory_needed, require_memory
 from p2gs_jax.pipeline.part import Part
-from p2gs_jax.pipeline.scale import extent_of_rates, near_depth, near_plane, scale_notes
+from p2gs_jax.pipeline.scale import (
+    extent_of_rates,
+    near_depth,
+    near_plane,
+    scale_notes,
+    seen_depths,
+)
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.images import ImageStore
@@ -184,8 +190,9 @@ def prepare(
     _require_something_to_see(scene, fitted)
     views = scene.training_views
     taken_by = [view.camera for view in views]
-    extent = scene_extent(views, scene.points)
-    rated = extent_of_rates(extent, scene.points, views, cfg)
+    radius = cameras_radius(views, scene.points)
+    depths = seen_depths(scene.points, views)
+    extent = extent_of_rates(radius, depths, cfg)
     coverage = coverage_of(scene, store)
     require_memory(memory_needed(scene, cfg, coverage))
     measured = measured_depths(scene, cfg)
@@ -195,11 +202,11 @@ def prepare(
     if store.backdrop is not None and init.shell == "auto":
         # What lies behind everything is the background.
         init = dataclasses.replace(init, shell="off")
-    depth = near_depth(scene.points, views)
+    depth = near_depth(depths)
     near = near_plane(depth, cfg)
     # Dense seeds cover some of what the points do not.
     sphere = None if part is None else part.shell
-    shell = None if dense else find_shell(views, scene.points, extent, init, sphere)
+    shell = None if dense else find_shell(views, scene.points, radius, init, sphere)
 
     guess = likely(cfg, kept, matched=has_tracks(scene) or dense)
     guess = None if guess is None else dataclasses.replace(guess, near=near)
@@ -222,7 +229,7 @@ def prepare(
         )
         known = kept is not None or part is not None or not cfg.photometry.select
         under = guess.resolve(cfg)
-        expected = Expected(fitted, params, owner, rated, coverage, guess, under, known, measured)
+        expected = Expected(fitted, params, owner, extent, coverage, guess, under, known, measured)
         on_expected(expected)
 
     def chosen(form: Form, response: Response) -> None:
@@ -268,7 +275,7 @@ def prepare(
             on_view=lambda i, n: reporter.stage("Matching photographs", i, n),
         )
         covering = np.concatenate([scene.points, added.points])
-        shell = find_shell(views, covering, extent, init, sphere)
+        shell = find_shell(views, covering, radius, init, sphere)
     if scene.point_colors is None:
         scene = with_colors(scene, photographed_radiance(scene, still, photometry, resolved))
     radiance = point_radiance(scene, solution, resolved) if part is None else part.radiance
@@ -304,7 +311,7 @@ def prepare(
             _initial_poses(nodes, resolved),
         ),
         owner,
-        rated,
+        extent,
         selection,
         color_pairs(tracks, resolved),
         overlaps(tracks, resolved),

@@ -21,42 +21,41 @@ EXTENT_PERCENTILE = 10.0
 COARSE = 1e-4
 
 
-def near_depth(
-    points: Float[np.ndarray, "p 3"],
-    views: Sequence[View],
-    percentile: float = NEAR_PERCENTILE,
-) -> float | None:
-    """Return how deep the nearest points of the views lie, scene units; None where none is seen.
+def seen_depths(points: Float[np.ndarray, "p 3"], views: Sequence[View]) -> Float[np.ndarray, " n"]:
+    """Return depths of some points in the frusta of some views, scene units.
 
     Args:
         points: of the scene.
-        views: some of them are looked at.
-        percentile: of the depths of the points in their frusta.
+        views: of it.
     """
     sample = points[:: max(1, len(points) // SHARE_POINTS)]
     depths = []
     for row in evenly_spaced(len(views), SHARE_VIEWS):
         xy, z = project_points(sample, views[row])
         depths.append(z[in_frame(xy, z, views[row].width, views[row].height)])
-    found = np.concatenate(depths) if depths else np.zeros(0)
-    return float(np.percentile(found, percentile)) if len(found) else None
+    return np.concatenate(depths) if depths else np.zeros(0)
 
 
-def extent_of_rates(
-    extent: float, points: Float[np.ndarray, "p 3"], views: Sequence[View], cfg: FitConfig
-) -> float:
+def near_depth(depths: Float[np.ndarray, " n"]) -> float | None:
+    """Return how deep the nearest points lie, scene units; None where none is seen.
+
+    Args:
+        depths: from `seen_depths`.
+    """
+    return float(np.percentile(depths, NEAR_PERCENTILE)) if len(depths) else None
+
+
+def extent_of_rates(radius: float, depths: Float[np.ndarray, " n"], cfg: FitConfig) -> float:
     """Return the length that rates of the means are shares of, scene units.
 
     Args:
-        extent: radius of the cameras.
-        points: of the scene.
-        views: for training.
+        radius: of the cameras, scene units.
+        depths: from `seen_depths`.
         cfg: as asked.
     """
-    if cfg.optimizer.extent == "cameras":
-        return extent
-    near = near_depth(points, views, EXTENT_PERCENTILE)
-    return extent if near is None else min(extent, near)
+    if cfg.optimizer.extent == "cameras" or not len(depths):
+        return radius
+    return min(radius, float(np.percentile(depths, EXTENT_PERCENTILE)))
 
 
 def near_plane(depth: float | None, cfg: FitConfig) -> float | None:

@@ -8,7 +8,7 @@ import pytest
 
 from p2gs_jax.config import FitConfig, InitConfig, preset
 from p2gs_jax.core.srgb import srgb_encode
-from p2gs_jax.gaussians.init.seeds import gaussians_from_points, scene_extent, subsample
+from p2gs_jax.gaussians.init.seeds import cameras_radius, gaussians_from_points, subsample
 from p2gs_jax.gaussians.init.shell import find_shell
 from p2gs_jax.photometry.observations import Observations, overlapping_views, sample_pairs
 from p2gs_jax.photometry.sources.sampling import sample
@@ -108,8 +108,8 @@ def test_seeds_carry_their_radiance(name):
 
 def test_extent_and_subsample():
     views = [view(x) for x in (0.0, 10.0)]
-    assert scene_extent(views, np.zeros((0, 3), np.float32)) == pytest.approx(5.5)
-    assert scene_extent([view(0.0)], np.full((5, 3), 10, np.float32)) > 0.5
+    assert cameras_radius(views, np.zeros((0, 3), np.float32)) == pytest.approx(5.5)
+    assert cameras_radius([view(0.0)], np.full((5, 3), 10, np.float32)) > 0.5
     kept = subsample(1000, 100, 0)
     assert len(kept) == 100
     assert np.all(np.diff(kept) > 0)

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import FitConfig
-from p2gs_jax.pipeline.scale import extent_of_rates, near_depth, near_plane, scale_notes
+from p2gs_jax.pipeline.scale import (
+    extent_of_rates,
+    near_depth,
+    near_plane,
+    scale_notes,
+    seen_depths,
+)
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.scene import load_scene
 from p2gs_jax.sweep import with_fields
@@ -32,11 +38,15 @@ def scaled(scene, factor, offset=0.0):
     return dataclasses.replace(scene, points=points, views=tuple(map(placed, scene.views)))
 
 
+def nearest(scene):
+    return near_depth(seen_depths(scene.points, scene.training_views))
+
+
 @pytest.mark.parametrize("factor", [1e-6, 1e-3, 1.0, 1e3])
 def test_the_near_plane_follows_scenes_that_it_would_cut(scene, factor):
     some = scaled(scene, factor)
-    depth = near_depth(some.points, some.training_views)
-    assert depth == pytest.approx(factor * near_depth(scene.points, scene.training_views), rel=1e-3)
+    depth = nearest(some)
+    assert depth == pytest.approx(factor * nearest(scene), rel=1e-3)
     assert 3 * factor < depth < 3.5 * factor
     cfg = FitConfig()
     near = near_plane(depth, cfg)
@@ -55,7 +65,7 @@ def test_the_near_plane_follows_scenes_that_it_would_cut(scene, factor):
 
 def test_a_near_plane_that_cuts_nothing_stays(scene):
     cfg = with_fields(FitConfig(), {"render.near": 0.5})
-    assert near_plane(near_depth(scene.points, scene.training_views), cfg) is None
+    assert near_plane(nearest(scene), cfg) is None
     assert near_plane(None, cfg) is None
     assert Decisions.as_asked(cfg).resolve(cfg).render.near == 0.5
     older = Decisions.as_asked(cfg).to_dict()
@@ -64,12 +74,14 @@ def test_a_near_plane_that_cuts_nothing_stays(scene):
 
 
 def test_points_that_no_view_shows_have_no_depth(scene):
-    assert near_depth(-scene.points, scene.training_views) is None
-    assert near_depth(scene.points[:0], scene.training_views) is None
+    for points in (-scene.points, scene.points[:0]):
+        depths = seen_depths(points, scene.training_views)
+        assert near_depth(depths) is None
+        assert extent_of_rates(300.0, depths, FitConfig()) == 300.0
 
 
 def test_a_scene_far_from_the_origin_is_said_to_be_coarse(scene):
-    depth = near_depth(scene.points, scene.training_views)
+    depth = nearest(scene)
     for offset, said in ((0.0, False), (1e3, False), (1e5, True)):
         notes = scale_notes(scaled(scene, 1.0, offset), None, FitConfig(), depth)
         assert bool(notes) == said
@@ -84,12 +96,13 @@ def test_rates_of_a_long_drive_are_those_of_its_streets(scene):
         dataclasses.replace(view, viewmat=_moved(view.viewmat, by)) for by in far for view in views
     ]
     street = np.concatenate([points + by for by in far]).astype(np.float32)
-    own = extent_of_rates(300.0, points, views, cfg)
+    narrow, wide = seen_depths(points, views), seen_depths(street, drive)
+    own = extent_of_rates(300.0, narrow, cfg)
     assert 3 < own < 6
-    assert extent_of_rates(300.0, street, drive, cfg) == pytest.approx(own, rel=0.2)
-    assert extent_of_rates(0.5, points, views, cfg) == 0.5
+    assert extent_of_rates(300.0, wide, cfg) == pytest.approx(own, rel=0.2)
+    assert extent_of_rates(0.5, narrow, cfg) == 0.5
     cameras = with_fields(cfg, {"optimizer.extent": "cameras"})
-    assert extent_of_rates(300.0, street, drive, cameras) == 300.0
+    assert extent_of_rates(300.0, wide, cameras) == 300.0
 
 
 def _moved(viewmat, by):

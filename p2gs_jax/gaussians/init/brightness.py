@@ -56,8 +56,7 @@ class Tones:
             formation: tone curve and cameras.
         """
         taken: Any = jax.tree.map(np.asarray, photometry)
-        logs = taken.raw_exposures if taken.parameterization == "log" else np.log(taken.exposures)
-        return cls(logs, taken.gammas, formation, taken.white_balance, taken.cameras)
+        return cls(taken.log_exposures, taken.gammas, formation, taken.white_balance, taken.cameras)
 
     def log_radiance(
         self,

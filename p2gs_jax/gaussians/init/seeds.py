@@ -27,8 +27,8 @@ def camera_centers(views: tuple[View, ...] | list[View]) -> Float[np.ndarray, "v
     return np.stack([-v.viewmat[:3, :3].T @ v.viewmat[:3, 3] for v in views])
 
 
-def scene_extent(views: list[View], points: Float[np.ndarray, "p 3"]) -> float:
-    """Return the radius that scales means' rates and densification thresholds (3DGS).
+def cameras_radius(views: list[View], points: Float[np.ndarray, "p 3"]) -> float:
+    """Return the radius of the cameras (3DGS), scene units.
 
     Where all cameras stand in one place, the median distance of the points is used.
     """

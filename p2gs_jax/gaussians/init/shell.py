@@ -69,18 +69,18 @@ class Sphere:
 
 
 def sphere_behind(
-    views: list[View], points: Float[np.ndarray, "p 3"], extent: float, cfg: InitConfig
+    views: list[View], points: Float[np.ndarray, "p 3"], radius: float, cfg: InitConfig
 ) -> Sphere:
     """Return where the shell of a scene lies: behind its seeds.
 
     Args:
         views: training views.
         points: seed points.
-        extent: scene extent, scene units.
+        radius: of the cameras, scene units.
         cfg: radius.
     """
     middle = camera_centers(views).mean(0)
-    radius = cfg.shell_radius * extent
+    radius *= cfg.shell_radius
     if len(points):
         far = float(np.quantile(np.linalg.norm(points - middle, axis=1), 0.98))
         radius = max(min(radius, 10 * far), BEHIND_SEEDS * far)
@@ -112,7 +112,7 @@ def covered_cells(view: View, points: Float[np.ndarray, "p 3"]) -> Bool[np.ndarr
 def find_shell(
     views: list[View],
     points: Float[np.ndarray, "p 3"],
-    extent: float,
+    radius: float,
     cfg: InitConfig,
     sphere: Sphere | None = None,
 ) -> Shell | None:
@@ -121,13 +121,13 @@ def find_shell(
     Args:
         views: training views.
         points: seed points.
-        extent: scene extent, scene units.
+        radius: of the cameras, scene units.
         cfg: number of directions, radius, and whether there is a shell.
         sphere: where it lies; None: behind the points.
     """
     if cfg.shell == "off":
         return None
-    sphere = sphere or sphere_behind(views, points, extent, cfg)
+    sphere = sphere or sphere_behind(views, points, radius, cfg)
     middle, radius = sphere.middle, sphere.radius
     directions = fibonacci_sphere(cfg.shell_count)
     candidates = middle + radius * directions
