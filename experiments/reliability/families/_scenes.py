@@ -15,16 +15,19 @@ import numpy as np
 
 GAMMA = 2.2
 FOCAL = 60.0
-# Options of a fit that takes a second once its programs are compiled. The model is given: a curve
-# that is fitted is a constant of the programs, which are then compiled for every fit.
-SMALLEST_FIT = {
-    "train.steps": 20,
+# Options of fits that are small: one level, few Gaussians, no seeds but the points.
+SMALL_FIT = {
     "train.coarse_to_fine": [],
     "densify.max_gaussians": 300,
     "densify.min_every_steps": 10,
     "render.sh_degree": 0,
     "init.shell": "off",
     "init.dense": "off",
+}
+# A fit that takes a second once its programs are compiled. The model is given: a curve that is
+# fitted is a constant of the programs, which are then compiled for every fit.
+SMALLEST_FIT = SMALL_FIT | {
+    "train.steps": 20,
     "photometry.select": False,
     "photometry.curve": "srgb",
 }

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from reliability.families._scenes import Made, in_a_row, write_scene
+from reliability.families._scenes import SMALL_FIT, Made, in_a_row, write_scene
 from reliability.family import Failure, Family, Mended, Report
 
 from p2gs_jax import UserError, fit
@@ -52,15 +52,7 @@ MENDED = (
         "::test_photographs_that_tell_nothing_choose_something_and_know_no_exposure",
     ),
 )
-OPTIONS = {
-    "train.steps": 60,
-    "train.coarse_to_fine": [],
-    "densify.max_gaussians": 300,
-    "densify.min_every_steps": 10,
-    "render.sh_degree": 0,
-    "init.shell": "off",
-    "init.dense": "off",
-}
+OPTIONS = SMALL_FIT | {"train.steps": 60}
 
 
 @dataclass(frozen=True)
