@@ -41,7 +41,13 @@ def list_images(folder: Path, *, recursive: bool = True) -> list[Path]:
     return [folder / p for p in sorted(visible, key=lambda p: p.as_posix())]
 
 
-def require_inside(name: PurePath, folder: Path, source: Path) -> None:
+MOVED = (
+    "move it there; or name the folder of all photographs with --images, and give names relative "
+    "to it"
+)
+
+
+def require_inside(name: PurePath, folder: Path, source: Path, fix: str = MOVED) -> None:
     """Refuse a name in a file that leads out of the folder it is relative to.
 
     Links below the folder are followed: whoever made it put them there.
@@ -50,6 +56,7 @@ def require_inside(name: PurePath, folder: Path, source: Path) -> None:
         name: as the file has it.
         folder: that it is relative to.
         source: the file.
+        fix: what to do.
 
     Raises:
         UserError: it leads out.
@@ -58,8 +65,24 @@ def require_inside(name: PurePath, folder: Path, source: Path) -> None:
     if os.path.isabs(normal) or normal.split("/")[0] == "..":
         raise UserError(
             f"{source} names {name}, which lies outside of {folder}",
-            fix="move it there; or name the folder of all photographs with --images, and give "
-            "names relative to it",
+            fix=fix,
+        )
+
+
+def require_plain(name: str, source: Path) -> None:
+    """Refuse a name that is no name of a folder, but a path.
+
+    Args:
+        name: as a file has it.
+        source: where it was found.
+
+    Raises:
+        UserError: it is a path.
+    """
+    if name in ("", ".", "..") or any(c in name for c in "/\\\0"):
+        raise UserError(
+            f"{source} has a camera by the name of {name!r}, which is no name of a folder",
+            fix="get its tables again, or name the camera otherwise in all of them",
         )
 
 

@@ -20,7 +20,7 @@ from p2gs_jax.scene.drives.lidar import MOST_MEASURED, owners, seeds, thinned
 from p2gs_jax.scene.drives.own_car import find_own_cars
 from p2gs_jax.scene.drives.poses import inverse
 from p2gs_jax.scene.drives.recording import Photograph, Recording
-from p2gs_jax.scene.files import check_missing
+from p2gs_jax.scene.files import check_missing, require_plain
 from p2gs_jax.types import Lidar, Scene, TrackedObject, View
 
 # World coordinates further than this from 0 are moved there: float32 has 7 digits.
@@ -49,9 +49,13 @@ def assemble(
         write_embedded: False only names the files of embedded photographs: they cannot be read.
 
     Raises:
-        UserError: a camera or frame is not there, photographs are missing, a sweep is broken.
+        UserError: a camera or frame is not there, a camera's name is a path, photographs are
+            missing, a sweep is broken.
     """
     cameras = {c.name: c for c in recording.cameras}
+    for name in cameras:
+        # What is written of a view lies in a folder of its camera.
+        require_plain(name, recording.root)
     names = chosen_cameras(cfg.cameras, list(cameras))
     every = sorted({p.frame for p in recording.photographs})
     if not every:

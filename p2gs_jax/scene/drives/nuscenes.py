@@ -17,7 +17,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +32,7 @@ from p2gs_jax.scene.drives.poses import from_quaternion, inverse
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sweep, SweepPoints
 from p2gs_jax.scene.drives.spin import turned
 from p2gs_jax.scene.drives.tables import finite_numbers
+from p2gs_jax.scene.files import require_inside
 from p2gs_jax.types import TrackedObject
 
 NUMBER = (int, float)
@@ -174,6 +175,17 @@ class _Drive:
             return None
         return _pose(ego, self.tables / "ego_pose.json") @ self.sensor(row).to_ego
 
+    def file(self, row: Row) -> Path:
+        """Return the file of a row of sample_data."""
+        name = PurePosixPath(row["filename"])
+        require_inside(
+            name,
+            self.root,
+            self.tables / "sample_data.json",
+            fix="get the tables again; files of a drive lie below the folder of its set",
+        )
+        return self.root / name
+
     def of(self, modality: str) -> list[Row]:
         """Return the rows of all sensors of a kind, in the order of time."""
         return [row for row in self.data if self.sensor(row).modality == modality]
@@ -259,7 +271,7 @@ def _photographs(
                 camera=sensor.channel,
                 frame=drive.moments[row["sample_token"]],
                 time=drive.seconds(row["timestamp"]),
-                path=drive.root / row["filename"],
+                path=drive.file(row),
                 pose=pose,
             )
         )
@@ -290,7 +302,7 @@ def _sweeps(drive: _Drive) -> tuple[tuple[Sweep, ...], int]:
     """Return laser sweeps, and how many of the keyframes' are missing."""
     sweeps, absent = [], 0
     for row in drive.of("lidar"):
-        path, pose = drive.root / row["filename"], drive.pose(row)
+        path, pose = drive.file(row), drive.pose(row)
         if pose is None or not path.is_file():
             absent += row["is_key_frame"]
             continue

@@ -1,5 +1,6 @@
 """From a recording to a scene: what is chosen, what is counted, what is said."""
 
+import dataclasses
 import io
 from pathlib import Path
 
@@ -84,6 +85,14 @@ def test_a_drive_becomes_views_with_frames_and_times_near_the_origin(drive):
     np.testing.assert_allclose(centre + scene.origin, FAR + np.array([0, 0, 3]), atol=1e-4)
     moved = scene.objects[0].poses[2, :3, 3] + scene.origin
     np.testing.assert_allclose(moved, FAR + np.array([2, 2, 0]), atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["../../CAM", "/CAM", "CAM/a", "..", "", "CAM\\a"])
+def test_a_camera_whose_name_is_a_path_is_refused(drive, name):
+    back = dataclasses.replace(drive.cameras[1], name=name)
+    hostile = dataclasses.replace(drive, cameras=(drive.cameras[0], back))
+    with pytest.raises(UserError, match="no name of a folder"):
+        assemble(hostile, PLAIN)
 
 
 def test_laser_points_are_told_apart_by_what_they_lie_on(drive):

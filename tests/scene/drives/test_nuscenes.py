@@ -335,6 +335,19 @@ def test_senseless_rows_are_named(made, table, change, words):
     assert f"{table}.json" in error.value.message
 
 
+@pytest.mark.parametrize("name", ["/etc/passwd", "../elsewhere.jpg", "samples/../../x.jpg"])
+@pytest.mark.parametrize("modality", ["CAM_FRONT", "LIDAR_TOP"])
+def test_files_outside_the_set_are_refused(made, name, modality):
+    def moved(rows):
+        row = next(r for r in rows if f"/{modality}/" in r["filename"] and r["is_key_frame"])
+        row["filename"] = name
+        return rows
+
+    edit(made, "sample_data", moved)
+    with pytest.raises(UserError, match=r"sample_data\.json names .* outside of"):
+        read(made)
+
+
 def test_a_sweep_that_is_cut_off_is_named_when_it_is_read(made):
     for path in (made / "sweeps" / "LIDAR_TOP").iterdir():
         path.write_bytes(path.read_bytes()[:-3])
