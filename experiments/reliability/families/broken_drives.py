@@ -24,8 +24,9 @@ from p2gs_jax.scene.known_exposures import check_source
 
 NAME = "broken_drives"
 ABOUT = """Drives of nuScenes, Argoverse 2, Waymo and KITTI, tables of exposures, lists of cameras
-and the files of a finished run, each cut, flipped, out of range, empty or gone. Each is read whole,
-or refused with code 2 by a message that names file, fault and remedy, within 30 s and 2 GB."""
+and the files of a finished run, each cut, flipped, out of range, empty or gone, and tables whose
+names lead out of the drive. Each is read whole, or refused with code 2 by a message that names
+file, fault and remedy, within 30 s and 2 GB."""
 MENDED = (
     Mended(
         "a table of exposures with a field beyond csv's limit: traceback",
@@ -34,6 +35,14 @@ MENDED = (
     Mended(
         "a run's scene.npz that is empty, or whose packed bytes are wrong: traceback",
         "tests/run/test_scene_file.py::test_a_broken_scene_file_is_refused",
+    ),
+    Mended(
+        "nuScenes' tables could name photographs and sweeps outside of the set",
+        "tests/scene/drives/test_nuscenes.py::test_files_outside_the_set_are_refused",
+    ),
+    Mended(
+        "renders of a camera whose name is a path were written outside of the run",
+        "tests/scene/drives/test_assemble.py::test_a_camera_whose_name_is_a_path_is_refused",
     ),
 )
 SEED = 20261125
@@ -65,6 +74,7 @@ def trials(made: Path) -> Iterator[Trial]:
         made: a folder for whole drives, which are made once.
     """
     yield from _drives(made)
+    yield from _ways_out(made)
     yield from _exposures()
     yield from _cameras()
 
@@ -88,6 +98,22 @@ def _drives(made: Path) -> Iterator[Trial]:
             yield Trial(f"{name}, {place}: {broken.name}", _copied(whole, place, broken), read)
         for place in files[:: max(1, len(files) // 6)]:
             yield Trial(f"{name}, {place} is gone", _copied(whole, place, None), read)
+
+
+def _ways_out(made: Path) -> Iterator[Trial]:
+    """Yield tables of nuScenes that name files and cameras elsewhere; after `_drives`."""
+    whole = made / "nuscenes"
+    for table, old, news in (
+        ("sample_data", b"samples/CAM_FRONT/", (b"../", b"/etc/", b"samples/../../")),
+        ("sample_data", b"samples/LIDAR_TOP/", (b"../", b"/etc/")),
+        ("sensor", b'"channel": "CAM_FRONT"', (b'"channel": "../../CAM"', b'"channel": "/CAM"')),
+    ):
+        place = f"set/v1.0-mini/{table}.json"
+        data = (whole / place).read_bytes()
+        for new in news:
+            broken = Broken(f"{new.decode()} for {old.decode()}", data.replace(old, new))
+            made_so = _copied(whole, place, broken)
+            yield Trial(f"nuscenes, {place}: {broken.name}", made_so, read, refused=True)
 
 
 def _damaged(data: bytes, rng: np.random.Generator) -> Broken:
