@@ -23,10 +23,10 @@ from p2gs_jax.run.read import load_run
 from p2gs_jax.scene.known_exposures import check_source
 
 NAME = "broken_drives"
-ABOUT = """Drives of nuScenes, Argoverse 2, Waymo and KITTI, tables of exposures, lists of cameras
-and the files of a finished run, each cut, flipped, out of range, empty or gone, and tables whose
-names lead out of the drive. Each is read whole, or refused with code 2 by a message that names
-file, fault and remedy, within 30 s and 2 GB."""
+ABOUT = """Drives of nuScenes, Argoverse 2, Waymo, PandaSet and KITTI (three layouts), tables of
+exposures, lists of cameras and the files of a finished run, each cut, flipped, out of range, empty
+or gone, and tables whose names lead out of the drive. Each is read whole, or refused with code 2 by
+a message that names file, fault and remedy, within 30 s and 2 GB."""
 MENDED = (
     Mended(
         "a table of exposures with a field beyond csv's limit: traceback",
@@ -55,6 +55,9 @@ WRITERS = {
     "argoverse": ("scene.drives.test_argoverse", "write_log"),
     "waymo": ("scene.drives.test_waymo", "write_segment"),
     "kitti_raw": ("scene.drives.made_kitti", "write_raw"),
+    "kitti_odometry": ("scene.drives.test_kitti_odometry_drives", "write_benchmark"),
+    "kitti_360": ("scene.drives.test_kitti_360_drives", "write_set"),
+    "pandaset": ("scene.drives.test_pandaset_drives", "write_sequence"),
 }
 RUN_FILES = ("config.json", "photometry.json", "decisions.json", "scene.npz", "radiance.ply")
 # JAX starts in each of these children, and asks for address space that it does not use.
@@ -84,20 +87,22 @@ def _drives(made: Path) -> Iterator[Trial]:
     for number, (name, (module, function)) in enumerate(WRITERS.items()):
         whole = made / name
         whole.mkdir(parents=True)
-        getattr(importlib.import_module(module), function)(whole / "set")
+        written = getattr(importlib.import_module(module), function)(whole / "set")
+        drive = written.relative_to(whole)
         files = sorted(
             p.relative_to(whole).as_posix()
             for p in whole.rglob("*")
             if p.is_file() and p.suffix not in (".png", ".jpg")
         )
-        yield Trial(f"{name} whole", _copied(whole, None, None), read, refused=False)
+        yield Trial(f"{name} whole", _copied(whole, drive, None, None), read, refused=False)
         rng = np.random.default_rng(SEED + number)
         for _ in range(DAMAGES):
             place = files[int(rng.integers(len(files)))]
             broken = _damaged((whole / place).read_bytes(), rng)
-            yield Trial(f"{name}, {place}: {broken.name}", _copied(whole, place, broken), read)
+            damaged = _copied(whole, drive, place, broken)
+            yield Trial(f"{name}, {place}: {broken.name}", damaged, read)
         for place in files[:: max(1, len(files) // 6)]:
-            yield Trial(f"{name}, {place} is gone", _copied(whole, place, None), read)
+            yield Trial(f"{name}, {place} is gone", _copied(whole, drive, place, None), read)
 
 
 def _ways_out(made: Path) -> Iterator[Trial]:
@@ -112,7 +117,7 @@ def _ways_out(made: Path) -> Iterator[Trial]:
         data = (whole / place).read_bytes()
         for new in news:
             broken = Broken(f"{new.decode()} for {old.decode()}", data.replace(old, new))
-            made_so = _copied(whole, place, broken)
+            made_so = _copied(whole, Path("set"), place, broken)
             yield Trial(f"nuscenes, {place}: {broken.name}", made_so, read, refused=True)
 
 
@@ -129,8 +134,10 @@ def _damaged(data: bytes, rng: np.random.Generator) -> Broken:
     return ways[int(rng.integers(len(ways)))]
 
 
-def _copied(whole: Path, place: str | None, broken: Broken | None) -> Callable[[Path], Path]:
-    """Return what makes a copy in which one file is another, or gone."""
+def _copied(
+    whole: Path, drive: Path, place: str | None, broken: Broken | None
+) -> Callable[[Path], Path]:
+    """Return what makes a copy in which one file is another, or gone, and names its drive."""
 
     def make(root: Path) -> Path:
         shutil.copytree(whole, root, dirs_exist_ok=True)
@@ -138,8 +145,7 @@ def _copied(whole: Path, place: str | None, broken: Broken | None) -> Callable[[
             (root / place).unlink()
         elif place is not None and broken is not None:
             (root / place).write_bytes(broken.data)
-        drives = sorted(root.rglob("*_sync"))
-        return drives[0] if drives else root / "set"
+        return root / drive
 
     return make
 

@@ -2,9 +2,9 @@
 
 import shutil
 
-import made_kitti as made
 import numpy as np
 import pytest
+from scene.drives import made_kitti as made
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
@@ -44,8 +44,13 @@ def velo_pose(t):
 
 @pytest.fixture
 def root(tmp_path):
-    calibration = tmp_path / "calibration"
-    calibration.mkdir()
+    return write_set(tmp_path)
+
+
+def write_set(root):
+    """Write a set of one drive."""
+    calibration = root / "calibration"
+    calibration.mkdir(parents=True)
     lines = ["calib_time: 28-May-2013"]
     for name, P in K.items():
         lines += [f"S_rect_{name[-2:]}: 64 48", f"R_rect_{name[-2:]}: "]
@@ -61,12 +66,12 @@ def root(tmp_path):
     for part, keys in parts.items():
         yaml += f"{part}:\n" + "".join(f"   {k}: {(LENS | PIXELS)[k]:.16e}\n" for k in keys)
     (calibration / "image_02.yaml").write_text(yaml)
-    poses = tmp_path / "data_poses" / NAME
+    poses = root / "data_poses" / NAME
     poses.mkdir(parents=True)
     rows = [f"{k} {made.numbers(made.car(0.1 * k)[:3])}" for k in FRAMES]
     (poses / "poses.txt").write_text("\n".join(rows) + "\n")
     stamps = "".join(made.stamp(0.1 * k) + "\n" for k in range(8))
-    images, scans = tmp_path / "data_2d_raw" / NAME, tmp_path / "data_3d_raw" / NAME
+    images, scans = root / "data_2d_raw" / NAME, root / "data_3d_raw" / NAME
     for camera in CAM_TO_CAR:
         data = "data_rgb" if camera == "image_02" else "data_rect"
         for k in range(8):
@@ -76,7 +81,7 @@ def root(tmp_path):
         local, _ = made.scan(made.world_points(), 0.1 * k, velo_pose)
         made.write_scan(scans / f"velodyne_points/data/{k:010d}.bin", local)
     (scans / "velodyne_points" / "timestamps.txt").write_text(stamps)
-    return tmp_path
+    return root
 
 
 def matrix(name, values):

@@ -2,9 +2,9 @@
 
 import shutil
 
-import made_kitti as made
 import numpy as np
 import pytest
+from scene.drives import made_kitti as made
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
@@ -30,16 +30,20 @@ def camera_pose(t):
 
 @pytest.fixture
 def sequence(tmp_path):
-    """Return sequence 03 of a made benchmark."""
-    folder = tmp_path / "sequences" / "03"
+    return write_benchmark(tmp_path)
+
+
+def write_benchmark(root):
+    """Write a benchmark, and return its sequence 03."""
+    folder = root / "sequences" / "03"
     folder.mkdir(parents=True)
     P = {k: made.P_RECT["02" if k < 3 else "03"] for k in range(4)}
     lines = [f"P{k}: {made.numbers(P[k])}" for k in P] + [f"Tr: {made.numbers(TR[:3])}"]
     (folder / "calib.txt").write_text("\n".join(lines) + "\n")
     (folder / "times.txt").write_text("".join(f"{0.1 * k:e}\n" for k in range(FRAMES)))
-    (tmp_path / "poses").mkdir()
+    (root / "poses").mkdir()
     rows = [made.numbers(camera_pose(0.1 * k)[:3]) for k in range(FRAMES)]
-    (tmp_path / "poses" / "03.txt").write_text("\n".join(rows) + "\n")
+    (root / "poses" / "03.txt").write_text("\n".join(rows) + "\n")
     points = made.world_points()
     for k in range(FRAMES):
         made.write_photograph(folder / f"image_2/{k:06d}.png")

@@ -3,9 +3,9 @@
 import shutil
 
 import cv2
-import made_kitti as made
 import numpy as np
 import pytest
+from scene.drives import made_kitti as made
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError

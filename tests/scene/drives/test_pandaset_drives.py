@@ -7,10 +7,10 @@ import shutil
 import time
 
 import cv2
-import made_kitti as made
 import numpy as np
 import pandas as pd
 import pytest
+from scene.drives import made_kitti as made
 from scipy.spatial.transform import Rotation
 
 from p2gs_jax.config import DataConfig
@@ -74,8 +74,11 @@ def write_table(path, table):
 
 @pytest.fixture
 def root(tmp_path):
-    """Return a made sequence: a car that stands at the origin and looks along y."""
-    folder = tmp_path / "002"
+    return write_sequence(tmp_path / "002")
+
+
+def write_sequence(folder):
+    """Write a sequence: a car that stands at the origin and looks along y."""
     looking = {"front_camera": np.eye(3), "left_camera": Rotation.from_euler("z", 90, True)}
     looking["front_camera"] = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     looking["left_camera"] = looking["left_camera"].as_matrix() @ looking["front_camera"]
