@@ -84,7 +84,7 @@ def main() -> None:
             width=size.width,
             height=image_height(size.width),
             points=size.points,
-            supersample=1,
+            supersample=3,
             sensor=Sensor(iso_std=2.0),
             layout="long",
             report=lambda line: print(line, flush=True),

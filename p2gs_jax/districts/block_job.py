@@ -22,6 +22,7 @@ from p2gs_jax.districts.cut import Cut
 from p2gs_jax.districts.part_of import BlockScene, block_scene
 from p2gs_jax.districts.shared import read_shared
 from p2gs_jax.formats.ply import write_radiance
+from p2gs_jax.gaussians.population import Coverage, default_max_gaussians
 from p2gs_jax.jobs import Job
 from p2gs_jax.pipeline.devices import mesh_of
 from p2gs_jax.pipeline.fit import begin_programs, begun, compact, optimise
@@ -29,10 +30,15 @@ from p2gs_jax.pipeline.preflight import Paths
 from p2gs_jax.pipeline.prepare import load, prepare
 from p2gs_jax.run.layout import RunFolder
 from p2gs_jax.run.lock import locked
+from p2gs_jax.scene.images import size_at
+from p2gs_jax.scene.visibility import shown_share
 from p2gs_jax.train.programs import StepPrograms
 from p2gs_jax.train.validation import pick_validation
 
 STATUS = Path("/proc/self/status")
+# A coarse point outside a block stands for many: of a town's births 41 in 100 went to the 23 in 100
+# of its points that lay there, and blocks had 5 % fewer Gaussians in their cores than one fit.
+OUTSIDE = 1.6
 
 
 def block_job(scene: Path, run: Path, folder: Path, cut: Cut, number: int, cfg: FitConfig) -> Job:
@@ -82,6 +88,37 @@ def block_config(cfg: FitConfig, cut: Cut, number: int, *, train_views: int) -> 
     )
 
 
+def with_population(cfg: FitConfig, block: Scene, own: int, whole: FitConfig) -> FitConfig:
+    """Return options that bound a block's population as the whole's would be there.
+
+    What lies outside the block grows as well, and is thrown away: its share is beside the block's.
+
+    Args:
+        cfg: of the block.
+        block: its scene.
+        own: how many of its points lie in the block.
+        whole: options of the whole, whose steps see a Gaussian as often as the block's do.
+    """
+    densify = cfg.densify
+    if densify.method != "mcmc" or densify.max_gaussians is not None:
+        return cfg
+    seeds = own + round(OUTSIDE * (len(block.points) - own))
+    limit = default_max_gaussians(seeds, shown_by(block, cfg), whole.train)
+    return dataclasses.replace(cfg, densify=dataclasses.replace(densify, max_gaussians=limit))
+
+
+def shown_by(scene: Scene, cfg: FitConfig) -> Coverage:
+    """Return how much of a scene its training views show, without their photographs.
+
+    Args:
+        scene: views and points.
+        cfg: largest width of a photograph.
+    """
+    views = scene.training_views
+    pixels = max(w * h for w, h in (size_at(v, cfg.data.max_width) for v in views))
+    return Coverage(pixels, shown_share(scene.points, views))
+
+
 def fit_block(folder: Path, arguments: dict[str, Any], reporter: Reporter) -> None:
     """Fit a block, or go on with it; leaves `radiance.ply` and `metrics.json`.
 
@@ -103,6 +140,7 @@ def fit_block(folder: Path, arguments: dict[str, Any], reporter: Reporter) -> No
     number = arguments["number"]
     cfg = block_config(whole, cut, number, train_views=len(scene.train_indices))
     block = block_scene(scene, shared, cut, number)
+    cfg = with_population(cfg, block.scene, block.own, whole)
     del scene, shared
     folder.mkdir(parents=True, exist_ok=True)
     with locked(folder):

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.memory import left_to_process
-from p2gs_jax.districts.block_job import block_config
+from p2gs_jax.districts.block_job import block_config, shown_by, with_population
 from p2gs_jax.districts.cut import Cut, cut_scene
 from p2gs_jax.districts.part_of import whole_of
 from p2gs_jax.errors import UserError
-from p2gs_jax.gaussians.population import Coverage
 from p2gs_jax.pipeline.memory_needed import memory_needed
-from p2gs_jax.scene.images import size_at
-from p2gs_jax.scene.visibility import shown_share
 from p2gs_jax.types import Scene
 
 # More blocks than this are not tried.
@@ -25,21 +22,17 @@ def bytes_needed(scene: Scene, cfg: FitConfig) -> float:
         scene: views and points.
         cfg: of this fit.
     """
-    views = scene.training_views
-    pixels = max(w * h for w, h in (size_at(v, cfg.data.max_width) for v in views))
-    coverage = Coverage(pixels, shown_share(scene.points, views))
-    return memory_needed(scene, cfg, coverage).total
+    return memory_needed(scene, cfg, shown_by(scene, cfg)).total
 
 
 def largest_block(scene: Scene, cfg: FitConfig, cut: Cut) -> float:
     """Return the bytes that the most demanding block of a cut takes."""
-    count = len(scene.train_indices)
-    return max(
-        bytes_needed(
-            whole_of(scene, cut, number)[0], block_config(cfg, cut, number, train_views=count)
-        )
-        for number in range(len(cut.blocks))
-    )
+    count, most = len(scene.train_indices), 0.0
+    for number in range(len(cut.blocks)):
+        block, _, own = whole_of(scene, cut, number)
+        options = block_config(cfg, cut, number, train_views=count)
+        most = max(most, bytes_needed(block, with_population(options, block, own, cfg)))
+    return most
 
 
 def fewest_blocks(scene: Scene, cfg: FitConfig, parallel: int) -> int:

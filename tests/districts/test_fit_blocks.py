@@ -11,10 +11,12 @@ import p2gs_jax
 from p2gs_jax.core.progress import Silent
 from p2gs_jax.districts import fit as module
 from p2gs_jax.districts import room
+from p2gs_jax.districts.block_job import block_config, shown_by, with_population
 from p2gs_jax.districts.cut import cut_scene
 from p2gs_jax.districts.plan import check_options, read_plan, write_plan
 from p2gs_jax.districts.shared import read_shared
 from p2gs_jax.errors import UserError
+from p2gs_jax.gaussians.population import default_max_gaussians
 from p2gs_jax.jobs import JobState
 from p2gs_jax.pipeline.prepare import load
 from p2gs_jax.sweep import with_fields
@@ -98,6 +100,23 @@ def test_one_block_is_an_ordinary_fit(tmp_path, monkeypatch):
     assert p2gs_jax.fit_blocks(scene, tmp_path / "run", SMALL, blocks="auto") == "fitted"
     assert asked["cfg"] == SMALL
     assert not (tmp_path / "run" / "blocks").exists()
+
+
+def test_a_block_has_the_population_of_the_whole_and_more_for_what_is_outside():
+    scene = make_road(points=20_000)
+    whole = with_fields(SMALL, {"densify.max_gaussians": None, "train.steps": 600})
+    block = block_config(whole, cut_scene(scene, 4), 0, train_views=len(scene.train_indices))
+    count = len(scene.points)
+    alone = with_population(block, scene, count, whole)
+    assert alone.densify.max_gaussians == default_max_gaussians(
+        count, shown_by(scene, whole), whole.train
+    )
+    half = with_population(block, scene, count // 2, whole)
+    assert half.densify.max_gaussians > alone.densify.max_gaussians
+    given = with_fields(block, {"densify.max_gaussians": 123})
+    assert with_population(given, scene, count, whole) == given
+    grown = with_fields(block, {"densify.method": "adaptive"})
+    assert with_population(grown, scene, count, whole) == grown
 
 
 def test_less_memory_than_a_block_needs_is_said_with_how_many_would_fit(monkeypatch):
