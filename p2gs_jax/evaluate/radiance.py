@@ -23,8 +23,10 @@ PU21_RANGE = (0.005, 10_000.0)
 # PU21 maps 100 cd/m^2, a standard display's white, to this; PSNR and SSIM take it as their peak.
 PU21_PEAK = 256.0
 WHITE_NITS = 100.0
-# Least number of evenly spaced pixels of a view for alignment and colour difference.
-ALIGNMENT_PIXELS, COLOR_PIXELS = 10_000, 20_000
+# Least number of evenly spaced pixels of a view for alignment and colour difference. The third
+# bounds, up to a factor of two, what is aligned of all views together: a line needs no more, and
+# 900 views of 160 pixels took 4 GB.
+ALIGNMENT_PIXELS, COLOR_PIXELS, MOST_ALIGNED = 10_000, 20_000, 1_000_000
 STOPS_CAP = 3.0
 
 
@@ -154,12 +156,13 @@ class RadianceScores:
 
     def _sample(self, brightest: float) -> np.ndarray:
         parts = []
+        each = max(1, min(ALIGNMENT_PIXELS, MOST_ALIGNED // len(self.views)))
         for _, _, *images in self.views:
             linear, truth, mask = (kept.read() for kept in images)
             keep = mask & (truth.min(-1) > 0) & (linear.min(-1) > 0)
             keep &= linear.max(-1) < brightest
             pick = np.flatnonzero(keep)
-            pick = pick[:: max(1, len(pick) // ALIGNMENT_PIXELS)]
+            pick = pick[:: max(1, len(pick) // each)]
             parts.append(
                 np.stack([np.log(x.reshape(-1, 3)[pick]).ravel() for x in (linear, truth)])
             )

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from p2gs_jax.evaluate import radiance
 from p2gs_jax.evaluate.radiance import RadianceScores, delta_e_itp, pu21_encode, pu21_psnr
 
 EVERYWHERE = np.ones((24, 32), bool)
@@ -55,6 +56,15 @@ def test_errors_are_measured_in_stops_and_capped():
     black = truth.copy()
     black[:2] = 1e-9
     assert scores(black, truth)["stops_rms"] < 3
+
+
+def test_what_is_aligned_does_not_grow_with_the_views(monkeypatch):
+    monkeypatch.setattr(radiance, "MOST_ALIGNED", 1000)
+    s, truth = RadianceScores(), image()
+    for k in range(10):
+        s.add(str(k), "train", truth / 2, truth, EVERYWHERE)
+    assert 1000 * 3 <= s._sample(1e9).shape[1] <= 2 * 1000 * 3
+    assert s.summary(1e9)["scale"] == pytest.approx(2, rel=1e-6)
 
 
 def test_saturated_pixels_do_not_count():
