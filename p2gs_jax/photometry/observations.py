@@ -36,6 +36,7 @@ class Observations:
         camera_names: what people call the cameras; their rows if empty.
         surroundings: log2 brightness of the photograph about each, as `sources/surroundings.py`
             measures it; None where nobody knows.
+        brightest: largest display values of the pixels that `colors` are means of; None: those.
     """
 
     views: Int[np.ndarray, " o"]
@@ -50,6 +51,7 @@ class Observations:
     positions: Float[np.ndarray, "o 2"] | None = None
     camera_names: tuple[str, ...] = ()
     surroundings: Float[np.ndarray, " o"] | None = None
+    brightest: Float[np.ndarray, "o 3"] | None = None
 
     def decoded(self, response: Response):
         """Return log exposed radiance, its stated standard deviation and dz/dy, each (O, 3)."""
@@ -58,8 +60,13 @@ class Observations:
         return z, deviation(y, slope, self.spread, response.base), slope
 
     def usable(self, black: float, saturation: float) -> Bool[np.ndarray, "o 3"]:
-        """Return whether a value is neither near black nor saturated and its point is shared."""
-        keep = (self.colors > black) & (self.colors < saturation)
+        """Return whether a value is neither near black nor saturated and its point is shared.
+
+        A mean is saturated where one of its pixels is: it is too dark then, by up to a tenth of a
+        stop on a town, which made exposures drift along a drive (BUILD_NOTES, "Clipped patches").
+        """
+        brightest = self.colors if self.brightest is None else self.brightest
+        keep = (self.colors > black) & (brightest < saturation)
         seen = keep.any(1)
         shared = np.bincount(self.points[seen], minlength=self.point_count)[self.points] >= 2
         return keep & (seen & shared)[:, None]
@@ -81,10 +88,9 @@ class Observations:
     def picked(self, pick: np.ndarray | slice) -> Observations:
         """Return some of them, chosen by a mask or by their rows."""
         taken = {k: getattr(self, k)[pick] for k in ("views", "points", "colors", "spread")}
-        if self.positions is not None:
-            taken["positions"] = self.positions[pick]
-        if self.surroundings is not None:
-            taken["surroundings"] = self.surroundings[pick]
+        for name in ("positions", "surroundings", "brightest"):
+            if getattr(self, name) is not None:
+                taken[name] = getattr(self, name)[pick]
         return replace(self, **taken)
 
     def thinned(self, per_view: int, seed: int) -> Bool[np.ndarray, " o"]:

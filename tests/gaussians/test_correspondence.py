@@ -5,11 +5,13 @@ import dataclasses
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from p2gs_jax.config import preset
 from p2gs_jax.core.srgb import srgb_decode, srgb_encode
 from p2gs_jax.evaluate.alignment import exposure_error
 from p2gs_jax.photometry.calibrate import calibrate_observations, options_of
+from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import Response
 from p2gs_jax.photometry.sources.projected import MOST_PER_POINT, projected_colors
 from p2gs_jax.photometry.sources.sampling import sample
@@ -126,6 +128,48 @@ def test_a_surface_has_the_same_colour_from_near_and_from_far():
     gap = np.log(srgb_decode(narrow.colors) / expected)
     assert np.std(gap) > 0.1
     assert np.std(np.log(expected)) < 0.5 * np.std(np.log(srgb_decode(narrow.colors)))
+
+
+@pytest.mark.parametrize("wider", [1.0, 2.0])
+def test_the_brightest_pixel_of_a_patch_is_known(wider):
+    image = np.random.default_rng(0).uniform(0, 1, (24, 30, 3)).astype(np.float32)
+    xy = np.random.default_rng(1).uniform(6, 18, (50, 2))
+    found = sample(image, np.ones((24, 30), np.float32), xy, np.full(50, wider))
+    reach = 1 if wider == 1 else 2  # patches of 3 and 5 pixels
+    for k, (x, y) in enumerate(np.floor(xy - 0.5).astype(int)):
+        patch = image[y - reach : y + reach + 2, x - reach : x + reach + 2]
+        np.testing.assert_array_equal(found.brightest[k], patch.max((0, 1)))
+
+
+def test_exposures_are_right_where_a_surface_has_highlights():
+    """Means of patches with clipped pixels are too dark: as if the exposure were shorter."""
+    rng = np.random.default_rng(0)
+    radiance = 0.05 * np.exp(0.2 * rng.standard_normal((120, 120, 1)))
+    radiance[rng.uniform(size=radiance.shape) < 0.01] = 0.8
+    xy = rng.uniform(5, 115, (3000, 2))
+    mask, gains = np.ones((120, 120), np.float32), (1.0, 4.0)
+    seen = [sample(np.repeat(encoded(np.minimum(g * radiance, 1)), 3, 2), mask, xy) for g in gains]
+    observations = Observations(
+        np.repeat([0, 1], 3000),
+        np.tile(np.arange(3000), 2),
+        np.concatenate([s.colors for s in seen]),
+        np.concatenate([s.spread for s in seen]),
+        2,
+        3000,
+        np.zeros(2, int),
+        brightest=np.concatenate([s.brightest for s in seen]),
+    )
+    for kept, right in (
+        (observations, True),
+        (dataclasses.replace(observations, brightest=None), False),
+    ):
+        usable = kept.usable(4 / 255, 250 / 255)[:, 0].reshape(2, 3000).all(0)
+        light = srgb_decode(kept.colors[:, 0]).reshape(2, 3000)[:, usable]
+        ratio = np.mean(np.log2(light[1] / light[0]))
+        assert (abs(ratio - 2) < 1e-3) == right
+        assert usable.mean() > 0.5
+    few = observations.picked(np.arange(7))
+    np.testing.assert_array_equal(few.brightest, observations.brightest[:7])
 
 
 def test_wide_patches_keep_away_from_the_border():

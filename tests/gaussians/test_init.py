@@ -35,7 +35,7 @@ def test_samples_sit_at_pixel_centres():
     # Half a pixel of misplacement on a ramp of 0.8/49 a pixel.
     slope = (srgb_encode(light + 1e-4) - srgb_encode(light - 1e-4)) / 2e-4
     for wider in (None, np.full(100, 2.0), np.full(100, 4.0)):
-        colors, spread, valid = sample(image, np.ones((40, 50), np.float32), xy, wider)
+        colors, spread, _, valid = sample(image, np.ones((40, 50), np.float32), xy, wider)
         assert valid.all()
         np.testing.assert_allclose(colors[:, 0], srgb_encode(light), atol=2e-4)
         np.testing.assert_allclose(spread[:, 0], 0.5 * slope * 0.8 / 49, rtol=5e-3)

@@ -149,7 +149,7 @@ def shell_gaussians(
         view = scene.views[index]
         scale = [mask.shape[1] / view.width, mask.shape[0] / view.height]
         xy = shell.xy[seen, row] * scale
-        colors, _, valid = sample(ldr, mask, xy)
+        colors, _, _, valid = sample(ldr, mask, xy)
         place = places(xy[valid], *mask.shape[::-1])
         colors = np.asarray(colors[valid], np.float32)
         total[seen[valid]] += inverse_formation(colors, taken.capture(row), cfg.photometry, place)

@@ -33,11 +33,13 @@ class Samples(NamedTuple):
     Attributes:
         colors: averages over patches, display-encoded.
         spread: standard deviation of `colors` from uncertain positions: gradient times that.
+        brightest: largest display values of the pixels that were averaged.
         valid: inside the image and its mask.
     """
 
     colors: Float32[np.ndarray, "o 3"]
     spread: Float32[np.ndarray, "o 3"]
+    brightest: Float32[np.ndarray, "o 3"]
     valid: Bool[np.ndarray, " o"]
 
 
@@ -58,18 +60,19 @@ def sample(
     factors = np.ones(len(xy)) if wider is None else wider
     # Odd, so that patches are centred.
     widths = 2 * np.rint((PATCH * factors - 1) / 2).astype(int) + 1
-    colors, spread = (np.zeros((len(xy), 3), np.float32) for _ in range(2))
-    valid = np.zeros(len(xy), bool)
+    out = Samples(*(np.zeros((len(xy), 3), np.float32) for _ in range(3)), np.zeros(len(xy), bool))
     linear = srgb_decode(ldr)  # light averages linearly, whatever the exposure
     for width in np.unique(widths).tolist():
         pick = np.flatnonzero(widths == width)
         smooth = cv2.blur(linear, (width, width), borderType=cv2.BORDER_REFLECT)
-        found = _sample_smooth(smooth, mask, xy[pick], width // 2)
-        colors[pick], spread[pick], valid[pick] = found
-    return Samples(colors, spread, valid)
+        brightest = cv2.dilate(ldr, np.ones((width, width), np.uint8))
+        found = _sample_smooth(smooth, brightest, mask, xy[pick], width // 2)
+        for whole, part in zip(out, found, strict=True):
+            whole[pick] = part
+    return out
 
 
-def _sample_smooth(smooth, mask, xy, margin: int) -> Samples:
+def _sample_smooth(smooth, brightest, mask, xy, margin: int) -> Samples:
     """Sample a linear image that is smooth already; `margin` pixels of its border are not used.
 
     Display values are interpolated. Only the pixels around the samples are encoded: a large
@@ -100,7 +103,8 @@ def _sample_smooth(smooth, mask, xy, margin: int) -> Samples:
     slope_y = 0.5 * (shown[:, 2:, 1:3] - shown[:, :2, 1:3])
     spread = POSITION_DEVIATION * np.sqrt(between(slope_x**2 + slope_y**2))
     valid = inside & (between(mask[rows, columns][:, 1:3, 1:3]) > 0.99)
-    return Samples(between(shown[:, 1:3, 1:3]), spread, valid)
+    around_it = brightest[rows[:, 1:3], columns[:, :, 1:3]].max((1, 2))
+    return Samples(between(shown[:, 1:3, 1:3]), spread, around_it, valid)
 
 
 def camera_rows(scene: Scene) -> Int[np.ndarray, " v"]:
@@ -148,7 +152,8 @@ def point_colors(
     coarsest = np.zeros(len(scene.points))
     for mine, footprint, kept in zip(points, footprints, keep, strict=True):
         np.maximum.at(coarsest, mine[kept], footprint[kept])
-    views, seen, colors, spreads, positions, around = [], [], [], [], [], []
+    views, seen, colors, spreads, brightest = [], [], [], [], []
+    positions, around = [], []
     for row, (index, kept) in enumerate(zip(scene.train_indices, keep, strict=True)):
         mine = points[row][kept]
         if len(mine):
@@ -160,6 +165,7 @@ def point_colors(
             seen.append(mine[found.valid])
             colors.append(found.colors[found.valid])
             spreads.append(found.spread[found.valid])
+            brightest.append(found.brightest[found.valid])
             around.append(surroundings(ldr, there[found.valid]))
             positions.append(places(there[found.valid], width, height).astype(np.float32))
         on_view(row + 1, len(scene.train_indices))
@@ -176,6 +182,7 @@ def point_colors(
         names=tuple(scene.views[i].name for i in scene.train_indices),
         positions=np.concatenate([np.zeros((0, 2), np.float32), *positions]),
         surroundings=np.concatenate([np.zeros(0, np.float32), *around]),
+        brightest=np.concatenate([empty, *brightest]),
         camera_names=tuple(sorted({scene.views[i].camera for i in scene.train_indices})),
     )
 

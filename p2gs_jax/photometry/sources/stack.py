@@ -186,11 +186,12 @@ def _observe(
     """Sample every frame at the same surface points."""
     frames, points = len(stack.images), len(xy)
     mask = stack.valid.astype(np.float32)
-    colors, spread = [], []
+    colors, spread, brightest = [], [], []
     for image, shift in zip(stack.images, shifts, strict=True):
         s = sample((image / 255).astype(np.float32), mask, xy - shift)
         colors.append(np.where(s.valid[:, None], s.colors, 0))
         spread.append(0.5 * s.spread)
+        brightest.append(s.brightest)
     return Observations(
         np.repeat(np.arange(frames), points),
         np.tile(np.arange(points), frames),
@@ -200,4 +201,5 @@ def _observe(
         points,
         np.zeros(frames, int),
         names=tuple(v.name for v in stack.views),
+        brightest=np.concatenate(brightest),
     )
