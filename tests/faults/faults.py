@@ -131,9 +131,16 @@ FAULTS = (
     Fault(
         "saturated pixels count as observations of radiance",
         "photometry/observations.py",
-        "(self.colors > black) & (self.colors < saturation)",
-        "(self.colors > black) & (self.colors < 2 + saturation)",
+        "(self.colors > black) & (brightest < saturation)",
+        "(self.colors > black) & (brightest < 2 + saturation)",
         "photometry/test_bundle_adjustment.py::test_saturation_must_be_masked",
+    ),
+    Fault(
+        "a mean counts where one of its pixels is saturated",
+        "photometry/observations.py",
+        "brightest = self.colors if self.brightest is None else self.brightest",
+        "brightest = self.colors",
+        "gaussians/test_correspondence.py::test_exposures_are_right_where_a_surface_has_highlights",
     ),
     Fault(
         "an exposure ratio is turned over",
