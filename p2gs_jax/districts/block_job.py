@@ -34,6 +34,7 @@ from p2gs_jax.scene.images import size_at
 from p2gs_jax.scene.visibility import shown_share
 from p2gs_jax.train.programs import StepPrograms
 from p2gs_jax.train.validation import pick_validation
+from p2gs_jax.types import Scene
 
 STATUS = Path("/proc/self/status")
 # A coarse point outside a block stands for many: of a town's births 41 in 100 went to the 23 in 100

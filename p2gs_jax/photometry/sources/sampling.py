@@ -60,13 +60,14 @@ def sample(
     factors = np.ones(len(xy)) if wider is None else wider
     # Odd, so that patches are centred.
     widths = 2 * np.rint((PATCH * factors - 1) / 2).astype(int) + 1
-    out = Samples(*(np.zeros((len(xy), 3), np.float32) for _ in range(3)), np.zeros(len(xy), bool))
+    colors, spread, brightest = (np.zeros((len(xy), 3), np.float32) for _ in range(3))
+    out = Samples(colors, spread, brightest, np.zeros(len(xy), bool))
     linear = srgb_decode(ldr)  # light averages linearly, whatever the exposure
     for width in np.unique(widths).tolist():
         pick = np.flatnonzero(widths == width)
         smooth = cv2.blur(linear, (width, width), borderType=cv2.BORDER_REFLECT)
-        brightest = cv2.dilate(ldr, np.ones((width, width), np.uint8))
-        found = _sample_smooth(smooth, brightest, mask, xy[pick], width // 2)
+        largest = cv2.dilate(ldr, np.ones((width, width), np.uint8))
+        found = _sample_smooth(smooth, largest, mask, xy[pick], width // 2)
         for whole, part in zip(out, found, strict=True):
             whole[pick] = part
     return out
