@@ -283,20 +283,24 @@ class Trainer:
 
     def _asked(self) -> int | None:
         """Return the signal that asks for the end, whichever process it reached."""
-        if jax.process_count() > 1:
-            arrived = [number for number in gathered(self.asked.arrived) if number is not None]
-            self.asked.arrived = max(arrived, default=None)
-        return self.asked.arrived
+        if jax.process_count() == 1:
+            return self.asked.arrived
+        # One that comes while the others are asked waits for the next time.
+        asked = max((n for n in gathered(self.asked.arrived) if n is not None), default=None)
+        if asked is not None:
+            self.asked.arrived = asked
+        return asked
 
     def _take_burst_of_stage(
         self, state: FitState, host: HostState, session: Session, *, trial: bool = False
     ) -> tuple[FitState, bool]:
         """Take a burst where no checkpoint can be written; signals end the run after it."""
         taken = self._take_burst(state, host, session, trial=trial)
-        if self.asked.arrived is not None:
+        asked = self._asked()
+        if asked is not None:
             self.on_message(
-                f"{interrupts.name_of(self.asked.arrived)}: the run stops within a stage of "
-                f"growth; {self.checkpoints.last_good()}."
+                f"{interrupts.name_of(asked)}: the run stops within a stage of growth; "
+                f"{self.checkpoints.last_good()}."
             )
             self.asked.deliver()
         return taken

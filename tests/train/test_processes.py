@@ -13,8 +13,9 @@ import pytest
 from tiny_scene import make_scene
 
 from p2gs_jax.cli.supervise import where
-from p2gs_jax.core import processes
+from p2gs_jax.core import interrupts, processes
 from p2gs_jax.run.checkpoint import saved_steps
+from p2gs_jax.train import loop
 
 ENOUGH_S = 240
 OPTIONS = (
@@ -182,6 +183,27 @@ def test_a_signal_at_one_stops_both_after_a_checkpoint(tmp_path):
     assert [rank.returncode for rank in ranks] == [128 + signal.SIGTERM] * 2, said
     assert max(saved_steps(run / "checkpoints")) == log_of(run)[-1]["step"]
     assert "--resume continues" in said[0]
+
+
+def test_a_signal_that_comes_while_the_others_are_asked_is_not_lost(monkeypatch):
+    first, second = (object.__new__(loop.Trainer) for _ in range(2))
+    for trainer in (first, second):
+        trainer.asked = interrupts.Held()
+        trainer.asked.begin()
+
+    def comes_now(mine):
+        first.asked._handle(signal.SIGTERM, None)
+        return [mine, None]
+
+    monkeypatch.setattr(loop.jax, "process_count", lambda: 2)
+    monkeypatch.setattr(loop, "gathered", comes_now)
+    assert first._asked() is None
+    waiting = [first.asked.arrived, second.asked.arrived]
+    monkeypatch.setattr(loop, "gathered", lambda mine: waiting)
+    for trainer in (first, second):
+        assert trainer._asked() == signal.SIGTERM
+        with pytest.raises(interrupts.Interrupted):
+            trainer.asked.deliver()
 
 
 @pytest.mark.parametrize(
