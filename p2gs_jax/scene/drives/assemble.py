@@ -201,10 +201,11 @@ def _read_sweeps(
     report(f"Reading {len(sweeps)} LiDAR sweeps")
     each = max(1, MOST_MEASURED // len(sweeps))
     rng = generator(0, Stream.LIDAR)
-    parts = []
+    parts, broken = [], 0
     for sweep in sweeps:
         points, at = sweep.read()
         finite = np.isfinite(points).all(1)
+        broken += int((~finite).sum())
         local = (points[finite] - origin).astype(np.float32)
         at = np.asarray(at, np.float64)[finite]
         part = Lidar(local, at, np.full(len(local), -1, np.int32))
@@ -212,4 +213,5 @@ def _read_sweeps(
         own = owners(part.points, part.times, objects)
         parts.append(Lidar(part.points, part.times, own))
     columns = ([p.points for p in parts], [p.times for p in parts], [p.objects for p in parts])
-    return Lidar(*map(np.concatenate, columns)), []
+    said = [f"{broken} LiDAR points are no finite numbers and are left out."] if broken else []
+    return Lidar(*map(np.concatenate, columns)), said

@@ -163,11 +163,11 @@ def passed(
     """Return when the scanner looked at points, seconds.
 
     Args:
-        points: in its own axes.
+        points: in its own axes; those that are not finite count as forward.
         forward_s: when it looked forward.
         turn_s: how long a turn took.
     """
-    azimuth = np.arctan2(points[:, 1], points[:, 0])
+    azimuth = np.nan_to_num(np.arctan2(points[:, 1], points[:, 0]))
     return forward_s + turn_s * (turned(azimuth, start=BACK) - 0.5)
 
 

@@ -299,3 +299,15 @@ def test_a_lens_that_ours_cannot_express_is_left_out(root):
 def test_damaged_files_end_in_a_recording_or_a_complaint(root):
     write_boxes(root, box(1, "car", 1, -1, np.eye(4)), box(2, "car", 2, 2, np.eye(4)))
     assert made.read_damaged(root, lambda: read_drive(root, CFG)) > 10
+
+
+def test_points_that_are_no_numbers_are_counted_and_left_out(root):
+    scan = sorted((root / "data_3d_raw").rglob("velodyne_points/data/*.bin"))[3]
+    values = np.fromfile(scan, "<f4").reshape(-1, 4)
+    values[:5, 0] = np.nan
+    values[5:7, 1] = np.inf
+    values.tofile(scan)
+    scene = load_scene(root, CFG)
+    assert np.isfinite(scene.lidar.points).all()
+    assert np.isfinite(scene.lidar.times).all()
+    assert any(note.startswith("7 LiDAR points are no finite numbers") for note in scene.notes)
