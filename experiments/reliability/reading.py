@@ -19,6 +19,7 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.core.printable import printable
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene import find_scene, with_what_lies_beside
+from p2gs_jax.scene.drives.assemble import assemble
 from p2gs_jax.scene.drives.recording import Recording
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Scene
@@ -75,12 +76,11 @@ def _whole(root: Path) -> int:
 
 
 def _swept(found: Recording) -> int:
-    """Read all that a survey of a drive leaves closed."""
-    for sweep in found.sweeps:
-        if not _finite(sweep.read().points):
-            return _nonsense("points of a sweep")
-    poses = [p.pose for p in found.photographs] + [o.poses for o in found.objects]
-    return 0 if _finite(*poses) else _nonsense("poses")
+    """Read all that a survey of a drive leaves closed, as a fit has it."""
+    scene = assemble(found, DataConfig(own_car=False, allow_missing=True), write_embedded=False)
+    measured = () if scene.lidar is None else (scene.lidar.points, scene.lidar.times)
+    poses = [view.viewmat for view in scene.views] + [o.poses for o in scene.objects]
+    return 0 if _finite(scene.points, *measured, *poses) else _nonsense("poses or points")
 
 
 def _finite(*arrays: np.ndarray) -> bool:

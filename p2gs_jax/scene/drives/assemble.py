@@ -204,10 +204,11 @@ def _read_sweeps(
     parts, broken = [], 0
     for sweep in sweeps:
         points, at = sweep.read()
-        finite = np.isfinite(points).all(1)
+        with np.errstate(over="ignore", invalid="ignore"):
+            local = (points - origin).astype(np.float32)
+        finite = np.isfinite(local).all(1)
         broken += int((~finite).sum())
-        local = (points[finite] - origin).astype(np.float32)
-        at = np.asarray(at, np.float64)[finite]
+        local, at = local[finite], np.asarray(at, np.float64)[finite]
         part = Lidar(local, at, np.full(len(local), -1, np.int32))
         part = thinned(part, each, rng)
         own = owners(part.points, part.times, objects)
