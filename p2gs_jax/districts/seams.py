@@ -21,8 +21,7 @@ from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Gaussians, Scene
 
-# Views of a boundary that are rendered at most. Of 12 of a town with 48 others, steps were .018 and
-# .005 stop.
+# Views of a boundary that are rendered at most. With 12 a step was .018 stop, with 48 .005.
 MOST_VIEWS = 48
 # Where either block shows less, nothing is compared.
 OPAQUE = 0.9

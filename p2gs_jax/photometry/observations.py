@@ -62,8 +62,8 @@ class Observations:
     def usable(self, black: float, saturation: float) -> Bool[np.ndarray, "o 3"]:
         """Return whether a value is neither near black nor saturated and its point is shared.
 
-        A mean is saturated where one of its pixels is: it is too dark then, by up to a tenth of a
-        stop on a town, which made exposures drift along a drive (BUILD_NOTES, "Clipped patches").
+        A mean is saturated where one of its pixels is: it is too dark then, which made exposures
+        drift along a drive (BUILD_NOTES, "Clipped patches").
         """
         brightest = self.colors if self.brightest is None else self.brightest
         keep = (self.colors > black) & (brightest < saturation)
