@@ -37,8 +37,9 @@ from p2gs_jax.train.validation import pick_validation
 from p2gs_jax.types import Scene
 
 STATUS = Path("/proc/self/status")
-# A coarse point outside a block stands for many: of a town's births 41 in 100 went to the 23 in 100
-# of its points that lay there, and blocks had 5 % fewer Gaussians in their cores than one fit.
+# Gaussians for a coarse point outside a block, which stands for many, to one for a point inside.
+# With 1, cores of a town had 5 % fewer Gaussians than one fit and .18 dB less; with 1.6, on another
+# town, 13 % more and .09 dB less (BUILD_NOTES, "Districts").
 OUTSIDE = 1.6
 
 
@@ -64,13 +65,17 @@ def block_job(scene: Path, run: Path, folder: Path, cut: Cut, number: int, cfg: 
     return Job(f"block {number}", folder / str(number), fit_block, said)
 
 
-def block_config(cfg: FitConfig, cut: Cut, number: int, *, train_views: int) -> FitConfig:
+def block_config(
+    cfg: FitConfig, cut: Cut, number: int, block: Scene, own: int, *, train_views: int
+) -> FitConfig:
     """Return the options of a block: its share of the steps and of the Gaussians.
 
     Args:
         cfg: of the whole.
         cut: of the scene.
         number: of the block.
+        block: its scene.
+        own: how many of its points lie in the block.
         train_views: of the whole.
     """
     share = len(cut.blocks[number].views) / train_views
@@ -82,6 +87,8 @@ def block_config(cfg: FitConfig, cut: Cut, number: int, *, train_views: int) -> 
     most = densify.max_gaussians
     if isinstance(most, int):
         most = max(1, round(share * most))
+    elif most is None and densify.method == "mcmc":
+        most = _population(cfg, block, own)
     return dataclasses.replace(
         cfg,
         train=dataclasses.replace(train, steps=steps, budget_s=budget),
@@ -89,23 +96,14 @@ def block_config(cfg: FitConfig, cut: Cut, number: int, *, train_views: int) -> 
     )
 
 
-def with_population(cfg: FitConfig, block: Scene, own: int, whole: FitConfig) -> FitConfig:
-    """Return options that bound a block's population as the whole's would be there.
+def _population(cfg: FitConfig, block: Scene, own: int) -> int:
+    """Return how many Gaussians a block may have, so that it is as dense as the whole would be.
 
-    What lies outside the block grows as well, and is thrown away: its share is beside the block's.
-
-    Args:
-        cfg: of the block.
-        block: its scene.
-        own: how many of its points lie in the block.
-        whole: options of the whole, whose steps see a Gaussian as often as the block's do.
+    The whole's steps see a Gaussian as often as the block's do. What lies outside the block grows
+    as well, and is thrown away: its share is beside the block's.
     """
-    densify = cfg.densify
-    if densify.method != "mcmc" or densify.max_gaussians is not None:
-        return cfg
     seeds = own + round(OUTSIDE * (len(block.points) - own))
-    limit = default_max_gaussians(seeds, shown_by(block, cfg), whole.train)
-    return dataclasses.replace(cfg, densify=dataclasses.replace(densify, max_gaussians=limit))
+    return default_max_gaussians(seeds, shown_by(block, cfg), cfg.train)
 
 
 def shown_by(scene: Scene, cfg: FitConfig) -> Coverage:
@@ -139,9 +137,9 @@ def fit_block(folder: Path, arguments: dict[str, Any], reporter: Reporter) -> No
     scene = load(Path(arguments["scene"]), Path(arguments["run"]), whole, Silent())
     shared, scene = read_shared(Path(arguments["shared"]), scene, whole)
     number = arguments["number"]
-    cfg = block_config(whole, cut, number, train_views=len(scene.train_indices))
     block = block_scene(scene, shared, cut, number)
-    cfg = with_population(cfg, block.scene, block.own, whole)
+    train_views = len(scene.train_indices)
+    cfg = block_config(whole, cut, number, block.scene, block.own, train_views=train_views)
     del scene, shared
     folder.mkdir(parents=True, exist_ok=True)
     with locked(folder):

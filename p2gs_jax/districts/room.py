@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.memory import left_to_process
-from p2gs_jax.districts.block_job import block_config, shown_by, with_population
+from p2gs_jax.districts.block_job import block_config, shown_by
 from p2gs_jax.districts.cut import Cut, cut_scene
 from p2gs_jax.districts.part_of import whole_of
 from p2gs_jax.errors import UserError
@@ -30,8 +30,8 @@ def largest_block(scene: Scene, cfg: FitConfig, cut: Cut) -> float:
     count, most = len(scene.train_indices), 0.0
     for number in range(len(cut.blocks)):
         block, _, own = whole_of(scene, cut, number)
-        options = block_config(cfg, cut, number, train_views=count)
-        most = max(most, bytes_needed(block, with_population(options, block, own, cfg)))
+        options = block_config(cfg, cut, number, block, own, train_views=count)
+        most = max(most, bytes_needed(block, options))
     return most
 
 

@@ -11,7 +11,7 @@ import p2gs_jax
 from p2gs_jax.core.progress import Silent
 from p2gs_jax.districts import fit as module
 from p2gs_jax.districts import room
-from p2gs_jax.districts.block_job import block_config, shown_by, with_population
+from p2gs_jax.districts.block_job import block_config, shown_by
 from p2gs_jax.districts.cut import cut_scene
 from p2gs_jax.districts.plan import check_options, read_plan, write_plan
 from p2gs_jax.districts.shared import read_shared
@@ -105,18 +105,21 @@ def test_one_block_is_an_ordinary_fit(tmp_path, monkeypatch):
 def test_a_block_has_the_population_of_the_whole_and_more_for_what_is_outside():
     scene = make_road(points=20_000)
     whole = with_fields(SMALL, {"densify.max_gaussians": None, "train.steps": 600})
-    block = block_config(whole, cut_scene(scene, 4), 0, train_views=len(scene.train_indices))
-    count = len(scene.points)
-    alone = with_population(block, scene, count, whole)
-    assert alone.densify.max_gaussians == default_max_gaussians(
-        count, shown_by(scene, whole), whole.train
+    cut, count, views = cut_scene(scene, 4), len(scene.points), len(scene.train_indices)
+
+    def most(own, **densify):
+        cfg = with_fields(whole, {f"densify.{name}": value for name, value in densify.items()})
+        return block_config(cfg, cut, 0, scene, own, train_views=views).densify.max_gaussians
+
+    assert most(count) == default_max_gaussians(count, shown_by(scene, whole), whole.train)
+    assert most(count // 2) > most(count)
+    share = len(cut.blocks[0].views) / views
+    assert (
+        most(count, max_gaussians=1000)
+        == most(count // 2, max_gaussians=1000)
+        == round(1000 * share)
     )
-    half = with_population(block, scene, count // 2, whole)
-    assert half.densify.max_gaussians > alone.densify.max_gaussians
-    given = with_fields(block, {"densify.max_gaussians": 123})
-    assert with_population(given, scene, count, whole) == given
-    grown = with_fields(block, {"densify.method": "adaptive"})
-    assert with_population(grown, scene, count, whole) == grown
+    assert most(count, method="adaptive") is None
 
 
 def test_less_memory_than_a_block_needs_is_said_with_how_many_would_fit(monkeypatch):
