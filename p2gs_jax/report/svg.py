@@ -22,6 +22,8 @@ import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from p2gs_jax.core.drawn_names import names_as_they_are
+
 # Widths of the charts, CSS pixels; one point of matplotlib is one pixel.
 WIDE, NARROW = 860, 280
 TEXT = 12.0
@@ -42,7 +44,6 @@ VARIABLES = {
 RC: dict[Any, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "p2gs-jax",
-    "text.parse_math": False,
     "font.family": "DejaVu Sans",
     "font.size": TEXT,
     "axes.edgecolor": MUTED,
@@ -79,7 +80,8 @@ def chart(draw: Draw, label: str) -> str:
     """
     parts = []
     for wide in (True, False):
-        with matplotlib.rc_context({**RC, "font.size": TEXT if wide else NARROW_TEXT}):
+        size = TEXT if wide else NARROW_TEXT
+        with names_as_they_are(), matplotlib.rc_context({**RC, "font.size": size}):
             figure = draw(wide)
             kind = "wide" if wide else "narrow"
             parts.append(f'<div class="chart {kind}">{_markup(figure, label)}</div>')
