@@ -76,7 +76,12 @@ def _whole(root: Path) -> int:
 
 
 def _swept(found: Recording) -> int:
-    """Read all that a survey of a drive leaves closed, as a fit has it."""
+    """Read all that a survey of a drive leaves closed, as a fit has it.
+
+    Every sweep first: a fit reads only those of the photographs' time.
+    """
+    for sweep in found.sweeps:
+        sweep.read()
     scene = assemble(found, DataConfig(own_car=False, allow_missing=True), write_embedded=False)
     measured = () if scene.lidar is None else (scene.lidar.points, scene.lidar.times)
     poses = [view.viewmat for view in scene.views] + [o.poses for o in scene.objects]

@@ -60,7 +60,8 @@ class SweepPoints(NamedTuple):
     """One sweep of a laser scanner.
 
     Attributes:
-        points: world coordinates, each as of its own time.
+        points: world coordinates, each as of its own time; as the file has them, so they may be no
+            finite numbers (`assemble` counts and drops those).
         times: seconds; of all points alike where the set gives no more.
     """
 
