@@ -21,6 +21,10 @@ IMAGE_SUFFIXES = DEVELOPED_SUFFIXES | {
     *(".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".ppm")
 }
 _ASPECT_TOLERANCE = 0.01
+_MOVED = (
+    "move it there; or name the folder of all photographs with --images, and give names relative "
+    "to it"
+)
 # Where Pillow takes a picture for an attack.
 MOST_PIXELS = 2 * (Image.MAX_IMAGE_PIXELS or 2**26)
 
@@ -41,13 +45,7 @@ def list_images(folder: Path, *, recursive: bool = True) -> list[Path]:
     return [folder / p for p in sorted(visible, key=lambda p: p.as_posix())]
 
 
-MOVED = (
-    "move it there; or name the folder of all photographs with --images, and give names relative "
-    "to it"
-)
-
-
-def require_inside(name: PurePath, folder: Path, source: Path, fix: str = MOVED) -> None:
+def require_inside(name: PurePath, folder: Path, source: Path, fix: str = _MOVED) -> None:
     """Refuse a name in a file that leads out of the folder it is relative to.
 
     Links below the folder are followed: whoever made it put them there.

@@ -93,8 +93,9 @@ def _mean_radiance(
             continue
         ldr, mask = store.get(index, 1)
         xy = xy * [mask.shape[1] / view.width, mask.shape[0] / view.height]
-        colors, _, _, valid = sample(ldr, mask, xy)
-        colors, at = np.asarray(colors[valid], np.float32), seen[valid]
+        samples = sample(ldr, mask, xy)
+        valid = samples.valid
+        colors, at = np.asarray(samples.colors[valid], np.float32), seen[valid]
         place = places(xy[valid], *mask.shape[::-1])
         found = inverse_formation(colors, taken.capture(row), cfg.photometry, place)
         says = (colors > cfg.loss.black) & (colors < cfg.loss.saturation)

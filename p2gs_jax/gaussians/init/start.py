@@ -149,9 +149,10 @@ def shell_gaussians(
         view = scene.views[index]
         scale = [mask.shape[1] / view.width, mask.shape[0] / view.height]
         xy = shell.xy[seen, row] * scale
-        colors, _, _, valid = sample(ldr, mask, xy)
+        samples = sample(ldr, mask, xy)
+        valid = samples.valid
         place = places(xy[valid], *mask.shape[::-1])
-        colors = np.asarray(colors[valid], np.float32)
+        colors = np.asarray(samples.colors[valid], np.float32)
         total[seen[valid]] += inverse_formation(colors, taken.capture(row), cfg.photometry, place)
         weight[seen[valid]] += 1
     seen = weight > 0
