@@ -15,6 +15,7 @@ from p2gs_jax.photometry.adjustment.linear import Balanced, one_thread
 from p2gs_jax.photometry.adjustment.matrices import is_small
 from p2gs_jax.photometry.adjustment.normal import summed
 from p2gs_jax.photometry.adjustment.parameters import Parameters
+from p2gs_jax.photometry.adjustment.robust import weigh
 from p2gs_jax.photometry.adjustment.shared import (
     SHARED_REGION,
     shared_deviation,
@@ -79,7 +80,9 @@ def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncerta
     each = summed(fit.model, fit.theta, fit.at, fit.at.weight * fit.at.residual, clusters)
     if observations.positions is not None and len(rows.row):
         labels = regions(observations.positions, observations.views, SHARED_REGION)
-        deviation = shared_deviation(fit.model, fit.at, labels)
+        # In all points, also those that count for little: what matte ones share is less.
+        alike = weigh(fit.model, fit.theta, fit.at.weight, "geman_mcclure")
+        deviation = shared_deviation(fit.model, alike, labels)
         if deviation > 0:
             shared = deviation * shared_scores(fit.model, fit.theta, fit.at, labels)
             each = sp.csr_array(sp.vstack([each, shared]))

@@ -93,7 +93,7 @@ def _blocks(problem: Problem) -> Iterator[_Block]:
 
 
 def _weighed(fit: Fit, part: Problem, response: Response) -> Weighted:
-    """Return residuals and weights at the solution."""
+    """Return residuals and weights at the solution, each observation judged by itself."""
     rows = make_rows(part.observations, part.layout, part.usable, response, part.log_pivot)
     model = Forward.of(rows, fit.model.unknowns)
     rest: tuple[Loss, ...] = ("l1", "geman_mcclure", "geman_mcclure")

@@ -11,6 +11,7 @@ from p2gs_jax.photometry.adjustment.explained import explain
 from p2gs_jax.photometry.adjustment.linear import one_thread
 from p2gs_jax.photometry.adjustment.problem import Problem
 from p2gs_jax.photometry.adjustment.result import solution_of
+from p2gs_jax.photometry.adjustment.robust import Loss
 from p2gs_jax.photometry.adjustment.rows import make_rows
 from p2gs_jax.photometry.adjustment.solve import Fit, solve
 from p2gs_jax.photometry.adjustment.system import System, make_system
@@ -34,6 +35,7 @@ def solve_model(
     use: Float[np.ndarray, " o"] | None = None,
     splines: ResponseKind | None = None,
     tolerance: float = TOLERANCE,
+    loss: Loss = "geman_mcclure",
 ) -> tuple[Fit, System]:
     """Solve one form; see `fit_model`.
 
@@ -44,6 +46,7 @@ def solve_model(
         use: 0 keeps an observation out.
         splines: what gets a spline over the response's base, solved for as well; None: nothing.
         tolerance: change of a parameter, log units, at which the rounds end.
+        loss: of residuals.
     """
     weight = problem.usable if use is None else problem.usable * use[:, None]
     rows = make_rows(
@@ -51,7 +54,7 @@ def solve_model(
     )
     system = make_system(problem, form, splines)
     with one_thread():
-        return solve(rows, system, tolerance), system
+        return solve(rows, system, tolerance, loss), system
 
 
 def fit_model(
@@ -71,7 +74,7 @@ def fit_model(
     o = problem.observations
     pick = o.thinned(_per_view(o.view_count), 0)
     few = problem if pick.all() else problem.part(pick)
-    fit, system = solve_model(few, form, response)
+    fit, system = solve_model(few, form, response, loss="whole_points")
     known = uncertainty(fit, system, few.observations)
     return solution_of(problem, form, response, fit, explain(fit, problem, response), known)
 

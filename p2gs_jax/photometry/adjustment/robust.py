@@ -12,9 +12,11 @@ from p2gs_jax.photometry.adjustment.parameters import Parameters
 from p2gs_jax.photometry.adjustment.rows import Rows
 from p2gs_jax.photometry.adjustment.system import EMPTY
 
-Loss = Literal["l1", "geman_mcclure"]
+Loss = Literal["l1", "geman_mcclure", "whole_points"]
 # Width of the Geman-McClure loss in robust standard deviations.
 GEMAN_MCCLURE = 3.0
+# What is known of a point's spread before it is looked at counts as this many observations.
+PRIOR_SPREAD = 3.0
 SMALLEST_SCALE = 0.3
 MEDIAN_ROWS = 4096
 
@@ -74,20 +76,57 @@ def weigh(
     # One weight for the whole observation: an outlier is wrong in all channels.
     used = rows.weight.sum(1)
     square = (u**2 * rows.weight).sum(1) / np.maximum(used, 1) / (GEMAN_MCCLURE * scale) ** 2
-    robust = 1 / (1 + square) ** 2
-    of_l1 = loss == "l1"
-    factor = 1 / np.maximum(np.abs(u) / scale, 0.5) if of_l1 else robust[:, None]
+    if loss == "l1":
+        factor, curvature = 1 / np.maximum(np.abs(u) / scale, 0.5), 1.0
+    else:
+        of = _whole_points if loss == "whole_points" else _geman_mcclure
+        of_observation, curvature = of(rows, square, used / 3)
+        factor = of_observation[:, None]
     weight = rows.weight / sigma**2 * factor
     radiance, precision = _radiance(rows, a, z_of_point, weight)
-    seen = used > 0
-    second_derivative = ((1 - 3 * square) / (1 + square) ** 3)[seen].sum()
-    curvature = second_derivative / max(robust[seen].sum(), 1e-9)
     of_point = radiance[rows.row]
     residual = z_of_point - a * of_point
     level = of_point + added
-    return Weighted(
-        weight, sigma, slope, residual, radiance, level, precision, scale, float(curvature)
-    )
+    return Weighted(weight, sigma, slope, residual, radiance, level, precision, scale, curvature)
+
+
+def _geman_mcclure(
+    rows: Rows, square: Float[np.ndarray, " o"], share: Float[np.ndarray, " o"]
+) -> tuple[Float[np.ndarray, " o"], float]:
+    """Return weights, and the mean curvature of the loss over them.
+
+    Args:
+        rows: observations.
+        square: of residuals, in widths of the loss.
+        share: of each observation's channels that count.
+    """
+    robust = 1 / (1 + square) ** 2
+    second = (1 - 3 * square) / (1 + square) ** 3
+    seen = share > 0
+    return robust, float(second[seen].sum() / max(robust[seen].sum(), 1e-9))
+
+
+def _whole_points(
+    rows: Rows, square: Float[np.ndarray, " o"], share: Float[np.ndarray, " o"]
+) -> tuple[Float[np.ndarray, " o"], float]:
+    """Return weights and curvature where every point has a spread of its own.
+
+    Gloss and silhouettes make all that a point shows uncertain, and by different amounts. So the
+    Geman-McClure losses of a point's observations are summed as the squares of Student's t are,
+    whose scale is the point's own: it counts the less, the more its views differ. Arguments as for
+    `_geman_mcclure`.
+    """
+    alone, _ = _geman_mcclure(rows, square, share)
+    bound = GEMAN_MCCLURE**2
+    losses = rows.by_row @ (share * bound * square / (1 + square))
+    # A point's radiance takes one observation away.
+    freedom = np.maximum(rows.by_row @ share - 1, 0)
+    of_row = (PRIOR_SPREAD + freedom) / (PRIOR_SPREAD + losses)
+    robust = alone * of_row[rows.row]
+    second = share * (1 - 3 * square) / (1 + square) ** 3 * of_row[rows.row]
+    pulls = rows.by_row @ (share**2 * bound * square * alone**2)
+    along = 2 * of_row / (PRIOR_SPREAD + losses) * pulls
+    return robust, float((second.sum() - along.sum()) / max((share * robust).sum(), 1e-9))
 
 
 def _radiance(rows: Rows, a, z, weight):

@@ -1,6 +1,7 @@
-"""Rounds of weighing and stepping: four under an L1 loss, then Geman-McClure's to a fixed point.
+"""Rounds of weighing and stepping: four under an L1 loss, then Geman-McClure's to a fixed point,
+either of single observations or of whole points (`robust.py`).
 
-Outliers are weighted away: 0 / 10 / 30 % of them give .005 / .005 / .006 EV (docs/photometry.md,
+Outliers are weighted away: 0 / 10 / 30 % of them give .005 / .006 / .007 EV (docs/photometry.md,
 4). The L1 rounds bring the start near enough for the loss that ignores what is far away.
 """
 
@@ -84,13 +85,14 @@ def _next(model: Forward, system: System, last: _Round, loss: Loss) -> _Round:
     return _Round(new, at.weight, moved, last.moved)
 
 
-def solve(rows: Rows, system: System, tolerance: float) -> Fit:
+def solve(rows: Rows, system: System, tolerance: float, loss: Loss) -> Fit:
     """Adjust exposures, gammas, cameras and response to observations (float64).
 
     Args:
         rows: observations.
         system: free directions, gauges, priors.
         tolerance: largest change of a parameter in a round that counts as none.
+        loss: of the rounds after those under L1.
     """
     model = Forward.of(rows, system.unknowns)
     after = functools.partial(_next, model, system)
@@ -98,13 +100,13 @@ def solve(rows: Rows, system: System, tolerance: float) -> Fit:
     for _ in range(L1_ROUNDS):
         last = after(last, "l1")
     # The first of these changes the loss: what it moves says nothing about the next.
-    last, count = after(last, "geman_mcclure"), L1_ROUNDS + 1
+    last, count = after(last, loss), L1_ROUNDS + 1
     while count < MOST_ROUNDS:
-        last, count = after(last, "geman_mcclure"), count + 1
+        last, count = after(last, loss), count + 1
         if last.moved < tolerance:
             break
     theta, moved, before = last.theta, last.moved, last.moved_before
-    at = weigh(model, theta, last.weight, "geman_mcclure")
+    at = weigh(model, theta, last.weight, loss)
     return Fit(
         theta=theta,
         at=at._replace(curvature=max(at.curvature, 0.1)),
