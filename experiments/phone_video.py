@@ -74,10 +74,7 @@ def main() -> None:
     shake -= np.linspace(0, 1, o.frames)[:, None] * shake[-1]
     log_exposure = None
     with av.open(str(o.out), "w") as container:
-        codec, options = ("libx264", {"crf": "16"})
-        if o.hlg:
-            codec, options = "libx265", {"crf": "12", "x265-params": "log-level=none"}
-        stream = container.add_stream(codec, rate=FPS, options=options)
+        stream = container.add_stream("libx264", rate=FPS, options={"crf": "12" if o.hlg else "16"})
         stream.width, stream.height = width, height
         stream.pix_fmt = "yuv420p10le" if o.hlg else "yuv420p"
         coding = (9, 18, 1) if o.hlg else (1, 1, 1)

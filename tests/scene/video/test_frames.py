@@ -20,6 +20,7 @@ COLOURS = np.array(
     ],
     np.uint8,
 )
+PHONE = Path(__file__).with_name("red_hlg_hevc.mp4")
 CARD = np.repeat(np.repeat(COLOURS[None], 64, 0), 40, 1)
 
 
@@ -37,7 +38,7 @@ def seen(path: Path) -> np.ndarray:
         ("libx264", "yuv420p", True, 1),
         ("libx264rgb", "rgb24", True, 0),
         ("ffv1", "yuv422p10le", False, 1),
-        ("libx265", "yuv420p10le", False, 9),
+        ("libx264", "yuv420p10le", False, 9),
     ],
 )
 def test_colours_survive_every_way_of_coding_them(tmp_path, codec, layout, full, matrix) -> None:
@@ -74,7 +75,6 @@ def test_hdr_video_becomes_light(tmp_path: Path, coding, name) -> None:
     path = tmp_path / "a.mkv"
     grey = np.repeat(np.repeat(np.linspace(6000, 46000, 8)[None, :, None], 64, 0), 40, 1)
     card = np.repeat(grey, 3, 2).astype(np.uint16)
-    # Without loss: x265 is not the same twice on a busy machine.
     write_video(path, [card] * 2, codec="ffv1", layout="yuv422p10le", coding=coding)
     frame = next(iter(frames_of(path)))
     assert frame.transfer == name
@@ -83,14 +83,10 @@ def test_hdr_video_becomes_light(tmp_path: Path, coding, name) -> None:
     np.testing.assert_allclose(light, expected, rtol=0.03, atol=1e-3)
 
 
-def test_wide_colours_of_hdr_video_are_brought_to_srgb(tmp_path: Path) -> None:
-    path = tmp_path / "a.mp4"
-    # BT.2020's coordinates of sRGB red at half of HLG's range: outside sRGB nothing is left over.
-    red = np.array([0.6274, 0.0691, 0.0164]) / 12
-    signal = np.sqrt(3 * red)
-    card = np.broadcast_to(np.rint(signal * 65535).astype(np.uint16), (64, 64, 3))
-    write_video(path, [card] * 2, codec="libx265", layout="yuv420p10le", coding=HLG, quality=1)
-    light = srgb_decode(next(iter(frames_of(path))).codes()[32, 32] / 65535)
+def test_wide_colours_of_a_phones_hdr_video_are_brought_to_srgb() -> None:
+    # BT.2020's coordinates of sRGB red at half of HLG's range, as HEVC of 10 bits in an .mp4.
+    # The file is kept since libx265 in PyAV 18.1 fails on every other call (write_video's note).
+    light = srgb_decode(next(iter(frames_of(PHONE))).codes()[32, 32] / 65535)
     assert light == pytest.approx((1 / 12, 0, 0), abs=3e-3)
 
 
