@@ -158,14 +158,20 @@ def row(name: str, run: dict[str, Any]) -> list[str]:
     ]
 
 
+FIGURES = ("levelled_stops", "step_stops", "spread_stops", "step_depth", "spread_depth")
+
+
 def seams(run: dict[str, Any]) -> str:
     """Return the table of seams of a run in blocks."""
     rows = []
     for seam in run["districts"]["seams"]:
-        values = [seam[k] for k in ("step_stops", "spread_stops", "step_depth", "spread_depth")]
+        values = [seam[k] for k in FIGURES]
         cells = ["n/a" if v is None else f"{v:.4f}" for v in values]
         rows.append([" and ".join(map(str, seam["blocks"])), str(seam["pixels"]), *cells])
-    header = ("seam", "pixels", "step, stops", "spread, stops", "step of depth", "spread of depth")
+    header = (
+        *("seam", "pixels", "step levelled, stops", "step left, stops", "spread, stops"),
+        *("step of depth", "spread of depth"),
+    )
     return table(header, rows)
 
 

@@ -91,7 +91,7 @@ class Cut:
         return self.blocks[number].holds(self.ground.place(points))
 
     def neighbours(self) -> list[tuple[int, int]]:
-        """Return the pairs of blocks that share an edge of some length."""
+        """Return the pairs of blocks whose cores touch, be it at a corner."""
         found = []
         for a, first in enumerate(self.blocks):
             for b in range(a + 1, len(self.blocks)):
@@ -100,7 +100,7 @@ class Cut:
                     np.maximum(first.lower, second.lower),
                     np.minimum(first.upper, second.upper),
                 )
-                if (high >= low).all() and (high > low).any():
+                if (high >= low).all():
                     found.append((a, b))
         return found
 

@@ -20,10 +20,11 @@ from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.core.runtime import return_freed_memory
 from p2gs_jax.districts.block_job import block_job, peak_bytes
 from p2gs_jax.districts.cut import Cut, cut_scene
+from p2gs_jax.districts.level import level_seams
 from p2gs_jax.districts.merge import merge_cores
 from p2gs_jax.districts.plan import check_options, check_scene, read_plan, write_plan
 from p2gs_jax.districts.room import fewest_blocks, require_room
-from p2gs_jax.districts.seams import Seam, measure_seams
+from p2gs_jax.districts.seams import Seam
 from p2gs_jax.districts.shared import (
     ARRAYS,
     DECISIONS,
@@ -192,7 +193,7 @@ class _District:
             read_ply(RunFolder(self.blocks / str(k)).radiance) for k in range(len(self.cut.blocks))
         ]
         with self.clock("seams"):
-            seams = measure_seams(
+            fitted, seams = level_seams(
                 solved.scene, prepared.store, self.cut, fitted, prepared.cfg.render
             )
         gaussians, counts = merge_cores(self.cut, fitted)
@@ -313,7 +314,7 @@ class _District:
         if seen:
             worst = max(seen, key=lambda s: abs(s.step_stops or 0.0))
             self.reporter.message(
-                f"The largest step of radiance between blocks: {worst.step_stops:+.4f} stops "
+                f"The largest step of radiance left between blocks: {worst.step_stops:+.4f} stops "
                 f"(blocks {worst.blocks[0]} and {worst.blocks[1]}); median difference "
                 f"{worst.spread_stops:.3f} stops, {worst.spread_depth:.1%} of depth."
             )

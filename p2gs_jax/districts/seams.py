@@ -1,7 +1,7 @@
 """Whether two blocks agree where they meet: the same views, rendered by each, along the boundary.
 
-Each block fitted the strip around the boundary by itself. What differs there in one direction is
-the step that the merged scene has; what differs both ways is what two fits of anything differ by.
+Each block fitted the strip around the boundary by itself. What differs there in one direction is a
+step; what differs both ways is what two fits of anything differ by.
 """
 
 from __future__ import annotations
@@ -43,6 +43,7 @@ class Seam:
         spread_stops: median size of that ratio.
         step_depth: median of the second's depth over the first's, less one.
         spread_depth: median size of that.
+        levelled_stops: the step that was taken out before, as other views told it; None: nothing.
     """
 
     blocks: tuple[int, int]
@@ -52,10 +53,17 @@ class Seam:
     spread_stops: float | None
     step_depth: float | None
     spread_depth: float | None
+    levelled_stops: float | None = None
 
 
 def measure_seams(
-    scene: Scene, store: ImageStore, cut: Cut, fitted: Sequence[Gaussians], cfg: RenderConfig
+    scene: Scene,
+    store: ImageStore,
+    cut: Cut,
+    fitted: Sequence[Gaussians],
+    cfg: RenderConfig,
+    *,
+    which: slice = slice(None),
 ) -> list[Seam]:
     """Compare neighbouring blocks in training views of both.
 
@@ -65,9 +73,11 @@ def measure_seams(
         cut: of the scene.
         fitted: all Gaussians of each block.
         cfg: rendering options.
+        which: of the views that two blocks share, in the order of the scene.
     """
     return [
-        _seam(scene, store, cut, (a, b), (fitted[a], fitted[b]), cfg) for a, b in cut.neighbours()
+        _seam(scene, store, cut, (a, b), (fitted[a], fitted[b]), cfg, which)
+        for a, b in cut.neighbours()
     ]
 
 
@@ -78,9 +88,10 @@ def _seam(
     pair: tuple[int, int],
     fitted: tuple[Gaussians, Gaussians],
     cfg: RenderConfig,
+    which: slice,
 ) -> Seam:
     first, second = (cut.blocks[k] for k in pair)
-    both = sorted(set(first.views) & set(second.views))
+    both = sorted(set(first.views) & set(second.views))[which]
     renderers = make_renderer(cfg), make_renderer(cfg)
     stops, depths, views = [], [], 0
     for row in (both[k] for k in evenly_spaced(len(both), MOST_VIEWS)):

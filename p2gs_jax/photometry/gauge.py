@@ -10,8 +10,7 @@ import dataclasses
 import jax
 import numpy as np
 
-from p2gs_jax.render.radiance import RadianceKind
-from p2gs_jax.render.spherical_harmonics import C0
+from p2gs_jax.render.radiance import RadianceKind, scaled
 from p2gs_jax.types import Params
 
 
@@ -29,18 +28,10 @@ def recentre(params: Params, activation: RadianceKind) -> Params:
         return params
     # On the host: once a fit, and every operation would be a program of its own.
     photometry = jax.tree.map(np.asarray, params.photometry)
-    sh = np.array(params.gaussians.sh)
     log_scale = np.mean(photometry.log_exposures)
     balance = photometry.white_balance
     tint = np.zeros(3, np.float32) if balance is None else balance.mean(0)
-    log_scales = log_scale + tint
-    if activation == "exp":
-        sh[:, 0] += log_scales / C0
-    else:
-        # radiance = value + 1/2: the half must grow with the rest.
-        factors = np.exp(log_scales)
-        sh *= factors
-        sh[:, 0] += (factors - 1) * 0.5 / C0
+    sh = scaled(np.asarray(params.gaussians.sh), log_scale + tint, activation)
     if photometry.parameterization == "log":
         raw = photometry.raw_exposures - log_scale
     else:

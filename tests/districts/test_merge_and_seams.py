@@ -5,38 +5,14 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from walls import halves, wall
 
 from p2gs_jax.config import DataConfig, RenderConfig
-from p2gs_jax.districts.cut import Block, Cut, Ground
 from p2gs_jax.districts.merge import merge_cores
 from p2gs_jax.districts.seams import measure_seams, unprojected
 from p2gs_jax.errors import UserError
 from p2gs_jax.render.spherical_harmonics import C0
 from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.types import Gaussians, Scene, View
-
-GROUND = Ground(np.zeros(3), np.eye(3)[:2])
-INF = np.inf
-
-
-def halves(margin=1.0, views=(0, 1)):
-    left = Block((-INF, -INF), (0.0, INF), views)
-    return Cut(GROUND, margin, (left, Block((0.0, -INF), (INF, INF), views)))
-
-
-def wall(log_radiance=0.0, depth=4.0, width=41):
-    """Return a wall of Gaussians across x, all of one radiance."""
-    x, y = np.meshgrid(np.linspace(-3, 3, width), np.linspace(-2, 2, 27))
-    count = x.size
-    means = np.stack([x.ravel(), y.ravel(), np.full(count, depth)], 1)
-    sh = np.full((count, 1, 3), log_radiance / C0)
-    return Gaussians(
-        means=jnp.asarray(means, jnp.float32),
-        quats=jnp.tile(jnp.eye(1, 4), (count, 1)),
-        log_scales=jnp.full((count, 3), np.log(0.15)),
-        opacity_logits=jnp.full((count,), 4.0),
-        sh=jnp.asarray(sh, jnp.float32),
-    )
 
 
 def test_every_gaussian_is_kept_by_the_block_whose_core_holds_it():
@@ -59,29 +35,13 @@ def test_nothing_in_any_core_is_said():
         merge_cores(cut, [away, dataclasses.replace(away, means=-away.means)])
 
 
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    from PIL import Image
-
-    root = tmp_path_factory.mktemp("seams")
-    K = np.array([[40, 0, 32], [0, 40, 24], [0, 0, 1]], np.float32)
-    views = []
-    for k in range(2):
-        path = root / f"{k}.png"
-        Image.new("RGB", (64, 48)).save(path)
-        viewmat = np.eye(4, dtype=np.float32)
-        viewmat[0, 3] = 0.3 * k
-        views.append(View(path.name, path, "0", viewmat, K, 64, 48))
-    return Scene(root, "made", tuple(views), np.zeros((1, 3), np.float32), None)
-
-
 @pytest.mark.parametrize(("stops", "farther"), [(0.0, 0.0), (0.1, 0.0), (-0.25, 0.02)])
-def test_a_seam_is_measured_as_it_was_made(scene, stops, farther):
-    store = ImageStore(scene.views, DataConfig())
+def test_a_seam_is_measured_as_it_was_made(two_views, stops, farther):
+    store = ImageStore(two_views.views, DataConfig())
     cfg = RenderConfig(sh_degree=0)
     first = wall(0.3)
     second = wall(0.3 + stops * np.log(2), depth=4.0 * (1 + farther))
-    (seam,) = measure_seams(scene, store, halves(), [first, second], cfg)
+    (seam,) = measure_seams(two_views, store, halves(), [first, second], cfg)
     assert seam.blocks == (0, 1)
     assert seam.views == 2
     assert seam.pixels > 100
@@ -90,10 +50,10 @@ def test_a_seam_is_measured_as_it_was_made(scene, stops, farther):
     assert seam.step_depth == pytest.approx(farther, abs=0.002)
 
 
-def test_a_boundary_that_no_view_shows_is_said(scene):
-    store = ImageStore(scene.views, DataConfig())
+def test_a_boundary_that_no_view_shows_is_said(two_views):
+    store = ImageStore(two_views.views, DataConfig())
     (seam,) = measure_seams(
-        scene, store, halves(views=()), [wall(), wall()], RenderConfig(sh_degree=0)
+        two_views, store, halves(views=()), [wall(), wall()], RenderConfig(sh_degree=0)
     )
     assert (seam.views, seam.pixels, seam.step_stops) == (0, 0, None)
 
