@@ -61,9 +61,12 @@ def of_fit(metrics: dict[str, Any], command: str) -> dict[str, Any]:
         command: that measures the row, without folders of this machine.
     """
     seconds = metrics["seconds"]
+    # Of a resumed fit, "optimisation" is that of all its processes, all else of the last.
+    last = sum(seconds.get(k, 0.0) for k in ("compiling", "steps", "densification", "checkpoints"))
+    around = seconds["total_until_evaluation"] - last + seconds["evaluation_and_files"]
     return {
         "gaussians": metrics["counts"]["gaussians"],
-        "seconds": round(seconds["total_until_evaluation"] + seconds["evaluation_and_files"]),
+        "seconds": round(around + seconds["optimisation"]),
         "seconds_of_steps": round(seconds["optimisation"]),
         "date": datetime.date.today().isoformat(),
         "commit": commit(),
