@@ -177,17 +177,23 @@ def find_scene(
         )
     folders = [root / cfg.images] if cfg.images is not None else [root / "images", root]
     for folder in folders:
-        # Subfolders of the root itself may hold anything: masks, or the results of other runs.
-        paths = list_images(folder, recursive=folder != root)
+        # Subfolders of the root may hold anything, masks or results of other runs, unless it is
+        # asked for.
+        paths = list_images(folder, recursive=folder != root or cfg.images is not None)
         for path in paths:
             image_size(path)
         if paths:
             return PhotographsAlone(folder, paths)
     looked = ", ".join(str(folder) for folder in folders)
+    fix = "name the folder that holds one of these"
+    below = sorted(d.name for d in root.iterdir() if list_images(d, recursive=False))
+    if cfg.images is None and below:
+        fix += f"; photographs are in its folder(s) {', '.join(below[:3])}"
+        fix += ": if these are cameras, add --data.images ."
     raise UserError(
         f"no scene in {root}: there is no COLMAP model (cameras, images and points3D as .bin or "
         f".txt, in sparse/0, sparse or the folder itself), no transforms.json or "
         f"transforms_train.json, no poses_bounds.npy, no calib.txt with poses.txt, no drive of a "
         f"known data set, and no photographs (looked in {looked})",
-        fix="name the folder that holds one of these",
+        fix=fix,
     )

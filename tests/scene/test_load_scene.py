@@ -11,7 +11,7 @@ from scene.helpers import write_tiny_model
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene import ImageStore, load_scene
+from p2gs_jax.scene import ImageStore, PhotographsAlone, find_scene, load_scene
 from p2gs_jax.scene.exif import ExifSettings, read_exif_ev, read_exif_settings
 from p2gs_jax.scene.split import assign_split
 from p2gs_jax.types import View
@@ -30,6 +30,22 @@ def test_nothing_there(tmp_path):
     file.write_bytes(b"")
     with pytest.raises(UserError, match=r"notes.txt is a file"):
         load_scene(file, CFG)
+
+
+def test_a_folder_of_cameras_is_one_if_asked_for(tmp_path):
+    for name in ("front/0.png", "left/0.png"):
+        (tmp_path / name).parent.mkdir()
+        cv2.imwrite(str(tmp_path / name), np.zeros((8, 8, 3), np.uint8))
+    with pytest.raises(UserError, match="no scene in") as info:
+        load_scene(tmp_path, CFG)
+    assert "folder(s) front, left" in str(info.value.fix)
+    assert "--data.images ." in str(info.value.fix)
+    found = find_scene(tmp_path, dataclasses.replace(CFG, images="."))
+    assert isinstance(found, PhotographsAlone)
+    assert [p.relative_to(found.folder).as_posix() for p in found.paths] == [
+        "front/0.png",
+        "left/0.png",
+    ]
 
 
 def test_masks_are_found_and_used(tmp_path):

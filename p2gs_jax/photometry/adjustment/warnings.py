@@ -12,7 +12,7 @@ from p2gs_jax.photometry.solution import MIN_OBSERVATIONS
 
 # A channel off by this much in a view is worth a word.
 NOTICEABLE_BALANCE_EV = 0.1
-# Of a standard error, what does not matter.
+# Of a typical standard error, what is left of the way that is worth no word.
 NEGLIGIBLE = 0.1
 
 
@@ -31,18 +31,14 @@ def solver_warnings(
         names: of all views.
     """
     out = []
-    if not fit.converged:
-        said = f"The photometric solution had not settled after {fit.rounds} rounds"
-        said += f" (its last moved a parameter by {fit.moved:.1e}, log units)"
-        typical = float(np.median(errors)) if errors.size else 0.0
-        if fit.left <= NEGLIGIBLE * typical:
-            share = f"{NEGLIGIBLE:.0%} of a typical standard error"
-            out.append(f"{said}; what is left of the way is less than {share}.")
-        else:
-            out.append(
-                f"{said}: exposures may be off by more than their standard errors say. Compare "
-                "them with --photometry.no-select and a simpler --photometry.model."
-            )
+    typical = float(np.median(errors)) if errors.size else 0.0
+    if not fit.converged and fit.left > NEGLIGIBLE * typical:
+        out.append(
+            f"The photometric solution had not settled after {fit.rounds} rounds (its last moved a "
+            f"parameter by {fit.moved:.1e}, log units): exposures may be off by more than their "
+            "standard errors say. Compare them with --photometry.no-select and a simpler "
+            "--photometry.model."
+        )
     if len(lost):
         out.append(
             f"The standard errors of {len(lost)} training view(s) cannot be told: what joins them "
