@@ -56,7 +56,9 @@ def test_a_signal_leaves_a_table_and_the_same_sweep_goes_on(tmp_path, fake):
     with pytest.raises(Interrupted), interrupts.raised():
         sweep("scene", tmp_path, CONFIGS)
     rows = json.loads((tmp_path / "sweep.json").read_text())
-    assert [row["status"] for row in rows] == ["done", "interrupted", "interrupted"]
+    assert [row["status"] for row in rows[:2]] == ["done", "interrupted"]
+    # It may or may not have been asked to begin.
+    assert rows[2]["status"] in ("interrupted", "waiting")
     assert not list(tmp_path.rglob(REASON))
     fake(finished)
     assert [row["status"] for row in sweep("scene", tmp_path, CONFIGS).rows] == ["done"] * 3
