@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,8 @@ MARKERS = "osD^vPX*"
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 CHANNELS = ("red", "green", "blue")
 MOST_CURVES = 12
+# What is as wide as the narrowest panel.
+TITLE_LETTERS = 36
 
 
 @names_as_they_are()
@@ -87,7 +90,8 @@ def write_calibration_plot(
         right.plot(stops, y, lw=0.9, label=printable(label))
     srgb = log_exposed(y, Response())[0] / LN2
     right.plot(srgb, y, "k--", lw=0.9, label="sRGB")
-    right.set_title(f"Tone curve: {s.response.name}", loc="left", fontsize=10)
+    title = textwrap.fill(f"Tone curve: {s.response.name}", TITLE_LETTERS)
+    right.set_title(title, loc="left", fontsize=10)
     right.set_xlabel("log2 of the exposed radiance (0: white)")
     right.set_ylabel("photographed value")
     right.set_xlim(-9, 1)
