@@ -133,7 +133,9 @@ def _compared(
         opaque = np.maximum(alpha, 1e-6)
         shown.append((linear.mean(-1) / opaque, np.asarray(drawn.depth) / opaque, alpha))
     (one, near, solid), (other, far, covered) = shown
-    points = unprojected(near, np.asarray(camera.K), np.asarray(camera.viewmat))
+    # Chosen by one of the depths, pixels would be those in which the other is farther off.
+    middle = np.sqrt(np.maximum(near * far, 0.0))
+    points = unprojected(middle, np.asarray(camera.K), np.asarray(camera.viewmat))
     places = cut.ground.place(points.reshape(-1, 3))
     strip = np.ones(len(places), bool)
     for number in pair:
