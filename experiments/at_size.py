@@ -2,9 +2,9 @@
 
 python experiments/at_size.py [--out DIR] [--methods robust 3dgs ...] [--stds 4 2 0]
 
-One town, three cameras with 100 photographs of 480x325 each, 7,000 steps, population by need. Rows
-are kept in `experiments/at_size.json`, with the commit and seconds of each; called again, it goes
-on where it was interrupted. `experiments/at_size.md` is written from all that are there.
+One town, three cameras with 100 photographs of 480x325 each along 90 m, 7,000 steps, population by
+need. Rows are kept in `experiments/at_size.json`, with the commit and seconds of each; called
+again, it goes on where it was interrupted. `experiments/at_size.md` is written from all that are there.
 """
 
 from __future__ import annotations
@@ -25,7 +25,9 @@ from p2gs_jax.core.atomic import write_text
 from p2gs_jax.sweep.rows import read_row
 
 # The paper's drive at a quarter of its width; hours.
-AT_SIZE = Protocol(towns=(0,), frames=100, width=480, points=60_000, steps=7000, gaussians=None)
+AT_SIZE = Protocol(
+    towns=(0,), frames=100, step_m=0.9, width=480, points=60_000, steps=7000, gaussians=None
+)
 ROWS = Path(__file__).with_name("at_size.json")
 BENCHMARK = "towns at size"
 ORDER = (

@@ -11,7 +11,7 @@ from p2gs_jax.core.streams import SceneStream, generator
 from p2gs_jax.synth import houses, street_furniture
 from p2gs_jax.synth.settings import Layout
 from p2gs_jax.synth.solids import Builder, Solid, pack
-from p2gs_jax.synth.town import UNDERPASS, Light, Town
+from p2gs_jax.synth.town import STREET_END, UNDERPASS, Light, Town
 
 # Of the houses along one street, m; the next one begins there.
 STREET_M = 126.0
@@ -27,7 +27,8 @@ def build_town(seed: int = 0, layout: Layout = "street", reach: float = 0.0) -> 
         reach: how far the cameras drive in a long one, m.
     """
     if layout == "long":
-        return pack(_streets(seed, max(1, math.ceil(reach / STREET_M))), seed, _light(seed))
+        count = 1 + max(0, math.ceil((reach - STREET_END) / STREET_M))
+        return pack(_streets(seed, count), seed, _light(seed))
     build = Builder(generator(seed, SceneStream.BUILDINGS), UNDERPASS if layout == "town" else None)
     _furnish(build)
     if layout == "town":

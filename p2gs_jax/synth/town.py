@@ -22,6 +22,8 @@ CROSS_STREET = (27.0, 36.0)
 """The side street's extent along x, between the buildings' corners."""
 UNDERPASS = (54.0, 68.0)
 """Where a house stands across the street, along x."""
+STREET_END = 100.0
+"""How far one can drive: behind it stands the tower that closes the view."""
 UNDERPASS_HEIGHT = 5.2
 FLOOR_HEIGHT = 3.2
 GROUND_FLOOR_HEIGHT = 4.0

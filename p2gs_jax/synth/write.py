@@ -38,7 +38,7 @@ from p2gs_jax.synth.rig import MOUNTS, camera_viewmat, drive, intrinsics
 from p2gs_jax.synth.seed_points import observe_seeds, sample_seeds
 from p2gs_jax.synth.sensor import ISO_REFERENCE, draw_shots, photograph
 from p2gs_jax.synth.settings import Layout, Sensor
-from p2gs_jax.synth.town import Town
+from p2gs_jax.synth.town import STREET_END, Town
 from p2gs_jax.synth.tracer import Tracer
 
 FORMAT = "p2gs-jax street, version 2"
@@ -128,6 +128,7 @@ def write_street(
     out = Path(out)
     sensor = sensor or Sensor(iso_std=iso_std)
     _check(out, frames, width, height, sensor.iso_std, supersample)
+    _check_way(frames, step, layout)
     say = report or (lambda line: None)
     town = build_town(seed, layout, frames * step)
     names = tuple(f"{camera}/{f:06d}.png" for camera in sorted(MOUNTS) for f in range(frames))
@@ -229,6 +230,16 @@ def _check(
             fix="use at least 1 frame, 16x16 pixels, 1 sample, and a spread of 0 or more",
         )
     _require_free(out)
+
+
+def _check_way(frames: int, step: float, layout: Layout) -> None:
+    way = (frames - 1) * step
+    if layout != "long" and way > STREET_END:
+        raise UserError(
+            f"{frames} frames of {step:g} m go on for {way:.0f} m; the street ends after "
+            f"{STREET_END:.0f}.",
+            fix="use --layout long, which is as many streets as the drive is long, or fewer frames",
+        )
 
 
 def _require_free(out: Path) -> None:

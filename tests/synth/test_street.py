@@ -192,6 +192,24 @@ def test_card_and_refusals(street, tmp_path):
     assert not (tmp_path / "x").exists()
 
 
+@pytest.mark.parametrize("layout", ["street", "town"])
+def test_a_drive_does_not_go_through_the_tower(tmp_path, layout):
+    with pytest.raises(UserError, match=r"101 frames of 1\.2 m go on for 120 m") as error:
+        write_street(tmp_path / "x", frames=101, step=1.2, layout=layout)
+    assert "--layout long" in str(error.value.fix)
+    assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize("way", [90.0, 100.0, 120.0, 226.0, 300.0])
+def test_the_last_street_of_a_long_town_ends_behind_the_drive(way):
+    town = build_town(3, "long", way)
+    x = np.linspace(0, way + 3, 200)
+    eyes = np.stack([x, np.full_like(x, -1.75), np.full_like(x, 3.845)], 1)
+    inside = (eyes[:, None] > np.asarray(town.lo)) & (eyes[:, None] < np.asarray(town.hi))
+    boxes = np.asarray(town.material) == Material.FACADE
+    assert not inside.all(-1)[:, boxes].any()
+
+
 def test_a_long_town_goes_on_as_far_as_the_drive():
     short, long = build_town(3, "long", 50.0), build_town(3, "long", 300.0)
     houses = np.asarray(long.material) == Material.FACADE
