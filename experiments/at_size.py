@@ -4,7 +4,8 @@ python experiments/at_size.py [--out DIR] [--methods robust 3dgs ...] [--stds 4 
 
 One town, three cameras with 100 photographs of 480x325 each along 90 m, 7,000 steps, population by
 need. Rows are kept in `experiments/at_size.json`, with the commit and seconds of each; called
-again, it goes on where it was interrupted. `experiments/at_size.md` is written from all that are there.
+again, it goes on where it was interrupted. `experiments/at_size.md` is written from all that are
+there.
 """
 
 from __future__ import annotations
