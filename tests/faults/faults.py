@@ -124,8 +124,8 @@ FAULTS = (
     Fault(
         "recentring moves exposures but not radiance",
         "photometry/gauge.py",
-        "sh[:, 0] += log_scales / C0",
-        "sh[:, 0] += 0.0 * log_scales / C0",
+        "log_scale + tint, activation)",
+        "0.0 * (log_scale + tint), activation)",
         "photometry/test_gauge.py",
     ),
     Fault(
