@@ -81,7 +81,8 @@ class DataConfig:
     max_width: int | None = None
     """Shrink images to at most this many pixels across; None keeps them as they are."""
     images: str | None = None
-    """Image folder, where it is not `images/` beside the model."""
+    """Image folder, where it is not `images/` beside the model; `.` is the scene's folder with all
+    below it, as of cameras that have a folder each."""
     format: SceneFormat | None = None
     """How to read the scene; None takes the first of these that the folder holds."""
     alpha: AlphaUse = "background"

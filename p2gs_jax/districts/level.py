@@ -11,11 +11,11 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from p2gs_jax.config import RenderConfig
+from p2gs_jax.core.numerics import on_device
 from p2gs_jax.districts.cut import OVERLAP, Cut
 from p2gs_jax.districts.seams import Seam, measure_seams
 from p2gs_jax.render.radiance import scaled
@@ -53,7 +53,7 @@ def level_seams(
     for number, gaussians in enumerate(fitted):
         shift = shifts(cut, number, np.asarray(gaussians.means), steps) * np.log(2)
         sh = scaled(np.asarray(gaussians.sh), shift[:, None], cfg.radiance)
-        levelled.append(dataclasses.replace(gaussians, sh=jnp.asarray(sh)))
+        levelled.append(dataclasses.replace(gaussians, sh=on_device(sh)))
     left = measure_seams(scene, store, cut, levelled, cfg, which=slice(1, None, 2))
     return levelled, [dataclasses.replace(s, levelled_stops=steps.get(s.blocks)) for s in left]
 

@@ -186,10 +186,11 @@ def find_scene(
             return PhotographsAlone(folder, paths)
     looked = ", ".join(str(folder) for folder in folders)
     fix = "name the folder that holds one of these"
-    below = sorted(d.name for d in root.iterdir() if list_images(d, recursive=False))
-    if cfg.images is None and below:
-        fix += f"; photographs are in its folder(s) {', '.join(below[:3])}"
-        fix += ": if these are cameras, add --data.images ."
+    if cfg.images is None:
+        below = sorted(d.name for d in root.iterdir() if list_images(d, recursive=False))
+        if below:
+            fix += f"; photographs are in its folder(s) {', '.join(below[:3])}"
+            fix += ": if these are cameras, add --data.images ."
     raise UserError(
         f"no scene in {root}: there is no COLMAP model (cameras, images and points3D as .bin or "
         f".txt, in sparse/0, sparse or the folder itself), no transforms.json or "

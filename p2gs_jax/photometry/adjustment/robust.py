@@ -100,8 +100,7 @@ def _geman_mcclure(
         square: of residuals, in widths of the loss.
         share: of each observation's channels that count.
     """
-    robust = 1 / (1 + square) ** 2
-    second = (1 - 3 * square) / (1 + square) ** 3
+    robust, second = _derivatives(square)
     seen = share > 0
     return robust, float(second[seen].sum() / max(robust[seen].sum(), 1e-9))
 
@@ -116,17 +115,24 @@ def _whole_points(
     whose scale is the point's own: it counts the less, the more its views differ. Arguments as for
     `_geman_mcclure`.
     """
-    alone, _ = _geman_mcclure(rows, square, share)
+    alone, curved = _derivatives(square)
     bound = GEMAN_MCCLURE**2
     losses = rows.by_row @ (share * bound * square / (1 + square))
     # A point's radiance takes one observation away.
     freedom = np.maximum(rows.by_row @ share - 1, 0)
     of_row = (PRIOR_SPREAD + freedom) / (PRIOR_SPREAD + losses)
     robust = alone * of_row[rows.row]
-    second = share * (1 - 3 * square) / (1 + square) ** 3 * of_row[rows.row]
+    second = share * curved * of_row[rows.row]
     pulls = rows.by_row @ (share**2 * bound * square * alone**2)
     along = 2 * of_row / (PRIOR_SPREAD + losses) * pulls
     return robust, float((second.sum() - along.sum()) / max((share * robust).sum(), 1e-9))
+
+
+def _derivatives(
+    square: Float[np.ndarray, " o"],
+) -> tuple[Float[np.ndarray, " o"], Float[np.ndarray, " o"]]:
+    """Return slope over residual and curvature of the Geman-McClure loss, of one observation."""
+    return 1 / (1 + square) ** 2, (1 - 3 * square) / (1 + square) ** 3
 
 
 def _radiance(rows: Rows, a, z, weight):
