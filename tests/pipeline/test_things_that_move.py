@@ -259,7 +259,9 @@ def test_broken_or_foreign_owners_are_said(run, tmp_path):
 
 @pytest.mark.slow
 def test_rigid_beats_mask_inside_the_box_and_equals_it_elsewhere(folder, tmp_path):
-    longer = {"train.steps": 400, "train.log_every": 10, "render.sh_degree": 0}
+    # With 3,000 the box's 700 are missing elsewhere, which costs .7 of 44 dB.
+    enough = {"densify.max_gaussians": 6000}
+    longer = {"train.steps": 400, "train.log_every": 10, "render.sh_degree": 0, **enough}
     errors = {}
     for method in ("rigid", "mask", "off"):
         cfg = with_fields(SHORT, {**longer, "dynamics.method": method})
@@ -268,8 +270,7 @@ def test_rigid_beats_mask_inside_the_box_and_equals_it_elsewhere(folder, tmp_pat
     inside, outside = ({m: e[part] for m, e in errors.items()} for part in (0, 1))
     assert inside["rigid"] > inside["mask"] + 10
     assert inside["rigid"] > inside["off"] + 10
-    # Of 44 dB: runs of one method differ by .1, the methods by .5 to .8.
-    assert outside["rigid"] > max(outside["mask"], outside["off"]) - 1.2
+    assert outside["rigid"] > max(outside["mask"], outside["off"]) - 0.5
 
 
 def _errors(run) -> tuple[float, float]:
