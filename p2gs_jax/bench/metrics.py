@@ -27,12 +27,14 @@ class Metric:
         tolerance: how far a value may be worse than the baseline before the gate closes; a factor
             where `absolute` is false, else in the metric's unit.
         absolute: see `tolerance`.
+        timed: a ratio of wall times, which other work on the machine moves.
     """
 
     title: str
     better: Literal["lower", "higher"]
     tolerance: float
     absolute: bool = False
+    timed: bool = False
 
     def worse(self, value: float, baseline: float) -> bool:
         """Return whether `value` is worse than `baseline` allows; NaN always is."""
@@ -44,7 +46,7 @@ class Metric:
 
 
 # Accuracy is deterministic up to the order of float32 sums; times are ratios to a reference
-# workload of the same run and still move with the machine.
+# workload of the same run and still move with the machine: 1.8 times between two, by our own CI.
 METRICS = {
     "max_abs": Metric("max abs", "lower", 1.25),
     "relative": Metric("relative max", "lower", 1.25),
@@ -52,9 +54,9 @@ METRICS = {
     "gradient": Metric("gradient rel. L2", "lower", 1.25),
     "relative_99": Metric("relative, 99 %", "lower", 1.5),
     "gradient_99": Metric("gradient, best 99 %", "lower", 1.5),
-    "forward": Metric("forward / reference", "lower", 2.0),
-    "both": Metric("forward + backward / reference", "lower", 2.0),
-    "step": Metric("training step / reference", "lower", 2.0),
+    "forward": Metric("forward / reference", "lower", 2.5, timed=True),
+    "both": Metric("forward + backward / reference", "lower", 2.5, timed=True),
+    "step": Metric("training step / reference", "lower", 2.5, timed=True),
 }
 ACCURACY = ("max_abs", "relative", "psnr", "gradient")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -68,32 +68,46 @@ def run(
     def section(title: str, *texts: str) -> None:
         sections.append("\n\n".join([f"## {title}", *texts]))
 
+    def of_variants(variants: Sequence[speed_error.Variant]) -> list[speed_error.MeasuredVariant]:
+        return speed_error.measure_speed_error(
+            sweep_scene(quick), tuple(variants), on_progress=on_progress
+        )
+
+    def of_levels(fits: dict[str, Callable[[], BenchScene]]) -> list[levels.Level]:
+        return levels.measure_levels(
+            fits,
+            dataclasses.replace(preset("robust"), render=render or RenderConfig()),
+            steps=levels.QUICK_STEPS if quick else None,
+            repeats=5 if quick else 7,
+            on_progress=on_progress,
+        )
+
+    variants = speed_error.QUICK if quick else speed_error.VARIANTS
+    fits = levels.QUICK if quick else levels.SCENES
     if "speed_error" in parts:
+        points = of_variants(variants)
         scene = sweep_scene(quick)
         camera = scene.camera
-        variants = speed_error.QUICK if quick else speed_error.VARIANTS
-        points = speed_error.measure_speed_error(scene, variants, on_progress=on_progress)
         title = f"{scene.gaussians.capacity} Gaussians, {camera.width}x{camera.height}, SH degree 3"
         section(f"Speed against error: {title}", report.speed_error_table(points))
         report.speed_error_plot(out / "speed_error.png", points, title)
         data["speed_error"] = [p._replace(variant=p.variant.name)._asdict() for p in points]  # pyright: ignore[reportArgumentType]
         gated |= gate.values(points)
     if "levels" in parts:
-        cfg = dataclasses.replace(preset("robust"), render=render or RenderConfig())
-        found = levels.measure_levels(
-            levels.QUICK if quick else levels.SCENES,
-            cfg,
-            steps=levels.QUICK_STEPS if quick else None,
-            repeats=5 if quick else 7,
-            on_progress=on_progress,
-        )
+        found = of_levels(fits)
         section("Levels of a fit: rendering and the whole step", report.levels_table(found))
         data["levels"] = [level._replace(lists=level.lists._asdict())._asdict() for level in found]  # pyright: ignore[reportArgumentType]
         gated |= levels.gate_rows(found)
     if write_baseline:
         gate.write_baseline(write_baseline, gated)
     if baseline:
-        complaints = gate.check(baseline, gated)
+
+        def anew(names: list[str]) -> gate.Rows:
+            slow = [v for v in variants if v.name in names]
+            rows = gate.values(of_variants(slow)) if slow else {}
+            return rows | levels.gate_rows(of_levels({k: fits[k] for k in names if k in fits}))
+
+        complaints = gate.settle(baseline, gated, anew)
     if "growth" in parts:
         curves = growth.measure_growth(quick=quick, on_progress=on_progress)
         per = report.memory_coefficients(curves)
