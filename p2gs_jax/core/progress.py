@@ -35,8 +35,19 @@ class LogRecord:
     entries: int
     seconds: float
     step_seconds: float
+    left_s: float | None
     terms: dict[str, float]
     trial: bool = False
+
+    def summary(self) -> str:
+        """Return where the run is, as text."""
+        parts = [
+            f"step {self.step}",
+            f"PSNR {self.psnr:.2f} dB",
+            f"{self.gaussians} Gaussians",
+            *([] if self.left_s is None else [f"{clock(self.left_s)} left"]),
+        ]
+        return ", ".join(parts)
 
 
 class Reporter(Protocol):
@@ -116,14 +127,11 @@ class TerminalReporter:
 
     def log(self, record: LogRecord) -> None:
         """Show loss, PSNR, Gaussians, views per second and the time left."""
-        left = record.seconds * (1 - record.progress) / max(record.progress, 1e-3)
         if self.live is None:
-            self._now_and_then(
-                f"{record.progress:.0%}, step {record.step}, PSNR {record.psnr:.2f} dB, "
-                f"{record.gaussians} Gaussians, {clock(left)} left"
-            )
+            self._now_and_then(f"{record.progress:.0%}, {record.summary()}")
             return
         rate = 1 / record.step_seconds if record.step_seconds else 0.0
+        left = "" if record.left_s is None else f"{clock(record.left_s)} left"
         bar = "█" * int(24 * record.progress)
         table = Table.grid(padding=(0, 2))
         table.add_row(
@@ -133,6 +141,6 @@ class TerminalReporter:
             f"PSNR {record.psnr:.2f} dB",
             f"{record.gaussians} Gaussians",
             f"{rate:.1f} views/s",
-            f"{clock(left)} left" if not record.trial else "trying without growth",
+            "trying without growth" if record.trial else left,
         )
         self.live.update(table)

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from p2gs_jax.core.progress import LogRecord, clock
+from p2gs_jax.core.progress import LogRecord
 from p2gs_jax.jobs.job import JobState
 
 # Seconds between two writes.
@@ -38,12 +38,7 @@ class ProgressFile:
 
     def log(self, record: LogRecord) -> None:
         """Show the state of the optimisation."""
-        left = record.seconds * (1 - record.progress) / max(record.progress, 1e-3)
-        doing = (
-            f"step {record.step}, PSNR {record.psnr:.2f} dB, {record.gaussians} Gaussians, "
-            f"{clock(left)} left"
-        )
-        self._write({"doing": doing, "progress": record.progress}, now=False)
+        self._write({"doing": record.summary(), "progress": record.progress}, now=False)
 
     def _write(self, state: dict[str, Any], *, now: bool) -> None:
         if not now and time.monotonic() - self._written < EVERY_S:

@@ -17,7 +17,13 @@ from p2gs_jax.train.host import HostState
 
 
 def record_of(
-    reports: Sequence[StepReport], host: HostState, gaussians: int, shrink: int, *, trial: bool
+    reports: Sequence[StepReport],
+    host: HostState,
+    gaussians: int,
+    shrink: int,
+    *,
+    left_s: float | None,
+    trial: bool,
 ) -> LogRecord:
     """Return what is logged of a burst.
 
@@ -26,6 +32,7 @@ def record_of(
         host: after it.
         gaussians: population after it.
         shrink: factor by which its images were shrunk.
+        left_s: seconds that optimisation still takes, about; None: not known yet.
         trial: it belongs to a run that automatic growth compares with.
     """
     last = reports[-1]
@@ -39,6 +46,7 @@ def record_of(
         entries=int(last.entries),
         seconds=round(host.elapsed_s, 3),
         step_seconds=round(host.step_s, 5),
+        left_s=None if left_s is None else round(left_s, 1),
         terms={k: _mean(r.terms[k] for r in reports) for k in last.terms},
         trial=trial,
     )

@@ -270,7 +270,9 @@ class Trainer:
         state, reports = self.bursts.take(state, host)
         self._tick(session, host)
         if reports:
-            record = record_of(reports, host, count_alive(state), host.shrink, trial=trial)
+            left_s = session.left(host, self.levels)
+            alive = count_alive(state)
+            record = record_of(reports, host, alive, host.shrink, left_s=left_s, trial=trial)
             self.log.append(record)
             # From here on a signal waits for the next place to continue from.
             self.asked.begin()

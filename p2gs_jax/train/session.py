@@ -7,7 +7,7 @@ import math
 import time
 
 from p2gs_jax.train.host import HostState
-from p2gs_jax.train.schedule import Pace
+from p2gs_jax.train.schedule import Levels, Pace, seconds_left
 
 # How many times slower than an unloaded machine this one may be taken for.
 MOST_SLOWNESS = 3.0
@@ -44,6 +44,14 @@ class Session:
         pace = dataclasses.replace(self.pace, per_step=host.pace)
         self.pace = pace.replan(host.progress, self._passed(host), host.step_s)
         host.pace = self.pace.per_step
+
+    def left(self, host: HostState, plan: Levels) -> float | None:
+        """Return about how many seconds optimisation still takes, None where no step was timed."""
+        if self.pace.deadline_s is not None:
+            return max(self.pace.deadline_s - self._passed(host), 0.0)
+        if host.step_s <= 0:
+            return None
+        return seconds_left(host.progress, host.pace, host.step_s, plan)
 
     def over(self, host: HostState) -> bool:
         """Return whether the time that optimisation may take is used up."""

@@ -35,7 +35,9 @@ def environment():
 
 def content(run):
     log = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
-    timeless = [{k: v for k, v in r.items() if k not in ("seconds", "step_seconds")} for r in log]
+    timeless = [
+        {k: v for k, v in r.items() if k not in ("seconds", "step_seconds", "left_s")} for r in log
+    ]
     return timeless, (run / "radiance.ply").read_bytes(), (run / "photometry.json").read_text()
 
 

@@ -1,10 +1,14 @@
 """Schedules follow progress; the pace follows the clock."""
 
+import functools
+
 import pytest
 
 from p2gs_jax.config import TrainConfig
 from p2gs_jax.train import schedule
+from p2gs_jax.train.host import HostState
 from p2gs_jax.train.schedule import Pace
+from p2gs_jax.train.session import Session
 
 
 def test_levels_and_degrees():
@@ -54,3 +58,21 @@ def test_long_fits_take_lower_rates():
     # A Gaussian that every fourth view shows is updated as often in four times the steps.
     assert schedule.rate_factor(1 / 9600, 0.25, settled) == pytest.approx(0.5)
     assert schedule.rate_factor(1 / 30_000, 1.0, None) == 1.0
+
+
+def test_finer_levels_count_for_more_in_the_time_left():
+    plan = ((0.25, 4), (0.5, 2), (1.0, 1))
+    left = functools.partial(schedule.seconds_left, per_step=0.001, step_s=0.1, plan=plan)
+    assert left(0.0) == pytest.approx(25 + 50 + 200)
+    assert left(0.3) == pytest.approx(20 + 100)
+    assert left(0.9) == pytest.approx(10)
+    assert left(1.0) == 0
+
+
+def test_a_session_says_what_is_left_of_its_steps_or_of_its_budget():
+    host = HostState(progress=0.5, pace=0.01, step_s=0.2, shrink=1, elapsed_s=10.0)
+    free = Session(Pace(0.01), host, finish_s=0.0, full_step_s=0.2)
+    assert free.left(host, ((1.0, 1),)) == pytest.approx(10.0)
+    bound = Session(Pace(0.01, deadline_s=40.0), host, finish_s=0.0, full_step_s=0.2)
+    assert bound.left(host, ((1.0, 1),)) == pytest.approx(30.0)
+    assert free.left(HostState(pace=0.01), ((1.0, 1),)) is None
