@@ -34,7 +34,8 @@ def run_jobs(
         jobs: of different names.
         engine: from `open_engine`.
         folder: for job files, progress and output of the jobs; seen by all machines.
-        on_end: called with the number of a job that has ended, in this thread.
+        on_end: called with the number of a job that has ended, in this thread; once more where a
+            signal came into the call.
         on_look: called with all states, twice a second.
 
     Raises:
@@ -45,52 +46,69 @@ def run_jobs(
     folder.mkdir(parents=True, exist_ok=True)
     (folder / STOP).unlink(missing_ok=True)
     watched = [_Watched(job, write_job(folder, job)) for job in jobs]
-    pending: dict[Future, int] = {}
+
+    def pending() -> dict[Future, int]:
+        return {one.future: n for n, one in enumerate(watched) if one.future is not None}
+
+    def tell(number: int) -> None:
+        on_end(number, watched[number].state)
+        watched[number].future = None
+
     try:
-        for number, one in enumerate(watched):
-            pending[one.begin(engine)] = number
-        while pending:
-            ended, _ = wait(pending, timeout=LOOK_S, return_when=FIRST_COMPLETED)
+        for one in watched:
+            one.begin(engine)
+        while waited := pending():
+            ended, _ = wait(waited, timeout=LOOK_S, return_when=FIRST_COMPLETED)
             for future in ended:
-                number = pending.pop(future)
-                again = watched[number].end(future, engine)
-                if again is not None:
-                    pending[again] = number
-                else:
-                    on_end(number, watched[number].state)
-            for number in pending.values():
+                if watched[waited[future]].end(engine):
+                    tell(waited[future])
+            for number in pending().values():
                 watched[number].look()
             on_look([one.state for one in watched])
     except KeyboardInterrupt:
+        # Whatever the signal came into: what was handed over and not told yet is waited for.
         (folder / STOP).touch()
-        wait(pending)
-        for future, number in pending.items():
-            watched[number].end(future, None)
-            on_end(number, watched[number].state)
+        waited = pending()
+        wait(waited)
+        for number in waited.values():
+            watched[number].end(None)
+            tell(number)
         raise
     return [one.state for one in watched]
 
 
 class _Watched:
-    """A job that was handed to an engine."""
+    """A job that was handed to an engine.
+
+    Attributes:
+        state: how far it is.
+        future: what the engine gave for it; None before, and once its end was told.
+    """
 
     def __init__(self, job: Job, files: JobFiles):
         self.job, self.files = job, files
         self.state = JobState(job.name)
+        self.future: Future | None = None
         self._since: float | None = None
 
-    def begin(self, engine: Executor) -> Future:
+    def begin(self, engine: Executor) -> None:
+        """Hand the job over."""
         self.state.begun += 1
         self.state.doing, self.state.progress = "", None
         self.files.progress.unlink(missing_ok=True)
-        return engine.submit(run_in_process, str(self.files.path))
+        self.future = engine.submit(run_in_process, str(self.files.path))
 
-    def end(self, future: Future, engine: Executor | None) -> Future | None:
-        """Note how the job ended; or begin it again, and return that."""
+    def end(self, engine: Executor | None) -> bool:
+        """Note how the job ended, or begin it again; return whether it ended.
+
+        Args:
+            engine: takes it again where its worker was lost; None: nothing begins any more.
+        """
+        assert self.future is not None
         self.look()
         state = self.state
         try:
-            state.status, state.reason = future.result()
+            state.status, state.reason = self.future.result()
         except (Exception, asyncio.CancelledError) as error:
             state.status = "lost" if is_lost(error) else "failed"
             state.reason = f"{type(error).__name__}: {error}"
@@ -99,7 +117,8 @@ class _Watched:
         elif state.status == "lost" and state.begun < MOST_BEGUN:
             state.status = "waiting"
             try:
-                return self.begin(engine)
+                self.begin(engine)
+                return False
             except Exception as gone:  # the engine itself ended
                 state.status = "failed"
                 state.reason = f"{state.reason}; the engine takes no more jobs ({gone})"
@@ -109,7 +128,7 @@ class _Watched:
         if state.status == "failed" and not (self.job.folder / REASON).exists():
             self.job.folder.mkdir(parents=True, exist_ok=True)
             write_json(self.job.folder / REASON, {"reason": state.reason})
-        return None
+        return True
 
     def look(self) -> None:
         """Read how far the job is."""

@@ -108,6 +108,23 @@ def test_what_is_stopped_ends_and_the_same_call_goes_on(tmp_path):
     assert [s.status for s in states] == ["done", "done"]
 
 
+def test_a_job_whose_end_was_being_told_as_the_signal_came_is_told(tmp_path):
+    (job,) = jobs_of(tmp_path, one={})
+    told = []
+
+    def interrupted_once(number, state):
+        told.append(state.status)
+        if len(told) == 1:
+            raise KeyboardInterrupt
+
+    with (
+        pytest.raises(KeyboardInterrupt),
+        open_engine("local", 1, tmp_path) as engine,
+    ):
+        run_jobs([job], engine, tmp_path / "jobs", on_end=interrupted_once)
+    assert told == ["done", "done"]
+
+
 def test_a_job_ends_with_whoever_waits_for_it(tmp_path):
     (job,) = jobs_of(tmp_path, orphan={"first": "wait"})
     files = write_job(tmp_path / "jobs", job)
