@@ -34,6 +34,8 @@ def main() -> None:
             "psnr": test["averaged"]["psnr"],
             "psnr_exposure_fitted": test["exposure_fitted"]["psnr"],
         }
+        if "photometry_fitted" in test:
+            figures["psnr_photometry_fitted"] = test["photometry_fitted"]["psnr"]
         return {"figures": figures, **of_fit(metrics, f"p2gs-jax fit FOX {' '.join(options)}")}
 
     wanted = [Key("nerf_fox", "fox", m, s) for s in args.steps for m in args.methods]
