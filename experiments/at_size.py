@@ -19,7 +19,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent / "published"))
 
-from published_rows import Key, fitted, measure, of_fit, read_rows
+from published_rows import Key, fitted, measure, of_fit, read_rows, shown_seconds
 from towns import METHODS, STD_NAMES, WITH_EXPOSURES, Options, Protocol, number, scene, table
 
 from p2gs_jax.core.atomic import write_text
@@ -81,7 +81,7 @@ def to_markdown(rows: Mapping[Key, Mapping[str, Any]]) -> str:
         [
             *(NAMES[key.method], key.scene),
             *(number(row["figures"].get(name, float("nan")), d) for _, name, d in COLUMNS),
-            *(str(row["gaussians"]), str(row["seconds"]), row["commit"]),
+            *(str(row["gaussians"]), shown_seconds(row), row["commit"]),
         ]
         for key, row in sorted(rows.items(), key=lambda item: place(item[0]))
     ]

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import datetime
 import json
+import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -68,10 +69,17 @@ def of_fit(metrics: dict[str, Any], command: str) -> dict[str, Any]:
         "gaussians": metrics["counts"]["gaussians"],
         "seconds": round(around + seconds["optimisation"]),
         "seconds_of_steps": round(seconds["optimisation"]),
+        "cores": len(os.sched_getaffinity(0)),
         "date": datetime.date.today().isoformat(),
         "commit": commit(),
         "command": command,
     }
+
+
+def shown_seconds(row: Mapping[str, Any]) -> str:
+    """Return a row's seconds as a cell says them; a row without cores had two."""
+    alone = " on one core" if row.get("cores", 2) == 1 else ""
+    return f"{row['seconds']}{alone}"
 
 
 def fitted(scene: Path, run: Path, options: Sequence[str]) -> dict[str, Any]:

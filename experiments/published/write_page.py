@@ -9,7 +9,7 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from published_rows import HERE, Key, read_rows
+from published_rows import HERE, Key, read_rows, shown_seconds
 
 from p2gs_jax.core.atomic import write_text
 
@@ -80,7 +80,7 @@ def _cells(key: Key, row: Mapping[str, Any], benchmark: Mapping[str, Any]) -> li
         beside = ", ".join(f"{found[compared] - value:+.2f}" for value in known)
     return [
         *(key.scene, key.method, str(key.steps), *cells, beside),
-        *(str(row["gaussians"]), str(row["seconds"]), row["commit"], f"`{row['command']}`"),
+        *(str(row["gaussians"]), shown_seconds(row), row["commit"], f"`{row['command']}`"),
     ]
 
 
