@@ -75,7 +75,8 @@ class StepPrograms:
         self, step: Step | MeshStep, key: Key, arguments, images: bool = True
     ) -> list[Future]:
         """Return the programs of a step in their order, those yet unknown on their way."""
-        rows = min(key.room.visible, key.slots)
+        visible_only = step.settings("show")["visible_only"]
+        rows = min(key.room.visible, key.slots) if visible_only else key.slots
         of_gaussians = (key.slots, rows, key.degree)
         shapes = {
             "show": of_gaussians,

@@ -70,6 +70,13 @@ def test_a_larger_population_keeps_the_program_of_the_image(programs):
     assert sorted(step.made) == ["advance", "advance", "differentiate", "show", "show"]
 
 
+def test_a_larger_population_that_every_view_shows_needs_another(programs):
+    step = Traced(under(visible_only=False))
+    for slots in (5000, 9000):
+        programs.get(step, COARSE._replace(slots=slots), *SHAPES)
+    assert step.made.count("differentiate") == 2
+
+
 @pytest.mark.parametrize(
     ("change", "again"),
     [
