@@ -44,19 +44,23 @@ COLUMNS = (
     ("ISO 8, novel, dB", "iso_8_novel", 2),
     ("ISO 8, novel, SSIM", "iso_8_novel_ssim", 3),
     ("EV error", "ev", 4),
+    ("radiance, novel, mu law, dB", "mu_law_novel", 2),
 )
 HEAD = """Photographs: under the mean exposure and gamma of the training views, as in the paper.
 ISO 8: against photographs of the same views at one exposure without noise, one scale for all.
+Radiance: against the true one as GaussHDR judges it (mu = 5000), one scale for all; methods that
+splat display values have none.
 
 """
 
 
-def figures(metrics: Mapping[str, Any], ev: float | None) -> dict[str, float]:
+def figures(metrics: Mapping[str, Any], ev: float | None, linear: bool) -> dict[str, float]:
     """Return a row's figures.
 
     Args:
         metrics: as `metrics.json`.
-        ev: RMS error of the exposures, stops; None where the method has none.
+        ev: RMS error of the exposures, stops; None where the method or the photographs have none.
+        linear: the method has linear radiance.
     """
     iso_8 = metrics["reference"]["scale_aligned"]
     found = {
@@ -66,7 +70,11 @@ def figures(metrics: Mapping[str, Any], ev: float | None) -> dict[str, float]:
         "iso_8_novel": iso_8["test"]["psnr"],
         "iso_8_novel_ssim": iso_8["test"]["ssim"],
     }
-    return found if ev is None else {**found, "ev": ev}
+    if ev is not None:
+        found["ev"] = ev
+    if linear:
+        found["mu_law_novel"] = metrics["radiance"]["test"]["mu_law_psnr"]
+    return found
 
 
 def to_markdown(rows: Mapping[Key, Mapping[str, Any]]) -> str:
@@ -105,8 +113,8 @@ def main() -> None:
         said = ("--preset", key.method, "--steps", str(key.steps))
         run = options.folder / street.name / key.method
         metrics = fitted(street, run, (*said, "--reference", str(street / "reference")))
-        known = std != 0 and NAMES[key.method] in WITH_EXPOSURES
-        found = figures(metrics, read_row(run, street)["ev"] if known else None)
+        linear = NAMES[key.method] in WITH_EXPOSURES
+        found = figures(metrics, read_row(run, street)["ev"] if linear and std else None, linear)
         command = f"{options.command} --methods {key.method} --stds {std:g} --steps {key.steps}"
         return {"figures": found, **of_fit(metrics, command)}
 

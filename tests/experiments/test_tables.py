@@ -133,10 +133,15 @@ def test_wrong_options_end_with_two(argv, monkeypatch):
 def test_rows_at_size_are_sorted_and_exposures_are_only_said_where_there_are_some():
     key = at_size.Key(at_size.BENCHMARK, "ISO std 4", "3dgs", 7000)
     rest = {"gaussians": 1000, "seconds": 60, "commit": "abc"}
+    radiance = {"radiance": {"test": {"mu_law_psnr": 31.0}}}
+
+    def row(level, ev, linear):
+        return {"figures": at_size.figures(metrics(level, **radiance), ev, linear), **rest}
+
     rows = {
-        key: {"figures": at_size.figures(metrics(20.0), None), **rest},
-        key._replace(method="robust"): {"figures": at_size.figures(metrics(25.0), 0.01), **rest},
-        key._replace(scene="ISO-Const"): {"figures": at_size.figures(metrics(22.0), None), **rest},
+        key: row(20.0, None, False),
+        key._replace(method="robust"): row(25.0, 0.01, True),
+        key._replace(scene="ISO-Const"): row(22.0, None, False),
     }
     lines = [line for line in at_size.to_markdown(rows).splitlines() if line.startswith("| ")]
     assert [line.split(" | ")[:2] for line in lines[1:]] == [
@@ -144,6 +149,8 @@ def test_rows_at_size_are_sorted_and_exposures_are_only_said_where_there_are_som
         ["| 3DGS", "ISO-Const"],
         ["| 3DGS", "ISO std 4"],
     ]
-    assert "| 25.00 | 24.00 | 25.00 | 24.00 | 0.800 | 0.0100 | 1000 | 60 | abc |" in lines[1]
-    assert "| n/a | 1000 |" in lines[2]
+    assert (
+        "| 25.00 | 24.00 | 25.00 | 24.00 | 0.800 | 0.0100 | 31.00 | 1000 | 60 | abc |" in lines[1]
+    )
+    assert "| n/a | n/a | 1000 |" in lines[2]
     assert set(at_size.ORDER) <= set(at_size.NAMES)
