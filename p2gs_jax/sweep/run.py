@@ -64,7 +64,7 @@ def sweep(
         configs: by name.
         seeds: each replaces `train.seed`.
         reference: see `fit`.
-        max_parallel: processes at a time; one uses all cores.
+        max_parallel: processes at a time; steps of one hardly use more than one core (BUILD_NOTES).
         engine: where they run (`jobs.engines.open_engine`): local, dask://HOST:PORT or slurm.
         report: receives a line per run.
         on_look: receives how far the unfinished runs are, twice a second.
