@@ -11,9 +11,11 @@ HERE = Path(__file__).parent
 def commit() -> str:
     """Return the short commit of this checkout, "unknown" without git, and whether files differ.
 
-    Kept figures (`experiments/**.json`) differ with every figure, and do not count.
+    Kept figures (`experiments/**.json`) and the pages written from them differ with every figure,
+    and do not count.
     """
-    changed = _git("status", "--porcelain", "-uno", "--", ":/", ":(top,exclude)experiments/**.json")
+    kept = [f":(top,exclude)experiments/**.{suffix}" for suffix in ("json", "md")]
+    changed = _git("status", "--porcelain", "-uno", "--", ":/", *kept)
     return (_git("rev-parse", "--short", "HEAD") or "unknown") + (" and changes" if changed else "")
 
 
