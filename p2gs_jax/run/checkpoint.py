@@ -96,9 +96,10 @@ class CheckpointStore:
     """The checkpoints of one run.
 
     Args:
-        folder: where they lie. One run writes to it at a time: opening the store removes what an
-            interrupted save left behind. Of a fit in several processes all call all methods, each
-            writes its part and reads everything.
+        folder: where they lie. One run writes to it at a time: what an interrupted save left
+            behind is removed in the background when the store opens, at the latest by the next
+            save. Of a fit in several processes all call all methods, each writes its part and
+            reads everything.
         keep: how many.
     """
 
