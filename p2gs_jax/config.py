@@ -135,8 +135,9 @@ class RenderConfig:
     """Activation from spherical harmonics to radiance; `linear` is 3DGS's max(0, sh + 1/2)."""
     near: float = 0.05
     """Near plane, scene units; nearer in scenes that it would cut (ours: pipeline/scale.py)."""
-    blur: float = 0.3
-    """Variance added to the 2D covariance, pixels^2 (3DGS: 0.3)."""
+    blur: float = 0.05
+    """Variance added to the 2D covariance, pixels^2 (3DGS: 0.3; Mip-Splatting's filter: 0.1; ours:
+    BUILD_NOTES, "Blur")."""
     tile: tuple[int, int] = (16, 8)
     """Tile width and height in pixels (ours: docs/kernel.md)."""
     chunk: int = 16
@@ -534,7 +535,7 @@ def _paper(exposure_weight: float, name: PresetName) -> FitConfig:
     """Return the method exactly as printed; BUILD_NOTES.md says what it does."""
     return FitConfig(
         preset=name,
-        render=RenderConfig(radiance="linear"),
+        render=RenderConfig(radiance="linear", blur=0.3),
         photometry=PhotometryConfig(
             select=False,
             curve="power",

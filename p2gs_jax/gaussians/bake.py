@@ -34,6 +34,8 @@ from p2gs_jax.types import Camera, Gaussians, Render
 DIRECTIONS = 64
 # Gaussians per block; the last block is padded, so that one program fits all.
 CHUNK = 8192
+# Variance that viewers add to the 2D covariance, pixels^2, as 3DGS does.
+VIEWER_BLUR = 0.3
 # Adam's rates per step for colours of degree 0, of the others, and for opacity logits; they decay
 # to a tenth. Measured on two runs (BUILD_NOTES, "Display PLY").
 COLOR_RATE, BANDS_RATE, OPACITY_RATE, DECAY = 0.05, 0.0025, 0.3, 0.1
@@ -162,7 +164,7 @@ _basis = jax.jit(basis, static_argnums=1)
 
 def viewer_config(cfg: RenderConfig) -> RenderConfig:
     """Return the options of an ordinary 3DGS viewer: display colours max(0, sh + 1/2)."""
-    return replace(cfg, radiance="linear", cutoff_rule="opacity")
+    return replace(cfg, radiance="linear", cutoff_rule="opacity", blur=VIEWER_BLUR)
 
 
 class _Trainable(NamedTuple):
