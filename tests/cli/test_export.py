@@ -124,7 +124,7 @@ def test_the_baking_error_is_written_and_true(exported):
     index = fitted.scene.train_indices[1]
     camera = camera_of(ImageStore(fitted.scene.views, fitted.cfg.data), index)
     linear = make_renderer(fitted.cfg.render)(fitted.params.gaussians, fitted.alive, camera).linear
-    viewer = make_renderer(replace(fitted.cfg.render, radiance="linear"))
+    viewer = make_renderer(replace(fitted.cfg.render, radiance="linear", blur=0.3))
     shown = np.clip(viewer(read_ply(out / "display.ply"), fitted.alive, camera).linear, 0, 1)
     difference = 255 * (shown - develop(linear, fitted.common_display()))
     found = said["baking_error"]["train"]["per_view"][fitted.scene.views[index].name]
