@@ -20,7 +20,8 @@ Written by `python experiments/published/write_page.py` from [rows.json](publish
 [published.json](published/published.json): each figure beside the published one, with the command,
 the seconds of the whole fit, and the commit. Scripts, and what is not run here:
 [published](published/README.md). A row is one run and one seed. Machine: that of
-[results](results/README.md).
+[results](results/README.md). Rows of commits before 057bc06 (2026-11-25) are of splats blurred by
+.3 pixels^2, as 3DGS does: `--render.blur 0.3` makes them again, the default is .05 since.
 """
 NOT_RUN = "Not run yet."
 
