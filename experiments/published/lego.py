@@ -16,11 +16,18 @@ from typing import Any
 
 from published_rows import Key, fitted, measure, of_fit
 
-# Of each method its options; the presets densify by `mcmc`.
+BLUR = ("--render.blur", "0.3")
+# Of each method its options; `3dgs` and `robust` densify by `mcmc`.
 METHODS = {
-    "3dgs, adaptive densification": ("--preset", "3dgs", "--densify.method", "adaptive"),
+    "3dgs_published": ("--preset", "3dgs_published"),
     "3dgs": ("--preset", "3dgs"),
     "robust": ("--preset", "robust"),
+    "3dgs, blur of 3DGS": ("--preset", "3dgs", *BLUR),
+    "robust, blur of 3DGS": ("--preset", "robust", *BLUR),
+    "3dgs, adaptive, blur of 3DGS": (
+        *("--preset", "3dgs", "--densify.method", "adaptive"),
+        *BLUR,
+    ),
 }
 STEPS = (7_000, 30_000)
 

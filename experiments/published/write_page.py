@@ -20,8 +20,9 @@ Written by `python experiments/published/write_page.py` from [rows.json](publish
 [published.json](published/published.json): each figure beside the published one, with the command,
 the seconds of the whole fit, and the commit. Scripts, and what is not run here:
 [published](published/README.md). A row is one run and one seed. Machine: that of
-[results](results/README.md). Rows of commits before 057bc06 (2026-11-25) are of splats blurred by
-.3 pixels^2, as 3DGS does: `--render.blur 0.3` makes them again, the default is .05 since.
+[results](results/README.md). Splats are blurred by .05 pixels^2 where nothing is said. Until
+057bc06 (2026-11-25) .3, the blur of 3DGS, was the default: rows of LOM and nerf_fox from before
+need `--render.blur 0.3` to be made again; those of lego name it.
 """
 NOT_RUN = "Not run yet."
 

@@ -25,8 +25,8 @@ class Demo:
     out: Path = Path("runs/demo")
     """Folder for the street and the run."""
     preset: Annotated[str, tyro.conf.arg(metavar="NAME")] = "robust"
-    """A preset of `fit`: robust, paper, paper_appendix, 3dgs, 3dgs_gain, 3dgs_affine,
-    3dgs_bilateral, 3dgs_curve, luminance_gs, ppisp or ppisp_solved."""
+    """A preset of `fit`: robust, paper, paper_appendix, 3dgs, 3dgs_published, 3dgs_gain,
+    3dgs_affine, 3dgs_bilateral, 3dgs_curve, luminance_gs, ppisp or ppisp_solved."""
     budget: Annotated[str, tyro.conf.arg(metavar="TIME")] = "125s"
     """Wall-clock limit of the fit: 90s, 20m or 1h30m."""
     frames: int = 10

@@ -54,8 +54,8 @@ class Fit:
     """Continue an interrupted run; give the options it was started with."""
     preset: Preset = "robust"
     """Where all values start: robust; the method as printed, paper or paper_appendix; baselines
-    3dgs, 3dgs_gain, 3dgs_affine, 3dgs_bilateral, 3dgs_curve, luminance_gs or ppisp; or
-    ppisp_solved."""
+    3dgs (3dgs_published: as printed, 30000 steps), 3dgs_gain, 3dgs_affine, 3dgs_bilateral,
+    3dgs_curve, luminance_gs or ppisp; or ppisp_solved."""
     steps: int | None = None
     """Optimisation steps, one view each; default: the preset's (robust 2000, paper 30000)."""
     gaussians: Count = None
