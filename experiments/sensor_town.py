@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -97,13 +97,19 @@ class AtIso8(NamedTuple):
     pictures: dict[int, tuple[np.ndarray, np.ndarray]]
 
 
-def at_iso_8(run: p2gs_jax.Run) -> AtIso8:
-    """Show held-out views as photographs at ISO 8 and compare."""
+def at_iso_8(run: p2gs_jax.Run, views: Sequence[int] | None = None) -> AtIso8:
+    """Show held-out views as photographs at ISO 8 and compare.
+
+    Args:
+        run: the fit.
+        views: rows of the held-out views that are taken; all by default.
+    """
     scene = run.scene
+    held = scene.test_indices if views is None else views
     display = common_display(run, range(len(scene.train_indices)))
     reference = load_reference(scene.root / "reference", scene, run.cfg)
     shown, targets, masks = [], [], []
-    for index in scene.test_indices:
+    for index in held:
         target = reference(index)
         assert target is not None
         shown.append(
@@ -118,7 +124,7 @@ def at_iso_8(run: p2gs_jax.Run) -> AtIso8:
 
     found = pictures(_fitted_factors(pictures, targets, masks))
     scores = [float(psnr(*three)) for three in zip(found, targets, masks, strict=True)]
-    pairs = zip(scene.test_indices, zip(found, targets, strict=True), strict=True)
+    pairs = zip(held, zip(found, targets, strict=True), strict=True)
     return AtIso8(run, float(np.mean(scores)), dict(pairs))
 
 
