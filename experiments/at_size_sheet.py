@@ -83,7 +83,9 @@ def _cut(image: np.ndarray, detail: Detail) -> np.ndarray:
 
 def _as_jpeg(png: Path, path: Path) -> None:
     """Replace a PNG file by a JPEG one."""
-    _, data = cv2.imencode(".jpg", cv2.imread(str(png)), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    picture = cv2.imread(str(png))
+    assert picture is not None, png
+    _, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     with atomic_write(path) as file:
         file.write_bytes(data.tobytes())
     png.unlink()
