@@ -21,6 +21,8 @@ from towns import Options, scene
 import p2gs_jax
 from p2gs_jax.core.atomic import atomic_write
 
+# What fits under a cut.
+SHORT = {"3dgs_bilateral": "3DGS + grid"}
 METHODS = ("robust", "3dgs_curve", "3dgs_affine", "ppisp", "3dgs_bilateral", "3dgs")
 
 
@@ -64,8 +66,8 @@ def main() -> None:
             shown, target = pictures[rows[detail.view]]
             if not columns[detail]:
                 photograph = np.asarray(run.photograph(rows[detail.view]))
-                columns[detail] = [("as photographed", photograph), ("at ISO 8", target)]
-            columns[detail].append((NAMES[method], shown))
+                columns[detail] = [("photograph", photograph), ("at ISO 8", target)]
+            columns[detail].append((SHORT.get(method, NAMES[method]), shown))
     contact = [
         (f"{detail.view}, held out", [(text, _cut(image, detail)) for text, image in cells])
         for detail, cells in columns.items()
