@@ -333,11 +333,6 @@ class OptimizerConfig:
     """Raw gammas (ours: likewise)."""
     appearance: float = 1e-2
     """Corrections of display values (3DGS's exposure compensation starts at 1e-2)."""
-    appearance_views: float | None = None
-    """Of how many training views that rate is; of more, what each view has of its own takes the
-    rate times the root of the ratio: Adam divides the gradient that a view gives in one step of
-    many by its root mean square over all, so a visit moves it by the root of their number. None:
-    whatever their number (ours: BUILD_NOTES, "Learned corrections at size")."""
     appearance_final: float = 0.1
     """They decay exponentially to this fraction (3DGS: 0.1)."""
     appearance_warmup: float = 0.0
@@ -531,8 +526,6 @@ class FitConfig:
 # Of PPISP's parameters. Published: 2e-3 over 30,000 steps; ours: for fits of some hundred to some
 # thousand (BUILD_NOTES, "PPISP").
 PPISP_RATE = 1e-1
-# Training views of the scenes on which rates of learned corrections were chosen.
-FEW_VIEWS = 25.0
 
 
 def _robust() -> FitConfig:
@@ -632,17 +625,6 @@ def _published_3dgs() -> FitConfig:
     )
 
 
-def _affine() -> FitConfig:
-    """Return 3DGS with a colour matrix per view, whose rate ends lower than published (ours)."""
-    base = _ldr("3dgs_affine", appearance="affine")
-    return dataclasses.replace(
-        base,
-        optimizer=dataclasses.replace(
-            base.optimizer, appearance_final=0.01, appearance_views=FEW_VIEWS
-        ),
-    )
-
-
 def _ppisp() -> FitConfig:
     """Return PPISP without its controller, under the schedule, renderer and budget of `robust`."""
     base = _ldr("ppisp", appearance="ppisp", rate=PPISP_RATE)
@@ -652,10 +634,7 @@ def _ppisp() -> FitConfig:
             base.loss, regularizers=dataclasses.replace(base.loss.regularizers, appearance=1.0)
         ),
         optimizer=dataclasses.replace(
-            base.optimizer,
-            appearance_final=0.01,
-            appearance_views=FEW_VIEWS,
-            appearance_warmup=500 / 30_000,
+            base.optimizer, appearance_final=0.01, appearance_warmup=500 / 30_000
         ),
     )
 
@@ -708,7 +687,7 @@ def preset(name: PresetName) -> FitConfig:
         "3dgs": lambda: _ldr("3dgs"),
         "3dgs_published": _published_3dgs,
         "3dgs_gain": lambda: _ldr("3dgs_gain", gain=True),
-        "3dgs_affine": _affine,
+        "3dgs_affine": lambda: _ldr("3dgs_affine", appearance="affine"),
         "3dgs_bilateral": lambda: _ldr("3dgs_bilateral", appearance="bilateral", rate=2e-3),
         "3dgs_curve": lambda: _ldr("3dgs_curve", appearance="curve"),
         "ppisp": _ppisp,

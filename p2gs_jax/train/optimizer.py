@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import math
 from typing import Any, NamedTuple
 
 import jax
@@ -19,10 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.gaussians.population import grow
-from p2gs_jax.photometry.appearance import Corrections
-from p2gs_jax.photometry.luminance.parameters import Luminance
 from p2gs_jax.photometry.models import MODELS
-from p2gs_jax.photometry.ppisp.parameters import Ppisp
 from p2gs_jax.types import Gaussians, Params, Photometry, Vibration
 
 # For exposures, gammas and corrections (Kingma and Ba).
@@ -211,23 +207,9 @@ def learning_rates(
             None if balance is None else o.exposures * gate * by_view,
             like.photometry.cameras,
         ),
-        appearance=_corrections_rates(progress, like.appearance, cfg),
+        appearance=jax.tree.map(lambda _: appearance_rate(progress, cfg), like.appearance),
         poses=None if like.poses is None else _pose_rates(cfg) * decay,
     )
-
-
-def _corrections_rates(
-    progress: Array, like: Corrections | None, cfg: FitConfig
-) -> Corrections | None:
-    """Return the rates of learned corrections; what each view has of its own, by their number."""
-    rate, usual = appearance_rate(progress, cfg), cfg.optimizer.appearance_views
-    rates: Any = jax.tree.map(lambda _: rate, like)
-    if like is None or usual is None or isinstance(like, Luminance):
-        return rates  # what enhances is learned by all views together
-    of_camera = isinstance(like, Ppisp)
-    views = like.exposures.shape[0] if of_camera else like.shape[0]
-    own = rate * math.sqrt(min(1.0, usual / views))
-    return dataclasses.replace(rates, exposures=own, colors=own) if of_camera else own
 
 
 def _pose_rates(cfg: FitConfig) -> Float[Array, " 6"]:
