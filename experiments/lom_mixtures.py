@@ -38,8 +38,6 @@ from p2gs_jax.evaluate.references import load_reference
 METHODS = ("robust", "ppisp", "ppisp_solved", "3dgs", "3dgs_affine", "3dgs_bilateral")
 # Contact sheet: methods shown between the photograph and the reference, and held-out views.
 SHOWN, SHEET_ROWS = ("robust", "3dgs_affine"), 3
-# Scores of held-out views that fit the exposure alone, or nothing.
-NOT_ALL = frozenset({"averaged", "exposure_fitted"})
 
 
 # ------------------------------------------------------------------ the common exposure
@@ -123,12 +121,11 @@ def measure(
     def judge(method: str, run: p2gs_jax.Run, metrics: dict[str, Any]) -> dict[str, Any]:
         common = shown[method] = under_common_exposure(run, groups)
         test = metrics["test"]
-        all_fitted = [v["psnr"] for k, v in test.items() if k not in NOT_ALL and "psnr" in v]
         return {
             "spread_ev": spreads(run, groups),
             "own_exposure": test["exposure_fitted"]["psnr"],
-            # The protocol that fits most comes last.
-            "own_all": all_fitted[-1] if all_fitted else test["exposure_fitted"]["psnr"],
+            # There where a view has more than an exposure.
+            "own_all": test.get("photometry_fitted", test["exposure_fitted"])["psnr"],
             "common": common.psnr,
             "steps": metrics["counts"]["steps"],
             "seconds": metrics["seconds"]["optimisation"],
