@@ -26,7 +26,7 @@ class CaptionedImage:
         title: above it.
         image: display values.
         captions: (text, first column, end column), written below those columns with a tick at
-            each inner edge.
+            each inner edge, and shortened where it is wider than they are.
     """
 
     title: str
@@ -41,6 +41,14 @@ def _font(width: int) -> ImageFont.FreeTypeFont:
 
 def _line(width: int) -> int:
     return round(1.7 * _font(width).size)
+
+
+def _shortened(text: str, width: int, font: ImageFont.FreeTypeFont) -> str:
+    """Return the text, or as much of its beginning as fits before an ellipsis."""
+    if font.getlength(text) <= width:
+        return text
+    fits = (n for n in range(len(text) - 1, 0, -1) if font.getlength(f"{text[:n]}…") <= width)
+    return next((f"{text[:n]}…" for n in fits), "")
 
 
 def stacked_size(width: int, heights: Sequence[int], captions: int) -> tuple[int, int]:
@@ -65,8 +73,7 @@ def stacked(rows: Sequence[CaptionedImage]) -> Float32[np.ndarray, "h w 3"]:
         for text, start, end in row.captions:
             if end < width:
                 draw.line([(end, top), (end, top + line / 2)], INK, max(1, line // 16))
-            if draw.textlength(text, font) <= end - start:
-                place = ((start + end) / 2, top + line / 2)
-                draw.text(place, text, FAINT, font, anchor="mm")
+            place = ((start + end) / 2, top + line / 2)
+            draw.text(place, _shortened(text, end - start, font), FAINT, font, anchor="mm")
         top += line if row.captions else 0
     return np.asarray(sheet, np.float32) / 255

@@ -25,9 +25,14 @@ def test_images_come_through_between_lines_of_text():
     assert (sheet[41 + 3 * line : tops[2]] == 1).all()  # no title, no ink
 
 
-def test_captions_that_do_not_fit_are_left_out():
-    image = np.zeros((10, 300, 3))
-    captions = [("a caption that is much too long for it", 0, 20), ("", 20, 300)]
-    sheet = stacked([CaptionedImage("", image, captions)])
-    without = stacked([CaptionedImage("", image, [("", 0, 20), ("", 20, 300)])])
-    np.testing.assert_array_equal(sheet, without)
+def test_captions_that_do_not_fit_are_shortened():
+    def under(text, end):
+        row = CaptionedImage("", np.zeros((10, 300, 3)), [(text, 0, end)])
+        return stacked([row])[10:, :].min(axis=2) < 0.9
+
+    long = "a caption that is much too long for it"
+    ink = under(long, 100)[-10:, :98]  # without the tick
+    assert ink.any()
+    assert not ink[:, :2].any()  # no ink beyond either edge
+    np.testing.assert_array_equal(under(long, 4), under("", 4))  # not even an ellipsis fits
+    assert under(long, 300).sum() > ink.sum()
