@@ -7,6 +7,7 @@ the radiance that its pictures show under the run's usual display.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -15,14 +16,14 @@ import jax
 import numpy as np
 
 from p2gs_jax.config import FitConfig
-from p2gs_jax.evaluate.alignment import with_fitted_exposure
 from p2gs_jax.evaluate.drives import is_drive, masks_of_parts
+from p2gs_jax.evaluate.light_of_renders import Light, light_of
 from p2gs_jax.evaluate.lpips import LpipsWeights
 from p2gs_jax.evaluate.moving import still_mask
 from p2gs_jax.evaluate.parallel import map_in_order
 from p2gs_jax.evaluate.renders_of_others import OtherRenders, in_order, orders
 from p2gs_jax.evaluate.view_scores import Collector, view_scores
-from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
+from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.photometry.mean import mean_parameters, usual_display
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Params, Scene
@@ -70,7 +71,7 @@ def check_renders(found: OtherRenders, scene: Scene, store: ImageStore) -> Other
         UserError: see `OtherRenders.read`.
     """
     for row in found.files:
-        found.read(row, _size(store, row))
+        found.read(row, _size(store, row), over=store.backdrop is not None)
     possible = orders(scene) if found.numbered else []
     if len(possible) < 2:
         return found
@@ -95,7 +96,7 @@ def _size(store: ImageStore, row: int) -> tuple[int, int]:
 def _distance(found: OtherRenders, row: int, store: ImageStore) -> float:
     """Return the mean squared distance of a render from a photograph."""
     photograph, mask = store.get(row)
-    pixels, _ = found.read(row, _size(store, row))
+    pixels = found.read(row, _size(store, row)).pixels
     return float(np.mean(mask[..., None] * (pixels - photograph) ** 2))
 
 
@@ -124,32 +125,24 @@ def judge_renders(
     mean = mean_parameters(small.photometry)
     drive = is_drive(scene)
 
-    def light(row: int, shown: DisplayTransform):
-        """Return what was rendered: radiance, how it is shown, and the picture itself."""
-        pixels, linear = found.read(row, _size(store, row))
-        if linear:
+    def light(row: int, shown: DisplayTransform) -> Light:
+        rendered = found.read(row, _size(store, row), over=store.backdrop is not None)
+        if rendered.linear:
             shown = replace(shown, exposure=mean.exposure)
-            return pixels, shown, develop(pixels, shown)
-        # A correction of display values belongs to renders of this run.
-        shown = replace(shown, correction=None)
-        return undevelop(pixels, shown), shown, pixels
+        return light_of(rendered, shown, store, row)
 
     def judged(row: int) -> tuple[str, dict[str, Any], dict[str, Any]]:
         view = scene.views[row]
         photograph, mask = store.get(row)
         parts = masks_of_parts(scene, row, mask) if drive else None
         shown = usual_display(small, taken_by, view.camera, tone)
-        linear, shown, picture = light(row, shown)
-        fitted = with_fitted_exposure(shown, linear, photograph, still_mask(scene, row, mask))
+        rendered = light(row, shown)
+        fitted = rendered.fitted(photograph, still_mask(scene, row, mask))
+        score = functools.partial(view_scores, judge.lpips_weights, parts=parts)
         return (
             view.name,
-            view_scores(judge.lpips_weights, picture, photograph, mask, parts),
-            {
-                **view_scores(
-                    judge.lpips_weights, develop(linear, fitted), photograph, mask, parts
-                ),
-                "exposure": fitted.exposure,
-            },
+            score(rendered.picture, photograph, mask),
+            {**score(rendered.under(fitted), photograph, mask), "exposure": fitted.exposure},
         )
 
     as_rendered, exposure_fitted = Collector(), Collector()
@@ -169,28 +162,31 @@ def judge_renders(
     return scores
 
 
-def _against_reference(rows: Iterable[int], judge: Judge, light) -> dict[str, Any]:
+def _against_reference(
+    rows: Iterable[int], judge: Judge, light: Callable[[int], Light]
+) -> dict[str, Any]:
     """Score renders against photographs of one common exposure.
 
     Args:
         rows: of the views that have one.
         judge: by what.
-        light: row -> radiance, how it is shown, picture.
+        light: row -> what its render shows.
     """
     assert judge.reference is not None
     as_rendered, aligned = Collector(), Collector()
     exposures, rows = [], list(rows)
     for row in rows:
         target, mask = judge.reference(row), judge.store.get(row)[1]
-        linear, shown, picture = light(row)
-        exposures.append(with_fitted_exposure(shown, linear, target, mask).exposure)
-        plain = view_scores(judge.lpips_weights, picture, target, mask)
+        assert target is not None
+        rendered = light(row)
+        exposures.append(rendered.fitted(target, mask).exposure)
+        plain = view_scores(judge.lpips_weights, rendered.picture, target, mask)
         as_rendered.add(judge.scene.views[row].name, plain)
     common = float(np.exp(np.median(np.log(exposures))))
     for row in rows:
         target, mask = judge.reference(row), judge.store.get(row)[1]
-        linear, shown, _ = light(row)
-        ldr = develop(linear, replace(shown, exposure=common))
+        rendered = light(row)
+        ldr = rendered.under(replace(rendered.shown, exposure=common))
         aligned.add(
             judge.scene.views[row].name, view_scores(judge.lpips_weights, ldr, target, mask)
         )

@@ -99,7 +99,7 @@ def fit_exposure(
     def error(log2_exposure, stride=1):
         # What depends on the place counts in parts of the image, so fewer pixels are one as well.
         every = (slice(None, None, stride),) * 2
-        behind = None if matte is None else matte._replace(alpha=matte.alpha[every])
+        behind = None if matte is None else matte.every(stride)
         taken = dataclasses.replace(capture, exposure=jnp.exp2(log2_exposure))
         ldr = composited(display(formation(linear[every], taken, cfg, correction)), behind)
         squared = mask[every][..., None] * (ldr - photograph[every]) ** 2

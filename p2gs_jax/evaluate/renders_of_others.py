@@ -9,13 +9,14 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from jaxtyping import Float32
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.formats.exr import read_exr
+from p2gs_jax.formats.exr import read_exr_with_alpha
 from p2gs_jax.types import Scene
 
 # Display values come first: a program that writes both developed them itself.
@@ -26,6 +27,20 @@ PLACES = (".", "rgb", "test/rgb", "renders", "test/renders", "test")
 LUMINANCE_GS = re.compile(r"val_(\d+)_enh")
 # gsplat's trainer writes photograph and render side by side, in the order of held-out views.
 GSPLAT = re.compile(r"(?:val|test)_step(\d+)_(\d+)")
+
+
+class Rendered(NamedTuple):
+    """What a file holds.
+
+    Attributes:
+        pixels: display values in [0, 1], or linear radiance.
+        linear: which.
+        alpha: opacity, by which radiance is premultiplied; None: it has none.
+    """
+
+    pixels: Float32[np.ndarray, "h w 3"]
+    linear: bool
+    alpha: Float32[np.ndarray, "h w"] | None
 
 
 @dataclass(frozen=True)
@@ -70,19 +85,23 @@ class OtherRenders:
             )
         return tuple(said)
 
-    def read(self, row: int, size: tuple[int, int]) -> tuple[Float32[np.ndarray, "h w 3"], bool]:
-        """Return a render, and whether it is linear radiance; else display values in [0, 1].
+    def read(self, row: int, size: tuple[int, int], over: bool = False) -> Rendered:
+        """Return a render.
 
         Args:
             row: of the view.
             size: (width, height) that it must have.
+            over: it is to be put over a background: radiance must have an opacity.
 
         Raises:
             UserError: it cannot be read, has another size, or holds what is no colour.
         """
         path = self.files[row]
-        linear = path.suffix.lower() == ".exr"
-        pixels = read_exr(path)[0] if linear else _read_display(path)
+        linear, alpha = path.suffix.lower() == ".exr", None
+        if linear:
+            pixels, alpha, _ = read_exr_with_alpha(path)
+        else:
+            pixels = _read_display(path)
         height, width = pixels.shape[:2]
         if self.right_half and width == 2 * size[0]:
             pixels, width = pixels[:, size[0] :], size[0]
@@ -92,12 +111,18 @@ class OtherRenders:
                 fix="render it at the size that the run was fitted at, or fit the run at that of "
                 "the renders (--max-width)",
             )
+        if linear and over and alpha is None:
+            raise UserError(
+                f"{path} has no channel A, and the scene's photographs are shown over a "
+                "background.",
+                fix="write the opacity of the render as well, or pictures over that background",
+            )
         if not np.isfinite(pixels).all():
             bad = int((~np.isfinite(pixels)).any(-1).sum())
             raise UserError(
                 f"{path} has {bad} pixels that are infinite or no number.", fix="render it again"
             )
-        return pixels, linear
+        return Rendered(pixels, linear, alpha)
 
 
 def _read_display(path: Path) -> Float32[np.ndarray, "h w 3"]:

@@ -136,11 +136,24 @@ def read_exr(path: Path) -> tuple[Float32[np.ndarray, "h w 3"], dict]:
     Raises:
         UserError: the file cannot be read or has no R, G, B.
     """
+    linear, _, header = read_exr_with_alpha(path)
+    return linear, header
+
+
+def read_exr_with_alpha(
+    path: Path,
+) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"] | None, dict]:
+    """Return linear radiance, premultiplied by the opacity; that, or None; and the header.
+
+    Raises:
+        UserError: the file cannot be read or has no R, G, B.
+    """
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             channels = file.channels()
             linear = np.stack([channels[c].pixels for c in "RGB"], -1).astype(np.float32)
-            return linear, dict(file.header())
+            alpha = channels["A"].pixels.astype(np.float32) if "A" in channels else None
+            return linear, alpha, dict(file.header())
     except (RuntimeError, KeyError, OSError, ValueError) as error:
         raise UserError(
             f"{path} is no readable RGB OpenEXR file: {error}.",

@@ -36,7 +36,8 @@ class DisplayTransform:
         correction: of display values (photometry/appearance.py), or None.
         white_balance: log factors on red, green, blue beside the exposure; None: all 1.
         camera: row in `formation.cameras`, whose vignetting and response it has; None: no camera's.
-        backdrop: display values that pictures are put over, after all else; None: nothing.
+        backdrop: display values that pictures are put over, after all else: of all pixels or of
+            each; None: nothing.
     """
 
     exposure: float
@@ -45,7 +46,7 @@ class DisplayTransform:
     correction: Correction | None = None
     white_balance: tuple[float, float, float] | None = None
     camera: int | None = None
-    backdrop: tuple[float, float, float] | None = None
+    backdrop: tuple[float, float, float] | Float32[np.ndarray, "h w 3"] | None = None
 
     @property
     def capture(self) -> Capture:

@@ -25,11 +25,17 @@ class Matte(NamedTuple):
 
     Attributes:
         alpha: opacity of the render.
-        backdrop: display values of red, green, blue.
+        backdrop: display values of red, green, blue, of all pixels or of each.
     """
 
     alpha: Float[Array, "h w"] | Any
-    backdrop: Float[Array, " 3"] | Any
+    backdrop: Float[Array, " 3"] | Float[Array, "h w 3"] | Any
+
+    def every(self, stride: int) -> Matte:
+        """Return it of every so many pixels along each axis."""
+        one_in = (slice(None, None, stride),) * 2
+        behind = self.backdrop if self.backdrop.ndim == 1 else self.backdrop[one_in]
+        return Matte(self.alpha[one_in], behind)
 
 
 def uncovered(linear: Values, matte: Matte | None) -> Values:

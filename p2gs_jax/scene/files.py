@@ -17,9 +17,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.scene.photographs.kinds import DEVELOPED_SUFFIXES
 from p2gs_jax.scene.photographs.sizes import size_of
 
-IMAGE_SUFFIXES = DEVELOPED_SUFFIXES | {
-    *(".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".ppm")
-}
+IMAGE_SUFFIXES = DEVELOPED_SUFFIXES | {*(".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm")}
 _ASPECT_TOLERANCE = 0.01
 _MOVED = (
     "move it there; or name the folder of all photographs with --images, and give names relative "

@@ -41,7 +41,7 @@ def triangulate(
         only_training: leave held-out views out.
 
     Raises:
-        UserError: there is only one view.
+        UserError: there is only one view, or a photograph cannot be read.
     """
     views = tuple(scene.training_views) if only_training else scene.views
     if len(views) < 2:
@@ -91,6 +91,12 @@ def _build(folder: Path, views: Sequence[View], report: Callable[[str], None]) -
         enlarge=max(max(view.width, view.height) for view in views) < LONG_ENOUGH,
     )
     prior = _set_cameras(database, views)
+    if unread := sorted({*names} - {image.name for image in prior.images.values()}):
+        raise UserError(
+            f"COLMAP reads {len(views) - len(unread)} of {len(views)} photographs, and not "
+            f"{image_folder / unread[0]}.",
+            fix="export those photographs again as PNG or JPEG, or remove them from the scene",
+        )
     pairs = pairs_by_pose(names, np.stack([view.viewmat for view in views]))
     n = len(views) * (len(views) - 1) // 2 if pairs is None else len(pairs)
     report(f"matching {n} image pairs")

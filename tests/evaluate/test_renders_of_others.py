@@ -92,7 +92,7 @@ def test_16_bits_and_grey_are_display_values_too(tmp_path):
     found = find_renders(folder, scene)
     scores = judge_renders(found, judge(scene, store))["as_rendered"]["per_view"]
     assert scores["a.png"]["psnr"] > 100
-    grey, linear = found.read(2, SIZE)
+    grey, linear, _ = found.read(2, SIZE)
     assert not linear
     np.testing.assert_allclose(grey, 0.2, atol=1e-6)
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 
 import cv2
 import numpy as np
@@ -10,7 +11,10 @@ from scene.posed import around, blender
 
 from p2gs_jax import load_run
 from p2gs_jax.config import preset
-from p2gs_jax.formats.exr import read_exr
+from p2gs_jax.errors import UserError
+from p2gs_jax.evaluate.against import Judge, check_renders, judge_renders
+from p2gs_jax.evaluate.renders_of_others import find_renders
+from p2gs_jax.formats.exr import read_exr, write_exr
 from p2gs_jax.pipeline.fit import fit
 
 SIZE, COLOR = 48, np.array([0.8, 0.3, 0.2])
@@ -81,3 +85,50 @@ def test_pictures_show_the_background_and_exr_files_do_not(ball):
     linear, _ = read_exr(stem.with_suffix(".exr"))
     assert np.abs(linear[:3, :3]).max() < 0.1
     assert run.own_display(0).backdrop == pytest.approx((0.1, 0.9, 0.1))
+
+
+@pytest.fixture
+def twin(ball, tmp_path):
+    """Return a copy of the run's renders, and how it is judged as another program's."""
+    result, run = ball
+    shutil.copytree(run.folder / "renders", tmp_path / "twin")
+
+    def judged():
+        found = check_renders(find_renders(tmp_path / "twin", run.scene), run.scene, run.store)
+        return judge_renders(found, Judge(run.scene, run.store, run.params, run.cfg))
+
+    return tmp_path / "twin", judged, result.metrics["test"]
+
+
+def test_renders_of_others_are_judged_over_the_same_background(twin):
+    folder, judged, own = twin
+    for kind, suffix, tolerance in (("pictures", ".png", 0.1), ("radiance", ".exr", 0.01)):
+        found = judged()
+        fitted = found["exposure_fitted"]
+        assert fitted["psnr"] == pytest.approx(own["exposure_fitted"]["psnr"], abs=tolerance), kind
+        for path in folder.rglob(f"*{suffix}"):
+            path.unlink()
+        if kind == "radiance":
+            mean = found["as_rendered"]["psnr"]
+            assert mean == pytest.approx(own["averaged"]["psnr"], abs=tolerance)
+
+
+def test_an_exposure_moves_what_is_there_and_not_what_is_behind_it(twin):
+    folder, judged, own = twin
+    # Darker by a power of light, the background with it: no exposure brings that back.
+    for path in folder.rglob("*.render.png"):
+        cv2.imwrite(str(path), np.rint(0.7 * cv2.imread(str(path)).astype(float)))
+    found = judged()
+    behind = -10 * np.log10(0.75 * np.mean((0.3 * np.array([0.1, 0.9, 0.1])) ** 2))
+    assert found["as_rendered"]["psnr"] < found["exposure_fitted"]["psnr"] < behind + 1
+    assert found["exposure_fitted"]["psnr"] < own["exposure_fitted"]["psnr"] - 3
+
+
+def test_radiance_over_a_background_needs_an_opacity(twin):
+    folder, judged, _ = twin
+    for path in folder.rglob("*.png"):
+        path.unlink()
+    path = next(folder.rglob("*.exr"))
+    write_exr(path, read_exr(path)[0])
+    with pytest.raises(UserError, match="no channel A"):
+        judged()

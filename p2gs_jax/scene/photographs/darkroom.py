@@ -15,7 +15,7 @@ import numpy as np
 
 from p2gs_jax.core.atomic import write_text
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene.photographs.avif import read_avif
+from p2gs_jax.scene.photographs.by_pillow import read_by_pillow
 from p2gs_jax.scene.photographs.files import write_png
 from p2gs_jax.scene.photographs.gain_maps import has_gain_map
 from p2gs_jax.scene.photographs.heif import read_heif
@@ -30,6 +30,7 @@ NAMES: dict[Kind, str] = {
     "raw": "camera raw",
     "heif": "HEIC",
     "avif": "AVIF",
+    "webp": "WebP",
     "exr": "linear EXR",
     "float_tiff": "TIFF of floats",
 }
@@ -94,8 +95,8 @@ class Darkroom:
             return read_raw(path, self._balances.get(self._facts[path].camera))
         if kind == "heif":
             return read_heif(path)
-        if kind == "avif":
-            return read_avif(path)
+        if kind in ("avif", "webp"):
+            return read_by_pillow(path)
         return read_exr(path) if kind == "exr" else read_float_tiff(path)
 
     def _develop(self, path: Path, target: Path) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from p2gs_jax.types import Scene
 # Other results: other folders.
 _VERSION = 1
 # Of two files of one shot, the one that says most of the light is used.
-_RANK: tuple[Kind, ...] = ("exr", "float_tiff", "raw", "heif", "avif", "plain")
+_RANK: tuple[Kind, ...] = ("exr", "float_tiff", "raw", "heif", "avif", "webp", "plain")
 
 
 @dataclass(frozen=True)

@@ -5,15 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-Kind = Literal["plain", "raw", "heif", "avif", "exr", "float_tiff"]
+Kind = Literal["plain", "raw", "heif", "avif", "webp", "exr", "float_tiff"]
 
 HEIF_SUFFIXES = frozenset({".heic", ".heif", ".hif"})
 RAW_SUFFIXES = frozenset(
     {".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".sr2", ".raf", ".orf", ".rw2"}
     | {".pef", ".srw", ".rwl", ".3fr", ".iiq", ".erf", ".mrw", ".x3f"}
 )
-AVIF_SUFFIX, EXR_SUFFIX = ".avif", ".exr"
-DEVELOPED_SUFFIXES = HEIF_SUFFIXES | RAW_SUFFIXES | {AVIF_SUFFIX, EXR_SUFFIX}
+AVIF_SUFFIX, WEBP_SUFFIX, EXR_SUFFIX = ".avif", ".webp", ".exr"
+DEVELOPED_SUFFIXES = HEIF_SUFFIXES | RAW_SUFFIXES | {AVIF_SUFFIX, WEBP_SUFFIX, EXR_SUFFIX}
 """What cannot be used before it is developed."""
 _TIFF_SUFFIXES = frozenset({".tif", ".tiff"})
 _SAMPLE_FORMAT, _FLOATING = 339, 3
@@ -28,6 +28,8 @@ def kind_of(path: Path) -> Kind:
         return "raw"
     if suffix == AVIF_SUFFIX:
         return "avif"
+    if suffix == WEBP_SUFFIX:
+        return "webp"
     if suffix == EXR_SUFFIX:
         return "exr"
     return "float_tiff" if suffix in _TIFF_SUFFIXES and _floating(path) else "plain"

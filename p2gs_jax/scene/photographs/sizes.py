@@ -6,7 +6,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from p2gs_jax.scene.photographs.avif import avif_size, read_avif_exif
+from p2gs_jax.scene.photographs.by_pillow import pillow_size, read_pillow_exif
 from p2gs_jax.scene.photographs.heif import heif_size, read_heif_exif
 from p2gs_jax.scene.photographs.kinds import kind_of
 from p2gs_jax.scene.photographs.linear import exr_size, read_exr_exif
@@ -22,8 +22,8 @@ def size_of(path: Path) -> tuple[int, int] | None:
     kind = kind_of(path)
     if kind == "heif":
         return heif_size(path)
-    if kind == "avif":
-        return avif_size(path)
+    if kind in ("avif", "webp"):
+        return pillow_size(path)
     if kind == "raw":
         return read_facts(path).size
     return exr_size(path) if kind == "exr" else None
@@ -34,8 +34,8 @@ def exif_of(path: Path) -> Image.Exif | None:
     kind = kind_of(path)
     if kind == "heif":
         return read_heif_exif(path)
-    if kind == "avif":
-        return read_avif_exif(path)
+    if kind in ("avif", "webp"):
+        return read_pillow_exif(path)
     if kind == "raw":
         return read_raw_exif(path)
     return read_exr_exif(path) if kind == "exr" else None

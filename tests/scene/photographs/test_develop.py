@@ -211,15 +211,22 @@ def test_broken_heic(folder: Path) -> None:
         developed(folder)
 
 
-# --------------------------------------------------------------------- AVIF
+# ------------------------------------------------------------ AVIF and WebP
 
 
-@pytest.mark.skipif(not features.check("avif"), reason="this Pillow knows no AVIF")
-def test_avif_keeps_its_values_profile_and_settings(folder: Path) -> None:
-    pixels = (40 + 150 * patches()).astype(np.uint8)
-    how = {"quality": 100, "subsampling": "4:4:4", "exif": settings().tobytes()}
-    Image.fromarray(pixels).save(folder / "a.avif", icc_profile=DISPLAY_P3, **how)
-    assert image_size(folder / "a.avif") == (96, 64)
+@pytest.mark.parametrize(
+    ("kind", "how"),
+    [("avif", {"quality": 100, "subsampling": "4:4:4"}), ("webp", {"lossless": True})],
+)
+def test_what_pillow_reads_keeps_its_values_profile_and_settings(
+    folder: Path, kind: str, how: dict
+) -> None:
+    if not features.check(kind):
+        pytest.skip(f"this Pillow knows no {kind}")
+    pixels, file = (40 + 150 * patches()).astype(np.uint8), folder / f"a.{kind}"
+    how = {**how, "exif": settings().tobytes()}
+    Image.fromarray(pixels).save(file, icc_profile=DISPLAY_P3, **how)
+    assert image_size(file) == (96, 64)
     result = developed(folder)
     assert result.known is None
     path = result.paths[0]
@@ -228,8 +235,8 @@ def test_avif_keeps_its_values_profile_and_settings(folder: Path) -> None:
     with Image.open(path) as image:
         assert image.info["icc_profile"] == DISPLAY_P3
     assert read_exif_ev(path) == pytest.approx(np.log2(200 / 60 / 2.8**2), abs=1e-3)
-    (folder / "a.avif").write_bytes((folder / "a.avif").read_bytes()[:300])
-    with pytest.raises(UserError, match=r"a\.avif cannot be decoded"):
+    file.write_bytes(file.read_bytes()[: 300 if kind == "avif" else -40])
+    with pytest.raises(UserError, match=rf"a\.{kind} cannot be decoded"):
         developed(folder)
 
 

@@ -1,4 +1,4 @@
-"""AVIF through Pillow: 8 bits, whatever the file holds."""
+"""AVIF and WebP through Pillow: 8 bits, whatever the file holds. COLMAP reads neither."""
 
 from __future__ import annotations
 
@@ -8,26 +8,27 @@ import numpy as np
 from PIL import Image, features
 
 from p2gs_jax.errors import UserError
+from p2gs_jax.scene.photographs.kinds import AVIF_SUFFIX
 from p2gs_jax.scene.photographs.picture import Picture
 
 _MODES = {1: "L", 2: "LA", 3: "RGB", 4: "RGBA"}
 
 
-def avif_size(path: Path) -> tuple[int, int]:
+def pillow_size(path: Path) -> tuple[int, int]:
     """Return (width, height) as stored.
 
     Raises:
-        UserError: this Pillow knows no AVIF, or the file is broken.
+        UserError: this Pillow does not know the kind, or the file is broken.
     """
     with _open(path) as image:
         return image.size
 
 
-def read_avif(path: Path) -> Picture:
+def read_by_pillow(path: Path) -> Picture:
     """Return a photograph of display values.
 
     Raises:
-        UserError: this Pillow knows no AVIF, or the file is broken.
+        UserError: this Pillow does not know the kind, or the file is broken.
     """
     with _open(path) as image:
         try:
@@ -38,7 +39,7 @@ def read_avif(path: Path) -> Picture:
             raise _broken(path, error) from None
 
 
-def read_avif_exif(path: Path) -> Image.Exif | None:
+def read_pillow_exif(path: Path) -> Image.Exif | None:
     """Return how a photograph was taken, or None."""
     try:
         with _open(path) as image:
@@ -48,14 +49,15 @@ def read_avif_exif(path: Path) -> Image.Exif | None:
 
 
 def _open(path: Path) -> Image.Image:
-    if not features.check("avif"):
+    kind = "AVIF" if path.suffix.lower() == AVIF_SUFFIX else "WebP"
+    if not features.check(kind.lower()):
         raise UserError(
-            f"{path} is AVIF, which this Pillow does not read.",
+            f"{path} is {kind}, which this Pillow does not read.",
             fix="pip install --upgrade 'pillow>=11.3', or export the photographs as JPEG",
         )
     try:
-        return Image.open(path, formats=["AVIF"])
-    except Exception as error:  # libavif's errors arrive as several types
+        return Image.open(path, formats=[kind])
+    except Exception as error:  # errors of libraries arrive as several types
         raise _broken(path, error) from None
 
 
