@@ -44,10 +44,10 @@ def main() -> None:
     def row(key: Key) -> dict[str, Any]:
         options = (*METHODS[key.method], "--steps", str(key.steps), "--background", "white")
         name = f"{key.method.replace(', ', '_').replace(' ', '_')}_{key.steps}"
-        metrics = fitted(args.scene, args.out / name, options)
-        test = metrics["test"]["averaged"]
+        fit = fitted(args.scene, args.out / name, options, args.again)
+        test = fit.metrics["test"]["averaged"]
         figures = {k: test[k] for k in ("psnr", "ssim", "lpips") if k in test}
-        return {"figures": figures, **of_fit(metrics, f"p2gs-jax fit LEGO {' '.join(options)}")}
+        return {"figures": figures, **of_fit(fit, f"p2gs-jax fit LEGO {' '.join(options)}")}
 
     measure([Key("lego", "lego", m, s) for s in args.steps for m in args.methods], row, args.again)
 

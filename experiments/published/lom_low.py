@@ -31,7 +31,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from published_rows import HERE, Key, measure, of_fit
+from published_rows import HERE, Key, fitted, measure, of_fit
 
 import p2gs_jax
 from p2gs_jax.evaluate.alignment import fit_capture, with_fitted_exposure
@@ -41,7 +41,6 @@ from p2gs_jax.photometry.display import with_capture
 
 sys.path.insert(0, str(HERE.parent))
 
-from judging import configs
 from mixtures import write_mixture
 
 METHODS = ("robust", "3dgs", "luminance_gs")
@@ -164,22 +163,14 @@ def main() -> None:
         if not scene.exists():
             write_mixture(lom, scene, ["low"])
         run = args.out / "runs" / f"{key.scene}_{key.method}_{key.steps}"
-        if not (run / "metrics.json").is_file():
-            cfg = configs([key.method], steps=key.steps)[key.method]
-            p2gs_jax.fit(
-                scene,
-                run,
-                cfg,
-                reference=scene / "reference",
-                resume=(run / "config.json").is_file(),
-            )
-        metrics = json.loads((run / "metrics.json").read_text())
+        said = ("--preset", key.method, "--steps", str(key.steps))
+        fit = fitted(scene, run, (*said, "--reference", str(scene / "reference")), args.again)
         command = (
             f"python experiments/published/lom_low.py LOM_{key.scene.upper()} "
             f"--methods {key.method} --steps {key.steps}"
         )
         found = figures(p2gs_jax.load_run(run), their_test_views(lom))
-        return {"figures": found, **of_fit(metrics, command)}
+        return {"figures": found, **of_fit(fit, command)}
 
     wanted = [Key("lom_low", n, m, s) for s in args.steps for n in folders for m in args.methods]
     measure(wanted, row, args.again)

@@ -28,15 +28,16 @@ def main() -> None:
 
     def row(key: Key) -> dict[str, Any]:
         options = ("--preset", key.method, "--steps", str(key.steps))
-        metrics = fitted(args.scene, args.out / f"{key.method}_{key.steps}", options)
-        test = metrics["test"]
+        run = args.out / f"{key.method}_{key.steps}"
+        fit = fitted(args.scene, run, options, args.again)
+        test = fit.metrics["test"]
         figures = {
             "psnr": test["averaged"]["psnr"],
             "psnr_exposure_fitted": test["exposure_fitted"]["psnr"],
         }
         if "photometry_fitted" in test:
             figures["psnr_photometry_fitted"] = test["photometry_fitted"]["psnr"]
-        return {"figures": figures, **of_fit(metrics, f"p2gs-jax fit FOX {' '.join(options)}")}
+        return {"figures": figures, **of_fit(fit, f"p2gs-jax fit FOX {' '.join(options)}")}
 
     wanted = [Key("nerf_fox", "fox", m, s) for s in args.steps for m in args.methods]
     measure(wanted, row, args.again)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import datetime
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -54,13 +55,26 @@ def add_row(key: Key, row: dict[str, Any], path: Path = ROWS) -> None:
     write_json(path, [rows[k] for k in sorted(rows)])
 
 
-def of_fit(metrics: dict[str, Any], command: str) -> dict[str, Any]:
+class Fit(NamedTuple):
+    """A finished fit.
+
+    Attributes:
+        metrics: as `metrics.json`.
+        commit: of the checkout that fitted it; of one that was resumed by others, all.
+    """
+
+    metrics: dict[str, Any]
+    commit: str
+
+
+def of_fit(fit: Fit, command: str) -> dict[str, Any]:
     """Return what every row says of its fit.
 
     Args:
-        metrics: as `metrics.json`.
+        fit: from `fitted`.
         command: that measures the row, without folders of this machine.
     """
+    metrics = fit.metrics
     seconds = metrics["seconds"]
     # Of a resumed fit, "optimisation" is that of all its processes, all else of the last.
     last = sum(seconds.get(k, 0.0) for k in ("compiling", "steps", "densification", "checkpoints"))
@@ -71,7 +85,7 @@ def of_fit(metrics: dict[str, Any], command: str) -> dict[str, Any]:
         "seconds_of_steps": round(seconds["optimisation"]),
         "cores": len(os.sched_getaffinity(0)),
         "date": datetime.date.today().isoformat(),
-        "commit": commit(),
+        "commit": fit.commit,
         "command": command,
     }
 
@@ -82,22 +96,44 @@ def shown_seconds(row: Mapping[str, Any]) -> str:
     return f"{row['seconds']}{alone}"
 
 
-def fitted(scene: Path, run: Path, options: Sequence[str]) -> dict[str, Any]:
-    """Fit by the command line, or go on with what was interrupted; return its `metrics.json`.
+def fitted(scene: Path, run: Path, options: Sequence[str], again: bool = False) -> Fit:
+    """Fit by the command line, or go on with what was interrupted.
+
+    Args:
+        scene: what is fitted.
+        run: folder of the fit; beside it a file keeps the options and the commit that made it.
+        options: of `p2gs-jax fit`.
+        again: fit anew what is finished.
 
     Raises:
-        SystemExit: the fit failed.
+        SystemExit: the fit failed, or the folder holds one of other options.
     """
-    found = run / "metrics.json"
+    found, record = run / "metrics.json", run.with_name(f"{run.name}.made.json")
+    if again and found.is_file():
+        shutil.rmtree(run)
+    begun = (run / "config.json").is_file()
+    made = {"options": [scene.name, *options], "commits": []}
+    if begun:
+        kept = json.loads(record.read_text(encoding="utf-8")) if record.is_file() else {}
+        if kept.get("options") != made["options"]:
+            raise SystemExit(
+                f"{run} was not fitted with {' '.join(made['options'])}: remove that folder, or "
+                "name another --out."
+            )
+        made = kept
     if not found.is_file():
-        resumed = ["--resume"] if (run / "config.json").is_file() else []
+        made["commits"] = list(dict.fromkeys([*made["commits"], commit()]))
+        run.parent.mkdir(parents=True, exist_ok=True)
+        write_json(record, made)
+        resumed = ["--resume"] if begun else []
         words = ["fit", str(scene), "--out", str(run), *options, *resumed]
         code = subprocess.run(
             [sys.executable, "-m", "p2gs_jax.cli", *words], check=False
         ).returncode
         if code:
             raise SystemExit(f"p2gs-jax {' '.join(words)} ended with {code}")
-    return json.loads(found.read_text(encoding="utf-8"))
+    metrics = json.loads(found.read_text(encoding="utf-8"))
+    return Fit(metrics, ", then ".join(made["commits"]))
 
 
 def measure(

@@ -56,6 +56,32 @@ def test_what_is_there_is_not_measured_again(tmp_path):
     assert measured[-1] == 1
 
 
+def test_a_fit_is_kept_with_what_made_it(tmp_path, monkeypatch):
+    run, fits = tmp_path / "runs" / "3dgs_20", []
+    monkeypatch.setattr(rows, "commit", lambda: f"commit {len(fits)}")
+
+    def fit(words, check):
+        fits.append(words[words.index("fit") :])
+        run.mkdir(exist_ok=True)
+        (run / "config.json").write_text("{}")
+        if len(fits) > 1:
+            (run / "metrics.json").write_text(json.dumps({"psnr": len(fits)}))
+        return SimpleNamespace(returncode=int(len(fits) == 1))
+
+    monkeypatch.setattr(rows.subprocess, "run", fit)
+    given = (Path("lego"), run, ("--preset", "3dgs"))
+    with pytest.raises(SystemExit, match="ended with 1"):
+        rows.fitted(*given)
+    for _ in range(2):
+        assert rows.fitted(*given) == rows.Fit({"psnr": 2}, "commit 0, then commit 1")
+    assert ["--resume" in words for words in fits] == [False, True]
+    with pytest.raises(SystemExit, match="was not fitted with lego --preset robust"):
+        rows.fitted(Path("lego"), run, ("--preset", "robust"))
+    # Measured again, nothing of the old fit is left.
+    assert rows.fitted(*given, again=True) == rows.Fit({"psnr": 3}, "commit 2")
+    assert "--resume" not in fits[-1]
+
+
 def test_the_page_sets_figures_beside_published_ones():
     page = write_page.page(PUBLISHED, {KEY: ROW})
     assert "| lego | 3dgs | 30000 | 34.00 | 0.980 | -1.78 | 1000 | 60 | abc |" in page
