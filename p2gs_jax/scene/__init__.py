@@ -22,7 +22,7 @@ from p2gs_jax.scene.llff import is_llff, load_llff
 from p2gs_jax.scene.masks import attach_masks
 from p2gs_jax.scene.photographs.colours import colour_notes
 from p2gs_jax.scene.photographs.develop import develop, developed_views, with_originals
-from p2gs_jax.scene.random_seeds import with_random_seeds
+from p2gs_jax.scene.random_seeds import FEWEST, with_random_seeds
 from p2gs_jax.scene.rig import is_rig, load_rig
 from p2gs_jax.scene.split import split_scene
 from p2gs_jax.scene.split_lists import lists_beside, split_as_listed
@@ -46,7 +46,8 @@ def load_scene(
     `transforms_train.json` with those of the other parts of the split; LLFF's `poses_bounds.npy`; a
     rig with KITTI's calib.txt and poses.txt; a drive as a data set lays it out (`drives`);
     photographs in `images/` or the folder itself, whose cameras are then found by structure from
-    motion. Poses without points get theirs by triangulation, or at random where nothing matches.
+    motion. Poses without points get theirs by triangulation, or at random where hardly anything
+    matches.
 
     Args:
         root: folder, .json file, or video.
@@ -87,7 +88,7 @@ def load_scene(
 
         # Where somebody says what is held out, it gives no seeds either.
         scene = triangulate(scene, work_dir, report, only_training=listed)
-        if len(scene.points) == 0:
+        if len(scene.points) < FEWEST:
             scene = with_random_seeds(scene)
     return scene
 

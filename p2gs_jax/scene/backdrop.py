@@ -62,7 +62,10 @@ def with_alpha(scene: Scene, cfg: DataConfig) -> Scene:
     backdrop_of(cfg)
     found = [has_alpha(view.image_path) for view in scene.views]
     if not any(found):
-        return scene
+        if cfg.background == DataConfig.background:
+            return scene
+        note = f"--background {cfg.background} shows nowhere: no photograph has an alpha channel."
+        return dataclasses.replace(scene, notes=(*scene.notes, note))
     views = tuple(
         dataclasses.replace(view, alpha=cfg.alpha) if there else view
         for view, there in zip(scene.views, found, strict=True)

@@ -1,4 +1,4 @@
-"""Seeds at random where a scene has neither points nor matches: in what its cameras see together.
+"""Seeds at random where a scene has neither points nor matches, in what its cameras see together.
 
 NeRF's synthetic scenes are begun so by 3DGS, with 100,000 points in a cube that is known to hold
 them. Here the volume follows from the cameras: the pixels of all training views between the nearest
@@ -18,6 +18,8 @@ from p2gs_jax.scene.visibility import in_frame, project_points
 from p2gs_jax.types import Scene, View
 
 COUNT = 100_000
+# Fewer matched points than this are as good as none.
+FEWEST = 50
 # A point is kept if it is seen by this share of the views that see the most seen one.
 COMMON = 0.5
 # Where the cameras look at no common place: nearest and farthest depth, in their extent.
@@ -33,13 +35,15 @@ def with_random_seeds(scene: Scene) -> Scene:
     Their colours are left to the photographs, and they count as no observations of anything.
 
     Args:
-        scene: without points, split.
+        scene: without points, or with fewer than `FEWEST`; split.
     """
+    few = len(scene.points)
+    without = f"Only {few} points were matched" if few else "Neither points nor matches"
     views = scene.training_views
     near, far = depth_range(views) if scene.depths is None else scene.depths
     points = common_points(views, near, far)
     note = (
-        f"Neither points nor matches: {len(points)} seeds were drawn at random where the cameras "
+        f"{without}: {len(points)} seeds were drawn at random where the cameras "
         f"look, at depths of {near:.3g} to {far:.3g}."
     )
     return dataclasses.replace(

@@ -33,15 +33,22 @@ class SplitLists:
 
     Attributes:
         source: the file, or the files, in words.
+        folder: that it is, or they are, in.
         train: what is trained on; None: the rest.
-        test: what is held out; None: `val` if there is one, else the rest.
+        test: what is held out; None or empty: `val` if there is one, else the rest.
         val: held out by others while they train; here it takes the place of `test` or is left out.
     """
 
     source: str
+    folder: Path
     train: tuple[str, ...] | None = None
     test: tuple[str, ...] | None = None
     val: tuple[str, ...] | None = None
+
+    @property
+    def where(self) -> str:
+        """The file, or the files, with their folder."""
+        return str(self.folder / self.source)
 
 
 def read_split(path: Path) -> SplitLists:
@@ -51,7 +58,7 @@ def read_split(path: Path) -> SplitLists:
         UserError: it is not there, or holds no such lists.
     """
     if path.suffix.lower() != ".json":
-        return SplitLists(path.name, test=_lines(path))
+        return SplitLists(path.name, path.parent, test=_lines(path))
     try:
         said = parse_json(_text(path))
     except json.JSONDecodeError as error:
@@ -87,7 +94,7 @@ def lists_in(path: Path, said: object, keys: dict[str, str]) -> SplitLists | Non
         if not isinstance(given, list) or not all(isinstance(n, str) and n for n in given):
             raise UserError(f'{path}: "{key}" is no list of names', fix="correct the file")
         lists[name] = tuple(given)
-    return SplitLists(path.name, **lists) if lists else None
+    return SplitLists(path.name, path.parent, **lists) if lists else None
 
 
 def lists_beside(*folders: Path) -> SplitLists | None:
@@ -97,7 +104,8 @@ def lists_beside(*folders: Path) -> SplitLists | None:
         found = {name: path for name, path in files.items() if path.is_file()}
         if found:
             source = " and ".join(path.name for path in found.values())
-            return SplitLists(source, **{name: _lines(path) for name, path in found.items()})
+            names = {name: _lines(path) for name, path in found.items()}
+            return SplitLists(source, folder, **names)
     return None
 
 
@@ -115,7 +123,8 @@ def split_as_listed(scene: Scene, lists: SplitLists, *, allow_missing: bool = Fa
     """
     views, notes, unused = scene.views, [], []
     rows_of = _rows_by_name(views)
-    held = lists.test if lists.test is not None else lists.val
+    # Tools write empty lists for what they have not.
+    held = lists.test or lists.val or None
     rows: dict[str, set[int]] = {}
     for part, names in (("train", lists.train), ("test", held)):
         if names is None:
@@ -128,7 +137,7 @@ def split_as_listed(scene: Scene, lists: SplitLists, *, allow_missing: bool = Fa
         said += ", ".join(unused[:5]) + (", ..." if len(unused) > 5 else "")
         if registered and not allow_missing:
             raise UserError(
-                f"{lists.source} lists {registered[0]}, which the scene does not have",
+                f"{lists.where} lists {registered[0]}, which the scene does not have",
                 fix=f"correct the name, or add the photograph; {_WITHOUT}",
             )
         notes.append(said)
@@ -138,12 +147,12 @@ def split_as_listed(scene: Scene, lists: SplitLists, *, allow_missing: bool = Fa
     both = sorted(train & test)
     if both:
         raise UserError(
-            f"{lists.source}: {views[both[0]].name} is both trained on and held out",
+            f"{lists.where}: {views[both[0]].name} is both trained on and held out",
             fix=f"take it out of one of the lists; {_WITHOUT}",
         )
     if not train:
         raise UserError(
-            f"{lists.source} leaves no view to train on", fix=f"correct the lists; {_WITHOUT}"
+            f"{lists.where} leaves no view to train on", fix=f"correct the lists; {_WITHOUT}"
         )
     split = [
         dataclasses.replace(v, split="test" if i in test else "train") for i, v in enumerate(views)
@@ -151,8 +160,16 @@ def split_as_listed(scene: Scene, lists: SplitLists, *, allow_missing: bool = Fa
     scene = dataclasses.replace(scene, views=tuple(split), split_by=lists.source)
     left = sorted(everything - train - test)
     if left:
-        notes.append(f"{len(left)} views are in no list of {lists.source}: they are not used")
+        notes.append(
+            f"{len(left)} views are neither trained on nor held out by {lists.source}: they are "
+            "not used"
+        )
         scene = without_views(scene, left)
+    if not test:
+        notes.append(
+            f"{lists.source} holds no view out: nothing says how good views are that are not "
+            "trained on. --split every holds out every n-th."
+        )
     return dataclasses.replace(scene, notes=(*scene.notes, *notes))
 
 
@@ -231,7 +248,7 @@ def _row(
     if len(rows) > 1:
         names = " and ".join(views[row].name for row in sorted(rows)[:2])
         raise UserError(
-            f"{lists.source}: {name} may be {names}", fix="write more of the path into the list"
+            f"{lists.where}: {name} may be {names}", fix="write more of the path into the list"
         )
     if not rows:
         unused.append(name)

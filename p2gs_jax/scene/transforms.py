@@ -79,8 +79,13 @@ def load_transforms(root: Path, json_path: Path, cfg: DataConfig) -> Scene:
     data = _parse(json_path)
     scene = _assembled(root, "transforms", _frames(json_path, data), cfg)
     points = data.get("ply_file_path")
-    if isinstance(points, str) and points:
+    if points:
+        if not isinstance(points, str):
+            raise UserError(f'{json_path}: "ply_file_path" is no name of a file', fix=_FIX)
         scene = replace(scene, **read_points(_beside(json_path, points))._asdict())
+        if not len(scene.points):
+            note = f"{points} holds no points: seeds are found as if it were not named."
+            scene = replace(scene, notes=(*scene.notes, note))
     lists = lists_in(json_path, data, _LISTS)
     if lists is None or cfg.split is not None or not cfg.test_every:
         return scene

@@ -33,6 +33,13 @@ def store_of(root, **options):
     return ImageStore(load_scene(root, cfg).views, cfg)
 
 
+def test_a_background_that_shows_nowhere_is_said(tmp_path):
+    write_tiny_model(tmp_path, n=2)
+    assert not any("--background" in n for n in load_scene(tmp_path, DataConfig()).notes)
+    scene = load_scene(tmp_path, DataConfig(background="black"))
+    assert "--background black shows nowhere" in scene.notes[-1]
+
+
 @pytest.mark.parametrize(
     ("background", "color"),
     [

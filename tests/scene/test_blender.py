@@ -169,6 +169,54 @@ def test_broken_copies(tmp_path, change, message):
         load_scene(broken(tmp_path, change), CFG)
 
 
+@pytest.fixture
+def lego(shared_data, tmp_path):
+    """Return a copy of the real lego: its poses, and links to its photographs."""
+    source = shared_data("nerf_synthetic_lego")
+    for part in ("train", "test"):
+        (tmp_path / part).mkdir()
+        for path in (source / part).iterdir():
+            (tmp_path / part / path.name).symlink_to(path)
+        name = f"transforms_{part}.json"
+        (tmp_path / name).write_bytes((source / name).read_bytes())
+    return tmp_path
+
+
+def first(root, part):
+    data = json.loads((root / f"transforms_{part}.json").read_text())
+    return data, (root / data["frames"][0]["file_path"]).with_suffix(".png")
+
+
+def test_lego_without_a_frame(lego):
+    _, path = first(lego, "test")
+    path.unlink()
+    with pytest.raises(UserError, match=rf"transforms_test.json do not exist: test/{path.stem}"):
+        find_scene(lego, CFG)
+
+
+def test_lego_with_an_alpha_of_another_size(lego):
+    _, path = first(lego, "train")
+    path.unlink()
+    write_rgba(path, size=(400, 300))
+    with pytest.raises(UserError, match=rf"wrong size: .*{path.name} is 400x300, .* 800x800"):
+        find_scene(lego, CFG)
+
+
+def test_lego_with_a_split_that_names_what_is_not_there(lego):
+    _, path = first(lego, "test")
+    (lego / "mine.txt").write_text(f"test/{path.name}\ntest/r_9999.png\n")
+    with pytest.raises(UserError, match=r"mine.txt lists test/r_9999.png"):
+        load_scene(lego, DataConfig(split=str(lego / "mine.txt")))
+
+
+def test_lego_with_a_pose_that_is_no_number(lego):
+    data, path = first(lego, "train")
+    data["frames"][0]["transform_matrix"][0][3] = float("nan")
+    (lego / "transforms_train.json").write_text(json.dumps(data))
+    with pytest.raises(UserError, match=rf"transforms_train.json.*{path.stem}"):
+        find_scene(lego, CFG)
+
+
 def test_missing_frames_may_be_skipped(tmp_path):
     scene = find_scene(broken(tmp_path, no_frame), DataConfig(allow_missing=True))
     assert len(scene.test_indices) == 2

@@ -41,7 +41,9 @@ def test_lists_beside_a_colmap_model(model, folder):
     (model / folder / "train.txt").write_text("images/im 0.png\n")
     scene = load_scene(model, CFG)
     assert [view.name for view in scene.views] == ["im 0.png", "im 1.png", "im 3.png"]
-    assert "1 views are in no list of train.txt and test.txt" in scene.notes[-1]
+    assert (
+        "1 views are neither trained on nor held out by train.txt and test.txt" in scene.notes[-1]
+    )
     assert scene.tracks is not None
     assert sorted(scene.tracks.view_indices) == [0, 1, 2]
 
@@ -79,6 +81,17 @@ def test_broken_lists(model, tmp_path, name, text, message):
     path.write_text(text)
     with pytest.raises(UserError, match=message):
         load_scene(model, DataConfig(split=str(path)))
+
+
+def test_an_empty_list_holds_nothing_out_and_says_so(model, tmp_path):
+    lists = tmp_path / "mine.json"
+    lists.write_text(json.dumps({"test": [], "val": ["im 2.png"]}))
+    assert held_out(load_scene(model, DataConfig(split=str(lists)))) == ["im 2.png"]
+    names = [f"im {k}.png" for k in range(4)]
+    lists.write_text(json.dumps({"train": names, "test": []}))
+    scene = load_scene(model, DataConfig(split=str(lists)))
+    assert held_out(scene) == []
+    assert "mine.json holds no view out" in scene.notes[-1]
 
 
 def test_a_list_that_is_not_there(model, tmp_path):
@@ -164,4 +177,9 @@ def test_broken_nerfstudio_seeds(tmp_path):
     write_ply(path, np.zeros((9, 3)))
     path.write_bytes(path.read_bytes()[:-7])
     with pytest.raises(UserError, match=r"sparse_pc.ply is no PLY of points"):
+        find_scene(tmp_path, CFG)
+    write_ply(path, np.zeros((0, 3)))
+    assert "sparse_pc.ply holds no points" in find_scene(tmp_path, CFG).notes[-1]
+    studio(tmp_path, ply_file_path=7)
+    with pytest.raises(UserError, match='"ply_file_path" is no name of a file'):
         find_scene(tmp_path, CFG)
