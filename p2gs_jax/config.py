@@ -139,6 +139,10 @@ class RenderConfig:
     blur: float = 0.05
     """Variance added to the 2D covariance, pixels^2 (3DGS: 0.3; Mip-Splatting's filter: 0.1; ours:
     BUILD_NOTES, "Blur")."""
+    background: tuple[float, float, float] | None = None
+    """Linear radiance of red, green and blue behind all splats, under the run's exposures; None:
+    none, black. Where early stopping leaves transmittance T it is off by T times this. What alpha
+    in photographs is shown over is `data.background`, which is no light."""
     tile: tuple[int, int] = (16, 8)
     """Tile width and height in pixels (ours: docs/kernel.md)."""
     chunk: int = 16

@@ -258,7 +258,7 @@ class Render(eqx.Module):
     """One rendered view.
 
     Attributes:
-        linear: linear HDR radiance, premultiplied by alpha (black background).
+        linear: linear HDR radiance, premultiplied by alpha, before `RenderConfig.background`.
         alpha: accumulated opacity in [0, 1].
         depth: alpha-weighted camera z; divide by alpha for the expected depth. None if it was
             not asked for.

@@ -106,7 +106,8 @@ def linear_sidecar(
             "(tone.formula)",
         },
         "rendering": {
-            "compositing": "front to back, by alpha, in linear light, over black",
+            "compositing": "front to back, by alpha, in linear light, over `background`",
+            "background": list(cfg.render.background or (0.0, 0.0, 0.0)),
             "blur_px2": cfg.render.blur,
             "alpha_cutoff": cfg.render.alpha_cutoff,
             "alpha_max": cfg.render.alpha_max,

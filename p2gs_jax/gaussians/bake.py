@@ -164,7 +164,8 @@ _basis = jax.jit(basis, static_argnums=1)
 
 def viewer_config(cfg: RenderConfig) -> RenderConfig:
     """Return the options of an ordinary 3DGS viewer: display colours max(0, sh + 1/2)."""
-    return replace(cfg, radiance="linear", cutoff_rule="opacity", blur=VIEWER_BLUR)
+    usual = {"radiance": "linear", "cutoff_rule": "opacity", "blur": VIEWER_BLUR}
+    return replace(cfg, **usual, background=None)
 
 
 class _Trainable(NamedTuple):

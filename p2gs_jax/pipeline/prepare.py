@@ -176,8 +176,8 @@ def prepare(
         part: what was solved for a whole of which `scene` is a part, or None.
 
     Raises:
-        UserError: there is not the memory for it, nothing to see, or no room on the disk for
-            decoded photographs.
+        UserError: there is not the memory for it, nothing to see, no room on the disk for
+            decoded photographs, or two backgrounds.
     """
     clock = clock or Stopwatch()
     begin = time.monotonic()
@@ -199,7 +199,14 @@ def prepare(
     dense = wants_dense(scene, coverage, cfg)
     seeds = _choose_points(scene, cfg)
     init = cfg.init
-    if store.backdrop is not None and init.shell == "auto":
+    behind = cfg.render.background is not None
+    if store.backdrop is not None and behind:
+        raise UserError(
+            "render.background is light behind the splats, and the photographs' alpha shows "
+            "data.background there.",
+            fix="leave one of them out: --render.background None, or --data.alpha mask",
+        )
+    if (store.backdrop is not None or behind) and init.shell == "auto":
         # What lies behind everything is the background.
         init = dataclasses.replace(init, shell="off")
     depth = near_depth(depths)

@@ -110,7 +110,7 @@ def render_linear(
         The render. Where `overflow` is set it must be discarded and the capacity grown.
     """
     if gaussians.capacity == 0:
-        return _nothing(camera, with_depth)
+        return _nothing(camera, cfg, with_depth)
     gaussians = at_time(gaussians, camera.objects)
     of_each = camera_of_each(camera, owner)
     splats = project(gaussians, alive, of_each, cfg)
@@ -154,6 +154,7 @@ def render_splats(
         implementation=cfg.implementation,
         with_depth=with_depth,
     )
+    linear = _before(linear, alpha, cfg)
     return Render(linear, alpha, depth, count, overflow, splats.visible)
 
 
@@ -175,10 +176,19 @@ def required_capacity(
     return count_entries(splats, camera.width, camera.height, cfg)
 
 
-def _nothing(camera: Camera, with_depth: bool) -> Render:
+def _before(
+    linear: Float[Array, "h w 3"], alpha: Float[Array, "h w"], cfg: RenderConfig
+) -> Float[Array, "h w 3"]:
+    """Return radiance with that of the background, where it shows through."""
+    if cfg.background is None:
+        return linear
+    return linear + (1 - alpha)[..., None] * jnp.asarray(cfg.background, linear.dtype)
+
+
+def _nothing(camera: Camera, cfg: RenderConfig, with_depth: bool) -> Render:
     blank = jnp.zeros((camera.height, camera.width))
     return Render(
-        linear=jnp.zeros((*blank.shape, 3)),
+        linear=_before(jnp.zeros((*blank.shape, 3)), blank, cfg),
         alpha=blank,
         depth=blank if with_depth else None,
         count=jnp.int32(0),

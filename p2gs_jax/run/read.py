@@ -104,6 +104,11 @@ class Run:
         """Return the run without anything that moves."""
         return self._of(standing(self.params.gaussians, self.owner), None)
 
+    def over_black(self) -> Run:
+        """Return the run without the radiance behind its splats."""
+        render = replace(self.cfg.render, background=None)
+        return replace(self, cfg=replace(self.cfg, render=render))
+
     def only_objects(self) -> Run:
         """Return the run with nothing but what moves.
 

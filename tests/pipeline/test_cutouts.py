@@ -124,6 +124,15 @@ def test_an_exposure_moves_what_is_there_and_not_what_is_behind_it(twin):
     assert found["exposure_fitted"]["psnr"] < own["exposure_fitted"]["psnr"] - 3
 
 
+def test_light_behind_the_splats_and_a_background_are_one_too_many(ball, tmp_path):
+    _, run = ball
+    cfg = dataclasses.replace(
+        run.cfg, render=dataclasses.replace(run.cfg.render, background=(1.0,) * 3)
+    )
+    with pytest.raises(UserError, match=r"render.background is light behind the splats"):
+        fit(run.scene.root, tmp_path / "run", cfg)
+
+
 def test_radiance_over_a_background_needs_an_opacity(twin):
     folder, judged, _ = twin
     for path in folder.rglob("*.png"):

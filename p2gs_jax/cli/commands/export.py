@@ -72,6 +72,10 @@ def run(options: Export) -> int:
     fitted = load_run(options.run, options.scene)
     if options.without_objects:
         fitted = fitted.without_objects()
+    if fitted.cfg.render.background is not None and {"html", *DISPLAY} & set(formats):
+        stdout().print(
+            "The radiance behind the splats is in no format of splats: over black there."
+        )
     transform = _display_transform(fitted, options)
     folder = options.out or options.run / "exports"
     places = [folder / place for name in formats for place in _places(name, options)]
@@ -83,7 +87,8 @@ def run(options: Export) -> int:
     with TerminalReporter() as reporter:
         display = None
         if set(formats) & set(DISPLAY):
-            display = DisplayFiles(fitted, store, transform, options.bake_steps, reporter)
+            splats = fitted.over_black()
+            display = DisplayFiles(splats, store, transform, options.bake_steps, reporter)
         for name in formats:
             begin = time.monotonic()
             if name == "linear-ply":
@@ -99,7 +104,7 @@ def run(options: Export) -> int:
             elif name == "drive":
                 said = _drive(folder, fitted)
             elif name == "html":
-                said = _html(folder, fitted, transform, options, reporter)
+                said = _html(folder, fitted.over_black(), transform, options, reporter)
             else:
                 assert display is not None
                 path, sidecar = (folder / place for place in _places(name, options))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -255,6 +256,11 @@ def resolve_fit(args: Fit) -> configs.FitConfig:
     check(data.test_every >= 0, "--test-every must be 0 or more")
     check(train.steps >= 1, "--steps must be at least 1")
     check(train.batch >= 1, "--train.batch must be at least 1")
+    behind = cfg.render.background or (0.0,)
+    check(
+        all(math.isfinite(x) and x >= 0 for x in behind),
+        "--render.background must be linear radiance, three numbers that are not negative",
+    )
     cfg = dataclasses.replace(cfg, data=data, train=train, evaluation=evaluation, densify=densify)
     return _known(cfg, args)
 
