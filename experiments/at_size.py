@@ -1,10 +1,11 @@
 """The paper's comparison of spreads of ISO at a real size and length; resumable, row by row.
 
-python experiments/at_size.py [--out DIR] [--methods robust 3dgs ...] [--stds 4 2 0]
+python experiments/at_size.py [--out DIR] [--methods robust 3dgs ...] [--stds 4 2 0 | --dusk]
 
 One town, three cameras with 100 photographs of 480x325 each along 90 m, 7,000 steps, population by
-need: that of the presets that have a bound, also for the paper's, which has none. Learned
-corrections take rates that suit 261 training views, as some presets' do not. Rows are kept in
+need: that of the presets that have a bound, also for the paper's, which has none. `--dusk`: no ISO
+is drawn; each camera's automatic exposure moves over six stops instead. Learned corrections take
+rates that suit 261 training views, as some presets' do not. Rows are kept in
 `experiments/at_size.json`, with the commit and seconds of each; called again, it goes on where it
 was interrupted. `experiments/at_size.md` is written from all that are there.
 """
@@ -20,8 +21,20 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent / "published"))
 
+from exposure_spread import sensor
 from published_rows import Key, fitted, measure, of_fit, read_rows, shown_seconds
-from towns import METHODS, STD_NAMES, WITH_EXPOSURES, Options, Protocol, number, scene, table
+from towns import (
+    CONSTANT,
+    METHODS,
+    STD_NAMES,
+    WITH_EXPOSURES,
+    Options,
+    Protocol,
+    number,
+    photographed,
+    scene,
+    table,
+)
 
 from p2gs_jax.core.atomic import write_text
 from p2gs_jax.sweep.rows import read_row
@@ -37,6 +50,7 @@ UNBOUNDED = frozenset({"paper"})
 # What their corrections start at and which fraction they end at: the best of what was tried at half
 # the width (BUILD_NOTES, "Learned corrections at size"); the presets' own lose up to 1 dB there.
 RATES = {"3dgs_affine": (3e-3, 0.01), "ppisp": (2e-2, 0.01), "3dgs_bilateral": (2e-3, 0.1)}
+DUSK, STOPS = "dusk, 6 stops", 6.0
 ROWS = Path(__file__).with_name("at_size.json")
 BENCHMARK = "towns at size"
 ORDER = (
@@ -102,7 +116,7 @@ def to_markdown(rows: Mapping[Key, Mapping[str, Any]]) -> str:
     header += ["Gaussians", "seconds", "commit"]
 
     def place(key: Key) -> tuple[int, int]:
-        return ORDER.index(key.method), list(STD_NAMES.values()).index(key.scene)
+        return ORDER.index(key.method), [*STD_NAMES.values(), DUSK].index(key.scene)
 
     lines = [
         [
@@ -120,6 +134,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/paper"))
     parser.add_argument("--methods", nargs="+", default=list(ORDER), choices=ORDER)
     parser.add_argument("--stds", type=float, nargs="+", default=[4.0, 2.0, 0.0])
+    parser.add_argument("--dusk", action="store_true", help="automatic exposure instead of ISO")
     parser.add_argument("--steps", type=int, default=AT_SIZE.steps)
     parser.add_argument("--again", action="store_true", help="measure also what is there")
     args = parser.parse_args()
@@ -127,19 +142,23 @@ def main() -> None:
     options = Options(args.out, protocol, 1, None, "python experiments/at_size.py")
 
     def row(key: Key) -> dict[str, Any]:
-        std = next(s for s, name in STD_NAMES.items() if name == key.scene)
-        street, said = scene(options, 0, std), options_of(key)
+        std = next((s for s, name in STD_NAMES.items() if name == key.scene), None)
+        if std is None:
+            street, which = photographed(options, 0, f"dusk{STOPS:g}", sensor(STOPS)), "--dusk"
+        else:
+            street, which = scene(options, 0, std), f"--stds {std:g}"
+        said = options_of(key)
         run = options.folder / street.name / key.method
         fit = fitted(street, run, (*said, "--reference", str(street / "reference")), args.again)
         linear = NAMES[key.method] in WITH_EXPOSURES
-        ev = read_row(run, street)["ev"] if linear and std else None
-        command = f"{options.command} --methods {key.method} --stds {std:g} --steps {key.steps}"
+        ev = read_row(run, street)["ev"] if linear and std != CONSTANT else None
+        command = f"{options.command} --methods {key.method} {which} --steps {key.steps}"
         found = figures(fit.metrics, ev, linear)
         return {"figures": found, "options": " ".join(said), **of_fit(fit, command)}
 
     wanted = [
-        Key(BENCHMARK, STD_NAMES[std], method, args.steps)
-        for std in args.stds
+        Key(BENCHMARK, name, method, args.steps)
+        for name in ([DUSK] if args.dusk else [STD_NAMES[std] for std in args.stds])
         for method in args.methods
     ]
     for key in wanted:

@@ -126,8 +126,13 @@ def options(description: str | None, name: str) -> Options:
 
 def scene(o: Options, town: int, std: float) -> Path:
     """Return a town's folder; it is made where it does not exist."""
+    return photographed(o, town, f"iso{std:g}", Sensor(iso_std=std))
+
+
+def photographed(o: Options, town: int, name: str, sensor: Sensor) -> Path:
+    """Return the folder of a town as a sensor sees it; it is made where it does not exist."""
     p = o.protocol
-    path = o.out / "towns" / p.data / f"town_{town}_iso{std:g}"
+    path = o.out / "towns" / p.data / f"town_{town}_{name}"
     if not path.exists():
         p2gs_jax.write_street(
             path,
@@ -136,7 +141,7 @@ def scene(o: Options, town: int, std: float) -> Path:
             height=image_height(p.width),
             step=p.step_m,
             points=p.points,
-            sensor=Sensor(iso_std=std),
+            sensor=sensor,
             seed=town,
             layout="town",
         )

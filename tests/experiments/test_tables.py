@@ -142,12 +142,14 @@ def test_rows_at_size_are_sorted_and_exposures_are_only_said_where_there_are_som
         key: row(20.0, None, False),
         key._replace(method="robust"): row(25.0, 0.01, True),
         key._replace(scene="ISO-Const"): row(22.0, None, False),
+        key._replace(scene=at_size.DUSK): row(15.0, None, False),
     }
     lines = [line for line in at_size.to_markdown(rows).splitlines() if line.startswith("| ")]
     assert [line.split(" | ")[:2] for line in lines[1:]] == [
         ["| robust (ours)", "ISO std 4"],
         ["| 3DGS", "ISO-Const"],
         ["| 3DGS", "ISO std 4"],
+        ["| 3DGS", "dusk, 6 stops"],
     ]
     assert (
         "| 25.00 | 24.00 | 25.00 | 24.00 | 0.800 | 0.0100 | 31.00 | 1000 | 60 | abc |" in lines[1]
