@@ -25,6 +25,15 @@ the seconds of the whole fit, and the commit. Scripts, and what is not run here:
 need `--render.blur 0.3` to be made again; those of lego name it.
 """
 NOT_RUN = "Not run yet."
+AT_SIZE, HDR = HERE.parent / "at_size.json", "mu_law_novel"
+HDR_HEAD = """## HDR radiance, as GaussHDR and HDR-NeRF judge it
+
+PSNR of radiance after log(1 + 5000 x) / log(5001), 1 being the brightest true value of the view, one
+scale for all views (`p2gs_jax/evaluate/mu_law.py`). Their scenes are not at hand, so no published
+figure stands beside these: a town of 300 photographs whose true radiance is known
+([at size](RESULTS.md#at-size-300-photographs-of-480x325-7000-steps)). Photographs of one exposure
+(ISO-Const) do not tell the curve.
+"""
 
 
 def table(header: list[str], rows: list[list[str]]) -> list[str]:
@@ -86,12 +95,35 @@ def _cells(key: Key, row: Mapping[str, Any], benchmark: Mapping[str, Any]) -> li
     ]
 
 
-def page(published: Mapping[str, Any], rows: Mapping[Key, Mapping[str, Any]]) -> str:
+def hdr_section(rows: Mapping[Key, Mapping[str, Any]]) -> list[str]:
+    """Return the lines of the HDR score, of the towns at size whose true radiance is known.
+
+    Args:
+        rows: of `experiments/at_size.json`.
+    """
+    found = {key: row for key, row in sorted(rows.items()) if HDR in row["figures"]}
+    header = ["photographed at", "method", "steps", "mu law, novel views, dB", "commit", "command"]
+    cells = [
+        [
+            *(key.scene, key.method, str(key.steps), f"{row['figures'][HDR]:.2f}"),
+            *(row["commit"], f"`{row['command']}`"),
+        ]
+        for key, row in found.items()
+    ]
+    return [HDR_HEAD, *table(header, cells), ""]
+
+
+def page(
+    published: Mapping[str, Any],
+    rows: Mapping[Key, Mapping[str, Any]],
+    at_size: Mapping[Key, Mapping[str, Any]],
+) -> str:
     """Return the whole page.
 
     Args:
         published: as `published.json`.
         rows: from `read_rows`.
+        at_size: likewise, of the towns at size.
 
     Raises:
         SystemExit: a row belongs to no benchmark.
@@ -101,12 +133,13 @@ def page(published: Mapping[str, Any], rows: Mapping[Key, Mapping[str, Any]]) ->
     lines = [HEAD]
     for name, benchmark in published.items():
         lines += section(name, benchmark, rows)
+    lines += hdr_section(at_size)
     return "\n".join(lines).rstrip() + "\n"
 
 
 def main() -> None:
     published = json.loads((HERE / "published.json").read_text(encoding="utf-8"))
-    write_text(OUT, page(published, read_rows()))
+    write_text(OUT, page(published, read_rows(), read_rows(AT_SIZE)))
 
 
 if __name__ == "__main__":

@@ -83,17 +83,19 @@ def test_a_fit_is_kept_with_what_made_it(tmp_path, monkeypatch):
 
 
 def test_the_page_sets_figures_beside_published_ones():
-    page = write_page.page(PUBLISHED, {KEY: ROW})
+    hdr = {KEY._replace(scene="ISO std 4"): {**ROW, "figures": {write_page.HDR: 36.214}}}
+    page = write_page.page(PUBLISHED, {KEY: ROW}, hdr)
     assert "| lego | 3dgs | 30000 | 34.00 | 0.980 | -1.78 | 1000 | 60 | abc |" in page
+    assert "| ISO std 4 | 3dgs | 30000 | 36.21 | abc |" in page
     assert write_page.NOT_RUN in page
     assert "| sofa | Aleth-NeRF | 19.52 |" in page
     with pytest.raises(SystemExit, match="unheard"):
-        write_page.page(PUBLISHED, {KEY._replace(benchmark="unheard"): ROW})
+        write_page.page(PUBLISHED, {KEY._replace(benchmark="unheard"): ROW}, {})
 
 
 def test_the_page_in_the_repository_is_that_of_its_rows():
     assert write_page.OUT.read_text(encoding="utf-8") == write_page.page(
-        PUBLISHED, rows.read_rows()
+        PUBLISHED, rows.read_rows(), rows.read_rows(write_page.AT_SIZE)
     )
 
 
