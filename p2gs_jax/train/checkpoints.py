@@ -15,6 +15,19 @@ from p2gs_jax.run.decisions import KEY, Decisions
 from p2gs_jax.train.host import HostState
 from p2gs_jax.train.state import FitState, grow_state
 
+# Of a run's time, what writing checkpoints may take; and by how much they may come later for it.
+SHARE, LATEST = 0.01, 20.0
+
+
+def pause_between(every_s: float, took_s: float) -> float:
+    """Return how long a run goes on after a checkpoint, seconds.
+
+    Args:
+        every_s: as asked (`train.checkpoint_every_s`).
+        took_s: what the last one took.
+    """
+    return max(every_s, min(took_s / SHARE, LATEST * every_s))
+
 
 class RunCheckpoints:
     """State and counters of a run, and what its scene decided.

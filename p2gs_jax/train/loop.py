@@ -34,7 +34,7 @@ from p2gs_jax.run.layout import RunFolder
 from p2gs_jax.run.left_out_file import LeftOutFile
 from p2gs_jax.train import room, schedule
 from p2gs_jax.train.burst import Bursts
-from p2gs_jax.train.checkpoints import RunCheckpoints
+from p2gs_jax.train.checkpoints import RunCheckpoints, pause_between
 from p2gs_jax.train.host import HostState
 from p2gs_jax.train.inputs import InputSource
 from p2gs_jax.train.left_out import LeftOut
@@ -235,7 +235,7 @@ class Trainer:
         self, state: FitState, host: HostState, session: Session, strategy: Strategy
     ) -> tuple[FitState, HostState]:
         """Take bursts until the run is complete, or its time over."""
-        saved = host.elapsed_s
+        saved, pause = host.elapsed_s, self.cfg.train.checkpoint_every_s
         while not schedule.is_over(host.progress, host.pace):
             state, stepped = self._take_burst(state, host, session)
             if stepped:
@@ -252,9 +252,12 @@ class Trainer:
                     )
                 break
             asked = self._asked()
-            if asked is not None or host.elapsed_s - saved > self.cfg.train.checkpoint_every_s:
+            if asked is not None or host.elapsed_s - saved > pause:
+                begun = host.elapsed_s
                 self._save(self.spread.whole(state), host)
+                self._tick(session, host)
                 saved = host.elapsed_s
+                pause = pause_between(self.cfg.train.checkpoint_every_s, saved - begun)
             if asked is not None:
                 self.on_message(
                     f"{interrupts.name_of(asked)}: the run stops after step {host.step} "

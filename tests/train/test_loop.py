@@ -57,6 +57,30 @@ def test_a_resumed_run_keeps_its_pace(harness):
     assert [line["step"] for line in harness.log()] == list(range(5, 101, 5))
 
 
+def test_checkpoints_take_no_more_than_a_hundredth_of_a_run(harness):
+    """A hundred steps of .1 s: a save that takes .022 s comes every 2.5 s, not every .5."""
+    saved, save = [], harness.checkpoints.save
+
+    def slow(step, *arguments):
+        harness.clock.now += 0.022
+        saved.append(step)
+        save(step, *arguments)
+
+    harness.checkpoints.save = slow
+    harness.run(
+        with_fields(SHORT, {"train.checkpoint_every_s": 0.4}),
+        programs=Programs(harness.clock, compile_s=0.0),
+    )
+    assert saved == [5, 30, 55, 80, 100]
+    # Nor are they further apart than twenty times what was asked for.
+    saved.clear()
+    harness.run(
+        with_fields(SHORT, {"train.checkpoint_every_s": 0.04}),
+        programs=Programs(harness.clock, compile_s=0.0),
+    )
+    assert saved == [*range(5, 100, 10), 100]
+
+
 def test_a_level_begins_a_new_estimate_of_the_pace_and_the_log_names_the_level_of_its_steps(
     harness,
 ):
