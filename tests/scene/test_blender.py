@@ -1,5 +1,6 @@
 """NeRF's synthetic scenes: one .json for each part of the split, RGBA, nothing else."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -9,8 +10,8 @@ from scene.posed import around, blender, write_rgba
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene import find_scene, load_scene
-from p2gs_jax.scene.random_seeds import common_points, depth_range
+from p2gs_jax.scene import find_scene, load_scene, triangulate
+from p2gs_jax.scene.random_seeds import FEWEST, common_points, depth_range
 from p2gs_jax.scene.transforms import load_blender
 
 CFG = DataConfig()
@@ -95,6 +96,22 @@ def test_the_split_of_the_data_set_wins_and_random_seeds_follow(tmp_path):
     every = load_scene(tmp_path, DataConfig(split="every", test_every=3))
     assert every.split_by == "every 3rd view of each camera"
     assert sum(view.split == "test" for view in every.views) == 3
+
+
+@pytest.mark.parametrize("count", [FEWEST - 1, FEWEST])
+def test_a_handful_of_matched_points_is_as_good_as_none(tmp_path, monkeypatch, count):
+    matched = np.random.default_rng(0).uniform(-1, 1, (count, 3)).astype(np.float32)
+    monkeypatch.setattr(
+        triangulate,
+        "triangulate",
+        lambda scene, *_, **__: dataclasses.replace(scene, points=matched),
+    )
+    scene = load_scene(write(tmp_path), CFG)
+    assert scene.random_seeds == (count < FEWEST)
+    if scene.random_seeds:
+        assert f"Only {count} points were matched: {len(scene.points)} seeds" in scene.notes[-1]
+    else:
+        np.testing.assert_array_equal(scene.points, matched)
 
 
 def test_random_seeds_are_the_same_every_time_and_in_the_views(tmp_path):
