@@ -71,6 +71,8 @@ def test_existing_run_is_not_overwritten(run_command, tmp_path):
         ("--steps", "0"),
         ("--max-width", "3"),
         ("--test-every", "-1"),
+        ("--render.background", "0.1", "nan", "0.1"),
+        ("--render.background", "0.1", "-0.1", "0.1"),
         ("--preset", "best"),
     ],
 )
