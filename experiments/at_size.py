@@ -5,7 +5,7 @@ python experiments/at_size.py [--out DIR] [--methods robust 3dgs ...] [--stds 4 
 One town, three cameras with 100 photographs of 480x325 each along 90 m, 7,000 steps, population by
 need: that of the presets that have a bound, also for the paper's, which has none. `--dusk`: no ISO
 is drawn; each camera's automatic exposure moves over six stops instead. Learned corrections take
-rates that suit 261 training views, as some presets' do not. Rows are kept in
+rates that suit 261 training views and ISO, as some presets' do not. Rows are kept in
 `experiments/at_size.json`, with the commit and seconds of each; called again, it goes on where it
 was interrupted. `experiments/at_size.md` is written from all that are there.
 """
@@ -48,7 +48,8 @@ AT_SIZE = Protocol(
 GAUSSIANS = 189_096
 UNBOUNDED = frozenset({"paper"})
 # What their corrections start at and which fraction they end at: the best of what was tried at half
-# the width (BUILD_NOTES, "Learned corrections at size"); the presets' own lose up to 1 dB there.
+# the width (BUILD_NOTES, "Learned corrections at size"); the presets' own lose up to 1 dB there. At
+# dusk AT's own are the best.
 RATES = {"3dgs_affine": (3e-3, 0.01), "ppisp": (2e-2, 0.01), "3dgs_bilateral": (2e-3, 0.1)}
 DUSK, STOPS = "dusk, 6 stops", 6.0
 ROWS = Path(__file__).with_name("at_size.json")
@@ -81,7 +82,7 @@ def options_of(key: Key) -> tuple[str, ...]:
     said = ("--preset", key.method, "--steps", str(key.steps))
     if key.method in UNBOUNDED:
         said = (*said, "--gaussians", str(GAUSSIANS))
-    if rates := RATES.get(key.method):
+    if key.scene != DUSK and (rates := RATES.get(key.method)):
         start, final = map(str, rates)
         said = (*said, "--optimizer.appearance", start, "--optimizer.appearance-final", final)
     return said
