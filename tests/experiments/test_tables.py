@@ -156,3 +156,10 @@ def test_rows_at_size_are_sorted_and_exposures_are_only_said_where_there_are_som
     )
     assert "| n/a | n/a | 1000 |" in lines[2]
     assert set(at_size.ORDER) <= set(at_size.NAMES)
+
+
+def test_corrections_at_size_take_rates_of_their_own_but_for_dusk():
+    key = at_size.Key(at_size.BENCHMARK, "ISO std 4", "3dgs_affine", 7000)
+    plain = ("--preset", "3dgs_affine", "--steps", "7000")
+    assert at_size.options_of(key)[:6] == (*plain, "--optimizer.appearance", "0.003")
+    assert at_size.options_of(key._replace(scene=at_size.DUSK)) == plain
