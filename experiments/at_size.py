@@ -88,6 +88,18 @@ def options_of(key: Key) -> tuple[str, ...]:
     return said
 
 
+def street_of(options: Options, name: str) -> Path:
+    """Return the folder of the town that rows of a name were trained on, made where missing."""
+    if name == DUSK:
+        return photographed(options, 0, f"dusk{STOPS:g}", sensor(STOPS))
+    return scene(options, 0, std_of(name))
+
+
+def std_of(name: str) -> float:
+    """Return the ISO's spread that rows of a name were trained on."""
+    return next(std for std, known in STD_NAMES.items() if known == name)
+
+
 def figures(metrics: Mapping[str, Any], ev: float | None, linear: bool) -> dict[str, float]:
     """Return a row's figures.
 
@@ -143,16 +155,14 @@ def main() -> None:
     options = Options(args.out, protocol, 1, None, "python experiments/at_size.py")
 
     def row(key: Key) -> dict[str, Any]:
-        std = next((s for s, name in STD_NAMES.items() if name == key.scene), None)
-        if std is None:
-            street, which = photographed(options, 0, f"dusk{STOPS:g}", sensor(STOPS)), "--dusk"
-        else:
-            street, which = scene(options, 0, std), f"--stds {std:g}"
+        street = street_of(options, key.scene)
+        which = "--dusk" if key.scene == DUSK else f"--stds {std_of(key.scene):g}"
         said = options_of(key)
         run = options.folder / street.name / key.method
         fit = fitted(street, run, (*said, "--reference", str(street / "reference")), args.again)
         linear = NAMES[key.method] in WITH_EXPOSURES
-        ev = read_row(run, street)["ev"] if linear and std != CONSTANT else None
+        vary = key.scene != STD_NAMES[CONSTANT]
+        ev = read_row(run, street)["ev"] if linear and vary else None
         command = f"{options.command} --methods {key.method} {which} --steps {key.steps}"
         found = figures(fit.metrics, ev, linear)
         return {"figures": found, "options": " ".join(said), **of_fit(fit, command)}

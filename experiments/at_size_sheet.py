@@ -1,6 +1,6 @@
 """A picture of the table at size: details of held-out views at ISO 8, by method.
 
-python experiments/at_size_sheet.py [--out DIR] [--std 4] [--methods robust 3dgs ...]
+python experiments/at_size_sheet.py [--out DIR] [--std 4 | --dusk] [--methods robust 3dgs ...]
 
 Of the runs that `at_size.py --out DIR` has finished; those that are missing are said.
 """
@@ -13,10 +13,10 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from at_size import AT_SIZE, NAMES
+from at_size import AT_SIZE, DUSK, NAMES, street_of
 from judging import contact_sheet
 from sensor_town import at_iso_8
-from towns import Options, scene
+from towns import STD_NAMES, Options
 
 import p2gs_jax
 from p2gs_jax.core.atomic import atomic_write
@@ -48,10 +48,11 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/paper"), help="of at_size.py")
     parser.add_argument("--picture", type=Path, default=Path("at_size.jpg"), help="to write")
     parser.add_argument("--std", type=float, default=4.0, help="of the ISO")
+    parser.add_argument("--dusk", action="store_true", help="automatic exposure instead of ISO")
     parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=list(NAMES))
     args = parser.parse_args()
     options = Options(args.out, AT_SIZE, 1, None, "")
-    town = scene(options, 0, args.std)
+    town = street_of(options, DUSK if args.dusk else STD_NAMES[args.std])
     columns: dict[Detail, list[tuple[str, np.ndarray]]] = {detail: [] for detail in DETAILS}
     for method in args.methods:
         folder = options.folder / town.name / method
