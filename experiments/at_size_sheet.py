@@ -62,7 +62,7 @@ def main() -> None:
         run = p2gs_jax.load_run(folder)
         views, held = run.scene.views, run.scene.test_indices
         rows = {Path(views[i].name).with_suffix("").as_posix(): i for i in held}
-        pictures = at_iso_8(run, [rows[detail.view] for detail in DETAILS]).pictures
+        pictures = at_iso_8(run).pictures
         for detail in DETAILS:
             shown, target = pictures[rows[detail.view]]
             if not columns[detail]:

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -97,15 +97,10 @@ class AtIso8(NamedTuple):
     pictures: dict[int, tuple[np.ndarray, np.ndarray]]
 
 
-def at_iso_8(run: p2gs_jax.Run, views: Sequence[int] | None = None) -> AtIso8:
-    """Show held-out views as photographs at ISO 8 and compare.
-
-    Args:
-        run: the fit.
-        views: rows of the held-out views that are taken; all by default.
-    """
+def at_iso_8(run: p2gs_jax.Run) -> AtIso8:
+    """Show held-out views as photographs at ISO 8 and compare."""
     scene = run.scene
-    held = scene.test_indices if views is None else views
+    held = scene.test_indices
     display = common_display(run, range(len(scene.train_indices)))
     reference = load_reference(scene.root / "reference", scene, run.cfg)
     shown, targets, masks = [], [], []
