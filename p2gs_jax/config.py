@@ -359,8 +359,8 @@ class OptimizerConfig:
     """All other rates decay exponentially to this fraction (3DGS: no decay; ours: BUILD_NOTES)."""
     settled: float | None = 600.0
     """How often a fit may update a Gaussian before these rates are too high: one that does it more
-    often takes all rates of Gaussians times the root of the ratio. None: never (ours: BUILD_NOTES,
-    "Length")."""
+    often takes all rates of Gaussians but those of colours times the root of the ratio. None: never
+    (ours: BUILD_NOTES, "Length")."""
     extent: Literal["cameras", "near"] = "near"
     """What rates of the means and thresholds in scene extents are shares of: the radius of the
     cameras (3DGS), or the depth of what is near them where that is smaller (ours: a long drive is

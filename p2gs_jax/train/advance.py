@@ -36,7 +36,7 @@ class Controls(eqx.Module):
     Attributes:
         progress: fraction of the run completed.
         active_degree: spherical-harmonics degree in use.
-        rate: factor on the rates of Gaussians, from the length of the fit.
+        rate: factor on the rates of Gaussians but for colours, from the length of the fit.
         seed: of the fit, from `device_seed`.
     """
 

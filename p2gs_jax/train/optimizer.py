@@ -177,15 +177,17 @@ def learning_rates(
 
     Args:
         progress: fraction of the run completed.
-        rate: factor on those of Gaussians (`schedule.rate_factor`).
+        rate: factor on those of Gaussians but for colours (`schedule.rate_factor`).
         extent: scene extent, scene units.
         like: the parameters, for their structure.
         cfg: rates and schedules.
         bands: spherical-harmonics coefficients in use.
     """
     o = cfg.optimizer
-    decay = rate * o.final**progress
-    sh = jnp.full((bands, 1), o.sh_rest).at[0].set(o.sh_dc) * decay
+    final = o.final**progress
+    decay = rate * final
+    # Colours gain by their full rates in long fits too (BUILD_NOTES, "Length").
+    sh = jnp.full((bands, 1), o.sh_rest).at[0].set(o.sh_dc) * final
     gate = photometry_gate(progress, cfg)
     varies, balance = MODELS[cfg.photometry.model], like.photometry.raw_white_balance
     by_view = cfg.photometry.white_balance == "view"

@@ -85,7 +85,7 @@ def sh_degree_at(progress: float, cfg: TrainConfig, highest: int) -> int:
 
 
 def rate_factor(per_step: float, shown: float, settled: float | None) -> float:
-    """Return the factor on the rates of Gaussians in a fit of this length, at most 1.
+    """Return the factor on rates of Gaussians but for colours in a fit of this length, at most 1.
 
     Near an optimum the noise of Adam's steps adds up as their number times the squared rate: so
     long fits take rates lower by the root of their length (ours: BUILD_NOTES, "Length").

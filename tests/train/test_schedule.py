@@ -2,13 +2,17 @@
 
 import functools
 
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
-from p2gs_jax.config import TrainConfig
+from p2gs_jax.config import FitConfig, TrainConfig
 from p2gs_jax.train import schedule
 from p2gs_jax.train.host import HostState
+from p2gs_jax.train.optimizer import learning_rates
 from p2gs_jax.train.schedule import Pace
 from p2gs_jax.train.session import Session
+from p2gs_jax.types import Gaussians, Params, Photometry
 
 
 def test_levels_and_degrees():
@@ -58,6 +62,19 @@ def test_long_fits_take_lower_rates():
     # A Gaussian that every fourth view shows is updated as often in four times the steps.
     assert schedule.rate_factor(1 / 9600, 0.25, settled) == pytest.approx(0.5)
     assert schedule.rate_factor(1 / 30_000, 1.0, None) == 1.0
+
+
+def test_colours_keep_their_rates_in_long_fits():
+    zeros = jnp.zeros((2, 4, 3))
+    gaussians = Gaussians(zeros[:, 0], jnp.ones((2, 4)), zeros[:, 0], jnp.zeros(2), zeros)
+    like = Params(gaussians, Photometry(jnp.zeros(2), jnp.zeros(2), "log"))
+    short, long = (
+        learning_rates(jnp.float32(0.5), jnp.float32(rate), 1.0, like, FitConfig(), 4).gaussians
+        for rate in (1.0, 0.25)
+    )
+    for name in ("means", "quats", "log_scales", "opacity_logits"):
+        assert float(getattr(long, name)) == pytest.approx(float(getattr(short, name)) / 4)
+    np.testing.assert_array_equal(long.sh, short.sh)
 
 
 def test_finer_levels_count_for_more_in_the_time_left():
