@@ -22,7 +22,9 @@ the seconds of the whole fit, and the commit. Scripts, and what is not run here:
 [published](published/README.md). A row is one run and one seed. Machine: that of
 [results](results/README.md). Splats are blurred by .05 pixels^2 where nothing is said. Until
 057bc06 (2026-11-25) .3, the blur of 3DGS, was the default: rows of LOM and nerf_fox from before
-need `--render.blur 0.3` to be made again; those of lego name it.
+need `--render.blur 0.3` to be made again; those of lego name it. Rows of lego and nerf_fox are of
+before 05f3698 (2026-11-26), when colours were slowed in long fits like all else
+([length](results/2026-11-25-length.md)).
 """
 NOT_RUN = "Not run yet."
 AT_SIZE, HDR = HERE.parent / "at_size.json", "mu_law_novel"
