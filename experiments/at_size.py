@@ -146,7 +146,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("runs/paper"))
     parser.add_argument("--methods", nargs="+", default=list(ORDER), choices=ORDER)
-    parser.add_argument("--stds", type=float, nargs="+", default=[4.0, 2.0, 0.0])
+    parser.add_argument("--stds", type=float, nargs="+", default=[4.0, 2.0, 0.0], choices=STD_NAMES)
     parser.add_argument("--dusk", action="store_true", help="automatic exposure instead of ISO")
     parser.add_argument("--steps", type=int, default=AT_SIZE.steps)
     parser.add_argument("--again", action="store_true", help="measure also what is there")

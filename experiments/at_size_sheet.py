@@ -47,7 +47,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("runs/paper"), help="of at_size.py")
     parser.add_argument("--picture", type=Path, default=Path("at_size.jpg"), help="to write")
-    parser.add_argument("--std", type=float, default=4.0, help="of the ISO")
+    parser.add_argument("--std", type=float, default=4.0, choices=STD_NAMES, help="of the ISO")
     parser.add_argument("--dusk", action="store_true", help="automatic exposure instead of ISO")
     parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=list(NAMES))
     args = parser.parse_args()
