@@ -7,17 +7,16 @@ import resource
 import shutil
 import signal
 import sys
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from filelock import FileLock
 
-# Programs compiled by one test or its child processes serve the others of the session; a fresh
-# session compiles everything once.
-_COMPILED = tempfile.TemporaryDirectory(prefix="p2gs-compiled-")
-os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", _COMPILED.name)
+# Programs compiled by one test or its child processes serve all others, in later sessions too: JAX
+# finds them by what they compute.
+COMPILED = Path(__file__).parents[1] / ".pytest_cache" / "xla"
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(COMPILED))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 
 # From here on, programs of a finished file are forgotten; those wanted again come from disk.
