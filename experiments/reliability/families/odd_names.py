@@ -108,8 +108,15 @@ def with_photograph(odd: str) -> Callable[[Path], Path]:
 
 def _camera(odd: str) -> Callable[[Path], Path]:
     def make(root: Path) -> Path:
-        scenes.write_rig(root)
-        (root / "images" / "front").rename(root / "images" / odd.replace("/", "|"))
+        scenes.write_transforms(root)
+        place = root / "images" / odd.replace("/", "|")
+        place.mkdir()
+        said = json.loads((root / "transforms.json").read_text())
+        frame = said["frames"][0]
+        photograph = root / frame["file_path"]
+        photograph.rename(place / photograph.name)
+        frame["file_path"] = f"images/{place.name}/{photograph.name}"
+        (root / "transforms.json").write_text(json.dumps(said))
         return root
 
     return make

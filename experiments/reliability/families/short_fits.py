@@ -19,7 +19,6 @@ SPACING = 100
 CHOSEN = frozenset(
     {
         "colmap whole (True)",
-        "rig whole",
         "kind: CMYK.jpg",
         "kind: palette.png",
         "kind: animated.webp",
