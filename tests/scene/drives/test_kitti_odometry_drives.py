@@ -11,7 +11,6 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.drives import read_drive
 from p2gs_jax.scene.drives.kitti_odometry import is_kitti_odometry, read_kitti_odometry
-from p2gs_jax.scene.rig import load_rig
 
 CFG = DataConfig()
 TR = made.VELO_TO_CAM
@@ -63,33 +62,6 @@ def test_scans_lie_in_the_world_of_the_first_camera(sequence):
         np.testing.assert_allclose(points, expected, atol=1e-4)
         assert np.abs(times - sweep.time).max() <= 0.05
     assert recording.photographs[1].time == pytest.approx(0.1)
-
-
-def test_real_cameras_are_those_of_the_rig(shared_data, tmp_path):
-    """The same files read as a rig, which was checked against COLMAP's triangulation."""
-    source = shared_data("kitti_stereo_a")
-    rig, folder = tmp_path / "rig", tmp_path / "sequences" / "00"
-    (tmp_path / "poses").mkdir()
-    for target in (rig, folder):
-        target.mkdir(parents=True)
-        shutil.copy(source / "calib.txt", target)
-    shutil.copy(source / "poses.txt", rig)
-    shutil.copy(source / "poses.txt", tmp_path / "poses" / "00.txt")
-    (rig / "images").symlink_to(source / "images")
-    for k, side in enumerate(("left", "right")):
-        (folder / f"image_{k}").symlink_to(source / "images" / side)
-    (folder / "times.txt").write_text("".join(f"{0.1 * k}\n" for k in range(40)))
-    scene = load_rig(rig, CFG)
-    recording = read(folder)
-    assert len(recording.photographs) == len(scene.views) == 80
-    names = {"left": "image_0", "right": "image_1"}
-    found = {(p.camera, p.path.name): p for p in recording.photographs}
-    for view in scene.views:
-        photograph = found[names[view.camera], view.image_path.name]
-        camera = next(c for c in recording.cameras if c.name == photograph.camera)
-        np.testing.assert_allclose(camera.K, view.K, rtol=1e-6)
-        np.testing.assert_allclose(np.linalg.inv(photograph.pose), view.viewmat, atol=2e-4)
-        assert (camera.width, camera.height) == (view.width, view.height) == (1226, 370)
 
 
 def test_the_benchmark_names_its_sequences(sequence):
