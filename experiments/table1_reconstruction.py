@@ -33,8 +33,7 @@ from towns import (
 
 from p2gs_jax.render.host import make_renderer
 from p2gs_jax.run.read import load_run
-from p2gs_jax.scene.device import camera_of
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 
 # Table 1 of the paper (Waymo): FPS on its GPU, SSIM, PSNR, HIS, Std-Luminance.
 PAPER = {

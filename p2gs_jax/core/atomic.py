@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from p2gs_jax.core.disk import naming
+from p2gs_jax.core.atomic import naming
 from p2gs_jax.errors import UserError
 
 _BEGUN = ".writing-"

@@ -12,7 +12,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from p2gs_jax.core.terminal import PlainConsole
+from p2gs_jax.core.progress import PlainConsole
 
 # Seconds between lines of progress where there is no terminal.
 EVERY_S = 15.0

@@ -12,8 +12,8 @@ from p2gs_jax.evaluate.alignment import with_fitted_exposure
 from p2gs_jax.evaluate.renders_of_others import Rendered
 from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
 from p2gs_jax.photometry.matte import LEAST
-from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.scene.pixels.decode import floats
+from p2gs_jax.scene.pixels.store import ImageStore
 
 
 class Light(NamedTuple):

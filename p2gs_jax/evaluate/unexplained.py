@@ -23,7 +23,7 @@ from p2gs_jax.core.numerics import on_host
 from p2gs_jax.evaluate.array_store import ArrayStore, StoredArray
 from p2gs_jax.evaluate.novel_views import Surface
 from p2gs_jax.render.warp import warp
-from p2gs_jax.scene.geometry import scale_intrinsics
+from p2gs_jax.scene.lens import scale_intrinsics
 from p2gs_jax.types import Camera, Scene, View
 
 # Photographs are compared at this width; lengths below are in its pixels.

@@ -17,7 +17,7 @@ from p2gs_jax.photometry.observations import COARSEST, Observations
 from p2gs_jax.photometry.one_response import solve_response
 from p2gs_jax.photometry.response import Response
 from p2gs_jax.photometry.selection import Selection, select
-from p2gs_jax.scene.known_exposures import read_known_exposures
+from p2gs_jax.scene.exposures import read_known_exposures
 from p2gs_jax.types import Scene
 
 # Points of a view that a given kind of curve is fitted to.

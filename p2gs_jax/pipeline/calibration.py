@@ -14,7 +14,7 @@ from p2gs_jax.photometry.agreement import Agreement, compare, note_on_levels
 from p2gs_jax.photometry.selection import Selection
 from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.run.photometry_file import MEAN_GAUGE
-from p2gs_jax.scene.known_exposures import stated_ev
+from p2gs_jax.scene.exposures import stated_ev
 from p2gs_jax.types import Scene, View
 
 

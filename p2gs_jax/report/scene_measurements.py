@@ -16,8 +16,7 @@ from p2gs_jax.render.warp import surface_depth
 from p2gs_jax.report.run_files import RunFiles
 from p2gs_jax.report.view_comparisons import ViewComparison, spread
 from p2gs_jax.run.read import Run, load_run
-from p2gs_jax.scene.device import camera_of
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 from p2gs_jax.synth.exposures import read_true_exposures
 
 MOST_PAIRS, MOST_CLIPPED, MOST_RENDERED = 12, 24, 3

@@ -19,7 +19,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from p2gs_jax.core.disk import naming
+from p2gs_jax.core.atomic import naming
 from p2gs_jax.errors import UserError
 
 Tree = TypeVar("Tree")

@@ -11,8 +11,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from p2gs_jax.core.atomic import remove_begun
-from p2gs_jax.core.disk import naming
+from p2gs_jax.core.atomic import naming, remove_begun
 from p2gs_jax.errors import UserError
 
 try:

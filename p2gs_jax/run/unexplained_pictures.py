@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float32
 
 from p2gs_jax.evaluate.unexplained import WIDTH, Unexplained
 from p2gs_jax.formats.png import write_png
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import Scene
 
 MOST_PICTURES = 6

@@ -7,7 +7,7 @@ from rich.table import Table
 from rich.text import Text
 
 from p2gs_jax.core.printable import printable
-from p2gs_jax.core.terminal import PlainConsole
+from p2gs_jax.core.progress import PlainConsole
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import pytest
 from p2gs_jax.config import FitConfig
 from p2gs_jax.evaluate import evaluate as evaluation
 from p2gs_jax.evaluate.array_store import ArrayStore
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import Gaussians, Params, Photometry, Render, Scene, View
 
 

@@ -12,7 +12,7 @@ from p2gs_jax.evaluate.evaluate import evaluate
 from p2gs_jax.evaluate.untold import Untold, untold_notes
 from p2gs_jax.render.host import make_renderer
 from p2gs_jax.run.read import load_run
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 
 SIZE = (20, 30)
 EVERYTHING = np.ones(SIZE, np.float32)

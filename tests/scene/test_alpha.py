@@ -9,7 +9,7 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.run.scene_file import read_scene, write_scene
 from p2gs_jax.scene import ImageStore, load_scene
-from p2gs_jax.scene.backdrop import backdrop_of, has_alpha
+from p2gs_jax.scene.masks import background_color, has_alpha
 from p2gs_jax.train.views import TrainingViews
 
 RNG = np.random.default_rng(0)
@@ -158,7 +158,7 @@ def test_which_files_have_alpha(cutouts, tmp_path):
 @pytest.mark.parametrize("text", ["blue", "1,1", "0.5,0.5,1.5", "0,0,nan", "", "1,1,1,1"])
 def test_colours_that_are_none(text):
     with pytest.raises(UserError, match="is no colour"):
-        backdrop_of(DataConfig(background=text))
+        background_color(DataConfig(background=text))
 
 
 def test_a_mask_of_another_shape_is_refused(cutouts):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene.known_exposures import check_source, read_known_exposures
+from p2gs_jax.scene.exposures import check_source, read_known_exposures
 from p2gs_jax.types import View
 
 

@@ -9,7 +9,7 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.cache import cached_folder
-from p2gs_jax.scene.features import pairs_by_name, pairs_by_pose
+from p2gs_jax.scene.sfm.features import pairs_by_name, pairs_by_pose
 
 CFG = DataConfig()
 

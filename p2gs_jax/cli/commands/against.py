@@ -14,7 +14,7 @@ from p2gs_jax.cli.commands.console import stdout
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.evaluate.against import Judge, check_renders, judge_renders, own_scores
 from p2gs_jax.evaluate.renders_of_others import OtherRenders, find_renders
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import Scene
 
 PROTOCOLS = {

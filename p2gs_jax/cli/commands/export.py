@@ -28,9 +28,8 @@ from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.render.vibration import at_time
 from p2gs_jax.run.appearance_file import write_appearance
 from p2gs_jax.run.read import Run, load_run
-from p2gs_jax.scene.device import camera_of
-from p2gs_jax.scene.exif import read_exif_settings
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.exposures import read_exif_settings
+from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 
 PLACES: dict[Format, tuple[str, ...]] = {
     "linear-ply": ("linear.ply", "linear.json"),

@@ -33,8 +33,7 @@ from p2gs_jax.render.host import make_renderer
 from p2gs_jax.render.spherical_harmonics import MAX_DEGREE
 from p2gs_jax.render.vibration import at_time
 from p2gs_jax.run.read import Run
-from p2gs_jax.scene.device import camera_of
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 from p2gs_jax.types import Gaussians
 
 STEPS = 240

@@ -10,8 +10,7 @@ from p2gs_jax.cli.options.survey import Survey as Options
 from p2gs_jax.cli.options.survey import resolve_survey
 from p2gs_jax.core.progress import TerminalReporter
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene.plan_picture import draw_plan
-from p2gs_jax.scene.survey import Survey, SurveyedCamera, labels_of, survey
+from p2gs_jax.scene.survey import Survey, SurveyedCamera, draw_plan, labels_of, survey
 
 # Labels of boxes that are named; the rest is counted.
 MOST_LABELS = 8

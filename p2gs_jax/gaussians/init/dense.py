@@ -25,7 +25,7 @@ from p2gs_jax.gaussians.init.brightness import MatchImages, Tones
 from p2gs_jax.gaussians.init.flow import CHECKS, DepthMap, Flows, depth_map, pixel_centers
 from p2gs_jax.gaussians.init.pairs import neighbours, visibility
 from p2gs_jax.photometry.cameras import places
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import Scene
 
 # A depth that two neighbours must agree on needs at least three views.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from p2gs_jax.config import FitConfig
 from p2gs_jax.gaussians.init.dense import FEWEST_VIEWS
 from p2gs_jax.gaussians.population import Coverage, default_max_gaussians
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.visibility import shown_share
 from p2gs_jax.types import Scene
 

@@ -15,7 +15,7 @@ from p2gs_jax.gaussians.init.shell import Shell
 from p2gs_jax.photometry.cameras import places
 from p2gs_jax.photometry.formation import inverse_formation
 from p2gs_jax.photometry.sources.sampling import sample
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import Gaussians, Photometry, Scene, View
 
 # Of a time budget at most this share goes into dense seeds, if two idle cores need so long a view.

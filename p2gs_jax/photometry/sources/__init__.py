@@ -11,7 +11,7 @@ from collections.abc import Callable
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.sources.projected import projected_colors
 from p2gs_jax.photometry.sources.tracks import has_tracks, track_colors
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import Scene
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.sources.sampling import sample_where_seen, thinned
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.visibility import project_points, unoccluded
 from p2gs_jax.types import Scene
 

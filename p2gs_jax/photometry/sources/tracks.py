@@ -8,7 +8,7 @@ import numpy as np
 
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.sources.sampling import point_colors
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import Scene
 
 

@@ -40,7 +40,7 @@ from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sw
 from p2gs_jax.scene.drives.tables import finite_numbers, missing_file, numbered
 from p2gs_jax.scene.drives.unified_lens import as_opencv
 from p2gs_jax.scene.files import image_size
-from p2gs_jax.scene.geometry import intrinsics
+from p2gs_jax.scene.lens import intrinsics
 from p2gs_jax.scene.rigid import (
     inverse,
     rigid,

@@ -22,7 +22,7 @@ from p2gs_jax.scene.drives.unmoving import (
     weigh,
 )
 from p2gs_jax.scene.files import decode_grey, undecodable
-from p2gs_jax.scene.geometry import scale_intrinsics
+from p2gs_jax.scene.lens import scale_intrinsics
 from p2gs_jax.scene.rigid import (
     inverse,
     up_of_drive,

@@ -12,7 +12,7 @@ from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.drives import read_drive
 from p2gs_jax.scene.drives.kitti_360 import is_kitti_360, read_kitti_360
 from p2gs_jax.scene.drives.unified_lens import as_opencv
-from p2gs_jax.scene.geometry import undistort_points
+from p2gs_jax.scene.lens import undistort_points
 
 CFG = DataConfig()
 NAME = "2013_05_28_drive_0000_sync"
