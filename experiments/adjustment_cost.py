@@ -18,6 +18,7 @@ import resource
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 
@@ -41,7 +42,9 @@ def measure(frames: int, points: int) -> dict[str, float]:
     from p2gs_jax import exposure_error
     from p2gs_jax.photometry.adjustment.fit import fit_model
     from p2gs_jax.photometry.adjustment.problem import make_problem
-    from p2gs_jax.synth.drive import make_drive, make_exposures, observe
+
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+    from synthetic_drive import make_drive, make_exposures, observe
 
     drive = make_drive(frames, points)
     truth = make_exposures(drive, "iso4")

@@ -13,7 +13,6 @@ from p2gs_jax.scene.backdrop import with_alpha
 from p2gs_jax.scene.colmap import find_model, load_colmap
 from p2gs_jax.scene.drives import read_drive
 from p2gs_jax.scene.drives.assemble import assemble
-from p2gs_jax.scene.drives.kitti_odometry import is_kitti_odometry
 from p2gs_jax.scene.drives.recording import Recording
 from p2gs_jax.scene.exif import read_exif_ev
 from p2gs_jax.scene.files import image_size, list_images
@@ -163,10 +162,7 @@ def find_scene(
         return load_blender(root, cfg)
     if is_llff(root) and cfg.format in (None, "llff"):
         return load_llff(root, cfg)
-    # SemanticKITTI's sequences have a poses.txt, too.
-    if is_rig(root) and (
-        cfg.format == "rig" or (cfg.format is None and not is_kitti_odometry(root))
-    ):
+    if is_rig(root) and cfg.format in (None, "rig"):
         return load_rig(root, cfg)
     recording = read_drive(root, cfg, report)
     if recording is not None:

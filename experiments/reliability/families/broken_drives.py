@@ -23,7 +23,7 @@ from p2gs_jax.run.read import load_run
 from p2gs_jax.scene.known_exposures import check_source
 
 NAME = "broken_drives"
-ABOUT = """Drives of nuScenes, Argoverse 2, Waymo, PandaSet and KITTI (three layouts), tables of
+ABOUT = """Drives of nuScenes, Argoverse 2, Waymo, PandaSet and KITTI, tables of
 exposures, lists of cameras and the files of a finished run, each cut, flipped, out of range, empty
 or gone, and tables whose names lead out of the drive. Each is read whole, or refused with code 2 by
 a message that names file, fault and remedy, within 30 s and 2 GB."""
@@ -46,8 +46,7 @@ MENDED = (
     ),
     Mended(
         "LiDAR points of KITTI that are no numbers: traceback",
-        "tests/scene/drives/test_kitti_360_drives.py"
-        "::test_points_that_are_no_numbers_are_counted_and_left_out",
+        "tests/scene/drives/test_assemble.py::test_laser_points_are_told_apart_by_what_they_lie_on",
     ),
 )
 SEED = 20261125
@@ -60,8 +59,6 @@ WRITERS = {
     "argoverse": ("scene.drives.test_argoverse", "write_log"),
     "waymo": ("scene.drives.test_waymo", "write_segment"),
     "kitti_raw": ("scene.drives.made_kitti", "write_raw"),
-    "kitti_odometry": ("scene.drives.test_kitti_odometry_drives", "write_benchmark"),
-    "kitti_360": ("scene.drives.test_kitti_360_drives", "write_set"),
     "pandaset": ("scene.drives.test_pandaset_drives", "write_sequence"),
 }
 RUN_FILES = ("config.json", "photometry.json", "decisions.json", "scene.npz", "radiance.ply")
