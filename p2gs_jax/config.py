@@ -41,7 +41,6 @@ SceneFormat = Literal[
     "transforms",
     "blender",
     "llff",
-    "rig",
     "pandaset",
     "nuscenes",
     "waymo",
