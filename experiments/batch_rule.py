@@ -15,7 +15,9 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core.compile_cache import use_compile_cache
 from p2gs_jax.core.runtime import tune_process
 from p2gs_jax.pipeline.fit import fit
-from p2gs_jax.run.layout import RunFolder
+from p2gs_jax.run.folder import (
+    RunFolder,
+)
 from p2gs_jax.sweep import with_fields
 from p2gs_jax.synth.write import write_street
 

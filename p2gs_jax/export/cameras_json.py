@@ -13,7 +13,9 @@ import numpy as np
 from jaxtyping import Float
 
 from p2gs_jax.formats.usd import APERTURE_MM, NamedCamera
-from p2gs_jax.run.photometry_file import ViewPhotometry
+from p2gs_jax.run.photometry_files import (
+    ViewPhotometry,
+)
 
 FORMAT, VERSION = "p2gs-jax cameras", 1
 # Ours are right, down, forward. Blender: right, forward, up; right-handed.

@@ -20,7 +20,10 @@ from jaxtyping import Float64
 from p2gs_jax.core.atomic import write_json, write_text
 from p2gs_jax.core.json_text import parse_json
 from p2gs_jax.errors import UserError
-from p2gs_jax.run.photometry_file import PhotometryFile, ViewPhotometry
+from p2gs_jax.run.photometry_files import (
+    PhotometryFile,
+    ViewPhotometry,
+)
 from p2gs_jax.types import Scene, View
 
 FORMAT, VERSION = "p2gs-jax drive", 1

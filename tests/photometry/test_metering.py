@@ -13,7 +13,10 @@ from p2gs_jax.photometry.metering import (
     meter,
     white_level,
 )
-from p2gs_jax.run.metering_file import read_metering, write_metering
+from p2gs_jax.run.photometry_files import (
+    read_metering,
+    write_metering,
+)
 
 RNG = np.random.default_rng(0)
 PICTURE = np.exp2(RNG.normal(-3, 2, (40, 60, 1))) * np.ones(3)

@@ -4,7 +4,9 @@ import shutil
 
 import numpy as np
 
-from p2gs_jax.run.layout import RunFolder
+from p2gs_jax.run.folder import (
+    RunFolder,
+)
 from p2gs_jax.run.read import load_run
 
 

@@ -36,12 +36,15 @@ from p2gs_jax.scene.drives.kitti_files import (
     rectified_camera,
     untwisted,
 )
-from p2gs_jax.scene.drives.poses import inverse, rigid
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sweep, SweepPoints
 from p2gs_jax.scene.drives.tables import finite_numbers, missing_file, numbered
 from p2gs_jax.scene.drives.unified_lens import as_opencv
 from p2gs_jax.scene.files import image_size
 from p2gs_jax.scene.geometry import intrinsics
+from p2gs_jax.scene.rigid import (
+    inverse,
+    rigid,
+)
 from p2gs_jax.types import Distortion
 
 # Seconds a frame, where the time stamps were not downloaded.

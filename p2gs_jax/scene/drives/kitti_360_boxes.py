@@ -17,8 +17,10 @@ from jaxtyping import Float64
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.drives.kitti_tracklets import child_text, read_xml
 from p2gs_jax.scene.drives.objects import tracked
-from p2gs_jax.scene.drives.poses import rigid
 from p2gs_jax.scene.drives.tables import finite_numbers
+from p2gs_jax.scene.rigid import (
+    rigid,
+)
 from p2gs_jax.types import TrackedObject
 
 _FIX = "get the file again as published"

@@ -9,10 +9,12 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene.drives.poses import interpolated
 from p2gs_jax.scene.drives.recording import SweepPoints
 from p2gs_jax.scene.drives.spin import turned
 from p2gs_jax.scene.drives.tables import finite_numbers, missing_file
+from p2gs_jax.scene.rigid import (
+    interpolated,
+)
 
 PHOTOGRAPHS = (".png", ".jpg", ".jpeg")
 # Seconds of a turn of the scanner, where no file says when it began and ended.

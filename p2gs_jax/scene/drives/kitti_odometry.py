@@ -30,10 +30,12 @@ from p2gs_jax.scene.drives.kitti_files import (
     read_rows,
     rectified_camera,
 )
-from p2gs_jax.scene.drives.poses import rigid
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sweep, SweepPoints
 from p2gs_jax.scene.drives.tables import numbered
 from p2gs_jax.scene.files import image_size
+from p2gs_jax.scene.rigid import (
+    rigid,
+)
 
 GREY = ("image_0", "image_1")
 

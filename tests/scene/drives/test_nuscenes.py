@@ -5,6 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from p2gs_jax.scene.rigid import (
+    inverse,
+)
 from scene.drives.writers import (
     HEIGHT,
     WIDTH,
@@ -23,7 +26,6 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.drives.assemble import assemble
 from p2gs_jax.scene.drives.nuscenes import is_nuscenes, read_nuscenes
-from p2gs_jax.scene.drives.poses import inverse
 from p2gs_jax.scene.images import ImageStore
 
 START = 1532402927647951

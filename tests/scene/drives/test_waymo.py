@@ -7,6 +7,9 @@ import cv2
 import numpy as np
 import pyarrow as pa
 import pytest
+from p2gs_jax.scene.rigid import (
+    inverse,
+)
 from pyarrow import parquet
 from scene.drives.writers import (
     FORWARD,
@@ -22,7 +25,6 @@ from scipy.spatial.transform import Rotation
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene import load_scene
-from p2gs_jax.scene.drives.poses import inverse
 from p2gs_jax.scene.drives.waymo import is_waymo, read_waymo
 
 START = 1550083467346370
