@@ -6,12 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from made_drive import FAR, SPEED, WALL, make_recording
-from p2gs_jax.scene.rigid import (
-    headings,
-    left_of_way,
-    moment_of,
-    up_of_drive,
-)
 
 from p2gs_jax.config import DataConfig, FitConfig
 from p2gs_jax.core.atomic import plain
@@ -22,6 +16,12 @@ from p2gs_jax.evaluate.novel_views import Surface, picked, shifted, unseen_share
 from p2gs_jax.evaluate.region_scores import mean_of_parts, parts_of, region_scores
 from p2gs_jax.scene.drives.assemble import assemble
 from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.rigid import (
+    headings,
+    left_of_way,
+    moment_of,
+    up_of_drive,
+)
 from p2gs_jax.scene.split import assign_split
 from p2gs_jax.types import Gaussians, Lidar, Params, Photometry, Render, View
 

@@ -199,7 +199,9 @@ def test_photometry_of_incomplete_views(tmp_path):
     with pytest.raises(ValueError, match=r"view 0: .*gamma"):
         write_photometry(path, model="m", curve={}, gauge="g", mean={}, views=[{"image": "a"}])
     assert not path.exists()
-    path.write_text('{"model": 1, "curve": 1, "gauge": 1, "mean": 1, "views": [3]}')
+    path.write_text(
+        '{"version": 2, "model": 1, "curve": 1, "gauge": 1, "mean": 1, "cameras": 1, "views": [3]}'
+    )
     with pytest.raises(UserError, match="view 0: not an object"):
         read_photometry(path)
 

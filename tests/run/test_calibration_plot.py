@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from synthetic_drive import make_drive, make_exposures, observe
 
 from p2gs_jax.photometry.adjustment.curve import fit_response
 from p2gs_jax.photometry.adjustment.fit import fit_model
@@ -12,7 +13,6 @@ from p2gs_jax.run.plots import (
     curves_to_draw,
     write_calibration_plot,
 )
-from p2gs_jax.synth.drive import make_drive, make_exposures, observe
 
 DRIVE = make_drive(12, 400)
 PIVOT = 0.18

@@ -7,9 +7,6 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pytest
-from p2gs_jax.scene.rigid import (
-    inverse,
-)
 from pyarrow import feather
 from scene.drives.writers import (
     HEIGHT,
@@ -31,6 +28,9 @@ from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.drives import arrow
 from p2gs_jax.scene.drives.argoverse import is_argoverse, read_argoverse
 from p2gs_jax.scene.drives.assemble import assemble
+from p2gs_jax.scene.rigid import (
+    inverse,
+)
 
 START = 315968112437425433
 CAMERAS = {

@@ -10,9 +10,6 @@ import cv2
 import numpy as np
 import pandas as pd
 import pytest
-from p2gs_jax.scene.rigid import (
-    interpolated,
-)
 from scene.drives import made_kitti as made
 from scipy.spatial.transform import Rotation
 
@@ -23,6 +20,9 @@ from p2gs_jax.scene.drives import read_drive
 from p2gs_jax.scene.drives.lidar import owners
 from p2gs_jax.scene.drives.pandaset import is_pandaset, read_pandaset
 from p2gs_jax.scene.drives.pickled_tables import read_table
+from p2gs_jax.scene.rigid import (
+    interpolated,
+)
 
 CFG = DataConfig()
 BEGIN = 1557539956.5
