@@ -1,4 +1,4 @@
-"""Checkpoints of any pytree: written whole or not at all, the last few kept, a broken newest survived.
+"""Checkpoints of any pytree: written whole or not at all, and a broken newest is survived.
 
 A checkpoint is a folder named by its step, with one `.npz`: the bytes of every leaf, and a table of
 their names, types and shapes beside plain values. The checksums of the archive find flipped bits.

@@ -1,7 +1,7 @@
 """What each camera did to the light, for other tools to read (docs/files.md).
 
 `photometry.json` has exposures, gammas and tone curve; `metering.json` the rule that explains the
-exposures; `appearance.npy`, `ppisp.json` or `luminance.json` the corrections that a baseline learns.
+exposures; `appearance.npy`, `ppisp.json` or `luminance.json` what a baseline learns.
 """
 
 from __future__ import annotations
