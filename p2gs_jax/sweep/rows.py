@@ -11,7 +11,6 @@ import numpy as np
 from p2gs_jax.core.clock import whole_run
 from p2gs_jax.core.json_text import parse_json
 from p2gs_jax.evaluate.alignment import exposure_error
-from p2gs_jax.run.old_metrics import as_today
 from p2gs_jax.synth.exposures import read_true_exposures
 
 # Name of the column, path in metrics.json, digits.
@@ -44,7 +43,7 @@ def read_row(run: Path, scene: Path) -> dict[str, Any]:
         run: its folder.
         scene: where `truth/exposures.csv` may lie.
     """
-    metrics = as_today(parse_json((run / "metrics.json").read_text(encoding="utf-8")))
+    metrics = parse_json((run / "metrics.json").read_text(encoding="utf-8"))
     row: dict[str, Any] = {}
     for name, path, _ in COLUMNS:
         value = metrics

@@ -19,7 +19,9 @@ from p2gs_jax.pipeline.decide import kept_choice
 from p2gs_jax.pipeline.preflight import Paths, check_run_dir, check_sizes, preflight
 from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.run.decisions import KEY, Decisions
-from p2gs_jax.run.layout import RunFolder
+from p2gs_jax.run.folder import (
+    RunFolder,
+)
 from p2gs_jax.sweep import with_fields
 from p2gs_jax.types import Photometry, View
 

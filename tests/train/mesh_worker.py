@@ -27,7 +27,9 @@ from p2gs_jax.pipeline.fit import optimise
 from p2gs_jax.pipeline.prepare import load, prepare
 from p2gs_jax.render import xla_cpu
 from p2gs_jax.render.capacity import Room
-from p2gs_jax.run.layout import RunFolder
+from p2gs_jax.run.folder import (
+    RunFolder,
+)
 from p2gs_jax.sweep import with_fields
 from p2gs_jax.train.advance import Controls
 from p2gs_jax.train.batches import stacked
