@@ -20,14 +20,16 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.spatial import KDTree
-
 from p2gs_jax.bench.scenes import BenchScene, make_gaussians, street
 from p2gs_jax.bench.timing import interleaved
+from scipy.spatial import KDTree
+
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render import bin_tiles, count_entries, project, rasterize
 from p2gs_jax.render.capacity import bucket
-from p2gs_jax.render.spherical_harmonics import C0
+from p2gs_jax.render.harmonics import (
+    C0,
+)
 from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.types import Camera
 

@@ -18,7 +18,10 @@ from p2gs_jax.formats.gltf import EXTENSION, write_gltf
 from p2gs_jax.formats.gsplat_checkpoint import write_gsplat
 from p2gs_jax.formats.torch_file import write_torch
 from p2gs_jax.formats.usd import CAMERAS, SPLATS, NamedCamera, write_usd
-from p2gs_jax.render.spherical_harmonics import C0, evaluate
+from p2gs_jax.render.harmonics import (
+    C0,
+    evaluate,
+)
 
 FLIP = np.array([1.0, -1.0, -1.0])
 

@@ -21,7 +21,9 @@ from p2gs_jax.core.progress import Silent
 from p2gs_jax.evaluate.evaluate import evaluate
 from p2gs_jax.pipeline.fit import compact, optimise
 from p2gs_jax.pipeline.prepare import load, prepare
-from p2gs_jax.render.host import make_renderer
+from p2gs_jax.render.capacity import (
+    make_renderer,
+)
 from p2gs_jax.run.layout import RunFolder
 from p2gs_jax.sweep import with_fields
 from p2gs_jax.train.loop import TrainResult
