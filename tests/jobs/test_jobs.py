@@ -189,7 +189,7 @@ def test_the_table_names_every_job_that_runs():
     [
         ("ray://host:1", "there is no engine 'ray://host:1'"),
         ("dask://host", "names no port"),
-        ("slurm:gpu", "'gpu' is no OPTION=VALUE"),
+        ("slurm:gpu", "'gpu' is not OPTION=VALUE"),
     ],
 )
 def test_engines_that_are_not_there_are_refused(name, said):
@@ -198,7 +198,7 @@ def test_engines_that_are_not_there_are_refused(name, said):
 
 
 def test_a_missing_library_is_named_with_its_extra(monkeypatch):
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("p2gs_jax.jobs.engines.find_spec", lambda name: None)
     with pytest.raises(UserError, match=r"p2gs-jax\[dask\]"):
         check_engine("dask://host:8786")
     with pytest.raises(UserError, match=r"p2gs-jax\[slurm\]"):
