@@ -11,10 +11,11 @@ from p2gs_jax.config import FitConfig, preset
 from p2gs_jax.errors import DivergenceError, UserError
 
 if TYPE_CHECKING:
-    from p2gs_jax import sweep
     from p2gs_jax.core.devices import Devices
     from p2gs_jax.districts.fit import fit_blocks
     from p2gs_jax.evaluate.alignment import exposure_error
+    from p2gs_jax.jobs.configs import grid, read_sweep, with_fields
+    from p2gs_jax.jobs.sweep import sweep
     from p2gs_jax.paths.pinhole import make_camera
     from p2gs_jax.photometry.display import DisplayTransform, develop
     from p2gs_jax.pipeline.calibrate import calibrate
@@ -24,8 +25,6 @@ if TYPE_CHECKING:
     from p2gs_jax.pipeline.fit import fit
     from p2gs_jax.render import render_linear, required_capacity
     from p2gs_jax.run.read import Run, load_run
-    from p2gs_jax.jobs.configs import grid, read_sweep, with_fields
-    from p2gs_jax.jobs.sweep import sweep
     from p2gs_jax.synth.write import write_street
     from p2gs_jax.types import Camera, Gaussians, Params, Photometry, Render, Scene
 

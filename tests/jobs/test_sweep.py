@@ -10,15 +10,26 @@ import pytest
 from tiny_scene import make_scene
 
 import p2gs_jax
+from p2gs_jax.cli import main
 from p2gs_jax.core import interrupts
+from p2gs_jax.core.clock import whole_run
 from p2gs_jax.core.interrupts import Interrupted
 from p2gs_jax.errors import UserError
+from p2gs_jax.jobs.configs import (
+    grid,
+    read_sweep,
+    with_fields,
+)
 from p2gs_jax.jobs.job import REASON, JobFiles, read_job
-from p2gs_jax.run.lock import locked
-from p2gs_jax.cli import main
-from p2gs_jax.core.clock import whole_run
-from p2gs_jax.sweep import grid, read_sweep, sweep, with_fields
-from p2gs_jax.sweep.rows import brief, failures, to_markdown
+from p2gs_jax.jobs.sweep import (
+    brief,
+    failures,
+    sweep,
+    to_markdown,
+)
+from p2gs_jax.run.folder import (
+    locked,
+)
 
 BASE = p2gs_jax.preset("robust")
 SMALL = with_fields(
@@ -225,9 +236,7 @@ def test_a_signal_leaves_a_table_and_the_same_sweep_goes_on(tmp_path):
         return finished(run, stop)
 
     with pytest.raises(Interrupted), interrupts.raised():
-        sweep(
-            "scene", tmp_path, CONFIGS, on_look=lambda states: all_begun.set(), run=runner(work)
-        )
+        sweep("scene", tmp_path, CONFIGS, on_look=lambda states: all_begun.set(), run=runner(work))
     rows = json.loads((tmp_path / "sweep.json").read_text())
     assert [row["status"] for row in rows] == ["done", "interrupted", "interrupted"]
     assert not list(tmp_path.rglob(REASON))

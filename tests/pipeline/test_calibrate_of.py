@@ -21,7 +21,9 @@ from p2gs_jax.gaussians.relit import relit
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.render.host import make_renderer
 from p2gs_jax.render.spherical_harmonics import C0
-from p2gs_jax.run.photometry_file import read_photometry
+from p2gs_jax.run.photometry_files import (
+    read_photometry,
+)
 from p2gs_jax.run.read import load_run
 from p2gs_jax.types import Camera, Gaussians
 
