@@ -23,7 +23,10 @@ from p2gs_jax.render.harmonics import (
     LOG_RADIANCE_LIMIT,
     degree_of,
 )
-from p2gs_jax.run.photometry_file import PhotometryFile, ViewPhotometry
+from p2gs_jax.run.photometry_files import (
+    PhotometryFile,
+    ViewPhotometry,
+)
 from p2gs_jax.scene import ImageStore
 from p2gs_jax.types import GAMMA_SRGB, Gaussians, Scene
 

@@ -23,8 +23,12 @@ from p2gs_jax.pipeline.prepare import Prepared
 from p2gs_jax.render.capacity import (
     make_renderer,
 )
-from p2gs_jax.run.layout import RunFolder
-from p2gs_jax.run.unexplained_pictures import write_unexplained
+from p2gs_jax.run.folder import (
+    RunFolder,
+)
+from p2gs_jax.run.plots import (
+    write_unexplained,
+)
 from p2gs_jax.run.write import summary_rows, write_results, write_view
 from p2gs_jax.scene.drives.moving import fitted_objects
 from p2gs_jax.types import Params

@@ -180,7 +180,7 @@ def test_the_command_writes_it(finished_run, run_command, tmp_path):
         (("--format", "html", "--photographs", "-1"), "--photographs"),
         (("--format", "html", "--bake-steps", "3"), "--bake-steps"),
         (("--format", "splat", "--size-mb", "3"), "--size-mb"),
-        (("--format", "drive", "--photographs", "3"), "--photographs"),
+        (("--format", "exr", "--photographs", "3"), "--photographs"),
     ],
 )
 def test_options_that_make_no_sense_are_refused(finished_run, run_command, tmp_path, words, named):

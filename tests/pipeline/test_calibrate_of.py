@@ -25,7 +25,9 @@ from p2gs_jax.render.capacity import (
 from p2gs_jax.render.harmonics import (
     C0,
 )
-from p2gs_jax.run.photometry_file import read_photometry
+from p2gs_jax.run.photometry_files import (
+    read_photometry,
+)
 from p2gs_jax.run.read import load_run
 from p2gs_jax.types import Camera, Gaussians
 

@@ -19,13 +19,17 @@ from p2gs_jax.config import preset
 from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.core.progress import Silent
 from p2gs_jax.evaluate.evaluate import evaluate
+from p2gs_jax.jobs.configs import (
+    with_fields,
+)
 from p2gs_jax.pipeline.fit import compact, optimise
 from p2gs_jax.pipeline.prepare import load, prepare
 from p2gs_jax.render.capacity import (
     make_renderer,
 )
-from p2gs_jax.run.layout import RunFolder
-from p2gs_jax.sweep import with_fields
+from p2gs_jax.run.folder import (
+    RunFolder,
+)
 from p2gs_jax.train.loop import TrainResult
 from p2gs_jax.train.programs import Key, StepPrograms
 from p2gs_jax.train.state import FitState

@@ -19,10 +19,16 @@ from p2gs_jax.evaluate.references import find_radiance, load_reference
 from p2gs_jax.render.capacity import (
     make_renderer,
 )
-from p2gs_jax.run.layout import RunFolder
-from p2gs_jax.run.metering_file import write_metering
+from p2gs_jax.run.folder import (
+    RunFolder,
+)
+from p2gs_jax.run.photometry_files import (
+    write_metering,
+)
+from p2gs_jax.run.plots import (
+    write_unexplained,
+)
 from p2gs_jax.run.read import load_run
-from p2gs_jax.run.unexplained_pictures import write_unexplained
 
 
 def run(options: Eval) -> int:

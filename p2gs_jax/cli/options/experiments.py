@@ -63,8 +63,6 @@ class Synth:
     """Samples a pixel along each axis."""
     points: int = 60_000
     """Seed points sampled for the COLMAP model; those seen once are dropped."""
-    lidar: bool = True
-    """Write KITTI's calibration, poses and LiDAR scans."""
     seed: int = 0
     """Seeds the town, the ISO and the points."""
 

@@ -1,15 +1,35 @@
-"""Sweeps vary what they are told to, keep what is finished, and name what failed."""
+"""Sweeps vary the given fields, keep finished runs, name failures and stop together."""
 
 import json
+import os
+import signal
+import threading
+from pathlib import Path
 
 import pytest
 from tiny_scene import make_scene
 
 import p2gs_jax
 from p2gs_jax.cli import main
+from p2gs_jax.core import interrupts
 from p2gs_jax.core.clock import whole_run
-from p2gs_jax.sweep import grid, read_sweep, sweep, with_fields
-from p2gs_jax.sweep.rows import brief, failures, to_markdown
+from p2gs_jax.core.interrupts import Interrupted
+from p2gs_jax.errors import UserError
+from p2gs_jax.jobs.configs import (
+    grid,
+    read_sweep,
+    with_fields,
+)
+from p2gs_jax.jobs.job import REASON, JobFiles, read_job
+from p2gs_jax.jobs.sweep import (
+    brief,
+    failures,
+    sweep,
+    to_markdown,
+)
+from p2gs_jax.run.folder import (
+    locked,
+)
 
 BASE = p2gs_jax.preset("robust")
 SMALL = with_fields(
@@ -67,7 +87,7 @@ def test_the_printed_table_is_short_and_the_kept_one_says_what_columns_are():
         *("configuration", "seeds", "seconds", "Gaussians", "training PSNR dB"),
         *("held-out PSNR dB", "exposure error EV"),
     ]
-    assert lines == [["a", "1 of 2", "56", "300", "25.00", "21.00", "0.010"]]
+    assert lines == [["a", "1 of 2", "56", "300", "25.00", "21.00", "0.0100"]]
     assert failures(rows) == ["a, seed 1: failed: no seeds"]
     text = to_markdown(rows)
     for column in ("seconds", "train_*", "test_psnr_fitted", "ev"):
@@ -153,9 +173,9 @@ preset = "paper"
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("scene = ", "no TOML"),
+        ("scene = ", "not valid TOML"),
         ("sceen = 'x'", "unknown key 'sceen'"),
-        ("seeds = [1]", "names no scene"),
+        ("seeds = [1]", "does not name a scene"),
         ("scene = 'x'\nseeds = 3", "write whole numbers"),
         ("scene = 'x'\npreset = 'best'", "no preset 'best'"),
         ("scene = 'x'\n[grid]\n'train.stepz' = [1]", "no configuration field"),
@@ -179,3 +199,71 @@ def test_means_are_over_finished_seeds_only():
     table = to_markdown(rows)
     assert "| a | 2 of 3 | 21.00 |" in table
     assert "fell over" in table
+
+
+CONFIGS = {name: p2gs_jax.preset("robust") for name in ("a", "b", "c")}
+
+
+def runner(work):
+    """Return what an engine calls for a job: a function of its folder and of the stop file."""
+
+    def run(job_path):
+        files = JobFiles(Path(job_path))
+        return work(read_job(files.path).folder, files.stop)
+
+    return run
+
+
+def finished(run, stop):
+    run.mkdir(parents=True)
+    (run / "metrics.json").write_text('{"counts": {"gaussians": 5}, "seconds": {}}')
+    return "done", None
+
+
+def test_a_signal_leaves_a_table_and_the_same_sweep_goes_on(tmp_path):
+    all_begun = threading.Event()
+
+    def work(run, stop):
+        if stop.exists():
+            return "stopped", None
+        if run.parent.name == "b":
+            # A signal that comes before a run was handed over finds it waiting.
+            assert all_begun.wait(60)
+            os.kill(os.getpid(), signal.SIGTERM)
+            while not stop.exists():
+                pass
+            return "stopped", None
+        return finished(run, stop)
+
+    with pytest.raises(Interrupted), interrupts.raised():
+        sweep("scene", tmp_path, CONFIGS, on_look=lambda states: all_begun.set(), run=runner(work))
+    rows = json.loads((tmp_path / "sweep.json").read_text())
+    assert [row["status"] for row in rows] == ["done", "interrupted", "interrupted"]
+    assert not list(tmp_path.rglob(REASON))
+    rows = sweep("scene", tmp_path, CONFIGS, run=runner(finished)).rows
+    assert [row["status"] for row in rows] == ["done"] * 3
+
+
+def test_a_run_with_broken_files_fails_alone(tmp_path):
+    def work(run, stop):
+        ended = finished(run, stop)
+        if run.parent.name == "b":
+            (run / "metrics.json").write_text("[]")
+        return ended
+
+    rows = sweep("scene", tmp_path, CONFIGS, max_parallel=3, run=runner(work)).rows
+    assert [row["status"] for row in rows] == ["done", "failed", "done"]
+    assert "its files cannot be read" in rows[1]["reason"]
+
+
+def test_the_reason_is_of_the_last_try(tmp_path):
+    said = iter(["first", "second"])
+    run = runner(lambda run, stop: ("failed", next(said)))
+    one = {"a": CONFIGS["a"]}
+    assert sweep("scene", tmp_path, one, run=run).rows[0]["reason"] == "first"
+    assert sweep("scene", tmp_path, one, run=run).rows[0]["reason"] == "second"
+
+
+def test_two_sweeps_do_not_share_a_folder(tmp_path):
+    with locked(tmp_path), pytest.raises(UserError, match=f"process {os.getpid()}"):
+        sweep("scene", tmp_path, CONFIGS)
