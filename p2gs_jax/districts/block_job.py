@@ -14,10 +14,12 @@ import numpy as np
 from p2gs_jax.config import FitConfig, from_dict, to_dict
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.clock import Stopwatch
-from p2gs_jax.core.compile_cache import use_compile_cache
 from p2gs_jax.core.memory import text_of
 from p2gs_jax.core.progress import Reporter, Silent
-from p2gs_jax.core.runtime import tune_process
+from p2gs_jax.core.runtime import (
+    tune_process,
+    use_compile_cache,
+)
 from p2gs_jax.districts.cut import Cut
 from p2gs_jax.districts.part_of import BlockScene, block_scene
 from p2gs_jax.districts.shared import read_shared

@@ -11,7 +11,9 @@ from p2gs_jax.config import FitConfig, PhotometryConfig
 from p2gs_jax.config import from_dict as config_from_dict
 from p2gs_jax.config import to_dict as config_to_dict
 from p2gs_jax.core.atomic import plain
-from p2gs_jax.core.json_text import parse_json
+from p2gs_jax.core.text import (
+    parse_json,
+)
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.lpips import LpipsWeights
 from p2gs_jax.evaluate.lpips_weights import read_lpips_weights

@@ -13,8 +13,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float32, Int
 
 from p2gs_jax.config import FitConfig, from_dict
-from p2gs_jax.core.json_text import parse_json
 from p2gs_jax.core.numerics import on_device
+from p2gs_jax.core.text import (
+    parse_json,
+)
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.ply import read_ply
 from p2gs_jax.gaussians.posed import chosen, posed, standing

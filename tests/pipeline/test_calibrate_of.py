@@ -11,7 +11,9 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from p2gs_jax.config import PhotometryConfig, RenderConfig
-from p2gs_jax.core.srgb import srgb_encode
+from p2gs_jax.core.numerics import (
+    srgb_encode,
+)
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.alignment import exposure_error
 from p2gs_jax.formats.foreign import read_foreign
