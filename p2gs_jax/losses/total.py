@@ -27,8 +27,11 @@ from p2gs_jax.photometry.cameras import darkens, places
 from p2gs_jax.photometry.formation import formation
 from p2gs_jax.photometry.luminance.parameters import Curves
 from p2gs_jax.render import render_splats
-from p2gs_jax.render.blocks import Shown, splat
 from p2gs_jax.render.objects import with_corrections
+from p2gs_jax.render.visible import (
+    Shown,
+    splat,
+)
 from p2gs_jax.render.warp import sample_bilinear, surface_depth, warp
 from p2gs_jax.types import Batch, Camera, Params, Photometry, Render
 

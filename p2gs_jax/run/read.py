@@ -22,7 +22,10 @@ from p2gs_jax.photometry.cameras import camera_rows
 from p2gs_jax.photometry.display import DisplayTransform, display_of_view
 from p2gs_jax.photometry.mean import MeanParameters, mean_parameters, usual_display
 from p2gs_jax.photometry.metering import ExposureOf, Metering, meter
-from p2gs_jax.render.host import RenderView, make_renderer
+from p2gs_jax.render.capacity import (
+    RenderView,
+    make_renderer,
+)
 from p2gs_jax.run.decisions import read_decisions
 from p2gs_jax.run.folder import RunFolder, find
 from p2gs_jax.run.photometry_files import (

@@ -12,7 +12,9 @@ from p2gs_jax.gaussians.posed import standing
 from p2gs_jax.jobs.configs import (
     with_fields,
 )
-from p2gs_jax.render.vibration import STILL
+from p2gs_jax.render.project import (
+    STILL,
+)
 from p2gs_jax.scene import drives, load_scene
 
 CFG = with_fields(FitConfig(), {"dynamics.method": "vibration", "dynamics.vibrating": 500})

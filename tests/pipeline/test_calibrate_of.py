@@ -19,8 +19,12 @@ from p2gs_jax.formats.ply import read_ply, write_ply
 from p2gs_jax.formats.splat import write_splat
 from p2gs_jax.gaussians.relit import relit
 from p2gs_jax.photometry.display import DisplayTransform, develop
-from p2gs_jax.render.host import make_renderer
-from p2gs_jax.render.spherical_harmonics import C0
+from p2gs_jax.render.capacity import (
+    make_renderer,
+)
+from p2gs_jax.render.harmonics import (
+    C0,
+)
 from p2gs_jax.run.photometry_files import (
     read_photometry,
 )

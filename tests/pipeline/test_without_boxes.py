@@ -13,7 +13,10 @@ from p2gs_jax.formats.ply import read_ply
 from p2gs_jax.jobs.configs import (
     with_fields,
 )
-from p2gs_jax.render.vibration import STILL, at_time
+from p2gs_jax.render.project import (
+    STILL,
+    at_time,
+)
 from p2gs_jax.report.report import write_report
 from p2gs_jax.scene import drives
 

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from p2gs_jax.render.blocks import BLOCK
 from p2gs_jax.render.capacity import (
     ANYWHERE,
     FEWEST_ENTRIES,
@@ -15,6 +14,9 @@ from p2gs_jax.render.capacity import (
     TileCapacity,
     bucket,
     until_it_fits,
+)
+from p2gs_jax.render.visible import (
+    BLOCK,
 )
 
 

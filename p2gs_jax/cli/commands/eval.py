@@ -16,7 +16,9 @@ from p2gs_jax.evaluate.against import Judge
 from p2gs_jax.evaluate.evaluate import evaluate
 from p2gs_jax.evaluate.lpips_weights import read_lpips_weights
 from p2gs_jax.evaluate.references import find_radiance, load_reference
-from p2gs_jax.render.host import make_renderer
+from p2gs_jax.render.capacity import (
+    make_renderer,
+)
 from p2gs_jax.run.folder import (
     RunFolder,
 )

@@ -12,7 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from p2gs_jax.core.numerics import on_host
 from p2gs_jax.errors import UserError
-from p2gs_jax.render.objects import HIDDEN
+from p2gs_jax.render.project import (
+    HIDDEN,
+)
 from p2gs_jax.scene.rigid import (
     interpolated,
 )

@@ -17,7 +17,6 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from p2gs_jax.config import RenderConfig
-from p2gs_jax.render.binning.boxes import Boxes, boxes, depth_keys, grid_size
 from p2gs_jax.render.xla_cpu import compiled_loop
 from p2gs_jax.types import Splats2D, TileList
 
@@ -30,6 +29,56 @@ MOST_ENTRIES = 2**30
 REACH_MARGIN = 1e-4
 # Rows of tiles solved at once.
 ROWS = 8192
+
+
+class Boxes(NamedTuple):
+    """Where each splat stays above the cutoff.
+
+    Attributes:
+        visible: reaches at least one pixel centre's row and column.
+        reach: log(opacity / cutoff): the exponent at which it falls below the cutoff.
+        first: first pixel column and row inside the box; `last`: the last ones.
+    """
+
+    visible: Bool[Array, " n"]
+    reach: Float[Array, " n"]
+    first: Int[Array, "n 2"]
+    last: Int[Array, "n 2"]
+
+
+def grid_size(width: int, height: int, tile: tuple[int, int]) -> tuple[int, int]:
+    """Return the number of tiles across and down."""
+    return -(-width // tile[0]), -(-height // tile[1])
+
+
+def bits_for(count: int) -> int:
+    """Return how many bits tell `count` things apart (at least one)."""
+    return max(1, int(count - 1).bit_length())
+
+
+def boxes(splats: Splats2D, width: int, height: int) -> Boxes:
+    """Return the box of every splat, clipped to the image."""
+    reach = splats.log_opacities - splats.log_cutoffs
+    radius = jnp.sqrt(2 * jnp.maximum(reach, 0.0))[:, None] * jnp.sqrt(splats.cov_diagonal)
+    size = jnp.array([width, height], jnp.float32)
+    # Pixel centres sit at +0.5: the first and last centres inside the box.
+    first = jnp.clip(jnp.ceil(splats.means2d - radius - 0.5), 0, size).astype(jnp.int32)
+    last = jnp.clip(jnp.floor(splats.means2d + radius - 0.5), -1, size - 1).astype(jnp.int32)
+    visible = splats.visible & (reach > 0) & jnp.all(last >= first, -1)
+    return Boxes(visible, reach, first, last)
+
+
+def depth_keys(depths: Float[Array, " n"], visible: Bool[Array, " n"]):
+    """Return (keys, span): unsigned integers that order positive depths, invisible ones last.
+
+    Bits of positive floats order as the floats do; the smallest visible one is subtracted so that
+    few bits are left to sort. `span` is the largest key.
+    """
+    bits = jnp.asarray(depths.astype(jnp.float32)).view(jnp.uint32)
+    low = jnp.min(jnp.where(visible, bits, jnp.uint32(0xFFFFFFFF)))
+    high = jnp.max(jnp.where(visible, bits, 0))
+    span = jnp.maximum(high, low) - low + 1
+    return jnp.where(visible, bits - low, span), span
 
 
 def _at(a, i):
@@ -171,8 +220,8 @@ def _ellipses(splats: Splats2D, box: Boxes) -> _Ellipses:
 def _span(e: _Ellipses, row: Int[Array, " m"], width: int, tile: tuple[int, int]):
     """Return (first tile column, number of tiles) that each ellipse covers in a row of tiles.
 
-    Both count pixel centres: a tile is covered if the ellipse reaches one of its columns of pixel
-    centres within the row's first and last line of them.
+    A tile is covered if the ellipse reaches one of its columns of pixel centres within the row's
+    first and last line of them.
     """
     tile_x, tile_y = tile
     top = jnp.maximum(row * tile_y + 0.5 - e.y, -e.extent)
@@ -214,7 +263,7 @@ def count_entries(splats: Splats2D, width: int, height: int, cfg: RenderConfig) 
 def bin_tiles(
     splats: Splats2D, width: int, height: int, capacity: int, cfg: RenderConfig
 ) -> TileList:
-    """See `p2gs_jax.render.binning.bin_tiles`."""
+    """Return the lists, see `p2gs_jax.render.binning.bin_tiles`."""
     across, down = grid_size(width, height, cfg.tile)
     tile_count = across * down
     box = boxes(splats, width, height)
@@ -241,14 +290,8 @@ def bin_tiles(
 def _solve_rows(row, owner, order, ellipses: _Ellipses, used, width: int, tile: tuple[int, int]):
     """Return (Gaussian, first tile column, number of tiles) of every row of tiles, block by block.
 
-    Args:
-        row: rows of tiles that splats touch.
-        owner: whose they are, as places in `order`.
-        order: splats from front to back.
-        ellipses: of all splats.
-        used: how many rows there are.
-        width: image width, pixels.
-        tile: tile size, pixels.
+    `row` are the `used` rows of tiles that splats touch; `owner` whose they are, as places in
+    `order`, which lists the splats from front to back.
     """
     size = min(ROWS, row.shape[0])
     table = jnp.stack(ellipses, -1)

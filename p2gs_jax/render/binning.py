@@ -1,18 +1,51 @@
-"""Binning by sorts: for GPUs, and wherever sequential loops are slow.
+"""Binning: which Gaussians each tile composites, in depth order, without a per-tile cap.
 
-Integer work throughout. Single-operand uint32 sorts of packed keys are about five times as fast
-per element on XLA's CPU backend as comparator or multi-operand sorts (docs/kernel.md).
+No gradients flow here. Two ways: by counting (binning_cpu.py), sequential and linear, for CPUs; by
+sorting (here), data-parallel, for everything else. `RenderConfig.binning` None takes the device's.
+
+Sorting is integer work throughout. Single-operand uint32 sorts of packed keys are about five times
+as fast per element on XLA's CPU backend as comparator or multi-operand sorts (docs/kernel.md).
 """
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from p2gs_jax.config import RenderConfig
-from p2gs_jax.render.binning.boxes import bits_for, boxes, depth_keys, grid_size
+from p2gs_jax.render import binning_cpu
+from p2gs_jax.render.binning_cpu import bits_for, boxes, depth_keys, grid_size
 from p2gs_jax.types import Splats2D, TileList
+
+
+def count_entries(splats: Splats2D, width: int, height: int, cfg: RenderConfig) -> Int[Array, ""]:
+    """Return the tile-list capacity this view needs, at most 2^30."""
+    return _choose(binning_cpu.count_entries, _count_by_sorting, splats, cfg, width, height)
+
+
+def bin_tiles(
+    splats: Splats2D, width: int, height: int, capacity: int, cfg: RenderConfig
+) -> TileList:
+    """List the Gaussians of every tile in depth order.
+
+    A tile gets a Gaussian only if its ellipse at the alpha cutoff reaches a pixel centre of it. The
+    list holds `capacity` entries, see `count_entries`; if `overflow` is set it is incomplete and
+    must not be composited.
+    """
+    return _choose(binning_cpu.bin_tiles, _bin_by_sorting, splats, cfg, width, height, capacity)
+
+
+def _choose(counting, sorting, splats: Splats2D, cfg: RenderConfig, *static):
+    splats = jax.tree.map(lax.stop_gradient, splats)
+
+    def way(function):
+        return lambda s: function(s, *static, cfg)
+
+    if cfg.binning is not None:
+        return way({"counting": counting, "sorting": sorting}[cfg.binning])(splats)
+    return lax.platform_dependent(splats, cpu=way(counting), default=way(sorting))
 
 
 def sort_payloads(keys: UInt32[Array, " n"], payload_bits: int) -> Int[Array, " n"]:
@@ -56,16 +89,17 @@ def _too_many(entries: Int[Array, " n"]) -> Bool[Array, ""]:
     return jnp.sum(entries.astype(jnp.float32)) > 2.0**30
 
 
-def count_entries(splats: Splats2D, width: int, height: int, cfg: RenderConfig) -> Int[Array, ""]:
-    """Return the tile-list capacity this view needs: tiles of all bounding boxes."""
+def _count_by_sorting(
+    splats: Splats2D, width: int, height: int, cfg: RenderConfig
+) -> Int[Array, ""]:
+    """Return the tiles of all bounding boxes."""
     entries = _extents(splats, width, height, cfg)[-1]
     return jnp.where(_too_many(entries), 2**30, jnp.sum(entries))
 
 
-def bin_tiles(
+def _bin_by_sorting(
     splats: Splats2D, width: int, height: int, capacity: int, cfg: RenderConfig
 ) -> TileList:
-    """See `p2gs_jax.render.binning.bin_tiles`."""
     tile_x, tile_y = cfg.tile
     across_tiles, down_tiles = grid_size(width, height, cfg.tile)
     tile_count = across_tiles * down_tiles

@@ -1,4 +1,4 @@
-"""Scenes that break rasterizers, with the expected result and float32's error against float64."""
+"""Scenes that break rasterizers: what must happen, and float32's error against float64."""
 
 from __future__ import annotations
 
@@ -12,11 +12,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from p2gs_jax.bench.metrics import FIELDS
+from benchmarks.oracle import FIELDS
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render import project, render_linear, view_radiance
-from p2gs_jax.render.binning.boxes import grid_size
-from p2gs_jax.render.spherical_harmonics import C0
+from p2gs_jax.render.binning_cpu import (
+    grid_size,
+)
+from p2gs_jax.render.harmonics import (
+    C0,
+)
 from p2gs_jax.types import Camera, Gaussians, Splats2D
 
 # A near plane that float32 represents exactly, so that "on the plane" means the same in float64.
@@ -94,10 +98,10 @@ class HardCase:
     unseen: bool = False
 
 
-def _bright_and_dark(n: int = 48) -> Gaussians:
+def _bright_and_dark() -> Gaussians:
     rng = np.random.default_rng(3)
-    level = np.where(np.arange(n) % 2, 1e4, 1.0)[:, None]
-    return crowd(n, 3, radiance=level * rng.uniform(0.5, 1, (n, 3)), logit=rng.normal(2, 2, n))
+    level = np.where(np.arange(48) % 2, 1e4, 1.0)[:, None]
+    return crowd(48, 3, radiance=level * rng.uniform(0.5, 1, (48, 3)), logit=rng.normal(2, 2, 48))
 
 
 CASES = (
@@ -292,10 +296,7 @@ def float64_oracle(gaussians: Gaussians, view: Camera, cfg: RenderConfig):
 def gap(case: HardCase, cfg: RenderConfig, oracle=None) -> Gap:
     """Compare one implementation with the float64 oracle on one case.
 
-    Args:
-        case: the scene.
-        cfg: the implementation and its options.
-        oracle: from `float64_oracle`, to share it between implementations.
+    `oracle` is what `float64_oracle` returned, where several implementations share it.
     """
     g = case.build()
     truth, v_truth, undecided, brightest = oracle or float64_oracle(g, case.view, cfg)
@@ -322,3 +323,14 @@ def gap(case: HardCase, cfg: RenderConfig, oracle=None) -> Gap:
         finite=all(bool(np.all(np.isfinite(a))) for a in leaves),
         silent=not any(np.any(a) for a in leaves),
     )
+
+
+def table(gaps: dict[str, Gap]) -> tuple[list[str], list[list[str]]]:
+    """Return header and rows: what must happen, and how far float32 is from float64."""
+    rows = []
+    for case in CASES:
+        g = gaps[case.name]
+        values = "zero" if g.silent else "finite" if g.finite else "NOT FINITE"
+        numbers = f"{g.value:.1e}", f"{g.gradient:.1e}", str(g.undecided)
+        rows.append([f"{case.name}: {case.expect}", *numbers, values])
+    return ["case", "image", "gradient", "undecided pairs", "values"], rows

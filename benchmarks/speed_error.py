@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from p2gs_jax.bench.metrics import errors
-from p2gs_jax.bench.oracle import truth, untruncated
-from p2gs_jax.bench.scenes import BenchScene
-from p2gs_jax.bench.timing import interleaved
+from benchmarks.gate import ACCURACY, METRICS, Rows
+from benchmarks.oracle import errors, truth, untruncated
+from benchmarks.scenes import BenchScene, street
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render import render_linear, required_capacity
 from p2gs_jax.render.capacity import bucket
@@ -27,7 +27,7 @@ BATCH = 8
 
 @dataclasses.dataclass(frozen=True)
 class Variant:
-    """One point of the plot.
+    """One setting of one knob.
 
     Attributes:
         knob: name of the varied option.
@@ -48,12 +48,8 @@ class Variant:
 
     @property
     def name(self) -> str:
-        """What tables call it."""
+        """The name in tables and baselines."""
         return f"{self.knob} {self.setting}".strip()
-
-    def config(self, base: RenderConfig) -> RenderConfig:
-        """Return the rendering options of this point."""
-        return dataclasses.replace(base, **dict(self.changes))
 
 
 def _knob(knob: str, field: str, *values, label: Callable[[Any], str] = str) -> list[Variant]:
@@ -115,6 +111,23 @@ class MeasuredVariant(NamedTuple):
     temporaries: int
 
 
+def interleaved(jobs: Mapping[str, Callable[[], Any]], repeats: int = 7) -> dict[str, float]:
+    """Return the median wall time of each job, milliseconds.
+
+    The jobs run in turns, so that a machine that slows down slows all, and each runs untimed
+    first in every turn, so that it does not pay for the memory and caches of the one before (a
+    small job after a large one read 2-3 times its time).
+    """
+    times: dict[str, list[float]] = {name: [] for name in jobs}
+    for _ in range(repeats):
+        for name, job in jobs.items():
+            jax.block_until_ready(job())
+            start = time.perf_counter()
+            jax.block_until_ready(job())
+            times[name].append(time.perf_counter() - start)
+    return {name: float(np.median(t)) * 1e3 for name, t in times.items()}
+
+
 def reference_workload() -> Callable[[], jax.Array]:
     """Return work that uses a machine as rendering does: exponentials, products, gathers.
 
@@ -131,20 +144,19 @@ def reference_workload() -> Callable[[], jax.Array]:
     return lambda: work(x, index)
 
 
-def stored(gaussians: Gaussians, storage: str) -> Gaussians:
+def _stored(gaussians: Gaussians, storage: str) -> Gaussians:
     """Return the parameters as they come back from storage."""
-    if storage == "float32":
-        return gaussians
 
     def narrow(a):
         return a.astype(jnp.bfloat16).astype(jnp.float32)
 
     if storage == "sh":
         return dataclasses.replace(gaussians, sh=narrow(gaussians.sh))
-    return jax.tree.map(narrow, gaussians)
+    return gaussians if storage == "float32" else jax.tree.map(narrow, gaussians)
 
 
 def _kept(scene: BenchScene, budget: float) -> np.ndarray:
+    """Return the indices of that part of the Gaussians whose footprint times opacity is largest."""
     g = scene.gaussians
     if budget >= 1:
         return np.arange(g.capacity)
@@ -156,31 +168,30 @@ def _kept(scene: BenchScene, budget: float) -> np.ndarray:
     return np.sort(order[: max(1, round(budget * g.capacity))])
 
 
-def cotangent(scene: BenchScene, seed: int = 0) -> np.ndarray:
-    """Return the random weights whose weighted sum of the image is differentiated."""
+def cotangent(scene: BenchScene) -> np.ndarray:
+    """Return the random weights (H, W, 3) whose weighted sum of the image is differentiated."""
     shape = (scene.camera.height, scene.camera.width, 3)
-    return np.random.default_rng(seed).normal(size=shape).astype(np.float32) / np.prod(shape[:2])
+    return np.random.default_rng(0).normal(size=shape).astype(np.float32) / np.prod(shape[:2])
 
 
 def programs(scene: BenchScene, variant: Variant, base: RenderConfig, weights: np.ndarray):
     """Compile one variant.
 
     Returns:
-        Forward and forward-and-backward as functions of no arguments, the entries, and the bytes
-        of temporaries of the latter.
+        Forward and forward-and-backward as functions of no arguments, the indices of the Gaussians
+        that are kept, the entries, and the bytes of temporaries of forward-and-backward.
     """
-    cfg = variant.config(base)
+    cfg = dataclasses.replace(base, **dict(variant.changes))
     kept = jnp.asarray(_kept(scene, variant.budget))
     gaussians = jax.tree.map(lambda a: a[kept], scene.gaussians)
     alive = jnp.ones(gaussians.capacity, bool)
-    need = int(required_capacity(stored(gaussians, variant.storage), alive, scene.camera, cfg))
+    need = int(required_capacity(_stored(gaussians, variant.storage), alive, scene.camera, cfg))
     capacity = bucket(need)
 
     def linear(g):
-        g = stored(g, variant.storage)
-        degree = variant.degree
+        g = _stored(g, variant.storage)
         return render_linear(
-            g, alive, scene.camera, cfg, capacity, active_degree=degree, with_depth=False
+            g, alive, scene.camera, cfg, capacity, active_degree=variant.degree, with_depth=False
         ).linear
 
     def objective(g):
@@ -196,25 +207,25 @@ def programs(scene: BenchScene, variant: Variant, base: RenderConfig, weights: n
     return (lambda: forward(gaussians)), (lambda: both(gaussians)), kept, need, temporaries
 
 
+def sweep_scene(quick: bool) -> BenchScene:
+    """Return a street of degree 3, with about five stops of contrast."""
+    if quick:
+        return street(4000, 256, 144, radius=6.0, degree=3)
+    return street(20_000, 640, 360, radius=4.0, spread=1.1, degree=3)
+
+
 def measure_speed_error(
     scene: BenchScene,
-    variants: tuple[Variant, ...] = VARIANTS,
-    base: RenderConfig | None = None,
+    variants: Sequence[Variant] = VARIANTS,
     *,
     repeats: int = 7,
     on_progress: Callable[[str, int, int], None] = lambda stage, done, count: None,
 ) -> list[MeasuredVariant]:
-    """Time every variant and compare it with the float64 truth.
+    """Time every variant, in batches interleaved with the reference workload; compare with float64.
 
-    Args:
-        scene: what to render.
-        variants: the points; timed in batches, each batch interleaved with the reference workload.
-        base: what the variants change; default `RenderConfig()`.
-        repeats: timed runs of each.
-        on_progress: called with (stage, done, count).
+    `on_progress` is called with (stage, done, count).
     """
-    base = base or RenderConfig()
-    weights = cotangent(scene)
+    base, weights = RenderConfig(), cotangent(scene)
     on_progress("float64 truth", 0, 1)
     whole = truth(scene.gaussians, scene.camera, untruncated(base), weights)
     same_rules = truth(scene.gaussians, scene.camera, base, weights)
@@ -240,28 +251,53 @@ def measure_speed_error(
             untouched = v.storage == "float32" and v.degree is None and v.budget == 1
             rules = untouched and not {"alpha_cutoff", "cutoff_rule"} & {k for k, _ in v.changes}
             ms = {k: times[f"{v.name} {k}"] for k in ("forward", "both")}
-            points.append(
-                MeasuredVariant(
-                    v,
-                    ms,
-                    {k: t / times[REFERENCE] for k, t in ms.items()},
-                    errors(linear, gradient, whole),
-                    errors(linear, gradient, same_rules) if rules else None,
-                    need,
-                    temporaries,
-                )
-            )
+            ratios = {k: t / times[REFERENCE] for k, t in ms.items()}
+            error = errors(linear, gradient, whole)
+            numerics = errors(linear, gradient, same_rules) if rules else None
+            points.append(MeasuredVariant(v, ms, ratios, error, numerics, need, temporaries))
     on_progress("variants", len(variants), len(variants))
     return points
 
 
-def front(points: list[MeasuredVariant], time: str = "both", error: str = "gradient") -> list[str]:
-    """Return the names of the points that no other beats in both time and error."""
-    return [
-        p.variant.name
+def gate_rows(points: list[MeasuredVariant]) -> Rows:
+    """Return per variant what the gate compares.
+
+    The total error includes the rules' cutoffs; `numerics ...` is the implementation's own error.
+    """
+    return {
+        p.variant.name: {**p.error, **p.ratios}
+        | {f"numerics {k}": v for k, v in (p.numerics or {}).items()}
         for p in points
-        if not any(
-            q.milliseconds[time] < p.milliseconds[time] and q.error[error] < p.error[error]
+    }
+
+
+def table(points: list[MeasuredVariant]) -> tuple[list[str], list[list[str]]]:
+    """Return header and rows; a star marks points that no other beats in both time and error."""
+    rows = []
+    for p in points:
+        beaten = any(
+            q.milliseconds["both"] < p.milliseconds["both"]
+            and q.error["gradient"] < p.error["gradient"]
             for q in points
         )
-    ]
+        numerics = p.numerics or {}
+        rows.append(
+            [
+                p.variant.name + ("" if beaten else " *"),
+                *(f"{p.milliseconds[k]:.1f}" for k in ("forward", "both")),
+                *(number(k, p.error) for k in ACCURACY),
+                *(number(k, numerics) for k in ("relative", "gradient")),
+                f"{p.entries / 1e3:.0f}k",
+                f"{p.temporaries / 1e6:.0f}",
+            ]
+        )
+    header = ["variant (* on the front)", "fwd ms", "fwd+bwd ms"]
+    header += [METRICS[k].title for k in ACCURACY]
+    return [*header, "rel., same cutoff", "grad., same cutoff", "entries", "MB"], rows
+
+
+def number(metric: str, values: Mapping[str, float]) -> str:
+    """Return one value as a table shows it; empty where it was not measured."""
+    if metric not in values:
+        return ""
+    return f"{values[metric]:.1f}" if metric == "psnr" else f"{values[metric]:.1e}"

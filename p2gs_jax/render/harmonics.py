@@ -1,12 +1,19 @@
-"""Real spherical harmonics to degree 3, in the sign convention of 3DGS."""
+"""Real spherical harmonics to degree 3, in the sign convention of 3DGS, and linear HDR radiance."""
 
 from __future__ import annotations
 
+from typing import Literal
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
+from p2gs_jax.core.numerics import Values, namespace
 from p2gs_jax.render.xla_cpu import stack_columns
+
+RadianceKind = Literal["exp", "linear"]
+LOG_RADIANCE_LIMIT = 30.0
 
 C0 = 0.28209479177387814
 C1 = 0.4886025119029199
@@ -95,16 +102,10 @@ def evaluate(
     directions: tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]],
     active_degree: Int[Array, ""] | int | None = None,
 ) -> Float[Array, "n 3"]:
-    """Evaluate spherical harmonics in the given directions.
+    """Return the values of K = (degree + 1)^2 coefficients in unit directions, before activation.
 
-    Args:
-        sh: coefficients, K = (degree + 1)^2.
-        directions: x, y and z of unit vectors from the camera to the Gaussians, world axes.
-        active_degree: coefficients above this degree are ignored; traced, so that raising it
-            does not recompile. None uses all.
-
-    Returns:
-        Pre-activation values per channel.
+    Directions are x, y and z from the camera to the Gaussians, world axes. Coefficients above
+    `active_degree` are ignored; it is traced, so that raising it does not recompile.
     """
     degree = degree_of(sh.shape[1])
     columns = basis(directions, degree)
@@ -115,3 +116,42 @@ def evaluate(
             for d, c in zip(degrees, columns, strict=True)
         ]
     return _combine(stack_columns(columns), sh)
+
+
+def radiance_activation(value: Values, kind: RadianceKind) -> Values:
+    """Return radiance >= 0 of sums of spherical harmonics.
+
+    `exp` takes them for log radiance, clipped to +-30; `linear` is max(0, value + 1/2), as 3DGS
+    and the paper.
+    """
+    xp = namespace(value)
+    if kind == "exp":
+        return xp.exp(xp.clip(value, -LOG_RADIANCE_LIMIT, LOG_RADIANCE_LIMIT))
+    return xp.maximum(value + 0.5, 0.0)
+
+
+def radiance_preactivation(radiance: Values, kind: RadianceKind) -> Values:
+    """Return the value whose activation is `radiance` > 0."""
+    return namespace(radiance).log(radiance) if kind == "exp" else radiance - 0.5
+
+
+def scaled(
+    sh: Float[np.ndarray, "n k 3"], log_scales: Float[np.ndarray, "..."], kind: RadianceKind
+) -> Float[np.ndarray, "n k 3"]:
+    """Return coefficients whose radiance is larger by factors, exactly.
+
+    Args:
+        sh: spherical-harmonics coefficients.
+        log_scales: natural logarithms of the factors: of the channels (3,), of Gaussians (n, 1),
+            or of both (n, 3).
+        kind: how radiance follows from the coefficients.
+    """
+    sh = np.array(sh)
+    if kind == "exp":
+        sh[:, 0] += log_scales / C0
+    else:
+        # radiance = value + 1/2: the half must grow with the rest.
+        factors = np.exp(log_scales)
+        sh *= np.expand_dims(factors, -2)
+        sh[:, 0] += (factors - 1) * 0.5 / C0
+    return sh
