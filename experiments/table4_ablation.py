@@ -28,9 +28,7 @@ from towns import (
 )
 
 from p2gs_jax.config import FitConfig, preset
-from p2gs_jax.jobs.configs import (
-    with_fields,
-)
+from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.pipeline.decide import without_tracks
 from p2gs_jax.run.decisions import Decisions
 

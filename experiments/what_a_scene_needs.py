@@ -27,9 +27,7 @@ from towns import (
 )
 
 from p2gs_jax.config import FitConfig, preset
-from p2gs_jax.jobs.configs import (
-    with_fields,
-)
+from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.photometry.models import MODELS
 
 FACTORS = (0.5, 1.0, 1.6, 2.5, 4.0)

@@ -15,12 +15,7 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
-from p2gs_jax.core.atomic import (
-    BROKEN_ARRAYS,
-    atomic_folder,
-    naming,
-    remove_begun,
-)
+from p2gs_jax.core.atomic import BROKEN_ARRAYS, atomic_folder, naming, remove_begun
 from p2gs_jax.errors import UserError
 
 Tree = TypeVar("Tree")
