@@ -196,7 +196,7 @@ def check_cache() -> dict[str, Any]:
     """Set up JAX's compile cache; return its folder, size, and whether programs can be added."""
     found: dict[str, Any] = {"folder": None, "bytes": 0, "writable": False}
     try:
-        from p2gs_jax.core.compile_cache import MOST_BYTES, cache_folder, use_compile_cache
+        from p2gs_jax.core.runtime import MOST_BYTES, cache_folder, use_compile_cache
 
         use_compile_cache()
         folder = cache_folder()

@@ -53,7 +53,7 @@ class Eval:
         from p2gs_jax.evaluate.lpips_weights import read_lpips_weights
         from p2gs_jax.evaluate.references import find_radiance, load_reference
         from p2gs_jax.evaluate.renders_of_others import find_renders
-        from p2gs_jax.render.host import make_renderer
+        from p2gs_jax.render.capacity import make_renderer
         from p2gs_jax.run.folder import (
             RunFolder,
         )
@@ -144,7 +144,7 @@ def _judged(
 
 def _kept(path: Path) -> dict[str, Any]:
     """Return the metrics that only a fit can measure: counts, times, notes."""
-    from p2gs_jax.core.json_text import parse_json
+    from p2gs_jax.core.text import parse_json
 
     try:
         old = parse_json(path.read_text())

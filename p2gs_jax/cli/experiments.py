@@ -140,9 +140,9 @@ class Sweep:
     def execute(self) -> int:
         """Run the sweep and print its table; 1 where a run failed."""
         from p2gs_jax.cli.tables import make_table, stdout
+        from p2gs_jax.jobs.configs import read_sweep
+        from p2gs_jax.jobs.sweep import brief, failures, sweep
         from p2gs_jax.jobs.table import JobsTable
-        from p2gs_jax.sweep import read_sweep, sweep
-        from p2gs_jax.sweep.rows import brief, failures
 
         console, wanted = stdout(), read_sweep(self.file)
         with JobsTable(console) as table:

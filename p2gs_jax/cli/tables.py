@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from p2gs_jax.core.numerics import LN2
-from p2gs_jax.core.terminal import PlainConsole
+from p2gs_jax.core.progress import PlainConsole
 from p2gs_jax.photometry.cameras import corner
 from p2gs_jax.photometry.solution import WEAK_GAMMA, PhotometricSolution
 from p2gs_jax.pipeline.calibrate_of import CalibrationOf

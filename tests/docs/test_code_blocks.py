@@ -24,7 +24,7 @@ from p2gs_jax.cli.fit import (
     checked,
 )
 from p2gs_jax.cli.parser import COMMANDS, GROUPS, parse
-from p2gs_jax.sweep.toml import read_sweep
+from p2gs_jax.jobs.configs import read_sweep
 
 BLOCKS = [block for page in PAGES for block in blocks(page)]
 
