@@ -16,11 +16,9 @@ import numpy as np
 from jaxtyping import Float
 
 from p2gs_jax.config import RenderConfig
-from p2gs_jax.core.srgb import srgb_encode
+from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.render import project, rasterize, view_radiance
-from p2gs_jax.render.tiles import (
-    with_cutoffs,
-)
+from p2gs_jax.render.tiles import with_cutoffs
 from p2gs_jax.types import Camera, Gaussians, Splats2D
 
 BLOCK = (32, 24)

@@ -14,10 +14,9 @@ import numpy as np
 from p2gs_jax.config import FitConfig, from_dict, to_dict
 from p2gs_jax.core.atomic import write_json, write_text
 from p2gs_jax.core.clock import whole_run
-from p2gs_jax.core.compile_cache import use_compile_cache
-from p2gs_jax.core.json_text import parse_json
 from p2gs_jax.core.progress import Reporter
-from p2gs_jax.core.runtime import tune_process
+from p2gs_jax.core.runtime import tune_process, use_compile_cache
+from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.alignment import exposure_error
 from p2gs_jax.jobs.engines import LOCAL, check_engine, open_engine

@@ -34,9 +34,7 @@ from p2gs_jax.pipeline.finish import Account, finish
 from p2gs_jax.pipeline.fit import compact, optimise
 from p2gs_jax.pipeline.preflight import check_run_dir
 from p2gs_jax.pipeline.prepare import Prepared
-from p2gs_jax.run.folder import (
-    RunFolder,
-)
+from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.run.write import write_start
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.images import ImageStore

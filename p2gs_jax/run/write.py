@@ -23,12 +23,8 @@ from p2gs_jax.photometry.display import develop
 from p2gs_jax.photometry.mean import usual_display
 from p2gs_jax.photometry.metering import Metering
 from p2gs_jax.photometry.solution import PhotometricSolution
-from p2gs_jax.render.harmonics import (
-    MAX_DEGREE,
-)
-from p2gs_jax.render.project import (
-    at_time,
-)
+from p2gs_jax.render.harmonics import MAX_DEGREE
+from p2gs_jax.render.project import at_time
 from p2gs_jax.run.decisions import Decisions, write_decisions
 from p2gs_jax.run.folder import RunFolder, remembered
 from p2gs_jax.run.photometry_files import write_appearance, write_fitted, write_metering

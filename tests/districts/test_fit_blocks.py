@@ -17,12 +17,8 @@ from p2gs_jax.districts.plan import check_options, read_plan, write_plan
 from p2gs_jax.districts.shared import read_shared
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.population import default_max_gaussians
-from p2gs_jax.jobs.configs import (
-    with_fields,
-)
-from p2gs_jax.jobs.job import (
-    JobState,
-)
+from p2gs_jax.jobs.configs import with_fields
+from p2gs_jax.jobs.job import JobState
 from p2gs_jax.pipeline.prepare import load
 
 SMALL = with_fields(

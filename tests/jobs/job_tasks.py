@@ -36,9 +36,7 @@ def count(folder, arguments, reporter):
 
 def fit_with_least_effort(folder, arguments, reporter):
     """Fit, compiling as the tests' own process does (conftest)."""
-    from p2gs_jax.jobs.sweep import (
-        fit_task,
-    )
+    from p2gs_jax.jobs.sweep import fit_task
     from p2gs_jax.render import xla_cpu
 
     flags = [word.removeprefix("--").split("=") for word in os.environ["XLA_FLAGS"].split()]

@@ -13,10 +13,7 @@ from job_tasks import count
 from rich.console import Console
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.jobs.engines import (
-    check_engine,
-    open_engine,
-)
+from p2gs_jax.jobs.engines import check_engine, open_engine
 from p2gs_jax.jobs.job import (
     REASON,
     Job,
@@ -26,13 +23,9 @@ from p2gs_jax.jobs.job import (
     read_progress,
     write_job,
 )
-from p2gs_jax.jobs.run import (
-    run_jobs,
-)
+from p2gs_jax.jobs.run import run_jobs
 from p2gs_jax.jobs.table import line_of, table_of
-from p2gs_jax.jobs.worker import (
-    run_in_process,
-)
+from p2gs_jax.jobs.worker import run_in_process
 
 
 @pytest.fixture(autouse=True)

@@ -15,21 +15,10 @@ from p2gs_jax.core import interrupts
 from p2gs_jax.core.clock import whole_run
 from p2gs_jax.core.interrupts import Interrupted
 from p2gs_jax.errors import UserError
-from p2gs_jax.jobs.configs import (
-    grid,
-    read_sweep,
-    with_fields,
-)
+from p2gs_jax.jobs.configs import grid, read_sweep, with_fields
 from p2gs_jax.jobs.job import REASON, JobFiles, read_job
-from p2gs_jax.jobs.sweep import (
-    brief,
-    failures,
-    sweep,
-    to_markdown,
-)
-from p2gs_jax.run.folder import (
-    locked,
-)
+from p2gs_jax.jobs.sweep import brief, failures, sweep, to_markdown
+from p2gs_jax.run.folder import locked
 
 BASE = p2gs_jax.preset("robust")
 SMALL = with_fields(

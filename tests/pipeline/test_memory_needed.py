@@ -10,9 +10,7 @@ from tiny_scene import make_scene
 import p2gs_jax
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.population import Coverage
-from p2gs_jax.jobs.configs import (
-    with_fields,
-)
+from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.pipeline import fit as pipeline
 from p2gs_jax.pipeline import memory_needed as module
 from p2gs_jax.pipeline.memory_needed import MemoryNeeded, memory_needed, require_memory

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import FitConfig
-from p2gs_jax.jobs.configs import (
-    with_fields,
-)
+from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.pipeline.scale import (
     extent_of_rates,
     near_depth,

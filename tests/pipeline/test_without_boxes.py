@@ -10,13 +10,8 @@ import p2gs_jax
 from p2gs_jax.core.atomic import read_jsonl
 from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.formats.ply import read_ply
-from p2gs_jax.jobs.configs import (
-    with_fields,
-)
-from p2gs_jax.render.project import (
-    STILL,
-    at_time,
-)
+from p2gs_jax.jobs.configs import with_fields
+from p2gs_jax.render.project import STILL, at_time
 from p2gs_jax.report.report import write_report
 from p2gs_jax.scene import drives
 

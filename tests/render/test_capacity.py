@@ -15,9 +15,7 @@ from p2gs_jax.render.capacity import (
     bucket,
     until_it_fits,
 )
-from p2gs_jax.render.visible import (
-    BLOCK,
-)
+from p2gs_jax.render.visible import BLOCK
 
 
 def test_buckets_are_few_and_hold_what_they_must():

@@ -11,9 +11,7 @@ import pytest
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.progress import Silent
 from p2gs_jax.formats.ply import write_radiance
-from p2gs_jax.jobs.configs import (
-    with_fields,
-)
+from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.report.run_files import read_run
 from p2gs_jax.report.scene_measurements import measure_scene
 from p2gs_jax.run.decisions import Decisions

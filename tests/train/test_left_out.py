@@ -12,9 +12,7 @@ from moving_box import RENDER, drive_format, make_world, write_photographs
 from p2gs_jax.config import DataConfig, FitConfig
 from p2gs_jax.errors import DivergenceError
 from p2gs_jax.evaluate.unexplained import Unexplained
-from p2gs_jax.jobs.configs import (
-    with_fields,
-)
+from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.scene import ImageStore, drives, load_scene
 from p2gs_jax.scene.drives.object_masks import object_mask
 from p2gs_jax.train import left_out

@@ -9,14 +9,8 @@ from rich.text import Text
 
 from p2gs_jax.cli.commands.console import stdout
 from p2gs_jax.cli.options.experiments import Sweep
-from p2gs_jax.jobs.configs import (
-    read_sweep,
-)
-from p2gs_jax.jobs.sweep import (
-    brief,
-    failures,
-    sweep,
-)
+from p2gs_jax.jobs.configs import read_sweep
+from p2gs_jax.jobs.sweep import brief, failures, sweep
 from p2gs_jax.jobs.table import JobsTable
 
 

@@ -25,9 +25,7 @@ from p2gs_jax.gaussians.mcmc import shaped_noise
 from p2gs_jax.losses.regularizers import population_terms
 from p2gs_jax.losses.total import Partner
 from p2gs_jax.photometry.appearance import Corrections
-from p2gs_jax.render.harmonics import (
-    coefficient_count,
-)
+from p2gs_jax.render.harmonics import coefficient_count
 from p2gs_jax.render.visible import (
     block_size,
     compact,
