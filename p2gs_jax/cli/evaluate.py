@@ -54,15 +54,9 @@ class Eval:
         from p2gs_jax.evaluate.references import find_radiance, load_reference
         from p2gs_jax.evaluate.renders_of_others import find_renders
         from p2gs_jax.render.capacity import make_renderer
-        from p2gs_jax.run.folder import (
-            RunFolder,
-        )
-        from p2gs_jax.run.photometry_files import (
-            write_metering,
-        )
-        from p2gs_jax.run.plots import (
-            write_unexplained,
-        )
+        from p2gs_jax.run.folder import RunFolder
+        from p2gs_jax.run.photometry_files import write_metering
+        from p2gs_jax.run.plots import write_unexplained
         from p2gs_jax.run.read import load_run
 
         fitted = load_run(self.run, self.scene)

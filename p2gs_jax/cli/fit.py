@@ -155,9 +155,7 @@ class Calibrate:
         from p2gs_jax.pipeline.calibrate_of import STEPS, calibrate_of
         from p2gs_jax.pipeline.calibrate_run import calibrate_run
         from p2gs_jax.pipeline.calibrate_stack import calibrate_stack
-        from p2gs_jax.pipeline.calibration import (
-            write_calibration,
-        )
+        from p2gs_jax.pipeline.calibration import write_calibration
 
         scene, out, cfg, known = self.scene, self.out, self.checked(), self.config.photometry
         is_run = (scene / "config.json").is_file() and (scene / "radiance.ply").is_file()

@@ -17,9 +17,7 @@ from p2gs_jax.core.progress import PlainConsole
 from p2gs_jax.photometry.cameras import corner
 from p2gs_jax.photometry.solution import WEAK_GAMMA, PhotometricSolution
 from p2gs_jax.pipeline.calibrate_of import CalibrationOf
-from p2gs_jax.pipeline.calibration import (
-    CalibrationResult,
-)
+from p2gs_jax.pipeline.calibration import CalibrationResult
 
 # Columns of words; all others hold numbers.
 WORDS = ("views", "view", "camera", "protocol", "program", "lens", "configuration", "")

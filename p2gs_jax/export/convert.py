@@ -43,9 +43,7 @@ from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.render.harmonics import MAX_DEGREE
 from p2gs_jax.render.project import at_time
-from p2gs_jax.run.photometry_files import (
-    write_appearance,
-)
+from p2gs_jax.run.photometry_files import write_appearance
 from p2gs_jax.run.read import Run
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.exif import read_exif_settings

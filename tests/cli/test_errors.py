@@ -7,9 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from p2gs_jax.cli.shared import (
-    parse_duration,
-)
+from p2gs_jax.cli.shared import parse_duration
 from p2gs_jax.config import preset, to_dict
 from p2gs_jax.core.atomic import no_empty_folders
 from p2gs_jax.errors import UserError

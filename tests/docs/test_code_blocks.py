@@ -18,11 +18,7 @@ from tiny_scene import make_scene
 
 from p2gs_jax import config
 from p2gs_jax.cli import main
-from p2gs_jax.cli.fit import (
-    Calibrate,
-    Fit,
-    checked,
-)
+from p2gs_jax.cli.fit import Calibrate, Fit, checked
 from p2gs_jax.cli.parser import COMMANDS, GROUPS, parse
 from p2gs_jax.jobs.configs import read_sweep
 
