@@ -46,8 +46,6 @@ SceneFormat = Literal[
     "waymo",
     "argoverse",
     "kitti_raw",
-    "kitti_odometry",
-    "kitti_360",
     "images",
 ]
 # How structure from motion finds poses, and which photographs it matches with which.

@@ -15,7 +15,7 @@ from jaxtyping import Float, Float32, UInt8
 from PIL import Image
 
 from p2gs_jax.config import DataConfig
-from p2gs_jax.core.json_text import parse_json
+from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError, broken
 from p2gs_jax.scene.convert.convert import size_of
 from p2gs_jax.scene.convert.kinds import CONVERTED_SUFFIXES

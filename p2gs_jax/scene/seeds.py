@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from p2gs_jax.core.ply_table import read_table, refusing
+from p2gs_jax.core.ply import read_table, refusing
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.errors import broken
 from p2gs_jax.scene.rigid import camera_centers

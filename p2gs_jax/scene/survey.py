@@ -15,10 +15,9 @@ import numpy as np
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.core.atomic import atomic_write
-from p2gs_jax.core.drawn_names import names_as_they_are
 from p2gs_jax.core.numerics import evenly_spaced
-from p2gs_jax.core.printable import printable
 from p2gs_jax.core.streams import Stream, generator
+from p2gs_jax.core.text import names_as_they_are, printable
 from p2gs_jax.scene import PhotographsAlone, Video, find_scene, with_what_lies_beside
 from p2gs_jax.scene.cache import Report
 from p2gs_jax.scene.drives.assemble import SWEEP_SLACK_S, assemble

@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from p2gs_jax.config import DataConfig
-from p2gs_jax.core.array_files import BROKEN_ARRAYS
+from p2gs_jax.core.atomic import BROKEN_ARRAYS
 from p2gs_jax.errors import UserError, broken
 from p2gs_jax.scene.colmap import subfolder
 from p2gs_jax.scene.files import (

@@ -17,7 +17,7 @@ from jaxtyping import Float, UInt, UInt8
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.core.atomic import write_text
-from p2gs_jax.core.srgb import srgb_decode
+from p2gs_jax.core.numerics import srgb_decode
 from p2gs_jax.errors import UserError, broken
 from p2gs_jax.scene.cache import Report, cached_folder, file_fingerprints
 from p2gs_jax.scene.convert.convert import Converted, cache_of, write_png

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float, UInt
 from PIL import Image
 
-from p2gs_jax.core.srgb import srgb_encode
+from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.scene.convert.kinds import has_gain_map
 
 Transfer = Literal["linear", "hlg", "pq"]

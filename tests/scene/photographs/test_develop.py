@@ -15,7 +15,7 @@ import pytest
 from PIL import Image, features
 from scene.photographs.made import DISPLAY_P3, patches, settings, write_dng
 
-from p2gs_jax.core.srgb import srgb_decode, srgb_encode
+from p2gs_jax.core.numerics import srgb_decode, srgb_encode
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.convert.convert import Converted, convert_photographs
 from p2gs_jax.scene.convert.kinds import has_gain_map, kind_of
