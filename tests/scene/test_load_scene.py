@@ -28,7 +28,7 @@ def test_nothing_there(tmp_path):
         load_scene(tmp_path / "nowhere", CFG)
     file = tmp_path / "notes.txt"
     file.write_bytes(b"")
-    with pytest.raises(UserError, match=r"notes.txt is a file"):
+    with pytest.raises(UserError, match=r"notes.txt is neither"):
         load_scene(file, CFG)
 
 

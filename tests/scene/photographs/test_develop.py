@@ -267,7 +267,7 @@ def test_exr_that_is_broken_inside(folder: Path) -> None:
     light[0, 0], light[0, 1], light[0, 2] = np.nan, np.inf, -1
     write_exr(folder / "a.exr", light)
     result = developed(folder)
-    assert any("1 pixels of linear photographs are no numbers" in note for note in result.notes)
+    assert any("1 pixels of linear photographs are not numbers" in note for note in result.notes)
     out = light_of(result.paths[0])
     assert (out[0, 0] == 0).all()
     assert (out[0, 1] == 1).all()
@@ -294,7 +294,7 @@ def test_exr_grey_alpha_and_chromaticities(folder: Path) -> None:
 
 def test_no_exr(folder: Path) -> None:
     (folder / "a.exr").write_bytes(b"\x76\x2f\x31\x01 and nothing")
-    with pytest.raises(UserError, match=r"a\.exr is no readable OpenEXR"):
+    with pytest.raises(UserError, match=r"a\.exr is not a readable OpenEXR"):
         developed(folder)
 
 
