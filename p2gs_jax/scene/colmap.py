@@ -56,9 +56,9 @@ def load_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
     images = sorted(model.images, key=lambda image: image.name)
     place = image_folder(root, cfg) or _find_images(root, folder, images)
     for image in images:
-        require_inside(PurePosixPath(image.name), place, model.images_path)
+        require_inside(PurePosixPath(image.name), place, model.file("images"))
     missing = [image.name for image in images if not (place / image.name).is_file()]
-    notes = check_missing(missing, len(images), model.images_path, cfg)
+    notes = check_missing(missing, len(images), model.file("images"), cfg)
     skipped = set(missing)
     images = [image for image in images if image.name not in skipped]
 
@@ -66,9 +66,9 @@ def load_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
     views, resized = [], []
     for image in images:
         camera, path = model.cameras[image.camera_id], place / image.name
-        K, distortion = _lens(model.cameras_path, camera)
+        K, distortion = _lens(model.file("cameras"), camera)
         size = (camera.width, camera.height)
-        K, width, height = at_file_size(path, K, size, model.cameras_path)
+        K, width, height = at_file_size(path, K, size, model.file("cameras"))
         if (width, height) != size:
             resized.append(f"{width}x{height} instead of {camera.width}x{camera.height}")
         views.append(
@@ -76,7 +76,7 @@ def load_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
                 name=image.name,
                 image_path=path,
                 camera=subfolder(image.name) or fallback[image.camera_id],
-                viewmat=_viewmat(image, model.images_path),
+                viewmat=_viewmat(image, model.file("images")),
                 K=K,
                 width=width,
                 height=height,
@@ -154,22 +154,22 @@ def _camera_names(images: Sequence[ImageRecord]) -> dict[int, str]:
 
 def _check_model(model: Model) -> None:
     if not model.cameras:
-        raise broken(model.cameras_path, "holds no cameras", _FIX)
+        raise broken(model.file("cameras"), "holds no cameras", _FIX)
     if not model.images:
         fix = "COLMAP's mapping found nothing; run it again on these photographs"
-        raise broken(model.images_path, "holds no registered images", fix)
+        raise broken(model.file("images"), "holds no registered images", fix)
     twice = [name for name, n in Counter(i.name for i in model.images).items() if n > 1]
     if twice:
-        raise broken(model.images_path, f"lists {twice[0]} more than once", _FIX)
+        raise broken(model.file("images"), f"lists {twice[0]} more than once", _FIX)
     for image in model.images:
         if image.camera_id not in model.cameras:
             why = f"{image.name} was taken by camera {image.camera_id}, which "
-            why += f"{model.cameras_path} does not have"
-            raise broken(f"{model.images_path}:", why, _FIX)
+            why += f"{model.file('cameras')} does not have"
+            raise broken(f"{model.file('images')}:", why, _FIX)
     bad = int((~(np.abs(model.xyz) < HUGE).all(axis=1)).sum())
     if bad:
         why = f"{bad} of {len(model.xyz)} points are not finite"
-        raise broken(f"{model.points_path}:", why, _FIX)
+        raise broken(f"{model.file('points3D')}:", why, _FIX)
 
 
 def _find_images(root: Path, folder: Path, images: Sequence[ImageRecord]) -> Path:

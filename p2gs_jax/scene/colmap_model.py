@@ -77,19 +77,23 @@ class Model:
     """A COLMAP model as its files state it: cameras by id, images in the file's order.
 
     Attributes:
+        kind: suffix of its files.
         point_ids: ascending.
         xyz: scene units.
         rgb: display-encoded colours.
     """
 
-    cameras_path: Path
-    images_path: Path
-    points_path: Path
+    folder: Path
+    kind: str
     cameras: dict[int, CameraRecord]
     images: tuple[ImageRecord, ...]
     point_ids: Int[np.ndarray, " p"]
     xyz: Float[np.ndarray, "p 3"]
     rgb: UInt8[np.ndarray, "p 3"]
+
+    def file(self, stem: str) -> Path:
+        """Return a file of the model, for messages."""
+        return self.folder / f"{stem}.{self.kind}"
 
 
 def is_model(folder: Path) -> bool:
@@ -118,8 +122,15 @@ def read_model(folder: Path) -> Model:
     cameras, images, points = binary if ext == "bin" else text
     ids, xyz, rgb = points(paths[2])
     order = np.argsort(ids, kind="stable")
-    known, taken = cameras(paths[0]), tuple(images(paths[1]))
-    return Model(*paths, known, taken, ids[order], xyz[order], rgb[order])
+    return Model(
+        folder,
+        ext,
+        cameras(paths[0]),
+        tuple(images(paths[1])),
+        ids[order],
+        xyz[order],
+        rgb[order],
+    )
 
 
 class _Cursor:

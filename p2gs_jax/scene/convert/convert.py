@@ -184,8 +184,8 @@ def converted_views(scene: Scene, work_dir: Path | None, report: Report) -> Scen
     Raises:
         UserError: one cannot be decoded, or a package for it is missing.
     """
-    kinds = {view.image_path: kind_of(view.image_path) for view in scene.views}
-    wanted = {path: kind for path, kind in kinds.items() if kind != "plain"}
+    kinds: dict[Path, Kind] = {v.image_path: kind_of(v.image_path) for v in scene.views}
+    wanted: dict[Path, Kind] = {path: kind for path, kind in kinds.items() if kind != "plain"}
     if not wanted:
         return scene
     # A suffix more keeps photographs apart that differ in theirs.
