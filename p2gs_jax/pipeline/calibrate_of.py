@@ -18,9 +18,15 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.foreign import score_foreign
 from p2gs_jax.formats.foreign import read_foreign
 from p2gs_jax.gaussians.bake import viewer_config
-from p2gs_jax.gaussians.init.dense_bound import coverage_of
-from p2gs_jax.gaussians.init.seeds import cameras_radius
-from p2gs_jax.gaussians.relit import relit
+from p2gs_jax.gaussians.dense import (
+    coverage_of,
+)
+from p2gs_jax.gaussians.bake import (
+    relit,
+)
+from p2gs_jax.gaussians.seeds import (
+    cameras_radius,
+)
 from p2gs_jax.photometry.calibrate import calibrate_observations, options_of
 from p2gs_jax.photometry.initial import initial_photometry
 from p2gs_jax.photometry.mean import usual_display

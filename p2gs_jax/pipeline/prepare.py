@@ -20,21 +20,40 @@ from p2gs_jax.core.progress import Reporter
 from p2gs_jax.core.runtime import return_freed_memory
 from p2gs_jax.core.streams import Stream
 from p2gs_jax.errors import UserError
-from p2gs_jax.gaussians.init.brightness import Tones, rough_tones
-from p2gs_jax.gaussians.init.dense import DenseSeeds
-from p2gs_jax.gaussians.init.dense_bound import coverage_of, dense_limit, wants_dense
-from p2gs_jax.gaussians.init.nodes import Nodes, find_nodes, node_gaussians
-from p2gs_jax.gaussians.init.photographed import nodes_radiance, photographed_radiance, with_colors
-from p2gs_jax.gaussians.init.seeds import cameras_radius, merge, subsample
-from p2gs_jax.gaussians.init.shell import find_shell
-from p2gs_jax.gaussians.init.start import (
-    black_gaussians,
+from p2gs_jax.gaussians.dense import (
+    DenseSeeds,
+    coverage_of,
+    dense_limit,
     gaussians_of,
     match_photographs,
+    wants_dense,
+)
+from p2gs_jax.gaussians.matching import (
+    Tones,
+    rough_tones,
+)
+from p2gs_jax.gaussians.moving import (
+    Nodes,
+    clock_of,
+    find_nodes,
+    node_gaussians,
+    nodes_radiance,
+    vibrates,
+    with_vibration,
+)
+from p2gs_jax.gaussians.population import Coverage
+from p2gs_jax.gaussians.seeds import (
+    cameras_radius,
+    merge,
+    photographed_radiance,
+    subsample,
+    with_colors,
+)
+from p2gs_jax.gaussians.shell import (
+    black_gaussians,
+    find_shell,
     shell_gaussians,
 )
-from p2gs_jax.gaussians.init.vibration import clock_of, vibrates, with_vibration
-from p2gs_jax.gaussians.population import Coverage
 from p2gs_jax.losses.relative_exposure import ColorPairs
 from p2gs_jax.photometry.calibrate import calibrate_observations, options_of
 from p2gs_jax.photometry.initial import initial_appearance, initial_photometry, point_radiance
