@@ -2,7 +2,7 @@
 
 python experiments/what_a_scene_needs.py [--quick] [--towns 0]
 
-On ISO std 4. The last row of the first table is `--gaussians auto`, which ends growth by itself.
+On ISO std 4.
 """
 
 from __future__ import annotations
@@ -32,7 +32,6 @@ from p2gs_jax.sweep import with_fields
 
 FACTORS = (0.5, 1.0, 1.6, 2.5, 4.0)
 DEGREES = (0, 1, 2, 3)
-AUTO = "Gaussians: auto"
 
 
 def variants(o: Options) -> dict[str, FitConfig]:
@@ -47,8 +46,7 @@ def variants(o: Options) -> dict[str, FitConfig]:
         f"model: {m.replace('_', ' ')}": {"photometry.select": False, "photometry.model": m}
         for m in MODELS
     }
-    auto = {AUTO: {"densify.max_gaussians": "auto"}}
-    ladders = counts | auto | models | {"model: chosen": {}} | degrees
+    ladders = counts | models | {"model: chosen": {}} | degrees
     return {name: with_fields(robust, fields) for name, fields in ladders.items()}
 
 
@@ -72,21 +70,13 @@ def rows(runs: Runs, names: list[str]) -> list[list[str]]:
 def plot(o: Options, runs: Runs, names: list[str]) -> None:
     figure = Figure(figsize=(5.5, 3.6), layout="constrained")
     axis = figure.subplots()
-    ladder = [n for n in names if n.startswith("Gaussians") and n != AUTO]
+    ladder = [n for n in names if n.startswith("Gaussians")]
     for path, label in (
         (("train", "psnr"), "training views"),
         (("test", "exposure_fitted", "psnr"), "held out"),
     ):
         counts = [runs.mean(n, WIDE, "counts", "gaussians") for n in ladder]
-        line = axis.plot(counts, [runs.mean(n, WIDE, *path) for n in ladder], "o-", label=label)
-        axis.plot(
-            runs.mean(AUTO, WIDE, "counts", "gaussians"),
-            runs.mean(AUTO, WIDE, *path),
-            "*",
-            ms=14,
-            color=line[0].get_color(),
-            label=f"{label}, auto",
-        )
+        axis.plot(counts, [runs.mean(n, WIDE, *path) for n in ladder], "o-", label=label)
     axis.set(xscale="log", xlabel="Gaussians", ylabel="PSNR, dB")
     axis.grid(alpha=0.3)
     axis.legend(fontsize=8)

@@ -19,9 +19,6 @@ os.environ.setdefault("GLOG_minloglevel", "3")
 # Where Pillow refuses, too (scene/files.py): what a header says is not decoded to find out.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2 * 89_478_485))
 
-# Set for one of several processes of a fit, by the parent that watches it: the descriptor of a pipe
-# that ends with that parent.
-PARENT = "P2GS_JAX_PARENT_PIPE"
 # Commands that must work without JAX.
 WITHOUT_JAX = ("doctor", "completion")
 
@@ -36,12 +33,6 @@ def _run(argv: list[str]) -> int:
         print(script(options.shell), end="")
         return 0
     # Imported here so that --help answers at once.
-    if name == "fit":
-        from p2gs_jax.cli.options.fit import resolve_processes
-        from p2gs_jax.cli.supervise import is_child, supervise
-
-        if resolve_processes(options) is not None and not is_child():
-            return supervise(argv, options.out)
     if name not in WITHOUT_JAX:
         from p2gs_jax.core.compile_cache import use_compile_cache
         from p2gs_jax.core.runtime import tune_process
@@ -76,11 +67,6 @@ def main(argv: list[str] | None = None) -> None:
     except KeyboardInterrupt as error:
         print(f"p2gs-jax: interrupted{_CONTINUED.get(command, '')}", file=sys.stderr)
         code = interrupts.exit_code(error)
-    if code and PARENT in os.environ:
-        # At its own exit a process waits for the others, which may wait for it.
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
     sys.exit(code)
 
 

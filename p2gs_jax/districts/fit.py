@@ -292,7 +292,6 @@ class _District:
             extent=cameras_radius(scene.training_views, scene.points),
             selection=solved.selection,
             pairs=None,
-            overlaps=None,
             measured=None,
             coverage=coverage_of(scene, store),
             decisions=shared.decisions,

@@ -220,7 +220,6 @@ def _prepared(
         extent=cameras_radius(scene.training_views, np.asarray(foreign.means)),
         selection=selection,
         pairs=None,
-        overlaps=None,
         measured=None,
         coverage=coverage_of(scene, store),
         decisions=decisions,

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from p2gs_jax.core.numerics import Values, namespace
 from p2gs_jax.render.spherical_harmonics import C0
 
-RadianceKind = Literal["exp", "softplus", "linear"]
+RadianceKind = Literal["exp", "linear"]
 LOG_RADIANCE_LIMIT = 30.0
 
 
@@ -19,14 +19,12 @@ def radiance_activation(value: Values, kind: RadianceKind) -> Values:
 
     Args:
         value: sum of spherical harmonics.
-        kind: `exp` (log radiance, clipped to +-30), `softplus`, or `linear`: max(0, value + 1/2)
-            as 3DGS and the paper.
+        kind: `exp` (log radiance, clipped to +-30), or `linear`: max(0, value + 1/2) as 3DGS and
+            the paper.
     """
     xp = namespace(value)
     if kind == "exp":
         return xp.exp(xp.clip(value, -LOG_RADIANCE_LIMIT, LOG_RADIANCE_LIMIT))
-    if kind == "softplus":
-        return xp.logaddexp(value, 0.0)  # softplus
     return xp.maximum(value + 0.5, 0.0)
 
 
@@ -35,8 +33,6 @@ def radiance_preactivation(radiance: Values, kind: RadianceKind) -> Values:
     xp = namespace(radiance)
     if kind == "exp":
         return xp.log(radiance)
-    if kind == "softplus":
-        return radiance + xp.log(-xp.expm1(-radiance))
     return radiance - 0.5
 
 
@@ -49,13 +45,12 @@ def scaled(
         sh: spherical-harmonics coefficients.
         log_scales: natural logarithms of the factors: of the channels (3,), of Gaussians (n, 1),
             or of both (n, 3).
-        kind: `exp` moves by a constant and `linear` by a factor, exactly; `softplus` can do
-            neither, and is returned as it is.
+        kind: `exp` moves by a constant and `linear` by a factor, exactly.
     """
     sh = np.array(sh)
     if kind == "exp":
         sh[:, 0] += log_scales / C0
-    elif kind == "linear":
+    else:
         # radiance = value + 1/2: the half must grow with the rest.
         factors = np.exp(log_scales)
         sh *= np.expand_dims(factors, -2)

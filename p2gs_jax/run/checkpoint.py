@@ -17,7 +17,6 @@ from typing import Any, TypeVar
 
 import jax
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from p2gs_jax.core.disk import naming
 from p2gs_jax.errors import UserError
@@ -44,25 +43,8 @@ def _pack(tree) -> tuple[np.ndarray, dict[str, list]]:
     return data, table
 
 
-def _divided(data: np.ndarray) -> np.ndarray | jax.Array:
-    """Return bytes as an array of which each process writes its part; of one process as they are.
-
-    Zeros fill the last part up.
-    """
-    if jax.process_count() == 1:
-        return data
-    mesh = Mesh(np.array(jax.devices()), ("parts",))
-    whole = np.zeros(-(-len(data) // mesh.size) * mesh.size, np.uint8)
-    whole[: len(data)] = data
-    sharding = NamedSharding(mesh, PartitionSpec("parts"))
-    return jax.make_array_from_callback(whole.shape, sharding, lambda at: whole[at])
-
-
 def saved_steps(folder: Path) -> list[int]:
-    """Return the steps of complete checkpoints, by the names in their folder; rising.
-
-    Other than those of `CheckpointStore`, one process can ask this alone.
-    """
+    """Return the steps of complete checkpoints, by the names in their folder; rising."""
     if not folder.is_dir():
         return []
     return sorted(int(path.name) for path in folder.iterdir() if path.name.isdecimal())
@@ -98,8 +80,7 @@ class CheckpointStore:
     Args:
         folder: where they lie. One run writes to it at a time: what an interrupted save left
             behind is removed in the background when the store opens, at the latest by the next
-            save. Of a fit in several processes all call all methods, each writes its part and
-            reads everything.
+            save.
         keep: how many.
     """
 
@@ -158,7 +139,7 @@ class CheckpointStore:
             manager.save(
                 step,
                 args=ocp.args.Composite(
-                    leaves=ocp.args.PyTreeSave({"data": _divided(data)}),
+                    leaves=ocp.args.PyTreeSave({"data": data}),
                     meta=ocp.args.JsonSave(saved),
                 ),
             )

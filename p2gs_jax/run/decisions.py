@@ -47,7 +47,6 @@ class Decisions:
         curve: base of the tone curve.
         spline: its correction, or None.
         freeze_until: share of the run during which exposures and gammas keep still.
-        correspondence: how the relative-exposure loss finds pixels of one surface, or None.
         log_exposure_mean: weight of the pull on the mean log exposure; None: no pull.
         exposure_rate: learning rate of the exposures.
         gamma_rate: learning rate of the gammas.
@@ -63,7 +62,6 @@ class Decisions:
     curve: Literal["power", "srgb", "spline", "linear"]
     spline: tuple[float, ...] | None
     freeze_until: float
-    correspondence: Literal["tracks", "depth"] | None
     log_exposure_mean: float | None
     exposure_rate: float
     gamma_rate: float
@@ -83,7 +81,6 @@ class Decisions:
             curve=p.curve,
             spline=p.spline,
             freeze_until=p.freeze_until,
-            correspondence=cfg.loss.relative_exposure.correspondence,
             log_exposure_mean=cfg.loss.regularizers.log_exposure_mean,
             exposure_rate=cfg.optimizer.exposures,
             gamma_rate=cfg.optimizer.gammas,
@@ -130,9 +127,6 @@ class Decisions:
             ),
             loss=replace(
                 loss,
-                relative_exposure=replace(
-                    loss.relative_exposure, correspondence=self.correspondence
-                ),
                 regularizers=replace(loss.regularizers, log_exposure_mean=self.log_exposure_mean),
             ),
             render=cfg.render if self.near is None else replace(cfg.render, near=self.near),

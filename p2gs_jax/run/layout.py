@@ -43,14 +43,6 @@ class RunFolder:
         """Folder of decoded photographs while a fit runs whose memory does not hold them."""
         return self.root / "cache" / "pixels"
 
-    def pixels_of(self, process: int) -> Path:
-        """Likewise of one of several processes; those of the first lie in `pixels`.
-
-        Args:
-            process: its number.
-        """
-        return self.pixels if process == 0 else self.root / "cache" / f"pixels-{process}"
-
     @property
     def radiance(self) -> Path:
         """The Gaussians, with linear radiance."""
@@ -104,16 +96,6 @@ class RunFolder:
     def renders(self) -> Path:
         """Folder of the held-out views."""
         return self.root / "renders"
-
-    @property
-    def left_out(self) -> Path:
-        """Folder of photographs with what no static scene explains and the fit leaves out."""
-        return self.root / "left_out"
-
-    @property
-    def left_out_masks(self) -> Path:
-        """What every look of the fit left out of the steps that followed it."""
-        return self.root / "left_out.npz"
 
     @property
     def unexplained(self) -> Path:

@@ -74,5 +74,5 @@ def _kept_metrics(path: Path) -> dict:
     except (OSError, ValueError):
         return {}
     kept = ("counts", "seconds", "seconds_per_step", "notes", "photometry")
-    kept += ("growth", "exposures", "of")
+    kept += ("exposures", "of")
     return {k: old[k] for k in kept if k in old}

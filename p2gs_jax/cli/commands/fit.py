@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import os
-import sys
 import time
 
-import jax
 from rich.console import Console
 
 from p2gs_jax.cli.commands.console import print_metrics
@@ -15,15 +12,12 @@ from p2gs_jax.cli.options.fit import (
     resolve_blocks,
     resolve_devices,
     resolve_fit,
-    resolve_processes,
 )
-from p2gs_jax.cli.supervise import LOST, end_with_parent
-from p2gs_jax.core.processes import is_first
-from p2gs_jax.core.progress import Silent, TerminalReporter
+from p2gs_jax.core.progress import TerminalReporter
 from p2gs_jax.districts.fit import fit_blocks
 from p2gs_jax.jobs.table import JobsTable
-from p2gs_jax.pipeline.devices import with_a_view_each
 from p2gs_jax.pipeline.fit import fit
+from p2gs_jax.train.data_parallel import with_a_view_each
 
 
 def run(options: Fit) -> int:
@@ -31,17 +25,7 @@ def run(options: Fit) -> int:
     blocks = resolve_blocks(options)
     if blocks is not None:
         return _in_blocks(options, blocks)
-    processes = resolve_processes(options)
-    if processes is None:
-        return _run(options)
-    end_with_parent()
-    processes.join()
-    try:
-        return _run(options)
-    except jax.errors.JaxRuntimeError as error:
-        print(f"p2gs-jax: {str(error).splitlines()[0][:300]}", file=sys.stderr, flush=True)
-        # Not through Python's exit, where JAX would wait for who is gone.
-        os._exit(LOST)
+    return _run(options)
 
 
 def _run(o: Fit) -> int:
@@ -54,13 +38,12 @@ def _run(o: Fit) -> int:
             cfg,
             reference=o.reference,
             resume=o.resume,
-            reporter=terminal if is_first() else Silent(),
+            reporter=terminal,
             # Starting the interpreter and loading libraries is processor time from end to end.
             spent_s=time.process_time(),
             devices=devices,
         )
-    if is_first():
-        print_metrics(result.metrics, o.out)
+    print_metrics(result.metrics, o.out)
     return 0
 
 

@@ -6,21 +6,16 @@ import dataclasses
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Literal
 
 import tyro
 
 from p2gs_jax import config as configs
 from p2gs_jax.cli.options.parse import check, parse_duration, parse_gaussians
-from p2gs_jax.errors import UserError
-
-if TYPE_CHECKING:
-    from p2gs_jax.core.devices import Devices
-    from p2gs_jax.core.processes import Processes
 
 Preset = Annotated[configs.PresetName, tyro.conf.arg(metavar="NAME")]
 Duration = Annotated[str | None, tyro.conf.arg(metavar="TIME")]
-Count = Annotated[str | None, tyro.conf.arg(metavar="N|auto")]
+Count = Annotated[str | None, tyro.conf.arg(metavar="N")]
 Exposures = Annotated[str | None, tyro.conf.arg(metavar="FILE|exif")]
 Weights = Annotated[str | None, tyro.conf.arg(metavar="alex|vgg|FILE")]
 Folder = Annotated[Path, tyro.conf.arg(metavar="DIR")]
@@ -60,8 +55,7 @@ class Fit:
     steps: int | None = None
     """Optimisation steps, one view each; default: the preset's (robust 2000, paper 30000)."""
     gaussians: Count = None
-    """Upper bound on the Gaussians: a whole number, or auto (grow while held-out training views
-    gain by it); default: from the seeds and the pixels."""
+    """Upper bound on the Gaussians; default: from the seeds and the pixels."""
     test_every: int | None = None
     """Hold out every n-th view of each camera for evaluation; 0 holds out none; default: 8, or as
     the data set says."""
@@ -106,18 +100,6 @@ class Fit:
     """Seeds every random choice; default: 0."""
     devices: Annotated[str, tyro.conf.arg(metavar="N|all")] = "1"
     """Devices of a step, each with its own views (--train.batch; default then: one view each)."""
-    shard: Annotated[str, tyro.conf.arg(metavar="views|gaussians|VxG")] = "views"
-    """Where Gaussians lie: all on every device (views), divided among all devices (gaussians), or
-    in each of V groups among its G devices, such as 2x2 (docs/scaling.md)."""
-    coordinator: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT")] = None
-    """Several processes fit together, on one host or many: where process 0 listens. Under Slurm and
-    Open MPI --devices all finds all of it (docs/scaling.md)."""
-    processes: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """How many processes; all bring all of their devices."""
-    process: Annotated[int | None, tyro.conf.arg(metavar="I")] = None
-    """Which of them this one is, from 0."""
-    process_timeout: Annotated[int, tyro.conf.arg(metavar="SECONDS")] = 100
-    """Seconds after which a process that is not heard of is taken for dead, and all end."""
 
 
 @dataclass(frozen=True)
@@ -185,11 +167,10 @@ def resolve_blocks(args: Fit) -> int | str | None:
         )
         return None
     check(args.jobs >= 1, "--jobs must be at least 1")
-    alone = (args.devices, args.coordinator, args.processes, args.process)
     check(
-        alone == ("1", None, None, None),
-        "--blocks fits every block on one device, in one process",
-        fix="leave out --devices and --coordinator; blocks have --jobs and --engine",
+        args.devices == "1",
+        "--blocks fits every block on one device",
+        fix="leave out --devices; blocks have --jobs and --engine",
     )
     check(
         words == "auto" or (words.isdigit() and int(words) >= 1),
@@ -265,55 +246,20 @@ def resolve_fit(args: Fit) -> configs.FitConfig:
     return _known(cfg, args)
 
 
-def resolve_processes(args: Fit) -> Processes | None:
-    """Return how this process finds the others of a fit; None where it is alone.
+def resolve_devices(args: Fit) -> int | Literal["all"]:
+    """Return the number of devices of a fit, or `all`.
 
     Raises:
-        UserError: some of it is missing, or makes no sense.
+        UserError: it is neither.
     """
-    from p2gs_jax.core.processes import Processes, scheduled
-
-    given = (args.coordinator, args.processes, args.process)
-    check(args.process_timeout >= 1, "--process-timeout must be at least 1")
-    if given == (None, None, None):
-        if args.devices != "all" or not scheduled():
-            return None
-        return Processes(None, None, None, args.process_timeout)
-    if args.coordinator is None or args.processes is None or args.process is None:
-        raise UserError(
-            "--coordinator, --processes and --process go together.",
-            fix="give every process all three: --coordinator HOST:PORT --processes N --process I",
-        )
-    host, _, port = args.coordinator.rpartition(":")
-    check(
-        bool(host) and port.isdecimal() and 0 < int(port) < 2**16,
-        f"--coordinator {args.coordinator} is no HOST:PORT",
-    )
-    check(args.processes >= 1, "--processes must be at least 1")
-    check(
-        0 <= args.process < args.processes,
-        f"--process {args.process} is none of {args.processes}",
-        fix="count them from 0",
-    )
-    return Processes(args.coordinator, args.process, args.processes, args.process_timeout)
-
-
-def resolve_devices(args: Fit) -> Devices:
-    """Return the devices of a fit; of several processes all of them.
-
-    Raises:
-        UserError: the number is none.
-    """
-    from p2gs_jax.core.devices import Devices
-
-    if args.devices == "all" or resolve_processes(args) is not None:
-        return Devices("all", args.shard)
+    if args.devices == "all":
+        return "all"
     check(
         args.devices.isdecimal() and int(args.devices) >= 1,
-        f"--devices {args.devices} is no number of devices",
+        f"--devices {args.devices} is not a number of devices",
         fix="give 1 or more, or all",
     )
-    return Devices(int(args.devices), args.shard)
+    return int(args.devices)
 
 
 def _known(cfg: configs.FitConfig, args: Fit | Calibrate) -> configs.FitConfig:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from typing import Literal
 
 from p2gs_jax.errors import UserError
 
@@ -24,18 +23,16 @@ def parse_duration(text: str) -> float:
     return total
 
 
-def parse_gaussians(text: str) -> int | Literal["auto"]:
-    """Return the value of `--gaussians`: a whole number from 1 on, or `auto`.
+def parse_gaussians(text: str) -> int:
+    """Return the value of `--gaussians`.
 
     Raises:
-        UserError: it is neither.
+        UserError: it is not a whole number from 1 on.
     """
-    if text == "auto":
-        return "auto"
     if re.fullmatch(r"\d+", text) is None or int(text) < 1:
         raise UserError(
-            f"--gaussians {text!r} is no number of Gaussians.",
-            fix="write a whole number from 1 on, or auto",
+            f"--gaussians {text!r} is not a number of Gaussians.",
+            fix="write a whole number from 1 on",
         )
     return int(text)
 

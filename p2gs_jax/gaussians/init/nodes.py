@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 
 from p2gs_jax.config import DynamicsConfig, FitConfig
 from p2gs_jax.gaussians.init.seeds import NEIGHBOURS, gaussians_from_points
-from p2gs_jax.scene.drives.moving import MovingObjects, key_times
+from p2gs_jax.scene.drives.moving import MovingObjects
 from p2gs_jax.scene.drives.object_masks import outline_of, painted
 from p2gs_jax.scene.drives.poses import interpolated, inverse
 from p2gs_jax.types import Gaussians, Lidar, Scene, TrackedObject, View
@@ -58,7 +58,7 @@ def find_nodes(scene: Scene, cfg: DynamicsConfig) -> Nodes | None:
     if any(view.time is None for view in views):
         left = tuple(scene.objects[row] for row in moving)
         said = "Views have no times: where things that move were is not known; they are masked."
-        return Nodes(_moving((), views), *_nothing(), left, (said,))
+        return Nodes(MovingObjects(()), *_nothing(), left, (said,))
     kept, left, points, filled = [], [], [], 0
     for row in moving:
         thing = scene.objects[row]
@@ -81,7 +81,11 @@ def find_nodes(scene: Scene, cfg: DynamicsConfig) -> Nodes | None:
         + "."
     ]
     return Nodes(
-        _moving(kept, views), np.concatenate([empty, *points]), owner, tuple(left), tuple(notes)
+        MovingObjects(tuple(kept)),
+        np.concatenate([empty, *points]),
+        owner,
+        tuple(left),
+        tuple(notes),
     )
 
 
@@ -129,11 +133,6 @@ def on_surface(size: tuple[float, float, float], count: int) -> Float[np.ndarray
         flat = np.stack(np.meshgrid(*lines, indexing="ij"), -1).reshape(-1, 2)
         found.append(np.insert(flat, axis, sign * half[axis], axis=1))
     return np.concatenate(found)
-
-
-def _moving(objects: Sequence[TrackedObject], views: Sequence[View]) -> MovingObjects:
-    times = [view.time for view in views if view.time is not None] or [0.0]
-    return MovingObjects(tuple(objects), key_times(objects, times))
 
 
 def _nothing() -> tuple[np.ndarray, np.ndarray]:

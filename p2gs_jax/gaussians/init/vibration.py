@@ -13,7 +13,7 @@ from p2gs_jax.core.numerics import on_device
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.gaussians.init.seeds import merge
 from p2gs_jax.render.vibration import STILL
-from p2gs_jax.scene.drives.moving import MovingObjects, key_times, middle_time
+from p2gs_jax.scene.drives.moving import MovingObjects, middle_time
 from p2gs_jax.types import Gaussians, Scene, Vibration
 
 # Initial opacity of what may move: most of it is at places that something stands still at.
@@ -27,8 +27,7 @@ def vibrates(scene: Scene, cfg: FitConfig) -> bool:
 
 def clock_of(scene: Scene) -> MovingObjects:
     """Return the clock of a scene whose Gaussians vibrate: no objects, but times of views."""
-    times = [view.time for view in scene.training_views if view.time is not None]
-    return MovingObjects((), key_times((), times), middle=middle_time(scene))
+    return MovingObjects((), middle=middle_time(scene))
 
 
 def with_vibration(gaussians: Gaussians, scene: Scene, cfg: FitConfig) -> Gaussians:
