@@ -34,8 +34,7 @@ def _run(argv: list[str]) -> int:
         return 0
     # Imported here so that --help answers at once.
     if name not in WITHOUT_JAX:
-        from p2gs_jax.core.compile_cache import use_compile_cache
-        from p2gs_jax.core.runtime import tune_process
+        from p2gs_jax.core.runtime import tune_process, use_compile_cache
 
         use_compile_cache()
         tune_process()
@@ -77,7 +76,7 @@ _CONTINUED = {
 
 
 def _complain(error: UserError) -> int:
-    from p2gs_jax.core.printable import printable
+    from p2gs_jax.core.text import printable
 
     print(printable(f"p2gs-jax: error: {error}"), file=sys.stderr)
     return 2

@@ -13,12 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from p2gs_jax.config import LossConfig, PhotometryConfig
-from p2gs_jax.photometry.formation import (
-    expose,
-    gain,
-    inverse_formation,
-    tone_map,
-)
+from p2gs_jax.photometry.formation import expose, gain, inverse_formation, tone_map
 from p2gs_jax.types import Photometry
 
 

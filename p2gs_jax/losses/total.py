@@ -16,16 +16,12 @@ from p2gs_jax.losses.lidar import lidar_loss
 from p2gs_jax.losses.luminance import luminance_terms
 from p2gs_jax.losses.matte import matted_loss, unit
 from p2gs_jax.losses.regularizers import photometry_regularizers
-from p2gs_jax.losses.relative_exposure import (
-    ColorPairs,
-    ExposurePairs,
-    relative_exposure_loss,
-)
+from p2gs_jax.losses.relative_exposure import ColorPairs, ExposurePairs, relative_exposure_loss
 from p2gs_jax.photometry.appearance import Corrections, correction_of, regularisation
 from p2gs_jax.photometry.formation import formation
 from p2gs_jax.photometry.luminance.parameters import Curves
 from p2gs_jax.render import render_splats
-from p2gs_jax.render.blocks import Shown, splat
+from p2gs_jax.render.visible import Shown, splat
 from p2gs_jax.types import Batch, Camera, Params, Photometry, Render
 
 # The readings of L_exp that compare renders from two poses.

@@ -19,8 +19,8 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.streams import noise_key
 from p2gs_jax.gaussians.mcmc import exploration_noise
-from p2gs_jax.render.blocks import splat
-from p2gs_jax.render.spherical_harmonics import coefficient_count
+from p2gs_jax.render.harmonics import coefficient_count
+from p2gs_jax.render.visible import splat
 from p2gs_jax.train.image_gradient import ImageGradient, differentiable
 from p2gs_jax.train.optimizer import Optimizer, OptState, learning_rates, means_rate
 from p2gs_jax.train.state import FAULT_NONE, FAULT_NONFINITE, FAULT_OVERFLOW, Fault, FitState

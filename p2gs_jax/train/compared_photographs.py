@@ -8,7 +8,7 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.errors import UserError
 from p2gs_jax.losses.relative_exposure import ColorPairs
-from p2gs_jax.photometry.cameras import darkens
+from p2gs_jax.photometry.formation import darkens
 from p2gs_jax.photometry.observations import Observations, sample_pairs
 
 PAIR_POOL = 200_000

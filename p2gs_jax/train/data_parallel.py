@@ -26,10 +26,17 @@ from p2gs_jax.core.streams import noise_key
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.mcmc import shaped_noise
 from p2gs_jax.losses.total import Partner
-from p2gs_jax.render.blocks import block_size, owners_at, slice_of, splat, take_rows, whole_blocks
 from p2gs_jax.render.capacity import Room
-from p2gs_jax.render.spherical_harmonics import coefficient_count
-from p2gs_jax.render.visible import compact
+from p2gs_jax.render.harmonics import coefficient_count
+from p2gs_jax.render.visible import (
+    block_size,
+    compact,
+    owners_at,
+    slice_of,
+    splat,
+    take_rows,
+    whole_blocks,
+)
 from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.train import image_gradient
 from p2gs_jax.train.advance import Moved, StepReport, is_healthy, settled

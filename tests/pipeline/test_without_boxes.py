@@ -10,9 +10,9 @@ import p2gs_jax
 from p2gs_jax.core.atomic import read_jsonl
 from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.formats.ply import read_ply
-from p2gs_jax.render.vibration import STILL, at_time
+from p2gs_jax.jobs.configs import with_fields
+from p2gs_jax.render.project import STILL, at_time
 from p2gs_jax.scene import drives
-from p2gs_jax.sweep import with_fields
 
 STEPS = 60
 CFG = with_fields(

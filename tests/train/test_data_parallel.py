@@ -11,7 +11,7 @@ import pytest
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
-from p2gs_jax.sweep import with_fields
+from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.train.batches import batches_of, stacked
 from p2gs_jax.train.data_parallel import mesh_of, with_a_view_each
 from p2gs_jax.train.state import FAULT_OVERFLOW

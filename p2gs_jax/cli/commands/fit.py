@@ -7,12 +7,7 @@ import time
 from rich.console import Console
 
 from p2gs_jax.cli.commands.console import print_metrics
-from p2gs_jax.cli.options.fit import (
-    Fit,
-    resolve_blocks,
-    resolve_devices,
-    resolve_fit,
-)
+from p2gs_jax.cli.options.fit import Fit, resolve_blocks, resolve_devices, resolve_fit
 from p2gs_jax.core.progress import TerminalReporter
 from p2gs_jax.districts.fit import fit_blocks
 from p2gs_jax.jobs.table import JobsTable

@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float, Float64
 
 from p2gs_jax.core.numerics import on_host
 from p2gs_jax.errors import UserError
-from p2gs_jax.render.objects import HIDDEN
-from p2gs_jax.scene.drives.poses import interpolated
+from p2gs_jax.render.project import HIDDEN
+from p2gs_jax.scene.rigid import interpolated
 from p2gs_jax.types import Placement, Scene, TrackedObject
 
 MOST_LISTED = 12
