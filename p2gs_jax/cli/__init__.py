@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import sys
-from importlib import import_module
 
 from p2gs_jax.core import interrupts
 from p2gs_jax.core.memory import ran_out
@@ -24,21 +23,16 @@ WITHOUT_JAX = ("doctor", "completion")
 
 
 def _run(argv: list[str]) -> int:
+    # Everything is imported where it is needed, so that --help answers at once.
     from p2gs_jax.cli.parser import parse
 
     name, options = parse(argv)
-    if name == "completion":
-        from p2gs_jax.cli.completion import script
-
-        print(script(options.shell), end="")
-        return 0
-    # Imported here so that --help answers at once.
     if name not in WITHOUT_JAX:
         from p2gs_jax.core.runtime import tune_process, use_compile_cache
 
         use_compile_cache()
         tune_process()
-    return import_module(f"p2gs_jax.cli.commands.{name}").run(options)
+    return options.execute()
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -87,9 +81,9 @@ def _missing(error: ImportError, argv: list[str]) -> int:
     if (error.name or "").split(".")[0] == "p2gs_jax":
         raise error
     if argv[:1] == ["doctor"]:
-        from p2gs_jax.cli.commands.doctor import diagnose
+        from p2gs_jax.cli.doctor import Doctor
 
-        return diagnose(as_json="--json" in argv)
+        return Doctor(json="--json" in argv).execute()
     fix = "`p2gs-jax doctor` says what is missing for what"
     return _complain(UserError(f"a library cannot be imported: {error}.", fix=fix))
 

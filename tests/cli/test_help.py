@@ -97,12 +97,11 @@ def test_a_preset_decides_the_values():
 
 
 def test_options_are_read_as_what_they_are():
-    argv = "fit a --out b --steps 7 --render.stop-error None --densify.max-gaussians None"
+    argv = "fit a --out b --steps 7 --render.stop-error None"
     _, options = parse([*argv.split(), "--train.coarse-to-fine", ".1", ".2", "--resume"])
-    assert options.steps == 7
+    assert options.config.train.steps == 7
     assert options.resume
     assert options.config.render.stop_error is None
-    assert options.config.densify.max_gaussians is None
     assert options.config.train.coarse_to_fine == (0.1, 0.2)
 
 
