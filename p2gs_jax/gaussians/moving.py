@@ -16,7 +16,7 @@ from p2gs_jax.core.numerics import on_device
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.gaussians.seeds import NEIGHBOURS, gaussians_from_points, mean_radiance, merge
 from p2gs_jax.render.project import STILL
-from p2gs_jax.scene.drives.moving import MovingObjects, key_times, middle_time
+from p2gs_jax.scene.drives.moving import MovingObjects, middle_time
 from p2gs_jax.scene.drives.object_masks import outline_of, painted
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.scene.rigid import interpolated, inverse
@@ -62,7 +62,7 @@ def find_nodes(scene: Scene, cfg: DynamicsConfig) -> Nodes | None:
     if any(view.time is None for view in views):
         left = tuple(scene.objects[row] for row in moving)
         said = "Views have no times: where things that move were is not known; they are masked."
-        return Nodes(_moving((), views), *_nothing(), left, (said,))
+        return Nodes(MovingObjects(()), *_nothing(), left, (said,))
     kept, left, points, filled = [], [], [], 0
     for row in moving:
         thing = scene.objects[row]
@@ -85,7 +85,11 @@ def find_nodes(scene: Scene, cfg: DynamicsConfig) -> Nodes | None:
         + "."
     ]
     return Nodes(
-        _moving(kept, views), np.concatenate([empty, *points]), owner, tuple(left), tuple(notes)
+        MovingObjects(tuple(kept)),
+        np.concatenate([empty, *points]),
+        owner,
+        tuple(left),
+        tuple(notes),
     )
 
 
@@ -146,11 +150,6 @@ def on_surface(size: tuple[float, float, float], count: int) -> Float[np.ndarray
     return np.concatenate(found)
 
 
-def _moving(objects: Sequence[TrackedObject], views: Sequence[View]) -> MovingObjects:
-    times = [view.time for view in views if view.time is not None] or [0.0]
-    return MovingObjects(tuple(objects), key_times(objects, times))
-
-
 def _nothing() -> tuple[np.ndarray, np.ndarray]:
     return np.zeros((0, 3), np.float32), np.zeros(0, np.int32)
 
@@ -199,8 +198,7 @@ def vibrates(scene: Scene, cfg: FitConfig) -> bool:
 
 def clock_of(scene: Scene) -> MovingObjects:
     """Return the clock of a scene whose Gaussians vibrate: no objects, but times of views."""
-    times = [view.time for view in scene.training_views if view.time is not None]
-    return MovingObjects((), key_times((), times), middle=middle_time(scene))
+    return MovingObjects((), middle=middle_time(scene))
 
 
 def with_vibration(gaussians: Gaussians, scene: Scene, cfg: FitConfig) -> Gaussians:

@@ -8,18 +8,8 @@ import pytest
 
 from p2gs_jax.config import DataConfig, DensifyConfig, FitConfig, InitConfig, preset
 from p2gs_jax.core.numerics import srgb_encode
-from p2gs_jax.gaussians.dense import (
-    MATCH_SIDE,
-    coverage_of,
-    dense_limit,
-    dense_seeds,
-    wants_dense,
-)
-from p2gs_jax.gaussians.flow import (
-    CHECKS,
-    Flows,
-    depth_map,
-)
+from p2gs_jax.gaussians.dense import MATCH_SIDE, coverage_of, dense_limit, dense_seeds, wants_dense
+from p2gs_jax.gaussians.flow import CHECKS, Flows, depth_map
 from p2gs_jax.gaussians.matching import (
     MatchImages,
     Tones,
