@@ -18,9 +18,9 @@ import cv2
 import numpy as np
 
 from p2gs_jax.evaluate.alignment import exposure_error
-from p2gs_jax.photometry.adjustment.curve import fit_response
 from p2gs_jax.photometry.adjustment.fit import fit_model
 from p2gs_jax.photometry.adjustment.problem import KnownExposures, make_problem
+from p2gs_jax.photometry.adjustment.solve import fit_response
 from p2gs_jax.photometry.response import Response, log_exposed
 from p2gs_jax.photometry.sources.stack import SATURATED, read_stack
 from p2gs_jax.pipeline.calibrate_stack import PIVOT, StackResult, calibrate_stack

@@ -23,9 +23,8 @@ from p2gs_jax.losses.relative_exposure import (
     relative_exposure_loss,
 )
 from p2gs_jax.photometry.appearance import Corrections, correction_of, regularisation
-from p2gs_jax.photometry.cameras import darkens, places
-from p2gs_jax.photometry.formation import formation
-from p2gs_jax.photometry.luminance.parameters import Curves
+from p2gs_jax.photometry.formation import darkens, formation, places
+from p2gs_jax.photometry.luminance import Curves
 from p2gs_jax.render import render_splats
 from p2gs_jax.render.blocks import Shown, splat
 from p2gs_jax.render.objects import with_corrections

@@ -22,12 +22,11 @@ from p2gs_jax.gaussians.init.dense_bound import coverage_of
 from p2gs_jax.gaussians.init.seeds import cameras_radius
 from p2gs_jax.gaussians.relit import relit
 from p2gs_jax.photometry.calibrate import calibrate_observations, options_of
-from p2gs_jax.photometry.initial import initial_photometry
-from p2gs_jax.photometry.mean import usual_display
+from p2gs_jax.photometry.display import usual_display
 from p2gs_jax.photometry.observations import Observations
+from p2gs_jax.photometry.parameters import initial_photometry
 from p2gs_jax.photometry.selection import Selection
-from p2gs_jax.photometry.sources.rendered import rendered_colors
-from p2gs_jax.photometry.sources.tracks import has_tracks, track_colors
+from p2gs_jax.photometry.sources.points import has_tracks, rendered_colors, track_colors
 from p2gs_jax.pipeline.calibration import Calibration, with_stated
 from p2gs_jax.pipeline.decide import decide
 from p2gs_jax.pipeline.finish import Account, finish

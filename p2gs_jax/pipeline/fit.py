@@ -23,7 +23,7 @@ from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.lpips import LpipsWeights
 from p2gs_jax.photometry.appearance import exposures_apart
-from p2gs_jax.photometry.gauge import recentre
+from p2gs_jax.photometry.parameters import recentre
 from p2gs_jax.photometry.selection import Selection
 from p2gs_jax.pipeline.agreement import agree_on_options, same_start
 from p2gs_jax.pipeline.decide import kept_choice

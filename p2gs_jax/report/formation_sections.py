@@ -7,8 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from p2gs_jax.config import PhotometryConfig, camera_formations
-from p2gs_jax.photometry.cameras import corner, log_vignetting
-from p2gs_jax.photometry.formation import inverse_tone_map
+from p2gs_jax.photometry.formation import corner, inverse_tone_map, log_vignetting
 from p2gs_jax.report.charts import (
     ChartPanel,
     Series,

@@ -14,8 +14,8 @@ from p2gs_jax.core.json_text import parse_json
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.appearance import Corrections, identity
-from p2gs_jax.photometry.luminance.parameters import Luminance
-from p2gs_jax.photometry.ppisp.parameters import Ppisp
+from p2gs_jax.photometry.luminance import Luminance
+from p2gs_jax.photometry.ppisp import Ppisp
 from p2gs_jax.types import View
 
 

@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from p2gs_jax.core.atomic import write_json
-from p2gs_jax.photometry.agreement import Agreement
-from p2gs_jax.photometry.solution import PhotometricSolution
+from p2gs_jax.photometry.solution import Agreement, PhotometricSolution
 from p2gs_jax.run.calibration_plot import write_calibration_plot
 from p2gs_jax.run.photometry_file import write_solution
 from p2gs_jax.types import View

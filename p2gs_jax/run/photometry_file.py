@@ -14,7 +14,7 @@ from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.json_text import parse_json
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.errors import UserError
-from p2gs_jax.photometry.cameras import corner
+from p2gs_jax.photometry.formation import corner
 from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.types import View
 

@@ -15,8 +15,7 @@ from p2gs_jax.config import (
 )
 from p2gs_jax.losses import relative_exposure as rel
 from p2gs_jax.losses.total import depth_pairs
-from p2gs_jax.photometry.cameras import places
-from p2gs_jax.photometry.formation import formation
+from p2gs_jax.photometry.formation import formation, places
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import KNOTS
 from p2gs_jax.train.compared_photographs import color_pairs

@@ -5,10 +5,9 @@ import pytest
 
 from p2gs_jax.photometry.adjustment import solve
 from p2gs_jax.photometry.adjustment.errors import uncertainty
-from p2gs_jax.photometry.adjustment.explained import explain
-from p2gs_jax.photometry.adjustment.fit import TOLERANCE, fit_model, solve_model
+from p2gs_jax.photometry.adjustment.fit import explain, fit_model, solution_of
 from p2gs_jax.photometry.adjustment.problem import make_problem
-from p2gs_jax.photometry.adjustment.result import solution_of
+from p2gs_jax.photometry.adjustment.solve import TOLERANCE, solve_model
 from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import Response

@@ -12,11 +12,19 @@ from hypothesis import strategies as st
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.photometry.appearance import correction_of, exposures_apart
 from p2gs_jax.photometry.formation import formation
-from p2gs_jax.photometry.ppisp.homography import SOURCES, homography, offsets, recolored
-from p2gs_jax.photometry.ppisp.parameters import OneView, applied, identity
-from p2gs_jax.photometry.ppisp.regularisation import regularisation
-from p2gs_jax.photometry.ppisp.response import identity_response, respond
-from p2gs_jax.photometry.ppisp.vignetting import falloff
+from p2gs_jax.photometry.ppisp import (
+    SOURCES,
+    OneView,
+    applied,
+    falloff,
+    homography,
+    identity,
+    identity_response,
+    offsets,
+    recolored,
+    regularisation,
+    respond,
+)
 from p2gs_jax.types import Params, Photometry
 
 IMAGE = np.random.default_rng(0).uniform(0.02, 0.9, (12, 20, 3))

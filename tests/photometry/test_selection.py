@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from p2gs_jax.photometry.candidates import Candidate, choose
-from p2gs_jax.photometry.choices import Choice
-from p2gs_jax.photometry.models import Form
+from p2gs_jax.photometry.models import Choice, Form
 from p2gs_jax.photometry.response import Response
 from p2gs_jax.photometry.selection import select
 from p2gs_jax.synth.drive import make_drive, make_exposures, observe

@@ -24,7 +24,7 @@ from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.gaussians.init.brightness import MatchImages, Tones
 from p2gs_jax.gaussians.init.flow import CHECKS, DepthMap, Flows, depth_map, pixel_centers
 from p2gs_jax.gaussians.init.pairs import neighbours, visibility
-from p2gs_jax.photometry.cameras import places
+from p2gs_jax.photometry.formation import places
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Scene
 

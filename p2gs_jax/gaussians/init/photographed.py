@@ -12,8 +12,7 @@ from jaxtyping import Float, Int
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.srgb import srgb_encode
 from p2gs_jax.gaussians.init.nodes import Nodes
-from p2gs_jax.photometry.cameras import places
-from p2gs_jax.photometry.formation import inverse_formation
+from p2gs_jax.photometry.formation import inverse_formation, places
 from p2gs_jax.photometry.sources.sampling import sample
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.scene.visibility import project_points, unoccluded

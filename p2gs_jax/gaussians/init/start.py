@@ -12,8 +12,7 @@ from p2gs_jax.gaussians.init.brightness import Tones
 from p2gs_jax.gaussians.init.dense import MOST_VIEWS, DenseSeeds, dense_seeds
 from p2gs_jax.gaussians.init.seeds import gaussians_from_points, merge, neighbour_scales
 from p2gs_jax.gaussians.init.shell import Shell
-from p2gs_jax.photometry.cameras import places
-from p2gs_jax.photometry.formation import inverse_formation
+from p2gs_jax.photometry.formation import inverse_formation, places
 from p2gs_jax.photometry.sources.sampling import sample
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Gaussians, Photometry, Scene, View
