@@ -41,14 +41,11 @@ SceneFormat = Literal[
     "transforms",
     "blender",
     "llff",
-    "rig",
     "pandaset",
     "nuscenes",
     "waymo",
     "argoverse",
     "kitti_raw",
-    "kitti_odometry",
-    "kitti_360",
     "images",
 ]
 # How structure from motion finds poses, and which photographs it matches with which.

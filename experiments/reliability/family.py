@@ -24,18 +24,6 @@ class Failure(NamedTuple):
     reason: str
 
 
-class Mended(NamedTuple):
-    """A fault of the program that the family found and that is mended.
-
-    Attributes:
-        fault: what happened, one line.
-        test: that guards it, `tests/FOLDER/test_FILE.py` with `::test_name` or without.
-    """
-
-    fault: str
-    test: str
-
-
 @dataclass(frozen=True)
 class Family:
     """What trials of one kind found.
@@ -45,7 +33,6 @@ class Family:
         tried: how many trials.
         survived: how many ended as they should.
         failures: the others.
-        mended: faults found on the way that are no more.
         command: that repeats it.
         seconds: that it took.
         figures: further numbers, rows of one table; all have the same keys.
@@ -55,7 +42,6 @@ class Family:
     tried: int
     survived: int
     failures: tuple[Failure, ...] = ()
-    mended: tuple[Mended, ...] = ()
     command: str = ""
     seconds: float = 0.0
     figures: tuple[Mapping[str, str | int | float], ...] = ()

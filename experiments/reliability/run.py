@@ -1,6 +1,6 @@
-"""What the program survived: families of trials, a dated record, and docs/reliability.md.
+"""What the program survives: families of trials, and a dated record.
 
-python experiments/reliability/run.py [--quick] [--only FAMILY...] [--out DIR] [--page]
+python experiments/reliability/run.py [--quick] [--only FAMILY...] [--out DIR]
 
 A family is a module `families/NAME.py` with
 
@@ -9,21 +9,19 @@ A family is a module `families/NAME.py` with
     run     run(quick: bool, out: Path, report: Callable[[str], None]) -> Family
 
 `out` is an empty folder of its own; `Family` is in `family.py`. Trials follow from a fixed seed, so
-that a second run tries the same. Faults that were mended stay in the module's `MENDED`, each
-with the test of the ordinary suite that guards it. `NAME` of a module that begins with `_` is no
-family: others share what is in it.
+that a second run tries the same. A module whose name begins with `_` holds what families share.
 
-`YYYY-MM-DD.json` beside this file holds one entry a family, with the commit it was measured at; a
-family that runs again replaces its entry, and `--quick` never replaces a whole run. The page shows
-the newest entry of every family; `--page` writes only that. Both are written after every family.
-Ends with 1 where a trial failed.
+`YYYY-MM-DD.json` beside this file holds one entry a family, with the commit it was measured at. The
+program ends with 1 where a trial failed.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import datetime
 import importlib
+import json
 import shutil
 import sys
 import tempfile
@@ -37,11 +35,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from checkout import commit
 from reliability.family import COMMAND, Failure, Family
-from reliability.page import write_page
-from reliability.record import Entry, write_entry
+
+from p2gs_jax.core.atomic import write_json
 
 HERE = Path(__file__).resolve().parent
-PAGE = HERE.parents[1] / "docs" / "reliability.md"
 
 
 def families() -> dict[str, ModuleType]:
@@ -59,20 +56,14 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="a part of every family, minutes")
     parser.add_argument("--only", nargs="+", choices=known, metavar="FAMILY", help=", ".join(known))
     parser.add_argument("--out", type=Path, help="keep here what the trials leave behind")
-    parser.add_argument("--page", action="store_true", help="try nothing, write the page")
     args = parser.parse_args(argv)
-    about = {name: module.ABOUT for name, module in known.items()}
-    if args.page:
-        write_page(PAGE, HERE, about)
-        return 0
     scratch = args.out or Path(tempfile.mkdtemp(prefix="reliability-"))
     failed = 0
     try:
         for name in args.only or known:
             found = one(known[name], args.quick, scratch / name)
             failed += len(found.failures)
-            write_entry(HERE, Entry(found, today(), commit(), args.quick))
-            write_page(PAGE, HERE, about)
+            record(found, args.quick)
             print(f"{name}: {found.survived} of {found.tried} survived, {found.seconds:.0f} s")
             for failure in found.failures:
                 print(f"  {failure.name}: {failure.reason}")
@@ -100,9 +91,21 @@ def one(module: ModuleType, quick: bool, out: Path) -> Family:
     )
 
 
-def today() -> str:
-    """Return the date in UTC."""
-    return datetime.datetime.now(datetime.UTC).date().isoformat()
+def record(found: Family, quick: bool) -> None:
+    """Put what a family found into the record of today (UTC); a part never replaces the whole."""
+    date = datetime.datetime.now(datetime.UTC).date().isoformat()
+    path = HERE / f"{date}.json"
+    entries = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
+    known = {entry["family"]["name"]: entry for entry in entries}
+    if quick and not known.get(found.name, {"quick": True})["quick"]:
+        return
+    known[found.name] = {
+        "family": dataclasses.asdict(found),
+        "date": date,
+        "commit": commit(),
+        "quick": quick,
+    }
+    write_json(path, [known[name] for name in sorted(known)])
 
 
 if __name__ == "__main__":

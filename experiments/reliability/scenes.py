@@ -148,29 +148,3 @@ def write_transforms(root: Path) -> None:
     write_photographs(root / "images")
     (root / "transforms.json").write_text(json.dumps(transforms()))
     (root / "points.ply").write_text(ply())
-
-
-def calibration() -> str:
-    """Return a rig's calib.txt."""
-    row = f"{FOCAL} 0 {WIDTH / 2 - 0.5} 0 0 {FOCAL} {HEIGHT / 2 - 0.5} 0 0 0 1 0"
-    return f"P0: {row}\nTr_velo_to_cam0: 1 0 0 0 0 1 0 0 0 0 1 0\n"
-
-
-def poses() -> str:
-    """Return a rig's poses.txt."""
-    return "".join(f"1 0 0 {_shift(view)} 0 1 0 0 0 0 1 0\n" for view in range(VIEWS))
-
-
-def scan() -> bytes:
-    """Return a LiDAR scan."""
-    return np.column_stack([_xyz(), np.full(POINTS, 0.5)]).astype("<f4").tobytes()
-
-
-def write_rig(root: Path) -> None:
-    """Write a rig with scans."""
-    write_photographs(root / "images" / "front")
-    (root / "calib.txt").write_text(calibration())
-    (root / "poses.txt").write_text(poses())
-    (root / "velodyne").mkdir()
-    for view in range(VIEWS):
-        (root / "velodyne" / f"{view:06d}.bin").write_bytes(scan())

@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from reliability.family import Failure, Family, Mended, Report
+from reliability.family import Failure, Family, Report
 
 SECONDS = 30.0
 BYTES = 2 * 2**30
@@ -74,7 +74,6 @@ def run_trials(
     trials: Sequence[Trial],
     out: Path,
     report: Report,
-    mended: Sequence[Mended] = (),
 ) -> Family:
     """Try all, one child each.
 
@@ -83,7 +82,6 @@ def run_trials(
         trials: all of them.
         out: an empty folder; every trial has a folder of its own there while it runs.
         report: receives progress.
-        mended: what the family found before.
     """
     start = time.perf_counter()
     failures, outcomes = [], []
@@ -111,7 +109,6 @@ def run_trials(
         len(trials),
         len(trials) - len(failures),
         tuple(failures),
-        tuple(mended),
         seconds=time.perf_counter() - start,
         figures=(figures,),
     )

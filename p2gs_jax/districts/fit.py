@@ -47,8 +47,7 @@ from p2gs_jax.pipeline.fit import FitResult, fit
 from p2gs_jax.pipeline.preflight import Paths, Views, check_run_dir
 from p2gs_jax.pipeline.prepare import Prepared, load
 from p2gs_jax.run.decisions import read_decisions
-from p2gs_jax.run.layout import RunFolder
-from p2gs_jax.run.lock import RunLock, locked, require_free
+from p2gs_jax.run.folder import RunFolder, RunLock, locked, require_free
 from p2gs_jax.run.write import write_start
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Gaussians, Params, Scene

@@ -139,7 +139,7 @@ def regularisation(parameters: Corrections, kind: Appearance) -> Float[Array, ""
     For bilateral grids it is the mean squared difference of neighbouring cells.
     """
     if isinstance(parameters, Ppisp):
-        return ppisp.regularisation(parameters)
+        return ppisp.regularisation_of(parameters)
     if isinstance(parameters, Luminance) or kind != "bilateral":
         return None
     return sum((jnp.mean(jnp.diff(parameters, axis=k) ** 2) for k in (2, 3, 4)), jnp.zeros(()))

@@ -17,7 +17,7 @@ from p2gs_jax.photometry.appearance import Corrections, identity
 from p2gs_jax.photometry.formation import camera_rows, inverse_tone_map
 from p2gs_jax.photometry.luminance import Luminance, statistics_of
 from p2gs_jax.photometry.solution import PhotometricSolution
-from p2gs_jax.render.radiance import RadianceKind, scaled
+from p2gs_jax.render.harmonics import RadianceKind, scaled
 from p2gs_jax.types import GAMMA_SRGB, Params, Photometry, Scene, View
 
 # Exposures drawn at random are at least this.

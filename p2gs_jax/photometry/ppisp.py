@@ -51,7 +51,7 @@ class OneView(eqx.Module):
 
     Attributes:
         exposure: stops.
-        color: parameters of `homography`.
+        color: parameters of `homography_of`.
         response: of the camera.
         vignetting: of the camera; None: light without a place in an image.
     """
@@ -67,7 +67,7 @@ class Ppisp(eqx.Module):
 
     Attributes:
         exposures: stops.
-        colors: parameters of `homography`.
+        colors: parameters of `homography_of`.
         responses: of each camera.
         vignettings: of each camera.
         names: of the cameras.
@@ -147,7 +147,7 @@ def offsets(parameters: Float[Array, "... 8"]) -> Float[Array, "... 4 2"]:
     return jnp.einsum("...ki,kij->...kj", pairs, blocks)
 
 
-def homography(parameters: Float[Array, " 8"]) -> Float[Array, "3 3"]:
+def homography_of(parameters: Float[Array, " 8"]) -> Float[Array, "3 3"]:
     """Return the map of homogeneous chromaticities that takes `SOURCES` to where they move.
 
     Colours are taken as homogeneous (R, G, R + G + B), so that (R, G) / (R + G + B) are
@@ -173,9 +173,9 @@ def homography(parameters: Float[Array, " 8"]) -> Float[Array, "3 3"]:
 
 
 def recolored(rgb: Float[Array, "... 3"], parameters: Float[Array, " 8"]) -> Float[Array, "... 3"]:
-    """Return linear colours under the `homography`; R + G + B stays, but for `EPSILON`."""
+    """Return linear colours under their homography; R + G + B stays, but for `EPSILON`."""
     intensity = rgb.sum(-1, keepdims=True)
-    moved = jnp.concatenate([rgb[..., :2], intensity], -1) @ homography(parameters).T
+    moved = jnp.concatenate([rgb[..., :2], intensity], -1) @ homography_of(parameters).T
     # Parameters that throw a colour beyond the horizon would turn it negative.
     moved = moved * intensity / (jnp.maximum(moved[..., 2:], 0.0) + EPSILON)
     red, green = moved[..., 0], moved[..., 1]
@@ -216,7 +216,7 @@ def _power(base: Float[Array, "..."], exponent: Float[Array, "..."], flat: float
     return jnp.where(on, jnp.exp(exponent * jnp.log(jnp.where(on, base, 1.0))), 0.0)
 
 
-def regularisation(parameters: Ppisp) -> Float[Array, ""]:
+def regularisation_of(parameters: Ppisp) -> Float[Array, ""]:
     """Return what keeps parameters where radiance can be told from them (paper, 4.6).
 
     Means over the views of exposures and of chromaticities are pulled to 0; channels of a camera to

@@ -27,14 +27,13 @@ from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.parameters import initial_photometry
 from p2gs_jax.photometry.selection import Selection
 from p2gs_jax.photometry.sources.points import has_tracks, rendered_colors, track_colors
-from p2gs_jax.pipeline.calibration import Calibration, with_stated
+from p2gs_jax.pipeline.calibration import Calibration, with_stated, write_calibration
 from p2gs_jax.pipeline.decide import decide
 from p2gs_jax.pipeline.finish import Account, finish
 from p2gs_jax.pipeline.fit import compact, optimise
 from p2gs_jax.pipeline.preflight import check_run_dir
 from p2gs_jax.pipeline.prepare import Prepared
-from p2gs_jax.run.calibration_files import write_calibration
-from p2gs_jax.run.layout import RunFolder
+from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.run.write import write_start
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.images import ImageStore

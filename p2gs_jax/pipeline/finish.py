@@ -20,9 +20,9 @@ from p2gs_jax.evaluate.unexplained import Unexplained, shares_by_view
 from p2gs_jax.evaluate.untold import untold_notes
 from p2gs_jax.photometry.metering import Metering
 from p2gs_jax.pipeline.prepare import Prepared
-from p2gs_jax.render.host import make_renderer
-from p2gs_jax.run.layout import RunFolder
-from p2gs_jax.run.unexplained_pictures import write_unexplained
+from p2gs_jax.render.capacity import make_renderer
+from p2gs_jax.run.folder import RunFolder
+from p2gs_jax.run.plots import write_unexplained
 from p2gs_jax.run.write import summary_rows, write_results, write_view
 from p2gs_jax.scene.drives.moving import fitted_objects
 from p2gs_jax.types import Params

@@ -35,8 +35,7 @@ from p2gs_jax.pipeline.prepare import Expected, Prepared, load, prepare
 from p2gs_jax.pipeline.reserve import seconds_to_finish
 from p2gs_jax.run.checkpoint import saved_steps
 from p2gs_jax.run.decisions import Decisions
-from p2gs_jax.run.layout import RunFolder
-from p2gs_jax.run.lock import RunLock, locked, require_free
+from p2gs_jax.run.folder import RunFolder, RunLock, locked, require_free
 from p2gs_jax.run.write import write_start
 from p2gs_jax.train.loop import Trainer, TrainResult
 from p2gs_jax.train.programs import StepPrograms

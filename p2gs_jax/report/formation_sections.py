@@ -19,7 +19,7 @@ from p2gs_jax.report.charts import (
 from p2gs_jax.report.page import Section, figure, folded, table
 from p2gs_jax.report.run_files import RunFiles
 from p2gs_jax.report.svg import FIRST, FOURTH, INK, SECOND, THIRD
-from p2gs_jax.run.photometry_file import CameraPhotometry, ViewPhotometry
+from p2gs_jax.run.photometry_files import CameraPhotometry, ViewPhotometry
 from p2gs_jax.types import GAMMA_SRGB
 
 # More cameras than this share one panel, without names.

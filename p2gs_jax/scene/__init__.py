@@ -13,7 +13,6 @@ from p2gs_jax.scene.backdrop import with_alpha
 from p2gs_jax.scene.colmap import find_model, load_colmap
 from p2gs_jax.scene.drives import read_drive
 from p2gs_jax.scene.drives.assemble import assemble
-from p2gs_jax.scene.drives.kitti_odometry import is_kitti_odometry
 from p2gs_jax.scene.drives.recording import Recording
 from p2gs_jax.scene.exif import read_exif_ev
 from p2gs_jax.scene.files import image_size, list_images
@@ -23,7 +22,6 @@ from p2gs_jax.scene.masks import attach_masks
 from p2gs_jax.scene.photographs.colours import colour_notes
 from p2gs_jax.scene.photographs.develop import develop, developed_views, with_originals
 from p2gs_jax.scene.random_seeds import FEWEST, with_random_seeds
-from p2gs_jax.scene.rig import is_rig, load_rig
 from p2gs_jax.scene.split import split_scene
 from p2gs_jax.scene.split_lists import lists_beside, split_as_listed
 from p2gs_jax.scene.transforms import is_blender, load_blender, load_transforms
@@ -44,10 +42,9 @@ def load_scene(
     In this order, unless `cfg.format` names one: a COLMAP model in `sparse/0`, `sparse` or the
     folder itself; `transforms.json` in it, or `root` itself where that is a .json file;
     `transforms_train.json` with those of the other parts of the split; LLFF's `poses_bounds.npy`; a
-    rig with KITTI's calib.txt and poses.txt; a drive as a data set lays it out (`drives`);
-    photographs in `images/` or the folder itself, whose cameras are then found by structure from
-    motion. Poses without points get theirs by triangulation, or at random where hardly anything
-    matches.
+    drive as a data set lays it out (`drives`); photographs in `images/` or the folder itself, whose
+    cameras are then found by structure from motion. Poses without points get theirs by
+    triangulation, or at random where hardly anything matches.
 
     Args:
         root: folder, .json file, or video.
@@ -163,11 +160,6 @@ def find_scene(
         return load_blender(root, cfg)
     if is_llff(root) and cfg.format in (None, "llff"):
         return load_llff(root, cfg)
-    # SemanticKITTI's sequences have a poses.txt, too.
-    if is_rig(root) and (
-        cfg.format == "rig" or (cfg.format is None and not is_kitti_odometry(root))
-    ):
-        return load_rig(root, cfg)
     recording = read_drive(root, cfg, report)
     if recording is not None:
         return recording
@@ -195,7 +187,7 @@ def find_scene(
     raise UserError(
         f"no scene in {root}: there is no COLMAP model (cameras, images and points3D as .bin or "
         f".txt, in sparse/0, sparse or the folder itself), no transforms.json or "
-        f"transforms_train.json, no poses_bounds.npy, no calib.txt with poses.txt, no drive of a "
+        f"transforms_train.json, no poses_bounds.npy, no drive of a "
         f"known data set, and no photographs (looked in {looked})",
         fix=fix,
     )

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from p2gs_jax.config import DataConfig
-from p2gs_jax.core.json_text import parse_json
+from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.colmap import HUGE, subfolder
 from p2gs_jax.scene.files import (

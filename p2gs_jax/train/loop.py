@@ -30,7 +30,7 @@ from p2gs_jax.evaluate.unexplained import Unexplained
 from p2gs_jax.gaussians.population import STEP_SECONDS_PER_PIXEL, Coverage
 from p2gs_jax.losses.relative_exposure import ColorPairs
 from p2gs_jax.run.decisions import Decisions
-from p2gs_jax.run.layout import RunFolder
+from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.run.left_out_file import LeftOutFile
 from p2gs_jax.train import room, schedule
 from p2gs_jax.train.burst import Bursts

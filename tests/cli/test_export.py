@@ -14,7 +14,7 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.formats.ply import read_ply
 from p2gs_jax.formats.splat import read_splat
-from p2gs_jax.render.host import make_renderer
+from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.read import load_run
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.device import camera_of
@@ -28,8 +28,8 @@ STEPS = ("--bake-steps", "12")
 def exported(finished_run, tmp_path_factory):
     """Return a run and a folder with every format that needs no extra package."""
     out = tmp_path_factory.mktemp("exports")
-    formats = ("linear-ply", "display-ply", "splat", "colmap", "exr", "drive")
-    formats += ("gltf", "gsplat", "nerfstudio", "cameras")
+    formats = ("linear-ply", "display-ply", "splat", "colmap", "exr")
+    formats += ("gltf", "nerfstudio")
     argv = ["export", str(finished_run), "--format", *formats, "--out", str(out), *STEPS]
     with pytest.raises(SystemExit) as stop:
         main(argv)
@@ -49,15 +49,6 @@ def test_the_linear_ply_is_the_run_bit_for_bit(exported):
     train = [fitted.scene.views[i].name for i in fitted.scene.train_indices]
     np.testing.assert_allclose([e[n] for n in train], fitted.params.photometry.exposures, rtol=1e-6)
     assert said["mean"]["gamma"] == pytest.approx(fitted.mean.gamma)
-
-
-def test_scenes_that_are_no_drives_have_a_table_too(exported):
-    fitted, out = exported
-    lines = (out / "drive.csv").read_text().splitlines()
-    assert len(lines) == 1 + len(fitted.scene.views)
-    said = json.loads((out / "drive.json").read_text())
-    assert said["views"][0]["frame"] is None
-    assert (fitted.scene.root / said["views"][0]["image"]).is_file()
 
 
 def as_viewers_do(path):

@@ -11,7 +11,6 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[2] / "experiments"))
 
 import drive_cases
-import long_drive
 import selection_on_drive
 import sensor_town
 
@@ -119,24 +118,6 @@ def test_the_table_says_how_often_each_part_was_right():
     assert "| a | 1 of 2 | 2 | 2 | 1 | 2 |" in text
     assert "Right: 1 of 2." in text
     assert "largest loss 0.0020" in text
-
-
-def test_long_drives_are_chains_of_what_was_asked_for():
-    made = long_drive.make_long_drive(120, 4000, seed=1)
-    seen = made.observations
-    assert seen.view_count == len(made.exposures) == 120
-    assert 3000 < len(seen.points) <= 4000
-    assert seen.colors.dtype == np.float32
-    assert seen.positions is not None
-    assert np.linalg.norm(seen.positions, axis=1).max() < 1
-    frame = seen.views // long_drive.CAMERAS
-    for point in range(5):
-        mine = seen.points == point
-        assert np.ptp(frame[mine]) == mine.sum() - 1 < long_drive.TRACK
-        assert len(set(seen.cameras[seen.views[mine]])) <= 2
-    assert np.all(seen.components(seen.usable(4 / 255, 250 / 255)) == 0)
-    again = long_drive.make_long_drive(120, 4000, seed=1)
-    np.testing.assert_array_equal(again.observations.colors, seen.colors)
 
 
 def test_factors_per_channel_are_those_that_fit_all_pictures():

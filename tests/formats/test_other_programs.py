@@ -1,8 +1,5 @@
-"""glTF, OpenUSD, gsplat's checkpoint and compressed PLY, read by other people's readers."""
+"""glTF, OpenUSD and compressed PLY, read by other people's readers."""
 
-import io
-import pickle
-import zipfile
 from typing import Any
 
 import numpy as np
@@ -15,10 +12,8 @@ from splats import random_splats
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.compressed_ply import read_compressed_ply, write_compressed_ply
 from p2gs_jax.formats.gltf import EXTENSION, write_gltf
-from p2gs_jax.formats.gsplat_checkpoint import write_gsplat
-from p2gs_jax.formats.torch_file import write_torch
 from p2gs_jax.formats.usd import CAMERAS, SPLATS, NamedCamera, write_usd
-from p2gs_jax.render.spherical_harmonics import C0, evaluate
+from p2gs_jax.render.harmonics import C0, evaluate
 
 FLIP = np.array([1.0, -1.0, -1.0])
 
@@ -145,77 +140,6 @@ def test_usd_is_read_by_pxr(tmp_path):
         ndc = matrix.Transform(Gf.Vec3d(*(point * FLIP)))
         seen = [(ndc[0] + 1) / 2 * 320, (1 - ndc[1]) / 2 * 240]
         np.testing.assert_allclose(seen, expected, atol=1e-3)
-
-
-class Restricted(pickle.Unpickler):
-    """Rebuild tensors as torch does, and nothing else."""
-
-    def __init__(self, archive, folder):
-        super().__init__(io.BytesIO(archive.read(f"{folder}/data.pkl")))
-        self.archive, self.folder = archive, folder
-
-    def find_class(self, module, name):
-        known = {
-            ("torch", "FloatStorage"): np.dtype("<f4"),
-            ("torch._utils", "_rebuild_tensor_v2"): self.rebuild,
-            ("collections", "OrderedDict"): dict,
-        }
-        return known[module, name]
-
-    def persistent_load(self, pid):
-        kind, dtype, key, place, count = pid
-        assert (kind, place) == ("storage", "cpu")
-        data = np.frombuffer(self.archive.read(f"{self.folder}/data/{key}"), dtype)
-        assert len(data) == count
-        return data
-
-    @staticmethod
-    def rebuild(storage, offset, size, stride, requires_grad, hooks):
-        assert offset == 0
-        assert not requires_grad
-        assert hooks == {}
-        strides = [4 * s for s in stride]
-        return np.lib.stride_tricks.as_strided(storage, size, strides)
-
-
-def checkpoint(path):
-    with zipfile.ZipFile(path) as archive:
-        assert all(i.compress_type == zipfile.ZIP_STORED for i in archive.infolist())
-        assert archive.read("archive/version") == b"3\n"
-        return Restricted(archive, "archive").load()
-
-
-def assert_is_checkpoint_of(found, g):
-    assert found["step"] == 0
-    splats = {name: np.asarray(value) for name, value in found["splats"].items()}
-    assert set(splats) == {"means", "scales", "quats", "opacities", "sh0", "shN"}
-    np.testing.assert_array_equal(splats["means"], g.means)
-    np.testing.assert_array_equal(splats["scales"], g.log_scales)
-    np.testing.assert_array_equal(splats["quats"], g.quats)
-    np.testing.assert_array_equal(splats["opacities"], g.opacity_logits)
-    np.testing.assert_array_equal(np.concatenate([splats["sh0"], splats["shN"]], 1), g.sh)
-
-
-@pytest.mark.parametrize("degree", [0, 3])
-def test_a_gsplat_checkpoint_is_rebuilt_from_its_pickle(tmp_path, degree):
-    g = random_splats(degree=degree)
-    write_gsplat(tmp_path / "a.pt", g)
-    assert_is_checkpoint_of(checkpoint(tmp_path / "a.pt"), g)
-
-
-def test_a_gsplat_checkpoint_is_read_by_torch(tmp_path):
-    torch = pytest.importorskip("torch", reason="torch is not installed")
-    g = random_splats()
-    write_gsplat(tmp_path / "a.pt", g)
-    assert_is_checkpoint_of(torch.load(tmp_path / "a.pt", weights_only=True), g)
-
-
-def test_numbers_of_any_size_are_pickled(tmp_path):
-    tree = {"a": 2**40, "b": -3, "c": {"d": np.arange(6.0).reshape(2, 3).T}}
-    write_torch(tmp_path / "a.pt", tree)
-    found = checkpoint(tmp_path / "a.pt")
-    assert (found["a"], found["b"]) == (2**40, -3)
-    np.testing.assert_array_equal(found["c"]["d"], tree["c"]["d"])
 
 
 def unpacked(codes, bits):

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from synthetic_drive import make_drive, make_exposures, observe
 
-from p2gs_jax.core.srgb import srgb_decode, srgb_encode
+from p2gs_jax.core.numerics import srgb_decode, srgb_encode
 from p2gs_jax.evaluate.alignment import exposure_error
 from p2gs_jax.photometry.adjustment import fit as fitting
 from p2gs_jax.photometry.adjustment import robust
@@ -19,7 +20,6 @@ from p2gs_jax.photometry.adjustment.solve import solve_model
 from p2gs_jax.photometry.models import MODELS, Form
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import Response
-from p2gs_jax.synth.drive import make_drive, make_exposures, observe
 
 LIMITS = {"black": 4 / 255, "saturation": 250 / 255, "pivot": 0.18}
 DRIVE = make_drive(12, 1000)

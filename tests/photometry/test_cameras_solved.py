@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from synthetic_drive import make_drive, make_exposures, observe
 
 from p2gs_jax.photometry.adjustment import fit as explained
 from p2gs_jax.photometry.adjustment import matrices
@@ -19,7 +20,6 @@ from p2gs_jax.photometry.models import (
     possible,
 )
 from p2gs_jax.photometry.response import FREE, HELD, Response, log_exposed
-from p2gs_jax.synth.drive import make_drive, make_exposures, observe
 
 LIMITS = {"black": 4 / 255, "saturation": 250 / 255, "pivot": 0.18}
 DRIVE = make_drive(12, 1000)

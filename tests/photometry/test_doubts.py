@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from synthetic_drive import make_drive, make_exposures, observe
 
 from p2gs_jax.photometry.adjustment import solve
 from p2gs_jax.photometry.adjustment.errors import uncertainty
@@ -12,7 +13,6 @@ from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import Response
 from p2gs_jax.photometry.selection import select
-from p2gs_jax.synth.drive import make_drive, make_exposures, observe
 
 LIMITS = {"black": 4 / 255, "saturation": 250 / 255, "pivot": 0.18}
 GROUP, POINTS, SEEN_BY = 20, 800, 6

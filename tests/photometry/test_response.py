@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from synthetic_drive import make_drive, make_exposures, observe
 
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.photometry.adjustment.parameters import Splines
@@ -23,7 +24,6 @@ from p2gs_jax.photometry.response import (
     spline_count,
     spline_parameters,
 )
-from p2gs_jax.synth.drive import make_drive, make_exposures, observe
 from p2gs_jax.synth.sensor import encode
 
 BENT = Response("srgb", tuple(0.3 * np.sin(3 * KNOTS) - 0.1))

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 from reliability import scenes
-from reliability.family import Family, Mended, Report
+from reliability.family import Family, Report
 from reliability.mutations import Broken, cuts, flips, random_bytes, wrong_json, wrong_words
 from reliability.reading import fit_into, read
 from reliability.trials import REFUSED, Trial, in_child, run_trials
 
-from p2gs_jax.core.printable import printable
+from p2gs_jax.core.text import printable
 from p2gs_jax.errors import UserError
 from p2gs_jax.paths.files import read_cameras
 from p2gs_jax.run.read import load_run
@@ -27,29 +27,6 @@ ABOUT = """Drives of nuScenes, Argoverse 2, Waymo, PandaSet and KITTI (three lay
 exposures, lists of cameras and the files of a finished run, each cut, flipped, out of range, empty
 or gone, and tables whose names lead out of the drive. Each is read whole, or refused with code 2 by
 a message that names file, fault and remedy, within 30 s and 2 GB."""
-MENDED = (
-    Mended(
-        "a table of exposures with a field beyond csv's limit: traceback",
-        "tests/scene/test_known_exposures.py::test_a_field_beyond_the_limit_is_refused",
-    ),
-    Mended(
-        "a run's scene.npz that is empty, or whose packed bytes are wrong: traceback",
-        "tests/run/test_scene_file.py::test_a_broken_scene_file_is_refused",
-    ),
-    Mended(
-        "nuScenes' tables could name photographs and sweeps outside of the set",
-        "tests/scene/drives/test_nuscenes.py::test_files_outside_the_set_are_refused",
-    ),
-    Mended(
-        "renders of a camera whose name is a path were written outside of the run",
-        "tests/scene/drives/test_assemble.py::test_a_camera_whose_name_is_a_path_is_refused",
-    ),
-    Mended(
-        "LiDAR points of KITTI that are no numbers: traceback",
-        "tests/scene/drives/test_kitti_360_drives.py"
-        "::test_points_that_are_no_numbers_are_counted_and_left_out",
-    ),
-)
 SEED = 20261125
 SPACING = 5
 DAMAGES = 12
@@ -72,7 +49,7 @@ ADDRESSES = 8 * 2**30
 def run(quick: bool, out: Path, report: Report) -> Family:
     """Try all; `quick`: every fifth."""
     found = [*trials(out / "made"), *_runs(out / "made")]
-    return run_trials(NAME, found[:: SPACING if quick else 1], out, report, MENDED)
+    return run_trials(NAME, found[:: SPACING if quick else 1], out, report)
 
 
 def trials(made: Path) -> Iterator[Trial]:

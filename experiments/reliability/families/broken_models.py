@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from reliability import scenes
-from reliability.family import Family, Mended, Report
+from reliability.family import Family, Report
 from reliability.mutations import (
     Broken,
     Field,
@@ -31,35 +31,13 @@ ABOUT = """COLMAP models (binary and text), transforms.json, rigs, seed points, 
 masks that are cut at fields, flipped, miscounted or out of range. Each is read whole, or refused
 with code 2 by a message that names file, fault and remedy, within 30 s and 2 GB."""
 _TRANSFORMS = "tests/scene/test_transforms.py"
-MENDED = (
-    Mended(
-        "an id of a point beyond 64 bits in points3D.txt: traceback",
-        "tests/scene/test_colmap.py::test_broken_models",
-    ),
-    Mended(
-        "a focal length, centre or pose of 1e308 in transforms.json: infinite cameras",
-        f"{_TRANSFORMS}::test_broken_files",
-    ),
-    Mended(
-        "JSON nested 100,000 deep, or a number of 10,000 digits: traceback",
-        f"{_TRANSFORMS}::test_what_python_will_not_parse_is_no_json",
-    ),
-    Mended(
-        "a count in a PLY's header took memory at its word",
-        f"{_TRANSFORMS}::test_a_count_of_points_beyond_the_file_costs_no_memory",
-    ),
-    Mended(
-        "a singular pose or projection of a rig: traceback",
-        "tests/scene/test_rig.py::test_matrices_that_have_no_inverse_are_named",
-    ),
-)
 SEED = 20261123
 SPACING = 9
 
 
 def run(quick: bool, out: Path, report: Report) -> Family:
     """Try all; `quick`: every ninth."""
-    return run_trials(NAME, list(trials())[:: SPACING if quick else 1], out, report, MENDED)
+    return run_trials(NAME, list(trials())[:: SPACING if quick else 1], out, report)
 
 
 def trials() -> Iterator[Trial]:

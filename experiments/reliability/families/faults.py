@@ -15,7 +15,7 @@ from pathlib import Path
 from reliability.families import _fits as fits
 from reliability.families._fits import Trial
 from reliability.families._scenes import Made, write_scene
-from reliability.family import Failure, Family, Mended, Report
+from reliability.family import Failure, Family, Report
 
 NAME = "faults"
 ABOUT = """
@@ -24,36 +24,6 @@ loses disk, folder, memory or clock. Survived: it ends with the exit code and th
 to the fault, without a traceback, and resumed it gives the run that was never interrupted, byte for
 byte (log, Gaussians, photometry, scores).
 """
-MENDED = (
-    Mended("SIGTERM killed a fit without a checkpoint", "tests/train/test_loop.py"),
-    Mended("SIGTERM to a sweep left its runs behind", "tests/train/test_sweep_processes.py"),
-    Mended("two processes wrote into one run folder", "tests/run/test_lock.py"),
-    Mended(
-        "a full disk ended in a traceback of whatever library wrote",
-        "tests/core/test_disk.py::test_a_full_disk_is_named_with_the_file",
-    ),
-    Mended(
-        "a checkpoint without room printed pages of another library's tracebacks",
-        "tests/core/test_disk.py"
-        "::test_a_checkpoint_without_room_is_named_and_the_one_before_it_stays",
-    ),
-    Mended(
-        "a full disk tore the log silently",
-        "tests/core/test_disk.py::test_a_log_without_room_is_named_and_mended",
-    ),
-    Mended(
-        "a removed folder was made again, without what resuming needs",
-        "tests/run/test_lock.py::test_a_folder_that_was_removed_underneath_is_named",
-    ),
-    Mended(
-        "what a killed fit had begun to write stayed in its folder",
-        "tests/run/test_lock.py::test_what_a_killed_process_had_begun_to_write_is_removed",
-    ),
-    Mended(
-        "memory that could not suffice was noticed when it ran out",
-        "tests/pipeline/test_memory_needed.py",
-    ),
-)
 KILLS, KILLS_QUICK = 50, 4
 # Bytes that a file may have: from no room for the first file to none for the checkpoint.
 ROOMS = (0, 300, 1_000, 4_000, 20_000, 60_000)
@@ -146,7 +116,7 @@ class Faults:
                 moment = "between steps"
             elif kind == "checkpoint":
                 folder = run / "checkpoints"
-                fits.wait_for(process, lambda: any(folder.glob("*orbax-checkpoint-tmp*")))
+                fits.wait_for(process, lambda: any(folder.glob(".writing-*")))
                 moment = "while it wrote a checkpoint"
             else:
                 fits.wait_for(process, lambda: (run / "renders").exists())
@@ -283,7 +253,7 @@ def run(quick: bool, out: Path, report: Report) -> Family:
         report(f"faults: {name}: {reason or 'survived'}")
         found.append((name, reason))
     failures = tuple(Failure(name, reason) for name, reason in found if reason is not None)
-    return Family(NAME, len(found), len(found) - len(failures), failures, MENDED)
+    return Family(NAME, len(found), len(found) - len(failures), failures)
 
 
 def _after(seconds: float) -> Callable[[], bool]:

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 from reliability.families._scenes import SMALL_FIT, Made, in_a_row, write_scene
-from reliability.family import Failure, Family, Mended, Report
+from reliability.family import Failure, Family, Report
 
 from p2gs_jax import UserError, fit
 from p2gs_jax.config import preset
 from p2gs_jax.core.progress import Silent
 from p2gs_jax.formats.ply import read_ply
-from p2gs_jax.sweep import with_fields
+from p2gs_jax.jobs.configs import with_fields
 
 NAME = "hard_numbers"
 ABOUT = """
@@ -25,33 +25,6 @@ where none belong, and far too little of everything. Survived: what is written b
 happens, a fit with its warning or a refusal with its words; all that a fit writes is finite, and
 exposures that cannot be known are said to be unknown.
 """
-MENDED = (
-    Mended(
-        "a view that its mask hides altogether was scored 120 dB",
-        "tests/evaluate/test_untold.py::test_hidden_views_are_left_out_of_the_scores",
-    ),
-    Mended(
-        "masks that hide everything were fitted",
-        "tests/pipeline/test_preflight.py::test_masks_that_hide_everything_are_refused",
-    ),
-    Mended(
-        "black and saturated photographs had exposures like any other",
-        "tests/evaluate/test_untold.py::test_black_and_saturated_photographs_tell_no_exposure",
-    ),
-    Mended(
-        "the near plane cut scenes in millimetres",
-        "tests/pipeline/test_scale.py::test_the_near_plane_follows_scenes_that_it_would_cut",
-    ),
-    Mended(
-        "nothing was said of scenes so far from the origin that float32 is coarse",
-        "tests/pipeline/test_scale.py::test_a_scene_far_from_the_origin_is_said_to_be_coarse",
-    ),
-    Mended(
-        "photographs without a usable colour had a mean of nothing as their density",
-        "tests/photometry/test_selection.py"
-        "::test_photographs_that_tell_nothing_choose_something_and_know_no_exposure",
-    ),
-)
 OPTIONS = SMALL_FIT | {"train.steps": 60}
 
 
@@ -171,7 +144,7 @@ def run(quick: bool, out: Path, report: Report) -> Family:
         if reason is not None:
             failures.append(Failure(name, reason))
     survived = len(names) - len(failures)
-    return Family(NAME, len(names), survived, tuple(failures), MENDED, figures=tuple(figures))
+    return Family(NAME, len(names), survived, tuple(failures), figures=tuple(figures))
 
 
 def attempt(case: Case, out: Path) -> tuple[str | None, dict[str, str | float]]:

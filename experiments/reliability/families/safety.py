@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from reliability import scenes
 from reliability.families.odd_names import with_photograph
-from reliability.family import Family, Mended, Report
+from reliability.family import Family, Report
 from reliability.reading import FIT, command, read
 from reliability.trials import REFUSED, Trial, run_trials
 
@@ -27,20 +27,6 @@ ABOUT = """The viewer listens on loopback unless told otherwise, refuses pages o
 names that were made to point here, and wants a token where others reach it; reports hold no script
 and escape names; pickles that call something are refused; temporary files are private; the package
 calls nothing that runs text. A trial survives if what is forbidden does not happen."""
-MENDED = (
-    Mended(
-        "any site open in the same browser could connect to the viewer: no check of Origin or Host",
-        "tests/viewer/test_guard.py::test_pages_of_other_sites_are_refused",
-    ),
-    Mended(
-        "the viewer on 0.0.0.0 let in whoever reached the port: there was no token",
-        "tests/viewer/test_guard.py::test_others_need_the_token",
-    ),
-    Mended(
-        "a packed table that unpacks to gigabytes was unpacked in full",
-        "tests/scene/drives/test_pickled_tables.py::test_a_bomb_is_not_unpacked",
-    ),
-)
 PACKAGE = Path(__file__).resolve().parents[3] / "p2gs_jax"
 HAPPENED = 71
 HTML = "<img src=x onerror=alert(1)>.png"
@@ -51,7 +37,7 @@ LOOPBACK, SECRET = "127.0.0.1", "secret"
 def run(quick: bool, out: Path, report: Report) -> Family:
     """Try all; `quick`: no fit."""
     found = [t for t in trials() if not (quick and t.seconds > 100)]
-    return run_trials(NAME, found, out, report, MENDED)
+    return run_trials(NAME, found, out, report)
 
 
 def trials() -> Iterator[Trial]:

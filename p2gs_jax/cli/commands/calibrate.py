@@ -20,7 +20,7 @@ from p2gs_jax.pipeline.calibrate import calibrate
 from p2gs_jax.pipeline.calibrate_of import STEPS, calibrate_of
 from p2gs_jax.pipeline.calibrate_run import calibrate_run
 from p2gs_jax.pipeline.calibrate_stack import calibrate_stack
-from p2gs_jax.run.calibration_files import CalibrationResult, write_calibration
+from p2gs_jax.pipeline.calibration import CalibrationResult, write_calibration
 
 
 def run(options: Calibrate) -> int:

@@ -10,17 +10,17 @@ from p2gs_jax.cli.commands import against
 from p2gs_jax.cli.commands.console import print_metrics
 from p2gs_jax.cli.options.results import Eval
 from p2gs_jax.core.atomic import write_json
-from p2gs_jax.core.json_text import parse_json
 from p2gs_jax.core.progress import TerminalReporter
+from p2gs_jax.core.text import parse_json
 from p2gs_jax.evaluate.against import Judge
 from p2gs_jax.evaluate.evaluate import evaluate
 from p2gs_jax.evaluate.lpips_weights import read_lpips_weights
 from p2gs_jax.evaluate.references import find_radiance, load_reference
-from p2gs_jax.render.host import make_renderer
-from p2gs_jax.run.layout import RunFolder
-from p2gs_jax.run.metering_file import write_metering
+from p2gs_jax.render.capacity import make_renderer
+from p2gs_jax.run.folder import RunFolder
+from p2gs_jax.run.photometry_files import write_metering
+from p2gs_jax.run.plots import write_unexplained
 from p2gs_jax.run.read import load_run
-from p2gs_jax.run.unexplained_pictures import write_unexplained
 
 
 def run(options: Eval) -> int:

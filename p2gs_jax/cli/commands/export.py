@@ -10,14 +10,12 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from p2gs_jax.cli.commands.console import stdout
-from p2gs_jax.cli.commands.export_display import DisplayFiles, named_cameras
+from p2gs_jax.cli.commands.export_display import DisplayFiles
 from p2gs_jax.cli.options.export import DISPLAY, SIZE_MB, Export, Format, check_export
 from p2gs_jax.core.atomic import atomic_folder, write_json
 from p2gs_jax.core.progress import Reporter, TerminalReporter
 from p2gs_jax.errors import UserError
-from p2gs_jax.export.cameras_json import cameras_table
 from p2gs_jax.export.colmap_folder import write_colmap_folder
-from p2gs_jax.export.drive_table import drive_table, write_drive
 from p2gs_jax.export.nerfstudio_folder import write_nerfstudio_folder
 from p2gs_jax.export.page import MEGABYTE, write_page
 from p2gs_jax.export.sidecar import corrections_name, linear_sidecar
@@ -27,8 +25,8 @@ from p2gs_jax.formats.through_gsply import require_gsply
 from p2gs_jax.formats.usd import require_pxr
 from p2gs_jax.gaussians.bake import display_of_splats
 from p2gs_jax.photometry.display import DisplayTransform
-from p2gs_jax.render.vibration import at_time
-from p2gs_jax.run.appearance_file import write_appearance
+from p2gs_jax.render.project import at_time
+from p2gs_jax.run.photometry_files import write_appearance
 from p2gs_jax.run.read import Run, load_run
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.exif import read_exif_settings
@@ -42,23 +40,11 @@ PLACES: dict[Format, tuple[str, ...]] = {
     "compressed-ply": ("display.compressed.ply", "display.compressed.ply.json"),
     "gltf": ("display.glb", "display.glb.json"),
     "usd": ("display.usdc", "display.usdc.json"),
-    "gsplat": ("display.pt", "display.pt.json"),
     "colmap": ("colmap",),
     "nerfstudio": ("nerfstudio",),
-    "cameras": ("cameras.json",),
     "exr": ("exr",),
-    "drive": ("drive.csv", "drive.json"),
     "html": ("scene.html",),
 }
-# In place of display.spz, where it is cut.
-BLOCKS = "display_blocks"
-
-
-def _places(name: Format, options: Export) -> tuple[str, ...]:
-    """Return what a format writes."""
-    if name == "spz" and options.spz_blocks is not None:
-        return BLOCKS, PLACES["spz"][1]
-    return PLACES[name]
 
 
 def run(options: Export) -> int:
@@ -78,7 +64,7 @@ def run(options: Export) -> int:
         )
     transform = _display_transform(fitted, options)
     folder = options.out or options.run / "exports"
-    places = [folder / place for name in formats for place in _places(name, options)]
+    places = [folder / place for name in formats for place in PLACES[name]]
     _check_places(folder, places, options.overwrite)
     _check_names(fitted, formats)
     if {"colmap", "nerfstudio"} & set(formats):
@@ -97,22 +83,16 @@ def run(options: Export) -> int:
                 said = _colmap(folder, fitted, store, reporter)
             elif name == "nerfstudio":
                 said = _nerfstudio(folder, fitted, store, reporter)
-            elif name == "cameras":
-                said = _cameras(folder, fitted, store)
             elif name == "exr":
                 said = _exr(folder, fitted, store, reporter)
-            elif name == "drive":
-                said = _drive(folder, fitted)
             elif name == "html":
                 said = _html(folder, fitted.over_black(), transform, options, reporter)
             else:
                 assert display is not None
-                path, sidecar = (folder / place for place in _places(name, options))
-                said = display.write(name, path, sidecar, blocks=options.spz_blocks)
+                path, sidecar = (folder / place for place in PLACES[name])
+                said = display.write(name, path, sidecar)
             seconds = time.monotonic() - begin
-            stdout().print(
-                f"{folder / _places(name, options)[0]}: {said} ({seconds:.1f} s)", soft_wrap=True
-            )
+            stdout().print(f"{folder / PLACES[name][0]}: {said} ({seconds:.1f} s)", soft_wrap=True)
     return 0
 
 
@@ -205,12 +185,6 @@ def _nerfstudio(folder: Path, fitted: Run, store: ImageStore, reporter: Reporter
     return f"{len(fitted.scene.views)} views for `ns-train splatfacto --data`"
 
 
-def _cameras(folder: Path, fitted: Run, store: ImageStore) -> str:
-    cameras = named_cameras(fitted, store)
-    write_json(folder / PLACES["cameras"][0], cameras_table(cameras, fitted.photometry["views"]))
-    return f"{len(cameras)} cameras for Blender and Unreal"
-
-
 def _exr(folder: Path, fitted: Run, store: ImageStore, reporter: Reporter) -> str:
     views = fitted.scene.views
     with atomic_folder(folder / PLACES["exr"][0]) as temporary:
@@ -228,13 +202,6 @@ def _exr(folder: Path, fitted: Run, store: ImageStore, reporter: Reporter) -> st
             )
             reporter.stage("Rendering", index + 1, len(views))
     return f"{len(views)} linear renders"
-
-
-def _drive(folder: Path, fitted: Run) -> str:
-    table = drive_table(fitted.scene, fitted.photometry)
-    csv_name, json_name = PLACES["drive"]
-    write_drive(folder / csv_name, folder / json_name, table)
-    return f"{len(table['views'])} photographs of {len(table['cameras'])} cameras"
 
 
 def _html(

@@ -13,10 +13,8 @@ from p2gs_jax.cli.options.export import Format
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.core.progress import Reporter
-from p2gs_jax.export.blocks import write_blocks
 from p2gs_jax.formats.compressed_ply import read_compressed_ply, write_compressed_ply
 from p2gs_jax.formats.gltf import write_gltf
-from p2gs_jax.formats.gsplat_checkpoint import write_gsplat
 from p2gs_jax.formats.ply import write_ply
 from p2gs_jax.formats.splat import read_splat, write_splat
 from p2gs_jax.formats.spz import read_spz, write_spz
@@ -31,9 +29,9 @@ from p2gs_jax.gaussians.bake import (
     true_target,
 )
 from p2gs_jax.photometry.display import DisplayTransform
-from p2gs_jax.render.host import make_renderer
-from p2gs_jax.render.spherical_harmonics import MAX_DEGREE
-from p2gs_jax.render.vibration import at_time
+from p2gs_jax.render.capacity import make_renderer
+from p2gs_jax.render.harmonics import MAX_DEGREE
+from p2gs_jax.render.project import at_time
 from p2gs_jax.run.read import Run
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
@@ -64,7 +62,6 @@ WRITERS = {
     "spz": _Writer(write_spz, read_spz),
     "compressed-ply": _Writer(write_compressed_ply, read_compressed_ply),
     "gltf": _Writer(write_gltf),
-    "gsplat": _Writer(write_gsplat),
 }
 
 
@@ -108,20 +105,16 @@ class DisplayFiles:
             )
             reporter.stage("Rendering true pictures", done + 1, len(rows))
 
-    def write(self, name: Format, path: Path, sidecar: Path, *, blocks: int | None = None) -> str:
+    def write(self, name: Format, path: Path, sidecar: Path) -> str:
         """Write one format and its JSON; return sentences about it.
 
         Args:
             name: of the format.
             path: the file.
             sidecar: what says how it was made and how far it is from the truth.
-            blocks: of SPZ: into how many files of a folder it is cut; None: one file.
         """
-        begin, parts = time.monotonic(), {}
-        if name == "spz" and blocks is not None:
-            shown, parts["blocks"] = write_blocks(path, self._bake(MAX_DEGREE), blocks)
-            error = self._error(shown)
-        elif name == "display-ply":
+        begin = time.monotonic()
+        if name == "display-ply":
             shown = self._bake(MAX_DEGREE)
             error = self._error_of_baked(MAX_DEGREE)
             comments = [
@@ -158,7 +151,6 @@ class DisplayFiles:
                 "bake_steps": self.steps,
                 "seconds": time.monotonic() - begin,
                 "baking_error": error,
-                **parts,
             },
         )
         return "; ".join([f"{self.gaussians.capacity} Gaussians", *_sentences(error)])

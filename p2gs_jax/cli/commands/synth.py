@@ -23,7 +23,6 @@ def run(options: Synth) -> int:
         layout=o.layout,
         supersample=o.supersample,
         points=o.points,
-        lidar=o.lidar,
         seed=o.seed,
         report=console.print,
     )

@@ -21,12 +21,9 @@ Format = Literal[
     "compressed-ply",
     "gltf",
     "usd",
-    "gsplat",
     "colmap",
     "nerfstudio",
-    "cameras",
     "exr",
-    "drive",
     "html",
 ]
 FORMATS: tuple[Format, ...] = get_args(Format)
@@ -38,7 +35,6 @@ DISPLAY: tuple[Format, ...] = (
     "compressed-ply",
     "gltf",
     "usd",
-    "gsplat",
 )
 # What the option --size-mb is where it is not given: a page that a mail or a wiki takes.
 SIZE_MB = 20.0
@@ -50,18 +46,16 @@ class Export:
 
     p2gs-jax export runs/street --format display-ply
     p2gs-jax export runs/street --format linear-ply colmap exr --out for_others
-    p2gs-jax export runs/street --format usd cameras exr --out for_blender
+    p2gs-jax export runs/street --format usd exr --out for_blender
     """
 
     run: Annotated[Path, tyro.conf.Positional]
     """Run folder."""
     format: tuple[Format, ...]
     """One or more: linear-ply (radiance, with a JSON file that explains it), display-ply, splat,
-    spz, compressed-ply, gltf, usd and gsplat (display colours, for viewers and other programs),
-    colmap and nerfstudio (undistorted photographs, model, exposures), cameras (JSON for Blender and
-    Unreal), exr (linear renders of all views), drive (CSV and JSON: poses in the data set's world,
-    exposures with errors), html (one page that is the scene: linear light, developed in the
-    browser)."""
+    spz, compressed-ply, gltf and usd (display colours, for viewers and other programs), colmap and
+    nerfstudio (undistorted photographs, model, exposures), exr (linear renders of all views), html
+    (one page that is the scene: linear light, developed in the browser)."""
     out: Path | None = None
     """Folder to write into (default: RUN/exports)."""
     exposure_ev: float | None = None
@@ -87,9 +81,6 @@ class Export:
     photographs: int | None = None
     """html: how many photographs to embed, evenly spread, for the split view (default: none;
     whoever has the page has them, with all they show)."""
-    spz_blocks: int | None = None
-    """spz: cut the scene in space into so many files of equally many Gaussians (default: one file),
-    for viewers that load what they show; positions are finer, too."""
     scene: SceneFolder = None
     """Where the run's scene lies now, if it is not where it was."""
     overwrite: bool = False
@@ -112,12 +103,9 @@ def check_export(args: Export) -> None:
     size = args.size_mb
     check(size is None or (math.isfinite(size) and size > 0), "--size-mb must be positive")
     check(args.photographs is None or args.photographs >= 0, "--photographs must be 0 or more")
-    blocks = args.spz_blocks
-    check(blocks is None or 1 <= blocks <= 999, "--spz-blocks must be a number from 1 to 999")
     look = ("exposure_ev", "exposure_of", "gamma", "curve", "white_balance_of")
     _require_a_use(args, look, (*DISPLAY, "html"), "a format that is developed")
     _require_a_use(args, ("bake_steps",), DISPLAY, "a format that holds display colours")
-    _require_a_use(args, ("spz_blocks",), ("spz",), "the format spz")
     _require_a_use(args, ("size_mb", "photographs"), ("html",), "the format html")
 
 

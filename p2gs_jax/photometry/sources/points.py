@@ -17,7 +17,7 @@ from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.sources.sampling import PROJECTED_UNCERTAINTY, point_colors
-from p2gs_jax.render.host import make_renderer
+from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.render.warp import project_points as warped_points
 from p2gs_jax.render.warp import surface_depth, unproject, visible
 from p2gs_jax.scene.device import camera_of
