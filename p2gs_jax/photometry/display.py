@@ -16,12 +16,7 @@ from jaxtyping import Array, Float, Float32
 
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.core.numerics import LN2, on_host
-from p2gs_jax.photometry.appearance import (
-    Correction,
-    correction_of,
-    mean_correction,
-    without_place,
-)
+from p2gs_jax.photometry.appearance import Correction, correction_of, mean_correction, without_place
 from p2gs_jax.photometry.formation import (
     Matte,
     camera_row,

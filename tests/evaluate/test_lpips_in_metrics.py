@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from lpips_files import made_arrays, write_weights
 
-from p2gs_jax.cli.commands.console import print_metrics
+from p2gs_jax.cli.tables import print_metrics
 from p2gs_jax.config import FitConfig
 from p2gs_jax.evaluate.evaluate import evaluate
 from p2gs_jax.evaluate.lpips import lpips
