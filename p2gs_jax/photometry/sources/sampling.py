@@ -152,7 +152,9 @@ def point_colors(
     wider, keep = _at_one_scale(scene, store, points)
     nothing = np.zeros((0, 3), np.float32)
     empty = np.zeros(0, int), np.zeros(0, int), nothing, nothing, nothing
-    parts = [(*empty, np.zeros(0, np.float32), np.zeros((0, 2), np.float32))]
+    parts: list[tuple[np.ndarray, ...]] = [
+        (*empty, np.zeros(0, np.float32), np.zeros((0, 2), np.float32))
+    ]
     for row, (index, kept) in enumerate(zip(scene.train_indices, keep, strict=True)):
         mine = points[row][kept]
         if len(mine):
