@@ -17,24 +17,27 @@ model leaves out.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 from scipy.sparse import csr_array
+from scipy.spatial.transform import Rotation
 
 from p2gs_jax.config import LossConfig
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.photometry.cameras import places
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import inverse_formation, inverse_tone_map
-from p2gs_jax.render.warp import sample_bilinear, warp
+from p2gs_jax.render.warp import project_points as project
+from p2gs_jax.render.warp import sample_bilinear, surface_depth, unproject, warp
 from p2gs_jax.scene.rigid import (
     moment_of,
 )
 from p2gs_jax.scene.visibility import project_points, unoccluded
-from p2gs_jax.types import Camera, Scene
+from p2gs_jax.types import Camera, Render, Scene
 
 # Least pixels in common.
 FEWEST_PIXELS = 200
@@ -42,6 +45,10 @@ FEWEST_PIXELS = 200
 FEWEST_SHARED = 30
 # Points that overlaps are counted on where there are no tracks.
 MOST_COUNTED = 5000
+# In a picture of a seam, rendered depth is used from this opacity of the halfway view on, and
+# elsewhere this multiple of the largest rendered depth.
+OPAQUE, FAR = 0.5, 100.0
+BLANK = 0.5
 
 
 class Photographed(NamedTuple):
@@ -87,11 +94,7 @@ def neighbouring_pairs(scene: Scene, most: int) -> list[tuple[int, int]]:
 
     On a rig these are different cameras at the same time that share points: of a drive, in the
     same frame; else, files of the same name in different folders. Elsewhere every view is paired
-    with the one it shares most with.
-
-    Args:
-        scene: with tracks, or points to project.
-        most: pairs at most, spread evenly over the views.
+    with the one it shares most with. There are at most `most` pairs, spread evenly over the views.
     """
     train = scene.train_indices
     shared = _shared_points(scene)
@@ -144,11 +147,8 @@ def measure_seam(
 ) -> Seam | None:
     """Return the seam between two photographs, or None where they have too little in common.
 
-    Args:
-        first: in whose pixels the two are compared.
-        second: its neighbour.
-        common: the display transform of "after", and the gamma of "before".
-        cfg: display values between which a pixel is used.
+    They are compared in the pixels of the first; `common` is the display transform of "after", and
+    has the gamma of "before". `cfg` says between which display values a pixel is used.
     """
     there = warp(jnp.asarray(first.depth), first.camera, jnp.asarray(second.depth), second.camera)
     ldr = sample_bilinear(jnp.asarray(second.ldr), there.xy)
@@ -182,10 +182,8 @@ def radiance_of(
 ) -> Float32[np.ndarray, "... 3"]:
     """Return the radiance that a photograph shows: what was done to light undone, on the host.
 
-    Args:
-        ldr: an image, or loose pixels of one.
-        transform: how it was taken.
-        positions: of loose pixels, where vignetting counts (photometry/cameras.py:places).
+    Loose pixels of an image need their `positions` where vignetting counts
+    (photometry/cameras.py:places).
     """
     ldr = np.asarray(ldr, np.float32)
     return inverse_formation(ldr, transform.capture, transform.formation, positions)
@@ -203,3 +201,79 @@ def _informative(ldr: Float[np.ndarray, "h w 3"], cfg: LossConfig) -> Bool[np.nd
 
 def _apart(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.median(np.abs(a - b)))
+
+
+def redeveloped(
+    ldr: Float[np.ndarray, "... 3"], own: DisplayTransform, common: DisplayTransform
+) -> Float32[np.ndarray, "... 3"]:
+    """Return a photograph, taken back to radiance and developed with the common display transform.
+
+    Saturated pixels stay at the value of its white.
+    """
+    return develop(radiance_of(ldr, own), common)
+
+
+class SeamPicture(NamedTuple):
+    """One picture made of two photographs, with a hard edge in the middle.
+
+    Attributes:
+        before: of the photographs as taken.
+        after: of the photographs developed alike.
+        left_first: the left half is the first photograph.
+    """
+
+    before: Float32[np.ndarray, "h w 3"]
+    after: Float32[np.ndarray, "h w 3"]
+    left_first: bool
+
+
+def seam_picture(
+    first: Photographed,
+    second: Photographed,
+    common: DisplayTransform,
+    render: Callable[[Camera], Render],
+) -> SeamPicture:
+    """Warp half of each photograph into a camera halfway between the two.
+
+    There is no occlusion test: beside foreground edges the picture repeats the foreground. Pixels
+    that a photograph does not cover are grey. `common` is the display transform of "after", and
+    `render` renders a camera with depth.
+    """
+    camera = camera_between(first.camera, second.camera)
+    result = render(camera)
+    depth = np.asarray(surface_depth(result, OPAQUE))
+    known = depth > 0
+    far = FAR * (float(depth[known].max()) if known.any() else 1.0)
+    points = unproject(jnp.asarray(np.where(known, depth, far)), camera)
+    reached, before, after = [], [], []
+    for photograph in (first, second):
+        xy, z = project(points, photograph.camera)
+        size = jnp.array([photograph.camera.width, photograph.camera.height])
+        inside = np.asarray((z > 1e-6) & jnp.all((xy >= 0) & (xy < size), axis=-1))
+        ldr = np.asarray(sample_bilinear(jnp.asarray(photograph.ldr), xy))
+        alike = redeveloped(ldr, photograph.transform, common)
+        reached.append(inside)
+        before.append(np.where(inside[..., None], ldr, BLANK))
+        after.append(np.where(inside[..., None], alike, BLANK))
+    edge = camera.width // 2
+    left_first = bool(
+        reached[0][:, :edge].sum() + reached[1][:, edge:].sum()
+        >= reached[1][:, :edge].sum() + reached[0][:, edge:].sum()
+    )
+    left, right = (0, 1) if left_first else (1, 0)
+
+    def joined(images: list[np.ndarray]) -> np.ndarray:
+        return np.concatenate([images[left][:, :edge], images[right][:, edge:]], 1)
+
+    return SeamPicture(joined(before), joined(after), left_first)
+
+
+def camera_between(first: Camera, second: Camera) -> Camera:
+    """Return a camera halfway between two, with the size of the first."""
+    viewmats = np.stack([np.asarray(c.viewmat, np.float64) for c in (first, second)])
+    turns, shifts = viewmats[:, :3, :3], viewmats[:, :3, 3]
+    center = np.mean([-r.T @ t for r, t in zip(turns, shifts, strict=True)], 0)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = Rotation.from_matrix(turns).mean().as_matrix()
+    viewmat[:3, 3] = -viewmat[:3, :3] @ center
+    return Camera(jnp.asarray(viewmat, jnp.float32), first.K, first.width, first.height)

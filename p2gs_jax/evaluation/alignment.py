@@ -29,13 +29,10 @@ TOLERANCE = 5e-4
 
 
 class ExposureError(TypedDict):
-    """Errors of recovered exposures, in stops.
+    """Errors of recovered exposures, in stops: RMS and largest after the scale is aligned.
 
-    Attributes:
-        ev: RMS after scale alignment.
-        ev_max: largest.
-        ev_scale_power: RMS after scale and power alignment.
-        power: the power that aligns them best; 1 where truth has no spread.
+    `ev_scale_power` is the RMS after scale and power are aligned; `power` is the power that aligns
+    them best, 1 where truth has no spread.
     """
 
     ev: float
@@ -124,14 +121,9 @@ def fit_exposure(
 def with_fitted_exposure(
     shown: DisplayTransform, linear, photograph, mask, alpha=None
 ) -> DisplayTransform:
-    """Return the display transform with the exposure solved that fits a photograph best.
+    """Return a display transform with the exposure under which a render fits a photograph best.
 
-    Args:
-        shown: all but the exposure.
-        linear: radiance.
-        photograph: display values.
-        mask: 1 = use.
-        alpha: opacity of the render, for the backdrop of the transform; None: over nothing.
+    The opacity of the render is for the backdrop of the transform; None: the render is over nothing.
     """
     how = (shown.capture, shown.formation, shown.correction, shown.matte(alpha))
     found = float(fit_exposure(linear, photograph, mask, *how))
@@ -151,20 +143,10 @@ def fit_capture(
     gamma: bool,
     white_balance: bool,
 ) -> Capture:
-    """Return exposure, and what else is asked for, that fit a photograph best (squared LDR error).
+    """Return exposure, and gamma or white balance, that fit a photograph best (squared LDR error).
 
-    Levenberg-Marquardt on their logarithms.
-
-    Args:
-        linear: the render.
-        photograph: display values.
-        mask: 1 = use.
-        start: with the exposure that `fit_exposure` found.
-        cfg: formation model.
-        correction: of display values, or None.
-        matte: as for `fit_exposure`.
-        gamma: solve it too, or leave it.
-        white_balance: likewise.
+    Levenberg-Marquardt on their logarithms, from the exposure that `fit_exposure` found; arguments
+    are those of `fit_exposure`. What is not asked for stays as `start` has it.
     """
     # Imported late: of what evaluates, little searches.
     import optimistix

@@ -1,26 +1,53 @@
-"""Arrays that are needed twice: in memory up to a bound, in a temporary folder beyond it.
-
-Some scores need two passes over the views: one for a scale common to all, one for the scores.
-"""
+"""What passes over all views need: a map in threads, and arrays that are kept between two passes."""
 
 from __future__ import annotations
 
+import os
 import tempfile
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+# A bound on the rendered images held at once.
+MOST_WORKERS = 4
 MOST_BYTES = 1 << 30
 
 
-def most_bytes(cache_mb: int, share: float = 0.5) -> int:
-    """Return how much may be held beside photographs that take `cache_mb` themselves.
+def map_in_order(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+    """Yield a function's results in the order of the items, computed in threads.
 
-    Args:
-        cache_mb: `DataConfig.cache_mb`.
-        share: of it.
+    NumPy, JAX and image readers release the interpreter's lock. The first item is computed alone,
+    so that programs compile once. `Executor.map` would submit all items at once; here at most one
+    result more than there are threads is held.
     """
+    workers = min(os.cpu_count() or 1, MOST_WORKERS)
+    rest = iter(items)
+    for first in rest:
+        yield function(first)
+        break
+    waiting: deque[Future[Result]] = deque()
+    with ThreadPoolExecutor(workers, thread_name_prefix="evaluate") as pool:
+        try:
+            for item in rest:
+                waiting.append(pool.submit(function, item))
+                if len(waiting) > workers:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def most_bytes(cache_mb: int, share: float = 0.5) -> int:
+    """Return how much may be held beside photographs that take `cache_mb` (MB) themselves."""
     return min(MOST_BYTES, int(share * cache_mb * 2**20))
 
 
@@ -47,18 +74,12 @@ class StoredArray:
 
 
 class ArrayStore:
-    """Keeps arrays; as a context manager it removes its folder at the end.
+    """Keeps arrays in memory up to `most_bytes`, and in a temporary folder beyond it.
 
-    Attributes:
-        bytes_held: bytes in memory.
+    As a context manager it removes its folder at the end. `bytes_held` are in memory.
     """
 
     def __init__(self, most_bytes: int = MOST_BYTES):
-        """Begin empty; the folder is made when it is needed.
-
-        Args:
-            most_bytes: bound on the bytes in memory.
-        """
         self.bytes_held = 0
         self._most, self._count = most_bytes, 0
         self._folder: tempfile.TemporaryDirectory | None = None

@@ -86,15 +86,12 @@ class OtherRenders:
         return tuple(said)
 
     def read(self, row: int, size: tuple[int, int], over: bool = False) -> Rendered:
-        """Return a render.
+        """Return the render of a view, which must have a size of (width, height) pixels.
 
-        Args:
-            row: of the view.
-            size: (width, height) that it must have.
-            over: it is to be put over a background: radiance must have an opacity.
+        With `over` it is to be put over a background: radiance must then have an opacity.
 
         Raises:
-            UserError: it cannot be read, has another size, or holds what is no colour.
+            UserError: it cannot be read, has another size, or holds what is not a colour.
         """
         path = self.files[row]
         linear, alpha = path.suffix.lower() == ".exr", None
@@ -120,7 +117,7 @@ class OtherRenders:
         if not np.isfinite(pixels).all():
             bad = int((~np.isfinite(pixels)).any(-1).sum())
             raise UserError(
-                f"{path} has {bad} pixels that are infinite or no number.", fix="render it again"
+                f"{path} has {bad} pixels that are infinite or not a number.", fix="render it again"
             )
         return Rendered(pixels, linear, alpha)
 
@@ -151,10 +148,6 @@ def find_renders(folder: str | Path, scene: Scene) -> OtherRenders:
     Looked for in this order: pictures with the names of views, here or in one of `PLACES`; those
     of the 3DGS code (`test/ours_N/renders`, the largest N; before pictures by name), of gsplat's
     trainer or Luminance-GS, or bare numbers here: all the held-out views in the order of names.
-
-    Args:
-        folder: of the renders.
-        scene: the views.
 
     Raises:
         UserError: the scene holds nothing out, the folder holds no render, or numbered ones whose

@@ -11,7 +11,7 @@ import numpy as np
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
-from p2gs_jax.evaluate.radiance import Truth
+from p2gs_jax.evaluation.radiance import Truth
 from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
@@ -21,7 +21,7 @@ Reference = Callable[[int], np.ndarray | None]
 
 
 def check_reference(folder: str | Path | None) -> None:
-    """Complain about a folder that is none, before there are any views; None is fine.
+    """Complain about a folder that is missing, before there are any views; None is fine.
 
     Raises:
         UserError: there is no such folder.
@@ -33,12 +33,7 @@ def check_reference(folder: str | Path | None) -> None:
 
 
 def load_reference(folder: str | Path, scene: Scene, cfg: FitConfig) -> Reference:
-    """Return a function from a view's row to its photograph under the common exposure.
-
-    Args:
-        folder: photographs named as the scene's.
-        scene: the views.
-        cfg: image size.
+    """Return a function from a view's row to its photograph under the common exposure, or None.
 
     Raises:
         UserError: the folder does not exist or holds no photograph of any view.

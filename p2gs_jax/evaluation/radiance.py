@@ -1,4 +1,4 @@
-"""Recovered radiance against HDR truth: stops, PU21, colour (docs/photometry.md, 6)."""
+"""Recovered radiance against HDR truth: stops, PU21, colour, mu law (docs/photometry.md, 6)."""
 
 from __future__ import annotations
 
@@ -9,10 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from p2gs_jax.core.numerics import LN2
-from p2gs_jax.evaluate.array_store import ArrayStore, StoredArray
-from p2gs_jax.evaluate.metrics import ssim
-from p2gs_jax.evaluate.mu_law import mu_law_psnr
-from p2gs_jax.evaluate.parallel import map_in_order
+from p2gs_jax.evaluation.passes import ArrayStore, StoredArray, map_in_order
+from p2gs_jax.evaluation.scores import ssim
 
 Truth = Callable[[int], Float[np.ndarray, "h w 3"] | None]
 
@@ -23,6 +21,8 @@ PU21_RANGE = (0.005, 10_000.0)
 # PU21 maps 100 cd/m^2, a standard display's white, to this; PSNR and SSIM take it as their peak.
 PU21_PEAK = 256.0
 WHITE_NITS = 100.0
+# GaussHDR (CVPR 2025) and HDR-NeRF (CVPR 2022): log(1 + mu x) / log(1 + mu), mu = 5000.
+MU = 5000.0
 # Least number of evenly spaced pixels of a view for alignment and colour difference. The third
 # bounds, up to a factor of two, what is aligned of all views together: a line needs no more, and
 # 900 views of 160 pixels took 4 GB.
@@ -81,6 +81,35 @@ def delta_e_itp(linear, truth, mask: Bool[np.ndarray, "h w"], white: float) -> f
     return float(np.mean(colour.difference.delta_E_ITP(encoded(linear), encoded(truth))))
 
 
+def mu_law(x: Float[np.ndarray, "..."], mu: float = MU) -> Float[np.ndarray, "..."]:
+    """Return radiance over the brightest, clipped to [0, 1], compressed by the mu law to [0, 1]."""
+    return np.log1p(mu * np.clip(x, 0.0, 1.0)) / np.log1p(mu)
+
+
+def mu_law_psnr(
+    linear: Float[np.ndarray, "h w 3"],
+    truth: Float[np.ndarray, "h w 3"],
+    mask: Bool[np.ndarray, "h w"],
+    mu: float = MU,
+) -> float:
+    """Return PSNR of tone-mapped radiance, dB, as GaussHDR's code computes it for synthetic scenes.
+
+    Both images are divided by the brightest true channel of the view. Its authors write both as
+    8-bit files first, which this does not. NaN where no pixel counts, or the truth is black.
+
+    Args:
+        linear: recovered radiance, aligned to the truth by one scale common to all views.
+        truth: true radiance.
+        mask: which pixels count.
+        mu: of the mu law.
+    """
+    brightest = float(truth[mask].max()) if mask.any() else 0.0
+    if brightest <= 0:
+        return float("nan")
+    a, b = (mu_law(x[mask].astype(np.float64) / brightest, mu) for x in (linear, truth))
+    return float(-10 * np.log10(max(float(np.mean((a - b) ** 2)), 1e-12)))
+
+
 @dataclass
 class RadianceScores:
     """Collects views, then scores them under one common alignment.
@@ -117,23 +146,10 @@ class RadianceScores:
         shift = float(np.median(logs[1] - logs[0])) if logs.size else 0.0
         power, offset = _power(logs)
         scale = float(np.exp(shift))
-        white = brightest * scale
 
         def judged(view) -> dict[str, float]:
-            linear, truth, mask = (kept.read() for kept in view[2:])
-            keep = mask & (truth.min(-1) > 0) & (linear.max(-1) < brightest)
-            a, b = np.log2(np.maximum(linear[keep], 1e-12)), np.log2(truth[keep])
-            stops = np.minimum(np.abs(a + shift / LN2 - b), STOPS_CAP)
-            bent = np.minimum(np.abs(power * a + offset / LN2 - b), STOPS_CAP)
-            return {
-                "stops_median": float(np.median(stops)) if stops.size else float("nan"),
-                "stops_rms": float(np.sqrt(np.mean(stops**2))) if stops.size else float("nan"),
-                "stops_rms_power": float(np.sqrt(np.mean(bent**2))) if bent.size else float("nan"),
-                "pu21_psnr": pu21_psnr(linear * scale, truth, mask, white),
-                "pu21_ssim": pu21_ssim(linear * scale, truth, mask, white),
-                "delta_e_itp": delta_e_itp(linear * scale, truth, mask, white),
-                "mu_law_psnr": mu_law_psnr(linear * scale, truth, mask),
-            }
+            images = (kept.read() for kept in view[2:])
+            return _view_scores(*images, brightest, shift, power, offset)
 
         found = map_in_order(judged, self.views)
         rows = {name: row for (name, *_), row in zip(self.views, found, strict=True)}
@@ -168,6 +184,27 @@ class RadianceScores:
             )
         # Single precision is too coarse for a line through half a million points.
         return np.concatenate(parts, 1).astype(np.float64) if parts else np.zeros((2, 0))
+
+
+def _view_scores(
+    linear, truth, mask, brightest: float, shift: float, power: float, offset: float
+) -> dict[str, float]:
+    """Return the scores of a view; `shift` and `offset` are natural logarithms."""
+    keep = mask & (truth.min(-1) > 0) & (linear.max(-1) < brightest)
+    a, b = np.log2(np.maximum(linear[keep], 1e-12)), np.log2(truth[keep])
+    stops = np.minimum(np.abs(a + shift / LN2 - b), STOPS_CAP)
+    bent = np.minimum(np.abs(power * a + offset / LN2 - b), STOPS_CAP)
+    scale = float(np.exp(shift))
+    shown = (linear * scale, truth, mask, brightest * scale)
+    return {
+        "stops_median": float(np.median(stops)) if stops.size else float("nan"),
+        "stops_rms": float(np.sqrt(np.mean(stops**2))) if stops.size else float("nan"),
+        "stops_rms_power": float(np.sqrt(np.mean(bent**2))) if bent.size else float("nan"),
+        "pu21_psnr": pu21_psnr(*shown),
+        "pu21_ssim": pu21_ssim(*shown),
+        "delta_e_itp": delta_e_itp(*shown),
+        "mu_law_psnr": mu_law_psnr(*shown[:3]),
+    }
 
 
 def _mean(values: list[float]) -> float:

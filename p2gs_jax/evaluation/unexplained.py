@@ -11,17 +11,15 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Float16, Float32
+from jaxtyping import Bool, Float, Float32
 
 from p2gs_jax.core.numerics import on_host
-from p2gs_jax.evaluate.array_store import ArrayStore, StoredArray
-from p2gs_jax.evaluate.novel_views import Surface
+from p2gs_jax.evaluation.passes import ArrayStore, StoredArray
 from p2gs_jax.render.warp import warp
 from p2gs_jax.scene.geometry import scale_intrinsics
 from p2gs_jax.types import Camera, Scene, View
@@ -57,25 +55,38 @@ class Unexplained(NamedTuple):
     share: float
 
 
-@dataclass(frozen=True)
-class _Seen:
+class Surface(NamedTuple):
+    """The surface that a view shows.
+
+    Attributes:
+        depth: camera z, 0 where there is none; perhaps kept.
+        viewmat: world-to-camera.
+        K: intrinsics in pixels, at the size of `depth`.
+    """
+
+    depth: Float32[np.ndarray, "h w"] | StoredArray
+    viewmat: Float[np.ndarray, "4 4"]
+    K: Float[np.ndarray, "3 3"]
+
+    def depths(self) -> Float32[np.ndarray, "h w"]:
+        """Return `depth`, read."""
+        kept = self.depth
+        return (kept.read() if isinstance(kept, StoredArray) else kept).astype(np.float32)
+
+    @property
+    def center(self) -> Float[np.ndarray, " 3"]:
+        """Position of the camera in the world."""
+        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+
+
+class _Seen(NamedTuple):
     """A training view, reduced; in half precision and perhaps on disk: there may be thousands."""
 
     size: tuple[int, int]
-    kept: tuple[StoredArray, StoredArray, StoredArray]
+    residual: StoredArray
+    valid: StoredArray
+    depth: StoredArray
     K: Float32[np.ndarray, "3 3"]
-
-    @property
-    def residual(self) -> Float16[np.ndarray, "h w"]:
-        return self.kept[0].read()
-
-    @property
-    def valid(self) -> Bool[np.ndarray, "h w"]:
-        return self.kept[1].read()
-
-    @property
-    def depth(self) -> StoredArray:
-        return self.kept[2]
 
 
 def residual_over_noise(
@@ -83,13 +94,7 @@ def residual_over_noise(
     photograph: Float32[np.ndarray, "h w 3"],
     valid: Bool[np.ndarray, "h w"],
 ) -> Float32[np.ndarray, "h w"]:
-    """Return how far a render is off, in units of the view's noise, 0 where pixels do not count.
-
-    Args:
-        render: display values.
-        photograph: display values.
-        valid: which pixels count.
-    """
+    """Return how far a render is off, in units of the view's noise, 0 where pixels do not count."""
     square = np.ones((SQUARE, SQUARE), np.uint8)
     mean = cv2.blur(render - photograph, (SQUARE, SQUARE))
     spread = cv2.dilate(photograph, square) - cv2.erode(photograph, square)
@@ -127,26 +132,20 @@ def _morphology(mask: Bool[np.ndarray, "h w"], kind: int, side: int) -> Bool[np.
 
 
 def shares_by_view(scene: Scene, found: Mapping[int, Unexplained]) -> dict:
-    """Return the mean share of pixels (`share`), and that of each view by name (`per_view`).
-
-    Args:
-        scene: its views.
-        found: by row of the view.
-    """
+    """Return the mean share of pixels (`share`), and that of each view by name (`per_view`)."""
     shares = {scene.views[row].name: one.share for row, one in found.items()}
     return {"share": float(np.mean(list(shares.values()))), "per_view": shares}
 
 
 class Residuals:
-    """Collects renders of training views, and finds what no static scene explains in them."""
+    """Collects renders of training views, and finds what no static scene explains in them.
+
+    Args:
+        views: of the scene.
+        arrays: keeps what all views need to the end; None: memory does.
+    """
 
     def __init__(self, views: Sequence[View], arrays: ArrayStore | None = None):
-        """Begin empty.
-
-        Args:
-            views: of the scene.
-            arrays: keeps what all views need to the end; None: memory does.
-        """
         self._views = views
         self._arrays = ArrayStore() if arrays is None else arrays
         self._seen: dict[int, _Seen] = {}
@@ -181,12 +180,9 @@ class Residuals:
             valid,
             np.minimum(nearest, np.finfo(np.float16).max).astype(np.float16),
         )
-        first, second, third = map(self._arrays.put, arrays)
-        self._seen[index] = _Seen(
-            size,
-            (first, second, third),
-            scale_intrinsics(K, size[0] / width, size[1] / height).astype(np.float32),
-        )
+        scaled = scale_intrinsics(K, size[0] / width, size[1] / height).astype(np.float32)
+        residual, counted, surface = map(self._arrays.put, arrays)
+        self._seen[index] = _Seen(size, residual, counted, surface, scaled)
 
     def find(
         self,
@@ -205,7 +201,7 @@ class Residuals:
         for done, (index, others) in enumerate(self._compared()):
             on_progress(done, len(self._seen))
             seen = self._seen[index]
-            residual, valid = seen.residual.astype(np.float32), seen.valid
+            residual, valid = seen.residual.read().astype(np.float32), seen.valid.read()
             mask = regions(residual, self._usual(index, others, unknown)) & valid
             found[index] = Unexplained(mask, float(mask.sum() / max(int(valid.sum()), 1)))
         return found
@@ -239,11 +235,11 @@ class Residuals:
             to = _warp(depths[0], self._camera(index), depths[1], self._camera(other))
             xy = np.asarray(to.xy) - np.float32(0.5)
             # The worst nearby: depth is off by a pixel at edges.
-            residual = there.residual.astype(np.float32)
+            residual = there.residual.read().astype(np.float32)
             worst = cv2.dilate(residual, np.ones((SQUARE, SQUARE), np.uint8))
             carried = cv2.remap(worst, xy[..., 0], xy[..., 1], cv2.INTER_NEAREST)
             counts = cv2.remap(
-                there.valid.astype(np.uint8), xy[..., 0], xy[..., 1], cv2.INTER_NEAREST
+                there.valid.read().astype(np.uint8), xy[..., 0], xy[..., 1], cv2.INTER_NEAREST
             )
             values[k] = np.where(np.asarray(to.seen) & (counts > 0), carried, np.nan)
         values[-1] = np.where(np.isnan(values[:-1]).all(0), unknown, np.nan)
