@@ -25,7 +25,7 @@ from towns import METHODS, WIDE, fit_all, methods, options, stamp
 
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.mean import mean_parameters
-from p2gs_jax.render.host import make_renderer
+from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.read import Run, load_run
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore

@@ -28,9 +28,9 @@ from towns import (
 )
 
 from p2gs_jax.config import FitConfig, preset
+from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.pipeline.decide import without_tracks
 from p2gs_jax.run.decisions import Decisions
-from p2gs_jax.sweep import with_fields
 
 # Table 4 of the paper (Waymo): PSNR.
 ROBUST, PRINTED = "robust (ours)", "P2GS as printed"

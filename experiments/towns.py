@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 
 import p2gs_jax
 from p2gs_jax.config import FitConfig, PresetName, to_dict
-from p2gs_jax.sweep import sweep
+from p2gs_jax.jobs.sweep import sweep
 from p2gs_jax.synth.rig import image_height
 from p2gs_jax.synth.sensor import Sensor
 

@@ -27,8 +27,8 @@ from towns import (
 )
 
 from p2gs_jax.config import FitConfig, preset
+from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.photometry.models import MODELS
-from p2gs_jax.sweep import with_fields
 
 FACTORS = (0.5, 1.0, 1.6, 2.5, 4.0)
 DEGREES = (0, 1, 2, 3)

@@ -16,7 +16,7 @@ import p2gs_jax.scene.structure_from_motion
 import p2gs_jax.scene.triangulate  # noqa: F401
 from p2gs_jax.cli import main
 from p2gs_jax.config import DataConfig
-from p2gs_jax.core.printable import printable
+from p2gs_jax.core.text import printable
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene import find_scene, with_what_lies_beside
 from p2gs_jax.scene.drives.assemble import assemble

@@ -43,8 +43,7 @@ def _run(argv: list[str]) -> int:
         if resolve_processes(options) is not None and not is_child():
             return supervise(argv, options.out)
     if name not in WITHOUT_JAX:
-        from p2gs_jax.core.compile_cache import use_compile_cache
-        from p2gs_jax.core.runtime import tune_process
+        from p2gs_jax.core.runtime import tune_process, use_compile_cache
 
         use_compile_cache()
         tune_process()
@@ -91,7 +90,7 @@ _CONTINUED = {
 
 
 def _complain(error: UserError) -> int:
-    from p2gs_jax.core.printable import printable
+    from p2gs_jax.core.text import printable
 
     print(printable(f"p2gs-jax: error: {error}"), file=sys.stderr)
     return 2

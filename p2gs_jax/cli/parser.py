@@ -10,7 +10,7 @@ from typing import Annotated, Any, Union
 import tyro
 
 from p2gs_jax.cli import help_text
-from p2gs_jax.cli.options.experiments import Bench, Demo, Sweep, Synth
+from p2gs_jax.cli.options.experiments import Demo, Sweep, Synth
 from p2gs_jax.cli.options.export import Export
 from p2gs_jax.cli.options.fit import Calibrate, Fit, named_preset
 from p2gs_jax.cli.options.pages import Compare, Report
@@ -37,7 +37,6 @@ COMMANDS: dict[str, type] = {
     "demo": Demo,
     "synth": Synth,
     "sweep": Sweep,
-    "bench": Bench,
     "doctor": Doctor,
     "completion": Completion,
 }
@@ -46,7 +45,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "First": ("doctor", "demo"),
     "From photographs": ("scene", "fit", "calibrate"),
     "With a finished run": ("view", "report", "render", "export", "eval", "compare"),
-    "Data with truth, and measurements": ("synth", "sweep", "bench"),
+    "Data with truth, and sweeps": ("synth", "sweep"),
     "Your shell": ("completion",),
 }
 WITH_PRESET = ("fit", "calibrate")

@@ -19,9 +19,7 @@ from p2gs_jax.core.atomic import read_jsonl
 from p2gs_jax.core.interrupts import SIGNALS
 from p2gs_jax.errors import UserError
 from p2gs_jax.run.checkpoint import saved_steps
-from p2gs_jax.run.folder import (
-    RunFolder,
-)
+from p2gs_jax.run.folder import RunFolder
 
 # Exit code of a child that lost its partners.
 LOST = 70

@@ -14,24 +14,20 @@ import numpy as np
 from p2gs_jax.config import FitConfig, from_dict, to_dict
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.clock import Stopwatch
-from p2gs_jax.core.compile_cache import use_compile_cache
 from p2gs_jax.core.memory import text_of
 from p2gs_jax.core.progress import Reporter, Silent
-from p2gs_jax.core.runtime import tune_process
+from p2gs_jax.core.runtime import tune_process, use_compile_cache
 from p2gs_jax.districts.cut import Cut
 from p2gs_jax.districts.part_of import BlockScene, block_scene
 from p2gs_jax.districts.shared import read_shared
 from p2gs_jax.formats.ply import write_radiance
 from p2gs_jax.gaussians.population import Coverage, default_max_gaussians
-from p2gs_jax.jobs import Job
+from p2gs_jax.jobs.job import Job
 from p2gs_jax.pipeline.devices import mesh_of
 from p2gs_jax.pipeline.fit import begin_programs, begun, compact, optimise
 from p2gs_jax.pipeline.preflight import Paths
 from p2gs_jax.pipeline.prepare import load, prepare
-from p2gs_jax.run.folder import (
-    RunFolder,
-    locked,
-)
+from p2gs_jax.run.folder import RunFolder, locked
 from p2gs_jax.scene.images import size_at
 from p2gs_jax.scene.visibility import shown_share
 from p2gs_jax.train.programs import StepPrograms

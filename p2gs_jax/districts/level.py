@@ -18,7 +18,7 @@ from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.districts.cut import OVERLAP, Cut
 from p2gs_jax.districts.seams import Seam, measure_seams
-from p2gs_jax.render.radiance import scaled
+from p2gs_jax.render.harmonics import scaled
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Gaussians, Scene
 

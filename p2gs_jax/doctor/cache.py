@@ -27,7 +27,7 @@ class Cache:
 def inspect_cache() -> Cache:
     """Set up JAX's compile cache and return its state; never raises."""
     try:
-        from p2gs_jax.core.compile_cache import MOST_BYTES, cache_folder, use_compile_cache
+        from p2gs_jax.core.runtime import MOST_BYTES, cache_folder, use_compile_cache
 
         use_compile_cache()
         folder = cache_folder()

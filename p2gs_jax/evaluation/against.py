@@ -23,7 +23,7 @@ from p2gs_jax.evaluation.renders_of_others import OtherRenders, Rendered, in_ord
 from p2gs_jax.evaluation.scores import still_mask, summary_of, view_scores
 from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
 from p2gs_jax.photometry.matte import LEAST
-from p2gs_jax.render.host import make_renderer
+from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.scene.pixels.decode import floats

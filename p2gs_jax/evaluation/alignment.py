@@ -123,7 +123,7 @@ def with_fitted_exposure(
 ) -> DisplayTransform:
     """Return a display transform with the exposure under which a render fits a photograph best.
 
-    The opacity of the render is for the backdrop of the transform; None: the render is over nothing.
+    The opacity of the render is for the backdrop of the transform; None: it is over nothing.
     """
     how = (shown.capture, shown.formation, shown.correction, shown.matte(alpha))
     found = float(fit_exposure(linear, photograph, mask, *how))

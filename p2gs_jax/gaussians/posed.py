@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 from p2gs_jax.core.numerics import fibonacci_sphere, on_device
-from p2gs_jax.render.spherical_harmonics import basis, degree_of
-from p2gs_jax.render.vibration import STILL
+from p2gs_jax.render.harmonics import basis, degree_of
+from p2gs_jax.render.project import STILL
 from p2gs_jax.types import Gaussians
 
 # Twice as many as coefficients of degree 3, and more: the least squares are exact.

@@ -9,8 +9,7 @@ import numpy as np
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.photometry.display import DisplayTransform, undevelop
-from p2gs_jax.render.radiance import radiance_preactivation
-from p2gs_jax.render.spherical_harmonics import C0, coefficient_count
+from p2gs_jax.render.harmonics import C0, coefficient_count, radiance_preactivation
 from p2gs_jax.types import Gaussians
 
 # Display values beyond which a splat counts as saturated.

@@ -17,18 +17,14 @@ from p2gs_jax.losses.lidar import lidar_loss
 from p2gs_jax.losses.luminance import luminance_terms
 from p2gs_jax.losses.matte import matted_loss, unit
 from p2gs_jax.losses.regularizers import photometry_regularizers, population_terms, pose_terms
-from p2gs_jax.losses.relative_exposure import (
-    ColorPairs,
-    ExposurePairs,
-    relative_exposure_loss,
-)
+from p2gs_jax.losses.relative_exposure import ColorPairs, ExposurePairs, relative_exposure_loss
 from p2gs_jax.photometry.appearance import Corrections, correction_of, regularisation
-from p2gs_jax.photometry.cameras import darkens, places
-from p2gs_jax.photometry.formation import formation
+from p2gs_jax.photometry.cameras import places
+from p2gs_jax.photometry.formation import darkens, formation
 from p2gs_jax.photometry.luminance.parameters import Curves
 from p2gs_jax.render import render_splats
-from p2gs_jax.render.blocks import Shown, splat
 from p2gs_jax.render.objects import with_corrections
+from p2gs_jax.render.visible import Shown, splat
 from p2gs_jax.render.warp import sample_bilinear, surface_depth, warp
 from p2gs_jax.types import Batch, Camera, Params, Photometry, Render
 

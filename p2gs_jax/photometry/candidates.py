@@ -7,17 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from p2gs_jax.photometry.adjustment.clusters import side_by_side
+from p2gs_jax.photometry.adjustment.errors import side_by_side
 from p2gs_jax.photometry.adjustment.fit import TOLERANCE_TO_COMPARE, solve_model
 from p2gs_jax.photometry.adjustment.problem import Problem
 from p2gs_jax.photometry.adjustment.solve import Fit
-from p2gs_jax.photometry.choices import Choice
-from p2gs_jax.photometry.held_out import (
+from p2gs_jax.photometry.candidates import (
     Predicted,
     largest_difference,
     mean_deficit,
     predict_held_out,
 )
+from p2gs_jax.photometry.choices import Choice
 from p2gs_jax.photometry.models import Form, parameter_count
 from p2gs_jax.photometry.response import Response
 

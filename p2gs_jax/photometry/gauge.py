@@ -10,7 +10,7 @@ import dataclasses
 import jax
 import numpy as np
 
-from p2gs_jax.render.radiance import RadianceKind, scaled
+from p2gs_jax.render.harmonics import RadianceKind, scaled
 from p2gs_jax.types import Params
 
 

@@ -10,9 +10,7 @@ from p2gs_jax.photometry.response import Response
 from p2gs_jax.photometry.selection import Selection
 from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.run.decisions import KEY, Decisions
-from p2gs_jax.run.folder import (
-    RunFolder,
-)
+from p2gs_jax.run.folder import RunFolder
 
 # Exposures that are learned from nothing move this many times faster (docs/photometry.md, 4).
 FROM_NOTHING = 10.0

@@ -21,7 +21,7 @@ from p2gs_jax.core.devices import Devices
 from p2gs_jax.core.processes import first_alone, is_first
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
-from p2gs_jax.evaluate.lpips import LpipsWeights
+from p2gs_jax.evaluation.lpips import LpipsWeights
 from p2gs_jax.photometry.appearance import exposures_apart
 from p2gs_jax.photometry.gauge import recentre
 from p2gs_jax.photometry.selection import Selection
@@ -35,12 +35,7 @@ from p2gs_jax.pipeline.prepare import Expected, Prepared, load, prepare
 from p2gs_jax.pipeline.reserve import seconds_to_finish
 from p2gs_jax.run.checkpoint import saved_steps
 from p2gs_jax.run.decisions import Decisions
-from p2gs_jax.run.folder import (
-    RunFolder,
-    RunLock,
-    locked,
-    require_free,
-)
+from p2gs_jax.run.folder import RunFolder, RunLock, locked, require_free
 from p2gs_jax.run.write import write_start
 from p2gs_jax.train.loop import Trainer, TrainResult
 from p2gs_jax.train.programs import StepPrograms

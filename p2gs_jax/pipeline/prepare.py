@@ -24,11 +24,7 @@ from p2gs_jax.gaussians.init.brightness import Tones, rough_tones
 from p2gs_jax.gaussians.init.dense import DenseSeeds
 from p2gs_jax.gaussians.init.dense_bound import coverage_of, dense_limit, wants_dense
 from p2gs_jax.gaussians.init.nodes import Nodes, find_nodes, node_gaussians
-from p2gs_jax.gaussians.init.photographed import (
-    nodes_radiance,
-    photographed_radiance,
-    with_colors,
-)
+from p2gs_jax.gaussians.init.photographed import nodes_radiance, photographed_radiance, with_colors
 from p2gs_jax.gaussians.init.seeds import cameras_radius, merge, subsample
 from p2gs_jax.gaussians.init.shell import find_shell
 from p2gs_jax.gaussians.init.start import (

@@ -9,9 +9,7 @@ from p2gs_jax.report.page import Section, folded, paragraph, row, table
 from p2gs_jax.report.pictures import jpeg
 from p2gs_jax.report.run_files import RunFiles, number_at
 from p2gs_jax.report.view_comparisons import read_png
-from p2gs_jax.run.folder import (
-    RunFolder,
-)
+from p2gs_jax.run.folder import RunFolder
 
 PROTOCOLS = (
     ("training", "own exposure and gamma", ("train",)),

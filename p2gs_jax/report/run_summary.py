@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from p2gs_jax.core.clock import whole_run
-from p2gs_jax.evaluate.alignment import ExposureError, exposure_error
+from p2gs_jax.evaluation.alignment import ExposureError, exposure_error
 from p2gs_jax.photometry.agreement import Agreement, compare
 from p2gs_jax.photometry.models import MODELS
 from p2gs_jax.report.run_files import RunFiles

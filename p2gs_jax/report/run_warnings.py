@@ -12,9 +12,7 @@ from p2gs_jax.photometry.solution import MIN_OBSERVATIONS, WEAK_GAMMA
 from p2gs_jax.report.run_files import RunFiles, number_at
 from p2gs_jax.report.run_summary import against_exif, count
 from p2gs_jax.report.scene_measurements import SceneMeasurements
-from p2gs_jax.run.photometry_files import (
-    ViewPhotometry,
-)
+from p2gs_jax.run.photometry_files import ViewPhotometry
 
 # Least gap between the PSNR of training and held-out views, dB.
 WIDE_GAP = 4.0

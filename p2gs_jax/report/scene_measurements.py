@@ -8,9 +8,15 @@ import numpy as np
 
 from p2gs_jax.core.progress import Reporter
 from p2gs_jax.errors import UserError
-from p2gs_jax.evaluate.metrics import psnr
-from p2gs_jax.evaluate.seam_picture import SeamPicture, seam_picture
-from p2gs_jax.evaluate.seams import Photographed, Seam, measure_seam, neighbouring_pairs
+from p2gs_jax.evaluation.scores import psnr
+from p2gs_jax.evaluation.seams import (
+    Photographed,
+    Seam,
+    SeamPicture,
+    measure_seam,
+    neighbouring_pairs,
+    seam_picture,
+)
 from p2gs_jax.photometry.display import develop
 from p2gs_jax.render.warp import surface_depth
 from p2gs_jax.report.run_files import RunFiles

@@ -15,9 +15,7 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
-from p2gs_jax.core.array_files import BROKEN_ARRAYS
-from p2gs_jax.core.atomic import atomic_folder, remove_begun
-from p2gs_jax.core.disk import naming
+from p2gs_jax.core.atomic import BROKEN_ARRAYS, atomic_folder, naming, remove_begun
 from p2gs_jax.errors import UserError
 
 Tree = TypeVar("Tree")

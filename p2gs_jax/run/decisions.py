@@ -23,7 +23,7 @@ from p2gs_jax.config import (
     camera_formations,
 )
 from p2gs_jax.core.atomic import plain, write_json
-from p2gs_jax.core.json_text import parse_json
+from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
 
 # Under this name in the metadata of checkpoints.

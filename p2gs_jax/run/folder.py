@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from p2gs_jax.config import Appearance
-from p2gs_jax.core.atomic import remove_begun
-from p2gs_jax.core.disk import naming
+from p2gs_jax.core.atomic import naming, remove_begun
 from p2gs_jax.errors import UserError
 
 try:

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from p2gs_jax.core.array_files import BROKEN_ARRAYS
-from p2gs_jax.core.atomic import atomic_write
+from p2gs_jax.core.atomic import BROKEN_ARRAYS, atomic_write
 from p2gs_jax.core.processes import is_first
 from p2gs_jax.errors import UserError
-from p2gs_jax.evaluate.unexplained import Unexplained
+from p2gs_jax.evaluation.unexplained import Unexplained
 
 Masks = dict[int, Unexplained]
 

@@ -17,8 +17,8 @@ from jaxtyping import Float
 
 from p2gs_jax.config import Appearance, CameraFormation, FitConfig, PhotometryConfig
 from p2gs_jax.core.atomic import write_array, write_json
-from p2gs_jax.core.json_text import parse_json
 from p2gs_jax.core.numerics import LN2, on_device
+from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.appearance import Corrections, identity
 from p2gs_jax.photometry.cameras import corner

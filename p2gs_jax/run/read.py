@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float32, Int
 
 from p2gs_jax.config import FitConfig, from_dict
-from p2gs_jax.core.json_text import parse_json
 from p2gs_jax.core.numerics import on_device
+from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.ply import read_ply
 from p2gs_jax.gaussians.posed import chosen, posed, standing
@@ -22,7 +22,7 @@ from p2gs_jax.photometry.cameras import camera_rows
 from p2gs_jax.photometry.display import DisplayTransform, display_of_view
 from p2gs_jax.photometry.mean import MeanParameters, mean_parameters, usual_display
 from p2gs_jax.photometry.metering import ExposureOf, Metering, meter
-from p2gs_jax.render.host import RenderView, make_renderer
+from p2gs_jax.render.capacity import RenderView, make_renderer
 from p2gs_jax.run.decisions import read_decisions
 from p2gs_jax.run.folder import RunFolder, find
 from p2gs_jax.run.photometry_files import (

@@ -17,9 +17,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
-from p2gs_jax.core.array_files import BROKEN_ARRAYS
-from p2gs_jax.core.atomic import atomic_write
-from p2gs_jax.core.json_text import parse_json
+from p2gs_jax.core.atomic import BROKEN_ARRAYS, atomic_write
+from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.drives.moving import KeyTimes, MovingObjects
 from p2gs_jax.types import Distortion, Lidar, Scene, TrackedObject, Tracks, View

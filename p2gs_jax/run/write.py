@@ -13,7 +13,7 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.config import to_dict as config_to_dict
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.numerics import evenly_spaced
-from p2gs_jax.evaluate.evaluate import ViewResult
+from p2gs_jax.evaluation.evaluate import ViewResult
 from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.formats.ply import write_ply, write_radiance
 from p2gs_jax.formats.png import write_png
@@ -23,8 +23,8 @@ from p2gs_jax.photometry.display import develop
 from p2gs_jax.photometry.mean import usual_display
 from p2gs_jax.photometry.metering import Metering
 from p2gs_jax.photometry.solution import PhotometricSolution
-from p2gs_jax.render.spherical_harmonics import MAX_DEGREE
-from p2gs_jax.render.vibration import at_time
+from p2gs_jax.render.harmonics import MAX_DEGREE
+from p2gs_jax.render.project import at_time
 from p2gs_jax.run.decisions import Decisions, write_decisions
 from p2gs_jax.run.folder import RunFolder, remembered
 from p2gs_jax.run.photometry_files import write_appearance, write_fitted, write_metering

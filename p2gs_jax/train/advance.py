@@ -20,8 +20,8 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core.streams import noise_key
 from p2gs_jax.gaussians.mcmc import exploration_noise
 from p2gs_jax.losses.regularizers import population_terms
-from p2gs_jax.render.blocks import splat
-from p2gs_jax.render.spherical_harmonics import coefficient_count
+from p2gs_jax.render.harmonics import coefficient_count
+from p2gs_jax.render.visible import splat
 from p2gs_jax.train.image_gradient import ImageGradient, differentiable
 from p2gs_jax.train.object_poses import MovedPoses, move_poses, placed_by, seen_by
 from p2gs_jax.train.optimizer import Optimizer, OptState, learning_rates, means_rate

@@ -9,7 +9,7 @@ from p2gs_jax.core.numerics import on_device
 from p2gs_jax.errors import UserError
 from p2gs_jax.losses.relative_exposure import ColorPairs
 from p2gs_jax.losses.total import OBSERVED_FORMS
-from p2gs_jax.photometry.cameras import darkens
+from p2gs_jax.photometry.formation import darkens
 from p2gs_jax.photometry.observations import Observations, overlapping_views, sample_pairs
 
 PAIR_POOL = 200_000

@@ -12,10 +12,10 @@ from jaxtyping import Array, Bool, Float, Int
 from p2gs_jax.config import FitConfig, RenderConfig
 from p2gs_jax.losses.total import Partner, decoded, image_loss
 from p2gs_jax.photometry.appearance import Corrections
-from p2gs_jax.render.blocks import Shown, splat_listed, whole_blocks
-from p2gs_jax.render.objects import camera_of_each, with_corrections
-from p2gs_jax.render.spherical_harmonics import coefficient_count
-from p2gs_jax.render.visible import compact, in_view
+from p2gs_jax.render.harmonics import coefficient_count
+from p2gs_jax.render.objects import with_corrections
+from p2gs_jax.render.project import camera_of_each
+from p2gs_jax.render.visible import Shown, compact, in_view, splat_listed, whole_blocks
 from p2gs_jax.types import Batch, Frustum, Gaussians, Photometry
 
 

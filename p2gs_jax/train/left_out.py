@@ -18,11 +18,11 @@ import numpy as np
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.clock import Stopwatch
-from p2gs_jax.evaluate.array_store import ArrayStore, most_bytes
-from p2gs_jax.evaluate.parallel import map_in_order
-from p2gs_jax.evaluate.unexplained import Residuals, Unexplained
+from p2gs_jax.evaluation.passes import ArrayStore, most_bytes
+from p2gs_jax.evaluation.passes import map_in_order
+from p2gs_jax.evaluation.unexplained import Residuals, Unexplained
 from p2gs_jax.photometry.display import develop, display_of_view
-from p2gs_jax.render.host import make_renderer
+from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.render.objects import with_corrections
 from p2gs_jax.render.warp import surface_depth
 from p2gs_jax.run.left_out_file import LeftOutFile

@@ -26,13 +26,11 @@ from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.core.devices import Devices
 from p2gs_jax.core.processes import from_first, gathered
 from p2gs_jax.core.progress import LogRecord
-from p2gs_jax.evaluate.unexplained import Unexplained
+from p2gs_jax.evaluation.unexplained import Unexplained
 from p2gs_jax.gaussians.population import STEP_SECONDS_PER_PIXEL, Coverage
 from p2gs_jax.losses.relative_exposure import ColorPairs
 from p2gs_jax.run.decisions import Decisions
-from p2gs_jax.run.folder import (
-    RunFolder,
-)
+from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.run.left_out_file import LeftOutFile
 from p2gs_jax.train import room, schedule
 from p2gs_jax.train.burst import Bursts

@@ -16,7 +16,7 @@ import optax
 from jax import lax
 from jaxtyping import Array, Bool, Int
 
-from p2gs_jax.render.blocks import block_size, owners_at, put_rows, slice_of, take_rows
+from p2gs_jax.render.visible import block_size, owners_at, put_rows, slice_of, take_rows
 from p2gs_jax.train.optimizer import AdamState
 from p2gs_jax.types import Gaussians
 

@@ -10,11 +10,11 @@ import numpy as np
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
-from p2gs_jax.evaluate.alignment import fit_exposure
-from p2gs_jax.evaluate.metrics import psnr
+from p2gs_jax.evaluation.alignment import fit_exposure
+from p2gs_jax.evaluation.scores import psnr
 from p2gs_jax.photometry.display import develop, display_of_view
 from p2gs_jax.photometry.mean import usual_display
-from p2gs_jax.render.host import make_renderer
+from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.render.objects import with_corrections
 from p2gs_jax.train.views import TrainingViews
 from p2gs_jax.types import Params, Population

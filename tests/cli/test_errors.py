@@ -130,8 +130,6 @@ WRONG = [
     ("synth new --layout village", "'street', 'town'"),
     ("sweep none.toml", "docs/sweeps.md"),
     ("sweep file.txt", "is no TOML"),
-    ("bench sped", "choose speed_error"),
-    ("bench speed_error --baseline none.json", "--write-baseline FILE"),
     ("doctor --jsn", "--json"),
     ("completion ksh", "'bash', 'zsh'"),
 ]

@@ -14,7 +14,7 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.formats.ply import read_ply
 from p2gs_jax.formats.splat import read_splat
-from p2gs_jax.render.host import make_renderer
+from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.read import load_run
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.device import camera_of

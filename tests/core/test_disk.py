@@ -8,8 +8,14 @@ import resource
 import numpy as np
 import pytest
 
-from p2gs_jax.core.atomic import append_jsonl, atomic_write, read_jsonl, write_array, write_text
-from p2gs_jax.core.disk import naming
+from p2gs_jax.core.atomic import (
+    append_jsonl,
+    atomic_write,
+    naming,
+    read_jsonl,
+    write_array,
+    write_text,
+)
 from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.formats.png import write_png
 from p2gs_jax.run.checkpoint import CheckpointStore

@@ -13,7 +13,7 @@ from p2gs_jax.districts import seams as measuring
 from p2gs_jax.districts.cut import OVERLAP, Block, Cut
 from p2gs_jax.districts.level import INWARDS, level_seams, shifts
 from p2gs_jax.districts.merge import merge_cores
-from p2gs_jax.render.spherical_harmonics import C0
+from p2gs_jax.render.harmonics import C0
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
 

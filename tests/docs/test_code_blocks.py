@@ -20,7 +20,7 @@ from p2gs_jax import config
 from p2gs_jax.cli import main
 from p2gs_jax.cli.options.fit import Calibrate, Fit, resolve_calibration, resolve_fit
 from p2gs_jax.cli.parser import COMMANDS, GROUPS, parse
-from p2gs_jax.sweep.toml import read_sweep
+from p2gs_jax.jobs.configs import read_sweep
 
 BLOCKS = [block for page in PAGES for block in blocks(page)]
 

@@ -147,7 +147,7 @@ def test_cores_of_a_container(tmp_path, monkeypatch):
 
 
 def test_an_unwritable_cache_is_said(monkeypatch, tmp_path):
-    import p2gs_jax.core.compile_cache as compile_cache
+    import p2gs_jax.core.runtime as compile_cache
 
     monkeypatch.setattr(compile_cache, "use_compile_cache", lambda: None)
     monkeypatch.setattr(compile_cache, "cache_folder", lambda: tmp_path)

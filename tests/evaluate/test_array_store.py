@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import FitConfig
-from p2gs_jax.evaluate import evaluate as evaluation
-from p2gs_jax.evaluate.array_store import ArrayStore
+from p2gs_jax.evaluation import evaluate as evaluation
+from p2gs_jax.evaluation.passes import ArrayStore
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Gaussians, Params, Photometry, Render, Scene, View
 

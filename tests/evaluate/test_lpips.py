@@ -10,9 +10,8 @@ import pytest
 from lpips_files import CONVOLUTIONS, made_arrays, write_weights
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.evaluate import lpips_package
-from p2gs_jax.evaluate.lpips import lpips
-from p2gs_jax.evaluate.lpips_weights import read_lpips_weights
+from p2gs_jax.evaluation import lpips as lpips_package
+from p2gs_jax.evaluation.lpips import lpips, read_lpips_weights
 
 ARRAYS = {net: made_arrays(net) for net in CONVOLUTIONS}
 NETS = tuple(ARRAYS)
@@ -183,10 +182,10 @@ class Trap:
 def test_pickles_are_not_opened(tmp_path):
     trap = Trap(tmp_path / "sprung")
     (tmp_path / "w.npz").write_bytes(pickle.dumps(trap))
-    with pytest.raises(UserError, match=r"no \.npz"):
+    with pytest.raises(UserError, match=r"not a \.npz"):
         read_lpips_weights(tmp_path / "w.npz")
     poisoned = arrays() | {"net.slice1.0.bias": np.array([trap] * 64, object)}
-    with pytest.raises(UserError, match=r"no \.npz of arrays"):
+    with pytest.raises(UserError, match=r"not a \.npz of arrays"):
         read_lpips_weights(write_weights(tmp_path / "p.npz", poisoned))
     assert not trap.path.exists()
 
@@ -199,17 +198,17 @@ def test_other_files(tmp_path):
     path = tmp_path / "w.npz"
     for content in (b"", b"PK\x03\x04 but no more", b"some text"):
         path.write_bytes(content)
-        with pytest.raises(UserError, match=r"no \.npz"):
+        with pytest.raises(UserError, match=r"not a \.npz"):
             read_lpips_weights(path)
     whole = write_weights(tmp_path / "whole.npz", arrays()).read_bytes()
     broken = bytearray(whole)
     broken[5000:5100] = bytes(100)
     path.write_bytes(broken)
-    with pytest.raises(UserError, match=r"no \.npz"):
+    with pytest.raises(UserError, match=r"not a \.npz"):
         read_lpips_weights(path)
     with path.open("wb") as file:
         np.save(file, np.zeros(3))
-    with pytest.raises(UserError, match=r"no \.npz"):
+    with pytest.raises(UserError, match=r"not a \.npz"):
         read_lpips_weights(path)
     with zipfile.ZipFile(path, "w") as file:  # as PyTorch saves
         file.writestr("archive/data.pkl", b"bytes")
@@ -265,7 +264,7 @@ class Harm:
         (None, "not installed"),
         (b"nothing", "does not hold the weights"),
         (pickle.dumps({"AlexNet_0": 3}), "does not hold the weights"),
-        (pickle.dumps({"AlexNet_0": Harm()}), "holds a builtins.print, no array"),
+        (pickle.dumps({"AlexNet_0": Harm()}), "holds a builtins.print, which is not an array"),
     ],
 )
 def test_a_package_that_is_missing_or_damaged(monkeypatch, tmp_path, capsys, content, said):

@@ -8,11 +8,10 @@ from lpips_files import made_arrays, write_weights
 
 from p2gs_jax.cli.commands.console import print_metrics
 from p2gs_jax.config import FitConfig
-from p2gs_jax.evaluate.evaluate import evaluate
-from p2gs_jax.evaluate.lpips import lpips
-from p2gs_jax.evaluate.lpips_weights import read_lpips_weights
+from p2gs_jax.evaluation.evaluate import evaluate
+from p2gs_jax.evaluation.lpips import lpips, read_lpips_weights
+from p2gs_jax.jobs.sweep import to_markdown
 from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.sweep.rows import to_markdown
 from p2gs_jax.types import Gaussians, Params, Photometry, Render, Scene, View
 
 
@@ -52,14 +51,13 @@ def judged(scene, weights):
     store = ImageStore(scene.views, cfg.data)
     return evaluate(
         params,
-        np.zeros(0, bool),
         scene,
         store,
         grey,
         cfg,
         reference=lambda row: store.get(row, 1)[0],
         lpips_weights=weights,
-    )
+    ).metrics
 
 
 def test_every_comparison_gets_it_where_there_are_weights(weights, tmp_path, capsys):

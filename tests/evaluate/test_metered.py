@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import PhotometryConfig
-from p2gs_jax.evaluate.array_store import ArrayStore
-from p2gs_jax.evaluate.metered import MeteredViews
+from p2gs_jax.evaluation.metered import MeteredViews
+from p2gs_jax.evaluation.passes import ArrayStore
 from p2gs_jax.photometry.metering import meter
 
 KEY = 0.2
@@ -24,12 +24,12 @@ def test_scores_are_under_the_metered_exposure(metered):
         for k, level in enumerate(levels):
             views.add_training(f"{k}.png", meter(*picture(level)))
         linear, mask = picture(0.4)
-        views.add_held_out("new.png", meter(linear, mask), linear, linear, mask)
+        views.add_held_out(7, meter(linear, mask), linear, linear, mask)
         exposures = KEY / levels if metered else drawn
         found = views.fit(exposures, 2.2, PhotometryConfig())
         scores = views.scores(found, lambda name, image, e, *_: {"level": float(image.mean() * e)})
     if metered:
-        assert scores["new.png"]["level"] == pytest.approx(KEY, rel=1e-4)
-        assert scores["new.png"]["exposure"] == pytest.approx(KEY / 0.4, rel=1e-4)
+        assert scores[7]["level"] == pytest.approx(KEY, rel=1e-4)
+        assert scores[7]["exposure"] == pytest.approx(KEY / 0.4, rel=1e-4)
     else:
         assert scores == {}

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from p2gs_jax.evaluate.mu_law import mu_law, mu_law_psnr
+from p2gs_jax.evaluation.radiance import mu_law, mu_law_psnr
 
 TRUTH = np.random.default_rng(0).uniform(0.1, 4.0, (8, 10, 3))
 EVERYWHERE = np.ones((8, 10), bool)

@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from p2gs_jax.evaluate.parallel import MOST_WORKERS, map_in_order
+from p2gs_jax.evaluation.passes import MOST_WORKERS, map_in_order
 
 
 def test_results_keep_their_order_whatever_finishes_first():

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from p2gs_jax.evaluate import radiance
-from p2gs_jax.evaluate.radiance import RadianceScores, delta_e_itp, pu21_encode, pu21_psnr
+from p2gs_jax.evaluation import radiance
+from p2gs_jax.evaluation.radiance import RadianceScores, delta_e_itp, pu21_encode, pu21_psnr
 
 EVERYWHERE = np.ones((24, 32), bool)
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import LossConfig
-from p2gs_jax.evaluate.evaluate import evaluate
-from p2gs_jax.evaluate.untold import Untold, untold_notes
-from p2gs_jax.render.host import make_renderer
+from p2gs_jax.evaluation.evaluate import evaluate
+from p2gs_jax.evaluation.scores import Untold, untold_notes
+from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.read import load_run
 from p2gs_jax.scene.images import ImageStore
 
@@ -82,13 +82,12 @@ def test_hidden_views_are_left_out_of_the_scores(tmp_path, finished_run):
     shown = []
     now = evaluate(
         run.params,
-        np.asarray(run.alive),
         scene,
         ImageStore(scene.views, run.cfg.data),
         make_renderer(run.cfg.render, run.owner),
         run.cfg,
         on_view=shown.append,
-    )
+    ).metrics
     assert sorted(now["hidden"]) == sorted([trained[0], held_out[0]])
     assert now["exposures_unknown"] == [trained[1]]
     assert list(now["train"]["per_view"]) == trained[1:]

@@ -14,15 +14,8 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.formats.exr import read_exr, write_exr
 from p2gs_jax.formats.ply import field_names, read_ply, write_ply, write_radiance
 from p2gs_jax.formats.png import write_png
-from p2gs_jax.run.photometry_files import (
-    read_photometry,
-    write_photometry,
-)
-from p2gs_jax.run.plots import (
-    _lines,
-    _shorten,
-    write_summary,
-)
+from p2gs_jax.run.photometry_files import read_photometry, write_photometry
+from p2gs_jax.run.plots import _lines, _shorten, write_summary
 from p2gs_jax.types import Gaussians
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import DataConfig, DensifyConfig, FitConfig, InitConfig, preset
-from p2gs_jax.core.srgb import srgb_encode
+from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.gaussians.init.brightness import MatchImages, Tones, at_common_exposure, rough_tones
 from p2gs_jax.gaussians.init.dense import MATCH_SIDE, dense_seeds
 from p2gs_jax.gaussians.init.dense_bound import coverage_of, dense_limit, wants_dense

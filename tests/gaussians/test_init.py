@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import FitConfig, InitConfig, preset
-from p2gs_jax.core.srgb import srgb_encode
+from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.gaussians.init.seeds import cameras_radius, gaussians_from_points, subsample
 from p2gs_jax.gaussians.init.shell import find_shell
 from p2gs_jax.photometry.observations import Observations, overlapping_views, sample_pairs

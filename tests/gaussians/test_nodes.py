@@ -11,10 +11,7 @@ from p2gs_jax.gaussians.init.nodes import find_nodes, node_gaussians, on_surface
 from p2gs_jax.gaussians.init.photographed import nodes_radiance
 from p2gs_jax.photometry.initial import initial_photometry
 from p2gs_jax.scene import ImageStore, drives, load_scene
-from p2gs_jax.scene.rigid import (
-    interpolated,
-    inverse,
-)
+from p2gs_jax.scene.rigid import interpolated, inverse
 from p2gs_jax.types import Photometry
 
 CFG = DynamicsConfig()

@@ -6,17 +6,8 @@ import pytest
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.display import DisplayTransform, develop
-from p2gs_jax.photometry.metering import (
-    METERS,
-    adapted,
-    fit_metering,
-    meter,
-    white_level,
-)
-from p2gs_jax.run.photometry_files import (
-    read_metering,
-    write_metering,
-)
+from p2gs_jax.photometry.metering import METERS, adapted, fit_metering, meter, white_level
+from p2gs_jax.run.photometry_files import read_metering, write_metering
 
 RNG = np.random.default_rng(0)
 PICTURE = np.exp2(RNG.normal(-3, 2, (40, 60, 1))) * np.ones(3)

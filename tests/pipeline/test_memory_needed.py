@@ -10,11 +10,11 @@ from tiny_scene import make_scene
 import p2gs_jax
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.population import Coverage
+from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.pipeline import fit as pipeline
 from p2gs_jax.pipeline import memory_needed as module
 from p2gs_jax.pipeline.memory_needed import MemoryNeeded, memory_needed, require_memory
 from p2gs_jax.run.checkpoint import CheckpointStore
-from p2gs_jax.sweep import with_fields
 
 GB = 1e9
 ROBUST = p2gs_jax.preset("robust")

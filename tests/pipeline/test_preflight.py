@@ -13,16 +13,14 @@ import p2gs_jax
 from p2gs_jax.cli import main
 from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import DivergenceError, UserError
+from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.losses.relative_exposure import ExposurePairs, relative_exposure_loss
 from p2gs_jax.pipeline import fit as pipeline
 from p2gs_jax.pipeline.decide import kept_choice
 from p2gs_jax.pipeline.preflight import Paths, check_run_dir, check_sizes, preflight
 from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.run.decisions import KEY, Decisions
-from p2gs_jax.run.folder import (
-    RunFolder,
-)
-from p2gs_jax.sweep import with_fields
+from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.types import Photometry, View
 
 

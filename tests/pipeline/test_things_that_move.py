@@ -246,9 +246,7 @@ def test_a_resumed_run_is_the_one_that_was_never_stopped(result, folder, tmp_pat
 
 
 def test_broken_or_foreign_owners_are_said(run, tmp_path):
-    from p2gs_jax.run.scene_file import (
-        read_objects,
-    )
+    from p2gs_jax.run.scene_file import read_objects
 
     path = tmp_path / "objects.npz"
     path.write_bytes((run.folder / "objects.npz").read_bytes()[:100])

@@ -10,10 +10,10 @@ import p2gs_jax
 from p2gs_jax.core.atomic import read_jsonl
 from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.formats.ply import read_ply
-from p2gs_jax.render.vibration import STILL, at_time
+from p2gs_jax.jobs.configs import with_fields
+from p2gs_jax.render.project import STILL, at_time
 from p2gs_jax.report.report import write_report
 from p2gs_jax.scene import drives
-from p2gs_jax.sweep import with_fields
 
 # Before the look the fit must be good enough to tell what moves from what is fitted badly.
 STEPS, LOOK = 60, 40

@@ -14,10 +14,10 @@ from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.numerics import fibonacci_sphere
 from p2gs_jax.gaussians.posed import posed, turning
 from p2gs_jax.render import project, render_linear, required_capacity, view_radiance
-from p2gs_jax.render.blocks import BLOCK, splat, splat_listed
-from p2gs_jax.render.objects import HIDDEN, camera_of_each, corrected
-from p2gs_jax.render.spherical_harmonics import evaluate
-from p2gs_jax.render.visible import compact, in_view
+from p2gs_jax.render.harmonics import evaluate
+from p2gs_jax.render.objects import corrected
+from p2gs_jax.render.project import HIDDEN, camera_of_each
+from p2gs_jax.render.visible import BLOCK, compact, in_view, splat, splat_listed
 from p2gs_jax.scene.drives.moving import KeyTimes, MovingObjects
 from p2gs_jax.train.room import count_view
 from p2gs_jax.types import Camera, Placement, TrackedObject

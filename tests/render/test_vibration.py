@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import RenderConfig
-from p2gs_jax.render.blocks import splat
-from p2gs_jax.render.vibration import CYCLE, STILL, at_time
-from p2gs_jax.render.visible import in_view
+from p2gs_jax.render.project import CYCLE, STILL, at_time
+from p2gs_jax.render.visible import in_view, splat
 from p2gs_jax.types import Camera, Gaussians, Placement, Vibration
 
 LIFE = 0.4

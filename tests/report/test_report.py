@@ -12,8 +12,7 @@ import pytest
 from page_tools import copy_run, edit, look_at
 
 from p2gs_jax.cli import main
-from p2gs_jax.evaluate.seam_picture import SeamPicture
-from p2gs_jax.evaluate.seams import Seam
+from p2gs_jax.evaluation.seams import Seam, SeamPicture
 from p2gs_jax.report.report import report_page, write_report
 from p2gs_jax.report.run_files import read_run
 from p2gs_jax.report.scene_measurements import SceneMeasurements, SeamPair

@@ -11,6 +11,7 @@ import pytest
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.progress import Silent
 from p2gs_jax.formats.ply import write_radiance
+from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.report.run_files import read_run
 from p2gs_jax.report.scene_measurements import measure_scene
 from p2gs_jax.run.decisions import Decisions
@@ -19,7 +20,6 @@ from p2gs_jax.run.photometry_files import write_photometry
 from p2gs_jax.run.scene_file import write_scene
 from p2gs_jax.run.write import write_start
 from p2gs_jax.scene import load_scene
-from p2gs_jax.sweep.fields import with_fields
 from p2gs_jax.types import Gaussians
 
 WIDTH, HEIGHT, FOCAL, WALL = 96, 64, 80.0, 4.0

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.evaluate.unexplained import Unexplained
+from p2gs_jax.evaluation.unexplained import Unexplained
 from p2gs_jax.run.left_out_file import LeftOutFile
 
 RNG = np.random.default_rng(0)

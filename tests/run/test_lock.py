@@ -8,11 +8,7 @@ import sys
 import pytest
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.run.folder import (
-    NAME,
-    locked,
-    require_free,
-)
+from p2gs_jax.run.folder import NAME, locked, require_free
 
 HOLD = """
 import os, sys

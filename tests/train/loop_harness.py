@@ -12,8 +12,8 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import read_jsonl
 from p2gs_jax.core.numerics import on_host
 from p2gs_jax.gaussians.population import Coverage
+from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.run.decisions import Decisions
-from p2gs_jax.sweep import with_fields
 from p2gs_jax.train import burst, checkpoints, loop, session, state
 from p2gs_jax.train.advance import StepReport
 from p2gs_jax.train.state import FAULT_NONFINITE, FAULT_OVERFLOW, Fault, FitState

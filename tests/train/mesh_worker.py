@@ -21,16 +21,14 @@ from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.core.devices import Devices
 from p2gs_jax.core.numerics import on_host
 from p2gs_jax.core.progress import Silent
+from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.losses.total import Partner
 from p2gs_jax.pipeline.devices import mesh_of
 from p2gs_jax.pipeline.fit import optimise
 from p2gs_jax.pipeline.prepare import load, prepare
 from p2gs_jax.render import xla_cpu
 from p2gs_jax.render.capacity import Room
-from p2gs_jax.run.folder import (
-    RunFolder,
-)
-from p2gs_jax.sweep import with_fields
+from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.train.advance import Controls
 from p2gs_jax.train.batches import stacked
 from p2gs_jax.train.mesh.spread import OnMesh

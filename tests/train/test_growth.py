@@ -12,8 +12,8 @@ import p2gs_jax
 from p2gs_jax.cli import main
 from p2gs_jax.config import from_dict, to_dict
 from p2gs_jax.core.progress import Silent
+from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.sweep import with_fields
 from p2gs_jax.train import growth
 from p2gs_jax.train.growth import Growth, StageResult
 from p2gs_jax.train.host import HostState

@@ -9,7 +9,7 @@ from loop_harness import GROWING, SEEDS, Harness, Programs, signalled
 
 from p2gs_jax.core.interrupts import Interrupted
 from p2gs_jax.errors import DivergenceError
-from p2gs_jax.sweep import with_fields
+from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.train import growth
 
 

@@ -11,10 +11,10 @@ from moving_box import RENDER, drive_format, make_world, write_photographs
 
 from p2gs_jax.config import DataConfig, FitConfig
 from p2gs_jax.errors import DivergenceError
-from p2gs_jax.evaluate.unexplained import Unexplained
+from p2gs_jax.evaluation.unexplained import Unexplained
+from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.scene import ImageStore, drives, load_scene
 from p2gs_jax.scene.drives.object_masks import object_mask
-from p2gs_jax.sweep import with_fields
 from p2gs_jax.train import left_out
 from p2gs_jax.train.left_out import MOST_OF_A_VIEW, Looked, bounded, described, look
 from p2gs_jax.train.state import Fault, FitState

@@ -9,7 +9,7 @@ from loop_harness import SHORT, Harness, Programs, signalled
 
 from p2gs_jax.core.interrupts import Interrupted
 from p2gs_jax.errors import DivergenceError, UserError
-from p2gs_jax.sweep import with_fields
+from p2gs_jax.jobs.configs import with_fields
 
 BUDGET = with_fields(SHORT, {"train.budget_s": 60.0})
 LEVELS = with_fields(SHORT, {"train.coarse_to_fine": [0.33]})

@@ -12,8 +12,8 @@ import pytest
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.devices import Devices
 from p2gs_jax.errors import UserError
+from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.pipeline.devices import mesh_of, with_a_view_each
-from p2gs_jax.sweep import with_fields
 from p2gs_jax.train.batches import batches_of, stacked
 from p2gs_jax.train.state import FAULT_NONE, FAULT_OVERFLOW
 

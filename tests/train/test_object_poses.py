@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from p2gs_jax.config import FitConfig
 from p2gs_jax.losses.regularizers import pose_terms
 from p2gs_jax.losses.total import Partner, total_loss
-from p2gs_jax.render.blocks import BLOCK
 from p2gs_jax.render.capacity import Room
-from p2gs_jax.render.objects import HIDDEN
+from p2gs_jax.render.project import HIDDEN
+from p2gs_jax.render.visible import BLOCK
 from p2gs_jax.train.advance import Controls, finite_names
 from p2gs_jax.train.optimizer import make_optimizer
 from p2gs_jax.train.state import FAULT_NONE, FAULT_NONFINITE, grow_state, initial_state

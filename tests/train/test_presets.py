@@ -11,7 +11,7 @@ from tiny_scene import make_scene
 import p2gs_jax
 from p2gs_jax.core.atomic import read_jsonl
 from p2gs_jax.photometry.appearance import identity
-from p2gs_jax.render.blocks import BLOCK
+from p2gs_jax.render.visible import BLOCK
 from p2gs_jax.train.optimizer import appearance_rate
 
 FORMS = ("literal_same_pose", "literal_pixels", "exposed", "observed_linear", "observed_ldr")

@@ -14,9 +14,8 @@ from tiny_scene import make_scene
 from p2gs_jax.config import FitConfig
 from p2gs_jax.losses.total import Partner, image_loss, total_loss
 from p2gs_jax.pipeline.fit import fit
-from p2gs_jax.render.blocks import BLOCK, splat
 from p2gs_jax.render.capacity import Room
-from p2gs_jax.render.visible import in_view
+from p2gs_jax.render.visible import BLOCK, in_view, splat
 from p2gs_jax.train import advance, image_gradient
 from p2gs_jax.train.advance import Controls, finite_names
 from p2gs_jax.train.optimizer import B1, learning_rates, make_optimizer

@@ -11,7 +11,7 @@ from splats import random_splats
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.gaussians.population import Coverage, default_max_gaussians
-from p2gs_jax.sweep import with_fields
+from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.train import growth
 from p2gs_jax.train.host import HostState
 from p2gs_jax.train.optimizer import make_optimizer

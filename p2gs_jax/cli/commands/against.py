@@ -12,8 +12,9 @@ from rich.text import Text
 
 from p2gs_jax.cli.commands.console import stdout
 from p2gs_jax.core.atomic import write_json
-from p2gs_jax.evaluate.against import Judge, check_renders, judge_renders, own_scores
-from p2gs_jax.evaluate.renders_of_others import OtherRenders, find_renders
+from p2gs_jax.evaluation.against import check_renders, judge_renders, own_scores
+from p2gs_jax.evaluation.evaluate import Judge
+from p2gs_jax.evaluation.renders_of_others import OtherRenders, find_renders
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Scene
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from p2gs_jax.core.terminal import PlainConsole
+from p2gs_jax.core.progress import PlainConsole
 
 # Parts of a fit, as metrics.json has them under "seconds", and what they are called in print.
 PARTS = {

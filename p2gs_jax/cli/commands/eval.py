@@ -4,28 +4,19 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from p2gs_jax.cli.commands import against
 from p2gs_jax.cli.commands.console import print_metrics
 from p2gs_jax.cli.options.results import Eval
 from p2gs_jax.core.atomic import write_json
-from p2gs_jax.core.json_text import parse_json
 from p2gs_jax.core.progress import TerminalReporter
-from p2gs_jax.evaluate.against import Judge
-from p2gs_jax.evaluate.evaluate import evaluate
-from p2gs_jax.evaluate.lpips_weights import read_lpips_weights
-from p2gs_jax.evaluate.references import find_radiance, load_reference
-from p2gs_jax.render.host import make_renderer
-from p2gs_jax.run.folder import (
-    RunFolder,
-)
-from p2gs_jax.run.photometry_files import (
-    write_metering,
-)
-from p2gs_jax.run.plots import (
-    write_unexplained,
-)
+from p2gs_jax.core.text import parse_json
+from p2gs_jax.evaluation.evaluate import Judge, evaluate
+from p2gs_jax.evaluation.lpips import read_lpips_weights
+from p2gs_jax.evaluation.references import find_radiance, load_reference
+from p2gs_jax.render.capacity import make_renderer
+from p2gs_jax.run.folder import RunFolder
+from p2gs_jax.run.photometry_files import write_metering
+from p2gs_jax.run.plots import write_unexplained
 from p2gs_jax.run.read import load_run
 
 
@@ -44,9 +35,8 @@ def run(options: Eval) -> int:
     store = fitted.store
     others = against.find_all(options.against, fitted.scene, store)
     with TerminalReporter() as reporter:
-        metrics = evaluate(
+        found = evaluate(
             fitted.params,
-            np.asarray(fitted.alive),
             fitted.scene,
             store,
             make_renderer(fitted.cfg.render, fitted.owner),
@@ -54,12 +44,12 @@ def run(options: Eval) -> int:
             reference=truth,
             radiance=find_radiance(fitted.scene, store),
             lpips_weights=weights,
-            on_metering=lambda found: write_metering(folder.metering, found),
-            on_unexplained=lambda found: write_unexplained(
-                folder.unexplained, fitted.scene, store, found
-            ),
             on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
         )
+        metrics = found.metrics
+        write_metering(folder.metering, found.metering)
+        if found.unexplained:
+            write_unexplained(folder.unexplained, fitted.scene, store, found.unexplained)
         judge = Judge(fitted.scene, store, fitted.params, fitted.cfg, weights, truth)
         beside = against.judge_all(
             others, judge, metrics, lambda done, count: reporter.stage("Judging", done, count)

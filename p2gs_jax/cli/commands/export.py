@@ -25,10 +25,8 @@ from p2gs_jax.formats.through_gsply import require_gsply
 from p2gs_jax.formats.usd import require_pxr
 from p2gs_jax.gaussians.bake import display_of_splats
 from p2gs_jax.photometry.display import DisplayTransform
-from p2gs_jax.render.vibration import at_time
-from p2gs_jax.run.photometry_files import (
-    write_appearance,
-)
+from p2gs_jax.render.project import at_time
+from p2gs_jax.run.photometry_files import write_appearance
 from p2gs_jax.run.read import Run, load_run
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.exif import read_exif_settings

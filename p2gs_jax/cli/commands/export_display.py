@@ -29,9 +29,9 @@ from p2gs_jax.gaussians.bake import (
     true_target,
 )
 from p2gs_jax.photometry.display import DisplayTransform
-from p2gs_jax.render.host import make_renderer
-from p2gs_jax.render.spherical_harmonics import MAX_DEGREE
-from p2gs_jax.render.vibration import at_time
+from p2gs_jax.render.capacity import make_renderer
+from p2gs_jax.render.harmonics import MAX_DEGREE
+from p2gs_jax.render.project import at_time
 from p2gs_jax.run.read import Run
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore

@@ -9,9 +9,9 @@ from rich.text import Text
 
 from p2gs_jax.cli.commands.console import stdout
 from p2gs_jax.cli.options.experiments import Sweep
+from p2gs_jax.jobs.configs import read_sweep
+from p2gs_jax.jobs.sweep import brief, failures, sweep
 from p2gs_jax.jobs.table import JobsTable
-from p2gs_jax.sweep import read_sweep, sweep
-from p2gs_jax.sweep.rows import brief, failures
 
 
 def run(options: Sweep) -> int:

@@ -1,4 +1,4 @@
-"""`demo`, `synth`, `sweep` and `bench`: data with truth, many fits, and measurements."""
+"""`demo`, `synth` and `sweep`: data with truth, and many fits."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Annotated
 
 import tyro
 
-from p2gs_jax.config import RenderConfig
 from p2gs_jax.synth.settings import Layout, Sensor
 
 
@@ -86,29 +85,3 @@ class Sweep:
     """Fits at a time on this machine (default: the file's, or 1)."""
     engine: Annotated[str, tyro.conf.arg(metavar="NAME")] = "local"
     """Where fits run: local, dask://HOST:PORT, or slurm:OPTION=VALUE,... (docs/sweeps.md)."""
-
-
-@dataclass(frozen=True)
-class Bench:
-    """Measure the renderer: speed, error, growth, memory, hard cases.
-
-    p2gs-jax bench --quick
-    p2gs-jax bench speed_error memory --out runs/bench
-    p2gs-jax bench levels --render.chunk 32
-    """
-
-    parts: Annotated[
-        tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[PART ...]")
-    ] = ()
-    """speed_error, levels, growth, memory, step, hard_cases, implementations; none named runs
-    all."""
-    out: Path = Path("runs/bench")
-    """Folder for tables, JSON and plots."""
-    quick: bool = False
-    """Fewer and smaller: two minutes instead of half an hour."""
-    baseline: Path | None = None
-    """Compare speed_error and levels with this file; exit code 1 where they are worse."""
-    write_baseline: Path | None = None
-    """Write what speed_error and levels measured, for a later --baseline."""
-    render: RenderConfig = field(default_factory=RenderConfig)
-    """Options of the renderer, for levels."""

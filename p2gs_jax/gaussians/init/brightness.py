@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from p2gs_jax.config import PhotometryConfig
-from p2gs_jax.photometry.cameras import darkens, log_vignetting, squared_radii
+from p2gs_jax.photometry.formation import darkens, log_vignetting, squared_radii
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import Response, base_log, log_exposed
 from p2gs_jax.photometry.spline_curve import spline_of

@@ -13,10 +13,7 @@ from p2gs_jax.config import DynamicsConfig, FitConfig
 from p2gs_jax.gaussians.init.seeds import NEIGHBOURS, gaussians_from_points
 from p2gs_jax.scene.drives.moving import MovingObjects, key_times
 from p2gs_jax.scene.drives.object_masks import outline_of, painted
-from p2gs_jax.scene.rigid import (
-    interpolated,
-    inverse,
-)
+from p2gs_jax.scene.rigid import interpolated, inverse
 from p2gs_jax.types import Gaussians, Lidar, Scene, TrackedObject, View
 
 # A view shows an object from this share of its pixels on.

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from p2gs_jax.config import FitConfig
-from p2gs_jax.core.srgb import srgb_encode
+from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.gaussians.init.nodes import Nodes
 from p2gs_jax.photometry.cameras import places
 from p2gs_jax.photometry.formation import inverse_formation

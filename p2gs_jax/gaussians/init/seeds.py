@@ -10,8 +10,7 @@ from scipy.spatial import KDTree
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.core.streams import Stream, generator
-from p2gs_jax.render.radiance import radiance_preactivation
-from p2gs_jax.render.spherical_harmonics import C0, coefficient_count
+from p2gs_jax.render.harmonics import C0, coefficient_count, radiance_preactivation
 from p2gs_jax.types import Gaussians, View
 
 NEIGHBOURS = 3

@@ -12,7 +12,7 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.gaussians.init.seeds import merge
-from p2gs_jax.render.vibration import STILL
+from p2gs_jax.render.project import STILL
 from p2gs_jax.scene.drives.moving import MovingObjects, key_times, middle_time
 from p2gs_jax.types import Gaussians, Scene, Vibration
 

@@ -12,9 +12,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.scene.drives.recording import SweepPoints
 from p2gs_jax.scene.drives.spin import turned
 from p2gs_jax.scene.drives.tables import missing_file
-from p2gs_jax.scene.rigid import (
-    interpolated,
-)
+from p2gs_jax.scene.rigid import interpolated
 
 PHOTOGRAPHS = (".png", ".jpg", ".jpeg")
 # Seconds of a turn of the scanner, where no file says when it began and ended.

@@ -12,10 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from p2gs_jax.core.numerics import on_host
 from p2gs_jax.errors import UserError
-from p2gs_jax.render.objects import HIDDEN
-from p2gs_jax.scene.rigid import (
-    interpolated,
-)
+from p2gs_jax.render.project import HIDDEN
+from p2gs_jax.scene.rigid import interpolated
 from p2gs_jax.types import Params, Placement, Scene, TrackedObject
 
 # Key times lie this many poses of a track apart: between two of them are several photographs, so

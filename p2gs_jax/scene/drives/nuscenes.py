@@ -32,10 +32,7 @@ from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sw
 from p2gs_jax.scene.drives.spin import turned
 from p2gs_jax.scene.drives.tables import finite_numbers
 from p2gs_jax.scene.files import require_inside
-from p2gs_jax.scene.rigid import (
-    from_quaternion,
-    inverse,
-)
+from p2gs_jax.scene.rigid import from_quaternion, inverse
 from p2gs_jax.types import TrackedObject
 
 NUMBER = (int, float)

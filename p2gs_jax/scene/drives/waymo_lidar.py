@@ -24,9 +24,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.scene.drives.arrow import ParquetTable
 from p2gs_jax.scene.drives.recording import Sweep, SweepPoints
 from p2gs_jax.scene.drives.spin import turned
-from p2gs_jax.scene.rigid import (
-    rigid,
-)
+from p2gs_jax.scene.rigid import rigid
 
 STAMP, LASER = "key.frame_timestamp_micros", "key.laser_name"
 # Of the upper scanner: seconds a turn (10 Hz), and where it begins in the car's axes.

@@ -25,16 +25,16 @@ from p2gs_jax.gaussians.mcmc import shaped_noise
 from p2gs_jax.losses.regularizers import population_terms
 from p2gs_jax.losses.total import Partner
 from p2gs_jax.photometry.appearance import Corrections
-from p2gs_jax.render.blocks import (
+from p2gs_jax.render.harmonics import coefficient_count
+from p2gs_jax.render.visible import (
     block_size,
+    compact,
     owners_at,
     slice_of,
     splat,
     take_rows,
     whole_blocks,
 )
-from p2gs_jax.render.spherical_harmonics import coefficient_count
-from p2gs_jax.render.visible import compact
 from p2gs_jax.train import image_gradient
 from p2gs_jax.train.advance import Controls, Moved, StepReport, is_healthy, settled
 from p2gs_jax.train.image_gradient import ImageGradient, differentiable
