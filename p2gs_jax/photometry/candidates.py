@@ -11,13 +11,13 @@ from p2gs_jax.photometry.adjustment.errors import side_by_side
 from p2gs_jax.photometry.adjustment.fit import TOLERANCE_TO_COMPARE, solve_model
 from p2gs_jax.photometry.adjustment.problem import Problem
 from p2gs_jax.photometry.adjustment.solve import Fit
-from p2gs_jax.photometry.candidates import (
+from p2gs_jax.photometry.choices import Choice
+from p2gs_jax.photometry.held_out import (
     Predicted,
     largest_difference,
     mean_deficit,
     predict_held_out,
 )
-from p2gs_jax.photometry.choices import Choice
 from p2gs_jax.photometry.models import Form, parameter_count
 from p2gs_jax.photometry.response import Response
 

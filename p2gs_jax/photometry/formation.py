@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.core.numerics import Scalar, Values, namespace, positive_pow, safe_log
 from p2gs_jax.photometry.appearance import Correction, corrected
-from p2gs_jax.photometry.formation import darkens, log_vignetting, squared_radii
+from p2gs_jax.photometry.cameras import darkens, log_vignetting, squared_radii
 from p2gs_jax.photometry.spline_curve import decode, encode
 from p2gs_jax.types import GAMMA_SRGB, Capture
 

@@ -25,12 +25,12 @@ from p2gs_jax.report.charts import (
     response_chart,
 )
 from p2gs_jax.report.drive_charts import CameraOverTime, over_time_chart
-from p2gs_jax.report.page import Section, figure, folded, listed, paragraph, table
-from p2gs_jax.report.photometry_sections import (
+from p2gs_jax.report.formation_sections import (
     responses_section,
     vignetting_section,
     white_balance_section,
 )
+from p2gs_jax.report.page import Section, figure, folded, listed, paragraph, table
 from p2gs_jax.report.run_files import RunFiles
 from p2gs_jax.report.scene_measurements import SceneMeasurements, true_stops
 from p2gs_jax.report.svg import FIRST, INK, SECOND

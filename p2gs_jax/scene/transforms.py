@@ -32,8 +32,8 @@ from p2gs_jax.scene.files import (
 )
 from p2gs_jax.scene.geometry import intrinsics, make_distortion, scale_intrinsics
 from p2gs_jax.scene.point_cloud import read_points
-from p2gs_jax.scene.split_lists import lists_in
 from p2gs_jax.scene.split import split_as_listed
+from p2gs_jax.scene.split_lists import lists_in
 from p2gs_jax.types import Distortion, Scene, Split, View
 
 _PINHOLES = frozenset({"PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"})

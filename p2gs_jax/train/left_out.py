@@ -18,8 +18,7 @@ import numpy as np
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.clock import Stopwatch
-from p2gs_jax.evaluation.passes import ArrayStore, most_bytes
-from p2gs_jax.evaluation.passes import map_in_order
+from p2gs_jax.evaluation.passes import ArrayStore, map_in_order, most_bytes
 from p2gs_jax.evaluation.unexplained import Residuals, Unexplained
 from p2gs_jax.photometry.display import develop, display_of_view
 from p2gs_jax.render.capacity import make_renderer

@@ -94,13 +94,13 @@ def test_errors_that_have_nothing_to_do_with_room_stay_as_they_are(tmp_path):
 
 
 def test_the_command_line_ends_with_the_reason_and_the_path(tmp_path, run_command, monkeypatch):
-    from p2gs_jax.cli.commands import synth
+    from p2gs_jax.cli.experiments import Synth
 
     def run(options):
         with room_for(100):
             write_text(tmp_path / "out.json", json.dumps(list(range(999))))
 
-    monkeypatch.setattr(synth, "run", run)
+    monkeypatch.setattr(Synth, "execute", run)
     code, text = run_command("synth", tmp_path / "new")
     assert code == 2
     assert f"{tmp_path / 'out.json'}: File too large" in text

@@ -132,12 +132,12 @@ def test_memory_that_runs_out_is_named(tmp_path, run_command, monkeypatch, error
 
 
 def test_other_commands_name_it_too(tmp_path, run_command, monkeypatch):
-    from p2gs_jax.cli.commands import synth
+    from p2gs_jax.cli.experiments import Synth
 
     def run(options):
         raise MemoryError("Unable to allocate 9 TB")
 
-    monkeypatch.setattr(synth, "run", run)
+    monkeypatch.setattr(Synth, "execute", run)
     code, text = run_command("synth", tmp_path / "new")
     assert code == 2
     assert "memory ran out (Unable to allocate 9 TB)" in text

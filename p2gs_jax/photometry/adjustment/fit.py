@@ -7,9 +7,10 @@ from jaxtyping import Float
 
 from p2gs_jax.config import ResponseKind
 from p2gs_jax.photometry.adjustment.errors import uncertainty
-from p2gs_jax.photometry.adjustment.fit import explain, solution_of
+from p2gs_jax.photometry.adjustment.explained import explain
 from p2gs_jax.photometry.adjustment.linear import one_thread
 from p2gs_jax.photometry.adjustment.problem import Problem
+from p2gs_jax.photometry.adjustment.result import solution_of
 from p2gs_jax.photometry.adjustment.robust import Loss
 from p2gs_jax.photometry.adjustment.rows import make_rows
 from p2gs_jax.photometry.adjustment.solve import Fit, solve

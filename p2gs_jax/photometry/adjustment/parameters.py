@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from p2gs_jax.photometry.adjustment.parameters import Features, Splines
+from p2gs_jax.photometry.adjustment.features import Features
+from p2gs_jax.photometry.adjustment.spline import Splines
 
 
 class Parameters(NamedTuple):

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from p2gs_jax.photometry.adjustment.problem import Layout
+from p2gs_jax.photometry.adjustment.rows import Layout
 from p2gs_jax.photometry.observations import Observations
 
 

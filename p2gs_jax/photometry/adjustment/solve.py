@@ -14,12 +14,12 @@ import numpy as np
 from jaxtyping import Float
 
 from p2gs_jax.photometry.adjustment.forward import Forward
+from p2gs_jax.photometry.adjustment.linear import Balanced
 from p2gs_jax.photometry.adjustment.matrices import Matrix
 from p2gs_jax.photometry.adjustment.normal import normal_equations
 from p2gs_jax.photometry.adjustment.parameters import Parameters
 from p2gs_jax.photometry.adjustment.robust import Loss, Weighted, noise_weight, weigh
 from p2gs_jax.photometry.adjustment.rows import Rows
-from p2gs_jax.photometry.adjustment.solve import Balanced
 from p2gs_jax.photometry.adjustment.system import System, with_priors
 
 # Rounds of both losses together are no more than MOST_ROUNDS.

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Float32, Int
 from p2gs_jax.core.numerics import srgb_decode, srgb_encode
 from p2gs_jax.photometry.cameras import places
 from p2gs_jax.photometry.observations import COARSEST, Observations
-from p2gs_jax.photometry.sources.sampling import surroundings
+from p2gs_jax.photometry.sources.surroundings import surroundings
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.scene.visibility import project_points
 from p2gs_jax.types import Scene

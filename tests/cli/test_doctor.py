@@ -10,19 +10,22 @@ import jax.numpy as jnp
 import pytest
 from packaging.requirements import Requirement
 
-from p2gs_jax.cli import main
-from p2gs_jax.cli.commands import doctor
-from p2gs_jax.doctor import cache, features, libraries, machine, render
+from p2gs_jax.cli import doctor, main
+from p2gs_jax.cli.doctor import Doctor
 
 PROJECT = Path(__file__).resolve().parents[2] / "pyproject.toml"
 
 
 def library(name, trouble=None):
-    return libraries.Library(name, "1.0", trouble)
+    return {"name": name, "version": "1.0", "trouble": trouble}
+
+
+def features(libraries, backend):
+    return {f["name"]: f for f in doctor.check_features(libraries, backend)}
 
 
 def test_everything_here_is_well(capsys):
-    assert doctor.diagnose(as_json=True) == 0
+    assert Doctor(json=True).execute() == 0
     found = json.loads(capsys.readouterr().out)
     assert found["healthy"]
     assert found["self_test"]["ok"]
@@ -40,7 +43,7 @@ def test_the_self_test_can_be_skipped(capsys, monkeypatch):
     def never():
         raise AssertionError
 
-    monkeypatch.setattr(render, "self_test", never)
+    monkeypatch.setattr(doctor, "check_render", never)
     with pytest.raises(SystemExit) as stop:
         main(["doctor", "--skip-self-test"])
     assert stop.value.code == 0
@@ -51,23 +54,23 @@ def test_every_dependency_can_be_tried():
     """A dependency whose module is called otherwise must be in MODULES."""
     project = tomllib.loads(PROJECT.read_text())["project"]
     for name in [Requirement(line).name for line in project["dependencies"]]:
-        assert find_spec(libraries.module_of(name)) is not None, name
+        assert find_spec(doctor.module_of(name)) is not None, name
 
 
 def test_without_metadata_the_core_is_tried(monkeypatch):
     def unknown(name):
         raise importlib.metadata.PackageNotFoundError(name)
 
-    monkeypatch.setattr(libraries.importlib.metadata, "requires", unknown)
-    assert {"jax", "jaxlib", "numpy"} <= set(libraries.requirements())
+    monkeypatch.setattr(doctor.importlib.metadata, "requires", unknown)
+    assert {"jax", "jaxlib", "numpy"} <= set(doctor.requirements())
 
 
 def test_a_broken_library_is_said_and_costs_the_exit_code(capsys, monkeypatch, tmp_path):
     (tmp_path / "broken_splats.py").write_text("raise OSError('libsplat.so: no such file')")
     monkeypatch.syspath_prepend(tmp_path)
     wanted = dict.fromkeys(["numpy", "broken_splats", "absent_splats"])
-    monkeypatch.setattr(libraries, "requirements", lambda: wanted)
-    assert doctor.diagnose(as_json=False) == 1
+    monkeypatch.setattr(doctor, "requirements", lambda: wanted)
+    assert Doctor().execute() == 1
     text = " ".join(capsys.readouterr().out.split())
     assert "libsplat.so: no such file" in text
     assert "No module named 'absent_splats'" in text
@@ -77,9 +80,9 @@ def test_a_broken_library_is_said_and_costs_the_exit_code(capsys, monkeypatch, t
 
 def test_an_old_library_is_said(monkeypatch):
     wanted = {"numpy": Requirement("numpy>=999").specifier}
-    monkeypatch.setattr(libraries, "requirements", lambda: wanted)
-    (found,) = libraries.check_libraries()
-    assert found.trouble == "too old: numpy>=999 is needed"
+    monkeypatch.setattr(doctor, "requirements", lambda: wanted)
+    (found,) = doctor.check_libraries()
+    assert found["trouble"] == "too old: numpy>=999 is needed"
 
 
 def test_a_wrong_image_fails_the_self_test(monkeypatch):
@@ -95,9 +98,9 @@ def test_a_wrong_image_fails_the_self_test(monkeypatch):
         )
 
     monkeypatch.setattr(rendering, "render_linear", wrong)
-    found = render.self_test()
-    assert not found.ok
-    assert "image" in found.remark
+    found = doctor.check_render()
+    assert not found["ok"]
+    assert "image" in found["remark"]
 
 
 def test_a_renderer_that_raises_fails_the_self_test(monkeypatch):
@@ -107,43 +110,40 @@ def test_a_renderer_that_raises_fails_the_self_test(monkeypatch):
         raise RuntimeError("XLA said no")
 
     monkeypatch.setattr(rendering, "render_linear", broken)
-    assert "XLA said no" in render.self_test().remark
+    assert "XLA said no" in doctor.check_render()["remark"]
 
 
 def test_features_say_what_to_install(monkeypatch):
-    monkeypatch.setattr(features.importlib.util, "find_spec", lambda name: None)
-    monkeypatch.setattr(features.shutil, "which", lambda name: None)
-    found = {f.name: f for f in features.list_features([library("jax")], "cpu")}
-    assert found["fit, calibrate, render, eval"].ready
-    assert not found["view"].ready
-    assert "p2gs-jax[viewer]" in found["view"].remark
-    assert "Chromium" in found["report --pdf"].remark
-    assert not found["videos (fit x.mp4, render --out x.mp4)"].ready
+    monkeypatch.setattr(doctor.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(doctor.shutil, "which", lambda name: None)
+    found = features([library("jax")], "cpu")
+    assert found["fit, calibrate, render, eval"]["ready"]
+    assert not found["view"]["ready"]
+    assert "p2gs-jax[viewer]" in found["view"]["remark"]
+    assert "Chromium" in found["report --pdf"]["remark"]
+    assert not found["videos (fit x.mp4, render --out x.mp4)"]["ready"]
 
 
 def test_pycolmap_is_only_for_photographs_without_poses():
-    found = {
-        f.name: f
-        for f in features.list_features([library("pycolmap", "no"), library("jax")], "cpu")
-    }
-    assert found["fit, calibrate, render, eval"].ready
-    assert not found["photographs without poses"].ready
+    found = features([library("pycolmap", "no"), library("jax")], "cpu")
+    assert found["fit, calibrate, render, eval"]["ready"]
+    assert not found["photographs without poses"]["ready"]
 
 
 def test_a_gpu_that_jax_does_not_use(monkeypatch):
-    monkeypatch.setattr(features.shutil, "which", lambda name: f"/usr/bin/{name}")
-    remark = {f.name: f.remark for f in features.list_features([], "cpu")}["NVIDIA GPU"]
+    monkeypatch.setattr(doctor.shutil, "which", lambda name: f"/usr/bin/{name}")
+    remark = features([], "cpu")["NVIDIA GPU"]["remark"]
     assert "p2gs-jax[cuda]" in remark
-    assert {f.name: f.ready for f in features.list_features([], "gpu")}["NVIDIA GPU"]
+    assert features([], "gpu")["NVIDIA GPU"]["ready"]
 
 
 def test_cores_of_a_container(tmp_path, monkeypatch):
-    monkeypatch.setattr(machine.memory, "CGROUP", tmp_path)
-    free = machine.cores()
+    monkeypatch.setattr(doctor.memory, "CGROUP", tmp_path)
+    free = doctor.cores()
     (tmp_path / "cpu.max").write_text("100000 100000\n")
-    assert machine.cores() == 1
+    assert doctor.cores() == 1
     (tmp_path / "cpu.max").write_text("max 100000\n")
-    assert machine.cores() == free
+    assert doctor.cores() == free
 
 
 def test_an_unwritable_cache_is_said(monkeypatch, tmp_path):
@@ -152,8 +152,8 @@ def test_an_unwritable_cache_is_said(monkeypatch, tmp_path):
     monkeypatch.setattr(compile_cache, "use_compile_cache", lambda: None)
     monkeypatch.setattr(compile_cache, "cache_folder", lambda: tmp_path)
     (tmp_path / "program").write_bytes(b"x" * 2_000_000)
-    assert cache.inspect_cache().remark.startswith("2 MB of at most")
-    monkeypatch.setattr(cache.os, "access", lambda folder, mode: False)
-    assert "JAX_COMPILATION_CACHE_DIR" in cache.inspect_cache().remark
+    assert doctor.check_cache()["remark"].startswith("2 MB of at most")
+    monkeypatch.setattr(doctor.os, "access", lambda folder, mode: False)
+    assert "JAX_COMPILATION_CACHE_DIR" in doctor.check_cache()["remark"]
     monkeypatch.setattr(compile_cache, "cache_folder", lambda: None)
-    assert "nothing is kept" in cache.inspect_cache().remark
+    assert "nothing is kept" in doctor.check_cache()["remark"]

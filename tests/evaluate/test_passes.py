@@ -1,11 +1,26 @@
-"""Results come in order, few wait, and an error reaches the caller."""
+"""Results come in order, and arrays wait on disk where they would fill the memory."""
 
 import threading
 import time
+from pathlib import Path
 
+import numpy as np
 import pytest
 
-from p2gs_jax.evaluation.passes import MOST_WORKERS, map_in_order
+from p2gs_jax.evaluation.passes import MOST_WORKERS, ArrayStore, map_in_order
+
+
+def test_arrays_beyond_the_bound_lie_on_disk_until_the_end():
+    arrays = [np.random.default_rng(k).normal(size=(50, 3)).astype(np.float32) for k in range(3)]
+    with ArrayStore(most_bytes=arrays[0].nbytes) as store:
+        kept = [store.put(a) for a in arrays]
+        assert store.bytes_held == arrays[0].nbytes
+        assert store.put(kept[1]) is kept[1]
+        files = [k.path for k in kept if k.path is not None]
+        assert len(files) == 2
+        for a, k in zip(arrays, kept, strict=True):
+            assert k.read().tobytes() == a.tobytes()
+    assert not any(Path(f).exists() for f in files)
 
 
 def test_results_keep_their_order_whatever_finishes_first():
