@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 # Folders that do not say whose renders they hold.
 COMMON = re.compile(r"renders|rgb|test|ours_\d+|\.")
 # What only a fit can measure.
-KEPT = ("counts", "seconds", "seconds_per_step", "notes", "photometry", "growth", "exposures", "of")
+KEPT = ("counts", "seconds", "seconds_per_step", "notes", "photometry", "exposures", "of")
 
 
 @dataclass(frozen=True)

@@ -17,10 +17,9 @@ from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.against import score_foreign
 from p2gs_jax.formats.foreign import read_foreign
-from p2gs_jax.gaussians.bake import viewer_config
-from p2gs_jax.gaussians.init.dense_bound import coverage_of
-from p2gs_jax.gaussians.init.seeds import cameras_radius
-from p2gs_jax.gaussians.relit import relit
+from p2gs_jax.gaussians.bake import relit, viewer_config
+from p2gs_jax.gaussians.dense import coverage_of
+from p2gs_jax.gaussians.seeds import cameras_radius
 from p2gs_jax.photometry.calibrate import calibrate_observations, options_of
 from p2gs_jax.photometry.initial import initial_photometry
 from p2gs_jax.photometry.mean import usual_display
@@ -219,7 +218,6 @@ def _prepared(
         extent=cameras_radius(scene.training_views, np.asarray(foreign.means)),
         selection=selection,
         pairs=None,
-        overlaps=None,
         measured=None,
         coverage=coverage_of(scene, store),
         decisions=decisions,

@@ -133,8 +133,8 @@ def _generalisation(run: RunFiles) -> RunWarning | None:
         "New views are worse than training views",
         f"Training photographs are met at {train:.1f} dB, held-out ones at {held_out:.1f} dB, even "
         f"with {solved} fitted to each. Either the held-out views look where few others do, or "
-        "there are too few photographs for this many Gaussians: add photographs, or try "
-        "--gaussians auto.",
+        "there are too few photographs for this many Gaussians: add photographs, or give fewer "
+        "Gaussians with --gaussians.",
     )
 
 

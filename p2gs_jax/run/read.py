@@ -57,7 +57,7 @@ class Run:
         photometry: `photometry.json`, with what `params` does not hold: standard errors, EXIF,
             exposures fitted to held-out photographs.
         owner: the moving object that each Gaussian belongs to, -1: none; None: nothing moves.
-        moving: these objects, with their corrected poses.
+        moving: these objects.
     """
 
     folder: Path

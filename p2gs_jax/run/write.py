@@ -88,7 +88,7 @@ def write_results(
         scene: its views.
         cfg: what the fit computed under.
         owner: the moving object that each Gaussian belongs to, or None.
-        moving: these objects, with their corrected poses.
+        moving: these objects.
         fitted: exposures solved for held-out views, by row.
         unknown: names of photographs that tell no exposure.
         solution: what the fit started from, or None.

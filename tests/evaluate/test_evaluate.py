@@ -1,4 +1,4 @@
-"""Every protocol of an evaluation: LPIPS where there are weights, views that tell nothing, memory."""
+"""Every protocol of an evaluation: LPIPS where there are weights, views that tell nothing."""
 
 import dataclasses
 import json

@@ -41,11 +41,6 @@ def test_photographs_stay_and_the_mean_goes(activation, parameterization):
     assert abs(float(jnp.mean(jnp.log(p.photometry.exposures)))) > 0.3
 
 
-def test_softplus_is_left_alone():
-    p = params("log")
-    assert recentre(p, "softplus") is p
-
-
 @pytest.mark.parametrize("activation", ["exp", "linear"])
 def test_a_common_tint_goes_into_the_radiance(activation):
     p = params("log")

@@ -17,7 +17,7 @@ from p2gs_jax.evaluation.alignment import exposure_error
 from p2gs_jax.formats.foreign import read_foreign
 from p2gs_jax.formats.ply import read_ply, write_ply
 from p2gs_jax.formats.splat import write_splat
-from p2gs_jax.gaussians.relit import relit
+from p2gs_jax.gaussians.bake import relit
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.render.harmonics import C0

@@ -87,7 +87,7 @@ def test_without_a_solution_only_views_learn():
     cfg = with_fields(FitConfig(), asked)
     decided = decide(cfg, None, matched=False)
     assert (decided.white_balance, decided.vignetting) == ("view", None)
-    assert likely(cfg, None, matched=False) == dataclasses.replace(decided, correspondence="depth")
+    assert likely(cfg, None, matched=False) == decided
     by_camera = with_fields(cfg, {"photometry.white_balance": "camera"})
     assert unsolved(Decisions.as_asked(by_camera)).white_balance is None
 

@@ -7,16 +7,22 @@ seeds. Scenes whose views are covered by seeds get none.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from p2gs_jax.config import InitConfig
+from p2gs_jax.config import FitConfig, InitConfig
 from p2gs_jax.core.numerics import fibonacci_sphere
-from p2gs_jax.gaussians.init.seeds import camera_centers
+from p2gs_jax.gaussians.seeds import camera_centers, gaussians_from_points, merge
+from p2gs_jax.photometry.cameras import places
+from p2gs_jax.photometry.formation import inverse_formation
+from p2gs_jax.photometry.sources.sampling import sample
+from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.scene.visibility import in_frame, project_points
-from p2gs_jax.types import View
+from p2gs_jax.types import Gaussians, Photometry, Scene, View
 
 # Each view is cut into cells; a cell with a seed in it or beside it counts as covered.
 CELLS_ACROSS = 16
@@ -27,6 +33,9 @@ EMPTY_IMAGE_FRACTION = 0.04
 # Distance of the shell over that of the far seeds.
 BEHIND_SEEDS = 2.0
 OVERLAP = 0.7
+# Shell colours come from small images: a direction covers many pixels.
+SHELL_SHRINK = 4
+SHELL_OPACITY = 0.5
 
 
 @dataclass(frozen=True)
@@ -57,12 +66,7 @@ class Shell:
 
 @dataclass(frozen=True)
 class Sphere:
-    """Where a shell lies.
-
-    Attributes:
-        middle: scene units.
-        radius: scene units.
-    """
+    """Where a shell lies, scene units."""
 
     middle: Float[np.ndarray, " 3"]
     radius: float
@@ -71,14 +75,7 @@ class Sphere:
 def sphere_behind(
     views: list[View], points: Float[np.ndarray, "p 3"], radius: float, cfg: InitConfig
 ) -> Sphere:
-    """Return where the shell of a scene lies: behind its seeds.
-
-    Args:
-        views: training views.
-        points: seed points.
-        radius: of the cameras, scene units.
-        cfg: radius.
-    """
+    """Return where the shell of a scene lies: behind its seeds, beyond the cameras' radius."""
     middle = camera_centers(views).mean(0)
     radius *= cfg.shell_radius
     if len(points):
@@ -116,14 +113,9 @@ def find_shell(
     cfg: InitConfig,
     sphere: Sphere | None = None,
 ) -> Shell | None:
-    """Return the shell a scene needs, or None.
+    """Return the shell that a scene needs, or None.
 
-    Args:
-        views: training views.
-        points: seed points.
-        radius: of the cameras, scene units.
-        cfg: number of directions, radius, and whether there is a shell.
-        sphere: where it lies; None: behind the points.
+    It lies on `sphere`, or behind the seed points, beyond the cameras' radius.
     """
     if cfg.shell == "off":
         return None
@@ -155,4 +147,56 @@ def find_shell(
         (seen & ~explained)[keep],
         xy[keep],
         empty_fraction,
+    )
+
+
+def black_gaussians(
+    points: np.ndarray, shell: Shell | None, views: Sequence[View], cfg: FitConfig
+) -> Gaussians:
+    """Return Gaussians of points and shell without colours: enough to compile for."""
+    views = list(views)
+    black = gaussians_from_points(points, np.zeros_like(points), views, cfg)
+    if shell is None:
+        return black
+    far = gaussians_from_points(
+        shell.points, np.zeros_like(shell.points), views, cfg, scales=shell.scales
+    )
+    return merge(black, far)
+
+
+def shell_gaussians(
+    shell: Shell,
+    scene: Scene,
+    store: ImageStore,
+    photometry: Photometry,
+    views: Sequence[View],
+    cfg: FitConfig,
+) -> Gaussians:
+    """Return the Gaussians of a shell, coloured by what the photographs show in its directions."""
+    taken: Photometry = jax.tree.map(np.asarray, photometry)
+    total = np.zeros((len(shell.points), 3))
+    weight = np.zeros(len(shell.points))
+    for row, index in enumerate(scene.train_indices):
+        seen = np.flatnonzero(shell.seen[:, row])
+        if not len(seen):
+            continue
+        ldr, mask = store.get(index, SHELL_SHRINK)
+        view = scene.views[index]
+        scale = [mask.shape[1] / view.width, mask.shape[0] / view.height]
+        xy = shell.xy[seen, row] * scale
+        samples = sample(ldr, mask, xy)
+        valid = samples.valid
+        place = places(xy[valid], *mask.shape[::-1])
+        colors = np.asarray(samples.colors[valid], np.float32)
+        total[seen[valid]] += inverse_formation(colors, taken.capture(row), cfg.photometry, place)
+        weight[seen[valid]] += 1
+    seen = weight > 0
+    radiance = total[seen] / weight[seen, None]
+    return gaussians_from_points(
+        shell.points[seen],
+        radiance.astype(np.float32),
+        list(views),
+        cfg,
+        scales=shell.scales[seen],
+        opacity=SHELL_OPACITY,
     )

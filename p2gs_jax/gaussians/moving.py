@@ -1,20 +1,27 @@
-"""Which moving objects get Gaussians of their own, and where these begin: in the box's frame."""
+"""Where Gaussians begin that move: in the frames of boxes, or vibrating at times of their own."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Float, Float32, Int
 from scipy.spatial import KDTree
 
 from p2gs_jax.config import DynamicsConfig, FitConfig
-from p2gs_jax.gaussians.init.seeds import NEIGHBOURS, gaussians_from_points
-from p2gs_jax.scene.drives.moving import MovingObjects, key_times
+from p2gs_jax.core.numerics import on_device
+from p2gs_jax.core.streams import Stream, generator
+from p2gs_jax.gaussians.seeds import NEIGHBOURS, gaussians_from_points, mean_radiance, merge
+from p2gs_jax.render.project import STILL
+from p2gs_jax.scene.drives.moving import MovingObjects, middle_time
 from p2gs_jax.scene.drives.object_masks import outline_of, painted
+from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.scene.rigid import interpolated, inverse
-from p2gs_jax.types import Gaussians, Lidar, Scene, TrackedObject, View
+from p2gs_jax.scene.visibility import project_points, unoccluded
+from p2gs_jax.types import Gaussians, Lidar, Photometry, Scene, TrackedObject, Vibration, View
 
 # A view shows an object from this share of its pixels on.
 LEAST_AREA, AREA_WIDTH = 2e-4, 200
@@ -24,6 +31,8 @@ GROUND = 0.1
 OUTSIDE = 0.1
 WIDEST = 0.3
 VOXEL_GROWTH = 1.3
+# Initial opacity of what may vibrate: most of it is at places that something stands still at.
+OPACITY = 0.1
 
 
 class Nodes(NamedTuple):
@@ -34,7 +43,7 @@ class Nodes(NamedTuple):
         points: in the frame of their box, scene units.
         owner: row of the object in `moving`.
         left: moving objects that get none: their pixels are left out of the fit.
-        notes: what the user should know.
+        notes: for the user.
     """
 
     moving: MovingObjects
@@ -45,12 +54,7 @@ class Nodes(NamedTuple):
 
 
 def find_nodes(scene: Scene, cfg: DynamicsConfig) -> Nodes | None:
-    """Return the seeds of the objects that move in a scene; None where it has none.
-
-    Args:
-        scene: objects, laser points, views.
-        cfg: which objects get any, and how many.
-    """
+    """Return the seeds of the objects that move in a scene; None where it has none."""
     moving = [row for row, thing in enumerate(scene.objects) if thing.moving]
     views = scene.training_views
     if cfg.method != "rigid" or not moving:
@@ -58,7 +62,7 @@ def find_nodes(scene: Scene, cfg: DynamicsConfig) -> Nodes | None:
     if any(view.time is None for view in views):
         left = tuple(scene.objects[row] for row in moving)
         said = "Views have no times: where things that move were is not known; they are masked."
-        return Nodes(_moving((), views), *_nothing(), left, (said,))
+        return Nodes(MovingObjects(()), *_nothing(), left, (said,))
     kept, left, points, filled = [], [], [], 0
     for row in moving:
         thing = scene.objects[row]
@@ -81,7 +85,11 @@ def find_nodes(scene: Scene, cfg: DynamicsConfig) -> Nodes | None:
         + "."
     ]
     return Nodes(
-        _moving(kept, views), np.concatenate([empty, *points]), owner, tuple(left), tuple(notes)
+        MovingObjects(tuple(kept)),
+        np.concatenate([empty, *points]),
+        owner,
+        tuple(left),
+        tuple(notes),
     )
 
 
@@ -90,11 +98,7 @@ def node_gaussians(
 ) -> Gaussians:
     """Return the Gaussians of moving objects, in the frames of their boxes.
 
-    Args:
-        nodes: from `find_nodes`.
-        radiance: of their points, in the gauge of the exposures.
-        views: training views.
-        cfg: everything.
+    `radiance` is that of their points, in the gauge of the exposures.
     """
     scales = np.full(len(nodes.points), WIDEST)
     for row in np.unique(nodes.owner):
@@ -107,13 +111,28 @@ def node_gaussians(
     return gaussians_from_points(nodes.points, radiance, list(views), cfg, scales=scales)
 
 
-def on_surface(size: tuple[float, float, float], count: int) -> Float[np.ndarray, "p 3"]:
-    """Return about `count` points spread evenly over a box, but for its bottom.
+def nodes_radiance(
+    nodes: Nodes, scene: Scene, store: ImageStore, photometry: Photometry, cfg: FitConfig
+) -> Float[np.ndarray, "p 3"]:
+    """Return the mean radiance of points of moving objects, where they were in each view."""
+    still = len(scene.points)
 
-    Args:
-        size: of the box, which is centred at 0.
-        count: how many.
-    """
+    def seen_in(view: View):
+        assert view.time is not None
+        poses, there = nodes.moving.poses(view.time)
+        rows = np.flatnonzero(there[nodes.owner])
+        pose = poses[nodes.owner[rows]]
+        world = np.einsum("nij,nj->ni", pose[:, :3, :3], nodes.points[rows]) + pose[:, :3, 3]
+        xy, z = project_points(np.concatenate([scene.points, world]), view)
+        seen = np.flatnonzero(unoccluded(xy, z, view.width, view.height))
+        seen = seen[seen >= still]
+        return rows[seen - still], xy[seen]
+
+    return mean_radiance(len(nodes.points), seen_in, scene, store, photometry, cfg)
+
+
+def on_surface(size: tuple[float, float, float], count: int) -> Float[np.ndarray, "p 3"]:
+    """Return about `count` points spread evenly over a box about 0, but for its bottom."""
     half = np.asarray(size, float) / 2
     faces = [(axis, sign) for axis in range(3) for sign in (-1, 1) if (axis, sign) != (2, -1)]
     areas = [4 * np.prod(np.delete(half, axis)) for axis, _ in faces]
@@ -129,11 +148,6 @@ def on_surface(size: tuple[float, float, float], count: int) -> Float[np.ndarray
         flat = np.stack(np.meshgrid(*lines, indexing="ij"), -1).reshape(-1, 2)
         found.append(np.insert(flat, axis, sign * half[axis], axis=1))
     return np.concatenate(found)
-
-
-def _moving(objects: Sequence[TrackedObject], views: Sequence[View]) -> MovingObjects:
-    times = [view.time for view in views if view.time is not None] or [0.0]
-    return MovingObjects(tuple(objects), key_times(objects, times))
 
 
 def _nothing() -> tuple[np.ndarray, np.ndarray]:
@@ -175,3 +189,49 @@ def _views_that_show(thing: TrackedObject, views: Sequence[View], cfg: DynamicsC
         if shown >= cfg.least_views:
             break
     return shown
+
+
+def vibrates(scene: Scene, cfg: FitConfig) -> bool:
+    """Return whether Gaussians vibrate: it was asked for, and all views have times."""
+    return cfg.dynamics.method == "vibration" and all(v.time is not None for v in scene.views)
+
+
+def clock_of(scene: Scene) -> MovingObjects:
+    """Return the clock of a scene whose Gaussians vibrate: no objects, but times of views."""
+    return MovingObjects((), middle=middle_time(scene))
+
+
+def with_vibration(gaussians: Gaussians, scene: Scene, cfg: FitConfig) -> Gaussians:
+    """Return Gaussians that stand still, and behind them some that may move.
+
+    These are drawn from the laser points, each at its own time, or from the Gaussians themselves at
+    any time where there are none; they look like the nearest one.
+    """
+    times = np.array([view.time for view in scene.views if view.time is not None])
+    middle, rng = middle_time(scene), generator(cfg.train.seed, Stream.VIBRATING)
+    means, count = np.asarray(gaussians.means), cfg.dynamics.vibrating
+    if scene.lidar is not None and len(scene.lidar.points):
+        known = len(scene.lidar.points)
+        drawn = np.sort(rng.choice(known, min(count, known), replace=False))
+        points, at = scene.lidar.points[drawn], scene.lidar.times[drawn]
+        _, near = KDTree(means).query(points)
+    else:
+        near = rng.integers(0, len(means), count)
+        points, at = means[near], rng.uniform(times.min(), times.max(), count)
+    at = np.clip(at, times.min(), times.max()) - middle
+    faint = np.full(len(at), np.log(OPACITY / (1 - OPACITY)))
+    like = jax.tree.map(lambda a: np.asarray(a)[near], gaussians)
+    moving = dataclasses.replace(
+        like,
+        means=on_device(points),
+        opacity_logits=on_device(faint),
+        vibration=_vibration(at, cfg.dynamics.vibration_life),
+    )
+    still = _vibration(np.zeros(len(means)), STILL)
+    return merge(dataclasses.replace(gaussians, vibration=still), moving)
+
+
+def _vibration(peaks: np.ndarray, life: float) -> Vibration:
+    count = len(peaks)
+    velocities, lives = np.zeros((count, 3)), np.full(count, np.log(life))
+    return Vibration(on_device(velocities), on_device(peaks), on_device(lives))

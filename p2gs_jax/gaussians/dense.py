@@ -8,7 +8,7 @@ four cells together give one, and a cell that shows a seed already gives none.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
@@ -21,12 +21,14 @@ from scipy.spatial.transform import Rotation
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.core.streams import Stream, generator
-from p2gs_jax.gaussians.init.brightness import MatchImages, Tones
-from p2gs_jax.gaussians.init.flow import CHECKS, DepthMap, Flows, depth_map, pixel_centers
-from p2gs_jax.gaussians.init.pairs import neighbours, visibility
+from p2gs_jax.gaussians.flow import CHECKS, DepthMap, Flows, depth_map, pixel_centers
+from p2gs_jax.gaussians.matching import MatchImages, Tones, neighbours, visibility
+from p2gs_jax.gaussians.population import Coverage, default_max_gaussians
+from p2gs_jax.gaussians.seeds import gaussians_from_points, neighbour_scales
 from p2gs_jax.photometry.cameras import places
 from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.types import Scene
+from p2gs_jax.scene.visibility import shown_share
+from p2gs_jax.types import Gaussians, Photometry, Scene, View
 
 # A depth that two neighbours must agree on needs at least three views.
 FEWEST_VIEWS = 3
@@ -48,6 +50,12 @@ SAME_DEPTH = 0.05
 PLAIN = 0.5
 # Bound met within this share, in at most so many attempts.
 SLACK, ATTEMPTS = 0.05, 5
+# Of a time budget at most this share goes into dense seeds, if two idle cores need so long a view.
+DENSE_TIME, DENSE_SECONDS, FEWEST_DENSE_VIEWS = 0.25, 0.6, 8
+# Seeds may take this share of the bound on the population; the rest grows where it is needed.
+DENSE_SHARE = 0.6
+# Scenes with this share of the bound in seeds need no more.
+ENOUGH_SEEDS = 0.5
 
 
 @dataclass(frozen=True)
@@ -133,7 +141,7 @@ def dense_seeds(
         existing: seeds that keep their place.
         limit: most seeds to return.
         most_views: that give seeds, taken evenly; their neighbours may be any.
-        on_view: progress: views done, views in all.
+        on_view: called with views done and views in all.
     """
     rows = scene.train_indices
     if len(rows) < FEWEST_VIEWS or limit < 1 or not len(scene.points):
@@ -209,14 +217,9 @@ def choose_seeds(
     limit: int,
     seed: int,
 ) -> DenseSeeds:
-    """Draw seeds evenly from the candidates of all views, as many as the bound allows.
+    """Draw at most `limit` seeds evenly from the candidates of all views.
 
-    Args:
-        found: candidates of each view.
-        images: their cameras.
-        existing: seeds that keep their place.
-        limit: most seeds to return.
-        seed: of the order of views, and of what is left out.
+    Existing seeds keep their place; `seed` is that of the order of views, and of what is left out.
     """
     rng = generator(seed, Stream.DENSE_SEEDS)
     order = rng.permutation(len(found))
@@ -333,3 +336,112 @@ def _seeds(candidates: Candidates, images: MatchImages, pick, spacing):
         [np.where(flat, 1 / facing, 1), np.ones_like(size), across], 1
     )
     return _world(candidates, images, pick), candidates.radiance[pick], scales, quats
+
+
+def match_photographs(
+    scene: Scene,
+    store: ImageStore,
+    match: Tones,
+    points: np.ndarray,
+    photometry: Photometry,
+    cfg: FitConfig,
+    *,
+    limit: int,
+    on_view: Callable[[int, int], None],
+) -> DenseSeeds:
+    """Find at most `limit` dense seeds, with radiances in the gauge of the starting exposures.
+
+    `match` brings photographs to one brightness for matching; `points` are seeds that are there
+    already.
+    """
+    most_views, budget = MOST_VIEWS, cfg.train.budget_s
+    if budget is not None:
+        affordable = int(DENSE_TIME * budget / DENSE_SECONDS)
+        most_views = min(most_views, max(affordable, FEWEST_DENSE_VIEWS))
+    tones = Tones.of(photometry, cfg.photometry)
+    return dense_seeds(
+        scene,
+        store,
+        match,
+        tones,
+        cfg,
+        existing=points,
+        limit=limit,
+        most_views=most_views,
+        on_view=on_view,
+    )
+
+
+def gaussians_of(
+    points: np.ndarray,
+    radiance: np.ndarray,
+    dense: DenseSeeds | None,
+    views: Sequence[View],
+    cfg: FitConfig,
+) -> Gaussians:
+    """Return Gaussians of the scene's points and of dense seeds, the former first.
+
+    A point that has dense seeds around it is as small as they are near. `radiance` is that of the
+    points, in the gauge of the exposures.
+    """
+    views = list(views)
+    if dense is None:
+        return gaussians_from_points(points, radiance, views, cfg)
+    everything = np.concatenate([points, dense.points])
+    count = len(points)
+    scales = np.repeat(neighbour_scales(everything, views)[:, None], 3, 1)
+    scales[count:] = dense.scales
+    opacity = np.full(len(everything), cfg.init.opacity)
+    opacity[count:] = cfg.init.dense_opacity
+    quats = np.tile(np.eye(1, 4), (len(everything), 1))
+    quats[count:] = dense.quats
+    return gaussians_from_points(
+        everything,
+        np.concatenate([radiance, dense.radiance]),
+        views,
+        cfg,
+        scales=scales,
+        opacity=opacity,
+        quats=quats,
+    )
+
+
+def coverage_of(scene: Scene, store: ImageStore) -> Coverage:
+    """Return how much of a scene its training views show; the largest counts."""
+    sizes = [store.camera(i)[2:] for i in scene.train_indices]
+    return Coverage(max(w * h for w, h in sizes), shown_share(scene.points, scene.training_views))
+
+
+def seed_bound(cfg: FitConfig, seeds: int, coverage: Coverage) -> int:
+    """Return the bound on the population that so many seeds are measured by."""
+    given = cfg.densify.max_gaussians
+    if isinstance(given, int):
+        return given
+    return default_max_gaussians(seeds, coverage, cfg.train)
+
+
+def dense_limit(cfg: FitConfig, seeds: int, coverage: Coverage) -> int:
+    """Return how many dense seeds a fit may start from, beside so many that are there already."""
+    bound = seed_bound(cfg, seeds, coverage)
+    room = bound - seeds
+    wanted = cfg.init.dense_points
+    if wanted is None:
+        wanted = int(DENSE_SHARE * bound) - seeds
+    elif not isinstance(cfg.densify.max_gaussians, int):
+        room = wanted
+    return max(0, min(wanted, room))
+
+
+def wants_dense(scene: Scene, coverage: Coverage, cfg: FitConfig) -> bool:
+    """Return whether the scene gets dense seeds.
+
+    The baselines that splat display values get them as well: a comparison with them is about
+    photometry, so all start from the same surfaces.
+    """
+    if cfg.init.dense == "off" or len(scene.train_indices) < FEWEST_VIEWS:
+        return False
+    seeds = min(len(scene.points), cfg.init.max_seeds)
+    if dense_limit(cfg, seeds, coverage) == 0:
+        return False
+    bound = seed_bound(cfg, seeds, coverage)
+    return cfg.init.dense == "on" or seeds < ENOUGH_SEEDS * bound

@@ -1,4 +1,4 @@
-"""Photographs prepared for matching: radiance and usable pixels; host side."""
+"""Photographs prepared for matching, radiance and usable pixels, and which of them to match."""
 
 from __future__ import annotations
 
@@ -9,14 +9,17 @@ from typing import Any
 import cv2
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from p2gs_jax.config import PhotometryConfig
+from p2gs_jax.core.streams import Stream, generator
+from p2gs_jax.gaussians.seeds import camera_centers
 from p2gs_jax.photometry.formation import darkens, log_vignetting, squared_radii
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import Response, base_log, log_exposed
 from p2gs_jax.photometry.spline_curve import spline_of
 from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.visibility import in_frame, project_points, unoccluded
 from p2gs_jax.types import GAMMA_SRGB, Photometry, Scene
 
 TABLE = 1024
@@ -27,18 +30,24 @@ CACHED = 48
 WHITE_QUANTILE = 0.995
 LARGEST_GAIN = 30.0
 ROUNDS = 30
+# Angles under which a pair sees its points, degrees: below the first the depth is uncertain, above
+# the second flow begins to fail; it is hopeless some `FADE` later.
+NARROW, WIDE, FADE = 4.0, 12.0, 8.0
+# Exposures this far apart (natural logarithm) share few usable tones.
+EXPOSURE_FADE = 1.5
+FEWEST_SHARED = 5
+MOST_POINTS = 20_000
+# Least points in a view for an occlusion test among them.
+FEWEST_HIDING = 1000
 
 
 @dataclass(frozen=True)
 class Tones:
     """How display values of each training view become radiance: L = T^-1(y) / (e W V), in numpy.
 
-    Attributes:
-        log_exposures: natural logarithm.
-        gammas: of the tone curves.
-        formation: base curve, with its splines; cameras; pivot.
-        white_balance: log factors on the channels, or None.
-        cameras: row of each view in `formation.cameras`, or None.
+    Exposures are natural logarithms, white balances log factors on the channels; `formation` has
+    the base curve with its splines, cameras and pivot; `cameras` is the row of each view in
+    `formation.cameras`.
     """
 
     log_exposures: Float[np.ndarray, " v"]
@@ -49,12 +58,7 @@ class Tones:
 
     @classmethod
     def of(cls, photometry: Photometry, formation: PhotometryConfig) -> Tones:
-        """Return the tones of a fit.
-
-        Args:
-            photometry: of the training views.
-            formation: tone curve and cameras.
-        """
+        """Return the tones of a fit."""
         taken: Any = jax.tree.map(np.asarray, photometry)
         return cls(taken.log_exposures, taken.gammas, formation, taken.white_balance, taken.cameras)
 
@@ -64,12 +68,9 @@ class Tones:
         ldr: Float32[np.ndarray, "... 3"],
         positions: Float[np.ndarray, "... 2"] | None = None,
     ) -> Float32[np.ndarray, "... 3"]:
-        """Return log radiance of display values of a training view.
+        """Return log radiance of an image of a training view, or of loose pixels of one.
 
-        Args:
-            row: of the view.
-            ldr: an image, or loose pixels of one.
-            positions: of loose pixels, where vignetting counts (photometry/cameras.py:places).
+        Loose pixels have `positions` where vignetting counts (photometry/cameras.py:places).
         """
         camera = None if self.cameras is None else self.cameras[row]
         y = np.linspace(0.0, 1.0, TABLE)
@@ -104,11 +105,7 @@ def rough_tones(tracks: Observations | None, count: int) -> Tones:
     """Return tones good enough to compare photographs where no exposures were solved.
 
     One factor per view under sRGB's curve: residuals of log radiance against each point's mean,
-    averaged by turns.
-
-    Args:
-        tracks: colours of shared points, or None: all factors 1.
-        count: training views.
+    averaged by turns. Without tracks of points, all factors are 1.
     """
     log_exposures, gammas = np.zeros(count), np.full(count, GAMMA_SRGB)
     if tracks is None or not len(tracks.points):
@@ -128,15 +125,10 @@ def rough_tones(tracks: Observations | None, count: int) -> Tones:
 
 @dataclass(frozen=True)
 class MatchImage:
-    """A training view prepared for matching.
+    """A training view prepared for matching, at a reduced size.
 
-    Attributes:
-        ldr: photograph.
-        luminance: linear radiance.
-        usable: neither masked, nor clipped, nor black.
-        viewmat: world-to-camera.
-        K: intrinsics at this size.
-        log_exposure: natural logarithm.
+    `luminance` is linear radiance; `usable` pixels are neither masked, nor clipped, nor black;
+    `log_exposure` is natural.
     """
 
     ldr: Float32[np.ndarray, "h w 3"]
@@ -151,13 +143,8 @@ class MatchImage:
 class MatchImages:
     """The training views of a scene, loaded when asked for; from any thread.
 
-    Attributes:
-        scene: its training views.
-        store: photographs.
-        tones: how they are compared.
-        longest: longest side, pixels.
-        black: display values up to here are not used.
-        saturation: display values from here on are clipped.
+    Their longest side has `longest` pixels; display values up to `black` and from `saturation` on
+    are not used.
     """
 
     scene: Scene
@@ -211,3 +198,58 @@ def at_common_exposure(
         for f in (a, b)
     )
     return first.astype(np.uint8), second.astype(np.uint8)
+
+
+def visibility(scene: Scene, seed: int) -> Bool[np.ndarray, "v p"]:
+    """Return which training view sees which point: by tracks, else by projection."""
+    rows = scene.train_indices
+    seen = np.zeros((len(rows), len(scene.points)), bool)
+    if scene.tracks is not None and len(scene.tracks.xy):
+        row_of = np.full(len(scene.views), -1)
+        row_of[list(rows)] = np.arange(len(rows))
+        view = row_of[scene.tracks.view_indices]
+        seen[view[view >= 0], scene.tracks.point_indices[view >= 0]] = True
+        return seen
+    for row, index in enumerate(rows):
+        view = scene.views[index]
+        xy, z = project_points(scene.points, view)
+        seen[row] = in_frame(xy, z, view.width, view.height)
+        if seen[row].sum() >= FEWEST_HIDING:
+            seen[row] = unoccluded(xy, z, view.width, view.height)
+    if len(scene.points) > MOST_POINTS:
+        rng = generator(seed, Stream.SHARED_POINTS)
+        seen[:, rng.permutation(len(scene.points))[MOST_POINTS:]] = False
+    return seen
+
+
+def neighbours(
+    scene: Scene,
+    seen: Bool[np.ndarray, "v p"],
+    log_exposures: Float[np.ndarray, " v"],
+    count: int,
+) -> list[Int[np.ndarray, " k"]]:
+    """Return for every training view the rows of the `count` views to match it with, best first.
+
+    `seen` says which view sees which point.
+    """
+    views = [scene.views[i] for i in scene.train_indices]
+    centers = camera_centers(views)
+    score = np.zeros((len(views), len(views)))
+    shared = seen.astype(np.float32) @ seen.T.astype(np.float32)
+    for i in range(len(views)):
+        to_i = scene.points[seen[i]] - centers[i]
+        to_i /= np.maximum(np.linalg.norm(to_i, axis=1, keepdims=True), 1e-12)
+        for j in np.flatnonzero(shared[i] >= FEWEST_SHARED):
+            if i == j:
+                continue
+            both = seen[j][seen[i]]
+            to_j = scene.points[seen[i]][both] - centers[j]
+            to_j /= np.maximum(np.linalg.norm(to_j, axis=1, keepdims=True), 1e-12)
+            cosine = np.clip((to_i[both] * to_j).sum(1), -1, 1)
+            angle = float(np.degrees(np.median(np.arccos(cosine))))
+            fade = max(angle - WIDE, 0.0) / FADE
+            score[i, j] = shared[i, j] * min(angle / NARROW, 1.0) * np.exp(-(fade**2))
+    apart = np.abs(log_exposures[:, None] - log_exposures[None]) / EXPOSURE_FADE
+    score *= np.exp(-(apart**2))
+    best = np.argsort(-score, axis=1, kind="stable")[:, :count]
+    return [b[score[i, b] > 0] for i, b in enumerate(best)]

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from scipy.spatial import KDTree
 
-from p2gs_jax.gaussians.init.brightness import MatchImage, MatchImages, at_common_exposure
+from p2gs_jax.gaussians.matching import MatchImage, MatchImages, at_common_exposure
 
 # Pixels, at the size that is matched.
 FORWARD_BACKWARD = 1.0
@@ -161,10 +161,7 @@ class _Pair(NamedTuple):
 class Flows:
     """Flows between training views, computed when asked for; from any thread.
 
-    Attributes:
-        images: the views.
-        points: that start the flow, scene units.
-        seen: which training view sees which.
+    `points` start the flow; `seen` says which training view sees which.
     """
 
     images: MatchImages
@@ -227,13 +224,7 @@ def _match(flows: Flows, i: int, j: int) -> _Pair:
 
 
 def depth_map(flows: Flows, row: int, near: Sequence[int]) -> DepthMap:
-    """Return the depth of a view, where at least two of its neighbours agree on it.
-
-    Args:
-        flows: between the views.
-        row: the view.
-        near: its neighbours.
-    """
+    """Return the depth of a view, where at least two of its neighbours `near` agree on it."""
     pairs = [_match(flows, row, int(j)) for j in near]
     inverse = np.stack([p.inverse for p in pairs])
     precision = np.stack([p.precision for p in pairs])
@@ -276,11 +267,7 @@ def _fuse(inverse, precision):
 
 
 def plane_fit(inverse: Float[np.ndarray, "h w"], valid: Bool[np.ndarray, "h w"]):
-    """Fit a plane to the depths about every pixel; inverse depth is linear in pixels on a plane.
-
-    Args:
-        inverse: 1 / z.
-        valid: which to fit.
+    """Fit a plane to the valid inverse depths about every pixel; planes are linear in them.
 
     Returns:
         Inverse depth of the plane at the pixel, its slope per pixel [h w 2], whether the window

@@ -1,17 +1,25 @@
-"""Seed points with linearised colours become Gaussians."""
+"""Seed points become Gaussians, with the radiance that photographs show at them."""
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable
+
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
 from p2gs_jax.config import FitConfig
-from p2gs_jax.core.numerics import on_device
+from p2gs_jax.core.numerics import on_device, srgb_encode
 from p2gs_jax.core.streams import Stream, generator
+from p2gs_jax.photometry.cameras import places
+from p2gs_jax.photometry.formation import inverse_formation
+from p2gs_jax.photometry.sources.sampling import sample
 from p2gs_jax.render.harmonics import C0, coefficient_count, radiance_preactivation
-from p2gs_jax.types import Gaussians, View
+from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.visibility import project_points, unoccluded
+from p2gs_jax.types import Gaussians, Photometry, Scene, View
 
 NEIGHBOURS = 3
 # 3DGS: the radius of the camera centres, with ten percent to spare.
@@ -19,10 +27,15 @@ EXTENT_MARGIN = 1.1
 MIN_RADIANCE = 1e-3
 # No seed starts wider than this fraction of its distance from the nearest camera.
 MAX_ANGLE = 0.05
+# Values that say nothing of the radiance count only where there are no others.
+LEAST_WEIGHT = 1e-3
+
+# From a view to the points that it shows, and where, pixels at its full size.
+SeenIn = Callable[[View], tuple[Int[np.ndarray, " s"], Float[np.ndarray, "s 2"]]]
 
 
 def camera_centers(views: tuple[View, ...] | list[View]) -> Float[np.ndarray, "v 3"]:
-    """Return camera centres in world coordinates."""
+    """Return camera centres in world coordinates, in the precision of the view matrices."""
     return np.stack([-v.viewmat[:3, :3].T @ v.viewmat[:3, 3] for v in views])
 
 
@@ -106,3 +119,60 @@ def gaussians_from_points(
 def merge(a: Gaussians, b: Gaussians) -> Gaussians:
     """Return both sets of Gaussians, `a` first."""
     return jax.tree.map(lambda x, y: on_device(np.concatenate([x, y])), a, b)
+
+
+def photographed_radiance(
+    scene: Scene, store: ImageStore, photometry: Photometry, cfg: FitConfig
+) -> Float[np.ndarray, "p 3"]:
+    """Return the mean radiance at the scene's points in the training photographs that see them.
+
+    It is in the gauge of the exposures that the fit starts from. Points that no photograph sees get
+    the median of all others.
+    """
+
+    def seen_in(view: View):
+        xy, z = project_points(scene.points, view)
+        seen = np.flatnonzero(unoccluded(xy, z, view.width, view.height))
+        return seen, xy[seen]
+
+    return mean_radiance(len(scene.points), seen_in, scene, store, photometry, cfg)
+
+
+def mean_radiance(
+    count: int,
+    seen_in: SeenIn,
+    scene: Scene,
+    store: ImageStore,
+    photometry: Photometry,
+    cfg: FitConfig,
+) -> Float[np.ndarray, "p 3"]:
+    """Return the mean radiance of so many points in the training photographs that see them."""
+    taken: Photometry = jax.tree.map(np.asarray, photometry)
+    total, weight = np.zeros((count, 3)), np.zeros((count, 3))
+    for row, index in enumerate(scene.train_indices):
+        view = scene.views[index]
+        seen, xy = seen_in(view)
+        if not len(seen):
+            continue
+        ldr, mask = store.get(index, 1)
+        xy = xy * [mask.shape[1] / view.width, mask.shape[0] / view.height]
+        samples = sample(ldr, mask, xy)
+        valid = samples.valid
+        colors, at = np.asarray(samples.colors[valid], np.float32), seen[valid]
+        place = places(xy[valid], *mask.shape[::-1])
+        found = inverse_formation(colors, taken.capture(row), cfg.photometry, place)
+        says = (colors > cfg.loss.black) & (colors < cfg.loss.saturation)
+        share = np.where(says, 1.0, LEAST_WEIGHT)
+        total[at] += share * found
+        weight[at] += share
+    known = weight.min(1) > 0
+    radiance = total / np.maximum(weight, LEAST_WEIGHT / 2)
+    if known.any():
+        radiance[~known] = np.median(radiance[known], axis=0)
+    return radiance.astype(np.float32)
+
+
+def with_colors(scene: Scene, radiance: Float[np.ndarray, "p 3"]) -> Scene:
+    """Return the scene with its points coloured, as sRGB of radiance at exposure 1."""
+    shown = np.asarray(srgb_encode(np.clip(radiance, 0, 1)))
+    return dataclasses.replace(scene, point_colors=np.rint(255 * shown).astype(np.uint8))
