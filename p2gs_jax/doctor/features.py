@@ -73,7 +73,7 @@ def _optional(name: str, module: str, fix: str, broken: Sequence[str]) -> Featur
 
 def _browser() -> Feature:
     try:
-        from p2gs_jax.report.pdf import find_browser
+        from p2gs_jax.report.page import find_browser
 
         return Feature("report --pdf", True, find_browser())
     except Exception:  # there is none, or a library is broken, which is said elsewhere

@@ -7,8 +7,7 @@ from rich.text import Text
 
 from p2gs_jax.cli.commands.console import stdout
 from p2gs_jax.cli.options.pages import Compare
-from p2gs_jax.report.compare import TableRow, apart, compare_runs
-from p2gs_jax.report.compare_page import write_comparison
+from p2gs_jax.report.compare import TableRow, apart, compare_runs, write_comparison
 
 
 def run(options: Compare) -> int:

@@ -7,7 +7,7 @@ from rich.text import Text
 from p2gs_jax.cli.commands.console import stdout
 from p2gs_jax.cli.options.pages import Report
 from p2gs_jax.core.progress import TerminalReporter
-from p2gs_jax.report.pdf import find_browser, print_pdf
+from p2gs_jax.report.page import find_browser, print_pdf
 from p2gs_jax.report.report import write_report
 from p2gs_jax.report.run_files import read_run
 

@@ -12,8 +12,8 @@ from p2gs_jax.config import FitConfig, to_dict
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.progress import Silent
 from p2gs_jax.formats.ply import write_radiance
+from p2gs_jax.report.measurements import measure_scene
 from p2gs_jax.report.run_files import read_run
-from p2gs_jax.report.scene_measurements import measure_scene
 from p2gs_jax.run.photometry_file import write_photometry
 from p2gs_jax.types import Gaussians
 
