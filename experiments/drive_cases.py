@@ -1,12 +1,14 @@
 """Synthetic drives by what their cameras do to the light, and what should be found in each.
 
-Every case is 60 views by three cameras, 8 bits, 8 % outliers (`p2gs_jax/synth/drive.py`).
+Every case is 60 views by three cameras, 8 bits, 8 % outliers (`tests/synthetic_drive.py`).
 """
 
 from __future__ import annotations
 
 import itertools
+import sys
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -15,9 +17,20 @@ from jaxtyping import Float
 from p2gs_jax.config import Level, ResponseKind, VignettingKind
 from p2gs_jax.photometry.models import ModelName
 from p2gs_jax.photometry.observations import Observations
-from p2gs_jax.synth.drive import CAMERA_NAMES, Exposures, make_drive, make_exposures, observe
-from p2gs_jax.synth.drive_optics import Curves, Tints, make_white_balance
 from p2gs_jax.synth.settings import Curve
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+from synthetic_drive import (
+    CAMERA_NAMES,
+    Curves,
+    Exposures,
+    Tints,
+    make_drive,
+    make_exposures,
+    make_white_balance,
+    observe,
+)
 
 PIVOT = 0.18
 FRAMES, POINTS = 20, 1200

@@ -22,3 +22,18 @@ class UserError(Exception):
 
 class DivergenceError(UserError):
     """A loss or a gradient stopped being finite; names the step, the term and the checkpoint."""
+
+
+def broken(
+    source: object,
+    why: object,
+    fix: str = "get the file again: it is damaged or of another version",
+) -> UserError:
+    """Return the error for a file that does not hold what it should.
+
+    Args:
+        source: the file.
+        why: what is wrong, in words that follow the file's name.
+        fix: the remedy.
+    """
+    return UserError(f"{source} {why}", fix=fix)

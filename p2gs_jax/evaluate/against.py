@@ -23,8 +23,7 @@ from p2gs_jax.evaluate.moving import still_mask
 from p2gs_jax.evaluate.parallel import map_in_order
 from p2gs_jax.evaluate.renders_of_others import OtherRenders, in_order, orders
 from p2gs_jax.evaluate.view_scores import Collector, view_scores
-from p2gs_jax.photometry.display import DisplayTransform
-from p2gs_jax.photometry.mean import mean_parameters, usual_display
+from p2gs_jax.photometry.display import DisplayTransform, mean_parameters, usual_display
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Params, Scene
 

@@ -35,12 +35,19 @@ from p2gs_jax.evaluate.radiance import RadianceScores, Truth
 from p2gs_jax.evaluate.unexplained import Unexplained
 from p2gs_jax.evaluate.untold import Untold
 from p2gs_jax.evaluate.view_scores import Collector, view_scores
-from p2gs_jax.photometry.display import DisplayTransform, develop, display_of_view, with_capture
+from p2gs_jax.photometry.display import (
+    DisplayTransform,
+    MeanParameters,
+    develop,
+    display_of_view,
+    mean_parameters,
+    usual_display,
+    with_capture,
+)
 from p2gs_jax.photometry.formation import exposed_at
-from p2gs_jax.photometry.mean import MeanParameters, mean_parameters, usual_display
 from p2gs_jax.photometry.metering import Metering, Readings, meter
 from p2gs_jax.photometry.models import MODELS
-from p2gs_jax.render.host import RenderView
+from p2gs_jax.render.capacity import RenderView
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Params, Scene

@@ -11,7 +11,7 @@ from jaxtyping import Float32
 from p2gs_jax.evaluate.alignment import with_fitted_exposure
 from p2gs_jax.evaluate.renders_of_others import Rendered
 from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
-from p2gs_jax.photometry.matte import LEAST
+from p2gs_jax.photometry.formation import LEAST_ALPHA
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.scene.pixels.decode import floats
 
@@ -65,7 +65,7 @@ def light_of(rendered: Rendered, shown: DisplayTransform, store: ImageStore, row
     if found is None:
         return Light(undevelop(pixels, shown), shown, pixels, None)
     alpha, backdrop = floats(found), np.asarray(store.backdrop, np.float32)
-    covered, free = (np.maximum(a, LEAST)[..., None] for a in (alpha, 1 - alpha))
+    covered, free = (np.maximum(a, LEAST_ALPHA)[..., None] for a in (alpha, 1 - alpha))
     own = np.clip((pixels - (1 - alpha[..., None]) * backdrop) / covered, 0, 1)
     behind = (pixels - alpha[..., None] * own) / free
     shown = replace(shown, backdrop=behind)

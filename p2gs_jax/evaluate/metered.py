@@ -84,7 +84,7 @@ class MeteredViews:
             return {}
 
         def judged(view: _Kept) -> dict[str, float]:
-            exposure = float(np.exp(metering.log_exposure(view.readings)))
+            exposure = metering.exposure(view.readings)
             given = (view.linear.read(), exposure, view.photograph.read(), view.mask.read())
             alpha = None if view.alpha is None else view.alpha.read()
             return {**score(view.name, *given, alpha), "exposure": exposure}

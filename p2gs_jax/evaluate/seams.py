@@ -26,11 +26,10 @@ from scipy.sparse import csr_array
 
 from p2gs_jax.config import LossConfig
 from p2gs_jax.core.numerics import evenly_spaced
-from p2gs_jax.photometry.cameras import places
 from p2gs_jax.photometry.display import DisplayTransform, develop
-from p2gs_jax.photometry.formation import inverse_formation, inverse_tone_map
+from p2gs_jax.photometry.formation import inverse_formation, inverse_tone_map, places
 from p2gs_jax.render.warp import sample_bilinear, warp
-from p2gs_jax.scene.moments import moment_of
+from p2gs_jax.scene.rigid import moment_of
 from p2gs_jax.scene.visibility import project_points, unoccluded
 from p2gs_jax.types import Camera, Scene
 

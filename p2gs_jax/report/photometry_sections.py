@@ -9,8 +9,7 @@ import numpy as np
 
 from p2gs_jax.config import PhotometryConfig, camera_formations
 from p2gs_jax.errors import UserError
-from p2gs_jax.photometry.cameras import corner, log_vignetting
-from p2gs_jax.photometry.formation import inverse_tone_map
+from p2gs_jax.photometry.formation import corner, inverse_tone_map, log_vignetting
 from p2gs_jax.photometry.models import MODELS
 from p2gs_jax.report import charts, findings
 from p2gs_jax.report.charts import Series, Style
@@ -18,8 +17,7 @@ from p2gs_jax.report.findings import against_exif, column, reasons
 from p2gs_jax.report.page import figure, folded, listed, paragraph, table
 from p2gs_jax.report.run_files import RunFiles
 from p2gs_jax.report.svg import FIRST, FOURTH, INK, MUTED, SECOND, THIRD
-from p2gs_jax.run.photometry_file import CameraPhotometry, ViewPhotometry
-from p2gs_jax.run.read import resolved
+from p2gs_jax.run.photometry_files import CameraPhotometry, ViewPhotometry, with_curve_of
 from p2gs_jax.run.scene_file import read_times
 from p2gs_jax.scene.drives.choose import short_name
 from p2gs_jax.types import GAMMA_SRGB
@@ -297,7 +295,7 @@ def response_section(run: RunFiles) -> str:
         return ""
     try:
         cfg = PhotometryConfig() if run.cfg is None else run.cfg.photometry
-        cfg = resolved(cfg, run.photometry)
+        cfg = with_curve_of(cfg, run.photometry)
     except UserError as error:
         return paragraph(error.message)
     gammas = [v["gamma"] for v in run.train if v["gamma"] is not None] or [GAMMA_SRGB]

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 
 from p2gs_jax.config import FitConfig, from_dict
 from p2gs_jax.core.atomic import read_jsonl
-from p2gs_jax.core.json_text import parse_json
+from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
-from p2gs_jax.run.photometry_file import PhotometryFile, ViewPhotometry, read_photometry
-from p2gs_jax.run.places import find
+from p2gs_jax.run.folder import find
+from p2gs_jax.run.photometry_files import PhotometryFile, ViewPhotometry, read_photometry
 
 
 class HeldOutFiles(NamedTuple):

@@ -17,7 +17,7 @@ from p2gs_jax.report.findings import column, duration, seconds_of
 from p2gs_jax.report.page import figure, folded, paragraph, row, table, text
 from p2gs_jax.report.pictures import jpeg, read_png
 from p2gs_jax.report.run_files import RunFiles, number_at, part_at
-from p2gs_jax.run.layout import RunFolder
+from p2gs_jax.run.folder import RunFolder
 
 MOST_TERMS = 3
 SCORES = {"psnr": 2, "ssim": 4, "lpips": 4}

@@ -1,4 +1,4 @@
-"""Writes a drive as a scene folder: photographs, their truth, a COLMAP model, KITTI's files.
+"""Writes a drive as a scene folder: photographs, their truth, a COLMAP model.
 
     images/<camera>/<frame>.png      eight-bit photographs at the drawn ISO
     reference/<camera>/<frame>.png   the same views at ISO 8, without gains, vignetting and noise
@@ -6,7 +6,6 @@
     truth/sky_masks/<camera>/<frame>.png   255 where the pixel's centre sees the sky
     truth/exposures.csv              how every photograph was taken, see `exposures`
     sparse/0/*.bin                   PINHOLE cameras, poses, seed points with tracks
-    calib.txt, poses.txt, lidar_poses.txt, velodyne/<frame>.bin   see `kitti_files`
     dataset.json                     every parameter
 
 Everything but `reference/` and `truth/` is for a fit to see. The folder appears whole or not at
@@ -32,8 +31,6 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.synth.build_town import build_town
 from p2gs_jax.synth.colmap_files import DriveViews, write_colmap
 from p2gs_jax.synth.exposures import write_true_exposures
-from p2gs_jax.synth.kitti_files import write_calibration, write_poses, write_scan
-from p2gs_jax.synth.lidar import Lidar, Scanner
 from p2gs_jax.synth.rig import MOUNTS, camera_viewmat, drive, intrinsics
 from p2gs_jax.synth.seed_points import observe_seeds, sample_seeds
 from p2gs_jax.synth.sensor import ISO_REFERENCE, draw_shots, photograph
@@ -100,7 +97,6 @@ def write_street(
     hold_out: int = 8,
     sensor: Sensor | None = None,
     layout: Layout = "street",
-    lidar: bool = False,
     report: Callable[[str], None] | None = None,
 ) -> StreetTruth:
     """Render a drive along the procedural street and write it as a scene folder.
@@ -119,7 +115,6 @@ def write_street(
         sensor: what the cameras do to the light.
         layout: `town` adds an underpass and draws the sun's place from the seed; `long` is as many
             streets one behind another as the drive is long.
-        lidar: write KITTI's files with a scan for every frame.
         report: receives a line of progress now and then.
 
     Raises:
@@ -170,9 +165,6 @@ def write_street(
         views = DriveViews(names, cameras, viewmats, K, width, height)
         write_colmap(temporary / "sparse" / "0", views, xyz, rgb, xy, seen)
         write_true_exposures(temporary, names, cameras, shots)
-        if lidar:
-            say(f"scanning {frames} frames")
-            _write_kitti(temporary, town, track, viewmats.reshape(len(MOUNTS), frames, 4, 4), K)
         card = {
             "format": FORMAT,
             "seed": seed,
@@ -193,7 +185,6 @@ def write_street(
             "observations": int(seen.sum()),
             "solids": town.size,
             "light": asdict(town.light),
-            "lidar": asdict(Lidar()) if lidar else None,
         }
         (temporary / "dataset.json").write_text(json.dumps(card, indent=2) + "\n")
         _require_free(out)
@@ -285,16 +276,3 @@ def _write_view(
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with OpenEXR.File(header, channels | {"Z": depth.astype(np.float32)}) as file:
         file.write(str(path))
-
-
-def _write_kitti(root: Path, town: Town, track: np.ndarray, viewmats: np.ndarray, K) -> None:
-    """Write calibration, poses and scans; the world is camera 0 of the first frame."""
-    scanner = Scanner(town)
-    lidar_to_world = np.tile(np.eye(4), (len(track), 1, 1))
-    lidar_to_world[:, :3, 3] = track + np.asarray(scanner.lidar.mount)
-    to_kitti = viewmats[0, 0]
-    write_calibration(root / "calib.txt", K, [v[0] @ lidar_to_world[0] for v in viewmats])
-    write_poses(root / "poses.txt", to_kitti @ np.linalg.inv(viewmats[0]))
-    write_poses(root / "lidar_poses.txt", to_kitti @ lidar_to_world)
-    for frame, vehicle in enumerate(track):
-        write_scan(root / "velodyne" / f"{frame:06d}.bin", scanner.scan(vehicle))

@@ -10,9 +10,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from p2gs_jax.config import CameraFormation, PhotometryConfig
-from p2gs_jax.photometry.cameras import camera_row, camera_rows, corner, places, squared_radii
 from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
-from p2gs_jax.photometry.formation import expose, formation, inverse_formation, tone_map
+from p2gs_jax.photometry.formation import (
+    camera_row,
+    camera_rows,
+    corner,
+    expose,
+    formation,
+    inverse_formation,
+    places,
+    squared_radii,
+    tone_map,
+)
 from p2gs_jax.photometry.response import KNOTS, Response, log_exposed
 from p2gs_jax.types import Capture, Photometry
 

@@ -2,18 +2,17 @@
 
 import numpy as np
 import pytest
+from synthetic_drive import make_drive, make_exposures, observe
 
 from p2gs_jax.photometry.adjustment import solve
 from p2gs_jax.photometry.adjustment.errors import uncertainty
-from p2gs_jax.photometry.adjustment.explained import explain
-from p2gs_jax.photometry.adjustment.fit import TOLERANCE, fit_model, solve_model
+from p2gs_jax.photometry.adjustment.fit import explain, fit_model, solution_of
 from p2gs_jax.photometry.adjustment.problem import make_problem
-from p2gs_jax.photometry.adjustment.result import solution_of
+from p2gs_jax.photometry.adjustment.solve import TOLERANCE, solve_model
 from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import Response
 from p2gs_jax.photometry.selection import select
-from p2gs_jax.synth.drive import make_drive, make_exposures, observe
 
 LIMITS = {"black": 4 / 255, "saturation": 250 / 255, "pivot": 0.18}
 GROUP, POINTS, SEEN_BY = 20, 800, 6

@@ -6,14 +6,8 @@ import pytest
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.display import DisplayTransform, develop
-from p2gs_jax.photometry.metering import (
-    METERS,
-    adapted,
-    fit_metering,
-    meter,
-    white_level,
-)
-from p2gs_jax.run.metering_file import read_metering, write_metering
+from p2gs_jax.photometry.metering import METERS, adapted, fit_metering, meter, white_level
+from p2gs_jax.run.photometry_files import read_metering, write_metering
 
 RNG = np.random.default_rng(0)
 PICTURE = np.exp2(RNG.normal(-3, 2, (40, 60, 1))) * np.ones(3)
@@ -115,24 +109,20 @@ def test_exposures_along_a_path_adapt_alike_in_both_directions():
     assert np.all(np.diff(smooth) > 0)
     assert np.abs(np.diff(smooth)).max() < 0.2
     np.testing.assert_allclose(adapted(np.full(9, 0.3), 5.0), 0.3)
-    ring = adapted(steps, 5.0, closed=True)
-    assert abs(ring[0] - ring[-1]) < 0.2 < smooth[-1] - smooth[0]
 
 
 def test_the_file_gives_the_metering_back(tmp_path):
     rows = readings(12)
     metering = fit_metering(list("abcdefghijkl"), rows, -column(rows, "average"), 0.9)
     path = tmp_path / "metering.json"
-    assert read_metering(path) is None
     write_metering(path, metering)
     back = read_metering(path)
-    assert back is not None
     assert (back.rule, back.candidates, back.white) == (
         metering.rule,
         metering.candidates,
         metering.white,
     )
-    assert back.typical_log_exposure("log_average") == metering.typical_log_exposure("log_average")
+    assert back.typical_exposure("log_average") == metering.typical_exposure("log_average")
     path.write_text("{}")
     with pytest.raises(UserError, match=r"metering\.json cannot be read"):
         read_metering(path)

@@ -4,11 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from synthetic_drive import make_drive, make_exposures, observe
 
 from p2gs_jax.config import PhotometryConfig
-from p2gs_jax.photometry.adjustment.curve import fit_response
+from p2gs_jax.photometry.adjustment.parameters import Splines
 from p2gs_jax.photometry.adjustment.problem import make_problem
-from p2gs_jax.photometry.adjustment.spline import Splines
+from p2gs_jax.photometry.adjustment.solve import fit_response
 from p2gs_jax.photometry.formation import eotf, inverse_tone_map, tone_map
 from p2gs_jax.photometry.response import (
     FREE,
@@ -23,7 +24,6 @@ from p2gs_jax.photometry.response import (
     spline_count,
     spline_parameters,
 )
-from p2gs_jax.synth.drive import make_drive, make_exposures, observe
 from p2gs_jax.synth.sensor import encode
 
 BENT = Response("srgb", tuple(0.3 * np.sin(3 * KNOTS) - 0.1))

@@ -4,13 +4,12 @@ import dataclasses
 
 import numpy as np
 import pytest
+from synthetic_drive import make_drive, make_exposures, observe
 
 from p2gs_jax.photometry.candidates import Candidate, choose
-from p2gs_jax.photometry.choices import Choice
-from p2gs_jax.photometry.models import Form
+from p2gs_jax.photometry.models import Choice, Form
 from p2gs_jax.photometry.response import Response
 from p2gs_jax.photometry.selection import select
-from p2gs_jax.synth.drive import make_drive, make_exposures, observe
 
 LIMITS = {"black": 4 / 255, "saturation": 250 / 255, "pivot": 0.18}
 DRIVE = make_drive(20, 1200)

@@ -14,7 +14,7 @@ from p2gs_jax.core.progress import Silent
 from p2gs_jax.formats.ply import write_radiance
 from p2gs_jax.report.measurements import measure_scene
 from p2gs_jax.report.run_files import read_run
-from p2gs_jax.run.photometry_file import write_photometry
+from p2gs_jax.run.photometry_files import write_photometry
 from p2gs_jax.types import Gaussians
 
 WIDTH, HEIGHT, FOCAL, WALL = 96, 64, 80.0, 4.0

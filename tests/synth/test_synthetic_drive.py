@@ -2,10 +2,17 @@
 
 import numpy as np
 import pytest
+from synthetic_drive import (
+    encode_by,
+    falloff,
+    make_drive,
+    make_exposures,
+    make_white_balance,
+    observe,
+    smooth_errors,
+)
 
-from p2gs_jax.core.srgb import srgb_decode
-from p2gs_jax.synth.drive import make_drive, make_exposures, observe
-from p2gs_jax.synth.drive_optics import encode_by, falloff, make_white_balance, smooth_errors
+from p2gs_jax.core.numerics import srgb_decode
 from p2gs_jax.synth.sensor import encode
 
 DRIVE = make_drive(8, 400)

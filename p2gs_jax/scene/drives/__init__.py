@@ -12,8 +12,6 @@ from typing import NamedTuple
 
 from p2gs_jax.config import DataConfig, SceneFormat
 from p2gs_jax.scene.drives.argoverse import is_argoverse, read_argoverse
-from p2gs_jax.scene.drives.kitti_360 import is_kitti_360, read_kitti_360
-from p2gs_jax.scene.drives.kitti_odometry import is_kitti_odometry, read_kitti_odometry
 from p2gs_jax.scene.drives.kitti_raw import is_kitti_raw, read_kitti_raw
 from p2gs_jax.scene.drives.nuscenes import is_nuscenes, read_nuscenes
 from p2gs_jax.scene.drives.pandaset import is_pandaset, read_pandaset
@@ -41,8 +39,6 @@ FORMATS: dict[SceneFormat, DriveFormat] = {
     "waymo": DriveFormat(is_waymo, read_waymo),
     "argoverse": DriveFormat(is_argoverse, read_argoverse),
     "kitti_raw": DriveFormat(is_kitti_raw, read_kitti_raw),
-    "kitti_odometry": DriveFormat(is_kitti_odometry, read_kitti_odometry),
-    "kitti_360": DriveFormat(is_kitti_360, read_kitti_360),
 }
 
 

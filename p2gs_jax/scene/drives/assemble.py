@@ -18,9 +18,9 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.scene.drives.choose import chosen_cameras, chosen_frames
 from p2gs_jax.scene.drives.lidar import MOST_MEASURED, owners, seeds, thinned
 from p2gs_jax.scene.drives.own_car import find_own_cars
-from p2gs_jax.scene.drives.poses import inverse
 from p2gs_jax.scene.drives.recording import Photograph, Recording
 from p2gs_jax.scene.files import check_missing, require_plain
+from p2gs_jax.scene.rigid import inverse
 from p2gs_jax.types import Lidar, Scene, TrackedObject, View
 
 # World coordinates further than this from 0 are moved there: float32 has 7 digits.

@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene.drives.poses import interpolated
 from p2gs_jax.scene.drives.recording import SweepPoints
 from p2gs_jax.scene.drives.spin import turned
-from p2gs_jax.scene.drives.tables import finite_numbers, missing_file
+from p2gs_jax.scene.drives.tables import missing_file
+from p2gs_jax.scene.rigid import interpolated
 
 PHOTOGRAPHS = (".png", ".jpg", ".jpeg")
 # Seconds of a turn of the scanner, where no file says when it began and ended.
@@ -60,27 +60,6 @@ def named_matrix(
             f"{path} has no {name} of {wanted} finite numbers", fix="get the calibration again"
         )
     return values.reshape(shape)
-
-
-def read_rows(path: Path, columns: int) -> Float64[np.ndarray, "n columns"]:
-    """Return a table of numbers.
-
-    Raises:
-        UserError: it is missing or empty, or a line does not hold as many finite numbers.
-    """
-    rows = []
-    for number, line in enumerate(_lines(path), 1):
-        if line.strip():
-            row = finite_numbers(line.split(), path, f"line {number}")
-            if len(row) != columns:
-                raise UserError(
-                    f"{path}, line {number}: {len(row)} numbers where {columns} should be",
-                    fix="get the file again; it may be cut off",
-                )
-            rows.append(row)
-    if not rows:
-        raise UserError(f"{path} is empty", fix="get the file again")
-    return np.stack(rows)
 
 
 def read_stamps(path: Path) -> Float64[np.ndarray, " n"]:

@@ -35,10 +35,10 @@ from p2gs_jax.scene.drives.kitti_files import (
 )
 from p2gs_jax.scene.drives.kitti_tracklets import Tracklet, read_tracklets
 from p2gs_jax.scene.drives.objects import tracked
-from p2gs_jax.scene.drives.poses import interpolated, inverse, rigid
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sweep, SweepPoints
 from p2gs_jax.scene.drives.tables import finite_numbers, numbered
 from p2gs_jax.scene.files import image_size
+from p2gs_jax.scene.rigid import interpolated, inverse, rigid
 from p2gs_jax.types import TrackedObject
 
 EARTH_RADIUS_M = 6378137.0

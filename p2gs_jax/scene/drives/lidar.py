@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from scipy.spatial import KDTree
 
-from p2gs_jax.scene.drives.poses import interpolated, inverse
+from p2gs_jax.scene.rigid import interpolated, inverse
 from p2gs_jax.types import Lidar, TrackedObject
 
 # Boxes are drawn tightly and scanners scatter: points this near to a box are in it, metres.

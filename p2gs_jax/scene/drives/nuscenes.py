@@ -28,11 +28,11 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.scene.drives.choose import chosen_drive
 from p2gs_jax.scene.drives.json_rows import Row, read_rows
 from p2gs_jax.scene.drives.objects import Box, tracks
-from p2gs_jax.scene.drives.poses import from_quaternion, inverse
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sweep, SweepPoints
 from p2gs_jax.scene.drives.spin import turned
 from p2gs_jax.scene.drives.tables import finite_numbers
 from p2gs_jax.scene.files import require_inside
+from p2gs_jax.scene.rigid import from_quaternion, inverse
 from p2gs_jax.types import TrackedObject
 
 NUMBER = (int, float)

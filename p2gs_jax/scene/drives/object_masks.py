@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from p2gs_jax.scene.drives.poses import interpolated
+from p2gs_jax.scene.rigid import interpolated
 from p2gs_jax.types import TrackedObject, View
 
 # Boxes are cut off this near to the camera, scene units.

@@ -12,19 +12,11 @@ from jaxtyping import Bool, Float, UInt8
 
 from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.scene.cache import cached_folder
-from p2gs_jax.scene.directions import up_of_drive
-from p2gs_jax.scene.drives.poses import inverse
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera
-from p2gs_jax.scene.drives.unmoving import (
-    FEWEST,
-    WIDTH,
-    cut,
-    expected_motion,
-    often_apart,
-    weigh,
-)
+from p2gs_jax.scene.drives.unmoving import FEWEST, WIDTH, cut, expected_motion, often_apart, weigh
 from p2gs_jax.scene.files import decode_grey, undecodable
 from p2gs_jax.scene.geometry import scale_intrinsics
+from p2gs_jax.scene.rigid import inverse, up_of_drive
 
 # Photographs of a camera that are looked at, spread evenly over its way; fewer say too little.
 MOST_LOOKED_AT, FEWEST_LOOKED_AT = 24, 6

@@ -27,7 +27,6 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.scene.drives.choose import chosen_drive
 from p2gs_jax.scene.drives.objects import tracked
 from p2gs_jax.scene.drives.pickled_tables import read_table
-from p2gs_jax.scene.drives.poses import from_quaternion, inverse
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sweep, SweepPoints
 from p2gs_jax.scene.drives.spin import turned
 from p2gs_jax.scene.drives.tables import (
@@ -39,6 +38,7 @@ from p2gs_jax.scene.drives.tables import (
 )
 from p2gs_jax.scene.files import image_size
 from p2gs_jax.scene.geometry import intrinsics
+from p2gs_jax.scene.rigid import from_quaternion, inverse
 from p2gs_jax.types import TrackedObject
 
 PICKLES = (".pkl.gz", ".pkl")

@@ -33,7 +33,6 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.scene.drives.arrow import ParquetTable
 from p2gs_jax.scene.drives.choose import chosen_drive
 from p2gs_jax.scene.drives.objects import Box, tracks
-from p2gs_jax.scene.drives.poses import LONGEST_BEYOND_S
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera
 from p2gs_jax.scene.drives.spin import turned
 from p2gs_jax.scene.drives.waymo_lidar import (
@@ -45,6 +44,7 @@ from p2gs_jax.scene.drives.waymo_lidar import (
     transform,
 )
 from p2gs_jax.scene.geometry import intrinsics, make_distortion
+from p2gs_jax.scene.rigid import LONGEST_BEYOND_S
 from p2gs_jax.types import TrackedObject
 
 CAMERA = "key.camera_name"

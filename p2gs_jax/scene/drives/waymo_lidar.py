@@ -22,9 +22,9 @@ from jaxtyping import Float, Float64, Int
 
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.drives.arrow import ParquetTable
-from p2gs_jax.scene.drives.poses import rigid
 from p2gs_jax.scene.drives.recording import Sweep, SweepPoints
 from p2gs_jax.scene.drives.spin import turned
+from p2gs_jax.scene.rigid import rigid
 
 STAMP, LASER = "key.frame_timestamp_micros", "key.laser_name"
 # Of the upper scanner: seconds a turn (10 Hz), and where it begins in the car's axes.

@@ -13,8 +13,8 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.scene.drives.assemble import assemble
 from p2gs_jax.scene.drives.choose import chosen_cameras, chosen_frames, short_name
 from p2gs_jax.scene.drives.lidar import owners, seeds
-from p2gs_jax.scene.drives.poses import from_quaternion, interpolated, inverse, rigid
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sweep, SweepPoints
+from p2gs_jax.scene.rigid import from_quaternion, interpolated, inverse, rigid
 from p2gs_jax.scene.split import assign_split
 from p2gs_jax.types import Lidar, TrackedObject
 

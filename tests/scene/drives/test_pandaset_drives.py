@@ -20,7 +20,7 @@ from p2gs_jax.scene.drives import read_drive
 from p2gs_jax.scene.drives.lidar import owners
 from p2gs_jax.scene.drives.pandaset import is_pandaset, read_pandaset
 from p2gs_jax.scene.drives.pickled_tables import read_table
-from p2gs_jax.scene.drives.poses import interpolated
+from p2gs_jax.scene.rigid import interpolated
 
 CFG = DataConfig()
 BEGIN = 1557539956.5

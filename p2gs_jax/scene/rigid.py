@@ -1,0 +1,253 @@
+"""Rigid poses: checked, inverted, interpolated; and a drive's directions from its poses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from jaxtyping import Float, Float64
+from scipy.spatial.transform import Rotation
+
+from p2gs_jax.errors import broken
+from p2gs_jax.types import View
+
+# Singular values of the rotations in driving data sets differ from 1 by rounding only.
+ORTHOGONAL = 1e-3
+# Poses are continued past the ends of their track by at most this, seconds.
+LONGEST_BEYOND_S = 0.15
+# The right-hand axes of cameras must span a plane this well before its normal counts as up.
+PLANE_RATIO = 0.1
+# A direction over less than this is noise, metres.
+SHORTEST_WAY = 0.3
+# Driving directions are taken over this length of the way, where it is so long, metres.
+HEADING_WAY = 2.0
+
+
+def nearest_rotation(
+    matrix: Float[np.ndarray, "3 3"], tolerance: float = 0.01
+) -> Float64[np.ndarray, "3 3"] | None:
+    """Return the rotation nearest to a finite matrix, in the least squares of its elements.
+
+    None: the matrix mirrors, or one of its singular values differs from 1 by more than `tolerance`.
+    """
+    u, sizes, vt = np.linalg.svd(matrix)
+    if np.abs(sizes - 1.0).max() > tolerance or np.linalg.det(matrix) < 0:
+        return None
+    return u @ vt
+
+
+def rigid(
+    rotation: Float[np.ndarray, "3 3"], position: Float[np.ndarray, " 3"], source: Path, what: str
+) -> Float64[np.ndarray, "4 4"]:
+    """Return the matrix of a rotation and a position; rounding is taken out of the rotation.
+
+    Args:
+        rotation: 3x3.
+        position: scene units.
+        source: the file, for messages.
+        what: the thing that has this pose, for messages.
+
+    Raises:
+        UserError: it is not finite, or not a rotation.
+    """
+    rotation, position = np.asarray(rotation, np.float64), np.asarray(position, np.float64)
+    finite = np.isfinite(rotation).all() and np.isfinite(position).all()
+    nearest = nearest_rotation(rotation, ORTHOGONAL) if finite else None
+    if nearest is None:
+        if finite and nearest_rotation(-rotation, ORTHOGONAL) is not None:
+            fix = "write rotations of determinant 1"
+            raise broken(f"{source}:", f"the pose of {what} mirrors", fix)
+        raise broken(f"{source}:", f"the pose of {what} is no rotation and position")
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = nearest, position
+    return out
+
+
+def from_quaternions(
+    wxyz: Float[np.ndarray, "n 4"], positions: Float[np.ndarray, "n 3"], source: Path, what: str
+) -> Float64[np.ndarray, "n 4 4"]:
+    """Return the matrices of quaternions (w x y z) and positions.
+
+    Raises:
+        UserError: a quaternion is not of length 1 within a hundredth, or something is not finite.
+    """
+    wxyz = np.asarray(wxyz, np.float64)
+    bad = ~(np.abs(np.linalg.norm(wxyz, axis=1) - 1) < 1e-2) | ~np.isfinite(positions).all(1)
+    if bad.any():
+        where = f"{what} number {np.argmax(bad) + 1}"
+        raise broken(f"{source}:", f"{where} is no unit quaternion and position")
+    out = np.tile(np.eye(4), (len(wxyz), 1, 1))
+    if len(wxyz):
+        out[:, :3, :3] = Rotation.from_quat(np.roll(wxyz, -1, axis=1)).as_matrix()
+        out[:, :3, 3] = positions
+    return out
+
+
+def from_quaternion(
+    wxyz: Float[np.ndarray, " 4"], position: Float[np.ndarray, " 3"], source: Path, what: str
+) -> Float64[np.ndarray, "4 4"]:
+    """Return the matrix of one quaternion (w x y z) and a position.
+
+    Raises:
+        UserError: the quaternion is not of length 1 within a hundredth, or something is not finite.
+    """
+    wxyz = np.asarray(wxyz, np.float64)
+    if wxyz.shape != (4,) or not abs(np.linalg.norm(wxyz) - 1) < 1e-2:
+        why = f"the pose of {what} has a rotation that is no unit quaternion"
+        raise broken(f"{source}:", why)
+    return rigid(Rotation.from_quat(np.roll(wxyz, -1)).as_matrix(), position, source, what)
+
+
+def inverse(poses: Float64[np.ndarray, "*n 4 4"]) -> Float64[np.ndarray, "*n 4 4"]:
+    """Return the inverses of rigid matrices."""
+    out = np.zeros_like(poses)
+    turned = np.swapaxes(poses[..., :3, :3], -1, -2)
+    out[..., :3, :3] = turned
+    out[..., :3, 3] = -np.einsum("...ij,...j->...i", turned, poses[..., :3, 3])
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def camera_centers(viewmats: Float[np.ndarray, "n 4 4"]) -> Float64[np.ndarray, "n 3"]:
+    """Return the positions of cameras from their world-to-camera matrices, scene units."""
+    viewmats = viewmats.astype(np.float64)
+    return -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
+
+
+def interpolated(
+    times: Float[np.ndarray, " k"],
+    poses: Float64[np.ndarray, "k 4 4"],
+    at: Float[np.ndarray, " n"],
+    beyond_s: float = LONGEST_BEYOND_S,
+) -> tuple[Float64[np.ndarray, "n 4 4"], np.ndarray]:
+    """Return poses at given times, and which of these times the track covers.
+
+    Positions are linear in time, rotations turn evenly. Past an end the motion of the nearest two
+    poses goes on.
+
+    Args:
+        times: seconds, rising.
+        poses: at these times.
+        at: seconds.
+        beyond_s: how far past the ends a time still counts as covered.
+
+    Returns:
+        Poses (at uncovered times that of the nearest end) and flags [n].
+    """
+    times, at = np.asarray(times, np.float64), np.asarray(at, np.float64)
+    covered = (at >= times[0] - beyond_s) & (at <= times[-1] + beyond_s)
+    if len(times) == 1:
+        return np.repeat(poses, len(at), 0), covered
+    held = np.clip(at, times[0] - beyond_s, times[-1] + beyond_s)
+    before = np.clip(np.searchsorted(times, held, side="right") - 1, 0, len(times) - 2)
+    share = (held - times[before]) / (times[before + 1] - times[before])
+    first, second = poses[before], poses[before + 1]
+    out = np.tile(np.eye(4), (len(at), 1, 1))
+    out[:, :3, 3] = first[:, :3, 3] + share[:, None] * (second[:, :3, 3] - first[:, :3, 3])
+    start = Rotation.from_matrix(first[:, :3, :3])
+    turn = (start.inv() * Rotation.from_matrix(second[:, :3, :3])).as_rotvec()
+    out[:, :3, :3] = (start * Rotation.from_rotvec(share[:, None] * turn)).as_matrix()
+    return out, covered
+
+
+def moment_of(view: View) -> int | str:
+    """Return what views of one time step share: the frame of a drive, else the file's stem."""
+    return PurePosixPath(view.name).stem if view.frame is None else view.frame
+
+
+def up_direction(viewmats: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, " 3"]:
+    """Return up from world-to-camera matrices: what level cameras that look different ways share.
+
+    That is the normal of the plane that their right-hand axes span; pitch does not disturb it.
+    Where all look the same way, it is the mean of the cameras' up axes.
+    """
+    mean = -np.mean(viewmats[:, 1, :3], axis=0)
+    _, sizes, axes = np.linalg.svd(viewmats[:, 0, :3], full_matrices=True)
+    sizes = np.append(sizes, np.zeros(3))[:3] / np.sqrt(len(viewmats))
+    normal = axes[2] * np.sign(axes[2] @ mean)
+    if sizes[1] < PLANE_RATIO or sizes[2] > 0.5 * sizes[1] or not normal.any():
+        normal = mean
+    return normal / max(np.linalg.norm(normal), 1e-12)
+
+
+def up_of_drive(
+    viewmats: Float[np.ndarray, "n 4 4"], cameras: Sequence[str]
+) -> Float[np.ndarray, " 3"]:
+    """Return up, away from the road: square to the way that the cameras went, where they did.
+
+    Args:
+        viewmats: world-to-camera.
+        cameras: the camera that took each view.
+    """
+    up = up_direction(viewmats)
+    centers = -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
+    names = np.asarray(cameras)
+    for name in set(cameras):
+        centers[names == name] -= centers[names == name].mean(0)
+    _, sizes, axes = np.linalg.svd(centers, full_matrices=False)
+    # Where they drove around, the way is not a line, and the cameras' up axes must do.
+    if sizes[0] / np.sqrt(len(centers)) > SHORTEST_WAY / 4 and sizes[1] < sizes[0] / 3:
+        up = up - axes[0] * (axes[0] @ up)
+    return up / np.linalg.norm(up)
+
+
+def headings(
+    centers: Float[np.ndarray, "n 3"],
+    up: Float[np.ndarray, " 3"],
+    otherwise: Float[np.ndarray, " 3"],
+) -> Float[np.ndarray, "n 3"]:
+    """Return the level direction in which a camera drives at each of its places, of length 1.
+
+    It is taken over at least `HEADING_WAY` where the way is so long: at a stop poses jitter.
+
+    Args:
+        centers: positions of one camera in the order of time.
+        up: away from the road, of length 1.
+        otherwise: level direction for a camera that goes nowhere.
+    """
+    level = centers - np.outer(centers @ up, up)
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(level, axis=0), axis=1))])
+    first = np.searchsorted(way, way - HEADING_WAY / 2, side="right") - 1
+    last = np.searchsorted(way, way + HEADING_WAY / 2)
+    first, last = np.maximum(first, 0), np.minimum(last, len(way) - 1)
+    out = level[last] - level[first]
+    lengths = np.linalg.norm(out, axis=1)
+    far = lengths > SHORTEST_WAY / 2
+    if not far.any():
+        return np.tile(otherwise / np.linalg.norm(otherwise), (len(centers), 1))
+    out[far] /= lengths[far, None]
+    # Where it stands, the direction of the nearest place where it moves.
+    moving = np.flatnonzero(far)
+    nearest = moving[np.abs(np.arange(len(way))[:, None] - moving).argmin(1)]
+    return out[nearest]
+
+
+def left_of_way(views: Sequence[View]) -> Float[np.ndarray, "v 3"]:
+    """Return left of the driving direction at each view, level, of length 1.
+
+    The order of each camera's frames, or of its names, must be that of time.
+    """
+    viewmats = np.stack([view.viewmat for view in views]).astype(np.float64)
+    cameras = [view.camera for view in views]
+    up = up_of_drive(viewmats, cameras)
+    centers = camera_centers(viewmats)
+    otherwise = level_ahead(views, up)
+    out = np.zeros((len(views), 3))
+    for name in set(cameras):
+        rows = [k for k, camera in enumerate(cameras) if camera == name]
+        rows.sort(key=lambda k: time_order(views[k]))
+        out[rows] = np.cross(up, headings(centers[rows], up, otherwise))
+    return out
+
+
+def time_order(view: View) -> tuple[int, str]:
+    """Return what sorts the views of a camera by time: frames where there are any, else names."""
+    return (-1 if view.frame is None else view.frame, view.name)
+
+
+def level_ahead(views: Sequence[View], up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
+    """Return where the first camera, or one called "front", looks, without up and down."""
+    ahead = next((view for view in views if "front" in view.camera.lower()), views[0])
+    axis = ahead.viewmat[2, :3].astype(np.float64)
+    return axis - up * (up @ axis)
