@@ -22,7 +22,7 @@ from p2gs_jax.evaluation.passes import map_in_order
 from p2gs_jax.evaluation.renders_of_others import OtherRenders, Rendered, in_order, orders
 from p2gs_jax.evaluation.scores import still_mask, summary_of, view_scores
 from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
-from p2gs_jax.photometry.matte import LEAST
+from p2gs_jax.photometry.formation import LEAST_ALPHA
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
@@ -200,7 +200,7 @@ def light_of(rendered: Rendered, shown: DisplayTransform, store: ImageStore, row
     if found is None:
         return Light(undevelop(pixels, shown), shown, pixels, None)
     alpha, backdrop = floats(found), np.asarray(store.backdrop, np.float32)
-    covered, free = (np.maximum(a, LEAST)[..., None] for a in (alpha, 1 - alpha))
+    covered, free = (np.maximum(a, LEAST_ALPHA)[..., None] for a in (alpha, 1 - alpha))
     own = np.clip((pixels - (1 - alpha[..., None]) * backdrop) / covered, 0, 1)
     behind = (pixels - alpha[..., None] * own) / free
     shown = replace(shown, backdrop=behind)

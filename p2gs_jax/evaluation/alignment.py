@@ -15,8 +15,7 @@ from jaxtyping import Array, Float
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.photometry.appearance import Correction
 from p2gs_jax.photometry.display import DisplayTransform
-from p2gs_jax.photometry.formation import display, formation
-from p2gs_jax.photometry.matte import Matte, composited, uncovered
+from p2gs_jax.photometry.formation import Matte, composited, display, formation, uncovered
 from p2gs_jax.types import Capture
 
 # Photographs may be so much darker than what a scene is shown for (LOM `low`: 6.6 stops).

@@ -41,9 +41,15 @@ from p2gs_jax.evaluation.scores import (
     view_scores,
 )
 from p2gs_jax.evaluation.unexplained import Unexplained
-from p2gs_jax.photometry.display import DisplayTransform, develop, display_of_view, with_capture
+from p2gs_jax.photometry.display import (
+    DisplayTransform,
+    develop,
+    display_of_view,
+    mean_parameters,
+    usual_display,
+    with_capture,
+)
 from p2gs_jax.photometry.formation import exposed_at
-from p2gs_jax.photometry.mean import mean_parameters, usual_display
 from p2gs_jax.photometry.metering import Metering, Readings, meter
 from p2gs_jax.photometry.models import MODELS
 from p2gs_jax.render.capacity import RenderView

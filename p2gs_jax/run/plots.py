@@ -225,7 +225,7 @@ def _plot_recovered(left, middle, s: PhotometricSolution, cameras, stated_ev) ->
     """Draw exposures with their errors, and residuals, camera by camera."""
     seen = np.isfinite(s.exposure_errors)
     exposures_ev = np.where(seen, s.exposures_ev, np.nan)
-    errors_ev = np.where(seen, s.exposure_errors / LN2, np.nan)
+    errors_ev = np.where(seen, s.exposure_errors_ev, np.nan)
     names = list(dict.fromkeys(cameras))
     for i, name in enumerate(names):
         mine = np.array([c == name for c in cameras])

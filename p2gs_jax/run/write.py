@@ -19,8 +19,7 @@ from p2gs_jax.formats.ply import write_ply, write_radiance
 from p2gs_jax.formats.png import write_png
 from p2gs_jax.gaussians.bake import bake, display_comments, display_of_splats
 from p2gs_jax.gaussians.posed import posed
-from p2gs_jax.photometry.display import develop
-from p2gs_jax.photometry.mean import usual_display
+from p2gs_jax.photometry.display import develop, usual_display
 from p2gs_jax.photometry.metering import Metering
 from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.render.harmonics import MAX_DEGREE

@@ -1,21 +1,27 @@
-"""What a solution leaves that depends on the place or on the surroundings, not on the value.
+"""What a solution leaves that no model of it explains: by place, surroundings, frame or region.
 
 Exposure, gamma and response act on every pixel by its value alone. Local tone mapping darkens what
 lies in bright surroundings and lifts what lies in dark ones; flare lifts the dark near light
-sources; a shade or a reflection covers a part of the image. None of these is modelled: they are
-said. Evidence is counted by blocks of the image, as residuals of one surface are alike.
+sources; a shade or a reflection covers a part of the image. None of these is modelled: sentences
+name them. Evidence is counted by blocks of the image, as residuals of one surface are alike. A
+stack of photographs shows besides how its tone curve changed from frame to frame.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import itertools
+from collections.abc import Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.special import fdtrc, stdtr, stdtrit
 
-from p2gs_jax.photometry.observations import Observations
+from p2gs_jax.core.numerics import LN2
+from p2gs_jax.photometry.adjustment.problem import Problem
+from p2gs_jax.photometry.observations import Labels, Observations, PerChannel
+from p2gs_jax.photometry.response import DARKEST, log_exposed
+from p2gs_jax.photometry.solution import PhotometricSolution
 
 # Fewer observations, or fewer blocks of the image with any, tell nothing of a view.
 FEWEST, FEWEST_BLOCKS = 60, 12
@@ -29,17 +35,20 @@ REACH = 0.24
 MOST_LAMPS = 200
 # Residuals beyond this many robust standard deviations count as that.
 CLIPPED = 3.0
-# By kind: the chance of noise to look as clear in a view, and what is too small to say, stops. Few
-# blocks hold what is dark and near light: asked for more, flare is never clear.
-CHANCE = {"place": 2e-4, "local": 2e-4, "flare": 5e-3}
-NOTICEABLE_EV = {"place": 0.08, "local": 0.08, "flare": 0.1}
 # The darkest share of the values, where a veil shows, and values that are its sources.
 DARK, SOURCE = 0.35, 250 / 255
 # A veil that is looked for: light where all is light, 1 = white. Its size is then found.
 VEIL = 0.05
-
+# Smooth residuals of a stack above this many stops, at equal brightness, mean local tone mapping.
+LOCAL_EV = 0.075
+# Rows and columns of a stack's regions.
+GRID = (6, 8)
 
 Kind = Literal["place", "local", "flare"]
+Values = Float[np.ndarray, " n"]
+Table = Float[np.ndarray, "n k"]
+Places = Float[np.ndarray, "n 2"]
+Blocks = Int[np.ndarray, " n"]
 
 
 class Evidence(NamedTuple):
@@ -49,7 +58,7 @@ class Evidence(NamedTuple):
         ev: size, stops: RMS over the view for places, the change over the spread (two standard
             deviations) of the surroundings for local tone mapping, over the dark for flare;
             negative where it goes the other way. NaN where nothing can be told.
-        chance: of as much where there is nothing.
+        chance: that noise alone looks as clear.
     """
 
     ev: float
@@ -57,38 +66,42 @@ class Evidence(NamedTuple):
 
 
 NOTHING = Evidence(float("nan"), 1.0)
+# Of every view, what residuals depend on besides their value: smoothly on the place in the image;
+# falling with the brightness of the surroundings, at equal value and place; in dark values, rising
+# with how near bright light is.
+Neighbourhood = Mapping[Kind, Sequence[Evidence]]
 
 
-@dataclass(frozen=True)
-class Neighbourhood:
-    """What residuals of every view depend on besides their value.
+class _Clear(NamedTuple):
+    """When a kind is worth a sentence, and what it says.
 
-    Attributes:
-        place: on the place in the image, smoothly.
-        local: on the brightness of the surroundings, at equal value and place, falling.
-        flare: in dark values, on how near bright light is, rising.
+    Few blocks hold what is dark and near light: asked for less chance, flare is never clear.
     """
 
-    place: tuple[Evidence, ...]
-    local: tuple[Evidence, ...]
-    flare: tuple[Evidence, ...]
+    chance: float
+    least_ev: float
+    words: str
 
-    def clear(self, kind: Kind) -> list[int]:
-        """Return the views where a dependence is larger than noise and large enough to say."""
-        found: tuple[Evidence, ...] = getattr(self, kind)
-        chance, least = CHANCE[kind], NOTICEABLE_EV[kind]
-        return [k for k, e in enumerate(found) if e.chance < chance and e.ev > least]
 
-    def record(self) -> dict[str, list[dict[str, float]]]:
-        """Return numbers for `calibration.json`."""
-        kinds = {"place": self.place, "local": self.local, "flare": self.flare}
-        return {name: [e._asdict() for e in found] for name, found in kinds.items()}
+KINDS: dict[Kind, _Clear] = {
+    "place": _Clear(
+        2e-4,
+        0.08,
+        "depend on the place in the image: flare, a shade, reflections, or vignetting that is not "
+        "modelled",
+    ),
+    "local": _Clear(
+        2e-4,
+        0.08,
+        "fall where the surroundings are bright and rise where they are dark, at equal value: "
+        "local tone mapping, as phones do it",
+    ),
+    "flare": _Clear(5e-3, 0.1, "rise in the dark near bright light: flare"),
+}
 
 
 def neighbourhood(
-    observations: Observations,
-    residual_ev: Float[np.ndarray, "o 3"],
-    usable: Float[np.ndarray, "o 3"],
+    observations: Observations, residual_ev: PerChannel, usable: PerChannel
 ) -> Neighbourhood:
     """Test every view for residuals that depend on the place or on the surroundings.
 
@@ -99,46 +112,45 @@ def neighbourhood(
         usable: 1 where a value counts.
     """
     o, count = observations, observations.view_count
-    rows = {"place": [NOTHING] * count, "local": [NOTHING] * count, "flare": [NOTHING] * count}
+    found: dict[Kind, list[Evidence]] = {kind: [NOTHING] * count for kind in KINDS}
     if o.positions is None:
-        return Neighbourhood(*(tuple(r) for r in rows.values()))
+        return found
     weight = np.asarray(usable, np.float64)
     seen = weight.sum(1) > 0
     total = np.maximum(weight.sum(1), 1)
     residual = np.where(weight > 0, residual_ev, 0.0).sum(1) / total
-    value = np.log2(np.maximum(np.asarray(o.colors, np.float64), 0.5 / 255)) * 2.2
+    value = np.log2(np.maximum(np.asarray(o.colors, np.float64), DARKEST)) * 2.2
     value = (value * np.where(seen[:, None], weight, 1.0)).sum(1) / np.where(seen, total, 3)
     # Of the value without its own residual: else noise of the value looks like tone mapping.
     value = value - np.where(seen, residual, 0.0)
     bright: Bool[np.ndarray, " o"] = np.any(np.asarray(o.colors) >= SOURCE, axis=1)
     order = np.argsort(o.views, kind="stable")
     bounds = np.searchsorted(o.views[order], np.arange(count + 1))
+    of_view = [order[a:b] for a, b in itertools.pairwise(bounds)]
     around = np.full(len(seen), np.nan) if o.surroundings is None else o.surroundings - 0.0
-    for view in range(count if o.surroundings is not None else 0):
-        mine = order[bounds[view] : bounds[view + 1]]
+    for mine in of_view if o.surroundings is not None else ():
         around[mine] -= around[mine].mean() if len(mine) else 0.0
     moved = around - _point_means(around, o.points, o.point_count)
-    for view in range(count):
-        mine = order[bounds[view] : bounds[view + 1]]
+    for view, mine in enumerate(of_view):
         good = mine[seen[mine]]
         if len(good) < FEWEST:
             continue
         places = np.asarray(o.positions[good], np.float64)
-        block = _blocks(places)
+        block = np.unique(np.floor(places * BLOCKS).astype(int), axis=0, return_inverse=True)[1]
+        block = block.reshape(-1)
         if block.max() + 1 < FEWEST_BLOCKS:
             continue
         flat = _without_value(residual[good], value[good])
-        rows["place"][view] = _place(flat, places, block)
-        other = np.concatenate([_surface(places), _powers(value[good])], 1)
+        found["place"][view] = _place(flat, places, block)
+        level = value[good] - value[good].mean()
+        other = np.concatenate([_surface(places), np.stack([level, level * level], 1)], 1)
         lamps = np.asarray(o.positions[mine[bright[mine]]], np.float64)
-        rows["local"][view] = _local(flat, other, around[good], moved[good], block)
-        rows["flare"][view] = _flare(flat, other, value[good], places, lamps, block)
-    return Neighbourhood(*(tuple(r) for r in rows.values()))
+        found["local"][view] = _local(flat, other, around[good], moved[good], block)
+        found["flare"][view] = _flare(flat, other, value[good], places, lamps, block)
+    return found
 
 
-def _point_means(
-    values: Float[np.ndarray, " o"], points: Int[np.ndarray, " o"], count: int
-) -> Float[np.ndarray, " o"]:
+def _point_means(values: Float[np.ndarray, " o"], points: Labels, count: int):
     """Return the mean over all views of each observation's point; NaN do not count."""
     known = np.isfinite(values)
     total = np.bincount(points[known], values[known], count)
@@ -146,15 +158,7 @@ def _point_means(
     return (total / np.maximum(seen, 1))[points]
 
 
-def _blocks(places: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, " n"]:
-    """Return the block of the image that each observation lies in: 0, 1, ..."""
-    cell = np.floor(places * BLOCKS).astype(int)
-    return np.unique(cell, axis=0, return_inverse=True)[1].reshape(-1)
-
-
-def _without_value(
-    residual: Float[np.ndarray, " n"], value: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, " n"]:
+def _without_value(residual: Values, value: Values) -> Values:
     """Return residuals less the median of their class of value, clipped."""
     rank = np.argsort(np.argsort(value, kind="stable"), kind="stable")
     kind = rank * CLASSES // len(value)
@@ -165,20 +169,13 @@ def _without_value(
     return np.clip(flat, -limit, limit)
 
 
-def _powers(value: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 2"]:
-    v = value - value.mean()
-    return np.stack([v, v * v], 1)
-
-
-def _surface(places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 6"]:
+def _surface(places: Places) -> Float[np.ndarray, "n 6"]:
     """Return the terms of a quadratic surface, the constant first."""
     x, y = places.T
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], 1)
 
 
-def _place(
-    flat: Float[np.ndarray, " n"], places: Float[np.ndarray, "n 2"], block: Int[np.ndarray, " n"]
-) -> Evidence:
+def _place(flat: Values, places: Places, block: Blocks) -> Evidence:
     """Fit a quadratic surface; its significance is judged by means of blocks (F test)."""
     terms = _surface(places)
     n = np.bincount(block)
@@ -197,10 +194,11 @@ def _place(
     return Evidence(float((terms @ fit).std()), chance)
 
 
-def _slope(
-    y: Float[np.ndarray, " n"], x: Float[np.ndarray, " n"], block: Int[np.ndarray, " n"]
-) -> tuple[float, float]:
-    """Return the slope of y over x and its t value, with blocks as the independent units."""
+def _slope(y: Values, x: Values, block: Blocks) -> tuple[float, float]:
+    """Return the slope of y over x and its t value, with blocks as the independent units.
+
+    The t value is that of many degrees of freedom that is as unlikely as this one with few.
+    """
     x, y = x - x.mean(), y - y.mean()
     total = float(x @ x)
     if total < 1e-12:
@@ -218,26 +216,20 @@ def _slope(
     share = squares / total
     effective = max(1.0 / float(share @ share) - 1, 1.0)
     t = slope / (error + 1e-12)
-    return slope, _normal_t(t, effective)
-
-
-def _normal_t(t: float, freedom: float) -> float:
-    """Return the t value of many degrees of freedom that is as unlikely as t with few."""
-    chance = float(stdtr(freedom, -abs(t)))
-    return float(np.sign(t)) * abs(float(stdtrit(1e6, max(chance, 1e-300))))
+    chance = float(stdtr(effective, -abs(t)))
+    return slope, float(np.sign(t)) * abs(float(stdtrit(1e6, max(chance, 1e-300))))
 
 
 def _chance(t: float) -> float:
     return float(stdtr(1e6, -t))
 
 
-def _local(
-    flat: Float[np.ndarray, " n"],
-    other: Float[np.ndarray, "n k"],
-    around: Float[np.ndarray, " n"],
-    moved: Float[np.ndarray, " n"],
-    block: Int[np.ndarray, " n"],
-) -> Evidence:
+def _beside(other: Table, x: Values) -> Values:
+    """Return x less what value and place tell of it."""
+    return x - other @ np.linalg.lstsq(other, x, rcond=None)[0]
+
+
+def _local(flat: Values, other: Table, around: Values, moved: Values, block: Blocks) -> Evidence:
     """Test whether residuals fall with the brightness of the surroundings at equal value.
 
     What tone mapping does alike in all views is in the radiance of the points already; it shows
@@ -259,18 +251,8 @@ def _local(
     return best
 
 
-def _beside(other: Float[np.ndarray, "n k"], x: Float[np.ndarray, " n"]):
-    """Return x less what value and place tell of it."""
-    return x - other @ np.linalg.lstsq(other, x, rcond=None)[0]
-
-
 def _flare(
-    flat: Float[np.ndarray, " n"],
-    other: Float[np.ndarray, "n k"],
-    value: Float[np.ndarray, " n"],
-    places: Float[np.ndarray, "n 2"],
-    lamps: Float[np.ndarray, "l 2"],
-    block: Int[np.ndarray, " n"],
+    flat: Values, other: Table, value: Values, places: Places, lamps: Places, block: Blocks
 ) -> Evidence:
     """Test for a veil of light that is added about saturated values: it lifts the dark most."""
     if len(lamps) < 3:
@@ -283,30 +265,21 @@ def _flare(
     return Evidence(2 * slope * spread, _chance(t))
 
 
-SAID: dict[Kind, str] = {
-    "place": (
-        "depend on the place in the image: flare, a shade, reflections, or vignetting that is not "
-        "modelled"
-    ),
-    "local": (
-        "fall where the surroundings are bright and rise where they are dark, at equal value: "
-        "local tone mapping, as phones do it"
-    ),
-    "flare": "rise in the dark near bright light: flare",
-}
-
-
-def sentences(found: Neighbourhood, names: tuple[str, ...] | list[str]) -> list[str]:
+def neighbourhood_warnings(
+    observations: Observations,
+    residual_ev: PerChannel,
+    usable: PerChannel | Bool[np.ndarray, "o 3"],
+    names: Sequence[str],
+) -> list[str]:
     """Return a sentence for every kind of dependence that is clear in some photographs.
 
-    Args:
-        found: of all views.
-        names: of all views; their rows if empty.
+    Arguments are those of `neighbourhood`, and the names of all views: their rows if empty.
     """
+    found = neighbourhood(observations, residual_ev, np.asarray(usable, float))
     out = []
-    for kind, said in SAID.items():
-        rows: tuple[Evidence, ...] = getattr(found, kind)
-        clear = found.clear(kind)
+    for kind, (chance, least, words) in KINDS.items():
+        rows = found[kind]
+        clear = [k for k, e in enumerate(rows) if e.chance < chance and e.ev > least]
         if not clear:
             continue
         clear.sort(key=lambda k: -rows[k].ev)
@@ -314,24 +287,68 @@ def sentences(found: Neighbourhood, names: tuple[str, ...] | list[str]) -> list[
         head = ", ".join(f"{names[k] if names else f'row {k}'} {rows[k].ev:.2f}" for k in clear[:6])
         more = ", ..." if len(clear) > 6 else ""
         out.append(
-            f"Not modelled: residuals {said}. In {len(clear)} of {tested} training view(s), by EV: "
-            f"{head}{more}."
+            f"Not modelled: residuals {words}. In {len(clear)} of {tested} training view(s), by "
+            f"EV: {head}{more}."
         )
     return out
 
 
-def neighbourhood_warnings(
-    observations: Observations,
-    residual_ev: Float[np.ndarray, "o 3"],
-    usable: Float[np.ndarray, "o 3"] | Bool[np.ndarray, "o 3"],
-    names: tuple[str, ...] | list[str],
-) -> list[str]:
-    """Return what depends on the neighbourhood and is not modelled, photographs named.
+def residuals(problem: Problem, solution: PhotometricSolution) -> PerChannel:
+    """Return log residuals under a solution of an exposure per view; 0 of what cannot be used."""
+    o = problem.observations
+    z, _ = log_exposed(np.asarray(o.colors, np.float64), solution.response)
+    level = solution.log_exposures[o.views][:, None] + solution.point_log_radiance[o.points]
+    return np.where(problem.usable, z - level, 0.0)
+
+
+class Unexplained(NamedTuple):
+    """What one response leaves unexplained in a stack, RMS in stops.
+
+    Attributes:
+        curve_ev: depends on brightness, differently from frame to frame: tone curves that change.
+        local_ev: what then still varies smoothly over the image: tone mapping by region.
+    """
+
+    curve_ev: float
+    local_ev: float
+
+
+def unexplained(
+    problem: Problem,
+    residual: PerChannel,
+    xy: Float[np.ndarray, "p 2"],
+    size: tuple[int, ...],
+    signal: Bool[np.ndarray, " v"],
+) -> Unexplained:
+    """Split residuals into what depends on brightness and what depends on the place.
 
     Args:
-        observations: with positions and surroundings.
-        residual_ev: of log exposed radiance, stops.
-        usable: 1 where a value counts.
-        names: of the views; their rows if empty.
+        problem: the observations.
+        residual: from `residuals`.
+        xy: positions of the points, pixels.
+        size: height and width of the photographs, pixels.
+        signal: views to look at.
     """
-    return sentences(neighbourhood(observations, residual_ev, np.asarray(usable, float)), names)
+    o = problem.observations
+    good = problem.usable.all(1)
+    value = np.where(good, residual.mean(1), np.nan)
+    cell = (xy[:, 1] * GRID[0] // size[0]) * GRID[1] + xy[:, 0] * GRID[1] // size[1]
+    level = np.clip((o.colors.mean(1) * 10).astype(int), 0, 9)
+    means, curves = [], []
+    for frame in np.flatnonzero(signal):
+        mine = np.flatnonzero((o.views == frame) & good)
+        flat = value[mine].copy()
+        for k in range(10):
+            here = level[mine] == k
+            if here.sum() > 5:
+                # Near black and white only some of the values were usable: a biased choice.
+                if here.sum() >= 12 and 2 <= k <= 8:
+                    curves.append(np.median(flat[here]))
+                flat[here] -= np.median(flat[here])
+        cells = cell[o.points[mine]]
+        for c in np.unique(cells):
+            inside = flat[cells == c]
+            if len(inside) >= 12:
+                means.append(np.median(inside))
+    rms = (float(np.sqrt(np.mean(np.square(v)))) / LN2 if v else 0.0 for v in (curves, means))
+    return Unexplained(*rms)

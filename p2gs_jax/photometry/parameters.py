@@ -1,10 +1,11 @@
-"""Exposures, gammas, white balances and corrections before the first step."""
+"""Parameters of a fit: what they start from, and the gauge they end in."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -13,12 +14,11 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.photometry.appearance import Corrections, identity
-from p2gs_jax.photometry.cameras import camera_rows
-from p2gs_jax.photometry.formation import inverse_tone_map
-from p2gs_jax.photometry.luminance.parameters import Luminance
-from p2gs_jax.photometry.luminance.statistics import statistics_of
+from p2gs_jax.photometry.formation import camera_rows, inverse_tone_map
+from p2gs_jax.photometry.luminance import Luminance, statistics_of
 from p2gs_jax.photometry.solution import PhotometricSolution
-from p2gs_jax.types import GAMMA_SRGB, Photometry, Scene, View
+from p2gs_jax.render.harmonics import RadianceKind, scaled
+from p2gs_jax.types import GAMMA_SRGB, Params, Photometry, Scene, View
 
 # Exposures drawn at random are at least this.
 LEAST_EXPOSURE = 0.1
@@ -81,13 +81,7 @@ def initial_appearance(
 def point_radiance(
     scene: Scene, solution: PhotometricSolution | None, cfg: FitConfig
 ) -> Float[np.ndarray, "p 3"]:
-    """Return linear radiance of the scene's points: the solution's where it knows, else colours'.
-
-    Args:
-        scene: points with colours.
-        solution: of the bundle adjustment, or None.
-        cfg: the tone curve.
-    """
+    """Return linear radiance of a scene's points: the solution's where it knows, else colours'."""
     assert scene.point_colors is not None
     colors = scene.point_colors.astype(np.float32) / np.float32(255)
     radiance = inverse_tone_map(colors, np.float32(GAMMA_SRGB), cfg.photometry)
@@ -95,3 +89,32 @@ def point_radiance(
         known = np.exp(solution.point_log_radiance)
         radiance = np.where(np.isfinite(known), known, radiance)
     return radiance.astype(np.float32)
+
+
+def recentre(params: Params, activation: RadianceKind) -> Params:
+    """Return the same photographs with mean log exposure and white balance 0, exactly.
+
+    Radiance moves the other way: it fixes the gauges of scale (docs/photometry.md, 2, scale), of
+    which every channel has one of its own with white balance. `activation` is from spherical
+    harmonics to radiance.
+    """
+    # On the host: once a fit, and every operation would be a program of its own.
+    photometry = jax.tree.map(np.asarray, params.photometry)
+    log_scale = np.mean(photometry.log_exposures)
+    balance = photometry.white_balance
+    tint = np.zeros(3, np.float32) if balance is None else balance.mean(0)
+    sh = scaled(np.asarray(params.gaussians.sh), log_scale + tint, activation)
+    if photometry.parameterization == "log":
+        raw = photometry.raw_exposures - log_scale
+    else:
+        raw = photometry.raw_exposures / np.exp(log_scale)
+    moved = dataclasses.replace(
+        photometry,
+        raw_exposures=raw,
+        raw_white_balance=None if balance is None else balance - tint,
+    )
+    return dataclasses.replace(
+        params,
+        gaussians=dataclasses.replace(params.gaussians, sh=jax.device_put(sh)),
+        photometry=jax.device_put(moved),
+    )

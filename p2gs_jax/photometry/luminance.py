@@ -1,10 +1,11 @@
-"""What is learned of the photographs, and how it maps them to the enhanced scene and back.
+"""Luminance-GS (Cui, Chu and Harada, CVPR 2025): a colour matrix and a curve per photograph.
 
-As its authors describe it: one curve for all photographs, to which a small network adds a bias for
-each, clipped to [0, 1]; three orthonormal colour axes per photograph, along which the curve acts;
-three numbers per photograph that shape a pseudo curve (a power, then an S), towards which the curve
-is drawn. Ours: the network sees the histogram and the mean colour instead of attending to the
-image and the camera's pose; the curve is interpolated, where theirs takes the entry below.
+They map photographs to the enhanced scene and back. As its authors describe it: one curve for all
+photographs, to which a small network adds a bias for each, clipped to [0, 1]; three orthonormal
+colour axes per photograph, along which the curve acts; three numbers per photograph that shape a
+pseudo curve (a power, then an S), towards which the curve is drawn. Ours: the network sees the
+histogram and the mean colour instead of attending to the image and the camera's pose; the curve is
+interpolated, where theirs takes the entry below.
 """
 
 from __future__ import annotations
@@ -17,13 +18,16 @@ from jaxtyping import Array, Float, Int
 
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.core.streams import Stream, generator
-from p2gs_jax.photometry.luminance.axes import PARAMETERS, axes_of, spans
-from p2gs_jax.photometry.luminance.statistics import STATISTICS
 
 # Entries of a curve, as published.
 ENTRIES = 255
 # Width of the network (ours).
 HIDDEN = 32
+# Steps of the cumulative histogram that the network sees, and all that it sees.
+LEVELS = 32
+STATISTICS = LEVELS + 3
+# Parameters of the axes.
+AXES = 5
 # What a raw unit stands for, so that one learning rate serves all (the authors have rates of 1e-3
 # for the curve, 2e-4 for the axes and 1e-5 for the network).
 AXES_UNIT, BIAS_UNIT = 0.2, 0.1
@@ -91,11 +95,7 @@ class Luminance(eqx.Module):
 
 
 def identity(views: int) -> Luminance:
-    """Return parameters that change nothing; the statistics are zero until they are filled in.
-
-    Args:
-        views: how many training views there are.
-    """
+    """Return parameters that change nothing; the statistics are zero until they are filled in."""
     # Drawn once for all fits: a network of zeros would never learn.
     weights = generator(0, Stream.NETWORK).normal(0, STATISTICS**-0.5, (STATISTICS, HIDDEN))
     outputs = ENTRIES + 3
@@ -105,18 +105,33 @@ def identity(views: int) -> Luminance:
         on_device(np.zeros(HIDDEN)),
         on_device(np.zeros((HIDDEN, outputs))),
         on_device(np.zeros(outputs)),
-        on_device(np.zeros((views, PARAMETERS))),
+        on_device(np.zeros((views, AXES))),
         on_device(np.zeros((views, STATISTICS))),
     )
 
 
-def enhanced(ldr: Float[Array, "*p 3"], view: Curves) -> Float[Array, "*p 3"]:
-    """Return the enhanced display values that a photograph stands for.
+def axes_of(raw: Float[Array, " 5"]) -> Float[Array, "3 3"]:
+    """Return three orthonormal axes as rows: the identity at zero, as their authors build them.
 
     Args:
-        ldr: of the photograph.
-        view: how it was taken.
+        raw: three numbers beside (1, 0, 0), then the green and blue parts of the second axis
+            beside (1, 0); its red part makes it orthogonal to the first.
     """
+    first = raw[:3] + jnp.array([1.0, 0.0, 0.0], raw.dtype)
+    green, blue = raw[3] + 1.0, raw[4]
+    red = -(green * first[1] + blue * first[2]) / first[0]
+    second = jnp.stack([red, green, blue])
+    rows = jnp.stack([first, second, jnp.cross(first, second)])
+    return rows / jnp.linalg.norm(rows, axis=-1, keepdims=True)
+
+
+def spans(axes: Float[Array, "3 3"]) -> tuple[Float[Array, " 3"], Float[Array, " 3"]]:
+    """Return the least and the largest coordinate along each axis of colours in [0, 1]."""
+    return jnp.minimum(axes, 0).sum(-1), jnp.maximum(axes, 0).sum(-1)
+
+
+def enhanced(ldr: Float[Array, "*p 3"], view: Curves) -> Float[Array, "*p 3"]:
+    """Return the enhanced display values that a photograph stands for."""
     return _along_axes(ldr, view.axes, lambda t: _looked_up(t, view.curve))
 
 
@@ -125,10 +140,6 @@ def as_photographed(ldr: Float[Array, "*p 3"], view: Curves) -> Float[Array, "*p
 
     Where the curve falls it counts as level; level pieces return their lower end. The authors
     splat a second colour per Gaussian instead.
-
-    Args:
-        ldr: enhanced.
-        view: how it was taken.
     """
     count = view.curve.shape[0]
     even = jnp.linspace(0.0, 1.0, count, dtype=view.curve.dtype)
@@ -138,6 +149,7 @@ def as_photographed(ldr: Float[Array, "*p 3"], view: Curves) -> Float[Array, "*p
 
 
 def _along_axes(ldr, axes, change):
+    """Return colours whose coordinates along the axes, scaled to [0, 1], have changed."""
     low, high = spans(axes)
     along = (ldr @ axes.T - low) / (high - low)
     return (change(along) * (high - low) + low) @ axes
@@ -165,3 +177,32 @@ def pseudo_curve(shape: Float[Array, " 3"]) -> Float[Array, " k"]:
     return jnp.where(
         x <= turn, turn - turn * (1.0 - below) ** bend, turn + (1.0 - turn) * above**bend
     )
+
+
+def cumulative(
+    grey: Float[Array, " p"], weight: Float[Array, " p"], steps: int
+) -> Float[Array, " s"]:
+    """Return the share of pixels up to k / (steps - 1), for k from 0 to steps - 1.
+
+    Args:
+        grey: mean of the channels, [0, 1].
+        weight: of the pixels; without any, all shares are those of evenly spread values.
+        steps: number of shares.
+    """
+    bins = jnp.clip(jnp.ceil(grey * (steps - 1)), 0, steps - 1).astype(jnp.int32)
+    counts = jnp.zeros(steps, grey.dtype).at[bins].add(weight)
+    total = counts.sum()
+    even = jnp.linspace(0.0, 1.0, steps, dtype=grey.dtype)
+    return jnp.where(total > 0, jnp.cumsum(counts) / jnp.maximum(total, 1e-9), even)
+
+
+def statistics_of(
+    photograph: Float[Array, "h w 3"], mask: Float[Array, "h w"]
+) -> Float[Array, " s"]:
+    """Return what the network is given of a photograph: its histogram and its mean colour.
+
+    Every fourth pixel along both axes counts, where the mask is 1.
+    """
+    seen, weight = photograph[::4, ::4].reshape(-1, 3), mask[::4, ::4].reshape(-1)
+    mean = (weight[:, None] * seen).sum(0) / jnp.maximum(weight.sum(), 1.0)
+    return jnp.concatenate([cumulative(seen.mean(-1), weight, LEVELS), mean])
