@@ -13,7 +13,7 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.config import to_dict as config_to_dict
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.numerics import evenly_spaced
-from p2gs_jax.evaluate.evaluate import ViewResult
+from p2gs_jax.evaluation.evaluate import ViewResult
 from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.formats.ply import write_ply, write_radiance
 from p2gs_jax.formats.png import write_png
