@@ -40,7 +40,7 @@ from p2gs_jax.gaussians.seeds import cameras_radius
 from p2gs_jax.jobs.engines import LOCAL, check_engine, open_engine
 from p2gs_jax.jobs.job import JobState
 from p2gs_jax.jobs.run import run_jobs
-from p2gs_jax.photometry.gauge import recentre
+from p2gs_jax.photometry.parameters import recentre
 from p2gs_jax.pipeline import preflight
 from p2gs_jax.pipeline.finish import Account, finish
 from p2gs_jax.pipeline.fit import FitResult, fit
