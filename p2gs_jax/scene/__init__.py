@@ -11,11 +11,11 @@ from p2gs_jax.errors import UserError, broken
 from p2gs_jax.scene.cache import Report
 from p2gs_jax.scene.colmap import find_model, load_colmap
 from p2gs_jax.scene.convert.convert import convert_photographs, converted_views, with_originals
+from p2gs_jax.scene.convert.headers import read_exif_ev
 from p2gs_jax.scene.convert.icc import colour_notes
 from p2gs_jax.scene.drives import read_drive
 from p2gs_jax.scene.drives.assemble import assemble
 from p2gs_jax.scene.drives.recording import Recording
-from p2gs_jax.scene.exposures import read_exif_ev
 from p2gs_jax.scene.files import image_size, list_images
 from p2gs_jax.scene.masks import attach_masks, with_alpha
 from p2gs_jax.scene.pixels.store import ImageStore, camera_at, size_at

@@ -17,7 +17,7 @@ from PIL import Image
 from p2gs_jax.config import DataConfig
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError, broken
-from p2gs_jax.scene.convert.convert import size_of
+from p2gs_jax.scene.convert.headers import size_of
 from p2gs_jax.scene.convert.kinds import CONVERTED_SUFFIXES
 from p2gs_jax.scene.lens import scale_intrinsics
 

@@ -12,7 +12,7 @@ from scene.helpers import write_tiny_model
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene import ImageStore, PhotographsAlone, find_scene, load_scene
-from p2gs_jax.scene.exposures import ExifSettings, read_exif_ev, read_exif_settings
+from p2gs_jax.scene.convert.headers import ExifSettings, read_exif_ev, read_exif_settings
 from p2gs_jax.scene.split import assign_split
 from p2gs_jax.types import View
 

@@ -24,21 +24,12 @@ from jaxtyping import UInt
 from PIL import ExifTags, Image
 
 from p2gs_jax.core.atomic import atomic_write, write_text
-from p2gs_jax.errors import UserError, broken
+from p2gs_jax.errors import broken
 from p2gs_jax.scene.cache import Report, cached_folder, file_fingerprints
-from p2gs_jax.scene.convert.heif import exif_in, opened, read_heif
+from p2gs_jax.scene.convert.heif import read_heif
 from p2gs_jax.scene.convert.icc import GAIN_MAP_UNUSED, encode_16
 from p2gs_jax.scene.convert.kinds import Kind, Picture, has_gain_map, kind_of
-from p2gs_jax.scene.convert.linear import (
-    Balance,
-    exr_size,
-    read_exr,
-    read_exr_exif,
-    read_facts,
-    read_float_tiff,
-    read_raw,
-    read_raw_exif,
-)
+from p2gs_jax.scene.convert.linear import Balance, read_exr, read_facts, read_float_tiff, read_raw
 from p2gs_jax.scene.masks import mask_of
 from p2gs_jax.types import Scene
 
@@ -88,35 +79,6 @@ class Converted:
     originals: Mapping[str, Path]
     notes: tuple[str, ...] = ()
     known: str | None = None
-
-
-def size_of(path: Path) -> tuple[int, int] | None:
-    """Return (width, height) as converted; None: the file needs no conversion.
-
-    Raises:
-        UserError: it cannot be opened, or the package for it is missing.
-    """
-    kind = kind_of(path)
-    if kind in ("heif", "avif", "webp"):
-        with opened(path) as image:
-            return image.size
-    if kind == "raw":
-        return read_facts(path).size
-    return exr_size(path) if kind == "exr" else None
-
-
-def exif_of(path: Path) -> Image.Exif | None:
-    """Return how a photograph was taken; None: not known, or the file needs no conversion."""
-    kind = kind_of(path)
-    try:
-        if kind in ("heif", "avif", "webp"):
-            with opened(path) as image:
-                return exif_in(image.info)
-        if kind == "raw":
-            return read_raw_exif(path)
-        return read_exr_exif(path) if kind == "exr" else None
-    except UserError:
-        return None
 
 
 def convert_photographs(

@@ -18,7 +18,7 @@ from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.cache import Report, StageProgress, cached_folder, file_fingerprints
 from p2gs_jax.scene.colmap import load_colmap, subfolder
-from p2gs_jax.scene.exposures import read_exif_camera
+from p2gs_jax.scene.convert.headers import read_exif_camera
 from p2gs_jax.scene.files import image_size
 from p2gs_jax.scene.sfm.features import (
     kept_features,

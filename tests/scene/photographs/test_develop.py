@@ -18,8 +18,8 @@ from scene.photographs.made import DISPLAY_P3, patches, settings, write_dng
 from p2gs_jax.core.numerics import srgb_decode, srgb_encode
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.convert.convert import Converted, convert_photographs
+from p2gs_jax.scene.convert.headers import read_exif_ev, read_exif_settings
 from p2gs_jax.scene.convert.kinds import has_gain_map, kind_of
-from p2gs_jax.scene.exposures import read_exif_ev, read_exif_settings
 from p2gs_jax.scene.files import image_size, list_images
 
 
