@@ -96,8 +96,7 @@ def load_scene(
 def with_what_lies_beside(scene: Scene, cfg: DataConfig) -> Scene:
     """Return a scene with masks, EXIF exposures and split.
 
-    Raises:
-        UserError: so many views cannot be held out, or a list of those that are is wrong.
+    Raises UserError: so many views cannot be held out, or a list of those that are is wrong.
     """
     views, mask_notes = attach_masks(scene.views)
     views = tuple(
@@ -126,8 +125,7 @@ def find_scene(
 ) -> Scene | Recording | PhotographsAlone | Video:
     """Return what a folder holds, as `load_scene` finds it; nothing long is computed.
 
-    Raises:
-        UserError: there is no scene, or it is broken; the message names the file.
+    Raises UserError: there is no scene, or it is broken; the message names the file.
     """
     root = Path(root)
     if not root.exists():

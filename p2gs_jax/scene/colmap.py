@@ -48,8 +48,8 @@ def load_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
         cfg: where the images are, and whether some may be missing.
 
     Raises:
-        UserError: a file is broken, images are missing or of another size, the camera model is
-            not supported, or there is nothing in the model.
+        UserError: a file is broken, images are missing or of another size, the camera model is not
+            supported, or there is nothing in the model.
     """
     model = read_model(folder)
     _check_model(model)

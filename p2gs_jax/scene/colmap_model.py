@@ -105,8 +105,7 @@ def is_model(folder: Path) -> bool:
 def read_model(folder: Path) -> Model:
     """Read the model in a folder; binary files win where both kinds are complete.
 
-    Raises:
-        UserError: a file is missing, truncated or malformed; the message names it.
+    Raises UserError: a file is missing, truncated or malformed; the message names it.
     """
     for ext in ("bin", "txt"):
         paths = [folder / f"{stem}.{ext}" for stem in _STEMS]

@@ -48,8 +48,7 @@ def read_known_exposures(source: str, views: list[View]) -> Float[np.ndarray, " 
 def check_source(source: str | None) -> None:
     """Check that a source of `read_known_exposures`, or none, can be used: before there are views.
 
-    Raises:
-        UserError: the file cannot be used.
+    Raises UserError: the file cannot be used.
     """
     if source not in (None, "exif"):
         _read(Path(source))
@@ -58,10 +57,8 @@ def check_source(source: str | None) -> None:
 def stated_ev(source: str | None, views: list[View]) -> Float[np.ndarray, " v"]:
     """Return stated exposures in stops, up to a constant; NaN where nothing is stated.
 
-    The source is that of `read_known_exposures`; None takes EXIF where there is any.
-
-    Raises:
-        UserError: as of `read_known_exposures`.
+    The source is that of `read_known_exposures`; None takes EXIF where there is any. Raises
+    UserError: as of `read_known_exposures`.
     """
     if source is None:
         return _exif_ev(views)

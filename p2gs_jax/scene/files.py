@@ -53,8 +53,7 @@ def list_images(folder: Path, *, recursive: bool = True) -> list[Path]:
 def read_json(path: Path, fix: str) -> Any:
     """Return what a JSON file holds.
 
-    Raises:
-        UserError: it is absent, not text, or not valid JSON.
+    Raises UserError: it is absent, not text, or not valid JSON.
     """
     try:
         return parse_json(path.read_text(encoding="utf-8"))
@@ -70,10 +69,8 @@ def read_json(path: Path, fix: str) -> Any:
 def require_inside(name: PurePath, folder: Path, source: Path, fix: str = _MOVED) -> None:
     """Refuse a name in the file `source` that leads out of the folder it is relative to.
 
-    Links below the folder are followed: whoever made it put them there.
-
-    Raises:
-        UserError: it leads out.
+    Links below the folder are followed: whoever made it put them there. Raises UserError: it leads
+    out.
     """
     normal = os.path.normpath(name.as_posix())
     if os.path.isabs(normal) or normal.split("/")[0] == "..":
@@ -83,8 +80,7 @@ def require_inside(name: PurePath, folder: Path, source: Path, fix: str = _MOVED
 def require_plain(name: str, source: Path) -> None:
     """Refuse a name of a camera, found in the file `source`, that is a path.
 
-    Raises:
-        UserError: it is a path.
+    Raises UserError: it is a path.
     """
     if name in ("", ".", "..") or any(c in name for c in "/\\\0"):
         raise broken(
@@ -97,8 +93,7 @@ def require_plain(name: str, source: Path) -> None:
 def image_folder(root: Path, cfg: DataConfig) -> Path | None:
     """Return the image folder that the user names, or None.
 
-    Raises:
-        UserError: it does not exist.
+    Raises UserError: it does not exist.
     """
     if cfg.images is None:
         return None
@@ -112,9 +107,8 @@ def image_folder(root: Path, cfg: DataConfig) -> Path | None:
 def image_size(path: Path) -> tuple[int, int]:
     """Return (width, height) as stored, before any EXIF rotation.
 
-    Raises:
-        UserError: the file is not an image, or is too large; its name is not UTF-8; or a package
-            that opens it is missing.
+    Raises UserError: the file is not an image, or is too large; its name is not UTF-8; or a package
+    that opens it is missing.
     """
     try:
         str(path).encode()  # no other name can be written into the files of a run

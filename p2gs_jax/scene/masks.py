@@ -60,8 +60,7 @@ def image_folder_of(view: View) -> Path:
 def background_color(cfg: DataConfig) -> Float32[np.ndarray, " 3"]:
     """Return the display values that photographs with alpha are shown and judged over.
 
-    Raises:
-        UserError: the option is not a colour.
+    Raises UserError: the option is not a colour.
     """
     text = JUDGED if cfg.background == RANDOM else cfg.background
     if text in NAMED:
@@ -92,8 +91,7 @@ def has_alpha(path: Path) -> bool:
 def with_alpha(scene: Scene, cfg: DataConfig) -> Scene:
     """Return a scene whose views know what their alpha channel means.
 
-    Raises:
-        UserError: the option is not a colour.
+    Raises UserError: the option is not a colour.
     """
     background_color(cfg)
     found = [has_alpha(view.image_path) for view in scene.views]

@@ -69,8 +69,8 @@ def from_quaternions(
 ) -> Float64[np.ndarray, "n 4 4"]:
     """Return the matrices of quaternions (w x y z) and positions.
 
-    Raises:
-        UserError: a quaternion is not of length 1 within a hundredth, or something is not finite.
+    Raises UserError: a quaternion is not of length 1 within a hundredth, or something is not
+    finite.
     """
     wxyz = np.asarray(wxyz, np.float64)
     bad = ~(np.abs(np.linalg.norm(wxyz, axis=1) - 1) < 1e-2) | ~np.isfinite(positions).all(1)
@@ -89,8 +89,8 @@ def from_quaternion(
 ) -> Float64[np.ndarray, "4 4"]:
     """Return the matrix of one quaternion (w x y z) and a position.
 
-    Raises:
-        UserError: the quaternion is not of length 1 within a hundredth, or something is not finite.
+    Raises UserError: the quaternion is not of length 1 within a hundredth, or something is not
+    finite.
     """
     wxyz = np.asarray(wxyz, np.float64)
     if wxyz.shape != (4,) or not abs(np.linalg.norm(wxyz) - 1) < 1e-2:

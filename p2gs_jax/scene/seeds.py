@@ -37,10 +37,8 @@ _FIX = "write it again with the tool that made it"
 def read_points(path: Path) -> tuple[Float32[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"] | None]:
     """Return the positions and, where there are any, display colours of the points in a PLY.
 
-    Colours are red, green, blue: 0 to 255, or 0 to 1 as floats.
-
-    Raises:
-        UserError: the file is absent, is not such a PLY, or holds points that are not finite.
+    Colours are red, green, blue: 0 to 255, or 0 to 1 as floats. Raises UserError: the file is
+    absent, is not such a PLY, or holds points that are not finite.
     """
     if not path.is_file():
         fix = "put the file there, or take its name out of the .json: seeds are then found"

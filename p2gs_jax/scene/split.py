@@ -59,10 +59,8 @@ def assign_split(views: tuple[View, ...], test_every: int) -> tuple[View, ...]:
 
     Within each camera, sorted by name, views 0, n, 2n, ... are `test`, as in 3DGS; where views have
     frames, the frames 0, n, 2n, ... among all of them are. A camera that would be left without a
-    training view holds out none; n = 0 holds out none.
-
-    Raises:
-        UserError: n is negative, or 1, which would leave nothing to train on.
+    training view holds out none; n = 0 holds out none. Raises UserError: n is negative, or 1, which
+    would leave nothing to train on.
     """
     if test_every < 0 or test_every == 1:
         raise UserError(
@@ -116,8 +114,7 @@ class SplitLists:
 def read_split(path: Path) -> SplitLists:
     """Read the lists that a user names: .json, or text with the names of what is held out.
 
-    Raises:
-        UserError: it is absent, or holds no such lists.
+    Raises UserError: it is absent, or holds no such lists.
     """
     if not path.exists():
         raise broken(path, "does not exist", "correct the option --split")

@@ -110,8 +110,7 @@ def _metric(name: str) -> bool:
 def survey(root: Path, cfg: DataConfig, report: Report = lambda message: None) -> Survey:
     """Return what a folder holds, with the options of a fit; missing photographs are counted.
 
-    Raises:
-        UserError: there is no scene, or it is broken.
+    Raises UserError: there is no scene, or it is broken.
     """
     cfg = dataclasses.replace(cfg, allow_missing=True)
     found = find_scene(root, cfg, report)

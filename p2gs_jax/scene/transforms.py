@@ -113,11 +113,9 @@ def load_transforms(root: Path, json_path: Path, cfg: DataConfig) -> Scene:
 def load_blender(root: Path, cfg: DataConfig) -> Scene:
     """Read the views of NeRF's synthetic scenes, and of all that are laid out as they are.
 
-    `transforms_train.json` is trained on and `transforms_test.json` held out;
-    `transforms_val.json` takes its place where there is none. One camera took all views.
-
-    Raises:
-        UserError: as of `load_transforms`; or a photograph is listed in both.
+    `transforms_train.json` is trained on and `transforms_test.json` held out; `transforms_val.json`
+    takes its place where there is none. One camera took all views. Raises UserError: as of
+    `load_transforms`; or a photograph is listed in both.
     """
     train = root / "transforms_train.json"
     others = [root / f"transforms_{name}.json" for name in ("test", "val")]

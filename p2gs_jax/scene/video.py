@@ -111,8 +111,8 @@ class Frame:
 def frames_of(path: Path) -> Iterator[Frame]:
     """Yield all frames of a video.
 
-    Raises:
-        UserError: it is not a video, holds none, changes its size, or breaks off before two frames.
+    Raises UserError: it is not a video, holds none, changes its size, or breaks off before two
+    frames.
     """
     with _opened(path) as (container, stream):
         stream.thread_type = "AUTO"
@@ -156,8 +156,7 @@ def expected_frames(path: Path) -> int | None:
 def video_size(path: Path) -> tuple[int, int]:
     """Return (width, height) of the first frame, upright.
 
-    Raises:
-        UserError: as `frames_of`.
+    Raises UserError: as `frames_of`.
     """
     for frame in frames_of(path):
         return frame.size
@@ -223,8 +222,7 @@ def is_video(path: Path) -> bool:
 def read_video(path: Path, cfg: DataConfig, work_dir: Path | None, report: Report) -> Converted:
     """Return the chosen frames of a video as photographs, kept in `work_dir` or the user's cache.
 
-    Raises:
-        UserError: it is not a video, holds none, changes its size, or shows too little.
+    Raises UserError: it is not a video, holds none, changes its size, or shows too little.
     """
     key = {
         "version": _VERSION,

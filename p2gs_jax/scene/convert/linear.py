@@ -56,8 +56,7 @@ class RawFacts:
 def read_facts(path: Path) -> RawFacts:
     """Return what a raw file states about itself; pixels are not read.
 
-    Raises:
-        UserError: rawpy is not installed, or LibRaw does not know this file.
+    Raises UserError: rawpy is not installed, or LibRaw does not know this file.
     """
     with _raw(path) as raw:
         chosen = [float(x) for x in raw.camera_whitebalance[:3]]
@@ -101,8 +100,7 @@ def read_raw(path: Path, balance: Balance | None) -> Picture:
 def read_raw_exif(path: Path) -> Image.Exif:
     """Return how a raw photograph was taken.
 
-    Raises:
-        UserError: as `read_facts`.
+    Raises UserError: as `read_facts`.
     """
     with _raw(path) as raw:
         return _raw_exif(path, raw)
@@ -170,8 +168,7 @@ def _exr(path: Path, **how: bool) -> Iterator[Any]:
 def exr_size(path: Path) -> tuple[int, int]:
     """Return (width, height) of the data window.
 
-    Raises:
-        UserError: the file is not a readable OpenEXR.
+    Raises UserError: the file is not a readable OpenEXR.
     """
     with _exr(path, header_only=True) as file:
         low, high = file.header()["dataWindow"]
@@ -181,8 +178,7 @@ def exr_size(path: Path) -> tuple[int, int]:
 def read_exr_exif(path: Path) -> Image.Exif | None:
     """Return how an OpenEXR was taken, from its standard attributes, or None.
 
-    Raises:
-        UserError: the file is not a readable OpenEXR.
+    Raises UserError: the file is not a readable OpenEXR.
     """
     with _exr(path, header_only=True) as file:
         return _exr_exif(dict(file.header()))
@@ -192,9 +188,7 @@ def read_exr(path: Path) -> Picture:
     """Return the light of an OpenEXR: channels R, G, B (of its only layer, too) or Y.
 
     Chromaticities in the header are converted. What is premultiplied by A is divided by it again.
-
-    Raises:
-        UserError: the file is not a readable OpenEXR, or has no such channels.
+    Raises UserError: the file is not a readable OpenEXR, or has no such channels.
     """
     with _exr(path, separate_channels=True) as file:
         channels: dict[str, Any] = {k: c.pixels for k, c in file.channels().items()}
@@ -223,8 +217,7 @@ def read_exr(path: Path) -> Picture:
 def read_float_tiff(path: Path) -> Picture:
     """Return the light of a TIFF of floats.
 
-    Raises:
-        UserError: it cannot be decoded.
+    Raises UserError: it cannot be decoded.
     """
     raw = cv2.imread(str(path), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
     if raw is None or raw.dtype not in (np.float32, np.float64):

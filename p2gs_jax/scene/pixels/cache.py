@@ -80,8 +80,7 @@ class PixelFiles:
     def write(self, key: Key, photograph: Decoded) -> Decoded:
         """Keep a photograph, and return it mapped.
 
-        Raises:
-            UserError: the disk is full, or cannot be written.
+        Raises UserError: the disk is full, or cannot be written.
         """
         try:
             write_photograph(self.path(key), photograph)
@@ -97,8 +96,7 @@ class PixelFiles:
     def require_room(self, needed: int) -> None:
         """Refuse a disk that cannot take `needed` bytes of photographs, before hours go into them.
 
-        Raises:
-            UserError: it has less room.
+        Raises UserError: it has less room.
         """
         place = next(p for p in (self.folder, *self.folder.parents) if p.exists())
         there = sum(path.stat().st_size for path in self.folder.glob("*/*.px"))

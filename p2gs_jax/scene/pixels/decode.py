@@ -57,9 +57,8 @@ def resamples(view: View, size: tuple[int, int]) -> bool:
 def decode(view: View, sizes: Sequence[tuple[int, int]]) -> list[Decoded]:
     """Return a photograph at some (width, height) in pixels; its file is opened once.
 
-    Raises:
-        UserError: the file or its mask is missing, broken or of another size than the model's; or
-            there is too little memory for it.
+    Raises UserError: the file or its mask is missing, broken or of another size than the model's;
+    or there is too little memory for it.
     """
     try:
         return _decoded(view, sizes)

@@ -102,8 +102,7 @@ def load_images(
 def require_mapper(mapper: Mapper) -> None:
     """Refuse a mapper that this pycolmap does not have.
 
-    Raises:
-        UserError: it has no global one.
+    Raises UserError: it has no global one.
     """
     if mapper == "global" and not hasattr(pycolmap, "global_mapping"):
         raise UserError(
