@@ -35,10 +35,7 @@ __all__ = ["ImageStore", "camera_at", "load_scene", "size_at"]
 
 
 def load_scene(
-    root: Path,
-    cfg: DataConfig,
-    work_dir: Path | None = None,
-    report: Report = lambda message: None,
+    root: Path, cfg: DataConfig, work_dir: Path | None = None, report: Report = lambda message: None
 ) -> Scene:
     """Read a scene; the format is found from what lies in the folder.
 

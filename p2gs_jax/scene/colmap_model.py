@@ -122,13 +122,7 @@ def read_model(folder: Path) -> Model:
     ids, xyz, rgb = points(paths[2])
     order = np.argsort(ids, kind="stable")
     return Model(
-        folder,
-        ext,
-        cameras(paths[0]),
-        tuple(images(paths[1])),
-        ids[order],
-        xyz[order],
-        rgb[order],
+        folder, ext, cameras(paths[0]), tuple(images(paths[1])), ids[order], xyz[order], rgb[order]
     )
 
 

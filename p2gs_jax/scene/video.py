@@ -278,11 +278,7 @@ def _build(path: Path, cfg: DataConfig, folder: Path, report: Report) -> None:
 
 
 def _write(
-    path: Path,
-    wanted: set[int],
-    chosen: dict[int, Chosen],
-    folder: Path,
-    report: Report,
+    path: Path, wanted: set[int], chosen: dict[int, Chosen], folder: Path, report: Report
 ) -> tuple[list[dict], set[str | None]]:
     records: list[dict] = []
     transfers: set[str | None] = set()
