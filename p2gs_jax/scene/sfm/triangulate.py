@@ -12,8 +12,7 @@ import pycolmap
 
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.cache import Report, cached_folder, file_fingerprints
-from p2gs_jax.scene.colmap import tracks_of
-from p2gs_jax.scene.colmap_model import read_model
+from p2gs_jax.scene.colmap import read_model, tracks_of
 from p2gs_jax.scene.sfm.features import extract, match, opened, pairs_by_pose, quiet_colmap
 from p2gs_jax.types import Scene, View
 
