@@ -42,21 +42,11 @@ def load_scene(
     In this order, unless `cfg.format` names one: a COLMAP model in `sparse/0`, `sparse` or the
     folder itself; `transforms.json` in it, or `root` itself where that is a .json file;
     `transforms_train.json` with those of the other parts of the split; LLFF's `poses_bounds.npy`; a
-    drive as a data set lays it out (`drives`); photographs in `images/` or the folder itself, whose
-    cameras are then found by structure from motion. Poses without points get theirs by
-    triangulation, or at random where hardly anything matches.
-
-    Args:
-        root: folder, .json file, or video.
-        cfg: which photographs are used, and how.
-        work_dir: results of long computations are kept here for a resume; None keeps nothing.
-        report: receives progress, a line at a time.
-
-    Returns:
-        Views sorted by name, with split, masks and EXIF exposures; points; tracks; notes.
-
-    Raises:
-        UserError: there is no scene, or it is broken; the message names the file.
+    drive as a data set lays it out (`drives`); photographs in `images/` or the folder itself, or a
+    video, whose cameras are then found by structure from motion. Poses without points get theirs by
+    triangulation, or at random where hardly anything matches. Views are sorted by name. Long
+    computations keep their results in `work_dir` for a resume. Raises UserError: there is no scene,
+    or it is broken; the message names the file.
     """
     found = find_scene(root, cfg, report)
     if isinstance(found, Recording):

@@ -3,9 +3,7 @@
 Why not `pycolmap.Reconstruction`: version 4.2.1 accepts a truncated `cameras.bin` without an error
 and never returns from a truncated `points3D.bin`. Here every count is checked against the size of
 the file. Newer models' `rigs.bin` and `frames.bin` are not needed: `images.bin` still holds every
-registered image with its own pose. tests/scene/test_colmap.py compares this with pycolmap.
-
-Format: https://colmap.github.io/format.html
+registered image with its own pose. Format: https://colmap.github.io/format.html
 """
 
 from __future__ import annotations
@@ -209,14 +207,10 @@ class CameraRecord(NamedTuple):
 
 
 class ImageRecord(NamedTuple):
-    """One entry of `images`.
+    """One entry of `images`, its name relative to the image folder.
 
-    Attributes:
-        name: path relative to the image folder.
-        qvec: world-to-camera rotation, wxyz.
-        tvec: world-to-camera translation, scene units.
-        xy: keypoints that have a 3D point, pixels of the photograph, centres at +0.5.
-        point_ids: their points' ids.
+    Pose (wxyz and scene units) are world-to-camera; `xy` are the keypoints that have a 3D point,
+    pixels of the photograph with centres at +0.5, and `point_ids` their points' ids.
     """
 
     name: str
@@ -228,13 +222,10 @@ class ImageRecord(NamedTuple):
 
 
 class Model(NamedTuple):
-    """A COLMAP model as its files state it: cameras by id, images in the file's order.
+    """A COLMAP model as files of the suffix `kind` state it.
 
-    Attributes:
-        kind: suffix of its files.
-        point_ids: ascending.
-        xyz: scene units.
-        rgb: display-encoded colours.
+    Cameras are by id, images in the file's order, `point_ids` ascending; `xyz` are scene units,
+    `rgb` display-encoded.
     """
 
     folder: Path

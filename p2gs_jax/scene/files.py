@@ -35,11 +35,9 @@ MOST_PIXELS = 2 * (Image.MAX_IMAGE_PIXELS or 2**26)
 
 
 def list_images(folder: Path, *, recursive: bool = True) -> list[Path]:
-    """Return the images in a folder, sorted by relative path; hidden ones are left out.
+    """Return the images in a folder, which may be absent; hidden ones are left out.
 
-    Args:
-        folder: may be absent.
-        recursive: look into its subfolders too.
+    They are sorted by their relative path.
     """
     if not folder.is_dir():
         return []
@@ -69,8 +67,7 @@ def read_json(path: Path, fix: str) -> Any:
 def require_inside(name: PurePath, folder: Path, source: Path, fix: str = _MOVED) -> None:
     """Refuse a name in the file `source` that leads out of the folder it is relative to.
 
-    Links below the folder are followed: whoever made it put them there. Raises UserError: it leads
-    out.
+    Links below the folder are followed: whoever made it put them there.
     """
     normal = os.path.normpath(name.as_posix())
     if os.path.isabs(normal) or normal.split("/")[0] == "..":
@@ -164,16 +161,13 @@ def undecodable(path: Path) -> UserError:
 
 
 def check_missing(missing: Sequence[str], total: int, source: Path, cfg: DataConfig) -> list[str]:
-    """Reject a model whose images are missing on disk, unless `cfg.allow_missing` allows that.
+    """Return notes about images that a model names and the disk lacks.
 
     Args:
         missing: their names.
         total: number of images of the model.
         source: the file or folder that names them.
-        cfg: has the option.
-
-    Returns:
-        Notes for the user: none or one.
+        cfg: `allow_missing`.
 
     Raises:
         UserError: images are missing and that is not allowed, or no image is left.
@@ -193,16 +187,9 @@ def check_missing(missing: Sequence[str], total: int, source: Path, cfg: DataCon
 def at_file_size(
     path: Path, K: Float[np.ndarray, "3 3"], size: tuple[int, int], source: Path
 ) -> tuple[Float32[np.ndarray, "3 3"], int, int]:
-    """Return K, width and height of an image file, of which a model may have a larger copy.
+    """Return K, width and height of an image file; K and size (pixels) are the model's.
 
-    Args:
-        path: the image.
-        K: intrinsics according to the model, pixels.
-        size: width and height according to the model, pixels.
-        source: the file of the model.
-
-    Raises:
-        UserError: the file is not an image, or has another shape than the camera.
+    Raises UserError: the file is not an image, or has another shape than `source` says.
     """
     w, h = image_size(path)
     sx, sy = w / size[0], h / size[1]

@@ -41,11 +41,11 @@ _FIRST = 6
 
 @dataclass(frozen=True)
 class Motion:
-    """How far a frame is from the reference.
+    """How far a frame is from the reference, in longer sides of the picture.
 
     Attributes:
-        displacement: median displacement of the corners, in longer sides.
-        parallax: upper quartile of what the best rotation leaves of it, in longer sides.
+        displacement: median displacement of the corners.
+        parallax: upper quartile of what the best rotation leaves of it.
         kept: share of the reference's corners that are still seen.
     """
 
@@ -56,11 +56,9 @@ class Motion:
 
 @dataclass(frozen=True)
 class Chosen:
-    """A frame that was chosen.
+    """A frame that was chosen; its sharpness compares with neighbours only.
 
-    Attributes:
-        sharpness: compares with neighbours only.
-        way: motion since the frame chosen before, or None.
+    `way` is the motion since the frame chosen before.
     """
 
     number: int

@@ -31,15 +31,9 @@ _INSTEAD = "--split every holds out every n-th view instead"
 def split_scene(scene: Scene, cfg: DataConfig) -> Scene:
     """Return a scene whose views are split, and that says by what.
 
-    A file that the user names comes first, then what the data set says, then every n-th view;
-    `test_every` 0 holds out none in any case.
-
-    Args:
-        scene: as it was read; where the data set decides, `split_by` and the views say so.
-        cfg: `split` and `test_every`.
-
-    Raises:
-        UserError: the file is broken or names what is not there, or so many cannot be held out.
+    A file that the user names comes first, then what the data set says (`split_by` and the views),
+    then every n-th view; `test_every` 0 holds out none in any case. Raises UserError: the file is
+    broken or names what is not there, or so many cannot be held out.
     """
     if cfg.split is not None and cfg.split != EVERY and cfg.test_every:
         lists = read_split(Path(cfg.split))
@@ -89,11 +83,9 @@ def _with_test(views: Sequence[View], test: set[int]) -> tuple[View, ...]:
 
 @dataclasses.dataclass(frozen=True)
 class SplitLists:
-    """Names of photographs.
+    """Names of photographs, as `source` (files, in words) in `folder` lists them.
 
     Attributes:
-        source: the file, or the files, in words.
-        folder: that holds it or them.
         train: what is trained on; None: the rest.
         test: what is held out; None or empty: `val` if there is one, else the rest.
         val: held out by others while they train; here it takes the place of `test` or is left out.
@@ -131,13 +123,8 @@ def read_split(path: Path) -> SplitLists:
 def lists_in(path: Path, data: object, keys: dict[str, str]) -> SplitLists | None:
     """Return the lists in the data of a .json, or None where it holds none.
 
-    Args:
-        path: the file.
-        data: what it holds.
-        keys: what `train`, `test` and `val` are called in it.
-
-    Raises:
-        UserError: one of them is not a list of names.
+    `keys` are what `train`, `test` and `val` are called in it. Raises UserError: one of them is not
+    a list of names.
     """
     lists: dict[str, tuple[str, ...]] = {}
     for name, key in keys.items():
@@ -165,14 +152,8 @@ def lists_beside(*folders: Path) -> SplitLists | None:
 def split_as_listed(scene: Scene, lists: SplitLists, *, allow_missing: bool = False) -> Scene:
     """Return a scene whose views are split as lists say; what is in none of them is left out.
 
-    Args:
-        scene: as it was read.
-        lists: which views are which.
-        allow_missing: names that no photograph has are left out instead of an error.
-
-    Raises:
-        UserError: a name belongs to no photograph, or to several; it is in two lists; or nothing is
-            left to train on.
+    Names that no photograph has are an error unless `allow_missing`. Raises UserError: a name
+    belongs to no photograph, or to several; it is in two lists; or nothing is left to train on.
     """
     views, notes, unused = scene.views, [], []
     rows_of = _rows_by_name(views)

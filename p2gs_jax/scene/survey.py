@@ -44,7 +44,6 @@ class SurveyedCamera:
     """One physical camera, or photographs of one size where nothing else is known.
 
     Attributes:
-        name: empty where nothing is known.
         size: width and height, pixels.
         focal: length in pixels.
         across: angle of view from side to side, degrees.
@@ -65,19 +64,15 @@ class SurveyedCamera:
 
 @dataclass(frozen=True)
 class Survey:
-    """What there is.
+    """What there is; `scene` is None for photographs alone.
 
     Attributes:
-        root: the folder.
         format: as `DataConfig.format` names it.
-        cameras: by name.
-        scene: views, points, boxes; None: photographs alone.
         frames: moments in a drive, or None where views have none.
-        seconds: from the first photograph to the last, or None.
-        way: length of the way of the camera with the most photographs, scene units; None where
-            views have no frames.
+        seconds: from the first photograph to the last.
+        way: length of the way of the camera with the most photographs, scene units.
         missing: photographs that the cameras lack in these frames.
-        sweeps: sweeps of laser scanners, or None.
+        sweeps: sweeps of laser scanners.
         lacks: what a drive may have and this scene lacks, in words.
     """
 

@@ -2,9 +2,8 @@
 
 nerfstudio and instant-ngp write one `transforms.json`, Blender's scenes one for each part of the
 split. Poses are camera-to-world with OpenGL axes (x right, y up, z backwards); intrinsics follow
-COLMAP (pixel centres at +0.5), from which both tools take them. Of nerfstudio's other fields
-`ply_file_path` names seed points in the axes of the poses, `train_filenames`, `test_filenames` and
-`val_filenames` the split; `aabb_scale` means nothing to splats.
+COLMAP (pixel centres at +0.5). Of nerfstudio's other fields `ply_file_path` names seed points in
+the axes of the poses, `train_filenames`, `test_filenames` and `val_filenames` the split.
 
 LLFF's table has a row for each photograph, in the order of their names: a 3x5 matrix, row by row,
 and the nearest and the farthest depth. The matrix is the camera-to-world pose with the axes (down,

@@ -53,13 +53,10 @@ _SMALLEST_HD = 720
 
 @dataclass(frozen=True)
 class Frame:
-    """A decoded frame.
+    """A decoded frame, `turn` quarter turns against the clock from upright.
 
-    Attributes:
-        number: counts from 0 in the order in which frames are shown.
-        time: seconds from the beginning.
-        turn: quarter turns against the clock that put it upright.
-        square: width over height of a pixel.
+    Numbers count from 0 in the order in which frames are shown, `time` is seconds from the
+    beginning, and `square` the width over height of a pixel.
     """
 
     number: int

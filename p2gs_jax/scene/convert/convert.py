@@ -68,10 +68,8 @@ class Converted:
     """Photographs in a folder that structure from motion can read.
 
     Attributes:
-        folder: what their names are relative to.
-        paths: the files in it, sorted.
+        paths: the files in `folder`, sorted.
         originals: the user's files, by path relative to `folder`.
-        notes: what the user should know.
         known: why the response of them all is known, or None.
     """
 
@@ -337,16 +335,10 @@ def write_png(
     exif: Image.Exif | None = None,
     profile: bytes | None = None,
 ) -> None:
-    """Write a converted photograph.
+    """Write a converted photograph, uint8 or uint16 in the order R G B (A), or one channel.
 
-    Args:
-        path: the .png.
-        pixels: uint8 or uint16 in the order R G B, perhaps with alpha behind, or one channel.
-        exif: settings are taken from it. Not the orientation: poses belong to the stored raster.
-        profile: ICC profile of the colours, if they are not sRGB.
-
-    Raises:
-        UserError: the disk is full, or cannot be written.
+    Settings are taken from `exif`, but not the orientation: poses belong to the stored raster. The
+    ICC profile says which colours, if not sRGB. Raises UserError: the disk cannot be written.
     """
     order = {3: [2, 1, 0], 4: [2, 1, 0, 3]}.get(pixels.shape[2], [0])
     raster = np.ascontiguousarray(pixels[..., order])

@@ -51,14 +51,7 @@ def exif_of(path: Path) -> Image.Exif | None:
 
 @dataclass(frozen=True)
 class ExifSettings:
-    """Settings of a photograph, as far as its EXIF has them.
-
-    Attributes:
-        time: exposure time, seconds.
-        aperture: f-number.
-        iso: sensitivity.
-        taken: local date and time, `YYYY:MM:DD hh:mm:ss`.
-    """
+    """Exposure time in seconds, f-number, sensitivity and local date, as far as EXIF has them."""
 
     time: float | None = None
     aperture: float | None = None

@@ -40,8 +40,7 @@ class RawFacts:
         size: width and height in pixels, as the sensor lies.
         camera: make and model, as far as they are known; photographs of one share white balance.
         balance: factors on red, green and blue that the camera chose, green 1; None: not recorded.
-        black: levels that are subtracted, by colour of the filter.
-        white: level that becomes 1.
+        black: levels that are subtracted, by colour of the filter; `white` becomes 1.
         matrix: whether the camera's colours are known; otherwise its primaries are kept.
     """
 
@@ -76,12 +75,8 @@ def read_facts(path: Path) -> RawFacts:
 def read_raw(path: Path, balance: Balance | None) -> Picture:
     """Return the light of a raw photograph, saturated at 1, unrotated.
 
-    Args:
-        path: the file.
-        balance: factors on red, green and blue; None: LibRaw's for daylight.
-
-    Raises:
-        UserError: rawpy is not installed, or LibRaw cannot decode this file.
+    The factors on red, green and blue are `balance`, or LibRaw's for daylight. Raises UserError:
+    rawpy is not installed, or LibRaw cannot decode this file.
     """
     with _raw(path) as raw:
         pixels = raw.postprocess(

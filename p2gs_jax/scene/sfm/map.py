@@ -55,9 +55,9 @@ def load_images(
         image_folder: holds the photographs.
         paths: the photographs, in it or in its subfolders.
         cfg: passed on to the COLMAP reader.
-        work_dir: keeps the result under `sfm/`; it is reused while names, sizes and modification
-            times of the photographs stay the same. Features and matches stay under `features/`
-            and serve what is done again with more photographs or another mapper.
+        work_dir: keeps the result under `sfm/`, reused while names, sizes and modification times of
+            the photographs stay the same, and features and matches under `features/`, which serve
+            more photographs or another mapper.
         report: receives progress.
 
     Raises:
@@ -193,13 +193,7 @@ def _map_globally(
 def reasons(
     database: Path, names: Sequence[str], models: Sequence[pycolmap.Reconstruction]
 ) -> dict[str, str]:
-    """Return for every photograph that is not in the first model why not, in words.
-
-    Args:
-        database: features and matches.
-        names: of all photographs.
-        models: what was reconstructed; the first is used.
-    """
+    """Return why photographs are not in the first model, in words, from the database of matches."""
     parts = [{model.image(i).name for i in model.reg_image_ids()} for model in models]
     used = parts[0] if parts else set()
     left = [name for name in names if name not in used]
