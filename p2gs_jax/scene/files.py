@@ -20,6 +20,7 @@ from p2gs_jax.errors import UserError, broken
 from p2gs_jax.scene.convert.headers import size_of
 from p2gs_jax.scene.convert.kinds import CONVERTED_SUFFIXES
 from p2gs_jax.scene.lens import scale_intrinsics
+from p2gs_jax.scene.masks import first_few
 
 IMAGE_SUFFIXES = CONVERTED_SUFFIXES | {*(".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm")}
 # Ratios of width to height that differ by more than this are different shapes.
@@ -174,8 +175,8 @@ def check_missing(missing: Sequence[str], total: int, source: Path, cfg: DataCon
     """
     if not missing:
         return []
-    listed = ", ".join(missing[:5]) + (", ..." if len(missing) > 5 else "")
-    message = f"{len(missing)} of the {total} images named by {source} do not exist: {listed}"
+    message = f"{len(missing)} of the {total} images named by {source} do not exist: "
+    message += first_few(missing)
     if not cfg.allow_missing:
         fix = "add them, name their folder with --images, or skip them with --allow-missing"
         raise UserError(message, fix=fix)

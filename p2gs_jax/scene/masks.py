@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -33,8 +34,12 @@ def attach_masks(views: tuple[View, ...]) -> tuple[tuple[View, ...], list[str]]:
     bare = [view.name for view in masked if view.mask_path is None]
     if not bare or len(bare) == len(masked):
         return masked, []
-    listed = ", ".join(bare[:5]) + (", ..." if len(bare) > 5 else "")
-    return masked, [f"{len(bare)} of {len(masked)} views have no mask: {listed}"]
+    return masked, [f"{len(bare)} of {len(masked)} views have no mask: {first_few(bare)}"]
+
+
+def first_few(names: Sequence[str]) -> str:
+    """Return the first of some names for a message."""
+    return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
 
 
 def mask_of(view: View) -> Path | None:

@@ -63,8 +63,7 @@ def from_quaternions(
 ) -> Float64[np.ndarray, "n 4 4"]:
     """Return the matrices of quaternions (w x y z) and positions.
 
-    Raises UserError: a quaternion is not of length 1 within a hundredth, or something is not
-    finite.
+    Raises UserError: a quaternion has not length 1 within a hundredth, or something is not finite.
     """
     wxyz = np.asarray(wxyz, np.float64)
     bad = ~(np.abs(np.linalg.norm(wxyz, axis=1) - 1) < 1e-2) | ~np.isfinite(positions).all(1)
@@ -81,11 +80,7 @@ def from_quaternions(
 def from_quaternion(
     wxyz: Float[np.ndarray, " 4"], position: Float[np.ndarray, " 3"], source: Path, what: str
 ) -> Float64[np.ndarray, "4 4"]:
-    """Return the matrix of one quaternion (w x y z) and a position.
-
-    Raises UserError: the quaternion is not of length 1 within a hundredth, or something is not
-    finite.
-    """
+    """Return the matrix of one quaternion and a position; errors are as of `from_quaternions`."""
     wxyz = np.asarray(wxyz, np.float64)
     if wxyz.shape != (4,) or not abs(np.linalg.norm(wxyz) - 1) < 1e-2:
         why = f"the pose of {what} has a rotation that is no unit quaternion"
