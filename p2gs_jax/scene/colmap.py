@@ -121,8 +121,8 @@ def tracks_of(model: Model, views: Sequence[View]) -> Tracks | None:
         view_rows.append(np.full(int(seen.sum()), row))
     if not positions:
         return None
-    rows_and_points = (np.concatenate(at).astype(np.int32) for at in (view_rows, point_rows))
-    return Tracks(*rows_and_points, np.concatenate(positions))
+    seen_in, seen_points = (np.concatenate(at).astype(np.int32) for at in (view_rows, point_rows))
+    return Tracks(seen_in, seen_points, np.concatenate(positions))
 
 
 def subfolder(name: str) -> str | None:
@@ -406,9 +406,9 @@ def _text_lines(path: Path, *, blank: bool = False) -> Iterator[tuple[int, str]]
 def _image(
     name: str, camera_id: int, pose: list[float], xy: np.ndarray, ids: np.ndarray
 ) -> ImageRecord:
-    tracked, pose = ids >= 0, np.array(pose)
+    tracked, (qvec, tvec) = ids >= 0, np.split(np.array(pose), [4])
     xy, ids = np.asarray(xy[tracked], np.float64), ids[tracked].astype(np.int64)
-    return ImageRecord(name.replace("\\", "/"), camera_id, pose[:4], pose[4:], xy, ids)
+    return ImageRecord(name.replace("\\", "/"), camera_id, qvec, tvec, xy, ids)
 
 
 def _malformed(path: Path, line: int, what: object) -> UserError:

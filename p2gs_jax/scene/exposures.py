@@ -41,10 +41,7 @@ def read_known_exposures(source: str, views: list[View]) -> Float[np.ndarray, " 
 
 
 def check_source(source: str | None) -> None:
-    """Check that a source of `read_known_exposures`, or none, can be used: before there are views.
-
-    Raises UserError: the file cannot be used.
-    """
+    """Raise UserError where a source of `read_known_exposures` cannot be used; None can."""
     if source not in (None, "exif"):
         _read(Path(source))
 

@@ -50,10 +50,7 @@ def list_images(folder: Path, *, recursive: bool = True) -> list[Path]:
 
 
 def read_json(path: Path, fix: str) -> Any:
-    """Return what a JSON file holds.
-
-    Raises UserError: it is absent, not text, or not valid JSON.
-    """
+    """Return what a JSON file holds; UserError: it is absent, not text, or not valid JSON."""
     try:
         return parse_json(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -76,29 +73,17 @@ def require_inside(name: PurePath, folder: Path, source: Path, fix: str = _MOVED
 
 
 def require_plain(name: str, source: Path) -> None:
-    """Refuse a name of a camera, found in the file `source`, that is a path.
-
-    Raises UserError: it is a path.
-    """
+    """Refuse a name of a camera, found in the file `source`, that is a path."""
     if name in ("", ".", "..") or any(c in name for c in "/\\\0"):
-        raise broken(
-            source,
-            f"has a camera by the name of {name!r}, which is no name of a folder",
-            "get its tables again, or name the camera otherwise in all of them",
-        )
+        why = f"has a camera by the name of {name!r}, which is no name of a folder"
+        raise broken(source, why, "get its tables again, or rename the camera in all of them")
 
 
 def image_folder(root: Path, cfg: DataConfig) -> Path | None:
-    """Return the image folder that the user names, or None.
-
-    Raises UserError: it does not exist.
-    """
-    if cfg.images is None:
-        return None
-    folder = root / cfg.images
-    if not folder.is_dir():
-        fix = "correct the option --images"
-        raise UserError(f"the image folder {folder} does not exist", fix=fix)
+    """Return the image folder that the user names, or None; UserError: it does not exist."""
+    folder = None if cfg.images is None else root / cfg.images
+    if folder is not None and not folder.is_dir():
+        raise broken(f"the image folder {folder}", "does not exist", "correct the option --images")
     return folder
 
 
@@ -162,16 +147,9 @@ def undecodable(path: Path) -> UserError:
 
 
 def check_missing(missing: Sequence[str], total: int, source: Path, cfg: DataConfig) -> list[str]:
-    """Return notes about images that a model names and the disk lacks.
+    """Return notes about images that a model of `total` images names and the disk lacks.
 
-    Args:
-        missing: their names.
-        total: number of images of the model.
-        source: the file or folder that names them.
-        cfg: `allow_missing`.
-
-    Raises:
-        UserError: images are missing and that is not allowed, or no image is left.
+    Raises UserError: images are missing and `allow_missing` is not set, or no image is left.
     """
     if not missing:
         return []

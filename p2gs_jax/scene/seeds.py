@@ -73,14 +73,9 @@ def with_random_seeds(scene: Scene) -> Scene:
         f"{why}: {len(points)} seeds were drawn at random where the cameras "
         f"look, at depths of {near:.3g} to {far:.3g}."
     )
-    return dataclasses.replace(
-        scene,
-        points=points,
-        point_colors=None,
-        tracks=None,
-        random_seeds=True,
-        notes=(*scene.notes, note),
-    )
+    notes = (*scene.notes, note)
+    unseen = {"point_colors": None, "tracks": None, "random_seeds": True}
+    return dataclasses.replace(scene, points=points, notes=notes, **unseen)
 
 
 def depth_range(views: Sequence[View]) -> tuple[float, float]:

@@ -159,7 +159,10 @@ def split_as_listed(scene: Scene, lists: SplitLists, *, allow_missing: bool = Fa
         why = f"{name} lists {len(unused)} photographs that are not views of the scene"
         notes.append(f"{why}: {first_few(unused)}")
     everything = set(range(len(views)))
-    train, test = (None if rows is None else set(rows.values()) - {None} for rows in found)
+    train, test = (
+        None if rows is None else {row for row in rows.values() if row is not None}
+        for rows in found
+    )
     train = everything - (test or set()) if train is None else train
     test = everything - train if test is None else test
     if both := sorted(train & test):

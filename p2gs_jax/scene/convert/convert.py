@@ -220,10 +220,10 @@ class _Converter:
             if facts.balance is not None:
                 chosen[facts.camera].append(facts.balance)
         # One for each camera: the median of what it chose.
-        self._balances: dict[str, Balance] = {
-            camera: tuple(float(x) for x in np.exp(np.median(np.log(balances), axis=0)))  # type: ignore[misc]
-            for camera, balances in chosen.items()
-        }
+        self._balances: dict[str, Balance] = {}
+        for camera, balances in chosen.items():
+            red, green, blue = np.exp(np.median(np.log(balances), axis=0)).tolist()
+            self._balances[camera] = (red, green, blue)
         self._scale = self._common_scale()
 
     def fill(self, folder: Path, places: Mapping[Path, str], report: Report) -> dict[str, Any]:

@@ -22,10 +22,7 @@ _DEFAULT_ISO = 100.0
 
 
 def size_of(path: Path) -> tuple[int, int] | None:
-    """Return (width, height) as converted; None: the file needs no conversion.
-
-    Raises UserError: it cannot be opened, or the package for it is missing.
-    """
+    """Return (width, height) as converted; None: no need. UserError: it cannot be opened."""
     kind = kind_of(path)
     if kind in ("heif", "avif", "webp"):
         with opened(path) as image:

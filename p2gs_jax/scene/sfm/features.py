@@ -67,14 +67,9 @@ def extract(
 ) -> None:
     """Detect SIFT features of images on the CPU and store them in a new or an existing database.
 
-    Args:
-        image_folder: what `names` are relative to.
-        mode: how the images share cameras.
-        enlarge: look for features in images of twice the size as well.
-        camera: id of the camera in the database that took them; None: a new one, or more.
-
-    Raises:
-        UserError: COLMAP failed.
+    `mode` says how they share cameras, `camera` the id of one in the database that took them all;
+    with `enlarge` features are found in images of twice the size as well. Raises UserError: COLMAP
+    failed.
     """
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size = MAX_IMAGE_SIZE
