@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -82,14 +83,11 @@ def _entry(values: dict, index: int) -> Shot:
     unknown = sorted(set(values) - set(FIELDS))
     if unknown:
         raise ValueError(f"has an unknown field {unknown[0]!r} (known are {', '.join(FIELDS)})")
-    return Shot(
-        _name(values, index),
-        checked_pose(_given(values, "viewmat"), "viewmat"),
-        checked_lens(_given(values, "K")),
-        _pixels(values, "width"),
-        _pixels(values, "height"),
-        **{key: _number(values, key, *limits) for key, limits in LIMITS.items() if key in values},
-    )
+    viewmat = checked_pose(_given(values, "viewmat"), "viewmat")
+    K, name = checked_lens(_given(values, "K")), _name(values, index)
+    shot = Shot(name, viewmat, K, _pixels(values, "width"), _pixels(values, "height"))
+    more = {key: _number(values, key, *limits) for key, limits in LIMITS.items() if key in values}
+    return replace(shot, **more)
 
 
 def _nerfstudio(path: Path, data: dict) -> Callable[[dict, int], Shot]:

@@ -15,8 +15,7 @@ from jaxtyping import Float32
 from PIL import Image, ImageDraw, ImageFont
 
 from p2gs_jax.core.numerics import LN2
-from p2gs_jax.formats.frames import OutputFrame
-from p2gs_jax.formats.png import to_uint8
+from p2gs_jax.formats.frames import OutputFrame, to_uint8
 from p2gs_jax.paths.panorama import Cylinder, Layers, Wide, borders, render_wide, stitch
 from p2gs_jax.paths.rig import Rig, TimeStep
 from p2gs_jax.paths.shots import Poses, Shot

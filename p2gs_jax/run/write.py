@@ -15,8 +15,8 @@ from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.evaluate.evaluate import ViewResult
 from p2gs_jax.formats.exr import write_exr
+from p2gs_jax.formats.frames import write_png
 from p2gs_jax.formats.ply import write_ply, write_radiance
-from p2gs_jax.formats.png import write_png
 from p2gs_jax.gaussians.bake import bake, display_comments, display_of_splats
 from p2gs_jax.gaussians.posed import posed
 from p2gs_jax.photometry.display import develop, usual_display
