@@ -23,7 +23,9 @@ from p2gs_jax.districts.part_of import BlockScene, block_scene
 from p2gs_jax.districts.shared import read_shared
 from p2gs_jax.formats.ply import write_radiance
 from p2gs_jax.gaussians.population import Coverage, default_max_gaussians
-from p2gs_jax.jobs import Job
+from p2gs_jax.jobs.job import (
+    Job,
+)
 from p2gs_jax.pipeline.devices import mesh_of
 from p2gs_jax.pipeline.fit import begin_programs, begun, compact, optimise
 from p2gs_jax.pipeline.preflight import Paths

@@ -37,8 +37,17 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.formats.ply import read_ply
 from p2gs_jax.gaussians.init.dense_bound import coverage_of
 from p2gs_jax.gaussians.init.seeds import cameras_radius
-from p2gs_jax.jobs import JobState, open_engine, run_jobs
-from p2gs_jax.jobs.engines import LOCAL, check_engine
+from p2gs_jax.jobs.engines import (
+    LOCAL,
+    check_engine,
+    open_engine,
+)
+from p2gs_jax.jobs.job import (
+    JobState,
+)
+from p2gs_jax.jobs.run import (
+    run_jobs,
+)
 from p2gs_jax.photometry.gauge import recentre
 from p2gs_jax.pipeline import preflight
 from p2gs_jax.pipeline.finish import Account, finish

@@ -15,7 +15,9 @@ from p2gs_jax.evaluate.novel_views import SHIFTS, Surface, picked, shifted, unse
 from p2gs_jax.evaluate.region_scores import parts_of
 from p2gs_jax.evaluate.unexplained import Residuals, Unexplained, shares_by_view
 from p2gs_jax.render.warp import OPAQUE
-from p2gs_jax.scene.drives.object_masks import object_mask
+from p2gs_jax.scene.drives.objects import (
+    object_mask,
+)
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.scene.rigid import (
     left_of_way,

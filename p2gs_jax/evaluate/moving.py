@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from p2gs_jax.scene.drives.object_masks import object_mask
+from p2gs_jax.scene.drives.objects import (
+    object_mask,
+)
 from p2gs_jax.types import Scene
 
 

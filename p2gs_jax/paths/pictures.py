@@ -20,7 +20,9 @@ from p2gs_jax.paths.panorama import Layers
 from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
 from p2gs_jax.photometry.metering import ExposureOf, adapted, meter
 from p2gs_jax.run.read import Run
-from p2gs_jax.scene.drives.choose import short_name
+from p2gs_jax.scene.drives.recording import (
+    short_name,
+)
 from p2gs_jax.scene.images import ImageStore
 
 # Pictures are metered at this width, pixels.

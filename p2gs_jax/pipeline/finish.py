@@ -24,7 +24,9 @@ from p2gs_jax.render.host import make_renderer
 from p2gs_jax.run.layout import RunFolder
 from p2gs_jax.run.unexplained_pictures import write_unexplained
 from p2gs_jax.run.write import summary_rows, write_results, write_view
-from p2gs_jax.scene.drives.moving import fitted_objects
+from p2gs_jax.scene.drives.objects import (
+    fitted_objects,
+)
 from p2gs_jax.types import Params
 
 

@@ -27,8 +27,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from p2gs_jax.render.lane_queue import Queue
-from p2gs_jax.render.segments import cut, merge
+from p2gs_jax.render.rasterize_xla import (
+    Queue,
+    cut,
+    merge,
+)
 from p2gs_jax.render.tile_rows import DARKEST, GEOMETRY, Plan, geometry_gradient
 from p2gs_jax.render.xla_cpu import materialize
 

@@ -37,7 +37,9 @@ from p2gs_jax.report.svg import FIRST, INK, SECOND
 from p2gs_jax.run.photometry_file import ViewPhotometry
 from p2gs_jax.run.read import resolved
 from p2gs_jax.run.scene_file import read_times
-from p2gs_jax.scene.drives.choose import short_name
+from p2gs_jax.scene.drives.recording import (
+    short_name,
+)
 from p2gs_jax.types import GAMMA_SRGB
 
 # More cameras than this, or cameras with fewer views than this, share one panel.

@@ -13,7 +13,10 @@ from jaxtyping import Int
 from p2gs_jax.core.array_files import BROKEN_ARRAYS
 from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene.drives.moving import KeyTimes, MovingObjects
+from p2gs_jax.scene.drives.objects import (
+    KeyTimes,
+    MovingObjects,
+)
 from p2gs_jax.types import Scene, TrackedObject
 
 

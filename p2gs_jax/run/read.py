@@ -33,7 +33,10 @@ from p2gs_jax.run.places import candidates, find
 from p2gs_jax.run.scene_file import read_scene
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.device import camera_of
-from p2gs_jax.scene.drives.moving import MovingObjects, middle_time
+from p2gs_jax.scene.drives.objects import (
+    MovingObjects,
+    middle_time,
+)
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import GAMMA_SRGB, Camera, Gaussians, Params, Photometry, Render, Scene
 

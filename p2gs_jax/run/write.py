@@ -40,7 +40,10 @@ from p2gs_jax.run.places import remembered
 from p2gs_jax.run.scene_file import write_scene
 from p2gs_jax.run.summary import write_summary
 from p2gs_jax.scene.device import camera_of
-from p2gs_jax.scene.drives.moving import MovingObjects, middle_time
+from p2gs_jax.scene.drives.objects import (
+    MovingObjects,
+    middle_time,
+)
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Params, Photometry, Scene
 

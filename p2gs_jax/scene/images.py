@@ -12,8 +12,12 @@ from jaxtyping import Bool, Float32, UInt
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.scene.backdrop import RANDOM, backdrop_of
-from p2gs_jax.scene.drives.moving import MovingObjects
-from p2gs_jax.scene.drives.object_masks import MARGIN, outlines, painted
+from p2gs_jax.scene.drives.objects import (
+    MARGIN,
+    MovingObjects,
+    outlines,
+    painted,
+)
 from p2gs_jax.scene.geometry import scale_intrinsics
 from p2gs_jax.scene.pixels.decode import Decoded, floats
 from p2gs_jax.scene.pixels.files import Key, PixelFiles, file_bytes

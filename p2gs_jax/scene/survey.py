@@ -13,8 +13,10 @@ import numpy as np
 from p2gs_jax.config import DataConfig
 from p2gs_jax.scene import PhotographsAlone, Video, find_scene, with_what_lies_beside
 from p2gs_jax.scene.drives.assemble import SWEEP_SLACK_S, assemble
-from p2gs_jax.scene.drives.choose import chosen_frames
-from p2gs_jax.scene.drives.recording import Recording
+from p2gs_jax.scene.drives.recording import (
+    Recording,
+    chosen_frames,
+)
 from p2gs_jax.scene.exif import read_exif_ev
 from p2gs_jax.scene.files import image_size
 from p2gs_jax.scene.video.frames import expected_frames, video_size

@@ -11,9 +11,20 @@ from typing import Any
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import write_json, write_text
 from p2gs_jax.errors import UserError
-from p2gs_jax.jobs import Job, JobState, open_engine, run_jobs
-from p2gs_jax.jobs.engines import LOCAL, check_engine
-from p2gs_jax.jobs.job import read_reason, slug
+from p2gs_jax.jobs.engines import (
+    LOCAL,
+    check_engine,
+    open_engine,
+)
+from p2gs_jax.jobs.job import (
+    Job,
+    JobState,
+    read_reason,
+    slug,
+)
+from p2gs_jax.jobs.run import (
+    run_jobs,
+)
 from p2gs_jax.pipeline.preflight import check_run_dir
 from p2gs_jax.run.lock import locked
 from p2gs_jax.sweep.rows import read_row, to_markdown

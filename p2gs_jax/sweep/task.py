@@ -10,7 +10,9 @@ from p2gs_jax.config import FitConfig, from_dict, to_dict
 from p2gs_jax.core.compile_cache import use_compile_cache
 from p2gs_jax.core.progress import Reporter
 from p2gs_jax.core.runtime import tune_process
-from p2gs_jax.jobs import Job
+from p2gs_jax.jobs.job import (
+    Job,
+)
 from p2gs_jax.pipeline.fit import fit
 from p2gs_jax.run.layout import RunFolder
 

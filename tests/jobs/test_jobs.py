@@ -13,11 +13,22 @@ from job_tasks import count
 from rich.console import Console
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.jobs import REASON, Job, JobState, open_engine, run_jobs
-from p2gs_jax.jobs.engines import check_engine
-from p2gs_jax.jobs.job import JobFiles, write_job
+from p2gs_jax.jobs.engines import (
+    check_engine,
+    open_engine,
+)
+from p2gs_jax.jobs.job import (
+    REASON,
+    Job,
+    JobFiles,
+    JobState,
+    write_job,
+)
 from p2gs_jax.jobs.process import run_in_process
 from p2gs_jax.jobs.progress import ProgressFile, read_progress
+from p2gs_jax.jobs.run import (
+    run_jobs,
+)
 from p2gs_jax.jobs.table import line_of, table_of
 
 

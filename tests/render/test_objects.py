@@ -18,7 +18,10 @@ from p2gs_jax.render.blocks import BLOCK, splat, splat_listed
 from p2gs_jax.render.objects import HIDDEN, camera_of_each, corrected
 from p2gs_jax.render.spherical_harmonics import evaluate
 from p2gs_jax.render.visible import compact, in_view
-from p2gs_jax.scene.drives.moving import KeyTimes, MovingObjects
+from p2gs_jax.scene.drives.objects import (
+    KeyTimes,
+    MovingObjects,
+)
 from p2gs_jax.train.room import count_view
 from p2gs_jax.types import Camera, Placement, TrackedObject
 

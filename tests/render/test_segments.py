@@ -6,7 +6,13 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from p2gs_jax.render.segments import SEGMENTS_PER_LANE, cut, merge
+from p2gs_jax.render.rasterize_xla import (
+    cut,
+    merge,
+)
+from p2gs_jax.render.segments import (
+    SEGMENTS_PER_LANE,
+)
 from p2gs_jax.render.tile_rows import Plan
 
 TILES, LANES, CHUNK, PIXELS = 6, 4, 2, 3

@@ -13,7 +13,9 @@ from p2gs_jax.config import DataConfig, FitConfig
 from p2gs_jax.errors import DivergenceError
 from p2gs_jax.evaluate.unexplained import Unexplained
 from p2gs_jax.scene import ImageStore, drives, load_scene
-from p2gs_jax.scene.drives.object_masks import object_mask
+from p2gs_jax.scene.drives.objects import (
+    object_mask,
+)
 from p2gs_jax.sweep import with_fields
 from p2gs_jax.train import left_out
 from p2gs_jax.train.left_out import MOST_OF_A_VIEW, Looked, bounded, described, look

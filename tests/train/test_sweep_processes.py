@@ -12,8 +12,11 @@ import p2gs_jax
 from p2gs_jax.core import interrupts
 from p2gs_jax.core.interrupts import Interrupted
 from p2gs_jax.errors import UserError
-from p2gs_jax.jobs import REASON
-from p2gs_jax.jobs.job import JobFiles, read_job
+from p2gs_jax.jobs.job import (
+    REASON,
+    JobFiles,
+    read_job,
+)
 from p2gs_jax.run.lock import locked
 from p2gs_jax.sweep import run as module
 from p2gs_jax.sweep import sweep

@@ -11,8 +11,12 @@ from scipy.spatial import KDTree
 
 from p2gs_jax.config import DynamicsConfig, FitConfig
 from p2gs_jax.gaussians.init.seeds import NEIGHBOURS, gaussians_from_points
-from p2gs_jax.scene.drives.moving import MovingObjects, key_times
-from p2gs_jax.scene.drives.object_masks import outline_of, painted
+from p2gs_jax.scene.drives.objects import (
+    MovingObjects,
+    key_times,
+    outline_of,
+    painted,
+)
 from p2gs_jax.scene.rigid import (
     interpolated,
     inverse,

@@ -13,7 +13,11 @@ from p2gs_jax.core.numerics import on_device
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.gaussians.init.seeds import merge
 from p2gs_jax.render.vibration import STILL
-from p2gs_jax.scene.drives.moving import MovingObjects, key_times, middle_time
+from p2gs_jax.scene.drives.objects import (
+    MovingObjects,
+    key_times,
+    middle_time,
+)
 from p2gs_jax.types import Gaussians, Scene, Vibration
 
 # Initial opacity of what may move: most of it is at places that something stands still at.

@@ -11,9 +11,17 @@ from PIL import Image
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.drives.assemble import assemble
-from p2gs_jax.scene.drives.choose import chosen_cameras, chosen_frames, short_name
 from p2gs_jax.scene.drives.lidar import owners, seeds
-from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sweep, SweepPoints
+from p2gs_jax.scene.drives.recording import (
+    Photograph,
+    Recording,
+    RigCamera,
+    Sweep,
+    SweepPoints,
+    chosen_cameras,
+    chosen_frames,
+    short_name,
+)
 from p2gs_jax.scene.rigid import (
     from_quaternion,
     interpolated,

@@ -5,7 +5,9 @@ import json
 import pytest
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene.drives.json_rows import read_rows
+from p2gs_jax.scene.drives.tables import (
+    read_rows,
+)
 
 ROWS = [
     {"token": "a", "of": "x", "values": [1, 2.5, [3]]},

@@ -11,7 +11,10 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.drives import read_drive
-from p2gs_jax.scene.drives.kitti_raw import is_kitti_raw, read_kitti_raw
+from p2gs_jax.scene.drives.kitti import (
+    is_kitti_raw,
+    read_kitti_raw,
+)
 
 CFG = DataConfig()
 

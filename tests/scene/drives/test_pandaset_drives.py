@@ -19,7 +19,9 @@ from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.drives import read_drive
 from p2gs_jax.scene.drives.lidar import owners
 from p2gs_jax.scene.drives.pandaset import is_pandaset, read_pandaset
-from p2gs_jax.scene.drives.pickled_tables import read_table
+from p2gs_jax.scene.drives.tables import (
+    read_pickled,
+)
 from p2gs_jax.scene.rigid import (
     interpolated,
 )
@@ -316,7 +318,7 @@ def test_the_scanner_passed_boxes_when_it_is_said_to(real):
     """Points of the spinning scanner carry times; those in a box are of the box's time."""
     apart = []
     for sweep in real.sweeps:
-        table = read_table(real.root / f"lidar/{sweep.frame:02d}.pkl.gz")
+        table = read_pickled(real.root / f"lidar/{sweep.frame:02d}.pkl.gz")
         spinning = table["d"] == 0
         points = np.stack([table[a][spinning] for a in "xyz"], 1)
         times = table["t"][spinning]
@@ -334,8 +336,8 @@ def test_boxes_are_where_the_forward_scanner_saw_them_at_another_time(real):
     things = {thing.name: thing for thing in real.objects}
     ours, unmoved = [], []
     for sweep in real.sweeps:
-        points = read_table(real.root / f"lidar/{sweep.frame:02d}.pkl.gz")
-        boxes = read_table(real.root / f"annotations/cuboids/{sweep.frame:02d}.pkl.gz")
+        points = read_pickled(real.root / f"lidar/{sweep.frame:02d}.pkl.gz")
+        boxes = read_pickled(real.root / f"annotations/cuboids/{sweep.frame:02d}.pkl.gz")
         xyz, forward = np.stack([points[a] for a in "xyz"], 1), points["d"] == 1
         for k in np.flatnonzero(boxes["cuboids.sensor_id"] == 1):
             sibling = boxes["cuboids.sibling_id"][k]

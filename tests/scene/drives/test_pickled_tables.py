@@ -10,7 +10,9 @@ import pandas as pd
 import pytest
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene.drives.pickled_tables import read_table
+from p2gs_jax.scene.drives.tables import (
+    read_pickled,
+)
 
 TABLE = pd.DataFrame(
     {
@@ -39,7 +41,7 @@ def test_a_bomb_is_not_unpacked(tmp_path):
     path = tmp_path / "00.pkl.gz"
     path.write_bytes(gzip.compress(bytes(2**28 + 1), 1))
     with pytest.raises(UserError, match="unpacks to more than 256 MiB"):
-        read_table(path)
+        read_pickled(path)
 
 
 def assert_same(columns, table):
@@ -63,14 +65,14 @@ def test_what_pandas_writes_today(tmp_path, storage, protocol, variant):
         table = table.astype({"uuid": dtype, "label": dtype})
     path = tmp_path / "t.pkl"
     path.write_bytes(pickle.dumps(table, protocol=protocol))
-    assert_same(read_table(path), table)
+    assert_same(read_pickled(path), table)
 
 
 def test_the_real_files_of_an_old_pandas(shared_data):
     root = shared_data("pandaset_002")
     paths = [*sorted(root.glob("annotations/cuboids/*.pkl.gz"))[:5], root / "lidar/00.pkl.gz"]
     for path in paths:
-        columns, table = read_table(path), pd.read_pickle(path)
+        columns, table = read_pickled(path), pd.read_pickle(path)
         assert list(columns) == list(table.columns)
         for name, found in columns.items():
             if found.dtype == object:
@@ -98,7 +100,7 @@ def test_nothing_is_run(tmp_path, monkeypatch, content):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "t.pkl").write_bytes(pickle.dumps(content))
     with pytest.raises(UserError, match=r"t\.pkl holds no table .*: it holds a .*, no table"):
-        read_table(tmp_path / "t.pkl")
+        read_pickled(tmp_path / "t.pkl")
     assert not (tmp_path / "malicious").exists()
 
 
@@ -119,13 +121,13 @@ def test_what_is_no_table(tmp_path, content, message):
     path = tmp_path / "00.pkl"
     path.write_bytes(content)
     with pytest.raises(UserError, match=message) as info:
-        read_table(path)
+        read_pickled(path)
     assert "00.pkl" in str(info.value)
 
 
 def test_a_missing_file(tmp_path):
     with pytest.raises(UserError, match=r"00\.pkl is missing"):
-        read_table(tmp_path / "00.pkl")
+        read_pickled(tmp_path / "00.pkl")
 
 
 def test_every_cut_of_a_file_is_complained_about(tmp_path):
@@ -134,7 +136,7 @@ def test_every_cut_of_a_file_is_complained_about(tmp_path):
     for end in range(0, len(whole) - 1, 7):
         path.write_bytes(whole[:end])
         with pytest.raises(UserError):
-            read_table(path)
+            read_pickled(path)
 
 
 def test_damaged_bytes_end_in_a_table_or_a_complaint(tmp_path):
@@ -146,4 +148,4 @@ def test_damaged_bytes_end_in_a_table_or_a_complaint(tmp_path):
         damaged[rng.integers(len(whole))] = rng.integers(256)
         path.write_bytes(damaged)
         with contextlib.suppress(UserError):
-            read_table(path)
+            read_pickled(path)
