@@ -73,4 +73,4 @@ def bench(session: nox.Session) -> None:
     """Hold the renderer against the baseline, as CI does."""
     parts = session.posargs or ("speed_error", "levels", "--quick")
     out = Path(session.create_tmp()).resolve()
-    session.run("p2gs-jax", "bench", *parts, "--out", str(out), "--baseline", BASELINE)
+    session.run("python", "benchmarks/run.py", *parts, "--out", str(out), "--baseline", BASELINE)

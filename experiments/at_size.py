@@ -37,7 +37,7 @@ from towns import (
 )
 
 from p2gs_jax.core.atomic import write_text
-from p2gs_jax.sweep.rows import read_row
+from p2gs_jax.jobs.sweep import read_row
 
 # The paper's drive at a quarter of its width; hours.
 AT_SIZE = Protocol(

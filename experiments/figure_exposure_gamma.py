@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 import time
 from pathlib import Path
 
@@ -25,7 +24,7 @@ from towns import METHODS, WIDE, fit_all, methods, options, stamp
 
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.mean import mean_parameters
-from p2gs_jax.render.host import make_renderer
+from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.read import Run, load_run
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
@@ -72,19 +71,12 @@ def draw(run: Run, index: int, out: Path) -> dict:
     return {"view": run.scene.views[index].name, "renderings": rows}
 
 
-def _own_options() -> argparse.Namespace:
-    """Take the options that only this figure has from the command line."""
+def main() -> None:
     parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--run", type=Path)
     parser.add_argument("--view")
     own, rest = parser.parse_known_args()
-    sys.argv[1:] = rest
-    return own
-
-
-def main() -> None:
-    own = _own_options()
-    o = options(__doc__, "figure_exposure_gamma")
+    o = options(__doc__, "figure_exposure_gamma.py", rest)
     begin = time.monotonic()
     folder = own.run
     if folder is None:

@@ -69,7 +69,7 @@ def measured(
         A row of each method; of one that failed, why.
     """
     reference = scene / "reference"
-    result = p2gs_jax.sweep.sweep(
+    result = p2gs_jax.sweep(
         scene,
         out,
         under,

@@ -24,7 +24,7 @@ from typing import Any
 from judging import measured
 
 import p2gs_jax
-from p2gs_jax.cli.options.parse import parse_duration
+from p2gs_jax.cli.shared import parse_duration
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import write_json, write_text
 

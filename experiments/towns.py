@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 
 import p2gs_jax
 from p2gs_jax.config import FitConfig, PresetName, to_dict
-from p2gs_jax.sweep import sweep
+from p2gs_jax.jobs.sweep import sweep
 from p2gs_jax.synth.rig import image_height
 from p2gs_jax.synth.sensor import Sensor
 
@@ -100,22 +100,24 @@ class Options:
         return self.out / self.protocol.name
 
 
-def options(description: str | None, name: str) -> Options:
-    """Parse the options that all tables have."""
-    parser = argparse.ArgumentParser(description=description)
+def options(description: str | None, command: str, argv: Sequence[str] | None = None) -> Options:
+    """Parse the options that all tables have; None: of the command line."""
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--out", type=Path, default=Path("runs/paper"))
     parser.add_argument("--towns", type=int, nargs="+")
     parser.add_argument("--steps", type=int)
     parser.add_argument("--quick", action="store_true", help="one small town, few steps")
     parser.add_argument("--max-parallel", type=int, default=1, help="fits at a time")
     parser.add_argument("--lpips-weights", help="alex, vgg or a file; without them LPIPS is n/a")
-    args = parser.parse_args()
+    args = parser.parse_args(argv)
     protocol = QUICK if args.quick else FULL
     if args.towns:
         protocol = dataclasses.replace(protocol, towns=tuple(args.towns))
     if args.steps:
         protocol = dataclasses.replace(protocol, steps=args.steps)
-    command = f"python experiments/{name}.py"
+    command = f"python experiments/{command}"
     for flag in ("towns", "steps", "quick"):
         value = getattr(args, flag)
         if value:

@@ -11,10 +11,10 @@ from p2gs_jax.config import FitConfig, preset
 from p2gs_jax.errors import DivergenceError, UserError
 
 if TYPE_CHECKING:
-    from p2gs_jax import sweep
-    from p2gs_jax.core.devices import Devices
     from p2gs_jax.districts.fit import fit_blocks
     from p2gs_jax.evaluate.alignment import exposure_error
+    from p2gs_jax.jobs.configs import grid, read_sweep, with_fields
+    from p2gs_jax.jobs.sweep import sweep
     from p2gs_jax.paths.pinhole import make_camera
     from p2gs_jax.photometry.display import DisplayTransform, develop
     from p2gs_jax.pipeline.calibrate import calibrate
@@ -24,13 +24,11 @@ if TYPE_CHECKING:
     from p2gs_jax.pipeline.fit import fit
     from p2gs_jax.render import render_linear, required_capacity
     from p2gs_jax.run.read import Run, load_run
-    from p2gs_jax.sweep.fields import with_fields
     from p2gs_jax.synth.write import write_street
     from p2gs_jax.types import Camera, Gaussians, Params, Photometry, Render, Scene
 
 __all__ = [
     "Camera",
-    "Devices",
     "DisplayTransform",
     "DivergenceError",
     "FitConfig",
@@ -49,9 +47,11 @@ __all__ = [
     "exposure_error",
     "fit",
     "fit_blocks",
+    "grid",
     "load_run",
     "make_camera",
     "preset",
+    "read_sweep",
     "render_linear",
     "required_capacity",
     "sweep",
@@ -61,7 +61,6 @@ __all__ = [
 
 
 _LAZY = {
-    "Devices": "p2gs_jax.core.devices",
     "DisplayTransform": "p2gs_jax.photometry.display",
     "Run": "p2gs_jax.run.read",
     "calibrate": "p2gs_jax.pipeline.calibrate",
@@ -72,11 +71,14 @@ _LAZY = {
     "exposure_error": "p2gs_jax.evaluate.alignment",
     "fit": "p2gs_jax.pipeline.fit",
     "fit_blocks": "p2gs_jax.districts.fit",
+    "grid": "p2gs_jax.jobs.configs",
     "load_run": "p2gs_jax.run.read",
     "make_camera": "p2gs_jax.paths.pinhole",
+    "read_sweep": "p2gs_jax.jobs.configs",
     "render_linear": "p2gs_jax.render",
     "required_capacity": "p2gs_jax.render",
-    "with_fields": "p2gs_jax.sweep.fields",
+    "sweep": "p2gs_jax.jobs.sweep",
+    "with_fields": "p2gs_jax.jobs.configs",
     "write_street": "p2gs_jax.synth.write",
 }
 _LAZY |= dict.fromkeys(
@@ -88,8 +90,6 @@ def __getattr__(name: str):
     """Import what is heavy only when it is used: even the records need JAX, `--help` does not."""
     if name == "__version__":
         return version("p2gs-jax")
-    if name == "sweep":
-        return import_module("p2gs_jax.sweep")
     if name not in _LAZY:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(_LAZY[name]), name)

@@ -11,15 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from p2gs_jax.config import RenderConfig
-from p2gs_jax.render.host import make_renderer
+from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.scene.drives import DriveFormat
-from p2gs_jax.scene.drives.recording import (
-    Photograph,
-    Recording,
-    RigCamera,
-    Sweep,
-    SweepPoints,
-)
+from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sweep, SweepPoints
 from p2gs_jax.types import Camera, Gaussians, TrackedObject
 
 WIDTH, HEIGHT, FOCAL = 160, 96, 110.0

@@ -10,13 +10,15 @@ import numpy as np
 from reliability.trials import NONSENSE, REFUSED
 
 # Everything that reading needs, so that a forked child imports nothing.
-import p2gs_jax.cli.commands.scene
 import p2gs_jax.cli.parser
+import p2gs_jax.cli.tables
+import p2gs_jax.scene.plan_picture
 import p2gs_jax.scene.structure_from_motion
+import p2gs_jax.scene.survey
 import p2gs_jax.scene.triangulate  # noqa: F401
 from p2gs_jax.cli import main
 from p2gs_jax.config import DataConfig
-from p2gs_jax.core.printable import printable
+from p2gs_jax.core.text import printable
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene import find_scene, with_what_lies_beside
 from p2gs_jax.scene.drives.assemble import assemble

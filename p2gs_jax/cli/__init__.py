@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import sys
-from importlib import import_module
 
 from p2gs_jax.core import interrupts
 from p2gs_jax.core.memory import ran_out
@@ -19,36 +18,21 @@ os.environ.setdefault("GLOG_minloglevel", "3")
 # Where Pillow refuses, too (scene/files.py): what a header says is not decoded to find out.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2 * 89_478_485))
 
-# Set for one of several processes of a fit, by the parent that watches it: the descriptor of a pipe
-# that ends with that parent.
-PARENT = "P2GS_JAX_PARENT_PIPE"
 # Commands that must work without JAX.
 WITHOUT_JAX = ("doctor", "completion")
 
 
 def _run(argv: list[str]) -> int:
+    # Everything is imported where it is needed, so that --help answers at once.
     from p2gs_jax.cli.parser import parse
 
     name, options = parse(argv)
-    if name == "completion":
-        from p2gs_jax.cli.completion import script
-
-        print(script(options.shell), end="")
-        return 0
-    # Imported here so that --help answers at once.
-    if name == "fit":
-        from p2gs_jax.cli.options.fit import resolve_processes
-        from p2gs_jax.cli.supervise import is_child, supervise
-
-        if resolve_processes(options) is not None and not is_child():
-            return supervise(argv, options.out)
     if name not in WITHOUT_JAX:
-        from p2gs_jax.core.compile_cache import use_compile_cache
-        from p2gs_jax.core.runtime import tune_process
+        from p2gs_jax.core.runtime import tune_process, use_compile_cache
 
         use_compile_cache()
         tune_process()
-    return import_module(f"p2gs_jax.cli.commands.{name}").run(options)
+    return options.execute()
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -76,11 +60,6 @@ def main(argv: list[str] | None = None) -> None:
     except KeyboardInterrupt as error:
         print(f"p2gs-jax: interrupted{_CONTINUED.get(command, '')}", file=sys.stderr)
         code = interrupts.exit_code(error)
-    if code and PARENT in os.environ:
-        # At its own exit a process waits for the others, which may wait for it.
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
     sys.exit(code)
 
 
@@ -91,7 +70,7 @@ _CONTINUED = {
 
 
 def _complain(error: UserError) -> int:
-    from p2gs_jax.core.printable import printable
+    from p2gs_jax.core.text import printable
 
     print(printable(f"p2gs-jax: error: {error}"), file=sys.stderr)
     return 2
@@ -102,9 +81,9 @@ def _missing(error: ImportError, argv: list[str]) -> int:
     if (error.name or "").split(".")[0] == "p2gs_jax":
         raise error
     if argv[:1] == ["doctor"]:
-        from p2gs_jax.cli.commands.doctor import diagnose
+        from p2gs_jax.cli.doctor import Doctor
 
-        return diagnose(as_json="--json" in argv)
+        return Doctor(json="--json" in argv).execute()
     fix = "`p2gs-jax doctor` says what is missing for what"
     return _complain(UserError(f"a library cannot be imported: {error}.", fix=fix))
 

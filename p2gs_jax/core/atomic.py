@@ -1,34 +1,83 @@
-"""Files and folders that are written whole or not at all."""
+"""Files and folders that are written whole or not at all, and reasons why they cannot be."""
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import math
 import os
 import shutil
+import struct
 import tempfile
+import zipfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from p2gs_jax.core.disk import naming
 from p2gs_jax.errors import UserError
 
+# Errors that numpy, zipfile and zlib raise for .npy and .npz files of arbitrary bytes.
+BROKEN_ARRAYS = (
+    *(OSError, ValueError, KeyError, TypeError, IndexError, EOFError, MemoryError, RuntimeError),
+    *(zipfile.BadZipFile, zlib.error, struct.error),
+)
+# No room: on the disk, for the user, for a file of a process.
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _BEGUN = ".writing-"
+_PART = 1 << 20
+
+
+@contextlib.contextmanager
+def naming(path: Path, *, begun: Path | None = None, size: int = _PART) -> Iterator[None]:
+    """Let a write that fails in a `with` block for want of room or rights say so, with its path.
+
+    Writers of images, checkpoints and tables report a full disk as anything from `False` to a page
+    of C++; the system's own words name the fault. To find them, `size` bytes more are written to
+    `begun`, which holds what was written so far, or without it to a new file beside `path`.
+
+    Raises:
+        OSError: the system's reason, with `filename`. Other errors stay as they are.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno is None:
+            _raise_reason(path, begun, size, error)
+        elif error.filename is None:
+            raise OSError(error.errno, os.strerror(error.errno), str(path)) from error
+        raise
+    except Exception as error:
+        _raise_reason(path, begun, size, error)
+        raise
+
+
+def _raise_reason(path: Path, begun: Path | None, size: int, error: Exception) -> None:
+    """Raise what the system says to so many bytes more; nothing if it takes them."""
+    try:
+        with (
+            tempfile.NamedTemporaryFile(dir=path.parent, prefix=".trying-")
+            if begun is None
+            else begun.open("ab")
+        ) as file:
+            for _ in range(0, size, _PART):
+                file.write(bytes(_PART))
+            file.flush()
+    except OSError as reason:
+        code = reason.errno or errno.EIO
+        raise OSError(code, os.strerror(code), str(path)) from error
 
 
 @contextlib.contextmanager
 def atomic_write(path: Path, *, durable: bool = True) -> Iterator[Path]:
     """Yield a temporary path beside `path`; it replaces `path`, or is deleted after an error.
 
-    Args:
-        path: the file to write; its folder is created. The temporary name keeps the suffix, for
-            writers that choose a format by it.
-        durable: wait until it is on the disk, so that a power failure leaves no half of it. Not for
-            what is checked when it is read, and can be made again.
+    The folder of `path` is created. The temporary name keeps the suffix, for writers that choose a
+    format by it. With `durable` the file is on the disk before it replaces `path`, so that a power
+    failure leaves no half of it; without, its reader must check it.
 
     Raises:
         OSError: it cannot be written; `filename` names it, whatever the writer said.
@@ -54,8 +103,7 @@ def atomic_write(path: Path, *, durable: bool = True) -> Iterator[Path]:
 def atomic_folder(path: Path) -> Iterator[Path]:
     """Yield an empty folder beside `path`; it replaces `path`, or is deleted after an error.
 
-    Args:
-        path: the folder to make; what lies there is removed once the new one is whole.
+    What lies at `path` is removed once the new folder is whole.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -71,11 +119,9 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 
 
 def remove_begun(folder: Path, spare: str) -> None:
-    """Remove what a process that was killed had begun to write.
+    """Remove what a process that was killed had begun to write in a folder and its subfolders.
 
-    Args:
-        folder: in which nobody else writes; with its subfolders.
-        spare: subfolders that hold a file of this name are somebody else's.
+    Nobody else may write there; subfolders that hold a file named `spare` are somebody else's.
     """
     for at, folders, files in os.walk(folder):
         if spare in files and Path(at) != folder:
@@ -94,8 +140,7 @@ def remove_begun(folder: Path, spare: str) -> None:
 def no_empty_folders(path: Path) -> Iterator[None]:
     """Create a folder for a `with` block; after an error, delete the empty parts of it again.
 
-    Args:
-        path: the folder. It, and those above it, are removed only if they were not there before.
+    The folder, and those above it, are removed only if they were not there before.
     """
     new = [folder for folder in (path, *path.parents) if not folder.exists()]
     path.mkdir(parents=True, exist_ok=True)
@@ -175,7 +220,7 @@ def read_jsonl(path: Path) -> list[dict]:
     """Return the records of a JSON-lines file; a last line torn by a kill is left out.
 
     Raises:
-        UserError: another line is no JSON.
+        UserError: another line is not valid JSON.
     """
     try:
         lines = Path(path).read_bytes().rstrip(b"\n").split(b"\n")

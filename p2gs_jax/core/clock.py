@@ -14,12 +14,10 @@ _READ_BACK = "/jax/compilation_cache/cache_hits"
 
 
 class Stopwatch:
-    """Seconds by name; the same name adds up.
+    """Wall seconds by name, in the order in which the names were first used.
 
-    Threads may share one. Seconds are wall time: parts that overlap are both counted in full.
-
-    Attributes:
-        seconds: wall seconds by name, in the order in which the names were first used.
+    The same name adds up. Threads may share a stopwatch; parts that overlap are both counted in
+    full.
     """
 
     def __init__(self):
@@ -54,22 +52,16 @@ MOST_NAMED = 4
 
 
 def whole_run(seconds: Mapping[str, float]) -> float | None:
-    """Return how long a run took from start to end, or None where it does not say.
-
-    Args:
-        seconds: of `metrics.json`.
-    """
+    """Return how long a run took by the `seconds` of its metrics.json; None where they lack it."""
     parts = [seconds.get(k) for k in ("total_until_evaluation", "evaluation_and_files")]
     known = [p for p in parts if isinstance(p, int | float) and not isinstance(p, bool)]
     return float(sum(known)) if known else None
 
 
 def over_budget(budget_s: float | None, seconds: Mapping[str, float]) -> str | None:
-    """Return by how much a run exceeded its budget and where the seconds went; None if it did not.
+    """Return by how much a run exceeded its budget and where its `seconds` (metrics.json) went.
 
-    Args:
-        budget_s: for the whole run, or None.
-        seconds: of `metrics.json`.
+    None where it did not.
     """
     total = whole_run(seconds)
     if budget_s is None or total is None or total <= LATE[0] * budget_s + LATE[1]:

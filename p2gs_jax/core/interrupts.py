@@ -18,11 +18,7 @@ SIGNALS = tuple(
 
 
 class Interrupted(KeyboardInterrupt):
-    """A signal asked the program to end.
-
-    Attributes:
-        number: of the signal.
-    """
+    """A signal of this number asked the program to end."""
 
     def __init__(self, number: int):
         super().__init__(number)
@@ -53,8 +49,7 @@ def raised() -> Iterator[None]:
 class Held:
     """Signals that wait until the program is where it can be continued.
 
-    Attributes:
-        arrived: number of the signal that waits, or None.
+    `arrived` is the number of the signal that waits, or None.
     """
 
     def __init__(self):

@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import ctypes
 import errno
 import os
-import sys
+import resource
 from pathlib import Path
-
-try:
-    import resource
-except ImportError:  # systems without limits of processes
-    resource = None
 
 CGROUP = Path("/sys/fs/cgroup")
 MEMINFO = Path("/proc/meminfo")
@@ -41,18 +35,17 @@ def left_to_process() -> int | None:
     """
     _, available = memory()
     found = [] if available is None else [available + _numbers(MEMINFO).get("SwapFree", 0)]
-    if resource is not None:
-        limit, _ = resource.getrlimit(resource.RLIMIT_AS)
-        pages = text_of(STATM).split()
-        if limit != resource.RLIM_INFINITY and pages:
-            found.append(max(limit - int(pages[0]) * resource.getpagesize(), 0))
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    pages = text_of(STATM).split()
+    if limit != resource.RLIM_INFINITY and pages:
+        found.append(max(limit - int(pages[0]) * resource.getpagesize(), 0))
     return min(found, default=None)
 
 
 def resident() -> int:
     """Return the bytes of memory that this process holds; 0 where that is unknown."""
     pages = text_of(STATM).split()
-    return int(pages[1]) * resource.getpagesize() if len(pages) > 1 and resource else 0
+    return int(pages[1]) * resource.getpagesize() if len(pages) > 1 else 0
 
 
 def ran_out(error: BaseException) -> bool:
@@ -85,8 +78,6 @@ def _numbers(path: Path) -> dict[str, int]:
 
 
 def _system_memory() -> tuple[int | None, int | None]:
-    if sys.platform == "win32":
-        return _windows_memory()
     found = _numbers(MEMINFO)
     if "MemTotal" in found:
         return found["MemTotal"], found.get("MemAvailable")
@@ -99,23 +90,3 @@ def _pages(name: str) -> int | None:
         return os.sysconf(name) * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError, OSError):
         return None
-
-
-class _Status(ctypes.Structure):
-    """MEMORYSTATUSEX."""
-
-    _fields_ = (
-        ("length", ctypes.c_uint32),
-        ("load", ctypes.c_uint32),
-        ("total", ctypes.c_uint64),
-        ("available", ctypes.c_uint64),
-        ("rest", ctypes.c_uint64 * 5),
-    )
-
-
-def _windows_memory() -> tuple[int | None, int | None]:
-    status = _Status(length=ctypes.sizeof(_Status))
-    kernel = getattr(getattr(ctypes, "windll", None), "kernel32", None)
-    if kernel is None or not kernel.GlobalMemoryStatusEx(ctypes.byref(status)):
-        return None, None
-    return status.total, status.available

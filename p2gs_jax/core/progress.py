@@ -4,27 +4,42 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.live import Live
+from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
-from p2gs_jax.core.terminal import PlainConsole
+from p2gs_jax.core.text import printable
 
 # Seconds between lines of progress where there is no terminal.
 EVERY_S = 15.0
 
 
+class PlainConsole(Console):
+    """rich's console for text of others: neither markup nor control characters have an effect."""
+
+    def __init__(self, **options: Any):
+        super().__init__(highlight=False, markup=False, emoji=False, **options)
+
+    def render(
+        self, renderable: RenderableType, options: ConsoleOptions | None = None
+    ) -> Iterator[Segment]:
+        """Yield segments whose text is printable; colours are no part of it."""
+        for segment in super().render(renderable, options):
+            if segment.control:
+                yield segment
+            else:
+                yield Segment(printable(segment.text), segment.style)
+
+
 @dataclass(frozen=True)
 class LogRecord:
-    """One line of `log.jsonl`, and what the live display shows.
-
-    Those of a trial, the run without growth that automatic growth compares with, are lines of
-    `growth.jsonl`.
-    """
+    """One line of `log.jsonl`, and what the live display shows."""
 
     step: int
     progress: float
@@ -37,7 +52,6 @@ class LogRecord:
     step_seconds: float
     left_s: float | None
     terms: dict[str, float]
-    trial: bool = False
 
     def summary(self) -> str:
         """Return where the run is, as text."""
@@ -141,6 +155,6 @@ class TerminalReporter:
             f"PSNR {record.psnr:.2f} dB",
             f"{record.gaussians} Gaussians",
             f"{rate:.1f} views/s",
-            "trying without growth" if record.trial else left,
+            left,
         )
         self.live.update(table)

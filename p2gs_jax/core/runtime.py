@@ -1,19 +1,28 @@
-"""How the process of a command runs JAX on a CPU; programs that import the package decide alone.
+"""How the process of a command runs JAX; programs that import the package decide alone.
 
 Large arrays are made and freed in every step. By default the C library hands each back to the
 system and takes it, page by page, anew: a fifth of a step (BUILD_NOTES, "Memory is kept"). What one
-part of a run needed and the next does not is handed back between them.
+part of a run needed and the next does not is handed back between them. Compiled programs are kept
+on disk, so that only the first run of a kind waits for the compiler.
 """
 
 from __future__ import annotations
 
 import ctypes
+import hashlib
+import platform
 import sys
+from pathlib import Path
 
 import jax
+import platformdirs
 
 # Numbers of mallopt(3).
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_THRESHOLD = -1, -2, -3
+# Shorter compilations are not worth a file.
+SHORTEST_S = 0.5
+# The least recently used programs go first.
+MOST_BYTES = 512 * 2**20
 
 
 def keep_freed_memory() -> bool:
@@ -27,7 +36,8 @@ def keep_freed_memory() -> bool:
     if mallopt is None:
         return False
     wanted = ((_M_MMAP_THRESHOLD, 1 << 30), (_M_TRIM_THRESHOLD, 2**31 - 1), (_M_TOP_PAD, 64 << 20))
-    return all(mallopt(what, value) == 1 for what, value in wanted)
+    # A list: a library that refuses the first setting gets the others.
+    return all([mallopt(what, value) == 1 for what, value in wanted])
 
 
 def return_freed_memory() -> None:
@@ -49,3 +59,39 @@ def tune_process() -> None:
     """
     keep_freed_memory()
     jax.config.update("jax_cpu_enable_async_dispatch", False)
+
+
+def cache_folder() -> Path | None:
+    """Return where JAX keeps compiled programs, or None where it keeps none."""
+    values = jax.config.values
+    folder = values["jax_compilation_cache_dir"]
+    return Path(folder) if folder and values["jax_enable_compilation_cache"] else None
+
+
+def use_compile_cache() -> None:
+    """Let JAX keep compiled programs in the user's cache folder.
+
+    A folder that the user chose (JAX_COMPILATION_CACHE_DIR) stays; JAX_ENABLE_COMPILATION_CACHE=0
+    turns it off. Where the folder cannot be written, nothing is kept.
+    """
+    if jax.config.values["jax_compilation_cache_dir"] is not None:
+        return
+    folder = platformdirs.user_cache_path("p2gs-jax", appauthor=False) / _machine()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_compilation_cache_max_size", MOST_BYTES)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST_S)
+
+
+def _machine() -> str:
+    """Return a name for what compiled programs depend on: JAX's version and the CPU's abilities."""
+    abilities = platform.processor()
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        lines = info.read_text(errors="replace").splitlines()
+        abilities = next((line for line in lines if line.startswith(("flags", "Features"))), "")
+    key = hashlib.sha256(abilities.encode()).hexdigest()[:12]
+    return f"jax-{jax.__version__}-{platform.machine()}-{key}"

@@ -82,13 +82,7 @@ class SceneStream(IntEnum):
 
 
 def generator(seed: int, stream: Stream | SceneStream, *more: int) -> np.random.Generator:
-    """Return a generator at its beginning.
-
-    Args:
-        seed: of the fit, or of the scene.
-        stream: what it is for.
-        more: which step, view or row.
-    """
+    """Return the generator of a stream, and of a step, view or row in it, at its beginning."""
     return np.random.default_rng((seed, int(stream), *more))
 
 

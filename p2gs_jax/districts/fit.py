@@ -35,19 +35,11 @@ from p2gs_jax.districts.shared import (
 )
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.ply import read_ply
-from p2gs_jax.gaussians.init.dense_bound import coverage_of
-from p2gs_jax.gaussians.init.seeds import cameras_radius
-from p2gs_jax.jobs.engines import (
-    LOCAL,
-    check_engine,
-    open_engine,
-)
-from p2gs_jax.jobs.job import (
-    JobState,
-)
-from p2gs_jax.jobs.run import (
-    run_jobs,
-)
+from p2gs_jax.gaussians.dense import coverage_of
+from p2gs_jax.gaussians.seeds import cameras_radius
+from p2gs_jax.jobs.engines import LOCAL, check_engine, open_engine
+from p2gs_jax.jobs.job import JobState
+from p2gs_jax.jobs.run import run_jobs
 from p2gs_jax.photometry.gauge import recentre
 from p2gs_jax.pipeline import preflight
 from p2gs_jax.pipeline.finish import Account, finish
@@ -55,8 +47,7 @@ from p2gs_jax.pipeline.fit import FitResult, fit
 from p2gs_jax.pipeline.preflight import Paths, Views, check_run_dir
 from p2gs_jax.pipeline.prepare import Prepared, load
 from p2gs_jax.run.decisions import read_decisions
-from p2gs_jax.run.layout import RunFolder
-from p2gs_jax.run.lock import RunLock, locked, require_free
+from p2gs_jax.run.folder import RunFolder, RunLock, locked, require_free
 from p2gs_jax.run.write import write_start
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Gaussians, Params, Scene
@@ -301,7 +292,6 @@ class _District:
             extent=cameras_radius(scene.training_views, scene.points),
             selection=solved.selection,
             pairs=None,
-            overlaps=None,
             measured=None,
             coverage=coverage_of(scene, store),
             decisions=shared.decisions,

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.districts.cut import Cut
-from p2gs_jax.render.host import RenderView, make_renderer
+from p2gs_jax.render.capacity import RenderView, make_renderer
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Gaussians, Scene

@@ -19,9 +19,7 @@ from p2gs_jax.scene.drives.objects import (
     object_mask,
 )
 from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.scene.rigid import (
-    left_of_way,
-)
+from p2gs_jax.scene.rigid import left_of_way
 from p2gs_jax.types import Camera, Render, Scene, View
 
 

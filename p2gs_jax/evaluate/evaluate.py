@@ -40,7 +40,7 @@ from p2gs_jax.photometry.formation import exposed_at
 from p2gs_jax.photometry.mean import MeanParameters, mean_parameters, usual_display
 from p2gs_jax.photometry.metering import Metering, Readings, meter
 from p2gs_jax.photometry.models import MODELS
-from p2gs_jax.render.host import RenderView
+from p2gs_jax.render.capacity import RenderView
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import Params, Scene

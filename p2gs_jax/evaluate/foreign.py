@@ -11,7 +11,7 @@ from p2gs_jax.config import PhotometryConfig, RenderConfig
 from p2gs_jax.evaluate.alignment import with_fitted_exposure
 from p2gs_jax.evaluate.view_scores import Collector, view_scores
 from p2gs_jax.photometry.display import DisplayTransform, develop
-from p2gs_jax.render.host import make_renderer
+from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.types import GAMMA_SRGB, Gaussians, Scene

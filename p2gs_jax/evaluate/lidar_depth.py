@@ -9,10 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from p2gs_jax.scene.rigid import (
-    interpolated,
-    inverse,
-)
+from p2gs_jax.scene.rigid import interpolated, inverse
 from p2gs_jax.scene.visibility import project_points, unoccluded
 from p2gs_jax.types import Lidar, TrackedObject, View
 

@@ -30,9 +30,7 @@ from p2gs_jax.photometry.cameras import places
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import inverse_formation, inverse_tone_map
 from p2gs_jax.render.warp import sample_bilinear, warp
-from p2gs_jax.scene.rigid import (
-    moment_of,
-)
+from p2gs_jax.scene.rigid import moment_of
 from p2gs_jax.scene.visibility import project_points, unoccluded
 from p2gs_jax.types import Camera, Scene
 

@@ -21,7 +21,7 @@ from PIL import Image
 
 from p2gs_jax.core.atomic import atomic_folder, write_text
 from p2gs_jax.errors import UserError
-from p2gs_jax.run.photometry_file import ViewPhotometry
+from p2gs_jax.run.photometry_files import ViewPhotometry
 from p2gs_jax.scene import ImageStore
 from p2gs_jax.types import Scene, View
 

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from p2gs_jax.core.atomic import atomic_folder, write_json, write_text
-from p2gs_jax.core.ply_header import header_of
+from p2gs_jax.core.ply import header_of
 from p2gs_jax.export.colmap_folder import exposure_table, write_mask, write_photograph
-from p2gs_jax.run.photometry_file import ViewPhotometry
+from p2gs_jax.run.photometry_files import ViewPhotometry
 from p2gs_jax.scene import ImageStore
 from p2gs_jax.types import Scene
 

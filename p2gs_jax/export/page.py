@@ -25,7 +25,7 @@ from p2gs_jax.export.page_error import page_error, true_picture
 from p2gs_jax.export.page_scene import embedded_photographs, page_scene, rounded, uncorrected
 from p2gs_jax.export.page_splats import PageSplats, fit_into
 from p2gs_jax.photometry.display import DisplayTransform
-from p2gs_jax.render.host import make_renderer
+from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.read import Run
 
 SCRIPTS = ("decode", "shaders", "renderer", "camera", "link", "marks", "hands", "main")

@@ -12,7 +12,7 @@ from jaxtyping import Float, Float32
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.formats.false_color import luminance
 from p2gs_jax.photometry.display import DisplayTransform, develop
-from p2gs_jax.render.host import RenderView
+from p2gs_jax.render.capacity import RenderView
 from p2gs_jax.types import Camera, Gaussians
 
 # Stops are compared where the brightest channel is shown as this 8-bit level or more.

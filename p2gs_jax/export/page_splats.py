@@ -18,10 +18,9 @@ from p2gs_jax.export.page_error import PageError
 from p2gs_jax.formats.packed import Packed, pack, unpack
 from p2gs_jax.gaussians.posed import chosen
 from p2gs_jax.render import render_linear
-from p2gs_jax.render.capacity import TileCapacity, until_it_fits
-from p2gs_jax.render.cutoff import smallest_cutoff
-from p2gs_jax.render.host import count_needed
-from p2gs_jax.render.spherical_harmonics import C0, coefficient_count, degree_of
+from p2gs_jax.render.capacity import TileCapacity, count_needed, until_it_fits
+from p2gs_jax.render.harmonics import C0, coefficient_count, degree_of
+from p2gs_jax.render.tiles import smallest_cutoff
 from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.types import Camera, Gaussians
 

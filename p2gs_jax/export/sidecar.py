@@ -15,16 +15,14 @@ from p2gs_jax.config import Appearance, FitConfig, PhotometryConfig
 from p2gs_jax.formats.exr import BT709
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import EXPOSED_CEILING, EXPOSED_FLOOR
-from p2gs_jax.render.radiance import LOG_RADIANCE_LIMIT
-from p2gs_jax.render.spherical_harmonics import C0, C1, C2, C3, degree_of
-from p2gs_jax.run.photometry_file import PhotometryFile, ViewPhotometry
+from p2gs_jax.render.harmonics import C0, C1, C2, C3, LOG_RADIANCE_LIMIT, degree_of
+from p2gs_jax.run.photometry_files import PhotometryFile, ViewPhotometry
 from p2gs_jax.scene import ImageStore
 from p2gs_jax.types import GAMMA_SRGB, Gaussians, Scene
 
 FORMAT, VERSION = "p2gs-jax linear Gaussians", 2
 ACTIVATIONS = {
     "exp": f"L = exp(clip(s, -{LOG_RADIANCE_LIMIT:g}, {LOG_RADIANCE_LIMIT:g}))",
-    "softplus": "L = log(1 + exp(s))",
     "linear": "L = max(0, s + 1/2)",
 }
 # The basis of render/spherical_harmonics.py, in order; d = (x, y, z) is the direction.

@@ -16,9 +16,8 @@ from jaxtyping import Bool, Float, Int
 
 from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.core.numerics import on_device
-from p2gs_jax.core.ply_header import header_of
-from p2gs_jax.core.ply_table import read_table, refusing
-from p2gs_jax.render.radiance import RadianceKind
+from p2gs_jax.core.ply import header_of, read_table, refusing
+from p2gs_jax.render.harmonics import RadianceKind
 from p2gs_jax.types import Gaussians, Vibration
 
 

@@ -15,7 +15,7 @@ from scipy.special import expit
 
 from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.errors import UserError
-from p2gs_jax.render.spherical_harmonics import C0
+from p2gs_jax.render.harmonics import C0
 from p2gs_jax.types import Gaussians
 
 RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])

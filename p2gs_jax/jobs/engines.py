@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import threading
 from collections.abc import Iterator
-from concurrent.futures import CancelledError, Executor, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from p2gs_jax.errors import UserError
 
@@ -18,6 +21,8 @@ LOCAL = "local"
 KNOWN = "local, dask://HOST:PORT, slurm or slurm:OPTION=VALUE,..."
 # Seconds until a scheduler must have answered.
 ANSWER_S = 20
+# Seconds between questions how submitit's jobs are; it asks Slurm less often by itself.
+ASK_S = 1.0
 # By their names, so that no engine is imported that is not used: a worker died, or its node.
 _LOST = ("KilledWorker", "UncompletedJobError", "FutureCancelledError", "CommClosedError")
 
@@ -106,8 +111,6 @@ def _dask(name: str) -> Iterator[Executor]:
 def _submitit(kind: str, options: dict[str, int | str], folder: Path) -> Iterator[Executor]:
     import submitit
 
-    from p2gs_jax.jobs.submitit_engine import SubmititExecutor
-
     cluster = "local" if kind == "submitit-local" else "slurm"
     try:
         executor = submitit.AutoExecutor(folder=folder / "submitit", cluster=cluster)
@@ -118,7 +121,7 @@ def _submitit(kind: str, options: dict[str, int | str], folder: Path) -> Iterato
             fix="run this where `srun` is found, and name options as submitit does, for example "
             "slurm:timeout_min=240,slurm_partition=gpu",
         ) from error
-    with SubmititExecutor(executor) as jobs:
+    with _Submitit(executor) as jobs:
         yield jobs
 
 
@@ -128,7 +131,7 @@ def _options(name: str, text: str) -> dict[str, int | str]:
         key, equals, value = part.partition("=")
         if not (key.isidentifier() and equals and value):
             raise UserError(
-                f"--engine {name}: {part!r} is no OPTION=VALUE.",
+                f"--engine {name}: {part!r} is not OPTION=VALUE.",
                 fix="write slurm:timeout_min=240,slurm_partition=gpu",
             )
         found[key] = int(value) if value.isdigit() else value
@@ -136,7 +139,70 @@ def _options(name: str, text: str) -> dict[str, int | str]:
 
 
 def _require(module: str, extra: str, name: str) -> None:
-    from importlib.util import find_spec
-
     if find_spec(module) is None:
         raise UserError(f"--engine {name} needs {module}.", fix=f"pip install 'p2gs-jax[{extra}]'")
+
+
+class _Submitit(Executor):
+    """submitit's jobs as futures; a thread asks how they are."""
+
+    def __init__(self, executor: Any):
+        self._executor = executor
+        self._waiting: list[tuple[Any, Future]] = []
+        self._changed = threading.Condition()
+        self._closed = False
+        self._asking = threading.Thread(target=self._ask, name="submitit", daemon=True)
+        self._asking.start()
+
+    def submit(self, fn, /, *args, **kwargs) -> Future:
+        """Begin a job.
+
+        Raises:
+            RuntimeError: the executor was shut down.
+        """
+        future: Future = Future()
+        future.set_running_or_notify_cancel()
+        with self._changed:
+            if self._closed:
+                raise RuntimeError("this executor was shut down")
+            self._waiting.append((self._executor.submit(fn, *args, **kwargs), future))
+            self._changed.notify()
+        return future
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Take no more jobs; wait for those under way unless told otherwise."""
+        with self._changed:
+            self._closed = True
+            if cancel_futures:
+                for job, _ in self._waiting:
+                    job.cancel()
+            self._changed.notify()
+        if wait:
+            self._asking.join()
+
+    def _ask(self) -> None:
+        while True:
+            with self._changed:
+                if not self._waiting and not self._closed:
+                    self._changed.wait()
+                if not self._waiting and self._closed:
+                    return
+                waiting = list(self._waiting)
+            ended = [pair for pair in waiting if pair[0].done()]
+            for job, future in ended:
+                _settle(job, future)
+            with self._changed:
+                self._waiting = [pair for pair in self._waiting if pair not in ended]
+                if self._waiting:
+                    self._changed.wait(ASK_S)
+
+
+def _settle(job: Any, future: Future) -> None:
+    try:
+        error = job.exception()
+        if error is None:
+            future.set_result(job.result())
+        else:
+            future.set_exception(error)
+    except Exception as error:  # it left no result that can be read
+        future.set_exception(error)

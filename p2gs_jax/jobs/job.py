@@ -1,9 +1,12 @@
-"""A job: a function of the package and what it gets, as a file that any machine can read."""
+"""A job: a function of the package and its arguments, as a file that any machine can read."""
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 import re
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
@@ -11,12 +14,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 from p2gs_jax.core.atomic import write_json
-from p2gs_jax.core.progress import Reporter
+from p2gs_jax.core.progress import LogRecord, Reporter
 
 # In the folder of a job that failed.
 REASON = "failure.json"
-# Beside the job files: whoever runs one of them ends it.
-STOP = "stop"
+# Seconds between two writes of the progress.
+EVERY_S = 0.5
 
 Task = Callable[[Path, dict[str, Any], Reporter], None]
 Status = Literal["waiting", "running", "done", "failed", "stopped", "lost"]
@@ -24,13 +27,13 @@ Status = Literal["waiting", "running", "done", "failed", "stopped", "lost"]
 
 @dataclass(frozen=True)
 class Job:
-    """Something to be done, once, that can be begun again where it was left.
+    """Something to be done once, which can be begun again where it was left.
 
     Attributes:
-        name: as the user knows it; jobs of one call differ in it.
-        folder: where the results go. All machines of the engine see it under this path.
-        task: a function at the top of a module, of the folder, the arguments and a reporter. Called
-            again in the same folder, it goes on from its checkpoint.
+        name: as the user knows it; jobs of one call have different names.
+        folder: for the results. All machines of the engine see it under this path.
+        task: a function at the top of a module. Called again with the same folder, it goes on from
+            its checkpoint.
         arguments: JSON values.
     """
 
@@ -39,24 +42,18 @@ class Job:
     task: Task
     arguments: dict[str, Any]
 
-    @property
-    def slug(self) -> str:
-        """A file name for it."""
-        return slug(self.name)
-
 
 @dataclass
 class JobState:
     """How far a job is.
 
     Attributes:
-        name: of the job.
-        status: `stopped` where a signal asked for the end: the same call goes on with it; `lost`
+        status: `stopped` where a signal asked for the end: the same call goes on with it. `lost`
             never stays: such a job is begun again, or has failed.
-        begun: how many times it was begun by this call; more than once where a worker was lost.
+        begun: how many times this call began it; more than once where a worker was lost.
         reason: why it failed.
-        doing: what it does now, in words.
-        progress: of that, 0 to 1, or None.
+        doing: its present stage, in words.
+        progress: of that stage, 0 to 1, or None.
         seconds: since this call began it.
     """
 
@@ -71,17 +68,17 @@ class JobState:
 
 @dataclass(frozen=True)
 class JobFiles:
-    """Where a job's files lie: beside those of the other jobs, apart from results.
+    """The files of a job, which lie beside those of the other jobs, apart from results.
 
     Attributes:
-        path: of the job itself.
+        path: of the job file itself.
     """
 
     path: Path
 
     @property
     def progress(self) -> Path:
-        """How far it is."""
+        """How far the job is."""
         return self.path.with_suffix(".progress")
 
     @property
@@ -91,8 +88,8 @@ class JobFiles:
 
     @property
     def stop(self) -> Path:
-        """Asks all jobs beside it to end."""
-        return self.path.with_name(STOP)
+        """Where this file exists, all jobs beside it have to end."""
+        return self.path.with_name("stop")
 
 
 def slug(name: str) -> str:
@@ -101,13 +98,8 @@ def slug(name: str) -> str:
 
 
 def write_job(folder: Path, job: Job) -> JobFiles:
-    """Write a job file.
-
-    Args:
-        folder: of job files; absolute.
-        job: what it describes.
-    """
-    files = JobFiles(folder / f"{job.slug}.json")
+    """Write a job file into an absolute folder."""
+    files = JobFiles(folder / f"{slug(job.name)}.json")
     write_json(
         files.path,
         {
@@ -124,12 +116,18 @@ def read_job(path: Path) -> Job:
     """Read a job file.
 
     Raises:
-        ImportError, AttributeError: this version of the package has no such task.
+        ImportError, AttributeError: this version of the package does not have the task.
     """
     saved = json.loads(path.read_text(encoding="utf-8"))
     module, name = saved["task"].split(":")
     task = getattr(import_module(module), name)
     return Job(path.stem, Path(saved["folder"]), task, saved["arguments"])
+
+
+def write_reason(folder: Path, reason: str | None, **more: str) -> None:
+    """Leave in the folder of a job why it failed."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(folder / REASON, {"reason": reason, **more})
 
 
 def read_reason(folder: Path) -> str:
@@ -138,3 +136,43 @@ def read_reason(folder: Path) -> str:
         return json.loads((folder / REASON).read_text(encoding="utf-8"))["reason"]
     except (OSError, ValueError, KeyError, TypeError):
         return "it left no result and no reason"
+
+
+class ProgressFile:
+    """A reporter that keeps the newest state of a fit in a file, which others watch."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        self._written, self._stage = -EVERY_S, ""
+
+    def message(self, text: str) -> None:
+        """Keep a message for the user in the output."""
+        print(text, flush=True)
+
+    def stage(self, name: str, done: int = 0, total: int = 0) -> None:
+        """Begin or advance a stage."""
+        new, self._stage = name != self._stage, name
+        self._write({"doing": name, "progress": done / total if total else None}, now=new)
+
+    def log(self, record: LogRecord) -> None:
+        """Show the state of the optimisation."""
+        self._write({"doing": record.summary(), "progress": record.progress}, now=False)
+
+    def _write(self, state: dict[str, Any], *, now: bool) -> None:
+        if not now and time.monotonic() - self._written < EVERY_S:
+            return
+        self._written = time.monotonic()
+        # Not synced to the disk: nobody misses what a crash loses here.
+        beside = self.path.with_name(f".{self.path.name}.{os.getpid()}")
+        with contextlib.suppress(OSError):
+            beside.write_text(json.dumps({**state, "pid": os.getpid()}), encoding="utf-8")
+            os.replace(beside, self.path)
+
+
+def read_progress(path: Path) -> dict[str, Any] | None:
+    """Return the contents of a `ProgressFile`, or None where there are none yet."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return found if isinstance(found, dict) else None

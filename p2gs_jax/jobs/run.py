@@ -8,16 +8,25 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from pathlib import Path
 
-from p2gs_jax.core.atomic import write_json
 from p2gs_jax.jobs.engines import is_lost
-from p2gs_jax.jobs.job import REASON, STOP, Job, JobFiles, JobState, write_job
-from p2gs_jax.jobs.process import run_in_process
-from p2gs_jax.jobs.progress import update
+from p2gs_jax.jobs.job import (
+    REASON,
+    Job,
+    JobFiles,
+    JobState,
+    Status,
+    read_progress,
+    write_job,
+    write_reason,
+)
+from p2gs_jax.jobs.worker import run_in_process
 
 # A job whose worker was lost so many times is not begun again.
 MOST_BEGUN = 3
 # Seconds between looks at the progress of all.
 LOOK_S = 0.5
+# Runs the job of a file: how it ended, and why it failed.
+Runner = Callable[[str], tuple[Status, str | None]]
 
 
 def run_jobs(
@@ -27,16 +36,18 @@ def run_jobs(
     *,
     on_end: Callable[[int, JobState], None] = lambda number, state: None,
     on_look: Callable[[Sequence[JobState]], None] = lambda states: None,
+    run: Runner = run_in_process,
 ) -> list[JobState]:
-    """Run jobs and wait for all; what fails leaves its reason and ends nothing else.
+    """Run jobs and wait for all; a job that fails leaves its reason and ends nothing else.
 
     Args:
         jobs: of different names.
         engine: from `open_engine`.
-        folder: for job files, progress and output of the jobs; seen by all machines.
+        folder: for job files, progress and output of the jobs; all machines see it.
         on_end: called with the number of a job that has ended, in this thread; once more where a
             signal came into the call.
         on_look: called with all states, twice a second.
+        run: what the engine calls for each job file.
 
     Raises:
         KeyboardInterrupt: a signal asked for the end; the jobs under way were asked as well, and
@@ -44,8 +55,9 @@ def run_jobs(
     """
     folder = folder.absolute()
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / STOP).unlink(missing_ok=True)
-    watched = [_Watched(job, write_job(folder, job)) for job in jobs]
+    stop = JobFiles(folder / "any").stop
+    stop.unlink(missing_ok=True)
+    watched = [_Watched(job, write_job(folder, job), run) for job in jobs]
 
     def pending() -> dict[Future, int]:
         return {one.future: n for n, one in enumerate(watched) if one.future is not None}
@@ -66,8 +78,8 @@ def run_jobs(
                 watched[number].look()
             on_look([one.state for one in watched])
     except KeyboardInterrupt:
-        # Whatever the signal came into: what was handed over and not told yet is waited for.
-        (folder / STOP).touch()
+        # Wherever the signal came: jobs that were handed over and not yet told are waited for.
+        stop.touch()
         waited = pending()
         wait(waited)
         for number in waited.values():
@@ -85,8 +97,8 @@ class _Watched:
         future: what the engine gave for it; None before, and once its end was told.
     """
 
-    def __init__(self, job: Job, files: JobFiles):
-        self.job, self.files = job, files
+    def __init__(self, job: Job, files: JobFiles, run: Runner):
+        self.job, self.files, self.run = job, files, run
         self.state = JobState(job.name)
         self.future: Future | None = None
         self._since: float | None = None
@@ -96,7 +108,7 @@ class _Watched:
         self.state.begun += 1
         self.state.doing, self.state.progress = "", None
         self.files.progress.unlink(missing_ok=True)
-        self.future = engine.submit(run_in_process, str(self.files.path))
+        self.future = engine.submit(self.run, str(self.files.path))
 
     def end(self, engine: Executor | None) -> bool:
         """Note how the job ended, or begin it again; return whether it ended.
@@ -126,15 +138,15 @@ class _Watched:
             state.status = "failed"
             state.reason = f"its worker was lost {state.begun} times, at last: {state.reason}"
         if state.status == "failed" and not (self.job.folder / REASON).exists():
-            self.job.folder.mkdir(parents=True, exist_ok=True)
-            write_json(self.job.folder / REASON, {"reason": state.reason})
+            write_reason(self.job.folder, state.reason)
         return True
 
     def look(self) -> None:
         """Read how far the job is."""
-        if self.state.status in ("waiting", "running"):
-            update(self.state, self.files.progress)
-        if self.state.status == "running" and self._since is None:
-            self._since = time.monotonic()
+        state = self.state
+        found = read_progress(self.files.progress)
+        if state.status in ("waiting", "running") and found is not None:
+            state.status, state.doing, state.progress = "running", found["doing"], found["progress"]
+            self._since = self._since or time.monotonic()
         if self._since is not None:
-            self.state.seconds = time.monotonic() - self._since
+            state.seconds = time.monotonic() - self._since

@@ -19,11 +19,10 @@ _ORDER = ("running", "waiting", "failed", "stopped", "done")
 
 
 class JobsTable:
-    """Shows the states of jobs. Use as a context manager.
+    """Shows the states of jobs, as a context manager.
 
     Args:
-        console: where.
-        live: a display that is there already, which then shows the table; None: it has its own.
+        live: a display that then shows the table; None: the table has its own.
     """
 
     def __init__(self, console: Console, live: Live | None = None):

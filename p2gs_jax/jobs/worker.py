@@ -1,23 +1,104 @@
-"""One job, in this process: `python -m p2gs_jax.jobs.worker JOB.json`."""
+"""A job in a process of its own, on whichever machine: `python -m p2gs_jax.jobs.worker JOB.json`.
+
+A process gives its memory back, and one that the system kills takes nothing else with it. It ends
+with its caller: its standard input closes then, and no two processes write to one folder.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import signal
+import subprocess
 import sys
 import threading
 import traceback
 from pathlib import Path
 
 from p2gs_jax.core import interrupts
-from p2gs_jax.core.atomic import write_json
 from p2gs_jax.errors import UserError
-from p2gs_jax.jobs.job import REASON, JobFiles, read_job
-from p2gs_jax.jobs.progress import ProgressFile
+from p2gs_jax.jobs.job import (
+    REASON,
+    JobFiles,
+    ProgressFile,
+    Status,
+    read_job,
+    read_reason,
+    write_reason,
+)
+
+# Seconds between looks at the file that asks for the end.
+LOOK_S = 0.2
+# Exit codes of a job that was asked to end and left its checkpoint.
+ASKED = tuple(interrupts.exit_code(interrupts.Interrupted(n)) for n in interrupts.SIGNALS)
+
+
+def run_in_process(job_path: str) -> tuple[Status, str | None]:
+    """Run the job of a file in a process and wait for it: what engines call.
+
+    Returns:
+        How it ended, and why it failed; `lost` where a signal from elsewhere ended its process.
+    """
+    files = JobFiles(Path(job_path))
+    folder = read_job(files.path).folder
+    if files.stop.exists():
+        return "stopped", None
+    (folder / REASON).unlink(missing_ok=True)  # of an earlier try
+    files.progress.unlink(missing_ok=True)
+    with files.output.open("wb") as output:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "p2gs_jax.jobs.worker", job_path],
+            stdin=subprocess.PIPE,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            # Ctrl-C reaches the caller of the jobs, who asks each of them once.
+            process_group=0,
+        )
+        stopped = _wait(process, files.stop)
+    if process.returncode == 0:
+        return "done", None
+    if (folder / REASON).exists():
+        return "failed", read_reason(folder)
+    if stopped:
+        return "stopped", None
+    reason = _why(process.returncode, files.output)
+    # Nobody here asked it to end: a batch system takes the node back, or its time is over.
+    if process.returncode < 0 or process.returncode in ASKED:
+        return "lost", reason
+    write_reason(folder, reason)
+    return "failed", reason
+
+
+def _wait(process: subprocess.Popen, stop: Path) -> bool:
+    """Wait until a process ends; return whether it was asked to."""
+    asked = False
+    try:
+        while True:
+            try:
+                process.wait(LOOK_S)
+                return asked
+            except subprocess.TimeoutExpired:
+                if not asked and stop.exists():
+                    asked = True
+                    process.terminate()
+    finally:
+        if process.stdin is not None:
+            process.stdin.close()
+
+
+def _why(code: int, output: Path) -> str:
+    if code == -signal.SIGKILL:
+        return (
+            "its process was killed (SIGKILL), often because memory ran out: let fewer run at a "
+            "time, or lower --gaussians or --max-width"
+        )
+    by = f"by {signal.Signals(-code).name}" if code < 0 else f"with code {code}"
+    lines = output.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    return f"its process ended {by}: {(lines or ['no message'])[-1]}"
 
 
 def main(job_path: Path) -> int:
-    """Do what a job file says; 0 where it succeeded.
+    """Do the job of a file in this process; return 0 where it succeeded.
 
     A failure leaves its reason in the job's folder; a signal that asks for the end does not.
     """
@@ -31,22 +112,17 @@ def main(job_path: Path) -> int:
     except KeyboardInterrupt as error:
         return interrupts.exit_code(error)
     except UserError as error:
-        _leave(job.folder, {"reason": str(error)})
+        write_reason(job.folder, str(error))
         return 2
     except Exception as error:
         text = "".join(traceback.format_exception(error))
-        _leave(job.folder, {"reason": f"{type(error).__name__}: {error}", "traceback": text})
+        write_reason(job.folder, f"{type(error).__name__}: {error}", traceback=text)
         return 1
     return 0
 
 
-def _leave(folder: Path, reason: dict[str, str]) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    write_json(folder / REASON, reason)
-
-
 def _end_with_parent() -> None:
-    """End at once when whoever waits is gone: the job is begun again elsewhere, in this folder."""
+    """End at once when the caller is gone: the job is begun again elsewhere, in this folder."""
     with contextlib.suppress(OSError):
         while os.read(0, 1):
             pass

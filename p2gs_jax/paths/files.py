@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from p2gs_jax.core.atomic import write_json
-from p2gs_jax.core.json_text import parse_json
+from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
 from p2gs_jax.paths.geometry import inverse
 from p2gs_jax.paths.pinhole import LARGEST, as_matrix, checked_lens, orthonormal

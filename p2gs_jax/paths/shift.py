@@ -10,11 +10,7 @@ from jaxtyping import Float
 
 from p2gs_jax.paths.geometry import Poses, inverse
 from p2gs_jax.paths.shots import Shot
-from p2gs_jax.scene.rigid import (
-    headings,
-    level_ahead,
-    up_of_drive,
-)
+from p2gs_jax.scene.rigid import headings, level_ahead, up_of_drive
 from p2gs_jax.types import View
 
 

@@ -23,8 +23,8 @@ from p2gs_jax.core.numerics import LN2, on_device
 from p2gs_jax.photometry.luminance import parameters as luminance
 from p2gs_jax.photometry.luminance.parameters import Curves, Luminance
 from p2gs_jax.photometry.ppisp import parameters as isp
+from p2gs_jax.photometry.ppisp import regularisation as ppisp_regularisation
 from p2gs_jax.photometry.ppisp.parameters import OneView, Ppisp
-from p2gs_jax.photometry.ppisp.regularisation import regularisation as ppisp_regularisation
 from p2gs_jax.types import LUMINANCE, Params
 
 # Of all training views: a row for each, or what PPISP or Luminance-GS learns.

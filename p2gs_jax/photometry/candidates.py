@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from p2gs_jax.photometry.adjustment.clusters import side_by_side
+from p2gs_jax.photometry.adjustment.errors import side_by_side
 from p2gs_jax.photometry.adjustment.fit import TOLERANCE_TO_COMPARE, solve_model
 from p2gs_jax.photometry.adjustment.problem import Problem
 from p2gs_jax.photometry.adjustment.solve import Fit

@@ -10,7 +10,7 @@ import dataclasses
 import jax
 import numpy as np
 
-from p2gs_jax.render.radiance import RadianceKind, scaled
+from p2gs_jax.render.harmonics import RadianceKind, scaled
 from p2gs_jax.types import Params
 
 
@@ -22,10 +22,8 @@ def recentre(params: Params, activation: RadianceKind) -> Params:
     Args:
         params: the fit.
         activation: from spherical harmonics to radiance. `exp` moves by a constant and `linear` by
-            a factor, exactly; `softplus` can do neither, and is returned as it is.
+            a factor, exactly.
     """
-    if activation == "softplus":
-        return params
     # On the host: once a fit, and every operation would be a program of its own.
     photometry = jax.tree.map(np.asarray, params.photometry)
     log_scale = np.mean(photometry.log_exposures)

@@ -136,22 +136,3 @@ def sample_pairs(
     first = rng.integers(0, lengths[pick])
     second = (first + rng.integers(1, lengths[pick])) % lengths[pick]
     return order[starts[pick] + first], order[starts[pick] + second]
-
-
-def overlapping_views(observations: Observations, fewest: int) -> list[Int[np.ndarray, " k"]]:
-    """Return for every view the others that share at least `fewest` points with it.
-
-    A view that shares fewer with all of them keeps the one it shares most with, if any.
-
-    Args:
-        observations: of shared points.
-        fewest: points.
-    """
-    ones = np.ones(len(observations.views), np.float32)
-    shape = (observations.view_count, observations.point_count)
-    seen = sp.csr_array((ones, (observations.views, observations.points)), shape=shape)
-    seen.data[:] = 1
-    shared = (seen @ seen.T).toarray()
-    np.fill_diagonal(shared, 0)
-    enough = np.minimum(fewest, np.maximum(shared.max(1, initial=0), 1))
-    return [np.flatnonzero(row >= least) for row, least in zip(shared, enough, strict=True)]

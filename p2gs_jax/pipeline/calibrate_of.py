@@ -17,10 +17,9 @@ from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.foreign import score_foreign
 from p2gs_jax.formats.foreign import read_foreign
-from p2gs_jax.gaussians.bake import viewer_config
-from p2gs_jax.gaussians.init.dense_bound import coverage_of
-from p2gs_jax.gaussians.init.seeds import cameras_radius
-from p2gs_jax.gaussians.relit import relit
+from p2gs_jax.gaussians.bake import relit, viewer_config
+from p2gs_jax.gaussians.dense import coverage_of
+from p2gs_jax.gaussians.seeds import cameras_radius
 from p2gs_jax.photometry.calibrate import calibrate_observations, options_of
 from p2gs_jax.photometry.initial import initial_photometry
 from p2gs_jax.photometry.mean import usual_display
@@ -28,14 +27,13 @@ from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.selection import Selection
 from p2gs_jax.photometry.sources.rendered import rendered_colors
 from p2gs_jax.photometry.sources.tracks import has_tracks, track_colors
-from p2gs_jax.pipeline.calibration import Calibration, with_stated
+from p2gs_jax.pipeline.calibration import Calibration, with_stated, write_calibration
 from p2gs_jax.pipeline.decide import decide
 from p2gs_jax.pipeline.finish import Account, finish
 from p2gs_jax.pipeline.fit import compact, optimise
 from p2gs_jax.pipeline.preflight import check_run_dir
 from p2gs_jax.pipeline.prepare import Prepared
-from p2gs_jax.run.calibration_files import write_calibration
-from p2gs_jax.run.layout import RunFolder
+from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.run.write import write_start
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.images import ImageStore
@@ -220,7 +218,6 @@ def _prepared(
         extent=cameras_radius(scene.training_views, np.asarray(foreign.means)),
         selection=selection,
         pairs=None,
-        overlaps=None,
         measured=None,
         coverage=coverage_of(scene, store),
         decisions=decisions,

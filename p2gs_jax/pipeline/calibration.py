@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
+from jaxtyping import Float
 
 from p2gs_jax.config import PhotometryConfig
+from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.photometry.agreement import Agreement, compare, note_on_levels
 from p2gs_jax.photometry.selection import Selection
 from p2gs_jax.photometry.solution import PhotometricSolution
-from p2gs_jax.run.photometry_file import MEAN_GAUGE
+from p2gs_jax.run.photometry_files import write_solution
+from p2gs_jax.run.plots import write_calibration_plot
 from p2gs_jax.scene.known_exposures import stated_ev
 from p2gs_jax.types import Scene, View
 
@@ -60,7 +64,7 @@ class Calibration:
     @property
     def gauge(self) -> str:
         """What fixes the scale where no exposures are known, in words."""
-        return MEAN_GAUGE
+        return "mean log exposure is 0 over each connected group of views"
 
     @property
     def messages(self) -> list[str]:
@@ -140,4 +144,77 @@ def with_stated(
         seconds=seconds,
         pivot=pivot,
         known=photometry.known,
+    )
+
+
+class CalibrationResult(Protocol):
+    """What a calibration says: all that its files and its table need."""
+
+    @property
+    def views(self) -> Sequence[View]:
+        """The photographs, in the order of the solution."""
+        ...
+
+    @property
+    def solution(self) -> PhotometricSolution:
+        """Exposures, gammas, response."""
+        ...
+
+    @property
+    def pivot(self) -> float:
+        """Linear value that gammas leave alone."""
+        ...
+
+    @property
+    def known(self) -> str | None:
+        """Where known exposures came from, or None."""
+        ...
+
+    @property
+    def gauge(self) -> str:
+        """What fixes the scale where none are known, in words."""
+        ...
+
+    @property
+    def stated_ev(self) -> Float[np.ndarray, " v"]:
+        """Stated exposures in stops, laid over the recovered ones; NaN where unknown."""
+        ...
+
+    @property
+    def agreement(self) -> Agreement:
+        """Of recovered and stated exposures."""
+        ...
+
+    @property
+    def messages(self) -> Sequence[str]:
+        """What the user should know."""
+        ...
+
+    @property
+    def details(self) -> dict[str, Any]:
+        """The content of `calibration.json`."""
+        ...
+
+
+def write_calibration(result: CalibrationResult, out: Path) -> None:
+    """Write `photometry.json`, `calibration.json` and `calibration.png`.
+
+    Args:
+        result: what was found.
+        out: folder; created.
+    """
+    write_solution(
+        out / "photometry.json",
+        result.solution,
+        views=result.views,
+        pivot=result.pivot,
+        gauge=result.gauge if result.known is None else f"known exposures ({result.known})",
+    )
+    write_json(out / "calibration.json", result.details)
+    write_calibration_plot(
+        out / "calibration.png",
+        result.solution,
+        cameras=[v.camera for v in result.views],
+        stated_ev=result.stated_ev,
+        pivot=result.pivot,
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,17 +16,13 @@ from p2gs_jax.core.runtime import return_freed_memory
 from p2gs_jax.evaluate.evaluate import ViewResult, evaluate
 from p2gs_jax.evaluate.lpips import LpipsWeights
 from p2gs_jax.evaluate.references import Reference, find_radiance
-from p2gs_jax.evaluate.unexplained import Unexplained, shares_by_view
 from p2gs_jax.evaluate.untold import untold_notes
 from p2gs_jax.photometry.metering import Metering
 from p2gs_jax.pipeline.prepare import Prepared
-from p2gs_jax.render.host import make_renderer
-from p2gs_jax.run.layout import RunFolder
-from p2gs_jax.run.unexplained_pictures import write_unexplained
+from p2gs_jax.render.capacity import make_renderer
+from p2gs_jax.run.folder import RunFolder
+from p2gs_jax.run.plots import write_unexplained
 from p2gs_jax.run.write import summary_rows, write_results, write_view
-from p2gs_jax.scene.drives.objects import (
-    fitted_objects,
-)
 from p2gs_jax.types import Params
 
 
@@ -38,17 +34,12 @@ class Account:
         counts: numbers.
         seconds: times, by name.
         compiler: counts what was compiled for this fit.
-        growth: the history of automatic growth, or None.
-        left_out: what no static scene explains and the last steps left out, by row of the scene;
-            None where it was not looked for.
         of: scores of the model that was converted, as it was; None: this is a fit.
     """
 
     counts: dict[str, int]
     seconds: dict[str, float]
     compiler: CompileCounter = field(default_factory=CompileCounter)
-    growth: dict | None = None
-    left_out: Mapping[int, Unexplained] | None = None
     of: dict | None = None
 
 
@@ -83,8 +74,7 @@ def finish(
     return_freed_memory()
     _import_ahead("matplotlib.figure")
     scene, cfg = prepared.scene, prepared.cfg
-    moving = fitted_objects(prepared.store.moving, params)
-    store = prepared.store.placing(moving)
+    moving, store = prepared.store.moving, prepared.store
     fitted: dict[int, float] = {}
     shown: dict[int, ViewResult] = {}
     picks = summary_rows(scene)
@@ -141,9 +131,6 @@ def finish(
             metering=metering[0],
             true_ev=true_ev,
         )
-        if account.left_out is not None:
-            write_unexplained(folder.left_out, scene, store, account.left_out)
-            metrics["left_out"] = shares_by_view(scene, account.left_out)
     metrics |= _accounted(account, watch, prepared, reporter)
     still_ours()
     write_json(folder.metrics, metrics)
@@ -172,8 +159,6 @@ def _accounted(account: Account, watch: Stopwatch, prepared: Prepared, reporter:
     }
     if prepared.selection is not None:
         said["photometry"] = prepared.selection.solution.state
-    if account.growth is not None:
-        said["growth"] = account.growth
     if account.of is not None:
         said["of"] = account.of
     return said

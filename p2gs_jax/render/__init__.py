@@ -10,12 +10,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render.binning import bin_tiles, count_entries
-from p2gs_jax.render.cutoff import with_cutoffs
-from p2gs_jax.render.objects import camera_of_each
-from p2gs_jax.render.project import project, view_radiance
-from p2gs_jax.render.rasterize_reference import rasterize_reference
-from p2gs_jax.render.rasterize_tiles import TileImplementation, rasterize_tiles
-from p2gs_jax.render.vibration import at_time
+from p2gs_jax.render.project import at_time, camera_of_each, project, view_radiance
+from p2gs_jax.render.tiles import (
+    TileImplementation,
+    rasterize_reference,
+    rasterize_tiles,
+    with_cutoffs,
+)
 from p2gs_jax.types import Camera, Gaussians, Render, Splats2D, TileList
 
 # The oldest NVIDIA GPUs that Pallas supports through Triton.
@@ -45,11 +46,11 @@ def rasterize(
     implementation: Literal["reference"] | TileImplementation | None = None,
     with_depth: bool = True,
 ) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"], Float[Array, "h w"] | None]:
-    """Composite splats into linear radiance, alpha and alpha-weighted depth.
+    """Composite splats of linear HDR radiance into radiance, alpha and alpha-weighted depth.
 
     Args:
         splats: projected Gaussians.
-        radiance: linear HDR radiance of each, >= 0.
+        radiance: of each, >= 0.
         tiles: tile list; only `reference` does without.
         width: image width, pixels.
         height: image height, pixels.
@@ -101,13 +102,11 @@ def render_linear(
         alive: slots in use.
         camera: the view.
         cfg: rendering options.
-        capacity: tile-list entries; see `required_capacity`.
+        capacity: tile-list entries; see `required_capacity`. A render whose `overflow` is set must
+            be discarded and the capacity grown.
         owner: the moving object that each Gaussian belongs to (`Population.owner`), or None.
         active_degree: highest spherical-harmonics degree in use, None for all.
         with_depth: see `rasterize`.
-
-    Returns:
-        The render. Where `overflow` is set it must be discarded and the capacity grown.
     """
     if gaussians.capacity == 0:
         return _nothing(camera, cfg, with_depth)
@@ -127,16 +126,7 @@ def render_splats(
     *,
     with_depth: bool = True,
 ) -> Render:
-    """Render Gaussians that are projected already (see `render_linear`).
-
-    Args:
-        splats: the view's.
-        radiance: of each towards the camera.
-        camera: the view; its size counts.
-        cfg: rendering options.
-        capacity: tile-list entries.
-        with_depth: see `rasterize`.
-    """
+    """Render Gaussians that are projected already; see `render_linear`."""
     splats = with_cutoffs(splats, radiance, cfg)
     if cfg.implementation == "reference":
         tiles, count = None, jnp.int32(0)

@@ -6,10 +6,20 @@ and memory"). So capacities are generous, and overflows, which cost a compilatio
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
-from p2gs_jax.render.blocks import whole_blocks
+import jax
+import numpy as np
+from jaxtyping import Array, Bool, Int
+
+from p2gs_jax.config import RenderConfig
+from p2gs_jax.core.numerics import on_device
+from p2gs_jax.render import render_linear, required_capacity
+from p2gs_jax.render.visible import whole_blocks
+from p2gs_jax.render.xla_cpu import compiler_options
+from p2gs_jax.types import Camera, Gaussians, Render
 
 STEP = 1.25
 SMALLEST = 4096
@@ -52,12 +62,7 @@ def bucket(needed: int, margin: float = 1.0) -> int:
 
 
 class TileCapacity(NamedTuple):
-    """The length of a tile list.
-
-    Attributes:
-        entries: static size.
-        margins: how much of it is to spare.
-    """
+    """The static length of a tile list, and how much of it is to spare."""
 
     entries: int
     margins: Margins = PICTURES
@@ -83,12 +88,8 @@ def until_it_fits(
 ) -> tuple[Result, TileCapacity]:
     """Draw, with a longer tile list as long as it overflows.
 
-    Args:
-        draw: from a static number of entries to (result, entries needed, whether they overflowed).
-        capacity: to begin with.
-
-    Returns:
-        The result and the capacity that held it.
+    `draw` goes from a static number of entries to (result, entries needed, whether they
+    overflowed). The capacity that held the result is returned with it.
     """
     while True:
         result, needed, overflow = draw(capacity.entries)
@@ -131,12 +132,66 @@ class Room(NamedTuple):
         return self.entries >= other.entries and self.visible >= other.visible
 
     def grown(self, entries: int, visible: int) -> Room:
-        """Return room for a view that did not fit, with some to spare; only what was short grows.
-
-        Args:
-            entries: that the view needs.
-            visible: Gaussians that it shows.
-        """
+        """Return room for a view that needs this, with some to spare; only what was short grows."""
         lists = TileCapacity(self.entries, TRAINING).grown(entries)
         shown = TileCapacity(self.visible, TRAINING_VISIBLE).grown(visible)
         return Room(lists.entries, shown.entries)
+
+
+class RenderView(Protocol):
+    """Render one view; arguments as of `render_linear`."""
+
+    def __call__(
+        self,
+        gaussians: Gaussians,
+        alive: Bool[Array, " n"],
+        camera: Camera,
+        owner: Int[Array, " n"] | None = None,
+    ) -> Render:
+        """Return the render."""
+        ...
+
+
+count_needed = jax.jit(required_capacity, static_argnames="cfg")
+"""`required_capacity`, compiled."""
+
+
+@functools.cache
+def compiled_renderer() -> Any:
+    """Return `render_linear`, compiled; static are `cfg`, `capacity` and `with_depth`.
+
+    On first use: its options depend on the backend, which an import should not start.
+    """
+    static = ("cfg", "capacity", "with_depth")
+    return jax.jit(render_linear, static_argnames=static, compiler_options=compiler_options())
+
+
+def make_renderer(cfg: RenderConfig, owners: Int[np.ndarray, " n"] | None = None) -> RenderView:
+    """Return a function that renders one view, and grows its tile lists after an overflow.
+
+    `owners` are what `owner` is where it is not given.
+    """
+    known = None if owners is None else on_device(owners, np.int32)
+    capacities: dict[tuple[int, int], TileCapacity] = {}
+
+    def render_view(
+        gaussians: Gaussians,
+        alive: Bool[Array, " n"],
+        camera: Camera,
+        owner: Int[Array, " n"] | None = None,
+    ) -> Render:
+        owner = known if owner is None else owner
+        size = (camera.width, camera.height)
+        if size not in capacities:
+            needed = int(count_needed(gaussians, alive, camera, cfg=cfg, owner=owner))
+            capacities[size] = TileCapacity.allocate(needed)
+
+        def draw(entries: int) -> tuple[Render, Array, Array]:
+            render = compiled_renderer()
+            result = render(gaussians, alive, camera, cfg=cfg, capacity=entries, owner=owner)
+            return result, result.count, result.overflow
+
+        result, capacities[size] = until_it_fits(draw, capacities[size])
+        return result
+
+    return render_view

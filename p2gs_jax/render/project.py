@@ -1,8 +1,27 @@
-"""From 3D Gaussians to 2D splats: the local affine approximation of EWA splatting."""
+"""From 3D Gaussians, moving ones among them, to 2D splats and their radiance in one view.
+
+The local affine approximation of EWA splatting. What is around it concerns drives:
+
+Moving objects. Gaussians stay in the frame of their box, and the camera moves: what a Gaussian
+looks like depends on where the camera is in its own frame alone. So a Gaussian of an object is
+projected with the view matrix from that object's box to the camera, and nothing else in the
+renderer knows of objects.
+
+Vibration (PVG, arXiv 2311.18561, section 3.2). Gaussians may come, move and go:
+
+    mean(t)    = mean + velocity sin(2 pi (t - peak) / cycle) cycle / (2 pi) still(life)
+    opacity(t) = opacity exp(-(t - peak)^2 / (2 life^2))
+
+`still` = exp(-life / (2 cycle)) is how PVG tells what moves from what stands; there it scales the
+velocity that is shown, here the motion itself, so that what lives long stands exactly (ours).
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import functools
+import math
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -10,16 +29,69 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from p2gs_jax.config import RenderConfig
-from p2gs_jax.render import spherical_harmonics
-from p2gs_jax.render.radiance import radiance_activation
+from p2gs_jax.core.numerics import namespace
+from p2gs_jax.render import harmonics
 from p2gs_jax.render.xla_cpu import columns
-from p2gs_jax.types import Camera, Frustum, Gaussians, Splats2D
+from p2gs_jax.types import Camera, Frustum, Gaussians, Placement, Splats2D
+
+AnyCamera = TypeVar("AnyCamera", bound=Camera | Frustum)
 
 INVISIBLE_LOG_OPACITY = -100.0
 # Outside this range float32 products of scales and focal lengths leave the normal numbers.
 LOG_SCALE_RANGE = (-16.0, 9.0)
 # Beyond this many half images from the axis the affine approximation is evaluated at the border.
 TANGENT_LIMIT = 1.3
+# The view matrix of objects that are not there: every point is behind the camera.
+HIDDEN = np.array([[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, -1], [0, 0, 0, 1]], np.float32)
+# Seconds of a vibration (PVG: ten photographs, at ten a second).
+CYCLE = 1.0
+# Life of what stands still, seconds: its opacity is that of all times, and no gradient reaches it.
+STILL = math.exp(30.0)
+# Log opacities of what vibrates stay within these, so that their logits are finite.
+FAINTEST, MOST_OPAQUE = -30.0, -1e-6
+
+
+def at_time(gaussians: Gaussians, objects: Placement | None) -> Gaussians:
+    """Return Gaussians as they are at the time of a view; as they were given if none vibrates.
+
+    `objects` are the view's, with its time; without one, it is the middle of the drive. NumPy
+    arrays give NumPy results.
+    """
+    moves = gaussians.vibration
+    if moves is None:
+        return gaussians
+    time = None if objects is None else objects.time
+    t: Float[Array, ""] | np.ndarray = np.zeros((), np.float32) if time is None else time
+    xp = namespace(gaussians.means, t)
+    life = xp.exp(moves.log_lives)
+    away = t - moves.peaks
+    swing = xp.sin(away * (2 * math.pi / CYCLE)) * (CYCLE / (2 * math.pi))
+    swing = swing * xp.exp(-life / (2 * CYCLE))
+    log_opacity = -xp.logaddexp(0.0, -gaussians.opacity_logits) - 0.5 * (away / life) ** 2
+    log_opacity = xp.clip(log_opacity, FAINTEST, MOST_OPAQUE)
+    return dataclasses.replace(
+        gaussians,
+        means=gaussians.means + moves.velocities * swing[:, None],
+        opacity_logits=log_opacity - xp.log(-xp.expm1(log_opacity)),
+        vibration=None,
+    )
+
+
+def camera_of_each(camera: AnyCamera, owner: Int[Array, " n"] | None) -> AnyCamera:
+    """Return a camera with the view matrix of each Gaussian, along the last axis.
+
+    `owner` is the moving object that each Gaussian belongs to, -1: none; without it, the camera is
+    returned as it is. In a view without `objects`, none of them is there.
+    """
+    if owner is None:
+        return camera
+    xp = namespace(owner, camera.viewmat)
+    objects = xp.asarray(HIDDEN)[None] if camera.objects is None else camera.objects.viewmats
+    # The world comes last, where -1 finds it.
+    stack = xp.concatenate([objects, camera.viewmat[None]])
+    row = xp.minimum(owner, len(objects) - 1)
+    # An axis behind, so that each entry of the matrices is one vector.
+    return dataclasses.replace(camera, viewmat=xp.moveaxis(stack, 0, -1)[:, :, row], objects=None)
 
 
 def rotation_matrices(quats: Float[Array, "n 4"]) -> list[list[Float[Array, " n"]]]:
@@ -49,18 +121,10 @@ def project(
 ) -> Splats2D:
     """Project Gaussians into a view.
 
-    The determinant of the 2D covariance is summed from squared minors (Cauchy-Binet) rather than
-    taken as a difference, so needles keep a positive determinant in float32.
-
-    Args:
-        gaussians: the scene.
-        alive: slots in use; the others become invisible.
-        camera: the view.
-        cfg: near plane and blur.
-
-    Returns:
-        The splats; those that are not alive, not in front of the near plane or not finite are
-        invisible and have zero gradients.
+    Splats that are not alive, not in front of the near plane or not finite are invisible and have
+    zero gradients. The determinant of the 2D covariance is summed from squared minors
+    (Cauchy-Binet) rather than taken as a difference, so that needles keep a positive determinant in
+    float32.
     """
     R, t = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
     fx, fy, cx, cy = camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]
@@ -128,6 +192,5 @@ def view_radiance(
     offset = [m - c for m, c in zip(columns(gaussians.means), center, strict=True)]
     inverse = jax.lax.rsqrt(jnp.maximum(sum(o * o for o in offset), 1e-20))
     x, y, z = (o * inverse for o in offset)
-    return radiance_activation(
-        spherical_harmonics.evaluate(gaussians.sh, (x, y, z), active_degree), cfg.radiance
-    )
+    values = harmonics.evaluate(gaussians.sh, (x, y, z), active_degree)
+    return harmonics.radiance_activation(values, cfg.radiance)

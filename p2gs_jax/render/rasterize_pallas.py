@@ -26,9 +26,8 @@ from jax import lax
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plt
 
-from p2gs_jax.render.binning.boxes import bits_for
-from p2gs_jax.render.binning.sorting import sort_payloads
-from p2gs_jax.render.tile_rows import DARKEST, GEOMETRY, Plan, geometry_gradient
+from p2gs_jax.render.binning import bits_for, sort_payloads
+from p2gs_jax.render.tiles import DARKEST, GEOMETRY, Plan, geometry_gradient
 
 # Entries whose rows are loaded together; the stop rule is looked at once for each such group.
 UNROLL = 4

@@ -3,12 +3,15 @@
 B lanes each own one segment of a tile's list. Every iteration a lane composites the next C entries
 of its segment; when that ends, or all its pixels are opaque, it writes the result and takes the
 next segment, longest first. Long lists are cut so that no segment is longer than a fraction of a
-lane's fair share (segments.py): all lanes are busy to the end, however few tiles there are and
+lane's fair share (`cut`): all lanes are busy to the end, however few tiles there are and
 however uneven their lists. Compositing is associative, so the segments of a tile are composited
-independently and merged. Work wasted on padding is bounded by C per tile.
+independently and merged: one of colour c and transmittance t in front of one of colour d gives
+colour c + t d. Work wasted on padding is bounded by C per tile. A queue of whole lists took at
+least as long as its longest list: at a quarter of the resolution of a fit, lanes were idle for two
+thirds of the time (BUILD_NOTES, "Full lanes").
 
 The exponential is a polynomial on [-0.7, 0], squared as often as it takes to reach the cutoff
-(`exponent_scale`); rows are what tile_rows.py says.
+(`exponent_scale`); rows are what tiles.py says.
 
 Backward. The same segments, front to back, each from the transmittance and light before it. With
 R the gradient-weighted light still to come, q = w (radiance . g) and R -= q after each entry, the
@@ -25,19 +28,160 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array
+from jaxtyping import Array, Float, Int
 
-from p2gs_jax.render.rasterize_xla import (
-    Queue,
-    cut,
-    merge,
-)
-from p2gs_jax.render.tile_rows import DARKEST, GEOMETRY, Plan, geometry_gradient
-from p2gs_jax.render.xla_cpu import materialize
+from p2gs_jax.render.binning import bits_for, sort_payloads
+from p2gs_jax.render.tiles import DARKEST, GEOMETRY, Plan, geometry_gradient
+from p2gs_jax.render.xla_cpu import compiled_loop, materialize
 
 # The backward pass has more overhead per iteration: more pixels in flight are faster.
 BACKWARD_LANE_FACTOR = 2
 PREFIX_GROUP = 8
+# A segment is as many chunks long as a lane's fair share over this. So there are at most as many
+# segments as tiles and this many times lanes: a static bound.
+SEGMENTS_PER_LANE = 4
+
+
+class Segments(NamedTuple):
+    """Where each segment lies in the list of entries.
+
+    Slot t < T is the first segment of tile t. The slots after those hold all others, tile by tile
+    from front to back; slots that are not needed are empty and come last.
+
+    Attributes:
+        tiles: whose list it is a part of.
+        starts: first entry.
+        ends: behind the last entry.
+        extra: how many slots behind the first T are in use.
+    """
+
+    tiles: Int[Array, " s"]
+    starts: Int[Array, " s"]
+    ends: Int[Array, " s"]
+    extra: Int[Array, ""]
+
+
+def cut(offsets: Int[Array, " t1"], plan: Plan) -> Segments:
+    """Cut lists into segments; `offsets` are the start of every tile's list, and the last end."""
+    starts, ends = offsets[:-1], offsets[1:]
+    most = SEGMENTS_PER_LANE * plan.lanes
+    chunks = -((starts - ends) // plan.chunk)
+    length = jnp.maximum(1, -(-jnp.sum(chunks) // most)) * plan.chunk
+    more = jnp.maximum(-((starts - ends) // length) - 1, 0)
+    last = jnp.cumsum(more)
+    first = last - more
+    # The owner of an extra slot: the last tile whose extra slots begin at or before it.
+    tile = jnp.arange(plan.tile_count, dtype=jnp.int32)
+    owner = jnp.zeros(most, jnp.int32).at[jnp.where(more > 0, first, most)].max(tile, mode="drop")
+    owner = lax.cummax(owner)
+    slot = jnp.arange(most, dtype=jnp.int32)
+    used = slot < last[-1]
+    start = starts[owner] + (slot - first[owner] + 1) * length
+    end = jnp.minimum(start + length, ends[owner])
+    return Segments(
+        jnp.concatenate([tile, jnp.where(used, owner, 0)]),
+        jnp.concatenate([starts, jnp.where(used, start, 0)]),
+        jnp.concatenate([jnp.minimum(starts + length, ends), jnp.where(used, end, 0)]),
+        last[-1],
+    )
+
+
+@compiled_loop
+def _merge(composited, tiles, extra):
+    def at(a, i):
+        return lax.dynamic_slice_in_dim(a, i, 1)
+
+    def put(a, row, i):
+        return lax.dynamic_update_slice_in_dim(a, row, i, 0)
+
+    count = composited[0].shape[0] - tiles.shape[0]
+
+    # The front is part of the loop's state: an array both read and written would be copied.
+    def body(k, state):
+        image, before, last, front = state
+        tile = lax.dynamic_slice(tiles, (k,), (1,))[0]
+        firsts = [at(a, tile) for a in composited]
+        front = [jnp.where(tile == last, f, first) for f, first in zip(front, firsts, strict=True)]
+        behind = [at(a, count + k) for a in composited]
+        before = tuple(put(a, row, k) for a, row in zip(before, front, strict=True))
+        transmittance = front[-1]
+        merged = [f + transmittance * b for f, b in zip(front[:-1], behind[:-1], strict=True)]
+        merged = (*merged, transmittance * behind[-1])
+        image = tuple(put(a, row, tile) for a, row in zip(image, merged, strict=True))
+        return image, before, tile, merged
+
+    image = tuple(a[:count] for a in composited)
+    before = tuple(jnp.zeros((tiles.shape[0], *a.shape[1:]), a.dtype) for a in composited)
+    state = (image, before, jnp.int32(-1), tuple(a[:1] for a in composited))
+    return lax.fori_loop(0, extra, body, state)[:2]
+
+
+def merge(
+    composited: tuple[Float[Array, "s p"], ...], segments: Segments, plan: Plan
+) -> tuple[tuple[Float[Array, "t p"], ...], tuple[Float[Array, "e p"], ...]]:
+    """Return the channels and transmittance of every tile, and in front of each extra slot.
+
+    `composited` are the channels and, last, the transmittance of every slot.
+    """
+    return _merge(composited, segments.tiles[plan.tile_count :], segments.extra)
+
+
+class Queue(NamedTuple):
+    """Segments in the order in which lanes take them, longest first, then an empty slot per lane.
+
+    S slots hold segments; those from S on are empty: lanes wait there at the end.
+    """
+
+    order: Array  # [S + B]
+    work: Array  # how many slots hold entries
+    starts: Array  # [S + B]
+    ends: Array
+    centers: Array  # [S + B 2], middle of the tile, pixels
+    lane: Array  # [B]
+
+    @classmethod
+    def build(cls, segments: Segments, ends: Array, plan: Plan) -> Queue:
+        """Queue the segments; `ends` is where each is composited to, at most its own end."""
+        count, lanes = segments.starts.shape[0], plan.lanes
+        lane = jnp.arange(lanes, dtype=jnp.int32)
+        bits = bits_for(count)
+        limit = 2 ** (32 - bits) - 1
+        lengths = ends - segments.starts
+        key = jnp.uint32(limit) - jnp.minimum(lengths, limit).astype(jnp.uint32)
+        key = key << bits | jnp.arange(count, dtype=jnp.uint32)
+        parked = jnp.zeros(lanes, jnp.int32)
+        tiles = jnp.concatenate([segments.tiles, parked])
+        column, line = tiles % plan.across, tiles // plan.across
+        centers = jnp.stack(
+            [column * plan.tile_x + plan.tile_x / 2, line * plan.tile_y + plan.tile_y / 2], -1
+        )
+        return cls(
+            jnp.concatenate([sort_payloads(key, bits), count + lane]),
+            jnp.sum(lengths > 0, dtype=jnp.int32),
+            jnp.concatenate([segments.starts, parked]),
+            jnp.concatenate([ends, parked]),
+            centers.astype(jnp.float32),
+            lane,
+        )
+
+    @property
+    def slots(self) -> int:
+        """Number of slots."""
+        return self.starts.shape[0] - self.lane.shape[0]
+
+    def first(self):
+        """Return the slots that lanes begin with."""
+        lane = self.lane
+        return jnp.where(lane < self.work, self.order[: lane.shape[0]], self.slots + lane)
+
+    def advance(self, turn, slot, position, done):
+        """Hand finished lanes their next slots; return (turn, slot, position)."""
+        finished = done.astype(jnp.int32)
+        total = jnp.cumsum(finished)
+        mine = turn + total - 1
+        new = jnp.where(done, self.order[jnp.minimum(mine, self.slots - 1)], slot)
+        new = jnp.where(done & (mine >= self.work), self.slots + self.lane, new)
+        return turn + total[-1], new, jnp.where(done, self.starts[new], position)
 
 
 def exponent_scale(smallest_cutoff: float) -> float:

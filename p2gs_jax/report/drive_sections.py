@@ -9,7 +9,7 @@ from p2gs_jax.report.page import Section, folded, paragraph, row, table
 from p2gs_jax.report.pictures import jpeg
 from p2gs_jax.report.run_files import RunFiles, number_at
 from p2gs_jax.report.view_comparisons import read_png
-from p2gs_jax.run.layout import RunFolder
+from p2gs_jax.run.folder import RunFolder
 
 PROTOCOLS = (
     ("training", "own exposure and gamma", ("train",)),
@@ -129,26 +129,6 @@ def unexplained_section(run: RunFiles, problems: list[str]) -> Section:
     )
     body += _marked(run, "unexplained", RunFolder(run.folder).unexplained, problems)
     return Section("unexplained", title, body)
-
-
-def left_out_section(run: RunFiles, problems: list[str]) -> Section:
-    """Pixels of training views that the fit left out, because no static scene explains them.
-
-    Args:
-        run: the folder.
-        problems: receives a sentence for every picture that could not be read.
-    """
-    title = "What the fit left out"
-    share = run.number("left_out", "share")
-    if share is None:
-        return Section("left_out", title, "")
-    body = paragraph(
-        f"On average {share:.1%} of the pixels of a training view took no part in the last steps: "
-        "the fit so far showed them far worse than the same surfaces at other times. Scores count "
-        "these pixels like all others."
-    )
-    body += _marked(run, "left_out", RunFolder(run.folder).left_out, problems)
-    return Section("left_out", title, body)
 
 
 def _marked(run: RunFiles, key: str, folder: Path, problems: list[str]) -> str:

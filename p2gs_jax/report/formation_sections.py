@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from p2gs_jax.config import PhotometryConfig, camera_formations
-from p2gs_jax.photometry.cameras import corner, log_vignetting
-from p2gs_jax.photometry.formation import inverse_tone_map
+from p2gs_jax.photometry.cameras import corner
+from p2gs_jax.photometry.formation import inverse_tone_map, log_vignetting
 from p2gs_jax.report.charts import (
     ChartPanel,
     Series,
@@ -20,7 +20,7 @@ from p2gs_jax.report.charts import (
 from p2gs_jax.report.page import Section, figure, folded, table
 from p2gs_jax.report.run_files import RunFiles
 from p2gs_jax.report.svg import FIRST, FOURTH, INK, SECOND, THIRD
-from p2gs_jax.run.photometry_file import CameraPhotometry, ViewPhotometry
+from p2gs_jax.run.photometry_files import CameraPhotometry, ViewPhotometry
 from p2gs_jax.types import GAMMA_SRGB
 
 # More cameras than this share one panel, without names.

@@ -34,8 +34,7 @@ from p2gs_jax.report.page import Section, figure, folded, listed, paragraph, tab
 from p2gs_jax.report.run_files import RunFiles
 from p2gs_jax.report.scene_measurements import SceneMeasurements, true_stops
 from p2gs_jax.report.svg import FIRST, INK, SECOND
-from p2gs_jax.run.photometry_file import ViewPhotometry
-from p2gs_jax.run.read import resolved
+from p2gs_jax.run.photometry_files import ViewPhotometry, with_curve_of
 from p2gs_jax.run.scene_file import read_times
 from p2gs_jax.scene.drives.recording import (
     short_name,
@@ -268,7 +267,7 @@ def response_section(run: RunFiles) -> Section:
         return Section("response", "Tone curve", "")
     try:
         cfg = PhotometryConfig() if run.cfg is None else run.cfg.photometry
-        cfg = resolved(cfg, run.photometry)
+        cfg = with_curve_of(cfg, run.photometry)
     except UserError as error:
         return Section("response", "Tone curve", paragraph(error.message))
     gammas = [v["gamma"] for v in run.train if v["gamma"] is not None] or [GAMMA_SRGB]

@@ -8,7 +8,6 @@ from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.report import run_summary
 from p2gs_jax.report.drive_sections import (
     depth_section,
-    left_out_section,
     novel_section,
     parts_section,
     unexplained_section,
@@ -85,7 +84,6 @@ def report_page(run: RunFiles, scene: SceneMeasurements) -> str:
     comparisons = held_out_comparisons(run, MOST_COMPARED, problems) or list(scene.comparisons)
     found = run_warnings(run, scene)
     model, *camera = camera_sections(run, scene)
-    left_out = left_out_section(run, problems)
     unexplained = unexplained_section(run, problems)
     sections = [
         _warning_section(found, run, scene, problems),
@@ -93,7 +91,6 @@ def report_page(run: RunFiles, scene: SceneMeasurements) -> str:
         *camera,
         seam_section(scene),
         comparison_section(comparisons, len(run.held_out)),
-        left_out,
         unexplained,
         hdr_section(run, comparisons),
         score_section(run),

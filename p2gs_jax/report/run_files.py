@@ -9,11 +9,10 @@ from typing import Any
 
 from p2gs_jax.config import FitConfig, from_dict
 from p2gs_jax.core.atomic import read_jsonl
-from p2gs_jax.core.json_text import parse_json
+from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
-from p2gs_jax.run.old_metrics import as_today
-from p2gs_jax.run.photometry_file import PhotometryFile, ViewPhotometry, read_photometry
-from p2gs_jax.run.places import find
+from p2gs_jax.run.folder import find
+from p2gs_jax.run.photometry_files import PhotometryFile, ViewPhotometry, read_photometry
 
 
 @dataclass(frozen=True)
@@ -137,7 +136,7 @@ def read_run(folder: Path, scene: Path | None = None) -> RunFiles:
         cfg = from_dict(options) if options else None
     except (TypeError, ValueError) as error:
         missing.append(f"config.json is of another version of this program ({error}).")
-    metrics = as_today(_read_object(folder / "metrics.json", "the scores", missing))
+    metrics = _read_object(folder / "metrics.json", "the scores", missing)
     photometry = None
     try:
         photometry = read_photometry(folder / "photometry.json")

@@ -13,7 +13,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.report import run_summary
 from p2gs_jax.report.page import Section, figure, folded, paragraph, table, text
 from p2gs_jax.report.run_charts import Training, training_chart
-from p2gs_jax.report.run_files import RunFiles, number_at, part_at
+from p2gs_jax.report.run_files import RunFiles, number_at
 
 MOST_TERMS = 3
 PROTOCOLS = (
@@ -138,30 +138,7 @@ def training_section(run: RunFiles) -> Section:
     seconds = number_at(log[-1], "seconds")
     if seconds is not None:
         said += f" The last step came after {run_summary.duration(seconds)}."
-    return Section("training", "Training", figure(chart, said) + _growth(run))
-
-
-def _growth(run: RunFiles) -> str:
-    """Return the stages of automatic growth; empty where it was not asked for."""
-    stages = run.part("growth").get("looks")
-    if not isinstance(stages, list) or not stages:
-        return ""
-    rows = [
-        [
-            f"{number_at(stage, 'before') or 0:,.0f} → {number_at(stage, 'gaussians') or 0:,.0f}",
-            _shown(number_at(stage, "without"), 2),
-            _shown(number_at(stage, "psnr"), 2),
-            _shown(number_at(stage, "gain"), 2),
-            "kept" if part_at(stage).get("kept") else "taken back",
-        ]
-        for stage in stages
-    ]
-    names = ["Gaussians", "PSNR without, dB", "PSNR with, dB", "gain, dB", ""]
-    return (
-        "<h3>Automatic growth</h3>"
-        + table(names, rows, numbers=(0, 1, 2, 3))
-        + paragraph("Evaluated on training views that were left out meanwhile.", "note")
-    )
+    return Section("training", "Training", figure(chart, said))
 
 
 def _marks(run: RunFiles, log: list[dict[str, Any]]) -> list[tuple[float, str]]:

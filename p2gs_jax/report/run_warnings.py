@@ -12,7 +12,7 @@ from p2gs_jax.photometry.solution import MIN_OBSERVATIONS, WEAK_GAMMA
 from p2gs_jax.report.run_files import RunFiles, number_at
 from p2gs_jax.report.run_summary import against_exif, count
 from p2gs_jax.report.scene_measurements import SceneMeasurements
-from p2gs_jax.run.photometry_file import ViewPhotometry
+from p2gs_jax.run.photometry_files import ViewPhotometry
 
 # Least gap between the PSNR of training and held-out views, dB.
 WIDE_GAP = 4.0
@@ -133,8 +133,8 @@ def _generalisation(run: RunFiles) -> RunWarning | None:
         "New views are worse than training views",
         f"Training photographs are met at {train:.1f} dB, held-out ones at {held_out:.1f} dB, even "
         f"with {solved} fitted to each. Either the held-out views look where few others do, or "
-        "there are too few photographs for this many Gaussians: add photographs, or try "
-        "--gaussians auto.",
+        "there are too few photographs for this many Gaussians: add photographs, or give fewer "
+        "Gaussians with --gaussians.",
     )
 
 

@@ -22,7 +22,7 @@ import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from p2gs_jax.core.drawn_names import names_as_they_are
+from p2gs_jax.core.text import names_as_they_are
 
 # Widths of the charts, CSS pixels; one point of matplotlib is one pixel.
 WIDE, NARROW = 860, 280

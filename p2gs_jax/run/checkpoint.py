@@ -1,139 +1,48 @@
-"""Checkpoints of any pytree through orbax: atomic, the last few kept, a broken newest survived.
+"""Checkpoints of any pytree: written whole or not at all, and a broken newest is survived.
 
-All leaves travel as one buffer of bytes, uncompressed, beside a JSON list of their names, types,
-shapes and checksums. One array is read and written faster than a hundred, leaves of size zero
-need no care, a broken file is one error instead of a page of asyncio's, and the checksums find
-what orbax lets pass: flipped bits.
+A checkpoint is a folder named by its step, with one `.npz`: the bytes of every leaf, and a table of
+their names, types and shapes beside plain values. The checksums of the archive find flipped bits.
 """
 
 from __future__ import annotations
 
 import json
-import logging
-import zlib
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from p2gs_jax.core.disk import naming
+from p2gs_jax.core.atomic import BROKEN_ARRAYS, atomic_folder, naming, remove_begun
 from p2gs_jax.errors import UserError
 
 Tree = TypeVar("Tree")
-
-
-def _named_leaves(tree) -> dict[str, Any]:
-    """Return leaves under names, so that a checkpoint of another structure is recognised."""
-    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
-    return {f"{i:03d}{jax.tree_util.keystr(path)}": leaf for i, (path, leaf) in enumerate(leaves)}
-
-
-def _pack(tree) -> tuple[np.ndarray, dict[str, list]]:
-    """Return the bytes of all leaves, and [type, shape, checksum] of each by name."""
-    arrays = {k: np.asarray(v) for k, v in _named_leaves(tree).items()}
-    parts = [np.ascontiguousarray(a).reshape(-1).view(np.uint8) for a in arrays.values()]
-    # One byte more, because orbax refuses to write nothing.
-    data = np.concatenate([*parts, np.zeros(1, np.uint8)])
-    table = {
-        name: [array.dtype.name, list(array.shape), zlib.crc32(part.data)]
-        for (name, array), part in zip(arrays.items(), parts, strict=True)
-    }
-    return data, table
-
-
-def _divided(data: np.ndarray) -> np.ndarray | jax.Array:
-    """Return bytes as an array of which each process writes its part; of one process as they are.
-
-    Zeros fill the last part up.
-    """
-    if jax.process_count() == 1:
-        return data
-    mesh = Mesh(np.array(jax.devices()), ("parts",))
-    whole = np.zeros(-(-len(data) // mesh.size) * mesh.size, np.uint8)
-    whole[: len(data)] = data
-    sharding = NamedSharding(mesh, PartitionSpec("parts"))
-    return jax.make_array_from_callback(whole.shape, sharding, lambda at: whole[at])
+FILE, TABLE = "state.npz", "table"
 
 
 def saved_steps(folder: Path) -> list[int]:
-    """Return the steps of complete checkpoints, by the names in their folder; rising.
-
-    Other than those of `CheckpointStore`, one process can ask this alone.
-    """
+    """Return the steps of complete checkpoints, by the names in their folder; rising."""
     if not folder.is_dir():
         return []
     return sorted(int(path.name) for path in folder.iterdir() if path.name.isdecimal())
-
-
-def _unpack(data: np.ndarray, table: dict[str, list]) -> list[np.ndarray]:
-    """Return the leaves; each owns its memory.
-
-    Raises:
-        ValueError: a checksum differs or bytes are missing.
-    """
-    leaves, start = [], 0
-    for name, (kind, shape, checksum) in table.items():
-        dtype = np.dtype(kind)
-        part = data[start : start + dtype.itemsize * int(np.prod(shape))]
-        start += part.size
-        if zlib.crc32(part.data) != checksum:
-            raise ValueError(f"the checksum of {name} is wrong")
-        leaves.append(part.copy().view(dtype).reshape(shape))
-    return leaves
-
-
-def _plain_scalar(value):
-    """Turn a numpy or jax value into a plain one, for `json.dumps`."""
-    if hasattr(value, "tolist"):
-        return np.asarray(value).tolist()
-    raise TypeError(f"{type(value).__name__} in a checkpoint's values is not JSON")
 
 
 class CheckpointStore:
     """The checkpoints of one run.
 
     Args:
-        folder: where they lie. One run writes to it at a time: what an interrupted save left
-            behind is removed in the background when the store opens, at the latest by the next
-            save. Of a fit in several processes all call all methods, each writes its part and
-            reads everything.
+        folder: where they lie; one run writes to it at a time.
         keep: how many.
     """
 
     def __init__(self, folder: Path, keep: int = 2):
-        self.folder = Path(folder)
-        self.keep = keep
-        self._opened = None
-
-    def _manager(self):
-        # Imported late: orbax costs most of a second, which --help should not.
-        import orbax.checkpoint as ocp
-
-        if self._opened is None:
-            # What fails is raised to us as well; it logs pages of it.
-            logging.getLogger("absl").setLevel(logging.CRITICAL)
-            options = ocp.CheckpointManagerOptions(
-                max_to_keep=self.keep,
-                create=True,
-                cleanup_tmp_directories=True,
-                enable_async_checkpointing=False,
-            )
-            handler = ocp.PyTreeCheckpointHandler(use_ocdbt=False, use_compression=False)
-            self._opened = ocp.CheckpointManager(
-                self.folder.resolve(),
-                options=options,
-                item_handlers={"leaves": handler, "meta": ocp.JsonCheckpointHandler()},
-            )
-        return self._opened
+        self.folder, self.keep = Path(folder), keep
 
     def latest_step(self) -> int | None:
-        """Return the newest complete checkpoint, or None."""
-        if not self.folder.is_dir():
-            return None
-        return self._manager().latest_step()
+        """Return the step of the newest complete checkpoint, or None."""
+        return max(saved_steps(self.folder), default=None)
 
     def save(self, step: int, tree: Any, meta: dict) -> None:
         """Write a checkpoint; an interruption leaves the previous ones as they were.
@@ -147,22 +56,20 @@ class CheckpointStore:
             TypeError: `meta` holds something else.
             OSError: it cannot be written, for example because the disk is full.
         """
-        import orbax.checkpoint as ocp
-
-        manager = self._manager()
-        if step in manager.all_steps():
+        if step in saved_steps(self.folder):
             return
-        data, table = _pack(tree)
-        saved = json.loads(json.dumps({"meta": meta, "leaves": table}, default=_plain_scalar))
-        with naming(self.folder, size=data.nbytes):
-            manager.save(
-                step,
-                args=ocp.args.Composite(
-                    leaves=ocp.args.PyTreeSave({"data": _divided(data)}),
-                    meta=ocp.args.JsonSave(saved),
-                ),
-            )
-            manager.wait_until_finished()
+        leaves = {k: np.asarray(v) for k, v in _named_leaves(tree).items()}
+        table = {name: [leaf.dtype.name, list(leaf.shape)] for name, leaf in leaves.items()}
+        values = json.dumps({"meta": meta, "leaves": table}, default=_plain_scalar)
+        parts = [np.ascontiguousarray(leaf).reshape(-1).view(np.uint8) for leaf in leaves.values()]
+        remove_begun(self.folder, spare=".lock")
+        with (
+            naming(self.folder, size=sum(part.nbytes for part in parts)),
+            atomic_folder(self.folder / str(step)) as folder,
+        ):
+            np.savez(folder / FILE, *parts, **{TABLE: np.array(values)})
+        for older in saved_steps(self.folder)[: -self.keep]:
+            shutil.rmtree(self.folder / str(older))
 
     def read_meta(self, step: int) -> dict:
         """Return the plain values saved with a checkpoint.
@@ -170,13 +77,11 @@ class CheckpointStore:
         Raises:
             UserError: they cannot be read.
         """
-        return self._read_json(step)["meta"]
+        return self._read(step)[0]
 
     def latest_meta(self) -> dict | None:
         """Return the plain values of the newest checkpoint whose values can be read, or None."""
-        if not self.folder.is_dir():
-            return None
-        for step in sorted(self._manager().all_steps(), reverse=True):
+        for step in reversed(saved_steps(self.folder)):
             try:
                 return self.read_meta(step)
             except UserError:
@@ -193,19 +98,8 @@ class CheckpointStore:
         Raises:
             UserError: it cannot be read, or holds other leaves, shapes or types than `like`.
         """
-        import orbax.checkpoint as ocp
-
-        saved = self._read_json(step)
-        table = saved["leaves"]
-        self._check_structure(step, table, like)
-        try:
-            as_numpy = ocp.RestoreArgs(restore_type=np.ndarray)
-            args = ocp.args.PyTreeRestore(item={"data": 0}, restore_args={"data": as_numpy})
-            found = self._manager().restore(step, args=ocp.args.Composite(leaves=args))
-            leaves = _unpack(found["leaves"]["data"], table)
-        except Exception as error:
-            raise self._broken(step, error) from error
-        return jax.tree.unflatten(jax.tree.structure(like), leaves), saved["meta"]
+        meta, leaves = self._read(step, like)
+        return jax.tree.unflatten(jax.tree.structure(like), leaves), meta
 
     def restore_latest(
         self,
@@ -221,11 +115,8 @@ class CheckpointStore:
         Raises:
             UserError: there are checkpoints and none can be read.
         """
-        if not self.folder.is_dir():
-            return None
-        steps = sorted(self._manager().all_steps(), reverse=True)
         last: UserError | None = None
-        for step in steps:
+        for step in reversed(saved_steps(self.folder)):
             if last is not None:
                 on_message(f"{last.message} Trying the one before it.")
             try:
@@ -238,41 +129,54 @@ class CheckpointStore:
 
     def discard_after(self, step: int) -> None:
         """Remove checkpoints newer than `step`, which a resumed run will write again."""
-        manager = self._manager()
-        for newer in [s for s in manager.all_steps() if s > step]:
-            manager.delete(newer)
+        for newer in saved_steps(self.folder):
+            if newer > step:
+                shutil.rmtree(self.folder / str(newer))
 
-    def _read_json(self, step: int) -> dict:
-        import orbax.checkpoint as ocp
-
+    def _read(self, step: int, like: Any = None) -> tuple[dict, list[np.ndarray]]:
+        """Return the plain values, and the leaves of a structure where one is given."""
         try:
-            args = ocp.args.Composite(meta=ocp.args.JsonRestore())
-            saved = self._manager().restore(step, args=args)["meta"]
-            if not isinstance(saved, dict) or not {"meta", "leaves"} <= set(saved):
-                raise ValueError("it is none of this version")
-        except Exception as error:
-            raise self._broken(step, error) from error
-        return saved
+            with np.load(self.folder / str(step) / FILE, allow_pickle=False) as file:
+                values = json.loads(str(file[TABLE]))
+                meta, table = values["meta"], values["leaves"]
+                if like is not None:
+                    self._check_structure(step, table, like)
+                leaves = [] if like is None else [file[f"arr_{i}"] for i in range(len(table))]
+            shaped = zip(leaves, table.values(), strict=like is not None)
+            return meta, [a.view(np.dtype(kind)).reshape(shape) for a, (kind, shape) in shaped]
+        except UserError:
+            raise
+        except BROKEN_ARRAYS as error:
+            reason = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
+            raise UserError(
+                f"The checkpoint {self.folder / str(step)} cannot be read ({reason}).",
+                fix="remove that folder, or start again without --resume",
+            ) from error
 
     def _check_structure(self, step: int, table: dict[str, list], like) -> None:
         named = _named_leaves(like)
         wanted = {k: (np.dtype(v.dtype).name, tuple(v.shape)) for k, v in named.items()}
-        held = {k: (kind, tuple(shape)) for k, (kind, shape, _) in table.items()}
+        held = {k: (kind, tuple(shape)) for k, (kind, shape) in table.items()}
         differing = [k for k in {**wanted, **held} if wanted.get(k) != held.get(k)]
-        if not differing:
-            return
-        name = differing[0]
-        found, expected = held.get(name, "absent"), wanted.get(name, "absent")
-        raise UserError(
-            f"The checkpoint {self.folder / str(step)} belongs to another version or "
-            f"configuration: {name} is {found}, not {expected}.",
-            fix="resume with the version and the configuration of the run, or start again without "
-            "--resume",
-        )
+        if differing:
+            name = differing[0]
+            found, expected = held.get(name, "absent"), wanted.get(name, "absent")
+            raise UserError(
+                f"The checkpoint {self.folder / str(step)} belongs to another version or "
+                f"configuration: {name} is {found}, not {expected}.",
+                fix="resume with the version and the configuration of the run, or start again "
+                "without --resume",
+            )
 
-    def _broken(self, step: int, error: Exception) -> UserError:
-        reason = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
-        return UserError(
-            f"The checkpoint {self.folder / str(step)} cannot be read ({reason}).",
-            fix="remove that folder, or start again without --resume",
-        )
+
+def _named_leaves(tree) -> dict[str, Any]:
+    """Return leaves under names, so that a checkpoint of another structure is recognised."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
+    return {f"{i:03d}{jax.tree_util.keystr(path)}": leaf for i, (path, leaf) in enumerate(leaves)}
+
+
+def _plain_scalar(value):
+    """Turn a numpy or jax value into a plain one, for `json.dumps`."""
+    if hasattr(value, "tolist"):
+        return np.asarray(value).tolist()
+    raise TypeError(f"{type(value).__name__} in a checkpoint's values is not JSON")

@@ -23,19 +23,11 @@ from p2gs_jax.config import (
     camera_formations,
 )
 from p2gs_jax.core.atomic import plain, write_json
-from p2gs_jax.core.json_text import parse_json
+from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
 
 # Under this name in the metadata of checkpoints.
 KEY = "decided"
-# What decisions said nothing of before versions that choose it.
-_OLDER = {
-    "white_balance": None,
-    "vignetting": None,
-    "responses": "all",
-    "cameras": [],
-    "near": None,
-}
 
 
 @dataclass(frozen=True)
@@ -47,7 +39,6 @@ class Decisions:
         curve: base of the tone curve.
         spline: its correction, or None.
         freeze_until: share of the run during which exposures and gammas keep still.
-        correspondence: how the relative-exposure loss finds pixels of one surface, or None.
         log_exposure_mean: weight of the pull on the mean log exposure; None: no pull.
         exposure_rate: learning rate of the exposures.
         gamma_rate: learning rate of the gammas.
@@ -63,7 +54,6 @@ class Decisions:
     curve: Literal["power", "srgb", "spline", "linear"]
     spline: tuple[float, ...] | None
     freeze_until: float
-    correspondence: Literal["tracks", "depth"] | None
     log_exposure_mean: float | None
     exposure_rate: float
     gamma_rate: float
@@ -77,30 +67,15 @@ class Decisions:
     @classmethod
     def as_asked(cls, cfg: FitConfig) -> Decisions:
         """Return what the options say before a scene is known."""
-        p = cfg.photometry
-        return cls(
-            model=p.model,
-            curve=p.curve,
-            spline=p.spline,
-            freeze_until=p.freeze_until,
-            correspondence=cfg.loss.relative_exposure.correspondence,
-            log_exposure_mean=cfg.loss.regularizers.log_exposure_mean,
-            exposure_rate=cfg.optimizer.exposures,
-            gamma_rate=cfg.optimizer.gammas,
-            white_balance=p.white_balance,
-            vignetting=p.vignetting,
-            responses=p.responses,
-            cameras=p.cameras,
-        )
+        return cls(**{name: _at(cfg, place) for name, place in _PLACES.items()})
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Decisions:
-        """Return what `to_dict` and JSON made of it; older versions knew less.
+        """Return what `to_dict` and JSON made of it.
 
         Raises:
             KeyError, TypeError: something is missing or of another kind.
         """
-        values = _OLDER | values
         spline = values["spline"]
         kept = {f.name: values[f.name] for f in dataclasses.fields(cls)}
         kept["spline"] = None if spline is None else tuple(map(float, spline))
@@ -113,45 +88,25 @@ class Decisions:
 
     def resolve(self, cfg: FitConfig) -> FitConfig:
         """Return the options that a fit computes under: as asked, with these values filled in."""
-        replace, loss, o = dataclasses.replace, cfg.loss, cfg.optimizer
-        return replace(
-            cfg,
-            photometry=replace(
-                cfg.photometry,
-                select=False,
-                model=self.model,
-                curve=self.curve,
-                spline=self.spline,
-                white_balance=self.white_balance,
-                vignetting=self.vignetting,
-                responses=self.responses,
-                cameras=self.cameras,
-                freeze_until=self.freeze_until,
-            ),
-            loss=replace(
-                loss,
-                relative_exposure=replace(
-                    loss.relative_exposure, correspondence=self.correspondence
-                ),
-                regularizers=replace(loss.regularizers, log_exposure_mean=self.log_exposure_mean),
-            ),
-            render=cfg.render if self.near is None else replace(cfg.render, near=self.near),
-            optimizer=replace(o, exposures=self.exposure_rate, gammas=self.gamma_rate),
-        )
+        values = {place: getattr(self, name) for name, place in _PLACES.items()}
+        values["photometry.select"] = False
+        if self.near is not None:
+            values["render.near"] = self.near
+        for place, value in values.items():
+            cfg = _with(cfg, place, value)
+        return cfg
 
-    def require_same(self, saved: dict[str, Any] | None, folder: Path) -> None:
+    def require_same(self, saved: dict[str, Any], folder: Path) -> None:
         """Refuse to continue a run whose scene decides otherwise than it did; reasons may differ.
 
         Args:
-            saved: from the checkpoint; None, as older versions wrote, is believed.
-            folder: of the checkpoints.
+            saved: decisions in the checkpoint.
+            folder: where the checkpoints lie.
 
         Raises:
             UserError: a decision differs.
         """
-        if saved is None:
-            return
-        now, saved = self.to_dict(), _OLDER | saved
+        now = self.to_dict()
         del now["reasons"]
         other = [f"{k} was {saved.get(k)}, now {v}" for k, v in now.items() if saved.get(k) != v]
         if other:
@@ -163,13 +118,42 @@ class Decisions:
             )
 
 
+# Options that the scene settles, by the names of the decisions.
+_PLACES = {
+    "model": "photometry.model",
+    "curve": "photometry.curve",
+    "spline": "photometry.spline",
+    "freeze_until": "photometry.freeze_until",
+    "log_exposure_mean": "loss.regularizers.log_exposure_mean",
+    "exposure_rate": "optimizer.exposures",
+    "gamma_rate": "optimizer.gammas",
+    "white_balance": "photometry.white_balance",
+    "vignetting": "photometry.vignetting",
+    "responses": "photometry.responses",
+    "cameras": "photometry.cameras",
+}
+
+
+def _at(options: Any, place: str) -> Any:
+    for name in place.split("."):
+        options = getattr(options, name)
+    return options
+
+
+def _with(options: Any, place: str, value: Any) -> Any:
+    """Return options with the value at a place, a dotted name, replaced."""
+    name, _, rest = place.partition(".")
+    value = _with(getattr(options, name), rest, value) if rest else value
+    return dataclasses.replace(options, **{name: value})
+
+
 def write_decisions(path: Path, decisions: Decisions) -> None:
     """Write `decisions.json`."""
     write_json(path, decisions.to_dict())
 
 
 def read_decisions(path: Path) -> Decisions | None:
-    """Read `decisions.json`; None where there is none, as in runs of older versions.
+    """Read `decisions.json`; None where there is no such file.
 
     Raises:
         UserError: it is broken.

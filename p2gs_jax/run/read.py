@@ -12,26 +12,27 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Bool, Float32, Int
 
-from p2gs_jax.config import FitConfig, PhotometryConfig, from_dict
-from p2gs_jax.core.json_text import parse_json
+from p2gs_jax.config import FitConfig, from_dict
 from p2gs_jax.core.numerics import on_device
+from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.ply import read_ply
 from p2gs_jax.gaussians.posed import chosen, posed, standing
 from p2gs_jax.photometry.cameras import camera_rows
 from p2gs_jax.photometry.display import DisplayTransform, display_of_view
 from p2gs_jax.photometry.mean import MeanParameters, mean_parameters, usual_display
-from p2gs_jax.photometry.metering import ExposureOf, Metering, meter, meter_views
-from p2gs_jax.render.host import RenderView, make_renderer
-from p2gs_jax.run.appearance_file import read_appearance
+from p2gs_jax.photometry.metering import ExposureOf, Metering, meter
+from p2gs_jax.render.capacity import RenderView, make_renderer
 from p2gs_jax.run.decisions import read_decisions
-from p2gs_jax.run.layout import RunFolder
-from p2gs_jax.run.metering_file import read_metering
-from p2gs_jax.run.objects_file import read_objects
-from p2gs_jax.run.photometry_file import AGAIN, PhotometryFile, read_photometry
-from p2gs_jax.run.places import candidates, find
-from p2gs_jax.run.scene_file import read_scene
-from p2gs_jax.scene import load_scene
+from p2gs_jax.run.folder import RunFolder, find
+from p2gs_jax.run.photometry_files import (
+    AGAIN,
+    PhotometryFile,
+    read_appearance,
+    read_metering,
+    read_photometry,
+)
+from p2gs_jax.run.scene_file import read_objects, read_scene
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.drives.objects import (
     MovingObjects,
@@ -59,7 +60,7 @@ class Run:
         photometry: `photometry.json`, with what `params` does not hold: standard errors, EXIF,
             exposures fitted to held-out photographs.
         owner: the moving object that each Gaussian belongs to, -1: none; None: nothing moves.
-        moving: these objects, with their corrected poses.
+        moving: these objects.
     """
 
     folder: Path
@@ -81,12 +82,9 @@ class Run:
         return make_renderer(self.cfg.render, self.owner)
 
     def camera(self, index: int) -> Camera:
-        """Return the camera of a view at the size of the fit.
+        """Return the camera of a row of `scene.views` at the size of the fit.
 
         It sees what moves, where this run has it.
-
-        Args:
-            index: row in `scene.views`.
         """
         return camera_of(self.store, index)
 
@@ -116,7 +114,7 @@ class Run:
         """Return the run with nothing but what moves.
 
         Raises:
-            UserError: nothing does.
+            UserError: nothing moves.
         """
         self._require_objects()
         assert self.owner is not None
@@ -160,10 +158,7 @@ class Run:
         return posed(self.params.gaussians, self.owner, *self.moving.poses(at))
 
     def photograph(self, index: int) -> Float32[np.ndarray, "h w 3"]:
-        """Return a photograph at the size of the fit, display values.
-
-        Args:
-            index: row in `scene.views`.
+        """Return the photograph of a row of `scene.views` at the size of the fit, display values.
 
         Raises:
             UserError: it is gone or broken.
@@ -171,10 +166,7 @@ class Run:
         return self.store.get(index)[0]
 
     def require_photographs(self, indices: Sequence[int] | None = None) -> None:
-        """Make sure that photographs are there.
-
-        Args:
-            indices: rows in `scene.views`; None: all.
+        """Make sure that the photographs of some rows of `scene.views` are there; None: of all.
 
         Raises:
             UserError: one is not.
@@ -205,13 +197,10 @@ class Run:
         return mean_parameters(self.params.photometry)
 
     def own_display(self, index: int) -> DisplayTransform:
-        """Return how a view was taken.
+        """Return how the view in a row of `scene.views` was taken.
 
-        Of a held-out view the exposure is that fitted to its photograph, all else is as usual for
+        The exposure of a held-out view is that fitted to its photograph, all else is as usual for
         its camera.
-
-        Args:
-            index: row in `scene.views`.
         """
         if index in self.scene.train_indices:
             row = self.scene.train_indices.index(index)
@@ -258,14 +247,8 @@ class Run:
 
     @cached_property
     def metering(self) -> Metering:
-        """The rule that explains the training exposures; runs of older versions are rendered."""
-        saved = read_metering(RunFolder(self.folder).metering)
-        if saved is not None:
-            return saved
-        rendered = (self.render(self.camera(i)) for i in self.scene.train_indices)
-        names = [view.name for view in self.scene.training_views]
-        e, gamma = np.asarray(self.params.photometry.exposures), self.mean.gamma
-        return meter_views(names, rendered, e, gamma, self.cfg.photometry)
+        """The rule that explains the training exposures."""
+        return read_metering(RunFolder(self.folder).metering)
 
     def metered_display(
         self, rendered: Render, of: ExposureOf = "auto", exposure_ev: float = 0.0
@@ -283,26 +266,6 @@ class Run:
         return replace(self.common_display(), exposure=exposure)
 
 
-def resolved(cfg: PhotometryConfig, saved: PhotometryFile) -> PhotometryConfig:
-    """Return the options with the model and curve that a fit of an older version chose.
-
-    Raises:
-        UserError: the file names none.
-    """
-    curve, model = saved["curve"], saved["model"]
-    try:
-        spline = curve.get("spline")
-        return replace(
-            cfg,
-            select=False,
-            model=model,  # pyright: ignore[reportArgumentType]
-            curve=curve["name"],
-            spline=None if spline is None else tuple(map(float, spline)),
-        )
-    except (KeyError, TypeError, ValueError) as error:
-        raise UserError(f"photometry.json names no tone curve ({error}).", fix=AGAIN) from error
-
-
 def load_run(folder: str | Path, scene: str | Path | None = None) -> Run:
     """Read parameters, configuration and cameras of a finished run.
 
@@ -313,21 +276,29 @@ def load_run(folder: str | Path, scene: str | Path | None = None) -> Run:
         scene: where its scene lies now; None looks where it was, also relative to the run.
 
     Raises:
-        UserError: the folder is no run, is unfinished or damaged; `scene` does not exist; or the
-            run is of an older version, which kept no cameras, and its scene has moved.
+        UserError: the folder is not a run, is unfinished or damaged, or was made by a version that
+            this one cannot read; or `scene` does not exist.
     """
     files = RunFolder(Path(folder))
     _require_finished(files)
     saved, asked = _read_config(files.config)
-    found = _load_scene(saved, None if scene is None else Path(scene), asked, files.root)
+    if scene is not None and not Path(scene).exists():
+        raise UserError(
+            f"{scene} does not exist.", fix="name the folder of the run's scene with --scene"
+        )
+    root = find(saved, "scene", files.root) if scene is None else Path(scene)
+    found = read_scene(files.root, root or files.root / "scene")
+    decisions = read_decisions(files.decisions)
+    if decisions is None:
+        raise UserError(
+            f"{files.root} has no {files.decisions.name}: it was made by a version that this one "
+            "cannot read, or the file was removed.",
+            fix="restore it from a copy, or fit again",
+        )
+    cfg = decisions.resolve(asked)
     gaussians = read_ply(files.radiance)
     owner, moving = read_objects(files.objects, found, gaussians.capacity)
     photometry_file = read_photometry(files.photometry)
-    decisions = read_decisions(files.decisions)
-    if decisions is None:
-        cfg = replace(asked, photometry=resolved(asked.photometry, photometry_file))
-    else:
-        cfg = decisions.resolve(asked)
     photometry = _photometry(photometry_file, found, cfg, files)
     kind, views = cfg.photometry.appearance, found.training_views
     appearance = None if kind is None else read_appearance(files.appearance(kind), kind, views)
@@ -399,22 +370,3 @@ def _read_config(path: Path) -> tuple[dict[str, Any], FitConfig]:
             f"{path} is of another version of this program: {error}.",
             fix="open the run with the version that made it, or fit again with this one",
         ) from error
-
-
-def _load_scene(saved: dict[str, Any], given: Path | None, cfg: FitConfig, folder: Path) -> Scene:
-    if given is not None and not given.exists():
-        raise UserError(
-            f"{given} does not exist.", fix="name the folder of the run's scene with --scene"
-        )
-    root = given or find(saved, "scene", folder)
-    scene = read_scene(folder, root or folder / "scene")
-    if scene is not None:
-        return scene
-    if root is None or not root.exists():
-        looked = ", ".join(map(str, candidates(saved, "scene", folder))) or "nowhere: it names none"
-        raise UserError(
-            f"the scene of this run, {saved.get('scene')}, is not there (looked for {looked}), and "
-            f"this run, of an older version, kept no cameras.",
-            fix="put it back, or name its folder with --scene",
-        )
-    return load_scene(root, cfg.data, folder / "cache", lambda text: None)

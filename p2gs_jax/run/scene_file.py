@@ -1,25 +1,30 @@
-"""`scene.npz`: the cameras, points and tracks of a fit, so that a run opens without its scene.
+"""`scene.npz` and `objects.npz`: the scene of a run, so that it opens without its folder.
 
-Photographs are not in it; where they lie is kept relative to the scene's folder, or to the run's
-where its cache holds them (frames of a video, developed raw files).
+`scene.npz` has cameras, points and tracks. Photographs are not in it; where they lie is kept
+relative to the scene's folder, or to the run's where its cache holds them (frames of a video,
+developed raw files). `objects.npz` says which Gaussians belong to which moving object of the scene,
+with corrections of the objects' poses; runs in which nothing moves have no such file.
 """
 
 from __future__ import annotations
 
 import json
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from jaxtyping import Int
 
-from p2gs_jax.core.array_files import BROKEN_ARRAYS
-from p2gs_jax.core.atomic import atomic_write
-from p2gs_jax.core.json_text import parse_json
+from p2gs_jax.core.atomic import BROKEN_ARRAYS, atomic_write
+from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
+from p2gs_jax.scene.drives.objects import MovingObjects
 from p2gs_jax.types import Distortion, Lidar, Scene, TrackedObject, Tracks, View
 
 SCENE_FILE = "scene.npz"
-# Of a run: what was developed lies there.
+# Folder of a run in which developed photographs lie.
 CACHE = "cache"
 
 
@@ -32,28 +37,10 @@ def write_scene(folder: Path, scene: Scene) -> None:
     """
     base = _base(scene.root)
     own_cars = {v.camera: v.own_car for v in scene.views if v.own_car is not None}
-    said = {
+    table = {
         "format": scene.format,
         "notes": scene.notes,
-        "views": [
-            {
-                "name": v.name,
-                "camera": v.camera,
-                "split": v.split,
-                "exif_ev": v.exif_ev,
-                "image": _relative(
-                    v.image_path, folder if _below(v.image_path, folder / CACHE) else base
-                ),
-                "in_run": _below(v.image_path, folder / CACHE),
-                "mask": None if v.mask_path is None else _relative(v.mask_path, base),
-                "distortion": None if v.distortion is None else v.distortion.coefficients,
-                "lens": None if v.distortion is None else v.distortion.model,
-                "frame": v.frame,
-                "time": v.time,
-                "alpha": v.alpha,
-            }
-            for v in scene.views
-        ],
+        "views": [_view_row(view, folder, base) for view in scene.views],
         "objects": [
             {"name": o.name, "label": o.label, "size": o.size, "moving": o.moving}
             for o in scene.objects
@@ -85,81 +72,114 @@ def write_scene(folder: Path, scene: Scene) -> None:
         arrays["track_points"] = scene.tracks.point_indices
         arrays["track_xy"] = scene.tracks.xy
     with atomic_write(folder / SCENE_FILE) as temporary:
-        np.savez_compressed(temporary, json=np.array(json.dumps(said)), **arrays)
+        np.savez_compressed(temporary, json=np.array(json.dumps(table)), **arrays)
 
 
-def read_scene(folder: Path, root: Path) -> Scene | None:
-    """Return the scene of a run, or None where the run was made before there was such a file.
+def _view_row(view: View, folder: Path, base: Path) -> dict[str, Any]:
+    in_run = view.image_path.resolve().is_relative_to((folder / CACHE).resolve())
+    return {
+        "name": view.name,
+        "camera": view.camera,
+        "split": view.split,
+        "exif_ev": view.exif_ev,
+        "image": _relative(view.image_path, folder if in_run else base),
+        "in_run": in_run,
+        "mask": None if view.mask_path is None else _relative(view.mask_path, base),
+        "distortion": None if view.distortion is None else view.distortion.coefficients,
+        "lens": None if view.distortion is None else view.distortion.model,
+        "frame": view.frame,
+        "time": view.time,
+        "alpha": view.alpha,
+    }
+
+
+def read_scene(folder: Path, root: Path) -> Scene:
+    """Return the scene of a run.
 
     Args:
         folder: the run folder.
         root: the scene's folder now; it need not exist.
 
     Raises:
-        UserError: the file is broken.
+        UserError: the file is missing or broken.
     """
     path = folder / SCENE_FILE
     if not path.is_file():
-        return None
+        raise UserError(
+            f"{folder} has no {SCENE_FILE}: it was made by a version that this one cannot read, or "
+            "the file was removed.",
+            fix="restore it from a copy, or fit again",
+        )
     try:
         with np.load(path, allow_pickle=False) as file:
             a = dict(file)
-        said = parse_json(str(a["json"]))
-        base = _base(root)
-        own_cars = {c: a[f"own_car_{k}"] for k, c in enumerate(said.get("own_cars", ()))}
-        views = tuple(
-            View(
-                name=v["name"],
-                image_path=(folder if v.get("in_run") else base) / v["image"],
-                camera=v["camera"],
-                viewmat=a["viewmats"][i],
-                K=a["Ks"][i],
-                width=int(a["sizes"][i, 0]),
-                height=int(a["sizes"][i, 1]),
-                distortion=_distortion(v),
-                mask_path=None if v["mask"] is None else base / v["mask"],
-                exif_ev=v["exif_ev"],
-                split=v["split"],
-                frame=v.get("frame"),
-                time=v.get("time"),
-                own_car=own_cars.get(v["camera"]),
-                alpha=v.get("alpha", "mask"),
-            )
-            for i, v in enumerate(said["views"])
-        )
-        tracks = None
-        if "track_xy" in a:
-            tracks = Tracks(a["track_views"], a["track_points"], a["track_xy"])
-        return Scene(
-            root=root,
-            format=said["format"],
-            views=views,
-            points=a["points"],
-            point_colors=a.get("point_colors"),
-            tracks=tracks,
-            notes=tuple(said["notes"]),
-            objects=_objects(said, a),
-            lidar=None
-            if "lidar_points" not in a
-            else Lidar(a["lidar_points"], a["lidar_times"], a["lidar_objects"]),
-            origin=tuple(said.get("origin", (0.0, 0.0, 0.0))),
-            split_by=said.get("split_by"),
-            random_seeds=said.get("random_seeds", False),
-            known_response=said.get("known_response"),
-        )
+        return _scene_from(a, parse_json(str(a["json"])), folder, root)
     except BROKEN_ARRAYS as error:
         raise UserError(
-            f"{path} cannot be read: {error}.",
-            fix="restore it from a copy, or remove it: the scene is then read from its own folder",
+            f"{path} cannot be read: {error}.", fix="restore it from a copy, or fit again"
         ) from error
 
 
-def read_times(folder: Path) -> dict[str, float]:
-    """Return the times of a drive's views by name, seconds; empty where there are none to read.
+def _scene_from(a: Mapping[str, np.ndarray], table: dict, folder: Path, root: Path) -> Scene:
+    base = _base(root)
+    own_cars = {camera: a[f"own_car_{k}"] for k, camera in enumerate(table["own_cars"])}
+    views = tuple(
+        View(
+            name=v["name"],
+            image_path=(folder if v["in_run"] else base) / v["image"],
+            camera=v["camera"],
+            viewmat=a["viewmats"][i],
+            K=a["Ks"][i],
+            width=int(a["sizes"][i, 0]),
+            height=int(a["sizes"][i, 1]),
+            distortion=None
+            if v["distortion"] is None
+            else Distortion(tuple(v["distortion"]), v["lens"]),
+            mask_path=None if v["mask"] is None else base / v["mask"],
+            exif_ev=v["exif_ev"],
+            split=v["split"],
+            frame=v["frame"],
+            time=v["time"],
+            own_car=own_cars.get(v["camera"]),
+            alpha=v["alpha"],
+        )
+        for i, v in enumerate(table["views"])
+    )
+    objects = tuple(
+        TrackedObject(
+            name=thing["name"],
+            label=thing["label"],
+            size=tuple(thing["size"]),
+            times=a[f"object_{row}_times"],
+            poses=a[f"object_{row}_poses"],
+            moving=thing["moving"],
+        )
+        for row, thing in enumerate(table["objects"])
+    )
+    tracks = lidar = None
+    if "track_xy" in a:
+        tracks = Tracks(a["track_views"], a["track_points"], a["track_xy"])
+    if "lidar_points" in a:
+        lidar = Lidar(a["lidar_points"], a["lidar_times"], a["lidar_objects"])
+    return Scene(
+        root=root,
+        format=table["format"],
+        views=views,
+        points=a["points"],
+        point_colors=a.get("point_colors"),
+        tracks=tracks,
+        notes=tuple(table["notes"]),
+        objects=objects,
+        lidar=lidar,
+        origin=tuple(table["origin"]),
+        split_by=table["split_by"],
+        random_seeds=table["random_seeds"],
+        known_response=table["known_response"],
+    )
 
-    Args:
-        folder: the run folder.
-    """
+
+def read_times(folder: Path) -> dict[str, float]:
+    """Return the times of a drive's views by name, seconds; empty where there are none to read."""
     try:
         with np.load(folder / SCENE_FILE, allow_pickle=False) as file:
             views = parse_json(str(file["json"]))["views"]
@@ -173,10 +193,6 @@ def _base(root: Path) -> Path:
     return root.parent if root.suffix.lower() == ".json" else root
 
 
-def _below(path: Path, folder: Path) -> bool:
-    return path.resolve().is_relative_to(folder.resolve())
-
-
 def _relative(path: Path, base: Path) -> str:
     """Return a path from the scene's folder where it lies below it, else an absolute one."""
     for a, b in (
@@ -188,22 +204,58 @@ def _relative(path: Path, base: Path) -> str:
     return Path(os.path.abspath(path)).as_posix()
 
 
-def _distortion(view: dict) -> Distortion | None:
-    if view["distortion"] is None:
-        return None
-    return Distortion(tuple(view["distortion"]), view.get("lens", "radial"))
+def write_objects(
+    path: Path, owner: Int[np.ndarray, " n"] | None, moving: MovingObjects, scene: Scene
+) -> None:
+    """Write the owners of a run's Gaussians.
+
+    Args:
+        path: of the file.
+        owner: of each Gaussian, a row of `moving`, -1: none; None: nothing has a box.
+        moving: some of the scene's objects.
+        scene: with all of them.
+    """
+    rows = [
+        next(row for row, other in enumerate(scene.objects) if other is thing)
+        for thing in moving.objects
+    ]
+    arrays = {
+        "owner": np.asarray([] if owner is None else owner, np.int32),
+        "rows": np.array(rows, np.int32),
+    }
+    if moving.middle is not None:
+        arrays["middle"] = np.asarray(moving.middle, np.float64)
+    with atomic_write(path) as temporary:
+        np.savez_compressed(temporary, **arrays)
 
 
-def _objects(said: dict, arrays: dict[str, np.ndarray]) -> tuple[TrackedObject, ...]:
-    """Return the tracked things; runs of older versions have none."""
-    return tuple(
-        TrackedObject(
-            name=thing["name"],
-            label=thing["label"],
-            size=tuple(thing["size"]),
-            times=arrays[f"object_{row}_times"],
-            poses=arrays[f"object_{row}_poses"],
-            moving=thing["moving"],
-        )
-        for row, thing in enumerate(said.get("objects", ()))
-    )
+def read_objects(
+    path: Path, scene: Scene, count: int
+) -> tuple[Int[np.ndarray, " n"] | None, MovingObjects | None]:
+    """Return what `write_objects` wrote; None where nothing moves.
+
+    Args:
+        path: of the file.
+        scene: of the run.
+        count: of its Gaussians.
+
+    Raises:
+        UserError: the file is broken, or belongs to another run.
+    """
+    if not path.is_file():
+        return None, None
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            a = dict(file)
+        objects = tuple(scene.objects[row] for row in a["rows"].tolist())
+        owner = a["owner"]
+        if "middle" in a:
+            return None, MovingObjects((), middle=float(a["middle"]))
+        fits = len(owner) == count and owner.max(initial=-1) < len(objects)
+    except BROKEN_ARRAYS as error:
+        raise UserError(
+            f"{path} cannot be read: {error}.", fix="finish the fit again with --resume"
+        ) from error
+    if not fits:
+        raise UserError(f"{path} does not belong to this run.", fix="fit again")
+    return owner, MovingObjects(objects)

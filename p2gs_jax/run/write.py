@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import jax
@@ -12,7 +12,7 @@ import numpy as np
 from p2gs_jax.config import FitConfig
 from p2gs_jax.config import to_dict as config_to_dict
 from p2gs_jax.core.atomic import write_json
-from p2gs_jax.core.numerics import LN2, evenly_spaced
+from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.evaluate.evaluate import ViewResult
 from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.formats.ply import write_ply, write_radiance
@@ -20,32 +20,23 @@ from p2gs_jax.formats.png import write_png
 from p2gs_jax.gaussians.bake import bake, display_comments, display_of_splats
 from p2gs_jax.gaussians.posed import posed
 from p2gs_jax.photometry.display import develop
-from p2gs_jax.photometry.mean import MeanParameters, mean_parameters, usual_display
+from p2gs_jax.photometry.mean import usual_display
 from p2gs_jax.photometry.metering import Metering
 from p2gs_jax.photometry.solution import PhotometricSolution
-from p2gs_jax.render.spherical_harmonics import MAX_DEGREE
-from p2gs_jax.render.vibration import at_time
-from p2gs_jax.run.appearance_file import write_appearance
+from p2gs_jax.render.harmonics import MAX_DEGREE
+from p2gs_jax.render.project import at_time
 from p2gs_jax.run.decisions import Decisions, write_decisions
-from p2gs_jax.run.layout import RunFolder
-from p2gs_jax.run.metering_file import write_metering
-from p2gs_jax.run.objects_file import write_objects
-from p2gs_jax.run.photometry_file import (
-    ViewPhotometry,
-    balance_of,
-    camera_rows,
-    write_photometry,
-)
-from p2gs_jax.run.places import remembered
-from p2gs_jax.run.scene_file import write_scene
-from p2gs_jax.run.summary import write_summary
+from p2gs_jax.run.folder import RunFolder, remembered
+from p2gs_jax.run.photometry_files import write_appearance, write_fitted, write_metering
+from p2gs_jax.run.plots import write_summary
+from p2gs_jax.run.scene_file import write_objects, write_scene
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.drives.objects import (
     MovingObjects,
     middle_time,
 )
 from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.types import Params, Photometry, Scene
+from p2gs_jax.types import Params, Scene
 
 SUMMARY_VIEWS = 4
 
@@ -61,7 +52,7 @@ def write_start(
 
     Args:
         folder: of the run.
-        scene: what is fitted.
+        scene: folder or file that is fitted.
         reference: photographs of the same views under one common exposure, or None.
         cfg: as asked.
         decisions: of the scene.
@@ -85,11 +76,11 @@ def write_results(
     *,
     owner: np.ndarray | None = None,
     moving: MovingObjects | None = None,
-    fitted: dict[int, float],
+    fitted: Mapping[int, float],
     unknown: Sequence[str] = (),
     solution: PhotometricSolution | None,
     shown: Sequence[ViewResult],
-    metering: Metering | None = None,
+    metering: Metering,
     true_ev: np.ndarray | None = None,
 ) -> None:
     """Write the scene, the Gaussians, the photometry and the summary.
@@ -100,33 +91,28 @@ def write_results(
         scene: its views.
         cfg: what the fit computed under.
         owner: the moving object that each Gaussian belongs to, or None.
-        moving: these objects, with their corrected poses.
+        moving: these objects.
         fitted: exposures solved for held-out views, by row.
         unknown: names of photographs that tell no exposure.
         solution: what the fit started from, or None.
         shown: views of the summary.
-        metering: what explains the exposures, or None.
-        true_ev: true exposures of the training views for the plot, or None.
+        metering: what explains the exposures.
+        true_ev: true exposures of the training views for the plot, stops, or None.
     """
     write_scene(folder.root, scene)
     if moving is not None and (owner is not None or moving.middle is not None):
         write_objects(folder.objects, owner, moving, scene)
     _write_models(folder, params, owner, moving, scene, cfg)
-    model, curve, gauge = _photometry_model(params, cfg)
-    mean = mean_parameters(params.photometry)
-    write_photometry(
+    write_fitted(
         folder.photometry,
-        model=model,
-        curve=curve,
-        gauge=gauge,
-        mean=mean_row(mean),
-        views=_photometry_views(params, scene, fitted, solution, unknown),
-        cameras=camera_rows(
-            cfg.photometry.cameras, None if solution is None else solution.corner_errors
-        ),
+        params,
+        scene,
+        cfg,
+        fitted=fitted,
+        unknown=unknown,
+        solution=solution,
     )
-    if metering is not None:
-        write_metering(folder.metering, metering)
+    write_metering(folder.metering, metering)
     kind = cfg.photometry.appearance
     if kind is not None:
         write_appearance(folder.appearance(kind), params.appearance, scene.training_views)
@@ -137,14 +123,13 @@ def write_view(folder: Path, name: str, result: ViewResult, store: ImageStore) -
     """Write one view as EXR, PNG and its photograph, under the photograph's own name."""
     stem = folder / Path(name).with_suffix("")
     stem.parent.mkdir(parents=True, exist_ok=True)
-    camera = camera_of(store, result.index)
     write_exr(
         stem.with_suffix(".exr"),
         result.linear,
         depth=result.depth,
         alpha=result.alpha,
         taken=result.transform,
-        camera=camera,
+        camera=camera_of(store, result.index),
     )
     write_png(stem.with_name(f"{stem.name}.render.png"), result.ldr)
     write_png(stem.with_name(f"{stem.name}.photograph.png"), result.photograph)
@@ -176,77 +161,6 @@ def _write_models(
     shown = bake(placed, transform, cfg.render.radiance, MAX_DEGREE)
     write_ply(folder.splats, shown, display_comments(transform))
     write_radiance(folder.radiance, params.gaussians, alive, activation=cfg.render.radiance)
-
-
-def _photometry_views(
-    params: Params,
-    scene: Scene,
-    fitted: dict[int, float],
-    solution: PhotometricSolution | None = None,
-    unknown: Sequence[str] = (),
-) -> list[ViewPhotometry]:
-    """Return the `views` of `photometry.json`; held-out views have no exposure of their own.
-
-    Args:
-        params: the fit.
-        scene: its views.
-        fitted: exposures solved for held-out views.
-        solution: what the fit started from; it, its standard errors and its number of observations
-            are passed on.
-        unknown: names of photographs that tell no exposure.
-    """
-    taken: Photometry = jax.tree.map(np.asarray, params.photometry)
-    exposures, gammas, balances = taken.exposures, taken.gammas, taken.white_balance
-    rows = {index: k for k, index in enumerate(scene.train_indices)}
-    out: list[ViewPhotometry] = []
-    for index, view in enumerate(scene.views):
-        k = rows.get(index)
-        e = None if k is None else float(exposures[k])
-        balance = None if k is None or balances is None else np.exp(balances[k]).tolist()
-        out.append(
-            {
-                "image": view.name,
-                "camera": view.camera,
-                "exposure": e,
-                "exposure_ev": None if e is None else float(np.log2(e)),
-                "gamma": None if k is None else float(gammas[k]),
-                "exif_ev": view.exif_ev,
-                "split": view.split,
-                "exposure_fitted": fitted.get(index),
-                "white_balance": balance,
-                "white_balance_ev_error": None,
-            }
-        )
-        if view.name in unknown:
-            out[-1]["exposure_unknown"] = True
-        if k is not None and solution is not None and np.isfinite(solution.exposure_errors[k]):
-            out[-1]["exposure_ev_error"] = float(solution.exposure_errors[k] / LN2)
-            out[-1]["gamma_error"] = float(solution.gamma_errors[k])
-            out[-1]["exposure_ev_start"] = float(solution.exposures_ev[k])
-            out[-1]["observations"] = int(solution.observations_per_view[k])
-            out[-1]["white_balance_ev_error"] = balance_of(solution, k)[1]
-    return out
-
-
-def mean_row(mean: MeanParameters) -> dict:
-    """Return the `mean` of `photometry.json`: white balance as factors, where it is modelled."""
-    row = dataclasses.asdict(mean)
-    balance = row.pop("white_balance")
-    return row if balance is None else {**row, "white_balance": np.exp(balance).tolist()}
-
-
-def _photometry_model(params: Params, cfg: FitConfig) -> tuple[str, dict, str]:
-    """Return (model, curve, gauge) as `photometry.json` names them."""
-    gauge = (
-        "mean log exposure over the training views is 0; radiance is relative to it"
-        if params.photometry.parameterization == "log"
-        else "soft: the mean exposure is pulled towards 1 (paper, eq. 10)"
-    )
-    p = cfg.photometry
-    curve = {"name": p.curve, "pivot": p.pivot, "spline": p.spline}
-    if p.known is not None:
-        gauge = f"known exposures ({p.known}); radiance is in their units"
-    return p.model, curve, gauge
 
 
 def _write_summary(

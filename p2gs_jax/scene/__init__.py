@@ -22,8 +22,8 @@ from p2gs_jax.scene.masks import attach_masks
 from p2gs_jax.scene.photographs.colours import colour_notes
 from p2gs_jax.scene.photographs.develop import develop, developed_views, with_originals
 from p2gs_jax.scene.random_seeds import FEWEST, with_random_seeds
-from p2gs_jax.scene.split import split_scene
-from p2gs_jax.scene.split_lists import lists_beside, split_as_listed
+from p2gs_jax.scene.split import split_as_listed, split_scene
+from p2gs_jax.scene.split_lists import lists_beside
 from p2gs_jax.scene.transforms import is_blender, load_blender, load_transforms
 from p2gs_jax.scene.video.read import is_video, read_video
 from p2gs_jax.types import Scene

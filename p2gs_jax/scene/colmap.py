@@ -22,12 +22,7 @@ from p2gs_jax.scene.colmap_model import (
     unsupported_camera,
 )
 from p2gs_jax.scene.files import check_missing, check_size, require_inside
-from p2gs_jax.scene.geometry import (
-    intrinsics,
-    make_distortion,
-    scale_intrinsics,
-    undistort_points,
-)
+from p2gs_jax.scene.geometry import intrinsics, make_distortion, scale_intrinsics, undistort_points
 from p2gs_jax.types import Distortion, Scene, Tracks, View
 
 _FIX = "export the model again from COLMAP"

@@ -16,14 +16,7 @@ import pycolmap
 
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.scene.cache import file_fingerprints
-from p2gs_jax.scene.features import (
-    MAX_FEATURES,
-    MAX_IMAGE_SIZE,
-    Pair,
-    extract,
-    match,
-    quotable,
-)
+from p2gs_jax.scene.features import MAX_FEATURES, MAX_IMAGE_SIZE, Pair, extract, match, quotable
 from p2gs_jax.scene.pace import Pace
 
 DATABASE, RECORD = "database.db", "photographs.json"

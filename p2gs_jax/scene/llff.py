@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from p2gs_jax.config import DataConfig
-from p2gs_jax.core.array_files import BROKEN_ARRAYS
+from p2gs_jax.core.atomic import BROKEN_ARRAYS
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.files import check_size, list_images
 from p2gs_jax.scene.geometry import intrinsics, scale_intrinsics

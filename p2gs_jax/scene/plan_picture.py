@@ -9,15 +9,10 @@ import numpy as np
 from jaxtyping import Float
 
 from p2gs_jax.core.atomic import atomic_write
-from p2gs_jax.core.drawn_names import names_as_they_are
 from p2gs_jax.core.numerics import evenly_spaced
-from p2gs_jax.core.printable import printable
 from p2gs_jax.core.streams import Stream, generator
-from p2gs_jax.scene.rigid import (
-    interpolated,
-    level_ahead,
-    up_of_drive,
-)
+from p2gs_jax.core.text import names_as_they_are, printable
+from p2gs_jax.scene.rigid import interpolated, level_ahead, up_of_drive
 from p2gs_jax.scene.survey import Survey, cameras_of, centers_of
 from p2gs_jax.types import Scene, TrackedObject, View
 

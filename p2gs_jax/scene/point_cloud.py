@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from p2gs_jax.core.ply_table import read_table, refusing
+from p2gs_jax.core.ply import read_table, refusing
 from p2gs_jax.errors import UserError
 
 _FIX = "write it again with the tool that made it"

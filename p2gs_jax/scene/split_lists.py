@@ -18,7 +18,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from p2gs_jax.core.json_text import parse_json
+from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
 from p2gs_jax.types import Scene, Tracks, View
 

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from p2gs_jax.config import DataConfig
-from p2gs_jax.core.json_text import parse_json
+from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.colmap import HUGE, subfolder
 from p2gs_jax.scene.files import (
@@ -32,7 +32,8 @@ from p2gs_jax.scene.files import (
 )
 from p2gs_jax.scene.geometry import intrinsics, make_distortion, scale_intrinsics
 from p2gs_jax.scene.point_cloud import read_points
-from p2gs_jax.scene.split_lists import lists_in, split_as_listed
+from p2gs_jax.scene.split import split_as_listed
+from p2gs_jax.scene.split_lists import lists_in
 from p2gs_jax.types import Distortion, Scene, Split, View
 
 _PINHOLES = frozenset({"PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"})

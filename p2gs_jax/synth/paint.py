@@ -14,15 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from p2gs_jax.synth.facades import awning, facade, tiles
 from p2gs_jax.synth.surface import Point, Surface
-from p2gs_jax.synth.texture import (
-    as_column,
-    cell_offset,
-    detail,
-    hash1,
-    slab,
-    smooth,
-    value_noise,
-)
+from p2gs_jax.synth.texture import as_column, cell_offset, detail, hash1, slab, smooth, value_noise
 from p2gs_jax.synth.town import CROSS_STREET, ROAD_HALF_WIDTH, Material, Town
 from p2gs_jax.synth.vehicles import car_body, car_glass, wheel
 

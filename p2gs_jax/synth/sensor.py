@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from p2gs_jax.core.srgb import srgb_encode
+from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.core.streams import SceneStream, generator
 from p2gs_jax.errors import UserError
 from p2gs_jax.synth.settings import Curve, Sensor

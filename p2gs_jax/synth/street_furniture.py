@@ -5,13 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from p2gs_jax.synth.solids import Builder
-from p2gs_jax.synth.town import (
-    CROSS_STREET,
-    STEEL,
-    STONE,
-    Material,
-    Vec3,
-)
+from p2gs_jax.synth.town import CROSS_STREET, STEEL, STONE, Material, Vec3
 
 _PAINTS: list[Vec3] = [
     (0.50, 0.03, 0.03),

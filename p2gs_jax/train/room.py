@@ -15,10 +15,8 @@ from scipy.spatial.transform import Rotation
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.render.capacity import Room
-from p2gs_jax.render.cutoff import smallest_cutoff
-from p2gs_jax.render.objects import camera_of_each
-from p2gs_jax.render.project import LOG_SCALE_RANGE, TANGENT_LIMIT
-from p2gs_jax.render.vibration import at_time
+from p2gs_jax.render.project import LOG_SCALE_RANGE, TANGENT_LIMIT, at_time, camera_of_each
+from p2gs_jax.render.tiles import smallest_cutoff
 from p2gs_jax.render.visible import in_view
 from p2gs_jax.train.views import TrainingViews
 from p2gs_jax.types import Camera, Gaussians

@@ -10,12 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
-from p2gs_jax.gaussians.population import (
-    empty_gaussians,
-    empty_population,
-    fresh_population,
-    grow,
-)
+from p2gs_jax.gaussians.population import empty_gaussians, empty_population, fresh_population, grow
 from p2gs_jax.train.optimizer import Optimizer, OptState, grow_moments
 from p2gs_jax.types import Gaussians, Params, Population
 

@@ -18,8 +18,7 @@ from jaxtyping import Array, Bool
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.errors import UserError
-from p2gs_jax.render.capacity import ANYWHERE, TileCapacity
-from p2gs_jax.render.host import compiled_renderer, count_needed
+from p2gs_jax.render.capacity import ANYWHERE, TileCapacity, compiled_renderer, count_needed
 from p2gs_jax.types import Camera, Gaussians, Render
 from p2gs_jax.viewer.render_sizes import Size
 

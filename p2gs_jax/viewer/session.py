@@ -18,12 +18,7 @@ from p2gs_jax.viewer.panel import Panel
 from p2gs_jax.viewer.playback import Player
 from p2gs_jax.viewer.render_loop import RenderLoop, browser_view
 from p2gs_jax.viewer.save import exr_bytes, png_bytes, saved_size
-from p2gs_jax.viewer.settings import (
-    Settings,
-    common_settings,
-    same_display,
-    settings_of_view,
-)
+from p2gs_jax.viewer.settings import Settings, common_settings, same_display, settings_of_view
 from p2gs_jax.viewer.viewed_run import ViewedRun
 
 # Time between updates of the slider while playing, seconds.

@@ -12,9 +12,9 @@ from jaxtyping import UInt8
 
 from p2gs_jax.core.numerics import LN2, evenly_spaced, on_device
 from p2gs_jax.errors import UserError
-from p2gs_jax.photometry.cameras import darkens
 from p2gs_jax.photometry.display import develop
-from p2gs_jax.render.vibration import at_time
+from p2gs_jax.photometry.formation import darkens
+from p2gs_jax.render.project import at_time
 from p2gs_jax.run.read import Run
 from p2gs_jax.scene.images import size_at
 from p2gs_jax.types import Camera

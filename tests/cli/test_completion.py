@@ -5,7 +5,7 @@ import subprocess
 
 import pytest
 
-from p2gs_jax.cli.completion import script
+from p2gs_jax.cli.parser import completion_script
 
 TRY = """
 source {script}
@@ -23,7 +23,7 @@ def bash(tmp_path_factory):
     if shutil.which("bash") is None:
         pytest.skip("there is no bash here")
     path = tmp_path_factory.mktemp("bash") / "completion"
-    path.write_text(script("bash"))
+    path.write_text(completion_script("bash"))
     elsewhere = tmp_path_factory.mktemp("without_files")
 
     def run(code):
@@ -57,7 +57,7 @@ def test_a_path_of_cameras_is_a_word_or_a_file(bash):
     assert bash("try p2gs-jax render RUN --path dr") == ["1", "drive"]
     assert bash("try p2gs-jax render RUN --path cameras.j") == ["0"]
     for shell in ("zsh", "fish"):
-        assert "'choices': ['views', 'drive', 'orbit']" in script(shell)
+        assert "'choices': ['views', 'drive', 'orbit']" in completion_script(shell)
 
 
 def test_paths_are_left_to_bash(bash):
@@ -68,7 +68,7 @@ def test_paths_are_left_to_bash(bash):
 
 @pytest.mark.parametrize(("shell", "check"), [("zsh", "-n"), ("fish", "--no-execute")])
 def test_other_shells(tmp_path, shell, check):
-    text = script(shell)
+    text = completion_script(shell)
     assert "--preset" in text
     assert "calibrate" in text
     path = tmp_path / "completion"

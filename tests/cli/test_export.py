@@ -14,7 +14,7 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.formats.ply import read_ply
 from p2gs_jax.formats.splat import read_splat
-from p2gs_jax.render.host import make_renderer
+from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.read import load_run
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.device import camera_of
@@ -263,14 +263,14 @@ def test_no_run_and_an_unfinished_one(run_command, tmp_path):
 def test_names_that_lead_outside_are_refused(finished_run, run_command, tmp_path, monkeypatch):
     from dataclasses import replace
 
-    from p2gs_jax.cli.commands import export
+    from p2gs_jax.run import read
 
     def outside(folder, scene=None):
         fitted = load_run(folder)
         views = (replace(fitted.scene.views[0], name="../0.png"), *fitted.scene.views[1:])
         return replace(fitted, scene=replace(fitted.scene, views=views))
 
-    monkeypatch.setattr(export, "load_run", outside)
+    monkeypatch.setattr(read, "load_run", outside)
     for name in ("exr", "colmap"):
         code, text = run_command("export", finished_run, "--format", name, "--out", tmp_path / name)
         assert code == 2
@@ -281,7 +281,7 @@ def test_names_that_lead_outside_are_refused(finished_run, run_command, tmp_path
 def test_corrections_travel_with_the_linear_ply(finished_run, run_command, tmp_path, monkeypatch):
     from dataclasses import replace
 
-    from p2gs_jax.cli.commands import export
+    from p2gs_jax.run import read
 
     def corrected(folder, scene=None):
         fitted = load_run(folder)
@@ -293,7 +293,7 @@ def test_corrections_travel_with_the_linear_ply(finished_run, run_command, tmp_p
             cfg=replace(fitted.cfg, photometry=photometry),
         )
 
-    monkeypatch.setattr(export, "load_run", corrected)
+    monkeypatch.setattr(read, "load_run", corrected)
     code, text = run_command("export", finished_run, "--format", "linear-ply", "--out", tmp_path)
     assert code == 0, text
     said = json.loads((tmp_path / "linear.json").read_text())

@@ -73,7 +73,7 @@ def test_version(capsys, monkeypatch):
 def test_common_options_come_first_and_the_rest_on_request(capsys, monkeypatch):
     _, brief = shown(capsys, monkeypatch, "fit", "--help")
     _, whole = shown(capsys, monkeypatch, "fit", "--help-all")
-    for option in ("--out DIR", "--budget TIME", "--preset NAME", "--gaussians N|auto"):
+    for option in ("--out DIR", "--budget TIME", "--preset NAME", "--gaussians N"):
         assert option in brief
         assert option in whole
     assert "--help-all" in brief
@@ -97,12 +97,11 @@ def test_a_preset_decides_the_values():
 
 
 def test_options_are_read_as_what_they_are():
-    argv = "fit a --out b --steps 7 --render.stop-error None --densify.max-gaussians auto"
+    argv = "fit a --out b --steps 7 --render.stop-error None"
     _, options = parse([*argv.split(), "--train.coarse-to-fine", ".1", ".2", "--resume"])
-    assert options.steps == 7
+    assert options.config.train.steps == 7
     assert options.resume
     assert options.config.render.stop_error is None
-    assert options.config.densify.max_gaussians == "auto"
     assert options.config.train.coarse_to_fine == (0.1, 0.2)
 
 

@@ -11,11 +11,14 @@ import cv2
 import numpy as np
 import pytest
 
+from p2gs_jax.config import DataConfig
 from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.paths import Shot, covering, find_rig, view_shots
 from p2gs_jax.paths.pictures import RunRenderer
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.run.read import load_run
+from p2gs_jax.run.scene_file import write_scene
+from p2gs_jax.scene import load_scene
 
 SIZE = (96, 72)
 YAWS = {"left": -22.0, "right": 22.0}
@@ -94,7 +97,7 @@ def rig_run(finished_run, tmp_path_factory) -> Path:
         data = json.loads((root / "run" / name).read_text())
         data[key] = value
         (root / "run" / name).write_text(json.dumps(data))
-    (root / "run" / "scene.npz").unlink()
+    write_scene(root / "run", load_scene(root / "scene", DataConfig(test_every=2)))
     return root / "run"
 
 

@@ -9,7 +9,7 @@ from tiny_scene import make_scene
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
-from p2gs_jax.run.places import candidates, find, remembered
+from p2gs_jax.run.folder import candidates, find, remembered
 from p2gs_jax.run.read import load_run
 from p2gs_jax.run.scene_file import SCENE_FILE, read_scene, write_scene
 from p2gs_jax.scene import load_scene
@@ -83,10 +83,7 @@ def test_places_are_remembered_in_two_ways(tmp_path, monkeypatch):
     shutil.move(tmp_path / "street", tmp_path / "moved" / "street")
     shutil.move(tmp_path / "runs", tmp_path / "moved" / "runs")
     assert find(saved, "scene", tmp_path / "moved/runs/first") == tmp_path / "moved" / "street"
-    # As older versions wrote it.
-    old = {"scene": "street", "reference": None}
-    assert find(old, "scene", tmp_path / "moved/runs/first") == tmp_path / "moved" / "street"
-    assert find(old, "reference", tmp_path / "moved/runs/first") is None
+    assert find({"reference": None}, "reference", tmp_path / "moved/runs/first") is None
     assert candidates({}, "scene", tmp_path) == []
 
 
@@ -149,16 +146,15 @@ def test_a_broken_training_photograph_does_not_keep_held_out_views(
     assert (tmp_path / "r" / "2.photograph.png").is_file()
 
 
-def test_an_older_run_reads_its_scene(tmp_path, finished_run, alone):
-    (alone / SCENE_FILE).unlink()
-    opened = load_run(alone, finished_run.parent / "scene")
-    assert len(opened.scene.points) > 0
-    with pytest.raises(UserError, match=r"(?s)looked for .*gone.*kept no cameras.*--scene"):
-        load_run(alone)
+@pytest.mark.parametrize("name", [SCENE_FILE, "decisions.json", "metering.json"])
+def test_a_run_of_another_version_is_refused(alone, name):
+    (alone / name).unlink()
+    with pytest.raises(UserError, match=rf"(?s){name}.*(fit again|eval RUN)"):
+        _ = load_run(alone).metering
 
 
 def test_a_damaged_scene_file_is_named(alone):
     path = alone / SCENE_FILE
     path.write_bytes(path.read_bytes()[:300])
-    with pytest.raises(UserError, match=rf"(?s){SCENE_FILE}.*or remove it"):
+    with pytest.raises(UserError, match=rf"(?s){SCENE_FILE}.*fit again"):
         load_run(alone)

@@ -6,9 +6,9 @@ import sys
 
 CHILD = """
 import jax, jax.numpy as jnp
-from p2gs_jax.core import compile_cache
-compile_cache.SHORTEST_S = 0.0
-compile_cache.use_compile_cache()
+from p2gs_jax.core import runtime
+runtime.SHORTEST_S = 0.0
+runtime.use_compile_cache()
 print(jax.config.values["jax_compilation_cache_dir"])
 jax.jit(lambda x: jnp.sin(x) @ x)(jnp.ones((8, 8))).block_until_ready()
 """

@@ -8,8 +8,14 @@ import resource
 import numpy as np
 import pytest
 
-from p2gs_jax.core.atomic import append_jsonl, atomic_write, read_jsonl, write_array, write_text
-from p2gs_jax.core.disk import naming
+from p2gs_jax.core.atomic import (
+    append_jsonl,
+    atomic_write,
+    naming,
+    read_jsonl,
+    write_array,
+    write_text,
+)
 from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.formats.png import write_png
 from p2gs_jax.run.checkpoint import CheckpointStore
@@ -55,7 +61,7 @@ def test_a_checkpoint_without_room_is_named_and_the_one_before_it_stays(tmp_path
         store.save(2, {"a": large}, {})
     assert error.value.errno == errno.EFBIG
     assert error.value.filename == str(tmp_path / "checkpoints")
-    assert caplog.records == [], "users see one line, not orbax's pages"
+    assert caplog.records == [], "users see one line"
     again = CheckpointStore(tmp_path / "checkpoints")
     assert again.latest_step() == 1
     np.testing.assert_array_equal(again.restore(1, {"a": small})[0]["a"], small)
@@ -88,13 +94,13 @@ def test_errors_that_have_nothing_to_do_with_room_stay_as_they_are(tmp_path):
 
 
 def test_the_command_line_ends_with_the_reason_and_the_path(tmp_path, run_command, monkeypatch):
-    from p2gs_jax.cli.commands import synth
+    from p2gs_jax.cli.experiments import Synth
 
     def run(options):
         with room_for(100):
             write_text(tmp_path / "out.json", json.dumps(list(range(999))))
 
-    monkeypatch.setattr(synth, "run", run)
+    monkeypatch.setattr(Synth, "execute", run)
     code, text = run_command("synth", tmp_path / "new")
     assert code == 2
     assert f"{tmp_path / 'out.json'}: File too large" in text

@@ -12,7 +12,6 @@ from p2gs_jax.core import memory
 def container(monkeypatch, tmp_path):
     monkeypatch.setattr(memory, "CGROUP", tmp_path)
     monkeypatch.setattr(memory, "MEMINFO", tmp_path / "meminfo")
-    monkeypatch.setattr(memory.sys, "platform", "linux")
     lines = "MemTotal:  8000000 kB\nMemAvailable:  6000000 kB\nHugePages_Total:  0\n"
     (tmp_path / "meminfo").write_text(lines)
     return tmp_path
@@ -34,11 +33,6 @@ def test_memory_without_proc(container, monkeypatch):
     (container / "meminfo").unlink()
     monkeypatch.setattr(memory, "_pages", {"SC_PHYS_PAGES": 5}.get)
     assert memory.memory() == (5, None)
-
-
-def test_windows_without_its_library(container, monkeypatch):
-    monkeypatch.setattr(memory.sys, "platform", "win32")
-    assert memory.memory() == (None, None)
 
 
 def test_files_that_a_container_caches_can_go(container):

@@ -9,8 +9,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
 
-from p2gs_jax.core.ply_header import header_of, parse_header
-from p2gs_jax.core.ply_table import read_table, refusing
+from p2gs_jax.core.ply import header_of, parse_header, read_table, refusing
 from p2gs_jax.errors import UserError
 
 TYPES = {

@@ -6,8 +6,8 @@ import pytest
 from rich.table import Table
 from rich.text import Text
 
-from p2gs_jax.core.printable import printable
-from p2gs_jax.core.terminal import PlainConsole
+from p2gs_jax.core.progress import PlainConsole
+from p2gs_jax.core.text import printable
 
 
 @pytest.mark.parametrize(

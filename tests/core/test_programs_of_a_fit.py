@@ -13,7 +13,7 @@ from p2gs_jax.photometry.gauge import recentre
 from p2gs_jax.pipeline.calibrate import calibrate
 from p2gs_jax.pipeline.finish import Account, finish
 from p2gs_jax.pipeline.prepare import load, prepare
-from p2gs_jax.run.layout import RunFolder
+from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.run.read import load_run
 
 

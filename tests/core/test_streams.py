@@ -21,8 +21,8 @@ from p2gs_jax.core.streams import (
 )
 
 PACKAGE = Path(p2gs_jax.__file__).parent
-# Each draws everything from one stream of its own: toy data, benchmarks, an export's order.
-ALONE = ("core/streams.py", "synth/drive", "gaussians/bake.py", "bench/")
+# Each draws everything from one stream of its own: toy data, an export's order.
+ALONE = ("core/streams.py", "synth/drive", "gaussians/bake.py")
 
 
 @pytest.mark.parametrize("streams", [Stream, SceneStream])

@@ -17,11 +17,9 @@ from p2gs_jax.districts.plan import check_options, read_plan, write_plan
 from p2gs_jax.districts.shared import read_shared
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.population import default_max_gaussians
-from p2gs_jax.jobs.job import (
-    JobState,
-)
+from p2gs_jax.jobs.configs import with_fields
+from p2gs_jax.jobs.job import JobState
 from p2gs_jax.pipeline.prepare import load
-from p2gs_jax.sweep import with_fields
 
 SMALL = with_fields(
     p2gs_jax.preset("robust"),

@@ -11,7 +11,7 @@ from p2gs_jax.config import DataConfig, RenderConfig
 from p2gs_jax.districts.merge import merge_cores
 from p2gs_jax.districts.seams import measure_seams, unprojected
 from p2gs_jax.errors import UserError
-from p2gs_jax.render.spherical_harmonics import C0
+from p2gs_jax.render.harmonics import C0
 from p2gs_jax.scene.images import ImageStore
 
 

@@ -18,9 +18,9 @@ from tiny_scene import make_scene
 
 from p2gs_jax import config
 from p2gs_jax.cli import main
-from p2gs_jax.cli.options.fit import Calibrate, Fit, resolve_calibration, resolve_fit
+from p2gs_jax.cli.fit import Calibrate, Fit, checked
 from p2gs_jax.cli.parser import COMMANDS, GROUPS, parse
-from p2gs_jax.sweep.toml import read_sweep
+from p2gs_jax.jobs.configs import read_sweep
 
 BLOCKS = [block for page in PAGES for block in blocks(page)]
 
@@ -134,9 +134,9 @@ def check_ours(argv, where):
         return
     assert name in COMMANDS
     if isinstance(options, Fit):
-        resolve_fit(options)
+        checked(options.config)
     if isinstance(options, Calibrate):
-        resolve_calibration(options)
+        options.checked()
 
 
 RUN = [b for b in of("sh") if b.run]

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from lpips_files import made_arrays, write_weights
 
-from p2gs_jax.cli.commands.console import print_metrics
+from p2gs_jax.cli.tables import print_metrics
 from p2gs_jax.config import FitConfig
 from p2gs_jax.evaluate.evaluate import evaluate
 from p2gs_jax.evaluate.lpips import lpips
 from p2gs_jax.evaluate.lpips_weights import read_lpips_weights
+from p2gs_jax.jobs.sweep import to_markdown
 from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.sweep.rows import to_markdown
 from p2gs_jax.types import Gaussians, Params, Photometry, Render, Scene, View
 
 

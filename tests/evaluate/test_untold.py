@@ -10,7 +10,7 @@ import pytest
 from p2gs_jax.config import LossConfig
 from p2gs_jax.evaluate.evaluate import evaluate
 from p2gs_jax.evaluate.untold import Untold, untold_notes
-from p2gs_jax.render.host import make_renderer
+from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.read import load_run
 from p2gs_jax.scene.images import ImageStore
 

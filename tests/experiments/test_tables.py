@@ -9,12 +9,8 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[2] / "experiments"))
 
 import at_size
-import table1_reconstruction
-import table2_novel_views
-import table3_iso_robustness
-import table4_ablation
+import tables
 import towns
-import what_a_scene_needs
 
 from p2gs_jax.config import preset
 
@@ -27,8 +23,7 @@ def metrics(level: float, **extra):
         "test": {"averaged": there, "exposure_fitted": there},
         "reference": {"scale_aligned": {**here, "train": here, "test": there}},
         "consistency": {
-            k: dict.fromkeys(table1_reconstruction.STEADINESS, 0.1)
-            for k in ("averaged", "photographs")
+            k: dict.fromkeys(tables.STEADINESS, 0.1) for k in ("averaged", "photographs")
         },
         "counts": {"gaussians": 1000},
         "seconds": {"optimisation": 3.0},
@@ -63,41 +58,44 @@ def test_cells_are_means_of_their_own_method_and_iso():
 
 def test_losses_between_spreads_of_iso():
     loss = {0.0: 0.0, 2.0: 1.5, 4.0: 4.0}
-    runs = runs_of(table3_iso_robustness.wanted(), lambda name, std, town: 25.0 - loss[std])
-    for row in table3_iso_robustness.deltas(runs):
+    runs = runs_of(tables.iso_methods(), lambda name, std, town: 25.0 - loss[std])
+    for row in tables.changes(runs):
         assert row[1:7] == ["-2.50"] * 4 + ["-4.00"] * 2
-    printed = {row[0]: row[7] for row in table3_iso_robustness.deltas(runs)}
+    printed = {row[0]: row[7] for row in tables.changes(runs)}
     assert printed["P2GS as printed"] == "-0.85 / -0.95"  # as the paper's table has it
 
 
 def test_every_table_has_a_cell_for_every_column():
-    wanted = table3_iso_robustness.wanted()
-    runs = runs_of(wanted)
-    rows = table3_iso_robustness.rows(runs)
-    assert len(rows) == sum(map(len, wanted.values()))
-    assert {len(row) for row in rows} == {len(table3_iso_robustness.HEADER)}
-    rows = table1_reconstruction.rows(runs, {"3DGS": 12.0})
-    assert {len(row) for row in rows} == {len(table1_reconstruction.HEADER)}
-    assert {len(row) for row in table2_novel_views.rows(runs)} == {11}
-    ablations = runs_of({4.0: table4_ablation.variants()})
-    rows = table4_ablation.rows(ablations)
-    assert {len(row) for row in rows} == {len(table4_ablation.COLUMNS) + 2}
+    runs = runs_of(tables.iso_methods())
+    texts = [
+        tables.iso(runs),
+        tables.reconstruction(runs, {"3DGS": 12.0}),
+        tables.novel_views(runs),
+        tables.ablation(runs_of({4.0: tables.ablations()})),
+        tables.ladders(runs_of({4.0: tables.ladder_configs(100)})),
+    ]
+    for text in texts:
+        for block in text.split("\n\n"):
+            rows = [line for line in block.splitlines() if line.startswith("|")]
+            assert len({row.count("|") for row in rows}) <= 1
+    assert texts[0].count("robust (ours)") == 4  # three spreads of ISO, and the changes
+    for draw in (tables.plot_iso, tables.plot_novel_views):
+        assert draw(runs).axes
 
 
 def test_every_variant_differs_from_all_others():
     for variants in (
-        table4_ablation.variants(),
+        tables.ablations(),
         {k: v for k, v in towns.methods().items()},
     ):
         assert len(set(variants.values())) == len(variants)
 
 
 def test_ladders_vary_one_thing_at_a_time():
-    o = towns.Options(Path("."), towns.QUICK, 1, None, "")
-    configs = what_a_scene_needs.variants(o)
+    configs = tables.ladder_configs(100)
     assert configs["model: chosen"] == preset("robust")
     assert configs["SH degree 1"].render.sh_degree == 1
-    assert configs[what_a_scene_needs.AUTO].densify.max_gaussians == "auto"
+    assert configs["Gaussians: 160"].densify.max_gaussians == 160
     assert len({c for n, c in configs.items() if n.startswith("model")}) == 7
 
 
@@ -123,10 +121,9 @@ def test_a_table_says_where_it_comes_from(tmp_path):
 
 
 @pytest.mark.parametrize("argv", [["--steps", "many"], ["--towns"]])
-def test_wrong_options_end_with_two(argv, monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["x", *argv])
+def test_wrong_options_end_with_two(argv):
     with pytest.raises(SystemExit) as stop:
-        towns.options("x", "x")
+        towns.options("x", "x", argv)
     assert stop.value.code == 2
 
 

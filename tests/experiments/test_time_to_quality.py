@@ -1,4 +1,4 @@
-"""experiments/time_to_quality.py without a fit: rows, their keys, tables and curves."""
+"""experiments/time_to_quality.py and mixtures.py without a fit: rows, tables, curves, groups."""
 
 import json
 import sys
@@ -12,87 +12,38 @@ import mixtures
 import time_to_quality as t2q
 
 TOWN = t2q.SceneToFit("town", Path("/somewhere/town"), ("--reference", "/somewhere/reference"))
-FOX = t2q.SceneToFit("nerf_fox", Path("/data/fox"), ("--max-width", "480"))
 NEW = t2q.Version(t2q.THIS, Path("/new"), "aaa", "code-a")
 OLD = t2q.Version(t2q.AGAINST, Path("/old"), "bbb", "code-b")
 
 
-def row(job, wall, psnr, **extra):
-    return {
-        "version": job.version.label,
-        "commit": job.version.commit,
-        **job.key,
-        "wall_s": wall,
-        "test_psnr": psnr,
-        **extra,
-    }
+def row(version, budget, wall, psnr):
+    keys = {"scene": "town", "version": version.label, "commit": version.commit}
+    return {**keys, "code": version.code, "budget": budget, "wall_s": wall, "test_psnr": psnr}
 
 
-def test_versions_take_turns_and_cold_runs_come_first():
-    jobs = t2q.plan([TOWN, FOX], [NEW, OLD], ["warm", "cold"], [120, 60])
-    assert len(jobs) == 16
-    assert [j.version.label for j in jobs[:4]] == [t2q.THIS, t2q.AGAINST] * 2
-    assert [j.temperature for j in jobs[:4]] == ["cold", "cold", "warm", "warm"]
-    assert [j.budget for j in jobs[:8]] == [120] * 4 + [60] * 4
+def test_a_row_belongs_to_the_code_it_was_measured_with():
+    kept = row(NEW, 60, 61.0, 20.0)
+    assert t2q.Job(TOWN, NEW, 60).of(kept)
+    others = (NEW._replace(code="code-c"), 60), (OLD, 60), (NEW, 120)
+    assert not any(t2q.Job(TOWN, version, budget).of(kept) for version, budget in others)
 
 
-def test_finished_rows_are_kept_and_other_code_is_measured_anew(tmp_path):
-    jobs = t2q.plan([TOWN, FOX], [NEW, OLD], ["cold"], [60])
-    rows = [row(job, 61.0, 20.0) for job in jobs[:2]]
-    path = tmp_path / "rows.json"
-    assert t2q.read_rows(path) == []
-    t2q.write_rows(path, {"date": "today"}, rows)
-    again = t2q.read_rows(path)
-    assert t2q.missing(jobs, again) == jobs[2:]
-    changed = t2q.Version(t2q.THIS, Path("/new"), "ccc", "code-c")
-    assert len(t2q.missing(t2q.plan([TOWN], [changed], ["cold"], [60]), again)) == 1
-    assert json.loads(path.read_text())["stamp"] == {"date": "today"}
-
-
-def test_a_row_does_not_say_where_anything_lies():
-    (job,) = t2q.plan([TOWN], [NEW], ["cold"], [60])
-    assert "/" not in json.dumps(job.key)
-
-
-def test_the_table_has_a_cell_for_every_column():
-    jobs = t2q.plan([TOWN], [NEW, OLD], ["cold"], [60])
-    rows = [row(jobs[0], 61.5, 20.123, ev=0.0123, steps=300), row(jobs[1], 60.0, None)]
-    lines = t2q.table(rows).splitlines()
-    assert {line.count("|") for line in lines} == {len(t2q.HEADER) + 1}
-    assert "20.12" in lines[2]
-    assert "0.0123" in lines[2]
-    assert "n/a" in lines[3]
-
-
-def test_when_a_curve_reaches_a_level():
+def test_curves_tables_and_speedups():
     points = [(10.0, 20.0), (40.0, 22.0)]
     assert t2q.seconds_to(points, 21.0) == pytest.approx(20.0)
     assert t2q.seconds_to(points, 19.0) == 10.0
     assert t2q.seconds_to(points, 23.0) is None
     assert t2q.seconds_to([], 23.0) is None
-
-
-def test_speedups_compare_with_the_best_of_the_other():
-    ours = t2q.plan([TOWN], [NEW], ["warm"], [120, 60])
-    theirs = t2q.plan([TOWN], [OLD], ["warm"], [60, 120])
-    rows = [row(j, j.budget, v) for j, v in zip(ours, (23.0, 21.0), strict=True)]
-    rows += [row(j, j.budget, v) for j, v in zip(theirs, (21.0, 20.0), strict=True)]
-    (said,) = t2q.speedups(rows)
-    assert "at most 60 s here: 2.00 times" in said
-    rows = [row(j, j.budget, v) for j, v in zip(ours, (19.5, 19.0), strict=True)] + rows[2:]
-    assert "not reached here (best 19.50 dB)" in t2q.speedups(rows)[0]
+    rows = [row(NEW, 60, 60.0, 21.0), row(NEW, 120, 120.0, 23.0)]
+    rows += [row(OLD, 60, 60.0, None), row(OLD, 120, 120.0, 21.0)]
+    assert t2q.speedups(rows) == [
+        "town: 21.00 dB takes the other 120 s; here: in 60 s, 2.00 times as fast"
+    ]
+    lines = t2q.table(rows).splitlines()
+    assert len({line.count("|") for line in lines}) == 1
+    assert "21.00" in lines[2]
+    assert "n/a" in lines[4]
     assert len(t2q.plot(rows).axes) == 1
-
-
-def test_quality_is_read_where_metrics_have_it():
-    metrics = {
-        "counts": {"steps": 7, "gaussians": 9},
-        "test": {"exposure_fitted": {"psnr": 21.0}},
-        "reference": {"scale_aligned": {"test": {"psnr": 20.0}}},
-    }
-    found = t2q.quality(metrics)
-    assert (found["steps"], found["test_psnr"], found["reference_test_psnr"]) == (7, 21.0, 20.0)
-    assert found["train_psnr"] is None
 
 
 def test_exposures_are_judged_by_truth_or_within_their_groups():
@@ -105,11 +56,6 @@ def test_exposures_are_judged_by_truth_or_within_their_groups():
     within = mixtures.within_groups_ev(photometry, groups)
     assert within == pytest.approx((2 * 0.1**2 / 3) ** 0.5)
     assert mixtures.within_groups_ev(photometry, {}) is None
-
-
-def test_seconds_of_compiling_are_counted():
-    said = "Finished XLA compilation of jit(step) in 1.25 sec\nnothing\n"
-    assert t2q.compiling(said * 2) == (2, 2.5)
 
 
 def test_the_mixture_is_drawn_in_the_order_of_names(tmp_path):
@@ -130,29 +76,6 @@ def test_the_mixture_is_drawn_in_the_order_of_names(tmp_path):
         assert reference.read_text() == mixtures.REFERENCE
 
 
-def test_runs_use_their_own_code_and_an_own_cache(monkeypatch):
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "/mine")
-    found = t2q.environment(Path("/code"), Path("/cache"), Path("/fonts"))
-    assert found["PYTHONPATH"] == "/code"
-    assert found["XDG_CACHE_HOME"] == "/cache"
-    assert "JAX_COMPILATION_CACHE_DIR" not in found
-
-
 def test_absent_scenes_are_skipped_with_a_message(tmp_path, capsys):
-    found = t2q.scenes(["nerf_fox", "sofa"], tmp_path, tmp_path / "none", None, quick=False)
-    assert found == []
+    assert t2q.scenes(["nerf_fox", "sofa"], tmp_path, tmp_path / "none") == []
     assert capsys.readouterr().err.count("is skipped") == 2
-
-
-def test_a_cold_run_starts_empty_and_leaves_its_programs_where_they_are_found(tmp_path):
-    cache = tmp_path / "caches" / "town"
-    for name in ("first", "second"):
-        with t2q.emptied(cache) as folder:
-            assert folder == cache
-            assert list(folder.iterdir()) == []
-            (folder / name).write_text("")
-    assert {f.name for f in cache.iterdir()} == {"first", "second"}
-    with pytest.raises(RuntimeError), t2q.emptied(cache):
-        raise RuntimeError("a fit failed")
-    assert {f.name for f in cache.iterdir()} == {"first", "second"}
-    assert [f.name for f in cache.parent.iterdir()] == ["town"]

@@ -14,7 +14,7 @@ from p2gs_jax.export.page_scene import embedded_photographs, page_scene
 from p2gs_jax.export.page_splats import ever_drawn, fit_into, weights
 from p2gs_jax.formats.packed import pack
 from p2gs_jax.render import project
-from p2gs_jax.render.rasterize_reference import rasterize_reference
+from p2gs_jax.render.tiles import rasterize_reference
 from p2gs_jax.run.read import load_run
 
 HOSTILE = '</script><script>window.hacked=1</script><img src=x onerror="hacked=1">{{scene}}'

@@ -14,8 +14,8 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.formats.exr import read_exr, write_exr
 from p2gs_jax.formats.ply import field_names, read_ply, write_ply, write_radiance
 from p2gs_jax.formats.png import write_png
-from p2gs_jax.run.photometry_file import read_photometry, write_photometry
-from p2gs_jax.run.summary import _curves, _shorten, write_summary
+from p2gs_jax.run.photometry_files import read_photometry, write_photometry
+from p2gs_jax.run.plots import _lines, _shorten, write_summary
 from p2gs_jax.types import Gaussians
 
 
@@ -192,7 +192,9 @@ def test_photometry_of_incomplete_views(tmp_path):
     with pytest.raises(ValueError, match=r"view 0: .*gamma"):
         write_photometry(path, model="m", curve={}, gauge="g", mean={}, views=[{"image": "a"}])
     assert not path.exists()
-    path.write_text('{"model": 1, "curve": 1, "gauge": 1, "mean": 1, "views": [3]}')
+    path.write_text(
+        '{"version": 2, "model": 1, "curve": 1, "gauge": 1, "mean": 1, "cameras": 1, "views": [3]}'
+    )
     with pytest.raises(UserError, match="view 0: not an object"):
         read_photometry(path)
 
@@ -238,11 +240,11 @@ def test_a_summary_of_hostile_names_is_written_in_silence(tmp_path, recwarn):
     assert not [str(w.message) for w in recwarn]
 
 
-def test_curves_of_the_summary_share_one_level():
+def test_lines_of_the_summary_share_one_level():
     ev, cameras = np.array([1.0, 3.0, 2.0, 6.0]), ["a", "b", "a", "b"]
     exif = ev + 5
     exif[0] = np.nan
-    curves = _curves(ev, cameras, None, exif)
+    curves = _lines(ev, cameras, None, exif)
     labels = ["recovered, camera a", "recovered, camera b", "EXIF", ""]
     assert [label for *_, label in curves] == labels
     assert curves[0][2]["marker"] != curves[1][2]["marker"]

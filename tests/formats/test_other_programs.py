@@ -13,7 +13,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.formats.compressed_ply import read_compressed_ply, write_compressed_ply
 from p2gs_jax.formats.gltf import EXTENSION, write_gltf
 from p2gs_jax.formats.usd import CAMERAS, SPLATS, NamedCamera, write_usd
-from p2gs_jax.render.spherical_harmonics import C0, evaluate
+from p2gs_jax.render.harmonics import C0, evaluate
 
 FLIP = np.array([1.0, -1.0, -1.0])
 

@@ -12,7 +12,7 @@ from splats import random_splats
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.splat import read_splat, write_splat
 from p2gs_jax.formats.spz import fractional_bits, read_spz, write_spz
-from p2gs_jax.render.spherical_harmonics import C0, evaluate
+from p2gs_jax.render.harmonics import C0, evaluate
 
 FLIP = np.array([1.0, -1.0, -1.0])
 

@@ -21,8 +21,8 @@ from p2gs_jax.gaussians.bake import (
     viewer_config,
 )
 from p2gs_jax.photometry.display import DisplayTransform, develop
-from p2gs_jax.render.host import make_renderer
-from p2gs_jax.render.spherical_harmonics import C0, basis
+from p2gs_jax.render.capacity import make_renderer
+from p2gs_jax.render.harmonics import C0, basis
 
 CFG = RenderConfig(sh_degree=1)
 

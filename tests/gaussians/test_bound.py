@@ -5,8 +5,8 @@ from tiny_scene import make_scene
 
 import p2gs_jax
 from p2gs_jax.core.progress import Silent
+from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.pipeline.prepare import load, prepare
-from p2gs_jax.sweep import with_fields
 
 FIELDS = {
     "render.sh_degree": 0,

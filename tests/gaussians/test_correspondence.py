@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import preset
-from p2gs_jax.core.srgb import srgb_decode, srgb_encode
+from p2gs_jax.core.numerics import srgb_decode, srgb_encode
 from p2gs_jax.evaluate.alignment import exposure_error
 from p2gs_jax.photometry.calibrate import calibrate_observations, options_of
 from p2gs_jax.photometry.observations import Observations

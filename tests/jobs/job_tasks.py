@@ -36,8 +36,8 @@ def count(folder, arguments, reporter):
 
 def fit_with_least_effort(folder, arguments, reporter):
     """Fit, compiling as the tests' own process does (conftest)."""
+    from p2gs_jax.jobs.sweep import fit_task
     from p2gs_jax.render import xla_cpu
-    from p2gs_jax.sweep.task import fit_task
 
     flags = [word.removeprefix("--").split("=") for word in os.environ["XLA_FLAGS"].split()]
     values = {"true": True, "false": False}

@@ -15,16 +15,11 @@ from tiny_scene import make_scene
 
 import p2gs_jax
 from p2gs_jax.errors import UserError
-from p2gs_jax.jobs.engines import (
-    open_engine,
-)
-from p2gs_jax.jobs.job import JobFiles
-from p2gs_jax.jobs.progress import read_progress
-from p2gs_jax.jobs.run import (
-    run_jobs,
-)
-from p2gs_jax.sweep import with_fields
-from p2gs_jax.sweep.task import fit_job
+from p2gs_jax.jobs.configs import with_fields
+from p2gs_jax.jobs.engines import open_engine
+from p2gs_jax.jobs.job import JobFiles, read_progress
+from p2gs_jax.jobs.run import run_jobs
+from p2gs_jax.jobs.sweep import fit_job
 
 pytest.importorskip("distributed")
 

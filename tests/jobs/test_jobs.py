@@ -13,23 +13,19 @@ from job_tasks import count
 from rich.console import Console
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.jobs.engines import (
-    check_engine,
-    open_engine,
-)
+from p2gs_jax.jobs.engines import check_engine, open_engine
 from p2gs_jax.jobs.job import (
     REASON,
     Job,
     JobFiles,
     JobState,
+    ProgressFile,
+    read_progress,
     write_job,
 )
-from p2gs_jax.jobs.process import run_in_process
-from p2gs_jax.jobs.progress import ProgressFile, read_progress
-from p2gs_jax.jobs.run import (
-    run_jobs,
-)
+from p2gs_jax.jobs.run import run_jobs
 from p2gs_jax.jobs.table import line_of, table_of
+from p2gs_jax.jobs.worker import run_in_process
 
 
 @pytest.fixture(autouse=True)
@@ -139,7 +135,7 @@ def test_a_job_whose_end_was_being_told_as_the_signal_came_is_told(tmp_path):
 def test_a_job_ends_with_whoever_waits_for_it(tmp_path):
     (job,) = jobs_of(tmp_path, orphan={"first": "wait"})
     files = write_job(tmp_path / "jobs", job)
-    code = f"from p2gs_jax.jobs.process import run_in_process; run_in_process({str(files.path)!r})"
+    code = f"from p2gs_jax.jobs.worker import run_in_process; run_in_process({str(files.path)!r})"
     waiting = subprocess.Popen([sys.executable, "-c", code])
     while (read_progress(files.progress) or {}).get("doing") != "Counting":
         assert waiting.poll() is None
@@ -200,7 +196,7 @@ def test_the_table_names_every_job_that_runs():
     [
         ("ray://host:1", "there is no engine 'ray://host:1'"),
         ("dask://host", "names no port"),
-        ("slurm:gpu", "'gpu' is no OPTION=VALUE"),
+        ("slurm:gpu", "'gpu' is not OPTION=VALUE"),
     ],
 )
 def test_engines_that_are_not_there_are_refused(name, said):
@@ -209,7 +205,7 @@ def test_engines_that_are_not_there_are_refused(name, said):
 
 
 def test_a_missing_library_is_named_with_its_extra(monkeypatch):
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("p2gs_jax.jobs.engines.find_spec", lambda name: None)
     with pytest.raises(UserError, match=r"p2gs-jax\[dask\]"):
         check_engine("dask://host:8786")
     with pytest.raises(UserError, match=r"p2gs-jax\[slurm\]"):

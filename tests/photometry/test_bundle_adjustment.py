@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from synthetic_drive import make_drive, make_exposures, observe
 
-from p2gs_jax.core.srgb import srgb_decode, srgb_encode
+from p2gs_jax.core.numerics import srgb_decode, srgb_encode
 from p2gs_jax.evaluate.alignment import exposure_error
 from p2gs_jax.photometry.adjustment import fit as fitting
 from p2gs_jax.photometry.adjustment import robust

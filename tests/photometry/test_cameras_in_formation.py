@@ -10,9 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from p2gs_jax.config import CameraFormation, PhotometryConfig
-from p2gs_jax.photometry.cameras import camera_row, camera_rows, corner, places, squared_radii
+from p2gs_jax.photometry.cameras import camera_row, camera_rows, corner, places
 from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
-from p2gs_jax.photometry.formation import expose, formation, inverse_formation, tone_map
+from p2gs_jax.photometry.formation import (
+    expose,
+    formation,
+    inverse_formation,
+    squared_radii,
+    tone_map,
+)
 from p2gs_jax.photometry.response import KNOTS, Response, log_exposed
 from p2gs_jax.types import Capture, Photometry
 

@@ -9,7 +9,7 @@ from p2gs_jax.config import LossConfig, PhotometryConfig
 from p2gs_jax.losses.image import photometric_loss
 from p2gs_jax.losses.regularizers import variance
 from p2gs_jax.photometry.formation import eotf, formation, oetf, tone_map
-from p2gs_jax.render.radiance import radiance_activation, radiance_preactivation
+from p2gs_jax.render.harmonics import radiance_activation, radiance_preactivation
 from p2gs_jax.types import Capture, Photometry
 
 PAPER = PhotometryConfig(curve="power", pivot=1.0, clamp=True, parameterization="linear")
@@ -93,7 +93,7 @@ def test_parameterisations_never_reach_zero():
         assert float(p.gammas.min()) > 0
 
 
-@pytest.mark.parametrize("kind", ["exp", "softplus", "linear"])
+@pytest.mark.parametrize("kind", ["exp", "linear"])
 def test_radiance_activations_invert(kind):
     L = jnp.asarray([1e-3, 0.1, 1.0, 20.0], jnp.float32)
     np.testing.assert_allclose(

@@ -7,7 +7,7 @@ import pytest
 
 from p2gs_jax.photometry.neighbourhood import neighbourhood, neighbourhood_warnings
 from p2gs_jax.photometry.observations import Observations
-from p2gs_jax.photometry.sources.surroundings import surroundings
+from p2gs_jax.photometry.sources.sampling import surroundings
 
 VIEWS, POINTS = 8, 500
 NAMES = tuple(f"{k}.jpg" for k in range(VIEWS))

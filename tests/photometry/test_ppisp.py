@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.photometry.appearance import correction_of, exposures_apart
 from p2gs_jax.photometry.formation import formation
-from p2gs_jax.photometry.ppisp.homography import SOURCES, homography, offsets, recolored
+from p2gs_jax.photometry.ppisp import homography, regularisation
+from p2gs_jax.photometry.ppisp.homography import SOURCES, offsets, recolored
 from p2gs_jax.photometry.ppisp.parameters import OneView, applied, identity
-from p2gs_jax.photometry.ppisp.regularisation import regularisation
 from p2gs_jax.photometry.ppisp.response import identity_response, respond
 from p2gs_jax.photometry.ppisp.vignetting import falloff
 from p2gs_jax.types import Params, Photometry

@@ -13,7 +13,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.alignment import exposure_error
 from p2gs_jax.photometry.sources.stack import read_stack
 from p2gs_jax.pipeline.calibrate_stack import calibrate_stack
-from p2gs_jax.run.photometry_file import read_photometry
+from p2gs_jax.run.photometry_files import read_photometry
 
 
 def read_truth(root):

@@ -11,17 +11,17 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from p2gs_jax.config import PhotometryConfig, RenderConfig
-from p2gs_jax.core.srgb import srgb_encode
+from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluate.alignment import exposure_error
 from p2gs_jax.formats.foreign import read_foreign
 from p2gs_jax.formats.ply import read_ply, write_ply
 from p2gs_jax.formats.splat import write_splat
-from p2gs_jax.gaussians.relit import relit
+from p2gs_jax.gaussians.bake import relit
 from p2gs_jax.photometry.display import DisplayTransform, develop
-from p2gs_jax.render.host import make_renderer
-from p2gs_jax.render.spherical_harmonics import C0
-from p2gs_jax.run.photometry_file import read_photometry
+from p2gs_jax.render.capacity import make_renderer
+from p2gs_jax.render.harmonics import C0
+from p2gs_jax.run.photometry_files import read_photometry
 from p2gs_jax.run.read import load_run
 from p2gs_jax.types import Camera, Gaussians
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import FitConfig
+from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.pipeline.scale import (
     extent_of_rates,
     near_depth,
@@ -15,7 +16,6 @@ from p2gs_jax.pipeline.scale import (
 )
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.scene import load_scene
-from p2gs_jax.sweep import with_fields
 from p2gs_jax.types import Scene
 
 

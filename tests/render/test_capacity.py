@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from p2gs_jax.render.blocks import BLOCK
 from p2gs_jax.render.capacity import (
     ANYWHERE,
     FEWEST_ENTRIES,
@@ -16,6 +15,7 @@ from p2gs_jax.render.capacity import (
     bucket,
     until_it_fits,
 )
+from p2gs_jax.render.visible import BLOCK
 
 
 def test_buckets_are_few_and_hold_what_they_must():

@@ -1,4 +1,4 @@
-"""Hard cases over every implementation, against the float64 oracle (p2gs_jax/bench/hard_cases)."""
+"""Hard cases over every implementation, against the float64 oracle (benchmarks/hard_cases)."""
 
 import dataclasses
 import functools
@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from p2gs_jax.bench import hard_cases
-from p2gs_jax.bench.hard_cases import CASES, VIEW, HardCase, camera, crowd, gap
+from benchmarks import hard_cases
+from benchmarks.hard_cases import CASES, VIEW, HardCase, camera, crowd, gap
 from p2gs_jax.render import render_linear
 
 BASE = hard_cases.CONFIG

@@ -6,14 +6,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from p2gs_jax.render.rasterize_xla import (
-    cut,
-    merge,
-)
-from p2gs_jax.render.segments import (
-    SEGMENTS_PER_LANE,
-)
-from p2gs_jax.render.tile_rows import Plan
+from p2gs_jax.render.rasterize_xla import SEGMENTS_PER_LANE, cut, merge
+from p2gs_jax.render.tiles import Plan
 
 TILES, LANES, CHUNK, PIXELS = 6, 4, 2, 3
 UNUSED = dict.fromkeys(Plan._fields)

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.special import sph_harm_y
 
-from p2gs_jax.render.spherical_harmonics import MAX_DEGREE, basis
+from p2gs_jax.render.harmonics import MAX_DEGREE, basis
 
 
 def test_the_basis_is_that_of_3dgs():

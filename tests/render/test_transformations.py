@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from p2gs_jax.bench.scenes import street
+from benchmarks.scenes import street
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render import bin_tiles, project, render_linear
 from p2gs_jax.render.xla_cpu import SMALL_CALL

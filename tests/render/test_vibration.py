@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import RenderConfig
-from p2gs_jax.render.blocks import splat
-from p2gs_jax.render.vibration import CYCLE, STILL, at_time
-from p2gs_jax.render.visible import in_view
+from p2gs_jax.render.project import CYCLE, STILL, at_time
+from p2gs_jax.render.visible import in_view, splat
 from p2gs_jax.types import Camera, Gaussians, Placement, Vibration
 
 LIFE = 0.4
@@ -34,7 +33,7 @@ def gaussians(velocity=(2.0, 0.0, 0.0), peak=0.2, life=LIFE, count=1):
 
 
 def placement(time):
-    return Placement(jnp.zeros((0, 4, 4)), jnp.int32(0), jnp.float32(0), jnp.float32(time))
+    return Placement(jnp.zeros((0, 4, 4)), jnp.float32(time))
 
 
 def camera(time):

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render import bin_tiles, project, required_capacity, view_radiance
-from p2gs_jax.render.cutoff import with_cutoffs
+from p2gs_jax.render.tiles import with_cutoffs
 from p2gs_jax.render.visible import compact, in_view
 from p2gs_jax.train.room import count_view
 from p2gs_jax.types import Camera, Gaussians

@@ -9,7 +9,6 @@ from p2gs_jax.formats.png import write_png
 from p2gs_jax.report.drive_charts import CameraOverTime, over_time_chart
 from p2gs_jax.report.drive_sections import (
     depth_section,
-    left_out_section,
     novel_section,
     parts_section,
     unexplained_section,
@@ -38,19 +37,6 @@ def test_unexplained_pixels_are_counted_and_shown(files, tmp_path):
     assert "2.00%" in body
     assert body.count("<img") == 1
     assert len(problems) == 1
-
-
-def test_what_a_fit_left_out_is_counted_and_shown(files, tmp_path):
-    problems = []
-    assert left_out_section(files, problems).body == ""
-    metrics = {"left_out": {"share": 0.02, "per_view": {"front/00.jpg": 0.02}}}
-    run = dataclasses.replace(files, metrics=metrics)
-    write_png(tmp_path / "left_out" / "front" / "00.png", np.full((8, 12, 3), 0.5, np.float32))
-    body = left_out_section(run, problems).body
-    assert "2.0% of the pixels" in body
-    assert "front/00: 2.0%" in body
-    assert body.count("<img") == 1
-    assert not problems
 
 
 def test_parts_depth_and_shifted_views_are_tables(files):

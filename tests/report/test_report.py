@@ -288,13 +288,6 @@ def test_changes_of_resolution_and_freezing_are_marked(run):
     assert "exposures move from step 600" in said
 
 
-def test_automatic_growth_is_told(run):
-    files = read_run(run)
-    look = {"gaussians": 500, "psnr": 21.5, "before": 400, "without": 21.25, "progress": 0.2}
-    files.metrics["growth"] = {"looks": [{**look, "gain": 0.25, "kept": True}]}
-    assert "400 → 500 21.25 21.50 0.25 kept" in words_of(report_page(files, SceneMeasurements()))
-
-
 def test_two_cameras_get_a_panel_each_and_many_share_one(run):
     files = read_run(run)
     for i, view in enumerate(files.views):

@@ -8,13 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from p2gs_jax.config import FitConfig, to_dict
-from p2gs_jax.core.atomic import write_json
+from p2gs_jax.config import FitConfig
 from p2gs_jax.core.progress import Silent
 from p2gs_jax.formats.ply import write_radiance
+from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.report.run_files import read_run
 from p2gs_jax.report.scene_measurements import measure_scene
-from p2gs_jax.run.photometry_file import write_photometry
+from p2gs_jax.run.decisions import Decisions
+from p2gs_jax.run.folder import RunFolder
+from p2gs_jax.run.photometry_files import write_photometry
+from p2gs_jax.run.scene_file import write_scene
+from p2gs_jax.run.write import write_start
+from p2gs_jax.scene import load_scene
 from p2gs_jax.types import Gaussians
 
 WIDTH, HEIGHT, FOCAL, WALL = 96, 64, 80.0, 4.0
@@ -66,10 +71,9 @@ def wall_run(tmp_path_factory):
         jnp.zeros((n, 1, 3)),
     )
     write_radiance(run / "radiance.ply", gaussians, np.ones(n, bool), activation="exp")
-    cfg = to_dict(FitConfig())
-    cfg["data"]["test_every"] = 0
-    cfg["render"]["sh_degree"] = 0
-    write_json(run / "config.json", {"scene": str(scene), "reference": None, "fit": cfg})
+    cfg = with_fields(FitConfig(), {"data.test_every": 0, "render.sh_degree": 0})
+    write_start(RunFolder(run), scene, None, cfg, Decisions.as_asked(cfg))
+    write_scene(run, load_scene(scene, cfg.data))
     views = [
         {
             "image": f"{i}.png",

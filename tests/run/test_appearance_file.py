@@ -11,7 +11,7 @@ import pytest
 
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.appearance import identity
-from p2gs_jax.run.appearance_file import read_appearance, write_appearance
+from p2gs_jax.run.photometry_files import read_appearance, write_appearance
 from p2gs_jax.types import View
 
 CAMERAS = ("right", "left", "right")

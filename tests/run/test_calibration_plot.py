@@ -9,7 +9,7 @@ from p2gs_jax.photometry.adjustment.fit import fit_model
 from p2gs_jax.photometry.adjustment.problem import make_problem
 from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.response import Response
-from p2gs_jax.run.calibration_plot import curves_to_draw, write_calibration_plot
+from p2gs_jax.run.plots import curves_to_draw, write_calibration_plot
 
 DRIVE = make_drive(12, 400)
 PIVOT = 0.18

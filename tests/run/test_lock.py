@@ -8,12 +8,12 @@ import sys
 import pytest
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.run.lock import NAME, locked, require_free
+from p2gs_jax.run.folder import NAME, locked, require_free
 
 HOLD = """
 import os, sys
 from pathlib import Path
-from p2gs_jax.run.lock import locked
+from p2gs_jax.run.folder import locked
 with locked(Path(sys.argv[1])):
     print("held", flush=True)
     sys.stdin.read()

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from p2gs_jax.core.srgb import srgb_decode
+from p2gs_jax.core.numerics import srgb_decode
 from p2gs_jax.errors import UserError
 from p2gs_jax.synth.build_town import build_town
 from p2gs_jax.synth.exposures import read_true_exposures, read_true_shots

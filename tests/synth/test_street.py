@@ -11,7 +11,7 @@ from PIL import Image
 from scipy.ndimage import map_coordinates
 
 from p2gs_jax.config import DataConfig
-from p2gs_jax.core.srgb import srgb_decode, srgb_encode
+from p2gs_jax.core.numerics import srgb_decode, srgb_encode
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.colmap import load_colmap
 from p2gs_jax.synth.build_town import STREET_M, build_town

@@ -12,7 +12,7 @@ from synthetic_drive import (
     smooth_errors,
 )
 
-from p2gs_jax.core.srgb import srgb_decode
+from p2gs_jax.core.numerics import srgb_decode
 from p2gs_jax.synth.sensor import encode
 
 DRIVE = make_drive(8, 400)

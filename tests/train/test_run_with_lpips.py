@@ -7,7 +7,7 @@ from lpips_files import made_arrays, write_weights
 from tiny_scene import make_scene
 
 from p2gs_jax.cli import main
-from p2gs_jax.sweep.rows import read_row
+from p2gs_jax.jobs.sweep import read_row
 
 # Splats of display values: no bundle adjustment, and one resolution, to keep it short.
 SMALL = (

@@ -14,9 +14,8 @@ from tiny_scene import make_scene
 from p2gs_jax.config import FitConfig
 from p2gs_jax.losses.total import Partner, image_loss, total_loss
 from p2gs_jax.pipeline.fit import fit
-from p2gs_jax.render.blocks import BLOCK, splat
 from p2gs_jax.render.capacity import Room
-from p2gs_jax.render.visible import in_view
+from p2gs_jax.render.visible import BLOCK, in_view, splat
 from p2gs_jax.train import advance, image_gradient
 from p2gs_jax.train.advance import Controls, finite_names
 from p2gs_jax.train.optimizer import B1, learning_rates, make_optimizer
@@ -93,7 +92,7 @@ def made():
             ((splats, radiance),), params.photometry, None, batch, partner, cfg, 2**16
         )
         whole, _ = total_loss(
-            params, alive, batch, partner, cfg, capacity=2**16, active_degree=DEGREE, extent=EXTENT
+            params, alive, batch, partner, cfg, capacity=2**16, active_degree=DEGREE
         )
         return whole + loss, (whole, loss)
 

@@ -7,7 +7,7 @@ import pytest
 
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.display import develop
-from p2gs_jax.render.host import make_renderer
+from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.read import load_run
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore

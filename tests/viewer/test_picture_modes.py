@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from p2gs_jax.config import CameraFormation, PhotometryConfig
 from p2gs_jax.formats.false_color import OVER, clipping_overlay, depth_color, false_color
-from p2gs_jax.photometry.cameras import squared_radii
 from p2gs_jax.photometry.display import DisplayTransform, develop
+from p2gs_jax.photometry.formation import squared_radii
 from p2gs_jax.types import Camera
 from p2gs_jax.viewer.picture_modes import (
     MIDDLE_GREY,

@@ -9,7 +9,7 @@ import pytest
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.errors import UserError
-from p2gs_jax.render.host import make_renderer
+from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.types import Camera, Gaussians
 from p2gs_jax.viewer import programs as module
 from p2gs_jax.viewer.programs import Programs

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.render.host import make_renderer
+from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.read import load_run
 from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.viewer.browser_camera import ViewerSpace

@@ -16,7 +16,7 @@ from reliability.mutations import Broken, cuts, flips, random_bytes, wrong_json,
 from reliability.reading import fit_into, read
 from reliability.trials import REFUSED, Trial, in_child, run_trials
 
-from p2gs_jax.core.printable import printable
+from p2gs_jax.core.text import printable
 from p2gs_jax.errors import UserError
 from p2gs_jax.paths.files import read_cameras
 from p2gs_jax.run.read import load_run

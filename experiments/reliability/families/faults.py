@@ -116,7 +116,7 @@ class Faults:
                 moment = "between steps"
             elif kind == "checkpoint":
                 folder = run / "checkpoints"
-                fits.wait_for(process, lambda: any(folder.glob("*orbax-checkpoint-tmp*")))
+                fits.wait_for(process, lambda: any(folder.glob(".writing-*")))
                 moment = "while it wrote a checkpoint"
             else:
                 fits.wait_for(process, lambda: (run / "renders").exists())

@@ -16,7 +16,7 @@ from p2gs_jax import UserError, fit
 from p2gs_jax.config import preset
 from p2gs_jax.core.progress import Silent
 from p2gs_jax.formats.ply import read_ply
-from p2gs_jax.sweep import with_fields
+from p2gs_jax.jobs.configs import with_fields
 
 NAME = "hard_numbers"
 ABOUT = """

@@ -113,7 +113,7 @@ def _asks(outside: bool, path: str, headers: dict[str, str], served: bool) -> Ca
 
 
 def _listens(root: Path) -> int:
-    from p2gs_jax.cli.options.view import View
+    from p2gs_jax.cli.pages import View
     from p2gs_jax.viewer.guard import guard_of, is_loopback
 
     host = View(run=root).host

@@ -11,17 +11,13 @@ from jaxtyping import Float
 
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.photometry.adjustment.clusters import regions, side_by_side, small_sample
-from p2gs_jax.photometry.adjustment.linear import Balanced, one_thread
+from p2gs_jax.photometry.adjustment.linear import one_thread
 from p2gs_jax.photometry.adjustment.matrices import is_small
 from p2gs_jax.photometry.adjustment.normal import summed
 from p2gs_jax.photometry.adjustment.parameters import Parameters
 from p2gs_jax.photometry.adjustment.robust import weigh
-from p2gs_jax.photometry.adjustment.shared import (
-    SHARED_REGION,
-    shared_deviation,
-    shared_scores,
-)
-from p2gs_jax.photometry.adjustment.solve import Fit
+from p2gs_jax.photometry.adjustment.shared import SHARED_REGION, shared_deviation, shared_scores
+from p2gs_jax.photometry.adjustment.solve import Balanced, Fit
 from p2gs_jax.photometry.adjustment.system import System, gauge_strength
 from p2gs_jax.photometry.observations import Observations
 

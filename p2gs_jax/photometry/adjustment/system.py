@@ -12,11 +12,9 @@ from jaxtyping import Float
 
 from p2gs_jax.config import Level, ResponseKind
 from p2gs_jax.core.numerics import LN2
-from p2gs_jax.photometry.adjustment.features import Features
 from p2gs_jax.photometry.adjustment.matrices import Matrix
-from p2gs_jax.photometry.adjustment.parameters import Parameters, Unknowns
+from p2gs_jax.photometry.adjustment.parameters import Features, Parameters, Splines, Unknowns
 from p2gs_jax.photometry.adjustment.problem import Problem
-from p2gs_jax.photometry.adjustment.spline import Splines
 from p2gs_jax.photometry.models import MODELS, Form
 from p2gs_jax.photometry.response import KNOTS, spline_count
 

@@ -12,7 +12,7 @@ from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.sources.sampling import sample_where_seen, thinned
-from p2gs_jax.render.host import make_renderer
+from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.render.warp import project_points, surface_depth, unproject, visible
 from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.images import ImageStore

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
-from p2gs_jax.core.srgb import srgb_decode, srgb_encode
+from p2gs_jax.core.numerics import srgb_decode, srgb_encode
 from p2gs_jax.photometry.cameras import places
 from p2gs_jax.photometry.observations import COARSEST, Observations
 from p2gs_jax.photometry.sources.surroundings import surroundings

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from p2gs_jax.core.json_text import parse_json
+from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError, broken
 
 Row = dict[str, Any]

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, UInt
 from PIL import Image
 
-from p2gs_jax.core.srgb import srgb_encode
+from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.scene.photographs.light import ADOBE_RGB, BT709, adapted, rgb_to_xyz
 
 # The white of the profile connection space, D50.

@@ -14,7 +14,7 @@ import numpy as np
 from av.stream import Disposition
 from jaxtyping import Float, UInt, UInt8
 
-from p2gs_jax.core.srgb import srgb_decode
+from p2gs_jax.core.numerics import srgb_decode
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.photographs.light import (
     BT709,

@@ -28,9 +28,7 @@ from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.drives import arrow
 from p2gs_jax.scene.drives.argoverse import is_argoverse, read_argoverse
 from p2gs_jax.scene.drives.assemble import assemble
-from p2gs_jax.scene.rigid import (
-    inverse,
-)
+from p2gs_jax.scene.rigid import inverse
 
 START = 315968112437425433
 CAMERAS = {

@@ -5,9 +5,7 @@ from pathlib import Path
 import pytest
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene.drives.recording import (
-    chosen_drive,
-)
+from p2gs_jax.scene.drives.tables import chosen_drive
 
 ROOT = Path("set")
 THERE = ["scene-0061", "scene-0103", "scene-01"]

@@ -8,24 +8,14 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from pyarrow import parquet
-from scene.drives.writers import (
-    FORWARD,
-    HEIGHT,
-    WIDTH,
-    car_at,
-    cut,
-    jpeg,
-    matrix,
-)
+from scene.drives.writers import FORWARD, HEIGHT, WIDTH, car_at, cut, jpeg, matrix
 from scipy.spatial.transform import Rotation
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.drives.waymo import is_waymo, read_waymo
-from p2gs_jax.scene.rigid import (
-    inverse,
-)
+from p2gs_jax.scene.rigid import inverse
 
 START = 1550083467346370
 SEGMENT = "10023947602400723454_1120_000_1140_000"

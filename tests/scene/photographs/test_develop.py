@@ -15,7 +15,7 @@ import pytest
 from PIL import Image, features
 from scene.photographs.made import DISPLAY_P3, patches, settings, write_dng
 
-from p2gs_jax.core.srgb import srgb_decode, srgb_encode
+from p2gs_jax.core.numerics import srgb_decode, srgb_encode
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.exif import read_exif_ev, read_exif_settings
 from p2gs_jax.scene.files import image_size, list_images

@@ -13,7 +13,7 @@ from scene.photographs.made import settings, write_dng
 from scene.photographs.test_develop import save_heic, write_exr
 
 from p2gs_jax.config import DataConfig, FitConfig
-from p2gs_jax.core.srgb import srgb_encode
+from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.photometry.calibrate import options_of
 from p2gs_jax.run.scene_file import read_scene, write_scene
 from p2gs_jax.scene import ImageStore, load_scene

@@ -1,0 +1,178 @@
+"""Measure the renderer: milliseconds against error, levels of a fit, hard cases.
+
+python benchmarks/run.py --quick
+python benchmarks/run.py speed_error levels --quick --baseline experiments/bench/baseline.json
+python benchmarks/run.py levels --set chunk=32 --out runs/bench
+
+Tables go to OUT/bench.md, figures to OUT/bench.json. The exit code is 1 where `speed_error` or
+`levels` is worse than the baseline allows, 2 where the arguments are wrong.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import os
+import platform
+import sys
+from ast import literal_eval
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax
+
+# Benchmarks find each other however they are started.
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks import gate, hard_cases, levels, speed_error
+from p2gs_jax.config import RenderConfig, preset
+from p2gs_jax.core.atomic import write_json, write_text
+from p2gs_jax.core.progress import TerminalReporter
+from p2gs_jax.errors import UserError
+
+PARTS = ("speed_error", "levels", "hard_cases")
+# What a baseline holds.
+GATED = PARTS[:2]
+
+
+def stamp() -> dict:
+    """Return what a figure depends on besides the code."""
+    return {
+        "jax": jax.__version__,
+        "backend": jax.default_backend(),
+        "device": jax.devices()[0].device_kind,
+        "architecture": platform.machine(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None,
+    }
+
+
+def _section(title: str, header: list[str], rows: list[list[str]]) -> str:
+    """Return a Markdown table below its title, the first column left, the others right."""
+    lines = ["| " + " | ".join(r) + " |" for r in (header, *rows)]
+    return "\n".join([f"## {title}\n", lines[0], "|---|" + "---:|" * (len(header) - 1), *lines[1:]])
+
+
+def run(options: argparse.Namespace, on_progress) -> tuple[str, list[str]]:
+    """Run the chosen parts and write `bench.md` and `bench.json`.
+
+    Returns:
+        The tables as Markdown, and what is worse than the baseline allows.
+
+    Raises:
+        UserError: the baseline cannot be used.
+    """
+    parts, quick = options.parts or PARTS, options.quick
+    variants = speed_error.QUICK if quick else speed_error.VARIANTS
+    fits = levels.QUICK if quick else levels.SCENES
+    render = dataclasses.replace(RenderConfig(), **dict(options.set))
+    cfg = dataclasses.replace(preset("robust"), render=render)
+
+    def of_variants(chosen: Sequence[speed_error.Variant]) -> list[speed_error.MeasuredVariant]:
+        scene = speed_error.sweep_scene(quick)
+        return speed_error.measure_speed_error(scene, chosen, on_progress=on_progress)
+
+    def of_levels(names: Sequence[str]) -> list[levels.Level]:
+        return levels.measure_levels(
+            {k: fits[k] for k in names},
+            cfg,
+            steps=levels.QUICK_STEPS if quick else None,
+            repeats=5 if quick else 7,
+            on_progress=on_progress,
+        )
+
+    sections: list[str] = []
+    data: dict = {"stamp": stamp(), "quick": quick}
+    complaints: list[str] = []
+    gated: gate.Rows = {}
+    if "speed_error" in parts:
+        points = of_variants(variants)
+        sections.append(_section("Speed against error", *speed_error.table(points)))
+        data["speed_error"] = [p._asdict() | {"variant": p.variant.name} for p in points]
+        gated |= speed_error.gate_rows(points)
+    if "levels" in parts:
+        found = of_levels(list(fits))
+        title = "Levels of a fit: rendering and the whole step"
+        sections.append(_section(title, *levels.table(found)))
+        data["levels"] = [level._asdict() | {"lists": level.lists._asdict()} for level in found]
+        gated |= levels.gate_rows(found)
+    if options.write_baseline:
+        gate.write_baseline(options.write_baseline, gated)
+    if options.baseline:
+
+        def anew(names: list[str]) -> gate.Rows:
+            slow = [v for v in variants if v.name in names]
+            rows = speed_error.gate_rows(of_variants(slow)) if slow else {}
+            return rows | levels.gate_rows(of_levels([k for k in names if k in fits]))
+
+        complaints = gate.settle(options.baseline, gated, anew)
+    if "hard_cases" in parts:
+        gaps = {}
+        for i, case in enumerate(hard_cases.CASES):
+            on_progress("hard cases", i, len(hard_cases.CASES))
+            gaps[case.name] = hard_cases.gap(case, hard_cases.CONFIG)
+        sections.append(_section("Hard cases against float64", *hard_cases.table(gaps)))
+        data["hard_cases"] = {k: g._asdict() for k, g in gaps.items()}
+    text = "\n\n".join(sections) + "\n"
+    write_text(options.out / "bench.md", text)
+    write_json(options.out / "bench.json", data)
+    return text, complaints
+
+
+def _field(text: str) -> tuple[str, object]:
+    name, _, value = text.partition("=")
+    if name not in {f.name for f in dataclasses.fields(RenderConfig)}:
+        raise argparse.ArgumentTypeError(f"RenderConfig has no field {name!r}")
+    try:
+        return name, literal_eval(value)
+    except (ValueError, SyntaxError):
+        return name, value
+
+
+def options_of(arguments: Sequence[str] | None = None) -> argparse.Namespace:
+    """Return the parsed arguments; exits with 2 where they are wrong."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add = parser.add_argument
+    add("parts", nargs="*", help=f"{', '.join(PARTS)}; none named runs all", metavar="PART")
+    add("--out", type=Path, default=Path("runs/bench"), help="folder for tables and figures")
+    add("--quick", action="store_true", help="fewer and smaller: two minutes, not half an hour")
+    add("--baseline", type=Path, help="compare speed_error and levels with this file")
+    add("--write-baseline", type=Path, help="write what speed_error and levels measured")
+    add(
+        "--set",
+        type=_field,
+        action="append",
+        default=[],
+        metavar="FIELD=VALUE",
+        help="an option of the renderer (p2gs_jax.config.RenderConfig), for levels",
+    )
+    options = parser.parse_args(arguments)
+    if unknown := set(options.parts) - set(PARTS):
+        parser.error(f"there is no part {unknown.pop()!r}; choose {', '.join(PARTS)}")
+    if options.baseline or options.write_baseline:
+        if options.parts and not set(GATED) & set(options.parts):
+            parser.error(f"a baseline concerns {' and '.join(GATED)}: name one of these as well")
+        if options.baseline and not options.baseline.is_file():
+            parser.error(f"there is no file {options.baseline}: make one with --write-baseline")
+    return options
+
+
+def main() -> int:
+    """Run, print the tables, return the exit code."""
+    options = options_of()
+    try:
+        with TerminalReporter() as reporter:
+            text, complaints = run(options, reporter.stage)
+    except UserError as error:
+        print(error, file=sys.stderr)
+        return 2
+    print(text)
+    print(f"Results: {options.out}")
+    for complaint in complaints:
+        print(f"WORSE than {options.baseline}: {complaint}")
+    return 1 if complaints else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,1 +1,0 @@
-"""Benches: speed against error, measured in one process."""

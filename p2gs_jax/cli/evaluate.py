@@ -1,0 +1,147 @@
+"""`eval`: scores of a finished run, also beside other programs."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from p2gs_jax.cli.shared import SceneFolder
+
+if TYPE_CHECKING:
+    from p2gs_jax.evaluate.against import Judge
+    from p2gs_jax.evaluate.renders_of_others import OtherRenders
+
+# Folders that do not say whose renders they hold.
+COMMON = re.compile(r"renders|rgb|test|ours_\d+|\.")
+# What only a fit can measure.
+KEPT = ("counts", "seconds", "seconds_per_step", "notes", "photometry", "exposures", "of")
+
+
+@dataclass(frozen=True)
+class Eval:
+    """Evaluate a finished run again, also against a reference, or beside other programs.
+
+    p2gs-jax eval runs/castle --reference castle/iso8
+    p2gs-jax eval runs/castle --against gaussian-splatting/output/castle
+    """
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """Run folder."""
+    scene: SceneFolder = None
+    """Where the run's scene lies now, if it is not where it was."""
+    reference: Path | None = None
+    """Photographs of the same views under one common exposure."""
+    against: tuple[Path, ...] = ()
+    """Folders of renders of the held-out views, by other programs (docs/comparing.md)."""
+    lpips_weights: str | None = None
+    """Evaluate with LPIPS: alex, vgg, a .npz of weights, or none (default: as the run was)."""
+
+    def execute(self) -> int:
+        """Evaluate the run and rewrite its metrics; options replace those of the run."""
+        import numpy as np
+
+        from p2gs_jax.cli.tables import print_against, print_metrics
+        from p2gs_jax.core.atomic import write_json
+        from p2gs_jax.core.progress import TerminalReporter
+        from p2gs_jax.evaluate.against import Judge, check_renders
+        from p2gs_jax.evaluate.evaluate import evaluate
+        from p2gs_jax.evaluate.lpips_weights import read_lpips_weights
+        from p2gs_jax.evaluate.references import find_radiance, load_reference
+        from p2gs_jax.evaluate.renders_of_others import find_renders
+        from p2gs_jax.render.capacity import make_renderer
+        from p2gs_jax.run.folder import RunFolder
+        from p2gs_jax.run.photometry_files import write_metering
+        from p2gs_jax.run.plots import write_unexplained
+        from p2gs_jax.run.read import load_run
+
+        fitted = load_run(self.run, self.scene)
+        fitted.require_photographs()
+        scene, store, cfg, folder = fitted.scene, fitted.store, fitted.cfg, RunFolder(self.run)
+        name = self.lpips_weights or cfg.evaluation.lpips_weights
+        weights = None if name in (None, "none") else read_lpips_weights(name)
+        if weights is not None:
+            weights.require_sizes(scene.views, cfg.data.max_width)
+        reference = self.reference or fitted.reference
+        truth = None if reference is None else load_reference(reference, scene, cfg)
+        others = {
+            label: check_renders(find_renders(place, scene), scene, store)
+            for label, place in _labelled(self.against).items()
+        }
+        with TerminalReporter() as reporter:
+            metrics = evaluate(
+                fitted.params,
+                np.asarray(fitted.alive),
+                scene,
+                store,
+                make_renderer(cfg.render, fitted.owner),
+                cfg,
+                reference=truth,
+                radiance=find_radiance(scene, store),
+                lpips_weights=weights,
+                on_metering=lambda found: write_metering(folder.metering, found),
+                on_unexplained=lambda found: write_unexplained(
+                    folder.unexplained, scene, store, found
+                ),
+                on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
+            )
+            judge = Judge(scene, store, fitted.params, cfg, weights, truth)
+            beside = _judged(
+                others, judge, metrics, lambda done, count: reporter.stage("Judging", done, count)
+            )
+        metrics |= _kept(folder.metrics)
+        write_json(folder.metrics, metrics)
+        print_metrics(metrics, self.run)
+        if others:
+            write_json(folder.against, beside)
+            remarks = [remark for renders in others.values() for remark in renders.remarks]
+            print_against(beside, self.run, metrics, remarks, folder.against)
+        return 0
+
+
+def _labelled(folders: tuple[Path, ...]) -> dict[str, Path]:
+    """Return the folders by the names of their programs, or by their paths."""
+    labels = []
+    for folder in folders:
+        names = [n for n in folder.resolve().parts if not COMMON.fullmatch(n)]
+        labels.append(names[-1] if names else str(folder))
+    unique = len(set(labels)) == len(labels)
+    return dict(zip(labels if unique else map(str, folders), folders, strict=True))
+
+
+def _judged(
+    found: dict[str, OtherRenders],
+    judge: Judge,
+    metrics: dict[str, Any],
+    on_progress: Callable[[int, int], None],
+) -> dict[str, Any]:
+    """Return what `against.json` holds (docs/files.md)."""
+    from p2gs_jax.evaluate.against import judge_renders, own_scores
+
+    programs = {}
+    for label, renders in found.items():
+        names = [judge.scene.views[row].name for row in sorted(renders.files)]
+        programs[label] = {
+            "folder": str(renders.folder),
+            "layout": renders.layout,
+            "views": len(names),
+            "missing": list(renders.missing),
+            **judge_renders(renders, judge, on_progress),
+            "run": own_scores(metrics, names),
+        }
+    return {"version": 1, "programs": programs}
+
+
+def _kept(path: Path) -> dict[str, Any]:
+    """Return the metrics that only a fit can measure: counts, times, notes."""
+    from p2gs_jax.core.text import parse_json
+
+    try:
+        old = parse_json(path.read_text())
+    except (OSError, ValueError):
+        return {}
+    return {k: old[k] for k in KEPT if k in old}

@@ -1,0 +1,297 @@
+"""`fit` and `calibrate`: from photographs to a run folder, or to exposures alone."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal
+
+import tyro
+
+from p2gs_jax import config as configs
+from p2gs_jax.cli.shared import SHORT, check
+from p2gs_jax.config import FitConfig
+
+Preset = Annotated[configs.PresetName, tyro.conf.arg(metavar="NAME")]
+Config = Annotated[FitConfig, tyro.conf.arg(name="")]
+Folder = Annotated[Path, tyro.conf.arg(metavar="DIR")]
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Fit linear HDR radiance, exposures and gammas to photographs.
+
+    Writes a run folder; open its summary.png first. An interrupted run goes on with --resume.
+
+        p2gs-jax fit castle --out runs/castle --max-width 960 --budget 20m
+        p2gs-jax fit castle --out runs/castle --resume
+        p2gs-jax fit castle --out runs/paper --preset paper --steps 7000
+    """
+
+    SHORT_NAMES: ClassVar = tuple(SHORT)
+    scene: Annotated[Path, tyro.conf.Positional]
+    """COLMAP model, transforms.json, Blender's or LLFF's folder, a drive of a data set (PandaSet,
+    nuScenes, ...), a folder of photographs, or a video (docs/scenes.md)."""
+    out: Folder
+    """Run folder to create."""
+    config: Config
+    resume: bool = False
+    """Continue an interrupted run; give the options it was started with."""
+    preset: Preset = "robust"
+    """Initial values: robust; the method as printed, paper or paper_appendix; baselines 3dgs
+    (3dgs_published: as printed, 30000 steps), 3dgs_gain, 3dgs_affine, 3dgs_bilateral, 3dgs_curve,
+    luminance_gs or ppisp; or ppisp_solved."""
+    reference: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Photographs of the same views under one common exposure, for evaluation."""
+    blocks: Annotated[str | None, tyro.conf.arg(metavar="N|auto")] = None
+    """Cut the scene into N blocks that are fitted apart and merged; auto: into as few as memory
+    allows (docs/districts.md). Default: one fit."""
+    jobs: int = 1
+    """Blocks at a time on this machine."""
+    engine: Annotated[str, tyro.conf.arg(metavar="NAME")] = "local"
+    """Where blocks are fitted: local, dask://HOST:PORT, or slurm:OPTION=VALUE,...
+    (docs/sweeps.md)."""
+    devices: Annotated[str, tyro.conf.arg(metavar="N|all")] = "1"
+    """Devices of a step, each with its own views (--train.batch; default then: one view each)."""
+
+    def execute(self) -> int:
+        """Fit the scene; print the place and the scores of the results."""
+        import time
+
+        from p2gs_jax.cli.tables import print_metrics
+        from p2gs_jax.core.progress import TerminalReporter
+        from p2gs_jax.pipeline.fit import fit
+        from p2gs_jax.train.data_parallel import with_a_view_each
+
+        blocks = resolve_blocks(self)
+        if blocks is not None:
+            return self._execute_in_blocks(blocks)
+        devices = resolve_devices(self)
+        with TerminalReporter() as reporter:
+            result = fit(
+                self.scene,
+                self.out,
+                with_a_view_each(checked(self.config), devices),
+                reference=self.reference,
+                resume=self.resume,
+                reporter=reporter,
+                # Starting the interpreter and loading libraries is processor time throughout.
+                spent_s=time.process_time(),
+                devices=devices,
+            )
+        print_metrics(result.metrics, self.out)
+        return 0
+
+    def _execute_in_blocks(self, count: int | str) -> int:
+        from rich.console import Console
+
+        from p2gs_jax.cli.tables import print_metrics
+        from p2gs_jax.core.progress import TerminalReporter
+        from p2gs_jax.districts.fit import fit_blocks
+        from p2gs_jax.jobs.table import JobsTable
+
+        console = Console(stderr=True, highlight=False)
+        with TerminalReporter(console) as reporter:
+            result = fit_blocks(
+                self.scene,
+                self.out,
+                checked(self.config),
+                blocks=count,
+                parallel=self.jobs,
+                engine=self.engine,
+                reference=self.reference,
+                resume=self.resume,
+                reporter=reporter,
+                on_look=JobsTable(console, reporter.live).show,
+            )
+        print_metrics(result.metrics, self.out)
+        return 0
+
+
+@dataclass(frozen=True)
+class Calibrate:
+    """Solve exposures, gammas and tone curve alone, in seconds.
+
+    From the colours of shared points, without splatting, and with standard errors. Prints a table
+    and writes photometry.json; open calibration.png first.
+
+        p2gs-jax calibrate castle --out photometry
+        p2gs-jax calibrate castle --out photometry --known-exposures exif
+        p2gs-jax calibrate stack --out photometry --static
+        p2gs-jax calibrate castle --out runs/relit --of splats.ply
+    """
+
+    SHORT_NAMES: ClassVar = (
+        *("max_width", "known_exposures", "known_deviation_ev", "images", "drive", "cameras"),
+        *("frames", "every", "max_frames"),
+    )
+    scene: Annotated[Path, tyro.conf.Positional]
+    """COLMAP model, transforms.json, a folder of photographs, a video (docs/scenes.md), or a
+    finished run (correspondences then go through its rendered depth)."""
+    out: Folder
+    """Folder for photometry.json and calibration.png."""
+    config: Config
+    compare_with: Annotated[str | None, tyro.conf.arg(metavar="FILE|exif")] = None
+    """Stated exposures to compare with; default: EXIF."""
+    static: bool = False
+    """The folder holds photographs from one fixed viewpoint at several exposures."""
+    of: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Somebody's splats of the scene (.ply, .splat, .spz; display colours): exposures are
+    solved, and it is written as linear radiance into --out, a run folder."""
+    steps: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """With --of: steps in which its colours and opacities are fitted again; default: 600."""
+    preset: Preset = "robust"
+    """Initial values; see `fit`."""
+
+    def execute(self) -> int:
+        """Solve the photometry alone; print it as a table."""
+        from p2gs_jax.cli.tables import print_calibration, print_calibration_of, print_stack
+        from p2gs_jax.core.progress import TerminalReporter
+        from p2gs_jax.pipeline.calibrate import calibrate
+        from p2gs_jax.pipeline.calibrate_of import STEPS, calibrate_of
+        from p2gs_jax.pipeline.calibrate_run import calibrate_run
+        from p2gs_jax.pipeline.calibrate_stack import calibrate_stack
+        from p2gs_jax.pipeline.calibration import write_calibration
+
+        scene, out, cfg, known = self.scene, self.out, self.checked(), self.config.photometry
+        is_run = (scene / "config.json").is_file() and (scene / "radiance.ply").is_file()
+        with TerminalReporter() as reporter:
+            how = {"compare_with": self.compare_with, "reporter": reporter}
+            if self.static:
+                reporter.stage("Solving the stack")
+                result = calibrate_stack(
+                    scene,
+                    known=known.known,
+                    known_deviation_ev=known.known_deviation_ev,
+                    compare_with=self.compare_with,
+                )
+                write_calibration(result, out)
+            elif self.of is not None:
+                steps = STEPS if self.steps is None else self.steps
+                found = calibrate_of(self.of, scene, out, cfg, steps=steps, **how)
+            elif is_run:
+                result = calibrate_run(scene, out, cfg.photometry, **how)
+            else:
+                result = calibrate(scene, out, cfg, **how)
+        if self.static:
+            print_stack(result, out)
+        elif self.of is not None:
+            print_calibration_of(found, out)
+        else:
+            print_calibration(result, out)
+        return 0
+
+    def checked(self) -> FitConfig:
+        """Return the configuration.
+
+        Raises:
+            UserError: a value makes no sense.
+        """
+        scene, own_size = self.scene, self.config.data == FitConfig().data
+        is_run = (scene / "config.json").is_file() and (scene / "radiance.ply").is_file()
+        check(
+            not (self.static and self.of),
+            "--static and --of exclude each other",
+            fix="leave one out",
+        )
+        check(self.steps is None or self.of is not None, "--steps says nothing without --of")
+        check(self.steps is None or self.steps >= 1, "--steps must be at least 1")
+        cfg, leave_out = checked(self.config), "leave out --max-width, --images and --data options"
+        check(
+            own_size or not self.static,
+            "--static reads every photograph of the folder at its own size",
+            fix=leave_out,
+        )
+        check(
+            self.of is None or not is_run,
+            f"{scene} is a finished run; --of needs the photographs with their poses",
+            fix="name the scene that the run was fitted to",
+        )
+        check(
+            own_size or not is_run,
+            f"{scene} is a finished run: it keeps its own image size and folder",
+            fix=leave_out,
+        )
+        return cfg
+
+
+def checked(cfg: FitConfig) -> FitConfig:
+    """Return the configuration if its values make sense.
+
+    Raises:
+        UserError: one does not.
+    """
+    data, train, known, behind = cfg.data, cfg.train, cfg.photometry, cfg.render.background
+    most = cfg.densify.max_gaussians
+    check(data.max_width is None or data.max_width >= 16, "--max-width must be at least 16")
+    check(data.every is None or data.every >= 1, "--every must be at least 1")
+    check(data.max_frames >= 2, "--max-frames must be at least 2")
+    check(data.test_every >= 0, "--test-every must be 0 or more")
+    check(train.steps >= 1, "--steps must be at least 1")
+    check(train.batch >= 1, "--train.batch must be at least 1")
+    check(not isinstance(most, int) or most >= 1, "--gaussians must be at least 1")
+    check(
+        all(math.isfinite(x) and x >= 0 for x in behind or ()),
+        "--render.background must be linear radiance, three numbers that are not negative",
+    )
+    check(known.known_deviation_ev >= 0, "--known-deviation-ev must be 0 or more")
+    check(
+        known.known_deviation_ev == 0 or known.known is not None,
+        "--known-deviation-ev says nothing without --known-exposures",
+        fix="add --known-exposures FILE, or exif",
+    )
+    return cfg
+
+
+def resolve_blocks(args: Fit) -> int | str | None:
+    """Return how many blocks are asked for: a number, `auto`, or None for one fit.
+
+    Raises:
+        UserError: it is neither, or options of blocks are given without them.
+    """
+    words = args.blocks
+    if words is None:
+        check(
+            args.jobs == 1 and args.engine == "local",
+            "--jobs and --engine say nothing without --blocks",
+            fix="add --blocks auto, or a number",
+        )
+        return None
+    check(args.jobs >= 1, "--jobs must be at least 1")
+    check(
+        args.devices == "1",
+        "--blocks fits every block on one device",
+        fix="leave out --devices; blocks have --jobs and --engine",
+    )
+    check(
+        words == "auto" or (words.isdigit() and int(words) >= 1),
+        f"--blocks {words!r} is not a number of blocks",
+        fix="write a whole number from 1 on, or auto",
+    )
+    return words if words == "auto" else int(words)
+
+
+def resolve_devices(args: Fit) -> int | Literal["all"]:
+    """Return the number of devices of a fit, or `all`.
+
+    Raises:
+        UserError: the number is not valid.
+    """
+    if args.devices == "all":
+        return "all"
+    check(
+        args.devices.isdecimal() and int(args.devices) >= 1,
+        f"--devices {args.devices} is not a number of devices",
+        fix="give 1 or more, or all",
+    )
+    return int(args.devices)
+
+
+def named_preset(name: str) -> FitConfig:
+    """Return a preset.
+
+    Raises:
+        UserError: there is none of that name.
+    """
+    return configs.preset(name)  # pyright: ignore[reportArgumentType]

@@ -1,0 +1,222 @@
+"""The frames that `render` is asked for: which cameras, and how each is developed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float32
+
+from p2gs_jax.cli.render import FPS, Render
+from p2gs_jax.errors import UserError
+from p2gs_jax.formats.frames import OutputFrame
+from p2gs_jax.paths import (
+    PosePath,
+    Shot,
+    covering,
+    drive,
+    find_orbit,
+    find_rig,
+    of_camera,
+    orbit,
+    view_shots,
+)
+from p2gs_jax.paths.drive import frame_count, interpolated
+from p2gs_jax.paths.pictures import (
+    RunRenderer,
+    comparison_frames,
+    comparison_size,
+    metered_shots,
+    shot_frames,
+    wide_frames,
+)
+from p2gs_jax.paths.shift import beside, beside_shots
+from p2gs_jax.photometry.display import DisplayTransform
+from p2gs_jax.run.read import Run
+
+# A metered exposure follows what is seen within about this time, seconds.
+ADAPT_S = 0.5
+
+
+@dataclass(frozen=True)
+class Job:
+    """Frames to render.
+
+    Attributes:
+        frames: rendered one by one as the iterator advances.
+        count: how many there are.
+        size: (width, height) of the largest, pixels.
+        shots: cameras that can be kept as a file; none for panoramas.
+        notes: what the user should know.
+    """
+
+    frames: Iterator[OutputFrame]
+    count: int
+    size: tuple[int, int]
+    shots: Sequence[Shot] = ()
+    notes: Sequence[str] = ()
+
+
+def frames_of(
+    options: Render, renderer: RunRenderer, given: list[Shot] | None, say: Callable[[str], None]
+) -> Job:
+    """Return what to render.
+
+    Args:
+        options: checked.
+        renderer: of the run.
+        given: cameras from a file, in place of the scene's.
+        say: tells the user something while frames are rendered.
+
+    Raises:
+        UserError: the scene has no such views.
+    """
+    return (
+        _panoramas(options, renderer) if options.panorama else _shots(options, renderer, given, say)
+    )
+
+
+def _display_transform(fitted: Run, options: Render, shot: Shot | None = None) -> DisplayTransform:
+    """Return a shot's display transform: from the options, else its own, else its photograph's."""
+    if shot is not None and shot.view is not None:
+        transform = fitted.own_display(shot.view)
+    else:
+        ev = None if shot is None else shot.exposure_ev
+        transform = fitted.common_display(0.0 if ev is None else ev)
+    if options.exposure_of is not None and shot is not None and shot.exposure_ev is not None:
+        metered = fitted.common_display(shot.exposure_ev)  # with --exposure-ev already
+        transform = replace(transform, exposure=metered.exposure)
+    elif isinstance(options.exposure_ev, float | int):
+        common = fitted.common_display(float(options.exposure_ev))
+        transform = replace(common, gamma=transform.gamma, camera=transform.camera)
+    if options.white_balance_of is not None:
+        balance = fitted.white_balance_of(options.white_balance_of)
+        transform = replace(transform, white_balance=balance)
+    if options.no_vignetting:
+        transform = transform.without_place()
+    gamma = options.gamma
+    if gamma is None and shot is not None:
+        gamma = shot.gamma
+    if gamma is not None:
+        transform = replace(transform, gamma=gamma)
+    return transform if options.curve == "run" else transform.with_curve(options.curve)
+
+
+def _chosen(options: Render, fitted: Run) -> list[Shot]:
+    """Return shots of the views that `--split` leaves."""
+    shots = view_shots(fitted.scene.views, fitted.cfg.data.max_width)
+    pairs = zip(shots, fitted.scene.views, strict=True)
+    chosen = [shot for shot, view in pairs if options.split in ("all", view.split)]
+    if not chosen:
+        raise UserError(f"--split {options.split}: the scene has no such view.")
+    return chosen
+
+
+def _shots(
+    options: Render, renderer: RunRenderer, given: list[Shot] | None, say: Callable[[str], None]
+) -> Job:
+    """Return the job of rendering pinhole cameras."""
+    fitted, notes, photograph = renderer.run, [], None
+    views = fitted.scene.views
+    if given is not None:
+        shots = given
+    elif options.path == "views":
+        chosen = _chosen(options, fitted)
+        shots = chosen if options.camera is None else of_camera(chosen, views, options.camera)
+        photograph = _Photographs(fitted, say)
+    else:
+        chosen = _chosen(options, fitted)
+        own = of_camera(chosen, views, options.camera)
+        if options.path == "drive":
+            shots = drive(_recorded(own, options, fitted), options.frames)
+            if options.shift is not None:
+                shots = beside_shots(shots, views, options.shift)
+        else:
+            circle = find_orbit(chosen, own, np.asarray(fitted.scene.points, np.float64))
+            shots = orbit(circle, own, options.frames)
+            notes = [circle.description()]
+    if options.width is not None:
+        shots = [shot.resized(options.width) for shot in shots]
+    if options.exposure_of is not None:
+        added = options.exposure_ev if isinstance(options.exposure_ev, float | int) else 0.0
+        frames_s = ADAPT_S * (options.fps or FPS) if options.path != "views" else 0.0
+        shots = metered_shots(renderer, shots, options.exposure_of, added, frames_s)
+        if options.exposure_of == "auto":
+            notes = [*notes, fitted.metering.sentence]
+    size = (max(s.width for s in shots), max(s.height for s in shots))
+    frames = shot_frames(
+        renderer, shots, lambda shot: _display_transform(fitted, options, shot), photograph
+    )
+    return Job(frames, len(shots), size, shots, notes)
+
+
+class _Photographs:
+    """Photographs to write beside their renders, where they exist."""
+
+    def __init__(self, fitted: Run, say: Callable[[str], None]):
+        self._fitted, self._say, self._silent = fitted, say, False
+
+    def __call__(self, index: int) -> Float32[np.ndarray, "h w 3"] | None:
+        try:
+            return self._fitted.photograph(index)
+        except UserError as error:
+            if not self._silent:
+                self._say(f"Views without their photographs are NAME.png alone: {error.message}.")
+            self._silent = True
+            return None
+
+
+def _recorded(shots: list[Shot], options: Render, fitted: Run) -> list[Shot]:
+    """Return shots with the exposures and gammas of their photographs where `own` asks for them."""
+    if options.exposure_ev != "own":
+        return shots
+    transforms = [fitted.own_display(shot.view) for shot in shots if shot.view is not None]
+    mean = fitted.mean.exposure_geometric
+    return [
+        replace(shot, exposure_ev=math.log2(transform.exposure / mean), gamma=transform.gamma)
+        for shot, transform in zip(shots, transforms, strict=True)
+    ]
+
+
+def _panoramas(options: Render, renderer: RunRenderer) -> Job:
+    """Return the job of rendering panoramas of a rig."""
+    fitted = renderer.run
+    views = fitted.scene.views
+    rig = find_rig(view_shots(views, fitted.cfg.data.max_width), views)
+    cylinder = covering(rig.mounts.values(), np.eye(4))
+    if options.width is not None:
+        cylinder = cylinder.resized(options.width)
+    transform = _display_transform(fitted, options)
+    if options.path == "drive":
+        if len(rig.steps) < 2:
+            raise UserError(
+                "A drive needs at least two time steps; the rig has one.", fix="use --path views"
+            )
+        path = PosePath(rig.poses)
+        along = path.evenly(frame_count(len(rig.steps), options.frames))
+        poses = path(along)
+        times = interpolated(path.times, [step.time for step in rig.steps], along)
+        if options.shift is not None:
+            poses = beside(poses, views, options.shift)
+        size = (cylinder.width, cylinder.height)
+        return Job(wide_frames(renderer, cylinder, poses, transform, times), len(poses), size)
+    allowed = {shot.view for shot in _chosen(options, fitted)}
+    steps = []
+    for step in rig.steps:
+        shots = {c: s for c, s in step.shots.items() if s.view in allowed}
+        if shots:
+            steps.append(replace(step, shots=shots))
+    if not steps:
+        raise UserError(f"--split {options.split}: the rig has no such time step.")
+    notes = []
+    alone = len(views) - sum(len(step.shots) for step in rig.steps)
+    if alone:
+        notes.append(f"{alone} views have no other camera's at their time: they are left out.")
+    if fitted.params.appearance is not None:
+        notes.append("Corrections of display values that this run learned stay in the photographs.")
+    taken = [shot.view for step in steps for shot in step.shots.values() if shot.view is not None]
+    fitted.require_photographs(taken)
+    frames = comparison_frames(renderer, rig, steps, cylinder, transform, fitted.store)
+    return Job(frames, len(steps), comparison_size(cylinder), (), notes)

@@ -1,0 +1,341 @@
+"""How options are read and shown: rules for tyro, the overview of commands, prose around options.
+
+The text of an option is the string below its field. What tyro prints beside it (names of types,
+`(default: None)`) is replaced here.
+"""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import functools
+import inspect
+import io
+import shutil
+import sys
+import textwrap
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import redirect_stdout, suppress
+from itertools import pairwise
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import tyro
+from tyro.constructors import (
+    MISSING,
+    MISSING_NONPROP,
+    ConstructorRegistry,
+    PrimitiveConstructorSpec,
+    PrimitiveTypeInfo,
+    StructConstructorSpec,
+    StructFieldSpec,
+    StructTypeInfo,
+)
+
+from p2gs_jax.cli.shared import SHORT, parse_duration
+from p2gs_jax.config import DataConfig, FitConfig
+
+PLACEHOLDERS = {int: "N", float: "X", str: "TEXT", Path: "PATH"}
+# Placeholder of the description in tyro's help, replaced by `with_prose`.
+ABOUT = "@about@"
+EXAMPLE = "p2gs-jax "
+INDENT = "    "
+DURATION = PrimitiveConstructorSpec(
+    nargs=1,
+    metavar="TIME",
+    instance_from_str=lambda words: None if words[0] == "None" else parse_duration(words[0]),
+    is_instance=lambda value: value is None or isinstance(value, float),
+    str_from_instance=lambda value: [str(value)],
+)
+
+
+def registry(brief: bool) -> ConstructorRegistry:
+    """Return the rules by which tyro reads our option classes.
+
+    Args:
+        brief: of the configuration, show nothing but the fields that have short names.
+    """
+    rules = ConstructorRegistry()
+    short: dict[str, str] = {}  # names by field, of the command that is being read
+
+    @rules.struct_rule
+    def options(info: StructTypeInfo) -> StructConstructorSpec | None:
+        kind, default = info.type, info.default
+        if not dataclasses.is_dataclass(kind) or not kind.__module__.startswith("p2gs_jax."):
+            return None
+        if hasattr(kind, "SHORT_NAMES"):  # a command: tyro reads its configuration next
+            short.clear()
+            short.update({SHORT[name][0]: name for name in kind.SHORT_NAMES})
+            if brief:
+                return StructConstructorSpec(kind, tuple(_brief(kind, default)))
+        if kind is not FitConfig:
+            return StructConstructorSpec(kind, tuple(_fields(kind, default, short)))
+        # `preset` is an option of the command.
+        default = default if isinstance(default, FitConfig) else FitConfig()
+        fields = tuple(f for f in _fields(FitConfig, default, short) if f.name != "preset")
+        return StructConstructorSpec(functools.partial(FitConfig, preset=default.preset), fields)
+
+    rules.primitive_rule(_number_rule)
+    return rules
+
+
+def _number_rule(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+    """Return the parser of a number, a few words, or None, with plain error messages."""
+    kinds = set(get_args(info.type)) if _is_union(info.type) else {info.type}
+    optional = NoneType in kinds
+    known = {word for k in kinds if get_origin(k) is Literal for word in get_args(k)}
+    kinds = {k for k in kinds if get_origin(k) is not Literal} - {NoneType}
+    if kinds not in ({int}, {float}) or not all(isinstance(word, str) for word in known):
+        return None
+    (kind,) = kinds
+
+    def read(words: list[str]) -> int | float | str | None:
+        if optional and words[0] == "None":
+            return None
+        if words[0] in known:
+            return words[0]
+        try:
+            return kind(words[0])
+        except ValueError:
+            what = "whole number" if kind is int else "number"
+            other = f", and not {' or '.join(sorted(known))}" if known else ""
+            raise ValueError(f"{words[0]!r} is not a {what}{other}") from None
+
+    def fits(value: Any) -> bool:
+        if isinstance(value, str):
+            return value in known
+        return value is None if not isinstance(value, kind) else not isinstance(value, bool)
+
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="|".join([*sorted(known), PLACEHOLDERS[kind]]),
+        instance_from_str=read,
+        is_instance=fits,
+        str_from_instance=lambda value: [str(value)],
+    )
+
+
+def _brief(kind: type, default: Any) -> Iterator[StructFieldSpec]:
+    """Yield a command's options, with the short names in place of the whole configuration."""
+    for spec in _fields(kind, default, {}):
+        if not isinstance(spec.default, FitConfig | DataConfig):
+            yield spec
+            continue
+        for short in kind.SHORT_NAMES:  # type: ignore
+            group, field = SHORT[short][0].split(".")
+            parent = getattr(spec.default, group, spec.default)
+            yield _field(type(parent), field, parent, short)
+
+
+def _fields(kind: type, default: Any, short: Mapping[str, str]) -> Iterator[StructFieldSpec]:
+    group = next((n for n, hint in _hints(FitConfig).items() if hint is kind), None)
+    for name, hint in _hints(kind).items():
+        if get_origin(hint) is tuple and any(map(dataclasses.is_dataclass, get_args(hint))):
+            continue  # Records that a scene decides: they are not options.
+        yield _field(kind, name, default, short.get(f"{group}.{name}"), brief=False)
+
+
+def _field(
+    kind: type, name: str, parent: Any, short: str | None, *, brief: bool = True
+) -> StructFieldSpec:
+    """Return the rule of one option.
+
+    Args:
+        kind: the class of options.
+        name: of its field.
+        parent: the default of the class.
+        short: the field's short name, if it has one.
+        brief: the short name is the only one.
+    """
+    hint, default = _hints(kind)[name], _default(kind, name, parent)
+    extras = (*_settings(kind, name, hint, default, brief and short is not None), *_extras(hint))
+    if short is not None:
+        placeholder = SHORT[short][1]
+        shown = {} if placeholder is None else {"metavar": placeholder}
+        dashed = short.replace("_", "-")
+        names = {"name": dashed, "prefix_name": False} if brief else {"aliases": (f"--{dashed}",)}
+        extras = (*extras, tyro.conf.arg(**shown, **names))
+    if name == "budget_s":
+        extras = (*extras, DURATION)
+    return StructFieldSpec(
+        name=name,
+        type=Annotated[(_plain(hint), *extras)],  # type: ignore
+        default=default,
+        helptext=functools.partial(_text, kind, name),
+    )
+
+
+def _default(kind: type, name: str, parent: Any) -> Any:
+    if parent is MISSING:
+        return MISSING
+    if parent is not MISSING_NONPROP and hasattr(parent, name):
+        return getattr(parent, name)
+    field = next(f for f in dataclasses.fields(kind) if f.name == name)
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return MISSING_NONPROP if field.default is dataclasses.MISSING else field.default
+
+
+def _settings(kind: type, name: str, hint: Any, default: Any, brief: bool) -> tuple[Any, ...]:
+    """Return tyro's settings of an option, which those of its field may override.
+
+    In the configuration None is a value like others; in a command's own options it means "not
+    given", and there a switch that is off can only be turned on.
+    """
+    plain, none_counts = _plain(hint), kind.__module__ == FitConfig.__module__ and not brief
+    if plain is bool and not none_counts and not default:
+        return tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")
+    positional = tyro.conf.Positional in _extras(hint)
+    shown = name.upper() if positional else _placeholder(plain, none_counts)
+    hint_of = functools.partial(_default_shown, none_counts=none_counts)
+    return (tyro.conf.arg(metavar=shown, help_behavior_hint=hint_of),)
+
+
+def _placeholder(plain: Any, none_counts: bool) -> str | None:
+    """Return the placeholder of a value of a type, or None for tyro's own."""
+    origin, args = get_origin(plain), get_args(plain)
+    if _is_union(plain):
+        parts = [_placeholder(a, none_counts) or "" for a in args if a is not NoneType]
+        choices = ",".join(p.strip("{}") for p in parts if p.startswith("{"))
+        others = [p for p in parts if not p.startswith("{")]
+        if NoneType in args and none_counts:
+            choices, others = (f"{choices},None", others) if choices else ("", [*others, "None"])
+        return "|".join([*([f"{{{choices}}}"] if choices else []), *others])
+    if origin is Literal:
+        return "{" + ",".join(map(str, args)) + "}"
+    if origin is tuple:
+        shown = [_placeholder(a, none_counts) or "" for a in args if a is not Ellipsis]
+        return f"[{shown[0]} ...]" if Ellipsis in args else " ".join(shown)
+    return PLACEHOLDERS.get(plain)
+
+
+def _default_shown(default: str, *, none_counts: bool) -> str:
+    """Return the default that follows an option's text, or nothing."""
+    if not default or (default == "None" and not none_counts):
+        return ""
+    with suppress(ValueError):
+        default = f"{float(default):.4g}" if "." in default else default
+    return f"(default: {default})"
+
+
+def _is_union(hint: Any) -> bool:
+    return get_origin(hint) in (Union, UnionType)
+
+
+def _plain(hint: Any) -> Any:
+    return get_args(hint)[0] if get_origin(hint) is Annotated else hint
+
+
+def _extras(hint: Any) -> tuple[Any, ...]:
+    return get_args(hint)[1:] if get_origin(hint) is Annotated else ()
+
+
+@functools.cache
+def _hints(kind: type) -> dict[str, Any]:
+    """Return the types of the fields of a class by name."""
+    hints = get_type_hints(kind, include_extras=True)
+    return {field.name: hints[field.name] for field in dataclasses.fields(kind)}
+
+
+def _text(kind: type, name: str) -> str | None:
+    """Return the string below a field as one paragraph."""
+    text = _field_docs(kind).get(name)
+    return None if text is None else " ".join(text.split())
+
+
+@functools.cache
+def _field_docs(kind: type) -> dict[str, str]:
+    body = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0].body  # type: ignore
+    return {
+        field.target.id: str(text.value.value)
+        for field, text in pairwise(body)
+        if isinstance(field, ast.AnnAssign)
+        and isinstance(field.target, ast.Name)
+        and isinstance(text, ast.Expr)
+        and isinstance(text.value, ast.Constant)
+    }
+
+
+def overview(commands: Mapping[str, type], groups: Mapping[str, tuple[str, ...]]) -> str:
+    """Return what `p2gs-jax --help` prints.
+
+    Args:
+        commands: option classes by name.
+        groups: names of all commands under their headings.
+    """
+    indent = 2 + 2 + max(map(len, commands))
+    about = (
+        "One linear HDR radiance field, and an exposure and a gamma for every view, from ordinary "
+        "photographs."
+    )
+    lines = ["usage: p2gs-jax COMMAND [OPTIONS]", "", *_wrapped(about)]
+    for heading, names in groups.items():
+        lines += ["", heading]
+        for name in names:
+            head = f"  {name}".ljust(indent)
+            lines += _wrapped(first_paragraph(commands[name]), head, " " * indent)
+    lines += [
+        "",
+        "p2gs-jax COMMAND --help   options and examples of one command",
+        "p2gs-jax --version        which version this is",
+        "",
+        "Read on in docs/README.md; docs/quickstart.md begins with your photographs.",
+    ]
+    return "\n".join(lines)
+
+
+def first_paragraph(kind: type) -> str:
+    """Return the first paragraph of an option class's docstring."""
+    return _paragraphs(kind)[0]
+
+
+def with_prose(text: str, kind: type, name: str) -> str:
+    """Return tyro's help with the docstring's prose above the options and its examples below.
+
+    Args:
+        text: tyro's help, with `ABOUT` as the description.
+        kind: the option class.
+        name: of the command, if options were left out: how to list them is added.
+    """
+    found = _paragraphs(kind)
+    examples = [p for p in found if p.startswith(EXAMPLE)]
+    prose = ("\n".join(_wrapped(p)) for p in found if not p.startswith(EXAMPLE))
+    parts = [text.rstrip().replace(ABOUT, "\n\n".join(prose))]
+    if name:
+        parts.append(
+            f"Every other number of the method, with its unit and source:\n"
+            f"{INDENT}p2gs-jax {name} --help-all"
+        )
+    if examples:
+        parts.append("Examples:\n" + textwrap.indent("\n".join(examples), INDENT))
+    return "\n\n".join(parts)
+
+
+def captured(print_help: Callable[[], Any]) -> str:
+    """Return what a function prints before it exits, with the colours of the terminal."""
+    stream = _Recorder(io.BytesIO(), encoding=sys.stdout.encoding or "utf-8", write_through=True)
+    with redirect_stdout(stream), suppress(SystemExit):
+        print_help()
+    stream.seek(0)
+    return stream.read()
+
+
+class _Recorder(io.TextIOWrapper):
+    terminal = sys.__stdout__
+
+    def isatty(self) -> bool:
+        return self.terminal is not None and self.terminal.isatty()
+
+
+def _paragraphs(kind: type) -> list[str]:
+    """Return the docstring's paragraphs: prose joined to one line, examples a line each."""
+    blocks = [textwrap.dedent(b) for b in inspect.cleandoc(kind.__doc__ or "").split("\n\n")]
+    return [b.rstrip() if b.startswith(EXAMPLE) else " ".join(b.split()) for b in blocks]
+
+
+def _wrapped(text: str, first: str = "", rest: str = "") -> list[str]:
+    width = min(80, shutil.get_terminal_size().columns)
+    return textwrap.wrap(
+        text, width, initial_indent=first, subsequent_indent=rest, break_on_hyphens=False
+    )

@@ -1,1 +1,0 @@
-"""Options of the subcommands, without heavy imports: `--help` must be fast."""

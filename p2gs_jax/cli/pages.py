@@ -1,0 +1,144 @@
+"""`view`, `report` and `compare`: finished runs in the browser."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from p2gs_jax.cli.shared import SceneFolder, check
+from p2gs_jax.errors import UserError
+
+
+@dataclass(frozen=True)
+class View:
+    """Walk through a finished run in the browser, at any exposure.
+
+    p2gs-jax view runs/street
+    """
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """Run folder."""
+    scene: SceneFolder = None
+    """Where the run's scene lies now, if it is not where it was."""
+    port: int = 8080
+    """Port to listen on; 0 takes any free one."""
+    host: str = "127.0.0.1"
+    """Address to listen on. Other machines reach it only where this is changed, to 0.0.0.0 for
+    instance; whoever has the printed address with its token may then look, over plain HTTP."""
+    max_width: int = 1920
+    """Widest picture that is rendered, pixels; wider windows enlarge it."""
+
+    def execute(self) -> int:
+        """Show the run in the browser until Ctrl-C."""
+        from p2gs_jax.cli.tables import stdout
+        from p2gs_jax.run.read import load_run
+
+        try:
+            from p2gs_jax.viewer.server import check_address, serve
+        except ModuleNotFoundError as error:
+            if error.name is None or error.name.split(".")[0] != "viser":
+                raise
+            raise UserError(
+                "the viewer needs viser, which is not installed.",
+                fix="pip install 'p2gs-jax[viewer]'",
+            ) from None
+        check(self.max_width >= 64, "--max-width must be at least 64")
+        check_address(self.host, self.port)
+        serve(
+            load_run(self.run, self.scene),
+            host=self.host,
+            port=self.port,
+            max_width=self.max_width,
+            say=lambda text: stdout().print(text, highlight=False, soft_wrap=True),
+        )
+        return 0
+
+
+@dataclass(frozen=True)
+class Report:
+    """Explain a run on one page: exposures, seams, views, training.
+
+    p2gs-jax report runs/street
+    p2gs-jax report runs/street --pdf --out street.html
+    """
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """Run folder."""
+    out: Path | None = None
+    """The page (default: RUN/report.html)."""
+    pdf: bool = False
+    """Print the page as a PDF as well, beside it (needs a Chromium or Chrome)."""
+    scene: SceneFolder = None
+    """Where the run's scene lies now, if it is not where it was."""
+    render: bool = True
+    """Load the scene and render for the seams; without, only what the run folder holds."""
+
+    def execute(self) -> int:
+        """Write the page, and print it where that is asked for; 1 where a file is broken."""
+        from p2gs_jax.cli.tables import stdout
+        from p2gs_jax.core.progress import TerminalReporter
+        from p2gs_jax.report.pdf import find_browser, print_pdf
+        from p2gs_jax.report.report import write_report
+        from p2gs_jax.report.run_files import read_run
+
+        # Before anything is rendered: there may be no browser.
+        browser = find_browser() if self.pdf else None
+        with TerminalReporter() as reporter:
+            page = write_report(
+                self.run, self.out, scene=self.scene, render=self.render, reporter=reporter
+            )
+            paths, found = [page], read_run(self.run, self.scene)
+            for sentence in found.missing:
+                reporter.message(sentence)
+            if browser is not None:
+                reporter.stage("Printing")
+                paths.append(print_pdf(page, page.with_suffix(".pdf"), browser))
+        for path in paths:
+            stdout().print(f"{path} ({path.stat().st_size / 2**20:.1f} MB)")
+        return 1 if found.broken else 0
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Compare finished runs: one table, one page.
+
+    p2gs-jax compare runs/robust runs/paper --out compare.html
+    """
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN [RUN ...]")]
+    """Run folders; the first is the one that others are held against."""
+    out: Path = Path("compare.html")
+    """The page; the table lies beside it as Markdown, under the same name with .md."""
+
+    def execute(self) -> int:
+        """Print the runs side by side and write the page."""
+        from p2gs_jax.cli.tables import make_table, stdout
+        from p2gs_jax.report.compare import apart, compare_runs
+        from p2gs_jax.report.compare_page import write_comparison
+
+        found = compare_runs(self.runs)
+        page, table = write_comparison(found, self.out)
+        console = stdout()
+        for remark in found.remarks:
+            console.print(remark)
+        marked = " (* best)" if any(row.best for row in found.scores) else ""
+        for title, rows in (
+            (f"Scores{marked}", found.scores),
+            ("Options that differ", found.options),
+        ):
+            cells = [
+                (row.name, *(f"{c} *" if i in row.best else c for i, c in enumerate(row.cells)))
+                for row in rows
+            ]
+            if cells:
+                console.print(make_table(("", *found.labels), cells, title))
+        for label, x, y in found.exposures:
+            console.print(
+                f"Exposures of {label} and {found.labels[0]} differ by {apart(x, y):.3f} stops "
+                f"(RMS over {len(x)} views, means removed)."
+            )
+        console.print(f"Results: {page}, {table}")
+        return 0

@@ -1,0 +1,279 @@
+"""`render`: pictures of a finished run."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from p2gs_jax.cli.shared import MeteringRule, SceneFolder, check
+from p2gs_jax.errors import UserError
+
+if TYPE_CHECKING:
+    from p2gs_jax.run.read import Run
+
+PATHS = ("views", "drive", "orbit")
+FPS = 24.0
+# Sideways, scene units.
+MOST_SHIFT = 100.0
+OTHER_FILES = (".mov", ".avi", ".mkv", ".webm", ".gif", ".png", ".jpg", ".exr", ".json")
+
+
+@dataclass(frozen=True)
+class Render:
+    """Render views or a camera path of a run at any exposure.
+
+    p2gs-jax render runs/street --exposure-ev 1 --gamma 2.2 --out brighter
+    p2gs-jax render runs/street --path drive --out drive.mp4
+    p2gs-jax render runs/street --path drive --shift 2 --out left_lane.mp4
+    p2gs-jax render runs/street --panorama --split test --width 1400 --out wide
+    """
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """Run folder."""
+    path: str = "views"
+    """views: the scene's own. drive: smoothly through the views of one camera. orbit: around what
+    the cameras look at. FILE.json: a list of cameras (docs/rendering.md)."""
+    out: Path | None = None
+    """A folder, for linear EXR and PNG of every frame, or a video, NAME.mp4 (default: a folder
+    in RUN/renders)."""
+    split: Literal["all", "train", "test"] = "all"
+    """Which of the scene's views: held-out ones are test."""
+    camera: str | None = None
+    """Only the views of this camera; drive and orbit default to that with the most views."""
+    panorama: bool = False
+    """One wide image of all cameras of a rig. With views, at every time step: the photographs
+    stitched as taken, the same developed to one exposure, and the field. With drive: the field."""
+    exposure_ev: float | Literal["own"] | None = None
+    """Exposure in stops from the geometric mean of the training exposures; own: as photographed
+    (on a drive interpolated). Default: own for views, 0 for other paths."""
+    exposure_of: MeteringRule | None = None
+    """Exposure metered from each picture, smoothly along a path: auto: as the camera would have
+    chosen it, where a rule explains the photographs; log_average, centre: to mid-grey; highlights:
+    to just below white; protected: mid-grey, highlights kept. --exposure-ev then adds stops."""
+    gamma: float | None = None
+    """Gamma; default: each view's own, or the training views' mean for other paths."""
+    curve: Literal["run", "srgb", "power", "linear", "spline"] = "run"
+    """Tone curve; run: the one that was fitted."""
+    white_balance_of: str | None = None
+    """Name of the view whose white balance is shown, where views differ in it (default: each
+    view's own; neutral where an exposure is given, and for other paths)."""
+    no_vignetting: bool = False
+    """Leave out the darkening towards the corners that the cameras of this run have."""
+    without_objects: bool = False
+    """Leave out what moves."""
+    only_objects: bool = False
+    """Show only what moves."""
+    move_object: Annotated[
+        tuple[tuple[str, float, float, float], ...],
+        tyro.conf.arg(metavar="NAME X Y Z [NAME X Y Z ...]"),
+    ] = ()
+    """Show objects this far forward, left and up of where they are (metres, in the frame of their
+    box); of a track's name its beginning will do."""
+    shift: Annotated[float | None, tyro.conf.arg(metavar="METRES")] = None
+    """Move a drive sideways, seen from the driving direction: so many metres (scene units) to the
+    left; negative ones to the right."""
+    frames: int | None = None
+    """Frames of a drive (default: 8 from one view to the next) or an orbit (default: 120)."""
+    width: int | None = None
+    """Image width, pixels; the height follows (default: as the photographs)."""
+    fps: float | None = None
+    """Frames per second of a video (default: 24)."""
+    scene: SceneFolder = None
+    """Where the run's scene lies now, if it is not where it was."""
+    overwrite: bool = False
+    """Replace what an earlier render wrote."""
+
+    def execute(self) -> int:
+        """Render the run along the path, into a folder or a video."""
+        import time
+
+        from p2gs_jax.cli.frames import frames_of
+        from p2gs_jax.cli.tables import stdout
+        from p2gs_jax.core.clock import CompileCounter
+        from p2gs_jax.core.progress import TerminalReporter
+        from p2gs_jax.formats.frames import open_frames
+        from p2gs_jax.paths import read_cameras, write_cameras
+        from p2gs_jax.paths.pictures import RunRenderer
+        from p2gs_jax.run.read import load_run
+
+        begin, compiler = time.monotonic(), CompileCounter()
+        check_render(self)
+        out = self.out or self.run / "renders" / _default_name(self)
+        _check_place(out, self.overwrite)
+        given = read_cameras(Path(self.path)) if self.path not in PATHS else None
+        renderer = RunRenderer(_with_objects(load_run(self.run, self.scene), self))
+        _check_display(renderer.run, self)
+        with TerminalReporter() as reporter:
+            job = frames_of(self, renderer, given, reporter.message)
+            reading = time.monotonic() - begin
+            for note in job.notes:
+                reporter.message(note)
+            reporter.stage("Rendering", 0, job.count)
+            with open_frames(out, job.size, self.fps or FPS) as write:
+                for done, frame in enumerate(job.frames):
+                    write(frame)
+                    reporter.stage("Rendering", done + 1, job.count)
+            if job.shots and not is_video(out):
+                write_cameras(out / "cameras.json", job.shots)
+        console, total, compiling = stdout(), time.monotonic() - begin, compiler.seconds
+        kept = " (kept: the next time is faster)" if compiling >= 1.0 else ""
+        console.print(
+            f"{job.count} {'frame' if job.count == 1 else 'frames'}: {out}", soft_wrap=True
+        )
+        console.print(
+            f"{total:.1f} s: {reading:.1f} reading the run, {compiling:.1f} compiling{kept}, "
+            f"{max(total - reading - compiling, 0.0):.1f} rendering and writing."
+        )
+        console.print(
+            f"A frame takes {_median_ms(renderer.render_seconds)} to render and "
+            f"{_median_ms(renderer.develop_seconds)} to expose and encode, whatever exposure and "
+            "gamma."
+        )
+        return 0
+
+
+def _with_objects(fitted: Run, options: Render) -> Run:
+    """Return the run with what moves as the options want it.
+
+    Raises:
+        UserError: it has none of these objects.
+    """
+    for name, *offset in options.move_object:
+        fitted = fitted.with_moved(name, offset)
+    if options.without_objects:
+        return fitted.without_objects()
+    return fitted.only_objects() if options.only_objects else fitted
+
+
+def _check_display(fitted: Run, options: Render) -> None:
+    """Refuse a curve or a white balance that the run does not have."""
+    curve = fitted.cfg.photometry.curve
+    if options.curve == "spline" and curve != "spline":
+        raise UserError(
+            f"--curve spline: {options.run} has none; its curve is {curve}.",
+            fix="choose run, srgb, power or linear",
+        )
+    if options.white_balance_of is not None:
+        fitted.white_balance_of(options.white_balance_of)
+
+
+def _check_place(out: Path, overwrite: bool) -> None:
+    """Refuse to overwrite files, unless asked to."""
+    there = out.is_file() or (out.is_dir() and any(out.iterdir()))
+    if there and not overwrite:
+        what = f"{out} exists already" if out.is_file() else f"{out} holds files already"
+        raise UserError(
+            f"{what}.", fix="add --overwrite to replace them, or choose another place with --out"
+        )
+
+
+def _median_ms(seconds: Sequence[float]) -> str:
+    """Return the median; the first time includes compiling and counts only if it is alone."""
+    from statistics import median
+
+    return f"{1e3 * median(seconds[1:] or seconds):.1f} ms"
+
+
+def is_video(out: Path) -> bool:
+    """Return whether frames are written into one file."""
+    return out.suffix.lower() == ".mp4"
+
+
+def _default_name(options: Render) -> str:
+    if options.path == "views":
+        return "panorama" if options.panorama else "all"
+    name = options.path if options.path in PATHS else Path(options.path).stem
+    if options.shift:
+        name += f"_{abs(options.shift):g}_{'left' if options.shift > 0 else 'right'}"
+    return f"{name}_panorama" if options.panorama else name
+
+
+def check_render(o: Render) -> None:
+    """Reject options that make no sense, alone or together, before anything is read.
+
+    Raises:
+        UserError: one does not.
+    """
+    _check_picture(o)
+    _check_path(o)
+    _check_file(o)
+
+
+def _check_picture(o: Render) -> None:
+    from p2gs_jax.paths.files import LARGEST, MOST_STOPS
+
+    ev, one = o.exposure_ev, "leave one of them out"
+    check(
+        o.path in PATHS or o.path.lower().endswith(".json"),
+        f"--path {o.path!r} is unknown",
+        fix="choose views, drive, orbit or a FILE.json",
+    )
+    check(
+        o.exposure_of is None or not (o.panorama or ev == "own"),
+        "--exposure-of meters pictures of single cameras, instead of --exposure-ev own",
+        fix=one,
+    )
+    check(
+        not isinstance(ev, float | int) or abs(ev) <= MOST_STOPS,
+        f"--exposure-ev {ev} is not a number of stops",
+        fix="write 0, 1 or -2.5",
+    )
+    check(
+        ev != "own" or (o.path in ("views", "drive") and not o.panorama),
+        "--exposure-ev own is for views and drives, and not for panoramas",
+        fix="write a number of stops, or leave it out",
+    )
+    check(
+        not o.without_objects or not (o.only_objects or o.move_object),
+        "--without-objects leaves nothing to show or to move",
+        fix=one,
+    )
+    moved = [x for _, *offset in o.move_object for x in offset]
+    check(all(map(math.isfinite, moved)), "--move-object wants finite numbers of metres")
+    check(
+        o.gamma is None or 0 < o.gamma < math.inf,
+        "--gamma must be positive",
+        fix="write 2.2 for the tone curve as it is, more for less contrast",
+    )
+    width_fits = o.width is None or 16 <= o.width <= LARGEST
+    check(width_fits, f"--width must be between 16 and {LARGEST}")
+
+
+def _check_path(o: Render) -> None:
+    own, leave = o.path in PATHS, "leave it out"
+    moves = o.path in ("drive", "orbit")
+    check(o.frames is None or moves, "--frames is for --path drive and orbit", fix=leave)
+    check(o.shift is None or o.path == "drive", "--shift is for --path drive", fix=leave)
+    near = o.shift is None or abs(o.shift) <= MOST_SHIFT
+    check(near, f"--shift must be at most {MOST_SHIFT:g} to either side")
+    check(o.frames is None or o.frames >= 2, "--frames must be 2 or more")
+    check(
+        not o.panorama or o.path in ("views", "drive"),
+        "--panorama is for --path views and drive",
+        fix="choose one of them, or leave it out",
+    )
+    single = own and not o.panorama
+    check(o.camera is None or single, "--camera is for single cameras of the scene", fix=leave)
+    check(o.split == "all" or own, "--split is for the scene's own views", fix=leave)
+
+
+def _check_file(o: Render) -> None:
+    out = o.out
+    if out is not None:
+        check(
+            out.suffix.lower() not in OTHER_FILES,
+            f"--out {out}: {out.suffix} files are not written",
+            fix="name a folder, or NAME.mp4",
+        )
+        kind = "a folder" if out.is_dir() else "a file"
+        right = not out.exists() or out.is_dir() != is_video(out)
+        check(right, f"--out {out} is {kind}", fix="choose another name")
+    video = out is not None and is_video(out)
+    fix = "write --out NAME.mp4, or leave it out"
+    check(o.fps is None or video, "--fps is for videos", fix=fix)
+    check(o.fps is None or 1 <= o.fps <= 240, "--fps must be between 1 and 240")

@@ -1,0 +1,101 @@
+"""What the options of several commands share: types, parsers, short names, names of others."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from p2gs_jax.errors import UserError
+
+MeteringRule = Literal["auto", "log_average", "centre", "highlights", "protected"]
+SceneFolder = Annotated[Path | None, tyro.conf.arg(metavar="DIR")]
+# Short names of fields of the configuration: the field, and the placeholder of its value. A command
+# that has any lists them as `SHORT_NAMES`.
+SHORT = {
+    "budget": ("train.budget_s", "TIME"),
+    "max_width": ("data.max_width", "N"),
+    "steps": ("train.steps", "N"),
+    "gaussians": ("densify.max_gaussians", "N"),
+    "test_every": ("data.test_every", "N"),
+    "split": ("data.split", "FILE|every"),
+    "background": ("data.background", "COLOR"),
+    "images": ("data.images", "DIR"),
+    "allow_missing": ("data.allow_missing", None),
+    "drive": ("data.drive", "NAME"),
+    "cameras": ("data.cameras", "NAME"),
+    "frames": ("data.frames", "SLICE"),
+    "every": ("data.every", "N"),
+    "max_frames": ("data.max_frames", "N"),
+    "known_exposures": ("photometry.known", "FILE|exif"),
+    "known_deviation_ev": ("photometry.known_deviation_ev", "STOPS"),
+    "lpips_weights": ("evaluation.lpips_weights", "alex|vgg|FILE"),
+    "seed": ("train.seed", "N"),
+}
+SCENE = "the scene's folder itself, without an option"
+# Our names for options of 3DGS, gsplat and nerfstudio.
+OTHERS = {
+    "--steps": ("iterations", "iters", "max-steps", "max-num-iterations", "num-iterations"),
+    "--gaussians": ("cap-max", "max-gaussians", "num-gaussians"),
+    "--max-width": ("resolution", "downscale-factor", "data-factor"),
+    "--out": ("output", "output-dir", "output-path", "result-dir", "model-path"),
+    "--test-every": ("eval", "llffhold"),
+    "--render.sh-degree": ("sh-degree",),
+    "--background": ("white-background", "background-color", "random-background"),
+    "--budget": ("timeout", "time-limit"),
+    "--images": ("image-dir",),
+    "--overwrite": ("force",),
+    "--exposure-ev": ("exposure", "ev"),
+    SCENE: ("source-path", "data", "data-dir"),
+}
+SYNONYMS = {f"--{theirs}": ours for ours, names in OTHERS.items() for theirs in names}
+
+
+def parse_duration(text: str) -> float:
+    """Return the seconds of `90`, `90s`, `5m` or `1h30m`.
+
+    Raises:
+        UserError: the text is not a valid duration.
+    """
+    match = re.fullmatch(r"(?:(\d+)h)?(?:(\d+(?:\.\d+)?)m)?(?:(\d+(?:\.\d+)?)s?)?", text.strip())
+    if match is None or not any(match.groups()):
+        raise UserError(f"--budget {text!r} is not a valid duration.", fix="write 90s, 5m or 1h30m")
+    hours, minutes, seconds = (float(g or 0) for g in match.groups())
+    total = 3600 * hours + 60 * minutes + seconds
+    if total <= 0:
+        raise UserError(f"--budget {text!r} leaves no time.", fix="write 90s, 5m or 1h30m")
+    return total
+
+
+def check(condition: bool, text: str, *, fix: str | None = None) -> None:
+    """Raise a UserError unless the condition holds."""
+    if not condition:
+        raise UserError(text + ".", fix=fix)
+
+
+def check_option_names(command: str, argv: Sequence[str], options: Collection[str]) -> None:
+    """Reject options of other programs, and name ours.
+
+    Args:
+        command: name of the command.
+        argv: its arguments.
+        options: names of the command's own options, such as `--max-width`.
+
+    Raises:
+        UserError: there is an option of another program.
+    """
+    for word in argv:
+        name = word.split("=", 1)[0].replace("_", "-")
+        ours = SYNONYMS.get(name)
+        if ours is None or name in options:
+            continue
+        if ours is SCENE and command == "fit":
+            fix = f"name {SCENE}: p2gs-jax fit SCENE --out RUN"
+        elif ours in options or (ours.startswith("--render.") and "--config" in options):
+            fix = f"here it is called {ours}"
+        else:
+            continue
+        raise UserError(f"p2gs-jax {command} has no option {name}.", fix=fix)

@@ -1,0 +1,257 @@
+"""The tables and sentences that commands print as their results."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.box import HEAVY_HEAD, SIMPLE
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from p2gs_jax.core.numerics import LN2
+from p2gs_jax.core.progress import PlainConsole
+from p2gs_jax.photometry.cameras import corner
+from p2gs_jax.photometry.solution import WEAK_GAMMA, PhotometricSolution
+from p2gs_jax.pipeline.calibrate_of import CalibrationOf
+from p2gs_jax.pipeline.calibration import CalibrationResult
+
+# Columns of words; all others hold numbers.
+WORDS = ("views", "view", "camera", "protocol", "program", "lens", "configuration", "")
+# Parts of a fit, as metrics.json has them under "seconds", and what they are called in print.
+PARTS = {
+    "starting": "starting",
+    "reading": "reading",
+    "structure_from_motion": "structure from motion",
+    "photometry": "photometry",
+    "seeds": "seeds",
+    "compiling": "waiting for the compiler",
+    "steps": "steps",
+    "densification": "densification",
+    "looking": "looking for what moves",
+    "checkpoints": "checkpoints",
+    "evaluation": "evaluation",
+    "files": "files",
+}
+
+
+def stdout() -> Console:
+    """Return where results go; progress and messages go to stderr."""
+    return PlainConsole()
+
+
+def make_table(
+    columns: Sequence[str],
+    rows: Iterable[Sequence[str | Text]],
+    title: str | None = None,
+    *,
+    plain: bool = False,
+) -> Table:
+    """Return a table; `plain` draws few lines."""
+    out = Table(title=title, title_justify="left", box=SIMPLE if plain else HEAVY_HEAD)
+    for name in columns:
+        out.add_column(Text(name), justify="left" if name in WORDS else "right")
+    for row in rows:
+        out.add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in row))
+    return out
+
+
+def scores(part: Mapping[str, Any]) -> tuple[str, str, str]:
+    """Return PSNR, SSIM and LPIPS of a part of metrics.json in print."""
+    lpips = f"{part['lpips']:.4f}" if "lpips" in part else "n/a"
+    return f"{part['psnr']:.2f}", f"{part['ssim']:.4f}", lpips
+
+
+def print_metrics(metrics: dict[str, Any], out: Path) -> None:
+    """Print the scores of a run as a table."""
+    console, test = stdout(), metrics["test"]
+    parts = [
+        ("training", "own exposure and gamma", metrics["train"]),
+        ("training", "mean parameters", metrics["train"]["averaged"]),
+        ("held out", "mean parameters", test["averaged"]),
+        ("held out", "exposure fitted to each photograph", test["exposure_fitted"]),
+        (
+            "held out",
+            "all that varies per view fitted to each photograph",
+            test.get("photometry_fitted"),
+        ),
+        ("held out", "metered, as the camera would", test.get("metered")),
+    ]
+    for name, part in metrics.get("reference", {}).items():
+        how = f"reference photographs, {name.replace('_', ' ')}"
+        parts += [("all", how, part), ("held out", how, part["test"])]
+    rows = [(views, how, *scores(part)) for views, how, part in parts if part and "psnr" in part]
+    columns = ("views", "protocol", "PSNR dB", "SSIM", "LPIPS")
+    console.print(make_table(columns, rows, "How well it fits"))
+    hdr = metrics.get("radiance")
+    if hdr:
+        mu_law = f"; mu-law PSNR {hdr['mu_law_psnr']:.2f} dB" if "mu_law_psnr" in hdr else ""
+        console.print(
+            f"Radiance against HDR truth: {hdr['stops_median']:.3f} stops median, "
+            f"{hdr['stops_rms']:.3f} RMS; PU21 {hdr['pu21_psnr']:.2f} dB / {hdr['pu21_ssim']:.4f}; "
+            f"colour difference {hdr['delta_e_itp']:.1f} Delta E ITP{mu_law}."
+        )
+    counts = metrics.get("counts", {})
+    if counts:
+        console.print(
+            f"{counts['gaussians']} Gaussians, {counts['steps']} steps, "
+            f"{1e3 * metrics['seconds_per_step']:.0f} ms a step."
+        )
+    seconds = {k: v for k, v in metrics.get("seconds", {}).items() if k in PARTS and v >= 0.5}
+    if seconds:
+        spent = ", ".join(f"{PARTS[k]} {v:.0f}" for k, v in seconds.items())
+        programs = f" ({counts['programs']} programs)" if "programs" in counts else ""
+        console.print(f"Seconds: {spent}{programs}.")
+    console.print(f"Results: {out} (open {out / 'summary.png'} first)")
+
+
+def print_calibration(result: CalibrationResult, out: Path) -> None:
+    """Print solved exposures, gammas and cameras, with their errors."""
+    s, seconds = result.solution, result.seconds
+    _print_solution(result, _tone_columns(result))
+    stdout().print(
+        f"{result.observations} observations, {100 * s.outliers:.0f} % ignored as outliers; "
+        f"residual {s.residual_ev:.2f} EV; {seconds['reading']:.1f} s reading, "
+        f"{seconds['adjustment']:.1f} s adjusting."
+    )
+    stdout().print(f"Results: {out} (open {out / 'calibration.png'} first)")
+
+
+def print_calibration_of(found: CalibrationOf, out: Path) -> None:
+    """Print the same, and how well somebody's splats fit before and after."""
+    _print_solution(found.calibration, _tone_columns(found.calibration))
+    for split, name in (("train", "training"), ("test", "held-out")):
+        if split not in found.metrics["of"]:
+            continue
+        old, new = found.metrics["of"][split], found.metrics[split]
+        by_view = new["exposure_fitted"] if split == "test" else new
+        how = "fitted to each" if split == "test" else "as solved"
+        stdout().print(
+            f"PSNR of {name} views: {old['as_it_is']['psnr']:.2f} dB as the model was, "
+            f"{old['exposure_fitted']['psnr']:.2f} with a gain fitted to each; now "
+            f"{by_view['psnr']:.2f} with exposures {how}."
+        )
+    stdout().print(f"Results: {out} (a run folder: view, render, export, report read it)")
+
+
+def print_stack(result: CalibrationResult, out: Path) -> None:
+    """Print the solved exposures of a stack from one viewpoint, and its response."""
+    s = result.solution
+    points = [str(count) for count in s.observations_per_view]
+    signal = ["yes" if signal else "little" for signal in result.signal]
+    _print_solution(result, {"usable points": points, "signal": signal})
+    stdout().print(f"Response: {s.response.name}; residual {s.residual_ev:.2f} EV. Results: {out}")
+
+
+def _print_solution(result: CalibrationResult, more: Mapping[str, list[str]]) -> None:
+    """Print exposures with their standard errors, the notes, and each camera's vignetting."""
+    console, columns = stdout(), {**_exposure_columns(result), **more}
+    rows = zip(*columns.values(), strict=True)
+    console.print(
+        make_table(tuple(columns), rows, "Exposures in stops from their mean", plain=True)
+    )
+    for message in result.messages:
+        console.print(message)
+    s = result.solution
+    for camera, errors in zip(s.cameras, s.corner_errors, strict=False):
+        if camera.vignetting:
+            lost = ", ".join(
+                f"{np.log2(left):+.2f} +- {error / LN2:.2f}"
+                for left, error in zip(corner(camera), errors, strict=True)
+            )
+            console.print(f"Camera {camera.name}: {lost} EV in the corners (vignetting).")
+
+
+def _exposure_columns(result: CalibrationResult) -> dict[str, list[str]]:
+    """Return columns by title, without those that are empty or constant."""
+    s, views = result.solution, result.views
+    errors, stated, gaps = s.exposure_errors / LN2, result.stated_ev, result.agreement.gap_ev
+    known, given, wrong = np.isfinite(errors), np.isfinite(stated), result.agreement.disagrees
+    rows = range(len(views))
+    columns = {"view": [v.name for v in views]}
+    if len({v.camera for v in views}) > 1:
+        columns["camera"] = [v.camera for v in views]
+    columns["exposure"] = [
+        f"{s.exposures_ev[i]:+.2f} +- {errors[i]:.2f}" if known[i] else "unknown" for i in rows
+    ]
+    if given.any():
+        columns["stated"] = [f"{stated[i]:+.2f}" if given[i] else "" for i in rows]
+        columns["gap"] = [
+            f"{gaps[i]:+.2f}{' !' if wrong[i] else ''}" if np.isfinite(gaps[i]) else ""
+            for i in rows
+        ]
+    return columns
+
+
+def _tone_columns(result: CalibrationResult) -> dict[str, list[str]]:
+    """Return gammas and white balances with standard errors, and residuals in stops."""
+    s, rows = result.solution, range(len(result.views))
+    known = np.isfinite(s.exposure_errors)
+    gammas = [
+        f"{s.gammas[i]:.2f}"
+        + (f" +- {s.gamma_errors[i]:.2f}" if known[i] and s.gamma_errors[i] > 0 else "")
+        + (" (weak)" if known[i] and s.gamma_errors[i] > WEAK_GAMMA else "")
+        for i in rows
+    ]
+    residuals = [f"{s.view_residual_ev[i]:.2f}" if known[i] else "" for i in rows]
+    return {"gamma": gammas, **_balance_column(s), "residual": residuals}
+
+
+def _balance_column(s: PhotometricSolution) -> dict[str, list[str]]:
+    """Return gains of red, green and blue, stops, with the largest of their standard errors."""
+    if s.white_balance_level is None:
+        return {}
+    stops, errors = s.white_balance / LN2, s.white_balance_errors.max(1) / LN2
+    known = np.isfinite(errors) & np.isfinite(s.exposure_errors)
+    gains = [" ".join(f"{ev:+.2f}" for ev in row) for row in stops]
+    return {
+        "white balance (R G B)": [
+            f"{text} +- {error:.2f}" if seen else "unknown"
+            for text, error, seen in zip(gains, errors, known, strict=True)
+        ]
+    }
+
+
+def print_against(
+    against: dict[str, Any], run: Path, metrics: dict[str, Any], remarks: Iterable[str], path: Path
+) -> None:
+    """Print the scores of other programs beside those of a run.
+
+    Args:
+        against: what `against.json` holds.
+        run: the run folder.
+        metrics: of the run, as `metrics.json`.
+        remarks: on the renders that were found.
+        path: of `against.json`.
+    """
+    protocols = {
+        "averaged": "mean parameters",
+        "as_rendered": "as rendered",
+        "exposure_fitted": "exposure fitted to each photograph",
+    }
+    reference = {"as_rendered": "as rendered", "scale_aligned": "scale aligned"}
+    own = Path(run).resolve().name + " (this run)"
+    rows, shown = [], []
+    for label, program in against["programs"].items():
+        views = program["views"]
+        # Once, unless programs lack different views.
+        if program["missing"] or views not in shown:
+            shown.append(views)
+            rows += [(own, protocols[n], views, part) for n, part in program["run"].items()]
+            if "reference" in program and "reference" in metrics:
+                part = metrics["reference"]["scale_aligned"]["test"]
+                rows.append((own, "reference, scale aligned", len(part["per_view"]), part))
+        for name in ("as_rendered", "exposure_fitted"):
+            rows.append((label, protocols[name], views, program[name]))
+        for name, part in program.get("reference", {}).items():
+            rows.append((label, f"reference, {reference[name]}", len(part["per_view"]), part))
+    columns = ("program", "protocol", "views", "PSNR dB", "SSIM", "LPIPS")
+    cells = [(who, how, str(views), *scores(part)) for who, how, views, part in rows]
+    console = stdout()
+    console.print(make_table(columns, cells, "Held-out views, beside other programs"))
+    for remark in remarks:
+        console.print(remark)
+    console.print(f"Results: {path}")

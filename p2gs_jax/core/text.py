@@ -1,0 +1,50 @@
+"""Text of others, such as file names and their JSON: harmless in terminals, pictures and errors."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+# Control characters but tab and newline, surrogates, and what turns the direction of writing.
+_HIDDEN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+
+
+def printable(text: str) -> str:
+    r"""Return a text whose control characters are written out, as `\x1b`."""
+    return _HIDDEN.sub(lambda found: ascii(found.group())[1:-1], text)
+
+
+def parse_json(text: str) -> Any:
+    """Return the value of a text of JSON.
+
+    Raises:
+        json.JSONDecodeError: it is not valid JSON, is nested deeper than Python reads, or holds a
+            number of thousands of digits.
+    """
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError:
+        raise
+    except RecursionError:
+        raise json.JSONDecodeError("nested too deeply", text, 0) from None
+    except ValueError as error:
+        raise json.JSONDecodeError(str(error), text, 0) from None
+
+
+@contextlib.contextmanager
+def names_as_they_are() -> Iterator[None]:
+    """Let matplotlib draw names as they are: a `with` block, or a decorator.
+
+    Text between dollars is not a formula, and letters that the font lacks are boxes in the picture,
+    without a warning in the terminal. Control characters are left to the caller (`printable`).
+    """
+    # Imported here: it takes as long to load as a small scene to read.
+    import matplotlib
+
+    with matplotlib.rc_context({"text.parse_math": False}), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph", category=UserWarning)
+        yield

@@ -1,0 +1,380 @@
+"""A finished run in the files of other programs: one function that writes the formats asked for.
+
+Display colours are baked once for every degree of the harmonics that formats hold, and the error
+that baking leaves is measured and written beside them.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from p2gs_jax.core.atomic import atomic_folder, write_json
+from p2gs_jax.core.numerics import evenly_spaced
+from p2gs_jax.core.progress import Reporter
+from p2gs_jax.errors import UserError
+from p2gs_jax.export.colmap_folder import write_colmap_folder
+from p2gs_jax.export.nerfstudio_folder import write_nerfstudio_folder
+from p2gs_jax.export.page import MEGABYTE, write_page
+from p2gs_jax.export.sidecar import corrections_name, linear_sidecar
+from p2gs_jax.formats.compressed_ply import read_compressed_ply, write_compressed_ply
+from p2gs_jax.formats.exr import write_exr
+from p2gs_jax.formats.gltf import write_gltf
+from p2gs_jax.formats.ply import write_ply, write_radiance
+from p2gs_jax.formats.splat import read_splat, write_splat
+from p2gs_jax.formats.spz import read_spz, write_spz
+from p2gs_jax.formats.through_gsply import require_gsply
+from p2gs_jax.formats.usd import NamedCamera, require_pxr, write_usd
+from p2gs_jax.gaussians.bake import (
+    Target,
+    bake,
+    baking_error,
+    display_comments,
+    display_of_splats,
+    error_summary,
+    refine,
+    true_target,
+)
+from p2gs_jax.photometry.display import DisplayTransform
+from p2gs_jax.render.capacity import make_renderer
+from p2gs_jax.render.harmonics import MAX_DEGREE
+from p2gs_jax.render.project import at_time
+from p2gs_jax.run.photometry_files import write_appearance
+from p2gs_jax.run.read import Run
+from p2gs_jax.scene.device import camera_of
+from p2gs_jax.scene.exif import read_exif_settings
+from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.types import Gaussians
+
+# What each format writes into the folder.
+PLACES: dict[str, tuple[str, ...]] = {
+    "linear-ply": ("linear.ply", "linear.json"),
+    "display-ply": ("display.ply", "display.ply.json"),
+    "splat": ("display.splat", "display.splat.json"),
+    "spz": ("display.spz", "display.spz.json"),
+    "compressed-ply": ("display.compressed.ply", "display.compressed.ply.json"),
+    "gltf": ("display.glb", "display.glb.json"),
+    "usd": ("display.usdc", "display.usdc.json"),
+    "colmap": ("colmap",),
+    "nerfstudio": ("nerfstudio",),
+    "exr": ("exr",),
+    "html": ("scene.html",),
+}
+STEPS = 240
+# The baking error is measured on at most this many views of each split, evenly spread.
+MEASURED = 60
+
+
+@dataclass(frozen=True)
+class _Writer:
+    """Writer and reader of a format with display colours.
+
+    Attributes:
+        write: the file, of these Gaussians.
+        read: what a program reads; None: the numbers are those that were written.
+        degree: of the harmonics that the format holds.
+    """
+
+    write: Callable[[Path, Gaussians], int]
+    read: Callable[[Path], Gaussians] | None = None
+    degree: int = MAX_DEGREE
+
+
+WRITERS = {
+    "splat": _Writer(write_splat, read_splat, 0),
+    "spz": _Writer(write_spz, read_spz),
+    "compressed-ply": _Writer(write_compressed_ply, read_compressed_ply),
+    "gltf": _Writer(write_gltf),
+}
+
+
+def require_packages(formats: Sequence[str]) -> None:
+    """Raise a UserError where a format needs a package that is not installed."""
+    if {"spz", "compressed-ply"} & set(formats):
+        require_gsply()
+    if "usd" in formats:
+        require_pxr()
+
+
+def convert(
+    fitted: Run,
+    formats: Sequence[str],
+    folder: Path,
+    transform: DisplayTransform,
+    *,
+    bake_steps: int | None,
+    page_mb: float,
+    page_photographs: int,
+    overwrite: bool,
+    reporter: Reporter,
+) -> Iterator[tuple[Path, str, float]]:
+    """Write a run in every format; yield each place, a sentence about it, and seconds.
+
+    Args:
+        fitted: the run.
+        formats: names, as in PLACES.
+        folder: to write into.
+        transform: from radiance to the display colours of formats that hold these.
+        bake_steps: of their refinement; None: enough.
+        page_mb: largest size of the page, millions of bytes.
+        page_photographs: how many photographs the page embeds.
+        overwrite: replace what is there.
+        reporter: receives progress.
+
+    Raises:
+        UserError: something is in the way, or a photograph is missing that a format needs.
+    """
+    _check_places(folder, [folder / place for name in formats for place in PLACES[name]], overwrite)
+    if {"colmap", "nerfstudio", "exr"} & set(formats):
+        _check_names(fitted)
+    if {"colmap", "nerfstudio"} & set(formats):
+        fitted.require_photographs()
+    transform, display = display_of_splats(transform), None
+    for name in formats:
+        begin, place = time.monotonic(), folder / PLACES[name][0]
+        if name == "linear-ply":
+            text = _linear_ply(place, fitted)
+        elif name in ("colmap", "nerfstudio"):
+            text = _other_trainer(name, place, fitted, reporter)
+        elif name == "exr":
+            text = _exr(place, fitted, reporter)
+        elif name == "html":
+            page = write_page(
+                place,
+                fitted.over_black(),
+                transform,
+                size_mb=page_mb,
+                photographs=page_photographs,
+                say=reporter.stage,
+            )
+            text = " ".join([f"{page.size / MEGABYTE:.1f} MB.", *page.sentences])
+        else:
+            if display is None:
+                display = DisplayFiles(fitted.over_black(), transform, bake_steps, reporter)
+            text = display.write(name, place, folder / PLACES[name][1])
+        yield place, text, time.monotonic() - begin
+
+
+def _check_places(folder: Path, places: Sequence[Path], overwrite: bool) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise UserError(f"{folder} is a file.", fix="name a folder with --out")
+    there = [path for path in places if path.exists()]
+    if there and not overwrite:
+        raise UserError(
+            f"{there[0]} exists already.",
+            fix="add --overwrite to replace it, or name another folder with --out",
+        )
+
+
+def _check_names(fitted: Run) -> None:
+    """Refuse names that would lead files out of the folder they are written to."""
+    for view in fitted.scene.views:
+        name = PurePosixPath(view.name)
+        if name.is_absolute() or ".." in name.parts:
+            raise UserError(
+                f"the view {view.name} lies outside the image folder.",
+                fix="move its photograph into the image folder and fit again",
+            )
+
+
+def _linear_ply(ply: Path, fitted: Run) -> str:
+    g, kind = at_time(fitted.as_of(), None), fitted.cfg.photometry.appearance
+    sidecar = ply.with_suffix(".json")
+    activation = fitted.cfg.render.radiance
+    count = write_radiance(ply, g, np.ones(g.capacity, bool), activation=activation)
+    content = linear_sidecar(g, fitted.cfg, fitted.scene, fitted.store, fitted.photometry)
+    write_json(sidecar, content)
+    if kind is not None:
+        views = fitted.scene.training_views
+        write_appearance(ply.parent / corrections_name(kind), fitted.params.appearance, views)
+    return f"{count} Gaussians of linear radiance; {sidecar.name} says how to read them"
+
+
+def _other_trainer(name: str, place: Path, fitted: Run, reporter: Reporter) -> str:
+    write = write_colmap_folder if name == "colmap" else write_nerfstudio_folder
+    write(
+        place,
+        fitted.scene,
+        fitted.store,
+        fitted.photometry["views"],
+        on_view=lambda done, count: reporter.stage("Writing photographs", done, count),
+    )
+    views = f"{len(fitted.scene.views)} views"
+    if name == "colmap":
+        return f"{views}, {len(fitted.scene.points)} points, exposures.csv"
+    return f"{views} for `ns-train splatfacto --data`"
+
+
+def _exr(place: Path, fitted: Run, reporter: Reporter) -> str:
+    views = fitted.scene.views
+    with atomic_folder(place) as temporary:
+        for index, view in enumerate(views):
+            camera = camera_of(fitted.store, index)
+            result = fitted.render(camera)
+            write_exr(
+                (temporary / view.name).with_suffix(".exr"),
+                np.asarray(result.linear),
+                depth=np.asarray(result.depth),
+                alpha=np.asarray(result.alpha),
+                taken=fitted.own_display(index),
+                camera=camera,
+                shot=read_exif_settings(view.image_path),
+            )
+            reporter.stage("Rendering", index + 1, len(views))
+    return f"{len(views)} linear renders"
+
+
+class DisplayFiles:
+    """Display colours under one display transform, baked once per degree, with their error."""
+
+    def __init__(
+        self,
+        fitted: Run,
+        transform: DisplayTransform,
+        steps: int | None,
+        reporter: Reporter,
+    ):
+        """Render the true pictures that colours are refined against.
+
+        Args:
+            fitted: the run.
+            transform: from radiance to display values.
+            steps: of refinement; None: enough.
+            reporter: receives progress.
+        """
+        self.fitted, self.transform, self.reporter = fitted, transform, reporter
+        self.store = fitted.store
+        self.errors: dict[int, dict] = {}
+        self.gaussians, scene = at_time(fitted.as_of(), None), fitted.scene
+        self.steps = max(STEPS, len(scene.train_indices)) if steps is None else steps
+        self.baked: dict[int, Gaussians] = {}
+        render = make_renderer(fitted.cfg.render)
+        self.targets: dict[int, Target] = {}
+        wanted = scene.train_indices if self.steps else _spread(scene.train_indices)
+        rows = [*wanted, *_spread(scene.test_indices)]
+        for done, index in enumerate(rows):
+            self.targets[index] = true_target(
+                scene.views[index].name,
+                self.gaussians,
+                camera_of(self.store, index),
+                transform,
+                render,
+            )
+            reporter.stage("Rendering true pictures", done + 1, len(rows))
+
+    def write(self, name: str, path: Path, sidecar: Path) -> str:
+        """Write one format and its JSON; return sentences about it.
+
+        Args:
+            name: of the format.
+            path: the file.
+            sidecar: what says how it was made and how far it is from the truth.
+        """
+        begin = time.monotonic()
+        if name == "display-ply":
+            shown = self._bake(MAX_DEGREE)
+            error = self._error_of_baked(MAX_DEGREE)
+            comments = [
+                *display_comments(self.transform),
+                *(f"p2gs-jax: {t}" for t in _sentences(error)),
+            ]
+            write_ply(path, shown, comments)
+        elif name == "usd":
+            shown = self._bake(MAX_DEGREE)
+            write_usd(path, shown, named_cameras(self.fitted, self.store))
+            error = self._error_of_baked(MAX_DEGREE)
+        else:
+            writer = WRITERS[name]
+            shown = self._bake(writer.degree)
+            writer.write(path, shown)
+            if writer.read is None:
+                error = self._error_of_baked(writer.degree)
+            else:
+                error = self._error(writer.read(path))
+        write_json(
+            sidecar,
+            {
+                "file": path.name,
+                "gaussians": self.gaussians.capacity,
+                "exposure": self.transform.exposure,
+                "exposure_ev_from_mean": float(
+                    np.log2(self.transform.exposure / self.fitted.mean.exposure_geometric)
+                ),
+                "gamma": self.transform.gamma,
+                "curve": self.transform.formation.curve,
+                "white_balance": None
+                if self.transform.white_balance is None
+                else np.exp(self.transform.white_balance).tolist(),
+                "bake_steps": self.steps,
+                "seconds": time.monotonic() - begin,
+                "baking_error": error,
+            },
+        )
+        return "; ".join([f"{self.gaussians.capacity} Gaussians", *_sentences(error)])
+
+    def _bake(self, degree: int) -> Gaussians:
+        cfg, g = self.fitted.cfg, self.gaussians
+        if degree not in self.baked:
+            self.reporter.stage("Baking")
+            start = bake(g, self.transform, cfg.render.radiance, degree)
+            train = self.fitted.scene.train_indices
+            self.baked[degree] = refine(
+                start,
+                [self.targets[i] for i in train if i in self.targets],
+                cfg.render,
+                steps=self.steps,
+                seed=cfg.train.seed,
+                on_step=lambda done, steps: self.reporter.stage("Baking", done, steps),
+            )
+        return self.baked[degree]
+
+    def _error_of_baked(self, degree: int) -> dict:
+        """Return the error of a file that holds the baked colours as they are."""
+        if degree not in self.errors:
+            self.errors[degree] = self._error(self._bake(degree))
+        return self.errors[degree]
+
+    def _error(self, shown: Gaussians) -> dict:
+        """Return the baking error by split."""
+        self.reporter.stage("Measuring")
+        scene, render = self.fitted.scene, self.fitted.cfg.render
+        splits = {"train": scene.train_indices, "test": scene.test_indices}
+        return {
+            split: error_summary(
+                baking_error(shown, [self.targets[i] for i in _spread(rows)], render)
+            )
+            for split, rows in splits.items()
+        }
+
+
+def named_cameras(fitted: Run, store: ImageStore) -> list[NamedCamera]:
+    """Return the cameras of all photographs at the size of the fit."""
+    found = (store.camera(index) for index in range(len(fitted.scene.views)))
+    return [
+        NamedCamera(view.name, viewmat, K, width, height)
+        for view, (viewmat, K, width, height) in zip(fitted.scene.views, found, strict=True)
+    ]
+
+
+def _spread(rows: Sequence[int]) -> list[int]:
+    """Return at most MEASURED of the rows, evenly spread."""
+    return [rows[i] for i in evenly_spaced(len(rows), MEASURED)]
+
+
+def _sentences(error: dict) -> list[str]:
+    """Return sentences on the baking error."""
+    said = []
+    for split, name in (("train", "training"), ("test", "held-out")):
+        s = error[split]
+        if s is not None:
+            said.append(
+                f"baking error over {s['views']} {name} views: median {s['psnr_median']:.2f} dB, "
+                f"worst {s['psnr_worst']:.2f} dB ({s['worst_view']}), mean {s['mean_codes']:.2f} "
+                f"and largest {s['max_codes']:.0f} 8-bit levels; median "
+                f"{s['psnr_on_white_median']:.2f} dB over white"
+            )
+    return said

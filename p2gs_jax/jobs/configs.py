@@ -1,0 +1,213 @@
+"""Configurations by dotted field names: single ones, grids, and those that a TOML file lists."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import tomllib
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from p2gs_jax.config import FitConfig, preset
+from p2gs_jax.errors import UserError
+
+KEYS = ("scene", "reference", "out", "preset", "seeds", "max_parallel", "set", "grid", "case")
+
+
+def with_fields(cfg: FitConfig, fields: Mapping[str, Any]) -> FitConfig:
+    """Return the configuration with the values of some dotted fields replaced.
+
+    Raises:
+        UserError: a field (`loss.relative_exposure.weight`) does not exist, or does not take the
+            value.
+    """
+    for name, value in fields.items():
+        cfg = _replaced(cfg, name.split("."), value, name)
+    return cfg
+
+
+def _replaced(record: Any, path: Sequence[str], value: Any, whole: str) -> Any:
+    names = [f.name for f in dataclasses.fields(record)]
+    if path[0] not in names:
+        raise UserError(
+            f"there is no configuration field {whole!r}.",
+            fix=f"beside {path[0]!r} there are: {', '.join(names)}",
+        )
+    if len(path) > 1:
+        current = getattr(record, path[0])
+        if not dataclasses.is_dataclass(current):
+            raise UserError(
+                f"the configuration field {whole!r} goes too deep.",
+                fix=f"{path[0]!r} is a value itself: leave out what follows it",
+            )
+        value = _replaced(current, path[1:], value, whole)
+    else:
+        hint = typing.get_type_hints(type(record))[path[0]]
+        value = tuple(value) if isinstance(value, list) else value
+        if isinstance(value, int) and not isinstance(value, bool) and not _fits(value, hint):
+            value = float(value)
+        if not _fits(value, hint):
+            raise UserError(f"{whole} = {value!r} does not fit.", fix=f"it takes {_shown(hint)}")
+    return dataclasses.replace(record, **{path[0]: value})
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Return whether a value has the type of a configuration field."""
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if origin is typing.Literal:
+        return value in args
+    if origin in (typing.Union, types.UnionType):
+        return any(_fits(value, a) for a in args)
+    if origin is tuple:
+        if not isinstance(value, tuple):
+            return False
+        if len(args) == 2 and args[1] is Ellipsis:
+            return all(_fits(v, args[0]) for v in value)
+        return len(value) == len(args) and all(map(_fits, value, args))
+    if isinstance(value, bool):
+        return hint is bool
+    return isinstance(value, hint)
+
+
+def _shown(hint: Any) -> str:
+    """Return the values that a field takes, in words."""
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if origin is typing.Literal:
+        return ", ".join(repr(a) for a in args)
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join(_shown(a) for a in args)
+    if hint is type(None):
+        return '"none"'
+    return hint.__name__ if isinstance(hint, type) and not args else str(hint)
+
+
+def grid(base: FitConfig, **axes: Sequence[Any]) -> dict[str, FitConfig]:
+    """Return every combination of some fields' values, by a name that lists them.
+
+    Args:
+        base: gives all other fields.
+        axes: values by field; double underscores stand for dots, as in
+            `loss__relative_exposure__weight=[0.01, 0.1]`.
+
+    Raises:
+        UserError: see `with_fields`.
+    """
+    return _product(base, {name.replace("__", "."): values for name, values in axes.items()})
+
+
+def _product(base: FitConfig, axes: Mapping[str, Sequence[Any]]) -> dict[str, FitConfig]:
+    out = {}
+    for values in itertools.product(*axes.values()):
+        chosen = dict(zip(axes, values, strict=True))
+        name = ", ".join(f"{field.split('.')[-1]} {value}" for field, value in chosen.items())
+        out[name or "base"] = with_fields(base, chosen)
+    return out
+
+
+@dataclass(frozen=True)
+class SweepFile:
+    """The arguments of `sweep`, as a file gives them."""
+
+    scene: Path
+    out: Path
+    configs: dict[str, FitConfig]
+    seeds: tuple[int, ...]
+    reference: Path | None
+    max_parallel: int
+
+
+def read_sweep(path: Path) -> SweepFile:
+    """Read a TOML file that describes a sweep.
+
+        scene = "street"
+        reference = "street/reference"      # paths are relative to the file
+        out = "runs/sweep"
+        preset = "robust"
+        seeds = [0, 1, 2]
+        max_parallel = 1
+
+        [set]                               # for all
+        "train.steps" = 600
+
+        [grid]                              # every combination
+        "loss.relative_exposure.weight" = ["none", 0.01]
+
+        [[case]]                            # and single ones
+        name = "paper"
+        preset = "paper"
+        "densify.max_gaussians" = 30000
+
+    TOML has no null: "none" stands for it.
+
+    Raises:
+        UserError: the file is missing or not TOML, a key or a field is unknown, or a value is
+            wrong.
+    """
+    data = _parsed(Path(path))
+    seeds, parallel = data.get("seeds", [0]), data.get("max_parallel", 1)
+    if not isinstance(seeds, list) or not all(type(s) is int for s in seeds):
+        raise UserError(f"{path}: seeds = {seeds!r}.", fix="write whole numbers, as in [0, 1, 2]")
+    if type(parallel) is not int:
+        raise UserError(f"{path}: max_parallel = {parallel!r}.", fix="write a whole number")
+    folder, reference = Path(path).parent, data.get("reference")
+    return SweepFile(
+        scene=folder / data["scene"],
+        out=folder / data.get("out", Path(path).stem),
+        configs=_configs(data, path),
+        seeds=tuple(seeds),
+        reference=None if reference is None else folder / reference,
+        max_parallel=parallel,
+    )
+
+
+def _parsed(path: Path) -> dict[str, Any]:
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UserError(
+            f"{path} cannot be read: {error.strerror}.",
+            fix="name a TOML file; docs/sweeps.md shows one",
+        ) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UserError(
+            f"{path} is not valid TOML: {error}.",
+            fix="mend that line; docs/sweeps.md shows an example",
+        ) from error
+    unknown = [key for key in data if key not in KEYS]
+    if unknown:
+        raise UserError(f"{path}: unknown key {unknown[0]!r}.", fix=f"known: {', '.join(KEYS)}")
+    if "scene" not in data:
+        raise UserError(f"{path} does not name a scene.", fix='add scene = "FOLDER"')
+    return data
+
+
+def _configs(data: Mapping[str, Any], path: Path) -> dict[str, FitConfig]:
+    """Return the configurations of a file: those of its grid, then its single cases."""
+
+    def start(name: Any) -> FitConfig:
+        try:
+            return with_fields(preset(name), common)
+        except UserError as error:
+            raise UserError(f"{path}: {error.message}", fix=error.fix) from None
+
+    common = _nulls(data.get("set", {}))
+    usual, cases = data.get("preset", "robust"), data.get("case", [])
+    axes = {k: list(_nulls(dict(enumerate(v))).values()) for k, v in data.get("grid", {}).items()}
+    configs = _product(start(usual), axes) if axes or not cases else {}
+    for number, case in enumerate(cases, 1):
+        fields = _nulls(case)
+        name = str(fields.pop("name", f"case {number}"))
+        if name in configs:
+            raise UserError(
+                f"{path}: two configurations are called {name!r}.", fix="give each case its name"
+            )
+        configs[name] = with_fields(start(fields.pop("preset", usual)), fields)
+    return configs
+
+
+def _nulls(fields: Mapping[Any, Any]) -> dict[Any, Any]:
+    return {name: None if value == "none" else value for name, value in fields.items()}

@@ -1,0 +1,325 @@
+"""Sweeps: one scene fitted under many configurations, in processes, resumable, into one table."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from p2gs_jax.config import FitConfig, from_dict, to_dict
+from p2gs_jax.core.atomic import write_json, write_text
+from p2gs_jax.core.clock import whole_run
+from p2gs_jax.core.progress import Reporter
+from p2gs_jax.core.runtime import tune_process, use_compile_cache
+from p2gs_jax.core.text import parse_json
+from p2gs_jax.errors import UserError
+from p2gs_jax.evaluate.alignment import exposure_error
+from p2gs_jax.jobs.engines import LOCAL, check_engine, open_engine
+from p2gs_jax.jobs.job import Job, JobState, read_reason, slug
+from p2gs_jax.jobs.run import Runner, run_jobs
+from p2gs_jax.jobs.worker import run_in_process
+from p2gs_jax.pipeline.fit import fit
+from p2gs_jax.pipeline.preflight import check_run_dir
+from p2gs_jax.run.folder import RunFolder, locked
+from p2gs_jax.synth.exposures import read_true_exposures
+
+TABLE, TABLE_TEXT, JOBS = "sweep.json", "sweep.md", "jobs"
+
+
+@dataclass(frozen=True)
+class SweepResult:
+    """Result of a sweep.
+
+    Attributes:
+        rows: one dict per configuration and seed: name, seed, status (`done` or `failed`; in the
+            table of a sweep that was stopped also `waiting` and `interrupted`), run, the reason of
+            a failure, and those of `COLUMNS` that the run has.
+        out: the folder, with sweep.json and sweep.md.
+    """
+
+    rows: list[dict[str, Any]]
+    out: Path
+
+    def to_markdown(self) -> str:
+        """Return the table, means over seeds."""
+        return to_markdown(self.rows)
+
+
+def sweep(
+    scene: str | Path,
+    out: str | Path,
+    configs: Mapping[str, FitConfig],
+    *,
+    seeds: Sequence[int] = (0,),
+    reference: str | Path | None = None,
+    max_parallel: int = 1,
+    engine: str = LOCAL,
+    report: Callable[[str], None] = lambda line: None,
+    on_look: Callable[[Sequence[JobState]], None] = lambda states: None,
+    run: Runner = run_in_process,
+) -> SweepResult:
+    """Fit a scene under every configuration and seed.
+
+    Finished runs in `out` are kept, interrupted ones continue, failed ones are tried again; a
+    failure ends its run, not the sweep. The table is written anew after every run.
+
+    Args:
+        out: folder of the runs and the table.
+        configs: by name.
+        seeds: each replaces `train.seed`.
+        reference: see `fit`.
+        max_parallel: processes at a time; steps of one hardly use more than one core (BUILD_NOTES).
+        engine: where they run (`jobs.engines.open_engine`): local, dask://HOST:PORT or slurm.
+        report: receives a line per run.
+        on_look: receives how far the unfinished runs are, twice a second.
+        run: see `run_jobs`.
+
+    Raises:
+        UserError: nothing to do, names that would share a folder, a folder of other options, one
+            that another sweep is writing to, or an engine that is not there.
+        Interrupted: a signal asked for the end; the runs under way write their checkpoints first.
+    """
+    scene, out = Path(scene), Path(out)
+    _check(configs, seeds, max_parallel)
+    check_engine(engine)
+    out.mkdir(parents=True, exist_ok=True)
+    truth = None if reference is None else Path(reference)
+    jobs: list[Job] = []
+    rows: list[dict[str, Any]] = []
+    for name, cfg in configs.items():
+        for seed in seeds:
+            seeded = dataclasses.replace(cfg, train=dataclasses.replace(cfg.train, seed=seed))
+            folder = out / slug(name) / f"seed_{seed}"
+            check_run_dir(folder, True, seeded)
+            jobs.append(fit_job(f"{name}, seed {seed}", scene, folder, seeded, truth))
+            rows.append({"name": name, "seed": seed, "run": str(folder), "status": "waiting"})
+
+    def tell(number: int, state: JobState | None) -> None:
+        """Note what became of a run; None: it was there before."""
+        row = rows[number]
+        row.update(_outcome(jobs[number].folder, scene, state))
+        if row["status"] == "done":
+            took = 0.0 if state is None else state.seconds
+            text = "kept" if state is None else f"{row.get('seconds', took):.0f} s"
+        else:
+            text = f"{row['status']}: {row['reason']}"
+        report(f"[{number + 1}/{len(jobs)}] {jobs[number].name}: {text}")
+        write_json(out / TABLE, rows)
+        write_text(out / TABLE_TEXT, to_markdown(rows))
+
+    with locked(out):
+        left = []
+        for number, job in enumerate(jobs):
+            if (job.folder / "metrics.json").exists():
+                tell(number, None)
+            else:
+                left.append(number)
+        if left:
+            with open_engine(engine, max_parallel, out / JOBS) as workers:
+                run_jobs(
+                    [jobs[number] for number in left],
+                    workers,
+                    out / JOBS,
+                    on_end=lambda k, state: tell(left[k], state),
+                    on_look=on_look,
+                    run=run,
+                )
+    return SweepResult(rows, out)
+
+
+def _check(configs: Mapping[str, FitConfig], seeds: Sequence[int], max_parallel: int) -> None:
+    if not configs or not seeds:
+        raise UserError(
+            "a sweep needs at least one configuration and one seed.",
+            fix="see docs/sweeps.md for an example",
+        )
+    if max_parallel < 1:
+        raise UserError(f"max_parallel is {max_parallel}.", fix="let at least 1 run at a time")
+    folders = [slug(name) for name in configs]
+    if len(set(folders)) < len(folders):
+        twice = sorted({f for f in folders if folders.count(f) > 1})
+        raise UserError(
+            f"several configurations would share the folder {', '.join(twice)}.",
+            fix="give them names that differ in letters or digits",
+        )
+
+
+def fit_job(name: str, scene: Path, run: Path, cfg: FitConfig, reference: Path | None) -> Job:
+    """Return the job of a fit, which continues what its run folder holds."""
+    arguments = {
+        "scene": str(scene.absolute()),
+        "reference": None if reference is None else str(reference.absolute()),
+        "fit": to_dict(cfg),
+    }
+    return Job(name, run, fit_task, arguments)
+
+
+def fit_task(folder: Path, arguments: dict[str, Any], reporter: Reporter) -> None:
+    """Fit, or go on with a fit, under the arguments of a `fit_job`.
+
+    Raises:
+        UserError: see `fit`.
+    """
+    use_compile_cache()
+    tune_process()
+    fit(
+        arguments["scene"],
+        folder,
+        from_dict(arguments["fit"]),
+        reference=arguments["reference"],
+        resume=RunFolder(folder).config.exists(),
+        reporter=reporter,
+        # As for `p2gs-jax fit`: starting the interpreter counts.
+        spent_s=time.process_time(),
+    )
+
+
+def _outcome(run: Path, scene: Path, state: JobState | None) -> dict[str, Any]:
+    """Return the status of a run that has ended, with its columns or the reason."""
+    if state is not None and state.status == "stopped":
+        return {"status": "interrupted", "reason": "the same sweep continues it"}
+    if not (run / "metrics.json").exists():
+        return {"status": "failed", "reason": (state and state.reason) or read_reason(run)}
+    try:
+        return {"status": "done", **read_row(run, scene)}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        reason = f"its files cannot be read ({error}): remove {run} and repeat"
+        return {"status": "failed", "reason": reason}
+
+
+class Column(NamedTuple):
+    """A column of the table.
+
+    Attributes:
+        path: keys in metrics.json; () for values that are computed.
+        digits: after the decimal point.
+        heading: in the short table, which fits a terminal; "" where it is not there.
+    """
+
+    name: str
+    path: tuple[str, ...]
+    digits: int
+    heading: str = ""
+
+
+COLUMNS = (
+    Column("gaussians", ("counts", "gaussians"), 0, "Gaussians"),
+    Column("steps", ("counts", "steps"), 0),
+    Column("seconds", (), 0, "seconds"),
+    Column("train_psnr", ("train", "psnr"), 2, "training PSNR dB"),
+    Column("train_ssim", ("train", "ssim"), 4),
+    Column("train_lpips", ("train", "lpips"), 4),
+    Column("test_psnr_averaged", ("test", "averaged", "psnr"), 2),
+    Column("test_lpips_averaged", ("test", "averaged", "lpips"), 4),
+    Column("test_psnr_fitted", ("test", "exposure_fitted", "psnr"), 2, "held-out PSNR dB"),
+    Column("test_psnr_all_fitted", ("test", "photometry_fitted", "psnr"), 2),
+    Column("reference_psnr_averaged", ("reference", "averaged", "psnr"), 2),
+    Column("reference_psnr", ("reference", "scale_aligned", "psnr"), 2, "reference PSNR dB"),
+    Column("reference_lpips", ("reference", "scale_aligned", "lpips"), 4),
+    Column("reference_test_psnr", ("reference", "scale_aligned", "test", "psnr"), 2),
+    Column("reference_test_lpips", ("reference", "scale_aligned", "test", "lpips"), 4),
+    Column("radiance_stops", ("radiance", "stops_rms"), 3),
+    Column("ev", (), 4, "exposure error EV"),
+    Column("ev_power", (), 4),
+)
+# Explanations of columns by their names, or how these begin.
+MEANING = {
+    "seconds": "of the whole run, compilation and evaluation included",
+    "train_": "training views, each under its own exposure and gamma",
+    "test_psnr_averaged": "held-out views under the mean exposure and gamma (as in the paper)",
+    "test_psnr_fitted": "held-out views, exposure fitted to each photograph: the one to trust",
+    "test_psnr_all_fitted": "likewise, everything fitted that varies per view",
+    "reference_psnr": "all views against photographs of one exposure, one scale for all",
+    "reference_psnr_averaged": "likewise under the mean exposure",
+    "reference_test_": "likewise, held-out views only",
+    "radiance_stops": "RMS error of the radiance against HDR truth, stops",
+    "ev": "RMS error of the exposures against the truth, stops, after one scale",
+    "ev_power": "likewise after the best power as well",
+}
+
+
+def read_row(run: Path, scene: Path) -> dict[str, Any]:
+    """Return the columns that a finished run has, by name.
+
+    Args:
+        scene: where `truth/exposures.csv` may lie.
+    """
+    metrics = parse_json((run / "metrics.json").read_text(encoding="utf-8"))
+    row: dict[str, Any] = {}
+    for column in COLUMNS:
+        value = metrics
+        for key in column.path:
+            value = value.get(key) if isinstance(value, Mapping) else None
+        if column.path and value is not None:
+            row[column.name] = value
+    seconds = metrics.get("seconds")
+    total = whole_run(seconds) if isinstance(seconds, Mapping) else None
+    return row | ({} if total is None else {"seconds": total}) | _exposures(run, scene)
+
+
+def _exposures(run: Path, scene: Path) -> dict[str, float]:
+    """Return errors of the exposures where the scene knows them."""
+    truth = read_true_exposures(scene)
+    if not truth:
+        return {}
+    views = parse_json((run / "photometry.json").read_text(encoding="utf-8"))["views"]
+    pairs = [(v["exposure"], truth[v["image"]]) for v in views if v["exposure"] is not None]
+    if len(pairs) < 2:
+        return {}
+    error = exposure_error(*np.array(pairs).T)
+    return {"ev": error["ev"], "ev_power": error["ev_scale_power"]}
+
+
+def brief(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list[str]]]:
+    """Return headings and cells of the columns that matter most; means over seeds."""
+    by_name = {column.name: column for column in COLUMNS if column.heading}
+    shown = [by_name.pop("seconds"), *by_name.values()]
+    shown = [column for column in shown if any(column.name in row for row in rows)]
+    return ["configuration", "seeds", *(c.heading for c in shown)], _means(rows, shown)
+
+
+def _means(rows: Sequence[Mapping[str, Any]], columns: Sequence[Column]) -> list[list[str]]:
+    """Return a line of cells for each configuration: name, finished seeds, means over these."""
+    lines = []
+    for name in dict.fromkeys(row["name"] for row in rows):
+        mine = [row for row in rows if row["name"] == name]
+        done = [row for row in mine if row["status"] == "done"]
+        cells = []
+        for column in columns:
+            values = [row[column.name] for row in done if column.name in row]
+            cells.append(f"{np.mean(values):.{column.digits}f}" if values else "-")
+        lines.append([str(name), f"{len(done)} of {len(mine)}", *cells])
+    return lines
+
+
+def failures(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return a line for every run that is not done, with its reason."""
+    return [
+        f"{row['name']}, seed {row['seed']}: {row['status']}: {row.get('reason', '')}"
+        for row in rows
+        if row["status"] != "done"
+    ]
+
+
+def to_markdown(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return a table: a line per configuration, means over its seeds; failures with reasons."""
+    shown = [column for column in COLUMNS if any(column.name in row for row in rows)]
+    lines = [
+        "| configuration | seeds | " + " | ".join(c.name for c in shown) + " |",
+        "|---|---:|" + "---:|" * len(shown),
+        *("| " + " | ".join(line) + " |" for line in _means(rows, shown)),
+    ]
+    meant = [
+        f"- `{name}{'*' if name.endswith('_') else ''}`: {text}"
+        for name, text in MEANING.items()
+        if any(c.name == name or (name.endswith("_") and c.name.startswith(name)) for c in shown)
+    ]
+    bad = [f"- {line}" for line in failures(rows)]
+    lines += ["", *meant] if meant else []
+    lines += ["", "Not finished:", "", *bad] if bad else []
+    return "\n".join(lines) + "\n"

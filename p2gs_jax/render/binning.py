@@ -1,0 +1,177 @@
+"""Binning: which Gaussians each tile composites, in depth order, without a per-tile cap.
+
+No gradients flow here. Two ways: by counting (binning_cpu.py), sequential and linear, for CPUs; by
+sorting (here), data-parallel, for everything else. `RenderConfig.binning` None takes the device's.
+
+Sorting is integer work throughout. Single-operand uint32 sorts of packed keys are about five times
+as fast per element on XLA's CPU backend as comparator or multi-operand sorts (docs/kernel.md).
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, UInt32
+
+from p2gs_jax.config import RenderConfig
+from p2gs_jax.render import binning_cpu
+from p2gs_jax.render.binning_cpu import bits_for, boxes, depth_keys, grid_size
+from p2gs_jax.types import Splats2D, TileList
+
+
+def count_entries(splats: Splats2D, width: int, height: int, cfg: RenderConfig) -> Int[Array, ""]:
+    """Return the tile-list capacity this view needs, at most 2^30."""
+    return _choose(binning_cpu.count_entries, _count_by_sorting, splats, cfg, width, height)
+
+
+def bin_tiles(
+    splats: Splats2D, width: int, height: int, capacity: int, cfg: RenderConfig
+) -> TileList:
+    """List the Gaussians of every tile in depth order.
+
+    A tile gets a Gaussian only if its ellipse at the alpha cutoff reaches a pixel centre of it. The
+    list holds `capacity` entries, see `count_entries`; if `overflow` is set it is incomplete and
+    must not be composited.
+    """
+    return _choose(binning_cpu.bin_tiles, _bin_by_sorting, splats, cfg, width, height, capacity)
+
+
+def _choose(counting, sorting, splats: Splats2D, cfg: RenderConfig, *static):
+    splats = jax.tree.map(lax.stop_gradient, splats)
+
+    def way(function):
+        return lambda s: function(s, *static, cfg)
+
+    if cfg.binning is not None:
+        return way({"counting": counting, "sorting": sorting}[cfg.binning])(splats)
+    return lax.platform_dependent(splats, cpu=way(counting), default=way(sorting))
+
+
+def sort_payloads(keys: UInt32[Array, " n"], payload_bits: int) -> Int[Array, " n"]:
+    """Sort keys that carry a payload in their low bits; return the payloads in order."""
+    mask = jnp.uint32(2**payload_bits - 1)
+    return (lax.sort(keys, is_stable=False) & mask).astype(jnp.int32)
+
+
+def depth_order(depths: Float[Array, " n"], visible: Bool[Array, " n"]) -> Int[Array, " n"]:
+    """Return a stable argsort of positive depths, invisible ones last.
+
+    Two least-significant-digit passes. Exact while the visible depths' bit range fits two digits
+    of 32 - log2(N) bits each; beyond that the lowest mantissa bits tie and the index decides.
+    """
+    n = depths.shape[0]
+    payload_bits = bits_for(n)
+    digit_bits = 32 - payload_bits
+    key, span = depth_keys(depths, visible)
+    excess = (32 - lax.clz(span)).astype(jnp.int32) - 2 * digit_bits
+    key = key >> jnp.maximum(0, excess).astype(jnp.uint32)
+    key = jnp.minimum(key, jnp.uint32(2 ** min(2 * digit_bits, 32) - 1))
+    index = jnp.arange(n, dtype=jnp.uint32)
+    low_digit = key & jnp.uint32(2**digit_bits - 1)
+    by_low = sort_payloads(low_digit << payload_bits | index, payload_bits)
+    high_digit = (key >> digit_bits)[by_low]
+    return by_low[sort_payloads(high_digit << payload_bits | index, payload_bits)]
+
+
+def _extents(splats: Splats2D, width: int, height: int, cfg: RenderConfig):
+    """Return (boxes, x0, y0, tiles across, entries): the tiles of each bounding box."""
+    box = boxes(splats, width, height)
+    tile_x, tile_y = cfg.tile
+    x0, y0 = box.first[:, 0] // tile_x, box.first[:, 1] // tile_y
+    across = jnp.maximum(box.last[:, 0] // tile_x + 1 - x0, 1)
+    down = box.last[:, 1] // tile_y + 1 - y0
+    return box, x0, y0, across, jnp.where(box.visible, across * down, 0)
+
+
+def _too_many(entries: Int[Array, " n"]) -> Bool[Array, ""]:
+    """Return whether the sum of `entries` leaves int32."""
+    return jnp.sum(entries.astype(jnp.float32)) > 2.0**30
+
+
+def _count_by_sorting(
+    splats: Splats2D, width: int, height: int, cfg: RenderConfig
+) -> Int[Array, ""]:
+    """Return the tiles of all bounding boxes."""
+    entries = _extents(splats, width, height, cfg)[-1]
+    return jnp.where(_too_many(entries), 2**30, jnp.sum(entries))
+
+
+def _bin_by_sorting(
+    splats: Splats2D, width: int, height: int, capacity: int, cfg: RenderConfig
+) -> TileList:
+    tile_x, tile_y = cfg.tile
+    across_tiles, down_tiles = grid_size(width, height, cfg.tile)
+    tile_count = across_tiles * down_tiles
+    n = splats.depths.shape[0]
+    box, x0, y0, across, entries = _extents(splats, width, height, cfg)
+    order = depth_order(splats.depths, box.visible)
+
+    # Expand boxes into entries, in depth order: a scatter of starts and a running maximum.
+    ends = jnp.cumsum(entries[order])
+    starts = ends - entries[order]
+    count = jnp.where(_too_many(entries), 2**30, ends[-1])
+    rank = lax.cummax(
+        jnp.zeros(capacity, jnp.int32)
+        .at[jnp.where(entries[order] > 0, starts, capacity)]
+        .set(jnp.arange(n, dtype=jnp.int32), mode="drop")
+    )
+    ids = order[rank]
+    position = jnp.arange(capacity, dtype=jnp.int32)
+    table = jnp.concatenate(
+        [
+            splats.means2d,
+            splats.conic_factor,
+            jnp.stack([box.reach, *(v.astype(jnp.float32) for v in (x0, y0, across))], -1),
+        ],
+        axis=1,
+    )
+    row = table.at[ids].get(mode="promise_in_bounds")
+    mean_x, mean_y, a11, a12, a22, reach, x0_, y0_, across_ = (row[:, i] for i in range(9))
+    nth = (position - starts[rank]).astype(jnp.float32)
+    # Integer division is scalar code on the CPU; this float floor is exact below 2^22 tiles.
+    down = jnp.floor((nth + 0.5) / across_)
+    col, line = x0_ + nth - down * across_, y0_ + down
+
+    # Smallest exponent over the tile's rectangle of pixel centres, about the splat's centre.
+    half_x, half_y = (tile_x - 1) / 2, (tile_y - 1) / 2
+    dx, dy = col * tile_x + tile_x / 2 - mean_x, line * tile_y + tile_y / 2 - mean_y
+    left, right, top, bottom = dx - half_x, dx + half_x, dy - half_y, dy + half_y
+    A, B, C = a11 * a11, a11 * a12, a12 * a12 + a22 * a22
+
+    def quadratic(x, y):
+        return (a11 * x + a12 * y) ** 2 + (a22 * y) ** 2
+
+    near_x, near_y = jnp.clip(0.0, left, right), jnp.clip(0.0, top, bottom)
+    smallest = jnp.minimum(
+        quadratic(near_x, jnp.clip(-B / C * near_x, top, bottom)),
+        quadratic(jnp.clip(-B / A * near_y, left, right), near_y),
+    )
+    keep = (position < count) & (0.5 * smallest <= reach + 1e-4)
+    tile_id = jnp.where(keep, (line * across_tiles + col).astype(jnp.int32), tile_count)
+
+    rank_bits = bits_for(n)
+    if rank_bits + bits_for(tile_count + 1) <= 32:
+        key = tile_id.astype(jnp.uint32) << rank_bits | rank.astype(jnp.uint32)
+        sorted_ids = order[sort_payloads(key, rank_bits)]
+    else:
+        sorted_ids = ids[_stable_order(tile_id, tile_count + 1)]
+    histogram = jnp.zeros(tile_count + 1, jnp.int32).at[tile_id].add(1)
+    offsets = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(histogram[:tile_count])])
+    return TileList(sorted_ids, offsets, count, count > capacity)
+
+
+def _stable_order(keys: Int[Array, " m"], bound: int) -> Int[Array, " m"]:
+    """Return a stable argsort of integers below `bound`, digit by digit."""
+    index = jnp.arange(keys.shape[0], dtype=jnp.uint32)
+    payload_bits = bits_for(keys.shape[0])
+    digit_bits = 32 - payload_bits
+    order = None
+    for shift in range(0, bits_for(bound), digit_bits):
+        digit = (keys.astype(jnp.uint32) >> shift) & jnp.uint32(2**digit_bits - 1)
+        if order is None:
+            order = sort_payloads(digit << payload_bits | index, payload_bits)
+        else:
+            order = order[sort_payloads(digit[order] << payload_bits | index, payload_bits)]
+    assert order is not None
+    return order

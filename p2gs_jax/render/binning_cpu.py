@@ -1,0 +1,311 @@
+"""Binning by counting: linear time, exact, on loops that XLA's CPU backend compiles whole.
+
+A radix sort of the depths; then, from front to back, splats are expanded into the rows of tiles
+they touch and rows into tiles; then a counting sort by tile. Between the two expansions the
+columns that an ellipse covers in a row of tiles are solved in closed form, for all rows at once,
+so that no bounding box is ever expanded and the list holds exactly what is composited.
+
+Time depends on what a view needs, not on the capacity of its list: capacities may be generous.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from p2gs_jax.config import RenderConfig
+from p2gs_jax.render.xla_cpu import compiled_loop
+from p2gs_jax.types import Splats2D, TileList
+
+DIGIT_BITS = 13
+# Elements written at once: one vector register.
+WRITES = 8
+# Counts saturate here, within int32.
+MOST_ENTRIES = 2**30
+# Keeps splats that rounding alone would put below the cutoff.
+REACH_MARGIN = 1e-4
+# Rows of tiles solved at once.
+ROWS = 8192
+
+
+class Boxes(NamedTuple):
+    """Where each splat stays above the cutoff.
+
+    Attributes:
+        visible: reaches at least one pixel centre's row and column.
+        reach: log(opacity / cutoff): the exponent at which it falls below the cutoff.
+        first: first pixel column and row inside the box; `last`: the last ones.
+    """
+
+    visible: Bool[Array, " n"]
+    reach: Float[Array, " n"]
+    first: Int[Array, "n 2"]
+    last: Int[Array, "n 2"]
+
+
+def grid_size(width: int, height: int, tile: tuple[int, int]) -> tuple[int, int]:
+    """Return the number of tiles across and down."""
+    return -(-width // tile[0]), -(-height // tile[1])
+
+
+def bits_for(count: int) -> int:
+    """Return how many bits tell `count` things apart (at least one)."""
+    return max(1, int(count - 1).bit_length())
+
+
+def boxes(splats: Splats2D, width: int, height: int) -> Boxes:
+    """Return the box of every splat, clipped to the image."""
+    reach = splats.log_opacities - splats.log_cutoffs
+    radius = jnp.sqrt(2 * jnp.maximum(reach, 0.0))[:, None] * jnp.sqrt(splats.cov_diagonal)
+    size = jnp.array([width, height], jnp.float32)
+    # Pixel centres sit at +0.5: the first and last centres inside the box.
+    first = jnp.clip(jnp.ceil(splats.means2d - radius - 0.5), 0, size).astype(jnp.int32)
+    last = jnp.clip(jnp.floor(splats.means2d + radius - 0.5), -1, size - 1).astype(jnp.int32)
+    visible = splats.visible & (reach > 0) & jnp.all(last >= first, -1)
+    return Boxes(visible, reach, first, last)
+
+
+def depth_keys(depths: Float[Array, " n"], visible: Bool[Array, " n"]):
+    """Return (keys, span): unsigned integers that order positive depths, invisible ones last.
+
+    Bits of positive floats order as the floats do; the smallest visible one is subtracted so that
+    few bits are left to sort. `span` is the largest key.
+    """
+    bits = jnp.asarray(depths.astype(jnp.float32)).view(jnp.uint32)
+    low = jnp.min(jnp.where(visible, bits, jnp.uint32(0xFFFFFFFF)))
+    high = jnp.max(jnp.where(visible, bits, 0))
+    span = jnp.maximum(high, low) - low + 1
+    return jnp.where(visible, bits - low, span), span
+
+
+def _at(a, i):
+    return lax.dynamic_slice(a, (i,), (1,))[0]
+
+
+def _put(a, value, i):
+    return lax.dynamic_update_slice(a, value[None], (i,))
+
+
+def _starts(keys, bound: int):
+    """Return (starts, counts) of every key value below `bound`."""
+    counts = jnp.zeros(bound, jnp.int32).at[keys].add(1, mode="drop")
+    return jnp.cumsum(counts) - counts, counts
+
+
+@compiled_loop
+def _histogram(keys, blank, used):
+    """Return how often every value occurs among keys[:used], added to `blank`."""
+
+    def body(i, counts):
+        key = _at(keys, i)
+        return _put(counts, _at(counts, key) + 1, key)
+
+    return lax.fori_loop(0, used, body, blank)
+
+
+@compiled_loop
+def _place(keys, rows, values, starts, used):
+    """Return values[rows[:used]] in stable order of their keys; `starts`: where each key begins."""
+
+    def body(i, state):
+        cursor, out = state
+        key = _at(keys, i)
+        # Reading the cursor back after its update spares XLA a copy of the whole array.
+        cursor = _put(cursor, _at(cursor, key) + 1, key)
+        return cursor, _put(out, _at(values, _at(rows, i)), _at(cursor, key) - 1)
+
+    return lax.fori_loop(0, used, body, (starts, jnp.zeros_like(keys)))[1]
+
+
+@compiled_loop
+def _place_indirect(digits, order, starts):
+    """Return `order` stably sorted by the digits of the things it lists."""
+
+    def body(i, state):
+        cursor, out = state
+        index = _at(order, i)
+        digit = _at(digits, index)
+        cursor = _put(cursor, _at(cursor, digit) + 1, digit)
+        return cursor, _put(out, index, _at(cursor, digit) - 1)
+
+    return lax.fori_loop(0, order.shape[0], body, (starts, jnp.zeros_like(order)))[1]
+
+
+def depth_order(depths: Float[Array, " n"], visible: Bool[Array, " n"]) -> Int[Array, " n"]:
+    """Return a stable argsort of positive float32 depths, invisible ones last. Always exact."""
+    keys, span = depth_keys(depths, visible)
+    order = jnp.arange(depths.shape[0], dtype=jnp.int32)
+    for shift in range(0, 32, DIGIT_BITS):
+        digits = (keys >> shift & jnp.uint32(2**DIGIT_BITS - 1)).astype(jnp.int32)
+
+        def sort(digits=digits, order=order):
+            return _place_indirect(digits, order, _starts(digits, 2**DIGIT_BITS)[0])
+
+        if shift == 0:
+            order = sort()
+        else:
+            order = lax.cond(span >> shift > 0, sort, lambda order=order: order)
+    return order
+
+
+def _expand(firsts, lengths, used, capacity: int):
+    """Expand ranges: range i gives the values firsts[i], firsts[i] + 1, ... (lengths[i] of them).
+
+    Returns:
+        The number of values, up to MOST_ENTRIES; the first `capacity` of them; and the range of
+        each. Both arrays have room for one more write.
+    """
+
+    @compiled_loop
+    def expand(firsts, lengths, used):
+        def body(i, state):
+            first, length = _at(firsts, i), _at(lengths, i)
+            count, values, owners = state
+
+            def write(state):
+                k, values, owners = state
+                here = first + k + lax.iota(jnp.int32, WRITES)
+                values = lax.dynamic_update_slice(values, here, (count + k,))
+                mine = jnp.broadcast_to(i, (WRITES,))
+                return k + WRITES, values, lax.dynamic_update_slice(owners, mine, (count + k,))
+
+            _, values, owners = lax.while_loop(
+                lambda s: (s[0] < length) & (count + s[0] < capacity),
+                write,
+                (jnp.int32(0), values, owners),
+            )
+            return jnp.minimum(count + length, MOST_ENTRIES), values, owners
+
+        blank = jnp.zeros(capacity + WRITES, jnp.int32)
+        return lax.fori_loop(0, used, body, (jnp.int32(0), blank, blank))
+
+    return expand(firsts, lengths, used)
+
+
+class _Ellipses(NamedTuple):
+    """The outlines of splats at their cutoffs, pixels.
+
+    At height dy above its centre an ellipse spans slope dy +- half_width sqrt(1 - (curvature
+    dy)^2); it is widest to the right at dy = peak and reaches +-extent.
+    """
+
+    x: Array
+    y: Array
+    slope: Array
+    half_width: Array
+    curvature: Array
+    peak: Array
+    extent: Array
+
+
+def _ellipses(splats: Splats2D, box: Boxes) -> _Ellipses:
+    a11, a12, a22 = (splats.conic_factor[:, i] for i in range(3))
+    radius = jnp.sqrt(2 * (jnp.maximum(box.reach, 0) + REACH_MARGIN))
+    lean = -a12 / a22
+    extent = radius / a22
+    return _Ellipses(
+        x=splats.means2d[:, 0],
+        y=splats.means2d[:, 1],
+        slope=-a12 / a11,
+        half_width=radius / a11,
+        curvature=1 / extent,
+        peak=extent * lean * lax.rsqrt(1 + lean * lean),
+        extent=extent,
+    )
+
+
+def _span(e: _Ellipses, row: Int[Array, " m"], width: int, tile: tuple[int, int]):
+    """Return (first tile column, number of tiles) that each ellipse covers in a row of tiles.
+
+    A tile is covered if the ellipse reaches one of its columns of pixel centres within the row's
+    first and last line of them.
+    """
+    tile_x, tile_y = tile
+    top = jnp.maximum(row * tile_y + 0.5 - e.y, -e.extent)
+    bottom = jnp.minimum(row * tile_y + tile_y - 0.5 - e.y, e.extent)
+
+    def edge(side):
+        at = jnp.minimum(jnp.maximum(side * e.peak, top), bottom)
+        half = e.half_width * jnp.sqrt(jnp.maximum(1 - (e.curvature * at) ** 2, 0))
+        return e.x - 0.5 + e.slope * at + side * half
+
+    left = jnp.minimum(jnp.maximum(jnp.ceil(edge(-1)), 0.0), float(width))
+    right = jnp.minimum(jnp.maximum(jnp.floor(edge(1)), -1.0), width - 1.0)
+    first, last = (jnp.floor((p + 0.5) * (1 / tile_x)).astype(jnp.int32) for p in (left, right))
+    return first, jnp.where(right >= left, last - first + 1, 0)
+
+
+def _tile_rows(box: Boxes, tile_y: int):
+    """Return (first row of tiles, number of rows) of every box."""
+    first, last = box.first[:, 1] // tile_y, box.last[:, 1] // tile_y
+    return first, jnp.where(box.visible, last - first + 1, 0)
+
+
+def count_entries(splats: Splats2D, width: int, height: int, cfg: RenderConfig) -> Int[Array, ""]:
+    """Return the tile-list capacity this view needs: rows or entries, whichever are more."""
+    box = boxes(splats, width, height)
+    ellipses = _ellipses(splats, box)
+    first, rows = _tile_rows(box, cfg.tile[1])
+
+    def body(k, total):
+        lengths = _span(ellipses, first + k, width, cfg.tile)[1]
+        here = jnp.sum(jnp.where(k < rows, lengths, 0).astype(jnp.float32))
+        # Each step is exact below 2^24 and the sum saturates.
+        return jnp.minimum(total + here.astype(jnp.int32), MOST_ENTRIES)
+
+    entries = lax.fori_loop(0, jnp.max(rows, initial=0), body, jnp.int32(0))
+    return jnp.maximum(entries, jnp.minimum(jnp.sum(rows), MOST_ENTRIES))
+
+
+def bin_tiles(
+    splats: Splats2D, width: int, height: int, capacity: int, cfg: RenderConfig
+) -> TileList:
+    """Return the lists, see `p2gs_jax.render.binning.bin_tiles`."""
+    across, down = grid_size(width, height, cfg.tile)
+    tile_count = across * down
+    box = boxes(splats, width, height)
+    order = depth_order(splats.depths, box.visible)
+    first, rows = (a[order] for a in _tile_rows(box, cfg.tile[1]))
+    visible = jnp.sum(box.visible, dtype=jnp.int32)
+    row_count, row, owner = _expand(first, rows, visible, capacity)
+
+    used_rows = jnp.minimum(row_count, capacity)
+    ids, first, lengths = _solve_rows(
+        row, owner, order, _ellipses(splats, box), used_rows, width, cfg.tile
+    )
+    entries, tiles, row_of = _expand(row * across + first, lengths, used_rows, capacity)
+    used = jnp.minimum(entries, capacity)
+    # One value more than there are tiles: XLA dissolves the counting of a single one and aborts.
+    counts = _histogram(tiles, jnp.zeros(tile_count + 1, jnp.int32), used)
+    ends = jnp.cumsum(counts)
+    offsets = jnp.concatenate([jnp.zeros(1, jnp.int32), ends[:tile_count]])
+    listed = _place(tiles, row_of, ids, ends - counts, used)[:capacity]
+    count = jnp.maximum(row_count, entries)
+    return TileList(listed, offsets, count, count > capacity)
+
+
+def _solve_rows(row, owner, order, ellipses: _Ellipses, used, width: int, tile: tuple[int, int]):
+    """Return (Gaussian, first tile column, number of tiles) of every row of tiles, block by block.
+
+    `row` are the `used` rows of tiles that splats touch; `owner` whose they are, as places in
+    `order`, which lists the splats from front to back.
+    """
+    size = min(ROWS, row.shape[0])
+    table = jnp.stack(ellipses, -1)
+
+    def body(k, state):
+        here = (k * size,)
+        ids = order[lax.dynamic_slice(owner, here, (size,))]
+        block = table.at[ids].get(mode="promise_in_bounds")
+        mine = _Ellipses(*(block[:, i] for i in range(len(_Ellipses._fields))))
+        first, lengths = _span(mine, lax.dynamic_slice(row, here, (size,)), width, tile)
+        return tuple(
+            lax.dynamic_update_slice(a, b, here)
+            for a, b in zip(state, (ids, first, lengths), strict=True)
+        )
+
+    blank = jnp.zeros(row.shape[0], jnp.int32)
+    return lax.fori_loop(0, -(-used // size), body, (blank, blank, blank))

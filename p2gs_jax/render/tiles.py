@@ -1,0 +1,255 @@
+"""Compositing: the dense reference, and what all rasterizers of tiles share.
+
+A tile rasterizer is a module `rasterize_NAME` with its exponent's unit, `exponent_scale`, and a
+pair of functions:
+`forward(rows, ids, offsets, plan)` gives the channels of the image and the transmittance, [T P]
+each, and what its own backward needs;
+`backward(rows, ids, residuals, image, v_image, plan)` gives the gradient of the rows.
+
+Rows. A Gaussian is a row of floats: mean x, y; conic factor a11, a12, a22; log opacity; three
+radiances; depth if asked for; its own log cutoff if they differ. Factor, opacity and cutoff are
+divided by the plan's `exponent_scale` (the factor by its root), in the units that suit an
+implementation's exponential: e = log opacity - (u^2 + v^2) and alpha = exp(exponent_scale e).
+Row N is a dummy that absorbs padding.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from importlib import import_module
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from p2gs_jax.config import RenderConfig
+from p2gs_jax.render.binning import grid_size
+from p2gs_jax.types import Splats2D, TileList
+
+TileImplementation = Literal["xla", "pallas"]
+SMALLEST_CUTOFF = 1e-7
+DUMMY_LOG_OPACITY = -100.0
+GEOMETRY = 6  # columns of a row before its channels
+# Lanes for every tile of an image too small to fill them.
+MOST_LANES = 8
+# Floor of a pixel's brightness in the stop rule, over the brightest splat
+# (RenderConfig.stop_error).
+DARKEST = 1e-4
+
+
+def smallest_cutoff(cfg: RenderConfig) -> float:
+    """Return the lowest opacity cutoff that any splat may have."""
+    if cfg.cutoff_rule == "opacity":
+        return cfg.alpha_cutoff
+    return min(SMALLEST_CUTOFF, cfg.alpha_cutoff)
+
+
+def with_cutoffs(splats: Splats2D, radiance: Float[Array, "n 3"], cfg: RenderConfig) -> Splats2D:
+    """Return splats with the log cutoffs that `cfg.cutoff_rule` gives them.
+
+    Rule `radiance`: with L the brightest channel of a splat and M the geometric mean of L over the
+    visible splats, the cutoff is alpha_cutoff min(1, M / L), at least 1e-7 and at most
+    alpha_cutoff. A skipped contribution is then at most alpha_cutoff M (or 1e-7 L).
+    """
+    if cfg.cutoff_rule == "opacity":
+        return splats
+    log_l = jnp.log(jnp.maximum(lax.stop_gradient(jnp.max(radiance, -1)), 1e-30))
+    shown = splats.visible
+    mean = jnp.sum(jnp.where(shown, log_l, 0)) / jnp.maximum(jnp.sum(shown), 1)
+    lowered = float(np.log(cfg.alpha_cutoff)) - jnp.maximum(log_l - mean, 0)
+    lowest = float(np.log(smallest_cutoff(cfg)))
+    return dataclasses.replace(splats, log_cutoffs=jnp.maximum(lowered, lowest))
+
+
+def rasterize_reference(
+    splats: Splats2D, radiance: Float[Array, "n 3"], width: int, height: int, cfg: RenderConfig
+) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"], Float[Array, "h w"]]:
+    """Return radiance, alpha and alpha-weighted depth by dense compositing (paper, eq. 3).
+
+    The oracle: every pixel composites every Gaussian front to back, without a stop rule, by plain
+    autodiff, in whatever precision it is given. Memory is O(N H W): tests only.
+    """
+    order = jnp.argsort(jnp.where(splats.visible, splats.depths, jnp.inf))
+    s = jax.tree.map(lambda a: a[order], splats)
+    x = jnp.arange(width) + 0.5
+    y = jnp.arange(height) + 0.5
+    dx = x[None, None, :] - s.means2d[:, 0, None, None]
+    dy = y[None, :, None] - s.means2d[:, 1, None, None]
+    a11, a12, a22 = (s.conic_factor[:, i, None, None] for i in range(3))
+    exponent = s.log_opacities[:, None, None] - 0.5 * ((a11 * dx + a12 * dy) ** 2 + (a22 * dy) ** 2)
+    alpha = jnp.where(
+        exponent > s.log_cutoffs[:, None, None],
+        jnp.minimum(jnp.exp(exponent), cfg.alpha_max),
+        0.0,
+    )
+    behind = jnp.cumprod(1 - alpha, 0)
+    weight = alpha * jnp.concatenate([jnp.ones_like(behind[:1]), behind[:-1]])
+    return (
+        jnp.einsum("nhw,nk->hwk", weight, radiance[order]),
+        jnp.sum(weight, 0),
+        jnp.einsum("nhw,n->hw", weight, s.depths),
+    )
+
+
+class Plan(NamedTuple):
+    """Static shape of one compositing run."""
+
+    across: int
+    down: int
+    tile_x: int
+    tile_y: int
+    lanes: int
+    chunk: int
+    gaussians: int
+    channels: int
+    exponent_scale: float
+    log_cutoff: float
+    own_cutoffs: bool
+    alpha_max: float
+    stop_error: float | None
+    exp_degree: int | None
+    deterministic: bool
+
+    @property
+    def tile_count(self) -> int:
+        """Tiles of the image."""
+        return self.across * self.down
+
+    @property
+    def pixels(self) -> int:
+        """Pixels of a tile."""
+        return self.tile_x * self.tile_y
+
+    def local_pixels(self) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
+        """Return pixel-centre offsets from the tile centre."""
+        x = jnp.tile(jnp.arange(self.tile_x) - (self.tile_x - 1) / 2, self.tile_y)
+        y = jnp.repeat(jnp.arange(self.tile_y) - (self.tile_y - 1) / 2, self.tile_x)
+        return x.astype(jnp.float32), y.astype(jnp.float32)
+
+
+def pack_rows(
+    splats: Splats2D, radiance: Float[Array, "n 3"], plan: Plan
+) -> Float[Array, "n1 row"]:
+    """Return the rows of all Gaussians and of the dummy."""
+    factor = float(np.sqrt(0.5 / plan.exponent_scale))
+    columns = [
+        splats.means2d,
+        splats.conic_factor * factor,
+        splats.log_opacities[:, None] / plan.exponent_scale,
+        radiance,
+    ]
+    if plan.channels == 4:
+        columns.append(splats.depths[:, None])
+    if plan.own_cutoffs:
+        columns.append(splats.log_cutoffs[:, None] / plan.exponent_scale)
+    rows = jnp.where(splats.visible[:, None], jnp.concatenate(columns, axis=1), 0.0)
+    dummy = jnp.zeros((1, rows.shape[1]), rows.dtype).at[0, GEOMETRY - 1].set(DUMMY_LOG_OPACITY)
+    return jnp.concatenate([rows, dummy])
+
+
+def geometry_gradient(
+    moments: Sequence[Array], factor: Sequence[Array], center: Sequence[Array], scale: float
+) -> tuple[Array, ...]:
+    """Return the gradient to the first six columns of a row, from moments over a tile.
+
+    Args:
+        moments: sums over the tile's pixels of the gradient to the exponent, times 1, x, y, x^2,
+            x y, y^2, with x and y from the tile's centre.
+        factor: a11, a12, a22.
+        center: u, v, and the offsets x and y from the mean, at the tile's centre.
+        scale: the plan's `exponent_scale`.
+    """
+    m1, mx, my, mxx, mxy, myy = moments
+    a11, a12, a22 = factor
+    u0, v0, dx0, dy0 = center
+    # Moments of u and v themselves, and of u and v times the offsets.
+    mu, mv = u0 * m1 + a11 * mx + a12 * my, v0 * m1 + a22 * my
+    mux = u0 * mx + a11 * mxx + a12 * mxy
+    muy = u0 * my + a11 * mxy + a12 * myy
+    mvy = v0 * my + a22 * myy
+    return (
+        scale * (2 * a11 * mu),
+        scale * (2 * (a12 * mu + a22 * mv)),
+        scale * (-2 * (mux + dx0 * mu)),
+        scale * (-2 * (muy + dy0 * mu)),
+        scale * (-2 * (mvy + dy0 * mv)),
+        scale * m1,
+    )
+
+
+def _module(name: TileImplementation):
+    """Return the module; Pallas is imported only where it is used."""
+    return import_module(f"p2gs_jax.render.rasterize_{name}")
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4))
+def _composite(rows, ids, offsets, plan: Plan, name: TileImplementation):
+    return _module(name).forward(rows, ids, offsets, plan)[0]
+
+
+def _composite_fwd(rows, ids, offsets, plan: Plan, name: TileImplementation):
+    image, own = _module(name).forward(rows, ids, offsets, plan)
+    return image, (rows, ids, own, image)
+
+
+def _composite_bwd(plan: Plan, name: TileImplementation, residuals, v_image):
+    rows, ids, own, image = residuals
+    return _module(name).backward(rows, ids, own, image, v_image, plan), None, None
+
+
+_composite.defvjp(_composite_fwd, _composite_bwd)
+
+
+def _untile(channel, plan: Plan):
+    """Return a channel [T P] as an image."""
+    grid = channel.reshape(plan.down, plan.across, plan.tile_y, plan.tile_x)
+    return grid.transpose(0, 2, 1, 3).reshape(plan.down * plan.tile_y, plan.across * plan.tile_x)
+
+
+def rasterize_tiles(
+    splats: Splats2D,
+    radiance: Float[Array, "n 3"],
+    tiles: TileList,
+    width: int,
+    height: int,
+    cfg: RenderConfig,
+    implementation: TileImplementation,
+    with_depth: bool = True,
+) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"], Float[Array, "h w"] | None]:
+    """Composite the lists of a view, which must not have overflowed, tile by tile.
+
+    Returns:
+        Linear radiance (black background), alpha, and alpha-weighted depth or None.
+    """
+    tile_x, tile_y = cfg.tile
+    across, down = grid_size(width, height, cfg.tile)
+    smallest = smallest_cutoff(cfg)
+    plan = Plan(
+        across=across,
+        down=down,
+        tile_x=tile_x,
+        tile_y=tile_y,
+        lanes=max(1, min(cfg.pixels_in_flight // (tile_x * tile_y), MOST_LANES * across * down)),
+        chunk=cfg.chunk,
+        gaussians=splats.depths.shape[0],
+        channels=4 if with_depth else 3,
+        exponent_scale=_module(implementation).exponent_scale(smallest),
+        log_cutoff=float(np.log(smallest)),
+        own_cutoffs=cfg.cutoff_rule == "radiance",
+        alpha_max=cfg.alpha_max,
+        stop_error=cfg.stop_error,
+        exp_degree=cfg.exp_degree,
+        deterministic=cfg.deterministic,
+    )
+    rows = pack_rows(splats, radiance, plan)
+    tiled: tuple[Array, ...] = _composite(
+        rows, tiles.gaussian_ids, tiles.offsets, plan, implementation
+    )
+    *channels, transmittance = (_untile(a, plan)[:height, :width] for a in tiled)
+    depth = channels[3] if with_depth else None
+    return jnp.stack(channels[:3], -1), 1 - transmittance, depth

@@ -1,0 +1,496 @@
+"""What each camera did to the light, for other tools to read (docs/files.md).
+
+`photometry.json` has exposures, gammas and tone curve; `metering.json` the rule that explains the
+exposures; `appearance.npy`, `ppisp.json` or `luminance.json` what a baseline learns.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NotRequired, TypedDict
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from p2gs_jax.config import Appearance, CameraFormation, FitConfig, PhotometryConfig
+from p2gs_jax.core.atomic import write_array, write_json
+from p2gs_jax.core.numerics import LN2, on_device
+from p2gs_jax.core.text import parse_json
+from p2gs_jax.errors import UserError
+from p2gs_jax.photometry.appearance import Corrections, identity
+from p2gs_jax.photometry.cameras import corner
+from p2gs_jax.photometry.luminance.parameters import Luminance
+from p2gs_jax.photometry.mean import mean_parameters
+from p2gs_jax.photometry.metering import METERS, Metering, Rule
+from p2gs_jax.photometry.ppisp.parameters import Ppisp
+from p2gs_jax.photometry.solution import PhotometricSolution
+from p2gs_jax.types import Params, Photometry, Scene, View
+
+VERSION = 2
+AGAIN = "restore it from a copy, or run `p2gs-jax fit ... --resume` or `calibrate` again"
+# Absent where there was no bundle adjustment, or white balance is not modelled.
+_OPTIONAL = frozenset(
+    {
+        *("exposure_ev_error", "gamma_error", "exposure_ev_start", "observations"),
+        *("exposure_unknown", "white_balance", "white_balance_ev_error"),
+    }
+)
+
+
+class ViewPhotometry(TypedDict):
+    """One view.
+
+    Attributes:
+        image: name in the scene.
+        camera: physical camera.
+        exposure: e > 0, or null for a held-out view, which has none.
+        exposure_ev: log2 of it.
+        gamma: gamma, or null.
+        exif_ev: log2(t ISO / N^2) from EXIF, or null.
+        split: train or test.
+        exposure_fitted: for a held-out view, the scalar solved from its photograph.
+        exposure_unknown: true where the photograph is black or saturated everywhere.
+        exposure_ev_error: standard error of `exposure_ev` from the bundle adjustment, or null.
+        gamma_error: standard error of `gamma`, or null.
+        exposure_ev_start: `exposure_ev` before the first step, where a bundle adjustment gave it.
+        observations: usable observations of shared points that it had in this view.
+        white_balance: factors on red, green and blue beside the exposure, of geometric mean 1; null
+            where it is not modelled, and of a held-out view.
+        white_balance_ev_error: standard errors of their log2 from the bundle adjustment, or null.
+    """
+
+    image: str
+    camera: str
+    exposure: float | None
+    exposure_ev: float | None
+    gamma: float | None
+    exif_ev: float | None
+    split: str
+    exposure_fitted: float | None
+    exposure_unknown: NotRequired[bool]
+    exposure_ev_error: NotRequired[float | None]
+    gamma_error: NotRequired[float | None]
+    exposure_ev_start: NotRequired[float | None]
+    observations: NotRequired[int | None]
+    white_balance: NotRequired[list[float] | None]
+    white_balance_ev_error: NotRequired[list[float] | None]
+
+
+class CameraPhotometry(TypedDict):
+    """What one physical camera does besides; rows are one for all channels, or one for each.
+
+    Attributes:
+        name: as `camera` of its views.
+        vignetting: rows of k1, k2, k3 in log V(r) = k1 r^2 + k2 r^4 + k3 r^6, with r = 1 in the
+            corners; null: none.
+        corner: V in the corners, of every row, or null.
+        corner_ev_error: standard errors of their log2 from the bundle adjustment, or null.
+        splines: rows of a response of its own, as `curve.spline`; null: that one.
+    """
+
+    name: str
+    vignetting: list[list[float]] | None
+    corner: list[float] | None
+    corner_ev_error: list[float] | None
+    splines: list[list[float]] | None
+
+
+class PhotometryFile(TypedDict):
+    """The file: version, model, tone curve, gauge, mean parameters, cameras, views."""
+
+    version: int
+    model: str
+    curve: dict
+    gauge: str
+    mean: dict
+    cameras: list[CameraPhotometry]
+    views: list[ViewPhotometry]
+
+
+def write_photometry(
+    path: Path,
+    *,
+    model: str,
+    curve: dict,
+    gauge: str,
+    mean: dict,
+    views: list[ViewPhotometry],
+    cameras: Sequence[CameraPhotometry] = (),
+) -> None:
+    """Write `photometry.json` atomically.
+
+    Raises:
+        ValueError: a view lacks a field.
+    """
+    data = {
+        "version": VERSION,
+        "model": model,
+        "curve": curve,
+        "gauge": gauge,
+        "mean": mean,
+        "cameras": list(cameras),
+        "views": views,
+    }
+    if problem := _problem(data):
+        raise ValueError(problem)
+    write_json(path, data)
+
+
+def read_photometry(path: Path) -> PhotometryFile:
+    """Read `photometry.json`.
+
+    Raises:
+        UserError: it cannot be read, lacks a field, or has another version.
+    """
+    try:
+        data = parse_json(Path(path).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path} cannot be read: {error}.", fix=AGAIN) from error
+    if problem := _problem(data):
+        raise UserError(f"{path} is incomplete: {problem}.", fix=AGAIN)
+    return data
+
+
+def _problem(data) -> str | None:
+    """Return what keeps `data` from being a `PhotometryFile`, or None."""
+    if missing := _missing(data, PhotometryFile):
+        return missing
+    if data["version"] != VERSION:
+        return f"its version is {data['version']}, and this program reads version {VERSION}"
+    if not isinstance(data["views"], list):
+        return "views is not a list"
+    for number, view in enumerate(data["views"]):
+        if missing := _missing(view, ViewPhotometry):
+            return f"view {number}: {missing}"
+    return None
+
+
+def _missing(data, kind: Any) -> str | None:
+    if not isinstance(data, dict):
+        return "not an object"
+    names = [k for k in kind.__annotations__ if k not in data and k not in _OPTIONAL]
+    return f"{', '.join(names)} missing" if names else None
+
+
+def with_curve_of(cfg: PhotometryConfig, saved: PhotometryFile) -> PhotometryConfig:
+    """Return options with the model and the tone curve that a file names.
+
+    Raises:
+        UserError: it names none.
+    """
+    curve = saved["curve"]
+    try:
+        spline = curve["spline"]
+        return dataclasses.replace(
+            cfg,
+            select=False,
+            model=saved["model"],  # pyright: ignore[reportArgumentType]
+            curve=curve["name"],
+            spline=None if spline is None else tuple(map(float, spline)),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(f"photometry.json names no tone curve ({error}).", fix=AGAIN) from error
+
+
+def write_fitted(
+    path: Path,
+    params: Params,
+    scene: Scene,
+    cfg: FitConfig,
+    *,
+    fitted: Mapping[int, float],
+    unknown: Sequence[str] = (),
+    solution: PhotometricSolution | None = None,
+) -> None:
+    """Write `photometry.json` of a finished fit.
+
+    Args:
+        path: of the file.
+        params: what was fitted.
+        scene: its views.
+        cfg: what the fit computed under.
+        fitted: exposures solved for held-out views, by row.
+        unknown: names of photographs that tell no exposure.
+        solution: what the fit started from, or None; its errors and counts are passed on.
+    """
+    p, mean = cfg.photometry, dataclasses.asdict(mean_parameters(params.photometry))
+    gauge = (
+        "mean log exposure over the training views is 0; radiance is relative to it"
+        if params.photometry.parameterization == "log"
+        else "soft: the mean exposure is pulled towards 1 (paper, eq. 10)"
+    )
+    if p.known is not None:
+        gauge = f"known exposures ({p.known}); radiance is in their units"
+    balance = mean.pop("white_balance")
+    if balance is not None:
+        mean["white_balance"] = np.exp(balance).tolist()
+    write_photometry(
+        path,
+        model=p.model,
+        curve={"name": p.curve, "pivot": p.pivot, "spline": p.spline},
+        gauge=gauge,
+        mean=mean,
+        views=_fitted_rows(params, scene, fitted, unknown, solution),
+        cameras=_camera_rows(p.cameras, None if solution is None else solution.corner_errors),
+    )
+
+
+def _fitted_rows(
+    params: Params,
+    scene: Scene,
+    fitted: Mapping[int, float],
+    unknown: Sequence[str],
+    solution: PhotometricSolution | None,
+) -> list[ViewPhotometry]:
+    """Return the `views` of a fit; held-out views have no exposure of their own."""
+    taken: Photometry = jax.tree.map(np.asarray, params.photometry)
+    exposures, gammas, balances = taken.exposures, taken.gammas, taken.white_balance
+    rows = {index: k for k, index in enumerate(scene.train_indices)}
+    out: list[ViewPhotometry] = []
+    for index, view in enumerate(scene.views):
+        k = rows.get(index)
+        e = None if k is None else float(exposures[k])
+        balance = None if k is None or balances is None else np.exp(balances[k]).tolist()
+        row: ViewPhotometry = {
+            "image": view.name,
+            "camera": view.camera,
+            "exposure": e,
+            "exposure_ev": None if e is None else float(np.log2(e)),
+            "gamma": None if k is None else float(gammas[k]),
+            "exif_ev": view.exif_ev,
+            "split": view.split,
+            "exposure_fitted": fitted.get(index),
+            "white_balance": balance,
+            "white_balance_ev_error": None,
+        }
+        if view.name in unknown:
+            row["exposure_unknown"] = True
+        if k is not None and solution is not None and np.isfinite(solution.exposure_errors[k]):
+            row["exposure_ev_error"] = float(solution.exposure_errors[k] / LN2)
+            row["gamma_error"] = float(solution.gamma_errors[k])
+            row["exposure_ev_start"] = float(solution.exposures_ev[k])
+            row["observations"] = int(solution.observations_per_view[k])
+            row["white_balance_ev_error"] = _balance(solution, k)[1]
+        out.append(row)
+    return out
+
+
+def write_solution(
+    path: Path,
+    solution: PhotometricSolution,
+    *,
+    views: Sequence[View],
+    pivot: float,
+    gauge: str,
+) -> None:
+    """Write `photometry.json` of a bundle adjustment; views it knows nothing about get nulls.
+
+    Args:
+        path: of the file.
+        solution: exposures, gammas, response.
+        views: its views, in order.
+        pivot: linear value that gammas leave alone.
+        gauge: what fixes the scale, in words.
+    """
+    s = solution
+    seen = np.isfinite(s.exposure_errors)
+    e = np.exp(s.log_exposures[seen])
+    rows: list[ViewPhotometry] = []
+    for i, view in enumerate(views):
+        values = (
+            np.exp(s.log_exposures[i]),
+            s.exposures_ev[i],
+            s.exposure_errors[i] / LN2,
+            s.gammas[i],
+            s.gamma_errors[i],
+        )
+        exposure, ev, ev_error, gamma, gamma_error = (float(v) if seen[i] else None for v in values)
+        balance, balance_error = _balance(s, i)
+        rows.append(
+            {
+                "image": view.name,
+                "camera": view.camera,
+                "exposure": exposure,
+                "exposure_ev": ev,
+                "exposure_ev_error": ev_error,
+                "gamma": gamma,
+                "gamma_error": gamma_error,
+                "exif_ev": view.exif_ev,
+                "split": "train",
+                "exposure_fitted": None,
+                "white_balance": balance,
+                "white_balance_ev_error": balance_error,
+            }
+        )
+    write_photometry(
+        path,
+        model=s.model,
+        curve={"name": s.response.curve, "pivot": pivot, "spline": s.response.spline},
+        gauge=gauge,
+        mean={
+            "exposure": float(e.mean()) if e.size else 1.0,
+            "exposure_geometric": float(np.exp(np.log(e).mean())) if e.size else 1.0,
+            "gamma": float(s.gammas.mean()),
+        },
+        views=rows,
+        cameras=_camera_rows(s.cameras, s.corner_errors),
+    )
+
+
+def _camera_rows(
+    cameras: Sequence[CameraFormation], corner_errors: Float[np.ndarray, "c k"] | None
+) -> list[CameraPhotometry]:
+    """Return the `cameras` of the file; errors are those of log V in the corners, if known."""
+    known = corner_errors is not None and len(corner_errors) == len(cameras)
+    return [
+        {
+            "name": camera.name,
+            "vignetting": [list(row) for row in camera.vignetting] or None,
+            "corner": list(corner(camera)) or None,
+            "corner_ev_error": (corner_errors[i] / LN2).tolist() or None
+            if known and corner_errors is not None
+            else None,
+            "splines": [list(row) for row in camera.splines] or None,
+        }
+        for i, camera in enumerate(cameras)
+    ]
+
+
+def _balance(
+    solution: PhotometricSolution, row: int
+) -> tuple[list[float] | None, list[float] | None]:
+    """Return white balance and its errors of a view as the file has them: factors, and stops."""
+    if solution.white_balance_level is None or not np.isfinite(solution.exposure_errors[row]):
+        return None, None
+    errors = solution.white_balance_errors[row] / LN2
+    known = errors.tolist() if np.isfinite(errors).all() else None
+    return np.exp(solution.white_balance[row]).tolist(), known
+
+
+def write_metering(path: Path, metering: Metering) -> None:
+    """Write `metering.json`: what the meters read, and which rule explains the exposures."""
+    rows = zip(metering.names, metering.readings.tolist(), strict=True)
+    write_json(
+        path,
+        {
+            "said": metering.sentence,
+            "rule": dataclasses.asdict(metering.rule),
+            "candidates": [dataclasses.asdict(rule) for rule in metering.candidates],
+            "white": metering.white,
+            "readings": {name: dict(zip(METERS, row, strict=True)) for name, row in rows},
+        },
+    )
+
+
+def read_metering(path: Path) -> Metering:
+    """Read `metering.json`.
+
+    Raises:
+        UserError: it is missing or broken.
+    """
+    try:
+        data = parse_json(path.read_text(encoding="utf-8"))
+        readings = data["readings"]
+        values = [[row[name] for name in METERS] for row in readings.values()]
+        table = np.array(values, np.float64).reshape(-1, len(METERS))
+        candidates = tuple(map(_rule, data["candidates"]))
+        if all(rule.meters for rule in candidates):
+            raise ValueError("no candidate is a constant")
+        white = float(data["white"])
+        return Metering(_rule(data["rule"]), candidates, white, tuple(readings), table)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise UserError(
+            f"{path} cannot be read: {error!r}.", fix="write it again with `p2gs-jax eval RUN`"
+        ) from error
+
+
+def _rule(data: dict) -> Rule:
+    numbers = (data["offset"], data["residual_ev"], data["left_out_ev"])
+    offset, residual, left_out = (float("nan") if v is None else float(v) for v in numbers)
+    return Rule(tuple(data["meters"]), tuple(data["slopes"]), offset, residual, left_out)
+
+
+def write_appearance(path: Path, appearance: Corrections, views: Sequence[View]) -> None:
+    """Write what was learned of all training views; exposures lie in `photometry.json`."""
+    if isinstance(appearance, Ppisp):
+        cameras = zip(
+            appearance.names,
+            np.asarray(appearance.responses),
+            np.asarray(appearance.vignettings),
+            strict=True,
+        )
+        colors = zip(views, np.asarray(appearance.colors), strict=True)
+        data: dict[str, Any] = {
+            "cameras": {name: {"response": r, "vignetting": v} for name, r, v in cameras},
+            "views": {view.name: {"camera": view.camera, "color": c} for view, c in colors},
+        }
+        write_json(path, data)
+    elif isinstance(appearance, Luminance):
+        data = {name: np.asarray(getattr(appearance, name)) for name in _SHARED}
+        data["views"] = {
+            view.name: {name: np.asarray(getattr(appearance, name)[k]) for name in _OF_VIEWS}
+            for k, view in enumerate(views)
+        }
+        write_json(path, data)
+    else:
+        write_array(path, np.asarray(appearance))
+
+
+# Names in `luminance.json`: parameters of all views, and those of single ones.
+_SHARED = ("curve", "hidden", "hidden_bias", "out", "out_bias")
+_OF_VIEWS = ("axes", "statistics")
+
+
+def read_appearance(path: Path, kind: Appearance, views: Sequence[View]) -> Corrections:
+    """Return what `write_appearance` wrote of the training views.
+
+    Raises:
+        UserError: it cannot be read, or belongs to other views.
+    """
+    like = identity(kind, [view.camera for view in views])
+    try:
+        if isinstance(like, Ppisp | Luminance):
+            data = parse_json(path.read_text(encoding="utf-8"))
+            rows = [data["views"][view.name] for view in views]
+            return (
+                _ppisp(like, data, rows)
+                if isinstance(like, Ppisp)
+                else _luminance(like, data, rows)
+            )
+        corrections = np.load(path, allow_pickle=False)
+    except (OSError, ValueError) as error:
+        raise UserError(
+            f"{path} cannot be read: {error}.", fix="finish the fit again with --resume"
+        ) from error
+    except (KeyError, TypeError, AttributeError) as error:
+        raise UserError(f"{path} does not belong to this run.", fix="fit again") from error
+    if corrections.shape != like.shape:
+        raise UserError(f"{path} does not belong to this run.", fix="fit again")
+    return on_device(corrections)
+
+
+def _ppisp(like: Ppisp, data: dict[str, Any], rows: list[dict]) -> Ppisp:
+    cameras = [data["cameras"][name] for name in like.names]
+
+    def stacked(of: list[dict], key: str, shape: tuple[int, ...]):
+        return on_device(np.array([row[key] for row in of], np.float32).reshape(shape))
+
+    return dataclasses.replace(
+        like,
+        colors=stacked(rows, "color", like.colors.shape),
+        responses=stacked(cameras, "response", like.responses.shape),
+        vignettings=stacked(cameras, "vignetting", like.vignettings.shape),
+    )
+
+
+def _luminance(like: Luminance, data: dict[str, Any], rows: list[dict]) -> Luminance:
+    values = {name: data[name] for name in _SHARED}
+    values |= {name: [row[name] for row in rows] for name in _OF_VIEWS}
+
+    def shaped(name: str):
+        return on_device(np.array(values[name], np.float32).reshape(getattr(like, name).shape))
+
+    return Luminance(**{name: shaped(name) for name in values})

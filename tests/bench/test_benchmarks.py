@@ -1,0 +1,135 @@
+"""The gate of the benchmarks, their error metrics, and scenes with the lists that fits have."""
+
+import json
+
+import jax
+import numpy as np
+import pytest
+
+from benchmarks import gate, levels
+from benchmarks.hard_cases import splats
+from benchmarks.oracle import Truth, trimmed_errors
+from benchmarks.run import options_of
+from benchmarks.scenes import GROWN, room, town_level
+from p2gs_jax.config import FitConfig
+from p2gs_jax.errors import UserError
+
+ROWS = {"default": {"both": 1.0, "numerics psnr": 90.0}}
+LEVELS = {"town 1/4": {"step": 2.0, "numerics gradient": 1e-5}}
+
+
+@pytest.fixture
+def baseline(tmp_path):
+    path = tmp_path / "baseline.json"
+    gate.write_baseline(path, ROWS)
+    gate.write_baseline(path, LEVELS)
+    return path
+
+
+def test_rows_that_were_not_measured_stay_in_the_baseline(baseline):
+    assert json.loads(baseline.read_text()) == ROWS | LEVELS
+    assert gate.check(baseline, ROWS) == gate.check(baseline, LEVELS) == []
+
+
+def test_worse_values_are_named_with_their_row(baseline):
+    first, second = gate.check(baseline, {"town 1/4": {"step": 5.1, "numerics gradient": 1.3e-5}})
+    assert first.text.startswith("town 1/4: training step")
+    assert "gradient" in second.text
+    assert (first.timed, second.timed) == (True, False)
+    with pytest.raises(UserError, match="has no 'both' of 'room'"):
+        gate.check(baseline, {"room": {"both": 1.0}})
+
+
+@pytest.mark.parametrize(
+    ("first", "later", "complaint"),
+    [(2.0, (), None), (9.0, (2.1,), None), (9.0, (9.0, 4.0), None), (9.0, (6.0, 7.0), "is 6,")],
+)
+def test_a_time_is_worse_only_if_it_stays_so(baseline, first, later, complaint):
+    times, asked = iter(later), []
+
+    def measure(names):
+        asked.append(names)
+        return {"town 1/4": {"step": next(times), "numerics gradient": 0.0}}
+
+    slow = {"town 1/4": {"step": first, "numerics gradient": 1e-5}}
+    texts = gate.settle(baseline, ROWS | slow, measure)
+    assert asked == [["town 1/4"]] * len(later)
+    assert [complaint in t for t in texts] == ([] if complaint is None else [True])
+
+
+@pytest.mark.parametrize("step", [9.0, 2.0])
+def test_accuracy_counts_as_measured_first(baseline, step):
+    def measure(names):
+        assert step == 9.0, "accuracy was measured again"
+        return {"town 1/4": {"step": 2.0, "numerics gradient": 1e-5}}
+
+    (text,) = gate.settle(baseline, {"town 1/4": {"step": step, "numerics gradient": 1.0}}, measure)
+    assert "gradient" in text
+
+
+@pytest.mark.parametrize(
+    ("words", "way_on"),
+    [
+        ("sped", "choose speed_error"),
+        ("speed_error --baseline none.json", "--write-baseline"),
+        ("hard_cases --write-baseline x.json", "name one of these as well"),
+        ("levels --set chunks=3", "no field 'chunks'"),
+    ],
+)
+def test_wrong_arguments_end_with_2_and_a_remedy(words, way_on, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        options_of(words.split())
+    assert way_on in capsys.readouterr().err
+
+
+def test_a_contribution_on_the_cutoff_does_not_hide_the_others():
+    gradient = jax.tree.map(lambda a: np.ones(a.shape), splats(300))
+    exact = Truth(np.full((20, 20, 3), 0.5), gradient)
+    linear = exact.linear * (1 + 1e-6)
+    off = jax.tree.map(lambda a: a * (1 + 1e-6), gradient)
+    linear[3, 4] += 0.1
+    off.means[7] += 1.0
+    found = trimmed_errors(linear, off, exact)
+    np.testing.assert_allclose(found["relative_99"], 1e-6, rtol=1e-3)
+    np.testing.assert_allclose(found["gradient_99"], 1e-6, rtol=0.02)
+    linear += 1e-3
+    assert trimmed_errors(linear, off, exact)["relative_99"] > 1e-3
+
+
+def test_levels_differ_in_size_and_have_the_population_of_their_time():
+    scenes = [town_level(s, width=240, points=3000) for s in (4, 2, 1)]
+    assert [s.camera.width for s in scenes] == [60, 120, 240]
+    counts = [s.gaussians.capacity for s in scenes]
+    assert counts == sorted(counts)
+    assert counts[-1] == round(3000 * GROWN)
+    opacities = [
+        1 / (1 + np.exp(-np.asarray(s.gaussians.opacity_logits, np.float64))) for s in scenes
+    ]
+    spread = [o.std() for o in opacities]
+    assert spread == sorted(spread)
+    # The end of a fit, as measured: half of the Gaussians hide little, some nearly all.
+    low, middle, high = np.percentile(opacities[-1], (25, 50, 95))
+    assert 0.01 < low < 0.05
+    assert 0.07 < middle < 0.17
+    assert 0.6 < high < 0.9
+
+
+@pytest.mark.slow
+def test_coarse_levels_of_a_town_have_the_longest_lists():
+    coarse, fine = (
+        levels.lists(town_level(s, width=240, points=15_000), FitConfig()) for s in (4, 1)
+    )
+    assert coarse.longest > 1500
+    assert coarse.entries / coarse.tiles > 400
+    assert coarse.quantiles[2] > 5 * coarse.quantiles[0]
+    assert 80 < fine.entries / fine.tiles < 300
+    assert 300 < fine.longest < coarse.longest
+
+
+def test_lists_of_the_room_are_deep_and_the_same_every_time():
+    scene = room()
+    found = levels.lists(scene, FitConfig())
+    assert 150 < found.entries / found.tiles < 300
+    assert 500 < found.longest < 1200
+    for x, y in zip(jax.tree.leaves(scene), jax.tree.leaves(room()), strict=True):
+        np.testing.assert_array_equal(x, y)

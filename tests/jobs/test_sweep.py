@@ -1,0 +1,258 @@
+"""Sweeps vary the given fields, keep finished runs, name failures and stop together."""
+
+import json
+import os
+import signal
+import threading
+from pathlib import Path
+
+import pytest
+from tiny_scene import make_scene
+
+import p2gs_jax
+from p2gs_jax.cli import main
+from p2gs_jax.core import interrupts
+from p2gs_jax.core.clock import whole_run
+from p2gs_jax.core.interrupts import Interrupted
+from p2gs_jax.errors import UserError
+from p2gs_jax.jobs.configs import grid, read_sweep, with_fields
+from p2gs_jax.jobs.job import REASON, JobFiles, read_job
+from p2gs_jax.jobs.sweep import brief, failures, sweep, to_markdown
+from p2gs_jax.run.folder import locked
+
+BASE = p2gs_jax.preset("robust")
+SMALL = with_fields(
+    BASE,
+    {
+        "train.steps": 12,
+        "train.coarse_to_fine": [],
+        "densify.max_gaussians": 300,
+        "render.sh_degree": 0,
+    },
+)
+
+
+def test_fields_are_replaced_by_their_dotted_names():
+    cfg = with_fields(
+        BASE,
+        {
+            "loss.relative_exposure.weight": 1,
+            "loss.relative_exposure.form": "observed_ldr",
+            "train.coarse_to_fine": [0.5],
+            "data.max_width": None,
+            "photometry.select": False,
+        },
+    )
+    assert cfg.loss.relative_exposure.weight == 1.0
+    assert isinstance(cfg.loss.relative_exposure.weight, float)
+    assert cfg.train.coarse_to_fine == (0.5,)
+    assert not cfg.photometry.select
+    assert cfg.optimizer == BASE.optimizer
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "text"),
+    [
+        ("loss.wieght", 1.0, "no configuration field"),
+        ("train.steps.more", 1, "too deep"),
+        ("train.steps", 1.5, "does not fit"),
+        ("train.steps", True, "does not fit"),
+        ("photometry.curve", "cubic", "'srgb'"),
+        ("loss", 1.0, "does not fit"),
+        ("photometry.select", 1, "does not fit"),
+    ],
+)
+def test_wrong_fields_and_values_are_named(field, value, text):
+    with pytest.raises(p2gs_jax.UserError, match=text):
+        with_fields(BASE, {field: value})
+
+
+def test_the_printed_table_is_short_and_the_kept_one_says_what_columns_are():
+    row = {"name": "a", "seed": 0, "status": "done", "seconds": 56.2, "gaussians": 300}
+    row |= {"train_psnr": 25.0, "train_lpips": 0.1, "test_psnr_fitted": 21.0, "ev": 0.01}
+    rows = [row, {**row, "seed": 1, "status": "failed", "reason": "no seeds"}]
+    headings, lines = brief(rows)
+    assert headings == [
+        *("configuration", "seeds", "seconds", "Gaussians", "training PSNR dB"),
+        *("held-out PSNR dB", "exposure error EV"),
+    ]
+    assert lines == [["a", "1 of 2", "56", "300", "25.00", "21.00", "0.0100"]]
+    assert failures(rows) == ["a, seed 1: failed: no seeds"]
+    text = to_markdown(rows)
+    for column in ("seconds", "train_*", "test_psnr_fitted", "ev"):
+        assert f"- `{column}`: " in text
+    assert "ev_power" not in text
+
+
+def test_a_grid_has_every_combination():
+    configs = grid(BASE, loss__relative_exposure__weight=[None, 0.1], render__sh_degree=[0, 1, 3])
+    assert len(configs) == 6
+    assert configs["weight 0.1, sh_degree 3"].loss.relative_exposure.weight == 0.1
+    assert configs["weight None, sh_degree 0"].render.sh_degree == 0
+
+
+@pytest.mark.slow
+def test_a_sweep_keeps_what_is_done_and_names_what_failed(tmp_path):
+    scene = make_scene(tmp_path / "scene")
+    configs = {
+        "good": SMALL,
+        "bad": with_fields(p2gs_jax.preset("paper"), {"photometry.known": "exif"}),
+    }
+    said = []
+    result = sweep(scene, tmp_path / "out", configs, seeds=[0, 1], report=said.append)
+    status = {(r["name"], r["seed"]): r["status"] for r in result.rows}
+    assert status == {
+        ("good", 0): "done",
+        ("good", 1): "done",
+        ("bad", 0): "failed",
+        ("bad", 1): "failed",
+    }
+    good = result.rows[0]
+    assert good["steps"] == 12
+    assert good["train_psnr"] > 5
+    metrics = json.loads((tmp_path / "out" / "good" / "seed_0" / "metrics.json").read_text())
+    assert good["seconds"] == whole_run(metrics["seconds"]) > metrics["seconds"]["optimisation"]
+    assert said[0].endswith(f"{good['seconds']:.0f} s")
+    assert "starts exposures at random" in result.rows[2]["reason"]
+    assert json.loads((tmp_path / "out" / "sweep.json").read_text()) == result.rows
+    table = (tmp_path / "out" / "sweep.md").read_text()
+    assert "| good | 2 of 2 |" in table
+    assert "bad, seed 0: failed" in table
+    stamp = (tmp_path / "out" / "good" / "seed_0" / "metrics.json").stat().st_mtime_ns
+    again = sweep(scene, tmp_path / "out", {"good": SMALL}, seeds=[0, 1], report=said.append)
+    assert [r["status"] for r in again.rows] == ["done", "done"]
+    assert said[-1].endswith("kept")
+    assert (tmp_path / "out" / "good" / "seed_0" / "metrics.json").stat().st_mtime_ns == stamp
+    other = {"good": with_fields(SMALL, {"train.steps": 13})}
+    with pytest.raises(p2gs_jax.UserError, match="other options"):
+        sweep(scene, tmp_path / "out", other)
+    twins = {"a b": SMALL, "a_b": SMALL}
+    with pytest.raises(p2gs_jax.UserError, match="share the folder"):
+        sweep(scene, tmp_path / "out", twins)
+
+
+def test_a_file_describes_a_sweep(tmp_path):
+    path = tmp_path / "s.toml"
+    path.write_text(
+        """
+scene = "street"
+reference = "street/reference"
+seeds = [0, 3]
+[set]
+"train.steps" = 600
+[grid]
+"loss.relative_exposure.weight" = ["none", 0.01]
+[[case]]
+name = "paper"
+preset = "paper"
+"densify.max_gaussians" = 30000
+"""
+    )
+    wanted = read_sweep(path)
+    assert wanted.scene == tmp_path / "street"
+    assert wanted.out == tmp_path / "s"
+    assert wanted.reference == tmp_path / "street" / "reference"
+    assert wanted.seeds == (0, 3)
+    assert list(wanted.configs) == ["weight None", "weight 0.01", "paper"]
+    assert wanted.configs["paper"].preset == "paper"
+    assert all(cfg.train.steps == 600 for cfg in wanted.configs.values())
+    assert wanted.configs["paper"].densify.max_gaussians == 30000
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("scene = ", "not valid TOML"),
+        ("sceen = 'x'", "unknown key 'sceen'"),
+        ("seeds = [1]", "does not name a scene"),
+        ("scene = 'x'\nseeds = 3", "write whole numbers"),
+        ("scene = 'x'\npreset = 'best'", "no preset 'best'"),
+        ("scene = 'x'\n[grid]\n'train.stepz' = [1]", "no configuration field"),
+    ],
+)
+def test_a_wrong_file_says_what_is_wrong(tmp_path, capsys, text, message):
+    path = tmp_path / "s.toml"
+    path.write_text(text)
+    with pytest.raises(SystemExit) as code:
+        main(["sweep", str(path)])
+    assert code.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+def test_means_are_over_finished_seeds_only():
+    rows = [
+        {"name": "a", "seed": 0, "status": "done", "train_psnr": 20.0},
+        {"name": "a", "seed": 1, "status": "done", "train_psnr": 22.0},
+        {"name": "a", "seed": 2, "status": "failed", "reason": "fell over"},
+    ]
+    table = to_markdown(rows)
+    assert "| a | 2 of 3 | 21.00 |" in table
+    assert "fell over" in table
+
+
+CONFIGS = {name: p2gs_jax.preset("robust") for name in ("a", "b", "c")}
+
+
+def runner(work):
+    """Return what an engine calls for a job: a function of its folder and of the stop file."""
+
+    def run(job_path):
+        files = JobFiles(Path(job_path))
+        return work(read_job(files.path).folder, files.stop)
+
+    return run
+
+
+def finished(run, stop):
+    run.mkdir(parents=True)
+    (run / "metrics.json").write_text('{"counts": {"gaussians": 5}, "seconds": {}}')
+    return "done", None
+
+
+def test_a_signal_leaves_a_table_and_the_same_sweep_goes_on(tmp_path):
+    all_begun = threading.Event()
+
+    def work(run, stop):
+        if stop.exists():
+            return "stopped", None
+        if run.parent.name == "b":
+            # A signal that comes before a run was handed over finds it waiting.
+            assert all_begun.wait(60)
+            os.kill(os.getpid(), signal.SIGTERM)
+            while not stop.exists():
+                pass
+            return "stopped", None
+        return finished(run, stop)
+
+    with pytest.raises(Interrupted), interrupts.raised():
+        sweep("scene", tmp_path, CONFIGS, on_look=lambda states: all_begun.set(), run=runner(work))
+    rows = json.loads((tmp_path / "sweep.json").read_text())
+    assert [row["status"] for row in rows] == ["done", "interrupted", "interrupted"]
+    assert not list(tmp_path.rglob(REASON))
+    rows = sweep("scene", tmp_path, CONFIGS, run=runner(finished)).rows
+    assert [row["status"] for row in rows] == ["done"] * 3
+
+
+def test_a_run_with_broken_files_fails_alone(tmp_path):
+    def work(run, stop):
+        ended = finished(run, stop)
+        if run.parent.name == "b":
+            (run / "metrics.json").write_text("[]")
+        return ended
+
+    rows = sweep("scene", tmp_path, CONFIGS, max_parallel=3, run=runner(work)).rows
+    assert [row["status"] for row in rows] == ["done", "failed", "done"]
+    assert "its files cannot be read" in rows[1]["reason"]
+
+
+def test_the_reason_is_of_the_last_try(tmp_path):
+    said = iter(["first", "second"])
+    run = runner(lambda run, stop: ("failed", next(said)))
+    one = {"a": CONFIGS["a"]}
+    assert sweep("scene", tmp_path, one, run=run).rows[0]["reason"] == "first"
+    assert sweep("scene", tmp_path, one, run=run).rows[0]["reason"] == "second"
+
+
+def test_two_sweeps_do_not_share_a_folder(tmp_path):
+    with locked(tmp_path), pytest.raises(UserError, match=f"process {os.getpid()}"):
+        sweep("scene", tmp_path, CONFIGS)
