@@ -21,7 +21,7 @@ def read_feather(
         from pyarrow import feather
 
         table = feather.read_table(path, memory_map=False)
-    return _columns(table, path, numbers, objects)
+        return _columns(table, path, numbers, objects)
 
 
 class ParquetTable:
@@ -47,7 +47,7 @@ class ParquetTable:
         """
         with _reading(self.path):
             table = self._file.read(columns=[*numbers, *objects])
-        return _columns(table, self.path, numbers, objects)
+            return _columns(table, self.path, numbers, objects)
 
     def cells(self, row: int, names: Sequence[str]) -> list[Any]:
         """Return cells of one row: lists of numbers as arrays, texts and bytes as they are.
@@ -80,7 +80,7 @@ def _reading(path: Path) -> Iterator[None]:
         raise missing_file(path)
     try:
         yield
-    except (OSError, pyarrow.ArrowException) as error:
+    except (OSError, ValueError, pyarrow.ArrowException) as error:
         why = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise broken(path, f"cannot be read: {why}") from None
 

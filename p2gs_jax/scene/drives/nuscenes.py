@@ -259,7 +259,7 @@ def _sweeps(drive: _Drive) -> tuple[list[Sweep], int]:
 
 def _read_sweep(path: Path, pose: Pose, end: float) -> SweepPoints:
     values = np.fromfile(path, "<f4")
-    if values.size % POINT:
+    if values.size % POINT or path.stat().st_size % values.itemsize:
         raise broken(path, "is not a LiDAR sweep: float32 x y z intensity ring")
     local = values.reshape(-1, POINT)[:, :3].astype(np.float64)
     # Points are already moved to where the car was at the end; the time that they were measured
