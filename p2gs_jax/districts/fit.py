@@ -40,7 +40,7 @@ from p2gs_jax.gaussians.seeds import cameras_radius
 from p2gs_jax.jobs.engines import LOCAL, check_engine, open_engine
 from p2gs_jax.jobs.job import JobState
 from p2gs_jax.jobs.run import run_jobs
-from p2gs_jax.photometry.gauge import recentre
+from p2gs_jax.photometry.parameters import recentre
 from p2gs_jax.pipeline import preflight
 from p2gs_jax.pipeline.finish import Account, finish
 from p2gs_jax.pipeline.fit import FitResult, fit
@@ -49,7 +49,7 @@ from p2gs_jax.pipeline.prepare import Prepared, load
 from p2gs_jax.run.decisions import read_decisions
 from p2gs_jax.run.folder import RunFolder, RunLock, locked, require_free
 from p2gs_jax.run.write import write_start
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import Gaussians, Params, Scene
 
 BLOCKS = "blocks"

@@ -25,8 +25,8 @@ from p2gs_jax.gaussians.flow import CHECKS, DepthMap, Flows, depth_map, pixel_ce
 from p2gs_jax.gaussians.matching import MatchImages, Tones, neighbours, visibility
 from p2gs_jax.gaussians.population import Coverage, default_max_gaussians
 from p2gs_jax.gaussians.seeds import gaussians_from_points, neighbour_scales
-from p2gs_jax.photometry.cameras import places
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.photometry.formation import places
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.visibility import shown_share
 from p2gs_jax.types import Gaussians, Photometry, Scene, View
 

@@ -13,11 +13,10 @@ from scipy.spatial import KDTree
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import on_device, srgb_encode
 from p2gs_jax.core.streams import Stream, generator
-from p2gs_jax.photometry.cameras import places
-from p2gs_jax.photometry.formation import inverse_formation
+from p2gs_jax.photometry.formation import inverse_formation, places
 from p2gs_jax.photometry.sources.sampling import sample
 from p2gs_jax.render.harmonics import C0, coefficient_count, radiance_preactivation
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.visibility import project_points, unoccluded
 from p2gs_jax.types import Gaussians, Photometry, Scene, View
 

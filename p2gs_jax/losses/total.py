@@ -19,7 +19,7 @@ from p2gs_jax.losses.regularizers import photometry_regularizers
 from p2gs_jax.losses.relative_exposure import ColorPairs, ExposurePairs, relative_exposure_loss
 from p2gs_jax.photometry.appearance import Corrections, correction_of, regularisation
 from p2gs_jax.photometry.formation import formation
-from p2gs_jax.photometry.luminance.parameters import Curves
+from p2gs_jax.photometry.luminance import Curves
 from p2gs_jax.render import render_splats
 from p2gs_jax.render.visible import Shown, splat
 from p2gs_jax.types import Batch, Camera, Params, Photometry, Render

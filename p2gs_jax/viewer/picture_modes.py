@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, UInt8
 
 from p2gs_jax.formats.false_color import clipping_overlay, depth_color, false_color
-from p2gs_jax.photometry.cameras import places
 from p2gs_jax.photometry.display import DisplayTransform, develop
+from p2gs_jax.photometry.formation import places
 from p2gs_jax.types import Camera
 
 Mode = Literal["display", "stops", "clipping", "depth", "split"]

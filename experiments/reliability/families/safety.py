@@ -20,9 +20,7 @@ from reliability.family import Family, Report
 from reliability.reading import FIT, command, read
 from reliability.trials import REFUSED, Trial, run_trials
 
-from p2gs_jax.scene.drives.tables import (
-    read_pickled,
-)
+from p2gs_jax.scene.drives.tables import read_pickled
 
 NAME = "safety"
 ABOUT = """The viewer listens on loopback unless told otherwise, refuses pages of other sites and

@@ -29,7 +29,7 @@ from p2gs_jax.scene.drives.arrow import read_feather
 from p2gs_jax.scene.drives.objects import Box, Pose, tracks
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sweep, SweepPoints
 from p2gs_jax.scene.drives.tables import chosen_drive, counted, numbered
-from p2gs_jax.scene.geometry import intrinsics
+from p2gs_jax.scene.lens import intrinsics
 from p2gs_jax.scene.rigid import from_quaternions, interpolated
 from p2gs_jax.types import TrackedObject
 

@@ -25,7 +25,7 @@ from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.scene.cache import cached_folder
 from p2gs_jax.scene.drives.recording import Photograph, Recording, Report, RigCamera
 from p2gs_jax.scene.files import decode_grey, undecodable
-from p2gs_jax.scene.geometry import scale_intrinsics, undistort_points
+from p2gs_jax.scene.lens import scale_intrinsics, undistort_points
 from p2gs_jax.scene.rigid import inverse, up_of_drive
 from p2gs_jax.types import Distortion
 

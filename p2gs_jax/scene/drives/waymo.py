@@ -43,7 +43,7 @@ from p2gs_jax.scene.drives.lidar import turned
 from p2gs_jax.scene.drives.objects import Box, Pose, tracks
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sweep, SweepPoints
 from p2gs_jax.scene.drives.tables import chosen_drive, counted
-from p2gs_jax.scene.geometry import intrinsics, make_distortion
+from p2gs_jax.scene.lens import intrinsics, make_distortion
 from p2gs_jax.scene.rigid import LONGEST_BEYOND_S, rigid
 from p2gs_jax.types import TrackedObject
 

@@ -12,12 +12,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.scene.drives.assemble import assemble
 from p2gs_jax.scene.drives.lidar import owners, seeds
 from p2gs_jax.scene.drives.objects import tracked
-from p2gs_jax.scene.drives.recording import (
-    SweepPoints,
-    chosen_cameras,
-    chosen_frames,
-    short_name,
-)
+from p2gs_jax.scene.drives.recording import SweepPoints, chosen_cameras, chosen_frames, short_name
 from p2gs_jax.scene.rigid import from_quaternion, interpolated, inverse, rigid
 from p2gs_jax.scene.split import assign_split
 from p2gs_jax.types import Lidar

@@ -13,7 +13,7 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.scene.drives.assemble import assemble
 from p2gs_jax.scene.drives.lidar import owners
 from p2gs_jax.scene.drives.tables import read_pickled
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.rigid import interpolated, inverse
 
 
