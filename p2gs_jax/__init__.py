@@ -12,7 +12,7 @@ from p2gs_jax.errors import DivergenceError, UserError
 
 if TYPE_CHECKING:
     from p2gs_jax.districts.fit import fit_blocks
-    from p2gs_jax.evaluate.alignment import exposure_error
+    from p2gs_jax.evaluation.alignment import exposure_error
     from p2gs_jax.jobs.configs import grid, read_sweep, with_fields
     from p2gs_jax.jobs.sweep import sweep
     from p2gs_jax.paths.shots import make_camera
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from p2gs_jax.pipeline.calibrate_stack import calibrate_stack
     from p2gs_jax.pipeline.fit import fit
     from p2gs_jax.render import render_linear, required_capacity
+    from p2gs_jax.render.rasterization import rasterization
     from p2gs_jax.run.read import Run, load_run
     from p2gs_jax.synth.write import write_street
     from p2gs_jax.types import Camera, Gaussians, Params, Photometry, Render, Scene
@@ -51,6 +52,7 @@ __all__ = [
     "load_run",
     "make_camera",
     "preset",
+    "rasterization",
     "read_sweep",
     "render_linear",
     "required_capacity",
@@ -68,13 +70,14 @@ _LAZY = {
     "calibrate_run": "p2gs_jax.pipeline.calibrate_run",
     "calibrate_stack": "p2gs_jax.pipeline.calibrate_stack",
     "develop": "p2gs_jax.photometry.display",
-    "exposure_error": "p2gs_jax.evaluate.alignment",
+    "exposure_error": "p2gs_jax.evaluation.alignment",
     "fit": "p2gs_jax.pipeline.fit",
     "fit_blocks": "p2gs_jax.districts.fit",
     "grid": "p2gs_jax.jobs.configs",
     "load_run": "p2gs_jax.run.read",
     "make_camera": "p2gs_jax.paths.shots",
     "read_sweep": "p2gs_jax.jobs.configs",
+    "rasterization": "p2gs_jax.render.rasterization",
     "render_linear": "p2gs_jax.render",
     "required_capacity": "p2gs_jax.render",
     "sweep": "p2gs_jax.jobs.sweep",

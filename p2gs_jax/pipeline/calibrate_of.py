@@ -15,7 +15,7 @@ from p2gs_jax.core.atomic import no_empty_folders
 from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
-from p2gs_jax.evaluate.foreign import score_foreign
+from p2gs_jax.evaluation.against import score_foreign
 from p2gs_jax.formats.splat import read_foreign
 from p2gs_jax.gaussians.bake import relit, viewer_config
 from p2gs_jax.gaussians.dense import coverage_of
@@ -35,8 +35,8 @@ from p2gs_jax.pipeline.prepare import Prepared
 from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.run.write import write_start
 from p2gs_jax.scene import load_scene
-from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.scene.known_exposures import check_source
+from p2gs_jax.scene.exposures import check_source
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.train.programs import StepPrograms
 from p2gs_jax.types import Gaussians, Params, Scene
 
@@ -102,9 +102,9 @@ def calibrate_of(
             )
         store = ImageStore(scene.views, cfg.data)
         reporter.stage("Judging the model")
-        before = score_foreign(foreign, scene, store, viewer_config(cfg.render))
+        before, agreement = score_foreign(foreign, scene, store, viewer_config(cfg.render))
         observations = _observations(foreign, scene, store, cfg, reporter)
-        _check(observations, before.agreement, Path(model), Path(scene_dir))
+        _check(observations, agreement, Path(model), Path(scene_dir))
     clock.add("reading", time.monotonic() - begin)
     reporter.stage("Photometric bundle adjustment")
     selection = calibrate_observations(observations, options_of(cfg, scene))
@@ -134,7 +134,7 @@ def calibrate_of(
         "steps": result.host.step,
     }
     seconds = {**clock.seconds, **result.seconds, "optimisation": result.host.elapsed_s}
-    account = Account(counts=counts, seconds=seconds, of=before.summary)
+    account = Account(counts=counts, seconds=seconds, of=before)
     metrics = finish(params, prepared, folder, account, reporter, truth=None, lpips_weights=None)
     write_calibration(calibration, folder.root)
     return CalibrationOf(calibration, metrics)

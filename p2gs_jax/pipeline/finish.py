@@ -13,11 +13,10 @@ from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.clock import CompileCounter, Stopwatch, over_budget
 from p2gs_jax.core.progress import Reporter
 from p2gs_jax.core.runtime import return_freed_memory
-from p2gs_jax.evaluate.evaluate import ViewResult, evaluate
-from p2gs_jax.evaluate.lpips import LpipsWeights
-from p2gs_jax.evaluate.references import Reference, find_radiance
-from p2gs_jax.evaluate.untold import untold_notes
-from p2gs_jax.photometry.metering import Metering
+from p2gs_jax.evaluation.evaluate import ViewResult, evaluate
+from p2gs_jax.evaluation.lpips import LpipsWeights
+from p2gs_jax.evaluation.references import Reference, find_radiance
+from p2gs_jax.evaluation.scores import untold_notes
 from p2gs_jax.pipeline.prepare import Prepared
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.folder import RunFolder
@@ -78,7 +77,6 @@ def finish(
     fitted: dict[int, float] = {}
     shown: dict[int, ViewResult] = {}
     picks = summary_rows(scene)
-    metering: list[Metering] = []
 
     def on_view(result: ViewResult) -> None:
         view = scene.views[result.index]
@@ -90,9 +88,8 @@ def finish(
             shown[result.index] = result
 
     with watch("evaluation"):
-        metrics = evaluate(
+        found = evaluate(
             params,
-            np.ones(params.gaussians.capacity, bool),
             scene,
             store,
             make_renderer(cfg.render, owner),
@@ -101,18 +98,17 @@ def finish(
             radiance=find_radiance(scene, store),
             lpips_weights=lpips_weights,
             on_view=on_view,
-            on_metering=metering.append,
-            on_unexplained=lambda found: write_unexplained(folder.unexplained, scene, store, found),
             on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
         )
+    metrics, metering = found.metrics, found.metering
     hidden = metrics.get("hidden", ())
     fitted = {row: e for row, e in fitted.items() if scene.views[row].name not in hidden}
     for note in untold_notes(metrics):
         prepared.notes.append(note)
         reporter.message(note)
-    if metering[0].telling:
-        prepared.notes.append(metering[0].sentence)
-        reporter.message(metering[0].sentence)
+    if metering.telling:
+        prepared.notes.append(metering.sentence)
+        reporter.message(metering.sentence)
     # Views are written while they are judged.
     watch.add("evaluation", -watch.seconds.get("files", 0.0))
     reporter.stage("Writing files")
@@ -128,9 +124,11 @@ def finish(
             unknown=metrics.get("exposures_unknown", ()),
             solution=None if prepared.selection is None else prepared.selection.solution,
             shown=[shown[i] for i in picks],
-            metering=metering[0],
+            metering=metering,
             true_ev=true_ev,
         )
+        if found.unexplained:
+            write_unexplained(folder.unexplained, scene, store, found.unexplained)
     metrics |= _accounted(account, watch, prepared, reporter)
     still_ours()
     write_json(folder.metrics, metrics)

@@ -20,7 +20,7 @@ from p2gs_jax.core.atomic import no_empty_folders
 from p2gs_jax.core.clock import CompileCounter, Stopwatch
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
-from p2gs_jax.evaluate.lpips import LpipsWeights
+from p2gs_jax.evaluation.lpips import LpipsWeights
 from p2gs_jax.photometry.appearance import exposures_apart
 from p2gs_jax.photometry.parameters import recentre
 from p2gs_jax.photometry.selection import Selection

@@ -13,13 +13,12 @@ from p2gs_jax.config import to_dict as config_to_dict
 from p2gs_jax.core.atomic import plain
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
-from p2gs_jax.evaluate.lpips import LpipsWeights
-from p2gs_jax.evaluate.lpips_weights import read_lpips_weights
-from p2gs_jax.evaluate.references import Reference, check_reference, load_reference
+from p2gs_jax.evaluation.lpips import LpipsWeights, read_lpips_weights
+from p2gs_jax.evaluation.references import Reference, check_reference, load_reference
 from p2gs_jax.losses.total import SECOND_RENDER_FORMS
 from p2gs_jax.run.folder import RunFolder
-from p2gs_jax.scene.images import size_at
-from p2gs_jax.scene.known_exposures import check_source, read_known_exposures
+from p2gs_jax.scene.exposures import check_source, read_known_exposures
+from p2gs_jax.scene.pixels.store import size_at
 from p2gs_jax.train.schedule import shrinks
 from p2gs_jax.train.strategies import check_spread
 from p2gs_jax.types import Scene, View

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from p2gs_jax.core.clock import whole_run
-from p2gs_jax.evaluate.alignment import ExposureError, exposure_error
+from p2gs_jax.evaluation.alignment import ExposureError, exposure_error
 from p2gs_jax.photometry.models import MODELS
 from p2gs_jax.photometry.solution import MIN_OBSERVATIONS, WEAK_GAMMA, Agreement, compare
 from p2gs_jax.report.measurements import SceneMeasurements, seam_medians

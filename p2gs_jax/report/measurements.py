@@ -12,9 +12,15 @@ import numpy as np
 
 from p2gs_jax.core.progress import Reporter
 from p2gs_jax.errors import UserError
-from p2gs_jax.evaluate.metrics import psnr
-from p2gs_jax.evaluate.seam_picture import SeamPicture, seam_picture
-from p2gs_jax.evaluate.seams import Photographed, Seam, measure_seam, neighbouring_pairs
+from p2gs_jax.evaluation.scores import psnr
+from p2gs_jax.evaluation.seams import (
+    Photographed,
+    Seam,
+    SeamPicture,
+    measure_seam,
+    neighbouring_pairs,
+    seam_picture,
+)
 from p2gs_jax.photometry.display import develop
 from p2gs_jax.render.warp import surface_depth
 from p2gs_jax.report.charts import seams_chart
@@ -22,7 +28,7 @@ from p2gs_jax.report.page import figure, folded, paragraph, row, table
 from p2gs_jax.report.pictures import LARGE, ViewComparison, jpeg, spread, without_suffix
 from p2gs_jax.report.run_files import RunFiles
 from p2gs_jax.run.read import Run, load_run
-from p2gs_jax.scene.device import camera_of
+from p2gs_jax.scene.pixels.store import camera_of
 from p2gs_jax.synth.exposures import read_true_exposures
 
 MOST_PAIRS, MOST_CLIPPED, MOST_RENDERED = 12, 24, 3

@@ -13,7 +13,7 @@ from plyfile import PlyData, PlyElement
 from p2gs_jax.config import PhotometryConfig, RenderConfig
 from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.errors import UserError
-from p2gs_jax.evaluate.alignment import exposure_error
+from p2gs_jax.evaluation.alignment import exposure_error
 from p2gs_jax.formats.ply import read_ply, write_ply
 from p2gs_jax.formats.splat import read_foreign, write_splat
 from p2gs_jax.gaussians.bake import relit

@@ -16,7 +16,7 @@ from p2gs_jax.config import (
     RenderConfig,
     preset,
 )
-from p2gs_jax.evaluate.consistency import VideoScores
+from p2gs_jax.evaluation.scores import VideoScores
 from p2gs_jax.losses import relative_exposure as rel
 from p2gs_jax.losses.image import photometric_loss
 from p2gs_jax.losses.regularizers import photometry_regularizers

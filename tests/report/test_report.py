@@ -12,8 +12,7 @@ import pytest
 from page_tools import check_in_a_browser, copy_run, edit, headings, pictures, words_of
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.evaluate.seam_picture import SeamPicture
-from p2gs_jax.evaluate.seams import Seam
+from p2gs_jax.evaluation.seams import Seam, SeamPicture
 from p2gs_jax.report import page as pages
 from p2gs_jax.report.measurements import SceneMeasurements, SeamPair
 from p2gs_jax.report.report import report_page, write_report

@@ -12,7 +12,7 @@ from tiny_scene import make_scene
 
 from p2gs_jax.cli import main
 from p2gs_jax.config import CameraFormation, FitConfig
-from p2gs_jax.evaluate.seams import Photographed, measure_seam
+from p2gs_jax.evaluation.seams import Photographed, measure_seam
 from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.photometry.formation import corner, squared_radii
 from p2gs_jax.pipeline.decide import decide, likely, unsolved
