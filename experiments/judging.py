@@ -23,10 +23,8 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.formats.png import write_png
 from p2gs_jax.paths.captioned_images import CaptionedImage, stacked
-from p2gs_jax.photometry.luminance.parameters import Luminance
-from p2gs_jax.photometry.ppisp.homography import recolored
-from p2gs_jax.photometry.ppisp.parameters import Ppisp
-from p2gs_jax.photometry.ppisp.vignetting import falloff
+from p2gs_jax.photometry.luminance import Luminance
+from p2gs_jax.photometry.ppisp import Ppisp, falloff, recolored
 
 # Grey that a colour correction is applied to, where it is no factor per channel.
 GREY = 0.18

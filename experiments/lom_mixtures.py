@@ -32,8 +32,8 @@ from mixtures import GROUPS, REFERENCE, read_groups, spread_by_group, write_mixt
 import p2gs_jax
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import write_json, write_text
-from p2gs_jax.evaluate.metrics import psnr
-from p2gs_jax.evaluate.references import load_reference
+from p2gs_jax.evaluation.references import load_reference
+from p2gs_jax.evaluation.scores import psnr
 
 METHODS = ("robust", "ppisp", "ppisp_solved", "3dgs", "3dgs_affine", "3dgs_bilateral")
 # Contact sheet: methods shown between the photograph and the reference, and held-out views.

@@ -31,8 +31,8 @@ from scipy.optimize import minimize
 
 import p2gs_jax
 from p2gs_jax.core.atomic import write_json, write_text
-from p2gs_jax.evaluate.metrics import psnr
-from p2gs_jax.evaluate.references import load_reference
+from p2gs_jax.evaluation.references import load_reference
+from p2gs_jax.evaluation.scores import psnr
 from p2gs_jax.synth.exposures import read_true_shots
 from p2gs_jax.synth.rig import image_height
 from p2gs_jax.synth.settings import Sensor

@@ -11,9 +11,8 @@ from p2gs_jax.config import FitConfig, preset
 from p2gs_jax.errors import DivergenceError, UserError
 
 if TYPE_CHECKING:
-    from p2gs_jax.core.devices import Devices
     from p2gs_jax.districts.fit import fit_blocks
-    from p2gs_jax.evaluate.alignment import exposure_error
+    from p2gs_jax.evaluation.alignment import exposure_error
     from p2gs_jax.jobs.configs import grid, read_sweep, with_fields
     from p2gs_jax.jobs.sweep import sweep
     from p2gs_jax.paths.pinhole import make_camera
@@ -30,7 +29,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Camera",
-    "Devices",
     "DisplayTransform",
     "DivergenceError",
     "FitConfig",
@@ -63,7 +61,6 @@ __all__ = [
 
 
 _LAZY = {
-    "Devices": "p2gs_jax.core.devices",
     "DisplayTransform": "p2gs_jax.photometry.display",
     "Run": "p2gs_jax.run.read",
     "calibrate": "p2gs_jax.pipeline.calibrate",
@@ -71,7 +68,7 @@ _LAZY = {
     "calibrate_run": "p2gs_jax.pipeline.calibrate_run",
     "calibrate_stack": "p2gs_jax.pipeline.calibrate_stack",
     "develop": "p2gs_jax.photometry.display",
-    "exposure_error": "p2gs_jax.evaluate.alignment",
+    "exposure_error": "p2gs_jax.evaluation.alignment",
     "fit": "p2gs_jax.pipeline.fit",
     "fit_blocks": "p2gs_jax.districts.fit",
     "grid": "p2gs_jax.jobs.configs",

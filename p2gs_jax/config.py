@@ -59,9 +59,7 @@ Level = Literal["camera", "view"]
 VignettingKind = Literal["camera", "channel"]
 # What has a response of its own.
 ResponseKind = Literal["all", "camera", "channel"]
-ExposureLossForm = Literal[
-    "literal_same_pose", "literal_pixels", "exposed", "observed_linear", "observed_ldr"
-]
+ExposureLossForm = Literal["literal_same_pose", "literal_pixels", "observed_ldr"]
 
 
 @dataclass(frozen=True)
@@ -129,7 +127,7 @@ class RenderConfig:
     """How tiles get their lists; None counts on CPUs and sorts elsewhere (ours: BUILD_NOTES)."""
     sh_degree: int = 3
     """Highest spherical-harmonics degree (3DGS: 3)."""
-    radiance: Literal["exp", "softplus", "linear"] = "exp"
+    radiance: Literal["exp", "linear"] = "exp"
     """Activation from spherical harmonics to radiance; `linear` is 3DGS's max(0, sh + 1/2)."""
     near: float = 0.05
     """Near plane, scene units; nearer in scenes that it would cut (ours: pipeline/scale.py)."""
@@ -246,11 +244,8 @@ class RelativeExposureConfig:
     form: ExposureLossForm = "literal_same_pose"
     """Which reading of the printed formula."""
     huber_delta: float = 0.05
-    """Transition of the Huber loss in LDR units, `observed_ldr` only."""
-    correspondence: Literal["tracks", "depth"] | None = None
-    """Where the `observed` readings find the same surface in another photograph: at track
-    observations, or through the rendered depth with an occlusion test. None: at tracks where the
-    scene has any (ours: measured better and cheaper in BUILD_NOTES)."""
+    """Transition of the Huber loss in LDR units; `observed_ldr` compares photographed colours at
+    track observations."""
 
 
 @dataclass(frozen=True)
@@ -271,14 +266,6 @@ class RegularizerConfig:
     appearance: float | None = 10.0
     """Roughness of bilateral grids (bilateral-guided radiance fields: 10); a factor on the
     published weights of PPISP (1)."""
-    opacity: float | None = None
-    """Mean opacity (3DGS-MCMC: 0.01, which empties splats so that relocation can reuse them; ours:
-    at our populations it empties the scene within some thousand steps, BUILD_NOTES)."""
-    scale: float | None = None
-    """Mean scale in units of the scene extent (3DGS-MCMC: 0.01; ours: likewise)."""
-    object_poses: float | None = 1e-5
-    """Squares of the corrections of the poses of moving objects, over the 1 degree and 0.1 m that
-    boxes are drawn to (ours)."""
 
 
 @dataclass(frozen=True)
@@ -293,9 +280,6 @@ class LossConfig:
     """Photographed values from here on count as saturated (ours: docs/photometry.md, 3)."""
     black: float = 4.0 / 255.0
     """Photographed values up to here carry no exposure information (docs/photometry.md, 3)."""
-    quantization: float | None = None
-    """Half the interval that a stored value stands for (0.5 / 255 for 8 bits): predictions within
-    it are right and get no gradient. None compares with the stored value (ours: BUILD_NOTES)."""
     alpha: float | None = None
     """Weight of the mean difference between the render's opacity and the alpha channel of
     photographs shown over a background; None leaves it out (ours)."""
@@ -340,10 +324,6 @@ class OptimizerConfig:
     """They decay exponentially to this fraction (3DGS: 0.1)."""
     appearance_warmup: float = 0.0
     """Fraction of the run in which they rise from a hundredth (PPISP: 500 of 30,000 steps)."""
-    object_rotations: float = 1e-3
-    """Rotations that correct the poses of moving objects, radians (ours)."""
-    object_translations: float = 5e-3
-    """Likewise translations, scene units (ours)."""
     velocities: float = 0.3
     """Of Gaussians that vibrate, scene units per second (ours: BUILD_NOTES)."""
     peaks: float = 0.03
@@ -382,10 +362,9 @@ class DensifyConfig:
     method: Literal["mcmc", "adaptive"] | None = "mcmc"
     """`mcmc` relocates within a budget, `adaptive` is the 3DGS schedule (paper), None keeps the
     seeds."""
-    max_gaussians: int | Literal["auto"] | None = None
+    max_gaussians: int | None = None
     """Upper bound on the population, seeds included; None chooses from the pixels, the length of
-    the run and the seeds (gaussians/population.py), `auto` (mcmc only) stops growing where held-out
-    training views gain no more by it."""
+    the run and the seeds (gaussians/population.py)."""
     start: float = 1.0 / 60.0
     """First densification (3DGS: step 500)."""
     stop: float = 0.5
@@ -438,17 +417,10 @@ class DynamicsConfig:
     """Its points are thinned to one in a cube of this side, scene units (ours)."""
     most_points: int = 8000
     """Of one thing; the cubes grow until no more are left (ours)."""
-    correct_poses: bool = False
-    """Learn small corrections of the boxes' poses."""
     vibrating: int = 30_000
     """`vibration`: this many Gaussians begin as something that may move (ours)."""
     vibration_life: float = 0.3
     """And live for this long, seconds, before and after their peak (ours)."""
-    unexplained: Literal["fit", "mask"] = "fit"
-    """`mask`: pixels that no static explanation fits, found by their residuals over time and
-    without boxes, are left out of later steps; `fit`: they are fitted like all others."""
-    unexplained_at: tuple[float, ...] = (0.3, 0.6)
-    """When they are looked for, as fractions of the run; each look starts afresh (ours)."""
 
 
 @dataclass(frozen=True)
@@ -562,8 +534,6 @@ def _paper(exposure_weight: float, name: PresetName) -> FitConfig:
                 gamma_prior=0.1,
                 log_exposure_mean=None,
                 gamma_mean_variance=None,
-                opacity=None,
-                scale=None,
             ),
         ),
         # The paper prints no rates for e and gamma: 1e-3, as 3DGS's exposure compensation ends at.

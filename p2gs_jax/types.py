@@ -156,9 +156,6 @@ class Params(eqx.Module):
     photometry: Photometry
     appearance: Any = None
     """Corrections of all training views (`Corrections` of photometry/appearance.py), or None."""
-    poses: Float[Array, "t k 6"] | None = None
-    """Corrections of the poses of moving objects at key times: a rotation vector, radians, and a
-    translation, scene units, both in the axes of the box; None: poses are as they were tracked."""
 
 
 class Placement(eqx.Module):
@@ -166,14 +163,10 @@ class Placement(eqx.Module):
 
     Attributes:
         viewmats: box-to-camera of each, OpenCV axes; what is not there is behind the camera.
-        key: row of `Params.poses` at the key time before.
-        share: of the way from there to the next one.
         time: of the view, seconds from the middle of the drive, where Gaussians vibrate.
     """
 
     viewmats: Float[Array, "k 4 4"]
-    key: Int[Array, ""]
-    share: Float[Array, ""]
     time: Float[Array, ""] | None = None
 
 

@@ -157,7 +157,7 @@ def check_features(libraries: list[dict[str, Any]], backend: str | None) -> list
 
 def _browser() -> tuple[str, bool, str]:
     try:
-        from p2gs_jax.report.pdf import find_browser
+        from p2gs_jax.report.page import find_browser
 
         return "report --pdf", True, find_browser()
     except Exception:  # there is none, or a library is broken, which another check reports

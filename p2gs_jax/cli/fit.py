@@ -5,16 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal
 
 import tyro
 
 from p2gs_jax import config as configs
 from p2gs_jax.cli.shared import SHORT, check
 from p2gs_jax.config import FitConfig
-
-if TYPE_CHECKING:
-    from p2gs_jax.core.devices import Devices
 
 Preset = Annotated[configs.PresetName, tyro.conf.arg(metavar="NAME")]
 Config = Annotated[FitConfig, tyro.conf.arg(name="")]
@@ -64,8 +61,8 @@ class Fit:
 
         from p2gs_jax.cli.tables import print_metrics
         from p2gs_jax.core.progress import TerminalReporter
-        from p2gs_jax.pipeline.devices import with_a_view_each
         from p2gs_jax.pipeline.fit import fit
+        from p2gs_jax.train.data_parallel import with_a_view_each
 
         blocks = resolve_blocks(self)
         if blocks is not None:
@@ -275,22 +272,20 @@ def resolve_blocks(args: Fit) -> int | str | None:
     return words if words == "auto" else int(words)
 
 
-def resolve_devices(args: Fit) -> Devices:
-    """Return the devices of a fit.
+def resolve_devices(args: Fit) -> int | Literal["all"]:
+    """Return the number of devices of a fit, or `all`.
 
     Raises:
         UserError: the number is not valid.
     """
-    from p2gs_jax.core.devices import Devices
-
     if args.devices == "all":
-        return Devices("all")
+        return "all"
     check(
         args.devices.isdecimal() and int(args.devices) >= 1,
         f"--devices {args.devices} is not a number of devices",
         fix="give 1 or more, or all",
     )
-    return Devices(int(args.devices))
+    return int(args.devices)
 
 
 def named_preset(name: str) -> FitConfig:

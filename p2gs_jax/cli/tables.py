@@ -14,7 +14,7 @@ from rich.text import Text
 
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.core.progress import PlainConsole
-from p2gs_jax.photometry.cameras import corner
+from p2gs_jax.photometry.formation import corner
 from p2gs_jax.photometry.solution import WEAK_GAMMA, PhotometricSolution
 from p2gs_jax.pipeline.calibrate_of import CalibrationOf
 from p2gs_jax.pipeline.calibration import CalibrationResult

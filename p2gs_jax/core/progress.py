@@ -39,11 +39,7 @@ class PlainConsole(Console):
 
 @dataclass(frozen=True)
 class LogRecord:
-    """One line of `log.jsonl`, and what the live display shows.
-
-    Those of a trial, the run without growth that automatic growth compares with, are lines of
-    `growth.jsonl`.
-    """
+    """One line of `log.jsonl`, and what the live display shows."""
 
     step: int
     progress: float
@@ -56,7 +52,6 @@ class LogRecord:
     step_seconds: float
     left_s: float | None
     terms: dict[str, float]
-    trial: bool = False
 
     def summary(self) -> str:
         """Return where the run is, as text."""
@@ -160,6 +155,6 @@ class TerminalReporter:
             f"PSNR {record.psnr:.2f} dB",
             f"{record.gaussians} Gaussians",
             f"{rate:.1f} views/s",
-            "trying without growth" if record.trial else left,
+            left,
         )
         self.live.update(table)

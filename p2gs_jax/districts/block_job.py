@@ -23,15 +23,14 @@ from p2gs_jax.districts.shared import read_shared
 from p2gs_jax.formats.ply import write_radiance
 from p2gs_jax.gaussians.population import Coverage, default_max_gaussians
 from p2gs_jax.jobs.job import Job
-from p2gs_jax.pipeline.devices import mesh_of
 from p2gs_jax.pipeline.fit import begin_programs, begun, compact, optimise
 from p2gs_jax.pipeline.preflight import Paths
 from p2gs_jax.pipeline.prepare import load, prepare
 from p2gs_jax.run.folder import RunFolder, locked
 from p2gs_jax.scene.images import size_at
 from p2gs_jax.scene.visibility import shown_share
+from p2gs_jax.train.data_parallel import mesh_of
 from p2gs_jax.train.programs import StepPrograms
-from p2gs_jax.train.validation import pick_validation
 from p2gs_jax.types import Scene
 
 STATUS = Path("/proc/self/status")
@@ -151,9 +150,7 @@ def _fit(
     folder: RunFolder, block: BlockScene, cfg: FitConfig, reporter: Reporter, scene: str
 ) -> tuple[dict[str, int], dict[str, float]]:
     """Fit a block's scene and write its Gaussians; return counts and seconds."""
-    clock, validation, mesh = Stopwatch(), (), mesh_of(cfg, None)
-    if cfg.densify.max_gaussians == "auto":
-        validation = pick_validation([view.camera for view in block.scene.views])
+    clock, mesh = Stopwatch(), mesh_of(cfg)
     with contextlib.closing(StepPrograms()) as programs:
         prepared = prepare(
             block.scene,
@@ -165,9 +162,7 @@ def _fit(
             part=block.part,
         )
         with begun(folder, Paths(Path(scene), folder.root), cfg, prepared.decisions):
-            result = optimise(
-                prepared, folder, reporter, programs, resume=True, validation=validation, mesh=mesh
-            )
+            result = optimise(prepared, folder, reporter, programs, resume=True, mesh=mesh)
     params, _ = compact(result)
     count = params.gaussians.capacity
     reporter.stage("Writing files")

@@ -35,12 +35,12 @@ from p2gs_jax.districts.shared import (
 )
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.ply import read_ply
-from p2gs_jax.gaussians.init.dense_bound import coverage_of
-from p2gs_jax.gaussians.init.seeds import cameras_radius
+from p2gs_jax.gaussians.dense import coverage_of
+from p2gs_jax.gaussians.seeds import cameras_radius
 from p2gs_jax.jobs.engines import LOCAL, check_engine, open_engine
 from p2gs_jax.jobs.job import JobState
 from p2gs_jax.jobs.run import run_jobs
-from p2gs_jax.photometry.gauge import recentre
+from p2gs_jax.photometry.parameters import recentre
 from p2gs_jax.pipeline import preflight
 from p2gs_jax.pipeline.finish import Account, finish
 from p2gs_jax.pipeline.fit import FitResult, fit
@@ -292,7 +292,6 @@ class _District:
             extent=cameras_radius(scene.training_views, scene.points),
             selection=solved.selection,
             pairs=None,
-            overlaps=None,
             measured=None,
             coverage=coverage_of(scene, store),
             decisions=shared.decisions,

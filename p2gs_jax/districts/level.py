@@ -39,16 +39,13 @@ def level_seams(
         store: its photographs; only their cameras are used.
         cut: of the scene.
         fitted: all Gaussians of each block.
-        cfg: rendering options. With `softplus`, whose radiance no change of coefficients scales,
-            nothing is levelled.
+        cfg: rendering options.
 
     Returns:
         All Gaussians of each block, and its seams, with what was taken out of each.
     """
     told = measure_seams(scene, store, cut, fitted, cfg, which=slice(0, None, 2))
     steps = {s.blocks: s.step_stops for s in told if s.step_stops is not None}
-    if cfg.radiance == "softplus":
-        steps = {}
     levelled = []
     for number, gaussians in enumerate(fitted):
         shift = shifts(cut, number, np.asarray(gaussians.means), steps) * np.log(2)

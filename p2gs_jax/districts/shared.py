@@ -13,10 +13,9 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.core.progress import Reporter
 from p2gs_jax.errors import UserError
-from p2gs_jax.gaussians.init.photographed import photographed_radiance, with_colors
-from p2gs_jax.gaussians.init.seeds import cameras_radius
-from p2gs_jax.gaussians.init.shell import Sphere, sphere_behind
-from p2gs_jax.photometry.initial import initial_photometry, point_radiance
+from p2gs_jax.gaussians.seeds import cameras_radius, photographed_radiance, with_colors
+from p2gs_jax.gaussians.shell import Sphere, sphere_behind
+from p2gs_jax.photometry.parameters import initial_photometry, point_radiance
 from p2gs_jax.photometry.selection import Selection
 from p2gs_jax.pipeline.decide import decide
 from p2gs_jax.pipeline.prepare import solve

@@ -14,7 +14,7 @@ import numpy as np
 from p2gs_jax.core.numerics import evenly_spaced, on_device
 from p2gs_jax.formats.false_color import false_color
 from p2gs_jax.photometry.display import DisplayTransform
-from p2gs_jax.photometry.spline_curve import by_camera, tables
+from p2gs_jax.photometry.response import by_camera, tables
 from p2gs_jax.render import project, view_radiance
 from p2gs_jax.render.tiles import smallest_cutoff
 from p2gs_jax.run.read import Run

@@ -23,7 +23,6 @@ from p2gs_jax.types import GAMMA_SRGB, Gaussians, Scene
 FORMAT, VERSION = "p2gs-jax linear Gaussians", 2
 ACTIVATIONS = {
     "exp": f"L = exp(clip(s, -{LOG_RADIANCE_LIMIT:g}, {LOG_RADIANCE_LIMIT:g}))",
-    "softplus": "L = log(1 + exp(s))",
     "linear": "L = max(0, s + 1/2)",
 }
 # The basis of render/spherical_harmonics.py, in order; d = (x, y, z) is the direction.

@@ -17,7 +17,7 @@ from jaxtyping import Float32
 from scipy.special import expit
 
 from p2gs_jax.core.atomic import atomic_write
-from p2gs_jax.gaussians.half_turn import half_turn
+from p2gs_jax.gaussians.posed import half_turn
 from p2gs_jax.render.harmonics import degree_of
 from p2gs_jax.types import Gaussians
 

@@ -15,7 +15,7 @@ import numpy as np
 from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.through_gsply import gsply_data, require_gsply
-from p2gs_jax.gaussians.half_turn import half_turn
+from p2gs_jax.gaussians.posed import half_turn
 from p2gs_jax.types import Gaussians
 
 # Positions are integers of 24 bits with a sign; more than 24 fractional bits are not allowed.

@@ -18,7 +18,7 @@ from scipy.special import expit
 
 from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.errors import UserError
-from p2gs_jax.gaussians.half_turn import FLIP, half_turn
+from p2gs_jax.gaussians.posed import FLIP, half_turn
 from p2gs_jax.render.harmonics import degree_of
 from p2gs_jax.types import Gaussians
 

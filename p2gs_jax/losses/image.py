@@ -149,18 +149,6 @@ def censor(
     return jnp.where(agrees, target, ldr)
 
 
-def within_quantum(
-    ldr: Float[Array, "h w 3"], target: Float[Array, "h w 3"], half: float
-) -> Float[Array, "h w 3"]:
-    """Replace predictions by the nearest one that a stored value leaves open.
-
-    A stored value stands for everything within `half` of it: a prediction in there is right and
-    gets no gradient; outside, the distance to the interval counts.
-    """
-    away = ldr - target
-    return jnp.where(jnp.abs(away) <= half, target, ldr - half * jnp.sign(away))
-
-
 def photometric_loss(
     ldr: Float[Array, "h w 3"],
     target: Float[Array, "h w 3"],
@@ -173,12 +161,10 @@ def photometric_loss(
         ldr: prediction, display-encoded, may exceed 1.
         target: photograph, [0, 1].
         mask: 1 = use; masked pixels get exactly zero gradient.
-        cfg: weights, censoring and quantisation.
+        cfg: weights and censoring.
     """
     if cfg.censored:
         ldr = censor(ldr, target, cfg.saturation)
-    if cfg.quantization is not None:
-        ldr = within_quantum(ldr, target, cfg.quantization)
     weight = cfg.dssim_weight or 0.0
     valid = jnp.maximum(3 * jnp.sum(mask), 1.0)
     absolute = jnp.where(mask[..., None] > 0, jnp.abs(ldr - target), 0.0)

@@ -14,8 +14,7 @@ from jaxtyping import Array, Float
 
 from p2gs_jax.config import LossConfig
 from p2gs_jax.losses.image import photometric_loss
-from p2gs_jax.photometry.luminance.parameters import ENTRIES, Curves, enhanced, pseudo_curve
-from p2gs_jax.photometry.luminance.statistics import cumulative
+from p2gs_jax.photometry.luminance import ENTRIES, Curves, cumulative, enhanced, pseudo_curve
 
 # Published weights.
 ENHANCED, CURVE = 0.5, 10.0

@@ -11,9 +11,8 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.losses.image import censor, photometric_loss
 from p2gs_jax.losses.luminance import luminance_terms
 from p2gs_jax.photometry.appearance import Correction
-from p2gs_jax.photometry.formation import formation
-from p2gs_jax.photometry.luminance.parameters import Curves
-from p2gs_jax.photometry.matte import Matte, composited, uncovered
+from p2gs_jax.photometry.formation import Matte, composited, formation, uncovered
+from p2gs_jax.photometry.luminance import Curves
 from p2gs_jax.types import Batch, Capture, Render
 
 # Photographed colours of pixels that are less opaque are black.

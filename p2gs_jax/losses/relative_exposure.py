@@ -13,13 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from p2gs_jax.config import LossConfig, PhotometryConfig
-from p2gs_jax.photometry.formation import (
-    expose,
-    gain,
-    inverse_formation,
-    inverse_tone_map,
-    tone_map,
-)
+from p2gs_jax.photometry.formation import expose, gain, inverse_formation, tone_map
 from p2gs_jax.types import Photometry
 
 
@@ -55,11 +49,11 @@ class ExposurePairs(eqx.Module):
 
     Attributes:
         linear_i: render of view i, linear.
-        linear_j: render of view j, for `literal_pixels` and `exposed`.
+        linear_j: render of view j, for `literal_pixels`.
         view_i: row of view i.
         view_j: row of view j.
         photometry: what every view did to light.
-        pairs: corresponding observations, for the `observed` readings.
+        pairs: corresponding observations, for `observed_ldr`.
     """
 
     linear_i: Float[Array, "h w 3"]
@@ -85,11 +79,6 @@ def literal_pixels(linear_i, linear_j, e_i, e_j) -> Float[Array, ""]:
     return _per_pixel_l1(e_j / e_i * linear_i - linear_j)
 
 
-def exposed(linear_i, linear_j, e_j) -> Float[Array, ""]:
-    """Both radiances under the same exposure: e_j (L_i - L_j). Zero at one pose."""
-    return _per_pixel_l1(e_j * (linear_i - linear_j))
-
-
 def usable(colors: Float[Array, "m 3"], cfg: LossConfig) -> Float[Array, "m 3"]:
     """Return 1 where a photographed value is neither near black nor saturated."""
     return ((colors > cfg.black) & (colors < cfg.saturation)).astype(colors.dtype)
@@ -109,15 +98,6 @@ def _mean_over_pairs(
     weight = usable(pairs.colors_i, cfg) * usable(pairs.colors_j, cfg) * pairs.valid[:, None]
     fewest = FEWEST_VALID * pairs.valid.size
     return jnp.sum(weight * error) / jnp.maximum(jnp.sum(pairs.valid), fewest)
-
-
-def observed_linear(
-    pairs: ColorPairs, photometry: Photometry, loss: LossConfig, cfg: PhotometryConfig
-) -> Float[Array, ""]:
-    """alpha T_i^-1(I_i(u)) against T_j^-1(I_j(w(u))), at corresponding surface points."""
-    predicted, capture_j = _exposed_alike(pairs, photometry, cfg)
-    seen = inverse_tone_map(pairs.colors_j, capture_j.gamma[:, None], cfg, capture_j.camera)
-    return _mean_over_pairs(jnp.abs(predicted - seen), pairs, loss)
 
 
 def huber(x: Float[Array, "..."], delta: float) -> Float[Array, "..."]:
@@ -146,11 +126,10 @@ def relative_exposure_loss(
             renders of one size.
     """
     form = cfg.relative_exposure.form
-    if form in ("observed_linear", "observed_ldr"):
+    if form == "observed_ldr":
         if given.pairs is None:
             raise ValueError(f"the reading {form!r} needs corresponding observations")
-        reading = observed_linear if form == "observed_linear" else observed_ldr
-        return reading(given.pairs, given.photometry, cfg, photometry)
+        return observed_ldr(given.pairs, given.photometry, cfg, photometry)
     shape = given.linear_i.shape
     e_i, e_j = (
         gain(shape, given.photometry.capture(row), photometry)
@@ -163,6 +142,4 @@ def relative_exposure_loss(
     if given.linear_j.shape != shape:
         sizes = f"{shape} and {given.linear_j.shape}"
         raise ValueError(f"the reading {form!r} subtracts renders of one size, not {sizes}")
-    if form == "exposed":
-        return exposed(given.linear_i, given.linear_j, e_j)
     return literal_pixels(given.linear_i, given.linear_j, e_i, e_j)

@@ -5,17 +5,15 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from p2gs_jax.config import FitConfig, PhotometryConfig
-from p2gs_jax.photometry.adjustment.curve import fit_response
 from p2gs_jax.photometry.adjustment.fit import fit_model
 from p2gs_jax.photometry.adjustment.problem import KnownExposures, Problem, make_problem
-from p2gs_jax.photometry.choices import Curve
-from p2gs_jax.photometry.models import Form
+from p2gs_jax.photometry.adjustment.solve import fit_response
+from p2gs_jax.photometry.models import Curve, Form
 from p2gs_jax.photometry.observations import COARSEST, Observations
-from p2gs_jax.photometry.one_response import solve_response
-from p2gs_jax.photometry.response import Response
+from p2gs_jax.photometry.response import BASES, Response
 from p2gs_jax.photometry.selection import Selection, select
 from p2gs_jax.scene.known_exposures import read_known_exposures
 from p2gs_jax.types import Scene
@@ -51,23 +49,20 @@ class CalibrationOptions:
     choice: Choice = "held_out"
     known_response: str | None = None
 
+    @property
+    def limits(self) -> dict[str, Any]:
+        """What `make_problem` and `select` are given besides observations."""
+        return {k: getattr(self, k) for k in ("black", "saturation", "pivot", "known")}
+
     def problem(self, observations: Observations) -> Problem:
         """Lay observations out for the adjustment."""
-        return make_problem(
-            observations,
-            black=self.black,
-            saturation=self.saturation,
-            pivot=self.pivot,
-            known=self.known,
-        )
+        return make_problem(observations, **self.limits)
 
 
 def options_of(cfg: FitConfig, scene: Scene) -> CalibrationOptions:
-    """Return the options of a fit.
+    """Return the options of a fit to a scene, whose training views are the ones observed.
 
-    Args:
-        cfg: with `photometry.select` off, its model and curve are solved as they are.
-        scene: its training views are the ones observed; for known exposures.
+    With `photometry.select` off, the model and curve of `cfg` are solved as they are.
 
     Raises:
         UserError: the known exposures cannot be read.
@@ -127,20 +122,11 @@ def calibrate_observations(
 
 def _solved(observations: Observations, options: CalibrationOptions, on_chosen) -> Selection:
     if options.choice == "held_out":
-        return select(
-            observations,
-            black=options.black,
-            saturation=options.saturation,
-            pivot=options.pivot,
-            known=options.known,
-            known_response=options.known_response,
-            seed=options.seed,
-            on_chosen=on_chosen,
-        )
+        how = {"known_response": options.known_response, "seed": options.seed}
+        return select(observations, **options.limits, **how, on_chosen=on_chosen)
     problem = options.problem(observations)
     if options.choice == "one_response":
-        solution, said = solve_response(problem)
-        return Selection(solution, (), tuple(said))
+        return _solved_by_one_response(problem)
     form, response = options.choice
     notes: tuple[str, ...] = ()
     if isinstance(response, Curve):
@@ -152,3 +138,16 @@ def _solved(observations: Observations, options: CalibrationOptions, on_chosen) 
             notes = (f"A fitted response collapsed: {response.base} was used as it is.",)
         response = fitted or Response(response.base)
     return Selection(fit_model(problem, form, response), (), notes)
+
+
+def _solved_by_one_response(problem: Problem) -> Selection:
+    """Solve an exposure per view under the base curve whose fitted spline leaves least unexplained.
+
+    A stack holds every level of tone often, so nothing needs to be chosen by held-out colours.
+    """
+    fitted = [fit_response(problem, Response(base)) for base in BASES]
+    options = [fit_model(problem, "view_exposure", r) for r in fitted if r is not None]
+    if not options:
+        collapsed = "A fitted response collapsed: sRGB was used as it is."
+        return Selection(fit_model(problem, "view_exposure"), (), (collapsed,))
+    return Selection(min(options, key=lambda s: s.residual_ev), (), ())

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -19,15 +19,7 @@ from p2gs_jax.core.numerics import LN2
 from p2gs_jax.photometry.formation import exposed_at
 from p2gs_jax.types import Render
 
-MeterName = Literal[
-    "log_average",
-    "display_average",
-    "average",
-    "centre_log_average",
-    "centre_average",
-    "highlights",
-]
-METERS: tuple[MeterName, ...] = get_args(MeterName)
+# The meters, and what people call them.
 WORDS: dict[str, str] = {
     "log_average": "log average",
     "display_average": "average of display values",
@@ -36,8 +28,8 @@ WORDS: dict[str, str] = {
     "centre_average": "centre-weighted average",
     "highlights": "highlights (99th percentile)",
 }
-GivenRule = Literal["log_average", "centre", "highlights", "protected"]
-ExposureOf = Literal["auto"] | GivenRule
+METERS = tuple(WORDS)
+ExposureOf = Literal["auto", "log_average", "centre", "highlights", "protected"]
 Readings = Mapping[str, float]
 
 # Weights of linear red, green and blue in luminance (BT.709).
@@ -98,12 +90,7 @@ def meter(linear: Float[np.ndarray, "h w 3"], alpha: Float[np.ndarray, "h w"]) -
 
 
 def white_level(gamma: float, cfg: PhotometryConfig) -> float:
-    """Return the exposed radiance that is shown just below white.
-
-    Args:
-        gamma: of the display.
-        cfg: its tone curve.
-    """
+    """Return the exposed radiance that a display of this gamma shows just below white."""
     return exposed_at(BELOW_WHITE, gamma, cfg)
 
 
@@ -133,13 +120,11 @@ class Rule:
     @property
     def words(self) -> str:
         """What people call it."""
-        if not self.meters:
-            return "constant"
         parts = [
             WORDS.get(name, name) + ("" if slope == 1 else f" (slope {slope:.2f})")
             for name, slope in zip(self.meters, self.slopes, strict=True)
         ]
-        return " and ".join(parts)
+        return " and ".join(parts) or "constant"
 
 
 @dataclass(frozen=True)
@@ -185,13 +170,14 @@ class Metering:
                 found = min(found, white - readings["highlights"])
         return float(found) if np.isfinite(found) else self.constant.offset
 
-    def typical_log_exposure(self, of: ExposureOf = "auto") -> float:
-        """Return the mean over the training views: one exposure for all of a scene."""
-        rows: list[dict[str, float]] = [
-            {str(name): value for name, value in zip(METERS, row, strict=True)}
-            for row in self.readings.tolist()
-        ]
-        return float(np.mean([self.log_exposure(row, of) for row in rows]))
+    def exposure(self, readings: Readings, of: ExposureOf = "auto") -> float:
+        """Return the exposure of a picture, a factor on radiance; see `log_exposure`."""
+        return float(np.exp(self.log_exposure(readings, of)))
+
+    def typical_exposure(self, of: ExposureOf = "auto") -> float:
+        """Return the geometric mean over the training views: one exposure for all of a scene."""
+        rows = [dict(zip(METERS, row, strict=True)) for row in self.readings.tolist()]
+        return float(np.exp(float(np.mean([self.log_exposure(row, of) for row in rows]))))
 
     @property
     def telling(self) -> bool:
@@ -246,14 +232,13 @@ def fit_metering(
     if len(y) < FEWEST_VIEWS:
         mean = Rule((), (), float(np.mean(log_exposures)), constant.residual_ev)
         return Metering(mean, (mean,), white, tuple(names), table)
-    tried = [_fitted((m,), (1.0,), x, y) for m in METERS]
-    tried += [_fitted((m,), None, x, y) for m in METERS]
+    tried = [_fitted((m,), slopes, x, y) for slopes in ((1.0,), None) for m in METERS]
     tried.append(_fitted(("log_average", "highlights"), None, x, y))
     tried.sort(key=lambda pair: pair[0].left_out_ev)
     best, errors = tried[0]
-    simple = [pair for pair in tried if pair[0].slopes == (1.0,)]
-    if simple and WORTH_A_NUMBER * simple[0][0].left_out_ev < best.left_out_ev:
-        best, errors = simple[0]
+    simple = next(pair for pair in tried if pair[0].slopes == (1.0,))
+    if WORTH_A_NUMBER * simple[0].left_out_ev < best.left_out_ev:
+        best, errors = simple
     rule = best if _explains(best, errors, constant, alone) else constant
     candidates = sorted([constant, *(r for r, _ in tried)], key=lambda r: r.left_out_ev)
     return Metering(rule, tuple(candidates), white, tuple(names), table)
@@ -266,22 +251,18 @@ def meter_views(
     gamma: float,
     cfg: PhotometryConfig,
 ) -> Metering:
-    """Render, read and fit: `fit_metering` from pictures.
+    """Render, read and fit: `fit_metering` from pictures of the training views.
 
     Args:
-        names: of the training views.
+        names: of the views.
         rendered: one for each.
-        exposures: of each.
+        exposures: factors on radiance, one for each.
         gamma: of new views.
         cfg: tone curve.
     """
     readings = [meter(np.asarray(r.linear), np.asarray(r.alpha)) for r in rendered]
     logs = np.log(np.asarray(exposures, np.float64))
     return fit_metering(names, readings, logs, white_level(gamma, cfg))
-
-
-def _folds(count: int) -> list[np.ndarray]:
-    return [fold for fold in np.array_split(np.arange(count), min(count, FOLDS)) if len(fold)]
 
 
 def _fitted(
@@ -291,7 +272,9 @@ def _fitted(
     y: Float[np.ndarray, " v"],
 ) -> tuple[Rule, Float[np.ndarray, " f"]]:
     """Return a rule fitted to all views, and its mean squared error on every stretch left out."""
-    read = x[:, [METERS.index(m) for m in meters]]  # pyright: ignore[reportArgumentType]
+    if not len(y):
+        return Rule(meters, (0.0,) * len(meters), 0.0), np.zeros(0)
+    read = x[:, [METERS.index(m) for m in meters]]
 
     def solve(rows) -> tuple[np.ndarray, float]:
         if slopes is not None:
@@ -301,14 +284,12 @@ def _fitted(
             taken = -np.linalg.lstsq(read[rows] - middle, y[rows] - y[rows].mean(), rcond=1e-6)[0]
         return taken, float((y[rows] + read[rows] @ taken).mean())
 
-    if not len(y):
-        return Rule(meters, (0.0,) * len(meters), 0.0), np.zeros(0)
     everything = np.arange(len(y))
     taken, offset = solve(everything)
     residual = y - offset + read @ taken
     left = np.zeros(len(y))
     errors = []
-    for fold in _folds(len(y)) if len(y) > 1 else []:
+    for fold in np.array_split(everything, min(len(y), FOLDS)) if len(y) > 1 else []:
         s, o = solve(np.setdiff1d(everything, fold))
         left[fold] = y[fold] - o + read[fold] @ s
         errors.append(np.mean(left[fold] ** 2))
@@ -324,21 +305,13 @@ def _explains(best: Rule, errors: np.ndarray, constant: Rule, alone: np.ndarray)
     return bool(gain.mean() > 2 * gain.std(ddof=1) / np.sqrt(len(gain)))
 
 
-def adapted(
-    log_exposures: Float[np.ndarray, " f"], frames: float, closed: bool = False
-) -> Float[np.ndarray, " f"]:
+def adapted(log_exposures: Float[np.ndarray, " f"], frames: float) -> Float[np.ndarray, " f"]:
     """Return exposures along a path that follow those metered as slowly as cameras adapt.
 
-    An exponential filter to both sides, so that a path played backwards looks the same.
-
-    Args:
-        log_exposures: metered, frame by frame.
-        frames: after how many the filter has fallen to 1/e.
-        closed: whether the last frame is followed by the first one.
+    An exponential filter to both sides, so that a path played backwards looks the same; it falls to
+    1/e after so many frames.
     """
     count = len(log_exposures)
     away = np.abs(np.arange(count)[:, None] - np.arange(count))
-    if closed:
-        away = np.minimum(away, count - away)
     weight = np.exp(-away / max(frames, 1e-6))
     return weight @ np.asarray(log_exposures, np.float64) / weight.sum(1)

@@ -19,13 +19,20 @@ import numpy as np
 
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.core.streams import Stream, generator
-from p2gs_jax.photometry.adjustment.curve import EXPOSURES, fit_response
 from p2gs_jax.photometry.adjustment.fit import fit_model
 from p2gs_jax.photometry.adjustment.problem import KnownExposures, Problem, make_problem
-from p2gs_jax.photometry.adjustment.solve import MOST_ROUNDS
+from p2gs_jax.photometry.adjustment.solve import EXPOSURES, MOST_ROUNDS, fit_response
 from p2gs_jax.photometry.candidates import Candidate, Comparison, choose
-from p2gs_jax.photometry.choices import Choice, Curve, Scope, neighbours
-from p2gs_jax.photometry.models import MODELS, Form, channel_powers, parameter_count
+from p2gs_jax.photometry.models import (
+    MODELS,
+    Choice,
+    Curve,
+    Form,
+    Scope,
+    channel_powers,
+    neighbours,
+    parameter_count,
+)
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import BASES, Response, spline_parameters
 from p2gs_jax.photometry.solution import PhotometricSolution
@@ -98,9 +105,8 @@ def select(
     small = make(_subset(observations, seed, MOST_OBSERVATIONS))
     held = generator(seed, Stream.HELD_OUT).random(len(small.observations.points)) < HELD_OUT
     training = make(_subset(small.observations.picked(~held), seed, SPLINE_OBSERVATIONS))
-    search = _Search(
-        comparison := Comparison(small, held), training, known=known_response is not None
-    )
+    comparison = Comparison(small, held)
+    search = _Search(comparison, training, known=known_response is not None)
     notes = search.first()
     if known_response is not None:
         notes = [
@@ -120,20 +126,13 @@ def select(
 
 
 class _Search:
-    """Choices compared on held-out colours, with curves fitted on the others.
+    """Choices compared on held-out colours, with splines fitted on some of the others.
 
-    Args:
-        comparison: what was compared so far.
-        training: some of the observations that are not held out, for the splines.
-        known: the curve is known, and sRGB's.
-
-    Attributes:
-        comparison: as given.
-        spread: standard deviation of the exposures under sRGB, log units.
-        scope: what there is to choose from.
+    If the curve is `known`, it is sRGB's. `spread` is the standard deviation of the exposures under
+    sRGB, log units; `scope` is what there is to choose from.
     """
 
-    def __init__(self, comparison: Comparison, training: Problem, *, known: bool = False):
+    def __init__(self, comparison: Comparison, training: Problem, *, known: bool):
         self.comparison, self._training = comparison, training
         o = comparison.problem.observations
         cameras = int(o.cameras.max(initial=0)) + 1
@@ -151,12 +150,9 @@ class _Search:
         form = choice.form._replace(model="view_exposure")
         key = form, curve
         if key not in self._fitted:
+            base, by = Response(curve.base), curve.splines
             self._fitted[key] = fit_response(
-                self._training,
-                Response(curve.base),
-                form=form,
-                by=curve.splines,
-                spread=self.spread,
+                self._training, base, form=form, by=by, spread=self.spread
             )
         return self._fitted[key]
 
@@ -223,13 +219,13 @@ def _reasons(chosen: Candidate, candidates: list[Candidate]) -> list[str]:
         c = max(simpler, key=lambda c: c.density)
         out.append(
             f"Simpler ({c.name}) predicts held-out colours worse: log-likelihood lower by "
-            f"{c.density_gap(chosen):.3f} per observation (0.01 is little, 1 a lot)."
+            f"{chosen.density - c.density:.3f} per observation (0.01 is little, 1 a lot)."
         )
     richer = [c for c in candidates if c.parameters > chosen.parameters]
     if richer:
         c = max(richer, key=lambda c: c.density)
         out.append(
-            f"Richer ({c.name}) would gain {-c.density_gap(chosen):.3f} of held-out "
+            f"Richer ({c.name}) would gain {c.density - chosen.density:.3f} of held-out "
             f"log-likelihood per observation for {c.parameters - chosen.parameters} more "
             "parameters."
         )

@@ -11,7 +11,7 @@ from p2gs_jax.core.atomic import no_empty_folders
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.calibrate import calibrate_observations, options_of
-from p2gs_jax.photometry.sources import has_tracks, surface_colors
+from p2gs_jax.photometry.sources.points import has_tracks, surface_colors
 from p2gs_jax.pipeline.calibration import Calibration, with_stated, write_calibration
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.images import ImageStore

@@ -15,19 +15,17 @@ from p2gs_jax.core.atomic import no_empty_folders
 from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
-from p2gs_jax.evaluate.foreign import score_foreign
+from p2gs_jax.evaluation.against import score_foreign
 from p2gs_jax.formats.foreign import read_foreign
-from p2gs_jax.gaussians.bake import viewer_config
-from p2gs_jax.gaussians.init.dense_bound import coverage_of
-from p2gs_jax.gaussians.init.seeds import cameras_radius
-from p2gs_jax.gaussians.relit import relit
+from p2gs_jax.gaussians.bake import relit, viewer_config
+from p2gs_jax.gaussians.dense import coverage_of
+from p2gs_jax.gaussians.seeds import cameras_radius
 from p2gs_jax.photometry.calibrate import calibrate_observations, options_of
-from p2gs_jax.photometry.initial import initial_photometry
-from p2gs_jax.photometry.mean import usual_display
+from p2gs_jax.photometry.display import usual_display
 from p2gs_jax.photometry.observations import Observations
+from p2gs_jax.photometry.parameters import initial_photometry
 from p2gs_jax.photometry.selection import Selection
-from p2gs_jax.photometry.sources.rendered import rendered_colors
-from p2gs_jax.photometry.sources.tracks import has_tracks, track_colors
+from p2gs_jax.photometry.sources.points import has_tracks, rendered_colors, track_colors
 from p2gs_jax.pipeline.calibration import Calibration, with_stated, write_calibration
 from p2gs_jax.pipeline.decide import decide
 from p2gs_jax.pipeline.finish import Account, finish
@@ -104,9 +102,9 @@ def calibrate_of(
             )
         store = ImageStore(scene.views, cfg.data)
         reporter.stage("Judging the model")
-        before = score_foreign(foreign, scene, store, viewer_config(cfg.render))
+        before, agreement = score_foreign(foreign, scene, store, viewer_config(cfg.render))
         observations = _observations(foreign, scene, store, cfg, reporter)
-        _check(observations, before.agreement, Path(model), Path(scene_dir))
+        _check(observations, agreement, Path(model), Path(scene_dir))
     clock.add("reading", time.monotonic() - begin)
     reporter.stage("Photometric bundle adjustment")
     selection = calibrate_observations(observations, options_of(cfg, scene))
@@ -136,7 +134,7 @@ def calibrate_of(
         "steps": result.host.step,
     }
     seconds = {**clock.seconds, **result.seconds, "optimisation": result.host.elapsed_s}
-    account = Account(counts=counts, seconds=seconds, of=before.summary)
+    account = Account(counts=counts, seconds=seconds, of=before)
     metrics = finish(params, prepared, folder, account, reporter, truth=None, lpips_weights=None)
     write_calibration(calibration, folder.root)
     return CalibrationOf(calibration, metrics)
@@ -219,7 +217,6 @@ def _prepared(
         extent=cameras_radius(scene.training_views, np.asarray(foreign.means)),
         selection=selection,
         pairs=None,
-        overlaps=None,
         measured=None,
         coverage=coverage_of(scene, store),
         decisions=decisions,

@@ -11,7 +11,7 @@ from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.posed import standing
 from p2gs_jax.photometry.calibrate import calibrate_observations, options_of
-from p2gs_jax.photometry.sources.rendered import rendered_colors
+from p2gs_jax.photometry.sources.points import rendered_colors
 from p2gs_jax.pipeline.calibration import Calibration, with_stated, write_calibration
 from p2gs_jax.run.read import load_run
 

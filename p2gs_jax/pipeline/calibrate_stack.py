@@ -9,13 +9,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from p2gs_jax.core.numerics import LN2
 from p2gs_jax.photometry.adjustment.problem import KnownExposures, Problem
-from p2gs_jax.photometry.agreement import Agreement, compare
 from p2gs_jax.photometry.calibrate import CalibrationOptions, calibrate_observations
-from p2gs_jax.photometry.one_response import LOCAL_EV, Unexplained, residuals, unexplained
-from p2gs_jax.photometry.solution import PhotometricSolution
+from p2gs_jax.photometry.solution import Agreement, PhotometricSolution, compare
 from p2gs_jax.photometry.sources.stack import SATURATED, StackColors, read_stack, stack_colors
+from p2gs_jax.photometry.unmodelled import LOCAL_EV, Unexplained, residuals, unexplained
 from p2gs_jax.scene.known_exposures import read_known_exposures, stated_ev
 from p2gs_jax.types import View
 
@@ -127,7 +125,7 @@ def calibrate_stack(
     left = unexplained(
         problem, residuals(problem, solution), found.xy, stack.valid.shape, found.signal
     )
-    errors_ev = np.where(found.signal, solution.exposure_errors / LN2, np.inf)
+    errors_ev = np.where(found.signal, solution.exposure_errors_ev, np.inf)
     agreement = compare(solution.exposures_ev, errors_ev, stated)
     messages = [*selection.reasons, *solution.warnings, *_stack_messages(stack.views, found, left)]
     if agreement.views >= 2:

@@ -12,10 +12,8 @@ from jaxtyping import Float
 
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.core.atomic import write_json
-from p2gs_jax.core.numerics import LN2
-from p2gs_jax.photometry.agreement import Agreement, compare, note_on_levels
 from p2gs_jax.photometry.selection import Selection
-from p2gs_jax.photometry.solution import PhotometricSolution
+from p2gs_jax.photometry.solution import Agreement, PhotometricSolution, compare, note_on_levels
 from p2gs_jax.run.photometry_files import write_solution
 from p2gs_jax.run.plots import write_calibration_plot
 from p2gs_jax.scene.known_exposures import stated_ev
@@ -132,7 +130,7 @@ def with_stated(
     """
     stated = stated_ev(compare_with, list(scene.views))
     s, pivot = selection.solution, photometry.pivot
-    agreement = compare(s.exposures_ev, s.exposure_errors / LN2, stated)
+    agreement = compare(s.exposures_ev, s.exposure_errors_ev, stated)
     return Calibration(
         scene=scene,
         selection=selection,

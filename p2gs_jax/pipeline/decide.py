@@ -27,7 +27,7 @@ def decide(
         matched: there are colours of shared points.
         kept: from the checkpoints of a run that is resumed: what its cameras do stays to the digit.
     """
-    decided = with_correspondence(Decisions.as_asked(cfg), matched)
+    decided = Decisions.as_asked(cfg)
     if selection is None:
         decided = unsolved(decided)
         return without_tracks(decided) if cfg.photometry.start == "tracks" else decided
@@ -59,7 +59,7 @@ def likely(cfg: FitConfig, kept: Decisions | None, *, matched: bool) -> Decision
         matched: colours of shared points will be there.
     """
     p, d = cfg.photometry, cfg.densify
-    slots_known = d.method == "mcmc" and d.max_gaussians != "auto"
+    slots_known = d.method == "mcmc"
     if p.known is not None or cfg.loss.relative_exposure.weight is not None or not slots_known:
         return None
     # What cameras do enters the programs, and is not solved yet.
@@ -76,7 +76,7 @@ def likely(cfg: FitConfig, kept: Decisions | None, *, matched: bool) -> Decision
         decided = dataclasses.replace(
             decided, model="view_exposure", white_balance=None, vignetting=None, responses="all"
         )
-    return with_correspondence(decided, matched or p.start == "tracks")
+    return decided
 
 
 def with_choice(decided: Decisions, form: Form, response: Response) -> Decisions:
@@ -101,13 +101,6 @@ def unsolved(decided: Decisions) -> Decisions:
         vignetting=None,
         responses="all",
     )
-
-
-def with_correspondence(decided: Decisions, matched: bool) -> Decisions:
-    """Return the decisions with a way to compare photographs; one that was asked for stays."""
-    if decided.correspondence is not None:
-        return decided
-    return dataclasses.replace(decided, correspondence="tracks" if matched else "depth")
 
 
 def without_tracks(decided: Decisions) -> Decisions:

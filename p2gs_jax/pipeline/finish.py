@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,18 +13,15 @@ from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.clock import CompileCounter, Stopwatch, over_budget
 from p2gs_jax.core.progress import Reporter
 from p2gs_jax.core.runtime import return_freed_memory
-from p2gs_jax.evaluate.evaluate import ViewResult, evaluate
-from p2gs_jax.evaluate.lpips import LpipsWeights
-from p2gs_jax.evaluate.references import Reference, find_radiance
-from p2gs_jax.evaluate.unexplained import Unexplained, shares_by_view
-from p2gs_jax.evaluate.untold import untold_notes
-from p2gs_jax.photometry.metering import Metering
+from p2gs_jax.evaluation.evaluate import ViewResult, evaluate
+from p2gs_jax.evaluation.lpips import LpipsWeights
+from p2gs_jax.evaluation.references import Reference, find_radiance
+from p2gs_jax.evaluation.scores import untold_notes
 from p2gs_jax.pipeline.prepare import Prepared
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.run.plots import write_unexplained
 from p2gs_jax.run.write import summary_rows, write_results, write_view
-from p2gs_jax.scene.drives.moving import fitted_objects
 from p2gs_jax.types import Params
 
 
@@ -36,17 +33,12 @@ class Account:
         counts: numbers.
         seconds: times, by name.
         compiler: counts what was compiled for this fit.
-        growth: the history of automatic growth, or None.
-        left_out: what no static scene explains and the last steps left out, by row of the scene;
-            None where it was not looked for.
         of: scores of the model that was converted, as it was; None: this is a fit.
     """
 
     counts: dict[str, int]
     seconds: dict[str, float]
     compiler: CompileCounter = field(default_factory=CompileCounter)
-    growth: dict | None = None
-    left_out: Mapping[int, Unexplained] | None = None
     of: dict | None = None
 
 
@@ -81,12 +73,10 @@ def finish(
     return_freed_memory()
     _import_ahead("matplotlib.figure")
     scene, cfg = prepared.scene, prepared.cfg
-    moving = fitted_objects(prepared.store.moving, params)
-    store = prepared.store.placing(moving)
+    moving, store = prepared.store.moving, prepared.store
     fitted: dict[int, float] = {}
     shown: dict[int, ViewResult] = {}
     picks = summary_rows(scene)
-    metering: list[Metering] = []
 
     def on_view(result: ViewResult) -> None:
         view = scene.views[result.index]
@@ -98,9 +88,8 @@ def finish(
             shown[result.index] = result
 
     with watch("evaluation"):
-        metrics = evaluate(
+        found = evaluate(
             params,
-            np.ones(params.gaussians.capacity, bool),
             scene,
             store,
             make_renderer(cfg.render, owner),
@@ -109,18 +98,17 @@ def finish(
             radiance=find_radiance(scene, store),
             lpips_weights=lpips_weights,
             on_view=on_view,
-            on_metering=metering.append,
-            on_unexplained=lambda found: write_unexplained(folder.unexplained, scene, store, found),
             on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
         )
+    metrics, metering = found.metrics, found.metering
     hidden = metrics.get("hidden", ())
     fitted = {row: e for row, e in fitted.items() if scene.views[row].name not in hidden}
     for note in untold_notes(metrics):
         prepared.notes.append(note)
         reporter.message(note)
-    if metering[0].telling:
-        prepared.notes.append(metering[0].sentence)
-        reporter.message(metering[0].sentence)
+    if metering.telling:
+        prepared.notes.append(metering.sentence)
+        reporter.message(metering.sentence)
     # Views are written while they are judged.
     watch.add("evaluation", -watch.seconds.get("files", 0.0))
     reporter.stage("Writing files")
@@ -136,12 +124,11 @@ def finish(
             unknown=metrics.get("exposures_unknown", ()),
             solution=None if prepared.selection is None else prepared.selection.solution,
             shown=[shown[i] for i in picks],
-            metering=metering[0],
+            metering=metering,
             true_ev=true_ev,
         )
-        if account.left_out is not None:
-            write_unexplained(folder.left_out, scene, store, account.left_out)
-            metrics["left_out"] = shares_by_view(scene, account.left_out)
+        if found.unexplained:
+            write_unexplained(folder.unexplained, scene, store, found.unexplained)
     metrics |= _accounted(account, watch, prepared, reporter)
     still_ours()
     write_json(folder.metrics, metrics)
@@ -170,8 +157,6 @@ def _accounted(account: Account, watch: Stopwatch, prepared: Prepared, reporter:
     }
     if prepared.selection is not None:
         said["photometry"] = prepared.selection.solution.state
-    if account.growth is not None:
-        said["growth"] = account.growth
     if account.of is not None:
         said["of"] = account.of
     return said

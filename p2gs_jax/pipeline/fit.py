@@ -6,9 +6,10 @@ import contextlib
 import dataclasses
 import shutil
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import jax
 import numpy as np
@@ -17,17 +18,13 @@ from jax.sharding import Mesh
 from p2gs_jax.config import FitConfig, require_config
 from p2gs_jax.core.atomic import no_empty_folders
 from p2gs_jax.core.clock import CompileCounter, Stopwatch
-from p2gs_jax.core.devices import Devices
-from p2gs_jax.core.processes import first_alone, is_first
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
-from p2gs_jax.evaluate.lpips import LpipsWeights
+from p2gs_jax.evaluation.lpips import LpipsWeights
 from p2gs_jax.photometry.appearance import exposures_apart
-from p2gs_jax.photometry.gauge import recentre
+from p2gs_jax.photometry.parameters import recentre
 from p2gs_jax.photometry.selection import Selection
-from p2gs_jax.pipeline.agreement import agree_on_options, same_start
 from p2gs_jax.pipeline.decide import kept_choice
-from p2gs_jax.pipeline.devices import mesh_of
 from p2gs_jax.pipeline.finish import Account, finish
 from p2gs_jax.pipeline.memory_needed import memory_named
 from p2gs_jax.pipeline.preflight import Paths, check_run_dir, check_scene, preflight
@@ -37,6 +34,7 @@ from p2gs_jax.run.checkpoint import saved_steps
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.run.folder import RunFolder, RunLock, locked, require_free
 from p2gs_jax.run.write import write_start
+from p2gs_jax.train.data_parallel import mesh_of
 from p2gs_jax.train.loop import Trainer, TrainResult
 from p2gs_jax.train.programs import StepPrograms
 from p2gs_jax.train.views import TrainingViews
@@ -50,7 +48,6 @@ def optimise(
     programs: StepPrograms,
     *,
     resume: bool,
-    validation: Sequence[int] = (),
     spent_s: float = 0.0,
     reserve_s: float = 0.0,
     mesh: Mesh | None = None,
@@ -63,7 +60,6 @@ def optimise(
         reporter: receives progress.
         programs: compiled steps, some of them perhaps begun.
         resume: continue from the newest checkpoint.
-        validation: training views that automatic growth is judged by.
         spent_s: seconds of the budget that are already gone.
         reserve_s: seconds of the budget to keep for evaluation and files.
         mesh: the devices of a step of several views; None: the default one.
@@ -73,7 +69,6 @@ def optimise(
         prepared.fitted,
         prepared.scene.train_indices,
         cfg.train.seed,
-        prepared.overlaps,
         prepared.measured,
     )
 
@@ -92,8 +87,6 @@ def optimise(
         prepared.decisions,
         on_log=reporter.log,
         on_message=say,
-        validation=validation,
-        own_exposures=prepared.selection is not None,
         mesh=mesh,
     )
     alive = np.ones(prepared.params.gaussians.capacity, bool)
@@ -144,7 +137,7 @@ class FitResult:
     Attributes:
         params: the fit, live Gaussians only.
         scene: what it was fitted to.
-        metrics: what `metrics.json` holds; empty in all processes but the first.
+        metrics: what `metrics.json` holds.
         run_dir: the run folder.
         selection: what the bundle adjustment found, or None.
         decisions: what the scene settled.
@@ -168,7 +161,7 @@ def fit(
     reporter: Reporter | None = None,
     true_exposures: Mapping[str, float] | None = None,
     spent_s: float = 0.0,
-    devices: Devices | None = None,
+    devices: int | Literal["all"] = 1,
 ) -> FitResult:
     """Fit a scene and write a run folder.
 
@@ -181,8 +174,8 @@ def fit(
         reporter: receives progress.
         true_exposures: image name -> true exposure, where it is known, for the plot.
         spent_s: seconds of the budget that were gone before the call.
-        devices: which to take, and what is divided among them; None: one. Of several processes
-            (`jax.distributed`) all must call this, and all of their devices be taken.
+        devices: how many share the views of a step; with several, `train.batch` is a multiple of
+            them.
 
     Raises:
         UserError: something the user can mend.
@@ -193,15 +186,11 @@ def fit(
     reporter = reporter or Silent()
     paths = Paths(Path(scene_dir), Path(run_dir), None if reference is None else Path(reference))
     begin = time.monotonic() - spent_s
-    if is_first():
-        require_free(paths.run)
+    require_free(paths.run)
     lpips_weights = preflight(cfg, paths, resume=resume)
     mesh = mesh_of(cfg, devices)
-    # Before the first process writes anything that the others would refuse.
-    agree_on_options(cfg, devices, resume)
-    with _ours(paths.run) as lock, memory_named():
-        if is_first():
-            check_run_dir(paths.run, resume, cfg)  # another may have ended since
+    with no_empty_folders(paths.run), locked(paths.run) as lock, memory_named():
+        check_run_dir(paths.run, resume, cfg)  # another may have ended since
         return _fit(
             paths,
             cfg,
@@ -233,8 +222,7 @@ def _fit(
     folder = RunFolder(paths.run)
     clock, compiler = Stopwatch(), CompileCounter()
     reading = time.monotonic()
-    with first_alone():
-        scene = load(paths.scene, paths.run, cfg, reporter)
+    scene = load(paths.scene, paths.run, cfg, reporter)
     # Without a model, nearly all of it is finding and matching features.
     found = scene.format in ("images", "transforms")
     clock.add("structure_from_motion" if found else "reading", time.monotonic() - reading)
@@ -247,9 +235,8 @@ def _fit(
             clock,
             lambda known: begin_programs(programs, known, scene, folder, mesh),
             kept=kept_choice(cfg, folder) if resume else None,
-            pixels=folder.pixels_of(jax.process_index()),
+            pixels=folder.pixels,
         )
-        prepared = same_start(prepared)
         lock.require()
         with begun(folder, paths, cfg, prepared.decisions), memory_named():
             result = optimise(
@@ -258,7 +245,6 @@ def _fit(
                 reporter,
                 programs,
                 resume=resume,
-                validation=views.validation,
                 mesh=mesh,
                 spent_s=time.monotonic() - begin,
                 reserve_s=seconds_to_finish(
@@ -269,9 +255,6 @@ def _fit(
     params = exposures_apart(params)
     if cfg.photometry.parameterization == "log" and cfg.photometry.known is None:
         params = recentre(params, cfg.render.radiance)
-    if not is_first():
-        _close_pixels(prepared, folder)
-        return FitResult(params, scene, {}, paths.run, prepared.selection, prepared.decisions)
     account = Account(
         counts={
             "gaussians": params.gaussians.capacity,
@@ -290,8 +273,6 @@ def _fit(
             "optimisation": result.host.elapsed_s,
         },
         compiler=compiler,
-        growth=result.growth,
-        left_out=result.left_out,
     )
     lock.require()
     metrics = finish(
@@ -313,19 +294,9 @@ def _fit(
 
 
 def _close_pixels(prepared: Prepared, folder: RunFolder) -> None:
-    """Forget the decoded photographs of this process."""
+    """Forget the decoded photographs."""
     prepared.store.close()
-    shutil.rmtree(folder.pixels_of(jax.process_index()), ignore_errors=True)
-
-
-@contextlib.contextmanager
-def _ours(run_dir: Path) -> Iterator[RunLock]:
-    """Hold the folder of a run, which the first process alone writes to."""
-    if not is_first():
-        yield RunLock(run_dir, None)
-        return
-    with no_empty_folders(run_dir), locked(run_dir) as lock:
-        yield lock
+    shutil.rmtree(folder.pixels, ignore_errors=True)
 
 
 @contextlib.contextmanager
@@ -334,9 +305,6 @@ def begun(folder: RunFolder, paths: Paths, cfg: FitConfig, decisions: Decisions)
 
     A run that failed before its first checkpoint leaves nothing to continue or to overwrite.
     """
-    if not is_first():
-        yield
-        return
     write_start(folder, paths.scene, paths.reference, cfg, decisions)
     try:
         yield

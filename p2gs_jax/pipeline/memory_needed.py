@@ -17,7 +17,7 @@ import jax
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.memory import left_to_process, ran_out, resident
 from p2gs_jax.errors import UserError
-from p2gs_jax.gaussians.init.dense_bound import seed_bound
+from p2gs_jax.gaussians.dense import seed_bound
 from p2gs_jax.gaussians.population import Coverage
 from p2gs_jax.scene.images import size_at
 from p2gs_jax.types import Scene
@@ -65,13 +65,11 @@ def memory_needed(scene: Scene, cfg: FitConfig, coverage: Coverage) -> MemoryNee
     count = max(seed_bound(cfg, min(len(scene.points), cfg.init.max_seeds), coverage), 1)
     parameters = 11 + 3 * (cfg.render.sh_degree + 1) ** 2
     here = jax.default_backend() == "cpu"
-    # Automatic growth keeps a run without it beside it.
-    copies = 2 if cfg.densify.max_gaussians == "auto" else 1
     sizes = [size_at(view, cfg.data.max_width) for view in scene.views]
     decoded = sum(w * h for w, h in sizes) * A_PHOTOGRAPH_PIXEL
     return MemoryNeeded(
         programs=OF_PROGRAMS,
-        gaussians=float(here * copies * count * parameters * A_PARAMETER),
+        gaussians=float(here * count * parameters * A_PARAMETER),
         photographs=float(min(decoded, cfg.data.cache_mb * 2**20)),
         view=float(here * coverage.pixels * A_PIXEL),
         population=count,

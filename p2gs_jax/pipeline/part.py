@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32
 
-from p2gs_jax.gaussians.init.shell import Sphere
+from p2gs_jax.gaussians.shell import Sphere
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.types import Photometry
 

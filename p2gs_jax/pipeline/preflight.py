@@ -13,16 +13,14 @@ from p2gs_jax.config import to_dict as config_to_dict
 from p2gs_jax.core.atomic import plain
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
-from p2gs_jax.evaluate.lpips import LpipsWeights
-from p2gs_jax.evaluate.lpips_weights import read_lpips_weights
-from p2gs_jax.evaluate.references import Reference, check_reference, load_reference
+from p2gs_jax.evaluation.lpips import LpipsWeights, read_lpips_weights
+from p2gs_jax.evaluation.references import Reference, check_reference, load_reference
 from p2gs_jax.losses.total import SECOND_RENDER_FORMS
 from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.scene.images import size_at
 from p2gs_jax.scene.known_exposures import check_source, read_known_exposures
-from p2gs_jax.train.growth import check_method
 from p2gs_jax.train.schedule import shrinks
-from p2gs_jax.train.validation import pick_validation
+from p2gs_jax.train.strategies import check_spread
 from p2gs_jax.types import Scene, View
 
 
@@ -56,7 +54,7 @@ def preflight(cfg: FitConfig, paths: Paths, *, resume: bool = False) -> LpipsWei
         UserError: an option contradicts another, a file it names cannot be used, or the run folder
             holds another run.
     """
-    check_method(cfg.densify)
+    check_spread(cfg.densify)
     check_start(cfg.photometry, cfg.preset)
     check_run_dir(paths.run, resume, cfg)
     check_source(cfg.photometry.known)
@@ -70,11 +68,9 @@ class Views:
     """What a scene's views are to a fit.
 
     Attributes:
-        validation: rows of the training views that automatic growth is judged by.
         truth: photographs under one common exposure, or None.
     """
 
-    validation: tuple[int, ...]
     truth: Reference | None
 
 
@@ -98,11 +94,8 @@ def check_scene(
     if cfg.photometry.known is not None:
         read_known_exposures(cfg.photometry.known, training)
     check_sizes(training, cfg)
-    validation: tuple[int, ...] = ()
-    if cfg.densify.max_gaussians == "auto":
-        validation = pick_validation([view.camera for view in training])
     truth = None if paths.reference is None else load_reference(paths.reference, scene, cfg)
-    return Views(validation, truth)
+    return Views(truth)
 
 
 def check_start(p: PhotometryConfig, preset: str) -> None:

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.clock import Stopwatch
@@ -20,29 +19,41 @@ from p2gs_jax.core.progress import Reporter
 from p2gs_jax.core.runtime import return_freed_memory
 from p2gs_jax.core.streams import Stream
 from p2gs_jax.errors import UserError
-from p2gs_jax.gaussians.init.brightness import Tones, rough_tones
-from p2gs_jax.gaussians.init.dense import DenseSeeds
-from p2gs_jax.gaussians.init.dense_bound import coverage_of, dense_limit, wants_dense
-from p2gs_jax.gaussians.init.nodes import Nodes, find_nodes, node_gaussians
-from p2gs_jax.gaussians.init.photographed import nodes_radiance, photographed_radiance, with_colors
-from p2gs_jax.gaussians.init.seeds import cameras_radius, merge, subsample
-from p2gs_jax.gaussians.init.shell import find_shell
-from p2gs_jax.gaussians.init.start import (
-    black_gaussians,
+from p2gs_jax.gaussians.dense import (
+    DenseSeeds,
+    coverage_of,
+    dense_limit,
     gaussians_of,
     match_photographs,
-    shell_gaussians,
+    wants_dense,
 )
-from p2gs_jax.gaussians.init.vibration import clock_of, vibrates, with_vibration
+from p2gs_jax.gaussians.matching import Tones, rough_tones
+from p2gs_jax.gaussians.moving import (
+    Nodes,
+    clock_of,
+    find_nodes,
+    node_gaussians,
+    nodes_radiance,
+    vibrates,
+    with_vibration,
+)
 from p2gs_jax.gaussians.population import Coverage
+from p2gs_jax.gaussians.seeds import (
+    cameras_radius,
+    merge,
+    photographed_radiance,
+    subsample,
+    with_colors,
+)
+from p2gs_jax.gaussians.shell import black_gaussians, find_shell, shell_gaussians
 from p2gs_jax.losses.relative_exposure import ColorPairs
 from p2gs_jax.photometry.calibrate import calibrate_observations, options_of
-from p2gs_jax.photometry.initial import initial_appearance, initial_photometry, point_radiance
 from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.observations import Observations
+from p2gs_jax.photometry.parameters import initial_appearance, initial_photometry, point_radiance
 from p2gs_jax.photometry.response import Response
 from p2gs_jax.photometry.selection import Selection
-from p2gs_jax.photometry.sources import has_tracks, surface_colors
+from p2gs_jax.photometry.sources.points import has_tracks, surface_colors
 from p2gs_jax.pipeline.decide import decide, likely, with_choice
 from p2gs_jax.pipeline.memory_needed import memory_needed, require_memory
 from p2gs_jax.pipeline.part import Part
@@ -56,7 +67,7 @@ from p2gs_jax.pipeline.scale import (
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.train.compared_photographs import color_pairs, overlaps
+from p2gs_jax.train.compared_photographs import color_pairs
 from p2gs_jax.train.measured_depths import measured_depths
 from p2gs_jax.train.schedule import shrinks
 from p2gs_jax.types import Gaussians, Measured, Params, Scene, View
@@ -75,7 +86,6 @@ class Prepared:
         extent: what rates of the means are shares of, scene units.
         selection: photometric model, exposures and their errors from the tracks, or None.
         pairs: corresponding observations, or None.
-        overlaps: for every training view the ones that show the same surfaces, or None.
         measured: of every training view the depths that the loss compares with, or None.
         coverage: how much of the scene the views show.
         decisions: what the scene settled.
@@ -91,7 +101,6 @@ class Prepared:
     extent: float
     selection: Selection | None
     pairs: ColorPairs | None
-    overlaps: list[np.ndarray] | None
     measured: Sequence[Measured] | None
     coverage: Coverage
     decisions: Decisions
@@ -228,7 +237,6 @@ def prepare(
             black,
             initial_photometry(None, taken_by, guess.resolve(cfg)),
             initial_appearance(views, cfg),
-            _initial_poses(nodes, cfg),
         )
         known = kept is not None or part is not None or not cfg.photometry.select
         under = guess.resolve(cfg)
@@ -311,13 +319,11 @@ def prepare(
             gaussians,
             photometry,
             initial_appearance(views, resolved, lambda k: fitted.get(scene.train_indices[k])),
-            _initial_poses(nodes, resolved),
         ),
         owner,
         extent,
         selection,
         color_pairs(tracks, resolved),
-        overlaps(tracks, resolved),
         measured,
         coverage,
         decisions,
@@ -362,13 +368,6 @@ def _with_nodes(
     world = np.full(gaussians.capacity, -1, np.int32)
     owner = np.concatenate([world, nodes.owner])
     return merge(gaussians, node_gaussians(nodes, radiance, views, cfg)), owner
-
-
-def _initial_poses(nodes: Nodes | None, cfg: FitConfig) -> Array | None:
-    """Return corrections of poses before the first step; None where none are learned."""
-    if nodes is None or not len(nodes.moving) or not cfg.dynamics.correct_poses:
-        return None
-    return on_device(np.zeros((nodes.moving.keys.count, len(nodes.moving), 6)))
 
 
 class _Seeds(NamedTuple):

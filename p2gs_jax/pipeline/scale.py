@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import evenly_spaced
-from p2gs_jax.gaussians.init.seeds import camera_centers
+from p2gs_jax.gaussians.seeds import camera_centers
 from p2gs_jax.scene.visibility import SHARE_POINTS, SHARE_VIEWS, in_frame, project_points
 from p2gs_jax.types import Scene, View
 

@@ -102,13 +102,11 @@ def render_linear(
         alive: slots in use.
         camera: the view.
         cfg: rendering options.
-        capacity: tile-list entries; see `required_capacity`.
+        capacity: tile-list entries; see `required_capacity`. A render whose `overflow` is set must
+            be discarded and the capacity grown.
         owner: the moving object that each Gaussian belongs to (`Population.owner`), or None.
         active_degree: highest spherical-harmonics degree in use, None for all.
         with_depth: see `rasterize`.
-
-    Returns:
-        The render. Where `overflow` is set it must be discarded and the capacity grown.
     """
     if gaussians.capacity == 0:
         return _nothing(camera, cfg, with_depth)

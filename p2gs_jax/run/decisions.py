@@ -39,7 +39,6 @@ class Decisions:
         curve: base of the tone curve.
         spline: its correction, or None.
         freeze_until: share of the run during which exposures and gammas keep still.
-        correspondence: how the relative-exposure loss finds pixels of one surface, or None.
         log_exposure_mean: weight of the pull on the mean log exposure; None: no pull.
         exposure_rate: learning rate of the exposures.
         gamma_rate: learning rate of the gammas.
@@ -55,7 +54,6 @@ class Decisions:
     curve: Literal["power", "srgb", "spline", "linear"]
     spline: tuple[float, ...] | None
     freeze_until: float
-    correspondence: Literal["tracks", "depth"] | None
     log_exposure_mean: float | None
     exposure_rate: float
     gamma_rate: float
@@ -126,7 +124,6 @@ _PLACES = {
     "curve": "photometry.curve",
     "spline": "photometry.spline",
     "freeze_until": "photometry.freeze_until",
-    "correspondence": "loss.relative_exposure.correspondence",
     "log_exposure_mean": "loss.regularizers.log_exposure_mean",
     "exposure_rate": "optimizer.exposures",
     "gamma_rate": "optimizer.gammas",

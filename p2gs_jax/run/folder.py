@@ -48,13 +48,7 @@ class RunFolder:
         self.against = root / "against.json"
         self.summary = root / "summary.png"
         self.renders = root / "renders"
-        self.left_out = root / "left_out"
-        self.left_out_masks = root / "left_out.npz"
         self.unexplained = root / "unexplained"
-
-    def pixels_of(self, process: int) -> Path:
-        """Return where one of several processes keeps decoded photographs."""
-        return self.pixels if process == 0 else self.root / "cache" / f"pixels-{process}"
 
     def appearance(self, kind: Appearance) -> Path:
         """Return where the corrections lie that a baseline of this kind learns."""

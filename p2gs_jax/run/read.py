@@ -18,9 +18,14 @@ from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.ply import read_ply
 from p2gs_jax.gaussians.posed import chosen, posed, standing
-from p2gs_jax.photometry.cameras import camera_rows
-from p2gs_jax.photometry.display import DisplayTransform, display_of_view
-from p2gs_jax.photometry.mean import MeanParameters, mean_parameters, usual_display
+from p2gs_jax.photometry.display import (
+    DisplayTransform,
+    MeanParameters,
+    display_of_view,
+    mean_parameters,
+    usual_display,
+)
+from p2gs_jax.photometry.formation import camera_rows
 from p2gs_jax.photometry.metering import ExposureOf, Metering, meter
 from p2gs_jax.render.capacity import RenderView, make_renderer
 from p2gs_jax.run.decisions import read_decisions
@@ -57,7 +62,7 @@ class Run:
         photometry: `photometry.json`, with what `params` does not hold: standard errors, EXIF,
             exposures fitted to held-out photographs.
         owner: the moving object that each Gaussian belongs to, -1: none; None: nothing moves.
-        moving: these objects, with their corrected poses.
+        moving: these objects.
     """
 
     folder: Path
@@ -259,7 +264,7 @@ class Run:
             exposure_ev: stops more than that.
         """
         readings = meter(np.asarray(rendered.linear), np.asarray(rendered.alpha))
-        exposure = float(np.exp(self.metering.log_exposure(readings, of))) * 2**exposure_ev
+        exposure = self.metering.exposure(readings, of) * 2**exposure_ev
         return replace(self.common_display(), exposure=exposure)
 
 

@@ -20,7 +20,7 @@ from jaxtyping import Int
 from p2gs_jax.core.atomic import BROKEN_ARRAYS, atomic_write
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene.drives.moving import KeyTimes, MovingObjects
+from p2gs_jax.scene.drives.moving import MovingObjects
 from p2gs_jax.types import Distortion, Lidar, Scene, TrackedObject, Tracks, View
 
 SCENE_FILE = "scene.npz"
@@ -215,7 +215,6 @@ def write_objects(
         moving: some of the scene's objects.
         scene: with all of them.
     """
-    keys, corrections = moving.keys, moving.corrections
     rows = [
         next(row for row, other in enumerate(scene.objects) if other is thing)
         for thing in moving.objects
@@ -223,10 +222,7 @@ def write_objects(
     arrays = {
         "owner": np.asarray([] if owner is None else owner, np.int32),
         "rows": np.array(rows, np.int32),
-        "key_times": keys.first + keys.spacing * np.arange(keys.count),
     }
-    if corrections is not None:
-        arrays["corrections"] = np.asarray(corrections, np.float32)
     if moving.middle is not None:
         arrays["middle"] = np.asarray(moving.middle, np.float64)
     with atomic_write(path) as temporary:
@@ -252,19 +248,14 @@ def read_objects(
         with np.load(path, allow_pickle=False) as file:
             a = dict(file)
         objects = tuple(scene.objects[row] for row in a["rows"].tolist())
-        times, owner = a["key_times"], a["owner"]
-        spacing = float(times[1] - times[0]) if len(times) > 1 else 1.0
-        keys = KeyTimes(float(times[0]), spacing, len(times))
+        owner = a["owner"]
         if "middle" in a:
-            return None, MovingObjects((), keys, middle=float(a["middle"]))
+            return None, MovingObjects((), middle=float(a["middle"]))
         fits = len(owner) == count and owner.max(initial=-1) < len(objects)
-        corrections = a.get("corrections")
-        if corrections is not None:
-            fits &= corrections.shape == (len(times), len(objects), 6)
     except BROKEN_ARRAYS as error:
         raise UserError(
             f"{path} cannot be read: {error}.", fix="finish the fit again with --resume"
         ) from error
     if not fits:
         raise UserError(f"{path} does not belong to this run.", fix="fit again")
-    return owner, MovingObjects(objects, keys, corrections)
+    return owner, MovingObjects(objects)

@@ -13,14 +13,13 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.config import to_dict as config_to_dict
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.numerics import evenly_spaced
-from p2gs_jax.evaluate.evaluate import ViewResult
+from p2gs_jax.evaluation.evaluate import ViewResult
 from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.formats.ply import write_ply, write_radiance
 from p2gs_jax.formats.png import write_png
 from p2gs_jax.gaussians.bake import bake, display_comments, display_of_splats
 from p2gs_jax.gaussians.posed import posed
-from p2gs_jax.photometry.display import develop
-from p2gs_jax.photometry.mean import usual_display
+from p2gs_jax.photometry.display import develop, usual_display
 from p2gs_jax.photometry.metering import Metering
 from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.render.harmonics import MAX_DEGREE
@@ -88,7 +87,7 @@ def write_results(
         scene: its views.
         cfg: what the fit computed under.
         owner: the moving object that each Gaussian belongs to, or None.
-        moving: these objects, with their corrected poses.
+        moving: these objects.
         fitted: exposures solved for held-out views, by row.
         unknown: names of photographs that tell no exposure.
         solution: what the fit started from, or None.

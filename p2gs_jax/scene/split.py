@@ -9,7 +9,7 @@ from pathlib import Path
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene.split import read_split, split_as_listed
+from p2gs_jax.scene.split_lists import read_split, split_as_listed
 from p2gs_jax.types import Scene, View
 
 EVERY = "every"

@@ -19,11 +19,9 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.streams import noise_key
 from p2gs_jax.gaussians.mcmc import exploration_noise
-from p2gs_jax.losses.regularizers import population_terms
 from p2gs_jax.render.harmonics import coefficient_count
 from p2gs_jax.render.visible import splat
 from p2gs_jax.train.image_gradient import ImageGradient, differentiable
-from p2gs_jax.train.object_poses import MovedPoses, move_poses, placed_by, seen_by
 from p2gs_jax.train.optimizer import Optimizer, OptState, learning_rates, means_rate
 from p2gs_jax.train.state import FAULT_NONE, FAULT_NONFINITE, FAULT_OVERFLOW, Fault, FitState
 from p2gs_jax.train.update import Updated, update_listed
@@ -78,7 +76,6 @@ def finite_names(terms: dict, params: Params) -> tuple[str, ...]:
     given = {
         "gradient of white balances": params.photometry.raw_white_balance,
         "gradient of appearance": params.appearance,
-        "gradient of object poses": params.poses,
     }
     rest = (name for name, value in given.items() if value is not None)
     vibration = () if params.gaussians.vibration is None else OF_VIBRATION
@@ -123,7 +120,6 @@ def advance(
 
     progress, rate = controls.progress, controls.rate
     rates = learning_rates(progress, rate, extent, state.params, cfg, bands)
-    listed = jnp.sum(alive.at[ids].get(mode="fill", fill_value=False))
     key = noise_key(controls.seed, state.step)
     noise_rate = cfg.densify.noise * means_rate(progress, rate, extent, cfg)
 
@@ -138,44 +134,31 @@ def advance(
         count,
         healthy,
         bands=bands,
-        seen=lambda block, on, owner, placed: differentiable(
-            splat(block, on, seen_by(frusta, placed), cfg.render, controls.active_degree, owner)
+        seen=lambda block, on, owner: differentiable(
+            splat(block, on, frusta, cfg.render, controls.active_degree, owner)
         ),
         v_seen=gradient.v_shown,
-        own=lambda block, on: population_terms(block, on, cfg, extent, listed),
         optimizer=optimizer.gaussians,
         rates=rates.gaussians,
         noise=noise if mcmc else None,
         owner=population.owner,
-        placed=placed_by(frusta, state.params.poses),
-    )
-    objects = move_poses(
-        state.params.poses,
-        state.opt_state.poses,
-        updated.v_placed,
-        frusta,
-        optimizer.gaussians,
-        rates.poses,
-        cfg.loss.regularizers,
     )
     if not mcmc:
         where = jnp.where(healthy, ids, n)
         population = _observed(population, where, gradient, frusta[0])
-    moved = Moved(updated, objects, population)
+    moved = Moved(updated, population)
     return settled(state, moved, gradient, fits, count, rates, cfg=cfg, optimizer=optimizer)
 
 
 class Moved(NamedTuple):
-    """What a step did to everything that there is one of for each Gaussian or object.
+    """What a step did to everything that there is one of for each Gaussian.
 
     Attributes:
         updated: Gaussians.
-        objects: corrections of objects' poses.
         population: with this step's statistics.
     """
 
     updated: Updated
-    objects: MovedPoses
     population: Population
 
 
@@ -210,7 +193,7 @@ def settled(
         optimizer: from `make_optimizer`.
         views: that the step took.
     """
-    updated, objects, population = moved
+    updated, population = moved
     first = state.fault.kind == FAULT_NONE
     healthy = is_healthy(state, gradient, fits)
     old_rest = (state.params.photometry, state.params.appearance)
@@ -224,14 +207,10 @@ def settled(
     )
 
     # In the order of `finite_names`.
-    own = updated.value | objects.terms
-    terms = gradient.terms | own
     v_photometry, v_appearance = gradient.v_rest
-    checked = [_finite(terms), updated.finite, _finite(v_photometry)]
+    checked = [_finite(gradient.terms), updated.finite, _finite(v_photometry)]
     if v_appearance is not None:
         checked.append(jnp.all(_finite(v_appearance))[None])
-    if objects.finite is not None:
-        checked.append(objects.finite)
     checked = jnp.concatenate(checked)
     broken = FAULT_NONFINITE * ~jnp.all(checked)
     kind = jnp.where(fits, broken, FAULT_OVERFLOW).astype(jnp.int32)
@@ -241,20 +220,20 @@ def settled(
         Fault(kind, gradient.entries, count, term),
         state.fault,
     )
-    (photometry, appearance), rest_moments, poses, pose_moments = jax.tree.map(
+    (photometry, appearance), rest_moments = jax.tree.map(
         lambda new, old: jnp.where(healthy, new, old),
-        (rest, rest_moments, objects.poses, objects.moments),
-        (old_rest, state.opt_state.rest, state.params.poses, state.opt_state.poses),
+        (rest, rest_moments),
+        (old_rest, state.opt_state.rest),
     )
     state = FitState(
-        Params(updated.gaussians, photometry, appearance, poses),
-        OptState((updated.moments, optax.EmptyState()), rest_moments, pose_moments),
+        Params(updated.gaussians, photometry, appearance),
+        OptState((updated.moments, optax.EmptyState()), rest_moments),
         population,
         state.step + views * (fault.kind == FAULT_NONE),
         fault,
     )
-    loss = jax.tree.reduce(jnp.add, own, gradient.loss)
-    return state, StepReport(loss, terms, gradient.psnr, gradient.entries, count)
+    report = StepReport(gradient.loss, gradient.terms, gradient.psnr, gradient.entries, count)
+    return state, report
 
 
 def _rest_updated(optimizer: Optimizer, moments, rest, grads, rates, cfg: FitConfig):

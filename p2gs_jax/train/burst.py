@@ -11,10 +11,10 @@ from p2gs_jax.errors import DivergenceError
 from p2gs_jax.train import room, schedule
 from p2gs_jax.train.advance import StepReport, finite_names
 from p2gs_jax.train.checkpoints import RunCheckpoints
+from p2gs_jax.train.data_parallel import Spread
 from p2gs_jax.train.host import HostState
 from p2gs_jax.train.inputs import InputSource
 from p2gs_jax.train.level_programs import LevelPrograms
-from p2gs_jax.train.mesh.spread import Spread
 from p2gs_jax.train.schedule import Levels
 from p2gs_jax.train.state import FAULT_NONFINITE, FAULT_OVERFLOW, FitState
 

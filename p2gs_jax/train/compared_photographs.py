@@ -8,13 +8,10 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.errors import UserError
 from p2gs_jax.losses.relative_exposure import ColorPairs
-from p2gs_jax.losses.total import OBSERVED_FORMS
 from p2gs_jax.photometry.formation import darkens
-from p2gs_jax.photometry.observations import Observations, overlapping_views, sample_pairs
+from p2gs_jax.photometry.observations import Observations, sample_pairs
 
 PAIR_POOL = 200_000
-# Views that share this many points are worth comparing through depth.
-FEWEST_SHARED = 30
 
 
 def color_pairs(tracks: Observations | None, cfg: FitConfig) -> ColorPairs | None:
@@ -27,13 +24,14 @@ def color_pairs(tracks: Observations | None, cfg: FitConfig) -> ColorPairs | Non
     Raises:
         UserError: the loss wants them and the scene has no tracks.
     """
-    if not _compares_photographs(cfg, "tracks"):
+    relative = cfg.loss.relative_exposure
+    if relative.weight is None or relative.form != "observed_ldr":
         return None
     if tracks is None or not len(tracks.points):
         raise UserError(
             "the relative-exposure loss was to compare photographs at tracks, and this scene has "
             "none.",
-            fix="use --loss.relative-exposure.correspondence depth, or a scene with tracks",
+            fix="use --loss.relative-exposure.form literal_same_pose, or a scene with tracks",
         )
     first, second = sample_pairs(tracks, PAIR_POOL, cfg.train.seed)
     return ColorPairs(
@@ -53,22 +51,3 @@ def _positions(tracks: Observations, picks, cfg: FitConfig):
     if tracks.positions is None:
         raise ValueError("vignetting is modelled, and nobody knows where in the images points lie")
     return tuple(on_device(tracks.positions[pick]) for pick in picks)
-
-
-def overlaps(tracks: Observations | None, cfg: FitConfig) -> list[np.ndarray] | None:
-    """Return for every view those worth comparing through depth; None where the loss does not.
-
-    Args:
-        tracks: colours of shared points, or None.
-        cfg: the loss.
-    """
-    if tracks is None or not len(tracks.points) or not _compares_photographs(cfg, "depth"):
-        return None
-    return overlapping_views(tracks, FEWEST_SHARED)
-
-
-def _compares_photographs(cfg: FitConfig, correspondence: str) -> bool:
-    """Return whether the loss compares photographs in the given way."""
-    relative = cfg.loss.relative_exposure
-    observed = relative.weight is not None and relative.form in OBSERVED_FORMS
-    return observed and relative.correspondence == correspondence

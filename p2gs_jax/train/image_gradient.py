@@ -13,7 +13,6 @@ from p2gs_jax.config import FitConfig, RenderConfig
 from p2gs_jax.losses.total import Partner, decoded, image_loss
 from p2gs_jax.photometry.appearance import Corrections
 from p2gs_jax.render.harmonics import coefficient_count
-from p2gs_jax.render.objects import with_corrections
 from p2gs_jax.render.project import camera_of_each
 from p2gs_jax.render.visible import Shown, compact, in_view, splat_listed, whole_blocks
 from p2gs_jax.types import Batch, Frustum, Gaussians, Photometry
@@ -37,8 +36,8 @@ class ImageGradient(NamedTuple):
     """The loss of the images and its gradients.
 
     Attributes:
-        loss: without the terms on the Gaussians themselves.
-        terms: by name.
+        loss: sum of the terms.
+        terms: by name, weighted.
         v_shown: gradient by what `differentiable` takes of the splats.
         v_rest: by photometry and appearance.
         entries: tile-list entries that were needed.
@@ -63,7 +62,6 @@ def show(
     frusta: tuple[Frustum, ...],
     active_degree: Int[Array, ""],
     owner: Int[Array, " n"] | None = None,
-    poses: Float[Array, "t k 6"] | None = None,
     *,
     cfg: RenderConfig,
     visible_only: bool,
@@ -78,14 +76,12 @@ def show(
         frusta: the views.
         active_degree: spherical-harmonics degree in use.
         owner: the moving object that each Gaussian belongs to, or None.
-        poses: corrections of the objects' poses, or None.
         cfg: rendering options.
         visible_only: leave out what no view may show (`OptimizerConfig.visible_only`).
         room: length of the list; what finds no place is counted, not listed.
         degree: highest spherical-harmonics degree that is evaluated.
     """
     n = gaussians.capacity
-    frusta = with_corrections(frusta, poses)
     if visible_only:
         views = (camera_of_each(f, owner) for f in frusta)
         may = functools.reduce(jnp.logical_or, (in_view(gaussians, alive, v, cfg) for v in views))

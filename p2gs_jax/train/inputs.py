@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
@@ -47,7 +46,6 @@ class InputSource:
         views: the training views.
         pairs: corresponding observations, for the relative-exposure readings that need them.
         shown: share of the scene that a view shows.
-        own: which views of a batch this process composites, and therefore decodes.
     """
 
     def __init__(
@@ -56,9 +54,8 @@ class InputSource:
         views: TrainingViews,
         pairs: ColorPairs | None,
         shown: float,
-        own: Collection[int],
     ):
-        self.cfg, self.views, self.pairs, self.shown, self.own = cfg, views, pairs, shown, own
+        self.cfg, self.views, self.pairs, self.shown = cfg, views, pairs, shown
 
     def at(self, step: int, progress: float, pace: float, shrink: int) -> Inputs:
         """Return the inputs of a step.
@@ -80,18 +77,17 @@ class InputSource:
             device_seed(cfg.train.seed),
         )
         rows = self.views.indices_at(step, cfg.train.batch)
-        each = [self._of_view(step + k, row, shrink, k in self.own) for k, row in enumerate(rows)]
+        each = [self._of_view(step + k, row, shrink) for k, row in enumerate(rows)]
         if len(each) == 1:
             return Inputs(*each[0], controls)
         batches, partners = zip(*each, strict=True)
         return Inputs(stacked(batches), stacked(partners), controls)
 
-    def _of_view(self, step: int, row: int, shrink: int, own: bool) -> tuple[Batch, Partner]:
-        batch = self.views.batch(row, shrink, step, decoded=own)
+    def _of_view(self, step: int, row: int, shrink: int) -> tuple[Batch, Partner]:
+        batch = self.views.batch(row, shrink, step)
         return batch, partner_at(step, row, shrink, self.views, self.pairs, self.cfg)
 
     def prefetch(self, step: int, shrink: int) -> None:
         """Begin decoding the photographs of a step in the background."""
-        rows = self.views.indices_at(step, self.cfg.train.batch)
-        for k in self.own:
-            self.views.prefetch(rows[k], shrink)
+        for row in self.views.indices_at(step, self.cfg.train.batch):
+            self.views.prefetch(row, shrink)

@@ -7,9 +7,9 @@ from typing import Any
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.train import schedule
+from p2gs_jax.train.data_parallel import ParallelStep
 from p2gs_jax.train.host import HostState
 from p2gs_jax.train.inputs import Inputs
-from p2gs_jax.train.mesh.step import MeshStep
 from p2gs_jax.train.programs import Key, StepPrograms
 from p2gs_jax.train.room import cameras_by_size, size_name
 from p2gs_jax.train.schedule import Levels
@@ -29,7 +29,7 @@ class LevelPrograms:
     """
 
     def __init__(
-        self, cfg: FitConfig, step: Step | MeshStep, programs: StepPrograms, levels: Levels
+        self, cfg: FitConfig, step: Step | ParallelStep, programs: StepPrograms, levels: Levels
     ):
         self.cfg, self.step, self.programs, self.levels = cfg, step, programs, levels
 
@@ -68,11 +68,9 @@ class LevelPrograms:
         self.programs.expect(self.step, key, state, *inputs, images=images)
 
     def _key(self, state: FitState, inputs: Inputs, host: HostState, shrink: int) -> Key:
-        batches = (inputs.batch, inputs.partner.batch)
-        pixels = tuple(str(b.ldr.dtype) for b in batches if b is not None)
         room = host.rooms[size_name(inputs.size)]
         slots = state.params.gaussians.capacity
-        return Key(inputs.size, slots, room, self._degree(shrink), pixels)
+        return Key(inputs.size, slots, room, self._degree(shrink), str(inputs.batch.ldr.dtype))
 
     def _degree(self, shrink: int) -> int:
         """Return the highest spherical-harmonics degree that a level uses."""

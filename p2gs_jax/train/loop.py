@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,26 +23,19 @@ from jaxtyping import Bool
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core import interrupts
 from p2gs_jax.core.clock import Stopwatch
-from p2gs_jax.core.devices import Devices
-from p2gs_jax.core.processes import from_first, gathered
 from p2gs_jax.core.progress import LogRecord
-from p2gs_jax.evaluate.unexplained import Unexplained
 from p2gs_jax.gaussians.population import STEP_SECONDS_PER_PIXEL, Coverage
 from p2gs_jax.losses.relative_exposure import ColorPairs
 from p2gs_jax.run.decisions import Decisions
-from p2gs_jax.run.folder import RunFolder
-from p2gs_jax.run.left_out_file import LeftOutFile
 from p2gs_jax.train import room, schedule
 from p2gs_jax.train.burst import Bursts
 from p2gs_jax.train.checkpoints import RunCheckpoints, pause_between
+from p2gs_jax.train.data_parallel import ParallelStep, Spread, default_mesh
 from p2gs_jax.train.host import HostState
 from p2gs_jax.train.inputs import InputSource
-from p2gs_jax.train.left_out import LeftOut
 from p2gs_jax.train.level_programs import LevelPrograms
 from p2gs_jax.train.log import RunLog, record_of
-from p2gs_jax.train.mesh.spread import OnMesh, OnOneDevice, Spread
-from p2gs_jax.train.mesh.step import MeshStep
-from p2gs_jax.train.optimizer import Optimizer, make_optimizer
+from p2gs_jax.train.optimizer import make_optimizer
 from p2gs_jax.train.programs import StepPrograms
 from p2gs_jax.train.schedule import Pace
 from p2gs_jax.train.session import Session
@@ -63,19 +56,14 @@ class TrainResult:
         state: parameters and population.
         host: counters.
         max_gaussians: bound on the population.
-        growth: the history of automatic growth, as JSON values; None where it was not asked for.
         seconds: of this session, by name: compiling (waited for), steps, densification,
             checkpoints.
-        left_out: what no static scene explains and the last steps left out, by row of the scene;
-            None where it was not looked for.
     """
 
     state: FitState
     host: HostState
     max_gaussians: int
-    growth: dict | None = None
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
-    left_out: dict[int, Unexplained] | None = None
 
 
 class Trainer:
@@ -87,13 +75,11 @@ class Trainer:
         extent: scene extent, scene units.
         pairs: corresponding observations, for the relative-exposure readings that need them.
         coverage: how much of the scene the views show.
-        run_dir: where `log.jsonl`, `growth.jsonl` and `checkpoints/` go.
+        run_dir: where `log.jsonl` and `checkpoints/` go.
         programs: compiled steps, some of them perhaps begun.
         decided: what the scene settled; a run that is resumed must have settled the same.
         on_log: called with every log record.
         on_message: called with everything the user must know.
-        validation: training views that automatic growth is judged by.
-        own_exposures: their exposures come from tracks, so they may be judged under these.
         mesh: the devices of a step of several views; None: the default one.
     """
 
@@ -109,8 +95,6 @@ class Trainer:
         decided: Decisions,
         on_log: Callable[[LogRecord], None] = lambda record: None,
         on_message: Callable[[str], None] = lambda text: None,
-        validation: Sequence[int] = (),
-        own_exposures: bool = False,
         mesh: Mesh | None = None,
     ):
         self.cfg, self.views, self.coverage = cfg, views, coverage
@@ -121,14 +105,14 @@ class Trainer:
         self.clock = Stopwatch()
         self.log = RunLog(run_dir, on_log)
         self.checkpoints = RunCheckpoints(run_dir, cfg, decided, on_message)
-        masks = LeftOutFile(RunFolder(run_dir).left_out_masks)
-        self.left_out = LeftOut(cfg, views, masks, self.clock, on_message)
         self.asked = interrupts.Held()
         self.optimizer = make_optimizer(cfg)
-        step, self.spread = _step_and_spread(cfg, self.optimizer, extent, mesh)
-        self.source = InputSource(
-            cfg, views, pairs, coverage.shown, self.spread.own(cfg.train.batch)
-        )
+        if cfg.train.batch > 1:
+            mesh = mesh or default_mesh()
+        step = Step(cfg, self.optimizer, extent)
+        step = step if mesh is None else ParallelStep(step, mesh)
+        self.spread = Spread(mesh)
+        self.source = InputSource(cfg, views, pairs, coverage.shown)
         self.steps = LevelPrograms(cfg, step, programs, self.levels)
         self.bursts = Bursts(
             cfg.train,
@@ -145,13 +129,9 @@ class Trainer:
             coverage=coverage,
             levels=self.levels,
             views=views,
-            validation=validation,
-            own_exposures=own_exposures,
             programs=programs,
             spread=self.spread,
-            log=self.log,
             clock=self.clock,
-            take_burst=self._take_burst_of_stage,
             on_message=on_message,
         )
 
@@ -181,8 +161,7 @@ class Trainer:
             Interrupted: a signal asked for the end; a checkpoint is written first.
         """
         strategy = make_strategy(self.context, int(np.sum(np.asarray(alive))))
-        slots = self.spread.padded(strategy.slots)
-        state = initial_state(params, alive, self.optimizer, slots, owner)
+        state = initial_state(params, alive, self.optimizer, strategy.slots, owner)
         pace = Pace.from_config(self.cfg.train, spent_s + finish_s)
         host = HostState(pace=pace.per_step)
         restored = self.checkpoints.restore(state) if resume else None
@@ -192,8 +171,6 @@ class Trainer:
             state, host = restored
             self.log.truncate(host.step)
             pace = dataclasses.replace(pace, per_step=host.pace)
-        strategy.begin(host)
-        self.left_out.begin(host)
         full_step_s = STEP_SECONDS_PER_PIXEL * self.coverage.pixels
         session = Session(pace, host, finish_s=finish_s, full_step_s=full_step_s)
         population = state.population
@@ -201,17 +178,14 @@ class Trainer:
         state = self.spread.spread(state)
         self._expect(state, host, strategy)
         with interrupts.held() as self.asked:
-            state, host = self._loop(state, host, session, strategy)
+            state = self._loop(state, host, session, strategy)
             state = self.spread.whole(state)
-            strategy.end(state, host)
             self._save(state, host)
         return TrainResult(
             state,
             host,
             strategy.limit or state.params.gaussians.capacity,
-            strategy.summary(host),
             {"compiling": self.programs.waited_s, **self.clock.seconds},
-            self.left_out.summary(),
         )
 
     def expect(self, params: Params, owner, images: bool) -> None:
@@ -227,22 +201,18 @@ class Trainer:
         alive, host = np.ones(seeds, bool), HostState(rooms=dict(self.programs.rooms))
         self._allocate(params.gaussians, alive, owner, host, strategy)
         self.programs.rooms = dict(host.rooms)
-        slots = self.spread.padded(strategy.slots)
-        start = functools.partial(initial_state, optimizer=self.optimizer, slots=slots)
+        start = functools.partial(initial_state, optimizer=self.optimizer, slots=strategy.slots)
         self._expect(jax.eval_shape(start, params, alive, owner=owner), host, strategy, images)
 
     def _loop(
         self, state: FitState, host: HostState, session: Session, strategy: Strategy
-    ) -> tuple[FitState, HostState]:
+    ) -> FitState:
         """Take bursts until the run is complete, or its time over."""
         saved, pause = host.elapsed_s, self.cfg.train.checkpoint_every_s
         while not schedule.is_over(host.progress, host.pace):
             state, stepped = self._take_burst(state, host, session)
             if stepped:
-                state, host = strategy.update(state, host, session)
-            if self.left_out.due(host):
-                self.left_out.look(self.spread.whole(state), host)
-                self._tick(session, host)
+                state = strategy.update(state, host)
             session.replan(host)
             if session.over(host):
                 if host.progress < NEARLY_DONE:
@@ -251,11 +221,11 @@ class Trainer:
                         "again with a longer --budget; what was compiled now is kept."
                     )
                 break
-            asked = self._asked()
+            asked = self.asked.arrived
             if asked is not None or host.elapsed_s - saved > pause:
                 begun = host.elapsed_s
                 self._save(self.spread.whole(state), host)
-                self._tick(session, host)
+                session.tick(host)
                 saved = host.elapsed_s
                 pause = pause_between(self.cfg.train.checkpoint_every_s, saved - begun)
             if asked is not None:
@@ -264,51 +234,22 @@ class Trainer:
                     f"({host.progress:.0%}), where a checkpoint is written; --resume continues it."
                 )
                 self.asked.deliver()
-        return state, host
+        return state
 
     def _take_burst(
-        self, state: FitState, host: HostState, session: Session, *, trial: bool = False
+        self, state: FitState, host: HostState, session: Session
     ) -> tuple[FitState, bool]:
-        """Take a burst of steps and log it; see `strategies.base.TakeBurst`."""
+        """Take a burst of steps and log it; return the state, and whether there were any."""
         state, reports = self.bursts.take(state, host)
-        self._tick(session, host)
+        session.tick(host)
         if reports:
             left_s = session.left(host, self.levels)
             alive = count_alive(state)
-            record = record_of(reports, host, alive, host.shrink, left_s=left_s, trial=trial)
+            record = record_of(reports, host, alive, host.shrink, left_s=left_s)
             self.log.append(record)
             # From here on a signal waits for the next place to continue from.
             self.asked.begin()
         return state, bool(reports)
-
-    def _tick(self, session: Session, host: HostState) -> None:
-        """Write down the time; of several processes that of the first, so that all plan alike."""
-        session.tick(host)
-        host.elapsed_s, host.step_s = from_first((host.elapsed_s, host.step_s))
-
-    def _asked(self) -> int | None:
-        """Return the signal that asks for the end, whichever process it reached."""
-        if jax.process_count() == 1:
-            return self.asked.arrived
-        # One that comes while the others are asked waits for the next time.
-        asked = max((n for n in gathered(self.asked.arrived) if n is not None), default=None)
-        if asked is not None:
-            self.asked.arrived = asked
-        return asked
-
-    def _take_burst_of_stage(
-        self, state: FitState, host: HostState, session: Session, *, trial: bool = False
-    ) -> tuple[FitState, bool]:
-        """Take a burst where no checkpoint can be written; signals end the run after it."""
-        taken = self._take_burst(state, host, session, trial=trial)
-        asked = self._asked()
-        if asked is not None:
-            self.on_message(
-                f"{interrupts.name_of(asked)}: the run stops within a stage of growth; "
-                f"{self.checkpoints.last_good()}."
-            )
-            self.asked.deliver()
-        return taken
 
     def _save(self, state: FitState, host: HostState) -> None:
         with self.clock("checkpoints"):
@@ -348,13 +289,3 @@ class Trainer:
             self.steps.expect(state, inputs, host, shrink, images)
             if number == 0:
                 strategy.expect(state)  # wanted soon after the first step
-
-
-def _step_and_spread(
-    cfg: FitConfig, optimizer: Optimizer, extent: float, mesh: Mesh | None
-) -> tuple[Step | MeshStep, Spread]:
-    """Return the step of a fit, and how its state lies on the devices."""
-    if cfg.train.batch == 1 and (mesh is None or mesh.size == 1):
-        return Step(cfg, optimizer, extent), OnOneDevice()
-    mesh = mesh or Devices().mesh()
-    return MeshStep(cfg, optimizer, extent, mesh), OnMesh(mesh)

@@ -47,12 +47,10 @@ class OptState(NamedTuple):
     Attributes:
         gaussians: of the Gaussians, updates counted one by one.
         rest: of photometry and appearance.
-        poses: of the corrections of objects' poses, updates counted one by one; None without any.
     """
 
     gaussians: tuple[AdamState, optax.EmptyState]
     rest: tuple[AdamState, optax.EmptyState]
-    poses: tuple[AdamState, optax.EmptyState] | None = None
 
 
 def scale_by_adam(
@@ -105,7 +103,7 @@ class Optimizer(NamedTuple):
     """Two optax chains over the parameters.
 
     Attributes:
-        gaussians: for any rows of the Gaussians, or of corrections of poses.
+        gaussians: for any rows of the Gaussians.
         rest: for (photometry, appearance).
     """
 
@@ -118,7 +116,6 @@ class Optimizer(NamedTuple):
         return OptState(
             self.gaussians.init(params.gaussians),  # pyright: ignore[reportArgumentType]
             self.rest.init((params.photometry, params.appearance)),  # pyright: ignore
-            None if params.poses is None else self.gaussians.init(params.poses.reshape(-1, 6)),  # pyright: ignore
         )
 
 
@@ -210,14 +207,7 @@ def learning_rates(
             like.photometry.cameras,
         ),
         appearance=jax.tree.map(lambda _: appearance_rate(progress, cfg), like.appearance),
-        poses=None if like.poses is None else _pose_rates(cfg) * decay,
     )
-
-
-def _pose_rates(cfg: FitConfig) -> Float[Array, " 6"]:
-    """Return the rates of rotations and translations of objects, as in `Params.poses`."""
-    o = cfg.optimizer
-    return jnp.array([*[o.object_rotations] * 3, *[o.object_translations] * 3])
 
 
 def _changed(opt_state: OptState, change, counts) -> OptState:

@@ -9,7 +9,7 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import on_host
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.losses.relative_exposure import ColorPairs
-from p2gs_jax.losses.total import OBSERVED_FORMS, SECOND_RENDER_FORMS, Partner
+from p2gs_jax.losses.total import SECOND_RENDER_FORMS, Partner
 from p2gs_jax.train.views import TrainingViews
 
 PAIRS_PER_STEP = 4096
@@ -37,14 +37,12 @@ def partner_at(
     if relative.weight is None:
         return on_host(Partner, np.int32(0))
     other = views.partner_at(step, index)
-    camera, batch, drawn = None, None, None
+    camera, drawn = None, None
     if relative.form in SECOND_RENDER_FORMS:
         camera = views.camera(other, shrink)
-    elif relative.form in OBSERVED_FORMS and relative.correspondence == "depth":
-        batch = views.batch(other, shrink)
-    elif relative.form in OBSERVED_FORMS and pairs is not None:
+    elif relative.form == "observed_ldr" and pairs is not None:
         count = pairs.views_i.shape[0]
         rng = generator(cfg.train.seed, Stream.STEP_PAIRS, step)
         pick = rng.integers(0, count, min(PAIRS_PER_STEP, count))
         drawn = jax.tree.map(lambda a: np.asarray(a)[pick], pairs)
-    return on_host(Partner, np.int32(other), camera, batch, drawn)
+    return on_host(Partner, np.int32(other), camera, drawn)

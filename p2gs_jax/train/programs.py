@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import jax
 
 from p2gs_jax.render.capacity import Room
-from p2gs_jax.train.mesh.step import MeshStep
+from p2gs_jax.train.data_parallel import ParallelStep
 from p2gs_jax.train.step import Step
 
 # The first step waits for two programs of about equal size; but XLA itself compiles on several
@@ -32,14 +32,14 @@ class Key(NamedTuple):
         slots: room of the population.
         room: of a view.
         degree: highest spherical-harmonics degree in use.
-        pixels: types of the view's and the partner's photographs as they are stored.
+        pixels: type of the photograph as it is stored.
     """
 
     size: tuple[int, int]
     slots: int
     room: Room
     degree: int
-    pixels: tuple[str, ...]
+    pixels: str
 
 
 class StepPrograms:
@@ -56,11 +56,13 @@ class StepPrograms:
     def __init__(self):
         self.rooms: dict[str, Room] = {}
         self._made: dict[Hashable, Future] = {}
-        self._ready: dict[tuple[Step | MeshStep, Key], Callable] = {}
+        self._ready: dict[tuple[Step | ParallelStep, Key], Callable] = {}
         self._worker = ThreadPoolExecutor(WORKERS, thread_name_prefix="compile")
         self.waited_s = 0.0
 
-    def expect(self, step: Step | MeshStep, key: Key, *arguments: Any, images: bool = True) -> None:
+    def expect(
+        self, step: Step | ParallelStep, key: Key, *arguments: Any, images: bool = True
+    ) -> None:
         """Begin to compile a step in the background.
 
         Args:
@@ -72,7 +74,7 @@ class StepPrograms:
         self._parts(step, key, arguments, images)
 
     def _parts(
-        self, step: Step | MeshStep, key: Key, arguments, images: bool = True
+        self, step: Step | ParallelStep, key: Key, arguments, images: bool = True
     ) -> list[Future]:
         """Return the programs of a step in their order, those yet unknown on their way."""
         visible_only = step.settings("show")["visible_only"]
@@ -113,7 +115,7 @@ class StepPrograms:
         future = self._made[key]
         return lambda *given: self._wait(future)(*given)
 
-    def get(self, step: Step | MeshStep, key: Key, *arguments: Any):
+    def get(self, step: Step | ParallelStep, key: Key, *arguments: Any):
         """Return a compiled step, `(state, batch, partner, controls) -> (state, report)`."""
         if (step, key) not in self._ready:
             parts = self._parts(step, key, arguments)

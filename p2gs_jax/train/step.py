@@ -75,7 +75,10 @@ class Step:
     ) -> tuple[FitState, StepReport]:
         """Take a step, compiling it on first use."""
         parts = (
-            functools.partial(_compiled(name), **self._static(name, room, degree)) for name in PARTS
+            functools.partial(
+                _compiled(name), **self.settings(name), **static_sizes(name, room, degree)
+            )
+            for name in PARTS
         )
         return self.chained(*parts)(state, batch, partner, controls)
 
@@ -84,7 +87,7 @@ class Step:
 
         def step(state: FitState, batch: Batch, partner: Partner, controls: Controls):
             params, frusta = state.params, self.frusta(batch, partner)
-            listed = show(*_per_gaussian(state, frusta, controls))
+            listed = show(*per_gaussian(state, frusta, controls))
             gradient = differentiate(
                 listed.shown, params.photometry, params.appearance, batch, partner
             )
@@ -126,27 +129,18 @@ class Step:
     ):
         """Return one of the three programs, by its name, traced for arguments of these shapes."""
         program = {name: _compiled(name) for name in PARTS}
-        static = {name: self._static(name, room, degree) for name in PARTS}
+        static = {n: self.settings(n) | static_sizes(n, room, degree) for n in PARTS}
         params, frusta = state.params, self.frusta(batch, partner)
-        per_gaussian = _per_gaussian(state, frusta, controls)
+        arguments = per_gaussian(state, frusta, controls)
         if name == "show":
-            return program[name].lower(*per_gaussian, **static[name])
-        listed = program["show"].eval_shape(*per_gaussian, **static["show"])
+            return program[name].lower(*arguments, **static[name])
+        listed = program["show"].eval_shape(*arguments, **static["show"])
         image = (listed.shown, params.photometry, params.appearance, batch, partner)
         if name == "differentiate":
             return program[name].lower(*image, **static[name])
         gradient = program["differentiate"].eval_shape(*image, **static["differentiate"])
         moved = (state, listed.ids, listed.visible, gradient, frusta, controls)
         return program[name].lower(*moved, **static[name])
-
-    def _static(self, name: str, room: Room, degree: int) -> dict[str, Any]:
-        """Return the static arguments of one of the three programs."""
-        sizes = {
-            "show": {"room": room.visible, "degree": degree},
-            "differentiate": {"room": room.entries},
-            "advance": {"degree": degree},
-        }
-        return self.settings(name) | sizes[name]
 
     def frusta(self, batch: Batch, partner: Partner) -> tuple[Frustum, ...]:
         """Return the views of a step, for the programs that know no image size."""
@@ -158,11 +152,18 @@ class Step:
         )
 
 
-def _per_gaussian(state: FitState, frusta: tuple[Frustum, ...], controls: Controls) -> tuple:
+def static_sizes(name: str, room: Room, degree: int) -> dict[str, int]:
+    """Return the static sizes of one of the three programs, by argument."""
+    if name == "show":
+        return {"room": room.visible, "degree": degree}
+    return {"room": room.entries} if name == "differentiate" else {"degree": degree}
+
+
+def per_gaussian(state: FitState, frusta: tuple[Frustum, ...], controls: Controls) -> tuple:
     """Return the arguments of `show`."""
     params, population = state.params, state.population
     degree = controls.active_degree
-    return params.gaussians, population.alive, frusta, degree, population.owner, params.poses
+    return params.gaussians, population.alive, frusta, degree, population.owner
 
 
 def compilations() -> int:

@@ -27,16 +27,12 @@ class Updated(NamedTuple):
     Attributes:
         gaussians: with the listed ones moved.
         moments: likewise.
-        value: of the loss that belongs to the Gaussians, summed over the blocks.
         finite: whether the gradient of each array is finite, in the order of `Gaussians`.
-        v_placed: gradient of the loss by `placed`, summed over the blocks.
     """
 
     gaussians: Gaussians
     moments: AdamState
-    value: Any
     finite: Bool[Array, " f"]
-    v_placed: Any
 
 
 def update_listed(
@@ -50,12 +46,10 @@ def update_listed(
     bands: int,
     seen: Callable,
     v_seen: Any,
-    own: Callable,
     optimizer: optax.GradientTransformationExtraArgs,
     rates: Gaussians,
     noise: Callable | None,
     owner: Int[Array, " n"] | None = None,
-    placed: Any = None,
 ) -> Updated:
     """Move the listed Gaussians by one step.
 
@@ -67,16 +61,12 @@ def update_listed(
         count: how many are listed.
         healthy: otherwise nothing is written.
         bands: spherical-harmonics coefficients that are looked at and moved.
-        seen: (Gaussians, alive, owner) of a block and `placed` -> what the image is made of, per
-            Gaussian.
+        seen: (Gaussians, alive, owner) of a block -> what the image is made of, per Gaussian.
         v_seen: gradient of the loss to that, for the whole list.
-        own: (Gaussians, alive) of a block -> the block's share of the loss terms on the Gaussians
-            themselves, as a dictionary.
         optimizer: from `make_optimizer`, for the Gaussians.
         rates: learning rates.
         noise: (number of a block, ids, Gaussians, alive) -> what to add to their means, or None.
         owner: the moving object that each Gaussian belongs to, or None.
-        placed: what else `seen` depends on and a gradient is wanted of, or None.
     """
     n, size = gaussians.capacity, block_size(ids.shape[0])
 
@@ -86,13 +76,8 @@ def update_listed(
         mine = owners_at(owner, here)
         old = take_rows(state.gaussians, here, bands)
 
-        def objective(block, placed):
-            terms = own(block, shown)
-            total = jax.tree.reduce(jnp.add, terms, jnp.float32(0))
-            return (seen(block, shown, mine, placed), total), terms
-
-        _, pull, terms = jax.vjp(objective, old, placed, has_aux=True)
-        grads, v_placed = pull((slice_of(v_seen, k, size), jnp.float32(1)))
+        _, pull = jax.vjp(lambda block: seen(block, shown, mine), old)
+        (grads,) = pull(slice_of(v_seen, k, size))
         finite = jnp.stack([jnp.all(jnp.isfinite(g)) for g in jax.tree.leaves(grads)])
         adam = AdamState(
             state.moments.counts.at[here].get(mode="clip"),
@@ -116,22 +101,9 @@ def update_listed(
                 put_rows(state.moments.mu, where, new.mu),
                 put_rows(state.moments.nu, where, new.nu),
             ),
-            jax.tree.map(jnp.add, state.value, terms),
             state.finite & finite,
-            jax.tree.map(jnp.add, state.v_placed, v_placed),
         )
 
-    values = jax.eval_shape(
-        own,
-        jax.eval_shape(lambda: take_rows(gaussians, ids[:size], bands)),
-        jax.ShapeDtypeStruct((size,), bool),
-    )
-    start = Updated(
-        gaussians,
-        moments,
-        jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), values),
-        jnp.ones(len(jax.tree.leaves(gaussians)), bool),
-        jax.tree.map(jnp.zeros_like, placed),
-    )
+    start = Updated(gaussians, moments, jnp.ones(len(jax.tree.leaves(gaussians)), bool))
     used = jnp.minimum(count, ids.shape[0])
     return lax.fori_loop(0, -(-used // size), body, start)

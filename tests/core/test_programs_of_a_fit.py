@@ -9,7 +9,7 @@ from tiny_scene import make_scene
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.clock import CompileCounter
 from p2gs_jax.core.progress import Silent
-from p2gs_jax.photometry.gauge import recentre
+from p2gs_jax.photometry.parameters import recentre
 from p2gs_jax.pipeline.calibrate import calibrate
 from p2gs_jax.pipeline.finish import Account, finish
 from p2gs_jax.pipeline.prepare import load, prepare

@@ -16,7 +16,7 @@ import lom_mixtures
 
 from p2gs_jax.config import CameraFormation, FitConfig, preset
 from p2gs_jax.photometry.appearance import exposures_apart
-from p2gs_jax.photometry.ppisp.parameters import OneView, identity
+from p2gs_jax.photometry.ppisp import OneView, identity
 from p2gs_jax.run.read import Run
 from p2gs_jax.types import Params, Photometry, Scene, View
 

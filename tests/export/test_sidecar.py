@@ -58,7 +58,7 @@ def sidecar(folder, *, activation="exp", degree=3, **photometry):
     return json.loads((folder / "linear.json").read_text()), g, cfg
 
 
-@pytest.mark.parametrize("activation", ["exp", "softplus", "linear"])
+@pytest.mark.parametrize("activation", ["exp", "linear"])
 @pytest.mark.parametrize("degree", [0, 2, 3])
 def test_radiance_follows_from_the_two_files(tmp_path, activation, degree):
     said, g, _ = sidecar(tmp_path, activation=activation, degree=degree)

@@ -8,9 +8,9 @@ import pytest
 
 from p2gs_jax.config import FitConfig, InitConfig, preset
 from p2gs_jax.core.numerics import srgb_encode
-from p2gs_jax.gaussians.init.seeds import cameras_radius, gaussians_from_points, subsample
-from p2gs_jax.gaussians.init.shell import find_shell
-from p2gs_jax.photometry.observations import Observations, overlapping_views, sample_pairs
+from p2gs_jax.gaussians.seeds import cameras_radius, gaussians_from_points, subsample
+from p2gs_jax.gaussians.shell import find_shell
+from p2gs_jax.photometry.observations import Observations, sample_pairs
 from p2gs_jax.photometry.sources.sampling import sample
 from p2gs_jax.render import view_radiance
 from p2gs_jax.types import Camera, View
@@ -114,14 +114,3 @@ def test_extent_and_subsample():
     assert len(kept) == 100
     assert np.all(np.diff(kept) > 0)
     assert FitConfig() == preset("robust")
-
-
-def test_views_that_share_points_overlap():
-    """Three views in a chain and one that shares a single point with the last."""
-    seen = [(0, p) for p in range(10)] + [(1, p) for p in range(5, 20)]
-    seen += [(2, p) for p in range(15, 30)] + [(3, 29)] + [(4, 99), (0, 0)]
-    views, points = np.array(seen).T
-    colors = np.zeros((len(seen), 3), np.float32)
-    tracks = Observations(views, points, colors, colors, 5, 100, np.zeros(5, int))
-    found = [list(row) for row in overlapping_views(tracks, fewest=3)]
-    assert found == [[1], [0, 2], [1], [2], []]

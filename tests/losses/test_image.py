@@ -77,29 +77,6 @@ def test_identical_images_and_empty_mask():
     assert set(image.photometric_loss(x, x, ones, LossConfig(dssim_weight=None))) == {"l1"}
 
 
-def test_a_prediction_within_the_quantum_is_right():
-    """Half a code is forgiven, the rest costs what it is; values on the border are inside."""
-    half = 0.5 / 255
-    target = jnp.full((2, 3, 3), 0.4)
-    for away, left in ((0.0, 0.0), (half, 0.0), (-half, 0.0), (3 * half, 2 * half), (-0.1, 0.1)):
-        nearest = image.within_quantum(target + away, target, half * 1.0001)
-        expected = left if left < 0.05 else left - half
-        np.testing.assert_allclose(jnp.abs(nearest - target), expected, atol=1e-6)
-    slope = jax.grad(lambda x: jnp.sum(jnp.abs(image.within_quantum(x, target, half) - target)))
-    np.testing.assert_array_equal(slope(target + 0.9 * half), 0)
-    np.testing.assert_array_equal(slope(target - 1.5 * half), -1)
-
-
-def test_quantisation_aware_loss_is_zero_for_what_rounding_hides():
-    rng = np.random.default_rng(3)
-    truth = jnp.asarray(rng.uniform(0.1, 0.9, (24, 30, 3)), jnp.float32)
-    stored = jnp.round(truth * 255) / 255
-    mask = jnp.ones((24, 30))
-    aware = LossConfig(quantization=0.5001 / 255)
-    assert float(sum(image.photometric_loss(truth, stored, mask, aware).values())) < 1e-6
-    assert float(sum(image.photometric_loss(truth, stored, mask, LossConfig()).values())) > 5e-4
-
-
 def test_a_saturated_photograph_says_at_least_this_bright():
     target = jnp.full((12, 12, 3), 0.99)
     mask = jnp.ones((12, 12))

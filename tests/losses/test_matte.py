@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import FitConfig, LossConfig, PhotometryConfig, preset
-from p2gs_jax.evaluate.alignment import fit_exposure
+from p2gs_jax.evaluation.alignment import fit_exposure
 from p2gs_jax.losses.image import photometric_loss
 from p2gs_jax.losses.matte import matted_loss
 from p2gs_jax.photometry.display import DisplayTransform, develop

@@ -14,15 +14,13 @@ from p2gs_jax.config import (
     RelativeExposureConfig,
 )
 from p2gs_jax.losses import relative_exposure as rel
-from p2gs_jax.losses.total import depth_pairs
-from p2gs_jax.photometry.cameras import places
 from p2gs_jax.photometry.formation import formation
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import KNOTS
 from p2gs_jax.train.compared_photographs import color_pairs
-from p2gs_jax.types import Batch, Camera, Photometry, Render
+from p2gs_jax.types import Photometry
 
-WIDTH, HEIGHT, DEPTH = 48, 32, 5.0
+WIDTH, HEIGHT = 48, 32
 CAMERAS = (
     CameraFormation("a", ((-0.5, 0.1, 0.0),), (tuple(0.2 * np.sin(4 * KNOTS)),)),
     CameraFormation("b", ((-0.2, -0.3, 0.0),), (tuple(0.2 * np.cos(4 * KNOTS)),)),
@@ -30,7 +28,6 @@ CAMERAS = (
 SHADED = PhotometryConfig(cameras=CAMERAS)
 CURVED = dataclasses.replace(SHADED, curve="spline")
 CONFIGS = pytest.mark.parametrize("cfg", [SHADED, CURVED], ids=["srgb", "own responses"])
-READINGS = {"observed_ldr": rel.observed_ldr, "observed_linear": rel.observed_linear}
 
 
 def truth(views=4, seed=0) -> Photometry:
@@ -54,12 +51,11 @@ def observed(photometry, cfg, count=400) -> rel.ColorPairs:
 
 
 @CONFIGS
-@pytest.mark.parametrize("form", READINGS)
-def test_zero_at_the_truth_and_only_there(cfg, form):
+def test_zero_at_the_truth_and_only_there(cfg):
     right = truth()
     pairs = observed(right, cfg)
-    loss = LossConfig(relative_exposure=RelativeExposureConfig(1.0, form))
-    reading = READINGS[form]
+    loss = LossConfig(relative_exposure=RelativeExposureConfig(1.0, "observed_ldr"))
+    reading = rel.observed_ldr
     at_truth = float(reading(pairs, right, loss, cfg))
     assert at_truth < 2e-4
     wrong = {
@@ -106,37 +102,6 @@ def test_the_literal_readings_take_the_whole_gain():
 LINEAR = dataclasses.replace(SHADED, curve="linear", pivot=1.0)
 
 
-def wall(photometry, row, cfg, x=0.0) -> tuple[Render, Batch]:
-    """A smooth wall at z = DEPTH, photographed from x under a view's photometry."""
-    focal = 40.0
-    v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-    X, Y = (u - WIDTH / 2) / focal * DEPTH + x, (v - HEIGHT / 2) / focal * DEPTH
-    L = 0.1 * np.exp2(np.stack([np.sin(X), np.cos(0.7 * X + Y), np.sin(Y - 0.5 * X)], -1))
-    linear, one = jnp.asarray(L, jnp.float32), jnp.ones((HEIGHT, WIDTH))
-    viewmat = np.eye(4, dtype=np.float32)
-    viewmat[0, 3] = -x
-    K = np.array([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]], np.float32)
-    camera = Camera(jnp.asarray(viewmat), jnp.asarray(K), WIDTH, HEIGHT)
-    ldr = jnp.clip(formation(linear, photometry.capture(row), cfg), 0, 1)
-    render = Render(linear, one, DEPTH * one, jnp.int32(0), jnp.array(False), jnp.zeros(0, bool))
-    return render, Batch(camera, ldr, one, jnp.int32(row))
-
-
-@CONFIGS
-def test_pairs_through_depth_know_their_places(cfg):
-    flat = dataclasses.replace(truth(), raw_gammas=jnp.zeros(4))
-    pairs = depth_pairs(*wall(flat, 0, cfg), *wall(flat, 1, cfg, 0.7), True)
-    loss = LossConfig(relative_exposure=RelativeExposureConfig(1.0, "observed_ldr"))
-    found = float(rel.observed_ldr(pairs, flat, loss, cfg))
-    # Bilinear samples of a curved wall are not exact.
-    assert found < 2e-3
-    assert float(jnp.mean(pairs.valid)) > 0.8
-    turned = dataclasses.replace(pairs, positions_j=pairs.positions_i)
-    assert float(rel.observed_ldr(turned, flat, loss, cfg)) > found + 2e-3
-    corner = places(np.array([0.5, 0.5], np.float32), WIDTH, HEIGHT)
-    np.testing.assert_allclose(pairs.positions_i[0], corner, atol=1e-6)
-
-
 def test_pairs_of_tracks_have_places_where_they_count():
     count = 60
     rng = np.random.default_rng(0)
@@ -152,7 +117,7 @@ def test_pairs_of_tracks_have_places_where_they_count():
         positions=rng.uniform(-0.5, 0.5, (count, 2)).astype(np.float32),
     )
     base = FitConfig()
-    relative = RelativeExposureConfig(1.0, "observed_ldr", correspondence="tracks")
+    relative = RelativeExposureConfig(1.0, "observed_ldr")
     cfg = dataclasses.replace(base, loss=dataclasses.replace(base.loss, relative_exposure=relative))
     plain = color_pairs(observations, cfg)
     assert plain is not None

@@ -6,14 +6,9 @@ from synthetic_drive import make_drive, make_exposures, observe
 
 from p2gs_jax.photometry.adjustment import solve
 from p2gs_jax.photometry.adjustment.errors import uncertainty
-from p2gs_jax.photometry.adjustment.fit import (
-    TOLERANCE,
-    explain,
-    fit_model,
-    solution_of,
-    solve_model,
-)
+from p2gs_jax.photometry.adjustment.fit import explain, fit_model, solution_of
 from p2gs_jax.photometry.adjustment.problem import make_problem
+from p2gs_jax.photometry.adjustment.solve import TOLERANCE, solve_model
 from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import Response

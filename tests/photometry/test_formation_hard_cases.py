@@ -93,7 +93,7 @@ def test_parameterisations_never_reach_zero():
         assert float(p.gammas.min()) > 0
 
 
-@pytest.mark.parametrize("kind", ["exp", "softplus", "linear"])
+@pytest.mark.parametrize("kind", ["exp", "linear"])
 def test_radiance_activations_invert(kind):
     L = jnp.asarray([1e-3, 0.1, 1.0, 20.0], jnp.float32)
     np.testing.assert_allclose(

@@ -7,8 +7,7 @@ import pytest
 from synthetic_drive import make_drive, make_exposures, observe
 
 from p2gs_jax.photometry.candidates import Candidate, choose
-from p2gs_jax.photometry.choices import Choice
-from p2gs_jax.photometry.models import Form
+from p2gs_jax.photometry.models import Choice, Form
 from p2gs_jax.photometry.response import Response
 from p2gs_jax.photometry.selection import select
 

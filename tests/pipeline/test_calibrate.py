@@ -10,7 +10,7 @@ import pytest
 from p2gs_jax import calibrate
 from p2gs_jax.config import preset
 from p2gs_jax.errors import UserError
-from p2gs_jax.evaluate.alignment import exposure_error
+from p2gs_jax.evaluation.alignment import exposure_error
 from p2gs_jax.photometry.sources.stack import read_stack
 from p2gs_jax.pipeline.calibrate_stack import calibrate_stack
 from p2gs_jax.run.photometry_files import read_photometry

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import p2gs_jax
-from p2gs_jax.evaluate.alignment import exposure_error
+from p2gs_jax.evaluation.alignment import exposure_error
 from p2gs_jax.pipeline.calibrate_run import calibrate_run
 from p2gs_jax.run.photometry_files import read_photometry
 

@@ -1,4 +1,4 @@
-"""A drive without boxes: what moves vibrates, and what is still unexplained is left out."""
+"""A drive without boxes: what moves vibrates."""
 
 import shutil
 
@@ -12,11 +12,9 @@ from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.formats.ply import read_ply
 from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.render.project import STILL, at_time
-from p2gs_jax.report.report import write_report
 from p2gs_jax.scene import drives
 
-# Before the look the fit must be good enough to tell what moves from what is fitted badly.
-STEPS, LOOK = 60, 40
+STEPS = 60
 CFG = with_fields(
     p2gs_jax.FitConfig(),
     {
@@ -24,8 +22,6 @@ CFG = with_fields(
         "data.own_car": False,
         "dynamics.method": "vibration",
         "dynamics.vibrating": 600,
-        "dynamics.unexplained": "mask",
-        "dynamics.unexplained_at": [LOOK / STEPS],
         "photometry.select": False,
         "photometry.model": "view_exposure",
         "photometry.curve": "srgb",
@@ -52,21 +48,6 @@ def fitted(folder, tmp_path_factory):
         return p2gs_jax.fit(folder, run, CFG)
 
 
-def test_what_was_left_out_is_said_and_shown(fitted):
-    share = fitted.metrics["left_out"]["share"]
-    assert 0 < share < 0.35
-    assert set(fitted.metrics["left_out"]["per_view"]) == {
-        v.name for v in fitted.scene.training_views
-    }
-    (said,) = [note for note in fitted.metrics["notes"] if "no static scene" in note]
-    assert said.startswith(f"After step {LOOK}: {share:.1%}")
-    assert list((fitted.run_dir / "left_out").rglob("*.png"))
-    assert fitted.metrics["seconds"]["looking"] > 0
-    write_report(fitted.run_dir)
-    page = (fitted.run_dir / "report.html").read_text()
-    assert "What the fit left out" in page
-
-
 def test_gaussians_have_moved_and_a_run_shows_them_at_the_time_of_each_view(fitted):
     run = p2gs_jax.load_run(fitted.run_dir)
     moves = run.params.gaussians.vibration
@@ -86,18 +67,16 @@ def test_gaussians_have_moved_and_a_run_shows_them_at_the_time_of_each_view(fitt
     assert at_time(run.as_of(), None).vibration is None
 
 
-def test_it_resumes_after_a_look_as_if_nothing_had_happened(fitted, folder, tmp_path, monkeypatch):
+def test_it_resumes_as_if_nothing_had_happened(fitted, folder, tmp_path, monkeypatch):
     monkeypatch.setitem(drives.FORMATS, "pandaset", drive_format())
     run = tmp_path / "run"
     shutil.copytree(fitted.run_dir, run)
     steps = sorted(int(p.name) for p in (run / "checkpoints").iterdir() if p.name.isdigit())
-    assert LOOK < steps[0] < steps[-1] == STEPS
+    assert steps[-1] == STEPS
     shutil.rmtree(run / "checkpoints" / str(steps[-1]))
     for name in ("radiance.ply", "metrics.json"):
         (run / name).unlink()
-    shutil.rmtree(run / "left_out")
-    again = p2gs_jax.fit(folder, run, CFG, resume=True)
+    p2gs_jax.fit(folder, run, CFG, resume=True)
     assert (run / "radiance.ply").read_bytes() == (fitted.run_dir / "radiance.ply").read_bytes()
-    assert again.metrics["left_out"] == fitted.metrics["left_out"]
     steps = [line["step"] for line in read_jsonl(run / "log.jsonl")]
     assert steps == list(range(10, STEPS + 1, 10))

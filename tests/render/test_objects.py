@@ -15,12 +15,10 @@ from p2gs_jax.core.numerics import fibonacci_sphere
 from p2gs_jax.gaussians.posed import posed, turning
 from p2gs_jax.render import project, render_linear, required_capacity, view_radiance
 from p2gs_jax.render.harmonics import evaluate
-from p2gs_jax.render.objects import corrected
 from p2gs_jax.render.project import HIDDEN, camera_of_each
 from p2gs_jax.render.visible import BLOCK, compact, in_view, splat, splat_listed
-from p2gs_jax.scene.drives.moving import KeyTimes, MovingObjects
 from p2gs_jax.train.room import count_view
-from p2gs_jax.types import Camera, Placement, TrackedObject
+from p2gs_jax.types import Camera, Placement
 
 WIDTH, HEIGHT, CAPACITY = 48, 40, 2**14
 CFG = RenderConfig(sh_degree=3, stop_error=None)
@@ -58,7 +56,7 @@ def view(objects: bool = True) -> Camera:
     if objects:
         viewmats = (viewmat.astype(np.float64) @ POSES).astype(np.float32)
         viewmats[~THERE] = HIDDEN
-        placement = Placement(jnp.asarray(viewmats), jnp.int32(0), jnp.float32(0))
+        placement = Placement(jnp.asarray(viewmats))
     return Camera(jnp.asarray(viewmat), K, WIDTH, HEIGHT, placement)
 
 
@@ -86,7 +84,7 @@ def test_a_camera_in_the_frame_of_the_box_sees_what_moved_gaussians_show():
 def test_a_box_at_the_origin_is_no_box():
     g, owner = scene()
     camera = view()
-    at_origin = Placement(jnp.tile(camera.viewmat, (3, 1, 1)), jnp.int32(0), jnp.float32(0))
+    at_origin = Placement(jnp.tile(camera.viewmat, (3, 1, 1)))
     camera = dataclasses.replace(camera, objects=at_origin)
     alive = jnp.ones(COUNT, bool)
     ours, plain = picture(g, alive, camera, jnp.asarray(owner)), picture(g, alive, view(False))
@@ -167,36 +165,6 @@ def test_coefficients_turn_with_the_box():
     here = tuple(map(jnp.asarray, directions.T))
     there = tuple(map(jnp.asarray, (directions @ R).T.astype(np.float32)))
     np.testing.assert_allclose(evaluate(turned, here), evaluate(sh, there), atol=2e-5)
-
-
-def test_corrections_move_in_the_frame_of_the_box():
-    """On the device as on the host, and both as matrices say."""
-    rng = np.random.default_rng(0)
-    times = np.array([0.0, 1.0])
-    objects = tuple(
-        TrackedObject(str(k), "Car", (1, 1, 1), times, np.stack([POSES[k]] * 2), True)
-        for k in range(3)
-    )
-    poses = rng.normal(0, 0.05, (2, 3, 6)).astype(np.float32)
-    keys = KeyTimes(0.0, 1.0, 2)
-    plain, learned = MovingObjects(objects, keys), MovingObjects(objects, keys, poses)
-    viewmat = np.asarray(view().viewmat)
-    device = corrected(plain.placement(viewmat, 0.3), jnp.asarray(poses))
-    host = learned.placement(viewmat, 0.3)
-    np.testing.assert_allclose(device.viewmats, host.viewmats, atol=1e-5)
-    small = 0.7 * poses[0] + 0.3 * poses[1]
-    move = np.tile(np.eye(4), (3, 1, 1))
-    move[:, :3, :3] = Rotation.from_rotvec(small[:, :3]).as_matrix()
-    move[:, :3, 3] = small[:, 3:]
-    np.testing.assert_allclose(host.viewmats, viewmat @ POSES @ move, atol=2e-4)
-    assert np.abs(host.viewmats - plain.placement(viewmat, 0.3).viewmats).max() > 0.01
-
-
-def test_corrections_leave_hidden_what_is_not_there():
-    camera = view()
-    assert camera.objects is not None
-    found = corrected(camera.objects, jnp.full((1, 3, 6), 0.1))
-    np.testing.assert_array_equal(found.viewmats[2], HIDDEN)
 
 
 def test_radiance_is_seen_from_the_frame_of_the_box():

@@ -33,7 +33,7 @@ def gaussians(velocity=(2.0, 0.0, 0.0), peak=0.2, life=LIFE, count=1):
 
 
 def placement(time):
-    return Placement(jnp.zeros((0, 4, 4)), jnp.int32(0), jnp.float32(0), jnp.float32(time))
+    return Placement(jnp.zeros((0, 4, 4)), jnp.float32(time))
 
 
 def camera(time):

@@ -7,7 +7,7 @@ from moving_box import BOX_TO_WORLD, lens
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.scene import ImageStore
-from p2gs_jax.scene.drives.moving import KeyTimes, MovingObjects, key_times
+from p2gs_jax.scene.drives.moving import MovingObjects
 from p2gs_jax.scene.drives.object_masks import object_mask
 from p2gs_jax.types import TrackedObject, View
 
@@ -114,22 +114,12 @@ def test_cameras_of_a_store_know_where_objects_are(tmp_path):
     box = thing((-2, 0, 8.0), step=(4.0, 0, 0), times=(0.0, 0.5))
     store = ImageStore(views, DataConfig())
     assert store.placement(0) is None
-    moving = MovingObjects((box,), key_times([box], [0.0, 1.0]))
+    moving = MovingObjects((box,))
     store = store.placing(moving)
     placement = store.placement(0)
     assert placement is not None
     np.testing.assert_allclose(placement.viewmats[0], box.poses[1], atol=1e-6)
     assert store.placement(1) is None
-    assert moving.keys == KeyTimes(0.0, 1.0, 2)
     # Half a second after its last pose it is gone.
     gone = moving.placement(np.eye(4), 1.0)
     assert gone.viewmats[0, 2, 3] == -1
-
-
-def test_key_times():
-    keys = KeyTimes(1.0, 0.5, 4)
-    assert keys.at(0.0) == (0, 0.0)
-    assert keys.at(1.75) == (1, 0.5)
-    assert keys.at(2.5) == (2, 1.0)
-    assert keys.at(9.0) == (2, 1.0)
-    assert KeyTimes(0.0, 1.0, 1).at(3.0) == (0, 0.0)

@@ -17,7 +17,6 @@ from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.train import burst, checkpoints, loop, session, state
 from p2gs_jax.train.advance import StepReport
 from p2gs_jax.train.state import FAULT_NONFINITE, FAULT_OVERFLOW, Fault, FitState
-from p2gs_jax.train.strategies import automatic, mcmc
 from p2gs_jax.types import Batch, Camera, Gaussians, Params, Photometry, Population
 
 VIEWS, SEEDS = 4, 10
@@ -32,20 +31,13 @@ SHORT = with_fields(
         "densify.method": None,
     },
 )
-GROWING = with_fields(SHORT, {"densify.method": "mcmc", "densify.max_gaussians": "auto"})
 
 
 class Views:
     """Views of one size, without photographs."""
 
-    def __init__(self):
-        self.out = ()
-
     def __len__(self):
         return VIEWS
-
-    def leave_out(self, rows):
-        self.out = tuple(rows)
 
     def indices_at(self, step, count):
         return tuple((step + k) % VIEWS for k in range(count))
@@ -60,7 +52,7 @@ class Views:
         K = np.diag([400.0 / shrink, 400.0 / shrink, 1.0]).astype(np.float32)
         return on_host(Camera, np.eye(4, dtype=np.float32), K, 400 // shrink, 300 // shrink)
 
-    def batch(self, index, shrink, step=0, decoded=True):
+    def batch(self, index, shrink, step=0):
         nothing = np.zeros((1, 1, 3), np.uint8), np.ones((1, 1), bool)
         return on_host(Batch, self.camera(index, shrink), *nothing, np.int32(index))
 
@@ -163,24 +155,8 @@ class Harness:
         monkeypatch.setattr(
             loop, "initial_state", lambda p, a, o, slots, owner: state_of(SEEDS, slots)
         )
-        monkeypatch.setattr(automatic, "grow_state", self._grown)
-        monkeypatch.setattr(mcmc.Mcmc, "relocated", self._relocated)
-        # Copies and sums on the host compile nothing.
-        monkeypatch.setattr(automatic.jnp, "copy", np.copy)
+        # Sums on the host compile nothing.
         monkeypatch.setattr(state, "_sum", np.sum)
-        monkeypatch.setattr(automatic, "make_judge", lambda *a, **k: self.judge)
-        self.judge = lambda params, population: 20.0
-
-    def _grown(self, state, slots):
-        if slots <= state.params.gaussians.capacity:
-            return state
-        new = state_of(int(state.population.alive.sum()), slots)
-        return dataclasses.replace(new, step=state.step)
-
-    def _relocated(self, state, host, wanted):
-        count = max(int(state.population.alive.sum()), wanted)
-        new = state_of(count, state.params.gaussians.capacity)
-        return dataclasses.replace(new, step=state.step)
 
     def run(self, cfg=SHORT, *, resume=False, programs=None, pixels=None, **options):
         """Run to the end; return the result and the programs."""
@@ -196,7 +172,6 @@ class Harness:
             Decisions.as_asked(cfg),
             on_log=self.records.append,
             on_message=self.said.append,
-            validation=(1,) if cfg.densify.max_gaussians == "auto" else (),
         )
         result = trainer.run(
             state_of(SEEDS, SEEDS).params, np.ones(SEEDS, bool), resume=resume, **options

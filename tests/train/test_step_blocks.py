@@ -92,7 +92,7 @@ def made():
             ((splats, radiance),), params.photometry, None, batch, partner, cfg, 2**16
         )
         whole, _ = total_loss(
-            params, alive, batch, partner, cfg, capacity=2**16, active_degree=DEGREE, extent=EXTENT
+            params, alive, batch, partner, cfg, capacity=2**16, active_degree=DEGREE
         )
         return whole + loss, (whole, loss)
 

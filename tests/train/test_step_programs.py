@@ -14,8 +14,8 @@ from p2gs_jax.train.optimizer import make_optimizer
 from p2gs_jax.train.programs import Key, StepPrograms
 from p2gs_jax.train.step import Step
 
-COARSE = Key((120, 80), 500, Room(4096, 4096), 3, ("uint16",))
-FULL = COARSE._replace(size=(240, 160), room=Room(8192, 4096), pixels=("uint8",))
+COARSE = Key((120, 80), 500, Room(4096, 4096), 3, "uint16")
+FULL = COARSE._replace(size=(240, 160), room=Room(8192, 4096), pixels="uint8")
 SHAPES = tuple(np.zeros(k) for k in range(1, 5))
 
 

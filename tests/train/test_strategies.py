@@ -12,13 +12,11 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.gaussians.population import Coverage, default_max_gaussians
 from p2gs_jax.jobs.configs import with_fields
-from p2gs_jax.train import growth
 from p2gs_jax.train.host import HostState
 from p2gs_jax.train.optimizer import make_optimizer
 from p2gs_jax.train.state import count_alive, initial_state
 from p2gs_jax.train.strategies import make_strategy, mcmc
 from p2gs_jax.train.strategies.adaptive import Adaptive
-from p2gs_jax.train.strategies.automatic import Automatic
 from p2gs_jax.train.strategies.base import Strategy
 from p2gs_jax.train.strategies.mcmc import SLOTS, Mcmc
 from p2gs_jax.types import Params, Photometry
@@ -36,8 +34,6 @@ def of(seeds=SEEDS, **densify):
         coverage=COVERAGE,
         levels=((1.0, 1),),
         views=None,
-        validation=(),
-        own_exposures=False,
         clock=Stopwatch(),
         on_message=said.append,
         said=said,
@@ -59,13 +55,6 @@ def state():
         ({"method": "adaptive"}, Adaptive, None, SEEDS, False),
         ({"method": "adaptive", "max_gaussians": 300}, Adaptive, 300, SEEDS, False),
         ({"method": None, "max_gaussians": 300}, Strategy, 300, SEEDS, True),
-        (
-            {"max_gaussians": "auto"},
-            Automatic,
-            growth.upper_bound(SEEDS, DEFAULT),
-            SEEDS,
-            False,
-        ),
     ],
 )
 def test_a_configuration_means_a_strategy_with_its_bounds(densify, kind, limit, slots, ahead):
@@ -94,12 +83,10 @@ def test_fits_share_the_relocation_and_count_what_found_no_slot(monkeypatch):
     jax.clear_caches()
     monkeypatch.setattr(mcmc, "demand", chex.assert_max_traces(mcmc.demand, n=1))
     for _ in range(2):
-        strategy, host = of(max_gaussians=300), HostState(step=7, pace=0.01)
-        grown = strategy.relocated(state(), host, 70)
+        strategy, host = of(max_gaussians=150), HostState(step=7, progress=0.4999, pace=0.01)
         # Nothing was seen yet, so nothing pulls, and nobody is born.
-        assert count_alive(grown) == SEEDS
-        assert host.refused == 0
-        strategy.relocated(state(), host, 3 * SEEDS)
+        state_ = strategy.densify(state(), host)
+        assert count_alive(state_) == SEEDS
         assert host.refused == SEEDS
         assert len(strategy.run.said) == 1
         assert "Step 7: 50 Gaussians wanted to grow" in strategy.run.said[0]

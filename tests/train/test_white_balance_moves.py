@@ -12,10 +12,9 @@ from tiny_scene import make_scene
 
 from p2gs_jax.cli import main
 from p2gs_jax.config import CameraFormation, FitConfig
-from p2gs_jax.evaluate.seams import Photographed, measure_seam
+from p2gs_jax.evaluation.seams import Photographed, measure_seam
 from p2gs_jax.jobs.configs import with_fields
-from p2gs_jax.photometry.cameras import corner
-from p2gs_jax.photometry.formation import squared_radii
+from p2gs_jax.photometry.formation import corner, squared_radii
 from p2gs_jax.pipeline.decide import decide, likely, unsolved
 from p2gs_jax.render.warp import surface_depth
 from p2gs_jax.run.decisions import Decisions
@@ -87,7 +86,7 @@ def test_without_a_solution_only_views_learn():
     cfg = with_fields(FitConfig(), asked)
     decided = decide(cfg, None, matched=False)
     assert (decided.white_balance, decided.vignetting) == ("view", None)
-    assert likely(cfg, None, matched=False) == dataclasses.replace(decided, correspondence="depth")
+    assert likely(cfg, None, matched=False) == decided
     by_camera = with_fields(cfg, {"photometry.white_balance": "camera"})
     assert unsolved(Decisions.as_asked(by_camera)).white_balance is None
 

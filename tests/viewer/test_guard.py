@@ -10,7 +10,7 @@ import viser
 import websockets
 import websockets.sync.client
 
-from p2gs_jax.viewer.guard import Guard, guard_of, guarded, is_loopback
+from p2gs_jax.viewer.server import Guard, guard_of, guarded, is_loopback
 
 PROTOCOL = f"viser-v{viser.__version__}"
 

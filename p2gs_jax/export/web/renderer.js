@@ -1,6 +1,6 @@
 // Light in float: project, sort in a worker, composite back to front, develop.
 
-const ACTIVATIONS = { exp: 0, softplus: 1, linear: 2 };
+const ACTIVATIONS = { exp: 0, linear: 1 };
 const CURVES = { linear: 0, power: 1, srgb: 2, spline: 3 };
 // Largest half-precision number that leaves room for sums.
 const HALF_MOST = 6e4;

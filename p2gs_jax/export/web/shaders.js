@@ -48,7 +48,6 @@ vec3 harmonics(ivec2 at, vec3 d) {
 
 vec3 radiance(vec3 v) {
   if (activation == 0) return exp(clamp(v, -30.0, 30.0));
-  if (activation == 1) return max(v, 0.0) + log(1.0 + exp(-abs(v)));
   return max(v + 0.5, 0.0);
 }
 

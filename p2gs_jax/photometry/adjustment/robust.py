@@ -7,10 +7,10 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from p2gs_jax.photometry.adjustment.forward import Forward
-from p2gs_jax.photometry.adjustment.parameters import Parameters
-from p2gs_jax.photometry.adjustment.rows import Rows
+from p2gs_jax.photometry.adjustment.parameters import Forward, Parameters
+from p2gs_jax.photometry.adjustment.problem import Rows
 from p2gs_jax.photometry.adjustment.system import EMPTY
+from p2gs_jax.photometry.observations import PerChannel
 
 Loss = Literal["l1", "geman_mcclure", "whole_points"]
 # Width of the Geman-McClure loss in robust standard deviations.
@@ -19,6 +19,8 @@ GEMAN_MCCLURE = 3.0
 PRIOR_SPREAD = 3.0
 SMALLEST_SCALE = 0.3
 MEDIAN_ROWS = 4096
+
+PerObservation = Float[np.ndarray, " o"]
 
 
 class Weighted(NamedTuple):
@@ -36,25 +38,23 @@ class Weighted(NamedTuple):
         curvature: mean second derivative of the robust loss over its weight (1 for squares).
     """
 
-    weight: Float[np.ndarray, "o 3"]
-    sigma: Float[np.ndarray, "o 3"]
-    slope: Float[np.ndarray, "o 3"]
-    residual: Float[np.ndarray, "o 3"]
+    weight: PerChannel
+    sigma: PerChannel
+    slope: PerChannel
+    residual: PerChannel
     radiance: Float[np.ndarray, "r 3"]
-    level: Float[np.ndarray, "o 3"]
+    level: PerChannel
     precision: Float[np.ndarray, "r 3"]
     scale: float
     curvature: float
 
 
-def noise_weight(rows: Rows) -> Float[np.ndarray, "o 3"]:
+def noise_weight(rows: Rows) -> PerChannel:
     """Return weights by the stated noise alone: where robust ones start."""
     return rows.weight / rows.sigma**2
 
 
-def weigh(
-    model: Forward, theta: Parameters, weight: Float[np.ndarray, "o 3"], loss: Loss
-) -> Weighted:
+def weigh(model: Forward, theta: Parameters, weight: PerChannel, loss: Loss) -> Weighted:
     """Return residuals and the weights they imply.
 
     Args:
@@ -68,7 +68,7 @@ def weigh(
     if theta.c.size:
         z, sigma, slope = model.unknowns.splines.decode(rows, theta.c)
     a, b = theta.a[rows.views][:, None], theta.b[rows.views]
-    added = model.of_cameras(theta.k)
+    added = 0.0 if model.features is None else model.features.of(theta.k)
     z_of_point = z - (b + a * added)
     radiance, _ = _radiance(rows, a, z_of_point, weight)
     u = (z_of_point - a * radiance[rows.row]) / sigma
@@ -91,14 +91,14 @@ def weigh(
 
 
 def _geman_mcclure(
-    rows: Rows, square: Float[np.ndarray, " o"], share: Float[np.ndarray, " o"]
-) -> tuple[Float[np.ndarray, " o"], float]:
+    rows: Rows, square: PerObservation, share: PerObservation
+) -> tuple[PerObservation, float]:
     """Return weights, and the mean curvature of the loss over them.
 
     Args:
         rows: observations.
-        square: of residuals, in widths of the loss.
-        share: of each observation's channels that count.
+        square: squares of residuals, in widths of the loss.
+        share: share of each observation's channels that count.
     """
     robust, second = _derivatives(square)
     seen = share > 0
@@ -106,8 +106,8 @@ def _geman_mcclure(
 
 
 def _whole_points(
-    rows: Rows, square: Float[np.ndarray, " o"], share: Float[np.ndarray, " o"]
-) -> tuple[Float[np.ndarray, " o"], float]:
+    rows: Rows, square: PerObservation, share: PerObservation
+) -> tuple[PerObservation, float]:
     """Return weights and curvature where every point has a spread of its own.
 
     Gloss and silhouettes make all that a point shows uncertain, and by different amounts. So the
@@ -128,9 +128,7 @@ def _whole_points(
     return robust, float((second.sum() - along.sum()) / max((share * robust).sum(), 1e-9))
 
 
-def _derivatives(
-    square: Float[np.ndarray, " o"],
-) -> tuple[Float[np.ndarray, " o"], Float[np.ndarray, " o"]]:
+def _derivatives(square: PerObservation) -> tuple[PerObservation, PerObservation]:
     """Return slope over residual and curvature of the Geman-McClure loss, of one observation."""
     return 1 / (1 + square) ** 2, (1 - 3 * square) / (1 + square) ** 3
 
@@ -141,7 +139,7 @@ def _radiance(rows: Rows, a, z, weight):
     return rows.by_row @ (weight * a * z) / (precision + EMPTY), precision
 
 
-def _median(rows: Rows, values: Float[np.ndarray, "o 3"]) -> float:
+def _median(rows: Rows, values: PerChannel) -> float:
     """Return the median of used values; of more rows than MEDIAN_ROWS, of every n-th row."""
     used = rows.weight > 0
     step = max(1, rows.count // MEDIAN_ROWS)

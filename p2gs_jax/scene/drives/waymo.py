@@ -35,7 +35,14 @@ from p2gs_jax.scene.drives.choose import chosen_drive
 from p2gs_jax.scene.drives.objects import Box, tracks
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera
 from p2gs_jax.scene.drives.spin import turned
-from p2gs_jax.scene.drives.waymo import STAMP, TURN_S, TURN_START, Frames, read_sweeps, transform
+from p2gs_jax.scene.drives.waymo_lidar import (
+    STAMP,
+    TURN_S,
+    TURN_START,
+    Frames,
+    read_sweeps,
+    transform,
+)
 from p2gs_jax.scene.geometry import intrinsics, make_distortion
 from p2gs_jax.scene.rigid import LONGEST_BEYOND_S
 from p2gs_jax.types import TrackedObject

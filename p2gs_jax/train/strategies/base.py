@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
 
 import jax
 import numpy as np
@@ -15,35 +14,16 @@ from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.core.streams import densification_key, device_seed
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.population import Coverage, Outcome
+from p2gs_jax.train.data_parallel import Spread
 from p2gs_jax.train.host import HostState
-from p2gs_jax.train.log import RunLog
-from p2gs_jax.train.mesh.spread import Spread
 from p2gs_jax.train.optimizer import zero_moments
 from p2gs_jax.train.programs import StepPrograms
 from p2gs_jax.train.schedule import Levels
-from p2gs_jax.train.session import Session
 from p2gs_jax.train.state import FitState, count_alive, replace_gaussians
 from p2gs_jax.train.views import TrainingViews
 
 compiled_key = jax.jit(densification_key)
 _zero_moments = jax.jit(zero_moments)
-
-
-class TakeBurst(Protocol):
-    """Take a burst of steps and log it."""
-
-    def __call__(
-        self, state: FitState, host: HostState, session: Session, *, trial: bool = False
-    ) -> tuple[FitState, bool]:
-        """Return the state, and whether there were steps to take.
-
-        Args:
-            state: to start from; donated.
-            host: counters; changed.
-            session: the clock.
-            trial: the steps belong to a run that automatic growth compares with.
-        """
-        ...
 
 
 @dataclass(frozen=True)
@@ -56,13 +36,9 @@ class RunContext:
         coverage: how much of the scene the views show.
         levels: of the schedule.
         views: the training views.
-        validation: those that automatic growth is judged by.
-        own_exposures: their exposures come from tracks, so they may be judged under these.
         programs: compiles ahead.
         spread: how the state lies on the devices between its changes.
-        log: of the run.
         clock: receives seconds by name.
-        take_burst: takes steps.
         on_message: told what the user must know.
     """
 
@@ -71,18 +47,14 @@ class RunContext:
     coverage: Coverage
     levels: Levels
     views: TrainingViews
-    validation: Sequence[int]
-    own_exposures: bool
     programs: StepPrograms
     spread: Spread
-    log: RunLog
     clock: Stopwatch
-    take_burst: TakeBurst
     on_message: Callable[[str], None]
 
 
 class Strategy:
-    """Keeps the seeds: nothing is born, nothing dies. Others override `densify`, or `update`.
+    """Keeps the seeds: nothing is born, nothing dies. Others override `densify`.
 
     Attributes:
         limit: bound on the population, or None where there is none.
@@ -104,16 +76,12 @@ class Strategy:
 
     def bounds(self, seeds: int) -> tuple[int | None, int]:
         """Return `limit` and `slots` for an initial population."""
-        given = self.run.cfg.densify.max_gaussians
-        return (given if isinstance(given, int) else None), seeds
+        return self.run.cfg.densify.max_gaussians, seeds
 
     @property
     def most(self) -> int:
         """The largest population to make room for."""
         return max(self.limit or 0, self.slots)
-
-    def begin(self, host: HostState) -> None:
-        """Begin a session: the first, or one that continues from a checkpoint."""
 
     def expect(self, state: FitState) -> None:
         """Begin to compile what is wanted soon after the first step.
@@ -122,18 +90,12 @@ class Strategy:
             state: of the first step, or its shapes.
         """
 
-    def update(
-        self, state: FitState, host: HostState, session: Session
-    ) -> tuple[FitState, HostState]:
+    def update(self, state: FitState, host: HostState) -> FitState:
         """Change the population where it is time to; called after every burst.
 
         Args:
             state: after the burst; donated.
             host: counters; changed.
-            session: the clock.
-
-        Returns:
-            State and counters to go on from.
 
         Raises:
             UserError: no Gaussian is left.
@@ -143,18 +105,11 @@ class Strategy:
                 host.densified_at = host.progress
                 spread = self.run.spread
                 state = spread.spread(self.densify(spread.whole(state), host))
-        return state, host
+        return state
 
     def densify(self, state: FitState, host: HostState) -> FitState:
         """Return the state with another population; called when it is due."""
         return state
-
-    def end(self, state: FitState, host: HostState) -> None:
-        """End the run, complete or not."""
-
-    def summary(self, host: HostState) -> dict[str, Any] | None:
-        """Return what `metrics.json` says about growth, or None for nothing."""
-        return None
 
     # -------------------------------------------------------------- for those that densify
 

@@ -72,17 +72,8 @@ class Mcmc(Strategy):
 
     def densify(self, state: FitState, host: HostState) -> FitState:
         """Relocate, and grow on the way to the bound."""
-        return self.relocated(state, host, self._target(count_alive(state), host))
-
-    def relocated(self, state: FitState, host: HostState, wanted: int) -> FitState:
-        """Return the state after a relocation.
-
-        Args:
-            state: before; donated.
-            host: counters; changed.
-            wanted: the population to reach; where it has as many, none is born.
-        """
-        births = max(wanted - count_alive(state), 0)
+        alive = count_alive(state)
+        births = max(self._target(alive, host) - alive, 0)
         outcome: Outcome = self._relocate(
             self.key(host),
             state.params.gaussians,

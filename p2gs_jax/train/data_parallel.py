@@ -1,0 +1,473 @@
+"""Steps of several views, whose views are shared out among devices that each hold the whole scene.
+
+Within a device everything is as in a step of one view, view by view; between devices only sums of
+gradients travel. The loss is the mean over the views; learning rates are those of one view times
+the root of their number, so that as many views move a Gaussian about as far (Krizhevsky 2014;
+Grendel-GS, arXiv 2406.18533; docs/scaling.md).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.sharding import Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
+from jaxtyping import Array, Float, Int
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.core.streams import noise_key
+from p2gs_jax.errors import UserError
+from p2gs_jax.gaussians.mcmc import shaped_noise
+from p2gs_jax.losses.total import Partner
+from p2gs_jax.render.capacity import Room
+from p2gs_jax.render.harmonics import coefficient_count
+from p2gs_jax.render.visible import (
+    block_size,
+    compact,
+    owners_at,
+    slice_of,
+    splat,
+    take_rows,
+    whole_blocks,
+)
+from p2gs_jax.render.xla_cpu import compiler_options
+from p2gs_jax.train import image_gradient
+from p2gs_jax.train.advance import Moved, StepReport, is_healthy, settled
+from p2gs_jax.train.image_gradient import ImageGradient, Listed, differentiable
+from p2gs_jax.train.optimizer import learning_rates, means_rate
+from p2gs_jax.train.state import Fault, FitState
+from p2gs_jax.train.step import Step, per_gaussian, static_sizes
+from p2gs_jax.train.update import update_listed
+from p2gs_jax.types import Batch, Frustum, Gaussians
+
+VIEWS = "views"
+EVERYWHERE, OF_VIEWS = P(), P(VIEWS)
+
+
+def default_mesh(count: int = 1) -> Mesh:
+    """Return a mesh of the first devices."""
+    return Mesh(np.array(jax.devices()[:count]), (VIEWS,))
+
+
+def _counted(devices: int | Literal["all"]) -> int:
+    """Return a number of devices.
+
+    Raises:
+        UserError: there are not so many.
+    """
+    there = jax.device_count()
+    if devices == "all":
+        return there
+    if devices < 1:
+        raise UserError(
+            f"--devices {devices} is not a number of devices.", fix="give 1 or more, or all"
+        )
+    if devices > there:
+        raise UserError(
+            f"--devices {devices} asks for more than the {there} that JAX sees here "
+            f"({jax.default_backend()}).",
+            fix="give fewer, or all; on a CPU, XLA_FLAGS="
+            f"--xla_force_host_platform_device_count={devices} makes as many of its cores",
+        )
+    return devices
+
+
+def with_a_view_each(cfg: FitConfig, devices: int | Literal["all"]) -> FitConfig:
+    """Return a configuration that gives every device a view where it says nothing of batches.
+
+    Raises:
+        UserError: there are not so many devices.
+    """
+    count = _counted(devices)
+    if count == 1 or cfg.train.batch > 1:
+        return cfg
+    return dataclasses.replace(cfg, train=dataclasses.replace(cfg.train, batch=count))
+
+
+def mesh_of(cfg: FitConfig, devices: int | Literal["all"] = 1) -> Mesh | None:
+    """Return the mesh of a fit; None for one view a step on one device.
+
+    Raises:
+        UserError: there are not so many devices, or the batch cannot be shared out among them.
+    """
+    count, batch = _counted(devices), cfg.train.batch
+    if batch < 1:
+        raise UserError(f"--train.batch is {batch}.", fix="give 1 or more")
+    if batch == 1 and count == 1:
+        return None
+    if batch % count:
+        raise UserError(
+            f"--train.batch {batch} cannot be shared out among {count} devices.",
+            fix=f"give a multiple of {count}, such as --train.batch {-(-batch // count) * count}",
+        )
+    return default_mesh(count)
+
+
+@dataclasses.dataclass(frozen=True)
+class Spread:
+    """How a state lies on the devices of a fit: on each of them, or where JAX puts it.
+
+    Attributes:
+        mesh: the devices; None: one, where nothing is moved.
+    """
+
+    mesh: Mesh | None
+
+    def spread(self, state: FitState) -> FitState:
+        """Return a state as steps take it."""
+        return state if self.mesh is None else placed(state, self.mesh, EVERYWHERE)
+
+    def whole(self, state: FitState) -> FitState:
+        """Return a state of steps on the default device, for what looks at all Gaussians."""
+        if self.mesh is None:
+            return state
+        return jax.tree.map(lambda a: jnp.asarray(np.asarray(a)), state)
+
+    def healed(self, state: FitState) -> FitState:
+        """Return a state of steps without its fault."""
+        fault = Fault.none()
+        if self.mesh is not None:
+            fault = placed(fault, self.mesh, EVERYWHERE)
+        return dataclasses.replace(state, fault=fault)
+
+
+def placed(tree: Any, mesh: Mesh, spec: P) -> Any:
+    """Return the arrays of a tree on the devices of a mesh."""
+    sharding = NamedSharding(mesh, spec)
+    return jax.tree.map(lambda a: jax.device_put(np.asarray(a), sharding), tree)
+
+
+# -------------------------------------------------------------- what each device does
+
+
+def show(gaussians, alive, frusta: tuple[Frustum, ...], active_degree, owner, **given) -> Listed:
+    """List and project what each of the device's views may show; see `image_gradient.show`.
+
+    Args:
+        gaussians: the scene.
+        alive: slots in use.
+        frusta: the device's views, stacked.
+        active_degree: spherical-harmonics degree in use.
+        owner: the moving object that each Gaussian belongs to, or None.
+        given: static arguments.
+
+    Returns:
+        Stacked, one for each view; `visible` has a second axis of length 1.
+    """
+
+    def one(views):
+        return image_gradient.show(gaussians, alive, views, active_degree, owner, **given)
+
+    listed = lax.map(one, frusta)
+    return listed._replace(visible=listed.visible[:, None])
+
+
+def differentiate(
+    shown, photometry, appearance, batch: Batch, partner: Partner, *, views: int, **given
+) -> ImageGradient:
+    """Return the mean loss of all views, and its gradient; by splats, those of the own views.
+
+    Gradients by splats are those of a view's own loss; `advance` takes their mean.
+
+    Args:
+        shown: from `show`.
+        photometry: of all views of the fit.
+        appearance: corrections, or None.
+        batch: the device's views, stacked.
+        partner: of each.
+        views: of the step.
+        given: static arguments of `image_gradient.differentiate`.
+    """
+
+    def one(own):
+        mine, photograph, second = own
+        return image_gradient.differentiate(
+            mine, photometry, appearance, photograph, second, **given
+        )
+
+    each = lax.map(one, (shown, batch, partner))
+
+    def mean(tree):
+        return jax.tree.map(lambda a: lax.psum(jnp.sum(a, 0), VIEWS) / views, tree)
+
+    return ImageGradient(
+        mean(each.loss),
+        mean(each.terms),
+        each.v_shown,
+        mean(each.v_rest),
+        lax.pmax(jnp.max(each.entries), VIEWS),
+        lax.pmax(jnp.max(each.overflow.astype(jnp.int32)), VIEWS) > 0,
+        each.visible,
+        mean(each.psnr),
+    )
+
+
+class Sums(NamedTuple):
+    """What the views of a step add up to.
+
+    Attributes:
+        gradient: of the sum of the views' losses.
+        shown: views that may show each.
+        grad2d: norms of the gradients by the place on the screen, in units of half the image.
+        pulled: views in which that was not zero.
+    """
+
+    gradient: Gaussians
+    shown: Int[Array, " n"]
+    grad2d: Float[Array, " n"]
+    pulled: Float[Array, " n"]
+
+
+def advance(
+    state: FitState,
+    ids: Int[Array, "b v"],
+    visible: Int[Array, "b 1"],
+    gradient: ImageGradient,
+    frusta: tuple[Frustum, ...],
+    controls,
+    *,
+    cfg,
+    optimizer,
+    extent: float,
+    degree: int,
+    views: int,
+) -> tuple[FitState, StepReport]:
+    """Move everything by one step, on each device alike; see `train.advance.advance`.
+
+    Args:
+        state: before the step; donated.
+        ids: from `show`, for the device's views.
+        visible: likewise.
+        gradient: from `differentiate`.
+        frusta: as in `show`.
+        controls: of the schedule.
+        cfg: rendering, rates, noise.
+        optimizer: from `make_optimizer`.
+        extent: scene extent, scene units.
+        degree: highest spherical-harmonics degree that moves.
+        views: of the step.
+    """
+    gaussians, population = state.params.gaussians, state.population
+    alive, n, bands = population.alive, gaussians.capacity, coefficient_count(degree)
+    most = lax.pmax(jnp.max(visible), VIEWS)
+    fits = ~gradient.overflow & (most <= ids.shape[1])
+    healthy = is_healthy(state, gradient, fits)
+
+    sums = _sums(state, ids, visible, gradient, frusta, controls, cfg, bands)
+    seen, count = compact((sums.shown > 0) & alive, whole_blocks(n))
+
+    progress, rate = controls.progress, controls.rate
+    rates = learning_rates(progress, rate, extent, state.params, cfg, bands)
+    rates = jax.tree.map(lambda r: r * views**0.5, rates)
+    mcmc = cfg.densify.method == "mcmc"
+    updated = update_listed(
+        gaussians,
+        state.opt_state.gaussians[0],
+        alive,
+        seen,
+        count,
+        healthy,
+        bands=bands,
+        # Their gradient is known: a Gaussian is what it is made of.
+        seen=lambda block, on, owner: block,
+        v_seen=jax.tree.map(lambda g: g / views, take_rows(sums.gradient, seen, bands)),
+        optimizer=optimizer.gaussians,
+        rates=rates.gaussians,
+        noise=_noise(state, controls, cfg, extent, views) if mcmc else None,
+        owner=population.owner,
+    )
+    if not mcmc:
+        population = dataclasses.replace(
+            population,
+            grad2d_sum=population.grad2d_sum + jnp.where(healthy, sums.grad2d, 0),
+            seen_count=population.seen_count + jnp.where(healthy, sums.pulled, 0),
+        )
+    moved = Moved(updated, population)
+    return settled(
+        state, moved, gradient, fits, most, rates, cfg=cfg, optimizer=optimizer, views=views
+    )
+
+
+def _sums(state, ids, visible, gradient, frusta, controls, cfg, bands: int) -> Sums:
+    """Return the sums over all views, one after the other and then over the devices."""
+    gaussians, alive = state.params.gaussians, state.population.alive
+    owner, n = state.population.owner, gaussians.capacity
+
+    def add(sums: Sums, view) -> tuple[Sums, None]:
+        here, count, v_view, image, views = view
+        size = block_size(here.shape[0])
+
+        def body(k, sums: Sums) -> Sums:
+            rows = slice_of(here, k, size)
+            on = alive.at[rows].get(mode="fill", fill_value=False)
+            mine = owners_at(owner, rows)
+
+            def seen(block):
+                degree = controls.active_degree
+                return differentiable(splat(block, on, views, cfg.render, degree, mine))
+
+            _, pull = jax.vjp(seen, take_rows(gaussians, rows, bands))
+            v_block = slice_of(v_view, k, size)
+            (v_rows,) = pull(v_block)
+            half = jnp.stack([views[0].width / 2, views[0].height / 2])
+            on_screen = v_block[0][0] * half
+            pulled = slice_of(image, k, size) & (jnp.sum(jnp.abs(on_screen), -1) > 0)
+            added = Sums(
+                v_rows,
+                jnp.ones(size, jnp.int32),
+                jnp.linalg.norm(on_screen, axis=-1),
+                pulled.astype(jnp.float32),
+            )
+            return jax.tree.map(
+                lambda a, b: a.at[rows].add(b, mode="drop", unique_indices=True), sums, added
+            )
+
+        used = jnp.minimum(count, here.shape[0])
+        return lax.fori_loop(0, -(-used // size), body, sums), None
+
+    none = dataclasses.replace(gaussians, sh=gaussians.sh[:, :bands])
+    blank = jax.tree.map(jnp.zeros_like, none)
+    zeros = [jnp.zeros(n, kind) for kind in (jnp.int32, jnp.float32, jnp.float32)]
+    given = (ids, visible[:, 0], gradient.v_shown, gradient.visible, frusta)
+    sums, _ = lax.scan(add, Sums(blank, *zeros), given)
+    return lax.psum(sums, VIEWS)
+
+
+def _noise(state, controls, cfg, extent: float, views: int):
+    """Return the noise of `update_listed`; each Gaussian's is its own, whatever else is listed."""
+    key = noise_key(controls.seed, state.step)
+    rate = cfg.densify.noise * means_rate(controls.progress, controls.rate, extent, cfg)
+    rate = rate * views**0.5
+
+    def noise(block, rows, moved, on):
+        del block
+        keys = jax.vmap(functools.partial(jax.random.fold_in, key))(rows)
+        normal = jax.vmap(lambda k: jax.random.normal(k, (3,)))(keys)
+        return shaped_noise(normal, moved, on, rate)
+
+    return noise
+
+
+# ---------------------------------------------------------------------------- the step
+
+# Where the results lie; records annotate arrays.
+LISTED: Any = cast(Any, Listed)(ids=OF_VIEWS, visible=OF_VIEWS, shown=OF_VIEWS)
+GRADIENT: Any = cast(Any, ImageGradient)(
+    **{name: EVERYWHERE for name in ImageGradient._fields}
+    | {"v_shown": OF_VIEWS, "visible": OF_VIEWS}
+)
+# Along which axis the arguments and the results of each program are divided.
+SPECS: dict[str, tuple[Any, Any]] = {
+    "show": ((EVERYWHERE, EVERYWHERE, OF_VIEWS, EVERYWHERE, EVERYWHERE), LISTED),
+    "differentiate": ((OF_VIEWS, EVERYWHERE, EVERYWHERE, OF_VIEWS, OF_VIEWS), GRADIENT),
+    "advance": (
+        (EVERYWHERE, OF_VIEWS, OF_VIEWS, GRADIENT, OF_VIEWS, EVERYWHERE),
+        (EVERYWHERE, EVERYWHERE),
+    ),
+}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ParallelStep:
+    """The step `(state, batch, partner, controls, ...)` of `train/step.py`, of several views.
+
+    Batches and partners come stacked, states spread (`Spread`).
+
+    Attributes:
+        single: the step of one view; its `train.batch` is a multiple of the devices.
+        mesh: the devices.
+    """
+
+    single: Step
+    mesh: Mesh
+
+    def settings(self, name: str) -> dict[str, Any]:
+        """Return what one of the three programs takes from the configuration, by argument."""
+        views = {} if name == "show" else {"views": self.single.cfg.train.batch}
+        return self.single.settings(name) | views | {"mesh": self.mesh}
+
+    def chained(self, show, differentiate, advance):
+        """Return the step made of its three programs, compiled or not."""
+
+        def step(state: FitState, batch, partner, controls):
+            frusta = self._frusta(batch, partner)
+            batch, partner, frusta = placed((batch, partner, frusta), self.mesh, OF_VIEWS)
+            controls = placed(controls, self.mesh, EVERYWHERE)
+            params = state.params
+            listed = show(*per_gaussian(state, frusta, controls))
+            gradient = differentiate(
+                listed.shown, params.photometry, params.appearance, batch, partner
+            )
+            return advance(state, listed.ids, listed.visible, gradient, frusta, controls)
+
+        return step
+
+    def lowered(
+        self, name: str, state: FitState, batch, partner, controls, *, room: Room, degree: int
+    ):
+        """Return one of the three programs, by its name, traced for arguments of these shapes."""
+
+        def program(part: str):
+            static = self.settings(part) | static_sizes(part, room, degree)
+            return _compiled(part, **static)
+
+        frusta = jax.eval_shape(self._frusta, batch, partner)
+        frusta, batch, partner = self._shapes((frusta, batch, partner), OF_VIEWS)
+        state, controls = self._shapes((state, controls), EVERYWHERE)
+        params, arguments = state.params, per_gaussian(state, frusta, controls)
+        if name == "show":
+            return program(name).lower(*arguments)
+        listed = self._shapes(program("show").eval_shape(*arguments), OF_VIEWS)
+        image = (listed.shown, params.photometry, params.appearance, batch, partner)
+        if name == "differentiate":
+            return program(name).lower(*image)
+        found = program("differentiate").eval_shape(*image)
+        gradient = (self._shapes(a, s) for a, s in zip(found, GRADIENT, strict=True))
+        moved = (state, listed.ids, listed.visible, ImageGradient(*gradient), frusta, controls)
+        return program(name).lower(*moved)
+
+    def _frusta(self, batch: Batch, partner: Partner) -> tuple[Frustum, ...]:
+        """Return the views of a step, stacked."""
+        every = (self.single.cfg.train.batch,)
+        return tuple(
+            dataclasses.replace(
+                frustum,
+                width=np.full(every, frustum.width, np.float32),
+                height=np.full(every, frustum.height, np.float32),
+            )
+            for frustum in self.single.frusta(batch, partner)
+        )
+
+    def _shapes(self, tree, spec: P):
+        """Return shapes with where their arrays lie."""
+        sharding = NamedSharding(self.mesh, spec)
+        return jax.tree.map(
+            lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype, sharding=sharding), tree
+        )
+
+
+@functools.cache
+def _compiled(name: str, *, mesh: Mesh, **static: Any) -> Any:
+    """Return a part of a step, divided over the mesh and jitted."""
+    parts: dict[str, Callable] = {
+        "show": show,
+        "differentiate": differentiate,
+        "advance": advance,
+    }
+    into, out = SPECS[name]
+    body = jax.shard_map(
+        functools.partial(parts[name], **static),
+        mesh=mesh,
+        in_specs=into,
+        out_specs=out,
+        check_vma=False,
+    )
+    donated = (0,) if name == "advance" else ()
+    return jax.jit(body, compiler_options=compiler_options(), donate_argnums=donated)

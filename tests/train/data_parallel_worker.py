@@ -1,0 +1,155 @@
+"""Steps of several views on virtual devices, in a process of its own: prints JSON.
+
+JAX counts its devices once, so a test run cannot have both one and four: four are wanted here
+(XLA_FLAGS=--xla_force_host_platform_device_count=4).
+"""
+
+import dataclasses
+import json
+import sys
+
+import jax
+import numpy as np
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.core.numerics import on_host
+from p2gs_jax.losses.total import Partner
+from p2gs_jax.render import xla_cpu
+from p2gs_jax.render.capacity import Room
+from p2gs_jax.train.advance import Controls
+from p2gs_jax.train.batches import stacked
+from p2gs_jax.train.data_parallel import ParallelStep, Spread, default_mesh
+from p2gs_jax.train.optimizer import make_optimizer
+from p2gs_jax.train.state import initial_state
+from p2gs_jax.train.step import PARTS, Step
+from p2gs_jax.types import Batch, Camera, Gaussians, Params, Photometry
+
+COUNT, VIEWS = 500, 4
+WIDTH, HEIGHT, FOCAL = 48, 32, 45.0
+EXTENT, DEGREE = 2.0, 1
+ROOM = Room(16_384, 4096)
+CONTROLS = on_host(Controls, np.float32(0.3), np.int32(DEGREE), np.float32(0.7), np.uint32(0))
+
+
+def config(batch: int, method: str | None = "mcmc") -> FitConfig:
+    base = FitConfig()
+    return dataclasses.replace(
+        base,
+        render=dataclasses.replace(base.render, sh_degree=DEGREE, pixels_in_flight=2048),
+        densify=dataclasses.replace(base.densify, method=method),
+        # With an epsilon of about the gradient's size, updates are as smooth as the gradient.
+        optimizer=dataclasses.replace(base.optimizer, eps=1e-5),
+        train=dataclasses.replace(base.train, batch=batch),
+    )
+
+
+def start() -> Params:
+    """Some Gaussians that each view shows and others that it does not."""
+    rng = np.random.default_rng(0)
+    z = rng.uniform(3, 8, COUNT)
+    xy = rng.uniform(-0.9, 0.9, (COUNT, 2)) * z[:, None] * [WIDTH / FOCAL, HEIGHT / FOCAL]
+    values = (
+        np.concatenate([xy, z[:, None]], 1),
+        rng.normal(size=(COUNT, 4)),
+        rng.normal(-3, 0.4, (COUNT, 3)),
+        rng.normal(-1, 2, COUNT),
+        rng.normal(0, 0.3, (COUNT, (DEGREE + 1) ** 2, 3)),
+    )
+    zeros = np.zeros(VIEWS, np.float32)
+    gaussians = on_host(Gaussians, *(a.astype(np.float32) for a in values))
+    return on_host(Params, gaussians, on_host(Photometry, zeros + 0.1, zeros))
+
+
+def view(row: int) -> tuple[Batch, Partner]:
+    """A photograph of noise, from its own place."""
+    K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]], np.float32)
+    pose = np.eye(4, dtype=np.float32)
+    pose[0, 3] = 1.5 * row - 2
+    camera = on_host(Camera, pose, K, WIDTH, HEIGHT)
+    ldr = np.random.default_rng(row).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
+    batch = on_host(Batch, camera, ldr, np.ones((HEIGHT, WIDTH), bool), np.int32(row))
+    return batch, on_host(Partner, np.int32(0))
+
+
+def alive() -> np.ndarray:
+    return np.arange(COUNT) % 10 != 0
+
+
+def first_moments(state):
+    return state.opt_state.gaussians[0].mu, state.opt_state.rest[0].mu[0].raw_exposures
+
+
+def of_one_view() -> dict:
+    """Loss and first moments after a step of each view, all from the start; their means."""
+    cfg = config(1, method=None)
+    optimizer = make_optimizer(cfg)
+    step = Step(cfg, optimizer, EXTENT)
+    losses, moments = [], []
+    for row in range(VIEWS):
+        state = initial_state(start(), alive(), optimizer)
+        state, report = step(state, *view(row), CONTROLS, room=ROOM, degree=DEGREE)
+        assert int(state.fault.kind) == 0
+        losses.append(float(report.loss))
+        moments.append(jax.tree.map(np.asarray, first_moments(state)))
+    mean = jax.tree.map(lambda *a: np.mean(a, 0), *moments)
+    return {"loss": float(np.mean(losses)), "moments": mean}
+
+
+def on_devices(count: int) -> dict:
+    """A step without room, then two with it: losses, fault, moments and parameters."""
+    cfg = config(VIEWS)
+    optimizer, mesh = make_optimizer(cfg), default_mesh(count)
+    step, spread = ParallelStep(Step(cfg, optimizer, EXTENT), mesh), Spread(mesh)
+    state = spread.spread(initial_state(start(), alive(), optimizer))
+    inputs = (*map(stacked, zip(*map(view, range(VIEWS)), strict=True)), CONTROLS)
+
+    def taken(state, room):
+        lowered = [step.lowered(n, state, *inputs, room=room, degree=DEGREE) for n in PARTS]
+        return step.chained(*(part.compile() for part in lowered))
+
+    losses, first = [], None
+    found = {}
+    if count == VIEWS:
+        before = jax.tree.map(np.asarray, state.params)
+        state, _ = taken(state, Room(64, 4096))(state, *inputs)
+        found["fault"] = {k: int(getattr(state.fault, k)) for k in ("kind", "needed")}
+        found["stopped at"] = int(state.step)
+        found["moved"] = distance(before, state.params)
+        state = spread.healed(state)
+    run = taken(state, ROOM)
+    for _ in range(2):
+        state, report = run(state, *inputs)
+        losses.append(float(report.loss))
+        first = first or jax.tree.map(np.asarray, first_moments(spread.whole(state)))
+    state = spread.whole(state)
+    params = jax.tree.map(np.asarray, state.params)
+    return found | {"losses": losses, "moments": first, "params": params, "step": int(state.step)}
+
+
+def distance(tree, other) -> float:
+    """Return the largest relative L2 distance of two trees' arrays."""
+
+    def of(a, b):
+        return float(np.linalg.norm(a - b) / max(np.linalg.norm(a), 1e-30))
+
+    return max(map(of, jax.tree.leaves(tree), jax.tree.leaves(other)))
+
+
+def main() -> None:
+    xla_cpu._CPU_OPTIONS = {}
+    single = of_one_view()
+    found = {"one view": {"loss": single["loss"]}}
+    whole = None
+    for count in (1, 4):
+        made = on_devices(count)
+        whole = whole or made
+        found[str(count)] = {
+            "of one view": distance(single["moments"], made.pop("moments")),
+            "of one device": distance(whole["params"], made["params"]),
+            **{k: v for k, v in made.items() if k not in ("moments", "params")},
+        }
+    json.dump(found, sys.stdout)
+
+
+if __name__ == "__main__":
+    main()
