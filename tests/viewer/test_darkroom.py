@@ -1,4 +1,4 @@
-"""A frame is rendered once; looks change it afterwards. Settings follow the run."""
+"""A frame is developed in many ways. Settings follow the run."""
 
 from dataclasses import replace
 
@@ -7,11 +7,10 @@ import pytest
 
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.display import develop
-from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.read import load_run
 from p2gs_jax.scene.device import camera_of
-from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.viewer.frame_cache import FrameCache
+from p2gs_jax.viewer.live import Darkroom
+from p2gs_jax.viewer.pictures import limits_of_depth
 from p2gs_jax.viewer.settings import (
     Settings,
     common_settings,
@@ -19,39 +18,41 @@ from p2gs_jax.viewer.settings import (
     exposures_ev,
     settings_of_view,
 )
-
-
-class Counting:
-    """The renderer, counting."""
-
-    def __init__(self, run):
-        self.count, self.run, self.renderer = 0, run, make_renderer(run.cfg.render)
-
-    def render(self, camera):
-        self.count += 1
-        return self.renderer(self.run.params.gaussians, self.run.alive, camera)
+from p2gs_jax.viewer.viewed_run import ViewedRun
 
 
 @pytest.fixture(scope="module")
-def run(finished_run):
-    return load_run(finished_run)
+def viewed(finished_run):
+    out = ViewedRun(load_run(finished_run), 1920)
+    yield out
+    out.renderer.stop()
+    out.store.close()
+
+
+@pytest.fixture(scope="module")
+def run(viewed):
+    return viewed.run
 
 
 @pytest.fixture
-def setup(run):
-    store = ImageStore(run.scene.views, run.cfg.data)
-    programs = Counting(run)
-    out = FrameCache(run, store, programs, typical=4.0)
-    assert out.render(camera_of(store, 1))
-    yield out, programs, store
-    store.close()
+def darkroom(viewed):
+    return Darkroom(viewed)
 
 
-def test_a_new_look_renders_nothing(setup, run):
-    frame_cache, programs, _ = setup
+@pytest.fixture(scope="module")
+def frame(viewed):
+    return viewed.render_now(camera_of(viewed.store, 1))
+
+
+def moved(frame, axis, by):
+    viewmat = frame.camera.viewmat.at[axis, 3].add(by)
+    return replace(frame, camera=replace(frame.camera, viewmat=viewmat))
+
+
+def test_every_look_is_another(darkroom, frame, run):
     start = common_settings(run)
     shown = [
-        frame_cache.develop(replace(start, **change))
+        darkroom.develop(frame, replace(start, **change))
         for change in (
             {},
             {"exposure_ev": 1.5},
@@ -63,25 +64,22 @@ def test_a_new_look_renders_nothing(setup, run):
             {"mode": "split"},
         )
     ]
-    assert programs.count == 1
     assert all(np.any(a != b) for i, a in enumerate(shown) for b in shown[:i])
 
 
-def test_one_stop_doubles_the_light(setup, run):
-    frame_cache, _, _ = setup
+def test_one_stop_doubles_the_light(darkroom, frame):
     start = Settings(gamma=2.2, curve="linear")
-    dark, light = (frame_cache.develop(replace(start, exposure_ev=ev)) for ev in (-3.0, -2.0))
+    dark, light = (darkroom.develop(frame, replace(start, exposure_ev=ev)) for ev in (-3.0, -2.0))
     inside = (light < 1) & (dark > 1e-5)
     assert inside.mean() > 0.5
     np.testing.assert_allclose(light[inside], 2 * dark[inside], rtol=1e-4)
 
 
-def test_a_view_looks_as_the_run_says(setup, run):
-    frame_cache, _, _ = setup
+def test_a_view_looks_as_the_run_says(darkroom, frame, run):
     for index in (run.scene.train_indices[0], run.scene.test_indices[0]):
         settings = settings_of_view(run, index, common_settings(run))
-        expected = develop(frame_cache.frame.linear, run.own_display(index))
-        np.testing.assert_allclose(frame_cache.develop(settings), expected, atol=1e-5)
+        expected = develop(frame.linear, run.own_display(index))
+        np.testing.assert_allclose(darkroom.develop(frame, settings), expected, atol=1e-5)
 
 
 def test_exposures_count_from_the_mean_whatever_the_gauge(run):
@@ -124,81 +122,70 @@ def test_corrections_hold_under_the_curve_they_were_learned_with(run):
     assert display_of(with_corrections, other).correction is None
 
 
-def test_photographs_are_found_where_they_were_taken(setup, run):
-    frame_cache, _, store = setup
-    here = camera_of(store, 3)
-    assert frame_cache.view_at(here) == 3
-    moved = replace(here, viewmat=here.viewmat.at[0, 3].add(0.05))
-    assert frame_cache.view_at(moved) is None
-    assert frame_cache.nearest_view(moved) == 3
+def test_photographs_are_found_where_they_were_taken(viewed, frame):
+    assert viewed.view_at(frame.camera) == 1
+    away = moved(frame, 0, 0.05)
+    assert viewed.view_at(away.camera) is None
+    assert viewed.nearest_view(away.camera) == 1
 
 
-def test_the_split_shows_the_photograph_in_its_place(setup, run):
-    frame_cache, _, store = setup
+def test_the_split_shows_the_photograph_in_its_place(darkroom, viewed, frame, run):
     settings = settings_of_view(run, 1, Settings(gamma=2.2, mode="split", split=0.5))
-    shown = frame_cache.develop(settings)
-    photo = store.get(1)[0]
+    shown, photo = darkroom.develop(frame, settings), viewed.store.get(1)[0]
     width = photo.shape[1]
-    left = np.s_[2:-2, 2 : width // 2 - 3]
+    left, right = np.s_[2:-2, 2 : width // 2 - 3], np.s_[:, width // 2 + 3 :]
     np.testing.assert_allclose(shown[left], photo[left], atol=2e-3)
-    right = np.s_[:, width // 2 + 3 :]
-    rendered = frame_cache.develop(replace(settings, mode="display"))
+    rendered = darkroom.develop(frame, replace(settings, mode="display"))
     np.testing.assert_array_equal(shown[right], rendered[right])
     # ... and it is about the same thing, so the halves belong together.
     assert np.mean(np.abs(rendered[left] - photo[left])) < 0.15
 
 
-def test_a_broken_photograph_is_said_until_one_can_be_shown(setup, run, monkeypatch):
-    frame_cache, _, store = setup
-
+def test_a_broken_photograph_is_said_until_one_can_be_shown(
+    darkroom, viewed, frame, run, monkeypatch
+):
     def broken(*args):
         raise UserError("0.png is torn.", fix="mend it")
 
     split = replace(common_settings(run), mode="split")
     with monkeypatch.context() as patch:
-        patch.setattr(store, "get", broken)
-        frame_cache.develop(split)
-        assert frame_cache.photograph_error == "0.png is torn."
-    frame_cache.develop(split)
-    assert frame_cache.photograph_error is None
+        patch.setattr(viewed.store, "get", broken)
+        darkroom.develop(frame, split)
+        assert "0.png is torn." in darkroom.legend(frame, split)
+    darkroom.develop(frame, split)
+    assert darkroom.legend(frame, split) is None
 
 
-def test_where_no_photograph_was_taken_the_split_is_the_picture(setup, run):
-    frame_cache, _, store = setup
-    here = camera_of(store, 1)
-    frame_cache.render(replace(here, viewmat=here.viewmat.at[2, 3].add(0.4)))
-    settings = Settings(gamma=2.2, mode="split")
-    assert not frame_cache.photographed_from_here
+def test_where_no_photograph_was_taken_the_split_is_the_picture(darkroom, frame):
+    away, settings = moved(frame, 2, 0.4), Settings(gamma=2.2, mode="split")
+    assert "No photograph" in darkroom.legend(away, settings)
     np.testing.assert_array_equal(
-        frame_cache.develop(settings), frame_cache.develop(replace(settings, mode="display"))
+        darkroom.develop(away, settings),
+        darkroom.develop(away, replace(settings, mode="display")),
     )
 
 
-def test_depth_colours_stay_until_they_are_set_anew(setup):
-    frame_cache, _, store = setup
+def test_depth_colours_stay_until_they_are_set_anew(darkroom, frame):
     settings = Settings(gamma=2.2, mode="depth")
-    frame_cache.develop(settings)
-    limits = frame_cache.depth_limits
-    here = camera_of(store, 1)
-    frame_cache.render(replace(here, viewmat=here.viewmat.at[2, 3].add(2.0)))
-    frame_cache.develop(settings)
-    assert frame_cache.depth_limits == limits
-    frame_cache.set_depth_limits()
-    assert frame_cache.depth_limits != limits
+    darkroom.develop(frame, settings)
+    limits = darkroom.depth_limits
+    assert limits == limits_of_depth(frame)
+    darkroom.develop(replace(frame, depth=2 * frame.depth), settings)
+    assert darkroom.depth_limits == limits
+    assert "depth, scene units" in darkroom.legend(frame, settings)
 
 
-def test_a_metered_exposure_follows_the_picture(setup, run):
-    frame_cache, _, store = setup
+def test_a_metered_exposure_follows_the_picture(darkroom, viewed, frame, run):
     settings = replace(common_settings(run), metered=True)
-    here = frame_cache.transform(settings).exposure
-    rendered = run.render(frame_cache.frame.camera)
-    assert here == pytest.approx(run.metered_display(rendered).exposure, rel=1e-4)
-    more = frame_cache.transform(replace(settings, exposure_ev=1.0)).exposure
+    here = darkroom.transform(frame, settings).exposure
+    assert here == pytest.approx(run.metered_display(run.render(frame.camera)).exposure, rel=1e-4)
+    more = darkroom.transform(frame, replace(settings, exposure_ev=1.0)).exposure
     assert more == pytest.approx(2 * here)
-    plain = frame_cache.transform(replace(settings, metered=False)).exposure
+    plain = darkroom.transform(frame, replace(settings, metered=False)).exposure
     assert plain == pytest.approx(run.mean.exposure_geometric, rel=1e-5)
-    frame_cache.render(camera_of(store, 2))
-    there = run.metered_display(run.render(camera_of(store, 2))).exposure
-    adapting = frame_cache.transform(settings, settled=False).exposure
+    other = viewed.render_now(camera_of(viewed.store, 2))
+    there = run.metered_display(run.render(other.camera)).exposure
+    adapting = darkroom.transform(other, settings, settled=False).exposure
     assert min(here, there) <= adapting <= max(here, there)
-    assert frame_cache.transform(settings).exposure == pytest.approx(there, rel=1e-4)
+    assert darkroom.transform(other, settings).exposure == pytest.approx(there, rel=1e-4)
+    assert darkroom.metered_exposure == pytest.approx(there, rel=1e-4)
