@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from p2gs_jax.pipeline.calibrate_stack import calibrate_stack
     from p2gs_jax.pipeline.fit import fit
     from p2gs_jax.render import render_linear, required_capacity
+    from p2gs_jax.render.rasterization import rasterization
     from p2gs_jax.run.read import Run, load_run
     from p2gs_jax.synth.write import write_street
     from p2gs_jax.types import Camera, Gaussians, Params, Photometry, Render, Scene
@@ -51,6 +52,7 @@ __all__ = [
     "load_run",
     "make_camera",
     "preset",
+    "rasterization",
     "read_sweep",
     "render_linear",
     "required_capacity",
@@ -75,6 +77,7 @@ _LAZY = {
     "load_run": "p2gs_jax.run.read",
     "make_camera": "p2gs_jax.paths.pinhole",
     "read_sweep": "p2gs_jax.jobs.configs",
+    "rasterization": "p2gs_jax.render.rasterization",
     "render_linear": "p2gs_jax.render",
     "required_capacity": "p2gs_jax.render",
     "sweep": "p2gs_jax.jobs.sweep",

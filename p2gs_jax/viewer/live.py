@@ -24,7 +24,7 @@ from jaxtyping import Float32
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.photometry.metering import meter
-from p2gs_jax.scene.device import camera_of
+from p2gs_jax.scene.pixels.store import camera_of
 from p2gs_jax.types import Camera
 from p2gs_jax.viewer.camera import BrowserView, Size, browser_view, camera_of_browser
 from p2gs_jax.viewer.panel import Panel

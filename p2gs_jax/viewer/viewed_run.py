@@ -15,7 +15,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.display import develop
 from p2gs_jax.render.project import at_time
 from p2gs_jax.run.read import Run
-from p2gs_jax.scene.images import size_at
+from p2gs_jax.scene.pixels.store import size_at
 from p2gs_jax.scene.rigid import camera_centers
 from p2gs_jax.types import Camera, Render
 from p2gs_jax.viewer.camera import (

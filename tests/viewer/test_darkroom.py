@@ -8,7 +8,7 @@ import pytest
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.display import develop
 from p2gs_jax.run.read import load_run
-from p2gs_jax.scene.device import camera_of
+from p2gs_jax.scene.pixels.store import camera_of
 from p2gs_jax.viewer.live import Darkroom
 from p2gs_jax.viewer.pictures import limits_of_depth
 from p2gs_jax.viewer.settings import (

@@ -46,7 +46,7 @@ def assembled(parts: list[Entries], size: int) -> Matrix:
 
 def whole(matrix: Matrix) -> Float[np.ndarray, "n n"]:
     """Return a matrix that is dense."""
-    return matrix.toarray() if sp.issparse(matrix) else matrix
+    return matrix if isinstance(matrix, np.ndarray) else matrix.toarray()
 
 
 @dataclass(frozen=True)

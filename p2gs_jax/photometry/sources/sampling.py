@@ -13,7 +13,7 @@ from p2gs_jax.core.numerics import srgb_decode, srgb_encode
 from p2gs_jax.photometry.formation import places
 from p2gs_jax.photometry.observations import COARSEST, Observations
 from p2gs_jax.photometry.response import DARKEST
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.visibility import project_points
 from p2gs_jax.types import Scene
 
@@ -152,7 +152,9 @@ def point_colors(
     wider, keep = _at_one_scale(scene, store, points)
     nothing = np.zeros((0, 3), np.float32)
     empty = np.zeros(0, int), np.zeros(0, int), nothing, nothing, nothing
-    parts = [(*empty, np.zeros(0, np.float32), np.zeros((0, 2), np.float32))]
+    parts: list[tuple[np.ndarray, ...]] = [
+        (*empty, np.zeros(0, np.float32), np.zeros((0, 2), np.float32))
+    ]
     for row, (index, kept) in enumerate(zip(scene.train_indices, keep, strict=True)):
         mine = points[row][kept]
         if len(mine):
