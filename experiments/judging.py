@@ -21,8 +21,8 @@ from jaxtyping import Float
 import p2gs_jax
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import LN2
-from p2gs_jax.formats.png import write_png
-from p2gs_jax.paths.captioned_images import CaptionedImage, stacked
+from p2gs_jax.formats.frames import write_png
+from p2gs_jax.paths.pictures import CaptionedImage, stacked
 from p2gs_jax.photometry.luminance import Luminance
 from p2gs_jax.photometry.ppisp import Ppisp, falloff, recolored
 

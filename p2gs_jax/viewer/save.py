@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from p2gs_jax.formats.exr import write_exr
-from p2gs_jax.formats.png import write_png
+from p2gs_jax.formats.frames import write_png
 from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.viewer.picture_modes import RenderedFrame
 
