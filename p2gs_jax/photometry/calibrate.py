@@ -26,27 +26,18 @@ Choice = Literal["held_out", "one_response"] | tuple[Form, Response | Curve]
 
 @dataclass(frozen=True)
 class CalibrationOptions:
-    """How observations are solved.
+    """How observations are solved."""
 
-    Attributes:
-        black: values up to here say nothing.
-        saturation: values from here on say nothing.
-        pivot: linear value that gamma leaves alone.
-        known: exposures known beforehand, or None.
-        seed: which observations are held out.
-        choice: what varies, and the curve: those that predict held-out colours, an exposure per
-            view under one fitted response (stacks), or given ones; of a kind of curve, the splines
-            are fitted.
-        known_response: what the photographs are, where their curve is known to be sRGB's
-            (`Scene.known_response`): no other is compared with held-out colours.
-    """
-
-    black: float
-    saturation: float
-    pivot: float
-    known: KnownExposures | None = None
-    seed: int = 0
+    black: float  # values up to here say nothing
+    saturation: float  # values from here on say nothing
+    pivot: float  # linear value that gamma leaves alone
+    known: KnownExposures | None = None  # exposures known beforehand, or None
+    seed: int = 0  # which observations are held out
+    # What varies, and the curve: those that predict held-out colours, an exposure per view under
+    # one fitted response (stacks), or given ones; of a kind of curve, the splines are fitted.
     choice: Choice = "held_out"
+    # What the photographs are, where their curve is known to be sRGB's (`Scene.known_response`): no
+    # other is compared with held-out colours.
     known_response: str | None = None
 
     @property
@@ -104,10 +95,7 @@ def calibrate_observations(
 ) -> Selection:
     """Choose the photometric model and solve it.
 
-    Args:
-        observations: colours of shared points, from any of `sources`.
-        options: thresholds, what is known, what is chosen how.
-        on_chosen: receives a choice by held-out colours before it is solved on all observations.
+    `on_chosen` receives a choice by held-out colours before it is solved on all observations.
     """
     selection = _solved(observations, options, on_chosen)
     coarse = observations.too_coarse

@@ -29,25 +29,16 @@ Labels = Int[np.ndarray, " h"]
 
 @dataclass(frozen=True)
 class Candidate:
-    """One form under one curve.
+    """One form under one curve."""
 
-    Attributes:
-        choice: what varies, and the kind of curve.
-        response: the curve.
-        parameters: free parameters, gauges not counted.
-        density: mean held-out log density, nat per observation.
-        deficit: how much lower than the best candidate's density, nat per observation.
-        deficit_error: standard error of that, over views or regions of images.
-        difference: by how much its predictions differ from the best's, 8-bit levels: RMS of the
-            view where that is largest.
-    """
-
-    choice: Choice
-    response: Response
-    parameters: int
-    density: float
-    deficit: float
-    deficit_error: float
+    choice: Choice  # what varies, and the kind of curve
+    response: Response  # the curve
+    parameters: int  # free parameters, gauges not counted
+    density: float  # mean held-out log density, nat per observation
+    deficit: float  # how much lower than the best candidate's density, nat per observation
+    deficit_error: float  # standard error of that, over views or regions of images
+    # By how much its predictions differ from the best's, 8-bit levels: RMS of the view where that
+    # is largest.
     difference: float
 
     @property
@@ -148,28 +139,18 @@ def _mean(densities: Densities) -> float:
 
 
 class Predicted(NamedTuple):
-    """What a fit says about held-out observations, NaN where it can say nothing.
+    """What a fit says about held-out observations, NaN where it can say nothing."""
 
-    Attributes:
-        densities: log densities.
-        errors: photographed minus predicted display values.
-    """
-
-    densities: Densities
-    errors: Float[np.ndarray, "h 3"]
+    densities: Densities  # log densities
+    errors: Float[np.ndarray, "h 3"]  # photographed minus predicted display values
 
 
 def predict_held_out(
     problem: Problem, fit: Fit, response: Response, held: np.ndarray, scale: float
 ) -> Predicted:
-    """Return what a fit says about held-out observations.
+    """Return what a fit says about observations in rows `held`, which it was not fitted to.
 
-    Args:
-        problem: all observations.
-        fit: on those that are not held out.
-        response: what it was fitted under.
-        held: rows of the held-out observations.
-        scale: of the stated deviations.
+    `scale` is that of the stated deviations.
     """
     o, layout = problem.observations, problem.layout
     sigma, slope = (a[held] for a in o.decoded(response)[1:])

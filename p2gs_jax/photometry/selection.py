@@ -50,17 +50,12 @@ MOST_COMPARED = 80
 
 @dataclass(frozen=True)
 class Selection:
-    """What was chosen, and why.
+    """What was chosen, and why."""
 
-    Attributes:
-        solution: the chosen model on all observations.
-        candidates: everything compared, the best density first; empty where nothing was.
-        reasons: sentences for the user.
-    """
-
-    solution: PhotometricSolution
+    solution: PhotometricSolution  # the chosen model on all observations
+    # Everything compared, the best density first; empty where nothing was.
     candidates: tuple[Candidate, ...]
-    reasons: tuple[str, ...]
+    reasons: tuple[str, ...]  # sentences for the user
 
 
 def _subset(observations: Observations, seed: int, most: int) -> Observations:
@@ -177,8 +172,7 @@ class _Search:
     def first(self) -> list[str]:
         """Solve models under curves, and exposures with what cameras may do besides.
 
-        Returns:
-            What the user should know of curves left out.
+        What the user should know of curves left out is returned.
         """
         curves = [*(Curve(base) for base in BASES), Curve("srgb", "all")]
         self.solve(Choice(Form(model), curve) for curve in curves for model in MODELS)

@@ -52,17 +52,13 @@ Blocks = Int[np.ndarray, " n"]
 
 
 class Evidence(NamedTuple):
-    """One dependence in one view.
+    """One dependence in one view."""
 
-    Attributes:
-        ev: size, stops: RMS over the view for places, the change over the spread (two standard
-            deviations) of the surroundings for local tone mapping, over the dark for flare;
-            negative where it goes the other way. NaN where nothing can be told.
-        chance: that noise alone looks as clear.
-    """
-
+    # Size, stops: RMS over the view for places, the change over the spread (two standard
+    # deviations) of the surroundings for local tone mapping, over the dark for flare; negative
+    # where it goes the other way. NaN where nothing can be told.
     ev: float
-    chance: float
+    chance: float  # that noise alone looks as clear
 
 
 NOTHING = Evidence(float("nan"), 1.0)
@@ -105,11 +101,8 @@ def neighbourhood(
 ) -> Neighbourhood:
     """Test every view for residuals that depend on the place or on the surroundings.
 
-    Args:
-        observations: with positions; without, nothing can be told. Local tone mapping can be told
-            only with surroundings.
-        residual_ev: of log exposed radiance, stops; anything where not usable.
-        usable: 1 where a value counts.
+    Without positions nothing can be told, without surroundings no local tone mapping. Residuals
+    of log exposed radiance, in stops, count where `usable` is 1.
     """
     o, count = observations, observations.view_count
     found: dict[Kind, list[Evidence]] = {kind: [NOTHING] * count for kind in KINDS}
@@ -302,15 +295,11 @@ def residuals(problem: Problem, solution: PhotometricSolution) -> PerChannel:
 
 
 class Unexplained(NamedTuple):
-    """What one response leaves unexplained in a stack, RMS in stops.
+    """What one response leaves unexplained in a stack, RMS in stops."""
 
-    Attributes:
-        curve_ev: depends on brightness, differently from frame to frame: tone curves that change.
-        local_ev: what then still varies smoothly over the image: tone mapping by region.
-    """
-
+    # Depends on brightness, differently from frame to frame: tone curves that change.
     curve_ev: float
-    local_ev: float
+    local_ev: float  # what then still varies smoothly over the image: tone mapping by region
 
 
 def unexplained(
@@ -320,14 +309,9 @@ def unexplained(
     size: tuple[int, ...],
     signal: Bool[np.ndarray, " v"],
 ) -> Unexplained:
-    """Split residuals into what depends on brightness and what depends on the place.
+    """Split `residuals` of the `signal` views into what depends on brightness and on the place.
 
-    Args:
-        problem: the observations.
-        residual: from `residuals`.
-        xy: positions of the points, pixels.
-        size: height and width of the photographs, pixels.
-        signal: views to look at.
+    Positions of the points and the size of the photographs (height, width) are in pixels.
     """
     o = problem.observations
     good = problem.usable.all(1)

@@ -34,7 +34,7 @@ from p2gs_jax.formats.false_color import (
     depth_color,
     false_color,
 )
-from p2gs_jax.formats.png import write_png
+from p2gs_jax.formats.frames import write_png
 from p2gs_jax.gaussians.bake import display_of_splats
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import places

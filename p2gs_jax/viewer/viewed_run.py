@@ -31,12 +31,7 @@ from p2gs_jax.viewer.camera import (
     viewmat_between,
     viewmats_of,
 )
-from p2gs_jax.viewer.pictures import (
-    BrowserSplats,
-    RenderedFrame,
-    browser_splats,
-    exposure_colors,
-)
+from p2gs_jax.viewer.pictures import BrowserSplats, RenderedFrame, browser_splats, exposure_colors
 from p2gs_jax.viewer.renderer import Renderer
 from p2gs_jax.viewer.settings import exposures_ev
 

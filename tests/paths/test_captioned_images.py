@@ -1,6 +1,6 @@
 import numpy as np
 
-from p2gs_jax.paths.captioned_images import CaptionedImage, stacked, stacked_size
+from p2gs_jax.paths.pictures import CaptionedImage, stacked, stacked_size
 
 
 def test_images_come_through_between_lines_of_text():

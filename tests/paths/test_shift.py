@@ -7,9 +7,9 @@ import pytest
 from cameras import shot, turned, view
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.paths import covering
+from p2gs_jax.paths.drive import beside, beside_shots
+from p2gs_jax.paths.panorama import covering
 from p2gs_jax.paths.rig import find_rig
-from p2gs_jax.paths.shift import beside, beside_shots
 from p2gs_jax.paths.shots import view_shots
 from p2gs_jax.scene.rigid import inverse
 

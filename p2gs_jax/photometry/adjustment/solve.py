@@ -64,10 +64,8 @@ def one_thread():
 class Balanced:
     """A symmetric matrix over its free directions, its diagonal scaled to 1, ready to be solved.
 
-    Args:
-        normal: matrix over all parameters.
-        gauges: few rows, whose outer products are added to it.
-        basis: columns are the free directions.
+    Outer products of few rows, the gauges, are added to it. Columns of `basis` are the
+    directions.
     """
 
     def __init__(self, normal: Matrix, gauges: sp.csr_array, basis: sp.csr_array):
@@ -133,27 +131,17 @@ def _iterative(sparse: sp.csr_array, low_rank: Float[np.ndarray, "g n"]):
 
 
 class Fit(NamedTuple):
-    """A solution and what its errors are computed from.
+    """A solution and what its errors are computed from."""
 
-    Attributes:
-        theta: the parameters.
-        at: residuals and weights there.
-        model: what was solved.
-        normal: reduced normal matrix, without gauges and priors.
-        rounds: iterations.
-        moved: largest change of a parameter in the last round, log units.
-        left: how far the end is, were the rounds to go on as the last two did; inf if they grew.
-        converged: `moved` was less than the tolerance.
-    """
-
-    theta: Parameters
-    at: Weighted
-    model: Forward
-    normal: Matrix
-    rounds: int
-    moved: float
+    theta: Parameters  # the parameters
+    at: Weighted  # residuals and weights there
+    model: Forward  # what was solved
+    normal: Matrix  # reduced normal matrix, without gauges and priors
+    rounds: int  # iterations
+    moved: float  # largest change of a parameter in the last round, log units
+    # How far the end is, were the rounds to go on as the last two did; inf if they grew.
     left: float
-    converged: bool
+    converged: bool  # `moved` was less than the tolerance
 
 
 class _Round(NamedTuple):
@@ -186,11 +174,8 @@ def _next(model: Forward, system: System, last: _Round, loss: Loss) -> _Round:
 def solve(rows: Rows, system: System, tolerance: float, loss: Loss) -> Fit:
     """Adjust exposures, gammas, cameras and response to observations (float64).
 
-    Args:
-        rows: observations.
-        system: free directions, gauges, priors.
-        tolerance: largest change of a parameter in a round that counts as none, log units.
-        loss: of the rounds after those under L1.
+    A largest change of a parameter below the tolerance, log units, counts as none. `loss` is of
+    the rounds after those under L1.
     """
     model = make_forward(rows, system.unknowns)
     after = functools.partial(_next, model, system)
@@ -227,16 +212,10 @@ def solve_model(
     tolerance: float = TOLERANCE,
     loss: Loss = "geman_mcclure",
 ) -> tuple[Fit, System]:
-    """Solve one form.
+    """Solve one form under a response; `use` is 0 for observations that are kept out.
 
-    Args:
-        problem: observations.
-        form: what varies.
-        response: what decodes the colours.
-        use: 0 keeps an observation out.
-        splines: what gets a spline over the response's base, solved for as well; None: nothing.
-        tolerance: as for `solve`.
-        loss: as for `solve`.
+    `splines` says what gets a spline over the response's base that is solved for as well (None:
+    nothing). The tolerance and the loss are those of `solve`.
     """
     weight = problem.usable if use is None else problem.usable * use[:, None]
     rows, system = (
@@ -255,17 +234,12 @@ def fit_response(
     by: ResponseKind = "all",
     spread: float | None = None,
 ) -> Response | None:
-    """Return the base with the spline, or splines, that fit best.
+    """Return the base with the spline, or splines `by` camera or channel, that fit best.
 
-    None where one collapsed: it falls somewhere, is flat over mid tones, or stretches the exposures
-    by more than LARGEST_STRETCH (which no photograph contradicts: the power gauge).
-
-    Args:
-        problem: observations.
-        base: curve that splines are added to.
-        form: what varies beside it; no gammas, which bend curves as well.
-        by: what has a spline of its own.
-        spread: standard deviation of log exposures under the base; solved if not given.
+    None where one collapsed: it falls somewhere, is flat over mid tones, or stretches the
+    exposures by more than LARGEST_STRETCH (which no photograph contradicts: the power gauge).
+    The form that varies beside it has no gammas, which bend curves as well. `spread` is the
+    standard deviation of log exposures under the base; it is solved if not given.
     """
     compared = TOLERANCE_TO_COMPARE
     fit, system = solve_model(problem, form, base, splines=by, tolerance=compared)

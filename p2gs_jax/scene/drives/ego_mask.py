@@ -1,16 +1,18 @@
-"""What of a camera's picture never moves while its car drives: the car itself, from images alone.
+"""The ego mask: the car itself in the photographs of its cameras, found once a camera and kept.
 
-Structure that stays where it is says so only where the world would have moved: the farthest
-surface that a pixel can show, the road (above the horizon: nothing), is moved by the camera's own
-motion, and counts across an edge, not along it: a lane marking that runs with the car stays too.
-Structure that changes speaks for the world. What shows no structure, as smooth bonnets, sky and
-asphalt do, goes with its surroundings: a minimal cut through the pixels, cheap along edges that
-stay. Gradients are of logarithms: exposure does not matter.
+The car is what never moves while it drives. Structure that stays where it is says so only where the
+world would have moved: the farthest surface that a pixel can show, the road (above the horizon:
+nothing), is moved by the camera's own motion. Motion counts across an edge, not along it: a lane
+marking that runs with the car stays too. Structure that changes speaks for the world. Smooth
+bonnets, sky and asphalt show no structure and go with their surroundings: a minimal cut through
+the pixels, cheap along edges that stay. Gradients are of logarithms, so exposure does not matter.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
+from pathlib import Path
 from typing import NamedTuple
 
 import cv2
@@ -19,9 +21,21 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 from scipy.sparse import coo_array, csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
-from p2gs_jax.scene.lens import undistort_points
+from p2gs_jax.core.atomic import atomic_write
+from p2gs_jax.scene.cache import cached_folder
+from p2gs_jax.scene.drives.recording import Photograph, Recording, Report, RigCamera
+from p2gs_jax.scene.files import decode_grey, undecodable
+from p2gs_jax.scene.lens import scale_intrinsics, undistort_points
+from p2gs_jax.scene.rigid import inverse, up_of_drive
 from p2gs_jax.types import Distortion
 
+# Photographs of a camera that are looked at, spread evenly over its way; fewer say too little.
+MOST_LOOKED_AT, FEWEST_LOOKED_AT = 24, 6
+# A turn by one radian counts as this way, metres.
+TURN_AS_WAY = 10.0
+# The version is part of the key of kept results: raise it with every change of what is found.
+_VERSION = 1
+_SAID = "own car"
 # Lengths in the picture are in pixels at this width; so are all thresholds (BUILD_NOTES).
 WIDTH = 480
 # Display values below this are noise; also the blur before gradients, pixels.
@@ -44,6 +58,137 @@ CHANGE = (0.006, 0.018)
 NARROWEST, EDGE_SHARE, EDGE_EVIDENCE, LEAST_SHARE, GAP = 7, 0.5, 0.3, 0.002, 13
 _MOTION_STEP = 8
 _CAPACITY = 1000
+
+
+class EgoMask(NamedTuple):
+    """The car itself in one camera: in the photograph as stored, at a lower resolution.
+
+    `looked_at` counts photographs; it is 0 where the camera hardly moves and nothing can be told.
+    """
+
+    mask: Bool[np.ndarray, "h w"] | None
+    looked_at: int
+
+
+def find_ego_masks(
+    recording: Recording,
+    names: Sequence[str],
+    work_dir: Path | None = None,
+    report: Report = lambda message: None,
+) -> tuple[dict[str, Bool[np.ndarray, "h w"]], list[str]]:
+    """Return where the named cameras see their own car, and notes.
+
+    All photographs of the drive serve, whatever frames are used. Results are kept as pictures below
+    `work_dir` for a resume; None keeps nothing.
+    """
+    cameras = {c.name: c for c in recording.cameras}
+    poses = np.stack([p.pose for p in recording.photographs])
+    up = up_of_drive(inverse(poses), [p.camera for p in recording.photographs])
+    report("Looking for the car itself in the photographs")
+    masks: dict[str, Bool[np.ndarray, "h w"]] = {}
+    standing, without = [], []
+    for name in names:
+        there = [
+            p
+            for p in recording.photographs
+            if p.camera == name and (p.embedded is not None or p.path.is_file())
+        ]
+        spread = spread_over_the_way(sorted(there, key=lambda p: p.frame), MOST_LOOKED_AT)
+        found = _kept(cameras[name], spread, up, work_dir)
+        if found.mask is not None:
+            masks[name] = found.mask
+        else:
+            (without if found.looked_at else standing).append(name)
+    shares = [f"{name} {mask.mean():.1%}" for name, mask in masks.items()]
+    notes = [f"{_SAID}: {', '.join(shares)} of the picture, left out of the fit"] if shares else []
+    if without:
+        notes.append(f"{_SAID}: not seen by {', '.join(without)}")
+    if standing:
+        notes.append(
+            f"{_SAID}: {', '.join(standing)} took too few photographs, or hardly moved, so "
+            "nothing can be told from them; give masks if they show it"
+        )
+    return masks, notes
+
+
+def _kept(
+    camera: RigCamera,
+    photographs: Sequence[Photograph],
+    up: Float[np.ndarray, " 3"],
+    work_dir: Path | None,
+) -> EgoMask:
+    """Return where a camera sees its car, from an earlier run if that found it."""
+
+    def build(folder: Path) -> None:
+        pictures = np.array([_picture(p, camera) for p in photographs])
+        poses = np.array([p.pose for p in photographs]).reshape(-1, 4, 4)
+        result = find_ego_mask(camera, pictures, poses, up)
+        if result.mask is not None:
+            with atomic_write(folder / "car.png") as temporary:
+                cv2.imwrite(str(temporary), result.mask.astype(np.uint8) * 255)
+        (folder / "looked_at").write_text(str(result.looked_at))
+
+    stamps = [
+        (p.path.name, p.frame, 0 if p.embedded else p.path.stat().st_mtime_ns) for p in photographs
+    ]
+    places = [np.round(p.pose, 6).tolist() for p in photographs]
+    key = [_VERSION, camera.name, camera.K.tolist(), stamps, places]
+    with cached_folder(work_dir, f"own_car/{camera.name}", key, build) as folder:
+        looked_at = int((folder / "looked_at").read_text())
+        if not (folder / "car.png").is_file():
+            return EgoMask(None, looked_at)
+        picture = cv2.imread(str(folder / "car.png"), cv2.IMREAD_GRAYSCALE)
+    return EgoMask(np.asarray(picture) > 0, looked_at)
+
+
+def _picture(photograph: Photograph, camera: RigCamera) -> UInt8[np.ndarray, "h w"]:
+    """Return a photograph in grey at `WIDTH`; UserError: its file is broken."""
+    data = photograph.embedded() if photograph.embedded else photograph.path.read_bytes()
+    picture = decode_grey(data, camera.width // WIDTH)
+    if picture is None:
+        raise undecodable(photograph.path)
+    height = max(1, round(picture.shape[0] * WIDTH / picture.shape[1]))
+    return cv2.resize(picture, (WIDTH, height), interpolation=cv2.INTER_AREA)
+
+
+def spread_over_the_way(photographs: Sequence[Photograph], most: int) -> list[Photograph]:
+    """Return at most `most` photographs of one camera, given in the order of time.
+
+    They are spread evenly over its way, not over time: cars wait.
+    """
+    if len(photographs) < 2:
+        return list(photographs)
+    poses = np.stack([p.pose for p in photographs])
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    turned = np.einsum("nij,nij->n", poses[1:, :3, :3], poses[:-1, :3, :3])
+    steps += TURN_AS_WAY * np.arccos(np.clip((turned - 1) / 2, -1, 1))
+    way = np.concatenate([[0.0], np.cumsum(steps)])
+    stops = np.linspace(0, way[-1], most)
+    rows = sorted({int(np.abs(way - stop).argmin()) for stop in stops})
+    return [photographs[row] for row in rows]
+
+
+def find_ego_mask(
+    camera: RigCamera,
+    pictures: UInt8[np.ndarray, "n h w"],
+    poses: Float[np.ndarray, "n 4 4"],
+    up: Float[np.ndarray, " 3"],
+) -> EgoMask:
+    """Return where a camera sees its own car.
+
+    Pictures are grey, `WIDTH` pixels wide and in the order of the drive; poses are camera to world;
+    `up` leads away from the road and has length 1.
+    """
+    if len(pictures) < FEWEST_LOOKED_AT:
+        return EgoMask(None, 0)
+    height = pictures.shape[1]
+    K = scale_intrinsics(camera.K, WIDTH / camera.width, height / camera.height)
+    motion = expected_motion(poses, up, K, camera.distortion, WIDTH, height)
+    # How often the world has moved on at each pixel.
+    if np.minimum(np.linalg.norm(motion, axis=-1) / APART, 1).sum(0).max() < FEWEST:
+        return EgoMask(None, 0)
+    mask = cut(weigh(pictures, motion))
+    return EgoMask(mask if mask.any() else None, len(pictures))
 
 
 class Evidence(NamedTuple):
@@ -72,13 +217,8 @@ def expected_motion(
 ) -> Float32[np.ndarray, "n-1 h w 2"]:
     """Return how far the farthest surface that a pixel can show moves from frame to frame, pixels.
 
-    Args:
-        poses: camera to world, in the order of the frames.
-        up: away from the road, in the world, of length 1.
-        K: intrinsics in pixels of the undistorted image.
-        distortion: the lens, or None.
-        width: pixels.
-        height: pixels.
+    Poses are camera to world, in the order of the frames; `up` leads away from the road and has
+    length 1; K is in pixels of the undistorted image of that size.
     """
     columns = np.arange(_MOTION_STEP / 2, width, _MOTION_STEP)
     rows = np.arange(_MOTION_STEP / 2, height, _MOTION_STEP)
@@ -108,20 +248,10 @@ def expected_motion(
     return np.array(out)
 
 
-def often_apart(motion: Float32[np.ndarray, "m h w 2"]) -> Float32[np.ndarray, "h w"]:
-    """Return how often the world has moved on at each pixel."""
-    return np.minimum(np.linalg.norm(motion, axis=-1) / APART, 1).sum(0)
-
-
 def weigh(
     pictures: UInt8[np.ndarray, "n h w"], motion: Float32[np.ndarray, "n-1 h w 2"]
 ) -> Evidence:
-    """Return what frames say of every pixel.
-
-    Args:
-        pictures: grey, one a frame.
-        motion: from `expected_motion`.
-    """
+    """Return what grey pictures, one a frame, and their `expected_motion` say of every pixel."""
     gradients = np.array([_gradient(picture) for picture in pictures])
     usual = np.median(gradients, axis=0)
     across = usual / np.maximum(np.linalg.norm(usual, axis=-1, keepdims=True), 1e-6)
@@ -143,11 +273,7 @@ def _gradient(picture: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w 2"]
 
 
 def cut(evidence: Evidence) -> Bool[np.ndarray, "h w"]:
-    """Return the parts of a picture that never move, cleaned; they touch its border.
-
-    Args:
-        evidence: from `weigh`.
-    """
+    """Return the parts of a picture that never move, cleaned; they touch its border."""
     least, most = CHANGE
     moves = np.clip((evidence.change - least) / (most - least), 0, 1)
     gain = OWN * evidence.own - np.where(evidence.stays, 0, moves) - AREA
@@ -158,9 +284,7 @@ def cut(evidence: Evidence) -> Bool[np.ndarray, "h w"]:
 def _minimal_cut(gain: np.ndarray, passage: np.ndarray) -> Bool[np.ndarray, "h w"]:
     """Return the pixels of largest gain less outline; the border of the picture costs nothing.
 
-    Args:
-        gain: of each pixel.
-        passage: how much of the full price an outline through it costs.
+    `passage` is the share of the full price that an outline through a pixel costs.
     """
     h, w = gain.shape
     count = h * w
@@ -192,7 +316,7 @@ def _minimal_cut(gain: np.ndarray, passage: np.ndarray) -> Bool[np.ndarray, "h w
 
 
 def _solid_parts(found: Bool[np.ndarray, "h w"], evidence: Evidence) -> Bool[np.ndarray, "h w"]:
-    """Return the parts that are no lines, touch the border, and end at edges that stay."""
+    """Return the parts that are not lines, touch the border, and end at edges that stay."""
     opened = _morphology(found, cv2.MORPH_OPEN, NARROWEST)
     parts, count = _labelled(opened)
     near = cv2.dilate(evidence.stays.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0

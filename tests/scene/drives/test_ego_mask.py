@@ -9,7 +9,7 @@ import pytest
 from p2gs_jax.config import DataConfig
 from p2gs_jax.run.scene_file import read_scene, write_scene
 from p2gs_jax.scene.drives.assemble import assemble
-from p2gs_jax.scene.drives.own_car import find_own_car, find_own_cars, spread_over_the_way
+from p2gs_jax.scene.drives.ego_mask import find_ego_mask, find_ego_masks, spread_over_the_way
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera
 from p2gs_jax.scene.pixels.store import ImageStore
 
@@ -77,29 +77,29 @@ DRIVEN = np.array([pose_at(0.7 * k) for k in range(12)])
 
 def test_the_bonnet_is_found_whatever_the_exposures():
     exposures = 2.0 ** np.tile([-0.8, 0.3, 0.0], 4)
-    found = find_own_car(CAMERA, pictures(DRIVEN, exposures=exposures), DRIVEN, UP)
+    found = find_ego_mask(CAMERA, pictures(DRIVEN, exposures=exposures), DRIVEN, UP)
     assert found.mask is not None
     both = (found.mask & bonnet()).sum() / (found.mask | bonnet()).sum()
     assert both > 0.93
 
 
 def test_a_road_alone_holds_no_car():
-    found = find_own_car(CAMERA, pictures(DRIVEN, own=False), DRIVEN, UP)
+    found = find_ego_mask(CAMERA, pictures(DRIVEN, own=False), DRIVEN, UP)
     assert found.mask is None
     assert found.looked_at == len(DRIVEN)
 
 
 def test_a_bonnet_is_told_from_sky_in_turns():
     poses = np.array([pose_at(0.7 * k, 0.01 * k) for k in range(12)])
-    mask = find_own_car(CAMERA, pictures(poses), poses, UP).mask
+    mask = find_ego_mask(CAMERA, pictures(poses), poses, UP).mask
     assert mask is not None
     assert not mask[: H // 2].any()
 
 
 def test_a_car_that_stands_says_nothing():
     poses = np.array([pose_at(0.001 * k) for k in range(12)])
-    assert find_own_car(CAMERA, pictures(poses), poses, UP) == (None, 0)
-    assert find_own_car(CAMERA, pictures(DRIVEN[:3]), DRIVEN[:3], UP) == (None, 0)
+    assert find_ego_mask(CAMERA, pictures(poses), poses, UP) == (None, 0)
+    assert find_ego_mask(CAMERA, pictures(DRIVEN[:3]), DRIVEN[:3], UP) == (None, 0)
 
 
 def test_photographs_are_spread_over_the_way_not_over_time(tmp_path):
@@ -150,8 +150,8 @@ def test_drives_leave_it_out_and_runs_remember(recording, tmp_path):
 
 def test_what_was_found_is_kept(recording, tmp_path, monkeypatch):
     work = tmp_path / "work"
-    masks, notes = find_own_cars(recording, ["front"], work)
-    monkeypatch.setattr("p2gs_jax.scene.drives.own_car.find_own_car", None)
-    again, same = find_own_cars(recording, ["front"], work)
+    masks, notes = find_ego_masks(recording, ["front"], work)
+    monkeypatch.setattr("p2gs_jax.scene.drives.ego_mask.find_ego_mask", None)
+    again, same = find_ego_masks(recording, ["front"], work)
     np.testing.assert_array_equal(masks["front"], again["front"])
     assert same == notes
