@@ -86,6 +86,23 @@ def measured(
     return rows
 
 
+def to_markdown(rows: Sequence[dict[str, Any]], columns: Sequence[tuple[str, str, int]]) -> str:
+    """Return a table of the rows of `measured`; a cell without a value is empty.
+
+    Args:
+        columns: heading, key in a row, digits after the point.
+    """
+    lines = ["| method | " + " | ".join(heading for heading, _, _ in columns) + " |"]
+    lines.append("|---|" + "---:|" * len(columns))
+    for row in rows:
+        values = [(row.get(key), digits) for _, key, digits in columns]
+        cells = ["" if value is None else f"{value:.{digits}f}" for value, digits in values]
+        if "failed" in row:
+            cells = [f"failed: {row['failed']}", *[""] * (len(columns) - 1)]
+        lines.append("| " + " | ".join([row["method"], *cells]) + " |")
+    return "\n".join(lines) + "\n"
+
+
 def contact_sheet(path: Path, rows: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]]) -> None:
     """Write pictures of one size in rows.
 

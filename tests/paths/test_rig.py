@@ -45,9 +45,9 @@ def test_steps_are_found_by_name_and_cameras_are_placed_on_the_rig():
     assert [s.name for s in rig.steps] == [f"{k:06d}" for k in range(4)]
     for step in rig.steps:
         assert sorted(step.shots) == sorted(MOUNTS)
-        for camera, shot in step.shots.items():
+        for camera, found in step.shots.items():
             np.testing.assert_allclose(
-                rig.mounts[camera].viewmat @ inverse(step.pose), shot.viewmat, atol=1e-6
+                rig.mounts[camera].viewmat @ inverse(step.pose), found.viewmat, atol=1e-6
             )
 
 

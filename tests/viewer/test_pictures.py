@@ -1,23 +1,33 @@
 """One frame, many pictures: modes, and a photograph that lines up with the render."""
 
+import cv2
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from p2gs_jax.config import CameraFormation, PhotometryConfig
-from p2gs_jax.formats.false_color import OVER, clipping_overlay, depth_color, false_color
+from p2gs_jax.config import CameraFormation, PhotometryConfig, RenderConfig
+from p2gs_jax.formats.exr import read_exr
+from p2gs_jax.formats.false_color import OVER, clipping_overlay, depth_color, false_color, luminance
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import squared_radii
-from p2gs_jax.types import Camera
-from p2gs_jax.viewer.picture_modes import (
+from p2gs_jax.render import view_radiance
+from p2gs_jax.types import Camera, Gaussians
+from p2gs_jax.viewer.pictures import (
+    LARGEST_DEVIATION,
     MIDDLE_GREY,
     RenderedFrame,
     WarpedPhotograph,
+    browser_splats,
+    exposure_colors,
+    exr_bytes,
     limits_of_depth,
     picture_of,
     places_in,
+    png_bytes,
+    splat_colors,
     split_picture,
+    stops_legend,
     to_uint8_fast,
     warp_photograph,
 )
@@ -177,3 +187,82 @@ def test_vignetting_is_where_the_photograph_has_it():
     flat = picture_of(window, "display", transform.without_place(), taken_by=taken_by)
     assert np.ptp(flat) < 1e-6
     assert np.ptp(shown) > 0.1
+
+
+def splat_scene(n=5):
+    rng = np.random.default_rng(0)
+    return Gaussians(
+        means=jnp.asarray(rng.normal((0, 0, 5), 1, (n, 3)), jnp.float32),
+        quats=jnp.asarray(rng.normal(size=(n, 4)), jnp.float32).at[0].set(0),
+        log_scales=jnp.asarray(rng.normal(size=(n, 3)), jnp.float32).at[-1].set(20.0),
+        opacity_logits=jnp.asarray(rng.normal(size=n), jnp.float32),
+        sh=jnp.asarray(rng.normal(size=(n, 4, 3)), jnp.float32),
+    )
+
+
+def test_browser_splats_are_the_gaussians_in_viewer_units():
+    g, cfg = splat_scene(), RenderConfig(sh_degree=1)
+    seen_from = np.array([0.5, -0.2, 1.0])
+    alive = np.array([True, True, True, False, True])
+    splats = browser_splats(g, alive, cfg, seen_from=seen_from, unit=2.0)
+    np.testing.assert_allclose(splats.centers, 2 * np.asarray(g.means)[alive], rtol=1e-6)
+    rotation = Rotation.from_quat(np.asarray(g.quats[1], float), scalar_first=True).as_matrix()
+    variances = (2 * np.exp(np.asarray(g.log_scales[1], float))) ** 2
+    expected = rotation @ np.diag(variances) @ rotation.T
+    np.testing.assert_allclose(splats.covariances[1], expected, rtol=1e-4)
+    np.testing.assert_allclose(
+        splats.covariances[0], np.diag((2 * np.exp(np.asarray(g.log_scales[0]))) ** 2), rtol=1e-4
+    )
+    np.testing.assert_allclose(
+        splats.opacities[:, 0], 1 / (1 + np.exp(-np.asarray(g.opacity_logits)[alive])), rtol=1e-5
+    )
+    # Half floats end at 65504.
+    assert np.isfinite(splats.covariances.astype(np.float16)).all()
+    np.testing.assert_allclose(
+        np.linalg.eigvalsh(splats.covariances[-1].astype(float)), LARGEST_DEVIATION**2, rtol=1e-3
+    )
+    towards = Camera(jnp.eye(4).at[:3, 3].set(-seen_from), jnp.eye(3), 1, 1)
+    np.testing.assert_allclose(
+        splats.linear, np.asarray(view_radiance(g, towards, cfg))[alive], rtol=1e-6
+    )
+
+
+def test_splat_colours_are_developed_without_what_depends_on_the_place():
+    splats = browser_splats(
+        splat_scene(), np.ones(5, bool), RenderConfig(), seen_from=np.zeros(3), unit=1.0
+    )
+    plain = DisplayTransform(0.5, 2.2, PhotometryConfig())
+    shown = splat_colors(splats, plain, "display").astype(float)
+    assert np.abs(shown - np.rint(255 * np.asarray(develop(splats.linear, plain)))).max() <= 1
+    assert np.any(splat_colors(splats, plain, "stops") != shown)
+    bilateral = PhotometryConfig(appearance="bilateral")
+    grid = DisplayTransform(0.5, 2.2, bilateral, np.ones((12, 8, 16, 16)))
+    np.testing.assert_array_equal(splat_colors(splats, grid, "display"), shown)
+
+
+def test_longer_exposures_are_lighter_and_unknown_ones_grey():
+    colors = exposure_colors([1.0, -2.0, None, 0.0])
+    light = luminance(colors.astype(float))
+    assert light[1] < light[3] < light[0]
+    np.testing.assert_array_equal(colors[2], 128)
+    assert exposure_colors([0.0, 0.0]).shape == (2, 3)
+    assert exposure_colors([None]).tolist() == [[128, 128, 128]]
+
+
+def test_the_legend_names_every_stop():
+    text = stops_legend()
+    assert all(f">{name}<" in text for name in ("-6", "-1", "0", "+1", "+5"))
+
+
+def test_saved_files_hold_what_is_shown(tmp_path):
+    shown = frame()
+    linear = np.asarray(shown.linear)
+    ldr = np.clip(linear, 0, 1)
+    png = cv2.imdecode(np.frombuffer(png_bytes(ldr), np.uint8), cv2.IMREAD_COLOR)
+    np.testing.assert_array_equal(png[..., ::-1], np.rint(ldr * 255))
+    (tmp_path / "a.exr").write_bytes(exr_bytes(shown, TRANSFORM))
+    back, header = read_exr(tmp_path / "a.exr")
+    np.testing.assert_allclose(back, linear, rtol=1e-3)
+    assert header["p2gsExposureEV"] == pytest.approx(1.0)
+    viewmat = np.asarray(header["p2gsViewmat"]).reshape(4, 4)
+    np.testing.assert_allclose(viewmat, np.asarray(shown.camera.viewmat), atol=1e-5)

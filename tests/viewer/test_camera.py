@@ -4,17 +4,24 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from p2gs_jax.scene.rigid import camera_centers
 from p2gs_jax.types import Scene, View
-from p2gs_jax.viewer.browser_camera import (
+from p2gs_jax.viewer.camera import (
     TYPICAL_DISTANCE,
+    Pose,
     ViewerSpace,
-    camera_center,
     camera_of_browser,
     distance_seen,
     fov_that_holds,
+    frames_of,
+    frustum_size,
     make_viewer_space,
     pose_of,
+    viewmat_between,
 )
+
+pytest.importorskip("viser", reason="the extra `viewer` is not installed")
+
 
 SPACE = ViewerSpace(2.5, np.array([0.0, -1.0, 0.0]))
 
@@ -48,9 +55,8 @@ def test_a_point_is_where_the_browser_draws_it():
     rotation = Rotation.from_euler("xyz", [0.2, -0.4, 0.1])
     position, fov, aspect, size = np.array([1.0, -2.0, 0.5]), 0.9, 1.7, (340, 200)
     point = position / SPACE.unit + rotation.apply([0.3, 0.2, 4.0])
-    camera = camera_of_browser(
-        rotation.as_quat(scalar_first=True), position, fov, aspect, size, SPACE
-    )
+    pose = Pose(rotation.as_quat(scalar_first=True), position, position, fov)
+    camera = camera_of_browser(pose, aspect, size, SPACE)
     x, y, z = rotation.inv().apply(point * SPACE.unit - position) * [1, -1, -1]
     ndc = np.array([x / aspect, y]) / (-z * np.tan(fov / 2))
     expected = (ndc * [1, -1] + 1) / 2 * size
@@ -60,18 +66,18 @@ def test_a_point_is_where_the_browser_draws_it():
 def test_a_view_survives_the_trip():
     viewmat = a_viewmat()
     pose = pose_of(viewmat, SPACE, distance=3.0, fov=0.7)
-    camera = camera_of_browser(pose.wxyz, pose.position, pose.fov, 1.5, (300, 200), SPACE)
+    camera = camera_of_browser(pose, 1.5, (300, 200), SPACE)
     np.testing.assert_allclose(camera.viewmat, viewmat, atol=1e-6)
     np.testing.assert_allclose(camera.K[0, 0], camera.K[1, 1], rtol=1e-6)
-    ahead = (pose.look_at / SPACE.unit - camera_center(viewmat)) / 3.0
+    ahead = (pose.look_at / SPACE.unit - camera_centers(viewmat[None])[0]) / 3.0
     np.testing.assert_allclose(ahead, viewmat[2, :3], atol=1e-6)
 
 
 def test_any_size_shows_the_same_part_of_the_world():
     pose = pose_of(a_viewmat(), SPACE, distance=3.0, fov=0.7)
-    point = camera_center(a_viewmat()) + a_viewmat()[:3, :3].T @ [0.2, -0.1, 2.0]
+    point = camera_centers(a_viewmat()[None])[0] + a_viewmat()[:3, :3].T @ [0.2, -0.1, 2.0]
     shares = [
-        pixel(camera_of_browser(pose.wxyz, pose.position, 0.7, 1.6, size, SPACE), point) / size
+        pixel(camera_of_browser(pose, 1.6, size, SPACE), point) / size
         for size in ((1280, 800), (328, 200), (480, 480))
     ]
     np.testing.assert_allclose(shares, shares[:1] * 3, rtol=1e-5)
@@ -79,11 +85,12 @@ def test_any_size_shows_the_same_part_of_the_world():
 
 @pytest.mark.parametrize("aspect", [0.5, 1.0, 1.3, 3.0])
 def test_a_whole_photograph_is_seen(aspect):
-    K, width, height = np.array([[90.0, 0, 70], [0, 110, 30], [0, 0, 1]]), 120, 80
-    fov = fov_that_holds(K, width, height, aspect)
+    K = np.array([[90.0, 0, 70], [0, 110, 30], [0, 0, 1]])
+    view = View("a", None, "0", np.eye(4), K, 120, 80)
+    pose = Pose((1, 0, 0, 0), (0, 0, 0), (0, 0, 1), fov_that_holds(view, aspect))
     size = (round(1000 * aspect), 1000)
-    camera = camera_of_browser((1, 0, 0, 0), (0, 0, 0), fov, size[0] / size[1], size, SPACE)
-    corners = [(np.linalg.inv(K) @ [x, y, 1.0]) for x in (0, width) for y in (0, height)]
+    camera = camera_of_browser(pose, size[0] / size[1], size, SPACE)
+    corners = [(np.linalg.inv(K) @ [x, y, 1.0]) for x in (0, view.width) for y in (0, view.height)]
     at = np.array([pixel(camera, corner) for corner in corners])
     assert at.min() > -1
     assert np.all(at.max(0) < np.array(size) + 1)
@@ -113,3 +120,53 @@ def test_a_scene_without_points_is_measured_by_its_gaussians():
 def test_what_is_behind_or_beside_has_no_distance():
     assert distance_seen(np.eye(4), np.array([[0, 0, -3.0], [5, 0, 1.0], [0, 0, 7.0]])) == 7.0
     assert distance_seen(np.eye(4), np.array([[0, 0, -3.0]])) == 1.0
+
+
+def viewmat(turn, at):
+    out = np.eye(4)
+    out[:3, :3] = Rotation.from_rotvec(turn).as_matrix()
+    out[:3, 3] = -out[:3, :3] @ at
+    return out
+
+
+POSES = np.stack(
+    [
+        viewmat([0, 0, 0], [0, 0, 0]),
+        viewmat([0, 0.8, 0], [2, 0, 4]),
+        viewmat([0, 0, 1], [3, 0, 4]),
+    ]
+)
+
+
+@pytest.mark.parametrize(
+    ("place", "turn", "at"),
+    [
+        (0.0, [0, 0, 0], [0, 0, 0]),
+        (0.25, [0, 0.2, 0], [0.5, 0, 1]),
+        (1.0, [0, 0.8, 0], [2, 0, 4]),
+        (2.0, [0, 0, 1], [3, 0, 4]),
+        (9.0, [0, 0, 1], [3, 0, 4]),
+        (-1.0, [0, 0, 0], [0, 0, 0]),
+    ],
+)
+def test_poses_between_poses(place, turn, at):
+    np.testing.assert_allclose(viewmat_between(POSES, place), viewmat(turn, at), atol=1e-9)
+
+
+def test_a_drive_of_one_pose_stands_still():
+    np.testing.assert_allclose(viewmat_between(POSES[1:2], 0.7), POSES[1], atol=1e-12)
+
+
+def test_a_drive_is_one_camera_in_the_order_of_names():
+    views = [
+        View(name, None, camera, np.eye(4), np.eye(3), 2, 2)
+        for name, camera in (("b/2", "b"), ("a/1", "a"), ("b/1", "b"))
+    ]
+    scene = Scene(None, "test", tuple(views), np.zeros((0, 3)), np.zeros((0, 3)))
+    assert frames_of(scene, "b") == (2, 0)
+
+
+def test_frusta_of_neighbours_hardly_touch():
+    views = [a_view(viewmat([0, 0, 0], [k, 0, 0])) for k in range(4)]
+    assert frustum_size(views, SPACE._replace(unit=1.0)) == pytest.approx(0.35)
+    assert frustum_size(views[:1], SPACE) == pytest.approx(0.35)
