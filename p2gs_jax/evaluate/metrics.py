@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from p2gs_jax.losses.image import ssim as _ssim
+from p2gs_jax.evaluate.ssim import ssim as _ssim
 
 
 @jax.jit

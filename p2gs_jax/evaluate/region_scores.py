@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Float32
 
 from p2gs_jax.evaluate.lpips import LpipsWeights, lpips
 from p2gs_jax.evaluate.metrics import psnr
-from p2gs_jax.losses.image import ssim_map
+from p2gs_jax.evaluate.ssim import ssim_map
 
 PARTS = ("whole", "static", "moving")
 # Of fewer pixels nothing is said.

@@ -10,8 +10,9 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.paths.geometry import Poses, angles, inverse, rigid
+from p2gs_jax.paths.geometry import Poses, angles, rigid
 from p2gs_jax.paths.shots import Shot, common_lens
+from p2gs_jax.scene.rigid import inverse
 
 # Default number of frames from one pose to the next.
 FRAMES_BETWEEN = 8

@@ -18,9 +18,9 @@ from jaxtyping import Float
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
-from p2gs_jax.paths.geometry import inverse
 from p2gs_jax.paths.pinhole import LARGEST, as_matrix, checked_lens, orthonormal
 from p2gs_jax.paths.shots import Shot
+from p2gs_jax.scene.rigid import inverse
 
 FIELDS = ("name", "viewmat", "K", "width", "height", "exposure_ev", "gamma", "time")
 MOST_STOPS = 60.0

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from p2gs_jax.paths.geometry import inverse, look_at
+from p2gs_jax.paths.geometry import look_at
 from p2gs_jax.paths.shots import Shot, common_lens
-from p2gs_jax.scene.rigid import up_direction
+from p2gs_jax.scene.rigid import inverse, up_direction
 
 FRAMES = 120
 # Optical axes meet where they spread at least this much (sine squared) ...

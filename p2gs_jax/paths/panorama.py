@@ -14,8 +14,9 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 
 from p2gs_jax.paths.cylinder import Cylinder, project
-from p2gs_jax.paths.geometry import inverse, rigid
+from p2gs_jax.paths.geometry import rigid
 from p2gs_jax.paths.shots import Shot
+from p2gs_jax.scene.rigid import inverse
 
 # Angle of a slice: the affine approximation of splats is off far from the axis; in narrow slices it
 # is nearly the same on both sides of an edge.

@@ -12,16 +12,19 @@ from jaxtyping import Float32
 
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.formats.frames import OutputFrame
-from p2gs_jax.paths import Cylinder, Rig, Shot, TimeStep, Wide, render_wide, stitch
+from p2gs_jax.paths import Cylinder
 from p2gs_jax.paths.captioned_images import CaptionedImage, stacked, stacked_size
 from p2gs_jax.paths.cylinder import borders
-from p2gs_jax.paths.geometry import Poses, inverse
-from p2gs_jax.paths.panorama import Layers
+from p2gs_jax.paths.geometry import Poses
+from p2gs_jax.paths.panorama import Layers, Wide, render_wide, stitch
+from p2gs_jax.paths.rig import Rig, TimeStep
+from p2gs_jax.paths.shots import Shot
 from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
 from p2gs_jax.photometry.metering import ExposureOf, adapted, meter
 from p2gs_jax.run.read import Run
 from p2gs_jax.scene.drives.choose import short_name
 from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.rigid import inverse
 
 # Pictures are metered at this width, pixels.
 METERED_WIDTH = 240

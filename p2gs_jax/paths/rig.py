@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.paths.geometry import Pose, Poses, angles, inverse, mean_pose, rigid
+from p2gs_jax.paths.geometry import Pose, Poses, angles, mean_pose, rigid
 from p2gs_jax.paths.shots import Shot
-from p2gs_jax.scene.rigid import moment_of, up_direction
+from p2gs_jax.scene.rigid import inverse, moment_of, up_direction
 from p2gs_jax.types import View
 
 # Largest median angle between the cameras' relative rotations over time.

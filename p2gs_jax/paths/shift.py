@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from p2gs_jax.paths.geometry import Poses, inverse
+from p2gs_jax.paths.geometry import Poses
 from p2gs_jax.paths.shots import Shot
-from p2gs_jax.scene.rigid import headings, level_ahead, up_of_drive
+from p2gs_jax.scene.rigid import headings, inverse, level_ahead, up_of_drive
 from p2gs_jax.types import View
 
 

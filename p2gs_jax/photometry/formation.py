@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int
 
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.core.numerics import Scalar, Values, namespace, positive_pow, safe_log
-from p2gs_jax.photometry.appearance import Correction, corrected
+from p2gs_jax.photometry.appearance import Correction, Formation, corrected
 from p2gs_jax.photometry.cameras import darkens, log_vignetting, squared_radii
 from p2gs_jax.photometry.spline_curve import decode, encode
 from p2gs_jax.types import GAMMA_SRGB, Capture
@@ -185,9 +185,11 @@ def formation(
         linear: radiance; an image where there is a correction.
         capture: exposure, gamma, white balance and camera: of the view, or of each pixel.
         cfg: base curve, pivot, clamping, cameras, kind of correction.
-        correction: of the view's display values, or None.
+        correction: of the view's display values, or a formation in their place, or None.
         positions: where the pixels lie, if `linear` is no image and vignetting counts; see `gain`.
     """
+    if isinstance(correction, Formation):
+        return correction.apply(linear, capture)
     exposed = expose(linear, capture, cfg, positions)
     ldr: Any = tone_map(exposed, _by_pixel(capture.gamma), cfg, capture.camera)
     if cfg.appearance is None or correction is None:

@@ -34,7 +34,6 @@ from p2gs_jax.gaussians.init.start import (
 )
 from p2gs_jax.gaussians.init.vibration import clock_of, vibrates, with_vibration
 from p2gs_jax.gaussians.population import Coverage
-from p2gs_jax.losses.relative_exposure import ColorPairs
 from p2gs_jax.photometry.calibrate import calibrate_observations, options_of
 from p2gs_jax.photometry.initial import initial_appearance, initial_photometry, point_radiance
 from p2gs_jax.photometry.models import Form
@@ -55,8 +54,8 @@ from p2gs_jax.pipeline.scale import (
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.train.compared_photographs import color_pairs
-from p2gs_jax.train.measured_depths import measured_depths
+from p2gs_jax.train.exposure_loss import ColorPairs, color_pairs
+from p2gs_jax.train.lidar_depths import measured_depths
 from p2gs_jax.train.schedule import shrinks
 from p2gs_jax.types import Gaussians, Measured, Params, Scene, View
 

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from cameras import directions, shot, turned
 
-from p2gs_jax.paths import Cylinder, covering, render_wide, slices, stitch
+from p2gs_jax.paths import Cylinder, covering
 from p2gs_jax.paths.cylinder import borders
+from p2gs_jax.paths.panorama import render_wide, slices, stitch
 
 YAWS = (-45, 0, 45)
 WALL = 6.0

@@ -3,8 +3,9 @@ import pytest
 from cameras import turned, view
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.paths import find_rig, view_shots
-from p2gs_jax.paths.geometry import inverse
+from p2gs_jax.paths.rig import find_rig
+from p2gs_jax.paths.shots import view_shots
+from p2gs_jax.scene.rigid import inverse
 
 MOUNTS = {
     "front": turned(2, (0, 0.1, 0.5), pitch=3, roll=1),

@@ -7,9 +7,11 @@ import pytest
 from cameras import shot, turned, view
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.paths import covering, find_rig, view_shots
-from p2gs_jax.paths.geometry import inverse
+from p2gs_jax.paths import covering
+from p2gs_jax.paths.rig import find_rig
 from p2gs_jax.paths.shift import beside, beside_shots
+from p2gs_jax.paths.shots import view_shots
+from p2gs_jax.scene.rigid import inverse
 
 # Around the car, degrees to the right; alphabetically "back" comes first.
 AROUND = {"back": 180, "front": 0, "front_left": -60, "front_right": 60, "left": -120, "right": 120}
