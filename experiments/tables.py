@@ -54,8 +54,7 @@ from p2gs_jax.pipeline.decide import without_tracks
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.run.read import load_run
-from p2gs_jax.scene.device import camera_of
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 
 ROBUST, PRINTED = "robust (ours)", "P2GS as printed"
 MAIN = ("3DGS", "3DGS + AT", "Luminance-GS", PRINTED, ROBUST)

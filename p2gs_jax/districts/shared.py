@@ -21,7 +21,7 @@ from p2gs_jax.pipeline.decide import decide
 from p2gs_jax.pipeline.prepare import solve
 from p2gs_jax.pipeline.scale import near_depth, near_plane, scale_notes, seen_depths
 from p2gs_jax.run.decisions import Decisions, read_decisions, write_decisions
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import Photometry, Scene
 
 ARRAYS, DECISIONS = "shared.npz", "decisions.json"

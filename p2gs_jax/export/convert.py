@@ -45,9 +45,8 @@ from p2gs_jax.render.harmonics import MAX_DEGREE
 from p2gs_jax.render.project import at_time
 from p2gs_jax.run.photometry_files import write_appearance
 from p2gs_jax.run.read import Run
-from p2gs_jax.scene.device import camera_of
-from p2gs_jax.scene.exif import read_exif_settings
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.convert.headers import read_exif_settings
+from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 from p2gs_jax.types import Gaussians
 
 # What each format writes into the folder.

@@ -23,7 +23,7 @@ from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
 from p2gs_jax.photometry.metering import ExposureOf, adapted, meter
 from p2gs_jax.run.read import Run
 from p2gs_jax.scene.drives.choose import short_name
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.rigid import inverse
 
 # Pictures are metered at this width, pixels.

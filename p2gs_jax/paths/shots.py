@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene.geometry import scale_intrinsics
-from p2gs_jax.scene.images import camera_at
+from p2gs_jax.scene.lens import scale_intrinsics
+from p2gs_jax.scene.pixels.store import camera_at
 from p2gs_jax.types import Camera, View
 
 

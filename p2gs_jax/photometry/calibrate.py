@@ -15,7 +15,7 @@ from p2gs_jax.photometry.models import Curve, Form
 from p2gs_jax.photometry.observations import COARSEST, Observations
 from p2gs_jax.photometry.response import BASES, Response
 from p2gs_jax.photometry.selection import Selection, select
-from p2gs_jax.scene.known_exposures import read_known_exposures
+from p2gs_jax.scene.exposures import read_known_exposures
 from p2gs_jax.types import Scene
 
 # Points of a view that a given kind of curve is fitted to.

@@ -14,8 +14,8 @@ from p2gs_jax.photometry.calibrate import calibrate_observations, options_of
 from p2gs_jax.photometry.sources.points import has_tracks, surface_colors
 from p2gs_jax.pipeline.calibration import Calibration, with_stated, write_calibration
 from p2gs_jax.scene import load_scene
-from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.scene.known_exposures import check_source
+from p2gs_jax.scene.exposures import check_source
+from p2gs_jax.scene.pixels.store import ImageStore
 
 
 def calibrate(

@@ -35,8 +35,8 @@ from p2gs_jax.pipeline.prepare import Prepared
 from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.run.write import write_start
 from p2gs_jax.scene import load_scene
-from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.scene.known_exposures import check_source
+from p2gs_jax.scene.exposures import check_source
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.train.programs import StepPrograms
 from p2gs_jax.types import Gaussians, Params, Scene
 

@@ -14,7 +14,7 @@ from p2gs_jax.photometry.calibrate import CalibrationOptions, calibrate_observat
 from p2gs_jax.photometry.solution import Agreement, PhotometricSolution, compare
 from p2gs_jax.photometry.sources.stack import SATURATED, StackColors, read_stack, stack_colors
 from p2gs_jax.photometry.unmodelled import LOCAL_EV, Unexplained, residuals, unexplained
-from p2gs_jax.scene.known_exposures import read_known_exposures, stated_ev
+from p2gs_jax.scene.exposures import read_known_exposures, stated_ev
 from p2gs_jax.types import View
 
 PIVOT = 0.18

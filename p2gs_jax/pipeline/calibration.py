@@ -16,7 +16,7 @@ from p2gs_jax.photometry.selection import Selection
 from p2gs_jax.photometry.solution import Agreement, PhotometricSolution, compare, note_on_levels
 from p2gs_jax.run.photometry_files import write_solution
 from p2gs_jax.run.plots import write_calibration_plot
-from p2gs_jax.scene.known_exposures import stated_ev
+from p2gs_jax.scene.exposures import stated_ev
 from p2gs_jax.types import Scene, View
 
 

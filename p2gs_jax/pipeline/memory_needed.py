@@ -19,7 +19,7 @@ from p2gs_jax.core.memory import left_to_process, ran_out, resident
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.dense import seed_bound
 from p2gs_jax.gaussians.population import Coverage
-from p2gs_jax.scene.images import size_at
+from p2gs_jax.scene.pixels.store import size_at
 from p2gs_jax.types import Scene
 
 # Bytes.

@@ -66,7 +66,7 @@ from p2gs_jax.pipeline.scale import (
 )
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.scene import load_scene
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.train.compared_photographs import color_pairs
 from p2gs_jax.train.measured_depths import measured_depths
 from p2gs_jax.train.schedule import shrinks

@@ -5,7 +5,7 @@ from __future__ import annotations
 from p2gs_jax.config import FitConfig
 from p2gs_jax.evaluation.lpips import LpipsWeights
 from p2gs_jax.evaluation.scores import is_drive
-from p2gs_jax.scene.images import size_at
+from p2gs_jax.scene.pixels.store import size_at
 from p2gs_jax.types import Scene
 
 

@@ -18,7 +18,7 @@ from p2gs_jax.evaluation.unexplained import WIDTH, Unexplained
 from p2gs_jax.formats.png import write_png
 from p2gs_jax.photometry.response import Response, log_exposed
 from p2gs_jax.photometry.solution import PhotometricSolution
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import GAMMA_SRGB, Scene
 
 MARKERS = "osD^vPX*"

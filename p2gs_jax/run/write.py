@@ -29,9 +29,8 @@ from p2gs_jax.run.folder import RunFolder, remembered
 from p2gs_jax.run.photometry_files import write_appearance, write_fitted, write_metering
 from p2gs_jax.run.plots import write_summary
 from p2gs_jax.run.scene_file import write_objects, write_scene
-from p2gs_jax.scene.device import camera_of
 from p2gs_jax.scene.drives.moving import MovingObjects, middle_time
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 from p2gs_jax.types import Params, Scene
 
 SUMMARY_VIEWS = 4

@@ -12,8 +12,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.photometry.metering import meter
 from p2gs_jax.run.read import Run
-from p2gs_jax.scene.device import camera_of
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 from p2gs_jax.types import Camera
 from p2gs_jax.viewer.browser_camera import camera_center
 from p2gs_jax.viewer.picture_modes import (

@@ -16,7 +16,7 @@ from p2gs_jax.photometry.display import develop
 from p2gs_jax.photometry.formation import darkens
 from p2gs_jax.render.project import at_time
 from p2gs_jax.run.read import Run
-from p2gs_jax.scene.images import size_at
+from p2gs_jax.scene.pixels.store import size_at
 from p2gs_jax.types import Camera
 from p2gs_jax.viewer.browser_camera import (
     TYPICAL_DISTANCE,

@@ -17,8 +17,7 @@ from p2gs_jax.formats.splat import read_splat
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.read import load_run
 from p2gs_jax.scene import load_scene
-from p2gs_jax.scene.device import camera_of
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 
 C0 = 0.28209479177387814
 STEPS = ("--bake-steps", "12")

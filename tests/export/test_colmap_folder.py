@@ -12,7 +12,7 @@ from tiny_scene import make_scene
 from p2gs_jax.config import DataConfig
 from p2gs_jax.export.colmap_folder import write_colmap_folder
 from p2gs_jax.scene import ImageStore, load_scene
-from p2gs_jax.scene.known_exposures import read_known_exposures
+from p2gs_jax.scene.exposures import read_known_exposures
 
 EXPOSURES = {"0.png": 0.5, "1.png": 2.0, "2.png": 1.25}
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from p2gs_jax.config import CameraFormation, PhotometryConfig
 from p2gs_jax.formats.exr import read_exr, write_exr
 from p2gs_jax.photometry.display import DisplayTransform
-from p2gs_jax.scene.exif import ExifSettings
+from p2gs_jax.scene.convert.headers import ExifSettings
 from p2gs_jax.types import Camera
 
 WIDTH, HEIGHT = 90, 70

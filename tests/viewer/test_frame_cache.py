@@ -9,8 +9,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.display import develop
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.read import load_run
-from p2gs_jax.scene.device import camera_of
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 from p2gs_jax.viewer.frame_cache import FrameCache
 from p2gs_jax.viewer.settings import (
     Settings,

@@ -10,7 +10,7 @@ import pytest
 from p2gs_jax.errors import UserError
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.read import load_run
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.viewer.browser_camera import ViewerSpace
 from p2gs_jax.viewer.frame_cache import FrameCache
 from p2gs_jax.viewer.render_sizes import full_size, render_sizes

@@ -20,7 +20,7 @@ from p2gs_jax.core.text import printable
 from p2gs_jax.errors import UserError
 from p2gs_jax.paths.files import read_cameras
 from p2gs_jax.run.read import load_run
-from p2gs_jax.scene.known_exposures import check_source
+from p2gs_jax.scene.exposures import check_source
 
 NAME = "broken_drives"
 ABOUT = """Drives of nuScenes, Argoverse 2, Waymo, PandaSet and KITTI (three layouts), tables of

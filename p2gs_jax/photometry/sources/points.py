@@ -20,8 +20,7 @@ from p2gs_jax.photometry.sources.sampling import PROJECTED_UNCERTAINTY, point_co
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.render.warp import project_points as warped_points
 from p2gs_jax.render.warp import surface_depth, unproject, visible
-from p2gs_jax.scene.device import camera_of
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 from p2gs_jax.scene.visibility import project_points, unoccluded
 from p2gs_jax.types import Gaussians, Scene
 

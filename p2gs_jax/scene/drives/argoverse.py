@@ -31,7 +31,7 @@ from p2gs_jax.scene.drives.choose import chosen_drive
 from p2gs_jax.scene.drives.objects import Box, tracks
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sweep, SweepPoints
 from p2gs_jax.scene.drives.tables import numbered
-from p2gs_jax.scene.geometry import intrinsics
+from p2gs_jax.scene.lens import intrinsics
 from p2gs_jax.scene.rigid import from_quaternions, interpolated
 from p2gs_jax.types import TrackedObject
 

@@ -15,7 +15,7 @@ from p2gs_jax.scene.cache import cached_folder
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera
 from p2gs_jax.scene.drives.unmoving import FEWEST, WIDTH, cut, expected_motion, often_apart, weigh
 from p2gs_jax.scene.files import decode_grey, undecodable
-from p2gs_jax.scene.geometry import scale_intrinsics
+from p2gs_jax.scene.lens import scale_intrinsics
 from p2gs_jax.scene.rigid import inverse, up_of_drive
 
 # Photographs of a camera that are looked at, spread evenly over its way; fewer say too little.

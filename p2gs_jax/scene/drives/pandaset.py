@@ -37,7 +37,7 @@ from p2gs_jax.scene.drives.tables import (
     read_json_list,
 )
 from p2gs_jax.scene.files import image_size
-from p2gs_jax.scene.geometry import intrinsics
+from p2gs_jax.scene.lens import intrinsics
 from p2gs_jax.scene.rigid import from_quaternion, inverse
 from p2gs_jax.types import TrackedObject
 

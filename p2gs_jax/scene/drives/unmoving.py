@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 from scipy.sparse import coo_array, csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
-from p2gs_jax.scene.geometry import undistort_points
+from p2gs_jax.scene.lens import undistort_points
 from p2gs_jax.types import Distortion
 
 # Lengths in the picture are in pixels at this width; so are all thresholds (BUILD_NOTES).

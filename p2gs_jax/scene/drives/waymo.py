@@ -43,7 +43,7 @@ from p2gs_jax.scene.drives.waymo_lidar import (
     read_sweeps,
     transform,
 )
-from p2gs_jax.scene.geometry import intrinsics, make_distortion
+from p2gs_jax.scene.lens import intrinsics, make_distortion
 from p2gs_jax.scene.rigid import LONGEST_BEYOND_S
 from p2gs_jax.types import TrackedObject
 

@@ -23,7 +23,7 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.drives.assemble import assemble
 from p2gs_jax.scene.drives.nuscenes import is_nuscenes, read_nuscenes
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.rigid import inverse
 
 START = 1532402927647951

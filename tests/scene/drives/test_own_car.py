@@ -11,7 +11,7 @@ from p2gs_jax.run.scene_file import read_scene, write_scene
 from p2gs_jax.scene.drives.assemble import assemble
 from p2gs_jax.scene.drives.own_car import find_own_car, find_own_cars, spread_over_the_way
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 
 W, H, F, HEIGHT = 480, 270, 400.0, 1.6
 K = np.array([[F, 0, W / 2], [0, F, 0.45 * H], [0, 0, 1.0]])

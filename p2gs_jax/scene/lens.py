@@ -1,4 +1,4 @@
-"""Pixel geometry shared by the readers and the image store.
+"""Lenses and intrinsics, shared by the readers and the image store.
 
 Everything here uses pixel centres at +0.5. The algebra of a pinhole with OpenCV's distortion does
 not depend on where centres lie, so points need no shift; only OpenCV's *rasters* (remap) do, and
@@ -20,7 +20,7 @@ from p2gs_jax.types import Distortion
 # iteration does not converge for strong rational lenses.
 _TABLE, _POLISHING = 4096, 3
 _MOST_ROUNDS, _SETTLED = 20, 1e-10
-# No picture reaches further from its middle, focal lengths; terms that are smaller there are none.
+# No picture reaches further from its middle, focal lengths; smaller terms there count as zero.
 _FARTHEST, _NOTHING = 100.0, 1e-9
 
 
@@ -37,12 +37,7 @@ def scale_intrinsics(K: Float[np.ndarray, "3 3"], sx: float, sy: float) -> Float
 def make_distortion(
     coefficients: tuple[float, ...], model: Literal["radial", "fisheye"] = "radial"
 ) -> Distortion | None:
-    """Return the distortion, or None where a lens of all zeros is a pinhole.
-
-    Args:
-        coefficients: as in `Distortion`.
-        model: which.
-    """
+    """Return the distortion of `Distortion`'s coefficients, or None where they make a pinhole."""
     # A fisheye without coefficients still maps angles, not tangents, to distances.
     if model == "radial" and not any(coefficients):
         return None
@@ -54,14 +49,8 @@ def undistort_points(
 ) -> Float32[np.ndarray, "n 2"]:
     """Move pixel positions from the photograph to its undistorted version with the same K.
 
-    Args:
-        xy: positions in the photograph, pixels, centres at +0.5.
-        K: intrinsics, pixels.
-        distortion: the lens, or None.
-
-    Returns:
-        Positions; NaN where no pinhole ray comes: beyond where the lens model is monotonic, and at
-        the sides of a fisheye.
+    They are NaN where no pinhole ray comes: beyond where the lens model is monotonic, and at the
+    sides of a fisheye.
     """
     if distortion is None or len(xy) == 0:
         return np.asarray(xy, np.float32).reshape(-1, 2)
@@ -95,13 +84,7 @@ def undistortion_maps(
     """Return where each undistorted pixel lies in the photograph, for `cv2.remap`.
 
     Positions are in OpenCV's convention (pixel centres at integers), -10 where the lens model is
-    not monotonic any more.
-
-    Args:
-        K: intrinsics in pixels, centres at +0.5, of the photograph and of the result.
-        distortion: the lens.
-        width: pixels.
-        height: pixels.
+    not monotonic any more. K, with centres at +0.5, is that of the photograph and of the result.
     """
     shifted = np.asarray(K, np.float64).copy()
     shifted[:2, 2] -= 0.5
@@ -167,11 +150,8 @@ def _radially_undone(
 ) -> Float[np.ndarray, "n 2"]:
     """Return normalised positions without the radial part of a lens.
 
-    Args:
-        distorted: normalised positions.
-        distortion: the lens.
-        rough: as the table has it, and positions without a ray are put at the last one; else
-            exactly, and these are NaN.
+    They are exact, and NaN where there is no ray; `rough`: as the table has them, and positions
+    without a ray are put at the last one.
     """
     n, d, limit = _profile(distortion)
     fisheye = distortion.model == "fisheye"

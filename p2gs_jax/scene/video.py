@@ -1,7 +1,8 @@
-"""Frames of a video file, in order, and their colours."""
+"""From a video to a folder of photographs: its frames and their colours, and what is kept."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,23 +15,33 @@ import numpy as np
 from av.stream import Disposition
 from jaxtyping import Float, UInt, UInt8
 
+from p2gs_jax.config import DataConfig
+from p2gs_jax.core.atomic import write_text
 from p2gs_jax.core.numerics import srgb_decode
-from p2gs_jax.errors import UserError
-from p2gs_jax.scene.photographs.light import (
+from p2gs_jax.errors import UserError, broken
+from p2gs_jax.scene.cache import Report, cached_folder, file_fingerprints
+from p2gs_jax.scene.convert.convert import Converted, cache_of, write_png
+from p2gs_jax.scene.convert.icc import (
     BT709,
     BT2020,
     DISPLAY_P3,
     Primaries,
     Transfer,
+    encode_16,
     to_light,
     to_srgb_matrix,
 )
-from p2gs_jax.scene.photographs.profiles import encode_16
+from p2gs_jax.scene.motion import WIDTH, Chosen, choose_frames, thinned
 
+RECORD = "frames.json"
+_VERSION = 1
+_TRANSFER_NAMES = {"hlg": "HLG video", "pq": "PQ video"}
+_AGAIN = "copy or export the video again"
+_SHORT = "film while walking around the thing"
 VIDEO_SUFFIXES = frozenset(
     {".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".m2ts", ".ts", ".3gp", ".insv"}
 )
-# Codes of ITU-T H.273, as FFmpeg numbers them.
+# Codes of ITU-T H.273, in FFmpeg's numbers.
 _TRANSFERS: dict[int, Transfer] = {16: "pq", 18: "hlg"}
 _PRIMARIES: dict[int, Primaries] = {9: BT2020, 12: DISPLAY_P3}
 _BT601 = (0.299, 0.114)
@@ -45,7 +56,7 @@ class Frame:
     """A decoded frame.
 
     Attributes:
-        number: from 0, in the order in which they are shown.
+        number: counts from 0 in the order in which frames are shown.
         time: seconds from the beginning.
         turn: quarter turns against the clock that put it upright.
         square: width over height of a pixel.
@@ -69,11 +80,7 @@ class Frame:
         return _TRANSFERS.get(int(self._decoded.color_trc))
 
     def grey(self, width: int) -> UInt8[np.ndarray, "h w"]:
-        """Return it small and grey, not turned.
-
-        Args:
-            width: of the longer side, pixels; at most its own.
-        """
+        """Return it small and grey, not turned; its longer side has at most `width` pixels."""
         frame = self._decoded
         scale = min(1.0, width / max(frame.width, frame.height))
         # swscale wants even widths.
@@ -105,7 +112,7 @@ def frames_of(path: Path) -> Iterator[Frame]:
     """Yield all frames of a video.
 
     Raises:
-        UserError: it is no video, holds none, changes its size, or breaks off before two frames.
+        UserError: it is not a video, holds none, changes its size, or breaks off before two frames.
     """
     with _opened(path) as (container, stream):
         stream.thread_type = "AUTO"
@@ -120,11 +127,9 @@ def frames_of(path: Path) -> Iterator[Frame]:
                 size = decoded.width, decoded.height
                 if size != (first or size):
                     assert first is not None
-                    raise UserError(
-                        f"{path} changes its size: frame {number} is {size[0]}x{size[1]}, those "
-                        f"before are {first[0]}x{first[1]}.",
-                        fix="cut it into parts of one size and fit one of them",
-                    )
+                    why = f"changes its size: frame {number} is {size[0]}x{size[1]}, those "
+                    why += f"before are {first[0]}x{first[1]}."
+                    raise broken(path, why, "cut it into parts of one size and fit one of them")
                 first = size
                 time = float(decoded.time) if decoded.time is not None else number / rate
                 begin = time if begin is None else begin
@@ -134,10 +139,8 @@ def frames_of(path: Path) -> Iterator[Frame]:
         except av.FFmpegError as error:
             # The rest of a broken file is lost, what came before is fine: the caller says how many.
             if number < 2:
-                raise UserError(
-                    f"{path} cannot be decoded: {error.strerror or error}.",
-                    fix="copy or export the video again",
-                ) from None
+                why = f"cannot be decoded: {error.strerror or error}."
+                raise broken(path, why, _AGAIN) from None
 
 
 def expected_frames(path: Path) -> int | None:
@@ -164,9 +167,8 @@ def video_size(path: Path) -> tuple[int, int]:
 def no_frames(path: Path, count: int) -> UserError:
     """Return the error for a video that is too short."""
     held = "no frame" if count == 0 else "one frame" if count == 1 else f"{count} frames"
-    return UserError(
-        f"{path} holds {held}; a scene needs several, taken from different places.",
-        fix="film while walking around the thing",
+    return broken(
+        path, f"holds {held}; a scene needs several, taken from different places.", _SHORT
     )
 
 
@@ -175,24 +177,17 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
     try:
         container = av.open(str(path))
     except (av.FFmpegError, OSError) as error:
-        raise UserError(
-            f"{path} cannot be opened as a video: {error.strerror or error}.",
-            fix="copy or export the video again, as .mp4 or .mov",
-        ) from None
+        why = f"cannot be opened as a video: {error.strerror or error}."
+        raise broken(path, why, f"{_AGAIN}, as .mp4 or .mov") from None
     with container:
         # Covers of music are video streams of one picture.
-        streams = [s for s in container.streams.video if not _is_cover(s)]
+        cover = int(Disposition.attached_pic)
+        streams = [s for s in container.streams.video if not int(s.disposition) & cover]
         if not streams:
             kinds = sorted({s.type for s in container.streams}) or ["nothing"]
-            raise UserError(
-                f"{path} holds no video, but {', '.join(kinds)}.",
-                fix="name the file that holds the pictures",
-            )
+            why = f"holds no video, but {', '.join(kinds)}."
+            raise broken(path, why, "name the file that holds the pictures")
         yield container, streams[0]
-
-
-def _is_cover(stream: Any) -> bool:
-    return bool(int(stream.disposition) & int(Disposition.attached_pic))
 
 
 def _signal(frame: av.VideoFrame) -> Float[np.ndarray, "h w 3"]:
@@ -218,3 +213,113 @@ def _signal(frame: av.VideoFrame) -> Float[np.ndarray, "h w 3"]:
     kr, kb = _LUMA.get(int(cast(int, frame.colorspace)), _LUMA[usual])
     red, blue = y + 2 * (1 - kr) * v, y + 2 * (1 - kb) * u
     return np.stack([red, (y - kr * red - kb * blue) / (1 - kr - kb), blue], axis=-1)
+
+
+def is_video(path: Path) -> bool:
+    """Return whether a file counts as a video, by its name."""
+    return path.suffix.lower() in VIDEO_SUFFIXES
+
+
+def read_video(path: Path, cfg: DataConfig, work_dir: Path | None, report: Report) -> Converted:
+    """Return the chosen frames of a video as photographs, kept in `work_dir` or the user's cache.
+
+    Raises:
+        UserError: it is not a video, holds none, changes its size, or shows too little.
+    """
+    key = {
+        "version": _VERSION,
+        "file": file_fingerprints([path]),
+        "every": cfg.every,
+        "max_frames": cfg.max_frames,
+    }
+
+    def build(folder: Path) -> None:
+        _build(path, cfg, folder, report)
+
+    with cached_folder(cache_of(path, work_dir), "video", key, build) as folder:
+        record = json.loads((folder / RECORD).read_text())
+    paths = [folder / frame["file"] for frame in record["frames"]]
+    originals = {file.name: file for file in paths}
+    return Converted(folder, paths, originals, tuple(record["notes"]), record["known"])
+
+
+def _build(path: Path, cfg: DataConfig, folder: Path, report: Report) -> None:
+    expected = expected_frames(path)
+    seen = 0
+
+    def watched() -> Iterator[tuple[int, np.ndarray]]:
+        nonlocal seen
+        for frame in frames_of(path):
+            if seen % 100 == 0:
+                total = "" if expected is None else f" of {expected}"
+                report(f"looking through the video: frame {frame.number}{total}")
+            seen += 1
+            yield frame.number, frame.grey(WIDTH)
+
+    if cfg.every is None:
+        found = choose_frames(watched())
+    else:
+        found = [Chosen(n, 0.0, None) for n, _ in watched() if n % cfg.every == 0]
+    if seen < 2:
+        raise no_frames(path, seen)
+    by_number = {one.number: one for one in found}
+    numbers = thinned(list(by_number), cfg.max_frames)
+    notes = [_note(seen, len(found), len(numbers), cfg)]
+    if expected is not None and seen < expected - 2:
+        notes.append(f"The video breaks off: {seen} of {expected} frames could be decoded.")
+    if len(numbers) < 2:
+        why = f"{len(numbers)} of {seen} frames would be used; a scene needs several, taken from "
+        fix = f"{_SHORT}, or take frames by number with --every"
+        raise broken(f"{path}:", why + "different places.", fix)
+    records, transfers = _write(path, set(numbers), by_number, folder, report)
+    if transfers - {None} and None in transfers:
+        notes.append("The transfer function changes within the video: its curve is not known.")
+    known = None if None in transfers else ", ".join(_TRANSFER_NAMES[t] for t in sorted(transfers))  # type: ignore[index, type-var]
+    record = {"known": known, "notes": notes, "frames": records}
+    write_text(folder / RECORD, json.dumps(record, indent=1))
+
+
+def _write(
+    path: Path,
+    wanted: set[int],
+    chosen: dict[int, Chosen],
+    folder: Path,
+    report: Report,
+) -> tuple[list[dict], set[str | None]]:
+    records: list[dict] = []
+    transfers: set[str | None] = set()
+    for frame in frames_of(path):
+        if frame.number not in wanted:
+            continue
+        if len(records) % 10 == 0:
+            report(f"keeping frames: {len(records)} of {len(wanted)}")
+        name = f"{frame.number:06d}.png"
+        write_png(folder / name, frame.codes())
+        transfers.add(frame.transfer)
+        one = chosen[frame.number]
+        way = None if one.way is None else vars(one.way)
+        records.append(
+            {
+                "file": name,
+                "frame": frame.number,
+                "time": round(frame.time, 6),
+                "turn": 90 * frame.turn,
+                "sharpness": one.sharpness,
+                "way": way,
+            }
+        )
+        if len(records) == len(wanted):
+            break
+    return records, transfers
+
+
+def _note(seen: int, found: int, kept: int, cfg: DataConfig) -> str:
+    how = (
+        "sharp ones, each from a new place"
+        if cfg.every is None
+        else "all of them"
+        if cfg.every == 1
+        else f"every {cfg.every}th"
+    )
+    thin = f", thinned from {found} (--max-frames)" if kept < found else ""
+    return f"Of {seen} frames of the video {kept} are used: {how}{thin}."

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene.cache import cached_folder, file_fingerprints
+from p2gs_jax.scene.cache import Report, cached_folder, file_fingerprints
 from p2gs_jax.scene.colmap import tracks_of
 from p2gs_jax.scene.colmap_model import read_model
-from p2gs_jax.scene.features import extract, match, pairs_by_pose, quiet_colmap
+from p2gs_jax.scene.sfm.features import extract, match, opened, pairs_by_pose, quiet_colmap
 from p2gs_jax.types import Scene, View
 
 # Photographs with at least this many pixels along their longer side are not enlarged for SIFT
@@ -24,15 +24,11 @@ LINKS = "photographs"
 
 
 def triangulate(
-    scene: Scene,
-    work_dir: Path | None,
-    report: Callable[[str], None],
-    *,
-    only_training: bool = False,
+    scene: Scene, work_dir: Path | None, report: Report, *, only_training: bool = False
 ) -> Scene:
     """Return the scene with points and tracks; poses and intrinsics stay as they are.
 
-    Where nothing matches there are none.
+    There are none where nothing matches.
 
     Args:
         scene: posed views.
@@ -45,7 +41,11 @@ def triangulate(
     """
     views = tuple(scene.training_views) if only_training else scene.views
     if len(views) < 2:
-        raise _failed(scene.root)
+        raise UserError(
+            f"no point could be triangulated from the poses in {scene.root}",
+            fix="check that there are several photographs, that they are sharp, and that the poses "
+            "are theirs",
+        )
     key = {
         "pycolmap": pycolmap.__version__,
         "files": file_fingerprints([view.image_path for view in views]),
@@ -63,38 +63,25 @@ def triangulate(
     if tracks is None:
         return scene
     report(f"triangulated {len(model.xyz)} points with {len(tracks.xy)} observations")
-    return dataclasses.replace(
-        scene, points=model.xyz.astype(np.float32), point_colors=model.rgb, tracks=tracks
-    )
+    points = model.xyz.astype(np.float32)
+    return dataclasses.replace(scene, points=points, point_colors=model.rgb, tracks=tracks)
 
 
-def _failed(root: Path) -> UserError:
-    return UserError(
-        f"no point could be triangulated from the poses in {root}",
-        fix="check that there are several photographs, that they are sharp, and that the poses "
-        "are theirs",
-    )
-
-
-def _build(folder: Path, views: Sequence[View], report: Callable[[str], None]) -> None:
+def _build(folder: Path, views: Sequence[View], report: Report) -> None:
     quiet_colmap()
     names = [view.name for view in views]
     image_folder = _image_folder(views, folder)
     database = folder / "database.db"
     report(f"no seed points: detecting features in {len(views)} images")
     # Intrinsics are held fixed, so it does not matter that every image has its own camera.
-    extract(
-        database,
-        image_folder,
-        names,
-        mode=pycolmap.CameraMode.PER_IMAGE,
-        enlarge=max(max(view.width, view.height) for view in views) < LONG_ENOUGH,
-    )
+    enlarge = max(max(view.width, view.height) for view in views) < LONG_ENOUGH
+    mode = pycolmap.CameraMode.PER_IMAGE
+    extract(database, image_folder, names, mode=mode, enlarge=enlarge)
     prior = _set_cameras(database, views)
     if unread := sorted({*names} - {image.name for image in prior.images.values()}):
         raise UserError(
-            f"COLMAP reads {len(views) - len(unread)} of {len(views)} photographs, and not "
-            f"{image_folder / unread[0]}.",
+            f"COLMAP reads {len(views) - len(unread)} of {len(views)} photographs; one that it "
+            f"cannot read is {image_folder / unread[0]}.",
             fix="export those photographs again as PNG or JPEG, or remove them from the scene",
         )
     pairs = pairs_by_pose(names, np.stack([view.viewmat for view in views]))
@@ -124,11 +111,10 @@ def _set_cameras(database: Path, views: Sequence[View]) -> pycolmap.Reconstructi
     """Overwrite the guessed cameras in the database; return a model of the known poses."""
     known = {view.name: view for view in views}
     reconstruction = pycolmap.Reconstruction()
-    db = pycolmap.Database.open(database)
-    try:
+    with opened(database) as db:
         for image in db.read_all_images():
             view = known[image.name]
-            camera = _camera(view, image.camera_id)
+            camera = camera_of(view, image.camera_id)
             db.update_camera(camera)
             reconstruction.add_camera_with_trivial_rig(camera)
             pose = pycolmap.Rigid3d(view.viewmat[:3].astype(np.float64))
@@ -136,12 +122,11 @@ def _set_cameras(database: Path, views: Sequence[View]) -> pycolmap.Reconstructi
                 pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id),
                 pose,
             )
-    finally:
-        db.close()
     return reconstruction
 
 
-def _camera(view: View, camera_id: int) -> pycolmap.Camera:
+def camera_of(view: View, camera_id: int) -> pycolmap.Camera:
+    """Return COLMAP's camera for a view."""
     model, coefficients = _lens(view)
     K = view.K.astype(np.float64)
     return pycolmap.Camera(

@@ -1,22 +1,48 @@
-"""Colour profiles in photographs, and colours brought from them to sRGB.
+"""Colours: transfer functions, primaries and ICC profiles, brought to light or to sRGB.
 
-Only profiles made of a matrix and a curve per channel are applied (ICC.1:2022, 8.3.3): all that
-cameras and phones write are. Of others the photograph is used as it is, which `fit` says.
+Sources: ITU-R BT.2100-2 (HLG and PQ, tables 4 and 5), BT.2020, IEC 61966-2-1, ICC.1:2022. Only
+profiles made of a matrix and a curve per channel are applied (ICC.1:2022, 8.3.3): all that cameras
+and phones write are. A photograph with another profile is used as it is, which `fit` reports.
 """
 
 from __future__ import annotations
 
 import io
 import struct
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, UInt
 from PIL import Image
 
 from p2gs_jax.core.numerics import srgb_encode
-from p2gs_jax.scene.photographs.light import ADOBE_RGB, BT709, adapted, rgb_to_xyz
+from p2gs_jax.scene.convert.kinds import has_gain_map
 
+Transfer = Literal["linear", "hlg", "pq"]
+
+PQ_WHITE = 1000.0
+"""Luminance that becomes 1, cd/m^2: what phones and most masters reach; above, it is saturated."""
+_HLG_A = 0.17883277
+_HLG_B, _HLG_C = 1 - 4 * _HLG_A, 0.5 - _HLG_A * np.log(4 * _HLG_A)
+_M1, _M2 = 2610 / 16384, 2523 / 4096 * 128
+_C1, _C2, _C3 = 3424 / 4096, 2413 / 4096 * 32, 2392 / 4096 * 32
+
+# Chromaticities of red, green, blue and white.
+Primaries = tuple[float, float, float, float, float, float, float, float]
+_D65 = (0.3127, 0.3290)
+BT709: Primaries = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, *_D65)
+BT2020: Primaries = (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, *_D65)
+DISPLAY_P3: Primaries = (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, *_D65)
+ADOBE_RGB: Primaries = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, *_D65)
+
+# Bradford's cone responses.
+_BRADFORD = np.array(
+    [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]]
+)
 # The white of the profile connection space, D50.
 _PCS_WHITE = np.array([0.9642, 1.0, 0.8249])
 # Colours that move by less than this, display values, are sRGB's.
@@ -25,6 +51,47 @@ _INTEROPERABILITY, _INTEROP_INDEX = 0xA005, 1
 # How DCF marks Adobe RGB where there is no profile.
 _DCF_OPTION = "R03"
 _ENTRIES = 1024
+GAIN_MAP_UNUSED = (
+    "carry a gain map for bright displays; the photograph itself is used, the map is not."
+)
+
+
+def to_light(signal: Float[np.ndarray, "..."], transfer: Transfer) -> Float[np.ndarray, "..."]:
+    """Return light in [0, 1] of a signal in [0, 1], red, green and blue as coded.
+
+    HLG gives the light of the scene, 1 being the brightest the code can hold; PQ that of the
+    reference display, 1 being `PQ_WHITE`.
+    """
+    x = np.clip(signal, 0.0, 1.0)
+    if transfer == "hlg":
+        return np.where(x <= 0.5, x * x / 3, (np.exp((x - _HLG_C) / _HLG_A) + _HLG_B) / 12)
+    if transfer == "pq":
+        root = x ** (1 / _M2)
+        light = (np.maximum(root - _C1, 0) / (_C2 - _C3 * root)) ** (1 / _M1)
+        return np.minimum(light * (10000 / PQ_WHITE), 1.0)
+    return x
+
+
+def rgb_to_xyz(primaries: Primaries) -> Float[np.ndarray, "3 3"]:
+    """Return the matrix from linear colours to XYZ, white having Y = 1."""
+    xy = np.array(primaries).reshape(4, 2)
+    columns = np.stack([xy[:, 0] / xy[:, 1], np.ones(4), (1 - xy.sum(1)) / xy[:, 1]])
+    scale = np.linalg.solve(columns[:, :3], columns[:, 3])
+    return columns[:, :3] * scale
+
+
+def adapted(
+    from_white: Float[np.ndarray, " 3"], to_white: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, "3 3"]:
+    """Return the matrix that carries XYZ from one white to another (Bradford)."""
+    gain = (_BRADFORD @ to_white) / (_BRADFORD @ from_white)
+    return np.linalg.inv(_BRADFORD) @ np.diag(gain) @ _BRADFORD
+
+
+def to_srgb_matrix(primaries: Primaries) -> Float[np.ndarray, "3 3"]:
+    """Return the matrix from linear colours in other primaries to those in sRGB's."""
+    own, srgb = rgb_to_xyz(primaries), rgb_to_xyz(BT709)
+    return np.linalg.inv(srgb) @ adapted(own.sum(1), srgb.sum(1)) @ own
 
 
 @dataclass(frozen=True)
@@ -33,8 +100,8 @@ class Profile:
 
     Attributes:
         name: as the profile describes itself.
-        decode: light of `_ENTRIES` evenly spaced values from 0 to 1 by channel; None: colours are
-            looked up in tables, which is not done here.
+        decode: light of `_ENTRIES` evenly spaced values from 0 to 1 by channel; None: the profile
+            is made of tables, which are not applied here.
         matrix: from that light to linear sRGB.
     """
 
@@ -44,11 +111,7 @@ class Profile:
 
 
 def profile_of(image: Image.Image) -> Profile | None:
-    """Return the colour space of an opened photograph; None: sRGB, grey or unknown.
-
-    Args:
-        image: opened by Pillow; its pixels are not read.
-    """
+    """Return the colour space in the header of a photograph; None: sRGB, grey or unknown."""
     data = image.info.get("icc_profile")
     if data:
         return read_profile(bytes(data))
@@ -67,11 +130,7 @@ def adobe_rgb() -> Profile:
 
 
 def read_profile(data: bytes) -> Profile | None:
-    """Return the colour space that an ICC profile describes; None: sRGB, grey or broken.
-
-    Args:
-        data: the profile.
-    """
+    """Return the colour space that an ICC profile describes; None: sRGB, grey or broken."""
     try:
         tags = _tags(data)
         if data[16:20] != b"RGB ":
@@ -90,14 +149,10 @@ def read_profile(data: bytes) -> Profile | None:
 
 
 def to_srgb(pixels: UInt[np.ndarray, "h w 3"], profile: Profile) -> UInt[np.ndarray, "h w 3"]:
-    """Return colours in sRGB as 16 bits: 8 would be rounded twice.
+    """Return RGB colours in sRGB as 16 bits, since 8 would be rounded twice.
 
-    What sRGB cannot show is clipped: such channels count as black or saturated, as if the camera
-    had written sRGB.
-
-    Args:
-        pixels: unsigned integers in RGB order.
-        profile: their colour space; one of tables leaves them alone.
+    A profile made of tables leaves them alone. What sRGB cannot show is clipped: such channels
+    count as black or saturated, as if the camera had written sRGB.
     """
     if profile.decode is None or profile.matrix is None:
         return pixels
@@ -114,11 +169,13 @@ def encode_16(light: Float[np.ndarray, "..."]) -> UInt[np.ndarray, "..."]:
     return np.rint(srgb_encode(light) * 65535).astype(np.uint16)
 
 
-def applied(data: bytes, pixels: UInt[np.ndarray, "h w c"]) -> UInt[np.ndarray, "h w c"]:
-    """Return the colours of a photograph in sRGB.
+def with_profile_applied(
+    data: bytes, pixels: UInt[np.ndarray, "h w c"]
+) -> UInt[np.ndarray, "h w c"]:
+    """Return the colours of a photograph in sRGB, by the profile in its file.
 
     Args:
-        data: of its file.
+        data: the bytes of the file.
         pixels: as OpenCV decodes them: B G R, perhaps with alpha behind.
     """
     if pixels.ndim != 3 or pixels.shape[2] < 3 or pixels.dtype not in (np.uint8, np.uint16):
@@ -126,7 +183,7 @@ def applied(data: bytes, pixels: UInt[np.ndarray, "h w c"]) -> UInt[np.ndarray, 
     try:
         with Image.open(io.BytesIO(data)) as image:
             profile = profile_of(image)
-    except Exception:  # of what Pillow cannot open nothing is known
+    except Exception:  # nothing is known of what Pillow cannot open
         return pixels
     if profile is None or profile.decode is None:
         return pixels
@@ -193,3 +250,28 @@ def _curve(tag: bytes) -> Float[np.ndarray, " n"]:
     lift = {1: 0.0, 2: p[-1], 3: 0.0, 4: p[-2]}[kind]
     foot = {1: 0.0, 2: p[-1], 3: 0.0, 4: p[-1]}[kind]
     return np.where(x >= start, np.maximum(a * x + b, 0) ** g + lift, slope * x + foot)
+
+
+def colour_notes(paths: Iterable[Path]) -> tuple[str, ...]:
+    """Return what the user should know of profiles and gain maps; headers are read, no pixels."""
+    applied: Counter[str] = Counter()
+    kept: Counter[str] = Counter()
+    maps = 0
+    for path in paths:
+        maps += has_gain_map(path)
+        try:
+            with Image.open(path) as image:
+                profile = profile_of(image)
+        except Exception:  # whoever decodes it complains
+            continue
+        if profile is not None:
+            (kept if profile.decode is None else applied)[profile.name] += 1
+    out = [
+        f"{n} photographs are in {name}; they are converted to sRGB." for name, n in applied.items()
+    ]
+    out += [
+        f"{n} photographs have the colour profile {name}, made of tables, which is not applied: "
+        "their colours count as sRGB."
+        for name, n in kept.items()
+    ]
+    return (*out, f"{maps} photographs {GAIN_MAP_UNUSED}") if maps else tuple(out)

@@ -1,4 +1,4 @@
-"""Exposures known beforehand: from a CSV file or from EXIF."""
+"""Exposures known beforehand: from a CSV file, or from the EXIF of views."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from p2gs_jax.core.numerics import LN2
-from p2gs_jax.errors import UserError
+from p2gs_jax.errors import UserError, broken
 from p2gs_jax.types import View
 
 KINDS = ("ev", "exposure", "rel_exposure_ev", "exposure_time_s")
@@ -36,25 +36,17 @@ def read_known_exposures(source: str, views: list[View]) -> Float[np.ndarray, " 
             )
         return values
     table = _read(Path(source))
-    values = np.full(len(views), np.nan)
-    for row, view in enumerate(views):
-        value = table.get(view.name, table.get(Path(view.name).name))
-        if value is not None:
-            values[row] = value
+    found = (table.get(view.name, table.get(Path(view.name).name)) for view in views)
+    values = np.array([np.nan if value is None else value for value in found], float)
     if not np.isfinite(values).any():
         example = views[0].name if views else "image.jpg"
-        raise UserError(
-            f"{source} names none of the {len(views)} training views.",
-            fix=f"write names as the scene does, for example {example}",
-        )
+        why = f"names none of the {len(views)} training views."
+        raise broken(source, why, f"write names as the scene does, for example {example}")
     return values
 
 
 def check_source(source: str | None) -> None:
-    """Check that a source can be used, before there are any views.
-
-    Args:
-        source: see `read_known_exposures`; None is fine.
+    """Check that a source of `read_known_exposures`, or none, can be used: before there are views.
 
     Raises:
         UserError: the file cannot be used.
@@ -66,12 +58,10 @@ def check_source(source: str | None) -> None:
 def stated_ev(source: str | None, views: list[View]) -> Float[np.ndarray, " v"]:
     """Return stated exposures in stops, up to a constant; NaN where nothing is stated.
 
-    Args:
-        source: see `read_known_exposures`; None takes EXIF where there is any.
-        views: the views wanted, in order.
+    The source is that of `read_known_exposures`; None takes EXIF where there is any.
 
     Raises:
-        UserError: see `read_known_exposures`.
+        UserError: as of `read_known_exposures`.
     """
     if source is None:
         return _exif_ev(views)
@@ -83,14 +73,13 @@ def _exif_ev(views: list[View]) -> Float[np.ndarray, " v"]:
 
 
 def _read(path: Path) -> dict[str, float]:
+    """Return the natural logarithms of the exposures in a CSV file, by name."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise UserError(
-            f"{path} cannot be read: {reason}.",
-            fix="name a CSV file with the columns image and ev, or say exif",
-        ) from error
+        why = f"cannot be read: {getattr(error, 'strerror', None) or error}."
+        fix = "name a CSV file with the columns image and ev, or say exif"
+        raise broken(path, why, fix) from error
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     reader = csv.DictReader(lines)
     try:
@@ -98,33 +87,29 @@ def _read(path: Path) -> dict[str, float]:
         reader.fieldnames = names
         rows = list(reader)
     except csv.Error as error:
-        raise UserError(f"{path} is no CSV file: {error}.", fix="write it again") from None
+        raise broken(path, f"is not a CSV file: {error}.", "write it again") from None
     kind = next((n for n in KINDS if n in names), None)
     name = next((n for n in ("image", "file") if n in names), None)
     if name is None or kind is None:
-        raise UserError(
-            f"{path} has the columns {', '.join(names) or 'none'}.",
-            fix=f"it needs `image` and one of {', '.join(KINDS)}",
-        )
+        why = f"has the columns {', '.join(names) or 'none'}."
+        raise broken(path, why, f"it needs `image` and one of {', '.join(KINDS)}")
     out = {}
     for number, row in enumerate(rows, 2):
-        if not (row[kind] or "").strip():
-            continue
-        try:
-            value = float(row[kind])
-            log = (
-                value * LN2
-                if kind.endswith("ev")
-                else float(np.log(value))
-                if value > 0
-                else np.nan
-            )
-        except ValueError:
-            log = np.nan
-        if not np.isfinite(log):
-            raise UserError(
-                f"{path}, line {number}: {kind} is {row[kind]!r}.",
-                fix="write a finite number, above 0 for exposures",
-            )
-        out[(row[name] or "").strip()] = log
+        if (row[kind] or "").strip():
+            out[(row[name] or "").strip()] = _log_exposure(row[kind], kind, path, number)
     return out
+
+
+def _log_exposure(text: str, kind: str, path: Path, line: int) -> float:
+    try:
+        value = float(text)
+        if kind.endswith("ev"):
+            log = value * LN2
+        else:
+            log = float(np.log(value)) if value > 0 else np.nan
+    except ValueError:
+        log = np.nan
+    if not np.isfinite(log):
+        fix = "write a finite number, above 0 for exposures"
+        raise broken(f"{path}, line {line}:", f"{kind} is {text!r}.", fix)
+    return log

@@ -1,4 +1,4 @@
-"""Cameras, points and tracks from nothing but a folder of photographs."""
+"""Cameras, points and tracks from nothing but photographs, and why some did not register."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import dataclasses
 import json
 import shutil
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +16,24 @@ from p2gs_jax.config import DataConfig, Mapper
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene.cache import cached_folder, file_fingerprints
+from p2gs_jax.scene.cache import Report, StageProgress, cached_folder, file_fingerprints
 from p2gs_jax.scene.colmap import load_colmap, subfolder
-from p2gs_jax.scene.exif import read_exif_camera
-from p2gs_jax.scene.features import pairs_by_name, quiet_colmap
+from p2gs_jax.scene.convert.headers import read_exif_camera
 from p2gs_jax.scene.files import image_size
-from p2gs_jax.scene.kept_features import kept_features, match_kept
-from p2gs_jax.scene.pace import Pace
-from p2gs_jax.scene.unregistered import reasons, sentence
+from p2gs_jax.scene.sfm.features import (
+    kept_features,
+    match_kept,
+    opened,
+    pairs_by_name,
+    quiet_colmap,
+)
 from p2gs_jax.types import Scene
 
 KEPT, ACCOUNT = "features", "account.json"
+# Fewer features than this seldom give a pose.
+FEW_FEATURES = 100
+# COLMAP takes a pair with fewer inliers for unverified.
+LEAST_INLIERS = 15
 _ADVICE = (
     "photographs register when they are sharp, textured and overlap by more than half with at "
     "least two others, taken from different places"
@@ -39,7 +46,7 @@ def load_images(
     paths: Sequence[Path],
     cfg: DataConfig,
     work_dir: Path | None,
-    report: Callable[[str], None],
+    report: Report,
 ) -> Scene:
     """Run COLMAP's structure from motion on the CPU and read the largest model.
 
@@ -54,8 +61,8 @@ def load_images(
         report: receives progress.
 
     Raises:
-        UserError: fewer than two photographs, one of them is no image, none registered, or pycolmap
-            lacks the mapper.
+        UserError: fewer than two photographs, one of them is not an image, none registered, or
+            pycolmap lacks the mapper.
     """
     names = [path.relative_to(image_folder).as_posix() for path in paths]
     if len(paths) < 2:
@@ -76,18 +83,17 @@ def load_images(
         _build(folder, kept, image_folder, groups, cfg, report)
 
     with cached_folder(work_dir, "sfm", key, build) as folder:
-        scene = load_colmap(
-            root, folder / "model", dataclasses.replace(cfg, images=str(image_folder.resolve()))
-        )
-        why = _said_of(folder / ACCOUNT)
+        images = str(image_folder.resolve())
+        scene = load_colmap(root, folder / "model", dataclasses.replace(cfg, images=images))
+        why = json.loads((folder / ACCOUNT).read_text())["left_out"]
     registered = {view.name for view in scene.views}
     left_out = [name for name in names if name not in registered]
     notes = list(scene.notes)
     if left_out:
-        told = {name: why.get(name, "no reason is known") for name in left_out}
+        known = {name: why.get(name, "no reason is known") for name in left_out}
         notes.append(
             f"{len(left_out)} of {len(names)} images could not be registered and are not used: "
-            f"{sentence(told)}; {_ADVICE}"
+            f"{sentence(known)}; {_ADVICE}"
         )
     report(f"registered {len(registered)} of {len(names)} images, {len(scene.points)} points")
     return dataclasses.replace(scene, format="images", notes=tuple(notes))
@@ -106,21 +112,13 @@ def require_mapper(mapper: Mapper) -> None:
         )
 
 
-def _said_of(path: Path) -> dict[str, str]:
-    """Return why photographs did not register; nothing in results of older versions."""
-    try:
-        return json.loads(path.read_text())["left_out"]
-    except (OSError, ValueError, KeyError):
-        return {}
-
-
 def _build(
     folder: Path,
     kept: Path,
     image_folder: Path,
     groups: Mapping[tuple, Sequence[str]],
     cfg: DataConfig,
-    report: Callable[[str], None],
+    report: Report,
 ) -> None:
     """Fill the folder with the largest model and an account; the features are kept beside it."""
     quiet_colmap()
@@ -155,14 +153,14 @@ def _build(
 
 
 def _map(
-    database: Path, image_folder: Path, output: Path, count: int, report: Callable[[str], None]
+    database: Path, image_folder: Path, output: Path, count: int, report: Report
 ) -> list[pycolmap.Reconstruction]:
-    registered, pace = 2, Pace(report, "mapping", count, "images")
+    registered, progress = 2, StageProgress(report, "mapping", count, "images")
 
     def on_next_image() -> None:
         nonlocal registered
         registered += 1
-        pace(registered)
+        progress(registered)
 
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = 0
@@ -173,22 +171,84 @@ def _map(
 
 
 def _map_globally(
-    database: Path, image_folder: Path, output: Path, count: int, report: Callable[[str], None]
+    database: Path, image_folder: Path, output: Path, count: int, report: Report
 ) -> list[pycolmap.Reconstruction]:
     """Map all photographs at once; focal lengths, which this does not find, come first."""
     report(f"mapping {count} images at once")
-    # What it changes stays out of the matches that are kept.
-    own = output / database.name
-    shutil.copyfile(database, own)
+    # The copy keeps what it changes out of the matches that are kept.
+    copy = output / database.name
+    shutil.copyfile(database, copy)
     calibration = pycolmap.ViewGraphCalibrationOptions()
     calibration.random_seed = 0
     options = pycolmap.GlobalPipelineOptions()
     options.random_seed = 0
     try:
-        pycolmap.calibrate_view_graph(own, calibration)
-        models = pycolmap.global_mapping(own, image_folder, output, options=options)
+        pycolmap.calibrate_view_graph(copy, calibration)
+        models = pycolmap.global_mapping(copy, image_folder, output, options=options)
     except (RuntimeError, ValueError) as error:
-        raise UserError(
-            f"the global mapper failed: {error}.", fix="leave out --data.mapper global"
-        ) from error
+        fix = "leave out --data.mapper global"
+        raise UserError(f"the global mapper failed: {error}.", fix=fix) from error
     return list(models.values())
+
+
+def reasons(
+    database: Path, names: Sequence[str], models: Sequence[pycolmap.Reconstruction]
+) -> dict[str, str]:
+    """Return for every photograph that is not in the first model why not, in words.
+
+    Args:
+        database: features and matches.
+        names: of all photographs.
+        models: what was reconstructed; the first is used.
+    """
+    parts = [{model.image(i).name for i in model.reg_image_ids()} for model in models]
+    used = parts[0] if parts else set()
+    left = [name for name in names if name not in used]
+    if not left:
+        return {}
+    features, partners = _known(database)
+    return {name: _why(name, features.get(name, 0), partners.get(name, {}), parts) for name in left}
+
+
+def sentence(why: Mapping[str, str]) -> str:
+    """Return the photographs and the reasons, those of one reason together."""
+    by_reason: dict[str, list[str]] = defaultdict(list)
+    for name, reason in why.items():
+        by_reason[reason].append(name)
+    return "; ".join(f"{', '.join(names)} ({reason})" for reason, names in by_reason.items())
+
+
+def _why(name: str, count: int, met: Mapping[str, int], parts: Sequence[set[str]]) -> str:
+    """Return why a photograph with so many features and verified matches did not register."""
+    if count == 0:
+        return "no features: it does not open, or shows nothing"
+    few = f"only {count} features: blurred, dark or without texture"
+    if not met:
+        return few if count < FEW_FEATURES else "matches no other photograph"
+    other = next((part for part in parts[1:] if name in part), None)
+    if other is not None:
+        return f"in a part of {len(other)} photographs that shares too little with the rest"
+    here = {other: inliers for other, inliers in met.items() if parts and other in parts[0]}
+    if not here:
+        return "matches only photographs that did not register either"
+    if count < FEW_FEATURES:
+        return few
+    best = max(here, key=lambda other: here[other])
+    return (
+        f"{here[best]} matches with {best}, its best of {len(here)}: too few of them are points "
+        "that others see too"
+    )
+
+
+def _known(database: Path) -> tuple[dict[str, int], dict[str, dict[str, int]]]:
+    """Return the number of features of every photograph, and its verified matches by partner."""
+    with opened(database) as db:
+        images = {image.image_id: image.name for image in db.read_all_images()}
+        features = {name: db.num_keypoints_for_image(i) for i, name in images.items()}
+        partners: dict[str, dict[str, int]] = defaultdict(dict)
+        pairs, counts = db.read_two_view_geometry_num_inliers()
+        for pair, inliers in zip(pairs, counts, strict=True):
+            a, b = (images[i] for i in pycolmap.pair_id_to_image_pair(pair))
+            if inliers >= LEAST_INLIERS:
+                partners[a][b] = partners[b][a] = int(inliers)
+        return features, partners
