@@ -23,8 +23,8 @@ from p2gs_jax.gaussians.dense import (
     DenseSeeds,
     coverage_of,
     dense_limit,
+    dense_seeds,
     gaussians_of,
-    match_photographs,
     wants_dense,
 )
 from p2gs_jax.gaussians.matching import Tones, rough_tones
@@ -273,15 +273,15 @@ def prepare(
 
     added: DenseSeeds | None = None
     if dense:
-        added = match_photographs(
+        tones = Tones.of(photometry, resolved.photometry)
+        solved_tones = solution is not None or part is not None
+        added = dense_seeds(
             scene,
             still,
-            rough_tones(tracks, len(views))
-            if solution is None and part is None
-            else Tones.of(photometry, resolved.photometry),
-            scene.points[seeds.keep],
-            photometry,
+            tones if solved_tones else rough_tones(tracks, len(views)),
+            tones,
             resolved,
+            existing=scene.points[seeds.keep],
             limit=dense_limit(cfg, len(seeds.keep), coverage),
             on_view=lambda i, n: reporter.stage("Matching photographs", i, n),
         )
