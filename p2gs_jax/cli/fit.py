@@ -148,36 +148,26 @@ class Calibrate:
         """Solve the photometry alone; print it as a table."""
         from p2gs_jax.cli.tables import print_calibration, print_calibration_of, print_stack
         from p2gs_jax.core.progress import TerminalReporter
-        from p2gs_jax.pipeline.calibrate import calibrate
-        from p2gs_jax.pipeline.calibrate_of import STEPS, calibrate_of
-        from p2gs_jax.pipeline.calibrate_run import calibrate_run
-        from p2gs_jax.pipeline.calibrate_stack import calibrate_stack
-        from p2gs_jax.pipeline.calibration import write_calibration
+        from p2gs_jax.pipeline.calibrate import calibrate, calibrate_run, calibrate_stack
+        from p2gs_jax.pipeline.convert import STEPS, calibrate_of
 
-        scene, out, cfg, known = self.scene, self.out, self.checked(), self.config.photometry
+        scene, out, cfg = self.scene, self.out, self.checked()
         is_run = (scene / "config.json").is_file() and (scene / "radiance.ply").is_file()
         with TerminalReporter() as reporter:
             how = {"compare_with": self.compare_with, "reporter": reporter}
             if self.static:
-                reporter.stage("Solving the stack")
-                result = calibrate_stack(
-                    scene,
-                    known=known.known,
-                    known_deviation_ev=known.known_deviation_ev,
-                    compare_with=self.compare_with,
-                )
-                write_calibration(result, out)
+                result = calibrate_stack(scene, out, cfg, **how)
             elif self.of is not None:
                 steps = STEPS if self.steps is None else self.steps
-                found = calibrate_of(self.of, scene, out, cfg, steps=steps, **how)
+                result = calibrate_of(scene, out, cfg, model=self.of, steps=steps, **how)
             elif is_run:
-                result = calibrate_run(scene, out, cfg.photometry, **how)
+                result = calibrate_run(scene, out, cfg, **how)
             else:
                 result = calibrate(scene, out, cfg, **how)
         if self.static:
             print_stack(result, out)
         elif self.of is not None:
-            print_calibration_of(found, out)
+            print_calibration_of(result, out)
         else:
             print_calibration(result, out)
         return 0
