@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from p2gs_jax.evaluation.alignment import exposure_error
     from p2gs_jax.jobs.configs import grid, read_sweep, with_fields
     from p2gs_jax.jobs.sweep import sweep
-    from p2gs_jax.paths.pinhole import make_camera
+    from p2gs_jax.paths.shots import make_camera
     from p2gs_jax.photometry.display import DisplayTransform, develop
     from p2gs_jax.pipeline.calibrate import calibrate
     from p2gs_jax.pipeline.calibrate_of import calibrate_of
@@ -75,7 +75,7 @@ _LAZY = {
     "fit_blocks": "p2gs_jax.districts.fit",
     "grid": "p2gs_jax.jobs.configs",
     "load_run": "p2gs_jax.run.read",
-    "make_camera": "p2gs_jax.paths.pinhole",
+    "make_camera": "p2gs_jax.paths.shots",
     "read_sweep": "p2gs_jax.jobs.configs",
     "rasterization": "p2gs_jax.render.rasterization",
     "render_linear": "p2gs_jax.render",

@@ -17,7 +17,8 @@ from p2gs_jax.core.progress import PlainConsole
 from p2gs_jax.photometry.formation import corner
 from p2gs_jax.photometry.solution import WEAK_GAMMA, PhotometricSolution
 from p2gs_jax.pipeline.calibrate_of import CalibrationOf
-from p2gs_jax.pipeline.calibration import CalibrationResult
+from p2gs_jax.pipeline.calibrate_stack import StackResult
+from p2gs_jax.pipeline.calibration import Calibration, CalibrationResult
 
 # Columns of words; all others hold numbers.
 WORDS = ("views", "view", "camera", "protocol", "program", "lens", "configuration", "")
@@ -108,7 +109,7 @@ def print_metrics(metrics: dict[str, Any], out: Path) -> None:
     console.print(f"Results: {out} (open {out / 'summary.png'} first)")
 
 
-def print_calibration(result: CalibrationResult, out: Path) -> None:
+def print_calibration(result: Calibration, out: Path) -> None:
     """Print solved exposures, gammas and cameras, with their errors."""
     s, seconds = result.solution, result.seconds
     _print_solution(result, _tone_columns(result))
@@ -137,7 +138,7 @@ def print_calibration_of(found: CalibrationOf, out: Path) -> None:
     stdout().print(f"Results: {out} (a run folder: view, render, export, report read it)")
 
 
-def print_stack(result: CalibrationResult, out: Path) -> None:
+def print_stack(result: StackResult, out: Path) -> None:
     """Print the solved exposures of a stack from one viewpoint, and its response."""
     s = result.solution
     points = [str(count) for count in s.observations_per_view]
