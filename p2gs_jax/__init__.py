@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from p2gs_jax.jobs.configs import read_sweep as read_sweep
     from p2gs_jax.jobs.configs import with_fields as with_fields
     from p2gs_jax.jobs.sweep import sweep as sweep
-    from p2gs_jax.paths.pinhole import make_camera as make_camera
+    from p2gs_jax.paths.shots import make_camera as make_camera
     from p2gs_jax.photometry.display import DisplayTransform as DisplayTransform
     from p2gs_jax.photometry.display import develop as develop
     from p2gs_jax.pipeline.calibrate import calibrate as calibrate
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from p2gs_jax.pipeline.survey import survey as survey
     from p2gs_jax.render import render_linear as render_linear
     from p2gs_jax.render import required_capacity as required_capacity
+    from p2gs_jax.render.rasterization import rasterization as rasterization
     from p2gs_jax.run.read import Run as Run
     from p2gs_jax.run.read import load_run as load_run
     from p2gs_jax.run.write import write_run as write_run

@@ -12,18 +12,10 @@ from jaxtyping import Float32
 from p2gs_jax.cli.render import FPS, Render
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.frames import OutputFrame
-from p2gs_jax.paths import (
-    PosePath,
-    Shot,
-    covering,
-    drive,
-    find_orbit,
-    find_rig,
-    of_camera,
-    orbit,
-    view_shots,
-)
-from p2gs_jax.paths.drive import frame_count, interpolated
+from p2gs_jax.paths import drive, orbit
+from p2gs_jax.paths.drive import PosePath, beside, beside_shots, frame_count, interpolated
+from p2gs_jax.paths.orbit import find_orbit
+from p2gs_jax.paths.panorama import covering
 from p2gs_jax.paths.pictures import (
     RunRenderer,
     comparison_frames,
@@ -32,7 +24,8 @@ from p2gs_jax.paths.pictures import (
     shot_frames,
     wide_frames,
 )
-from p2gs_jax.paths.shift import beside, beside_shots
+from p2gs_jax.paths.rig import find_rig
+from p2gs_jax.paths.shots import Shot, of_camera, view_shots
 from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.run.read import Run
 

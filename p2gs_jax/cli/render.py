@@ -97,7 +97,7 @@ class Render:
         from p2gs_jax.core.clock import CompileCounter
         from p2gs_jax.core.progress import TerminalReporter
         from p2gs_jax.formats.frames import open_frames
-        from p2gs_jax.paths import read_cameras, write_cameras
+        from p2gs_jax.paths.files import read_cameras, write_cameras
         from p2gs_jax.paths.pictures import RunRenderer
         from p2gs_jax.run.read import load_run
 

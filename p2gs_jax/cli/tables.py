@@ -167,7 +167,7 @@ def _print_solution(result: Calibration, more: Mapping[str, list[str]]) -> None:
 def _exposure_columns(result: Calibration) -> dict[str, list[str]]:
     """Return columns by title, without those that are empty or constant."""
     s, views = result.solution, result.views
-    errors, stated, gaps = s.exposure_errors / LN2, result.stated_ev, result.agreement.gap_ev
+    errors, stated, gaps = s.exposure_errors_ev, result.stated_ev, result.agreement.gap_ev
     known, given, wrong = np.isfinite(errors), np.isfinite(stated), result.agreement.disagrees
     rows = range(len(views))
     columns = {"view": [v.name for v in views]}

@@ -27,7 +27,7 @@ from p2gs_jax.pipeline.fit import begin_programs, begun, compact, optimise
 from p2gs_jax.pipeline.preflight import Paths
 from p2gs_jax.pipeline.prepare import load, prepare
 from p2gs_jax.run.folder import RunFolder, locked
-from p2gs_jax.scene.images import size_at
+from p2gs_jax.scene.pixels.store import size_at
 from p2gs_jax.scene.visibility import shown_share
 from p2gs_jax.train.data_parallel import mesh_of
 from p2gs_jax.train.programs import StepPrograms

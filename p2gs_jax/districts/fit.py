@@ -46,7 +46,7 @@ from p2gs_jax.pipeline.prepare import load
 from p2gs_jax.run.decisions import read_decisions
 from p2gs_jax.run.folder import RunFolder, RunLock, locked, require_free
 from p2gs_jax.run.write import write_start
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import Params, Scene
 
 BLOCKS = "blocks"

@@ -15,12 +15,12 @@ from p2gs_jax.core.progress import Reporter
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.seeds import cameras_radius, photographed_radiance, with_colors
 from p2gs_jax.gaussians.shell import Sphere, sphere_behind
+from p2gs_jax.photometry.calibrate import Selection
 from p2gs_jax.photometry.parameters import point_radiance
-from p2gs_jax.photometry.selection import Selection
 from p2gs_jax.pipeline.exposures import solve_exposures
 from p2gs_jax.pipeline.survey import near_depth, near_plane, scale_notes, seen_depths
 from p2gs_jax.run.decisions import Decisions, read_decisions, write_decisions
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import Photometry, Scene
 
 ARRAYS, DECISIONS = "shared.npz", "decisions.json"

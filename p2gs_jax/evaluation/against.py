@@ -24,9 +24,8 @@ from p2gs_jax.evaluation.scores import still_mask, summary_of, view_scores
 from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
 from p2gs_jax.photometry.formation import LEAST_ALPHA
 from p2gs_jax.render.capacity import make_renderer
-from p2gs_jax.scene.device import camera_of
-from p2gs_jax.scene.images import ImageStore
 from p2gs_jax.scene.pixels.decode import floats
+from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 from p2gs_jax.types import GAMMA_SRGB, Gaussians, Scene
 
 # Protocols of a run that are set beside those of other programs.

@@ -53,8 +53,7 @@ from p2gs_jax.photometry.formation import exposed_at
 from p2gs_jax.photometry.metering import Metering, Readings, meter
 from p2gs_jax.photometry.models import MODELS
 from p2gs_jax.render.capacity import RenderView
-from p2gs_jax.scene.device import camera_of
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 from p2gs_jax.types import Camera, Params, Render, Scene
 
 

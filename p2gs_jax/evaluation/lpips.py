@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 
 from p2gs_jax.core.atomic import BROKEN_ARRAYS
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene.images import size_at
+from p2gs_jax.scene.pixels.store import size_at
 from p2gs_jax.types import View
 
 # Added to the length of a feature vector (the authors' code); a vector of zeros stays zero.

@@ -13,8 +13,7 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.radiance import Truth
 from p2gs_jax.formats.exr import read_exr
-from p2gs_jax.scene.device import camera_of
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 from p2gs_jax.types import Scene
 
 Reference = Callable[[int], np.ndarray | None]

@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float, Float32
 from p2gs_jax.core.numerics import on_host
 from p2gs_jax.evaluation.passes import ArrayStore, StoredArray
 from p2gs_jax.render.warp import warp
-from p2gs_jax.scene.geometry import scale_intrinsics
+from p2gs_jax.scene.lens import scale_intrinsics
 from p2gs_jax.types import Camera, Scene, View
 
 # Photographs are compared at this width; lengths below are in its pixels.

@@ -26,7 +26,7 @@ from p2gs_jax.gaussians.matching import MatchImages, Tones, neighbours, visibili
 from p2gs_jax.gaussians.population import Coverage, default_max_gaussians
 from p2gs_jax.gaussians.seeds import gaussians_from_points, neighbour_scales
 from p2gs_jax.photometry.formation import places
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.visibility import shown_share
 from p2gs_jax.types import Gaussians, Photometry, Scene, View
 

@@ -19,7 +19,7 @@ from p2gs_jax.core.numerics import fibonacci_sphere
 from p2gs_jax.gaussians.seeds import camera_centers, gaussians_from_points, merge
 from p2gs_jax.photometry.formation import inverse_formation, places
 from p2gs_jax.photometry.sources.sampling import sample
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.visibility import in_frame, project_points
 from p2gs_jax.types import Gaussians, Photometry, Scene, View
 

@@ -18,28 +18,27 @@ from jaxtyping import Float
 
 from p2gs_jax.config import FitConfig, require_config
 from p2gs_jax.core.atomic import no_empty_folders, write_json
-from p2gs_jax.core.numerics import LN2
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.posed import standing
 from p2gs_jax.photometry.adjustment.problem import KnownExposures
-from p2gs_jax.photometry.calibrate import CalibrationOptions, calibrate_observations, options_of
-from p2gs_jax.photometry.observations import Observations
-from p2gs_jax.photometry.selection import Selection
-from p2gs_jax.photometry.solution import Agreement, PhotometricSolution, compare, note_on_levels
-from p2gs_jax.photometry.sources.points import (
-    has_tracks,
-    rendered_colors,
-    surface_colors,
+from p2gs_jax.photometry.calibrate import (
+    CalibrationOptions,
+    Selection,
+    calibrate_observations,
+    options_of,
 )
+from p2gs_jax.photometry.observations import Observations
+from p2gs_jax.photometry.solution import Agreement, PhotometricSolution, compare, note_on_levels
+from p2gs_jax.photometry.sources.points import has_tracks, rendered_colors, surface_colors
 from p2gs_jax.photometry.sources.stack import SATURATED, StackColors, read_stack, stack_colors
 from p2gs_jax.photometry.unmodelled import LOCAL_EV, Unexplained, residuals, unexplained
 from p2gs_jax.run.photometry_files import write_solution
 from p2gs_jax.run.plots import write_calibration_plot
 from p2gs_jax.run.read import load_run
 from p2gs_jax.scene import load_scene
-from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.scene.known_exposures import check_source, read_known_exposures, stated_ev
+from p2gs_jax.scene.exposures import check_source, read_known_exposures, stated_ev
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import Scene, View
 
 STACK_PIVOT = 0.18
@@ -94,7 +93,7 @@ class Calibration:
     @property
     def errors_ev(self) -> Float[np.ndarray, " v"]:
         """Standard errors of the recovered exposures, stops; infinite where they are unknown."""
-        return self.solution.exposure_errors / LN2
+        return self.solution.exposure_errors_ev
 
 
 def write_calibration(result: Calibration, out: Path) -> None:
@@ -219,7 +218,7 @@ def solved(
     seconds = {"reading": sampled - begin, "adjustment": time.monotonic() - sampled}
     views, s, pivot = tuple(scene.training_views), selection.solution, cfg.photometry.pivot
     stated = stated_ev(compare_with, list(views))
-    agreement = compare(s.exposures_ev, s.exposure_errors / LN2, stated)
+    agreement = compare(s.exposures_ev, s.exposure_errors_ev, stated)
     messages = [*scene.notes, *selection.reasons, *s.warnings]
     if agreement.views:
         by = "EXIF" if compare_with in (None, "exif") else Path(str(compare_with)).name
@@ -315,7 +314,7 @@ def calibrate_stack(
     selection = calibrate_observations(found.observations, options)
     s, problem = selection.solution, options.problem(found.observations)
     left = unexplained(problem, residuals(problem, s), found.xy, stack.valid.shape, found.signal)
-    errors_ev = np.where(found.signal, s.exposure_errors / LN2, np.inf)
+    errors_ev = np.where(found.signal, s.exposure_errors_ev, np.inf)
     agreement = compare(s.exposures_ev, errors_ev, stated)
     messages = [*selection.reasons, *s.warnings, *_stack_messages(stack.views, found, left)]
     if agreement.views >= 2:

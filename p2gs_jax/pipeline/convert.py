@@ -16,19 +16,15 @@ from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.against import score_foreign
-from p2gs_jax.formats.foreign import read_foreign
+from p2gs_jax.formats.splat import read_foreign
 from p2gs_jax.gaussians.bake import relit, viewer_config
 from p2gs_jax.gaussians.dense import coverage_of
 from p2gs_jax.gaussians.seeds import cameras_radius
+from p2gs_jax.photometry.calibrate import Selection
 from p2gs_jax.photometry.display import usual_display
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.parameters import initial_photometry
-from p2gs_jax.photometry.selection import Selection
-from p2gs_jax.photometry.sources.points import (
-    has_tracks,
-    rendered_colors,
-    track_colors,
-)
+from p2gs_jax.photometry.sources.points import has_tracks, rendered_colors, track_colors
 from p2gs_jax.pipeline.calibrate import Calibration, solved, write_calibration
 from p2gs_jax.pipeline.exposures import decide
 from p2gs_jax.pipeline.finish import Account, finish
@@ -37,8 +33,8 @@ from p2gs_jax.pipeline.preflight import Paths, check_run_dir
 from p2gs_jax.pipeline.prepare import Prepared
 from p2gs_jax.run.folder import RunFolder, locked
 from p2gs_jax.scene import load_scene
-from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.scene.known_exposures import check_source
+from p2gs_jax.scene.exposures import check_source
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.train.programs import StepPrograms
 from p2gs_jax.types import Gaussians, Params, Scene
 

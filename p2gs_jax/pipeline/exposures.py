@@ -15,17 +15,16 @@ from jaxtyping import Float32
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.progress import Reporter, Silent
-from p2gs_jax.photometry.calibrate import calibrate_observations, options_of
+from p2gs_jax.photometry.calibrate import Selection, calibrate_observations, options_of
 from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.parameters import initial_photometry
 from p2gs_jax.photometry.response import Response
-from p2gs_jax.photometry.selection import Selection
 from p2gs_jax.photometry.sources.points import has_tracks, surface_colors
 from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.run.decisions import KEY, Decisions
 from p2gs_jax.run.folder import RunFolder
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import Photometry, Scene
 
 # Exposures that are learned from nothing move this many times faster (docs/photometry.md, 4).

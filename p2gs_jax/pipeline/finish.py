@@ -18,12 +18,12 @@ from p2gs_jax.evaluation.evaluate import Evaluation, ViewResult, evaluate
 from p2gs_jax.evaluation.lpips import LpipsWeights
 from p2gs_jax.evaluation.references import Reference, find_radiance
 from p2gs_jax.evaluation.scores import is_drive, untold_notes
-from p2gs_jax.photometry.selection import Selection
+from p2gs_jax.photometry.calibrate import Selection
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.run.plots import write_unexplained
 from p2gs_jax.run.write import summary_rows, write_run, write_view
-from p2gs_jax.scene.images import ImageStore, size_at
+from p2gs_jax.scene.pixels.store import ImageStore, size_at
 from p2gs_jax.types import Params, Scene
 
 

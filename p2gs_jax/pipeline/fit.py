@@ -21,8 +21,8 @@ from p2gs_jax.core.clock import CompileCounter, Stopwatch
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.appearance import exposures_apart
+from p2gs_jax.photometry.calibrate import Selection
 from p2gs_jax.photometry.parameters import recentre
-from p2gs_jax.photometry.selection import Selection
 from p2gs_jax.pipeline.exposures import kept_choice
 from p2gs_jax.pipeline.finish import Account, finish, seconds_to_finish
 from p2gs_jax.pipeline.preflight import Paths, check_run_dir, check_scene, memory_named, preflight

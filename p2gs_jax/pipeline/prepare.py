@@ -21,37 +21,22 @@ from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.core.runtime import return_freed_memory
 from p2gs_jax.core.streams import Stream
 from p2gs_jax.errors import UserError
-from p2gs_jax.gaussians.dense import (
-    DenseSeeds,
-    dense_limit,
-    gaussians_of,
-    match_photographs,
-)
+from p2gs_jax.gaussians.dense import DenseSeeds, dense_limit, gaussians_of, match_photographs
 from p2gs_jax.gaussians.matching import Tones, rough_tones
-from p2gs_jax.gaussians.moving import (
-    Nodes,
-    node_gaussians,
-    nodes_radiance,
-    with_vibration,
-)
+from p2gs_jax.gaussians.moving import Nodes, node_gaussians, nodes_radiance, with_vibration
 from p2gs_jax.gaussians.population import Coverage
-from p2gs_jax.gaussians.seeds import (
-    merge,
-    photographed_radiance,
-    subsample,
-    with_colors,
-)
+from p2gs_jax.gaussians.seeds import merge, photographed_radiance, subsample, with_colors
 from p2gs_jax.gaussians.shell import Shell, Sphere, black_gaussians, find_shell, shell_gaussians
 from p2gs_jax.losses.relative_exposure import ColorPairs
+from p2gs_jax.photometry.calibrate import Selection
 from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.parameters import initial_appearance, initial_photometry, point_radiance
 from p2gs_jax.photometry.response import Response
-from p2gs_jax.photometry.selection import Selection
 from p2gs_jax.pipeline.exposures import Exposures, likely, solve_exposures, with_choice
 from p2gs_jax.pipeline.survey import Survey, survey
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.scene import load_scene
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.train.compared_photographs import color_pairs
 from p2gs_jax.types import Gaussians, Measured, Params, Scene, View
 

@@ -13,25 +13,13 @@ from jaxtyping import Float, Int
 from p2gs_jax.config import FitConfig, InitConfig
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.errors import UserError
-from p2gs_jax.gaussians.dense import (
-    coverage_of,
-    wants_dense,
-)
-from p2gs_jax.gaussians.moving import (
-    Nodes,
-    clock_of,
-    find_nodes,
-    vibrates,
-)
+from p2gs_jax.gaussians.dense import coverage_of, wants_dense
+from p2gs_jax.gaussians.moving import Nodes, clock_of, find_nodes, vibrates
 from p2gs_jax.gaussians.population import Coverage
-from p2gs_jax.gaussians.seeds import (
-    camera_centers,
-    cameras_radius,
-    subsample,
-)
+from p2gs_jax.gaussians.seeds import camera_centers, cameras_radius, subsample
 from p2gs_jax.gaussians.shell import Shell, Sphere, find_shell
 from p2gs_jax.pipeline.preflight import memory_needed, require_memory
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.visibility import SHARE_POINTS, SHARE_VIEWS, in_frame, project_points
 from p2gs_jax.train.measured_depths import measured_depths
 from p2gs_jax.train.schedule import shrinks

@@ -28,7 +28,7 @@ from p2gs_jax.report.page import figure, folded, paragraph, row, table
 from p2gs_jax.report.pictures import LARGE, ViewComparison, jpeg, spread, without_suffix
 from p2gs_jax.report.run_files import RunFiles
 from p2gs_jax.run.read import Run, load_run
-from p2gs_jax.scene.device import camera_of
+from p2gs_jax.scene.pixels.store import camera_of
 from p2gs_jax.synth.exposures import read_true_exposures
 
 MOST_PAIRS, MOST_CLIPPED, MOST_RENDERED = 12, 24, 3

@@ -20,7 +20,7 @@ from jaxtyping import Int
 from p2gs_jax.core.atomic import BROKEN_ARRAYS, atomic_write
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene.drives.moving import MovingObjects
+from p2gs_jax.scene.drives.objects import MovingObjects
 from p2gs_jax.types import Distortion, Lidar, Scene, TrackedObject, Tracks, View
 
 SCENE_FILE = "scene.npz"

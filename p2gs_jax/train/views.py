@@ -9,7 +9,7 @@ from jaxtyping import Float32
 
 from p2gs_jax.core.numerics import on_host
 from p2gs_jax.core.streams import Stream, generator, view_order
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.train.batches import batches_of
 from p2gs_jax.types import Batch, Camera, Measured
 

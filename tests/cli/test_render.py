@@ -13,8 +13,10 @@ import pytest
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.formats.exr import read_exr
-from p2gs_jax.paths import Shot, covering, find_rig, view_shots
+from p2gs_jax.paths.panorama import covering
 from p2gs_jax.paths.pictures import RunRenderer
+from p2gs_jax.paths.rig import find_rig
+from p2gs_jax.paths.shots import Shot, view_shots
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.run.read import load_run
 from p2gs_jax.run.scene_file import write_scene

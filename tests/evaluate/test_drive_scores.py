@@ -15,7 +15,7 @@ from p2gs_jax.evaluation.evaluate import evaluate
 from p2gs_jax.evaluation.scores import mean_of_parts, parts_of, region_scores
 from p2gs_jax.evaluation.unexplained import Surface
 from p2gs_jax.scene.drives.assemble import assemble
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.rigid import headings, left_of_way, moment_of, up_of_drive
 from p2gs_jax.scene.split import assign_split
 from p2gs_jax.types import Gaussians, Lidar, Params, Photometry, Render, View

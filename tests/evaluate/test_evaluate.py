@@ -22,7 +22,7 @@ from p2gs_jax.jobs.sweep import to_markdown
 from p2gs_jax.photometry.metering import meter
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.read import load_run
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import Gaussians, Params, Photometry, Render, Scene, View
 
 HEIGHT, WIDTH = 34, 40

@@ -20,7 +20,7 @@ from p2gs_jax.gaussians.matching import (
 )
 from p2gs_jax.gaussians.population import Coverage
 from p2gs_jax.photometry.observations import Observations
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import Scene, View
 
 WIDTH, HEIGHT, FOCAL = 192, 144, 180.0

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from p2gs_jax.paths import Shot
+from p2gs_jax.paths.shots import Shot
 from p2gs_jax.types import View
 
 

@@ -5,8 +5,8 @@ import pytest
 from cameras import shot, turned
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.paths import read_cameras, write_cameras
-from p2gs_jax.paths.geometry import inverse
+from p2gs_jax.paths.files import read_cameras, write_cameras
+from p2gs_jax.scene.rigid import inverse
 
 GOOD = {
     "viewmat": np.eye(4).tolist(),

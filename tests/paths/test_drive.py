@@ -3,8 +3,9 @@ import pytest
 from cameras import shot, turned
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.paths import PosePath, Shot, drive, of_camera, view_shots
-from p2gs_jax.paths.geometry import inverse
+from p2gs_jax.paths.drive import PosePath, drive
+from p2gs_jax.paths.shots import Shot, of_camera, view_shots
+from p2gs_jax.scene.rigid import inverse
 from p2gs_jax.types import View
 
 

@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 from cameras import shot, turned
 
-from p2gs_jax.paths import find_orbit, orbit
-from p2gs_jax.paths.geometry import inverse, look_at
-from p2gs_jax.scene.rigid import up_direction
+from p2gs_jax.paths.orbit import find_orbit, look_at, orbit
+from p2gs_jax.scene.rigid import inverse, up_direction
 
 UP = np.array([0.0, -1, 0])
 FOCUS = np.array([3.0, -1, 7])

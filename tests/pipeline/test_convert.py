@@ -15,9 +15,8 @@ from p2gs_jax.config import PhotometryConfig, RenderConfig
 from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.alignment import exposure_error
-from p2gs_jax.formats.foreign import read_foreign
 from p2gs_jax.formats.ply import read_ply, write_ply
-from p2gs_jax.formats.splat import write_splat
+from p2gs_jax.formats.splat import read_foreign, write_splat
 from p2gs_jax.gaussians.bake import relit
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.render.capacity import make_renderer

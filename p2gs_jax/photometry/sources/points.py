@@ -20,8 +20,7 @@ from p2gs_jax.photometry.sources.sampling import PROJECTED_UNCERTAINTY, point_co
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.render.warp import project_points as warped_points
 from p2gs_jax.render.warp import surface_depth, unproject, visible
-from p2gs_jax.scene.device import camera_of
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 from p2gs_jax.scene.visibility import project_points, unoccluded
 from p2gs_jax.types import Gaussians, Scene
 
@@ -100,13 +99,8 @@ def rendered_colors(
 ) -> Observations:
     """Warp pixels of each training view into the others through rendered depth.
 
-    Args:
-        gaussians: the fit; all of them are alive.
-        scene: its views; points that they hide are left out by their depth.
-        store: photographs, sampled at the resolution of the fit.
-        cfg: how it is rendered.
-        seed: of the sampled pixels.
-        on_view: progress: depths rendered, views in all.
+    Points that a view hides are left out by their depth. All Gaussians are alive; photographs
+    are sampled at the resolution of the fit, and `seed` chooses the pixels.
     """
     rng = generator(seed, Stream.RENDERED_PIXELS)
     render = make_renderer(cfg)

@@ -13,7 +13,7 @@ from p2gs_jax.core.numerics import srgb_decode, srgb_encode
 from p2gs_jax.photometry.formation import places
 from p2gs_jax.photometry.observations import COARSEST, Observations
 from p2gs_jax.photometry.response import DARKEST
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.visibility import project_points
 from p2gs_jax.types import Scene
 
@@ -31,19 +31,13 @@ DIAGONAL, REACH = 200, 0.12
 
 
 class Samples(NamedTuple):
-    """Colours of an image at some positions.
+    """Colours of an image at some positions."""
 
-    Attributes:
-        colors: averages over patches, display-encoded.
-        spread: standard deviation of `colors` from uncertain positions: gradient times that.
-        brightest: largest display values of the pixels that were averaged.
-        valid: inside the image and its mask.
-    """
-
-    colors: Float32[np.ndarray, "o 3"]
+    colors: Float32[np.ndarray, "o 3"]  # averages over patches, display-encoded
+    # Standard deviation of `colors` from uncertain positions: gradient times that.
     spread: Float32[np.ndarray, "o 3"]
-    brightest: Float32[np.ndarray, "o 3"]
-    valid: Bool[np.ndarray, " o"]
+    brightest: Float32[np.ndarray, "o 3"]  # largest display values of the pixels that were averaged
+    valid: Bool[np.ndarray, " o"]  # inside the image and its mask
 
 
 def sample(
@@ -52,13 +46,9 @@ def sample(
     xy: Float[np.ndarray, "o 2"],
     wider: Float[np.ndarray, " o"] | None = None,
 ) -> Samples:
-    """Sample an image at pixel positions.
+    """Sample an image, where its mask is 1, at pixel positions (centres at +0.5).
 
-    Args:
-        ldr: photograph.
-        mask: 1 = use.
-        xy: positions, pixel centres at +0.5.
-        wider: factors by which the averaged patches are wider than PATCH; None: 1.
+    The averaged patches are wider than PATCH by the factors `wider`; None: 1.
     """
     factors = np.ones(len(xy)) if wider is None else wider
     # Odd, so that patches are centred.
@@ -152,7 +142,9 @@ def point_colors(
     wider, keep = _at_one_scale(scene, store, points)
     nothing = np.zeros((0, 3), np.float32)
     empty = np.zeros(0, int), np.zeros(0, int), nothing, nothing, nothing
-    parts = [(*empty, np.zeros(0, np.float32), np.zeros((0, 2), np.float32))]
+    parts: list[tuple[np.ndarray, ...]] = [
+        (*empty, np.zeros(0, np.float32), np.zeros((0, 2), np.float32))
+    ]
     for row, (index, kept) in enumerate(zip(scene.train_indices, keep, strict=True)):
         mine = points[row][kept]
         if len(mine):
