@@ -15,8 +15,8 @@ from p2gs_jax.core.progress import Reporter
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.seeds import cameras_radius, photographed_radiance, with_colors
 from p2gs_jax.gaussians.shell import Sphere, sphere_behind
+from p2gs_jax.photometry.calibrate import Selection
 from p2gs_jax.photometry.parameters import initial_photometry, point_radiance
-from p2gs_jax.photometry.selection import Selection
 from p2gs_jax.pipeline.decide import decide
 from p2gs_jax.pipeline.prepare import solve
 from p2gs_jax.pipeline.scale import near_depth, near_plane, scale_notes, seen_depths

@@ -17,8 +17,7 @@ from p2gs_jax.core.atomic import atomic_folder, write_json
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.core.progress import Reporter
 from p2gs_jax.errors import UserError
-from p2gs_jax.export.colmap_folder import write_colmap_folder
-from p2gs_jax.export.nerfstudio_folder import write_nerfstudio_folder
+from p2gs_jax.export.folders import write_colmap_folder, write_nerfstudio_folder
 from p2gs_jax.export.page import MEGABYTE, write_page
 from p2gs_jax.export.sidecar import corrections_name, linear_sidecar
 from p2gs_jax.formats.exr import write_exr

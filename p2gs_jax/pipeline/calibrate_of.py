@@ -20,11 +20,10 @@ from p2gs_jax.formats.splat import read_foreign
 from p2gs_jax.gaussians.bake import relit, viewer_config
 from p2gs_jax.gaussians.dense import coverage_of
 from p2gs_jax.gaussians.seeds import cameras_radius
-from p2gs_jax.photometry.calibrate import calibrate_observations, options_of
+from p2gs_jax.photometry.calibrate import Selection, calibrate_observations, options_of
 from p2gs_jax.photometry.display import usual_display
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.parameters import initial_photometry
-from p2gs_jax.photometry.selection import Selection
 from p2gs_jax.photometry.sources.points import has_tracks, rendered_colors, track_colors
 from p2gs_jax.pipeline.calibration import Calibration, with_stated, write_calibration
 from p2gs_jax.pipeline.decide import decide

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.core.atomic import write_json
-from p2gs_jax.photometry.selection import Selection
+from p2gs_jax.photometry.calibrate import Selection
 from p2gs_jax.photometry.solution import Agreement, PhotometricSolution, compare, note_on_levels
 from p2gs_jax.run.photometry_files import write_solution
 from p2gs_jax.run.plots import write_calibration_plot

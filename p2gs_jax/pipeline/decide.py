@@ -5,9 +5,9 @@ from __future__ import annotations
 import dataclasses
 
 from p2gs_jax.config import FitConfig
+from p2gs_jax.photometry.calibrate import Selection
 from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.response import Response
-from p2gs_jax.photometry.selection import Selection
 from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.run.decisions import KEY, Decisions
 from p2gs_jax.run.folder import RunFolder

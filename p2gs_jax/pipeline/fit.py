@@ -22,8 +22,8 @@ from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.lpips import LpipsWeights
 from p2gs_jax.photometry.appearance import exposures_apart
+from p2gs_jax.photometry.calibrate import Selection
 from p2gs_jax.photometry.parameters import recentre
-from p2gs_jax.photometry.selection import Selection
 from p2gs_jax.pipeline.decide import kept_choice
 from p2gs_jax.pipeline.finish import Account, finish
 from p2gs_jax.pipeline.memory_needed import memory_named

@@ -47,12 +47,11 @@ from p2gs_jax.gaussians.seeds import (
 )
 from p2gs_jax.gaussians.shell import black_gaussians, find_shell, shell_gaussians
 from p2gs_jax.losses.relative_exposure import ColorPairs
-from p2gs_jax.photometry.calibrate import calibrate_observations, options_of
+from p2gs_jax.photometry.calibrate import Selection, calibrate_observations, options_of
 from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.parameters import initial_appearance, initial_photometry, point_radiance
 from p2gs_jax.photometry.response import Response
-from p2gs_jax.photometry.selection import Selection
 from p2gs_jax.photometry.sources.points import has_tracks, surface_colors
 from p2gs_jax.pipeline.decide import decide, likely, with_choice
 from p2gs_jax.pipeline.memory_needed import memory_needed, require_memory

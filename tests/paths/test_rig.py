@@ -1,4 +1,4 @@
-"""Drives moved sideways, and rigs that look all around."""
+"""Rigs: found by names and frames, level and centred; drives moved sideways."""
 
 import dataclasses
 
@@ -12,6 +12,84 @@ from p2gs_jax.paths.panorama import covering
 from p2gs_jax.paths.rig import find_rig
 from p2gs_jax.paths.shots import view_shots
 from p2gs_jax.scene.rigid import inverse
+
+MOUNTS = {
+    "front": turned(2, (0, 0.1, 0.5), pitch=3, roll=1),
+    "left": turned(-45, (-0.4, 0, 0.2), pitch=3),
+    "right": turned(45, (0.4, -0.1, 0.2), pitch=3),
+}
+
+
+def vehicle(step):
+    """Return vehicle-to-world on a curved road."""
+    return inverse(turned(8 * step, (0.3 * step**2, 0, 2.0 * step)))
+
+
+def photographs(steps=4, mounts=MOUNTS, leave_out=()):
+    out = [
+        view(f"{camera}/{k:06d}.png", mount @ inverse(vehicle(k)))
+        for camera, mount in mounts.items()
+        for k in range(steps)
+        if (camera, k) not in leave_out
+    ]
+    return sorted(out, key=lambda v: v.name)
+
+
+def rig_of(views):
+    return find_rig(view_shots(views), views)
+
+
+def test_steps_are_found_by_name_and_cameras_are_placed_on_the_rig():
+    views = photographs()
+    rig = rig_of(views)
+    assert [s.name for s in rig.steps] == [f"{k:06d}" for k in range(4)]
+    for step in rig.steps:
+        assert sorted(step.shots) == sorted(MOUNTS)
+        for camera, found in step.shots.items():
+            np.testing.assert_allclose(
+                rig.mounts[camera].viewmat @ inverse(step.pose), found.viewmat, atol=1e-6
+            )
+
+
+def test_the_rig_is_centred_and_level():
+    rig = rig_of(photographs())
+    centers = np.stack([inverse(s.viewmat)[:3, 3] for s in rig.mounts.values()])
+    np.testing.assert_allclose(centers.mean(0), 0, atol=1e-9)
+    step = rig.steps[0]
+    np.testing.assert_allclose(step.pose[:3, 1], [0, 1, 0], atol=0.02)  # down stays down
+    assert np.rad2deg(np.arccos(step.pose[2, 2])) < 2  # forward stays forward
+
+
+def test_missing_photographs_do_not_move_the_rig():
+    full = rig_of(photographs())
+    some = rig_of(photographs(leave_out={("left", 0), ("right", 2), ("left", 3), ("front", 3)}))
+    assert [s.name for s in some.steps] == ["000000", "000001", "000002"]
+    assert sorted(some.steps[0].shots) == ["front", "right"]
+    for k in range(3):
+        np.testing.assert_allclose(some.steps[k].pose, full.steps[k].pose, atol=1e-5)
+
+
+ALONE = photographs(mounts={"front": MOUNTS["front"]})
+UNLIKE = [view(f"{c}/{c}_{k}.png", turned(0, (0, 0, k))) for c in "ab" for k in range(3)]
+LOOSE = [
+    view(f"{c}/{k}.png", turned(40 * k * (c == "b"), (0, 0, k))) for c in "ab" for k in range(4)
+]
+ABSENT = [*photographs(), view("back/000099.png", turned(180))]
+
+
+@pytest.mark.parametrize(
+    ("views", "words"),
+    [
+        (ALONE, "one camera"),
+        (UNLIKE, "never agree"),
+        (LOOSE, "turn against each other"),
+        (ABSENT, "'back'"),
+    ],
+)
+def test_what_is_not_a_rig_is_refused(views, words):
+    with pytest.raises(UserError, match=words):
+        rig_of(views)
+
 
 # Around the car, degrees to the right; alphabetically "back" comes first.
 AROUND = {"back": 180, "front": 0, "front_left": -60, "front_right": 60, "left": -120, "right": 120}

@@ -1,16 +1,18 @@
-"""What is exported as COLMAP is the same scene, to us and to pycolmap, with its exposures."""
+"""What is exported for COLMAP and nerfstudio is the same scene, with its exposures."""
 
 import csv
 import dataclasses
+import json
 
 import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
+from plyfile import PlyData
 from tiny_scene import make_scene
 
 from p2gs_jax.config import DataConfig
-from p2gs_jax.export.colmap_folder import write_colmap_folder
+from p2gs_jax.export.folders import write_colmap_folder, write_nerfstudio_folder
 from p2gs_jax.scene import ImageStore, load_scene
 from p2gs_jax.scene.exposures import read_known_exposures
 
@@ -171,3 +173,30 @@ def test_a_failure_leaves_nothing_behind(tmp_path):
     with pytest.raises(Exception, match=r"3\.png"):
         write_colmap_folder(root / "out", scene, store, rows(scene))
     assert sorted(p.name for p in root.iterdir()) == ["images", "sparse"]
+
+
+def test_nerfstudio_has_the_same_scene(tmp_path):
+    root = camera_with_distortion(make_scene(tmp_path / "scene"))
+    cfg = DataConfig(max_width=80, test_every=3)
+    scene = load_scene(root, cfg)
+    store = ImageStore(scene.views, cfg)
+    write_nerfstudio_folder(tmp_path / "out", scene, store, rows(scene))
+    back = load_scene(tmp_path / "out", DataConfig())
+    again = ImageStore(back.views, DataConfig())
+    assert back.format == "transforms"
+    assert len(back.views) == len(scene.views)
+    for index, (view, old) in enumerate(zip(back.views, scene.views, strict=True)):
+        assert old.name.endswith(view.name)
+        assert view.split == old.split
+        np.testing.assert_allclose(view.viewmat, old.viewmat, atol=1e-6)
+        for new, kept in zip(again.camera(index)[1:], store.camera(index)[1:], strict=True):
+            np.testing.assert_allclose(new, kept, rtol=1e-6)
+        here, there = again.get(index)[0], store.get(index)[0]
+        assert np.abs(here - there).mean() < 0.02
+    np.testing.assert_allclose(back.points, scene.points, atol=1e-6)
+
+    written = json.loads((tmp_path / "out" / "transforms.json").read_text())
+    assert len(written["val_filenames"]) == len(scene.test_indices)
+    cloud = PlyData.read(str(tmp_path / "out" / written["ply_file_path"]))["vertex"]
+    np.testing.assert_array_equal(cloud["red"], scene.point_colors[:, 0])
+    assert (tmp_path / "out" / "exposures.csv").is_file()
