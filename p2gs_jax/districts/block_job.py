@@ -157,9 +157,10 @@ def _fit(
             cfg,
             reporter,
             clock,
-            lambda known: begin_programs(programs, known, block.scene, folder, mesh),
+            lambda known, curve: begin_programs(programs, known, folder, mesh, curve=curve),
             pixels=folder.pixels,
-            part=block.part,
+            given=block.exposures,
+            sphere=block.shell,
         )
         with begun(folder, Paths(Path(scene), folder.root), cfg, prepared.decisions):
             result = optimise(prepared, folder, reporter, programs, resume=True, mesh=mesh)

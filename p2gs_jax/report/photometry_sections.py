@@ -19,7 +19,7 @@ from p2gs_jax.report.run_files import RunFiles
 from p2gs_jax.report.svg import FIRST, FOURTH, INK, MUTED, SECOND, THIRD
 from p2gs_jax.run.photometry_files import CameraPhotometry, ViewPhotometry, with_curve_of
 from p2gs_jax.run.scene_file import read_times
-from p2gs_jax.scene.drives.choose import short_name
+from p2gs_jax.scene.drives.recording import short_name
 from p2gs_jax.types import GAMMA_SRGB
 
 # More cameras than this, or cameras with fewer views than this, share one panel.

@@ -16,7 +16,7 @@ from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.formats.false_color import STOPS, false_color, luminance, stops
-from p2gs_jax.formats.png import to_uint8
+from p2gs_jax.formats.frames import to_uint8
 from p2gs_jax.report.page import paragraph, row, text
 from p2gs_jax.report.run_files import RunFiles, number_at
 

@@ -15,7 +15,7 @@ from p2gs_jax.config import CameraFormation, FitConfig
 from p2gs_jax.evaluation.seams import Photographed, measure_seam
 from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.photometry.formation import corner, squared_radii
-from p2gs_jax.pipeline.decide import decide, likely, unsolved
+from p2gs_jax.pipeline.exposures import decide, likely, unsolved
 from p2gs_jax.render.warp import surface_depth
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.run.read import load_run
@@ -84,9 +84,9 @@ def test_without_a_solution_only_views_learn():
         "photometry.vignetting": "camera",
     }
     cfg = with_fields(FitConfig(), asked)
-    decided = decide(cfg, None, matched=False)
+    decided = decide(cfg, None)
     assert (decided.white_balance, decided.vignetting) == ("view", None)
-    assert likely(cfg, None, matched=False) == decided
+    assert likely(cfg, None) == decided
     by_camera = with_fields(cfg, {"photometry.white_balance": "camera"})
     assert unsolved(Decisions.as_asked(by_camera)).white_balance is None
 
