@@ -22,12 +22,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 from towns import METHODS, WIDE, fit_all, methods, options, stamp
 
-from p2gs_jax.photometry.display import DisplayTransform, develop
-from p2gs_jax.photometry.mean import mean_parameters
+from p2gs_jax.photometry.display import DisplayTransform, develop, mean_parameters
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.read import Run, load_run
-from p2gs_jax.scene.device import camera_of
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 
 STOPS = (-2.0, -1.0, 0.0, 1.0, 2.0)
 GAMMAS = (1.6, 2.2, 3.0)

@@ -34,9 +34,9 @@ import numpy as np
 from published_rows import HERE, Key, fitted, measure, of_fit
 
 import p2gs_jax
-from p2gs_jax.evaluate.alignment import fit_capture, with_fitted_exposure
-from p2gs_jax.evaluate.metrics import psnr, ssim
-from p2gs_jax.evaluate.references import load_reference
+from p2gs_jax.evaluation.alignment import fit_capture, with_fitted_exposure
+from p2gs_jax.evaluation.references import load_reference
+from p2gs_jax.evaluation.scores import psnr, ssim
 from p2gs_jax.photometry.display import with_capture
 
 sys.path.insert(0, str(HERE.parent))

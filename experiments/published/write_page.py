@@ -31,8 +31,8 @@ AT_SIZE, HDR = HERE.parent / "at_size.json", "mu_law_novel"
 HDR_HEAD = """## HDR radiance, as GaussHDR and HDR-NeRF judge it
 
 PSNR of radiance after log(1 + 5000 x) / log(5001); 1 is the brightest true value of the view, one
-scale for all views (`p2gs_jax/evaluate/mu_law.py`). Their scenes are not at hand, so no published
-figure stands beside these: a town of 300 photographs whose true radiance is known
+scale for all views (`p2gs_jax/evaluation/radiance.py`). Their scenes are not at hand, so no
+published figure stands beside these: a town of 300 photographs whose true radiance is known
 ([at size](RESULTS.md#at-size-300-photographs-of-480x325-7000-steps)). Photographs of one exposure
 (ISO-Const) do not tell the curve.
 """

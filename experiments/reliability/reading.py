@@ -12,10 +12,8 @@ from reliability.trials import NONSENSE, REFUSED
 # Everything that reading needs, so that a forked child imports nothing.
 import p2gs_jax.cli.parser
 import p2gs_jax.cli.tables
-import p2gs_jax.scene.plan_picture
-import p2gs_jax.scene.structure_from_motion
-import p2gs_jax.scene.survey
-import p2gs_jax.scene.triangulate  # noqa: F401
+import p2gs_jax.scene.sfm.map
+import p2gs_jax.scene.sfm.triangulate  # noqa: F401
 from p2gs_jax.cli import main
 from p2gs_jax.config import DataConfig
 from p2gs_jax.core.text import printable
@@ -23,7 +21,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.scene import find_scene, with_what_lies_beside
 from p2gs_jax.scene.drives.assemble import assemble
 from p2gs_jax.scene.drives.recording import Recording
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import Scene
 
 FIT = (

@@ -13,8 +13,8 @@ import tyro
 from p2gs_jax.cli.shared import SceneFolder
 
 if TYPE_CHECKING:
-    from p2gs_jax.evaluate.against import Judge
-    from p2gs_jax.evaluate.renders_of_others import OtherRenders
+    from p2gs_jax.evaluation.evaluate import Judge
+    from p2gs_jax.evaluation.renders_of_others import OtherRenders
 
 # Folders that do not say whose renders they hold.
 COMMON = re.compile(r"renders|rgb|test|ours_\d+|\.")
@@ -43,16 +43,14 @@ class Eval:
 
     def execute(self) -> int:
         """Evaluate the run and rewrite its metrics; options replace those of the run."""
-        import numpy as np
-
         from p2gs_jax.cli.tables import print_against, print_metrics
         from p2gs_jax.core.atomic import write_json
         from p2gs_jax.core.progress import TerminalReporter
-        from p2gs_jax.evaluate.against import Judge, check_renders
-        from p2gs_jax.evaluate.evaluate import evaluate
-        from p2gs_jax.evaluate.lpips_weights import read_lpips_weights
-        from p2gs_jax.evaluate.references import find_radiance, load_reference
-        from p2gs_jax.evaluate.renders_of_others import find_renders
+        from p2gs_jax.evaluation.against import check_renders
+        from p2gs_jax.evaluation.evaluate import Judge, evaluate
+        from p2gs_jax.evaluation.lpips import read_lpips_weights
+        from p2gs_jax.evaluation.references import find_radiance, load_reference
+        from p2gs_jax.evaluation.renders_of_others import find_renders
         from p2gs_jax.render.capacity import make_renderer
         from p2gs_jax.run.folder import RunFolder
         from p2gs_jax.run.photometry_files import write_metering
@@ -73,9 +71,8 @@ class Eval:
             for label, place in _labelled(self.against).items()
         }
         with TerminalReporter() as reporter:
-            metrics = evaluate(
+            found = evaluate(
                 fitted.params,
-                np.asarray(fitted.alive),
                 scene,
                 store,
                 make_renderer(cfg.render, fitted.owner),
@@ -83,12 +80,12 @@ class Eval:
                 reference=truth,
                 radiance=find_radiance(scene, store),
                 lpips_weights=weights,
-                on_metering=lambda found: write_metering(folder.metering, found),
-                on_unexplained=lambda found: write_unexplained(
-                    folder.unexplained, scene, store, found
-                ),
                 on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
             )
+            metrics = found.metrics
+            write_metering(folder.metering, found.metering)
+            if found.unexplained:
+                write_unexplained(folder.unexplained, scene, store, found.unexplained)
             judge = Judge(scene, store, fitted.params, cfg, weights, truth)
             beside = _judged(
                 others, judge, metrics, lambda done, count: reporter.stage("Judging", done, count)
@@ -120,7 +117,7 @@ def _judged(
     on_progress: Callable[[int, int], None],
 ) -> dict[str, Any]:
     """Return what `against.json` holds (docs/files.md)."""
-    from p2gs_jax.evaluate.against import judge_renders, own_scores
+    from p2gs_jax.evaluation.against import judge_renders, own_scores
 
     programs = {}
     for label, renders in found.items():

@@ -110,8 +110,8 @@ def display_transform(fitted: Run, options: Export) -> DisplayTransform:
     ev = options.exposure_ev or 0.0
     transform = fitted.common_display(ev)
     if options.exposure_of is not None:
-        typical = fitted.metering.typical_log_exposure(options.exposure_of)
-        transform = replace(transform, exposure=math.exp(typical) * 2**ev)
+        typical = fitted.metering.typical_exposure(options.exposure_of)
+        transform = replace(transform, exposure=typical * 2**ev)
     if options.white_balance_of is not None:
         balance = fitted.white_balance_of(options.white_balance_of)
         transform = replace(transform, white_balance=balance)

@@ -80,7 +80,7 @@ class Report:
         """Write the page, and print it where that is asked for; 1 where a file is broken."""
         from p2gs_jax.cli.tables import stdout
         from p2gs_jax.core.progress import TerminalReporter
-        from p2gs_jax.report.pdf import find_browser, print_pdf
+        from p2gs_jax.report.page import find_browser, print_pdf
         from p2gs_jax.report.report import write_report
         from p2gs_jax.report.run_files import read_run
 
@@ -116,8 +116,7 @@ class Compare:
     def execute(self) -> int:
         """Print the runs side by side and write the page."""
         from p2gs_jax.cli.tables import make_table, stdout
-        from p2gs_jax.report.compare import apart, compare_runs
-        from p2gs_jax.report.compare_page import write_comparison
+        from p2gs_jax.report.compare import apart, compare_runs, write_comparison
 
         found = compare_runs(self.runs)
         page, table = write_comparison(found, self.out)

@@ -39,8 +39,7 @@ class Survey:
         """Print what there is, and draw it."""
         from p2gs_jax.cli.tables import stdout
         from p2gs_jax.core.progress import TerminalReporter
-        from p2gs_jax.scene.plan_picture import draw_plan
-        from p2gs_jax.scene.survey import survey
+        from p2gs_jax.scene.survey import draw_plan, survey
 
         out = self.out
         check(

@@ -36,13 +36,8 @@ def naming(path: Path, *, begun: Path | None = None, size: int = _PART) -> Itera
     """Let a write that fails in a `with` block for want of room or rights say so, with its path.
 
     Writers of images, checkpoints and tables report a full disk as anything from `False` to a page
-    of C++; the system's own words name the fault.
-
-    Args:
-        path: what is written, named in the error.
-        begun: the file that holds what was written so far: more is added to see whether that can
-            be. Without it, a new file is tried beside `path`.
-        size: bytes that are tried, about as many as the write needs.
+    of C++; the system's own words name the fault. To find them, `size` bytes more are written to
+    `begun`, which holds what was written so far, or without it to a new file beside `path`.
 
     Raises:
         OSError: the system's reason, with `filename`. Other errors stay as they are.
@@ -80,11 +75,9 @@ def _raise_reason(path: Path, begun: Path | None, size: int, error: Exception) -
 def atomic_write(path: Path, *, durable: bool = True) -> Iterator[Path]:
     """Yield a temporary path beside `path`; it replaces `path`, or is deleted after an error.
 
-    Args:
-        path: the file to write; its folder is created. The temporary name keeps the suffix, for
-            writers that choose a format by it.
-        durable: wait until it is on the disk, so that a power failure leaves no half of it. Not for
-            what is checked when it is read, and can be made again.
+    The folder of `path` is created. The temporary name keeps the suffix, for writers that choose a
+    format by it. With `durable` the file is on the disk before it replaces `path`, so that a power
+    failure leaves no half of it; without, its reader must check it.
 
     Raises:
         OSError: it cannot be written; `filename` names it, whatever the writer said.

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.gaussians.init.seeds import camera_centers
+from p2gs_jax.gaussians.seeds import camera_centers
 from p2gs_jax.scene.visibility import in_frame, project_points
 from p2gs_jax.types import Scene, View
 

@@ -19,7 +19,7 @@ from p2gs_jax.core.numerics import on_device
 from p2gs_jax.districts.cut import OVERLAP, Cut
 from p2gs_jax.districts.seams import Seam, measure_seams
 from p2gs_jax.render.harmonics import scaled
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import Gaussians, Scene
 
 # How far into a core its radiance is moved, as a share of the shortest core.

@@ -17,8 +17,7 @@ from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.districts.cut import Cut
 from p2gs_jax.render.capacity import RenderView, make_renderer
-from p2gs_jax.scene.device import camera_of
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 from p2gs_jax.types import Gaussians, Scene
 
 # Views of a boundary that are rendered at most. With 12 a step was .018 stop, with 48 .005.

@@ -14,7 +14,7 @@ import numpy as np
 from p2gs_jax.core.numerics import evenly_spaced, on_device
 from p2gs_jax.formats.false_color import false_color
 from p2gs_jax.photometry.display import DisplayTransform
-from p2gs_jax.photometry.spline_curve import by_camera, tables
+from p2gs_jax.photometry.response import by_camera, tables
 from p2gs_jax.render import project, view_radiance
 from p2gs_jax.render.tiles import smallest_cutoff
 from p2gs_jax.run.read import Run
@@ -43,11 +43,7 @@ def page_scene(
 ) -> dict[str, Any]:
     """Return what the page reads besides the Gaussians, as plain values or arrays.
 
-    Args:
-        fitted: the run.
-        gaussians: of the run, as of one time.
-        look: what it opens with.
-        photographs: data URLs, by row of the view.
+    It opens with `look`; `photographs` are data URLs by row of the view.
     """
     mean = fitted.mean.exposure_geometric
     return {
@@ -69,11 +65,7 @@ def page_scene(
 
 
 def embedded_photographs(fitted: Run, count: int) -> dict[int, str]:
-    """Return undistorted photographs as data URLs, by row of the view, evenly spread.
-
-    Args:
-        fitted: the run.
-        count: how many at most.
+    """Return at most `count` undistorted photographs as data URLs, by row, evenly spread.
 
     Raises:
         UserError: they are gone or broken.

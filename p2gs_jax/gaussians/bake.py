@@ -1,4 +1,4 @@
-"""Display colours for ordinary 3DGS viewers, and the error of their pictures.
+"""Display colours for ordinary 3DGS viewers, the error of their pictures, and radiance from them.
 
 A viewer composites display values; the true picture composites radiance and then applies the tone
 curve, which is not linear. Display colours computed for each Gaussian by itself are therefore wrong
@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, UInt8
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.numerics import fibonacci_sphere, on_device
-from p2gs_jax.photometry.display import DisplayTransform, develop
+from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
 from p2gs_jax.render import render_linear
 from p2gs_jax.render.capacity import (
     RenderView,
@@ -38,6 +38,7 @@ from p2gs_jax.render.harmonics import (
     coefficient_count,
     degree_of,
     radiance_activation,
+    radiance_preactivation,
 )
 from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.types import Camera, Gaussians, Render
@@ -47,6 +48,8 @@ DIRECTIONS = 64
 CHUNK = 8192
 # Variance that viewers add to the 2D covariance, pixels^2, as 3DGS does.
 VIEWER_BLUR = 0.3
+# Display values beyond which a splat of another program counts as saturated.
+BRIGHTEST = 250.0 / 255.0
 # Adam's rates per step for colours of degree 0, of the others, and for opacity logits; they decay
 # to a tenth. Measured on two runs (BUILD_NOTES, "Display PLY").
 COLOR_RATE, BANDS_RATE, OPACITY_RATE, DECAY = 0.05, 0.0025, 0.3, 0.1
@@ -54,13 +57,7 @@ COLOR_RATE, BANDS_RATE, OPACITY_RATE, DECAY = 0.05, 0.0025, 0.3, 0.1
 
 @dataclass(frozen=True)
 class Target:
-    """A view and its true picture.
-
-    Attributes:
-        name: of the view.
-        camera: its camera.
-        picture: the true picture, 8 bits.
-    """
+    """A view and its true picture, 8 bits."""
 
     name: str
     camera: Camera
@@ -71,12 +68,8 @@ class Target:
 class ViewError:
     """Differences between a viewer's picture of one view and the true one.
 
-    Attributes:
-        name: of the view.
-        psnr: dB.
-        mean_codes: mean absolute difference, 8-bit levels.
-        max_codes: largest absolute difference of any channel.
-        psnr_on_white: dB, in a viewer whose background is white instead of black.
+    The PSNR is in dB, also that in a viewer whose background is white instead of black; mean and
+    largest absolute difference of any channel are in 8-bit levels.
     """
 
     name: str
@@ -89,15 +82,7 @@ class ViewError:
 def true_target(
     name: str, gaussians: Gaussians, camera: Camera, transform: DisplayTransform, render: RenderView
 ) -> Target:
-    """Return the true picture of a view: radiance is composited, then developed.
-
-    Args:
-        name: of the view.
-        gaussians: linear radiance.
-        camera: the view.
-        transform: from radiance to display values.
-        render: of the run, from `make_renderer`.
-    """
+    """Return the true picture of a view: linear radiance is composited, then developed."""
     linear = render(gaussians, _all(gaussians), camera).linear
     picture = np.rint(255 * develop(linear, transform)).astype(np.uint8)
     return Target(name, camera, picture)
@@ -124,14 +109,7 @@ def display_comments(transform: DisplayTransform) -> list[str]:
 def bake(
     gaussians: Gaussians, transform: DisplayTransform, activation: RadianceKind, degree: int
 ) -> Gaussians:
-    """Return Gaussians with display colours, computed for each by itself.
-
-    Args:
-        gaussians: linear radiance.
-        transform: from radiance to display values.
-        activation: of the spherical harmonics.
-        degree: of the display colours; a higher one than the radiance has changes nothing.
-    """
+    """Return linear Gaussians with display colours of a degree, computed for each by itself."""
     sh = np.asarray(gaussians.sh)
     degree = min(degree, degree_of(sh.shape[1]))
     shown = display_sh(sh, lambda linear: develop(linear, transform), activation, degree)
@@ -146,13 +124,8 @@ def display_sh(
 ) -> Float[np.ndarray, "n k2 3"]:
     """Return coefficients whose value + 1/2 is the display colour, least squares over directions.
 
-    Exact for degree 0.
-
-    Args:
-        sh: coefficients of radiance.
-        tone: radiance -> display values, clamped to [0, 1] here.
-        activation: of the spherical harmonics.
-        degree: of the result; None keeps the radiance's.
+    Exact for degree 0. `tone` takes radiance to display values, clamped to [0, 1] here; `degree`
+    is that of the result, None keeps the radiance's.
     """
     directions = fibonacci_sphere(DIRECTIONS).astype(np.float32)
     axes = tuple(directions.T)
@@ -195,20 +168,12 @@ def refine(
     seed: int = 0,
     on_step: Callable[[int, int], None] = lambda done, steps: None,
 ) -> Gaussians:
-    """Return Gaussians whose pictures in a viewer are closer to the targets.
+    """Return Gaussians from `bake` whose pictures in a viewer are closer to the targets.
 
     Adam on the mean squared difference, one view a step, in epochs of random order. Every
     other step has a background of random colour instead of black, as viewers may have bright
     backgrounds. Base colours stay in [0, 1], which viewers with 8-bit colours need. Gaussians that
-    no target shows stay as they are.
-
-    Args:
-        gaussians: from `bake`.
-        targets: the true pictures.
-        cfg: rendering options of the run.
-        steps: 0 returns the Gaussians as they are.
-        seed: of the order.
-        on_step: steps done, steps in all.
+    no target shows stay as they are. `on_step` is called with steps done and steps in all.
     """
     if steps == 0 or not targets or gaussians.capacity == 0:
         return gaussians
@@ -256,13 +221,7 @@ def refine(
 def baking_error(
     gaussians: Gaussians, targets: Sequence[Target], cfg: RenderConfig
 ) -> list[ViewError]:
-    """Compare a viewer's pictures with the true ones.
-
-    Args:
-        gaussians: display colours, as the file holds them.
-        targets: the true pictures.
-        cfg: rendering options of the run.
-    """
+    """Compare a viewer's pictures of display colours, as a file holds them, with the true ones."""
     render = make_renderer(viewer_config(cfg))
     return [_difference(t, render(gaussians, _all(gaussians), t.camera)) for t in targets]
 
@@ -307,3 +266,20 @@ def error_summary(errors: Sequence[ViewError]) -> dict | None:
 
 def _all(gaussians: Gaussians) -> Array:
     return on_device(np.ones(gaussians.capacity), bool)
+
+
+def relit(gaussians: Gaussians, shown: DisplayTransform, cfg: RenderConfig) -> Gaussians:
+    """Return Gaussians with the radiance of their base colours, each by itself.
+
+    What depends on the direction begins at nothing: in a model that knows no exposures it mostly
+    tells one photograph's exposure from another's.
+
+    Args:
+        gaussians: display colours, 3DGS's: max(0, sh + 1/2).
+        shown: how the photographs were taken, on average; nothing that depends on the place.
+        cfg: activation and degree of the result.
+    """
+    colors = np.clip(0.5 + C0 * np.asarray(gaussians.sh[:, 0]), 0.0, BRIGHTEST)
+    sh = np.zeros((len(colors), coefficient_count(cfg.sh_degree), 3), np.float32)
+    sh[:, 0] = radiance_preactivation(undevelop(colors, shown), cfg.radiance) / C0
+    return replace(gaussians, sh=on_device(sh))

@@ -29,12 +29,7 @@ _WEIGHTS[0] = _WEIGHTS[-1] = _NODES[1] / 2
 def share(
     opacity: Float[Array, " n"], copies: Float[Array, " n"]
 ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Return opacity and scale factor of each of `copies` Gaussians that together look like one.
-
-    Args:
-        opacity: of the one, in (0, 1).
-        copies: how many share its place, >= 1.
-    """
+    """Return opacity and scale factor of each of `copies` Gaussians that together look like one."""
     new = 1 - jnp.exp(jnp.log1p(-jnp.minimum(opacity, 1 - 1e-6)) / copies)
     behind = jnp.log1p(-new[:, None] * jnp.exp(-(_NODES**2)))
     integrand = -jnp.expm1(copies[:, None] * behind)
@@ -59,18 +54,11 @@ def relocate_and_grow(
 ) -> Outcome:
     """Move transparent Gaussians onto opaque ones and add `births` new ones there.
 
-    Targets are drawn in proportion to opacity times demand. All Gaussians in one place get the
-    opacity and scale of `share`, and they are moved apart by `cfg.spread` of their extent: in
-    exactly one place they would have the same gradients, and opaque ones, which no noise reaches,
-    would never separate (BUILD_NOTES, "Twins").
-
-    Args:
-        key: randomness.
-        gaussians: the scene.
-        population: who is alive.
-        births: new Gaussians wanted; those without a free slot are counted in `refused`.
-        cfg: opacity threshold, spread.
-        demand: where more Gaussians are needed (`train/demand.py`); None: alike everywhere.
+    Targets are drawn in proportion to opacity times demand (`train/demand.py`; None: alike
+    everywhere). All Gaussians in one place get the opacity and scale of `share`, and they are moved
+    apart by `cfg.spread` of their extent: in exactly one place they would have the same gradients,
+    and opaque ones, which no noise reaches, would never separate (BUILD_NOTES, "Twins"). Births
+    without a free slot are counted in `refused`.
     """
     n = population.alive.shape[0]
     dead = transparent(gaussians, population, cfg)
@@ -116,11 +104,8 @@ def _apart(
 ) -> Gaussians:
     """Move Gaussians within their own extent, and shrink them so that their joint extent stays.
 
-    Args:
-        gaussians: the scene.
-        away: directions in units of the principal axes, variance 1; zero for all others.
-        where: which Gaussians.
-        spread: deviation of the moves over that of the Gaussian, below 1.
+    `away` are directions in units of the principal axes, of variance 1, zero for those that stay;
+    `spread` is the deviation of the moves over that of the Gaussian, below 1.
     """
     scales = jnp.exp(gaussians.log_scales)
     moved = _turned(rotation_matrices(gaussians.quats), spread * away * scales)
@@ -137,20 +122,12 @@ def _turned(R, local: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
 
 
 def exploration_noise(
-    key: PRNGKeyArray,
-    gaussians: Gaussians,
-    alive: Bool[Array, " n"],
-    rate: Float[Array, ""],
+    key: PRNGKeyArray, gaussians: Gaussians, alive: Bool[Array, " n"], rate: Float[Array, ""]
 ) -> Float[Array, "n 3"]:
     """Return the noise to add to the means after a step.
 
-    It has the shape of each Gaussian's covariance and reaches only nearly transparent ones.
-
-    Args:
-        key: randomness.
-        gaussians: the scene.
-        alive: slots in use.
-        rate: noise scale times the learning rate of the means.
+    It has the shape of each Gaussian's covariance and reaches only nearly transparent ones. `rate`
+    is the noise scale times the learning rate of the means.
     """
     # The same numbers in any precision.
     normal = jax.random.normal(key, gaussians.means.shape, jnp.float32)
@@ -158,10 +135,7 @@ def exploration_noise(
 
 
 def shaped_noise(
-    normal: Float[Array, "n 3"],
-    gaussians: Gaussians,
-    alive: Bool[Array, " n"],
-    rate: Float[Array, ""],
+    normal: Float[Array, "n 3"], gaussians: Gaussians, alive: Bool[Array, " n"], rate
 ) -> Float[Array, "n 3"]:
     """Return the noise that independent normal numbers give; see `exploration_noise`."""
     gate = jax.nn.sigmoid(NOISE_STEEPNESS * (NOISE_OPACITY - opacities(gaussians)))

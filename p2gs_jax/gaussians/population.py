@@ -32,12 +32,7 @@ class Outcome(NamedTuple):
 
 
 def fresh_population(alive: Bool[Array, " n"], owner: Int[Array, " n"] | None = None) -> Population:
-    """Return a population with empty statistics.
-
-    Args:
-        alive: slots in use.
-        owner: the moving object that each Gaussian belongs to, or None.
-    """
+    """Return a population with empty statistics; `owner` is the moving object of each Gaussian."""
     # Two arrays, not one twice: the step donates its input, and a buffer can be donated once only.
     none = [jnp.zeros(alive.shape, jnp.float32) for _ in range(2)]
     return Population(alive, *none, owner=owner)
@@ -68,12 +63,7 @@ MOST_BY_DEFAULT = 400_000
 
 
 class Coverage(NamedTuple):
-    """Size of the views, and the share of the scene that each shows.
-
-    Attributes:
-        pixels: of one view.
-        shown: share of the scene that a view shows on average.
-    """
+    """Pixels of one view, and the share of the scene that a view shows on average."""
 
     pixels: int
     shown: float
@@ -89,11 +79,6 @@ def default_max_gaussians(seeds: int, coverage: Coverage, train: TrainConfig) ->
 
     A long run can fit more Gaussians than a short one, and a scene of which a view shows little
     needs more. The limit is never below the seeds and a quarter.
-
-    Args:
-        seeds: points of the scene.
-        coverage: by the training photographs.
-        train: steps or budget.
     """
     steps = train.steps
     if train.budget_s is not None:
@@ -115,25 +100,19 @@ def grow(tree, fill):
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), tree, fill)
 
 
-def free_slots(alive: Bool[Array, " n"]) -> Int[Array, " n"]:
-    """Return slot indices, empty ones first, each group in order."""
-    return jnp.argsort(alive, stable=True).astype(jnp.int32)
-
-
 def place(
     requests: Bool[Array, " n"], alive: Bool[Array, " n"]
 ) -> tuple[Int[Array, " n"], Int[Array, ""]]:
-    """Assign an empty slot to each request, in order.
+    """Assign an empty slot to each request, in order; count the requests that found none.
 
-    Returns:
-        The slot of every requester (n, out of bounds, where there is none) and how many requests
-        found no slot.
+    Where there is no slot, it is n, out of bounds.
     """
     n = alive.shape[0]
     rank = jnp.cumsum(requests) - 1
     room = n - jnp.sum(alive)
     granted = requests & (rank < room)
-    slot = jnp.where(granted, free_slots(alive)[jnp.clip(rank, 0, n - 1)], n)
+    free = jnp.argsort(alive, stable=True).astype(jnp.int32)  # empty slots first, in order
+    slot = jnp.where(granted, free[jnp.clip(rank, 0, n - 1)], n)
     return slot, jnp.sum(requests) - jnp.sum(granted)
 
 

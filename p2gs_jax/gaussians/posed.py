@@ -1,10 +1,11 @@
-"""Gaussians of moving objects in world coordinates, as of one moment: for files and viewers."""
+"""Gaussians in other coordinates, for files and viewers: of the world at one moment, turned."""
 
 from __future__ import annotations
 
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
@@ -16,15 +17,12 @@ from p2gs_jax.types import Gaussians
 
 # Twice as many as coefficients of degree 3, and more: the least squares are exact.
 DIRECTIONS = 64
+# What a turn of 180 degrees about x does to coordinates.
+FLIP = (1.0, -1.0, -1.0)
 
 
 def standing(gaussians: Gaussians, owner: Int[np.ndarray, " n"] | None) -> Gaussians:
-    """Return only what stands still.
-
-    Args:
-        gaussians: the scene.
-        owner: the moving object that each belongs to, -1: none; None: there are none.
-    """
+    """Return only what stands still; `owner` is the moving object of each Gaussian, -1: none."""
     moves = gaussians.vibration
     if moves is not None:
         stands = np.asarray(moves.log_lives) > np.log(STILL) - 1
@@ -66,11 +64,9 @@ def posed(
 
 
 def turning(R: Float[np.ndarray, "3 3"], count: int) -> Float[np.ndarray, "k k"]:
-    """Return the matrix that turns spherical-harmonics coefficients.
+    """Return the matrix that turns so many spherical-harmonics coefficients.
 
-    Args:
-        R: a function of directions d becomes one of R^T d.
-        count: of coefficients.
+    A function of directions d becomes one of R^T d.
     """
     directions = fibonacci_sphere(DIRECTIONS)
     degree = degree_of(count)
@@ -91,3 +87,24 @@ def _turned(
     zero = ~np.any(quats, axis=1, keepdims=True)
     own = Rotation.from_quat(np.where(zero, np.eye(1, 4), quats), scalar_first=True)
     return (Rotation.from_matrix(R) * own).as_quat(scalar_first=True).astype(np.float32)
+
+
+def half_turn(g: Gaussians) -> Gaussians:
+    """Return the Gaussians turned by 180 degrees about x; twice is nothing.
+
+    From COLMAP's axes (right, down, forward) to those of graphics (right, up, back), and back.
+    """
+    flip = jnp.asarray(FLIP)
+    direction = np.array([[0.36, 0.48, 0.8]], np.float32)
+    degree = degree_of(g.sh.shape[1])
+    # A half turn about an axis only changes signs of the harmonics.
+    here, there = (
+        np.array([float(b[0]) for b in basis(tuple(jnp.asarray(d).T), degree)])
+        for d in (direction, direction * np.array(FLIP, np.float32))
+    )
+    return dataclasses.replace(
+        g,
+        means=g.means * flip,
+        quats=g.quats * jnp.asarray([1.0, *FLIP]),
+        sh=g.sh * jnp.asarray(np.sign(here * there), g.sh.dtype)[:, None],
+    )

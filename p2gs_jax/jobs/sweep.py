@@ -18,7 +18,7 @@ from p2gs_jax.core.progress import Reporter
 from p2gs_jax.core.runtime import tune_process, use_compile_cache
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
-from p2gs_jax.evaluate.alignment import exposure_error
+from p2gs_jax.evaluation.alignment import exposure_error
 from p2gs_jax.jobs.engines import LOCAL, check_engine, open_engine
 from p2gs_jax.jobs.job import Job, JobState, read_reason, slug
 from p2gs_jax.jobs.run import Runner, run_jobs

@@ -3,9 +3,9 @@
 `affine`: a 3x4 colour matrix per view (the 3DGS code's exposure compensation). `bilateral`: a grid
 of such matrices over the image and luminance (bilateral-guided radiance fields). `curve`: one
 rising curve per view for all channels (in the manner of Luminance-GS). Their parameters are
-deviations: zeros change nothing. `ppisp` takes the place of the tone curve and has parameters of
-cameras as well: `ppisp/`. `luminance` maps photographs to an enhanced scene, as Luminance-GS does:
-`luminance/`; renders are shown through its inverse.
+deviations: zeros change nothing. `ppisp` (`ppisp.py`) takes the place of the tone curve and has
+parameters of cameras as well. `luminance` (`luminance.py`) maps photographs to an enhanced scene,
+as Luminance-GS does; renders are shown through its inverse.
 """
 
 from __future__ import annotations
@@ -21,11 +21,9 @@ from jaxtyping import Array, Float, Int
 
 from p2gs_jax.config import Appearance
 from p2gs_jax.core.numerics import LN2, on_device
-from p2gs_jax.photometry.luminance import parameters as luminance
-from p2gs_jax.photometry.luminance.parameters import Curves, Luminance
-from p2gs_jax.photometry.ppisp import parameters as isp
-from p2gs_jax.photometry.ppisp import regularisation as ppisp_regularisation
-from p2gs_jax.photometry.ppisp.parameters import OneView, Ppisp
+from p2gs_jax.photometry import luminance, ppisp
+from p2gs_jax.photometry.luminance import Curves, Luminance
+from p2gs_jax.photometry.ppisp import OneView, Ppisp
 from p2gs_jax.types import LUMINANCE, Capture, Params
 
 
@@ -53,14 +51,9 @@ CURVE_KNOTS = 16
 
 
 def identity(kind: Appearance, cameras: Sequence[str]) -> Corrections:
-    """Return parameters that change nothing.
-
-    Args:
-        kind: which correction.
-        cameras: the physical camera of every training view.
-    """
+    """Return parameters that change nothing; `cameras` is the camera of every training view."""
     if kind == "ppisp":
-        return isp.identity(cameras)
+        return ppisp.identity(cameras)
     if kind == "luminance":
         return luminance.identity(len(cameras))
     shapes = {"affine": (3, 4), "bilateral": (12, *GRID), "curve": (CURVE_KNOTS,)}
@@ -77,12 +70,7 @@ def correction_of(appearance: Corrections | None, row: Int[Array, ""] | int) -> 
 
 
 def mean_correction(appearance: Corrections | None, camera: str | None = None) -> Correction | None:
-    """Return the mean over the training views, for views that have none of their own, or None.
-
-    Args:
-        appearance: of all training views.
-        camera: the physical camera of the view; None: none of them.
-    """
+    """Return the mean over the training views, for a view of a camera that has none of its own."""
     if isinstance(appearance, Ppisp):
         return appearance.mean(camera)
     if isinstance(appearance, Luminance):
@@ -120,23 +108,15 @@ def without_place(correction: Correction | None, kind: Appearance | None) -> Cor
 def corrected(
     ldr: Float[Array, "h w 3"], parameters: Correction, kind: Appearance
 ) -> Float[Array, "h w 3"]:
-    """Return display values as one view shows them.
-
-    Args:
-        ldr: rendered display values; for `ppisp` radiance.
-        parameters: of that view.
-        kind: which correction.
-    """
+    """Return display values as one view shows them; `ldr` is rendered, for `ppisp` radiance."""
     if isinstance(parameters, OneView):
-        return isp.applied(ldr, parameters)
+        return ppisp.applied(ldr, parameters)
     if isinstance(parameters, Curves):
         # The Gaussians learn through it; it is learned from photographs alone.
         return luminance.as_photographed(ldr, lax.stop_gradient(parameters))
     if kind == "affine":
         return ldr + ldr @ parameters[:, :3].T + parameters[:, 3]
-    if kind == "curve":
-        return _curve(ldr, parameters)
-    return _bilateral(ldr, parameters)
+    return _curve(ldr, parameters) if kind == "curve" else _bilateral(ldr, parameters)
 
 
 def _curve(ldr: Float[Array, "h w 3"], raw: Float[Array, " k"]) -> Float[Array, "h w 3"]:
@@ -175,12 +155,10 @@ def _hats(pixels: int, cells: int) -> np.ndarray:
 def regularisation(parameters: Corrections, kind: Appearance) -> Float[Array, ""] | None:
     """Return what a kind of correction asks of its parameters; None: nothing.
 
-    Of bilateral grids it is the mean squared difference of neighbouring cells.
+    For bilateral grids it is the mean squared difference of neighbouring cells.
     """
     if isinstance(parameters, Ppisp):
-        return ppisp_regularisation(parameters)
-    if isinstance(parameters, Luminance):
-        return None
-    if kind != "bilateral":
+        return ppisp.regularisation_of(parameters)
+    if isinstance(parameters, Luminance) or kind != "bilateral":
         return None
     return sum((jnp.mean(jnp.diff(parameters, axis=k) ** 2) for k in (2, 3, 4)), jnp.zeros(()))

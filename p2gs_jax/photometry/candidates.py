@@ -1,52 +1,44 @@
-"""Photometric models under curves, judged on colours that they have not seen."""
+"""Photometric models under curves, judged on colours that they have not seen.
+
+Densities over display values can be compared between curves; over decoded ones they could not.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from p2gs_jax.photometry.adjustment.errors import side_by_side
-from p2gs_jax.photometry.adjustment.fit import TOLERANCE_TO_COMPARE, solve_model
 from p2gs_jax.photometry.adjustment.problem import Problem
-from p2gs_jax.photometry.adjustment.solve import Fit
-from p2gs_jax.photometry.choices import Choice
-from p2gs_jax.photometry.held_out import (
-    Predicted,
-    largest_difference,
-    mean_deficit,
-    predict_held_out,
-)
-from p2gs_jax.photometry.models import Form, parameter_count
+from p2gs_jax.photometry.adjustment.solve import TOLERANCE_TO_COMPARE, Fit, solve_model
+from p2gs_jax.photometry.models import Choice, Form, parameter_count
 from p2gs_jax.photometry.response import Response
 
 STANDARD_ERRORS, SMALLEST_GAIN = 2.0, 0.01
 # Predictions that differ by no more than this in any view are as good as equal, 8-bit levels.
 INVISIBLE_DIFFERENCE = 1.0
+# The predictive density is a mixture: outliers exist, and must not decide.
+OUTLIERS, OUTLIER_DEVIATION = 0.1, 1.2
+
+Densities = Float[np.ndarray, " h"]
+Labels = Int[np.ndarray, " h"]
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """One form under one curve.
+    """One form under one curve."""
 
-    Attributes:
-        choice: what varies, and the kind of curve.
-        response: the curve.
-        parameters: free parameters, gauges not counted.
-        density: mean held-out log density, nat per observation.
-        deficit: how much lower than the best candidate's density, nat per observation.
-        deficit_error: standard error of that, over views or regions of images.
-        difference: by how much its predictions differ from the best's, 8-bit levels: RMS of the
-            view where that is largest.
-    """
-
-    choice: Choice
-    response: Response
-    parameters: int
-    density: float
-    deficit: float
-    deficit_error: float
+    choice: Choice  # what varies, and the kind of curve
+    response: Response  # the curve
+    parameters: int  # free parameters, gauges not counted
+    density: float  # mean held-out log density, nat per observation
+    deficit: float  # how much lower than the best candidate's density, nat per observation
+    deficit_error: float  # standard error of that, over views or regions of images
+    # By how much its predictions differ from the best's, 8-bit levels: RMS of the view where that
+    # is largest.
     difference: float
 
     @property
@@ -69,10 +61,6 @@ class Candidate:
         """Whether it is not clearly worse than the best, or nobody could tell."""
         return self.likely or self.difference <= INVISIBLE_DIFFERENCE
 
-    def density_gap(self, other: Candidate) -> float:
-        """Return by how much another candidate predicts better, nat per observation."""
-        return other.density - self.density
-
 
 def choose(candidates: list[Candidate]) -> Candidate:
     """Return the simplest candidate that is not clearly worse than the best.
@@ -85,15 +73,18 @@ def choose(candidates: list[Candidate]) -> Candidate:
     return max(as_simple, key=lambda c: c.density)
 
 
-class Comparison:
-    """Choices solved so far, and how well they predict what was held out.
+class Predicted(NamedTuple):
+    """What a fit says about held-out observations, NaN where it can say nothing."""
 
-    Args:
-        problem: all observations.
-        held: which of them are held out.
+    densities: Densities  # log densities
+    errors: Float[np.ndarray, "h 3"]  # photographed minus predicted display values
+
+
+class Comparison:
+    """Choices solved so far, and how well they predict what was `held` out.
 
     Attributes:
-        problem: as given.
+        problem: all observations.
         fits: the solutions, and the curves they were solved under.
     """
 
@@ -107,12 +98,7 @@ class Comparison:
         self._scale = np.inf
 
     def solve(self, choice: Choice, response: Response) -> Fit:
-        """Solve a choice on what is not held out.
-
-        Args:
-            choice: what varies.
-            response: the curve.
-        """
+        """Solve a choice under its curve on what is not held out."""
         fit, _ = solve_model(
             self.problem, choice.form, response, use=self._use, tolerance=TOLERANCE_TO_COMPARE
         )
@@ -126,36 +112,82 @@ class Comparison:
             self._scale, self._predicted = scale, {}
         for choice, (fit, response) in self.fits.items():
             if choice not in self._predicted:
-                predicted = predict_held_out(self.problem, fit, response, self._where, scale)
+                predicted = _predict(self.problem, fit, response, self._where, scale)
                 self._predicted[choice] = predicted
         density = {k: _mean(p.densities) for k, p in self._predicted.items()}
         best = self._predicted[max(density, key=lambda k: density[k])]
-        o = self.problem.observations
+        return [self._candidate(k, density[k], p, best) for k, p in self._predicted.items()]
+
+    def _candidate(
+        self, choice: Choice, density: float, found: Predicted, best: Predicted
+    ) -> Candidate:
+        o, response = self.problem.observations, self.fits[choice][1]
         cameras = int(o.cameras.max(initial=0)) + 1
-        return [
-            Candidate(
-                choice,
-                self.fits[choice][1],
-                parameters=parameter_count(
-                    choice.form, self.fits[choice][1], cameras, o.view_count
-                ),
-                density=density[choice],
-                difference=largest_difference(best.errors, found.errors, self._views, o.view_count),
-                **self._deficit(best.densities, found.densities),
-            )
-            for choice, found in self._predicted.items()
-        ]
-
-    def _deficit(self, best: Float[np.ndarray, " h"], other: Float[np.ndarray, " h"]):
-        """Return the deficit and its error: neighbours in an image err alike, as do its pixels."""
-
-        def over(labels: Int[np.ndarray, " h"]):
-            return mean_deficit(best, other, labels, int(labels.max(initial=-1)) + 1)
-
-        (deficit, of_views), (_, of_regions) = over(self._views), over(self._regions)
-        return {"deficit": deficit, "deficit_error": max(of_views, of_regions)}
+        # Neighbours in an image err alike, as do its pixels.
+        lower = best.densities - found.densities
+        (deficit, of_views), (_, of_regions) = (
+            _mean_deficit(lower, labels) for labels in (self._views, self._regions)
+        )
+        return Candidate(
+            choice,
+            response,
+            parameter_count(choice.form, response, cameras, o.view_count),
+            density,
+            deficit,
+            max(of_views, of_regions),
+            _largest_difference(best.errors - found.errors, self._views),
+        )
 
 
-def _mean(densities: Float[np.ndarray, " h"]) -> float:
+def _mean(densities: Densities) -> float:
     """Return the mean of what is known; where nothing is, no solution predicts anything."""
     return -np.inf if np.isnan(densities).all() else float(np.nanmean(densities))
+
+
+def _predict(
+    problem: Problem, fit: Fit, response: Response, held: np.ndarray, scale: float
+) -> Predicted:
+    """Return what a fit says about observations in rows `held`, which it was not fitted to.
+
+    `scale` is that of the stated deviations.
+    """
+    o, layout = problem.observations, problem.layout
+    sigma, slope = (a[held] for a in o.decoded(response)[1:])
+    residual = fit.at.residual[held]
+    precision = fit.at.precision[layout.row[held]]
+    known = problem.usable[held] & (precision > 1e-3)
+    a = fit.theta.a[o.views[held]][:, None]
+    variance = (scale * sigma) ** 2 + (scale * a) ** 2 / np.maximum(precision, 1e-9)
+
+    def normal(v):
+        return -0.5 * residual**2 / v - 0.5 * np.log(2 * np.pi * v)
+
+    mixture = np.logaddexp(
+        np.log(1 - OUTLIERS) + normal(variance),
+        np.log(OUTLIERS) + normal(variance + OUTLIER_DEVIATION**2),
+    )
+    density = mixture + np.log(np.maximum(slope, 1e-3))
+    # Channels are correlated: an observation counts once, as their mean.
+    count = known.sum(1)
+    return Predicted(
+        np.where(count > 0, (density * known).sum(1) / np.maximum(count, 1), np.nan),
+        np.where(known, residual / slope, np.nan),
+    )
+
+
+def _largest_difference(difference: Float[np.ndarray, "h 3"], views: Labels) -> float:
+    """Return the RMS of differences in the view where it is largest, 8-bit levels."""
+    known = np.isfinite(difference)
+    squares = np.bincount(views, (np.where(known, difference, 0.0) ** 2).sum(1))
+    counts = np.bincount(views, known.sum(1))
+    return float(255 * np.sqrt((squares / np.maximum(counts, 1)).max(initial=0.0)))
+
+
+def _mean_deficit(difference: Densities, labels: Labels) -> tuple[float, float]:
+    """Return the mean of what is known, and its standard error over views or regions."""
+    known, count = np.isfinite(difference), int(labels.max(initial=-1)) + 1
+    if not known.any():
+        return 0.0, np.inf
+    sums = np.bincount(labels[known], difference[known], count)
+    error = sums.std() * np.sqrt(count) / known.sum()
+    return float(difference[known].mean()), float(error)

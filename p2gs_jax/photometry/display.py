@@ -6,6 +6,7 @@ A transform without a camera shows no vignetting, and the response of no camera 
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -15,14 +16,25 @@ from jaxtyping import Array, Float, Float32
 
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.core.numerics import LN2, on_host
-from p2gs_jax.photometry.appearance import Correction, correction_of, without_place
-from p2gs_jax.photometry.formation import display, formation, inverse_formation
-from p2gs_jax.photometry.matte import Matte, composited, uncovered
-from p2gs_jax.photometry.spline_curve import by_camera
-from p2gs_jax.types import Capture, Params
+from p2gs_jax.photometry.appearance import Correction, correction_of, mean_correction, without_place
+from p2gs_jax.photometry.formation import (
+    Matte,
+    camera_row,
+    composited,
+    display,
+    formation,
+    inverse_formation,
+    uncovered,
+)
+from p2gs_jax.photometry.response import by_camera
+from p2gs_jax.types import Capture, Params, Photometry
 
 Curve = Literal["power", "srgb", "spline", "linear"]
 CURVES: tuple[Curve, ...] = get_args(Curve)
+
+Pixels = Float[Array, "... 3"] | Float[np.ndarray, "... 3"]
+Positions = Float[np.ndarray, "... 2"] | None
+Opacity = Float[Array, "h w"] | Float[np.ndarray, "h w"] | None
 
 
 @dataclass(frozen=True)
@@ -63,8 +75,7 @@ class DisplayTransform:
     @property
     def factors(self) -> Float[np.ndarray, " 3"]:
         """Exposure times white balance of each channel."""
-        w = (0.0, 0.0, 0.0) if self.white_balance is None else self.white_balance
-        return self.exposure * np.exp(np.asarray(w, float))
+        return self.exposure * np.exp(np.asarray(self.white_balance or (0.0, 0.0, 0.0), float))
 
     @property
     def vignetting(self) -> tuple[tuple[float, ...], ...]:
@@ -75,22 +86,17 @@ class DisplayTransform:
     @property
     def white_balance_ev(self) -> tuple[float, float]:
         """Gains of red and of blue over green, stops."""
-        red, green, blue = (0.0, 0.0, 0.0) if self.white_balance is None else self.white_balance
+        red, green, blue = self.white_balance or (0.0, 0.0, 0.0)
         return (red - green) / LN2, (blue - green) / LN2
 
-    def matte(self, alpha: Float[Array, "h w"] | Float[np.ndarray, "h w"] | None) -> Matte | None:
+    def matte(self, alpha: Opacity) -> Matte | None:
         """Return what a render of this opacity is put over; None: nothing, or it is not known."""
         if alpha is None or self.backdrop is None:
             return None
         return Matte(alpha, np.asarray(self.backdrop, np.float32))
 
     def with_white_balance_ev(self, red: float, blue: float) -> DisplayTransform:
-        """Return the transform with gains of red and blue over green; the exposure stays.
-
-        Args:
-            red: stops.
-            blue: stops.
-        """
+        """Return the transform with gains of red and blue over green, stops; the exposure stays."""
         mean = (red + blue) / 3
         balance = ((red - mean) * LN2, -mean * LN2, (blue - mean) * LN2)
         return replace(self, white_balance=balance)
@@ -121,21 +127,17 @@ class DisplayTransform:
 
 
 def develop(
-    linear: Float[Array, "... 3"] | Float[np.ndarray, "... 3"],
+    linear: Pixels,
     transform: DisplayTransform,
-    positions: Float[np.ndarray, "... 2"] | None = None,
-    alpha: Float[Array, "h w"] | Float[np.ndarray, "h w"] | None = None,
+    positions: Positions = None,
+    alpha: Opacity = None,
 ) -> Float32[np.ndarray, "... 3"]:
     """Return display values in [0, 1] of linear radiance.
 
-    All but the configuration is traced: changing it compiles nothing.
-
-    Args:
-        linear: radiance; an image where there is a correction or vignetting.
-        transform: how to show it.
-        positions: where vignetting takes the pixels to be, if not where they are in `linear`
-            (photometry/cameras.py:places).
-        alpha: opacity of the render, for the backdrop of the transform; None puts it over nothing.
+    All but the configuration is traced: changing it compiles nothing. Where there is a
+    correction or vignetting, the radiance is an image, or lies at `positions`
+    (photometry/formation.py:places). The transform's backdrop counts if the opacity `alpha` of
+    the render is given.
     """
     how = (transform.capture, transform.correction, positions, transform.matte(alpha))
     return np.asarray(_develop(linear, *how, transform.formation))
@@ -148,19 +150,12 @@ def _develop(linear, capture, correction, positions, matte, cfg: PhotometryConfi
 
 
 def undevelop(
-    ldr: Float[Array, "... 3"] | Float[np.ndarray, "... 3"],
-    transform: DisplayTransform,
-    positions: Float[np.ndarray, "... 2"] | None = None,
+    ldr: Pixels, transform: DisplayTransform, positions: Positions = None
 ) -> Float32[np.ndarray, "... 3"]:
     """Return the linear radiance that a photograph shows: the inverse of `develop`.
 
     Saturated values count as the radiance at which they saturate, values below half a code as that;
-    corrections of display values are not undone.
-
-    Args:
-        ldr: display values.
-        transform: how it was taken.
-        positions: of loose pixels, where vignetting counts (photometry/cameras.py:places).
+    corrections of display values are not undone. `positions` as for `develop`.
     """
     return np.asarray(_undevelop(ldr, transform.capture, positions, transform.formation))
 
@@ -171,12 +166,9 @@ def _undevelop(ldr, capture, positions, cfg: PhotometryConfig):
 
 
 def display_of_view(params: Params, row: int, cfg: PhotometryConfig) -> DisplayTransform:
-    """Return how a training view was taken.
+    """Return how the training view in a row of `Photometry` was taken.
 
-    Args:
-        params: the fit; of its small arrays, host ones compile nothing.
-        row: of the view in `Photometry`.
-        cfg: the formation model.
+    If the small arrays of `params` are on the host, this compiles nothing.
     """
     taken = jax.tree.map(np.asarray, params.photometry).capture(row)
     plain = DisplayTransform(1.0, 1.0, cfg, correction_of(params.appearance, row))
@@ -194,3 +186,60 @@ def with_capture(transform: DisplayTransform, taken: Capture) -> DisplayTransfor
         white_balance=None if balance is None else (red, green, blue),
         camera=None if taken.camera is None else int(taken.camera),
     )
+
+
+@dataclass(frozen=True)
+class MeanParameters:
+    """Parameters of a view that has none of its own: means over the training views."""
+
+    exposure: float  # arithmetic mean (paper, eq. 6)
+    exposure_geometric: float  # geometric mean, which the gauges leave in place
+    gamma: float  # arithmetic mean
+    # Mean of the log factors, or None where white balance is not modelled.
+    white_balance: tuple[float, float, float] | None = None
+
+
+def mean_parameters(photometry: Photometry) -> MeanParameters:
+    """Return the means over the training views."""
+    taken: Photometry = jax.tree.map(np.asarray, photometry)
+    e = taken.exposures.astype(np.float64)
+    return MeanParameters(
+        float(e.mean()),
+        float(np.exp(np.log(e).mean())),
+        float(taken.gammas.astype(np.float64).mean()),
+        _mean_balance(taken, slice(None)),
+    )
+
+
+def usual_display(
+    params: Params, taken_by: Sequence[str], camera: str | None, cfg: PhotometryConfig
+) -> DisplayTransform:
+    """Return how a view of a camera (None: of none) is shown that has no parameters of its own.
+
+    Its exposure is the geometric mean over the training views, its gamma and its correction are
+    the mean ones. Its white balance is the mean over all training views, or over those of its
+    camera where it varies by camera only. Its vignetting and its response are its camera's,
+    those of a correction as well. `taken_by` is the camera of every training view.
+    """
+    taken: Photometry = jax.tree.map(np.asarray, params.photometry)
+    mean = mean_parameters(taken)
+    balance = mean.white_balance
+    own = np.array([name == camera for name in taken_by], bool)
+    if cfg.white_balance == "camera" and own.any():
+        balance = _mean_balance(taken, own)
+    return DisplayTransform(
+        mean.exposure_geometric,
+        mean.gamma,
+        cfg,
+        mean_correction(params.appearance, camera),
+        balance,
+        None if camera is None else camera_row(camera, cfg),
+    )
+
+
+def _mean_balance(photometry: Photometry, rows) -> tuple[float, float, float] | None:
+    balance = photometry.white_balance
+    if balance is None:
+        return None
+    red, green, blue = (float(v) for v in np.asarray(balance, np.float64)[rows].mean(0))
+    return red, green, blue

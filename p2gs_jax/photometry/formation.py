@@ -3,51 +3,42 @@
 Paper: y = clamp(clamp(eL, 1e-6, 10)^(1/gamma), 0, 1). Robust (docs/photometry.md, 4):
 y = OETF(x0 (eL/x0)^(2.2/gamma)) with a pivot x0 at mid-grey that a change of gamma leaves alone,
 continued above 1 so that over-bright predictions keep a gradient. Where a scene needs it, e L is
-e W V L with the white balance W of the view and the vignetting V of its camera
-(photometry/cameras.py), and each camera has an OETF of its own (photometry/spline_curve.py). What
-is not modelled leaves the trace.
+e W V L with the white balance W of the view and the vignetting V of its camera, and each camera has
+an OETF of its own (photometry/response.py). What is not modelled leaves the trace.
+
+V of camera c darkens towards the corners: log V_c(r) = k1 r^2 + k2 r^4 + k3 r^6 with r = 1 in the
+corners of the image (docs/photometry.md, 1). Positions are measured from the image's centre in
+units of half its diagonal, so that they do not depend on the size of the image.
 
 All functions compute with numpy on host arrays and with JAX on others (`numerics.namespace`).
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from p2gs_jax.config import PhotometryConfig
+from p2gs_jax.config import CameraFormation, PhotometryConfig
 from p2gs_jax.core.numerics import Scalar, Values, namespace, positive_pow, safe_log
 from p2gs_jax.photometry.appearance import Correction, Formation, corrected
-from p2gs_jax.photometry.cameras import darkens, log_vignetting, squared_radii
-from p2gs_jax.photometry.spline_curve import decode, encode
+from p2gs_jax.photometry.response import DARKEST, UNKNOWN, decode, encode
 from p2gs_jax.types import GAMMA_SRGB, Capture
 
 EXPOSED_FLOOR, EXPOSED_CEILING = 1e-6, 10.0  # paper, Tone-mapping estimation
 SRGB_LINEAR_END, SRGB_ENCODED_END = 0.0031308, 0.04045
-# Darkest photographed value that is inverted: half a code of 8 bits.
-LDR_FLOOR = 0.5 / 255.0
+# Opacities below this count as this where radiance is divided by them.
+LEAST_ALPHA = 1e-3
 # A row of `PhotometryConfig.cameras`, one for every pixel, or None where it makes no difference.
 CameraRow = Int[Array, "..."] | int | None
 # Of loose pixels in their images, from the centre in units of half the diagonal.
 Positions = Float[Array, "*n 2"] | Float[np.ndarray, "*n 2"] | None
 
 
-def oetf(linear: Values, curve: str) -> Values:
-    """Encode linear values with the base curve; values above 1 continue it."""
-    if curve == "linear":
-        return linear
-    if curve == "power":
-        return positive_pow(linear, 1.0 / GAMMA_SRGB, EXPOSED_FLOOR)
-    xp = namespace(linear)
-    toe = linear <= SRGB_LINEAR_END
-    high = 1.055 * positive_pow(xp.where(toe, 1.0, linear), 1.0 / 2.4, EXPOSED_FLOOR) - 0.055
-    return xp.where(toe, 12.92 * linear, high)
-
-
 def eotf(encoded: Values, curve: str) -> Values:
-    """Decode: the inverse of `oetf` on [0, inf)."""
+    """Return linear values of the base curve's encoding, on [0, inf)."""
     if curve == "linear":
         return encoded
     if curve == "power":
@@ -58,20 +49,85 @@ def eotf(encoded: Values, curve: str) -> Values:
     return xp.where(toe, encoded / 12.92, positive_pow(base, 2.4, 1e-3))
 
 
+def camera_row(name: str, cfg: PhotometryConfig) -> int | None:
+    """Return the row of a camera in `cfg.cameras`: -1 if it is not there, None if nothing is."""
+    if not cfg.cameras:
+        return None
+    rows = [i for i, camera in enumerate(cfg.cameras) if camera.name == name]
+    return rows[0] if rows else UNKNOWN
+
+
+def camera_rows(names: Sequence[str], cfg: PhotometryConfig) -> tuple[int, ...] | None:
+    """Return the row of each camera in `cfg.cameras`; None if nothing is there."""
+    if not cfg.cameras:
+        return None
+    return tuple(UNKNOWN if (row := camera_row(n, cfg)) is None else row for n in names)
+
+
+def darkens(cfg: PhotometryConfig) -> bool:
+    """Return whether any camera has vignetting."""
+    return any(camera.vignetting for camera in cfg.cameras)
+
+
+def vignetting_table(cfg: PhotometryConfig) -> Float[np.ndarray, "c k n"]:
+    """Return the coefficients of all cameras and of an unknown one, which has none.
+
+    There is one row (K = 1) for all channels, or one for each where any camera has that.
+    """
+    rows = max([1, *(len(camera.vignetting) for camera in cfg.cameras)])
+    terms = max([1, *(len(row) for c in cfg.cameras for row in c.vignetting)])
+    table = np.zeros((len(cfg.cameras) + 1, rows, terms), np.float32)
+    for place, camera in zip(table, cfg.cameras, strict=False):
+        for channel in range(len(place)) if camera.vignetting else ():
+            row = camera.vignetting[channel if len(camera.vignetting) > 1 else 0]
+            place[channel, : len(row)] = row
+    return table
+
+
+def squared_radii(height: int, width: int, xp: Any = np) -> Float[np.ndarray, "h w"]:
+    """Return r^2 of the pixels of an image: 0 in its centre, 1 in its corners.
+
+    With JAX as `xp`, a compiled program holds a row and a column of them, not the image.
+    """
+    diagonal = (height**2 + width**2) / 4
+    y, x = np.arange(height) + 0.5 - height / 2, np.arange(width) + 0.5 - width / 2
+    column, row = (xp.asarray(v**2 / diagonal, np.float32) for v in (y, x))
+    return column[:, None] + row
+
+
+def places(xy: Values, width: int, height: int) -> Values:
+    """Return positions of pixels (centres at +0.5) from the image's centre in half diagonals."""
+    centre = np.array([width / 2, height / 2], np.float32)
+    return (xy - centre) / np.float32(np.hypot(*centre))
+
+
+def log_vignetting(
+    squared: Values, camera: Int[Array, "..."] | int, cfg: PhotometryConfig
+) -> Values:
+    """Return log V at r^2 of any shape, with an axis of one or three channels appended.
+
+    `camera` is a row in `cfg.cameras`, or -1: one for all, or one each.
+    """
+    xp = namespace(squared, camera)
+    k = xp.asarray(vignetting_table(cfg))[camera]
+    s = squared[..., None]
+    value = xp.zeros_like(s)
+    for term in reversed(range(k.shape[-1])):
+        value = s * (value + k[..., term])
+    return value
+
+
+def corner(camera: CameraFormation) -> tuple[float, ...]:
+    """Return V in the corners of a camera's image, one for every row of its vignetting."""
+    return tuple(float(np.exp(np.sum(row))) for row in camera.vignetting)
+
+
 def gain(
-    shape: tuple[int, ...],
-    capture: Capture,
-    cfg: PhotometryConfig,
-    positions: Positions = None,
+    shape: tuple[int, ...], capture: Capture, cfg: PhotometryConfig, positions: Positions = None
 ) -> Any:
     """Return e W V: what exposed radiance is of radiance, shaped to broadcast against it.
 
-    Args:
-        shape: of the radiance: of an image, or of loose pixels.
-        capture: of the view, or of each pixel.
-        cfg: the vignetting of cameras.
-        positions: of loose pixels, from the image's centre in units of half its diagonal; None: of
-            an image, or of pixels that have no place.
+    `capture` is of the view, or of each of loose pixels; these have `positions`, or none.
 
     Raises:
         ValueError: vignetting is modelled, and nobody knows where in the image the pixels lie.
@@ -92,10 +148,7 @@ def gain(
 
 
 def expose(
-    linear: Values,
-    capture: Capture,
-    cfg: PhotometryConfig,
-    positions: Positions = None,
+    linear: Values, capture: Capture, cfg: PhotometryConfig, positions: Positions = None
 ) -> Values:
     """Return e W V L (paper, eq. 4: e L); see `gain`."""
     return gain(linear.shape, capture, cfg, positions) * linear
@@ -104,13 +157,10 @@ def expose(
 def tone_map(
     exposed: Values, gamma: Scalar, cfg: PhotometryConfig, camera: CameraRow = None
 ) -> Values:
-    """Return the display-encoded image of exposed radiance.
+    """Return the display-encoded image of exposed radiance e L.
 
-    Args:
-        exposed: e L, any value; below 1e-6 it counts as 1e-6 with zero gradient.
-        gamma: > 0; dT/dgamma = -(ln x / gamma^2) x^(1/gamma) in the paper's form.
-        cfg: base curve, pivot, clamping.
-        camera: row in `cfg.cameras`, where cameras have curves of their own.
+    Radiance below 1e-6 counts as 1e-6 with zero gradient. In the paper's form dT/dgamma is -(ln
+    x / gamma^2) x^(1/gamma). `camera` counts where cameras have curves of their own.
     """
     xp = namespace(exposed, gamma)
     if cfg.clamp:
@@ -139,16 +189,12 @@ def tone_map(
 def inverse_tone_map(
     ldr: Values, gamma: Scalar, cfg: PhotometryConfig, camera: CameraRow = None
 ) -> Values:
-    """Return the exposed radiance e L of display values; values below half a code count as that.
+    """Return the exposed radiance e L of display values, by the arguments of `tone_map`.
 
-    Args:
-        ldr: display values.
-        gamma: > 0.
-        cfg: base curve, pivot.
-        camera: row in `cfg.cameras`, where cameras have curves of their own.
+    Values below half a code count as that.
     """
     xp = namespace(ldr, gamma)
-    y = xp.maximum(ldr, LDR_FLOOR)
+    y = xp.maximum(ldr, DARKEST)
     if cfg.curve == "power" and cfg.pivot == 1.0:
         return xp.exp(gamma * xp.log(y))
     if cfg.curve == "spline":
@@ -160,13 +206,7 @@ def inverse_tone_map(
 
 
 def exposed_at(level: float, gamma: float, cfg: PhotometryConfig) -> float:
-    """Return the exposed radiance that is shown as one display value; the least of several curves.
-
-    Args:
-        level: display value of all channels.
-        gamma: > 0.
-        cfg: base curve, pivot, cameras.
-    """
+    """Return the exposed radiance that shows as a display value; the least of several curves."""
     shown = np.full(3, level, np.float32)
     rows = range(-1, len(cfg.cameras)) if cfg.cameras else (None,)
     return min(float(inverse_tone_map(shown, np.float32(gamma), cfg, row).min()) for row in rows)
@@ -181,12 +221,9 @@ def formation(
 ) -> Values:
     """Return T(e W V L): what the camera records of radiance `linear`.
 
-    Args:
-        linear: radiance; an image where there is a correction.
-        capture: exposure, gamma, white balance and camera: of the view, or of each pixel.
-        cfg: base curve, pivot, clamping, cameras, kind of correction.
-        correction: of the view's display values, or a formation in their place, or None.
-        positions: where the pixels lie, if `linear` is no image and vignetting counts; see `gain`.
+    With a `correction` of the view's display values, the radiance is an image. `capture` is of
+    the view, or of each of loose pixels, which need `positions` if vignetting counts (see
+    `gain`).
     """
     if isinstance(correction, Formation):
         return correction.apply(linear, capture)
@@ -194,25 +231,15 @@ def formation(
     ldr: Any = tone_map(exposed, _by_pixel(capture.gamma), cfg, capture.camera)
     if cfg.appearance is None or correction is None:
         return ldr
-    shown: Any = corrected(ldr, correction, cfg.appearance)
-    return shown
+    return corrected(ldr, correction, cfg.appearance)
 
 
 def inverse_formation(
-    ldr: Values,
-    capture: Capture,
-    cfg: PhotometryConfig,
-    positions: Positions = None,
+    ldr: Values, capture: Capture, cfg: PhotometryConfig, positions: Positions = None
 ) -> Values:
     """Return the radiance of display values: the inverse of `formation` below saturation.
 
-    Corrections are not undone.
-
-    Args:
-        ldr: display values; below half a code they count as that.
-        capture: of the view, or of each pixel.
-        cfg: base curve, pivot, cameras.
-        positions: as for `formation`.
+    Values below half a code count as that; corrections are not undone.
     """
     exposed = inverse_tone_map(ldr, _by_pixel(capture.gamma), cfg, capture.camera)
     return exposed / gain(ldr.shape, capture, cfg, positions)
@@ -226,3 +253,41 @@ def _by_pixel(gamma: Any) -> Any:
 def display(ldr: Values) -> Values:
     """Clamp to what a display or an 8-bit file can hold."""
     return namespace(ldr).clip(ldr, 0.0, 1.0)
+
+
+class Matte(NamedTuple):
+    """What a render is put over, and how much of it shows.
+
+    A file with alpha holds the display colour c of what is there and how much of the pixel that
+    covers; published comparisons show a c + (1 - a) B, in display values. So is a render: its
+    radiance is premultiplied by the opacity A, what is there has the radiance L / A and the display
+    colour T(e L / A), and the picture is A T(e L / A) + (1 - A) B. Whatever the curve, the exposure
+    and B, the two agree where A = a and T(e L / A) = c. With a linear curve and e = 1 it is 3DGS's
+    L + (1 - A) B. B passes no camera: it is the same under every exposure, as in the photographs.
+    """
+
+    alpha: Float[Array, "h w"] | Any  # opacity A of the render
+    # Display values B of red, green, blue, of all pixels or of each.
+    backdrop: Float[Array, " 3"] | Float[Array, "h w 3"] | Any
+
+    def every(self, stride: int) -> Matte:
+        """Return it of every so many pixels along each axis."""
+        one_in = (slice(None, None, stride),) * 2
+        behind = self.backdrop if self.backdrop.ndim == 1 else self.backdrop[one_in]
+        return Matte(self.alpha[one_in], behind)
+
+
+def uncovered(linear: Values, matte: Matte | None) -> Values:
+    """Return the radiance of what is there: without the share of the pixel that it covers."""
+    if matte is None:
+        return linear
+    xp: Any = namespace(linear, matte.alpha)
+    return linear / xp.maximum(matte.alpha, LEAST_ALPHA)[..., None]
+
+
+def composited(ldr: Values, matte: Matte | None) -> Values:
+    """Return display values of what is there, over the background; None: there is none."""
+    if matte is None:
+        return ldr
+    alpha = matte.alpha[..., None]
+    return alpha * ldr + (1 - alpha) * matte.backdrop

@@ -7,9 +7,9 @@ the fitted one is whichever of them predicts the exposures that the camera itsel
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -17,17 +17,8 @@ from jaxtyping import Float
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.photometry.formation import exposed_at
-from p2gs_jax.types import Render
 
-MeterName = Literal[
-    "log_average",
-    "display_average",
-    "average",
-    "centre_log_average",
-    "centre_average",
-    "highlights",
-]
-METERS: tuple[MeterName, ...] = get_args(MeterName)
+# The meters, and what people call them.
 WORDS: dict[str, str] = {
     "log_average": "log average",
     "display_average": "average of display values",
@@ -36,8 +27,8 @@ WORDS: dict[str, str] = {
     "centre_average": "centre-weighted average",
     "highlights": "highlights (99th percentile)",
 }
-GivenRule = Literal["log_average", "centre", "highlights", "protected"]
-ExposureOf = Literal["auto"] | GivenRule
+METERS = tuple(WORDS)
+ExposureOf = Literal["auto", "log_average", "centre", "highlights", "protected"]
 Readings = Mapping[str, float]
 
 # Weights of linear red, green and blue in luminance (BT.709).
@@ -66,9 +57,7 @@ WORTH_A_NUMBER = 0.85
 def meter(linear: Float[np.ndarray, "h w 3"], alpha: Float[np.ndarray, "h w"]) -> dict[str, float]:
     """Return what every meter reads, natural logarithm of luminance; NaN where nothing is seen.
 
-    Args:
-        linear: radiance, premultiplied by `alpha`.
-        alpha: opacity.
+    The radiance is premultiplied by the opacity.
     """
     step = max(1, int(np.sqrt(alpha.size / PIXELS)))
     weight = np.asarray(alpha[::step, ::step], np.float64)
@@ -98,31 +87,19 @@ def meter(linear: Float[np.ndarray, "h w 3"], alpha: Float[np.ndarray, "h w"]) -
 
 
 def white_level(gamma: float, cfg: PhotometryConfig) -> float:
-    """Return the exposed radiance that is shown just below white.
-
-    Args:
-        gamma: of the display.
-        cfg: its tone curve.
-    """
+    """Return the exposed radiance that a display of this gamma shows just below white."""
     return exposed_at(BELOW_WHITE, gamma, cfg)
 
 
 @dataclass(frozen=True)
 class Rule:
-    """log e = offset - sum of slope times reading.
+    """log e = offset - sum of slope times reading."""
 
-    Attributes:
-        meters: what is read; none: a constant exposure.
-        slopes: of each meter: 1 keeps its reading constant, 0 ignores it.
-        offset: natural logarithm.
-        residual_ev: RMS of the exposures about it, stops.
-        left_out_ev: the same where each was predicted by a rule that was fitted without it.
-    """
-
-    meters: tuple[str, ...]
-    slopes: tuple[float, ...]
-    offset: float
-    residual_ev: float = float("nan")
+    meters: tuple[str, ...]  # what is read; none: a constant exposure
+    slopes: tuple[float, ...]  # of each meter: 1 keeps its reading constant, 0 ignores it
+    offset: float  # natural logarithm
+    residual_ev: float = float("nan")  # RMS of the exposures about it, stops
+    # The same where each was predicted by a rule that was fitted without it.
     left_out_ev: float = float("nan")
 
     def log_exposure(self, readings: Readings) -> float:
@@ -133,31 +110,22 @@ class Rule:
     @property
     def words(self) -> str:
         """What people call it."""
-        if not self.meters:
-            return "constant"
         parts = [
             WORDS.get(name, name) + ("" if slope == 1 else f" (slope {slope:.2f})")
             for name, slope in zip(self.meters, self.slopes, strict=True)
         ]
-        return " and ".join(parts)
+        return " and ".join(parts) or "constant"
 
 
 @dataclass(frozen=True)
 class Metering:
-    """How exposures of new pictures are chosen, and what explains those of the photographs.
+    """How exposures of new pictures are chosen, and what explains those of the photographs."""
 
-    Attributes:
-        rule: what `auto` follows: the rule that explains the photographs, or a constant.
-        candidates: all rules that were compared, best first.
-        white: exposed radiance that is shown just below white.
-        names: of the training views.
-        readings: of their renders, a row a view, a column for each of `METERS`.
-    """
-
-    rule: Rule
-    candidates: tuple[Rule, ...]
-    white: float
-    names: tuple[str, ...]
+    rule: Rule  # what `auto` follows: the rule that explains the photographs, or a constant
+    candidates: tuple[Rule, ...]  # all rules that were compared, best first
+    white: float  # exposed radiance that is shown just below white
+    names: tuple[str, ...]  # of the training views
+    # Of their renders, a row a view, a column for each of `METERS`.
     readings: Float[np.ndarray, "v k"]
 
     @property
@@ -185,13 +153,14 @@ class Metering:
                 found = min(found, white - readings["highlights"])
         return float(found) if np.isfinite(found) else self.constant.offset
 
-    def typical_log_exposure(self, of: ExposureOf = "auto") -> float:
-        """Return the mean over the training views: one exposure for all of a scene."""
-        rows: list[dict[str, float]] = [
-            {str(name): value for name, value in zip(METERS, row, strict=True)}
-            for row in self.readings.tolist()
-        ]
-        return float(np.mean([self.log_exposure(row, of) for row in rows]))
+    def exposure(self, readings: Readings, of: ExposureOf = "auto") -> float:
+        """Return the exposure of a picture, a factor on radiance; see `log_exposure`."""
+        return float(np.exp(self.log_exposure(readings, of)))
+
+    def typical_exposure(self, of: ExposureOf = "auto") -> float:
+        """Return the geometric mean over the training views: one exposure for all of a scene."""
+        rows = [dict(zip(METERS, row, strict=True)) for row in self.readings.tolist()]
+        return float(np.exp(float(np.mean([self.log_exposure(row, of) for row in rows]))))
 
     @property
     def telling(self) -> bool:
@@ -229,15 +198,10 @@ def fit_metering(
 ) -> Metering:
     """Find the metering rule that predicts the exposures of the training views best.
 
-    Every meter competes with slope 1 (the camera kept it constant) and with a free slope, and the
-    log average together with the highlights. Each stretch of views is predicted by rules that were
-    fitted to the others. A constant stays unless a rule leaves clearly less.
-
-    Args:
-        names: of the training views, in order.
-        readings: of their renders, from `meter`.
-        log_exposures: natural logarithm, as fitted.
-        white: exposed radiance that is shown just below white.
+    Every meter competes with slope 1 (the camera kept it constant) and with a free slope, and
+    the log average together with the highlights. Each stretch of views, which are in order, is
+    predicted by rules that were fitted to the others. A constant stays unless a rule leaves
+    clearly less. `white` is the exposed radiance that is shown just below white.
     """
     table = np.array([[r[name] for name in METERS] for r in readings]).reshape(-1, len(METERS))
     taken = np.isfinite(table).all(1)
@@ -246,42 +210,16 @@ def fit_metering(
     if len(y) < FEWEST_VIEWS:
         mean = Rule((), (), float(np.mean(log_exposures)), constant.residual_ev)
         return Metering(mean, (mean,), white, tuple(names), table)
-    tried = [_fitted((m,), (1.0,), x, y) for m in METERS]
-    tried += [_fitted((m,), None, x, y) for m in METERS]
+    tried = [_fitted((m,), slopes, x, y) for slopes in ((1.0,), None) for m in METERS]
     tried.append(_fitted(("log_average", "highlights"), None, x, y))
     tried.sort(key=lambda pair: pair[0].left_out_ev)
     best, errors = tried[0]
-    simple = [pair for pair in tried if pair[0].slopes == (1.0,)]
-    if simple and WORTH_A_NUMBER * simple[0][0].left_out_ev < best.left_out_ev:
-        best, errors = simple[0]
+    simple = next(pair for pair in tried if pair[0].slopes == (1.0,))
+    if WORTH_A_NUMBER * simple[0].left_out_ev < best.left_out_ev:
+        best, errors = simple
     rule = best if _explains(best, errors, constant, alone) else constant
     candidates = sorted([constant, *(r for r, _ in tried)], key=lambda r: r.left_out_ev)
     return Metering(rule, tuple(candidates), white, tuple(names), table)
-
-
-def meter_views(
-    names: Sequence[str],
-    rendered: Iterable[Render],
-    exposures: Float[np.ndarray, " v"],
-    gamma: float,
-    cfg: PhotometryConfig,
-) -> Metering:
-    """Render, read and fit: `fit_metering` from pictures.
-
-    Args:
-        names: of the training views.
-        rendered: one for each.
-        exposures: of each.
-        gamma: of new views.
-        cfg: tone curve.
-    """
-    readings = [meter(np.asarray(r.linear), np.asarray(r.alpha)) for r in rendered]
-    logs = np.log(np.asarray(exposures, np.float64))
-    return fit_metering(names, readings, logs, white_level(gamma, cfg))
-
-
-def _folds(count: int) -> list[np.ndarray]:
-    return [fold for fold in np.array_split(np.arange(count), min(count, FOLDS)) if len(fold)]
 
 
 def _fitted(
@@ -291,7 +229,9 @@ def _fitted(
     y: Float[np.ndarray, " v"],
 ) -> tuple[Rule, Float[np.ndarray, " f"]]:
     """Return a rule fitted to all views, and its mean squared error on every stretch left out."""
-    read = x[:, [METERS.index(m) for m in meters]]  # pyright: ignore[reportArgumentType]
+    if not len(y):
+        return Rule(meters, (0.0,) * len(meters), 0.0), np.zeros(0)
+    read = x[:, [METERS.index(m) for m in meters]]
 
     def solve(rows) -> tuple[np.ndarray, float]:
         if slopes is not None:
@@ -301,14 +241,12 @@ def _fitted(
             taken = -np.linalg.lstsq(read[rows] - middle, y[rows] - y[rows].mean(), rcond=1e-6)[0]
         return taken, float((y[rows] + read[rows] @ taken).mean())
 
-    if not len(y):
-        return Rule(meters, (0.0,) * len(meters), 0.0), np.zeros(0)
     everything = np.arange(len(y))
     taken, offset = solve(everything)
     residual = y - offset + read @ taken
     left = np.zeros(len(y))
     errors = []
-    for fold in _folds(len(y)) if len(y) > 1 else []:
+    for fold in np.array_split(everything, min(len(y), FOLDS)) if len(y) > 1 else []:
         s, o = solve(np.setdiff1d(everything, fold))
         left[fold] = y[fold] - o + read[fold] @ s
         errors.append(np.mean(left[fold] ** 2))
@@ -324,21 +262,13 @@ def _explains(best: Rule, errors: np.ndarray, constant: Rule, alone: np.ndarray)
     return bool(gain.mean() > 2 * gain.std(ddof=1) / np.sqrt(len(gain)))
 
 
-def adapted(
-    log_exposures: Float[np.ndarray, " f"], frames: float, closed: bool = False
-) -> Float[np.ndarray, " f"]:
+def adapted(log_exposures: Float[np.ndarray, " f"], frames: float) -> Float[np.ndarray, " f"]:
     """Return exposures along a path that follow those metered as slowly as cameras adapt.
 
-    An exponential filter to both sides, so that a path played backwards looks the same.
-
-    Args:
-        log_exposures: metered, frame by frame.
-        frames: after how many the filter has fallen to 1/e.
-        closed: whether the last frame is followed by the first one.
+    An exponential filter to both sides, so that a path played backwards looks the same; it falls to
+    1/e after so many frames.
     """
     count = len(log_exposures)
     away = np.abs(np.arange(count)[:, None] - np.arange(count))
-    if closed:
-        away = np.minimum(away, count - away)
     weight = np.exp(-away / max(frames, 1e-6))
     return weight @ np.asarray(log_exposures, np.float64) / weight.sum(1)

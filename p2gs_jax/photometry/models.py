@@ -1,4 +1,4 @@
-"""What may differ between views: the table of photometric models, from the simplest on."""
+"""What may be chosen: the table of photometric models, what cameras do besides, kinds of curves."""
 
 from __future__ import annotations
 
@@ -6,23 +6,18 @@ from typing import NamedTuple
 
 from p2gs_jax.config import Level, ResponseKind, VignettingKind
 from p2gs_jax.config import PhotometricModel as ModelName
-from p2gs_jax.photometry.response import Response
+from p2gs_jax.photometry.response import BASES, Base, Response
 
 
 class Model(NamedTuple):
-    """What varies.
-
-    Attributes:
-        exposure: per what the exposure varies; None if it does not.
-        gamma: likewise.
-        description: what reports call it.
-    """
+    """What varies: per what the exposure and the gamma do (None: not), and in words."""
 
     exposure: Level | None
     gamma: Level | None
     description: str
 
 
+# From the simplest on.
 MODELS: dict[ModelName, Model] = {
     "constant": Model(None, None, "one exposure for all views"),
     "camera_exposure": Model("camera", None, "an exposure per camera"),
@@ -33,7 +28,9 @@ MODELS: dict[ModelName, Model] = {
     ),
     "view_exposure_gamma": Model("view", "view", "an exposure and a gamma per view"),
 }
-
+_BY_LEVELS = {(model.exposure, model.gamma): name for name, model in MODELS.items()}
+_LEVELS: tuple[Level | None, ...] = (None, "camera", "view")
+_VIGNETTING: tuple[VignettingKind | None, ...] = (None, "camera", "channel")
 
 # Powers of the radius in log V(r) = k1 r^2 + k2 r^4 + k3 r^6.
 VIGNETTING_POWERS = (2, 4, 6)
@@ -45,17 +42,11 @@ def polynomials(vignetting: VignettingKind | None) -> int:
 
 
 class Form(NamedTuple):
-    """Everything that may vary: a model of exposures and gammas, and what cameras do besides.
+    """Everything that may vary: a model of exposures and gammas, and what cameras do besides."""
 
-    Attributes:
-        model: of exposures and gammas.
-        white_balance: per what it varies; per view only where exposures do.
-        vignetting: whether cameras darken towards their corners, each channel in its own way or
-            all in the same.
-    """
-
-    model: ModelName
-    white_balance: Level | None = None
+    model: ModelName  # of exposures and gammas
+    white_balance: Level | None = None  # per what it varies; per view only where exposures do
+    # Whether cameras darken towards their corners, each channel in its own way or all in the same.
     vignetting: VignettingKind | None = None
 
     @property
@@ -74,9 +65,7 @@ class Form(NamedTuple):
 def possible(form: Form, cameras: int) -> bool:
     """Return whether a form differs from every simpler one, and can be solved.
 
-    Args:
-        form: what varies.
-        cameras: number of physical cameras; with one, "per camera" means "for all".
+    With one physical camera, "per camera" means "for all".
     """
     varies = MODELS[form.model]
     levels = (varies.exposure, varies.gamma, form.white_balance)
@@ -86,14 +75,7 @@ def possible(form: Form, cameras: int) -> bool:
 
 
 def parameter_count(form: Form, response: Response, cameras: int, views: int) -> int:
-    """Return the number of free parameters; each level loses one to its gauge.
-
-    Args:
-        form: what varies.
-        response: adds those of its splines.
-        cameras: number of physical cameras.
-        views: number of views.
-    """
+    """Return the number of free parameters, splines included; each level loses one to its gauge."""
     size = {None: 0, "camera": cameras - 1, "view": views - 1}
     varies = MODELS[form.model]
     return (
@@ -110,9 +92,74 @@ def channel_powers(form: Form, by: ResponseKind | None) -> int:
     """Return how many powers of channels are gauges beside that of responses by themselves.
 
     Where every channel has exposures of its own, no photograph tells its power.
-
-    Args:
-        form: what varies.
-        by: what has a response of its own, or None.
     """
     return 2 if by == "channel" and form.white_balance == "view" else 0
+
+
+class Curve(NamedTuple):
+    """A kind of curve: its base, and what has a fitted spline over it (None: nothing)."""
+
+    base: Base = "srgb"
+    splines: ResponseKind | None = None
+
+
+_ONE_FOR_ALL = Curve("srgb", "all")
+_PLAIN = [Curve(base) for base in BASES]
+# One step from each kind: several splines are worth trying where one is.
+_CURVES: dict[ResponseKind | None, list[Curve]] = {
+    None: [*_PLAIN, _ONE_FOR_ALL],
+    "all": [*_PLAIN, Curve("srgb", "camera"), Curve("srgb", "channel")],
+    "camera": [_ONE_FOR_ALL, Curve("srgb", "channel")],
+    "channel": [_ONE_FOR_ALL, Curve("srgb", "camera")],
+}
+
+
+class Choice(NamedTuple):
+    """What varies, and under which kind of curve."""
+
+    form: Form
+    curve: Curve = Curve()
+
+
+class Scope(NamedTuple):
+    """What there is to choose from."""
+
+    cameras: int  # number of physical cameras
+    places: bool  # positions in the images are known: vignetting can be told
+    curves: bool  # exposures differ enough to tell a curve by
+    known: bool = False  # the curve is known, and sRGB's: no other is compared
+
+    def allows(self, choice: Choice) -> bool:
+        """Return whether a choice differs from simpler ones and can be solved."""
+        by = choice.curve.splines
+        if self.known and choice.curve != Curve():
+            return False
+        told = by is None or self.curves
+        several = by != "camera" or self.cameras > 1
+        seen = choice.form.vignetting is None or self.places
+        return told and several and seen and possible(choice.form, self.cameras)
+
+
+def neighbours(choice: Choice, scope: Scope) -> list[Choice]:
+    """Return the choices of a scope that differ in one thing, simpler and richer ones."""
+    form, curve = choice
+    exposure, gamma, _ = MODELS[form.model]
+    forms = [
+        form._replace(model=name)
+        for e in _LEVELS
+        for g in _LEVELS
+        if (e == exposure) != (g == gamma) and (name := _BY_LEVELS.get((e, g)))
+    ]
+    # Exposures alone may not become simpler while more depends on them.
+    if gamma is not None and exposure == gamma:
+        forms += [form._replace(model=_BY_LEVELS[(None, None)])]
+    if form.white_balance == "view" and exposure == "view":
+        forms += [
+            Form(name, "camera", form.vignetting)
+            for name, model in MODELS.items()
+            if model.exposure == "camera"
+        ]
+    forms += [form._replace(white_balance=level) for level in _LEVELS]
+    forms += [form._replace(vignetting=kind) for kind in _VIGNETTING]
+    near = [Choice(f, curve) for f in forms] + [Choice(form, c) for c in _CURVES[curve.splines]]
+    return [c for c in dict.fromkeys(near) if c != choice and scope.allows(c)]

@@ -12,6 +12,10 @@ from scipy.sparse.csgraph import connected_components
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.photometry.response import Response, deviation, log_exposed
 
+# An integer for every observation; a value for each of its channels.
+Labels = Int[np.ndarray, " o"]
+PerChannel = Float[np.ndarray, "o 3"]
+
 # Sources sample a point in its coarsest view, which is at most this many times coarser than its
 # finest: what is still farther away mixes in neighbours (BUILD_NOTES).
 COARSEST = 4.0
@@ -19,42 +23,28 @@ COARSEST = 4.0
 
 @dataclass(frozen=True)
 class Observations:
-    """Display-encoded colours of points in views.
+    """Display-encoded colours of points in views."""
 
-    Attributes:
-        views: row of the view.
-        points: row of the point.
-        colors: [0, 1].
-        spread: standard deviation of `colors` from misplacement and blur, in display values.
-        view_count: number of views.
-        point_count: number of points.
-        cameras: physical camera of each view, 0, 1, ...
-        too_coarse: observations of these points that were left out for their scale (`COARSEST`).
-        names: what people call the views; their rows if empty.
-        positions: in the image, from its centre in units of half its diagonal; None where nobody
-            knows, and nothing depends on the place.
-        camera_names: what people call the cameras; their rows if empty.
-        surroundings: log2 brightness of the photograph about each, as `sources/surroundings.py`
-            measures it; None where nobody knows.
-        brightest: largest display values of the pixels that `colors` are means of; None: those.
-    """
-
-    views: Int[np.ndarray, " o"]
-    points: Int[np.ndarray, " o"]
-    colors: Float[np.ndarray, "o 3"]
-    spread: Float[np.ndarray, "o 3"]
-    view_count: int
-    point_count: int
-    cameras: Int[np.ndarray, " v"]
-    too_coarse: int = 0
-    names: tuple[str, ...] = ()
+    views: Labels  # row of the view
+    points: Labels  # row of the point
+    colors: PerChannel  # in [0, 1]
+    spread: PerChannel  # standard deviation of `colors` from misplacement and blur
+    view_count: int  # number of views
+    point_count: int  # number of points
+    cameras: Int[np.ndarray, " v"]  # physical camera of each view, 0, 1, ...
+    too_coarse: int = 0  # observations that were left out for their scale (`COARSEST`)
+    names: tuple[str, ...] = ()  # of the views; empty: their rows
+    # In the image, from its centre in units of half its diagonal; None where nobody knows, and
+    # nothing depends on the place.
     positions: Float[np.ndarray, "o 2"] | None = None
-    camera_names: tuple[str, ...] = ()
+    camera_names: tuple[str, ...] = ()  # empty: their rows
+    # Log2 brightness of the photograph about each, as `surroundings` in `sources/sampling.py`
+    # measures it; None where nobody knows.
     surroundings: Float[np.ndarray, " o"] | None = None
-    brightest: Float[np.ndarray, "o 3"] | None = None
+    brightest: PerChannel | None = None  # largest of the pixels that `colors` are means of
 
-    def decoded(self, response: Response):
-        """Return log exposed radiance, its stated standard deviation and dz/dy, each (O, 3)."""
+    def decoded(self, response: Response) -> tuple[PerChannel, PerChannel, PerChannel]:
+        """Return log exposed radiance, its stated standard deviation and dz/dy."""
         y = np.asarray(self.colors, np.float64)
         z, slope = log_exposed(y, response, self.cameras[self.views])
         return z, deviation(y, slope, self.spread, response.base), slope
@@ -75,33 +65,22 @@ class Observations:
         """Return a label per view; views with different labels cannot be compared."""
         seen = usable.any(1)
         size = self.view_count + self.point_count
-        edges = sp.csr_array(
-            (
-                np.ones(int(seen.sum()), np.int8),
-                (self.views[seen], self.view_count + self.points[seen]),
-            ),
-            shape=(size, size),
-        )
+        ends = (self.views[seen], self.view_count + self.points[seen])
+        edges = sp.csr_array((np.ones(int(seen.sum()), np.int8), ends), shape=(size, size))
         labels = connected_components(edges, directed=False)[1][: self.view_count]
         return np.unique(labels, return_inverse=True)[1]
 
     def picked(self, pick: np.ndarray | slice) -> Observations:
         """Return some of them, chosen by a mask or by their rows."""
-        taken = {k: getattr(self, k)[pick] for k in ("views", "points", "colors", "spread")}
-        for name in ("positions", "surroundings", "brightest"):
-            if getattr(self, name) is not None:
-                taken[name] = getattr(self, name)[pick]
-        return replace(self, **taken)
+        names = ("views", "points", "colors", "spread", "positions", "surroundings", "brightest")
+        kept = {k: v[pick] for k in names if (v := getattr(self, k)) is not None}
+        return replace(self, **kept)
 
     def thinned(self, per_view: int, seed: int) -> Bool[np.ndarray, " o"]:
         """Return which to keep so that every view has enough and their number grows with the views.
 
-        Points are put in a random order; those are kept, in all their views, that come first in
-        some view.
-
-        Args:
-            per_view: how many points of a view come first.
-            seed: of the order.
+        Points are put in a random order; those are kept, in all their views, that are among the
+        first `per_view` of some view.
         """
         place = generator(seed, Stream.SOLVED_POINTS).permutation(self.point_count)[self.points]
         order = np.lexsort((place, self.views))
@@ -115,15 +94,9 @@ class Observations:
 def sample_pairs(
     observations: Observations, count: int, seed: int
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
-    """Draw pairs of observations of the same point in different views.
+    """Draw `count` pairs of rows of the same point in different views, with replacement.
 
-    Args:
-        observations: of points; those seen once are in no pair.
-        count: number of pairs, drawn with replacement.
-        seed: of the draws.
-
-    Returns:
-        Rows of `observations`: the first of each pair, the second; none where no point is shared.
+    The first of each pair and the second are returned; none where no point is shared.
     """
     order = np.argsort(observations.points, kind="stable")
     bounds = np.flatnonzero(np.diff(observations.points[order], prepend=-1, append=-1))

@@ -1,22 +1,25 @@
-"""From photographed values to log exposed radiance, with its uncertainty: z = F(y).
+"""Responses of cameras: from display values to log exposed radiance, z = F(y), and back.
 
 F is the logarithm of a base curve's decoding, optionally changed by a spline: F(y) = log base^-1(y)
 + B(y) c, with hat functions B over fixed knots; cameras or channels may have splines of their own.
-Host side, float64.
+That way is exact, on the host, in float64. Image formation needs the way back as well, on either
+side: it is tabulated over equal steps of log x, a table for each camera or channel with its own.
 """
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
-from p2gs_jax.config import ResponseKind
+from p2gs_jax.config import PhotometryConfig, ResponseKind
+from p2gs_jax.core.numerics import Values, namespace
 
 Base = Literal["srgb", "power"]
-BASES: tuple[Base, ...] = ("srgb", "power")
+BASES: tuple[Base, ...] = get_args(Base)
 # The spline's knots in display values; two of them are held, which fixes scale and power.
 KNOTS = np.array(
     [
@@ -27,29 +30,32 @@ KNOTS = np.array(
 HELD = (6, 16)
 FREE = tuple(k for k in range(len(KNOTS)) if k not in HELD)
 FREE_OF_EACH = tuple(k for k in range(len(KNOTS)) if k != HELD[0])
+# Darkest photographed value that is decoded: half a code of 8 bits.
 DARKEST = 0.5 / 255
 # Noise model: 8-bit quantisation, photon and read noise (linear units), and a floor in log units
 # for what no model explains: texture, specularity, interpolation.
 SHOT_NOISE, READ_NOISE, FLOOR = 2e-4, 1e-6, 0.03
 # A curve with a spline may be at most this much flatter than its base, so that noise stays finite.
 SMALLEST_SLOPE = 0.2
+# Entries of a table.
+TABLE = 1024
+# The row of a camera that is not in `PhotometryConfig.cameras`; tables end with a row for it.
+UNKNOWN = -1
+
+Spline = tuple[float, ...]
+Numbers = Float[np.ndarray, "..."]
 
 
 @dataclass(frozen=True)
 class Response:
-    """A response: one for all photographs, or one for each camera or channel.
+    """A response: one for all photographs, or one for each camera or channel."""
 
-    Attributes:
-        base: curve that splines are added to.
-        spline: values of log exposure added at `KNOTS`, or None; where several are, their mean.
-        by: what has a spline of its own.
-        splines: of each camera, or of red, green and blue; empty where one is for all.
-    """
-
-    base: Base = "srgb"
-    spline: tuple[float, ...] | None = None
-    by: ResponseKind = "all"
-    splines: tuple[tuple[float, ...], ...] = ()
+    base: Base = "srgb"  # curve that splines are added to
+    # Values of log exposure added at `KNOTS`, or None; where several are, their mean.
+    spline: Spline | None = None
+    by: ResponseKind = "all"  # what has a spline of its own
+    # Of each camera, or of red, green and blue; empty where one is for all.
+    splines: tuple[Spline, ...] = ()
 
     @property
     def name(self) -> str:
@@ -70,7 +76,7 @@ class Response:
         return spline_parameters(None if self.spline is None else self.by, len(self.splines))
 
     @property
-    def each(self) -> tuple[tuple[float, ...], ...]:
+    def each(self) -> tuple[Spline, ...]:
         """All its splines."""
         if self.spline is None:
             return ()
@@ -88,12 +94,7 @@ def free_knots(by: ResponseKind) -> tuple[int, ...]:
 
 
 def spline_count(by: ResponseKind | None, cameras: int) -> int:
-    """Return how many splines there are.
-
-    Args:
-        by: what has one of its own; None: nothing.
-        cameras: number of physical cameras.
-    """
+    """Return how many splines there are; `by` is what has one of its own (None: nothing)."""
     return {None: 0, "all": 1, "camera": cameras, "channel": 3}[by]
 
 
@@ -108,25 +109,19 @@ def spline_parameters(by: ResponseKind | None, cameras: int) -> int:
 def spline_groups(
     by: ResponseKind, cameras: Int[np.ndarray, " o"], shape: tuple[int, ...]
 ) -> Int[np.ndarray, "o 3"]:
-    """Return which spline decodes each value.
-
-    Args:
-        by: what has one of its own.
-        cameras: of each observation.
-        shape: of the values: observations and channels.
-    """
+    """Return which spline decodes each value of a shape; `cameras` is of each observation."""
     if by == "camera":
         return np.broadcast_to(cameras[:, None], shape)
     return np.broadcast_to(np.arange(3) if by == "channel" else 0, shape)
 
 
-def hat(y: Float[np.ndarray, "..."]) -> tuple[Int[np.ndarray, "..."], Float[np.ndarray, "..."]]:
+def hat(y: Numbers) -> tuple[Int[np.ndarray, "..."], Numbers]:
     """Return the left knot of each value and the fraction of the way to the next one."""
     left = np.clip(np.searchsorted(KNOTS, y) - 1, 0, len(KNOTS) - 2)
     return left, np.clip((y - KNOTS[left]) / (KNOTS[left + 1] - KNOTS[left]), 0, 1)
 
 
-def base_log(y: Float[np.ndarray, "..."], base: Base):
+def base_log(y: Numbers, base: Base) -> tuple[Numbers, Numbers]:
     """Return log of the decoded value and its derivative by the display value."""
     y = np.clip(y, DARKEST, 1.0)
     if base == "power":
@@ -140,16 +135,11 @@ def base_log(y: Float[np.ndarray, "..."], base: Base):
 
 
 def log_exposed(
-    y: Float[np.ndarray, "..."],
-    response: Response,
-    cameras: Int[np.ndarray, " o"] | None = None,
-):
-    """Return z = F(y) and dz/dy.
+    y: Numbers, response: Response, cameras: Int[np.ndarray, " o"] | None = None
+) -> tuple[Numbers, Numbers]:
+    """Return z = F(y) and dz/dy of display values, which are (o, 3) where splines are several.
 
-    Args:
-        y: display values; (o, 3) where splines are several.
-        response: the curve.
-        cameras: of each observation, where cameras have splines of their own.
+    `cameras` is of each observation, where cameras have splines of their own.
     """
     z, slope = base_log(y, response.base)
     if response.spline is None:
@@ -166,21 +156,15 @@ def log_exposed(
 
 
 def deviation(
-    y: Float[np.ndarray, "..."],
-    slope: Float[np.ndarray, "..."],
-    spread: Float[np.ndarray, "..."] | float = 0.0,
-    base: Base = "srgb",
-) -> Float[np.ndarray, "..."]:
+    y: Numbers, slope: Numbers, spread: Numbers | float = 0.0, base: Base = "srgb"
+) -> Numbers:
     """Return the standard deviation of z.
 
-    Args:
-        y: photographed values.
-        slope: dz/dy.
-        spread: standard deviation in display values from misplacement and blur.
-        base: curve by which photon noise is judged.
+    `slope` is dz/dy, `spread` the standard deviation in display values from misplacement and
+    blur; photon noise is judged by the base curve.
     """
-    exposed = np.exp(base_log(y, base)[0])
-    base_slope = base_log(y, base)[1]
+    logs, base_slope = base_log(y, base)
+    exposed = np.exp(logs)
     shot = np.sqrt(SHOT_NOISE * exposed + READ_NOISE) / exposed * slope / base_slope
     return np.sqrt((slope / (255 * np.sqrt(12))) ** 2 + shot**2 + (slope * spread) ** 2 + FLOOR**2)
 
@@ -196,3 +180,127 @@ def log_slope_minimum(response: Response) -> float:
     y = np.linspace(0.06, 0.94, 90)
     logs = [log_exposed(y, one)[0] for one in response.parts]
     return min(float(np.gradient(z, np.log(y)).min()) for z in logs)
+
+
+class Tables(NamedTuple):
+    """Display values over equal steps of log x."""
+
+    first: Float[np.ndarray, " r"]  # log x of the first entry, of every row
+    step: Float[np.ndarray, " r"]  # between entries
+    values: Float[np.ndarray, "r n"]  # display values
+    channels: int  # rows of one camera: 1 for all channels, or 3
+
+
+@functools.lru_cache(64)
+def _table(spline: Spline) -> tuple[float, float, np.ndarray]:
+    y = np.linspace(DARKEST, 1.0, 4096)
+    z = np.maximum.accumulate(log_exposed(y, Response("srgb", spline))[0])
+    z = z + 1e-9 * np.arange(len(z))
+    grid = np.linspace(z[0], z[-1], TABLE)
+    return float(grid[0]), float(grid[1] - grid[0]), np.interp(grid, z, y)
+
+
+def by_camera(cfg: PhotometryConfig) -> bool:
+    """Return whether any camera has a response of its own."""
+    return any(camera.splines for camera in cfg.cameras)
+
+
+@functools.lru_cache(8)
+def tables(cfg: PhotometryConfig) -> Tables:
+    """Return the tables of all responses.
+
+    With responses per camera there are rows for each, in order, and at the end for an unknown one:
+    the spline of all cameras, or else the mean of those there are.
+
+    Raises:
+        ValueError: there is no spline.
+    """
+    if cfg.spline is None and not by_camera(cfg):
+        raise ValueError("the curve 'spline' needs the values of its spline")
+    cameras = range(len(cfg.cameras)) if by_camera(cfg) else ()
+    each = [spline_of(cfg, camera) for camera in (*cameras, UNKNOWN)]
+    channels = max(map(len, each))
+    splines = [row for rows in each for row in _rows(rows, channels)]
+    first, step, values = zip(*map(_table, splines), strict=True)
+    return Tables(np.array(first), np.array(step), np.array(values), channels)
+
+
+def _rows(splines: tuple[Spline, ...], channels: int) -> tuple[Spline, ...]:
+    return splines * channels if len(splines) == 1 else splines
+
+
+def spline_of(cfg: PhotometryConfig, camera: int | None = None) -> tuple[Spline, ...]:
+    """Return the spline of a camera, on the host: one row for all channels, or one for each.
+
+    Without any spline the values are 0, which is sRGB. A camera of None or -1 is not in
+    `cfg.cameras`.
+    """
+    own = () if camera is None or camera < 0 else cfg.cameras[camera].splines
+    if own:
+        return own
+    if cfg.spline is not None:
+        return (cfg.spline,)
+    others = [c.splines for c in cfg.cameras if c.splines]
+    if not others:
+        return ((0.0,) * len(KNOTS),)
+    channels = max(map(len, others))
+    mean = np.mean([_rows(s, channels) for s in others], 0)
+    return tuple(tuple(map(float, row)) for row in mean)
+
+
+def encode(log_linear: Values, cfg: PhotometryConfig, camera=None) -> Values:
+    """Return display values through the table; linear in x below it, in log x above it.
+
+    With responses per channel the last axis of `log_linear` is the channel. `camera` is a row
+    in `cfg.cameras` (None: unknown): one for all, or one for every entry but for the last axis.
+    """
+    xp, table = namespace(log_linear, camera), tables(cfg)
+    if by_camera(cfg):
+        row = _row(table, camera, xp)
+        first, step = (xp.asarray(v, log_linear.dtype)[row] for v in (table.first, table.step))
+        flat, start = table.values.reshape(-1), row * TABLE
+        dimmest = xp.asarray(table.values[:, 0], log_linear.dtype)[row]
+    else:
+        first, step, flat = float(table.first[0]), float(table.step[0]), table.values[0]
+        start, dimmest = None, float(flat[0])
+    place = (log_linear - first) / step
+    left = xp.clip(xp.floor(place), 0, TABLE - 2).astype(np.int32)
+    values = xp.asarray(flat, log_linear.dtype)
+    at = left if start is None else left + start
+    # Above the table the last segment goes on, so that over-bright predictions keep a gradient.
+    inside = values[at] + (place - left) * (values[at + 1] - values[at])
+    dark = place < 0
+    below = dimmest * xp.exp(xp.where(dark, log_linear - first, 0.0))
+    return xp.where(dark, below, inside)
+
+
+def decode(y: Values, cfg: PhotometryConfig, camera=None) -> Values:
+    """Return log exposed radiance of display values, by tables as for `encode`.
+
+    Values beyond a table count as its ends.
+    """
+    xp, table = namespace(y, camera), tables(cfg)
+    if not by_camera(cfg):
+        logs = table.first[0] + table.step[0] * np.arange(TABLE)
+        # numpy's interp computes and returns double precision.
+        return xp.interp(y, table.values[0].astype(y.dtype), logs.astype(y.dtype)).astype(y.dtype)
+    row = _row(table, camera, xp)
+    values = xp.asarray(table.values.reshape(-1), y.dtype)
+    # `interp` takes one table; this halves intervals until one entry is left.
+    left, span = xp.zeros(y.shape, np.int32), TABLE
+    while span > 1:
+        span //= 2
+        left = xp.where(values[left + span + row * TABLE] <= y, left + span, left)
+    left = xp.minimum(left, TABLE - 2)
+    low, high = values[left + row * TABLE], values[left + 1 + row * TABLE]
+    along = xp.clip((y - low) / xp.maximum(high - low, 1e-9), 0, 1)
+    first, step = (xp.asarray(v, y.dtype)[row] for v in (table.first, table.step))
+    return first + step * (left + along)
+
+
+def _row(table: Tables, camera: Any, xp: Any) -> Int[Array, "..."]:
+    """Return the row of every entry's table, shaped to broadcast against display values."""
+    count = len(table.first) // table.channels
+    given = xp.asarray(-1 if camera is None else camera)
+    given = xp.where(given < 0, count - 1, given)[..., None]
+    return (given * table.channels + np.arange(table.channels)).astype(np.int32)

@@ -1,16 +1,18 @@
-"""The result: exposures, gammas and response of a scene, with what is known of their errors."""
+"""The result: exposures, gammas and response of a scene, what is known of their errors, and
+whether they agree with what the cameras say they did.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from p2gs_jax.config import CameraFormation, Level, VignettingKind
 from p2gs_jax.core.numerics import LN2
-from p2gs_jax.photometry.models import ModelName
+from p2gs_jax.photometry.models import MODELS, ModelName
 from p2gs_jax.photometry.response import Response
 from p2gs_jax.types import GAMMA_SRGB
 
@@ -18,66 +20,57 @@ from p2gs_jax.types import GAMMA_SRGB
 MIN_OBSERVATIONS = 15
 # Gammas with a larger standard error are only roughly known.
 WEAK_GAMMA = 0.1
+# A view disagrees when its gap exceeds this, and three standard errors.
+NOTICEABLE_EV = 0.2
+STANDARD_ERRORS = 3.0
+# Linear values at which exposures may be read instead of at the pivot.
+LEVELS = (0.05, 0.1, 0.18, 0.3, 0.5, 0.8)
+# One of them is worth a word where its RMS gap is below this share of the pivot's.
+NOTICEABLE_RMS_SHARE = 0.8
+
+PerView = Float[np.ndarray, " v"]
 
 
 @dataclass(frozen=True)
 class PhotometricSolution:
-    """Exposures, gammas and response, with what is known about their errors.
+    """Exposures, gammas and response, with what is known about their errors."""
 
-    Attributes:
-        model: what varies.
-        response: base curve and spline.
-        log_exposures: natural logarithm; mean 0 over each component unless exposures were known.
-        exposure_errors: standard errors of `log_exposures` (robust, gauge fixed); inf where
-            unobserved or not to be told.
-        gammas: per view.
-        gamma_errors: standard errors; 0 where gamma is not modelled, inf as above.
-        observations_per_view: usable observations.
-        component: views with equal numbers share a scale; others cannot be compared.
-        point_log_radiance: natural logarithm per channel; NaN where unobserved.
-        residual_ev: robust standard deviation of one observation, in stops.
-        view_residual_ev: the same per view.
-        view_balance_ev: median residual of red, green, blue in each view less their mean, stops:
-            what a scalar exposure leaves of a white balance; NaN where unobserved.
-        outliers: share of observations that the robust loss ignores.
-        rounds: iterations.
-        moved: largest change of a parameter in the last of them, log units.
-        converged: that was no more than the tolerance.
-        unknown_errors: observed views whose standard errors cannot be told.
-        warnings: what the user should know.
-        white_balance_level: per what the white balance varies; None: it does not.
-        white_balance: log factors on red, green, blue beside the exposure: mean 0 in every view,
-            and over the views of a component; zeros where it does not vary.
-        white_balance_errors: standard errors, as `exposure_errors`.
-        vignetting: whether cameras darken towards their corners, and each channel in its own way.
-        cameras: what each physical camera does, by its row in `Observations.cameras`; empty where
-            none does anything of its own.
-        corner_errors: standard errors of log V in the corner, per camera and row of `vignetting`.
-    """
-
-    model: ModelName
-    response: Response
-    log_exposures: Float[np.ndarray, " v"]
-    exposure_errors: Float[np.ndarray, " v"]
-    gammas: Float[np.ndarray, " v"]
-    gamma_errors: Float[np.ndarray, " v"]
-    observations_per_view: Int[np.ndarray, " v"]
+    model: ModelName  # what varies
+    response: Response  # base curve and spline
+    # Natural logarithm; mean 0 over each component unless exposures were known.
+    log_exposures: PerView
+    # Standard errors of `log_exposures` (robust, gauge fixed); inf where unobserved or not to be
+    # told.
+    exposure_errors: PerView
+    gammas: PerView  # per view
+    gamma_errors: PerView  # standard errors; 0 where gamma is not modelled, inf as above
+    observations_per_view: Int[np.ndarray, " v"]  # usable observations
+    # Views with equal numbers share a scale; others cannot be compared.
     component: Int[np.ndarray, " v"]
+    # Natural logarithm per channel; NaN where unobserved.
     point_log_radiance: Float[np.ndarray, "p 3"]
-    residual_ev: float
-    view_residual_ev: Float[np.ndarray, " v"]
+    residual_ev: float  # robust standard deviation of one observation, in stops
+    view_residual_ev: PerView  # the same per view
+    # Median residual of red, green, blue in each view less their mean, stops: what a scalar
+    # exposure leaves of a white balance; NaN where unobserved.
     view_balance_ev: Float[np.ndarray, "v 3"]
-    outliers: float
-    rounds: int
-    moved: float
-    converged: bool
-    unknown_errors: int
-    warnings: tuple[str, ...]
-    white_balance_level: Level | None
+    outliers: float  # share of observations that the robust loss ignores
+    rounds: int  # iterations
+    moved: float  # largest change of a parameter in the last of them, log units
+    converged: bool  # that was no more than the tolerance
+    unknown_errors: int  # observed views whose standard errors cannot be told
+    warnings: tuple[str, ...]  # what the user should know
+    white_balance_level: Level | None  # per what the white balance varies; None: it does not
+    # Log factors on red, green, blue beside the exposure: mean 0 in every view, and over the views
+    # of a component; zeros where it does not vary.
     white_balance: Float[np.ndarray, "v 3"]
-    white_balance_errors: Float[np.ndarray, "v 3"]
+    white_balance_errors: Float[np.ndarray, "v 3"]  # standard errors, as `exposure_errors`
+    # Whether cameras darken towards their corners, and each channel in its own way.
     vignetting: VignettingKind | None
+    # What each physical camera does, by its row in `Observations.cameras`; empty where none does
+    # anything of its own.
     cameras: tuple[CameraFormation, ...]
+    # Standard errors of log V in the corner, per camera and row of `vignetting`.
     corner_errors: Float[np.ndarray, "c k"]
 
     @property
@@ -87,19 +80,100 @@ class PhotometricSolution:
         return {"last_change": self.moved, **{k: getattr(self, k) for k in names}}
 
     @property
-    def exposures_ev(self) -> Float[np.ndarray, " v"]:
+    def exposures_ev(self) -> PerView:
         """Exposures in stops."""
         return self.log_exposures / LN2
 
-    def exposures_ev_at(self, level: float, pivot: float) -> Float[np.ndarray, " v"]:
-        """Return exposures in stops as they act on one level of tone.
+    @property
+    def exposure_errors_ev(self) -> PerView:
+        """Standard errors of the exposures in stops; inf where unknown."""
+        return self.exposure_errors / LN2
 
-        Where gammas differ between views, "the exposure" depends on where it is read: at the
-        pivot by definition, at another level it includes what gamma does there.
+    def exposures_ev_at(self, level: float, pivot: float) -> PerView:
+        """Return exposures in stops as they act on a linear `level` of tone, 1 = white.
 
-        Args:
-            level: linear value of the base curve, 1 = white.
-            pivot: linear value that gammas leave alone.
+        Where gammas differ between views, "the exposure" depends on where it is read: at
+        the pivot by definition, at another level it includes what gamma does there.
         """
         a = GAMMA_SRGB / self.gammas
         return (self.log_exposures + np.log(level / pivot) * (1 - 1 / a)) / LN2
+
+
+class Agreement(NamedTuple):
+    """Recovered exposures against stated ones (EXIF), scale aligned."""
+
+    views: int  # how many have both
+    correlation: float  # of the two, in stops; NaN where one of them does not vary
+    # Recovered over stated, least squares; other than 1 is the power gauge or tone mapping.
+    slope: float
+    rms_ev: float  # RMS gap in stops
+    offset_ev: float  # what to add to stated exposures to lay them over the recovered ones
+    gap_ev: PerView  # recovered minus stated, median removed; NaN where either is missing
+    disagrees: Bool[np.ndarray, " v"]  # views whose gap is noticeable and significant
+
+    def sentence(self, source: str = "EXIF") -> str:
+        """Say it in words."""
+        if self.views < 2:
+            return f"{source} gives the exposure of {self.views} view(s): nothing to compare."
+        head = (
+            f"{source} of {self.views} views: correlation {self.correlation:.3f}, slope "
+            f"{self.slope:.2f}, RMS {self.rms_ev:.2f} EV."
+        )
+        count = int(self.disagrees.sum())
+        if not count:
+            return head + f" {source} and the pixels agree within {NOTICEABLE_EV:g} EV."
+        worst = float(np.nanmax(np.abs(self.gap_ev)))
+        return head + (
+            f" {source} disagrees with the pixels in {count} of {self.views} views, by up to "
+            f"{worst:.2f} EV."
+        )
+
+
+def compare(exposures_ev: PerView, errors_ev: PerView, stated_ev: PerView) -> Agreement:
+    """Compare recovered with stated exposures, in stops.
+
+    Errors are inf where unknown; stated exposures hold up to a constant, and are NaN where
+    unknown.
+    """
+    both = np.isfinite(stated_ev) & np.isfinite(errors_ev)
+    gap = np.full(len(exposures_ev), np.nan)
+    count = int(both.sum())
+    a, b = exposures_ev[both], stated_ev[both]
+    difference = a - b
+    offset = float(np.median(difference)) if count else 0.0
+    if count < 2:
+        nan, nowhere = float("nan"), np.zeros(len(gap), bool)
+        return Agreement(count, nan, nan, nan, offset, gap, nowhere)
+    gap[both] = difference - offset
+    a, b = a - a.mean(), b - b.mean()
+    varies = a @ a > 1e-9 and b @ b > 1e-9
+    with np.errstate(invalid="ignore"):
+        disagrees = np.abs(gap) > np.maximum(NOTICEABLE_EV, STANDARD_ERRORS * errors_ev)
+    return Agreement(
+        count,
+        float(a @ b / np.sqrt((a @ a) * (b @ b))) if varies else float("nan"),
+        float(a @ b / (b @ b)) if varies else float("nan"),
+        float(np.sqrt(np.mean((difference - difference.mean()) ** 2))),
+        offset,
+        gap,
+        disagrees & both,
+    )
+
+
+def note_on_levels(
+    solution: PhotometricSolution, stated_ev: PerView, agreement: Agreement, pivot: float
+) -> list[str]:
+    """Say at which level stated exposures agree best, where gammas make them depend on it."""
+    if MODELS[solution.model].gamma is None or agreement.views < 3:
+        return []
+    errors_ev = solution.exposure_errors_ev
+    options = {x: compare(solution.exposures_ev_at(x, pivot), errors_ev, stated_ev) for x in LEVELS}
+    level = min(options, key=lambda x: options[x].rms_ev)
+    best = options[level]
+    if not best.rms_ev < NOTICEABLE_RMS_SHARE * agreement.rms_ev:
+        return []
+    return [
+        f"Read at a linear value of {level:g} instead of {pivot:g}, correlation is "
+        f"{best.correlation:.3f}, slope {best.slope:.2f}, RMS {best.rms_ev:.2f} EV: the cameras "
+        "did not only change exposure, they also moved other tones against it."
+    ]

@@ -132,7 +132,9 @@ def radiance_activation(value: Values, kind: RadianceKind) -> Values:
 
 def radiance_preactivation(radiance: Values, kind: RadianceKind) -> Values:
     """Return the value whose activation is `radiance` > 0."""
-    return namespace(radiance).log(radiance) if kind == "exp" else radiance - 0.5
+    if kind == "exp":
+        return namespace(radiance).log(radiance)
+    return radiance - 0.5
 
 
 def scaled(

@@ -28,11 +28,7 @@ class Warp(NamedTuple):
 
 
 def surface_depth(render: Render, opaque: float = OPAQUE) -> Float[Array, "h w"]:
-    """Return the expected depth where the render is opaque, and 0 elsewhere.
-
-    Args:
-        render: with depth.
-        opaque: the alpha above which a pixel has a surface.
+    """Return the expected depth where the alpha of a render is above `opaque`, and 0 elsewhere.
 
     Raises:
         ValueError: it was rendered without depth.
@@ -68,10 +64,7 @@ def visible(
 ) -> Bool[Array, "*n"]:
     """Return which projected points lie on the surface that a view shows at their pixel.
 
-    Args:
-        xy: positions in the view.
-        z: their depths in it.
-        depth: of the view, 0 where there is no surface; see `surface_depth`.
+    `xy` and `z` are their positions and depths in the view, `depth` is that of `surface_depth`.
     """
     height, width = depth.shape
     at = jnp.floor(xy).astype(jnp.int32)
@@ -89,11 +82,7 @@ def warp(
 ) -> Warp:
     """Return where the pixels of one view lie in another (docs/photometry.md, 3, w(u)).
 
-    Args:
-        depth: of this view, 0 where it shows no surface.
-        camera: this view.
-        other_depth: of the other view, 0 where it shows no surface.
-        other_camera: the other view.
+    Depths are those of `surface_depth`.
     """
     xy, z = project_points(unproject(depth, camera), other_camera)
     return Warp(xy, (depth > 0) & visible(xy, z, other_depth))

@@ -35,9 +35,8 @@ def compiled_loop(f: F) -> F:
     and keeps the call whole under differentiation: partial evaluation would hoist its constants
     into a call without arguments, which XLA 0.10 turns into invalid code.
 
-    Args:
-        f: a pure function of arrays, without matrix products, sorts or convolutions; not
-            differentiable.
+    `f` is a pure function of arrays, without matrix products, sorts or convolutions; it cannot be
+    differentiated.
     """
 
     @jax.custom_batching.sequential_vmap
@@ -60,14 +59,11 @@ def opaque_true(sample: Float[Array, ""]) -> Bool[Array, ""]:
 
 
 def materialize(always: Bool[Array, ""], compute):
-    """Force the arrays that `compute()` returns into memory.
+    """Force the arrays that `compute()`, without arguments, returns into memory.
 
     XLA's CPU backend fuses through `optimization_barrier` and then recomputes the whole chain in
-    each consumer (1155 against 421 CPU ms, docs/kernel.md); a conditional survives.
-
-    Args:
-        always: true, but computed from data, so that XLA cannot know: `opaque_true`.
-        compute: a function without arguments.
+    each consumer (1155 against 421 CPU ms, docs/kernel.md); a conditional survives. `always` is
+    true, but computed from data, so that XLA cannot know: `opaque_true`.
     """
     shapes = jax.eval_shape(compute)
     return lax.cond(

@@ -1,7 +1,4 @@
-"""Charts of the photometry: series over the photographs, and tone curves.
-
-Series differ by marker and line as well as by colour, and are labelled at their ends.
-"""
+"""Charts of the pages. Series differ by marker and line as well as by colour."""
 
 from __future__ import annotations
 
@@ -12,76 +9,60 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import FuncFormatter, MaxNLocator
+from scipy.ndimage import median_filter
 
-from p2gs_jax.report.svg import (
-    FIRST,
-    INK,
-    MUTED,
-    NARROW,
-    PAPER,
-    SECOND,
-    THIRD,
-    WIDE,
-    chart,
-    figure_of,
-    label_ends,
-    place,
-    place_text,
-)
+from p2gs_jax.report import svg
+from p2gs_jax.report.svg import FIRST, FOURTH, INK, MUTED, PAPER, SECOND, THIRD
 
-# Margins, CSS pixels: left for numbers, right for the names of curves.
-LEFT, NARROW_LEFT, RIGHT, NARROW_RIGHT = 58, 40, 74, 56
-LABEL_GAP = 15.0
 # CSS pixels per view for markers of full size; below it they are smaller.
 ROOM = 11.0
+# Half of the window of a running median, in shares of the run.
+SMOOTHING = 0.01
 
 
 @dataclass(frozen=True)
 class Style:
-    """Line, marker and colour of a series."""
+    """Line, marker and colour of a series; `width` and `size` are CSS pixels."""
 
     color: str
     marker: str
-    line: str
+    line: Any
     filled: bool = True
     size: float = 5.5
     order: int = 2
+    width: float = 1.5
+    opacity: float = 1.0
 
     @property
     def keywords(self) -> dict[str, Any]:
         """Keywords of `Axes.plot`."""
-        face = self.color if self.filled else PAPER
         return {
             "color": self.color,
             "marker": self.marker,
             "linestyle": self.line,
             "markersize": self.size,
-            "markerfacecolor": face,
+            "markerfacecolor": self.color if self.filled else PAPER,
             "markeredgecolor": self.color,
             "markeredgewidth": 1.3,
-            "linewidth": 1.5,
+            "linewidth": self.width,
             "zorder": self.order,
         }
 
 
-RECOVERED = Style(FIRST, "o", "-", order=4)
-FITTED = Style(FIRST, "D", "", filled=False, order=3)
-STATED = Style(SECOND, "x", ":", order=2)
-TRUE = Style(THIRD, "s", "--", filled=False, size=9, order=1)
+FOUND = Style(FIRST, "o", "-", order=4)
+# Exposures by their source.
+SOURCES = {
+    "found": FOUND,
+    "held out": Style(FIRST, "D", "", filled=False, order=3),
+    "EXIF": Style(SECOND, "x", ":", order=2),
+    "true": Style(THIRD, "s", "--", filled=False, size=9, order=1),
+}
 
 
 @dataclass(frozen=True)
 class Series:
-    """One curve.
-
-    Attributes:
-        label: its name.
-        x: places.
-        y: values; NaN where there is none.
-        style: of its line and markers.
-        error: half lengths of error bars, or None.
-    """
+    """A named curve; `y` is NaN where there is no value, `error` has half lengths of error bars."""
 
     label: str
     x: np.ndarray
@@ -90,16 +71,18 @@ class Series:
     error: np.ndarray | None = None
 
 
-@dataclass(frozen=True)
-class ChartPanel:
-    """Axes with curves; `title` names the camera."""
-
-    title: str
-    series: tuple[Series, ...]
+def _ends(series: Sequence[Series]) -> list[tuple[str, float, str]]:
+    """Return name, last known value and colour of the curves that have a name and a value."""
+    out = []
+    for s in series:
+        known = np.flatnonzero(np.isfinite(s.y))
+        if s.label and len(known):
+            out.append((s.label, float(s.y[known[np.argmax(s.x[known])]]), s.style.color))
+    return out
 
 
 def panels_chart(
-    panels: Sequence[ChartPanel],
+    panels: Sequence[tuple[str, Sequence[Series]]],
     *,
     y_label: str,
     x_label: str,
@@ -109,45 +92,45 @@ def panels_chart(
     """Return panels above each other with common axes.
 
     Args:
-        panels: from top to bottom.
+        panels: title and curves of each, from top to bottom.
         y_label: with its unit.
         x_label: with its unit.
         label: text alternative of the chart.
-        band: height of a horizontal line, or None.
+        band: height of a horizontal line.
     """
-    values = [_reach(s) for p in panels for s in p.series]
+    every = [s for _, series in panels for s in series]
+    values = [_reach(s) for s in every]
     low = min((v[0] for v in values), default=0.0)
     high = max((v[1] for v in values), default=1.0)
     room = 0.08 * max(high - low, 0.1)
-    places = np.concatenate([s.x for p in panels for s in p.series] or [np.zeros(1)])
+    places = np.concatenate([s.x for s in every] or [np.zeros(1)])
+    longest = max((len(s.x) for s in every), default=1)
+    tallest = svg.LABEL_GAP * (2 + max((len(_ends(series)) for _, series in panels), default=0))
 
     def draw(wide: bool) -> Figure:
-        left, right = (LEFT, RIGHT) if wide else (NARROW_LEFT, NARROW_RIGHT)
-        across = (WIDE if wide else NARROW) - left - right
-        each = (150 if wide else 120) + (70 if len(panels) == 1 else 0)
-        step = each + 34
-        top = 40 if any(p.title for p in panels) else 22
-        figure = figure_of(wide, top + step * len(panels) + 16)
-        for k, panel in enumerate(panels):
-            axes = place(figure, left, top + k * step, across, each)
+        each = max((150 if wide else 120) + (70 if len(panels) == 1 else 0), tallest)
+        top = 40 if any(title for title, _ in panels) else 22
+        right = svg.room_for([s.label for s in every], wide)
+        figure, rows, across = svg.stack(wide, len(panels), each, top=top, right=right)
+        for axes, (title, series) in zip(rows, panels, strict=True):
             axes.set_xlim(places.min() - 0.5, places.max() + 0.5)
             axes.set_ylim(low - room, high + room)
             if band is not None:
                 axes.axhline(band, color=MUTED, linewidth=0.8)
-            for s in panel.series:
-                _plot(axes, s, across / max(float(np.ptp(places)), 1.0))
-            axes.xaxis.set_major_locator(MaxNLocator(8 if wide else 5, integer=True))
-            axes.yaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
-            set_title(axes, panel.title)
-            label_ends(axes, _ends(panel.series), LABEL_GAP)
-            last = k == len(panels) - 1
-            axes.tick_params(labelbottom=last)
-            axes.set_xlabel(x_label if last else "")
+            for s in series:
+                _plot(axes, s, across / max(longest - 1, 1))
+            svg.set_ticks(axes, 8 if wide else 5, 5)
+            svg.set_title(axes, title)
+            svg.label_ends(axes, _ends(series))
+            axes.tick_params(labelbottom=axes is rows[-1])
+        rows[-1].set_xlabel(x_label)
         # One horizontal label for all panels.
-        place_text(figure, left, 12, y_label, MUTED)
+        width, height = figure.get_size_inches() * 72
+        left = svg.LEFT if wide else svg.NARROW_LEFT
+        figure.text(left / width, 1 - 12 / height, y_label, color=MUTED)
         return figure
 
-    return chart(draw, label)
+    return svg.chart(draw, label)
 
 
 def _reach(s: Series) -> tuple[float, float]:
@@ -159,13 +142,7 @@ def _reach(s: Series) -> tuple[float, float]:
 
 
 def _plot(axes: Axes, s: Series, room: float) -> None:
-    """Draw a series.
-
-    Args:
-        axes: to draw into.
-        s: the series.
-        room: CSS pixels from one view to the next.
-    """
+    """Draw a series where it is `room` CSS pixels from one view to the next."""
     known = np.isfinite(s.y)
     style = s.style.keywords
     crowded = room < ROOM
@@ -187,68 +164,163 @@ def _plot(axes: Axes, s: Series, room: float) -> None:
         )
 
 
-def _ends(series: Sequence[Series]) -> list[tuple[str, float, str]]:
-    out = []
-    for s in series:
-        known = np.flatnonzero(np.isfinite(s.y))
-        if s.label and len(known):
-            out.append((s.label, float(s.y[known[np.argmax(s.x[known])]]), s.style.color))
-    return out
-
-
-def set_title(axes: Axes, text: str) -> None:
-    """Set the title of axes, aligned to the left."""
-    axes.set_title(text, loc="left", fontsize="medium", color=INK, pad=6)
-
-
-@dataclass(frozen=True)
-class ToneCurve:
-    """A tone curve.
-
-    Attributes:
-        label: its name.
-        stops: exposed radiance, stops from mid-grey.
-        values: display values.
-        color: of the line.
-        line: its style.
-        width: CSS pixels.
-        opacity: 1 hides what lies below.
-    """
-
-    label: str
-    stops: np.ndarray
-    values: np.ndarray
-    color: str
-    line: Any
-    width: float = 1.6
-    opacity: float = 1.0
-
-
-def response_chart(curves: Sequence[ToneCurve], *, label: str) -> str:
-    """Return tone curves.
-
-    Args:
-        curves: the last is drawn on top.
-        label: text alternative of the chart.
-    """
+def response_chart(curves: Sequence[Series], *, label: str) -> str:
+    """Return tone curves: photographed values over stops from mid-grey; the last lies on top."""
 
     def draw(wide: bool) -> Figure:
-        left, right = (LEFT, RIGHT + 30) if wide else (NARROW_LEFT, NARROW_RIGHT)
-        across = min(520, (WIDE if wide else NARROW) - left - right)
+        right = svg.RIGHT + 30 if wide else 0
         tall = 260 if wide else 190
-        figure = figure_of(wide, 26 + tall + 46)
-        axes = place(figure, left, 26, across, tall)
-        ends = []
+        figure, (axes,), _ = svg.stack(wide, 1, tall, top=26, below=12, right=right, widest=520)
         for c in curves:
-            style = {"color": c.color, "linestyle": c.line, "linewidth": c.width}
-            axes.plot(c.stops, c.values, alpha=c.opacity, **style)
-            ends.append((c.label, float(c.values[-1]), c.color))
+            style = {"color": c.style.color, "linestyle": c.style.line, "linewidth": c.style.width}
+            axes.plot(c.x, c.y, alpha=c.style.opacity, **style)
         axes.set_xlim(-7, 3)
         axes.set_ylim(0, 1.02)
-        axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+        svg.set_ticks(axes, 6)
         axes.set_xlabel("exposed radiance, stops from mid-grey")
-        set_title(axes, "photographed value, 1 is white")
-        label_ends(axes, ends, LABEL_GAP)
+        svg.set_title(axes, "photographed value, 1 is white")
+        svg.label_ends(axes, [(c.label, float(c.y[-1]), c.style.color) for c in curves])
         return figure
 
-    return chart(draw, label)
+    return svg.chart(draw, label)
+
+
+def seams_chart(rows: Sequence[tuple[str, float, float]], *, label: str) -> str:
+    """Return a line per pair of photographs, from their difference as taken to that after.
+
+    Args:
+        rows: name, before and after, stops.
+        label: text alternative of the chart.
+    """
+    most = max(max(before, after) for _, before, after in rows)
+
+    def draw(wide: bool) -> Figure:
+        row, top, left = 36, 24, 14
+        tall = row * len(rows)
+        figure = svg.new_figure(wide, top + tall + 44)
+        axes = svg.place(figure, left, top, (svg.WIDE if wide else svg.NARROW) - 2 * left, tall)
+        axes.set_ylim(len(rows) - 0.35, -0.65)
+        axes.set_xlim(-0.02 * most, 1.04 * most)
+        axes.spines["left"].set_visible(False)
+        axes.grid(axis="y", visible=False)
+        axes.set_yticks([])
+        for k, (name, before, after) in enumerate(rows):
+            axes.plot([after, before], [k, k], color=MUTED, linewidth=1.5, zorder=2)
+            axes.plot(before, k, **Style(SECOND, "o", "", filled=False, size=9.5).keywords)
+            axes.plot(after, k, **Style(FIRST, "o", "", size=6.5, order=3).keywords)
+            axes.text(0, k - 0.28, name, color=MUTED, va="bottom")
+        axes.set_xlabel("difference of the same surface, stops")
+        mark = {"fontsize": "medium", "transform": axes.transAxes, "va": "bottom"}
+        axes.text(0, 1 + 6 / tall, "● developed alike", color=FIRST, **mark)
+        axes.text(1, 1 + 6 / tall, "○ as taken", color=SECOND, ha="right", **mark)
+        return figure
+
+    return svg.chart(draw, label)
+
+
+def training_chart(
+    steps: np.ndarray,
+    psnr: np.ndarray,
+    losses: dict[str, np.ndarray],
+    gaussians: np.ndarray,
+    marks: Sequence[tuple[float, str]],
+    *,
+    label: str,
+) -> str:
+    """Return PSNR, loss and Gaussians over the steps.
+
+    Args:
+        steps: of the log's lines.
+        psnr: dB.
+        losses: the whole loss and its largest terms, by name.
+        gaussians: how many there are.
+        marks: step, and what changes there.
+        label: text alternative of the chart.
+    """
+    window = max(3, 2 * round(SMOOTHING * len(steps)) + 1)
+    styles = [(INK, "-"), (FIRST, "--"), (SECOND, "-."), (THIRD, ":"), (FOURTH, (0, (5, 1, 1, 1)))]
+    smooth_psnr = median_filter(psnr, window, mode="nearest")
+    smooth_losses = [median_filter(v, window, mode="nearest") for v in losses.values()]
+
+    def draw(wide: bool) -> Figure:
+        figure, rows, _ = svg.stack(
+            wide,
+            3,
+            150 if wide else 120,
+            top=56 if wide else 22,
+            left=svg.LEFT if wide else svg.NARROW_LEFT + 4,
+            right=svg.room_for(tuple(losses), wide),
+        )
+        svg.set_title(rows[0], "PSNR on the training views, dB")
+        rows[0].plot(steps, psnr, color=FIRST, alpha=0.35, linewidth=0.8)
+        rows[0].plot(steps, smooth_psnr, color=FIRST, linewidth=2)
+        svg.set_title(rows[1], "Loss and its largest terms")
+        rows[1].set_yscale("log")
+        ends = []
+        for name, shown, (color, line) in zip(losses, smooth_losses, styles, strict=False):
+            rows[1].plot(steps, shown, color=color, linestyle=line, linewidth=1.6)
+            ends.append((name, float(shown[-1]), color))
+        svg.set_title(rows[2], "Gaussians")
+        rows[2].plot(steps, gaussians, color=FIRST, linewidth=2, drawstyle="steps-post")
+        rows[2].set_ylim(bottom=0, top=1.1 * float(gaussians.max()))
+        rows[2].set_xlabel("step")
+        for k, axes in enumerate(rows):
+            axes.set_xlim(0, float(steps[-1]))
+            svg.set_ticks(axes, 6 if wide else 4)
+            if k != 1:
+                axes.yaxis.set_major_locator(MaxNLocator(4))
+            axes.yaxis.set_major_formatter(FuncFormatter(_plain))
+            axes.tick_params(labelbottom=k == 2)
+            axes.yaxis.set_minor_formatter(FuncFormatter(lambda v, _: ""))
+            for at, _ in marks:
+                axes.axvline(at, color=MUTED, linewidth=1, linestyle=(0, (2, 3)))
+        svg.label_ends(rows[1], ends)
+        svg.label_ends(rows[0], [(f"{smooth_psnr[-1]:.1f}", float(smooth_psnr[-1]), FIRST)])
+        svg.label_ends(rows[2], [(f"{gaussians[-1]:,.0f}", float(gaussians[-1]), FIRST)])
+        # Alternating heights: neighbours may be close.
+        where = {"transform": rows[0].get_xaxis_transform(), "color": MUTED}
+        for k, (at, text) in enumerate(marks if wide else ()):
+            rows[0].text(at, 1.13 + 0.1 * (k % 2), text, **where)
+        return figure
+
+    return svg.chart(draw, label)
+
+
+def _plain(value: float, _: int) -> str:
+    return f"{value:,.0f}" if value >= 1000 else f"{value:.4g}"
+
+
+def against_chart(
+    panels: Sequence[tuple[str, np.ndarray, np.ndarray]], *, first: str, label: str
+) -> str:
+    """Return scatter plots of the exposures of several runs over those of the first one.
+
+    Args:
+        panels: name of a run, exposures of the first run, exposures of this one, stops.
+        first: name of the first run.
+        label: text alternative of the chart.
+    """
+    every = np.concatenate([v for _, x, y in panels for v in (x, y)])
+    low, high = float(every.min()), float(every.max())
+    room = 0.06 * max(high - low, 0.1)
+    limits = (low - room, high + room)
+
+    def draw(wide: bool) -> Figure:
+        columns = min(3, len(panels)) if wide else 1
+        side, step = 220, 220 + 66
+        figure = svg.new_figure(wide, -(-len(panels) // columns) * step)
+        for k, (name, x, y) in enumerate(panels):
+            left = (svg.LEFT if wide else svg.NARROW_LEFT) + (k % columns) * (side + 56)
+            axes = svg.place(figure, left, 24 + (k // columns) * step, side, side)
+            axes.plot(limits, limits, color=MUTED, linewidth=1)
+            axes.plot(x, y, **Style(FIRST, "o", "", filled=False).keywords)
+            axes.set_xlim(*limits)
+            axes.set_ylim(*limits)
+            axes.set_aspect("equal")
+            for axis in (axes.xaxis, axes.yaxis):
+                axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
+            axes.set_xlabel(f"{first}, stops")
+            svg.set_title(axes, f"{name}, stops")
+        return figure
+
+    return svg.chart(draw, label)

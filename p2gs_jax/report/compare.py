@@ -1,28 +1,30 @@
-"""Several runs in one table and on one page."""
+"""Several runs in one table and on one page: `compare.html`, and its tables as Markdown."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import NamedTuple
 
 import numpy as np
 
+from p2gs_jax.core.atomic import write_text
 from p2gs_jax.errors import UserError
-from p2gs_jax.report import run_summary
-from p2gs_jax.report.run_files import RunFiles, part_at, read_run
+from p2gs_jax.report import page as html
+from p2gs_jax.report.charts import against_chart
+from p2gs_jax.report.findings import DESCRIPTIONS, seconds_of, true_error
+from p2gs_jax.report.page import figure, listed, paragraph, text
+from p2gs_jax.report.pictures import jpeg, read_png, spread
+from p2gs_jax.report.run_files import RunFiles, read_run
 from p2gs_jax.report.run_sections import flat, option_text
-from p2gs_jax.report.scene_measurements import SceneMeasurements
-from p2gs_jax.report.view_comparisons import read_png
 from p2gs_jax.synth.exposures import read_true_exposures
 
-Better = Literal["high", "low"] | None
+MOST_VIEWS = 4
 
 
-@dataclass(frozen=True)
-class TableRow:
-    """One line of the table.
+class TableRow(NamedTuple):
+    """One line of a table.
 
     Attributes:
         name: with its unit.
@@ -59,45 +61,35 @@ class Comparison:
     exposures: tuple[tuple[str, np.ndarray, np.ndarray], ...]
 
 
-# Name, path in metrics.json, digits, which is better.
-NUMBERS: tuple[tuple[str, tuple[str, ...], int, Better], ...] = (
-    ("Gaussians", ("counts", "gaussians"), 0, None),
-    ("steps", ("counts", "steps"), 0, None),
-    ("training PSNR, dB", ("train", "psnr"), 2, "high"),
-    ("training SSIM", ("train", "ssim"), 4, "high"),
-    ("training LPIPS", ("train", "lpips"), 4, "low"),
-    ("held-out PSNR, mean exposure, dB", ("test", "averaged", "psnr"), 2, "high"),
-    ("held-out PSNR, fitted exposure, dB", ("test", "exposure_fitted", "psnr"), 2, "high"),
-    ("held-out SSIM, fitted exposure", ("test", "exposure_fitted", "ssim"), 4, "high"),
-    ("held-out LPIPS, fitted exposure", ("test", "exposure_fitted", "lpips"), 4, "low"),
-    (
-        "held-out PSNR, all fitted that varies per view, dB",
-        ("test", "photometry_fitted", "psnr"),
-        2,
-        "high",
-    ),
-    ("reference PSNR, one scale, dB", ("reference", "scale_aligned", "psnr"), 2, "high"),
-    (
-        "reference PSNR, held out, one scale, dB",
-        ("reference", "scale_aligned", "test", "psnr"),
-        2,
-        "high",
-    ),
-    ("radiance error, median, stops", ("radiance", "stops_median"), 3, "low"),
-    ("radiance error, RMS, stops", ("radiance", "stops_rms"), 3, "low"),
-    ("HDR inconsistency (HIS) of the renders", ("consistency", "per_view", "his"), 3, None),
-    ("HDR inconsistency (HIS) of the photographs", ("consistency", "photographs", "his"), 3, None),
-)
+# Where `metrics.json` has the numbers of the table; the last part says how they are shown.
+NUMBERS: dict[str, tuple[str, ...]] = {
+    "Gaussians": ("counts", "gaussians"),
+    "steps": ("counts", "steps"),
+    "training PSNR, dB": ("train", "psnr"),
+    "training SSIM": ("train", "ssim"),
+    "training LPIPS": ("train", "lpips"),
+    "held-out PSNR, mean exposure, dB": ("test", "averaged", "psnr"),
+    "held-out PSNR, fitted exposure, dB": ("test", "exposure_fitted", "psnr"),
+    "held-out SSIM, fitted exposure": ("test", "exposure_fitted", "ssim"),
+    "held-out LPIPS, fitted exposure": ("test", "exposure_fitted", "lpips"),
+    "held-out PSNR, all fitted that varies per view, dB": ("test", "photometry_fitted", "psnr"),
+    "reference PSNR, one scale, dB": ("reference", "scale_aligned", "psnr"),
+    "reference PSNR, held out, one scale, dB": ("reference", "scale_aligned", "test", "psnr"),
+    "radiance error, median, stops": ("radiance", "stops_median"),
+    "radiance error, RMS, stops": ("radiance", "stops_rms"),
+    "HDR inconsistency (HIS) of the renders": ("consistency", "per_view", "his"),
+    "HDR inconsistency (HIS) of the photographs": ("consistency", "photographs", "his"),
+}
+DIGITS = {"psnr": 2, "ssim": 4, "lpips": 4, "stops_median": 3, "stops_rms": 3, "his": 3, "ev": 4}
+BETTER = {"psnr": max, "ssim": max}
+BETTER |= dict.fromkeys(("lpips", "stops_median", "stops_rms", "ev"), min)
 
 
 def compare_runs(folders: Sequence[str | Path]) -> Comparison:
-    """Read and compare runs.
-
-    Args:
-        folders: run folders; exposures are drawn over those of the first.
+    """Read and compare runs; exposures are drawn over those of the first.
 
     Raises:
-        UserError: there are fewer than two, or one is no run folder.
+        UserError: there are fewer than two, or one is not a run folder.
     """
     if len(folders) < 2:
         raise UserError(
@@ -107,11 +99,7 @@ def compare_runs(folders: Sequence[str | Path]) -> Comparison:
     runs = tuple(read_run(Path(folder)) for folder in folders)
     labels = tuple(_labels([run.folder for run in runs]))
     same = all(_same_scene(runs[0], run) for run in runs[1:])
-    remarks = [
-        f"{label}: {sentence}"
-        for label, run in zip(labels, runs, strict=True)
-        for sentence in run.missing
-    ]
+    remarks = [f"{n}: {why}" for n, run in zip(labels, runs, strict=True) for why in run.missing]
     if not same:
         names = ", ".join(dict.fromkeys(str(run.scene) for run in runs))
         remarks.insert(
@@ -156,42 +144,35 @@ def _same_scene(first: RunFiles, other: RunFiles) -> bool:
 
 
 def _scores(runs: Sequence[RunFiles], same: bool) -> list[TableRow]:
-    def line(name: str, say: Callable[[RunFiles], str]) -> TableRow:
-        return TableRow(name, tuple(say(run) for run in runs))
+    def words(name: str, of: Callable[[RunFiles], str]) -> TableRow:
+        return TableRow(name, tuple(of(run) for run in runs))
+
+    def numbers(name: str, values: Sequence[float | None], key: str) -> list[TableRow]:
+        """Return a line, or none where no run has the number."""
+        known = [v for v in values if v is not None]
+        form = f",.{DIGITS.get(key, 0)}f"
+        cells = tuple("" if v is None else format(v, form) for v in values)
+        best = frozenset[int]()
+        if same and key in BETTER and len(set(filter(None, cells))) > 1:
+            goal = format(BETTER[key](known), form)
+            best = frozenset(i for i, cell in enumerate(cells) if cell == goal)
+        return [TableRow(name, cells, best)] if known else []
 
     rows = [
-        line("preset", lambda run: run.preset),
-        line("model", _model),
-        line("tone curve", _curve),
-        line("training views", lambda run: str(len(run.train) or "")),
+        words("preset", lambda run: run.preset),
+        words("model", _model),
+        words("tone curve", _curve),
+        words("training views", lambda run: str(len(run.train) or "")),
     ]
-    for name, path, digits, better in NUMBERS:
-        values = [run.number(*path) for run in runs]
-        if any(v is not None for v in values):
-            rows.append(_row(name, values, digits, better if same else None))
-    seconds = [run_summary.seconds_of(run) for run in runs]
-    if any(s is not None for s in seconds):
-        rows.insert(6, _row("seconds, whole run", seconds, 0, None))
-    errors = [_true_error(run) for run in runs]
-    if any(e is not None for e in errors):
-        rows.append(_row("exposure error, RMS, stops", errors, 4, "low" if same else None))
-    return rows
-
-
-def _row(name: str, values: Sequence[float | None], digits: int, better: Better) -> TableRow:
-    cells = tuple("" if v is None else f"{v:,.{digits}f}" for v in values)
-    known = [v for v in values if v is not None]
-    if better is None or len(known) < 2 or len(set(filter(None, cells))) < 2:
-        return TableRow(name, cells)
-    best = f"{(max if better == 'high' else min)(known):,.{digits}f}"
-    return TableRow(name, cells, frozenset(i for i, cell in enumerate(cells) if cell == best))
+    for name, path in NUMBERS.items():
+        rows += numbers(name, [run.number(*path) for run in runs], path[-1])
+    rows[6:6] = numbers("seconds, whole run", [seconds_of(run) for run in runs], "seconds")
+    return rows + numbers("exposure error, RMS, stops", [_true_error(run) for run in runs], "ev")
 
 
 def _model(run: RunFiles) -> str:
-    if run.photometry is None:
-        return ""
-    model = run.photometry["model"]
-    return run_summary.DESCRIPTIONS.get(model, model)
+    model = "" if run.photometry is None else run.photometry["model"]
+    return DESCRIPTIONS.get(model, model)
 
 
 def _curve(run: RunFiles) -> str:
@@ -203,46 +184,32 @@ def _true_error(run: RunFiles) -> float | None:
         truth = read_true_exposures(run.scene)
     except (OSError, KeyError, ValueError):
         return None
-    error = run_summary.true_error(run, SceneMeasurements(true_exposures=truth))
+    error = true_error(run, truth)
     return None if error is None else error["ev"]
 
 
 def _options(runs: Sequence[RunFiles]) -> list[TableRow]:
-    every = [flat(run.options) for run in runs]
-    names = list(dict.fromkeys(name for options in every for name in options))
-    rows = []
-    for name in names:
-        cells = tuple(option_text(options[name]) if name in options else "" for options in every)
-        if len(set(cells)) > 1:
-            rows.append(TableRow(name, cells))
-    return rows
+    every = [{n: option_text(value) for n, value in flat(run.options).items()} for run in runs]
+    names = dict.fromkeys(name for options in every for name in options)
+    rows = [TableRow(n, tuple(options.get(n, "") for options in every)) for n in names]
+    return [r for r in rows if len(set(r.cells)) > 1]
 
 
 def _exposures(runs: Sequence[RunFiles], labels: Sequence[str]):
-    first = _stops(runs[0])
-    for label, run in zip(labels[1:], runs[1:], strict=True):
-        other = _stops(run)
+    first, *others = (
+        {v["image"]: v["exposure_ev"] for v in run.train if v["exposure_ev"] is not None}
+        for run in runs
+    )
+    for label, other in zip(labels[1:], others, strict=True):
         common = [name for name in first if name in other]
         if len(common) >= 2:
             x, y = (np.array([values[n] for n in common]) for values in (first, other))
             yield label, x - x.mean(), y - y.mean()
 
 
-def _stops(run: RunFiles) -> dict[str, float]:
-    return {v["image"]: v["exposure_ev"] for v in run.train if v["exposure_ev"] is not None}
-
-
-def common_held_out(runs: Sequence[RunFiles]) -> list[str]:
-    """Return names of held-out views that every run shows."""
-    names = [{h.name for h in run.held_out} for run in runs]
-    return sorted(set.intersection(*names)) if names else []
-
-
-def psnr_of(run: RunFiles, name: str) -> str:
-    """Return the score of a held-out view in words; empty where there is none."""
-    scores = part_at(run.metrics, "test", "exposure_fitted", "per_view", name)
-    value = scores.get("psnr")
-    return f"{value:.1f} dB" if isinstance(value, int | float) else ""
+def apart(x: np.ndarray, y: np.ndarray) -> float:
+    """Return the RMS difference."""
+    return float(np.sqrt(np.mean((x - y) ** 2)))
 
 
 def to_markdown(found: Comparison) -> str:
@@ -261,19 +228,90 @@ def to_markdown(found: Comparison) -> str:
     return "\n".join(lines) + "\n"
 
 
-def apart(x: np.ndarray, y: np.ndarray) -> float:
-    """Return the RMS difference."""
-    return float(np.sqrt(np.mean((x - y) ** 2)))
-
-
 def _markdown_table(head: str, labels: Sequence[str], rows: Sequence[TableRow]) -> list[str]:
-    def plain(text: str) -> str:
-        return text.replace("|", "\\|")
+    def line(cells: Sequence[str]) -> str:
+        return f"| {' | '.join(c.replace('|', chr(92) + '|') for c in cells)} |"
 
-    lines = [f"| {head} | {' | '.join(map(plain, labels))} |", "|---|" + "---:|" * len(labels)]
-    for row in rows:
-        cells = [
-            f"**{plain(c)}**" if i in row.best else plain(c) or "-" for i, c in enumerate(row.cells)
-        ]
-        lines.append(f"| {plain(row.name)} | {' | '.join(cells)} |")
-    return lines
+    out = [line([head, *labels]), "|---|" + "---:|" * len(labels)]
+    for r in rows:
+        cells = [f"**{c}**" if i in r.best else c or "-" for i, c in enumerate(r.cells)]
+        out.append(line([r.name, *cells]))
+    return out
+
+
+def write_comparison(found: Comparison, out: Path) -> tuple[Path, Path]:
+    """Write the page and, beside it, its tables as Markdown; return both paths.
+
+    Raises:
+        UserError: the page cannot be written.
+    """
+    markdown = out.with_suffix(".md")
+    html.write_page(out, comparison_page(found))
+    write_text(markdown, to_markdown(found))
+    return out, markdown
+
+
+def comparison_page(found: Comparison) -> str:
+    """Return the page."""
+    count = len(found.runs)
+    names = dict.fromkeys(run.scene.name or "an unnamed scene" for run in found.runs)
+    head = f"<h1>{text(count)} runs of {text(' and '.join(names))}</h1>\n"
+    head += paragraph(", ".join(found.labels), "quiet") + listed(found.remarks)
+    scores = _table("", found.labels, found.scores)
+    if found.same_scene:
+        scores += paragraph("Bold: the best of a line.", "note")
+    options = paragraph("All options are the same.")
+    if found.options:
+        options = _table("option", found.labels, found.options)
+    sections = [
+        ("scores", "Scores", scores),
+        ("options", "Options that differ", options),
+        ("exposures", "Exposures against each other", _exposure_body(found)),
+        ("views", "The same held-out views", _view_body(found)),
+    ]
+    return html.page(f"{count} runs compared · p2gs-jax", head, sections, html.made_by("compare"))
+
+
+def _table(head: str, labels: Sequence[str], rows: Sequence[TableRow]) -> str:
+    return html.table(
+        [head, *labels],
+        [[r.name, *r.cells] for r in rows],
+        numbers=range(1, len(labels) + 1),
+        best=[frozenset(i + 1 for i in r.best) for r in rows],
+    )
+
+
+def _exposure_body(found: Comparison) -> str:
+    if not found.exposures:
+        return ""
+    label = "Exposures of the runs over the first run's"
+    chart = against_chart(found.exposures, first=found.labels[0], label=label)
+    differ = " ".join(
+        f"{label} and {found.labels[0]} differ by {apart(x, y):.3f} stops (RMS over "
+        f"{len(x)} views)."
+        for label, x, y in found.exposures
+    )
+    caption = "One mark a photograph, means removed; on the line both agree."
+    return figure(chart, f"{differ} {caption}")
+
+
+def _view_body(found: Comparison) -> str:
+    """Return held-out views that every run shows, in turn."""
+    by_run = [{h.name: h for h in run.held_out} for run in found.runs]
+    names = sorted(set.intersection(*map(set, by_run))) if found.same_scene else []
+    body = ""
+    for name in spread(names, MOST_VIEWS):
+        files = [by_name[name] for by_name in by_run]
+        try:
+            cells = [(jpeg(read_png(files[0].photograph), f"Photograph {name}"), "Photograph")]
+            for run, label, file in zip(found.runs, found.labels, files, strict=True):
+                psnr = run.part("test", "exposure_fitted", "per_view", name).get("psnr")
+                score = f": {psnr:.1f} dB" if isinstance(psnr, int | float) else ""
+                picture = jpeg(read_png(file.render), f"Render of {name} by {label}")
+                cells.append((picture, f"{label}{score}"))
+            body += f"<h3>{text(name)}</h3>{html.row(cells, 'many')}"
+        except UserError as error:
+            body += paragraph(f"{name} is not shown: {error.message}.")
+    if body:
+        body = paragraph("Each is rendered at the exposure fitted to its photograph.") + body
+    return body

@@ -1,76 +1,61 @@
-"""Building blocks of the pages: one HTML file each, without external resources."""
+"""Building blocks of the pages, and a page on paper: one HTML file without external resources."""
 
 from __future__ import annotations
 
 import html
+import os
+import re
+import shutil
+import subprocess
+import tempfile
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from importlib import resources
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from p2gs_jax.core.atomic import write_text
+from p2gs_jax.core.atomic import atomic_write, write_text
 from p2gs_jax.errors import UserError
 
 # The browser loads nothing from elsewhere, whatever the page contains.
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+BROWSERS = (
+    *("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome"),
+    *("microsoft-edge", "msedge", "brave-browser"),
+    "/Applications/Google Chrome.app/Contents/MacOS/Google Chrome",
+    "/Applications/Chromium.app/Contents/MacOS/Chromium",
+)
+# Longest wait for a browser to print.
+SECONDS = 120
 
 
-@dataclass(frozen=True)
-class Section:
-    """Part of a page.
-
-    Attributes:
-        key: its anchor.
-        title: its heading.
-        body: HTML.
-    """
-
-    key: str
-    title: str
-    body: str
-
-
-def page(title: str, head: str, sections: Sequence[Section], foot: str) -> str:
+def page(title: str, head: str, sections: Sequence[tuple[str, str, str]], foot: str) -> str:
     """Return the whole page.
 
     Args:
         title: of the window; text.
         head: HTML above the sections.
-        sections: in order; empty ones are left out.
+        sections: anchor, heading and HTML of each, in order; those without HTML are left out.
         foot: HTML below them.
     """
-    css = resources.files("p2gs_jax.report").joinpath("page.css").read_text(encoding="utf-8")
-    shown = [s for s in sections if s.body]
-    links = "".join(f'<a href="#{s.key}">{text(s.title)}</a>' for s in shown)
-    bodies = "\n".join(
-        f'<section id="{s.key}">\n<h2>{text(s.title)}</h2>\n{s.body}\n</section>' for s in shown
-    )
-    return f"""<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta http-equiv="Content-Security-Policy" content="{POLICY}">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<link rel="icon" href="data:,">
-<title>{text(title)}</title>
-<style>
-{css}</style>
-</head>
-<body>
-<div class="sheet">
-<header>
-{head}
-<nav aria-label="Sections">{links}</nav>
-</header>
-<main>
-{bodies}
-</main>
-<footer>{foot}</footer>
-</div>
-</body>
-</html>
-"""
+    shown = [(key, text(heading), body) for key, heading, body in sections if body]
+    parts = {
+        "policy": POLICY,
+        "title": text(title),
+        "css": _read("page.css"),
+        "head": head,
+        "links": "".join(f'<a href="#{key}">{heading}</a>' for key, heading, _ in shown),
+        "bodies": "\n".join(
+            f'<section id="{key}">\n<h2>{heading}</h2>\n{body}\n</section>'
+            for key, heading, body in shown
+        ),
+        "foot": foot,
+    }
+    # All at once: what is put in is never searched for places to put something.
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], _read("page.html"))
+
+
+def _read(name: str) -> str:
+    return resources.files("p2gs_jax.report").joinpath(name).read_text(encoding="utf-8")
 
 
 def check_place(path: Path) -> None:
@@ -80,7 +65,9 @@ def check_place(path: Path) -> None:
         UserError: it is a folder, or does not end in .html.
     """
     if path.suffix.lower() not in (".html", ".htm") or path.is_dir():
-        raise UserError(f"{path} is no name of a page.", fix="name a file that ends in .html")
+        raise UserError(
+            f"{path} is not a valid name for a page.", fix="name a file that ends in .html"
+        )
 
 
 def write_page(path: Path, html_text: str) -> None:
@@ -99,6 +86,48 @@ def write_page(path: Path, html_text: str) -> None:
         ) from error
 
 
+def find_browser() -> str:
+    """Return the path of a browser that prints.
+
+    Raises:
+        UserError: there is none.
+    """
+    path = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if path is None:
+        raise UserError(
+            f"--pdf needs Chromium or Chrome, and none was found (tried: {', '.join(BROWSERS)}).",
+            fix="install one of them, or open the page in any browser and print it from there",
+        )
+    return path
+
+
+def print_pdf(page: Path, out: Path, browser: str) -> Path:
+    """Print a page into a PDF file with a browser from `find_browser`.
+
+    Raises:
+        UserError: the browser did not print.
+    """
+    with atomic_write(out) as temporary, tempfile.TemporaryDirectory() as profile:
+        command = [
+            *(browser, "--headless", "--disable-gpu", "--no-first-run", "--no-pdf-header-footer"),
+            *(f"--user-data-dir={profile}", f"--print-to-pdf={temporary}"),
+            page.resolve().as_uri(),
+        ]
+        if hasattr(os, "geteuid") and os.geteuid() == 0:
+            command.insert(1, "--no-sandbox")  # Chromium refuses to run as root otherwise
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, timeout=SECONDS)
+            why = done.stderr.strip().splitlines()[-1:] or [f"exit code {done.returncode}"]
+        except (OSError, subprocess.TimeoutExpired) as error:
+            why = [str(error)]
+        if not temporary.read_bytes().startswith(b"%PDF"):
+            raise UserError(
+                f"{browser} did not print {page}: {why[0]}",
+                fix=f"open {page} in a browser and print it from there",
+            )
+    return out
+
+
 def made_by(command: str) -> str:
     """Return the foot of a page."""
     try:
@@ -114,7 +143,7 @@ def text(value: object) -> str:
 
 
 def paragraph(sentence: str, kind: str = "") -> str:
-    """Return a paragraph of text."""
+    """Return a paragraph of text, of a class of the style sheet."""
     of = f' class="{kind}"' if kind else ""
     return f"<p{of}>{text(sentence)}</p>"
 
@@ -125,15 +154,9 @@ def listed(sentences: Iterable[str]) -> str:
     return f'<ul class="plain">{items}</ul>' if items else ""
 
 
-def figure(content: str, caption: str = "") -> str:
-    """Return a figure.
-
-    Args:
-        content: HTML.
-        caption: text.
-    """
-    said = f"<figcaption>{text(caption)}</figcaption>" if caption else ""
-    return f"<figure>\n{content}\n{said}</figure>"
+def figure(content: str, caption: str) -> str:
+    """Return HTML with a caption, which is text."""
+    return f"<figure>\n{content}\n<figcaption>{text(caption)}</figcaption></figure>"
 
 
 def row(cells: Sequence[tuple[str, str]], columns: str) -> str:
@@ -143,7 +166,7 @@ def row(cells: Sequence[tuple[str, str]], columns: str) -> str:
         cells: picture as HTML, and its caption.
         columns: `two`, `three`, or `many` where there may be more.
     """
-    inner = "".join(f"<div>{picture}<span>{text(said)}</span></div>" for picture, said in cells)
+    inner = "".join(f"<div>{picture}<span>{text(under)}</span></div>" for picture, under in cells)
     return f'<div class="row {columns}">{inner}</div>'
 
 
@@ -153,34 +176,44 @@ def table(
     *,
     numbers: Iterable[int] = (),
     tall: bool = False,
+    best: Sequence[frozenset[int]] | None = None,
 ) -> str:
-    """Return a table, with a scroll bar of its own where it is too wide.
+    """Return a table, with a scroll bar where it is too wide.
 
     Args:
         names: of the columns.
         rows: text of the cells.
-        numbers: columns that are numbers.
+        numbers: columns that hold numbers.
         tall: scroll vertically as well.
+        best: of each row, its columns that are marked; the first column then heads the rows.
     """
-    of = [' class="n"' if i in set(numbers) else "" for i in range(len(names))]
+    kinds = ["n" if i in set(numbers) else "" for i in range(len(names))]
 
-    def cells(values: Sequence[str], kind: str) -> str:
-        return "".join(f"<{kind}{o}>{text(v)}</{kind}>" for o, v in zip(of, values, strict=True))
+    def cells(values: Sequence[str], marked: frozenset[int], tag: str) -> str:
+        out = ""
+        for i, (kind, value) in enumerate(zip(kinds, values, strict=True)):
+            head = best is not None and tag == "td" and i == 0
+            named = f"{kind} best" if i in marked else kind
+            attribute = f' class="{named}"' if named else ' scope="row"' if head else ""
+            element = "th" if head else tag
+            out += f"<{element}{attribute}>{text(value)}</{element}>"
+        return out
 
-    body = "\n".join(f"<tr>{cells(values, 'td')}</tr>" for values in rows)
-    scroll = "scroll tall" if tall else "scroll"
+    marks = [frozenset[int]()] * len(rows) if best is None else best
+    body = "\n".join(
+        f"<tr>{cells(values, marked, 'td')}</tr>"
+        for values, marked in zip(rows, marks, strict=True)
+    )
+    kind = "" if best is None else ' class="compare"'
     return (
-        f'<div class="{scroll}" tabindex="0"><table>\n'
-        f"<thead><tr>{cells(names, 'th')}</tr></thead>\n<tbody>\n{body}\n</tbody></table></div>"
+        f'<div class="{"scroll tall" if tall else "scroll"}" tabindex="0"><table{kind}>\n'
+        f"<thead><tr>{cells(names, frozenset(), 'th')}</tr></thead>\n<tbody>\n{body}\n</tbody>"
+        "</table></div>"
     )
 
 
 def key_numbers(items: Sequence[tuple[str, str, str]]) -> str:
-    """Return the key numbers at the top of a page.
-
-    Args:
-        items: name, value, and a remark.
-    """
+    """Return the key numbers at the top of a page: name, value and remark of each."""
     inner = "".join(
         f"<div><dt>{text(name)}</dt><dd>{text(value)}<small>{text(remark)}</small></dd></div>"
         for name, value, remark in items

@@ -1,195 +1,203 @@
-"""Sections on the photometry: model, exposures, gammas, tone curve."""
+"""Sections on the photometry: model, exposures, white balance, gammas, curves, vignetting."""
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
-import jax.numpy as jnp
 import numpy as np
 
-from p2gs_jax.config import PhotometryConfig
+from p2gs_jax.config import PhotometryConfig, camera_formations
 from p2gs_jax.errors import UserError
-from p2gs_jax.photometry.formation import inverse_tone_map
+from p2gs_jax.photometry.formation import corner, inverse_tone_map, log_vignetting
 from p2gs_jax.photometry.models import MODELS
-from p2gs_jax.report import run_summary
-from p2gs_jax.report.charts import (
-    FITTED,
-    RECOVERED,
-    STATED,
-    TRUE,
-    ChartPanel,
-    Series,
-    ToneCurve,
-    panels_chart,
-    response_chart,
-)
-from p2gs_jax.report.drive_charts import CameraOverTime, over_time_chart
-from p2gs_jax.report.formation_sections import (
-    responses_section,
-    vignetting_section,
-    white_balance_section,
-)
-from p2gs_jax.report.page import Section, figure, folded, listed, paragraph, table
+from p2gs_jax.report import charts, findings
+from p2gs_jax.report.charts import Series, Style
+from p2gs_jax.report.findings import against_exif, column, reasons
+from p2gs_jax.report.page import figure, folded, listed, paragraph, table
 from p2gs_jax.report.run_files import RunFiles
-from p2gs_jax.report.scene_measurements import SceneMeasurements, true_stops
-from p2gs_jax.report.svg import FIRST, INK, SECOND
-from p2gs_jax.run.photometry_files import ViewPhotometry, with_curve_of
+from p2gs_jax.report.svg import FIRST, FOURTH, INK, MUTED, SECOND, THIRD
+from p2gs_jax.run.photometry_files import CameraPhotometry, ViewPhotometry, with_curve_of
 from p2gs_jax.run.scene_file import read_times
-from p2gs_jax.scene.drives.choose import short_name
+from p2gs_jax.scene.drives.recording import short_name
 from p2gs_jax.types import GAMMA_SRGB
 
 # More cameras than this, or cameras with fewer views than this, share one panel.
 MOST_PANELS, FEWEST_VIEWS = 6, 3
 MID_GREY = 0.18
 ORDER = "photograph, in the order of names"
+CHANNELS = ("red", "green", "blue")
+MARKED = (
+    Style(SECOND, "^", "-", order=4),
+    Style(THIRD, "o", "-", order=3),
+    Style(FIRST, "s", "-", order=2),
+)
+PLAIN = Style(FIRST, "", "-")
+LINES = (Style(SECOND, "", "-"), Style(THIRD, "", "--"), Style(FIRST, "", ":"))
+# Lines of the cameras of a drive, in turn.
+CAMERA_COLORS, CAMERA_MARKERS = (FIRST, SECOND, THIRD, FOURTH, INK, MUTED), "osD^vPX*"
+COLORS, DASHES = (FIRST, SECOND, THIRD, FOURTH), ("-", "--", "-.", ":")
+# Display values at which tone curves are drawn.
+VALUES = np.linspace(0.004, 1.0, 240)
 
 
-def model_section(run: RunFiles) -> Section:
-    """What varies between views, and why."""
+def model_section(run: RunFiles) -> str:
+    """Return what varies between views, and why."""
     if run.photometry is None:
-        return Section("model", "What was modelled, and why", "")
-    model, curve = run.photometry["model"], run.photometry["curve"]
-    what = run_summary.DESCRIPTIONS.get(model, model)
-    body = paragraph(f"Model: {what}. Tone curve: {_curve_words(curve)}.")
-    body += listed(run_summary.reasons(run))
-    if run_summary.reasons(run):
+        return ""
+    model, curve = run.photometry["model"], str(run.photometry["curve"].get("name"))
+    what, under = findings.DESCRIPTIONS.get(model, model), findings.CURVES.get(curve, curve)
+    body = paragraph(f"Model: {what}. Tone curve: {under}.")
+    body += listed(reasons(run))
+    if reasons(run):
         body += paragraph(
             "Models and curves compete on colours of shared surface points that were held out, by "
             "their log-likelihood: 0.01 per observation is little, 1 is a lot. The simplest model "
             "that predicts about as well as the best one is taken.",
             "note",
         )
-    body += paragraph(f"Scale: {run.photometry['gauge']}.", "note")
-    return Section("model", "What was modelled, and why", body)
+    return body + paragraph(f"Scale: {run.photometry['gauge']}.", "note")
 
 
-def _curve_words(curve: dict) -> str:
-    name = str(curve.get("name"))
-    return run_summary.CURVES.get(name, name)
+def _panels(
+    run: RunFiles, curves: Callable[[list[ViewPhotometry], np.ndarray], Sequence[Series]]
+) -> list[tuple[str, Sequence[Series]]]:
+    """Return a panel for each camera, or one for all where there are many or small ones.
+
+    Args:
+        run: the run.
+        curves: returns the curves of a panel from its views and their places.
+    """
+    by_camera = {f"camera {c}": [v for v in run.views if v["camera"] == c] for c in run.cameras}
+    small = np.median([len(rows) for rows in by_camera.values()]) < FEWEST_VIEWS
+    if len(by_camera) > MOST_PANELS or small:
+        by_camera = {"all photographs": run.views}
+    elif len(by_camera) == 1:
+        by_camera = {"": run.views}
+    return [
+        (title, curves(rows, np.arange(1, len(rows) + 1, dtype=float)))
+        for title, rows in by_camera.items()
+    ]
 
 
-def exposure_section(run: RunFiles, scene: SceneMeasurements) -> Section:
-    """Exposures over time for each camera, with what EXIF and the truth say."""
-    views = [v for v in run.views if v["exposure"] is not None or v["exposure_fitted"] is not None]
-    if not views:
-        return Section("exposures", "Exposures", "")
+def exposure_section(run: RunFiles, truth: dict[str, float]) -> str:
+    """Return exposures over time for each camera, with what EXIF and the truth say."""
+    if all(v["exposure"] is None and v["exposure_fitted"] is None for v in run.views):
+        return ""
     center = float(np.mean([v["exposure_ev"] or 0.0 for v in run.train] or [0.0]))
-    panels = [_exposure_panel(title, rows, run, scene, center) for title, rows in _groups(run)]
-    chart = panels_chart(
-        panels,
+    # What lays EXIF, and the true exposures, over the recovered ones, stops.
+    agreement = against_exif(run)
+    exif = None if agreement is None else agreement.offset_ev
+    gap = column(v["exposure_ev"] for v in run.train) - _true_stops(run.train, truth)
+    known = np.isfinite(gap)
+    true = float(np.mean(gap[known])) if known.any() else None
+
+    def stops(rows: list[ViewPhotometry]) -> dict[str, np.ndarray]:
+        """Return exposures from the mean by source; NaN where unknown."""
+        found = column(v["exposure_ev"] for v in rows) - center
+        with np.errstate(divide="ignore"):
+            fitted = np.log2(column(v["exposure_fitted"] for v in rows)) - center
+        out = {"found": found, "held out": np.where(np.isfinite(found), np.nan, fitted)}
+        if exif is not None:
+            out["EXIF"] = column(v["exif_ev"] for v in rows) + exif - center
+        if true is not None:
+            out["true"] = _true_stops(rows, truth) + true - center
+        return out
+
+    def curves(rows: list[ViewPhotometry], x: np.ndarray) -> list[Series]:
+        errors = {"found": 2 * _errors(rows)}
+        every = [Series(n, x, y, charts.SOURCES[n], errors.get(n)) for n, y in stops(rows).items()]
+        return [s for s in every if np.isfinite(s.y).any()]
+
+    chart = charts.panels_chart(
+        _panels(run, curves),
         y_label="exposure, stops from the mean",
         x_label=ORDER,
         label="Exposures of the photographs of each camera, in stops",
         band=0.0,
     )
-    body = figure(chart, " ".join(_exposure_caption(run, scene)))
+    body = figure(chart, " ".join(_exposure_caption(run, truth)))
     times = read_times(run.folder)
     if times:
-        body = _over_time(run, times, center) + folded("Each camera by itself", body)
-    body += folded("Every photograph in numbers", _exposure_table(run, scene, center))
-    return Section("exposures", "Exposures", body)
+        body = _over_time(run, times, stops) + folded("Each camera by itself", body)
+    names = ["photograph", "camera", "stops", "error", "gamma"]
+    names += [name for name in stops([]) if name in ("EXIF", "true")]
+    rows = []
+    for v, *values in zip(run.views, *stops(run.views).values(), strict=True):
+        found, fitted, *others = values
+        held_out = np.isfinite(fitted) and v["exposure"] is None
+        error = "held out" if held_out else _shown(v.get("exposure_ev_error"), ".3f")
+        ev = _shown(fitted if held_out else found, "+.2f")
+        gamma = _shown(v["gamma"], ".2f")
+        more = [_shown(value, "+.2f") for value in others]
+        rows.append([v["image"], v["camera"], ev, error, gamma, *more])
+    numbers = table(names, rows, numbers=range(2, len(names)), tall=True)
+    return body + folded("Every photograph in numbers", numbers)
 
 
-def _over_time(run: RunFiles, times: dict[str, float], center: float) -> str:
+def _shown(value: float | None, form: str) -> str:
+    return format(value, form) if value is not None and np.isfinite(value) else ""
+
+
+def _errors(rows: list[ViewPhotometry]) -> np.ndarray:
+    return column(v.get("exposure_ev_error") for v in rows)
+
+
+def _true_stops(rows: list[ViewPhotometry], truth: dict[str, float]) -> np.ndarray:
+    """Return true exposures in stops, NaN where unknown."""
+    known = (truth.get(v["image"], 0.0) for v in rows)
+    return np.array([np.log2(e) if e > 0 else np.nan for e in known])
+
+
+def _over_time(
+    run: RunFiles,
+    times: dict[str, float],
+    stops: Callable[[list[ViewPhotometry]], dict[str, np.ndarray]],
+) -> str:
     """Return exposures of a drive over its seconds, a line a camera."""
     start = min(times.values())
-    cameras = []
-    for name in run.cameras:
+    series = []
+    for k, name in enumerate(run.cameras):
         rows = [v for v in run.views if v["camera"] == name and v["image"] in times]
         rows.sort(key=lambda v: times[v["image"]])
-        if not rows:
-            continue
-        found = _column(v["exposure_ev"] for v in rows) - center
-        with np.errstate(divide="ignore"):
-            fitted = np.log2(_column(v["exposure_fitted"] for v in rows)) - center
-        cameras.append(
-            CameraOverTime(
-                short_name(name),
-                np.array([times[v["image"]] - start for v in rows]),
-                found,
-                2 * _column(v.get("exposure_ev_error") for v in rows),
-                np.where(np.isfinite(found), np.nan, fitted),
-            )
-        )
-    chart = over_time_chart(
-        cameras,
-        title="exposure, stops from the mean",
+        seconds, found = np.array([times[v["image"]] - start for v in rows]), stops(rows)
+        line = ("-", (0, (5, 2)))[k // len(CAMERA_COLORS) % 2]
+        marker = CAMERA_MARKERS[k % len(CAMERA_MARKERS)]
+        style = Style(CAMERA_COLORS[k % len(CAMERA_COLORS)], marker, line, size=4, width=1.2)
+        empty = replace(style, line="", filled=False, size=5)
+        series.append(Series(short_name(name), seconds, found["found"], style, 2 * _errors(rows)))
+        series.append(Series("", seconds, found["held out"], empty))
+    chart = charts.panels_chart(
+        [("", series)],
+        y_label="exposure, stops from the mean",
+        x_label="seconds",
         label="Exposures of every camera over the seconds of the drive, in stops",
+        band=0.0,
     )
-    said = "A line a camera; error bars: two standard errors; empty marks: held-out photographs."
-    return figure(chart, said)
+    return figure(
+        chart,
+        "A line a camera; error bars: two standard errors; empty marks: held-out photographs.",
+    )
 
 
-def _groups(run: RunFiles) -> list[tuple[str, list[ViewPhotometry]]]:
-    """Return the views of each camera, or of all where there are many or small ones."""
-    by_camera = {c: [v for v in run.views if v["camera"] == c] for c in run.cameras}
-    small = np.median([len(rows) for rows in by_camera.values()]) < FEWEST_VIEWS
-    if len(by_camera) > MOST_PANELS or small:
-        return [("all photographs", run.views)]
-    if len(by_camera) == 1:
-        return [("", run.views)]
-    return [(f"camera {name}", rows) for name, rows in by_camera.items()]
-
-
-def _exposure_panel(
-    title: str, rows: list[ViewPhotometry], run: RunFiles, scene: SceneMeasurements, center: float
-) -> ChartPanel:
-    x = np.arange(1, len(rows) + 1, dtype=float)
-    found = _column(v["exposure_ev"] for v in rows) - center
-    with np.errstate(divide="ignore"):
-        fitted = np.log2(_column(v["exposure_fitted"] for v in rows)) - center
-    fitted = np.where(np.isfinite(found), np.nan, fitted)
-    errors = 2 * _column(v.get("exposure_ev_error") for v in rows)
-    series = [Series("found", x, found, RECOVERED, errors), Series("held out", x, fitted, FITTED)]
-    offset = _exif_offset(run)
-    if offset is not None:
-        stated = _column(v["exif_ev"] for v in rows) + offset - center
-        series.append(Series("EXIF", x, stated, STATED))
-    shift = _truth_offset(run, scene)
-    if shift is not None:
-        true = true_stops([v["image"] for v in rows], scene.true_exposures) + shift - center
-        series.append(Series("true", x, true, TRUE))
-    return ChartPanel(title, tuple(s for s in series if np.isfinite(s.y).any()))
-
-
-def _column(values) -> np.ndarray:
-    return np.array([np.nan if v is None else v for v in values], float)
-
-
-def _exif_offset(run: RunFiles) -> float | None:
-    """Return what lays EXIF over the recovered exposures, stops."""
-    agreement = run_summary.against_exif(run)
-    return None if agreement is None else agreement.offset_ev
-
-
-def _truth_offset(run: RunFiles, scene: SceneMeasurements) -> float | None:
-    """Return what lays the true exposures over the recovered ones, stops."""
-    found = _column(v["exposure_ev"] for v in run.train)
-    true = true_stops([v["image"] for v in run.train], scene.true_exposures)
-    both = np.isfinite(found) & np.isfinite(true)
-    return float(np.mean((found - true)[both])) if both.any() else None
-
-
-def _exposure_caption(run: RunFiles, scene: SceneMeasurements) -> list[str]:
+def _exposure_caption(run: RunFiles, truth: dict[str, float]) -> list[str]:
     out = ["Filled circles: found by the fit."]
     errors = [e for v in run.train if (e := v.get("exposure_ev_error")) is not None]
     if errors and max(errors) > 0:
+        small = ", smaller than the marks." if 2 * max(errors) < 0.05 else "."
         out.append(
-            f"Error bars: two standard errors, at most ±{2 * max(errors):.2g} stops here"
-            + (", smaller than the marks." if 2 * max(errors) < 0.05 else ".")
+            f"Error bars: two standard errors, at most ±{2 * max(errors):.2g} stops here{small}"
         )
     elif not errors:
         out.append("There are no error bars: nothing was solved beforehand from shared points.")
     if any(v["split"] == "test" for v in run.views):
         out.append("Open diamonds: fitted to held-out photographs after the run.")
-    agreement = run_summary.against_exif(run)
+    agreement, error = against_exif(run), findings.true_error(run, truth)
     if agreement is not None:
         out.append(
             f"Crosses, dotted: EXIF, laid over them; correlation {agreement.correlation:.2f}, RMS "
             f"{agreement.rms_ev:.2f} stops."
         )
-    error = run_summary.true_error(run, scene)
     if error is not None:
         out.append(
             f"Open squares, dashed: the true exposures; RMS error {error['ev']:.3f} stops, largest "
@@ -198,113 +206,202 @@ def _exposure_caption(run: RunFiles, scene: SceneMeasurements) -> list[str]:
     return out
 
 
-def _exposure_table(run: RunFiles, scene: SceneMeasurements, center: float) -> str:
-    def shown(value: float, digits: str = "+.2f") -> str:
-        return format(value, digits) if np.isfinite(value) else ""
+def white_balance_section(run: RunFiles) -> str:
+    """Return the white balance of every view, in stops."""
+    views = [v for v in run.views if v.get("white_balance") is not None]
+    if not views:
+        return ""
 
-    exif, true = _exif_offset(run), _truth_offset(run, scene)
-    names = ["photograph", "camera", "stops", "error", "gamma"]
-    names += ["EXIF"] if exif is not None else []
-    names += ["true"] if true is not None else []
-    rows = []
-    for v in run.views:
-        held_out = v["exposure"] is None and v["exposure_fitted"] is not None
-        ev = _column([v["exposure_ev"]])[0]
-        if held_out:
-            ev = float(np.log2(v["exposure_fitted"] or np.nan))
-        row = [
-            v["image"],
-            v["camera"],
-            shown(ev - center),
-            "held out" if held_out else shown(_column([v.get("exposure_ev_error")])[0], ".3f"),
-            shown(_column([v["gamma"]])[0], ".2f"),
-        ]
-        if exif is not None:
-            row.append(shown(_column([v["exif_ev"]])[0] + exif - center))
-        if true is not None:
-            row.append(shown(true_stops([v["image"]], scene.true_exposures)[0] + true - center))
-        rows.append(row)
-    return table(names, rows, numbers=range(2, len(names)), tall=True)
+    def stops(rows: list[ViewPhotometry]) -> np.ndarray:
+        return np.log2(_triples(v.get("white_balance") for v in rows))
+
+    def curves(rows: list[ViewPhotometry], x: np.ndarray) -> list[Series]:
+        y, errors = stops(rows), 2 * _triples(v.get("white_balance_ev_error") for v in rows)
+        names = enumerate(CHANNELS)
+        return [Series(name, x, y[:, c], MARKED[c], errors[:, c]) for c, name in names]
+
+    chart = charts.panels_chart(
+        _panels(run, curves),
+        y_label="gain beside the exposure, stops",
+        x_label=ORDER,
+        label="White balance of the photographs of each camera, in stops",
+        band=0.0,
+    )
+    most = views[int(np.argmax(np.ptp(stops(views), axis=1)))]
+    body = figure(
+        chart,
+        "Gains of the channels beside the exposure. In every photograph they average to 0, and so "
+        "does each channel over the photographs: only differences can be known. Error bars: two "
+        f"standard errors. Furthest from neutral: {most['image']}.",
+    )
+    cells = []
+    for v, gains in zip(views, stops(views), strict=True):
+        errors = v.get("white_balance_ev_error")
+        known = ["" if errors is None else f" ± {e:.3f}" for e in errors or CHANNELS]
+        each = [f"{gain:+.3f}{error}" for gain, error in zip(gains, known, strict=True)]
+        cells.append([v["image"], v["camera"], *each])
+    names = ["photograph", "camera", *(f"{name}, stops" for name in CHANNELS)]
+    numbers = table(names, cells, numbers=range(2, len(names)), tall=True)
+    body += folded("Every photograph in numbers", numbers)
+    return body
 
 
-def gamma_section(run: RunFiles) -> Section:
-    """Gammas, where there are any to show."""
+def _triples(values) -> np.ndarray:
+    return np.array([[np.nan] * 3 if v is None else v for v in values], float).reshape(-1, 3)
+
+
+def gamma_section(run: RunFiles) -> str:
+    """Return gammas, where there are any to show."""
     found = [v["gamma"] for v in run.train if v["gamma"] is not None]
     if not found or run.photometry is None:
-        return Section("gamma", "Gamma", "")
+        return ""
     level = MODELS[run.photometry["model"]].gamma if run.photometry["model"] in MODELS else "view"
     if level is None or np.ptp(found) < 1e-3:
         body = paragraph(
             f"Gamma was not modelled: it is {np.mean(found):.2f} in all views. Contrast that "
             "differs between photographs is left to the radiance."
         )
-        return Section("gamma", "Gamma", body)
-    panels = []
-    for title, rows in _groups(run):
-        x = np.arange(1, len(rows) + 1, dtype=float)
-        gammas = _column(v["gamma"] for v in rows)
-        errors = 2 * _column(v.get("gamma_error") for v in rows)
-        panels.append(ChartPanel(title, (Series("", x, gammas, RECOVERED, errors),)))
-    chart = panels_chart(
-        panels,
+        return body
+
+    def curves(rows: list[ViewPhotometry], x: np.ndarray) -> list[Series]:
+        errors = 2 * column(v.get("gamma_error") for v in rows)
+        return [Series("", x, column(v["gamma"] for v in rows), charts.FOUND, errors)]
+
+    chart = charts.panels_chart(
+        _panels(run, curves),
         y_label="gamma",
         x_label=ORDER,
         label="Gammas of the photographs of each camera",
         band=GAMMA_SRGB,
     )
-    said = (
+    caption = (
         "Gamma turns the tone curve about mid-grey: above the line at 2.2 a photograph has less "
         "contrast than its curve alone. Error bars: two standard errors."
     )
-    return Section("gamma", "Gamma", figure(chart, said))
+    return figure(chart, caption)
 
 
-def response_section(run: RunFiles) -> Section:
-    """The tone curve against sRGB."""
+def _stops(
+    y: np.ndarray, cfg: PhotometryConfig, gamma: float = GAMMA_SRGB, camera: int | None = None
+) -> np.ndarray:
+    """Return the exposed radiance of display values, in stops from mid-grey."""
+    linear = inverse_tone_map(y.astype(np.float32), np.float32(gamma), cfg, camera)
+    return np.log2(np.maximum(np.asarray(linear), 1e-6) / MID_GREY)
+
+
+def response_section(run: RunFiles) -> str:
+    """Return the tone curve against sRGB."""
     if run.photometry is None:
-        return Section("response", "Tone curve", "")
+        return ""
     try:
         cfg = PhotometryConfig() if run.cfg is None else run.cfg.photometry
         cfg = with_curve_of(cfg, run.photometry)
     except UserError as error:
-        return Section("response", "Tone curve", paragraph(error.message))
+        return paragraph(error.message)
     gammas = [v["gamma"] for v in run.train if v["gamma"] is not None] or [GAMMA_SRGB]
-    y = np.linspace(0.004, 1.0, 240)
-    srgb = dataclasses.replace(PhotometryConfig(), curve="srgb")
-    curves = []
     low, middle, high = min(gammas), float(np.median(gammas)), max(gammas)
-    if high - low > 0.02:
-        curves.append(ToneCurve(f"γ {low:.2f}", _stops(y, low, cfg), y, SECOND, "-."))
-        curves.append(ToneCurve(f"γ {high:.2f}", _stops(y, high, cfg), y, SECOND, ":"))
-    own, standard = _stops(y, middle, cfg), _stops(y, GAMMA_SRGB, srgb)
-    curves.append(ToneCurve("this run", own, y, FIRST, "-", 5.0, 0.45))
-    curves.append(ToneCurve("sRGB", standard, y, INK, (0, (4, 4))))
-    same = np.abs(own - standard)[y > 0.05].max()
-    said = "How exposed radiance becomes a value in the photograph. "
-    if same < 0.01:
-        said += "The curve of this run is sRGB's."
+    differ, curves = high - low > 0.02, []
+    for gamma, line in ((low, "-."), (high, ":")) if differ else ():
+        style = Style(SECOND, "", line, width=1.6)
+        curves.append(Series(f"γ {gamma:.2f}", _stops(VALUES, cfg, gamma), VALUES, style))
+    own = _stops(VALUES, cfg, middle)
+    standard = _stops(VALUES, replace(PhotometryConfig(), curve="srgb"))
+    broad = Style(FIRST, "", "-", width=5.0, opacity=0.45)
+    curves.append(Series("this run", own, VALUES, broad))
+    curves.append(Series("sRGB", standard, VALUES, Style(INK, "", (0, (4, 4)), width=1.6)))
+    apart = np.abs(own - standard)[VALUES > 0.05].max()
+    caption = "How exposed radiance becomes a value in the photograph. "
+    if apart < 0.01:
+        caption += "The curve of this run is sRGB's."
     else:
-        said += "Broad: this run; dashed: sRGB. They are at most "
-        said += f"{same:.2f} stops apart at values above 0.05."
-    if high - low > 0.02:
-        said += " Dash-dotted and dotted: the smallest and the largest gamma of a view."
-    chart = response_chart(curves, label="Tone curve of this run against sRGB")
-    return Section("response", "Tone curve", figure(chart, said))
+        caption += "Broad: this run; dashed: sRGB. They are at most "
+        caption += f"{apart:.2f} stops apart at values above 0.05."
+    if differ:
+        caption += " Dash-dotted and dotted: the smallest and the largest gamma of a view."
+    chart = charts.response_chart(curves, label="Tone curve of this run against sRGB")
+    return figure(chart, caption)
 
 
-def _stops(y: np.ndarray, gamma: float, cfg: PhotometryConfig) -> np.ndarray:
-    linear = np.asarray(inverse_tone_map(jnp.asarray(y), jnp.float32(gamma), cfg))
-    return np.log2(np.maximum(linear, 1e-6) / MID_GREY)
+def _cameras(run: RunFiles) -> list[CameraPhotometry]:
+    return [] if run.photometry is None else run.photometry.get("cameras", [])
 
 
-def camera_sections(run: RunFiles, scene: SceneMeasurements) -> Sequence[Section]:
-    """All of them."""
-    return (
-        model_section(run),
-        exposure_section(run, scene),
-        white_balance_section(run, _groups),
-        gamma_section(run),
-        response_section(run),
-        responses_section(run),
-        vignetting_section(run),
+def responses_section(run: RunFiles) -> str:
+    """Return the curves of cameras and channels that have their own; empty where none has."""
+    curved = [c for c in _cameras(run) if c["splines"]]
+    if not curved or run.photometry is None:
+        return ""
+    formations = camera_formations(
+        [{"name": c["name"], "vignetting": (), "splines": c["splines"]} for c in curved]
     )
+    # With one response per channel for all cameras, the first stands for all.
+    if all(c.splines == formations[0].splines for c in formations):
+        formations = formations[:1]
+    pivot = float(run.photometry["curve"].get("pivot") or MID_GREY)
+    cfg = PhotometryConfig(curve="spline", cameras=formations, pivot=pivot)
+    curves = []
+    for k, camera in enumerate(formations):
+        stops = _stops(np.repeat(VALUES[:, None], 3, 1), cfg, camera=k)
+        several = len(camera.splines) > 1
+        for c in range(len(camera.splines)):
+            named = [camera.name] if len(formations) > 1 else []
+            named += [CHANNELS[c]] if several else []
+            label = " ".join(named) if len(formations) <= MOST_PANELS else ""
+            color, line = (c, k) if several else (k, c)
+            style = Style(COLORS[color % len(COLORS)], "", DASHES[line % len(DASHES)], width=1.6)
+            curves.append(Series(label, stops[:, c], VALUES, style))
+    srgb = _stops(VALUES, PhotometryConfig())
+    curves.append(Series("sRGB", srgb, VALUES, Style(INK, "", (0, (4, 4)), width=1.6)))
+    what = "cameras" if len(formations) > 1 else "channels"
+    chart = charts.response_chart(curves, label=f"Responses of the {what} against sRGB")
+    apart = np.ptp([c.x for c in curves[:-1]], axis=0)[VALUES > 0.05].max()
+    caption = (
+        f"Each of the {what} has a response of its own; at values above 0.05 they are at most "
+        f"{apart:.2f} stops apart. Dashed in ink: sRGB."
+    )
+    return figure(chart, caption)
+
+
+def vignetting_section(run: RunFiles) -> str:
+    """Return how cameras darken towards their corners; empty where it is not modelled."""
+    shaded = [c for c in _cameras(run) if c["vignetting"]]
+    if not shaded:
+        return ""
+    formations = camera_formations(
+        [{"name": c["name"], "vignetting": c["vignetting"], "splines": ()} for c in shaded]
+    )
+    cfg = PhotometryConfig(cameras=formations)
+    r = np.linspace(0, 1, 51)
+    light = [100 * np.exp(log_vignetting(r**2, k, cfg)) for k in range(len(formations))]
+    panels: list[tuple[str, Sequence[Series]]] = []
+    if len(formations) > MOST_PANELS:
+        every = [Series("", 100 * r, v[:, c], PLAIN) for v in light for c in range(v.shape[1])]
+        panels.append((f"{len(formations)} cameras", every))
+    for c, v in zip(formations, light, strict=True) if not panels else ():
+        series = [Series("", 100 * r, v[:, 0], PLAIN)]
+        if len(c.vignetting) > 1:
+            channels = zip(CHANNELS, v.T, LINES, strict=True)
+            series = [Series(name, 100 * r, y, line) for name, y, line in channels]
+        panels.append((f"camera {c.name}" if len(formations) > 1 else "", series))
+    chart = charts.panels_chart(
+        panels,
+        y_label="light that is left, %",
+        x_label="distance from the centre, % of the way to the corners",
+        label="Vignetting of each camera",
+        band=100.0,
+    )
+    cells = []
+    for camera, found in zip(formations, shaded, strict=True):
+        errors = found["corner_ev_error"] or []
+        for k, left in enumerate(corner(camera)):
+            known = f" ± {errors[k]:.2f}" if k < len(errors) else ""
+            which = CHANNELS[k] if len(camera.vignetting) > 1 else "all"
+            ev = f"{np.log2(left):+.2f}{known}"
+            cells.append([camera.name, which, f"{100 * (1 - left):.0f} %", ev])
+    body = figure(
+        chart,
+        "What the lens leaves of the light, by distance from the image's centre. It is divided out "
+        "of what the photographs say of the radiance.",
+    )
+    names = ["camera", "channels", "lost in the corners", "that is, stops"]
+    return body + table(names, cells, numbers=range(2, 4))

@@ -1,25 +1,114 @@
-"""Pictures in the page, as data URLs."""
+"""Pictures as data URLs, and sections of them: held-out views, radiance in stops."""
 
 from __future__ import annotations
 
 import base64
 import html
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 
+from p2gs_jax.core.numerics import evenly_spaced
+from p2gs_jax.errors import UserError
+from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.formats.false_color import STOPS, false_color, luminance, stops
-from p2gs_jax.formats.png import to_uint8
+from p2gs_jax.formats.frames import to_uint8
+from p2gs_jax.report.page import paragraph, row, text
+from p2gs_jax.report.run_files import RunFiles, number_at
 
 # Largest width, pixels: a third of the page on a screen of twice its resolution, and all of it.
 SMALL, LARGE = 560, 900
 JPEG_QUALITY = 84
 # A difference of 1 / GAIN of the display's range is shown as white or black.
 GAIN = 4.0
+MOST_HDR = 2
+MID_GREY = 0.18
 
 
-def shrunk(image: Float[np.ndarray, "h w c"], width: int) -> Float[np.ndarray, "h2 w2 c"]:
+@dataclass(frozen=True)
+class ViewComparison:
+    """A photograph and its render.
+
+    Attributes:
+        name: of the view.
+        split: train or test.
+        photograph: display values.
+        render: under the view's own exposure, or that fitted to its photograph.
+        linear: radiance, or None.
+        psnr: of the render, dB, or None if unknown.
+    """
+
+    name: str
+    split: str
+    photograph: Float32[np.ndarray, "h w 3"]
+    render: Float32[np.ndarray, "h w 3"]
+    linear: Float32[np.ndarray, "h w 3"] | None
+    psnr: float | None
+
+
+def held_out_comparisons(run: RunFiles, most: int, problems: list[str]) -> list[ViewComparison]:
+    """Return held-out views from files: evenly over all of them, the worst first.
+
+    Args:
+        run: the folder.
+        most: views at most.
+        problems: receives a sentence for every view that could not be read.
+    """
+    scores = run.part("test", "exposure_fitted", "per_view")
+    psnr = {h.name: number_at(scores, h.name, "psnr") for h in run.held_out}
+
+    def rank(name: str) -> tuple[float, str]:
+        score = psnr[name]
+        return np.inf if score is None else score, name
+
+    out = []
+    for files in spread(sorted(run.held_out, key=lambda h: rank(h.name)), most):
+        try:
+            photograph, render = read_png(files.photograph), read_png(files.render)
+            linear = None if files.exr is None else read_exr(files.exr)[0]
+        except UserError as error:
+            problems.append(f"{files.name} is not shown: {error.message}.")
+            continue
+        found = psnr[files.name]
+        out.append(ViewComparison(files.name, "test", photograph, render, linear, found))
+    return out
+
+
+def spread(items: Sequence, most: int) -> list:
+    """Return at most `most` items, evenly spaced, the first and the last included."""
+    return [items[i] for i in evenly_spaced(len(items), most)]
+
+
+def read_png(path: Path) -> Float32[np.ndarray, "h w 3"]:
+    """Return display values of a PNG or JPEG.
+
+    Raises:
+        UserError: it cannot be read.
+    """
+    try:
+        raw = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR)
+    except (OSError, cv2.error):
+        raw = None
+    if raw is None:
+        raise UserError(f"{path} cannot be read")
+    return raw[..., ::-1].astype(np.float32) / 255
+
+
+def jpeg(ldr: Float[np.ndarray, "h w 3"], alt: str, width: int = SMALL) -> str:
+    """Return an `img` element of display values; NaN becomes black."""
+    return _element("jpeg", _shrunk(_clamped(ldr), width), alt)
+
+
+def png(ldr: Float[np.ndarray, "h w 3"], alt: str) -> str:
+    """Return an `img` element without loss: for flat colours, which JPEG would smear."""
+    return _element("png", np.asarray(ldr, np.float32), alt)
+
+
+def _shrunk(image: Float[np.ndarray, "h w c"], width: int) -> Float[np.ndarray, "h2 w2 c"]:
     """Return an image of at most `width` pixels across."""
     h, w = image.shape[:2]
     if w <= width:
@@ -28,28 +117,18 @@ def shrunk(image: Float[np.ndarray, "h w c"], width: int) -> Float[np.ndarray, "
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
-def jpeg(ldr: Float[np.ndarray, "h w 3"], alt: str, width: int = SMALL) -> str:
-    """Return an `img` element of display values; NaN becomes black."""
-    return _element(".jpg", "jpeg", shrunk(_clamped(ldr), width), alt)
-
-
-def png(ldr: Float[np.ndarray, "h w 3"], alt: str) -> str:
-    """Return an `img` element without loss: for flat colours, which JPEG would smear."""
-    return _element(".png", "png", np.asarray(ldr, np.float32), alt)
-
-
 def _clamped(image: np.ndarray) -> np.ndarray:
     return np.clip(np.nan_to_num(np.asarray(image, np.float32)), 0, 1)
 
 
-def _element(suffix: str, kind: str, image: np.ndarray, alt: str) -> str:
+def _element(kind: str, image: np.ndarray, alt: str) -> str:
     codes = to_uint8(image)[..., ::-1]
     options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if kind == "jpeg" else []
-    good, data = cv2.imencode(suffix, codes, options)
+    good, data = cv2.imencode(".jpg" if kind == "jpeg" else ".png", codes, options)
     assert good
-    text = base64.b64encode(data.tobytes()).decode("ascii")
+    encoded = base64.b64encode(data.tobytes()).decode("ascii")
     (h, w), alt = image.shape[:2], html.escape(alt)
-    return f'<img src="data:image/{kind};base64,{text}" width="{w}" height="{h}" alt="{alt}">'
+    return f'<img src="data:image/{kind};base64,{encoded}" width="{w}" height="{h}" alt="{alt}">'
 
 
 def signed_difference(
@@ -66,7 +145,7 @@ def stop_picture(
     linear: Float[np.ndarray, "h w 3"], middle: float, width: int = SMALL
 ) -> Float32[np.ndarray, "h w 3"]:
     """Return false colour in whole stops from `middle`, a luminance."""
-    return false_color(shrunk(np.maximum(np.nan_to_num(linear), 0), width), middle)
+    return false_color(_shrunk(np.maximum(np.nan_to_num(linear), 0), width), middle)
 
 
 def stop_shares(
@@ -95,3 +174,92 @@ def dynamic_range(linear: Float[np.ndarray, "h w 3"]) -> float:
         return 0.0
     low, high = np.percentile(values, (0.5, 99.5))
     return float(np.log2(high / low))
+
+
+def without_suffix(name: str) -> str:
+    """Return the name of a view without what stands behind its last dot."""
+    return name.rsplit(".", 1)[0]
+
+
+def comparison_section(comparisons: Sequence[ViewComparison], total: int) -> str:
+    """Return photographs, renders and their differences; `total` held-out views exist."""
+    if not comparisons:
+        return ""
+    if comparisons[0].split == "test":
+        some = f" ({len(comparisons)} of {total}, evenly from the worst to the best)"
+        which = "" if len(comparisons) == total else some
+        note = (
+            f"The fit never saw these photographs{which}; each is rendered at the exposure fitted "
+            "to it. "
+        )
+    else:
+        note = "No held-out view could be shown, so these are photographs that the fit knew. "
+    body = paragraph(
+        f"{note}Difference: in luminance; grey where both agree, lighter where the render is too "
+        f"bright, darker where it is too dark, white and black from {128 / GAIN * 2:.0f} of 255 on."
+    )
+    for s in comparisons:
+        score = "" if s.psnr is None else f" · {s.psnr:.1f} dB"
+        if s.render.shape == s.photograph.shape:
+            difference = signed_difference(s.render, s.photograph)
+        else:
+            difference = np.full_like(s.render, 0.5)
+        cells = [
+            (jpeg(s.photograph, f"Photograph {s.name}"), "Photograph"),
+            (jpeg(s.render, f"Render of {s.name}"), "Render"),
+            (jpeg(difference, f"Difference at {s.name}"), "Difference"),
+        ]
+        body += f"<h3>{text(without_suffix(s.name))}{text(score)}</h3>{row(cells, 'three')}"
+    return body
+
+
+def hdr_section(run: RunFiles, comparisons: Sequence[ViewComparison]) -> str:
+    """Return radiance as whole stops, with numbers."""
+    known = [(s, s.linear) for s in comparisons if s.linear is not None]
+    if not known:
+        return ""
+    mean = {} if run.photometry is None else run.photometry["mean"]
+    middle = MID_GREY / float(mean.get("exposure_geometric") or 1.0)
+    # Unseen areas render black: a view that the fit fails at would seem to have the widest range.
+    middling = float(np.median([s.psnr or 0.0 for s, _ in known]))
+    good = [(s, linear) for s, linear in known if (s.psnr or 0.0) >= middling]
+    widest = sorted(good, key=lambda pair: -dynamic_range(pair[1]))[:MOST_HDR]
+    body = paragraph(
+        "The radiance that the fit holds, before any exposure: one step of the scale is one stop, "
+        "a factor of two in light; lighter is brighter. 0 is mid-grey at the mean exposure, and a "
+        f"photograph at that exposure is white from about {np.log2(1 / MID_GREY):+.1f} on."
+    )
+    for s, linear in widest:
+        picture = png(stop_picture(linear, middle), f"Radiance of {s.name} in stops")
+        body += (
+            f"<h3>{text(without_suffix(s.name))} · {dynamic_range(linear):.1f} stops</h3>"
+            f'<div class="row two legend"><div>{picture}</div>'
+            f"<div>{_legend(stop_shares(linear, middle))}</div></div>"
+        )
+    body += paragraph(
+        "Stops in the titles lie between the darkest and the brightest half percent of the pixels. "
+        "Bars: share of the pixels in each step.",
+        "note",
+    )
+    return body
+
+
+def _legend(shares: Sequence[tuple[int, float, tuple[float, float, float]]]) -> str:
+    low, high = (round(v) for v in STOPS)
+    most = max(share for _, share, _ in shares) or 1.0
+    cells = []
+    for stop, share, color in shares:
+        ends = f"{stop:+d} to {stop + 1:+d}"
+        if stop == high - 1:
+            ends = f"above {stop:+d}"
+        elif stop == low:
+            ends = f"below {stop + 1:+d}"
+        rgb = ",".join(str(round(255 * c)) for c in color)
+        cells.append(
+            f'<span class="from">{ends.replace("-", "−").replace("+0", "0")}</span>'
+            f'<span class="swatch" style="background:rgb({rgb})"></span>'
+            f'<span class="share">{share:.0%}</span>'
+            f'<span><span class="bar" style="display:block;width:{100 * share / most:.1f}%">'
+            "</span></span>"
+        )
+    return f'<div class="stops">{"".join(cells)}</div>'

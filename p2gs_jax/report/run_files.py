@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from p2gs_jax.config import FitConfig, from_dict
 from p2gs_jax.core.atomic import read_jsonl
@@ -15,8 +15,7 @@ from p2gs_jax.run.folder import find
 from p2gs_jax.run.photometry_files import PhotometryFile, ViewPhotometry, read_photometry
 
 
-@dataclass(frozen=True)
-class HeldOutFiles:
+class HeldOutFiles(NamedTuple):
     """Files of a held-out view.
 
     Attributes:
@@ -38,13 +37,13 @@ class RunFiles:
 
     Attributes:
         folder: where it lies.
-        scene: the scene that it was fitted to: where it lies, or lay.
+        scene: where the scene that it was fitted to lies, or lay.
         given: the scene's place as the caller gave it, or None.
         options: `config.json`, nested values.
         cfg: the same as this version reads it, or None where it cannot.
         metrics: `metrics.json`; empty where there is none.
         photometry: `photometry.json`, or None.
-        log: lines of `log.jsonl`.
+        log: lines of `log.jsonl` that hold a step.
         held_out: held-out views in `renders/`, by name.
         missing: sentences on what could not be read.
         broken: names of files that exist but cannot be read.
@@ -83,7 +82,7 @@ class RunFiles:
         return list(dict.fromkeys(v["camera"] for v in self.views))
 
     def number(self, *path: str) -> float | None:
-        """Return a number of `metrics.json`, or None where it is missing or no number."""
+        """Return a number of `metrics.json`, or None where there is none."""
         return number_at(self.metrics, *path)
 
     def part(self, *path: str) -> dict[str, Any]:
@@ -95,20 +94,23 @@ class RunFiles:
         return part_at(self.options, *path[:-1]).get(path[-1])
 
 
-def part_at(values: Any, *path: str) -> dict[str, Any]:
-    """Return the mapping at a path of nested mappings, or an empty one."""
+def _at(values: Any, path: tuple[str, ...]) -> Any:
     for key in path:
         values = values.get(key) if isinstance(values, Mapping) else None
-    return dict(values) if isinstance(values, Mapping) else {}
+    return values
+
+
+def part_at(values: Any, *path: str) -> dict[str, Any]:
+    """Return the mapping at a path of nested mappings, or an empty one."""
+    found = _at(values, path)
+    return dict(found) if isinstance(found, Mapping) else {}
 
 
 def number_at(values: Any, *path: str) -> float | None:
     """Return the number at a path of nested mappings, or None."""
-    for key in path:
-        values = values.get(key) if isinstance(values, Mapping) else None
-    if isinstance(values, bool) or not isinstance(values, int | float):
-        return None
-    return float(values)
+    found = _at(values, path)
+    known = isinstance(found, int | float) and not isinstance(found, bool)
+    return float(found) if known else None
 
 
 def read_run(folder: Path, scene: Path | None = None) -> RunFiles:
@@ -119,7 +121,7 @@ def read_run(folder: Path, scene: Path | None = None) -> RunFiles:
         scene: where its scene lies now; None looks where it was.
 
     Raises:
-        UserError: it is no run folder.
+        UserError: it is not a run folder.
     """
     path = folder / "config.json"
     if not path.is_file():
@@ -144,11 +146,10 @@ def read_run(folder: Path, scene: Path | None = None) -> RunFiles:
         there = (folder / "photometry.json").exists()
         why = error.message if there else "photometry.json is missing"
         missing.append(f"The exposures are not shown: {why}.".replace("..", "."))
-    log = read_log(folder / "log.jsonl", missing)
-    names = [v["image"] for v in photometry["views"]] if photometry is not None else []
+    log = _read_log(folder / "log.jsonl", missing)
+    names = [] if photometry is None else [v["image"] for v in photometry["views"]]
     read = {path.name: saved, "metrics.json": metrics, "log.jsonl": log}
     read["photometry.json"] = photometry
-    broken = [n for n, found in read.items() if not found and (folder / n).exists()]
     return RunFiles(
         folder,
         scene or find(saved, "scene", folder) or Path(),
@@ -158,13 +159,13 @@ def read_run(folder: Path, scene: Path | None = None) -> RunFiles:
         metrics,
         photometry,
         log,
-        find_held_out(folder / "renders", names),
+        _find_held_out(folder / "renders", names),
         tuple(missing),
-        tuple(broken),
+        tuple(n for n, found in read.items() if not found and (folder / n).exists()),
     )
 
 
-def read_log(path: Path, missing: list[str]) -> list[dict[str, Any]]:
+def _read_log(path: Path, missing: list[str]) -> list[dict[str, Any]]:
     """Return the lines of the log that hold a step; `missing` receives why there are none."""
     try:
         records = read_jsonl(path)
@@ -177,13 +178,8 @@ def read_log(path: Path, missing: list[str]) -> list[dict[str, Any]]:
     return kept
 
 
-def find_held_out(folder: Path, names: list[str]) -> tuple[HeldOutFiles, ...]:
-    """Return the held-out views that `fit` wrote.
-
-    Args:
-        folder: `renders/` of a run.
-        names: of all views; `renders/` has them without their suffix.
-    """
+def _find_held_out(folder: Path, names: list[str]) -> tuple[HeldOutFiles, ...]:
+    """Return the held-out views that `fit` wrote into `renders/`, by the names of all views."""
     whole = {str(Path(name).with_suffix("")): name for name in names}
     out = []
     for render in sorted(folder.rglob("*.render.png")):
@@ -191,11 +187,10 @@ def find_held_out(folder: Path, names: list[str]) -> tuple[HeldOutFiles, ...]:
         photograph = render.with_name(f"{stem}.photograph.png")
         short = (render.parent.relative_to(folder) / stem).as_posix()
         # What `p2gs-jax render` wrote into renders/all is not a held-out view.
-        if not photograph.is_file() or (whole and short not in whole):
-            continue
-        exr = render.with_name(f"{stem}.exr")
-        name = whole.get(short, short)
-        out.append(HeldOutFiles(name, photograph, render, exr if exr.is_file() else None))
+        if photograph.is_file() and (short in whole or not whole):
+            exr = render.with_name(f"{stem}.exr")
+            exr = exr if exr.is_file() else None
+            out.append(HeldOutFiles(whole.get(short, short), photograph, render, exr))
     return tuple(out)
 
 
@@ -203,13 +198,15 @@ def _read_object(path: Path, what: str, missing: list[str]) -> dict[str, Any]:
     """Return a JSON object; `missing` receives why there is none."""
     try:
         value = parse_json(path.read_text(encoding="utf-8"))
+        why = f"{path.name} does not hold an object: {what} cannot be shown."
     except FileNotFoundError:
-        missing.append(f"{path.name} is missing: {what} cannot be shown. The run is not finished.")
-        return {}
+        value, why = (
+            None,
+            f"{path.name} is missing: {what} cannot be shown. The run is not finished.",
+        )
     except (OSError, ValueError) as error:
-        missing.append(f"{path.name} cannot be read: {what} cannot be shown ({error}).")
-        return {}
-    if not isinstance(value, dict):
-        missing.append(f"{path.name} holds no object: {what} cannot be shown.")
-        return {}
-    return value
+        value, why = None, f"{path.name} cannot be read: {what} cannot be shown ({error})."
+    if isinstance(value, dict):
+        return value
+    missing.append(why)
+    return {}

@@ -1,97 +1,92 @@
-"""Sections on the run itself: scores, training, timings, configuration."""
+"""Sections on scores and on the run itself: protocols, drives, training, timings, options."""
 
 from __future__ import annotations
 
 import itertools
 import json
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from p2gs_jax.config import preset, to_dict
 from p2gs_jax.errors import UserError
-from p2gs_jax.report import run_summary
-from p2gs_jax.report.page import Section, figure, folded, paragraph, table, text
-from p2gs_jax.report.run_charts import Training, training_chart
-from p2gs_jax.report.run_files import RunFiles, number_at
+from p2gs_jax.evaluation.protocols import PROTOCOLS
+from p2gs_jax.report.charts import training_chart
+from p2gs_jax.report.findings import column, duration, seconds_of
+from p2gs_jax.report.page import figure, folded, paragraph, row, table, text
+from p2gs_jax.report.pictures import jpeg, read_png
+from p2gs_jax.report.run_files import RunFiles, number_at, part_at
+from p2gs_jax.run.folder import RunFolder
 
 MOST_TERMS = 3
-PROTOCOLS = (
-    ("training", "own exposure and gamma", ("train",)),
-    ("training", "mean exposure and gamma", ("train", "averaged")),
-    ("held out", "mean exposure and gamma", ("test", "averaged")),
-    ("held out", "exposure fitted to each photograph", ("test", "exposure_fitted")),
-    (
-        "held out",
-        "all that varies per view fitted to each photograph",
-        ("test", "photometry_fitted"),
-    ),
-    ("held out", "exposure metered, as the camera would", ("test", "metered")),
-    ("all", "reference photographs, mean exposure", ("reference", "averaged")),
-    ("all", "reference photographs, geometric mean exposure", ("reference", "geometric")),
-    ("all", "reference photographs, one scale for all", ("reference", "scale_aligned")),
-    (
-        "held out",
-        "reference photographs, one scale for all",
-        ("reference", "scale_aligned", "test"),
-    ),
-)
-VIDEOS = (
-    ("photographs", "photographs"),
-    ("per_view", "renders, own exposures"),
-    ("averaged", "renders, mean exposure"),
-)
-
-
-def score_section(run: RunFiles) -> Section:
-    """Every score, by protocol."""
-    rows = []
-    for views, protocol, path in PROTOCOLS:
-        values = [run.number(*path, name) for name in ("psnr", "ssim", "lpips")]
-        if values[0] is not None or values[1] is not None:
-            rows.append(
-                [views, protocol, *(_shown(v, d) for v, d in zip(values, (2, 4, 4), strict=True))]
-            )
-    body = ""
-    if rows:
-        names = ["views", "shown with", "PSNR, dB", "SSIM", "LPIPS"]
-        if not any(r[-1] for r in rows):
-            names, rows = names[:-1], [r[:-1] for r in rows]
-        body += table(names, rows, numbers=range(2, len(names)))
-    body += _radiance(run) + _steadiness(run)
-    return Section("scores", "Scores", body)
+SCORES = {"psnr": 2, "ssim": 4, "lpips": 4}
+RADIANCE = {
+    "pu21_psnr": "PU21 PSNR {:.2f} dB",
+    "pu21_ssim": "PU21 SSIM {:.4f}",
+    "delta_e_itp": "colour difference {:.1f} ΔE ITP",
+    "mu_law_psnr": "mu-law PSNR {:.2f} dB",
+}
+VIDEOS = {
+    "photographs": "photographs",
+    "per_view": "renders, own exposures",
+    "averaged": "renders, mean exposure",
+}
+# Protocols of scores by part, parts of a view, and splits of depth, as `metrics.json` has them.
+BY_PART = ("train", "test_averaged", "test_fitted", "test_metered")
+PARTS = {"whole": "all", "static": "what stands", "moving": "what moves"}
+SPLITS = {"all": "all", "held_out": "held out"}
+DEPTH = ("median_m", "median_relative", "within_10_percent", "missing")
+COUNTS = {
+    "seed_points": "Seed points",
+    "gaussians": "Gaussians",
+    "refused_densifications": "Gaussians that found no room",
+    "tile_lists_grown": "Times a tile list grew",
+}
 
 
 def _shown(value: float | None, digits: int) -> str:
     return "" if value is None else f"{value:.{digits}f}"
 
 
+def _scores(run: RunFiles, *path: str) -> list[str]:
+    """Return PSNR, SSIM and LPIPS at a path of `metrics.json`; empty where there are none."""
+    return [_shown(run.number(*path, name), digits) for name, digits in SCORES.items()]
+
+
+def _table_without_empty(names: list[str], rows: list[list[str]], at: int, first: int) -> str:
+    """Return a table with numbers from column `first` on, without column `at` if it is empty."""
+    if not any(r[at] for r in rows):
+        names, rows = [*names[:at], *names[at + 1 :]], [[*r[:at], *r[at + 1 :]] for r in rows]
+    return table(names, rows, numbers=range(first, len(names)))
+
+
+def score_section(run: RunFiles) -> str:
+    """Return every score, by protocol."""
+    rows = [[p.views, p.shown, *_scores(run, *p.path)] for p in PROTOCOLS.values()]
+    rows = [r for r in rows if r[2] or r[3]]
+    names = ["views", "shown with", "PSNR, dB", "SSIM", "LPIPS"]
+    body = _table_without_empty(names, rows, 4, 2) if rows else ""
+    return body + _radiance(run) + _steadiness(run)
+
+
 def _radiance(run: RunFiles) -> str:
     median, rms = (run.number("radiance", name) for name in ("stops_median", "stops_rms"))
     if median is None or rms is None:
         return ""
-    said = (
+    known = {form: run.number("radiance", name) for name, form in RADIANCE.items()}
+    more = "".join("; " + form.format(v) for form, v in known.items() if v is not None)
+    return paragraph(
         f"Against the scene's true radiance, after one common scale: {median:.3f} stops median, "
-        f"{rms:.3f} RMS"
+        f"{rms:.3f} RMS{more}."
     )
-    rest = [
-        ("pu21_psnr", "PU21 PSNR {:.2f} dB"),
-        ("pu21_ssim", "PU21 SSIM {:.4f}"),
-        ("delta_e_itp", "colour difference {:.1f} ΔE ITP"),
-        ("mu_law_psnr", "mu-law PSNR {:.2f} dB"),
-    ]
-    for name, form in rest:
-        value = run.number("radiance", name)
-        said += "" if value is None else "; " + form.format(value)
-    return paragraph(said + ".")
 
 
 def _steadiness(run: RunFiles) -> str:
-    rows = []
-    for key, name in VIDEOS:
-        values = [run.number("consistency", key, n) for n in ("his", "std_luminance_relative")]
-        if values[0] is not None:
-            rows.append([name, *(_shown(v, 3) for v in values)])
+    found = {n: run.part("consistency", key) for key, n in VIDEOS.items()}
+    keys = ("his", "std_luminance_relative")
+    rows = [[n, *(_shown(number_at(part, k), 3) for k in keys)] for n, part in found.items()]
+    rows = [r for r in rows if r[1]]
     if not rows:
         return ""
     return (
@@ -106,42 +101,156 @@ def _steadiness(run: RunFiles) -> str:
     )
 
 
-def training_section(run: RunFiles) -> Section:
-    """Loss, PSNR and Gaussians over the steps."""
+def parts_section(run: RunFiles) -> str:
+    """Return scores over static pixels and over those of moving objects."""
+    rows = []
+    for name, (part, what) in itertools.product(BY_PART, PARTS.items()):
+        views, shown, path = PROTOCOLS[name]
+        scores, seen = _scores(run, *path, part), run.number(*path, part, "views")
+        if scores[0] and seen is not None:
+            rows.append([views, shown, what, *scores, f"{seen:.0f}"])
+    if not rows:
+        return ""
+    names = ["views", "shown with", "pixels", "PSNR, dB", "SSIM", "LPIPS", "views that show any"]
+    note = (
+        "Moving: within the boxes of what moves at some time. SSIM is the mean of the whole "
+        "image's map over the part."
+    )
+    body = _table_without_empty(names, rows, 5, 3) + paragraph(note, "note")
+    return body
+
+
+def depth_section(run: RunFiles) -> str:
+    """Return rendered depth against LiDAR."""
+    rows = []
+    for (split, views), part in itertools.product(SPLITS.items(), ("static", "moving")):
+        found = run.part("depth", split, part)
+        points = number_at(found, "points")
+        if points is not None:
+            cells = [_depth(found, name) for name in DEPTH]
+            rows.append([views, PARTS[part], *cells, f"{points:,.0f}"])
+    if not rows:
+        return ""
+    names = ["views", "points", "median error", "relative", "within 10 %", "no surface", "count"]
+    note = (
+        "Rendered depth at the points of the sweep nearest in time to each view, without those "
+        "that nearer points hide; points on moving boxes are carried to the time of the view. "
+        "Where the render shows no surface, the error counts as infinite."
+    )
+    body = table(names, rows, numbers=range(2, len(names))) + paragraph(note, "note")
+    return body
+
+
+def _depth(found: dict[str, Any], name: str) -> str:
+    value = number_at(found, name)
+    if value is None:  # infinite: more than half of the points have no surface
+        return "none"
+    return f"{value:.2f} m" if name == "median_m" else f"{value:.1%}"
+
+
+def novel_section(run: RunFiles) -> str:
+    """Return views from beside the way."""
+    items = run.metrics.get("novel_views")
+    rows, with_depth = [], False
+    items = sorted(items if isinstance(items, list) else [], key=_shift, reverse=True)
+    for item in items:
+        unseen, found = number_at(item, "unseen"), part_at(item, "depth", "static")
+        if number_at(item, "shift_m") is None or unseen is None:
+            continue
+        known = number_at(found, "points") is not None
+        with_depth |= known
+        depth = [_depth(found, n) if known else "" for n in ("median_m", "within_10_percent")]
+        side = "left" if _shift(item) > 0 else "right"
+        rows.append([f"{abs(_shift(item)):g} m to the {side}", f"{unseen:.1%}", *depth])
+    if not items:
+        return ""
+    names = ["camera", "pixels that no training view shows"]
+    names += ["median depth error", "depth within 10 %"] if with_depth else []
+    note = (
+        "Some views moved sideways, seen from the driving direction. There are no photographs to "
+        "compare with: the first number is what must be invented there, by the rendered depth; "
+        "depth is held against LiDAR as above, what stands only."
+    )
+    body = table(names, [r[: len(names)] for r in rows], numbers=range(1, len(names)))
+    return body + paragraph(note, "note")
+
+
+def _shift(item: Any) -> float:
+    return number_at(item, "shift_m") or 0.0
+
+
+def unexplained_section(run: RunFiles, problems: list[str]) -> str:
+    """Return pixels of training views that no static scene explains.
+
+    Args:
+        run: the folder.
+        problems: receives a sentence for every picture that could not be read.
+    """
+    share, folder = run.number("unexplained", "share"), RunFolder(run.folder).unexplained
+    if share is None:
+        return ""
+    body = paragraph(
+        f"On average {share:.1%} of the pixels of a training view differ from its render by far "
+        "more than the noise of that view, and more than the same surfaces do at other times. "
+        "That is what moves where nothing follows it, its shadow and its mirror image."
+    )
+    by_view = run.part("unexplained", "per_view")
+    shares = {name: number_at(by_view, name) or 0.0 for name in by_view}
+    cells = []
+    for path in sorted(folder.rglob("*.png")):
+        name = path.relative_to(folder).with_suffix("").as_posix()
+        try:
+            picture = jpeg(read_png(path), f"{name} with what is unexplained marked")
+        except UserError as error:
+            problems.append(f"{name} is not shown: {error.message}.")
+            continue
+        found = [s for view, s in shares.items() if view.rsplit(".", 1)[0] == name]
+        cells.append((picture, f"{name}: {found[0]:.1%}" if found else name))
+    body += "".join(row(cells[k : k + 2], "two") for k in range(0, len(cells), 2))
+    rows = [[view, f"{s:.2%}"] for view, s in sorted(shares.items(), key=lambda item: -item[1])]
+    if rows:
+        every = table(["view", "share"], rows, numbers=(1,), tall=True)
+        body += folded("Every training view", every)
+    return body
+
+
+def training_section(run: RunFiles) -> str:
+    """Return loss, PSNR and Gaussians over the steps."""
     log = [r for r in run.log if number_at(r, "gaussians") is not None]
     if len(log) < 2:
-        said = [m for m in run.missing if m.startswith("The training curves")]
-        return Section("training", "Training", "".join(paragraph(m) for m in said))
+        why = [m for m in run.missing if m.startswith("The training curves")]
+        return "".join(map(paragraph, why))
 
-    def column(*path: str) -> np.ndarray:
-        return np.array([np.nan if (v := number_at(r, *path)) is None else v for r in log])
+    def over_steps(*path: str) -> np.ndarray:
+        return column(number_at(r, *path) for r in log)
 
-    losses = {"loss": column("loss")}
     terms = sorted({name for r in log for name in r.get("terms") or {}})
-    values = {name: column("terms", name) for name in terms}
-    ranked = sorted(
-        (n for n in terms if np.isfinite(values[n]).any()), key=lambda n: -np.nanmedian(values[n])
+    values = {name: over_steps("terms", name) for name in terms}
+    known = [n for n in terms if np.isfinite(values[n]).any()]
+    ranked = sorted(known, key=lambda n: -np.nanmedian(values[n]))[:MOST_TERMS]
+    losses = {"loss": over_steps("loss")} | {n.replace("_", " "): values[n] for n in ranked}
+    marks = _marks(run, log)
+    chart = training_chart(
+        over_steps("step"),
+        over_steps("psnr"),
+        {n: np.where(v > 0, v, np.nan) for n, v in losses.items()},
+        over_steps("gaussians"),
+        marks,
+        label="PSNR, loss and Gaussians over the steps of the run",
     )
-    losses |= {n.replace("_", " "): values[n] for n in ranked[:MOST_TERMS]}
-    losses = {n: np.where(v > 0, v, np.nan) for n, v in losses.items()}
-    training = Training(
-        column("step"), column("psnr"), losses, column("gaussians"), tuple(_marks(run, log))
-    )
-    chart = training_chart(training, label="PSNR, loss and Gaussians over the steps of the run")
-    marks = "; ".join(f"{what} from step {at:.0f}" for at, what in training.marks)
-    said = (
+    caption = (
         "From log.jsonl; lines are running medians, the pale one is each entry. Entries average a "
         "few training views, so they scatter with how hard these are."
     )
     if marks:
-        said += f" Dotted: {marks}."
+        caption += f" Dotted: {'; '.join(f'{what} from step {at:.0f}' for at, what in marks)}."
     seconds = number_at(log[-1], "seconds")
     if seconds is not None:
-        said += f" The last step came after {run_summary.duration(seconds)}."
-    return Section("training", "Training", figure(chart, said))
+        caption += f" The last step came after {duration(seconds)}."
+    return figure(chart, caption)
 
 
-def _marks(run: RunFiles, log: list[dict[str, Any]]) -> list[tuple[float, str]]:
+def _marks(run: RunFiles, log: Sequence[dict[str, Any]]) -> list[tuple[float, str]]:
     """Return the steps at which images grow and exposures begin to move."""
     out = []
     for before, now in itertools.pairwise(log):
@@ -158,53 +267,42 @@ def _marks(run: RunFiles, log: list[dict[str, Any]]) -> list[tuple[float, str]]:
     return sorted(out)
 
 
-def timing_section(run: RunFiles) -> Section:
-    """Where the time went."""
-    before, optimisation = (
-        run.number("seconds", name) for name in ("total_until_evaluation", "optimisation")
+def timing_section(run: RunFiles) -> str:
+    """Return where the time went."""
+    before, optimisation, after = (
+        run.number("seconds", name)
+        for name in ("total_until_evaluation", "optimisation", "evaluation_and_files")
     )
-    after = run.number("seconds", "evaluation_and_files")
-    rows = []
+    start = None
     if before is not None and optimisation is not None and before >= optimisation:
-        rows.append(["Reading, exposures, seeds", run_summary.duration(before - optimisation)])
-    if optimisation is not None:
-        rows.append(["Optimisation, with compiling", run_summary.duration(optimisation)])
-    if after is not None:
-        rows.append(["Judging and writing files", run_summary.duration(after)])
-    total = run_summary.seconds_of(run)
-    if total is not None:
-        rows.append(["In all", run_summary.duration(total)])
-    step = run.number("seconds_per_step")
-    steps = run.number("counts", "steps")
+        start = before - optimisation
+    spent = {
+        "Reading, exposures, seeds": start,
+        "Optimisation, with compiling": optimisation,
+        "Judging and writing files": after,
+        "In all": seconds_of(run),
+    }
+    rows = [[name, duration(s)] for name, s in spent.items() if s is not None]
+    step, steps = run.number("seconds_per_step"), run.number("counts", "steps")
     if step is not None and steps is not None:
         rows.append(["Steps", f"{steps:,.0f}, {1e3 * step:.0f} ms each"])
-    counts = run.part("counts")
-    for key, name in (
-        ("seed_points", "Seed points"),
-        ("gaussians", "Gaussians"),
-        ("refused_densifications", "Gaussians that found no room"),
-        ("tile_lists_grown", "Times a tile list grew"),
-    ):
-        value = number_at(counts, key)
-        if value is not None:
-            rows.append([name, f"{value:,.0f}"])
-    if not rows:
-        return Section("timings", "Timings and counts", "")
-    return Section("timings", "Timings and counts", table(["", ""], rows, numbers=(1,)))
+    counts = {name: run.number("counts", key) for key, name in COUNTS.items()}
+    rows += [[name, f"{value:,.0f}"] for name, value in counts.items() if value is not None]
+    body = table(["", ""], rows, numbers=(1,)) if rows else ""
+    return body
 
 
-def configuration_section(run: RunFiles) -> Section:
-    """The options, first those that differ from the preset's."""
+def configuration_section(run: RunFiles) -> str:
+    """Return the options, first those that differ from the preset's."""
     if not run.options:
-        return Section("configuration", "Configuration", "")
-    given = flat(run.options)
+        return ""
     try:
         base = flat(to_dict(preset(run.preset)))  # pyright: ignore[reportArgumentType]
     except UserError:
         base = {}
     differs = [
         [name, option_text(value), option_text(base[name]) if name in base else ""]
-        for name, value in given.items()
+        for name, value in flat(run.options).items()
         if option_text(value) != option_text(base.get(name))
     ]
     body = paragraph(f"Preset {run.preset}. Scene: {run.scene}.")
@@ -214,17 +312,15 @@ def configuration_section(run: RunFiles) -> Section:
         body += paragraph("All options are the preset's.")
     dump = text(json.dumps(run.options, indent=2))
     body += folded("The whole configuration (config.json)", f'<pre tabindex="0">{dump}</pre>')
-    return Section("configuration", "Configuration", body)
+    return body
 
 
 def flat(options: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """Return nested options by dotted names."""
     out: dict[str, Any] = {}
     for name, value in options.items():
-        if isinstance(value, dict):
-            out |= flat(value, f"{prefix}{name}.")
-        else:
-            out[prefix + name] = value
+        nested = isinstance(value, dict)
+        out |= flat(value, f"{prefix}{name}.") if nested else {prefix + name: value}
     return out
 
 

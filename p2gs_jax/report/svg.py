@@ -11,7 +11,7 @@ import html
 import io
 import itertools
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import matplotlib
@@ -21,13 +21,18 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from p2gs_jax.core.text import names_as_they_are
 
 # Widths of the charts, CSS pixels; one point of matplotlib is one pixel.
 WIDE, NARROW = 860, 280
-TEXT = 12.0
-NARROW_TEXT = 11.0
+TEXT, NARROW_TEXT = 12.0, 11.0
+# Margins, CSS pixels: left for numbers, right for the names of curves; between two panels.
+LEFT, NARROW_LEFT, RIGHT, NARROW_RIGHT, GAP = 58, 40, 74, 56, 34
+LABEL_GAP = 15.0
+# Width of a character over the size of the text, with a margin.
+CHARACTER = 0.62
 # Placeholders: what matplotlib draws with, and what the page has for it.
 INK, MUTED, GRID = "#100001", "#100002", "#100003"
 FIRST, SECOND, THIRD, FOURTH, PAPER = "#100004", "#100005", "#100006", "#100007", "#100008"
@@ -68,11 +73,9 @@ RC: dict[Any, Any] = {
 }
 _NUMBERS = itertools.count(1)
 
-Draw = Callable[[bool], Figure]
 
-
-def chart(draw: Draw, label: str) -> str:
-    """Return a chart as HTML.
+def chart(draw: Callable[[bool], Figure], label: str) -> str:
+    """Return a chart as HTML, wide and narrow.
 
     Args:
         draw: returns the figure; True asks for the wide one. Called with the page's settings.
@@ -89,70 +92,8 @@ def chart(draw: Draw, label: str) -> str:
     return "\n".join(parts)
 
 
-def figure_of(wide: bool, height: float) -> Figure:
-    """Return an empty figure of the page's width.
-
-    Args:
-        wide: which of the two widths.
-        height: CSS pixels.
-    """
-    return plt.figure(figsize=((WIDE if wide else NARROW) / 72, height / 72), dpi=72)
-
-
-def place(figure: Figure, left: float, top: float, width: float, height: float, **kwargs) -> Axes:
-    """Return axes in a rectangle of CSS pixels, from the figure's top left corner."""
-    across, down = figure.get_size_inches() * 72
-    box = (left / across, 1 - (top + height) / down, width / across, height / down)
-    axes = figure.add_axes(box, **kwargs)
-    axes.tick_params(length=0, pad=4)
-    return axes
-
-
-def place_text(figure: Figure, left: float, base: float, text: str, color: str) -> None:
-    """Write a line of text with its base line `base` CSS pixels below the top."""
-    across, down = figure.get_size_inches() * 72
-    figure.text(left / across, 1 - base / down, text, color=color)
-
-
-def label_ends(axes: Axes, labels: list[tuple[str, float, str]], gap: float) -> None:
-    """Write names of curves beside their ends, moved apart where they would overlap.
-
-    Args:
-        axes: of the curves; the names are written to their right.
-        labels: text, height of the curve's end in data, colour.
-        gap: least distance between two names, CSS pixels.
-    """
-    low, high = axes.get_ylim()
-    figure = axes.get_figure()
-    assert isinstance(figure, Figure)
-    tall = axes.get_position().height * figure.get_size_inches()[1] * 72
-    scale = axes.get_yaxis_transform()
-    forward = axes.yaxis.get_transform().transform
-    backward = axes.yaxis.get_transform().inverted().transform
-    bottom, top = forward(low), forward(high)
-    wanted = [(float(forward(y)) - bottom) / (top - bottom) * tall for _, y, _ in labels]
-    order = sorted(range(len(labels)), key=lambda i: wanted[i])
-    for i, at in zip(order, spread_apart([wanted[i] for i in order], gap), strict=True):
-        text, _, color = labels[i]
-        value = float(backward(bottom + at / tall * (top - bottom)))
-        axes.text(1.012, value, text, color=color, va="center", ha="left", transform=scale)
-
-
-def spread_apart(heights: list[float], gap: float) -> list[float]:
-    """Return rising heights at least `gap` apart, groups that would overlap about their mean."""
-    groups: list[tuple[float, int]] = []
-    for height in heights:
-        groups.append((height, 1))
-        while len(groups) > 1:
-            (a, n), (b, m) = groups[-2:]
-            if b - a >= gap * (n + m) / 2 - 1e-9:
-                break
-            groups[-2:] = [((a * n + b * m) / (n + m), n + m)]
-    return [middle + gap * (k - (count - 1) / 2) for middle, count in groups for k in range(count)]
-
-
 def _markup(figure: Figure, label: str) -> str:
-    """Return the SVG element, with names of its own and the page's colours and font."""
+    """Return the SVG element, with ids that no other chart has and the page's colours and font."""
     buffer = io.StringIO()
     metadata = {"Date": None, "Creator": None, "Format": None, "Type": None}
     figure.savefig(buffer, format="svg", metadata=metadata)
@@ -172,9 +113,107 @@ def _markup(figure: Figure, label: str) -> str:
     view_box = re.search(r'viewBox="[^"]*"', opening)
     assert view_box is not None
     named = f'role="img" aria-label="{html.escape(label, quote=True)}"'
-    # No width and height of its own: the style sheet gives it the width of its column.
+    # No width and height: the style sheet gives it the width of its column.
     return f"<svg {view_box[0]} {named}>" + re.sub(r"\n\s*", "\n", rest)
 
 
 def _font(match: re.Match[str]) -> str:
     return f"font-size: {match[1]}px" if match[1] else "font-family: inherit"
+
+
+def new_figure(wide: bool, height: float) -> Figure:
+    """Return an empty figure of one of the two widths, `height` CSS pixels high."""
+    return plt.figure(figsize=((WIDE if wide else NARROW) / 72, height / 72), dpi=72)
+
+
+def place(figure: Figure, left: float, top: float, width: float, height: float) -> Axes:
+    """Return axes in a rectangle of CSS pixels, from the figure's top left corner."""
+    across, down = figure.get_size_inches() * 72
+    box = (left / across, 1 - (top + height) / down, width / across, height / down)
+    axes = figure.add_axes(box)
+    axes.tick_params(length=0, pad=4)
+    return axes
+
+
+def stack(
+    wide: bool,
+    count: int,
+    each: float,
+    *,
+    top: float,
+    below: float = 16,
+    left: float | None = None,
+    right: float = 0,
+    widest: float = WIDE,
+) -> tuple[Figure, list[Axes], float]:
+    """Return a figure of `count` panels above each other, their axes, and the panels' width.
+
+    Args:
+        wide: which of the two widths.
+        count: number of panels.
+        each: height of a panel, CSS pixels, as all that follow.
+        top: above the first panel.
+        below: below the last one's gap.
+        left: margin; None: that for numbers.
+        right: margin at least.
+        widest: largest width of a panel.
+    """
+    left = (LEFT if wide else NARROW_LEFT) if left is None else left
+    right = max(RIGHT if wide else NARROW_RIGHT, right)
+    across = min(widest, (WIDE if wide else NARROW) - left - right)
+    step = each + GAP
+    figure = new_figure(wide, top + step * count + below)
+    return figure, [place(figure, left, top + k * step, across, each) for k in range(count)], across
+
+
+def room_for(names: Sequence[str], wide: bool) -> float:
+    """Return the CSS pixels that the longest of the names takes."""
+    return CHARACTER * (TEXT if wide else NARROW_TEXT) * max(map(len, names), default=0)
+
+
+def set_title(axes: Axes, text: str) -> None:
+    """Set the title of axes, aligned to the left."""
+    axes.set_title(text, loc="left", fontsize="medium", color=INK, pad=6)
+
+
+def set_ticks(axes: Axes, across: int, down: int | None = None, *, whole: bool = True) -> None:
+    """Set the largest numbers of ticks; `whole` puts those of the x axis at whole numbers."""
+    axes.xaxis.set_major_locator(MaxNLocator(across, integer=whole))
+    if down is not None:
+        axes.yaxis.set_major_locator(MaxNLocator(down, steps=[1, 2, 5, 10]))
+
+
+def label_ends(axes: Axes, labels: Sequence[tuple[str, float, str]]) -> None:
+    """Write names of curves beside their ends, moved apart where they would overlap.
+
+    Args:
+        axes: of the curves; the names are written to their right.
+        labels: text, height of the curve's end in data, colour.
+    """
+    low, high = axes.get_ylim()
+    figure = axes.get_figure()
+    assert isinstance(figure, Figure)
+    tall = axes.get_position().height * figure.get_size_inches()[1] * 72
+    forward = axes.yaxis.get_transform().transform
+    backward = axes.yaxis.get_transform().inverted().transform
+    bottom, top = forward(low), forward(high)
+    wanted = [(float(forward(y)) - bottom) / (top - bottom) * tall for _, y, _ in labels]
+    order = sorted(range(len(labels)), key=lambda i: wanted[i])
+    for i, at in zip(order, spread_apart([wanted[i] for i in order], LABEL_GAP), strict=True):
+        text, _, color = labels[i]
+        value = float(backward(bottom + at / tall * (top - bottom)))
+        where = {"va": "center", "ha": "left", "transform": axes.get_yaxis_transform()}
+        axes.text(1.012, value, text, color=color, **where)
+
+
+def spread_apart(heights: list[float], gap: float) -> list[float]:
+    """Return rising heights at least `gap` apart, groups that would overlap about their mean."""
+    groups: list[tuple[float, int]] = []
+    for height in heights:
+        groups.append((height, 1))
+        while len(groups) > 1:
+            (a, n), (b, m) = groups[-2:]
+            if b - a >= gap * (n + m) / 2 - 1e-9:
+                break
+            groups[-2:] = [((a * n + b * m) / (n + m), n + m)]
+    return [middle + gap * (k - (count - 1) / 2) for middle, count in groups for k in range(count)]

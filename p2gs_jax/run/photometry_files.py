@@ -21,11 +21,11 @@ from p2gs_jax.core.numerics import LN2, on_device
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.appearance import Corrections, identity
-from p2gs_jax.photometry.cameras import corner
-from p2gs_jax.photometry.luminance.parameters import Luminance
-from p2gs_jax.photometry.mean import mean_parameters
+from p2gs_jax.photometry.display import mean_parameters
+from p2gs_jax.photometry.formation import corner
+from p2gs_jax.photometry.luminance import Luminance
 from p2gs_jax.photometry.metering import METERS, Metering, Rule
-from p2gs_jax.photometry.ppisp.parameters import Ppisp
+from p2gs_jax.photometry.ppisp import Ppisp
 from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.types import Params, Photometry, Scene, View
 

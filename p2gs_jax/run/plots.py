@@ -14,11 +14,11 @@ from jaxtyping import Bool, Float, Float32
 from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.core.text import names_as_they_are, printable
-from p2gs_jax.evaluate.unexplained import WIDTH, Unexplained
-from p2gs_jax.formats.png import write_png
+from p2gs_jax.evaluation.unexplained import WIDTH, Unexplained
+from p2gs_jax.formats.frames import write_png
 from p2gs_jax.photometry.response import Response, log_exposed
 from p2gs_jax.photometry.solution import PhotometricSolution
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import GAMMA_SRGB, Scene
 
 MARKERS = "osD^vPX*"
@@ -225,7 +225,7 @@ def _plot_recovered(left, middle, s: PhotometricSolution, cameras, stated_ev) ->
     """Draw exposures with their errors, and residuals, camera by camera."""
     seen = np.isfinite(s.exposure_errors)
     exposures_ev = np.where(seen, s.exposures_ev, np.nan)
-    errors_ev = np.where(seen, s.exposure_errors / LN2, np.nan)
+    errors_ev = np.where(seen, s.exposure_errors_ev, np.nan)
     names = list(dict.fromkeys(cameras))
     for i, name in enumerate(names):
         mine = np.array([c == name for c in cameras])

@@ -18,9 +18,14 @@ from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.ply import read_ply
 from p2gs_jax.gaussians.posed import chosen, posed, standing
-from p2gs_jax.photometry.cameras import camera_rows
-from p2gs_jax.photometry.display import DisplayTransform, display_of_view
-from p2gs_jax.photometry.mean import MeanParameters, mean_parameters, usual_display
+from p2gs_jax.photometry.display import (
+    DisplayTransform,
+    MeanParameters,
+    display_of_view,
+    mean_parameters,
+    usual_display,
+)
+from p2gs_jax.photometry.formation import camera_rows
 from p2gs_jax.photometry.metering import ExposureOf, Metering, meter
 from p2gs_jax.render.capacity import RenderView, make_renderer
 from p2gs_jax.run.decisions import read_decisions
@@ -33,9 +38,8 @@ from p2gs_jax.run.photometry_files import (
     read_photometry,
 )
 from p2gs_jax.run.scene_file import read_objects, read_scene
-from p2gs_jax.scene.device import camera_of
-from p2gs_jax.scene.drives.moving import MovingObjects, middle_time
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.drives.objects import MovingObjects, middle_time
+from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 from p2gs_jax.types import GAMMA_SRGB, Camera, Gaussians, Params, Photometry, Render, Scene
 
 CONFIG_AGAIN = (
@@ -259,7 +263,7 @@ class Run:
             exposure_ev: stops more than that.
         """
         readings = meter(np.asarray(rendered.linear), np.asarray(rendered.alpha))
-        exposure = float(np.exp(self.metering.log_exposure(readings, of))) * 2**exposure_ev
+        exposure = self.metering.exposure(readings, of) * 2**exposure_ev
         return replace(self.common_display(), exposure=exposure)
 
 

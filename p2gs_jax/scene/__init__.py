@@ -3,29 +3,32 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 from p2gs_jax.config import DataConfig
-from p2gs_jax.errors import UserError
-from p2gs_jax.scene.backdrop import with_alpha
+from p2gs_jax.errors import UserError, broken
+from p2gs_jax.scene.cache import Report
 from p2gs_jax.scene.colmap import find_model, load_colmap
+from p2gs_jax.scene.convert.convert import convert_photographs, converted_views, with_originals
+from p2gs_jax.scene.convert.headers import read_exif_ev
+from p2gs_jax.scene.convert.icc import colour_notes
 from p2gs_jax.scene.drives import read_drive
 from p2gs_jax.scene.drives.assemble import assemble
 from p2gs_jax.scene.drives.recording import Recording
-from p2gs_jax.scene.exif import read_exif_ev
 from p2gs_jax.scene.files import image_size, list_images
-from p2gs_jax.scene.images import ImageStore, camera_at, size_at
-from p2gs_jax.scene.llff import is_llff, load_llff
-from p2gs_jax.scene.masks import attach_masks
-from p2gs_jax.scene.photographs.colours import colour_notes
-from p2gs_jax.scene.photographs.develop import develop, developed_views, with_originals
-from p2gs_jax.scene.random_seeds import FEWEST, with_random_seeds
-from p2gs_jax.scene.split import split_as_listed, split_scene
-from p2gs_jax.scene.split_lists import lists_beside
-from p2gs_jax.scene.transforms import is_blender, load_blender, load_transforms
-from p2gs_jax.scene.video.read import is_video, read_video
+from p2gs_jax.scene.masks import attach_masks, with_alpha
+from p2gs_jax.scene.pixels.store import ImageStore, camera_at, size_at
+from p2gs_jax.scene.seeds import FEWEST, with_random_seeds
+from p2gs_jax.scene.split import lists_beside, split_as_listed, split_scene
+from p2gs_jax.scene.transforms import (
+    LLFF_FILE,
+    is_blender,
+    load_blender,
+    load_llff,
+    load_transforms,
+)
+from p2gs_jax.scene.video import VIDEO_SUFFIXES, read_video
 from p2gs_jax.types import Scene
 
 __all__ = ["ImageStore", "camera_at", "load_scene", "size_at"]
@@ -35,7 +38,7 @@ def load_scene(
     root: Path,
     cfg: DataConfig,
     work_dir: Path | None = None,
-    report: Callable[[str], None] = lambda message: None,
+    report: Report = lambda message: None,
 ) -> Scene:
     """Read a scene; the format is found from what lies in the folder.
 
@@ -63,25 +66,25 @@ def load_scene(
         scene = assemble(found, cfg, work_dir, report)
     elif isinstance(found, PhotographsAlone | Video):
         # Imported here as below: scenes with cameras and points do not need COLMAP.
-        from p2gs_jax.scene.structure_from_motion import load_images
+        from p2gs_jax.scene.sfm.map import load_images
 
         if isinstance(found, Video):
             photographs = read_video(found.path, cfg, work_dir, report)
             if cfg.matching == "auto":
                 cfg = dataclasses.replace(cfg, matching="sequence")
         else:
-            photographs = develop(*found, work_dir, report)
+            photographs = convert_photographs(*found, work_dir, report)
         folder, paths = photographs.folder, photographs.paths
         scene = load_images(Path(root), folder, paths, cfg, work_dir, report)
         scene = with_originals(scene, photographs)
     else:
         scene = found
     listed = scene.split_by is not None or cfg.split is not None
-    # Masks and EXIF are those of the photographs as they were taken, alpha is that of what is read.
-    scene = developed_views(with_what_lies_beside(scene, cfg), work_dir, report)
+    # Masks and EXIF belong to the photographs as they were taken, alpha to what is read.
+    scene = converted_views(with_what_lies_beside(scene, cfg), work_dir, report)
     scene = with_alpha(scene, cfg)
     if len(scene.points) == 0:
-        from p2gs_jax.scene.triangulate import triangulate
+        from p2gs_jax.scene.sfm.triangulate import triangulate
 
         # Where somebody says what is held out, it gives no seeds either.
         scene = triangulate(scene, work_dir, report, only_training=listed)
@@ -106,29 +109,20 @@ def with_what_lies_beside(scene: Scene, cfg: DataConfig) -> Scene:
 
 
 class PhotographsAlone(NamedTuple):
-    """Photographs of which nothing else is known.
-
-    Attributes:
-        folder: that their names are relative to.
-        paths: of them, sorted.
-    """
+    """Photographs of which nothing else is known: the folder of their names, and sorted paths."""
 
     folder: Path
     paths: list[Path]
 
 
 class Video(NamedTuple):
-    """A video of which nothing else is known.
-
-    Attributes:
-        path: of the file.
-    """
+    """A video of which nothing else is known."""
 
     path: Path
 
 
 def find_scene(
-    root: Path, cfg: DataConfig, report: Callable[[str], None] = lambda message: None
+    root: Path, cfg: DataConfig, report: Report = lambda message: None
 ) -> Scene | Recording | PhotographsAlone | Video:
     """Return what a folder holds, as `load_scene` finds it; nothing long is computed.
 
@@ -137,15 +131,13 @@ def find_scene(
     """
     root = Path(root)
     if not root.exists():
-        raise UserError(f"{root} does not exist", fix="check the path of the scene")
+        raise broken(root, "does not exist", "check the path of the scene")
     if root.is_file():
-        if is_video(root):
+        if root.suffix.lower() in VIDEO_SUFFIXES:
             return Video(root)
         if root.suffix.lower() != ".json":
-            raise UserError(
-                f"{root} is a file, but no transforms.json and no video",
-                fix="name the folder of the scene, its transforms.json, or a video",
-            )
+            fix = "name the folder of the scene, its transforms.json, or a video"
+            raise broken(root, "is neither a transforms.json nor a video", fix)
         return load_transforms(root, root, cfg)
     model = find_model(root)
     if model is not None and cfg.format in (None, "colmap"):
@@ -158,16 +150,18 @@ def find_scene(
         return load_transforms(root, root / "transforms.json", cfg)
     if is_blender(root) and cfg.format in (None, "blender"):
         return load_blender(root, cfg)
-    if is_llff(root) and cfg.format in (None, "llff"):
+    if (root / LLFF_FILE).is_file() and cfg.format in (None, "llff"):
         return load_llff(root, cfg)
     recording = read_drive(root, cfg, report)
     if recording is not None:
         return recording
     if cfg.format not in (None, "images"):
-        raise UserError(
-            f"{root} holds no scene in the format {cfg.format!r}",
-            fix="leave out --data.format, or name the folder that holds one",
-        )
+        fix = "leave out --data.format, or name the folder that holds one"
+        raise broken(root, f"holds no scene in the format {cfg.format!r}", fix)
+    return _photographs_alone(root, cfg)
+
+
+def _photographs_alone(root: Path, cfg: DataConfig) -> PhotographsAlone:
     folders = [root / cfg.images] if cfg.images is not None else [root / "images", root]
     for folder in folders:
         # Subfolders of the root may hold anything, masks or results of other runs, unless it is
@@ -187,7 +181,7 @@ def find_scene(
     raise UserError(
         f"no scene in {root}: there is no COLMAP model (cameras, images and points3D as .bin or "
         f".txt, in sparse/0, sparse or the folder itself), no transforms.json or "
-        f"transforms_train.json, no poses_bounds.npy, no drive of a "
-        f"known data set, and no photographs (looked in {looked})",
+        f"transforms_train.json, no poses_bounds.npy, no drive of a known data set, and no "
+        f"photographs (looked in {looked})",
         fix=fix,
     )

@@ -1,4 +1,4 @@
-"""Results of long computations, kept in the run folder for a resume."""
+"""Long computations: results are kept in the run folder for a resume, progress is reported."""
 
 from __future__ import annotations
 
@@ -6,13 +6,18 @@ import hashlib
 import json
 import shutil
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 from p2gs_jax.core.atomic import write_text
 
+Report = Callable[[str], None]
+"""Receives progress, a line at a time."""
 _MARKER = "finished"
+# Seconds between two messages.
+EVERY_S = 10.0
 
 
 @contextmanager
@@ -26,7 +31,7 @@ def cached_folder(
 
     Args:
         work_dir: where the folder lives; None uses a temporary one, gone after the `with` block.
-        name: of the folder.
+        name: name of the folder.
         key: JSON-serialisable; everything the result depends on.
         build: fills the empty folder it is given.
     """
@@ -50,3 +55,36 @@ def file_fingerprints(paths: Sequence[Path]) -> list[tuple[str, int, int]]:
     """Return (path, size in bytes, modification time in ns) of every file."""
     stats = [(path, path.stat()) for path in paths]
     return [(str(path.resolve()), stat.st_size, stat.st_mtime_ns) for path, stat in stats]
+
+
+class StageProgress:
+    """Reports now and then how far a stage of `total` units is; the first message comes at once."""
+
+    def __init__(
+        self,
+        report: Report,
+        stage: str,
+        total: int,
+        unit: str,
+        clock: Callable[[], float] = time.monotonic,
+    ):
+        """Begin the stage, such as "matching", of so many units, such as "image pairs"."""
+        self._report, self._stage, self._total, self._unit = report, stage, total, unit
+        self._clock = clock
+        self._begin = self._last = clock()
+        if total:
+            report(f"{stage}: {total} {unit}")
+
+    def __call__(self, done: int) -> None:
+        """Report how many are done, unless a message came just before."""
+        now = self._clock()
+        if now - self._last < EVERY_S or not 0 < done < self._total:
+            return
+        self._last = now
+        left = round((now - self._begin) / done * max(self._total - done, 0))
+        minutes, seconds = divmod(left, 60)
+        hours, minutes = divmod(minutes, 60)
+        clock = f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
+        self._report(
+            f"{self._stage}: {done} of {self._total} {self._unit}, about {clock} left at this pace"
+        )

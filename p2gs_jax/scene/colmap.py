@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from p2gs_jax.config import DataConfig
-from p2gs_jax.errors import UserError
+from p2gs_jax.errors import UserError, broken
 from p2gs_jax.scene.colmap_model import (
     CameraRecord,
     ImageRecord,
@@ -21,13 +20,17 @@ from p2gs_jax.scene.colmap_model import (
     read_model,
     unsupported_camera,
 )
-from p2gs_jax.scene.files import check_missing, check_size, require_inside
-from p2gs_jax.scene.geometry import intrinsics, make_distortion, scale_intrinsics, undistort_points
+from p2gs_jax.scene.files import HUGE, at_file_size, check_missing, image_folder, require_inside
+from p2gs_jax.scene.lens import intrinsics, make_distortion, undistort_points
 from p2gs_jax.types import Distortion, Scene, Tracks, View
 
 _FIX = "export the model again from COLMAP"
-# No finite number in float32 arithmetic from here on.
-HUGE = 1e30
+# Number of focal lengths in the parameters of the supported camera models.
+_FOCALS = {
+    **dict.fromkeys(("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"), 1),
+    **dict.fromkeys(("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"), 1),
+    **dict.fromkeys(("PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"), 2),
+}
 
 
 def find_model(root: Path) -> Path | None:
@@ -51,42 +54,39 @@ def load_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
     model = read_model(folder)
     _check_model(model)
     images = sorted(model.images, key=lambda image: image.name)
-    image_folder = _image_folder(root, folder, cfg, images)
+    place = image_folder(root, cfg) or _find_images(root, folder, images)
     for image in images:
-        require_inside(PurePosixPath(image.name), image_folder, model.images_path)
-    missing = [image.name for image in images if not (image_folder / image.name).is_file()]
-    notes = check_missing(missing, len(images), model.images_path, cfg)
+        require_inside(PurePosixPath(image.name), place, model.file("images"))
+    missing = [image.name for image in images if not (place / image.name).is_file()]
+    notes = check_missing(missing, len(images), model.file("images"), cfg)
     skipped = set(missing)
     images = [image for image in images if image.name not in skipped]
 
     fallback = _camera_names(images)
     views, resized = [], []
     for image in images:
-        camera = model.cameras[image.camera_id]
-        K, distortion = _lens(model.cameras_path, camera)
-        path = image_folder / image.name
-        width, height, sx, sy, differs = check_size(
-            path, camera.width, camera.height, model.cameras_path
-        )
-        if differs:
-            resized.append((width, height, camera))
+        camera, path = model.cameras[image.camera_id], place / image.name
+        K, distortion = _lens(model.file("cameras"), camera)
+        size = (camera.width, camera.height)
+        K, width, height = at_file_size(path, K, size, model.file("cameras"))
+        if (width, height) != size:
+            resized.append(f"{width}x{height} instead of {camera.width}x{camera.height}")
         views.append(
             View(
                 name=image.name,
                 image_path=path,
                 camera=subfolder(image.name) or fallback[image.camera_id],
-                viewmat=_viewmat(image, model.images_path),
-                K=scale_intrinsics(K, sx, sy).astype(np.float32),
+                viewmat=_viewmat(image, model.file("images")),
+                K=K,
                 width=width,
                 height=height,
                 distortion=distortion,
             )
         )
     if resized:
-        w, h, camera = resized[0]
         notes.append(
-            f"{len(resized)} images have another size than their camera (the first: {w}x{h} "
-            f"instead of {camera.width}x{camera.height}): intrinsics were rescaled"
+            f"{len(resized)} images have another size than their camera (the first: {resized[0]}): "
+            "intrinsics were rescaled"
         )
     others = sorted(p.name for p in folder.parent.iterdir() if p != folder and is_model(p))
     if folder.name == "0" and others:
@@ -114,7 +114,7 @@ def tracks_of(model: Model, views: Sequence[View]) -> Tracks | None:
     """
     if len(model.point_ids) == 0:
         return None
-    rows: Mapping[str, int] = {view.name: i for i, view in enumerate(views)}
+    rows = {view.name: i for i, view in enumerate(views)}
     view_rows, point_rows, positions = [], [], []
     for image in sorted(model.images, key=lambda image: image.name):
         row = rows.get(image.name)
@@ -154,46 +154,34 @@ def _camera_names(images: Sequence[ImageRecord]) -> dict[int, str]:
 
 def _check_model(model: Model) -> None:
     if not model.cameras:
-        raise UserError(f"{model.cameras_path} holds no cameras", fix=_FIX)
+        raise broken(model.file("cameras"), "holds no cameras", _FIX)
     if not model.images:
-        raise UserError(
-            f"{model.images_path} holds no registered images",
-            fix="COLMAP's mapping found nothing; run it again on these photographs",
-        )
+        fix = "COLMAP's mapping found nothing; run it again on these photographs"
+        raise broken(model.file("images"), "holds no registered images", fix)
     twice = [name for name, n in Counter(i.name for i in model.images).items() if n > 1]
     if twice:
-        raise UserError(f"{model.images_path} lists {twice[0]} more than once", fix=_FIX)
+        raise broken(model.file("images"), f"lists {twice[0]} more than once", _FIX)
     for image in model.images:
         if image.camera_id not in model.cameras:
-            raise UserError(
-                f"{model.images_path}: {image.name} was taken by camera {image.camera_id}, which "
-                f"{model.cameras_path} does not have",
-                fix=_FIX,
-            )
+            why = f"{image.name} was taken by camera {image.camera_id}, which "
+            why += f"{model.file('cameras')} does not have"
+            raise broken(f"{model.file('images')}:", why, _FIX)
     bad = int((~(np.abs(model.xyz) < HUGE).all(axis=1)).sum())
     if bad:
-        raise UserError(
-            f"{model.points_path}: {bad} of {len(model.xyz)} points are not finite", fix=_FIX
-        )
+        why = f"{bad} of {len(model.xyz)} points are not finite"
+        raise broken(f"{model.file('points3D')}:", why, _FIX)
 
 
-def _image_folder(root: Path, folder: Path, cfg: DataConfig, images: Sequence[ImageRecord]) -> Path:
-    if cfg.images is not None:
-        chosen = root / cfg.images
-        if not chosen.is_dir():
-            raise UserError(
-                f"the image folder {chosen} does not exist", fix="correct the option --images"
-            )
-        return chosen
-    bases = dict.fromkeys((root, folder.parent, folder.parent.parent))
-    for base in bases:
-        if (base / "images").is_dir():
-            return base / "images"
+def _find_images(root: Path, folder: Path, images: Sequence[ImageRecord]) -> Path:
+    places = [base / "images" for base in dict.fromkeys((root, *list(folder.parents)[:2]))]
+    for place in places:
+        if place.is_dir():
+            return place
     if any((root / image.name).is_file() for image in images):
         return root
+    looked = ", ".join(map(str, places))
     raise UserError(
-        f"no image folder for the COLMAP model {folder}: looked for "
-        + ", ".join(str(base / "images") for base in bases),
+        f"no image folder for the COLMAP model {folder}: looked for {looked}",
         fix="name the folder with --images",
     )
 
@@ -202,7 +190,7 @@ def _viewmat(image: ImageRecord, path: Path) -> Float[np.ndarray, "4 4"]:
     finite = (np.abs([*image.qvec, *image.tvec]) < HUGE).all()
     norm = np.linalg.norm(image.qvec) if finite else 0.0
     if norm < 1e-6:
-        raise UserError(f"{path}: the pose of {image.name} is not finite", fix=_FIX)
+        raise broken(f"{path}:", f"the pose of {image.name} is not finite", _FIX)
     viewmat = np.eye(4)
     viewmat[:3, :3] = Rotation.from_quat(np.roll(image.qvec / norm, -1)).as_matrix()
     viewmat[:3, 3] = image.tvec
@@ -210,30 +198,14 @@ def _viewmat(image: ImageRecord, path: Path) -> Float[np.ndarray, "4 4"]:
 
 
 def _lens(path: Path, camera: CameraRecord) -> tuple[Float[np.ndarray, "3 3"], Distortion | None]:
-    """Return K and distortion; COLMAP's terms are OpenCV's."""
-    p = camera.params
-    model: Literal["radial", "fisheye"] = "fisheye" if "FISHEYE" in camera.model else "radial"
-    match camera.model:
-        case "SIMPLE_PINHOLE":
-            fx, fy, cx, cy, *lens = p[0], p[0], p[1], p[2]
-        case "PINHOLE":
-            fx, fy, cx, cy, *lens = p
-        case "SIMPLE_RADIAL":
-            fx, fy, cx, cy, *lens = p[0], p[0], p[1], p[2], p[3], 0.0, 0.0, 0.0
-        case "RADIAL":
-            fx, fy, cx, cy, *lens = p[0], p[0], p[1], p[2], p[3], p[4], 0.0, 0.0
-        case "OPENCV" | "FULL_OPENCV" | "OPENCV_FISHEYE":
-            fx, fy, cx, cy, *lens = p
-        case "SIMPLE_RADIAL_FISHEYE":
-            fx, fy, cx, cy, *lens = p[0], p[0], p[1], p[2], p[3], 0.0, 0.0, 0.0
-        case "RADIAL_FISHEYE":
-            fx, fy, cx, cy, *lens = p[0], p[0], p[1], p[2], p[3], p[4], 0.0, 0.0
-        case _:
-            raise unsupported_camera(path, camera.model)
+    """Return K and distortion: COLMAP's terms are OpenCV's, and absent ones are 0."""
+    if camera.model not in _FOCALS:
+        raise unsupported_camera(path, camera.model)
+    focals, p = _FOCALS[camera.model], camera.params
+    fx, fy, (cx, cy) = p[0], p[focals - 1], p[focals : focals + 2]
     if not ((np.abs(p) < HUGE).all() and fx > 0 and fy > 0 and camera.width and camera.height):
-        raise UserError(
-            f"{path}: a {camera.model} camera of {camera.width}x{camera.height} pixels has "
-            f"impossible parameters {p}",
-            fix=_FIX,
-        )
-    return intrinsics(fx, fy, cx, cy), make_distortion(tuple(lens), model)
+        why = f"a {camera.model} camera of {camera.width}x{camera.height} pixels has "
+        raise broken(f"{path}:", f"{why}impossible parameters {p}", _FIX)
+    terms = p[focals + 2 :]
+    model = "fisheye" if "FISHEYE" in camera.model else "radial"
+    return intrinsics(fx, fy, cx, cy), make_distortion((*terms, *[0.0] * (4 - len(terms))), model)

@@ -18,26 +18,27 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from p2gs_jax.errors import UserError
+from p2gs_jax.errors import UserError, broken
 
-_STEMS = ("cameras", "images", "points3D")
 _FIX = "copy the model again from where it was made, or export it again from COLMAP"
 _LARGEST_ID = 2**63 - 1
-# (name, number of parameters) by COLMAP's model id.
-_MODELS = (
-    ("SIMPLE_PINHOLE", 3),
-    ("PINHOLE", 4),
-    ("SIMPLE_RADIAL", 4),
-    ("RADIAL", 5),
-    ("OPENCV", 8),
-    ("OPENCV_FISHEYE", 8),
-    ("FULL_OPENCV", 12),
-    ("FOV", 5),
-    ("SIMPLE_RADIAL_FISHEYE", 4),
-    ("RADIAL_FISHEYE", 5),
-    ("THIN_PRISM_FISHEYE", 12),
-    ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
-)
+_STEMS = ("cameras", "images", "points3D")
+_KEYPOINT = np.dtype([("xy", "<f8", 2), ("id", "<i8")])
+# Number of parameters, in the order of COLMAP's model ids.
+_MODELS = {
+    "SIMPLE_PINHOLE": 3,
+    "PINHOLE": 4,
+    "SIMPLE_RADIAL": 4,
+    "RADIAL": 5,
+    "OPENCV": 8,
+    "OPENCV_FISHEYE": 8,
+    "FULL_OPENCV": 12,
+    "FOV": 5,
+    "SIMPLE_RADIAL_FISHEYE": 4,
+    "RADIAL_FISHEYE": 5,
+    "THIN_PRISM_FISHEYE": 12,
+    "RAD_TAN_THIN_PRISM_FISHEYE": 16,
+}
 
 
 @dataclass(frozen=True)
@@ -73,31 +74,30 @@ class ImageRecord:
 
 @dataclass(frozen=True)
 class Model:
-    """A COLMAP model as its files state it; `points` are sorted by id.
+    """A COLMAP model as its files state it: cameras by id, images in the file's order.
 
     Attributes:
-        cameras_path: the cameras file, for messages.
-        images_path: the images file.
-        points_path: the points3D file.
-        cameras: by id.
-        images: in the file's order.
+        kind: suffix of its files.
         point_ids: ascending.
         xyz: scene units.
         rgb: display-encoded colours.
     """
 
-    cameras_path: Path
-    images_path: Path
-    points_path: Path
+    folder: Path
+    kind: str
     cameras: dict[int, CameraRecord]
     images: tuple[ImageRecord, ...]
     point_ids: Int[np.ndarray, " p"]
     xyz: Float[np.ndarray, "p 3"]
     rgb: UInt8[np.ndarray, "p 3"]
 
+    def file(self, stem: str) -> Path:
+        """Return a file of the model, for messages."""
+        return self.folder / f"{stem}.{self.kind}"
+
 
 def is_model(folder: Path) -> bool:
-    """Whether the folder looks like a COLMAP model, complete or not."""
+    """Return whether the folder looks like a COLMAP model, complete or not."""
     stems = ("cameras", "points3D")
     return any((folder / f"{stem}.{ext}").is_file() for stem in stems for ext in ("bin", "txt"))
 
@@ -116,24 +116,20 @@ def read_model(folder: Path) -> Model:
         ext = "txt" if (folder / "cameras.txt").is_file() else "bin"
         paths = [folder / f"{stem}.{ext}" for stem in _STEMS]
         absent = ", ".join(str(path) for path in paths if not path.is_file())
-        raise UserError(f"incomplete COLMAP model: {absent} does not exist", fix=_FIX)
-    cameras_path, images_path, points_path = paths
-    readers = (
-        (_binary_cameras, _binary_images, _binary_points)
-        if ext == "bin"
-        else (_text_cameras, _text_images, _text_points)
-    )
-    ids, xyz, rgb = readers[2](points_path)
+        raise broken("incomplete COLMAP model:", f"{absent} does not exist", _FIX)
+    text = (_text_cameras, _text_images, _text_points)
+    binary = (_binary_cameras, _binary_images, _binary_points)
+    cameras, images, points = binary if ext == "bin" else text
+    ids, xyz, rgb = points(paths[2])
     order = np.argsort(ids, kind="stable")
     return Model(
-        cameras_path=cameras_path,
-        images_path=images_path,
-        points_path=points_path,
-        cameras=readers[0](cameras_path),
-        images=tuple(readers[1](images_path)),
-        point_ids=ids[order],
-        xyz=xyz[order],
-        rgb=rgb[order],
+        folder,
+        ext,
+        cameras(paths[0]),
+        tuple(images(paths[1])),
+        ids[order],
+        xyz[order],
+        rgb[order],
     )
 
 
@@ -146,24 +142,20 @@ class _Cursor:
         self.position = 0
 
     def unpack(self, layout: str) -> tuple:
-        size = struct.calcsize(layout)
-        start = self.skip(size)
-        return struct.unpack_from(layout, self.data, start)
+        return struct.unpack_from(layout, self.data, self.skip(struct.calcsize(layout)))
 
     def skip(self, size: int) -> int:
         """Move on by `size` bytes and return where they start."""
         start = self.position
         if start + size > len(self.data):
-            raise self.error(
-                f"truncated: it ends at byte {len(self.data)} in the middle of a record"
-            )
+            raise self.cut("record")
         self.position = start + size
         return start
 
     def string(self) -> str:
         end = self.data.find(b"\0", self.position)
         if end < 0:
-            raise self.error(f"truncated: it ends at byte {len(self.data)} in the middle of a name")
+            raise self.cut("name")
         start, self.position = self.position, end + 1
         return self.data[start:end].decode("utf-8", "replace")
 
@@ -171,13 +163,13 @@ class _Cursor:
         """Read a number of records that need at least `record_size` bytes each."""
         (n,) = self.unpack("<Q")
         if n * record_size > len(self.data) - self.position:
-            raise self.error(
-                f"truncated: it announces {n} entries and has {len(self.data)} bytes in all"
-            )
+            why = f"is truncated: it announces {n} entries and has {len(self.data)} bytes in all"
+            raise broken(self.path, why, _FIX)
         return n
 
-    def error(self, what: str) -> UserError:
-        return UserError(f"{self.path} is {what}", fix=_FIX)
+    def cut(self, what: str) -> UserError:
+        why = f"is truncated: it ends at byte {len(self.data)} in the middle of a {what}"
+        return broken(self.path, why, _FIX)
 
 
 def _binary_cameras(path: Path) -> dict[int, CameraRecord]:
@@ -187,12 +179,9 @@ def _binary_cameras(path: Path) -> dict[int, CameraRecord]:
         camera_id, model_id, width, height = cursor.unpack("<iiQQ")
         if not 0 <= model_id < len(_MODELS):
             raise unsupported_camera(path, f"number {model_id}")
-        model, n = _MODELS[model_id]
+        model, n = list(_MODELS.items())[model_id]
         cameras[camera_id] = CameraRecord(model, width, height, cursor.unpack(f"<{n}d"))
     return cameras
-
-
-_KEYPOINT = np.dtype([("xy", "<f8", 2), ("id", "<i8")])
 
 
 def _binary_images(path: Path) -> Iterator[ImageRecord]:
@@ -226,7 +215,7 @@ def _text_cameras(path: Path) -> dict[int, CameraRecord]:
             cameras[int(camera_id)] = CameraRecord(model, int(width), int(height), values)
         except ValueError as error:
             raise _malformed(path, number, error) from None
-        if dict(_MODELS).get(model, len(values)) != len(values):
+        if _MODELS.get(model, len(values)) != len(values):
             raise _malformed(path, number, f"{len(values)} parameters for the model {model}")
     return cameras
 
@@ -261,7 +250,7 @@ def _text_points(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
                 raise ValueError("a point line needs at least 8 fields")
             ids.append(int(fields[0]))
             if abs(ids[-1]) > _LARGEST_ID:
-                raise ValueError(f"{ids[-1]} is no id of a point")
+                raise ValueError(f"{ids[-1]} is not a valid id of a point")
             xyz.append([float(value) for value in fields[1:4]])
             rgb.append([int(value) & 255 for value in fields[4:7]])
         except ValueError as error:
@@ -297,14 +286,14 @@ def _image(
 
 
 def _malformed(path: Path, line: int, what: object) -> UserError:
-    return UserError(f"{path} is malformed in line {line}: {what}", fix=_FIX)
+    return broken(path, f"is malformed in line {line}: {what}", _FIX)
 
 
 def unsupported_camera(path: Path, model: str) -> UserError:
     """Return the error for a camera model that `Distortion` cannot express."""
-    return UserError(
-        f"{path} uses the camera model {model}; supported are PINHOLE, SIMPLE_PINHOLE, "
-        "SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV, OPENCV_FISHEYE, RADIAL_FISHEYE and "
-        "SIMPLE_RADIAL_FISHEYE",
-        fix="run `colmap image_undistorter` and use the folder it writes",
+    return broken(
+        path,
+        f"uses the camera model {model}; supported are PINHOLE, SIMPLE_PINHOLE, SIMPLE_RADIAL, "
+        "RADIAL, OPENCV, FULL_OPENCV, OPENCV_FISHEYE, RADIAL_FISHEYE and SIMPLE_RADIAL_FISHEYE",
+        "run `colmap image_undistorter` and use the folder it writes",
     )

@@ -1,24 +1,31 @@
-"""Image files on disk: listing, sizes, and errors about missing ones."""
+"""Files of scenes: listing and measuring images, names and sizes that models give, JSON."""
 
 from __future__ import annotations
 
+import json
 import os
 import warnings
 from collections.abc import Sequence
 from pathlib import Path, PurePath
+from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, Float32, UInt8
 from PIL import Image
 
 from p2gs_jax.config import DataConfig
-from p2gs_jax.errors import UserError
-from p2gs_jax.scene.photographs.kinds import DEVELOPED_SUFFIXES
-from p2gs_jax.scene.photographs.sizes import size_of
+from p2gs_jax.core.text import parse_json
+from p2gs_jax.errors import UserError, broken
+from p2gs_jax.scene.convert.headers import size_of
+from p2gs_jax.scene.convert.kinds import CONVERTED_SUFFIXES
+from p2gs_jax.scene.lens import scale_intrinsics
 
-IMAGE_SUFFIXES = DEVELOPED_SUFFIXES | {*(".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm")}
-_ASPECT_TOLERANCE = 0.01
+IMAGE_SUFFIXES = CONVERTED_SUFFIXES | {*(".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm")}
+# Ratios of width to height that differ by more than this are different shapes.
+ASPECT_TOLERANCE = 0.01
+# Finite numbers from here on are not finite in float32 arithmetic.
+HUGE = 1e30
 _MOVED = (
     "move it there; or name the folder of all photographs with --images, and give names relative "
     "to it"
@@ -43,53 +50,77 @@ def list_images(folder: Path, *, recursive: bool = True) -> list[Path]:
     return [folder / p for p in sorted(visible, key=lambda p: p.as_posix())]
 
 
+def read_json(path: Path, fix: str) -> Any:
+    """Return what a JSON file holds.
+
+    Raises:
+        UserError: it is absent, not text, or not valid JSON.
+    """
+    try:
+        return parse_json(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise broken(path, "does not exist", fix) from None
+    except json.JSONDecodeError as error:
+        why = f"is not valid JSON: {error.msg} in line {error.lineno}, column {error.colno}"
+        raise broken(path, why, fix) from None
+    except (OSError, UnicodeDecodeError):
+        raise broken(path, "is not a text file", fix) from None
+
+
 def require_inside(name: PurePath, folder: Path, source: Path, fix: str = _MOVED) -> None:
-    """Refuse a name in a file that leads out of the folder it is relative to.
+    """Refuse a name in the file `source` that leads out of the folder it is relative to.
 
     Links below the folder are followed: whoever made it put them there.
-
-    Args:
-        name: as the file has it.
-        folder: that it is relative to.
-        source: the file.
-        fix: what to do.
 
     Raises:
         UserError: it leads out.
     """
     normal = os.path.normpath(name.as_posix())
     if os.path.isabs(normal) or normal.split("/")[0] == "..":
-        raise UserError(
-            f"{source} names {name}, which lies outside of {folder}",
-            fix=fix,
-        )
+        raise broken(source, f"names {name}, which lies outside of {folder}", fix)
 
 
 def require_plain(name: str, source: Path) -> None:
-    """Refuse a name that is no name of a folder, but a path.
-
-    Args:
-        name: as a file has it.
-        source: where it was found.
+    """Refuse a name of a camera, found in the file `source`, that is a path.
 
     Raises:
         UserError: it is a path.
     """
     if name in ("", ".", "..") or any(c in name for c in "/\\\0"):
-        raise UserError(
-            f"{source} has a camera by the name of {name!r}, which is no name of a folder",
-            fix="get its tables again, or name the camera otherwise in all of them",
+        raise broken(
+            source,
+            f"has a camera by the name of {name!r}, which is no name of a folder",
+            "get its tables again, or name the camera otherwise in all of them",
         )
+
+
+def image_folder(root: Path, cfg: DataConfig) -> Path | None:
+    """Return the image folder that the user names, or None.
+
+    Raises:
+        UserError: it does not exist.
+    """
+    if cfg.images is None:
+        return None
+    folder = root / cfg.images
+    if not folder.is_dir():
+        fix = "correct the option --images"
+        raise UserError(f"the image folder {folder} does not exist", fix=fix)
+    return folder
 
 
 def image_size(path: Path) -> tuple[int, int]:
     """Return (width, height) as stored, before any EXIF rotation.
 
     Raises:
-        UserError: the file is no image, or one that is too large; its name is not UTF-8; or a
-            package that opens it is missing.
+        UserError: the file is not an image, or is too large; its name is not UTF-8; or a package
+            that opens it is missing.
     """
-    size = size_of(_named_in_utf8(path)) or _size_in_header(path)
+    try:
+        str(path).encode()  # no other name can be written into the files of a run
+    except UnicodeEncodeError:
+        raise UserError(f"the name of {path} is not UTF-8", fix="rename it") from None
+    size = size_of(path) or _size_in_header(path)
     if size[0] * size[1] > MOST_PIXELS:
         raise _too_large(path)
     return size
@@ -115,27 +146,14 @@ def _size_in_header(path: Path) -> tuple[int, int]:
 
 
 def _too_large(path: Path) -> UserError:
-    return UserError(
-        f"{path} has more than {MOST_PIXELS / 1e6:.0f} million pixels",
-        fix="make the photographs smaller, or remove that one from the scene",
-    )
-
-
-def _named_in_utf8(path: Path) -> Path:
-    """Return the path; no other can be written into the files of a run."""
-    try:
-        str(path).encode()
-    except UnicodeEncodeError:
-        raise UserError(f"the name of {path} is not UTF-8", fix="rename it") from None
-    return path
+    fix = "make the photographs smaller, or remove that one from the scene"
+    return broken(path, f"has more than {MOST_PIXELS / 1e6:.0f} million pixels", fix)
 
 
 def decode_grey(data: bytes, shrink: int) -> UInt8[np.ndarray, "h w"] | None:
-    """Return a photograph in grey as stored, or None where it is none.
+    """Return the photograph in the bytes of a file in grey as stored, or None if it is broken.
 
-    Args:
-        data: of its file.
-        shrink: by up to this factor, where that saves time; JPEG does.
+    It is shrunk by up to the factor `shrink` where that saves time; JPEG does.
     """
     flags = {2: cv2.IMREAD_REDUCED_GRAYSCALE_2, 4: cv2.IMREAD_REDUCED_GRAYSCALE_4}
     flag = flags.get(2 ** min(int(np.log2(max(shrink, 1))), 2), cv2.IMREAD_GRAYSCALE)
@@ -143,7 +161,7 @@ def decode_grey(data: bytes, shrink: int) -> UInt8[np.ndarray, "h w"] | None:
 
 
 def undecodable(path: Path) -> UserError:
-    """Return the error for a file that is no readable image."""
+    """Return the error for a file that is not a readable image."""
     size = path.stat().st_size if path.is_file() else 0
     return UserError(
         f"cannot decode the image {path} ({size} bytes)",
@@ -152,13 +170,13 @@ def undecodable(path: Path) -> UserError:
 
 
 def check_missing(missing: Sequence[str], total: int, source: Path, cfg: DataConfig) -> list[str]:
-    """Reject a model whose images are missing on disk.
+    """Reject a model whose images are missing on disk, unless `cfg.allow_missing` allows that.
 
     Args:
         missing: their names.
         total: number of images of the model.
         source: the file or folder that names them.
-        cfg: `allow_missing` turns the error into a note.
+        cfg: has the option.
 
     Returns:
         Notes for the user: none or one.
@@ -171,37 +189,32 @@ def check_missing(missing: Sequence[str], total: int, source: Path, cfg: DataCon
     listed = ", ".join(missing[:5]) + (", ..." if len(missing) > 5 else "")
     message = f"{len(missing)} of the {total} images named by {source} do not exist: {listed}"
     if not cfg.allow_missing:
-        raise UserError(
-            message,
-            fix="add them, name their folder with --images, or skip them with --allow-missing",
-        )
+        fix = "add them, name their folder with --images, or skip them with --allow-missing"
+        raise UserError(message, fix=fix)
     if len(missing) == total:
         raise UserError(message, fix="point --images at the folder that holds them")
     return [f"skipped: {message}"]
 
 
-def check_size(
-    path: Path, width: int, height: int, source: Path
-) -> tuple[int, int, float, float, bool]:
-    """Compare an image file with the size its camera has in the model.
+def at_file_size(
+    path: Path, K: Float[np.ndarray, "3 3"], size: tuple[int, int], source: Path
+) -> tuple[Float32[np.ndarray, "3 3"], int, int]:
+    """Return K, width and height of an image file, of which a model may have a larger copy.
 
     Args:
         path: the image.
-        width: pixels, according to the model.
-        height: pixels, according to the model.
+        K: intrinsics according to the model, pixels.
+        size: width and height according to the model, pixels.
         source: the file of the model.
 
-    Returns:
-        Real width and height, the factors from model to file, and whether they differ.
-
     Raises:
-        UserError: the file is no image, or has another shape than the camera.
+        UserError: the file is not an image, or has another shape than the camera.
     """
     w, h = image_size(path)
-    sx, sy = w / width, h / height
-    if abs(sx / sy - 1.0) > _ASPECT_TOLERANCE:
+    sx, sy = w / size[0], h / size[1]
+    if abs(sx / sy - 1.0) > ASPECT_TOLERANCE:
         raise UserError(
-            f"wrong size: {path} is {w}x{h}, but {source} says {width}x{height}",
+            f"wrong size: {path} is {w}x{h}, but {source} says {size[0]}x{size[1]}",
             fix="use the photographs from which the model was made, neither cropped nor rotated",
         )
-    return w, h, sx, sy, (w, h) != (width, height)
+    return scale_intrinsics(K, sx, sy).astype(np.float32), w, h

@@ -1,18 +1,31 @@
-"""Which views are held out: as the user or the data set says, else every n-th of each physical
-camera, as 3DGS does; of a drive every n-th frame for all cameras."""
+"""Which views are held out: as the user or the data set lists them, else every n-th of each camera.
+
+    FILE.json            {"train": ["a.png", ...], "test": ["b.png", ...]}; one of them may be
+                         missing: it is then the rest. `val` is held out where there is no `test`
+    test.txt, train.txt  names, a line each (3DGS reads test.txt beside a COLMAP model); empty lines
+                         and those that begin with # do not count
+
+A name is that of the view, or any end of the path of its photograph, with or without the suffix.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 from collections import defaultdict
-from pathlib import Path
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+
+import numpy as np
 
 from p2gs_jax.config import DataConfig
-from p2gs_jax.errors import UserError
-from p2gs_jax.scene.split_lists import read_split, split_as_listed
-from p2gs_jax.types import Scene, View
+from p2gs_jax.errors import UserError, broken
+from p2gs_jax.scene.files import read_json
+from p2gs_jax.scene.masks import image_folder_of
+from p2gs_jax.types import Scene, Tracks, View
 
 EVERY = "every"
+_TEXT_FILES = {"train": "train.txt", "test": "test.txt"}
+_INSTEAD = "--split every holds out every n-th view instead"
 
 
 def split_scene(scene: Scene, cfg: DataConfig) -> Scene:
@@ -33,27 +46,20 @@ def split_scene(scene: Scene, cfg: DataConfig) -> Scene:
         return split_as_listed(scene, lists, allow_missing=cfg.allow_missing)
     if scene.split_by is not None and cfg.split != EVERY and cfg.test_every:
         return scene
-    views = assign_split(scene.views, cfg.test_every)
+    n = cfg.test_every
+    views = assign_split(scene.views, n)
     what = "frame" if any(view.frame is not None for view in views) else "view of each camera"
-    told = f"every {_ordinal(cfg.test_every)} {what}" if cfg.test_every else "--test-every 0"
-    return dataclasses.replace(scene, views=views, split_by=told)
-
-
-def _ordinal(n: int) -> str:
     ending = "th" if 10 <= n % 100 <= 20 else {1: "st", 2: "nd", 3: "rd"}.get(n % 10, "th")
-    return f"{n}{ending}"
+    by = f"every {n}{ending} {what}" if n else "--test-every 0"
+    return dataclasses.replace(scene, views=views, split_by=by)
 
 
 def assign_split(views: tuple[View, ...], test_every: int) -> tuple[View, ...]:
-    """Return the views with `split` set.
+    """Return the views with `split` set, in the order given.
 
-    Within each camera, sorted by name, views 0, n, 2n, ... are `test`; where views have frames,
-    the frames 0, n, 2n, ... among all of them are. A camera that would be left without a training
-    view holds out none.
-
-    Args:
-        views: all views, in any order; the order is kept.
-        test_every: n; 0 holds out none.
+    Within each camera, sorted by name, views 0, n, 2n, ... are `test`, as in 3DGS; where views have
+    frames, the frames 0, n, 2n, ... among all of them are. A camera that would be left without a
+    training view holds out none; n = 0 holds out none.
 
     Raises:
         UserError: n is negative, or 1, which would leave nothing to train on.
@@ -63,18 +69,226 @@ def assign_split(views: tuple[View, ...], test_every: int) -> tuple[View, ...]:
             f"cannot hold out every n-th view with n = {test_every}",
             fix="use 0 (hold out none) or a number from 2 on; 8 is usual",
         )
-    if not test_every:
-        return tuple(dataclasses.replace(v, split="train") for v in views)
-    by_camera: dict[str, list[int]] = defaultdict(list)
-    for i in sorted(range(len(views)), key=lambda i: views[i].name):
-        by_camera[views[i].camera].append(i)
-    frames = sorted({v.frame for v in views if v.frame is not None})
-    held_out = set(frames[::test_every])
     test: set[int] = set()
-    for rows in by_camera.values():
-        chosen = {i for i in rows if views[i].frame in held_out} if frames else rows[::test_every]
-        if len(chosen) < len(rows):
-            test.update(chosen)
+    if test_every:
+        by_camera: dict[str, list[int]] = defaultdict(list)
+        for i in sorted(range(len(views)), key=lambda i: views[i].name):
+            by_camera[views[i].camera].append(i)
+        frames = sorted({v.frame for v in views if v.frame is not None})
+        held = set(frames[::test_every])
+        for rows in by_camera.values():
+            chosen = {i for i in rows if views[i].frame in held} if frames else rows[::test_every]
+            if len(chosen) < len(rows):
+                test.update(chosen)
+    return _with_test(views, test)
+
+
+def _with_test(views: Sequence[View], test: set[int]) -> tuple[View, ...]:
     return tuple(
         dataclasses.replace(v, split="test" if i in test else "train") for i, v in enumerate(views)
     )
+
+
+@dataclasses.dataclass(frozen=True)
+class SplitLists:
+    """Names of photographs.
+
+    Attributes:
+        source: the file, or the files, in words.
+        folder: that holds it or them.
+        train: what is trained on; None: the rest.
+        test: what is held out; None or empty: `val` if there is one, else the rest.
+        val: held out by others while they train; here it takes the place of `test` or is left out.
+    """
+
+    source: str
+    folder: Path
+    train: tuple[str, ...] | None = None
+    test: tuple[str, ...] | None = None
+    val: tuple[str, ...] | None = None
+
+    @property
+    def where(self) -> str:
+        """The file, or the files, with their folder."""
+        return str(self.folder / self.source)
+
+
+def read_split(path: Path) -> SplitLists:
+    """Read the lists that a user names: .json, or text with the names of what is held out.
+
+    Raises:
+        UserError: it is absent, or holds no such lists.
+    """
+    if not path.exists():
+        raise broken(path, "does not exist", "correct the option --split")
+    if path.suffix.lower() != ".json":
+        return SplitLists(path.name, path.parent, test=_lines(path))
+    data = read_json(path, "correct the file")
+    found = lists_in(path, data, {name: name for name in ("train", "test", "val")})
+    if found is None:
+        fix = 'write {"train": [NAME, ...], "test": [NAME, ...]}, or one of the two'
+        raise broken(path, 'has no list "test" and no list "train"', fix)
+    return found
+
+
+def lists_in(path: Path, data: object, keys: dict[str, str]) -> SplitLists | None:
+    """Return the lists in the data of a .json, or None where it holds none.
+
+    Args:
+        path: the file.
+        data: what it holds.
+        keys: what `train`, `test` and `val` are called in it.
+
+    Raises:
+        UserError: one of them is not a list of names.
+    """
+    lists: dict[str, tuple[str, ...]] = {}
+    for name, key in keys.items():
+        given = data.get(key) if isinstance(data, dict) else None
+        if given is None:
+            continue
+        if not isinstance(given, list) or not all(isinstance(n, str) and n for n in given):
+            raise broken(f"{path}:", f'"{key}" is not a list of names', "correct the file")
+        lists[name] = tuple(given)
+    return SplitLists(path.name, path.parent, **lists) if lists else None
+
+
+def lists_beside(*folders: Path) -> SplitLists | None:
+    """Return the lists in `train.txt` and `test.txt` of the first folder that has one of them."""
+    for folder in folders:
+        files = {name: folder / file for name, file in _TEXT_FILES.items()}
+        found = {name: path for name, path in files.items() if path.is_file()}
+        if found:
+            source = " and ".join(path.name for path in found.values())
+            names = {name: _lines(path) for name, path in found.items()}
+            return SplitLists(source, folder, **names)
+    return None
+
+
+def split_as_listed(scene: Scene, lists: SplitLists, *, allow_missing: bool = False) -> Scene:
+    """Return a scene whose views are split as lists say; what is in none of them is left out.
+
+    Args:
+        scene: as it was read.
+        lists: which views are which.
+        allow_missing: names that no photograph has are left out instead of an error.
+
+    Raises:
+        UserError: a name belongs to no photograph, or to several; it is in two lists; or nothing is
+            left to train on.
+    """
+    views, notes, unused = scene.views, [], []
+    rows_of = _rows_by_name(views)
+    # Tools write empty lists for what they lack.
+    held = lists.test or lists.val or None
+    rows: dict[str, set[int]] = {}
+    for part, names in (("train", lists.train), ("test", held)):
+        if names is not None:
+            found = [_row(name, views, rows_of, lists, unused) for name in names]
+            rows[part] = {row for row in found if row is not None}
+    if unused:
+        absent = [name for name in unused if not _lies_there(name, views)]
+        if absent and not allow_missing:
+            why = f"lists {absent[0]}, which the scene does not have"
+            raise broken(lists.where, why, f"correct the name, or add the photograph; {_INSTEAD}")
+        notes.append(
+            f"{lists.source} lists {len(unused)} photographs that are not views of the scene: "
+            + ", ".join(unused[:5])
+            + (", ..." if len(unused) > 5 else "")
+        )
+    everything = set(range(len(views)))
+    train = rows.get("train", everything - rows.get("test", set()))
+    test = rows.get("test", everything - train)
+    if both := sorted(train & test):
+        why = f"{views[both[0]].name} is both trained on and held out"
+        raise broken(f"{lists.where}:", why, f"take it out of one of the lists; {_INSTEAD}")
+    if not train:
+        raise broken(lists.where, "leaves no view to train on", f"correct the lists; {_INSTEAD}")
+    scene = dataclasses.replace(scene, views=_with_test(views, test), split_by=lists.source)
+    left = sorted(everything - train - test)
+    if left:
+        notes.append(
+            f"{len(left)} views are neither trained on nor held out by {lists.source}: they are "
+            "not used"
+        )
+        scene = _without_views(scene, left)
+    if not test:
+        notes.append(
+            f"{lists.source} holds no view out: nothing says how good views are that are not "
+            "trained on. --split every holds out every n-th."
+        )
+    return dataclasses.replace(scene, notes=(*scene.notes, *notes))
+
+
+def _without_views(scene: Scene, rows: Sequence[int]) -> Scene:
+    """Return a scene without some of its views and their observations."""
+    kept = np.setdiff1d(np.arange(len(scene.views)), np.asarray(rows, int))
+    tracks = scene.tracks
+    if tracks is not None:
+        place = np.full(len(scene.views), -1)
+        place[kept] = np.arange(len(kept))
+        seen = place[tracks.view_indices] >= 0
+        tracks = Tracks(
+            place[tracks.view_indices[seen]].astype(tracks.view_indices.dtype),
+            tracks.point_indices[seen],
+            tracks.xy[seen],
+        )
+    return dataclasses.replace(scene, views=tuple(scene.views[i] for i in kept), tracks=tracks)
+
+
+def _lines(path: Path) -> tuple[str, ...]:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        fix = "write one name a line, or a .json with lists"
+        raise broken(path, "is not a text file", fix) from None
+    names = (line.strip() for line in text.splitlines())
+    found = tuple(name for name in names if name and not name.startswith("#"))
+    if not found:
+        raise broken(path, "names no photograph", "write one name a line")
+    return found
+
+
+def _normal(name: str) -> str:
+    return PurePosixPath(name.replace("\\", "/")).as_posix()
+
+
+def _rows_by_name(views: Sequence[View]) -> dict[str, set[int]]:
+    """Return the views that each end of a path may mean, with and without its suffix."""
+    rows: dict[str, set[int]] = defaultdict(set)
+    for row, view in enumerate(views):
+        parts = view.image_path.as_posix().lstrip("/").split("/")
+        for start in range(len(parts)):
+            tail = "/".join(parts[start:])
+            rows[tail].add(row)
+            rows[tail.removesuffix(view.image_path.suffix)].add(row)
+    return rows
+
+
+def _row(
+    name: str,
+    views: Sequence[View],
+    rows_of: dict[str, set[int]],
+    lists: SplitLists,
+    unused: list[str],
+) -> int | None:
+    """Return the view of a name; one that has none is added to `unused`."""
+    normal = _normal(name)
+    rows = rows_of.get(normal.lstrip("/"), set())
+    whole = {row: views[row].name for row in rows}
+    exact = {row for row, n in whole.items() if normal in (n, n.removesuffix(Path(n).suffix))}
+    rows = exact if len(exact) == 1 else rows
+    if len(rows) > 1:
+        names = " and ".join(views[row].name for row in sorted(rows)[:2])
+        fix = "write more of the path into the list"
+        raise broken(f"{lists.where}:", f"{name} may be {names}", fix)
+    if not rows:
+        unused.append(name)
+        return None
+    return next(iter(rows))
+
+
+def _lies_there(name: str, views: Sequence[View]) -> bool:
+    """Return whether a photograph is there of which the scene has no pose."""
+    path = image_folder_of(views[0]) / _normal(name)
+    return path.is_file() or (path.parent.is_dir() and any(path.parent.glob(f"{path.name}.*")))

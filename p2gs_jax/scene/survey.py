@@ -1,39 +1,55 @@
-"""What there is to fit, without fitting: counted, of every format; nothing long is computed."""
+"""What there is to fit, without fitting: counted, for every format, and drawn from above.
+
+Nothing long is computed. In the picture the drive goes to the right.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from p2gs_jax.config import DataConfig
+from p2gs_jax.core.atomic import atomic_write
+from p2gs_jax.core.numerics import evenly_spaced
+from p2gs_jax.core.streams import Stream, generator
+from p2gs_jax.core.text import names_as_they_are, printable
 from p2gs_jax.scene import PhotographsAlone, Video, find_scene, with_what_lies_beside
+from p2gs_jax.scene.cache import Report
+from p2gs_jax.scene.convert.headers import read_exif_ev
 from p2gs_jax.scene.drives.assemble import SWEEP_SLACK_S, assemble
-from p2gs_jax.scene.drives.choose import chosen_frames
-from p2gs_jax.scene.drives.recording import Recording
-from p2gs_jax.scene.exif import read_exif_ev
+from p2gs_jax.scene.drives.recording import Recording, chosen_frames
 from p2gs_jax.scene.files import image_size
-from p2gs_jax.scene.video.frames import expected_frames, video_size
-from p2gs_jax.types import Scene, View
+from p2gs_jax.scene.rigid import camera_centers, interpolated, level_ahead, time_order, up_of_drive
+from p2gs_jax.scene.video import expected_frames, video_size
+from p2gs_jax.types import Scene, TrackedObject, View
+
+# Colours by Okabe and Ito, which most people with colour blindness tell apart.
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#7F3C8D", "#6B6B3A")
+POINT, MOVING_POINT, STANDING, MOVING = "#b4b8bd", "#e8824a", "#5d646b", "#c0392b"
+MOST_POINTS, MOST_DIRECTIONS = 80_000, 9
+# What is drawn: this share of the points, no farther from the way than so many scene units or
+# lengths of the way.
+SHARE, AROUND, AROUND_WAYS = 0.9, 60.0, 0.6
+_CORNERS = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1], [1, 1]]) / 2
 
 
 @dataclass(frozen=True)
 class SurveyedCamera:
-    """One physical camera, or of photographs alone one size.
+    """One physical camera, or photographs of one size where nothing else is known.
 
     Attributes:
-        name: of the camera; empty where nothing is known of it.
-        photographs: how many.
+        name: empty where nothing is known.
         size: width and height, pixels.
-        focal: length in pixels, or None.
-        across: angle of view from side to side, degrees, or None.
-        lens: what distorts, in words; empty: nothing.
-        own_car: share of the picture that shows the car itself, or None.
-        ev: least and largest log2(time ISO / N^2) of EXIF, stops, or None.
+        focal: length in pixels.
+        across: angle of view from side to side, degrees.
+        lens: the model that distorts; empty: none does.
+        own_car: share of the picture that shows the car itself.
+        ev: least and largest log2(time ISO / N^2) of EXIF, stops.
     """
 
     name: str
@@ -57,11 +73,11 @@ class Survey:
         scene: views, points, boxes; None: photographs alone.
         frames: moments in a drive, or None where views have none.
         seconds: from the first photograph to the last, or None.
-        way: of the camera with the most photographs, scene units, or None where views have no
-            frames.
+        way: length of the way of the camera with the most photographs, scene units; None where
+            views have no frames.
         missing: photographs that the cameras lack in these frames.
-        sweeps: of laser scanners, or None.
-        lacks: what a drive may have and this scene has not, in words.
+        sweeps: sweeps of laser scanners, or None.
+        lacks: what a drive may have and this scene lacks, in words.
     """
 
     root: Path
@@ -82,20 +98,16 @@ class Survey:
 
     @property
     def unit(self) -> str:
-        """Of lengths: data sets of drives are metric."""
-        known = self.scene is not None and self.format not in ("colmap", "transforms")
-        return "m" if known else "scene units"
+        """The unit of lengths: data sets of drives are metric."""
+        return "m" if self.scene is not None and _metric(self.format) else "scene units"
 
 
-def survey(
-    root: Path, cfg: DataConfig, report: Callable[[str], None] = lambda message: None
-) -> Survey:
-    """Return what a folder holds; missing photographs are counted.
+def _metric(name: str) -> bool:
+    return name not in ("colmap", "transforms")
 
-    Args:
-        root: of the scene.
-        cfg: as of a fit.
-        report: receives progress.
+
+def survey(root: Path, cfg: DataConfig, report: Report = lambda message: None) -> Survey:
+    """Return what a folder holds, with the options of a fit; missing photographs are counted.
 
     Raises:
         UserError: there is no scene, or it is broken.
@@ -105,8 +117,8 @@ def survey(
     if isinstance(found, PhotographsAlone):
         return Survey(Path(root), "images", _sizes(found), lacks=("cameras", "points"))
     if isinstance(found, Video):
-        of_video = SurveyedCamera("", expected_frames(found.path) or 0, video_size(found.path))
-        return Survey(Path(root), "video", (of_video,), lacks=("cameras", "points"))
+        camera = SurveyedCamera("", expected_frames(found.path) or 0, video_size(found.path))
+        return Survey(Path(root), "video", (camera,), lacks=("cameras", "points"))
     sweeps, frames = None, None
     if isinstance(found, Recording):
         scene = assemble(found, cfg, None, report, write_embedded=False)
@@ -117,59 +129,47 @@ def survey(
         sweeps = sum(first <= sweep.time <= last for sweep in found.sweeps)
     else:
         scene = found
-    scene = with_what_lies_beside(scene, cfg)
-    return _of_scene(scene, frames, sweeps)
+    return _survey_of(with_what_lies_beside(scene, cfg), frames, sweeps)
 
 
-def _of_scene(scene: Scene, frames: int | None, sweeps: int | None) -> Survey:
-    views = scene.views
-    by_camera = {name: [v for v in views if v.camera == name] for name in cameras_of(scene)}
+def _survey_of(scene: Scene, frames: int | None, sweeps: int | None) -> Survey:
+    views, by_camera = scene.views, _by_camera(scene.views)
     times = [view.time for view in views if view.time is not None]
-    most = max(by_camera.values(), key=len)
-    lacks = []
-    if not len(scene.points):
-        lacks.append("points (they are triangulated when a fit starts)")
-    if frames and not sweeps:
-        lacks.append("LiDAR sweeps")
-    if frames and not scene.objects:
-        lacks.append("boxes")
-    if all(view.exif_ev is None for view in views):
-        lacks.append("exposures in EXIF")
+    lacking = {
+        "points (they are triangulated when a fit starts)": not len(scene.points),
+        "LiDAR sweeps": frames and not sweeps,
+        "boxes": frames and not scene.objects,
+        "exposures in EXIF": all(view.exif_ev is None for view in views),
+    }
+    longest = camera_centers(_viewmats(max(by_camera.values(), key=len)))
+    way = float(np.linalg.norm(np.diff(longest, axis=0), axis=1).sum())
     return Survey(
         scene.root,
         scene.format,
-        tuple(_camera(name, taken) for name, taken in by_camera.items()),
+        tuple(_camera(name, views) for name, views in by_camera.items()),
         scene,
         frames,
         max(times) - min(times) if times else None,
-        way_of(most) if frames else None,
+        way if frames else None,
         frames * len(by_camera) - len(views) if frames else 0,
         sweeps,
-        tuple(lacks),
+        tuple(what for what, absent in lacking.items() if absent),
     )
 
 
-def cameras_of(scene: Scene) -> list[str]:
-    """Return the names of a scene's cameras, sorted."""
-    return sorted({view.camera for view in scene.views})
+def _by_camera(views: Sequence[View]) -> dict[str, list[View]]:
+    """Return the views of each camera in the order of time, cameras sorted by name."""
+    names = sorted({view.camera for view in views})
+    return {name: sorted((v for v in views if v.camera == name), key=time_order) for name in names}
 
 
-def centers_of(views: Sequence[View]) -> np.ndarray:
-    """Return positions of cameras [v 3], in the order of frames where they have any."""
-    ordered = sorted(views, key=lambda v: (v.frame if v.frame is not None else -1, v.name))
-    viewmats = np.stack([view.viewmat for view in ordered]).astype(np.float64)
-    return -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
-
-
-def way_of(views: Sequence[View]) -> float:
-    """Return the length of a camera's way, scene units."""
-    return float(np.linalg.norm(np.diff(centers_of(views), axis=0), axis=1).sum())
+def _viewmats(views: Sequence[View]) -> np.ndarray:
+    return np.stack([view.viewmat for view in views]).astype(np.float64)
 
 
 def _camera(name: str, views: Sequence[View]) -> SurveyedCamera:
     view = views[0]
     focal = float(view.K[0, 0])
-    car = view.own_car
     return SurveyedCamera(
         name,
         len(views),
@@ -177,7 +177,7 @@ def _camera(name: str, views: Sequence[View]) -> SurveyedCamera:
         focal,
         float(np.rad2deg(2 * np.arctan(view.width / 2 / focal))),
         "" if view.distortion is None else view.distortion.model,
-        None if car is None else float(car.mean()),
+        None if view.own_car is None else float(view.own_car.mean()),
         _range([v.exif_ev for v in views]),
     )
 
@@ -203,3 +203,142 @@ def labels_of(scene: Scene) -> list[tuple[str, int, int]]:
     counts = Counter(thing.label for thing in scene.objects)
     moving = Counter(thing.label for thing in scene.objects if thing.moving)
     return [(label, count, moving[label]) for label, count in counts.most_common()]
+
+
+class _Plane:
+    """The ground, with the drive from left to right."""
+
+    def __init__(self, views: Sequence[View]):
+        up = up_of_drive(_viewmats(views), [view.camera for view in views])
+        longest = camera_centers(_viewmats(max(_by_camera(views).values(), key=len)))
+        way = longest[-1] - longest[0]
+        way -= up * (up @ way)
+        if np.linalg.norm(way) < 1e-6:
+            way = level_ahead(views, up)
+        along = way / max(np.linalg.norm(way), 1e-12)
+        self.axes = np.stack([along, np.cross(up, along)])
+        self.start = longest[0]
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        """Return positions [... 2] of points [... 3]."""
+        return (np.asarray(points, np.float64) - self.start) @ self.axes.T
+
+
+@names_as_they_are()
+def draw_plan(path: Path, survey: Survey) -> None:
+    """Write a PNG of a scene from above: cameras with their directions, points, boxes.
+
+    Raises:
+        ValueError: the survey has no cameras.
+    """
+    # Imported here: it takes as long to load as a small scene to read.
+    from matplotlib.figure import Figure
+
+    scene = survey.scene
+    if scene is None:
+        raise ValueError("photographs alone have no plan")
+    plane, by_camera = _Plane(scene.views), _by_camera(scene.views)
+    points = scene.points if scene.lidar is None else scene.lidar.points
+    low, high = _limits(plane(camera_centers(_viewmats(scene.views))), plane(points), scene.format)
+    across, down = high - low
+    tall = float(np.clip(13.0 * down / max(across, 1e-9), 4.0, 11.0))
+    figure = Figure(figsize=(13.0, tall + 0.9), layout="constrained", dpi=110)
+    axes = figure.subplots()
+    _draw_points(axes, plane(points), scene, low, high)
+    times = [view.time for view in scene.views if view.time is not None]
+    for thing in scene.objects if times else ():
+        _draw_box(axes, plane, thing, min(times), max(times))
+    for k, (name, views) in enumerate(by_camera.items()):
+        reach = 0.055 * float(max(across, down))
+        _draw_camera(axes, plane, name, views, COLORS[k % len(COLORS)], reach)
+    if survey.frames is not None:
+        axes.plot(0, 0, "o", mec="black", mew=1.3, mfc="none", ms=9, zorder=6, label="start")
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xticks=[], yticks=[])
+    _draw_scale(axes, low, high, survey.unit)
+    title = f"{printable(survey.root.resolve().name)} from above"
+    if survey.way:
+        title += f": {survey.way:.1f} {survey.unit} to the right"
+        title += "" if survey.seconds is None else f" in {survey.seconds:.1f} s"
+    axes.set_title(title, loc="left", fontsize=11)
+    handles, labels = axes.get_legend_handles_labels()
+    columns = {"ncols": min(6, len(labels)), "fontsize": 8, "frameon": False, "markerscale": 1.6}
+    figure.legend(handles, labels, loc="outside lower left", **columns)
+    with atomic_write(path) as temporary:
+        figure.savefig(temporary, format="png")
+
+
+def _limits(places: np.ndarray, points: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners of what is drawn: the cameras, and most of the points around them."""
+    low, high = places.min(0), places.max(0)
+    way = float(np.linalg.norm(high - low))
+    reach = 0.3 * way
+    if len(points):
+        beside = np.abs(np.clip(points, low, high) - points).max(1)
+        reach = float(np.quantile(beside, SHARE))
+    most = max(AROUND, AROUND_WAYS * way) if _metric(name) else 5 * max(way, 1e-6)
+    margin = max(min(reach, most), 0.1 * way, 1e-6)
+    return low - margin, high + margin
+
+
+def _draw_points(axes, points: np.ndarray, scene: Scene, low, high) -> None:
+    moving = np.zeros(len(points), bool) if scene.lidar is None else scene.lidar.objects >= 0
+    inside = np.flatnonzero(((points >= low) & (points <= high)).all(1))
+    if len(inside) > MOST_POINTS:
+        inside = generator(0, Stream.PLAN_POINTS).choice(inside, MOST_POINTS, replace=False)
+    what = "points" if scene.lidar is None else "LiDAR"
+    for rows, color, label in (
+        (inside[~moving[inside]], POINT, what),
+        (inside[moving[inside]], MOVING_POINT, f"{what} on moving boxes"),
+    ):
+        if len(rows):
+            axes.plot(*points[rows].T, ",", color=color, zorder=1, rasterized=True)
+            axes.plot([], [], "s", color=color, ms=4, label=label)
+
+
+def _draw_box(axes, plane: _Plane, thing: TrackedObject, first: float, last: float) -> None:
+    """Draw where a box was first and last while photographs were taken, and its track."""
+    within = thing.times[(thing.times >= first) & (thing.times <= last)]
+    if not len(within):
+        return
+    color = MOVING if thing.moving else STANDING
+    label = "moving boxes and their tracks" if thing.moving else "standing boxes"
+    corners = np.concatenate([_CORNERS * thing.size[:2], np.zeros((5, 1))], 1)
+    track = interpolated(thing.times, thing.poses, within)[0]
+    for pose in track[[0, -1]] if thing.moving else track[:1]:
+        known = label in axes.get_legend_handles_labels()[1]
+        outline = plane(corners @ pose[:3, :3].T + pose[:3, 3])
+        named = None if known else label
+        axes.plot(*outline.T, color=color, lw=0.9, zorder=3, label=named)
+    if thing.moving:
+        axes.plot(*plane(track[:, :3, 3]).T, color=color, lw=0.7, ls=(0, (3, 2)), zorder=3)
+
+
+def _draw_camera(
+    axes, plane: _Plane, name: str, views: Sequence[View], color: str, reach: float
+) -> None:
+    """Draw the way of a camera, and what it sees from some places of it."""
+    places = plane(camera_centers(_viewmats(views)))
+    label = f"{printable(name)} ({len(views)})"
+    axes.plot(*places.T, ".-", color=color, ms=3, lw=0.8, zorder=5, label=label)
+    for k in evenly_spaced(len(views), MOST_DIRECTIONS):
+        view = views[k]
+        sides = (np.array([0.0, view.width]) - view.K[0, 2]) / view.K[0, 0]
+        rays = np.stack([sides, np.zeros(2), np.ones(2)], -1) @ view.viewmat[:3, :3]
+        rays = rays.astype(np.float64) @ plane.axes.T
+        rays *= reach / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-9)
+        corners = np.stack([places[k], places[k] + rays[0], places[k] + rays[1]])
+        axes.fill(*corners.T, color=color, alpha=0.16, lw=0, zorder=2)
+        axes.plot(*corners[[1, 0, 2]].T, color=color, lw=0.6, zorder=4)
+
+
+def _draw_scale(axes, low, high, unit: str) -> None:
+    """Draw a bar of a round length in the lower right corner."""
+    across, down = high - low
+    target = 0.2 * across
+    power = 10.0 ** np.floor(np.log10(target))
+    length = max(step * power for step in (1, 2, 5) if step * power <= target)
+    right, base = high[0] - 0.02 * across, low[1] + 0.03 * down
+    ends = [right - length, right]
+    axes.plot(ends, [base, base], color="black", lw=3, solid_capstyle="butt", zorder=7)
+    where = {"ha": "center", "va": "bottom", "fontsize": 9, "zorder": 7}
+    axes.text(right - length / 2, base + 0.012 * down, f"{length:g} {unit}", **where)

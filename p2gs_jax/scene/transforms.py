@@ -1,46 +1,62 @@
-"""nerfstudio's and instant-ngp's `transforms.json`, and Blender's, one for each part of the split.
+"""Poses in one file beside the photographs: `transforms.json`, and LLFF's `poses_bounds.npy`.
 
-Poses are camera-to-world with OpenGL axes (x right, y up, z backwards); intrinsics follow COLMAP
-(pixel centres at +0.5), from which both tools take them. Of nerfstudio's other fields
+nerfstudio and instant-ngp write one `transforms.json`, Blender's scenes one for each part of the
+split. Poses are camera-to-world with OpenGL axes (x right, y up, z backwards); intrinsics follow
+COLMAP (pixel centres at +0.5), from which both tools take them. Of nerfstudio's other fields
 `ply_file_path` names seed points in the axes of the poses, `train_filenames`, `test_filenames` and
 `val_filenames` the split; `aabb_scale` means nothing to splats.
+
+LLFF's table has a row for each photograph, in the order of their names: a 3x5 matrix, row by row,
+and the nearest and the farthest depth. The matrix is the camera-to-world pose with the axes (down,
+right, backwards), and beside it height, width and focal length in pixels
+(github.com/Fyusion/LLFF, "Using your own poses").
 """
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 
 from p2gs_jax.config import DataConfig
-from p2gs_jax.core.text import parse_json
-from p2gs_jax.errors import UserError
-from p2gs_jax.scene.colmap import HUGE, subfolder
+from p2gs_jax.core.atomic import BROKEN_ARRAYS
+from p2gs_jax.errors import UserError, broken
+from p2gs_jax.scene.colmap import subfolder
 from p2gs_jax.scene.files import (
+    ASPECT_TOLERANCE,
+    HUGE,
     IMAGE_SUFFIXES,
+    at_file_size,
     check_missing,
-    check_size,
+    image_folder,
     image_size,
+    list_images,
+    read_json,
     require_inside,
 )
-from p2gs_jax.scene.geometry import intrinsics, make_distortion, scale_intrinsics
-from p2gs_jax.scene.point_cloud import read_points
-from p2gs_jax.scene.split import split_as_listed
-from p2gs_jax.scene.split_lists import lists_in
+from p2gs_jax.scene.lens import intrinsics, make_distortion
+from p2gs_jax.scene.rigid import nearest_rotation
+from p2gs_jax.scene.seeds import read_points
+from p2gs_jax.scene.split import lists_in, split_as_listed
 from p2gs_jax.types import Distortion, Scene, Split, View
 
+LLFF_FILE = "poses_bounds.npy"
+_LLFF_COLUMNS = 17
+# Columns of LLFF's rotation that are OpenCV's x, y, z, and their signs: right, down, forward.
+_LLFF_AXES, _LLFF_SIGNS = [1, 0, 2], np.array([1.0, 1.0, -1.0])
+_LLFF_FIX = "write it again with LLFF's imgs2poses.py, or remove it"
 _PINHOLES = frozenset({"PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"})
 _FISHEYE = "OPENCV_FISHEYE"
 _FIX = "correct the file, or write it again with the tool that made it"
+_UNDISTORT = "undistort the images to pinhole ones (colmap image_undistorter) and use those"
 _LISTS = {"train": "train_filenames", "test": "test_filenames", "val": "val_filenames"}
-_ASPECT = 0.01
 
 
 @dataclass(frozen=True)
@@ -49,9 +65,9 @@ class _Frame:
 
     Attributes:
         path: relative to the json's folder.
-        values: of the frame, over those of its file.
+        values: fields of the frame, over those of its file.
         source: the file.
-        split: of all frames of the file.
+        split: part of the split that all frames of the file belong to.
     """
 
     path: Path
@@ -75,17 +91,18 @@ def load_transforms(root: Path, json_path: Path, cfg: DataConfig) -> Scene:
 
     Raises:
         UserError: the file is malformed (the line or the frame is named), its lens model is not
-            supported, images are missing or of another size, or it lists views that it has not.
+            supported, images are missing or of another size, or it lists views that it lacks.
     """
     data = _parse(json_path)
     scene = _assembled(root, "transforms", _frames(json_path, data), cfg)
-    points = data.get("ply_file_path")
-    if points:
-        if not isinstance(points, str):
-            raise UserError(f'{json_path}: "ply_file_path" is no name of a file', fix=_FIX)
-        scene = replace(scene, **read_points(_beside(json_path, points))._asdict())
-        if not len(scene.points):
-            note = f"{points} holds no points: seeds are found as if it were not named."
+    name = data.get("ply_file_path")
+    if name:
+        if not isinstance(name, str):
+            raise broken(f"{json_path}:", '"ply_file_path" is not the name of a file', _FIX)
+        points, colors = read_points(_beside(json_path, name))
+        scene = replace(scene, points=points, point_colors=colors)
+        if not len(points):
+            note = f"{name} holds no points: seeds are found as if it were not named."
             scene = replace(scene, notes=(*scene.notes, note))
     lists = lists_in(json_path, data, _LISTS)
     if lists is None or cfg.split is not None or not cfg.test_every:
@@ -97,11 +114,7 @@ def load_blender(root: Path, cfg: DataConfig) -> Scene:
     """Read the views of NeRF's synthetic scenes, and of all that are laid out as they are.
 
     `transforms_train.json` is trained on and `transforms_test.json` held out;
-    `transforms_val.json` takes its place where there is none. All views are of one camera.
-
-    Args:
-        root: the folder with these files.
-        cfg: the image folder, and whether images may be missing.
+    `transforms_val.json` takes its place where there is none. One camera took all views.
 
     Raises:
         UserError: as of `load_transforms`; or a photograph is listed in both.
@@ -116,54 +129,133 @@ def load_blender(root: Path, cfg: DataConfig) -> Scene:
     return scene if test is None else replace(scene, split_by=test.name)
 
 
+def load_llff(root: Path, cfg: DataConfig) -> Scene:
+    """Read LLFF's poses, intrinsics and bounds; the scene has no points and no tracks yet.
+
+    Args:
+        root: the folder with poses_bounds.npy.
+        cfg: the image folder, such as `images_4`.
+
+    Raises:
+        UserError: the file is broken, has not a row for each photograph, or photographs have
+            another shape than it says.
+    """
+    path = root / LLFF_FILE
+    rows = _read_llff(path)
+    folder = root / (cfg.images or "images")
+    photographs = list_images(folder, recursive=False)
+    if len(photographs) != len(rows):
+        raise broken(
+            path,
+            f"has {len(rows)} rows, and {folder} holds {len(photographs)} photographs",
+            "put all photographs of the poses there and no others, or name their folder with "
+            "--images",
+        )
+    views, resized = [], 0
+    for k, (image, row) in enumerate(zip(photographs, rows, strict=True)):
+        matrix, what = row[:15].reshape(3, 5), f"row {k}"
+        height, width, focal = matrix[:, 4]
+        if not (min(height, width) >= 1 and focal > 0):
+            why = f"{what} has an impossible height, width or focal length"
+            raise broken(f"{path}:", why, _LLFF_FIX)
+        stated = (round(width), round(height))
+        K, w, h = at_file_size(image, intrinsics(focal, focal, width / 2, height / 2), stated, path)
+        resized += (w, h) != stated
+        rotation = matrix[:, _LLFF_AXES] * _LLFF_SIGNS
+        viewmat = _viewmat(rotation, matrix[:, 3], path, what, _LLFF_FIX)
+        views.append(View(image.name, image, "0", viewmat, K, w, h))
+    bounds = (float(rows[:, 15].min()), float(rows[:, 16].max()))
+    return _scene(root, "llff", views, _rescaled(resized, LLFF_FILE), bounds)
+
+
+def _scene(
+    root: Path,
+    name: str,
+    views: Sequence[View],
+    notes: Sequence[str],
+    depths: tuple[float, float] | None = None,
+) -> Scene:
+    points, colors = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+    return Scene(root, name, tuple(views), points, colors, notes=tuple(notes), depths=depths)
+
+
+def _rescaled(count: int, source: str) -> list[str]:
+    note = f"{count} images have another size than {source} says: intrinsics were rescaled"
+    return [note] if count else []
+
+
+def _viewmat(
+    rotation: Float[np.ndarray, "3 3"],
+    position: Float[np.ndarray, " 3"],
+    path: Path,
+    what: str,
+    fix: str,
+) -> Float[np.ndarray, "4 4"]:
+    """Return the world-to-camera matrix of a camera-to-world pose, both with OpenCV axes."""
+    nearest = nearest_rotation(rotation)
+    if nearest is None:
+        raise broken(f"{path}:", f"{what} is not a rotation and a translation", fix)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = nearest.T
+    viewmat[:3, 3] = -viewmat[:3, :3] @ position
+    return viewmat.astype(np.float32)
+
+
+def _read_llff(path: Path) -> Float64[np.ndarray, "v 17"]:
+    """Return the table; nothing in the file is run."""
+    try:
+        table = np.load(path, allow_pickle=False)
+    except BROKEN_ARRAYS as error:
+        raise broken(path, f"cannot be read: {error}", _LLFF_FIX) from None
+    if not isinstance(table, np.ndarray) or table.dtype.kind not in "fiu":
+        raise broken(path, "holds no numbers", _LLFF_FIX)
+    if table.ndim != 2 or table.shape[1] != _LLFF_COLUMNS or not len(table):
+        shape = "x".join(map(str, table.shape))
+        raise broken(path, f"holds {shape} numbers, not N x {_LLFF_COLUMNS}", _LLFF_FIX)
+    table = table.astype(np.float64)
+    for k, row in enumerate(table):
+        if not np.isfinite(row[:15]).all():
+            raise broken(f"{path}:", f"the pose in row {k} is not finite", _LLFF_FIX)
+        near, far = row[15:]
+        if not (np.isfinite([near, far]).all() and 0 < near < far):
+            why = f"row {k} has impossible bounds: {near:g} to {far:g}"
+            raise broken(f"{path}:", why, _LLFF_FIX)
+    return table
+
+
 def _assembled(root: Path, name: str, frames: Sequence[_Frame], cfg: DataConfig) -> Scene:
-    """Return a scene of frames; those of Blender's scenes are all of one camera."""
+    """Return a scene of frames; one camera took all of Blender's scenes."""
     folder = frames[0].source.parent
     # Names are relative to the deepest folder that holds all images, as `images/` for COLMAP.
     common = Path(os.path.commonpath([frame.path.parent for frame in frames]))
-    image_folder = folder / common
-    if cfg.images is not None:
-        image_folder = folder / cfg.images
-        if not image_folder.is_dir():
-            raise UserError(
-                f"the image folder {image_folder} does not exist",
-                fix="correct the option --images",
-            )
+    asked = image_folder(folder, cfg)
+    place = folder / common if asked is None else asked
     for frame in frames:
-        relative = frame.path if cfg.images is None else frame.path.relative_to(common)
-        require_inside(relative, folder if cfg.images is None else image_folder, frame.source)
+        if asked is None:
+            require_inside(frame.path, folder, frame.source)
+        else:
+            require_inside(frame.path.relative_to(common), asked, frame.source)
     found: list[tuple[str, _Frame]] = []
     notes: list[str] = []
     for source in dict.fromkeys(frame.source for frame in frames):
-        own = [frame for frame in frames if frame.source == source]
+        listed = [frame for frame in frames if frame.source == source]
         missing = []
-        for frame in own:
-            where = _with_suffix(image_folder, frame.path.relative_to(common))
+        for frame in listed:
+            where = _with_suffix(place, frame.path.relative_to(common))
             if where is None:
                 missing.append(frame.path.as_posix())
             else:
                 found.append((where, frame))
-        notes += check_missing(missing, len(own), source, cfg)
+        notes += check_missing(missing, len(listed), source, cfg)
     _require_once(found)
     views, resized = [], 0
     for where, frame in sorted(found, key=lambda item: item[0]):
-        view, differs = _view(frame, image_folder, where)
+        view, differs = _view(frame, place, where)
         views.append(replace(view, camera="0") if name == "blender" else view)
         resized += differs
-    if resized:
-        said = " and ".join(dict.fromkeys(frame.source.name for frame in frames))
-        notes.append(
-            f"{resized} images have another size than {said} says: intrinsics were rescaled"
-        )
+    sources = " and ".join(dict.fromkeys(frame.source.name for frame in frames))
     _require_one_shape(views, dict(found))
-    return Scene(
-        root=root,
-        format=name,
-        views=tuple(views),
-        points=np.zeros((0, 3), np.float32),
-        point_colors=np.zeros((0, 3), np.uint8),
-        notes=tuple(notes),
-    )
+    return _scene(root, name, views, [*notes, *_rescaled(resized, sources)])
 
 
 def _require_once(found: Sequence[tuple[str, _Frame]]) -> None:
@@ -173,11 +265,11 @@ def _require_once(found: Sequence[tuple[str, _Frame]]) -> None:
         return
     sources = [frame.source for name, frame in found if name == twice[0]]
     if len(set(sources)) == 1:
-        raise UserError(f"{sources[0]} lists {twice[0]} more than once", fix=_FIX)
-    raise UserError(
-        f"{sources[0]} and {sources[1].name} both list {twice[0]}: it cannot be both trained "
-        "on and held out",
-        fix=f"take it out of one of them, or name {sources[0]} itself for every 8th view",
+        raise broken(sources[0], f"lists {twice[0]} more than once", _FIX)
+    raise broken(
+        f"{sources[0]} and {sources[1].name}",
+        f"both list {twice[0]}: it cannot be both trained on and held out",
+        f"take it out of one of them, or name {sources[0]} itself for every 8th view",
     )
 
 
@@ -187,7 +279,7 @@ def _require_one_shape(views: Sequence[View], frames: Mapping[str, _Frame]) -> N
     for view in free:
         first = free[0]
         shapes = (view.width / view.height) / (first.width / first.height)
-        if abs(shapes - 1) > _ASPECT:
+        if abs(shapes - 1) > ASPECT_TOLERANCE:
             raise UserError(
                 f"wrong size: {view.image_path} is {view.width}x{view.height}, {first.name} "
                 f"{first.width}x{first.height}, and {frames[view.name].source} gives all of them "
@@ -198,19 +290,11 @@ def _require_one_shape(views: Sequence[View], frames: Mapping[str, _Frame]) -> N
 
 
 def _parse(path: Path) -> dict:
-    try:
-        data = parse_json(path.read_text(encoding="utf-8"))
-    except json.JSONDecodeError as error:
-        raise UserError(
-            f"{path} is not valid JSON: {error.msg} in line {error.lineno}, column {error.colno}",
-            fix=_FIX,
-        ) from None
-    except UnicodeDecodeError:
-        raise UserError(f"{path} is not a text file", fix=_FIX) from None
+    data = read_json(path, _FIX)
     if not isinstance(data, dict) or not isinstance(data.get("frames"), list):
-        raise UserError(f'{path} has no list "frames"', fix=_FIX)
+        raise broken(path, 'has no list "frames"', _FIX)
     if not data["frames"]:
-        raise UserError(f"{path} lists no frames", fix=_FIX)
+        raise broken(path, "lists no frames", _FIX)
     return data
 
 
@@ -219,7 +303,7 @@ def _frames(path: Path, data: dict, split: Split = "train") -> list[_Frame]:
     for i, values in enumerate(data["frames"]):
         name = values.get("file_path") if isinstance(values, dict) else None
         if not isinstance(name, str) or not name:
-            raise UserError(f'{path}: frame {i} has no "file_path"', fix=_FIX)
+            raise broken(f"{path}:", f'frame {i} has no "file_path"', _FIX)
         frames.append(_Frame(_relative(path, name), {**data, **values}, path, split))
     return frames
 
@@ -251,56 +335,65 @@ def _with_suffix(folder: Path, relative: Path) -> str | None:
     return None
 
 
-def _view(frame: _Frame, image_folder: Path, name: str) -> tuple[View, bool]:
+def _view(frame: _Frame, folder: Path, name: str) -> tuple[View, bool]:
+    """Return the view of a frame, and whether its image has another size than its file says."""
     path, values = frame.source, frame.values
-    image_path = image_folder / name
+    image_path = folder / name
     try:
-        width, height = int(values["w"]), int(values["h"])
-        if width <= 0 or height <= 0:
+        size = int(values["w"]), int(values["h"])
+        if min(size) <= 0:
             raise ValueError
     except KeyError:
-        width, height = image_size(image_path)
+        size = image_size(image_path)
     except (TypeError, ValueError, OverflowError):
-        raise UserError(f"{path}: {name} has an impossible size w, h", fix=_FIX) from None
-    K, distortion = _lens(path, values, name, width, height)
-    w, h, sx, sy, differs = check_size(image_path, width, height, path)
+        raise broken(f"{path}:", f"{name} has an impossible size w, h", _FIX) from None
+    K, distortion = _lens(path, values, name, *size)
+    K, width, height = at_file_size(image_path, K, size, path)
     mask = values.get("mask_path")
-    mask_path = None
-    if isinstance(mask, str) and mask:
-        mask_path = _beside(path, mask)
+    mask_path = _beside(path, mask) if isinstance(mask, str) and mask else None
     if mask_path is not None and not mask_path.is_file():
-        raise UserError(f"{path}: the mask {mask_path} of {name} does not exist", fix=_FIX)
+        raise broken(f"{path}:", f"the mask {mask_path} of {name} does not exist", _FIX)
+    c2w = _finite_pose(path, values.get("transform_matrix"), name)
+    rotation, what = c2w[:, :3] * np.array([1.0, -1.0, -1.0]), f"the transform_matrix of {name}"
     view = View(
         name=name,
         image_path=image_path,
         camera=subfolder(name) or "0",
-        viewmat=_viewmat(path, values.get("transform_matrix"), name),
-        K=scale_intrinsics(K, sx, sy).astype(np.float32),
-        width=w,
-        height=h,
+        viewmat=_viewmat(rotation, c2w[:, 3], path, what, _FIX),
+        K=K,
+        width=width,
+        height=height,
         distortion=distortion,
         mask_path=mask_path,
         split=frame.split,
     )
-    return view, differs
+    return view, (width, height) != size
+
+
+def _finite_pose(path: Path, matrix: object, name: str) -> Float64[np.ndarray, "3 4"]:
+    try:
+        c2w = np.array(matrix, np.float64)[:3]
+    except (TypeError, ValueError, IndexError):
+        c2w = np.zeros(0)
+    if c2w.shape != (3, 4) or not (np.abs(c2w) < HUGE).all():
+        why = f"the transform_matrix of {name} is not a finite 4x4 matrix"
+        raise broken(f"{path}:", why, _FIX)
+    return c2w
 
 
 def _lens(
-    path: Path, values: Mapping, name: str, width: int, height: int
+    path: Path, values: Mapping[str, Any], name: str, width: int, height: int
 ) -> tuple[Float[np.ndarray, "3 3"], Distortion | None]:
     model = str(values.get("camera_model", "OPENCV")).upper()
     fisheye = model == _FISHEYE or bool(values.get("is_fisheye"))
     if model not in (*_PINHOLES, _FISHEYE):
-        raise UserError(
-            f"{path} uses the camera model {model}; "
-            f"supported are {', '.join(sorted((*_PINHOLES, _FISHEYE)))}",
-            fix="undistort the images to pinhole ones (colmap image_undistorter) and use those",
-        )
+        known = ", ".join(sorted((*_PINHOLES, _FISHEYE)))
+        raise broken(path, f"uses the camera model {model}; supported are {known}", _UNDISTORT)
 
     def number(key: str, default: float) -> float:
         value = values.get(key, default)
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < HUGE:
-            raise UserError(f"{path}: {key} of {name} is {value!r}, not a number", fix=_FIX)
+            raise broken(f"{path}:", f"{key} of {name} is {value!r}, not a number", _FIX)
         return float(value)
 
     def focal(key: str, angle_key: str, size: int) -> float | None:
@@ -312,44 +405,15 @@ def _lens(
 
     fx = focal("fl_x", "camera_angle_x", width)
     fy = focal("fl_y", "camera_angle_y", height)
-    if fx is None:
-        fx = fy
-    if fy is None:
-        fy = fx
+    fx, fy = fy if fx is None else fx, fx if fy is None else fy
     if fx is None or fy is None or not (fx > 0 and fy > 0):
-        raise UserError(
-            f"{path}: no focal length for {name}: it needs a positive fl_x"
-            + ("" if fisheye else " or camera_angle_x"),
-            fix=_FIX,
-        )
-    cx, cy = number("cx", width / 2), number("cy", height / 2)
+        why = f"no focal length for {name}: it needs a positive fl_x"
+        raise broken(f"{path}:", why + ("" if fisheye else " or camera_angle_x"), _FIX)
+    K = intrinsics(fx, fy, number("cx", width / 2), number("cy", height / 2))
     if fisheye:
-        lens = tuple(number(key, 0.0) for key in ("k1", "k2", "k3", "k4"))
-        return intrinsics(fx, fy, cx, cy), make_distortion(lens, "fisheye")
+        return K, make_distortion(tuple(number(f"k{i}", 0.0) for i in (1, 2, 3, 4)), "fisheye")
     lens = tuple(number(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3"))
     if number("k4", 0.0) != 0.0:
-        raise UserError(
-            f"{path}: {name} has a k4, which no supported lens model knows",
-            fix="undistort the images to pinhole ones (colmap image_undistorter) and use those",
-        )
-    return intrinsics(fx, fy, cx, cy), make_distortion(lens if lens[4] else lens[:4])
-
-
-def _viewmat(path: Path, matrix: object, name: str) -> Float[np.ndarray, "4 4"]:
-    """Invert a camera-to-world matrix with OpenGL axes into OpenCV world-to-camera."""
-    try:
-        c2w = np.array(matrix, np.float64)[:3]
-    except (TypeError, ValueError, IndexError):
-        c2w = np.zeros(0)
-    if c2w.shape != (3, 4) or not (np.abs(c2w) < HUGE).all():
-        raise UserError(f"{path}: the transform_matrix of {name} is no finite 4x4 matrix", fix=_FIX)
-    rotation = c2w[:, :3] * np.array([1.0, -1.0, -1.0])
-    u, s, vt = np.linalg.svd(rotation)
-    if np.abs(s - 1.0).max() > 0.01 or np.linalg.det(rotation) < 0:
-        raise UserError(
-            f"{path}: the transform_matrix of {name} is no rotation and translation", fix=_FIX
-        )
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = (u @ vt).T
-    viewmat[:3, 3] = -viewmat[:3, :3] @ c2w[:, 3]
-    return viewmat.astype(np.float32)
+        why = f"{name} has a k4, which no supported lens model knows"
+        raise broken(f"{path}:", why, _UNDISTORT)
+    return K, make_distortion(lens if lens[4] else lens[:4])

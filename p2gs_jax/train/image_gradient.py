@@ -13,9 +13,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.photometry.appearance import Correction, Corrections, correction_of
-from p2gs_jax.photometry.formation import formation
-from p2gs_jax.photometry.luminance.parameters import Curves
-from p2gs_jax.photometry.matte import Matte, composited, uncovered
+from p2gs_jax.photometry.formation import Matte, composited, formation, uncovered
+from p2gs_jax.photometry.luminance import Curves
 from p2gs_jax.render import render_splats
 from p2gs_jax.render.harmonics import coefficient_count
 from p2gs_jax.render.project import camera_of_each

@@ -15,7 +15,7 @@ from jaxtyping import Float32, Int
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import on_host
 from p2gs_jax.core.streams import Stream, device_seed, generator, view_order
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.train import schedule
 from p2gs_jax.train.exposure_loss import SECOND_RENDER_FORMS, ColorPairs, Partner
 from p2gs_jax.train.update import Controls

@@ -13,8 +13,8 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import on_host
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.errors import UserError
-from p2gs_jax.evaluate.array_store import ArrayStore, StoredArray, most_bytes
-from p2gs_jax.scene.drives.object_masks import object_mask
+from p2gs_jax.evaluation.passes import ArrayStore, StoredArray, most_bytes
+from p2gs_jax.scene.drives.objects import object_mask
 from p2gs_jax.scene.visibility import project_points, unoccluded
 from p2gs_jax.types import Measured, Scene
 

@@ -32,13 +32,7 @@ from p2gs_jax.gaussians.population import (
 )
 from p2gs_jax.train.optimizer import AdamState, zero_moments, zero_opacity_moments
 from p2gs_jax.train.schedule import Levels, shrinks_left
-from p2gs_jax.train.state import (
-    FitState,
-    HostState,
-    alive_in,
-    grow_state,
-    replace_gaussians,
-)
+from p2gs_jax.train.state import FitState, HostState, alive_in, grow_state, replace_gaussians
 from p2gs_jax.types import Gaussians, Population
 
 SLOTS = 1024

@@ -22,10 +22,9 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from p2gs_jax.config import FitConfig, LossConfig, PhotometryConfig, RegularizerConfig
-from p2gs_jax.evaluate.ssim import one_less_ssim
+from p2gs_jax.evaluation.ssim import one_less_ssim
 from p2gs_jax.photometry.appearance import Correction, Corrections, regularisation
-from p2gs_jax.photometry.luminance.parameters import ENTRIES, Curves, enhanced, pseudo_curve
-from p2gs_jax.photometry.luminance.statistics import cumulative
+from p2gs_jax.photometry.luminance import ENTRIES, Curves, cumulative, enhanced, pseudo_curve
 from p2gs_jax.train.exposure_loss import ColorPairs, relative_exposure_loss
 from p2gs_jax.train.lidar_depths import lidar_loss
 from p2gs_jax.types import GAMMA_SRGB, Capture, Measured, Photometry

@@ -8,8 +8,7 @@ from tiny_scene import make_scene
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.scene import survey as surveys
-from p2gs_jax.scene.plan_picture import draw_plan
-from p2gs_jax.scene.survey import labels_of, survey
+from p2gs_jax.scene.survey import draw_plan, labels_of, survey
 
 
 @pytest.fixture

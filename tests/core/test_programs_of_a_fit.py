@@ -9,7 +9,7 @@ from tiny_scene import make_scene
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.clock import CompileCounter
 from p2gs_jax.core.progress import Silent
-from p2gs_jax.photometry.gauge import recentre
+from p2gs_jax.photometry.parameters import recentre
 from p2gs_jax.pipeline.calibrate import calibrate
 from p2gs_jax.pipeline.finish import Account, finish
 from p2gs_jax.pipeline.prepare import load, prepare
@@ -43,12 +43,12 @@ def test_a_fit_without_its_steps_compiles_few_programs(scene, tmp_path):
     assert counter.programs == 0
     metrics = finish(
         params,
-        prepared,
+        prepared.scene,
+        prepared.store,
+        prepared.cfg,
         RunFolder(tmp_path),
-        Account(counts={}, seconds={"reading": 1.0}, compiler=counter),
+        Account({}, {"reading": 1.0}, counter, prepared.selection, prepared.notes),
         Silent(),
-        truth=None,
-        lpips_weights=None,
     )
     # Counting tiles, rendering, developing (images; colours of splats), fitting an exposure, PSNR,
     # SSIM, and the basis of spherical harmonics.

@@ -14,8 +14,7 @@ from p2gs_jax.districts.cut import OVERLAP, Block, Cut
 from p2gs_jax.districts.level import INWARDS, level_seams, shifts
 from p2gs_jax.districts.merge import merge_cores
 from p2gs_jax.render.harmonics import C0
-from p2gs_jax.scene.device import camera_of
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 
 REACH = INWARDS / OVERLAP  # of a margin of one
 

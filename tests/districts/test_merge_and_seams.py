@@ -12,7 +12,7 @@ from p2gs_jax.districts.merge import merge_cores
 from p2gs_jax.districts.seams import measure_seams, unprojected
 from p2gs_jax.errors import UserError
 from p2gs_jax.render.harmonics import C0
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 
 
 def test_every_gaussian_is_kept_by_the_block_whose_core_holds_it():

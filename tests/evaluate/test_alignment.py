@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import PhotometryConfig
-from p2gs_jax.evaluate.alignment import exposure_error, fit_capture, fit_exposure
-from p2gs_jax.evaluate.metrics import psnr
+from p2gs_jax.evaluation.alignment import exposure_error, fit_capture, fit_exposure
+from p2gs_jax.evaluation.scores import psnr
 from p2gs_jax.photometry.formation import display, formation
 from p2gs_jax.types import Capture
 

@@ -9,13 +9,13 @@ from made_drive import FAR, SPEED, WALL, make_recording
 
 from p2gs_jax.config import DataConfig, FitConfig
 from p2gs_jax.core.atomic import plain
-from p2gs_jax.evaluate import seams
-from p2gs_jax.evaluate.evaluate import evaluate
-from p2gs_jax.evaluate.lidar_depth import at_time, depth_errors, summary
-from p2gs_jax.evaluate.novel_views import Surface, picked, shifted, unseen_share
-from p2gs_jax.evaluate.region_scores import mean_of_parts, parts_of, region_scores
+from p2gs_jax.evaluation import seams
+from p2gs_jax.evaluation.drives import at_time, depth_errors, picked, shifted, summary, unseen_share
+from p2gs_jax.evaluation.evaluate import evaluate
+from p2gs_jax.evaluation.scores import mean_of_parts, parts_of, region_scores
+from p2gs_jax.evaluation.unexplained import Surface
 from p2gs_jax.scene.drives.assemble import assemble
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.rigid import headings, left_of_way, moment_of, up_of_drive
 from p2gs_jax.scene.split import assign_split
 from p2gs_jax.types import Gaussians, Lidar, Params, Photometry, Render, View
@@ -69,21 +69,12 @@ def metrics(scene):
         Photometry(jnp.zeros(train), jnp.zeros(train), "log"),
         None,
     )
-    found = {}
     cfg = FitConfig()
     store = ImageStore(scene.views, cfg.data)
-    out = evaluate(
-        params,
-        np.zeros(0, bool),
-        scene,
-        store,
-        render,
-        cfg,
-        on_unexplained=found.update,
-    )
+    out = evaluate(params, scene, store, render, cfg)
     store.close()
-    assert set(found) == set(scene.train_indices)
-    return plain(out)
+    assert set(out.unexplained) == set(scene.train_indices)
+    return plain(out.metrics)
 
 
 def test_old_keys_stay_and_parts_stand_beside_them(scene, metrics):

@@ -5,8 +5,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from p2gs_jax.evaluate import radiance
-from p2gs_jax.evaluate.radiance import RadianceScores, delta_e_itp, pu21_encode, pu21_psnr
+from p2gs_jax.evaluation import radiance
+from p2gs_jax.evaluation.radiance import (
+    RadianceScores,
+    delta_e_itp,
+    mu_law,
+    mu_law_psnr,
+    pu21_encode,
+    pu21_psnr,
+)
 
 EVERYWHERE = np.ones((24, 32), bool)
 
@@ -89,3 +96,37 @@ def test_nothing_to_judge():
     s = RadianceScores()
     s.add("a", "train", image(), image(), none)
     assert np.isnan(s.summary(1.0)["stops_rms"])
+
+
+TRUTH = np.random.default_rng(0).uniform(0.1, 4.0, (8, 10, 3))
+SOME = np.ones((8, 10), bool)
+
+
+def test_the_curve_keeps_its_ends_rises_and_lifts_what_is_dark():
+    assert mu_law(np.array([0.0, 1.0, 7.0, -1.0])) == pytest.approx([0, 1, 1, 0])
+    assert (np.diff(mu_law(np.linspace(0, 1, 100))) > 0).all()
+    assert mu_law(np.array(0.01)) == pytest.approx(np.log(51) / np.log(5001))
+
+
+def test_a_constant_step_after_the_curve_is_its_psnr():
+    brightest = TRUTH.max()
+    shown = mu_law(TRUTH / brightest)
+    low = shown - 0.1
+    linear = (np.exp(low * np.log1p(5000.0)) - 1) / 5000.0 * brightest
+    assert (low > 0).all()
+    assert mu_law_psnr(linear, TRUTH, SOME) == pytest.approx(20.0, abs=1e-6)
+
+
+def test_masked_pixels_neither_count_nor_say_what_is_brightest():
+    mask = SOME.copy()
+    mask[0, 0] = False
+    wrong, truth = TRUTH * 0.9, TRUTH.copy()
+    before = mu_law_psnr(wrong, truth, mask)
+    wrong[0, 0], truth[0, 0] = 1e6, 1e4
+    assert mu_law_psnr(wrong, truth, mask) == before
+    assert before < mu_law_psnr(TRUTH, TRUTH, SOME)
+
+
+def test_nothing_to_compare_has_no_mu_law_score():
+    assert np.isnan(mu_law_psnr(TRUTH, TRUTH, ~SOME))
+    assert np.isnan(mu_law_psnr(TRUTH, 0 * TRUTH, SOME))

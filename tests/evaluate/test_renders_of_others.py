@@ -9,9 +9,10 @@ import pytest
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
-from p2gs_jax.evaluate.against import Judge, check_renders, judge_renders
-from p2gs_jax.evaluate.renders_of_others import find_renders, orders
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.evaluation.against import check_renders, judge_renders
+from p2gs_jax.evaluation.evaluate import Judge
+from p2gs_jax.evaluation.renders_of_others import find_renders, orders
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import Params, Photometry, Scene, View
 
 SIZE = (40, 34)

@@ -7,8 +7,14 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import LossConfig, PhotometryConfig
-from p2gs_jax.evaluate.seam_picture import camera_between, redeveloped, seam_picture
-from p2gs_jax.evaluate.seams import Photographed, measure_seam, neighbouring_pairs
+from p2gs_jax.evaluation.seams import (
+    Photographed,
+    camera_between,
+    measure_seam,
+    neighbouring_pairs,
+    redeveloped,
+    seam_picture,
+)
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.types import Camera, Render, Scene, Tracks, View
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import DataConfig
-from p2gs_jax.evaluate.array_store import ArrayStore
-from p2gs_jax.evaluate.unexplained import Residuals, Unexplained, regions, residual_over_noise
+from p2gs_jax.evaluation.passes import ArrayStore
+from p2gs_jax.evaluation.unexplained import Residuals, Unexplained, regions, residual_over_noise
 from p2gs_jax.run.plots import MOST_PICTURES, marked, worst_rows, write_unexplained
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import Scene, View
 
 W, H, F, DEPTH = 160, 96, 100.0, 10.0

@@ -16,7 +16,7 @@ from p2gs_jax.formats.ply import write_radiance
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.response import FREE, KNOTS
 from p2gs_jax.render.harmonics import evaluate, radiance_activation
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import Scene, View
 
 ROW = {"camera": "0", "exif_ev": None}

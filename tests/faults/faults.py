@@ -123,7 +123,7 @@ FAULTS = (
     ),
     Fault(
         "recentring moves exposures but not radiance",
-        "photometry/gauge.py",
+        "photometry/parameters.py",
         "log_scale + tint, activation)",
         "0.0 * (log_scale + tint), activation)",
         "photometry/test_gauge.py",

@@ -8,14 +8,19 @@ import pytest
 
 from p2gs_jax.config import DataConfig, DensifyConfig, FitConfig, InitConfig, preset
 from p2gs_jax.core.numerics import srgb_encode
-from p2gs_jax.gaussians.init.brightness import MatchImages, Tones, at_common_exposure, rough_tones
-from p2gs_jax.gaussians.init.dense import MATCH_SIDE, dense_seeds
-from p2gs_jax.gaussians.init.dense_bound import coverage_of, dense_limit, wants_dense
-from p2gs_jax.gaussians.init.flow import CHECKS, Flows, depth_map
-from p2gs_jax.gaussians.init.pairs import neighbours, visibility
+from p2gs_jax.gaussians.dense import MATCH_SIDE, coverage_of, dense_limit, dense_seeds, wants_dense
+from p2gs_jax.gaussians.flow import CHECKS, Flows, depth_map
+from p2gs_jax.gaussians.matching import (
+    MatchImages,
+    Tones,
+    at_common_exposure,
+    neighbours,
+    rough_tones,
+    visibility,
+)
 from p2gs_jax.gaussians.population import Coverage
 from p2gs_jax.photometry.observations import Observations
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import Scene, View
 
 WIDTH, HEIGHT, FOCAL = 192, 144, 180.0

@@ -7,9 +7,8 @@ import pytest
 from moving_box import FRAMES, SIZE, drive_format, make_world, write_photographs
 
 from p2gs_jax.config import DataConfig, DynamicsConfig, FitConfig
-from p2gs_jax.gaussians.init.nodes import find_nodes, node_gaussians, on_surface
-from p2gs_jax.gaussians.init.photographed import nodes_radiance
-from p2gs_jax.photometry.initial import initial_photometry
+from p2gs_jax.gaussians.moving import find_nodes, node_gaussians, nodes_radiance, on_surface
+from p2gs_jax.photometry.parameters import initial_photometry
 from p2gs_jax.scene import ImageStore, drives, load_scene
 from p2gs_jax.scene.rigid import interpolated, inverse
 from p2gs_jax.types import Photometry

@@ -7,7 +7,7 @@ import pytest
 from moving_box import FRAMES, INTERVAL, drive_format, make_world, write_photographs
 
 from p2gs_jax.config import DataConfig, FitConfig
-from p2gs_jax.gaussians.init.vibration import OPACITY, clock_of, vibrates, with_vibration
+from p2gs_jax.gaussians.moving import OPACITY, clock_of, vibrates, with_vibration
 from p2gs_jax.gaussians.posed import standing
 from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.render.project import STILL

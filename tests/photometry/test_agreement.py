@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from p2gs_jax.photometry.agreement import compare
+from p2gs_jax.photometry.solution import compare
 
 
 def test_agreement_ignores_a_common_offset():

@@ -7,7 +7,7 @@ import pytest
 from scipy.interpolate import RegularGridInterpolator
 
 from p2gs_jax.config import PhotometryConfig
-from p2gs_jax.evaluate.alignment import fit_exposure
+from p2gs_jax.evaluation.alignment import fit_exposure
 from p2gs_jax.photometry.appearance import GRID, corrected, identity, regularisation
 from p2gs_jax.photometry.formation import formation
 from p2gs_jax.types import LUMINANCE, Capture

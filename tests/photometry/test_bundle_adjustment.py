@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from synthetic_drive import make_drive, make_exposures, observe
 
 from p2gs_jax.core.numerics import srgb_decode, srgb_encode
-from p2gs_jax.evaluate.alignment import exposure_error
+from p2gs_jax.evaluation.alignment import exposure_error
 from p2gs_jax.photometry.adjustment import fit as fitting
 from p2gs_jax.photometry.adjustment import robust
-from p2gs_jax.photometry.adjustment.fit import fit_model, solve_model
-from p2gs_jax.photometry.adjustment.problem import KnownExposures, make_problem
-from p2gs_jax.photometry.adjustment.rows import make_rows
+from p2gs_jax.photometry.adjustment.fit import fit_model
+from p2gs_jax.photometry.adjustment.problem import KnownExposures, make_problem, make_rows
+from p2gs_jax.photometry.adjustment.solve import solve_model
 from p2gs_jax.photometry.models import MODELS, Form
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import Response
@@ -116,19 +116,19 @@ def test_the_fixed_point_minimises_the_robust_loss(loss):
     problem = make_problem(o, **LIMITS)
     fit, _ = solve_model(problem, Form("view_exposure_gamma"), Response(), loss=loss)
     with jax.enable_x64(True):
-        rows = make_rows(o, problem.layout, problem.usable, Response(), problem.log_pivot)
+        rows = make_rows(problem, problem.usable, Response())
         bound = (robust.GEMAN_MCCLURE * fit.at.scale) ** 2
         channels = rows.weight.sum(-1)
-        prior, seen = robust.PRIOR_SPREAD, rows.by_row @ (channels / 3)
+        prior, seen = robust.PRIOR_SPREAD, rows.layout.by_row @ (channels / 3)
 
         def total(b):
-            level = fit.at.radiance[rows.row] * fit.theta.a[rows.views][..., None]
-            u = (rows.z - b[rows.views][..., None] - level) / rows.sigma
+            level = fit.at.radiance[rows.layout.row] * fit.theta.a[rows.layout.views][..., None]
+            u = (rows.z - b[rows.layout.views][..., None] - level) / rows.sigma
             square = jnp.sum(u**2 * rows.weight, -1) / jnp.maximum(channels, 1) / bound
             each = bound * channels * square / (1 + square)
             if loss == "geman_mcclure":
                 return 0.5 * jnp.sum(each)
-            of_row = jnp.zeros(rows.count).at[rows.row].add(each) / 3 / fit.at.scale**2
+            of_row = jnp.zeros(rows.layout.rows).at[rows.layout.row].add(each) / 3 / fit.at.scale**2
             weight = (prior + np.maximum(seen - 1, 0)) * 1.5 * fit.at.scale**2
             return jnp.sum(weight * jnp.log(prior + of_row))
 

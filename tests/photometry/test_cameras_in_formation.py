@@ -10,12 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from p2gs_jax.config import CameraFormation, PhotometryConfig
-from p2gs_jax.photometry.cameras import camera_row, camera_rows, corner, places
 from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
 from p2gs_jax.photometry.formation import (
+    camera_row,
+    camera_rows,
+    corner,
     expose,
     formation,
     inverse_formation,
+    places,
     squared_radii,
     tone_map,
 )

@@ -4,12 +4,21 @@ import numpy as np
 import pytest
 from synthetic_drive import make_drive, make_exposures, observe
 
-from p2gs_jax.photometry.adjustment import explained, linear, matrices
-from p2gs_jax.photometry.adjustment.curve import fit_response
-from p2gs_jax.photometry.adjustment.fit import fit_model, solve_model
+from p2gs_jax.photometry.adjustment import fit as explained
+from p2gs_jax.photometry.adjustment import matrices
+from p2gs_jax.photometry.adjustment import solve as linear
+from p2gs_jax.photometry.adjustment.fit import fit_model
 from p2gs_jax.photometry.adjustment.problem import make_problem
-from p2gs_jax.photometry.choices import Choice, Curve, Scope, neighbours
-from p2gs_jax.photometry.models import Form, parameter_count, possible
+from p2gs_jax.photometry.adjustment.solve import fit_response, solve_model
+from p2gs_jax.photometry.models import (
+    Choice,
+    Curve,
+    Form,
+    Scope,
+    neighbours,
+    parameter_count,
+    possible,
+)
 from p2gs_jax.photometry.response import FREE, HELD, Response, log_exposed
 
 LIMITS = {"black": 4 / 255, "saturation": 250 / 255, "pivot": 0.18}

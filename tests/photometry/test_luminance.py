@@ -9,17 +9,20 @@ import pytest
 
 from p2gs_jax.config import LossConfig
 from p2gs_jax.photometry.appearance import corrected
-from p2gs_jax.photometry.luminance.axes import axes_of, spans
-from p2gs_jax.photometry.luminance.parameters import (
+from p2gs_jax.photometry.luminance import (
     ENTRIES,
     POWER_UNIT,
+    STATISTICS,
     Luminance,
     as_photographed,
+    axes_of,
+    cumulative,
     enhanced,
     identity,
     pseudo_curve,
+    spans,
+    statistics_of,
 )
-from p2gs_jax.photometry.luminance.statistics import STATISTICS, cumulative, statistics_of
 from p2gs_jax.train.terms import CURVE, contrast_loss, curve_prior, enhanced_loss
 
 IMAGE = np.random.default_rng(0).uniform(0.02, 0.98, (24, 32, 3))

@@ -109,8 +109,6 @@ def test_exposures_along_a_path_adapt_alike_in_both_directions():
     assert np.all(np.diff(smooth) > 0)
     assert np.abs(np.diff(smooth)).max() < 0.2
     np.testing.assert_allclose(adapted(np.full(9, 0.3), 5.0), 0.3)
-    ring = adapted(steps, 5.0, closed=True)
-    assert abs(ring[0] - ring[-1]) < 0.2 < smooth[-1] - smooth[0]
 
 
 def test_the_file_gives_the_metering_back(tmp_path):
@@ -124,7 +122,7 @@ def test_the_file_gives_the_metering_back(tmp_path):
         metering.candidates,
         metering.white,
     )
-    assert back.typical_log_exposure("log_average") == metering.typical_log_exposure("log_average")
+    assert back.typical_exposure("log_average") == metering.typical_exposure("log_average")
     path.write_text("{}")
     with pytest.raises(UserError, match=r"metering\.json cannot be read"):
         read_metering(path)

@@ -12,11 +12,19 @@ from hypothesis import strategies as st
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.photometry.appearance import correction_of, exposures_apart
 from p2gs_jax.photometry.formation import formation
-from p2gs_jax.photometry.ppisp import homography, regularisation
-from p2gs_jax.photometry.ppisp.homography import SOURCES, offsets, recolored
-from p2gs_jax.photometry.ppisp.parameters import OneView, applied, identity
-from p2gs_jax.photometry.ppisp.response import identity_response, respond
-from p2gs_jax.photometry.ppisp.vignetting import falloff
+from p2gs_jax.photometry.ppisp import (
+    SOURCES,
+    OneView,
+    applied,
+    falloff,
+    homography_of,
+    identity,
+    identity_response,
+    offsets,
+    recolored,
+    regularisation_of,
+    respond,
+)
 from p2gs_jax.types import Params, Photometry
 
 IMAGE = np.random.default_rng(0).uniform(0.02, 0.9, (12, 20, 3))
@@ -150,7 +158,7 @@ colors = st.lists(st.floats(-2, 2), min_size=8, max_size=8)
 @given(st.lists(colors, min_size=3, max_size=3))
 def test_homographies_map_the_control_points_and_keep_intensity(parameters):
     latent = jnp.asarray(parameters, jnp.float32)
-    h = np.asarray(jax.vmap(homography)(latent), float)
+    h = np.asarray(jax.vmap(homography_of)(latent), float)
     moved = np.einsum("bij,kj->bki", h, SOURCES)
     expected = SOURCES[None, :, :2] + np.asarray(offsets(latent))
     np.testing.assert_allclose(moved[..., :2] / moved[..., 2:], expected, atol=2e-5)
@@ -230,7 +238,7 @@ def test_black_and_saturated_pixels_have_finite_gradients():
 
 def test_the_regularisation_is_what_is_published():
     parameters = identity(["a", "a", "b"])
-    assert float(regularisation(parameters)) == pytest.approx(0, abs=1e-7)
+    assert float(regularisation_of(parameters)) == pytest.approx(0, abs=1e-7)
     rng = np.random.default_rng(5)
     parameters = jax.tree.map(
         lambda x: x + jnp.asarray(rng.normal(0, 0.4, x.shape), x.dtype), parameters
@@ -251,7 +259,7 @@ def test_the_regularisation_is_what_is_published():
         + 0.02 * (vignettings[..., :2] ** 2).sum(-1).mean()
         + 0.01 * np.maximum(vignettings[..., 2:], 0).mean()
     )
-    assert float(regularisation(parameters)) == pytest.approx(expected, rel=1e-5)
+    assert float(regularisation_of(parameters)) == pytest.approx(expected, rel=1e-5)
 
 
 @pytest.mark.parametrize("parameterization", ["log", "linear"])

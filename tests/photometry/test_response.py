@@ -7,9 +7,9 @@ import pytest
 from synthetic_drive import make_drive, make_exposures, observe
 
 from p2gs_jax.config import PhotometryConfig
-from p2gs_jax.photometry.adjustment.curve import fit_response
 from p2gs_jax.photometry.adjustment.parameters import Splines
 from p2gs_jax.photometry.adjustment.problem import make_problem
+from p2gs_jax.photometry.adjustment.solve import fit_response
 from p2gs_jax.photometry.formation import eotf, inverse_tone_map, tone_map
 from p2gs_jax.photometry.response import (
     FREE,

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 from p2gs_jax.config import from_dict
 from p2gs_jax.pipeline.preflight import check_run_dir
-from p2gs_jax.scene.pixels import held
+from p2gs_jax.scene.pixels import store as held
 
 FIT = (
     *("--steps", "60", "--train.coarse-to-fine", "--test-every", "3"),

@@ -15,7 +15,7 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import DivergenceError, UserError
 from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.pipeline import fit as pipeline
-from p2gs_jax.pipeline.decide import kept_choice
+from p2gs_jax.pipeline.exposures import kept_choice
 from p2gs_jax.pipeline.preflight import Paths, check_run_dir, check_sizes, preflight
 from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.run.decisions import KEY, Decisions

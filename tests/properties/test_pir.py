@@ -16,7 +16,7 @@ from p2gs_jax.config import (
     RenderConfig,
     preset,
 )
-from p2gs_jax.evaluate.consistency import VideoScores
+from p2gs_jax.evaluation.scores import VideoScores
 from p2gs_jax.photometry.formation import eotf, formation, inverse_tone_map, tone_map
 from p2gs_jax.render import render_linear
 from p2gs_jax.train import exposure_loss as rel

@@ -1,8 +1,32 @@
-"""Pages of tests: a run folder to change, and what a browser says of a page."""
+"""Pages of tests: a run folder to change, and what a page says, also in a browser."""
 
+import base64
+import html
 import json
+import re
 import shutil
 from pathlib import Path
+
+import cv2
+import numpy as np
+
+LOOK = """() => ({
+    content: document.documentElement.scrollWidth,
+    window: innerWidth,
+    images: [...document.images].map(i => [i.complete, i.naturalWidth, i.alt]),
+    headings: [...document.querySelectorAll('h2')].map(h => h.textContent),
+    anchors: [...document.querySelectorAll('nav a')].map(
+        a => document.querySelector(a.getAttribute('href')) !== null),
+    smallest: Math.min(...[...document.querySelectorAll('svg text')]
+        .filter(t => t.getBoundingClientRect().height > 0)
+        .map(t => [parseFloat(getComputedStyle(t).fontSize), t.getScreenCTM()])
+        .map(([size, m]) => size * Math.hypot(m.a, m.b))),
+    ids: [...document.querySelectorAll('[id]')].map(e => e.id),
+    spilled: [...document.querySelectorAll('svg text')]
+        .map(t => [t.textContent, t.getBoundingClientRect()])
+        .filter(([_, r]) => r.width > 0 && (r.left < 0 || r.right > innerWidth))
+        .map(([text]) => text),
+})"""
 
 
 def copy_run(source: Path, target: Path) -> Path:
@@ -17,35 +41,41 @@ def edit(path: Path, change) -> None:
     path.write_text(json.dumps(value))
 
 
-def look_at(browser, path: Path, width: int) -> dict:
-    """Open a page and return what it fetched, said and measured."""
+def headings(text: str) -> list[str]:
+    return [html.unescape(h) for h in re.findall(r"<h2>(.*?)</h2>", text)]
+
+
+def words_of(text: str) -> str:
+    """Return the text of a page."""
+    return " ".join(html.unescape(re.sub(r"<[^>]*>", " ", text)).split())
+
+
+def pictures(text: str) -> dict[str, np.ndarray]:
+    """Return decoded pictures of a page by their alt texts."""
+    found = {}
+    for data, alt in re.findall(r'src="data:image/\w+;base64,([^"]*)"[^>]*alt="([^"]*)"', text):
+        raw = np.frombuffer(base64.b64decode(data), np.uint8)
+        found[html.unescape(alt)] = cv2.imdecode(raw, cv2.IMREAD_COLOR)
+    return found
+
+
+def check_in_a_browser(browser, path: Path, width: int) -> dict:
+    """Open a page, check that it fits, fetches nothing and reports nothing; return its parts."""
     page = browser.new_page(viewport={"width": width, "height": 900})
-    fetched, said = [], []
+    fetched, messages = [], []
     page.on("request", lambda request: fetched.append(request.url))
-    page.on("console", lambda message: said.append(message.text))
-    page.on("pageerror", lambda error: said.append(str(error)))
+    page.on("console", lambda message: messages.append(message.text))
+    page.on("pageerror", lambda error: messages.append(str(error)))
     page.goto(path.as_uri())
     page.wait_for_load_state("load")
-    found = page.evaluate(
-        """() => ({
-            content: document.documentElement.scrollWidth,
-            window: innerWidth,
-            images: [...document.images].map(i => [i.complete, i.naturalWidth, i.alt]),
-            headings: [...document.querySelectorAll('h2')].map(h => h.textContent),
-            anchors: [...document.querySelectorAll('nav a')].map(
-                a => document.querySelector(a.getAttribute('href')) !== null),
-            smallest: Math.min(...[...document.querySelectorAll('svg text')]
-                .filter(t => t.getBoundingClientRect().height > 0)
-                .map(t => [parseFloat(getComputedStyle(t).fontSize), t.getScreenCTM()])
-                .map(([size, m]) => size * Math.hypot(m.a, m.b))),
-            ids: [...document.querySelectorAll('[id]')].map(e => e.id),
-            spilled: [...document.querySelectorAll('svg text')]
-                .map(t => [t.textContent, t.getBoundingClientRect()])
-                .filter(([_, r]) => r.width > 0 && (r.left < 0 || r.right > innerWidth))
-                .map(([text]) => text),
-        })"""
-    )
+    found = page.evaluate(LOOK)
     page.close()
-    found["fetched"] = [url for url in fetched if not url.startswith("data:")]
-    found["said"] = said
+    assert [url for url in fetched if not url.startswith("data:")] == [path.as_uri()]
+    assert messages == []
+    assert found["content"] <= found["window"] == width
+    assert found["smallest"] >= 9
+    assert found["spilled"] == []
+    assert all(complete and natural > 0 and alt for complete, natural, alt in found["images"])
+    assert all(found["anchors"])
+    assert len(found["ids"]) == len(set(found["ids"]))
     return found

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from synthetic_drive import make_drive, make_exposures, observe
 
-from p2gs_jax.photometry.adjustment.curve import fit_response
 from p2gs_jax.photometry.adjustment.fit import fit_model
 from p2gs_jax.photometry.adjustment.problem import make_problem
+from p2gs_jax.photometry.adjustment.solve import fit_response
 from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.response import Response
 from p2gs_jax.run.plots import curves_to_draw, write_calibration_plot

@@ -9,7 +9,7 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.run.scene_file import read_scene, write_scene
 from p2gs_jax.scene import ImageStore, load_scene
-from p2gs_jax.scene.backdrop import backdrop_of, has_alpha
+from p2gs_jax.scene.masks import background_color, has_alpha
 from p2gs_jax.train.inputs import TrainingViews
 
 RNG = np.random.default_rng(0)
@@ -91,7 +91,7 @@ def test_as_a_mask_and_not_at_all(cutouts):
         ),
         ({"background": "random"}, "shown over a random colour at every step, and white to judge"),
         ({"alpha": "mask"}, "transparent pixels are left out"),
-        ({"alpha": "ignore"}, "it is not looked at"),
+        ({"alpha": "ignore"}, "it is ignored"),
     ],
 )
 def test_it_is_always_told(cutouts, options, said):
@@ -157,8 +157,8 @@ def test_which_files_have_alpha(cutouts, tmp_path):
 
 @pytest.mark.parametrize("text", ["blue", "1,1", "0.5,0.5,1.5", "0,0,nan", "", "1,1,1,1"])
 def test_colours_that_are_none(text):
-    with pytest.raises(UserError, match="is no colour"):
-        backdrop_of(DataConfig(background=text))
+    with pytest.raises(UserError, match="is not a valid colour"):
+        background_color(DataConfig(background=text))
 
 
 def test_a_mask_of_another_shape_is_refused(cutouts):

@@ -10,8 +10,9 @@ from scene.posed import around, blender, write_rgba
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene import find_scene, load_scene, triangulate
-from p2gs_jax.scene.random_seeds import FEWEST, common_points, depth_range
+from p2gs_jax.scene import find_scene, load_scene
+from p2gs_jax.scene.seeds import FEWEST, common_points, depth_range
+from p2gs_jax.scene.sfm import triangulate
 from p2gs_jax.scene.transforms import load_blender
 
 CFG = DataConfig()

@@ -11,7 +11,7 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.files import image_size
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 
 SIDE = 20_000
 CFG = DataConfig(test_every=0)

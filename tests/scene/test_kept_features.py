@@ -9,11 +9,10 @@ from PIL import Image
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene import structure_from_motion
-from p2gs_jax.scene.features import quiet_colmap
-from p2gs_jax.scene.kept_features import kept_features, match_kept
-from p2gs_jax.scene.pace import Pace
-from p2gs_jax.scene.unregistered import reasons, sentence
+from p2gs_jax.scene.cache import StageProgress
+from p2gs_jax.scene.sfm import map as structure_from_motion
+from p2gs_jax.scene.sfm.features import kept_features, match_kept, quiet_colmap
+from p2gs_jax.scene.sfm.map import reasons, sentence
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +82,7 @@ def test_reasons(photographs, tmp_path):
 
 def test_pace_tells_what_is_left():
     now, said = [0.0], []
-    pace = Pace(said.append, "matching", 100, "pairs", clock=lambda: now[0])
+    pace = StageProgress(said.append, "matching", 100, "pairs", clock=lambda: now[0])
     for seconds, done in ((1, 5), (20, 25), (21, 26), (3600, 50), (3700, 100)):
         now[0] = seconds
         pace(done)
@@ -93,7 +92,7 @@ def test_pace_tells_what_is_left():
         "matching: 50 of 100 pairs, about 1:00:00 left at this pace",
     ]
     said.clear()
-    Pace(said.append, "matching", 0, "pairs")
+    StageProgress(said.append, "matching", 0, "pairs")
     assert said == []
 
 

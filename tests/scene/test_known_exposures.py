@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene.known_exposures import check_source, read_known_exposures
+from p2gs_jax.scene.exposures import check_source, read_known_exposures
 from p2gs_jax.types import View
 
 
@@ -63,5 +63,5 @@ def test_nothing_known():
 def test_a_field_beyond_the_limit_is_refused(tmp_path):
     path = tmp_path / "exposures.csv"
     path.write_text(f"image,ev\n{'x' * 200_000},1\n")
-    with pytest.raises(UserError, match=r"exposures.csv is no CSV file"):
+    with pytest.raises(UserError, match=r"exposures.csv is not a CSV file"):
         check_source(str(path))

@@ -11,15 +11,15 @@ from scene.helpers import write_tiny_model
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.scene import ImageStore, load_scene
-from p2gs_jax.scene.geometry import (
+from p2gs_jax.scene.lens import (
     _fold_radius,
     intrinsics,
     make_distortion,
     undistort_points,
     undistortion_maps,
 )
+from p2gs_jax.scene.sfm.triangulate import camera_of
 from p2gs_jax.scene.transforms import load_transforms
-from p2gs_jax.scene.triangulate import _camera
 from p2gs_jax.types import Distortion, View
 
 K = intrinsics(400.0, 410.0, 500.0, 300.0)
@@ -176,7 +176,7 @@ def test_colmap_lenses(tmp_path, camera, model, coefficients):
     view = load_scene(tmp_path, DataConfig()).views[0]
     assert view.distortion == Distortion(coefficients, model)
     # COLMAP projects with its own model to where ours comes from.
-    back = _camera(view, 1)
+    back = camera_of(view, 1)
     xy = back.img_from_cam(np.array([[0.2, -0.1, 1.0]]))
     np.testing.assert_allclose(
         undistort_points(xy, view.K, view.distortion)[0], (view.K @ [0.2, -0.1, 1.0])[:2], atol=1e-3

@@ -79,7 +79,7 @@ def mirrored(table):
         (swapped_bounds, "row 1 has impossible bounds: 6 to 2"),
         (nan_pose, "the pose in row 2 is not finite"),
         (no_focal, "row 0 has an impossible height, width or focal length"),
-        (mirrored, "row 3 is no rotation"),
+        (mirrored, "row 3 is not a rotation"),
     ],
 )
 def test_broken_tables(tmp_path, change, message):

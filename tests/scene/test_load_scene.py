@@ -12,7 +12,7 @@ from scene.helpers import write_tiny_model
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene import ImageStore, PhotographsAlone, find_scene, load_scene
-from p2gs_jax.scene.exif import ExifSettings, read_exif_ev, read_exif_settings
+from p2gs_jax.scene.convert.headers import ExifSettings, read_exif_ev, read_exif_settings
 from p2gs_jax.scene.split import assign_split
 from p2gs_jax.types import View
 
@@ -28,7 +28,7 @@ def test_nothing_there(tmp_path):
         load_scene(tmp_path / "nowhere", CFG)
     file = tmp_path / "notes.txt"
     file.write_bytes(b"")
-    with pytest.raises(UserError, match=r"notes.txt is a file"):
+    with pytest.raises(UserError, match=r"notes.txt is neither"):
         load_scene(file, CFG)
 
 

@@ -69,7 +69,7 @@ def test_a_list_of_the_user_wins(model, tmp_path):
         ("a.txt", "im 9.png\n", r"a.txt lists im 9.png, which the scene does not have"),
         ("a.txt", "\n# nothing\n", r"a.txt names no photograph"),
         ("a.json", '{"test": ["im 9.png"]}', r"a.json lists im 9.png"),
-        ("a.json", '{"test": "im 1.png"}', r'a.json: "test" is no list of names'),
+        ("a.json", '{"test": "im 1.png"}', r'a.json: "test" is not a list of names'),
         ("a.json", '{"tests": []}', r'a.json has no list "test" and no list "train"'),
         ("a.json", '{"test": [', r"a.json is not valid JSON: .* line 1"),
         ("a.json", '{"test": ["im 1.png"], "train": ["im 1"]}', r"both trained on and held out"),
@@ -104,7 +104,7 @@ def test_photographs_that_colmap_did_not_register_are_only_told(model):
     (model / "test.txt").write_text("im 1.png\nlost.png\n")
     scene = load_scene(model, CFG)
     assert held_out(scene) == ["im 1.png"]
-    assert "lists 1 photographs that are no views of the scene: lost.png" in scene.notes[-1]
+    assert "lists 1 photographs that are not views of the scene: lost.png" in scene.notes[-1]
 
 
 # ------------------------------------------------------------------ nerfstudio
@@ -181,5 +181,5 @@ def test_broken_nerfstudio_seeds(tmp_path):
     write_ply(path, np.zeros((0, 3)))
     assert "sparse_pc.ply holds no points" in find_scene(tmp_path, CFG).notes[-1]
     studio(tmp_path, ply_file_path=7)
-    with pytest.raises(UserError, match='"ply_file_path" is no name of a file'):
+    with pytest.raises(UserError, match='"ply_file_path" is not the name of a file'):
         find_scene(tmp_path, CFG)

@@ -9,7 +9,7 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.cache import cached_folder
-from p2gs_jax.scene.features import pairs_by_name, pairs_by_pose
+from p2gs_jax.scene.sfm.features import pairs_by_name, pairs_by_pose
 
 CFG = DataConfig()
 
@@ -27,7 +27,7 @@ def test_bare_folder_with_a_stranger_and_its_cache(shared_data, tmp_path):
     assert np.median(reprojection_errors(scene)) < 1.0
     assert len(scene.points) > 300
     note = next(note for note in scene.notes if "could not be registered" in note)
-    assert "stranger.jpg (looks like no other photograph)" in note
+    assert "stranger.jpg (matches no other photograph)" in note
     assert "overlap" in note
     assert any("detecting" in line for line in said)
 

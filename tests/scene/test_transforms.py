@@ -109,7 +109,7 @@ SINGULAR = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1]]
         ({"frames": frames("images/a.png", transform_matrix=[[1]])}, "transform_matrix of a.png"),
         (
             {"frames": [{"file_path": "images/a.png", "transform_matrix": SINGULAR}]},
-            "no rotation and translation",
+            "not a rotation and a translation",
         ),
         ({"frames": frames("images/a.png", "./images/a.png")}, "a.png more than once"),
         ({"frames": frames("images/a.png", mask_path="m.png")}, "mask .*m.png of a.png"),
@@ -152,7 +152,7 @@ def test_a_count_of_points_beyond_the_file_costs_no_memory(tmp_path, kind):
 def test_nan_pose(tmp_path):
     data = {"fl_x": 50, "frames": frames("images/a.png")}
     data["frames"][0]["transform_matrix"][1][3] = float("nan")
-    with pytest.raises(UserError, match=r"transform_matrix of a.png is no finite"):
+    with pytest.raises(UserError, match=r"transform_matrix of a.png is not a finite"):
         read(write(tmp_path, data))
 
 

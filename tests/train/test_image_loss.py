@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import LossConfig
-from p2gs_jax.evaluate import ssim
+from p2gs_jax.evaluation import ssim
 from p2gs_jax.train import terms
 
 

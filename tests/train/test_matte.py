@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import FitConfig, LossConfig, PhotometryConfig, preset
-from p2gs_jax.evaluate.alignment import fit_exposure
+from p2gs_jax.evaluation.alignment import fit_exposure
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import formation
 from p2gs_jax.train.image_gradient import compared

@@ -6,7 +6,7 @@ from tiny_scene import make_scene
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.scene import load_scene
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.train.image_gradient import decoded
 from p2gs_jax.train.inputs import TrainingViews
 

@@ -11,11 +11,10 @@ from tiny_scene import make_scene
 
 from p2gs_jax.cli import main
 from p2gs_jax.config import FitConfig
-from p2gs_jax.evaluate.seams import Photographed, measure_seam
+from p2gs_jax.evaluation.seams import Photographed, measure_seam
 from p2gs_jax.jobs.configs import with_fields
-from p2gs_jax.photometry.cameras import corner
-from p2gs_jax.photometry.formation import squared_radii
-from p2gs_jax.pipeline.decide import decide, likely, unsolved
+from p2gs_jax.photometry.formation import corner, squared_radii
+from p2gs_jax.pipeline.exposures import decide, likely, unsolved
 from p2gs_jax.render.warp import surface_depth
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.run.read import load_run

@@ -3,16 +3,15 @@
 Model, in logarithms relative to the pivot x0: F(I) - log x0 = a_v (h_v + l_p) + noise, with h the
 log exposure, l the log radiance of a point and channel, a = 2.2 / gamma, and F the log response
 (`response.py`). With b = a h this is b_v + a_v l_p: linear but for one product. Point radiances are
-eliminated exactly (variable projection), what remains is the Schur complement over the views: its
+eliminated exactly (variable projection). What remains is the Schur complement over the views: its
 entries are sums over pairs of observations of a point, so cost and memory grow with those pairs,
 never with points times views.
 
-`problem` and `rows` lay observations out, `system` says what is free and what is known besides,
-`robust` weighs, `normal` assembles, `solve` repeats both until nothing moves, `errors` says how
-sure the result is, `fit` and `curve` solve a model and a response with them, and `result` and
-`warnings` make of the numbers what is reported.
+`problem` lays observations out; `parameters` says what is solved for and `system` what is free and
+what is known besides. `robust` weighs, `normal` assembles sums from `matrices`, and `solve` repeats
+both until nothing moves. `errors` says how sure the result is, and `fit` makes a solution of it.
 
-On the host, in numpy: derivatives are written out anyway, a round takes milliseconds, and four
-programs for the models, curves and sizes of one scene took longer to compile than to solve
+All runs on the host, in numpy: derivatives are written out anyway, a round takes milliseconds, and
+four programs for the models, curves and sizes of one scene took longer to compile than to solve
 (BUILD_NOTES, "Compile less, outside the step").
 """

@@ -1,84 +1,373 @@
-"""Solving one photometric model."""
+"""From a problem to its solution: solved, explained, in its gauge, with errors and warnings."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
 import numpy as np
-from jaxtyping import Float
+import scipy.sparse as sp
+from jaxtyping import Bool, Float, Float32, Int
 
-from p2gs_jax.config import ResponseKind
-from p2gs_jax.photometry.adjustment.errors import uncertainty
-from p2gs_jax.photometry.adjustment.explained import explain
-from p2gs_jax.photometry.adjustment.linear import one_thread
-from p2gs_jax.photometry.adjustment.problem import Problem
-from p2gs_jax.photometry.adjustment.result import solution_of
-from p2gs_jax.photometry.adjustment.robust import Loss
-from p2gs_jax.photometry.adjustment.rows import make_rows
-from p2gs_jax.photometry.adjustment.solve import Fit, solve
-from p2gs_jax.photometry.adjustment.system import System, make_system
+from p2gs_jax.config import CameraFormation
+from p2gs_jax.core.numerics import LN2
+from p2gs_jax.photometry.adjustment.errors import Uncertainty, uncertainty
+from p2gs_jax.photometry.adjustment.parameters import Parameters, make_forward
+from p2gs_jax.photometry.adjustment.problem import Problem, make_rows
+from p2gs_jax.photometry.adjustment.robust import Weighted, noise_weight, weigh
+from p2gs_jax.photometry.adjustment.solve import Fit, solve_model
 from p2gs_jax.photometry.models import Form, ModelName
+from p2gs_jax.photometry.observations import Labels, Observations, PerChannel
 from p2gs_jax.photometry.response import Response
-from p2gs_jax.photometry.solution import PhotometricSolution
+from p2gs_jax.photometry.solution import MIN_OBSERVATIONS, PhotometricSolution
+from p2gs_jax.photometry.unmodelled import neighbourhood_warnings
+from p2gs_jax.types import GAMMA_SRGB
 
-# Change of a parameter, log units, at which rounds end: of what is kept, and of what is compared.
-TOLERANCE, TOLERANCE_TO_COMPARE = 1e-5, 5e-3
 # Points by which a view is solved; more only repeat them (BUILD_NOTES, "Exposures from a part").
 PER_VIEW = 1000
-# Of all views together, and what each has nevertheless.
+# Observations of all views together, and what each view has nevertheless.
 MOST_SOLVED, LEAST_PER_VIEW = 1_500_000, 200
-
-
-def solve_model(
-    problem: Problem,
-    form: Form,
-    response: Response,
-    *,
-    use: Float[np.ndarray, " o"] | None = None,
-    splines: ResponseKind | None = None,
-    tolerance: float = TOLERANCE,
-    loss: Loss = "geman_mcclure",
-) -> tuple[Fit, System]:
-    """Solve one form; see `fit_model`.
-
-    Args:
-        problem: observations.
-        form: what varies.
-        response: what decodes the colours.
-        use: 0 keeps an observation out.
-        splines: what gets a spline over the response's base, solved for as well; None: nothing.
-        tolerance: change of a parameter, log units, at which the rounds end.
-        loss: of residuals.
-    """
-    weight = problem.usable if use is None else problem.usable * use[:, None]
-    rows = make_rows(
-        problem.observations, problem.layout, weight, response, problem.log_pivot, splines or "all"
-    )
-    system = make_system(problem, form, splines)
-    with one_thread():
-        return solve(rows, system, tolerance, loss), system
+# Points of a view from which is told what is not modelled.
+UNMODELLED_PER_VIEW = 2000
+# Observations that count less than this share of what their noise alone would give are ignored.
+IGNORED = 0.25
+# Observations that are looked at together: 20 million at once are gigabytes.
+BLOCK = 1_000_000
+# A channel off by this much in a view is worth a word.
+NOTICEABLE_BALANCE_EV = 0.1
+# What is left of the way is worth no word below this share of a typical standard error.
+NEGLIGIBLE = 0.1
 
 
 def fit_model(
     problem: Problem, form: Form | ModelName, response: Response | None = None
 ) -> PhotometricSolution:
-    """Solve everything that varies, and radiances of all points.
+    """Solve everything that varies, and radiances of all points; by default under sRGB.
 
-    Of what views see very often, exposures are solved from a part; errors are of that part.
-
-    Args:
-        problem: from `make_problem`.
-        form: what varies; a model of exposures and gammas where nothing else does.
-        response: what decodes the colours; default sRGB.
+    Where views see very much, exposures are solved from a part; errors are of that part.
     """
     response = response or Response()
     form = Form(form) if isinstance(form, str) else form
     o = problem.observations
-    pick = o.thinned(_per_view(o.view_count), 0)
+    # Fewer, where views are thousands.
+    most = int(np.clip(MOST_SOLVED / max(o.view_count, 1), LEAST_PER_VIEW, PER_VIEW))
+    pick = o.thinned(most, 0)
     few = problem if pick.all() else problem.part(pick)
     fit, system = solve_model(few, form, response, loss="whole_points")
     known = uncertainty(fit, system, few.observations)
     return solution_of(problem, form, response, fit, explain(fit, problem, response), known)
 
 
-def _per_view(views: int) -> int:
-    """Return how many points of a view are solved from: fewer, where views are thousands."""
-    return int(np.clip(MOST_SOLVED / max(views, 1), LEAST_PER_VIEW, PER_VIEW))
+class Explained(NamedTuple):
+    """Radiances of points, and what is left of their observations."""
+
+    # Of each point relative to the pivot, gauges not yet set; NaN where unobserved.
+    log_radiance: Float[np.ndarray, "p 3"]
+    # Of each observation in log exposure; 0 where it is not usable.
+    residual: Float32[np.ndarray, "o 3"]
+    outliers: float  # share of the usable values that the robust loss ignores
+
+
+def explain(fit: Fit, problem: Problem, response: Response) -> Explained:
+    """Return radiances and residuals of all observations, whatever part `fit` was solved from."""
+    o = problem.observations
+    radiance = np.full((o.point_count, 3), np.nan)
+    residual = np.zeros((len(o.points), 3), np.float32)
+    ignored = 0
+    for pick, points, part in _blocks(problem):
+        at = _weighed(fit, part, response)
+        mine, usable = part.observations, part.usable
+        radiance[points] = _of_points(part, at)
+        of_exposure = at.residual / fit.theta.a[mine.views][:, None]
+        residual[pick] = np.where(usable, of_exposure, 0.0)
+        ideal = 1 / mine.decoded(response)[1] ** 2
+        ignored += int(((at.weight < IGNORED * ideal) & usable).sum())
+    return Explained(radiance, residual, ignored / max(int(problem.usable.sum()), 1))
+
+
+def _blocks(
+    problem: Problem,
+) -> Iterator[tuple[np.ndarray | slice, np.ndarray | slice, Problem]]:
+    """Yield whole points with all their observations: which these are, and they alone."""
+    points = problem.observations.points
+    if len(points) <= BLOCK:
+        yield slice(None), slice(None), problem
+        return
+    order = np.argsort(points, kind="stable")
+    place = 0
+    while place < len(order):
+        last = points[order[min(place + BLOCK, len(order)) - 1]]
+        end = int(np.searchsorted(points, last, side="right", sorter=order))
+        pick = order[place:end]
+        own, label = np.unique(points[pick], return_inverse=True)
+        part = problem.part(pick)
+        few = replace(part.observations, points=label, point_count=len(own))
+        yield pick, own, replace(part, observations=few)
+        place = end
+
+
+def _weighed(fit: Fit, part: Problem, response: Response) -> Weighted:
+    """Return residuals and weights at the solution, each observation judged by itself."""
+    rows = make_rows(part, part.usable, response)
+    model = make_forward(rows, fit.model.unknowns)
+    at = weigh(model, fit.theta, noise_weight(rows), "l1")
+    at = weigh(model, fit.theta, at.weight, "l1")
+    for _ in range(2):
+        at = weigh(model, fit.theta, at.weight, "geman_mcclure")
+    return at
+
+
+def _of_points(part: Problem, at: Weighted) -> Float[np.ndarray, "p 3"]:
+    """Combine the rows of each point."""
+    total, weight = (np.zeros((part.observations.point_count, 3)) for _ in range(2))
+    np.add.at(total, part.layout.point_of_row, at.precision * at.radiance)
+    np.add.at(weight, part.layout.point_of_row, at.precision)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(weight > 0, total / weight, np.nan)
+
+
+def solution_of(
+    problem: Problem,
+    form: Form,
+    response: Response,
+    fit: Fit,
+    explained: Explained,
+    known: Uncertainty,
+) -> PhotometricSolution:
+    """Return exposures in their gauge, with errors and warnings.
+
+    The problem holds all observations, whatever part of them `fit` was solved from.
+    """
+    o, component = problem.observations, problem.component
+    per_view = np.bincount(o.views[problem.usable.any(1)], minlength=o.view_count)
+    active = per_view > 0
+    free_scale = np.ones(o.view_count, bool)
+    if problem.known is not None:
+        given = np.isfinite(problem.known.log_exposures)
+        anchored = np.unique(component[given])
+        free_scale = ~np.isin(component, anchored)
+        active = active | given
+    scale, color = _Gauge(component, active & free_scale), _Gauge(component, active)
+    a, light = fit.theta.a, fit.theta.b / fit.theta.a[:, None]
+    h, balance = light.mean(1), light - light.mean(1, keepdims=True)
+    shift = scale.shift(h)
+    shifts = shift[:, None] + color.shift(balance)
+    of_cameras = known.system.unknowns.features.balance
+
+    def of_light(change: Parameters):
+        return (change.b - light[..., None] * change.a[:, None]) / a[:, None, None]
+
+    def of_balance(change: Parameters):
+        moved = of_light(change)
+        if of_cameras:
+            moved = moved + _balance_of_views(fit, change.k)
+        moved = np.broadcast_to(moved, (o.view_count, 3, moved.shape[2]))
+        return color.centred(moved - moved.mean(1, keepdims=True)).reshape(-1, moved.shape[2])
+
+    h_errors = known.few * known.of(lambda change: scale.centred(of_light(change).mean(1)))
+    a_errors = known.few * known.of(lambda change: change.a)
+    gamma = GAMMA_SRGB / a
+    lost = active & ~(np.isfinite(h_errors) & np.isfinite(a_errors))
+    seen = active & ~lost
+    if of_cameras:
+        balance = balance + _balance_of_views(fit, fit.theta.k[:, None])[..., 0]
+    balance = np.where(active[:, None], color.centred(np.broadcast_to(balance, (len(h), 3))), 0.0)
+    balance_errors = known.few[:, None] * known.of(of_balance).reshape(-1, 3)
+
+    used, residual = problem.usable, explained.residual
+    view_residual, tint = _per_view_ev(o.views, residual, used, o.view_count)
+    cameras, corner_errors = _cameras(fit, response, known, o)
+    return PhotometricSolution(
+        model=form.model,
+        response=response,
+        log_exposures=np.where(active, h - shift, 0.0),
+        exposure_errors=np.where(seen, h_errors, np.inf),
+        gammas=np.where(active, gamma, GAMMA_SRGB),
+        gamma_errors=np.where(seen, gamma / a * a_errors, np.inf),
+        observations_per_view=per_view,
+        component=component,
+        point_log_radiance=_point_radiance(problem, explained, shifts),
+        residual_ev=_spread_ev(residual[used]) if used.any() else 0.0,
+        view_residual_ev=view_residual,
+        view_balance_ev=tint,
+        outliers=explained.outliers,
+        rounds=fit.rounds,
+        moved=fit.moved,
+        converged=fit.converged,
+        unknown_errors=int(lost.sum()),
+        warnings=(
+            *_of_solver(fit, h_errors[seen], np.flatnonzero(lost), o.names),
+            *_of_observations(per_view, component[active], tint, o.names),
+            *_unmodelled(problem, residual),
+        ),
+        white_balance_level=form.white_balance,
+        white_balance=balance,
+        white_balance_errors=np.where(seen[:, None], balance_errors, np.inf),
+        vignetting=form.vignetting,
+        cameras=cameras,
+        corner_errors=corner_errors,
+    )
+
+
+class _Gauge:
+    """Means over those `counted` of the views of a component, whose absolute terms are unknown."""
+
+    def __init__(self, component: Int[np.ndarray, " v"], counted: Bool[np.ndarray, " v"]):
+        views = len(component)
+        labels = np.unique(component, return_inverse=True)[1]
+        count = int(labels.max(initial=-1)) + 1
+        members = np.flatnonzero(counted)
+        sizes = np.bincount(labels[members], minlength=count)
+        shares = 1 / sizes[labels[members]]
+        mean = sp.csr_array((shares, (labels[members], members)), shape=(count, views))
+        of_label = sp.csr_array((np.ones(views), (np.arange(views), labels)), shape=(views, count))
+        self._mean, self._of_label = mean, of_label
+
+    def shift(self, values: Float[np.ndarray, "v ..."]) -> Float[np.ndarray, "v ..."]:
+        """Return the mean of each view's component."""
+        flat = values.reshape(len(values), -1)
+        return (self._of_label @ (self._mean @ flat)).reshape(values.shape)
+
+    def centred(self, values: Float[np.ndarray, "v ..."]) -> Float[np.ndarray, "v ..."]:
+        """Return values less that."""
+        return values - self.shift(values)
+
+
+def _balance_of_views(fit: Fit, k: Float[np.ndarray, "k c"]) -> Float[np.ndarray, "v 3 c"]:
+    """Return the white balance of each view's camera."""
+    features, cameras = fit.model.unknowns.features, fit.model.rows.layout.cameras
+    return np.stack([features.balance_of(column) for column in k.T], -1)[cameras]
+
+
+def _cameras(
+    fit: Fit, response: Response, known: Uncertainty, o: Observations
+) -> tuple[tuple[CameraFormation, ...], Float[np.ndarray, "c j"]]:
+    """Return what each physical camera does, and standard errors of log V in its corners."""
+    features = fit.model.unknowns.features
+    if features.vignetting is None and not response.splines:
+        return (), np.zeros((0, 0))
+    coefficients = features.vignetting_of(fit.theta.k)
+    shape = coefficients.shape[:2]
+    names = o.camera_names or tuple(str(c) for c in range(features.cameras))
+    formations = []
+    for row, name in enumerate(names):
+        splines = response.splines[row : row + 1] if response.by == "camera" else response.splines
+        polynomials = tuple(tuple(float(x) for x in each) for each in coefficients[row])
+        formations.append(CameraFormation(name, polynomials, splines))
+
+    def corner(change: Parameters):
+        each = [features.vignetting_of(column).sum(2).ravel() for column in change.k.T]
+        return np.stack(each, 1)
+
+    errors = known.of(corner).reshape(shape) if np.prod(shape) else np.zeros(shape)
+    return tuple(formations), errors
+
+
+def _point_radiance(
+    problem: Problem, explained: Explained, shifts: Float[np.ndarray, "v x"]
+) -> Float[np.ndarray, "p 3"]:
+    """Return log radiance in the gauge: the shift of a point's views goes the other way."""
+    o = problem.observations
+    seen = problem.usable.any(1)
+    some_view = np.zeros(o.point_count, int)
+    some_view[o.points[seen]] = o.views[seen]
+    return explained.log_radiance + shifts[some_view] + problem.log_pivot
+
+
+def _spread_ev(residual: Float[np.ndarray, " n"]) -> float:
+    """Return the robust standard deviation of residuals, in stops."""
+    return 1.4826 * float(np.median(np.abs(residual))) / LN2
+
+
+def _per_view_ev(
+    views: Labels, residual: PerChannel, used: Bool[np.ndarray, "o 3"], count: int
+) -> tuple[Float[np.ndarray, " v"], Float[np.ndarray, "v 3"]]:
+    """Return the spread of every view and its colour balance; NaN where it has none."""
+    spread, balance = np.full(count, np.nan), np.full((count, 3), np.nan)
+    order = np.argsort(views, kind="stable")
+    bounds = np.searchsorted(views[order], np.arange(count + 1))
+    for view in range(count):
+        mine = order[bounds[view] : bounds[view + 1]]
+        seen = used[mine]
+        if seen.any():
+            spread[view] = _spread_ev(residual[mine][seen])
+        if (seen.sum(0) >= MIN_OBSERVATIONS).all():
+            medians = np.array([np.median(residual[mine, c][seen[:, c]]) for c in range(3)])
+            balance[view] = (medians - np.mean(medians)) / LN2
+    return spread, balance
+
+
+def _of_solver(
+    fit: Fit, errors: Float[np.ndarray, " k"], lost: Labels, names: Sequence[str]
+) -> list[str]:
+    """Say where the numbers themselves are not to be trusted: `lost` views have no errors."""
+    out = []
+    typical = float(np.median(errors)) if errors.size else 0.0
+    if not fit.converged and fit.left > NEGLIGIBLE * typical:
+        out.append(
+            f"The photometric solution had not settled after {fit.rounds} rounds (its last moved a "
+            f"parameter by {fit.moved:.1e}, log units): exposures may be off by more than their "
+            "standard errors say. Compare them with --photometry.no-select and a simpler "
+            "--photometry.model."
+        )
+    if len(lost):
+        out.append(
+            f"The standard errors of {len(lost)} training view(s) cannot be told: what joins them "
+            f"to the others is lost in rounding ({_listed(lost, names)})."
+        )
+    return out
+
+
+def _of_observations(
+    per_view: Int[np.ndarray, " v"],
+    component: Int[np.ndarray, " k"],
+    balance: Float[np.ndarray, "v 3"],
+    names: Sequence[str],
+) -> list[str]:
+    """Say what the observations do not tell, or tell of more than exposure.
+
+    `component` is of views that have any, or a known exposure; those of equal numbers share
+    points. `balance` is the residual of red, green, blue less their mean, stops.
+    """
+    out = []
+    few = np.flatnonzero(per_view < MIN_OBSERVATIONS)
+    if len(few):
+        out.append(
+            f"{len(few)} training view(s) have fewer than {MIN_OBSERVATIONS} usable track "
+            f"observations; their exposures are uncertain ({_listed(few, names)})."
+        )
+    groups = len(set(component.tolist()))
+    if groups > 1:
+        out.append(
+            f"The tracks fall into {groups} groups of views that share no point: exposures can "
+            "be compared only inside a group."
+        )
+    off = np.nan_to_num(np.abs(balance).max(1))
+    tinted = np.flatnonzero(off > NOTICEABLE_BALANCE_EV)
+    if len(tinted):
+        worst = int(off.argmax())
+        named = zip(("red", "green", "blue"), balance[worst], strict=True)
+        channels = ", ".join(f"{name} {value:+.2f}" for name, value in named)
+        out.append(
+            f"White balance changes: {len(tinted)} training view(s) are tinted against the others "
+            f"({_listed(tinted, names)}; most of all {_listed([worst], names)}, by {channels} EV). "
+            "An exposure here is one number for all channels."
+        )
+    return out
+
+
+def _unmodelled(problem: Problem, residual: PerChannel) -> list[str]:
+    """Say what depends on the place or the surroundings; of many observations, of a part."""
+    o = problem.observations
+    if o.positions is None or not len(o.points):
+        return []
+    pick = o.thinned(UNMODELLED_PER_VIEW, 0)
+    return neighbourhood_warnings(
+        o.picked(pick), residual[pick] / LN2, problem.usable[pick], o.names
+    )
+
+
+def _listed(rows: Sequence[int] | Labels, names: Sequence[str]) -> str:
+    head = ", ".join(names[r] if names else f"row {r}" for r in rows[:8])
+    return head + (", ..." if len(rows) > 8 else "")

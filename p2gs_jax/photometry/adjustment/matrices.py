@@ -9,25 +9,21 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Int
 
-# Up to so many unknowns matrices are kept and factorised as a whole.
+# Up to this many unknowns, matrices are kept and factorised as a whole.
 DENSE = 1500
+# Pairs whose products are formed at once: they stay in the cache.
+CHUNK = 1 << 15
 
 Matrix = np.ndarray | sp.csr_array
 
 
 def is_small(size: int) -> bool:
-    """Return whether matrices of so many unknowns are kept as a whole."""
+    """Return whether matrices of this many unknowns are kept as a whole."""
     return size <= DENSE
 
 
 class Entries(NamedTuple):
-    """Values at places of a matrix; those at one place are summed.
-
-    Attributes:
-        rows: where.
-        columns: where.
-        values: what.
-    """
+    """PerChannel at places of a matrix; those at one place are summed."""
 
     rows: Int[np.ndarray, " n"]
     columns: Int[np.ndarray, " n"]
@@ -35,37 +31,31 @@ class Entries(NamedTuple):
 
 
 def block(row: int, column: int, values: Float[np.ndarray, "n m"]) -> Entries:
-    """Return a dense block at a place."""
+    """Return a dense block whose first entry is at a place."""
     at = np.indices(values.shape)
     return Entries((row + at[0]).ravel(), (column + at[1]).ravel(), values.ravel())
 
 
 def assembled(parts: list[Entries], size: int) -> Matrix:
-    """Return the square matrix of all entries.
-
-    Args:
-        parts: its entries.
-        size: of the matrix.
-    """
+    """Return the square matrix of all entries."""
     rows, columns, values = (np.concatenate(part) for part in zip(*parts, strict=True))
     if not is_small(size):
         return sp.csr_array((values, (rows, columns)), shape=(size, size))
     return np.bincount(rows * size + columns, values, size**2).reshape(size, size)
 
 
+def whole(matrix: Matrix) -> Float[np.ndarray, "n n"]:
+    """Return a matrix that is dense."""
+    return matrix if isinstance(matrix, np.ndarray) else matrix.toarray()
+
+
 @dataclass(frozen=True)
 class Terms:
-    """What every value depends on linearly, in a fixed number of terms.
+    """What every value depends on linearly, in a fixed number of terms."""
 
-    Attributes:
-        index: parameter of each term; `count` where a term is none.
-        factor: of that parameter.
-        count: number of parameters.
-    """
-
-    index: Int[np.ndarray, "o 3 m"]
-    factor: Float[np.ndarray, "o 3 m"]
-    count: int
+    index: Int[np.ndarray, "o 3 m"]  # parameter of each term; `count` where there is no term
+    factor: Float[np.ndarray, "o 3 m"]  # of that parameter
+    count: int  # number of parameters
 
     def of(self, parameters: Float[np.ndarray, " k"]) -> Float[np.ndarray, "o 3"]:
         """Return the sums at some parameters."""
@@ -84,13 +74,7 @@ class Terms:
     def sums(
         self, values: Float[np.ndarray, "o 3"], place: Int[np.ndarray, "o 3"], places: int
     ) -> Float[np.ndarray, "places k"]:
-        """Return sums of values times factors at places, for each parameter.
-
-        Args:
-            values: what is summed.
-            place: where each belongs.
-            places: their number.
-        """
+        """Return sums of values times factors at each of `places` places, for each parameter."""
         width = self.count + 1
         at = place[..., None] * width + self.index
         total = np.bincount(at.ravel(), (values[..., None] * self.factor).ravel(), places * width)
@@ -109,3 +93,74 @@ class Terms:
                 total += found
         half = mixed.reshape(width, width)
         return (own.reshape(width, width) + half + half.T)[:-1, :-1]
+
+
+class Pairs:
+    """Every pair of observations of a row once, each with itself included.
+
+    Entries of the sums exist only where two views share a point: with thousands of views, those
+    are few of all.
+    """
+
+    def __init__(self, row: Int[np.ndarray, " o"], views: Int[np.ndarray, " o"], view_count: int):
+        # Sorted by row, the two of a pair lie close together.
+        self._order = np.argsort(row, kind="stable")
+        self._views = view_count
+        here, seen_by = row[self._order], views[self._order]
+        at = np.arange(len(here))
+        # Every entry with itself and those after it that equal it.
+        following = np.searchsorted(here, here, side="right") - at
+        self._first = np.repeat(at, following).astype(np.int32)
+        ends = np.cumsum(following) - following
+        offset = np.arange(len(self._first)) - np.repeat(ends, following)
+        self._second = (self._first + offset).astype(np.int32)
+        del offset
+        keys = seen_by[self._first] * np.int64(view_count) + seen_by[self._second]
+        unique, place = np.unique(keys, return_inverse=True)
+        self._place = place.astype(np.int32)
+        self._rows, self._columns = unique // max(view_count, 1), unique % max(view_count, 1)
+
+    def sums(
+        self,
+        factors: list[Float[np.ndarray, "o f"]],
+        shared: list[list[tuple[int, int]]],
+        kind: type[np.floating] = np.float64,
+    ) -> Entries:
+        """Return the sum over rows of outer products of per-view vectors: (x V, x V).
+
+        Args:
+            factors: of each of x parameters, what its view contributes, in f components.
+            shared: for every two parameters the components that they have in common, as pairs of
+                places in their factors: `shared[x * len(factors) + y]`.
+            kind: of the products. In the rounds float32: there the matrix decides how fast they
+                converge, never where they end. Standard errors need float64: what joins groups of
+                views by a few dark points is less than the rounding of what joins the views of a
+                group.
+        """
+        count, views = len(factors), self._views
+        parts = [f[self._order].astype(kind) for f in factors]
+        used = [k for k, common in enumerate(shared) if common]
+        totals = np.zeros((len(used), len(self._rows)))
+        # Not fewer at once than half of the entries they are added to.
+        chunk = max(CHUNK, len(self._rows) // 2)
+        for start in range(0, len(self._first), chunk):
+            part = slice(start, start + chunk)
+            first, second, place = self._first[part], self._second[part], self._place[part]
+            # A product of an observation with itself is counted twice below.
+            half = np.where(first == second, kind(0.5), kind(1.0))
+            left = [np.take(p, first, 0) * half[:, None] for p in parts]
+            right = [np.take(p, second, 0) for p in parts]
+            for total, k in zip(totals, used, strict=True):
+                x, y = divmod(k, count)
+                a, b = zip(*shared[k], strict=True)
+                products = np.einsum("pf,pf->p", left[x][:, a], right[y][:, b])
+                total += np.bincount(place, products, len(total))
+        rows = np.concatenate([self._rows + k // count * views for k in used])
+        columns = np.concatenate([self._columns + k % count * views for k in used])
+        totals = totals.ravel()
+        # The other order of each pair.
+        return Entries(
+            np.concatenate([rows, columns]),
+            np.concatenate([columns, rows]),
+            np.concatenate([totals, totals]),
+        )

@@ -8,41 +8,30 @@ from typing import NamedTuple, cast
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-from p2gs_jax.photometry.adjustment.forward import Forward
 from p2gs_jax.photometry.adjustment.matrices import Entries, Matrix, Terms, assembled, block
-from p2gs_jax.photometry.adjustment.parameters import Parameters, Unknowns
+from p2gs_jax.photometry.adjustment.parameters import Forward, Parameters, Unknowns
+from p2gs_jax.photometry.adjustment.problem import Rows
 from p2gs_jax.photometry.adjustment.robust import Weighted
-from p2gs_jax.photometry.adjustment.rows import Rows
-from p2gs_jax.photometry.adjustment.system import EMPTY
+from p2gs_jax.photometry.adjustment.system import EMPTY, Vector
+from p2gs_jax.photometry.observations import Labels, PerChannel
 
 
 class OfView(NamedTuple):
-    """A parameter that every view has.
+    """A parameter that every view has: the derivative of predictions, and where it acts."""
 
-    Attributes:
-        derivative: of predictions by it.
-        channels: in which it acts.
-    """
-
-    derivative: Float[np.ndarray, "o 3"]
+    derivative: PerChannel
     channels: list[int]
 
 
 def normal_equations(
     model: Forward, theta: Parameters, at: Weighted, kind: type[np.floating] = np.float64
-) -> tuple[Matrix, Float[np.ndarray, " d"]]:
+) -> tuple[Matrix, Vector]:
     """Return the reduced normal matrix and right side, without gauges and priors.
 
     A prediction b + a (l + k features) - c basis has the derivatives 1, l + k features, a features
-    and -basis; a point's own is a.
-
-    Args:
-        model: observations, and what explains them.
-        theta: parameters.
-        at: residuals and weights at these.
-        kind: of the products of pairs; see `Pairs.sums`.
+    and -basis; a point's own is a. The products of pairs are of a `kind`; see `Pairs.sums`.
     """
     rows, u = model.rows, model.unknowns
     w, pull = at.weight, at.weight * at.residual
@@ -75,15 +64,13 @@ def normal_equations(
     return assembled(parts, u.count), np.concatenate(right)
 
 
-def coupling(rows: Rows, theta: Parameters, at: Weighted) -> Float[np.ndarray, "o 3"]:
-    """Return what couples the observations of a point once it is eliminated: its own derivatives.
-
-    Args:
-        rows: observations.
-        theta: parameters.
-        at: weights at these.
-    """
-    return at.weight * theta.a[rows.views][:, None] / np.sqrt(at.precision + EMPTY)[rows.row]
+def coupling(rows: Rows, theta: Parameters, at: Weighted) -> PerChannel:
+    """Return what couples the observations of a point once it is eliminated: its derivatives."""
+    return (
+        at.weight
+        * theta.a[rows.layout.views][:, None]
+        / np.sqrt(at.precision + EMPTY)[rows.layout.row]
+    )
 
 
 def of_views(model: Forward, at: Weighted) -> list[OfView]:
@@ -99,7 +86,7 @@ def others(model: Forward, theta: Parameters) -> Terms | None:
     """Return the derivatives of predictions by k and c."""
     features, basis = model.features, model.basis
     if features is not None:
-        a = theta.a[model.rows.views][:, None, None]
+        a = theta.a[model.rows.layout.views][:, None, None]
         features = replace(features, factor=a * features.factor)
     if basis is not None:
         basis = replace(basis, factor=-basis.factor)
@@ -108,26 +95,26 @@ def others(model: Forward, theta: Parameters) -> Terms | None:
     return features.joined(basis)
 
 
-def _per_view(rows: Rows, values: Float[np.ndarray, "o 3"], channels: list[int]):
+def _per_view(rows: Rows, values: PerChannel, channels: list[int]):
     # Of nothing at all, numpy counts in integers.
-    total = np.bincount(rows.views, values[:, channels].sum(1), rows.view_count)
+    total = np.bincount(rows.layout.views, values[:, channels].sum(1), rows.layout.view_count)
     return total.astype(np.float64)
 
 
 def _with_others(
-    model: Forward, at: Weighted, terms: Terms, per_view: list[OfView], coupled
+    model: Forward, at: Weighted, terms: Terms, per_view: list[OfView], coupled: PerChannel
 ) -> tuple[list[Entries], Float[np.ndarray, " k"]]:
     """Return what k and c add to the equations: entries, and their right side."""
     rows, u = model.rows, model.unknowns
-    place = 3 * rows.row[:, None] + np.arange(3)
-    through = terms.sums(coupled, place, 3 * rows.count)
+    place = 3 * rows.layout.row[:, None] + np.arange(3)
+    through = terms.sums(coupled, place, 3 * rows.layout.rows)
     first = u.per_view
     parts = []
-    at_view = np.broadcast_to(rows.views[:, None], at.weight.shape)
+    at_view = np.broadcast_to(rows.layout.views[:, None], at.weight.shape)
     for x, one in enumerate(per_view):
         acting = np.isin(np.arange(3), one.channels)
         side = terms.sums(at.weight * one.derivative * acting, at_view, u.views)
-        mine = at_places(rows, coupled * one.derivative, rows.views, u.views, one.channels)
+        mine = at_places(rows, coupled * one.derivative, rows.layout.views, u.views, one.channels)
         side -= mine @ through
         across = block(x * u.views, first, side)
         parts += [across, Entries(across.columns, across.rows, across.values)]
@@ -142,50 +129,27 @@ def _with_others(
 
 
 def at_places(
-    rows: Rows,
-    values: Float[np.ndarray, "o 3"],
-    places: Int[np.ndarray, " o"],
-    count: int,
-    channels: Sequence[int] = (0, 1, 2),
+    rows: Rows, values: PerChannel, places: Labels, count: int, channels: Sequence[int] = (0, 1, 2)
 ) -> sp.csr_array:
-    """Return the matrix that holds values at places and points: (count, 3 rows).
-
-    Args:
-        rows: observations.
-        values: of each channel.
-        places: of each observation.
-        count: number of places.
-        channels: whose values it holds.
-    """
-    at = 3 * rows.row[:, None] + np.array(channels)
+    """Return the matrix that holds values of channels at places and points: (count, 3 rows)."""
+    at = 3 * rows.layout.row[:, None] + np.array(channels)
     where = np.broadcast_to(places[:, None], at.shape)
-    shape = (count, 3 * rows.count)
+    shape = (count, 3 * rows.layout.rows)
     return sp.csr_array((values[:, channels].ravel(), (where.ravel(), at.ravel())), shape=shape)
 
 
 def summed(
-    model: Forward,
-    theta: Parameters,
-    at: Weighted,
-    values: Float[np.ndarray, "o 3"],
-    places: Int[np.ndarray, " o"],
+    model: Forward, theta: Parameters, at: Weighted, values: PerChannel, places: Labels
 ) -> sp.csr_array:
     """Return sums over places of values times derivatives by all parameters: (places, d).
 
-    Of the pull of observations, weight times residual, these are the scores of clusters.
-
-    Args:
-        model: observations, and what explains them.
-        theta: parameters.
-        at: weights at these.
-        values: what is summed.
-        places: of each observation: 0, 1, ...
+    For the pull of observations, weight times residual, these are the scores of clusters.
     """
     rows, u = model.rows, model.unknowns
     count = int(places.max(initial=-1)) + 1
     per_view = [
         sp.csr_array(
-            ((values * p.derivative)[:, p.channels].sum(1), (places, rows.views)),
+            ((values * p.derivative)[:, p.channels].sum(1), (places, rows.layout.views)),
             shape=(count, u.views),
         )
         for p in of_views(model, at)
@@ -198,15 +162,9 @@ def summed(
 def over_all(
     u: Unknowns, per_view: list[sp.csr_array], more: Float[np.ndarray, "n k"] | None
 ) -> sp.csr_array:
-    """Return columns for all parameters; without gammas, a keeps its place.
-
-    Args:
-        u: the parameters.
-        per_view: columns of those that every view has.
-        more: columns of k and c; None where there are none.
-    """
+    """Return columns for all parameters: those of views, then those of k and c, if any."""
     parts = [*per_view]
-    if not u.gammas:
+    if not u.gammas:  # a keeps its place
         parts.append(sp.csr_array((cast(tuple[int, int], parts[0].shape)[0], u.views)))
     if more is not None:
         parts.append(sp.csr_array(more))

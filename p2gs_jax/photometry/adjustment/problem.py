@@ -4,44 +4,76 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+import scipy.sparse as sp
 from jaxtyping import Bool, Float, Int
 
-from p2gs_jax.photometry.adjustment.rows import Layout
-from p2gs_jax.photometry.observations import Observations
+from p2gs_jax.config import ResponseKind
+from p2gs_jax.photometry.adjustment.matrices import Pairs
+from p2gs_jax.photometry.observations import Observations, PerChannel
+from p2gs_jax.photometry.response import Response, hat, spline_groups
+
+LONGEST_ROW = 16
 
 
 @dataclass(frozen=True)
 class KnownExposures:
-    """What is known of the exposures besides the photographs.
+    """What is known of the exposures besides the photographs."""
 
-    Attributes:
-        log_exposures: natural logarithm; NaN where nothing is known.
-        deviation_ev: standard deviation in stops; 0 keeps the value.
+    log_exposures: Float[np.ndarray, " v"]  # natural logarithm; NaN where nothing is known
+    deviation_ev: float = 0.0  # standard deviation in stops; 0 keeps the value
+
+
+class Layout:
+    """Which row, view and camera each observation belongs to.
+
+    Tracks longer than `slots` are split into interleaved rows with a radiance of their own each,
+    which loses a few degrees of freedom and bounds the number of pairs. `by_row` sums observations
+    over their rows; `radius2` are squared distances from the image centre, 1 in the corners.
     """
 
-    log_exposures: Float[np.ndarray, " v"]
-    deviation_ev: float = 0.0
+    def __init__(self, observations: Observations):
+        points, places = np.asarray(observations.points), observations.positions
+        self.views, self.view_count = np.asarray(observations.views), observations.view_count
+        self.cameras = np.asarray(observations.cameras)
+        known = places is not None
+        self.radius2 = (places.astype(float) ** 2).sum(1) if known else np.zeros(len(points))
+        lengths = np.bincount(points, minlength=observations.point_count)
+        used = lengths[lengths > 0]
+        typical = int(np.quantile(used, 0.9)) if len(used) else 2
+        self.slots = int(min(LONGEST_ROW, max(2, 2 ** int(np.ceil(np.log2(max(typical, 2)))))))
+        split = -(-lengths // self.slots)
+        first = np.concatenate([[0], np.cumsum(split)])
+        order = np.argsort(points, kind="stable")
+        starts = np.concatenate([[0], np.cumsum(lengths)])
+        rank = np.empty(len(points), int)
+        rank[order] = np.arange(len(points)) - starts[points[order]]
+        self.row = first[points] + rank % np.maximum(split[points], 1)
+        self.rows = int(first[-1])
+        self.point_of_row = np.repeat(np.arange(observations.point_count), split)
+        count = len(points)
+        self.by_row = sp.csr_array(
+            (np.ones(count), (self.row, np.arange(count))), shape=(self.rows, count)
+        )
+
+    @functools.cached_property
+    def pairs(self) -> Pairs:
+        """Every pair of observations in a row once, themselves included."""
+        return Pairs(self.row, self.views, self.view_count)
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Observations laid out once, for any number of models.
+    """Observations laid out once, for any number of models."""
 
-    Attributes:
-        observations: the colours.
-        usable: which values can be used.
-        component: label of each view.
-        log_pivot: log of the value that gamma leaves alone.
-        known: exposures known beforehand, or None.
-    """
-
-    observations: Observations
-    usable: Bool[np.ndarray, "o 3"]
+    observations: Observations  # the colours
+    usable: Bool[np.ndarray, "o 3"]  # which values can be used
+    # Label of each view; views with different labels cannot be compared.
     component: Int[np.ndarray, " v"]
-    log_pivot: float
-    known: KnownExposures | None
+    log_pivot: float  # log of the linear value that gamma leaves alone
+    known: KnownExposures | None  # exposures known beforehand, or None
 
     @functools.cached_property
     def layout(self) -> Layout:
@@ -62,20 +94,32 @@ def make_problem(
     pivot: float,
     known: KnownExposures | None = None,
 ) -> Problem:
-    """Lay observations out for `fit_model`.
-
-    Args:
-        observations: the colours.
-        black: values up to here say nothing.
-        saturation: values from here on say nothing.
-        pivot: linear value that gamma leaves alone.
-        known: exposures known beforehand.
-    """
+    """Lay observations out; display values up to `black` or from `saturation` on say nothing."""
     usable = observations.usable(black, saturation)
-    return Problem(
-        observations,
-        usable,
-        observations.components(usable),
-        float(np.log(pivot)),
-        known,
-    )
+    component = observations.components(usable)
+    return Problem(observations, usable, component, float(np.log(pivot)), known)
+
+
+class Rows(NamedTuple):
+    """Observations by row (one point each, or a part of a long track) under one response."""
+
+    layout: Layout
+    z: PerChannel  # log exposed radiance under the base curve, relative to the pivot
+    sigma: PerChannel  # its standard deviation
+    weight: PerChannel  # 1 used, 0 masked or held out
+    knot: Int[np.ndarray, "o 3"]  # left spline knot
+    fraction: PerChannel  # of the way to the next knot
+    slope: PerChannel  # dz/dy under the base curve
+    group: Int[np.ndarray, "o 3"]  # which spline decodes a value, where they are solved for
+
+
+def make_rows(
+    problem: Problem, weight: PerChannel, response: Response, splines: ResponseKind | None = None
+) -> Rows:
+    """Return rows under one response; `splines` says what gets a spline that is solved for."""
+    layout, o = problem.layout, problem.observations
+    z, sigma, slope = o.decoded(response)
+    knot, fraction = hat(np.asarray(o.colors, np.float64))
+    group = spline_groups(splines or "all", layout.cameras[layout.views], z.shape)
+    weight = np.asarray(weight, np.float64)
+    return Rows(layout, z - problem.log_pivot, sigma, weight, knot, fraction, slope, group)

@@ -1,7 +1,7 @@
 """Rounds of weighing and stepping: four under an L1 loss, then Geman-McClure's to a fixed point,
 either of single observations or of whole points (`robust.py`).
 
-Outliers are weighted away: 0 / 10 / 30 % of them give .005 / .006 / .007 EV (docs/photometry.md,
+Outliers are weighted away: 0 / 10 / 30 % of them give 0.005 / 0.006 / 0.007 EV (docs/photometry.md,
 4). The L1 rounds bring the start near enough for the loss that ignores what is far away.
 """
 
@@ -11,102 +11,165 @@ import functools
 from typing import NamedTuple
 
 import numpy as np
+import scipy.linalg
+import scipy.sparse as sp
+import scipy.sparse.linalg
+import threadpoolctl
 from jaxtyping import Float
 
-from p2gs_jax.photometry.adjustment.forward import Forward
-from p2gs_jax.photometry.adjustment.linear import Balanced
-from p2gs_jax.photometry.adjustment.matrices import Matrix
+from p2gs_jax.config import ResponseKind
+from p2gs_jax.photometry.adjustment.matrices import Matrix, is_small, whole
 from p2gs_jax.photometry.adjustment.normal import normal_equations
-from p2gs_jax.photometry.adjustment.parameters import Parameters
+from p2gs_jax.photometry.adjustment.parameters import Forward, Parameters, make_forward
+from p2gs_jax.photometry.adjustment.problem import Problem, Rows, make_rows
 from p2gs_jax.photometry.adjustment.robust import Loss, Weighted, noise_weight, weigh
-from p2gs_jax.photometry.adjustment.rows import Rows
-from p2gs_jax.photometry.adjustment.system import System, with_priors
+from p2gs_jax.photometry.adjustment.system import System, make_system, with_priors
+from p2gs_jax.photometry.models import Form
+from p2gs_jax.photometry.response import Response, log_slope_minimum, monotone
 
 # Rounds of both losses together are no more than MOST_ROUNDS.
 L1_ROUNDS, MOST_ROUNDS = 4, 60
 A_RANGE = (0.3, 3.0)
+# Change of a parameter, log units, at which rounds end: for what is kept, and what is compared.
+TOLERANCE, TOLERANCE_TO_COMPARE = 1e-5, 5e-3
+# Damping of the balanced matrix, whose diagonal is 1.
+DAMPING = 1e-8
+# Groups of neighbouring unknowns, whose common changes a coarse system solves.
+GROUPS = 1000
+# Relative residual at which the iteration ends; a round's step need not be exact.
+PRECISION, MOST_ITERATIONS = 1e-7, 2000
+EXPOSURES = Form("view_exposure")
+# A spline may change the spread of exposures by this factor: the power gauge contradicts none.
+LARGEST_STRETCH = 1.6
+# d log exposure / d log value of mid tones; flatter ones are a collapse.
+SMALLEST_LOG_SLOPE = 0.3
+
+
+_libraries = functools.cache(threadpoolctl.ThreadpoolController)
+
+
+def one_thread():
+    """Return a context in which BLAS does not wake threads.
+
+    It does so for a system of a hundred unknowns, and waits for busy cores: 52 ms instead of 2
+    while something else computes (BUILD_NOTES).
+    """
+    return _libraries().limit(limits=1, user_api="blas")
+
+
+class Balanced:
+    """A symmetric matrix over its free directions, its diagonal scaled to 1, ready to be solved.
+
+    Outer products of few rows, the gauges, are added to it. Columns of `basis` are the
+    directions.
+    """
+
+    def __init__(self, normal: Matrix, gauges: sp.csr_array, basis: sp.csr_array):
+        reduced, held = basis.T @ normal @ basis, sp.csr_array(gauges @ basis)
+        diagonal = reduced.diagonal() + held.power(2).sum(0)
+        free = np.flatnonzero(diagonal > 1e-30)
+        self._scale = 1 / np.sqrt(diagonal[free])
+        self._directions = basis[:, free]
+        scaling = sp.diags_array(self._scale, format="csr")
+        matrix = scaling @ reduced[free][:, free] @ scaling
+        low_rank = held[:, free] @ scaling
+        if is_small(len(free)):
+            self._solve = _dense(whole(matrix) + (low_rank.T @ low_rank).toarray())
+        else:
+            self._solve = _iterative(sp.csr_array(matrix), low_rank.toarray())
+
+    def solve(self, right: Float[np.ndarray, "d ..."]) -> Float[np.ndarray, "d ..."]:
+        """Return the solution along the free directions."""
+        scale = self._scale.reshape(-1, *[1] * (right.ndim - 1))
+        return self._directions @ (scale * self._solve(scale * (self._directions.T @ right)))
+
+
+def _dense(matrix: Float[np.ndarray, "n n"]):
+    matrix[np.diag_indices_from(matrix)] += DAMPING
+    return lambda right: np.linalg.solve(matrix, right)
+
+
+def _iterative(sparse: sp.csr_array, low_rank: Float[np.ndarray, "g n"]):
+    """Conjugate gradients with a two-level preconditioner.
+
+    A long drive is a chain: what is wrong by a little everywhere adds up from its one end to its
+    other, and takes as many iterations as there are links. Sums over groups of neighbours are
+    therefore solved exactly.
+    """
+    count = low_rank.shape[1]
+    sparse = sp.csr_array(sparse + DAMPING * sp.eye_array(count))
+    group = np.arange(count) * GROUPS // count
+    coarse = sp.csr_array((np.ones(count), (np.arange(count), group)))
+    grouped = low_rank @ coarse
+    factor = scipy.linalg.cho_factor((coarse.T @ sparse @ coarse).toarray() + grouped.T @ grouped)
+
+    def multiply(x):
+        return sparse @ x + low_rank.T @ (low_rank @ x)
+
+    def precondition(residual):
+        return residual + coarse @ scipy.linalg.cho_solve(factor, coarse.T @ residual)
+
+    operator = functools.partial(scipy.sparse.linalg.LinearOperator, (count, count))
+    matrix, preconditioner = operator(multiply), operator(precondition)
+
+    def one(right):
+        found, _ = scipy.sparse.linalg.cg(
+            matrix, right, rtol=PRECISION, maxiter=MOST_ITERATIONS, M=preconditioner
+        )
+        return found
+
+    def solve(right):
+        if right.ndim == 1:
+            return one(right)
+        return np.stack([one(column) for column in right.T], 1)
+
+    return solve
 
 
 class Fit(NamedTuple):
-    """A solution and what its errors are computed from.
+    """A solution and what its errors are computed from."""
 
-    Attributes:
-        theta: the parameters.
-        at: residuals and weights there.
-        model: what was solved.
-        normal: reduced normal matrix, without gauges and priors.
-        rounds: iterations.
-        moved: largest change of a parameter in the last round, log units.
-        left: how far the end is, were the rounds to go on as the last two did; inf if they grew.
-        converged: `moved` was less than the tolerance.
-    """
-
-    theta: Parameters
-    at: Weighted
-    model: Forward
-    normal: Matrix
-    rounds: int
-    moved: float
+    theta: Parameters  # the parameters
+    at: Weighted  # residuals and weights there
+    model: Forward  # what was solved
+    normal: Matrix  # reduced normal matrix, without gauges and priors
+    rounds: int  # iterations
+    moved: float  # largest change of a parameter in the last round, log units
+    # How far the end is, were the rounds to go on as the last two did; inf if they grew.
     left: float
-    converged: bool
+    converged: bool  # `moved` was less than the tolerance
 
 
-class _Round(NamedTuple):
-    """Where a round ended.
-
-    Attributes:
-        theta: parameters after it.
-        weight: that it was computed with.
-        moved: its largest change of a parameter.
-        moved_before: the same of the round before.
-    """
-
-    theta: Parameters
-    weight: Float[np.ndarray, "o 3"]
-    moved: float
-    moved_before: float
-
-
-def _next(model: Forward, system: System, last: _Round, loss: Loss) -> _Round:
-    """Return the next round: weights under a loss, and one Gauss-Newton step with them."""
-    theta, u = last.theta, system.unknowns
-    at = weigh(model, theta, last.weight, loss)
+def _step(
+    model: Forward, system: System, theta: Parameters, at: Weighted
+) -> tuple[Parameters, float]:
+    """Return the parameters after one Gauss-Newton step, and its largest change of one of them."""
     normal, right = normal_equations(model, theta, at, np.float32)
     normal, gauges, right = with_priors(system, theta, normal, right)
-    step = u.split(Balanced(normal, gauges, system.basis).solve(right))
-    new = Parameters(
-        theta.b + step.b,
-        np.clip(theta.a + step.a, *A_RANGE),
-        theta.k + step.k,
-        theta.c + step.c,
-    )
+    step = system.unknowns.split(Balanced(normal, gauges, system.basis).solve(right))
+    new = Parameters(*(x + dx for x, dx in zip(theta, step, strict=True)))
+    new = new._replace(a=np.clip(new.a, *A_RANGE))
     changes = zip(new, theta, strict=True)
-    moved = float(np.max([np.abs(x - y).max(initial=0.0) for x, y in changes]))
-    return _Round(new, at.weight, moved, last.moved)
+    return new, float(np.max([np.abs(x - y).max(initial=0.0) for x, y in changes]))
 
 
 def solve(rows: Rows, system: System, tolerance: float, loss: Loss) -> Fit:
     """Adjust exposures, gammas, cameras and response to observations (float64).
 
-    Args:
-        rows: observations.
-        system: free directions, gauges, priors.
-        tolerance: largest change of a parameter in a round that counts as none.
-        loss: of the rounds after those under L1.
+    A largest change of a parameter below the tolerance, log units, counts as none. `loss` is of the
+    rounds after those under L1.
     """
-    model = Forward.of(rows, system.unknowns)
-    after = functools.partial(_next, model, system)
-    last = _Round(system.start, noise_weight(rows), np.inf, np.inf)
-    for _ in range(L1_ROUNDS):
-        last = after(last, "l1")
-    # The first of these changes the loss: what it moves says nothing about the next.
-    last, count = after(last, loss), L1_ROUNDS + 1
-    while count < MOST_ROUNDS:
-        last, count = after(last, loss), count + 1
-        if last.moved < tolerance:
+    model = make_forward(rows, system.unknowns)
+    theta, weight = system.start, noise_weight(rows)
+    moved, before, count = np.inf, np.inf, 0
+    for count in range(1, MOST_ROUNDS + 1):
+        at = weigh(model, theta, weight, "l1" if count <= L1_ROUNDS else loss)
+        weight, before = at.weight, moved
+        theta, moved = _step(model, system, theta, at)
+        # The first round of another loss says nothing of the next.
+        if count > L1_ROUNDS + 1 and moved < tolerance:
             break
-    theta, moved, before = last.theta, last.moved, last.moved_before
-    at = weigh(model, theta, last.weight, loss)
+    at = weigh(model, theta, weight, loss)
     return Fit(
         theta=theta,
         at=at._replace(curvature=max(at.curvature, 0.1)),
@@ -117,3 +180,57 @@ def solve(rows: Rows, system: System, tolerance: float, loss: Loss) -> Fit:
         left=moved**2 / (before - moved) if moved < before else np.inf if moved else 0.0,
         converged=moved < tolerance,
     )
+
+
+def solve_model(
+    problem: Problem,
+    form: Form,
+    response: Response,
+    *,
+    use: Float[np.ndarray, " o"] | None = None,
+    splines: ResponseKind | None = None,
+    tolerance: float = TOLERANCE,
+    loss: Loss = "geman_mcclure",
+) -> tuple[Fit, System]:
+    """Solve one form under a response; `use` is 0 for observations that are kept out.
+
+    `splines` says what gets a spline over the response's base that is solved for as well (None:
+    nothing). The tolerance and the loss are those of `solve`.
+    """
+    weight = problem.usable if use is None else problem.usable * use[:, None]
+    rows, system = (
+        make_rows(problem, weight, response, splines),
+        make_system(problem, form, splines),
+    )
+    with one_thread():
+        return solve(rows, system, tolerance, loss), system
+
+
+def fit_response(
+    problem: Problem,
+    base: Response,
+    *,
+    form: Form = EXPOSURES,
+    by: ResponseKind = "all",
+    spread: float | None = None,
+) -> Response | None:
+    """Return the base with the spline, or splines `by` camera or channel, that fit best.
+
+    None where one collapsed: it falls somewhere, is flat over mid tones, or stretches the
+    exposures by more than LARGEST_STRETCH (which no photograph contradicts: the power gauge).
+    The form that varies beside it has no gammas, which bend curves as well. `spread` is the
+    standard deviation of log exposures under the base; it is solved if not given.
+    """
+    compared = TOLERANCE_TO_COMPARE
+    fit, system = solve_model(problem, form, base, splines=by, tolerance=compared)
+    if spread is None:
+        plain, _ = solve_model(problem, form, base, tolerance=compared)
+        spread = float(np.std(plain.theta.b.mean(1)))
+    splines = system.unknowns.splines.values(fit.theta.c)
+    mean, *each = (tuple(map(float, values)) for values in (splines.mean(0), *splines))
+    response = Response(base.base, mean, by, () if by == "all" else tuple(each))
+    stretch = (np.std(fit.theta.b.mean(1)) + 1e-3) / (spread + 1e-3)
+    if problem.known is None and not 1 / LARGEST_STRETCH < stretch < LARGEST_STRETCH:
+        return None
+    rises = monotone(response) and log_slope_minimum(response) > SMALLEST_LOG_SLOPE
+    return response if rises else None

@@ -26,21 +26,17 @@ EMPTY = 1e-9
 A_PRIOR = 0.15
 # Standard deviation of each coefficient of log V about 0: lenses lose up to two stops.
 VIGNETTING_PRIOR = 0.7
-# A known exposure that is to be kept: stops.
+# Deviation of a known exposure that is to be kept, stops.
 FIXED_EV = 1e-5
-# Smoothness of the spline relative to its mean information, and the spacing of knots it is told at.
+# Smoothness of the spline relative to its mean information, and the spacing of knots it holds for.
 SMOOTHNESS, KNOT_SPACING = 3e-3, 0.12
+
+Vector = Float[np.ndarray, " d"]
 
 
 @dataclass(frozen=True)
 class Held:
-    """Linear combinations of the parameters, and where they are held.
-
-    Attributes:
-        rows: of a matrix; its product with the parameters is what is held.
-        targets: where.
-        precisions: how hard: inverse variances.
-    """
+    """Linear combinations of the parameters (rows), held at targets with inverse variances."""
 
     rows: sp.csr_array
     targets: Float[np.ndarray, " n"]
@@ -51,29 +47,21 @@ class Held:
         """Its normal matrix."""
         return sp.csr_array(self.rows.T @ self.rows.multiply(self.precisions[:, None]))
 
-    def pull(self, vector: Float[np.ndarray, " d"]) -> Float[np.ndarray, " d"]:
+    def pull(self, vector: Vector) -> Vector:
         """Return its right side at some parameters."""
         return self.rows.T @ (self.precisions * (self.targets - self.rows @ vector))
 
 
 @dataclass(frozen=True)
 class System:
-    """Which directions are free, and what is known besides the photographs.
+    """Which directions are free, and what is known besides the photographs."""
 
-    Attributes:
-        unknowns: what the parameters are.
-        basis: columns are the free directions.
-        anchors: the gauges; their precisions are relative (`gauge_strength`).
-        priors: what is known.
-        log_exposure: prior mean of h: where rounds start.
-        smoothness: matrix whose quadratic form keeps a spline smooth, (k, k).
-    """
-
-    unknowns: Unknowns
-    basis: sp.csr_array
-    anchors: Held
-    priors: Held
-    log_exposure: Float[np.ndarray, " v"]
+    unknowns: Unknowns  # what the parameters are
+    basis: sp.csr_array  # columns are the free directions
+    anchors: Held  # the gauges; their precisions are relative (`gauge_strength`)
+    priors: Held  # what is known
+    log_exposure: Float[np.ndarray, " v"]  # prior mean of h: where rounds start
+    # Matrix whose quadratic form keeps a spline smooth, (k, k).
     smoothness: Float[np.ndarray, "k k"]
 
     @property
@@ -92,13 +80,7 @@ class System:
 
 
 def make_system(problem: Problem, form: Form, splines: ResponseKind | None = None) -> System:
-    """Return free directions, gauges and priors of a form.
-
-    Args:
-        problem: for cameras, groups of views and known exposures.
-        form: what varies.
-        splines: what gets a spline that is solved for as well; None: the response is given.
-    """
+    """Return free directions, gauges and priors of a form; `splines` as in `make_rows`."""
     cameras, views = problem.observations.cameras, problem.observations.view_count
     camera_count = int(cameras.max(initial=0)) + 1
     model = MODELS[form.model]
@@ -138,19 +120,14 @@ def _directions(level: Level | None, cameras: np.ndarray) -> sp.csr_array:
     return sp.csr_array((np.ones(views), (np.arange(views), column)))
 
 
-def _selection(index, weights, size: int) -> Float[np.ndarray, " d"]:
-    row = np.zeros(size)
-    row[index] = weights
-    return row
-
-
 def _anchors(problem: Problem, u: Unknowns, log_exposure, precision) -> Held:
     """Return the gauges: scale, power and colour of each group of views that share points."""
-    size = u.count
-    rows, targets = [sp.csr_array((0, size))], []
+    rows, targets = [sp.csr_array((0, u.count))], []
 
     def hold(index, weights, target=0.0) -> None:
-        rows.append(sp.csr_array(_selection(index, weights, size)[None]))
+        row = np.zeros(u.count)
+        row[index] = weights
+        rows.append(sp.csr_array(row[None]))
         targets.append(target)
 
     for label in np.unique(problem.component):
@@ -165,15 +142,15 @@ def _anchors(problem: Problem, u: Unknowns, log_exposure, precision) -> Held:
                 both = np.concatenate([channel * u.views + members, u.views + members])
                 hold(both, np.repeat([share, -share], len(members)))
         if known.sum() < 2 or np.ptp(log_exposure[members]) < 1e-3:
-            hold(u.of_a.start + members, share, 1.0)
+            hold(u.at.a.start + members, share, 1.0)
     if u.features.balance:
         views_of = np.bincount(problem.observations.cameras, minlength=u.features.cameras)
         for direction in range(u.features.balance_count // u.features.cameras):
-            at = u.of_k.start + direction * u.features.cameras + np.arange(u.features.cameras)
+            at = u.at.k.start + direction * u.features.cameras + np.arange(u.features.cameras)
             hold(at, views_of / views_of.sum())
-    powers = u.of_c.start + u.splines.powers
+    powers = u.at.c.start + u.splines.powers
     if u.splines.by == "channel" and u.channels == 3:
-        # Of a channel with exposures of its own no photograph tells the power.
+        # No photograph tells the power of a channel with exposures of its own.
         for power in powers:
             hold(power, 1.0)
     elif powers.size:
@@ -186,24 +163,26 @@ def _priors(u: Unknowns, log_exposure, precision) -> Held:
     given, views = np.flatnonzero(precision > 0), np.arange(u.views)
     at = np.arange(len(given))
     b = [(np.full(len(given), 1 / u.channels), c * u.views + given) for c in range(u.channels)]
-    b.append((-log_exposure[given], u.of_a.start + given))
+    b.append((-log_exposure[given], u.at.a.start + given))
     values, columns = (np.concatenate(part) for part in zip(*b, strict=True))
     exposures = sp.csr_array(
         (values, (np.tile(at, u.channels + 1), columns)), shape=(len(given), u.count)
     )
-    whole = sp.csr_array(sp.eye_array(u.count))
-    of_a = whole[u.of_a.start + views] if u.gammas else whole[:0]
-    lenses = np.arange(u.of_k.start + u.features.balance_count, u.of_k.stop)
-    rows = sp.vstack([exposures, of_a, whole[lenses]])
-    targets = np.concatenate([np.zeros(len(given)), np.ones(of_a.shape[0]), np.zeros(len(lenses))])
-    precisions = np.concatenate(
-        [
-            precision[given],
-            np.full(of_a.shape[0], 1 / A_PRIOR**2),
-            np.full(len(lenses), 1 / VIGNETTING_PRIOR**2),
-        ]
+    every = sp.csr_array(sp.eye_array(u.count))
+    of_a = every[u.at.a.start + views] if u.gammas else every[:0]
+    lenses = np.arange(u.at.k.start + u.features.balance_count, u.at.k.stop)
+    gammas = of_a.shape[0]
+    return Held(
+        sp.csr_array(sp.vstack([exposures, of_a, every[lenses]])),
+        np.repeat([0.0, 1.0, 0.0], [len(given), gammas, len(lenses)]),
+        np.concatenate(
+            [
+                precision[given],
+                np.full(gammas, 1 / A_PRIOR**2),
+                np.full(len(lenses), 1 / VIGNETTING_PRIOR**2),
+            ]
+        ),
     )
-    return Held(sp.csr_array(rows), targets, precisions)
 
 
 def _smoothness(splines: Splines) -> Float[np.ndarray, "k k"]:
@@ -218,28 +197,17 @@ def _smoothness(splines: Splines) -> Float[np.ndarray, "k k"]:
 
 
 def gauge_strength(normal: Matrix, unknowns: Unknowns) -> float:
-    """Return how hard the anchors hold, on the scale of the exposures' information.
-
-    Args:
-        normal: over all parameters.
-        unknowns: what they are.
-    """
+    """Return how hard the anchors hold, on the scale of the exposures' information."""
     of_b = normal.diagonal()[: unknowns.channels * unknowns.views]
     return ANCHOR * float(np.mean(of_b) + EMPTY)
 
 
 def with_priors(
-    system: System, theta: Parameters, normal: Matrix, right: Float[np.ndarray, " d"]
-) -> tuple[Matrix, sp.csr_array, Float[np.ndarray, " d"]]:
+    system: System, theta: Parameters, normal: Matrix, right: Vector
+) -> tuple[Matrix, sp.csr_array, Vector]:
     """Return normal equations with priors, the rows of the gauges, and the right side of both.
 
-    A gauge is a mean over views: of thousands, its normal matrix would not be sparse.
-
-    Args:
-        system: priors and gauges.
-        theta: parameters.
-        normal: matrix of the observations.
-        right: its right side.
+    A gauge is a mean over views: over thousands of them its normal matrix would not be sparse.
     """
     u, vector = system.unknowns, theta.vector()
     normal = normal + system.priors.normal
@@ -247,9 +215,9 @@ def with_priors(
     strength = gauge_strength(normal, u)
     right = right + strength * system.anchors.pull(vector)
     if theta.c.size:
-        stiffness = float(np.mean(normal.diagonal()[u.of_c]))
+        stiffness = float(np.mean(normal.diagonal()[u.at.c]))
         smooth = stiffness * system.smoothness
-        before = sp.csr_array((u.of_c.start,) * 2)
+        before = sp.csr_array((u.at.c.start,) * 2)
         normal = normal + sp.block_diag([before, smooth], format="csr")
-        right = right - np.concatenate([np.zeros(u.of_c.start), smooth @ theta.c])
+        right = right - np.concatenate([np.zeros(u.at.c.start), smooth @ theta.c])
     return normal, np.sqrt(strength) * system.anchors.rows, right

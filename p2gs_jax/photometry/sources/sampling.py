@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
 from p2gs_jax.core.numerics import srgb_decode, srgb_encode
-from p2gs_jax.photometry.cameras import places
+from p2gs_jax.photometry.formation import places
 from p2gs_jax.photometry.observations import COARSEST, Observations
-from p2gs_jax.photometry.sources.surroundings import surroundings
-from p2gs_jax.scene.images import ImageStore
+from p2gs_jax.photometry.response import DARKEST
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.visibility import project_points
 from p2gs_jax.types import Scene
 
@@ -25,22 +25,19 @@ POSITION_DEVIATION = 0.5
 # Positions that come from calibration or rendered depth, not from matching, are less certain than
 # tracks by this factor.
 PROJECTED_UNCERTAINTY = 2.0
+# For its surroundings a photograph is reduced to about this diagonal, pixels; it is blurred over
+# this part of half.
+DIAGONAL, REACH = 200, 0.12
 
 
 class Samples(NamedTuple):
-    """Colours of an image at some positions.
+    """Colours of an image at some positions."""
 
-    Attributes:
-        colors: averages over patches, display-encoded.
-        spread: standard deviation of `colors` from uncertain positions: gradient times that.
-        brightest: largest display values of the pixels that were averaged.
-        valid: inside the image and its mask.
-    """
-
-    colors: Float32[np.ndarray, "o 3"]
+    colors: Float32[np.ndarray, "o 3"]  # averages over patches, display-encoded
+    # Standard deviation of `colors` from uncertain positions: gradient times that.
     spread: Float32[np.ndarray, "o 3"]
-    brightest: Float32[np.ndarray, "o 3"]
-    valid: Bool[np.ndarray, " o"]
+    brightest: Float32[np.ndarray, "o 3"]  # largest display values of the pixels that were averaged
+    valid: Bool[np.ndarray, " o"]  # inside the image and its mask
 
 
 def sample(
@@ -49,13 +46,9 @@ def sample(
     xy: Float[np.ndarray, "o 2"],
     wider: Float[np.ndarray, " o"] | None = None,
 ) -> Samples:
-    """Sample an image at pixel positions.
+    """Sample an image, where its mask is 1, at pixel positions (centres at +0.5).
 
-    Args:
-        ldr: photograph.
-        mask: 1 = use.
-        xy: positions, pixel centres at +0.5.
-        wider: factors by which the averaged patches are wider than PATCH; None: 1.
+    The averaged patches are wider than PATCH by the factors `wider`; None: 1.
     """
     factors = np.ones(len(xy)) if wider is None else wider
     # Odd, so that patches are centred.
@@ -68,8 +61,8 @@ def sample(
         smooth = cv2.blur(linear, (width, width), borderType=cv2.BORDER_REFLECT)
         largest = cv2.dilate(ldr, np.ones((width, width), np.uint8))
         found = _sample_smooth(smooth, largest, mask, xy[pick], width // 2)
-        for whole, part in zip(out, found, strict=True):
-            whole[pick] = part
+        for everything, part in zip(out, found, strict=True):
+            everything[pick] = part
     return out
 
 
@@ -81,12 +74,8 @@ def _sample_smooth(smooth, brightest, mask, xy, margin: int) -> Samples:
     """
     height, width = mask.shape
     position = (xy - 0.5).astype(np.float32)
-    inside = (
-        (position[:, 0] >= margin)
-        & (position[:, 1] >= margin)
-        & (position[:, 0] <= width - 1 - margin)
-        & (position[:, 1] <= height - 1 - margin)
-    )
+    last = [width - 1 - margin, height - 1 - margin]
+    inside = ((position >= margin) & (position <= last)).all(1)
     safe = np.where(inside[:, None], position, 1.0).astype(np.float32)
     corner = np.floor(safe).astype(int)
     part = safe - corner.astype(np.float32)
@@ -108,10 +97,23 @@ def _sample_smooth(smooth, brightest, mask, xy, margin: int) -> Samples:
     return Samples(between(shown[:, 1:3, 1:3]), spread, around_it, valid)
 
 
-def camera_rows(scene: Scene) -> Int[np.ndarray, " v"]:
-    """Return the physical camera of each training view as 0, 1, ..."""
-    names = [scene.views[i].camera for i in scene.train_indices]
-    return np.unique(names, return_inverse=True)[1]
+def surroundings(
+    ldr: Float32[np.ndarray, "h w 3"], xy: Float[np.ndarray, "o 2"]
+) -> Float32[np.ndarray, " o"]:
+    """Return the mean log2 brightness about pixel positions, in stops by a power of 2.2.
+
+    Local tone mapping looks at how bright a photograph is about a place.
+    """
+    height, width = ldr.shape[:2]
+    step = max(1, round(float(np.hypot(height, width)) / DIAGONAL))
+    size = (max(1, width // step), max(1, height // step))
+    gray = np.ascontiguousarray(ldr.mean(-1), np.float32)
+    small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
+    stops = 2.2 * np.log2(np.maximum(small, DARKEST))
+    blurred = cv2.GaussianBlur(stops, (0, 0), REACH * float(np.hypot(*stops.shape)) / 2)
+    at = np.floor(xy * [size[0] / width, size[1] / height]).astype(int)
+    column, row = np.clip(at, 0, [size[0] - 1, size[1] - 1]).T
+    return blurred[row, column].astype(np.float32)
 
 
 def point_colors(
@@ -137,94 +139,64 @@ def point_colors(
         uncertainty: of positions, in units of POSITION_DEVIATION.
         on_view: progress: views done, views in all.
     """
-    footprints = []
-    for index, mine in zip(scene.train_indices, points, strict=True):
-        z = project_points(scene.points[mine], scene.views[index])[1]
-        K = store.camera(index)[1]
-        # A track behind its camera is wrong, not close.
-        footprints.append(np.where(z > 0, z, np.inf) / np.mean(np.diag(K)[:2]))
-    finest = np.full(len(scene.points), np.inf)
-    for mine, footprint in zip(points, footprints, strict=True):
-        np.minimum.at(finest, mine, footprint)
-    keep = [
-        np.isfinite(f) & (f <= COARSEST * finest[mine])
-        for mine, f in zip(points, footprints, strict=True)
+    wider, keep = _at_one_scale(scene, store, points)
+    nothing = np.zeros((0, 3), np.float32)
+    empty = np.zeros(0, int), np.zeros(0, int), nothing, nothing, nothing
+    parts: list[tuple[np.ndarray, ...]] = [
+        (*empty, np.zeros(0, np.float32), np.zeros((0, 2), np.float32))
     ]
-    coarsest = np.zeros(len(scene.points))
-    for mine, footprint, kept in zip(points, footprints, keep, strict=True):
-        np.maximum.at(coarsest, mine[kept], footprint[kept])
-    views, seen, colors, spreads, brightest = [], [], [], [], []
-    positions, around = [], []
     for row, (index, kept) in enumerate(zip(scene.train_indices, keep, strict=True)):
         mine = points[row][kept]
         if len(mine):
             view, (_, _, width, height) = scene.views[index], store.camera(index)
             there = xy[row][kept] * [width / view.width, height / view.height]
             ldr, mask = store.get(index)
-            found = sample(ldr, mask, there, coarsest[mine] / footprints[row][kept])
-            views.append(np.full(int(found.valid.sum()), row))
-            seen.append(mine[found.valid])
-            colors.append(found.colors[found.valid])
-            spreads.append(found.spread[found.valid])
-            brightest.append(found.brightest[found.valid])
-            around.append(surroundings(ldr, there[found.valid]))
-            positions.append(places(there[found.valid], width, height).astype(np.float32))
+            found = sample(ldr, mask, there, wider[row][kept])
+            good = found.valid
+            shown = (values[good] for values in found[:3])
+            at = there[good]
+            at_places = places(at, width, height).astype(np.float32)
+            labels = np.full(len(at), row), mine[good]
+            parts.append((*labels, *shown, surroundings(ldr, at), at_places))
         on_view(row + 1, len(scene.train_indices))
-    empty = np.zeros((0, 3), np.float32)
+    views, seen, colors, spread, brightest, around, positions = (
+        np.concatenate(part) for part in zip(*parts, strict=True)
+    )
+    cameras = [scene.views[i].camera for i in scene.train_indices]
     return Observations(
-        views=np.concatenate([np.zeros(0, int), *views]),
-        points=np.concatenate([np.zeros(0, int), *seen]),
-        colors=np.concatenate([empty, *colors]),
-        spread=np.float32(uncertainty) * np.concatenate([empty, *spreads]),
+        views=views,
+        points=seen,
+        colors=colors,
+        spread=np.float32(uncertainty) * spread,
         view_count=len(scene.train_indices),
         point_count=len(scene.points),
-        cameras=camera_rows(scene),
+        cameras=np.unique(cameras, return_inverse=True)[1],
         too_coarse=int(sum((~kept).sum() for kept in keep)),
         names=tuple(scene.views[i].name for i in scene.train_indices),
-        positions=np.concatenate([np.zeros((0, 2), np.float32), *positions]),
-        surroundings=np.concatenate([np.zeros(0, np.float32), *around]),
-        brightest=np.concatenate([empty, *brightest]),
-        camera_names=tuple(sorted({scene.views[i].camera for i in scene.train_indices})),
+        positions=positions,
+        surroundings=around,
+        brightest=brightest,
+        camera_names=tuple(sorted(set(cameras))),
     )
 
 
-def sample_where_seen(
-    scene: Scene,
-    store: ImageStore,
-    chosen: Int[np.ndarray, " c"],
-    where: list[Float[np.ndarray, "c 2"]],
-    kept: Bool[np.ndarray, "v c"],
-    on_view: Callable[[int, int], None] = lambda i, n: None,
-) -> Observations:
-    """Sample chosen points at their positions in the training views that keep them.
-
-    Args:
-        scene: the views.
-        store: photographs.
-        chosen: row of each point.
-        where: positions in each training view, full resolution.
-        kept: which view samples which point.
-        on_view: progress.
-    """
-    picks = [np.flatnonzero(row) for row in kept]
-    points = [chosen[pick] for pick in picks]
-    xy = [where[row][pick] for row, pick in enumerate(picks)]
-    return point_colors(
-        scene, store, points, xy, uncertainty=PROJECTED_UNCERTAINTY, on_view=on_view
-    )
-
-
-def thinned(
-    seen: Bool[np.ndarray, "v p"], rng: np.random.Generator, most: int
-) -> Bool[np.ndarray, "v p"]:
-    """Return at most `most` views of each point, evenly at random.
-
-    Args:
-        seen: which view sees which point.
-        rng: draws the views.
-        most: views of a point.
-    """
-    order = rng.random(seen.shape)
-    order[~seen] = 2.0
-    rank = np.argsort(np.argsort(order, axis=0), axis=0)
-    return seen & (rank < most)
+def _at_one_scale(
+    scene: Scene, store: ImageStore, points: list[Int[np.ndarray, " o"]]
+) -> tuple[list[Float[np.ndarray, " o"]], list[Bool[np.ndarray, " o"]]]:
+    """Return of each view by how much points are averaged wider, and which it samples at all."""
+    footprints = []
+    for index, mine in zip(scene.train_indices, points, strict=True):
+        z = project_points(scene.points[mine], scene.views[index])[1]
+        K = store.camera(index)[1]
+        # A track behind its camera is wrong, not close.
+        footprints.append(np.where(z > 0, z, np.inf) / np.mean(np.diag(K)[:2]))
+    finest, coarsest = np.full(len(scene.points), np.inf), np.zeros(len(scene.points))
+    for mine, footprint in zip(points, footprints, strict=True):
+        np.minimum.at(finest, mine, footprint)
+    keep = [
+        np.isfinite(f) & (f <= COARSEST * finest[mine])
+        for mine, f in zip(points, footprints, strict=True)
+    ]
+    for mine, footprint, kept in zip(points, footprints, keep, strict=True):
+        np.maximum.at(coarsest, mine[kept], footprint[kept])
+    return [coarsest[mine] / f for mine, f in zip(points, footprints, strict=True)], keep

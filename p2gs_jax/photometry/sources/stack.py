@@ -13,7 +13,7 @@ from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.sources.sampling import sample
-from p2gs_jax.scene.exif import read_exif_ev
+from p2gs_jax.scene.convert.headers import read_exif_ev
 from p2gs_jax.types import View
 
 POINTS, CANDIDATES = 4000, 40_000
@@ -29,37 +29,27 @@ SIGNAL = 0.15
 LARGEST_SHIFT = 7
 SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"}
 
+Image = UInt8[np.ndarray, "h w 3"]
+
 
 class Stack(NamedTuple):
-    """Photographs of one viewpoint.
+    """Photographs of one viewpoint."""
 
-    Attributes:
-        views: the photographs; poses mean nothing.
-        images: 8-bit RGB.
-        valid: pixels that hold data in every frame (a pure blue border is none).
-    """
-
-    views: tuple[View, ...]
-    images: list[UInt8[np.ndarray, "h w 3"]]
+    views: tuple[View, ...]  # the photographs; poses mean nothing
+    images: list[Image]  # 8-bit RGB
+    # Pixels that hold data in every frame (a pure blue border is none).
     valid: Bool[np.ndarray, "h w"]
 
 
 class StackColors(NamedTuple):
-    """What a stack shows at points.
+    """What a stack shows at points."""
 
-    Attributes:
-        observations: colours, every frame at every point.
-        xy: positions of the points in the first frame, pixel centres at +0.5.
-        shifts: pixels by which each frame was moved to fit the first.
-        black: values up to here were taken as black.
-        signal: frames in which enough pixels are neither black nor saturated.
-    """
-
-    observations: Observations
+    observations: Observations  # colours, every frame at every point
+    # Positions of the points in the first frame, pixel centres at +0.5.
     xy: Float[np.ndarray, "p 2"]
-    shifts: Float[np.ndarray, "v 2"]
-    black: float
-    signal: Bool[np.ndarray, " v"]
+    shifts: Float[np.ndarray, "v 2"]  # pixels by which each frame was moved to fit the first
+    black: float  # values up to here were taken as black
+    signal: Bool[np.ndarray, " v"]  # frames in which enough pixels are neither black nor saturated
 
 
 def read_stack(folder: Path) -> Stack:
@@ -91,23 +81,12 @@ def read_stack(folder: Path) -> Stack:
         images.append(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
     blue = np.all([(i[..., 2] > 200) & (i[..., 0] < 60) & (i[..., 1] < 60) for i in images], 0)
     grown = cv2.dilate(blue.astype(np.uint8), np.ones((15, 15), np.uint8)) > 0
-    return Stack(tuple(_view(path) for path in files), images, ~grown)
+    pose, K = np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32)
+    views = (View(p.name, p, "0", pose, K, 1, 1, exif_ev=read_exif_ev(p)) for p in files)
+    return Stack(tuple(views), images, ~grown)
 
 
-def _view(path: Path) -> View:
-    return View(
-        path.name,
-        path,
-        "0",
-        np.eye(4, dtype=np.float32),
-        np.eye(3, dtype=np.float32),
-        1,
-        1,
-        exif_ev=read_exif_ev(path),
-    )
-
-
-def align(images: list[UInt8[np.ndarray, "h w 3"]]) -> Float[np.ndarray, "v 2"]:
+def align(images: list[Image]) -> Float[np.ndarray, "v 2"]:
     """Return shifts that bring each frame onto the first, through its neighbours.
 
     Median threshold bitmaps do not depend on exposure; frames that are mostly black or white give
@@ -125,14 +104,14 @@ def align(images: list[UInt8[np.ndarray, "h w 3"]]) -> Float[np.ndarray, "v 2"]:
     return shifts
 
 
-def black_level(images: list[UInt8[np.ndarray, "h w 3"]], valid) -> float:
+def black_level(stack: Stack) -> float:
     """Return the value up to which the darkest frame shows nothing but its black level.
 
     A frame that is mostly black has a spike in its histogram there, whatever the offset (film
     scans: 13-16 of 255); one that is not is trusted down to its darkest percent.
     """
-    darkest = min(images, key=lambda i: float(np.mean(i)))
-    values = darkest[valid]
+    darkest = min(stack.images, key=lambda i: float(np.mean(i)))
+    values = darkest[stack.valid]
     level = float(np.percentile(values, 1))
     for channel in range(3):
         counts = np.bincount(values[:, channel], minlength=256)[:BLACKEST] / len(values)
@@ -140,11 +119,6 @@ def black_level(images: list[UInt8[np.ndarray, "h w 3"]], valid) -> float:
         if counts[max(spike - 2, 0) : spike + 3].sum() > SPIKE:
             level = max(level, float(spike + 2))
     return level / 255 + ABOVE_BLACK
-
-
-def signal_share(values: UInt8[np.ndarray, "n 3"], black: float) -> float:
-    """Return the share of pixels that are neither black nor saturated in some channel."""
-    return float(((values > 255 * black) & (values < 255 * SATURATED)).any(-1).mean())
 
 
 def choose_points(stack: Stack, black: float, seed: int) -> Float[np.ndarray, "p 2"]:
@@ -167,17 +141,13 @@ def choose_points(stack: Stack, black: float, seed: int) -> Float[np.ndarray, "p
 
 
 def stack_colors(stack: Stack, seed: int = 0) -> StackColors:
-    """Align a stack, choose points with signal and sample every frame at them.
-
-    Args:
-        stack: from `read_stack`.
-        seed: of the sampled positions.
-    """
+    """Align a stack, choose points with signal (drawn by `seed`) and sample every frame there."""
     shifts = align(stack.images)
-    black = black_level(stack.images, stack.valid)
+    black = black_level(stack)
     xy = choose_points(stack, black, seed)
-    signal = np.array([signal_share(i[stack.valid], black) > SIGNAL for i in stack.images])
-    return StackColors(_observe(stack, xy, shifts), xy, shifts, black, signal)
+    pixels = (image[stack.valid] for image in stack.images)
+    lit = [((v > 255 * black) & (v < 255 * SATURATED)).any(-1).mean() > SIGNAL for v in pixels]
+    return StackColors(_observe(stack, xy, shifts), xy, shifts, black, np.array(lit))
 
 
 def _observe(

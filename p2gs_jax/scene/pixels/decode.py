@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt
 from PIL import Image
 
-from p2gs_jax.errors import UserError
-from p2gs_jax.scene.files import image_size, undecodable
-from p2gs_jax.scene.geometry import undistortion_maps
-from p2gs_jax.scene.photographs.profiles import applied
+from p2gs_jax.errors import UserError, broken
+from p2gs_jax.scene.convert.icc import with_profile_applied
+from p2gs_jax.scene.files import ASPECT_TOLERANCE, image_size, undecodable
+from p2gs_jax.scene.lens import undistortion_maps
 from p2gs_jax.types import View
 
 _FULL = 0.999  # a pixel is valid only where all of its sources are
@@ -28,8 +28,8 @@ class Decoded:
     Attributes:
         pixels: unsigned integers; the largest is 1.0.
         valid: where it shows something.
-        alpha: opacity of a photograph that is shown over a background, whose pixels are then
-            premultiplied by it; None: it is shown over none.
+        alpha: opacity of a photograph that is shown over a background; its pixels are
+            premultiplied by it.
     """
 
     pixels: UInt[np.ndarray, "h w 3"]
@@ -55,11 +55,7 @@ def resamples(view: View, size: tuple[int, int]) -> bool:
 
 
 def decode(view: View, sizes: Sequence[tuple[int, int]]) -> list[Decoded]:
-    """Return a photograph at some sizes; its file is opened once.
-
-    Args:
-        view: whose.
-        sizes: width and height in pixels of each.
+    """Return a photograph at some (width, height) in pixels; its file is opened once.
 
     Raises:
         UserError: the file or its mask is missing, broken or of another size than the model's; or
@@ -68,11 +64,8 @@ def decode(view: View, sizes: Sequence[tuple[int, int]]) -> list[Decoded]:
     try:
         return _decoded(view, sizes)
     except (MemoryError, cv2.error) as error:
-        raise UserError(
-            f"{view.image_path}: {view.width}x{view.height} pixels need more memory than there is "
-            f"({error})",
-            fix="make the photographs smaller",
-        ) from None
+        why = f"{view.width}x{view.height} pixels need more memory than there is ({error})"
+        raise broken(f"{view.image_path}:", why, "make the photographs smaller") from None
 
 
 def _decoded(view: View, sizes: Sequence[tuple[int, int]]) -> list[Decoded]:
@@ -158,10 +151,8 @@ def _decode(path: Path) -> tuple[np.ndarray, UInt[np.ndarray, "h w"] | None]:
     """
     raw = _read_raster(path, colours=True)
     if raw.dtype not in (np.uint8, np.uint16):
-        raise UserError(
-            f"{path} has {raw.dtype} pixels; photographs need 8 or 16 bits per channel",
-            fix="export it as PNG or JPEG",
-        )
+        why = f"has {raw.dtype} pixels; photographs need 8 or 16 bits per channel"
+        raise broken(path, why, "export it as PNG or JPEG")
     channels = 1 if raw.ndim == 2 else raw.shape[2]
     opacity = raw[..., -1] if channels in (2, 4) else None
     if channels <= 2:
@@ -175,7 +166,7 @@ def _decode_mask(view: View) -> Bool[np.ndarray, "h w"]:
     """Return where the mask is not zero, at the view's size."""
     assert view.mask_path is not None
     w, h = image_size(view.mask_path)
-    if abs(w / h / (view.width / view.height) - 1.0) > 0.01:
+    if abs(w / h / (view.width / view.height) - 1.0) > ASPECT_TOLERANCE:
         raise UserError(
             f"wrong size: the mask {view.mask_path} is {w}x{h}, its photograph "
             f"{view.width}x{view.height}",
@@ -198,9 +189,8 @@ def _read_raster(path: Path, *, colours: bool = False) -> np.ndarray:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise UserError(
-            f"cannot read {path}: {error.strerror or error}", fix="put the file back"
-        ) from None
+        why = f"cannot read {path}: {error.strerror or error}"
+        raise UserError(why, fix="put the file back") from None
     try:
         raw = cv2.imdecode(
             np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
@@ -209,11 +199,11 @@ def _read_raster(path: Path, *, colours: bool = False) -> np.ndarray:
         raw = None
     if raw is None or not _complete(path, data):
         raise undecodable(path)
-    return applied(data, raw) if colours else raw
+    return with_profile_applied(data, raw) if colours else raw
 
 
 def _complete(path: Path, data: bytes) -> bool:
-    """Whether the file was not cut: OpenCV fills the rest of a truncated image with grey."""
+    """Return whether the file was not cut: OpenCV fills the rest of a truncated image with grey."""
     if data[:2] == b"\xff\xd8" and data.rstrip(b"\0")[-2:] == b"\xff\xd9":
         return True
     if data[:4] == b"\x89PNG" and b"IEND" in data[-64:]:
@@ -222,6 +212,6 @@ def _complete(path: Path, data: bytes) -> bool:
         with Image.open(path) as image:
             image.load()
     except (OSError, SyntaxError, ValueError):
-        # Of formats that Pillow does not know, OpenCV decides.
+        # OpenCV decides on formats that Pillow does not know.
         return data[:2] != b"\xff\xd8" and data[:4] != b"\x89PNG"
     return True

@@ -17,17 +17,15 @@ from scene.photographs.made import DISPLAY_P3, patches, settings, write_dng
 
 from p2gs_jax.core.numerics import srgb_decode, srgb_encode
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene.exif import read_exif_ev, read_exif_settings
+from p2gs_jax.scene.convert.convert import Converted, convert_photographs
+from p2gs_jax.scene.convert.headers import read_exif_ev, read_exif_settings
+from p2gs_jax.scene.convert.kinds import has_gain_map, kind_of
 from p2gs_jax.scene.files import image_size, list_images
-from p2gs_jax.scene.photographs.darkroom import RECORD
-from p2gs_jax.scene.photographs.develop import Developed, develop
-from p2gs_jax.scene.photographs.gain_maps import has_gain_map
-from p2gs_jax.scene.photographs.kinds import kind_of
 
 
-def developed(folder: Path, work: Path | None = None) -> Developed:
+def developed(folder: Path, work: Path | None = None) -> Converted:
     work = work or folder.parent / "work"
-    return develop(folder, list_images(folder), work, lambda message: None)
+    return convert_photographs(folder, list_images(folder), work, lambda message: None)
 
 
 def light_of(path: Path) -> np.ndarray:
@@ -36,8 +34,8 @@ def light_of(path: Path) -> np.ndarray:
     return srgb_decode(codes[..., 2::-1] / 65535)
 
 
-def record_of(result: Developed) -> list[dict]:
-    return json.loads((result.folder / RECORD).read_text())["photographs"]
+def record_of(result: Converted) -> list[dict]:
+    return json.loads((result.folder / "photographs.json").read_text())["photographs"]
 
 
 def write_exr(path: Path, light: np.ndarray, names: str = "RGB", **header) -> None:
@@ -168,7 +166,7 @@ def test_raw_beside_jpeg_is_one_photograph(folder: Path) -> None:
 def test_without_rawpy_the_jpeg_beside_it_is_used(folder: Path, monkeypatch) -> None:
     write_dng(folder / "a.dng", np.full((64, 96, 3), 0.3))
     cv2.imwrite(str(folder / "a.jpg"), np.full((64, 96, 3), 90, np.uint8))
-    monkeypatch.setattr("p2gs_jax.scene.photographs.develop.find_spec", lambda name: None)
+    monkeypatch.setattr("p2gs_jax.scene.convert.convert.find_spec", lambda name: None)
     result = developed(folder)
     assert list(result.originals.values()) == [folder / "a.jpg"]
     assert result.known is None
@@ -269,7 +267,7 @@ def test_exr_that_is_broken_inside(folder: Path) -> None:
     light[0, 0], light[0, 1], light[0, 2] = np.nan, np.inf, -1
     write_exr(folder / "a.exr", light)
     result = developed(folder)
-    assert any("1 pixels of linear photographs are no numbers" in note for note in result.notes)
+    assert any("1 pixels of linear photographs are not numbers" in note for note in result.notes)
     out = light_of(result.paths[0])
     assert (out[0, 0] == 0).all()
     assert (out[0, 1] == 1).all()
@@ -296,7 +294,7 @@ def test_exr_grey_alpha_and_chromaticities(folder: Path) -> None:
 
 def test_no_exr(folder: Path) -> None:
     (folder / "a.exr").write_bytes(b"\x76\x2f\x31\x01 and nothing")
-    with pytest.raises(UserError, match=r"a\.exr is no readable OpenEXR"):
+    with pytest.raises(UserError, match=r"a\.exr is not a readable OpenEXR"):
         developed(folder)
 
 

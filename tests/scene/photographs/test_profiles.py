@@ -12,9 +12,8 @@ from PIL import Image, ImageCms
 from scene.photographs.made import ADOBE_RGB, DISPLAY_P3, patches
 
 from p2gs_jax.config import DataConfig
-from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.scene.photographs.colours import colour_notes
-from p2gs_jax.scene.photographs.profiles import adobe_rgb, profile_of, read_profile, to_srgb
+from p2gs_jax.scene.convert.icc import adobe_rgb, colour_notes, profile_of, read_profile, to_srgb
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import View
 
 SRGB = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()

@@ -17,7 +17,7 @@ from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.photometry.calibrate import options_of
 from p2gs_jax.run.scene_file import read_scene, write_scene
 from p2gs_jax.scene import ImageStore, load_scene
-from p2gs_jax.scene.photographs.develop import develop, with_originals
+from p2gs_jax.scene.convert.convert import convert_photographs, with_originals
 from p2gs_jax.scene.survey import survey
 
 CFG = DataConfig(test_every=0)
@@ -85,7 +85,7 @@ def test_names_paths_and_masks_are_the_users_own(tmp_path: Path) -> None:
     for name in ("a.png", "b.png"):
         cv2.imwrite(str(tmp_path / "scene" / "masks" / name), np.full((64, 96), 255, np.uint8))
     paths = [folder / "a.jpg", folder / "b.dng"]
-    photographs = develop(folder, paths, tmp_path / "work", lambda message: None)
+    photographs = convert_photographs(folder, paths, tmp_path / "work", lambda message: None)
     tiny = write_tiny_model(tmp_path / "tiny")
     found = load_scene(tmp_path / "tiny", CFG)
     assert tiny.is_dir()

@@ -10,8 +10,8 @@ import pytest
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.scene.pixels import ahead
+from p2gs_jax.scene.pixels import cache as ahead
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import View
 
 COUNT, SHRINKS = 12, (2, 1)

@@ -12,8 +12,8 @@ import pytest
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene.images import ImageStore
-from p2gs_jax.scene.pixels import files as module
+from p2gs_jax.scene.pixels import cache as module
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import Distortion, View
 
 SIZE = (48, 64)

@@ -13,10 +13,9 @@ from scene.made_videos import HLG, room, turn, write_video
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene import find_scene
+from p2gs_jax.scene.motion import Tracker, choose_frames, normalised, thinned
 from p2gs_jax.scene.survey import survey
-from p2gs_jax.scene.video.choose import choose_frames, thinned
-from p2gs_jax.scene.video.motion import Tracker, normalised
-from p2gs_jax.scene.video.read import RECORD, read_video
+from p2gs_jax.scene.video import RECORD, read_video
 
 
 def grey(position: float, yaw: float = 0.0, gain: float = 1.0) -> np.ndarray:

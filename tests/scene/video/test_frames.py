@@ -10,8 +10,8 @@ from scene.made_videos import HLG, PQ, turn, write_video
 
 from p2gs_jax.core.numerics import srgb_decode
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene.photographs.light import PQ_WHITE, to_light
-from p2gs_jax.scene.video.frames import expected_frames, frames_of, video_size
+from p2gs_jax.scene.convert.icc import PQ_WHITE, to_light
+from p2gs_jax.scene.video import expected_frames, frames_of, video_size
 
 COLOURS = np.array(
     [

@@ -1,0 +1,247 @@
+"""Renders and models of other programs, judged as a run is: the same views, masks and scores.
+
+A program that knows no exposures is compared by `as_rendered`, as the field does it, and by
+`exposure_fitted`, which gives it what held-out views of a run get: one scalar a view, applied to
+the radiance that its pictures show under the run's usual display.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float32
+
+from p2gs_jax.config import PhotometryConfig, RenderConfig
+from p2gs_jax.evaluation.alignment import with_fitted_exposure
+from p2gs_jax.evaluation.evaluate import Judge
+from p2gs_jax.evaluation.passes import map_in_order
+from p2gs_jax.evaluation.renders_of_others import OtherRenders, Rendered, in_order, orders
+from p2gs_jax.evaluation.scores import still_mask, summary_of, view_scores
+from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
+from p2gs_jax.photometry.formation import LEAST_ALPHA
+from p2gs_jax.render.capacity import make_renderer
+from p2gs_jax.scene.pixels.decode import floats
+from p2gs_jax.scene.pixels.store import ImageStore, camera_of
+from p2gs_jax.types import GAMMA_SRGB, Gaussians, Scene
+
+# Protocols of a run that are set beside those of other programs.
+OWN = ("averaged", "exposure_fitted")
+# How many pictures are looked at to tell two orders of views apart.
+MOST_LOOKED_AT = 8
+AS_IT_IS = DisplayTransform(1.0, GAMMA_SRGB, PhotometryConfig(curve="linear"))
+
+
+def check_renders(found: OtherRenders, scene: Scene, store: ImageStore) -> OtherRenders:
+    """Read all renders once, so that what is wrong with them is said before anything long.
+
+    Returns:
+        The same; numbered ones in that order of `orders` in which they are nearer to the
+        photographs.
+
+    Raises:
+        UserError: see `OtherRenders.read`.
+    """
+    for row in found.files:
+        found.read(row, _size(store, row), over=store.backdrop is not None)
+    possible = orders(scene) if found.numbered else []
+    if len(possible) < 2:
+        return found
+    # Only places where the orders differ tell anything.
+    where = [k for k in range(len(found.files)) if len({order[k] for order in possible}) > 1]
+    where = where[:MOST_LOOKED_AT]
+
+    def distance(order: tuple[int, ...]) -> float:
+        as_views = in_order(found, order)
+        return sum(_distance(as_views, order[k], store) for k in where)
+
+    sizes = {_size(store, row) for row in found.files}
+    return in_order(found, min(possible, key=distance)) if len(sizes) == 1 else found
+
+
+def _size(store: ImageStore, row: int) -> tuple[int, int]:
+    width, height = store.camera(row)[2:]
+    return width, height
+
+
+def _distance(found: OtherRenders, row: int, store: ImageStore) -> float:
+    """Return the mean squared distance of a render from a photograph."""
+    photograph, mask = store.get(row)
+    pixels = found.read(row, _size(store, row)).pixels
+    return float(np.mean(mask[..., None] * (pixels - photograph) ** 2))
+
+
+def judge_renders(
+    found: OtherRenders,
+    judge: Judge,
+    on_progress: Callable[[int, int], None] = lambda done, count: None,
+) -> dict[str, Any]:
+    """Return the scores of renders of held-out views, from `check_renders`.
+
+    Returns:
+        `as_rendered` and `exposure_fitted`, as the protocols of `metrics.json`; where there are
+        reference photographs `reference` with `as_rendered` and `scale_aligned`.
+
+    Raises:
+        UserError: see `OtherRenders.read`.
+    """
+
+    def light(row: int, shown: DisplayTransform) -> Light:
+        over = judge.store.backdrop is not None
+        rendered = found.read(row, _size(judge.store, row), over=over)
+        if rendered.linear:
+            shown = replace(shown, exposure=judge.mean.exposure)
+        return light_of(rendered, shown, judge.store, row)
+
+    def judged(row: int) -> tuple[dict[str, Any], dict[str, Any]]:
+        photograph, mask = judge.store.get(row)
+        score = judge.scorer(row, photograph, mask)
+        rendered = light(row, judge.usual(row))
+        fitted = rendered.fitted(photograph, still_mask(judge.scene, row, mask))
+        plain = score(rendered.picture)
+        return plain, {**score(rendered.under(fitted)), "exposure": fitted.exposure}
+
+    rows = sorted(found.files)
+    as_rendered, exposure_fitted = {}, {}
+    for done, (row, (plain, fitted)) in enumerate(
+        zip(rows, map_in_order(judged, rows), strict=True), 1
+    ):
+        name = judge.scene.views[row].name
+        as_rendered[name], exposure_fitted[name] = plain, fitted
+        on_progress(done, len(rows))
+    scores = {
+        "as_rendered": summary_of(as_rendered),
+        "exposure_fitted": summary_of(exposure_fitted),
+    }
+    compared = [r for r in rows if judge.reference is not None and judge.reference(r) is not None]
+    if compared:
+        everywhere = judge.usual(None)
+        scores["reference"] = _against_reference(compared, judge, lambda r: light(r, everywhere))
+    return scores
+
+
+def _against_reference(
+    rows: list[int], judge: Judge, light: Callable[[int], Light]
+) -> dict[str, Any]:
+    """Score renders against the photographs of one common exposure that these views have."""
+    assert judge.reference is not None
+
+    def score(row: int, ldr) -> dict[str, Any]:
+        target, mask = judge.reference(row), judge.store.get(row)[1]  # pyright: ignore
+        return view_scores(judge.lpips_weights, ldr, target, mask)
+
+    as_rendered, aligned, exposures = {}, {}, []
+    for row in rows:
+        rendered, name = light(row), judge.scene.views[row].name
+        target, mask = judge.reference(row), judge.store.get(row)[1]
+        assert target is not None
+        exposures.append(rendered.fitted(target, mask).exposure)
+        as_rendered[name] = score(row, rendered.picture)
+    common = float(np.exp(np.median(np.log(exposures))))
+    for row in rows:
+        rendered, name = light(row), judge.scene.views[row].name
+        aligned[name] = score(row, rendered.under(replace(rendered.shown, exposure=common)))
+    return {
+        "as_rendered": summary_of(as_rendered),
+        "scale_aligned": {**summary_of(aligned), "exposure": common},
+    }
+
+
+def own_scores(metrics: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
+    """Return the scores of a run, from its `metrics.json`, over some of its held-out views."""
+    wanted, test = list(names), metrics["test"]
+    return {name: summary_of({n: test[name]["per_view"][n] for n in wanted}) for name in OWN}
+
+
+class Light(NamedTuple):
+    """What a render shows, so that it can be shown under another exposure.
+
+    Attributes:
+        linear: radiance, premultiplied by `alpha`.
+        shown: how it becomes the picture.
+        picture: display values.
+        alpha: opacity, over the backdrop of `shown`; None: it is over nothing.
+    """
+
+    linear: Float32[np.ndarray, "h w 3"]
+    shown: DisplayTransform
+    picture: Float32[np.ndarray, "h w 3"]
+    alpha: Float32[np.ndarray, "h w"] | None
+
+    def fitted(
+        self, photograph: Float32[np.ndarray, "h w 3"], mask: Float32[np.ndarray, "h w"]
+    ) -> DisplayTransform:
+        """Return how it is shown under the exposure that fits a photograph best."""
+        return with_fitted_exposure(self.shown, self.linear, photograph, mask, self.alpha)
+
+    def under(self, shown: DisplayTransform) -> Float32[np.ndarray, "h w 3"]:
+        """Return it as a picture."""
+        return develop(self.linear, shown, alpha=self.alpha)
+
+
+def light_of(rendered: Rendered, shown: DisplayTransform, store: ImageStore, row: int) -> Light:
+    """Return what the render of a view shows.
+
+    A picture does not say where its background is. Its photograph does: what that covers moves with
+    the exposure, and the rest stays as the picture has it.
+    """
+    pixels, linear, opacity = rendered
+    if linear:
+        opacity = None if store.backdrop is None else opacity
+        shown = replace(shown, backdrop=store.backdrop_values)
+        return Light(pixels, shown, develop(pixels, shown, alpha=opacity), opacity)
+    # A correction of display values belongs to renders of this run.
+    shown = replace(shown, correction=None)
+    found = store.alpha(row)
+    if found is None:
+        return Light(undevelop(pixels, shown), shown, pixels, None)
+    alpha, backdrop = floats(found), np.asarray(store.backdrop, np.float32)
+    covered, free = (np.maximum(a, LEAST_ALPHA)[..., None] for a in (alpha, 1 - alpha))
+    own = np.clip((pixels - (1 - alpha[..., None]) * backdrop) / covered, 0, 1)
+    behind = (pixels - alpha[..., None] * own) / free
+    shown = replace(shown, backdrop=behind)
+    return Light(covered * undevelop(own, shown), shown, pixels, alpha)
+
+
+def score_foreign(
+    gaussians: Gaussians, scene: Scene, store: ImageStore, cfg: RenderConfig
+) -> tuple[dict[str, Any], float]:
+    """Render and judge a model of display colours in all views of a scene.
+
+    Args:
+        gaussians: display colours.
+        scene: views and their splits.
+        store: photographs.
+        cfg: of a viewer of display colours.
+
+    Returns:
+        `test` and `train`, each with `as_it_is` and `exposure_fitted` (one gain on display values,
+        solved from the photograph), as in `metrics.json`; and the median over the views of the
+        correlation of the grey values of render and photograph, which no gain changes.
+    """
+    render, alive = make_renderer(cfg), jnp.ones(gaussians.capacity, bool)
+    rows = {split: ({}, {}) for split in ("train", "test")}
+    agree = []
+    for index, view in enumerate(scene.views):
+        photograph, mask = store.get(index, 1)
+        linear = np.asarray(render(gaussians, alive, camera_of(store, index)).linear)
+        gained = with_fitted_exposure(AS_IT_IS, linear, photograph, mask)
+        for found, how in zip(rows[view.split], (AS_IT_IS, gained), strict=True):
+            found[view.name] = view_scores(None, develop(linear, how), photograph, mask)
+        agree.append(_correlation(linear.mean(-1)[mask > 0], photograph.mean(-1)[mask > 0]))
+    scores = {
+        split: {"as_it_is": summary_of(plain), "exposure_fitted": summary_of(gained)}
+        for split, (plain, gained) in rows.items()
+        if plain
+    }
+    return scores, float(np.median(agree))
+
+
+def _correlation(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the correlation of two samples; 0 where one does not vary."""
+    a, b = a - a.mean(), b - b.mean()
+    size = float(np.sqrt((a @ a) * (b @ b)))
+    return float(a @ b) / size if size > 0 else 0.0

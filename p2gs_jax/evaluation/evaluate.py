@@ -1,0 +1,413 @@
+"""Evaluation of a finished fit: every view under every protocol.
+
+Protocols (docs/photometry.md, 6): `per_view` renders a training view with its own exposure, gamma
+and white balance; `averaged` uses the mean parameters over the training views (paper, Rendering
+for evaluation); `exposure_fitted` solves one scalar exposure from the photograph, because a
+held-out view has none of its own; `photometry_fitted` solves all that the model gives every view,
+where that is more than an exposure; `metered` takes the exposure that the rule gives its render
+that explains the training exposures, where there is one (photometry/metering.py); against
+reference photographs of one common exposure, `scale_aligned` solves one scalar for all of them.
+Vignetting and responses are the camera's in all. Where photographs have alpha, they and the renders
+are put over the same background (photometry/matte.py).
+"""
+
+from __future__ import annotations
+
+import functools
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float32
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.evaluation.alignment import fit_capture, with_fitted_exposure
+from p2gs_jax.evaluation.drives import DriveScores
+from p2gs_jax.evaluation.lpips import LpipsWeights
+from p2gs_jax.evaluation.metered import MeteredViews
+from p2gs_jax.evaluation.passes import ArrayStore, StoredArray, map_in_order, most_bytes
+from p2gs_jax.evaluation.radiance import RadianceScores, Truth
+from p2gs_jax.evaluation.references import Reference
+from p2gs_jax.evaluation.scores import (
+    Untold,
+    VideoScores,
+    is_drive,
+    masks_of_parts,
+    still_mask,
+    summary_of,
+    view_scores,
+)
+from p2gs_jax.evaluation.unexplained import Unexplained
+from p2gs_jax.photometry.display import (
+    DisplayTransform,
+    develop,
+    display_of_view,
+    mean_parameters,
+    usual_display,
+    with_capture,
+)
+from p2gs_jax.photometry.formation import exposed_at
+from p2gs_jax.photometry.metering import Metering, Readings, meter
+from p2gs_jax.photometry.models import MODELS
+from p2gs_jax.render.capacity import RenderView
+from p2gs_jax.scene.pixels.store import ImageStore, camera_of
+from p2gs_jax.types import Camera, Params, Render, Scene
+
+
+@dataclass(frozen=True)
+class ViewResult:
+    """One rendered view.
+
+    Attributes:
+        index: row in `Scene.views`.
+        linear: linear radiance.
+        alpha: opacity.
+        depth: alpha-weighted depth.
+        ldr: display image under `transform`.
+        photograph: of the view.
+        transform: the view's own; of a held-out view the usual one with the exposure fitted to its
+            photograph.
+    """
+
+    index: int
+    linear: Float32[np.ndarray, "h w 3"]
+    alpha: Float32[np.ndarray, "h w"]
+    depth: Float32[np.ndarray, "h w"]
+    ldr: Float32[np.ndarray, "h w 3"]
+    photograph: Float32[np.ndarray, "h w 3"]
+    transform: DisplayTransform
+
+
+class Evaluation(NamedTuple):
+    """What an evaluation finds.
+
+    Attributes:
+        metrics: the `train`, `test`, `consistency`, `reference` and `radiance` parts of
+            `metrics.json`, those of drives, and the views without scores or exposure (`Untold`).
+        metering: the rule that explains the exposures of the training views.
+        unexplained: of a drive: what no static scene explains in the training views, by row.
+    """
+
+    metrics: dict[str, Any]
+    metering: Metering
+    unexplained: dict[int, Unexplained]
+
+
+class Judge:
+    """By what renders are judged: photographs, how the run shows radiance, and which scores.
+
+    Args:
+        scene: the views.
+        store: their photographs.
+        params: the run's; its small arrays say how views are shown.
+        cfg: formation model.
+        lpips_weights: or None, which leaves LPIPS out.
+        reference: view row -> photograph under one common exposure, or None.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        store: ImageStore,
+        params: Params,
+        cfg: FitConfig,
+        lpips_weights: LpipsWeights | None = None,
+        reference: Reference | None = None,
+    ):
+        self.scene, self.store, self.cfg = scene, store, cfg
+        self.lpips_weights, self.reference = lpips_weights, reference
+        # Small arrays stay on the host.
+        self.small: Params = jax.tree.map(np.asarray, replace(params, gaussians=None))
+        self.mean = mean_parameters(self.small.photometry)
+        self.taken_by = [view.camera for view in scene.training_views]
+        self.row_of = {index: row for row, index in enumerate(scene.train_indices)}
+
+    def usual(self, index: int | None) -> DisplayTransform:
+        """Return how a view is shown by the mean parameters; None: one of no camera."""
+        camera = None if index is None else self.scene.views[index].camera
+        shown = usual_display(self.small, self.taken_by, camera, self.cfg.photometry)
+        return self.over(shown)
+
+    def over(self, transform: DisplayTransform) -> DisplayTransform:
+        """Return a display transform that puts renders over what the photographs are over."""
+        return replace(transform, backdrop=self.store.backdrop_values)
+
+    def scorer(self, index: int, photograph, mask) -> Callable[[np.ndarray], dict[str, Any]]:
+        """Return a function from display images of a view to scores, of a drive also by part."""
+        parts = masks_of_parts(self.scene, index, mask)
+        return lambda ldr: view_scores(self.lpips_weights, ldr, photograph, mask, parts)
+
+
+def evaluate(
+    params: Params,
+    scene: Scene,
+    store: ImageStore,
+    render: RenderView,
+    cfg: FitConfig,
+    *,
+    reference: Reference | None = None,
+    radiance: Truth | None = None,
+    lpips_weights: LpipsWeights | None = None,
+    on_view: Callable[[ViewResult], None] = lambda result: None,
+    on_progress: Callable[[int, int], None] = lambda done, count: None,
+) -> Evaluation:
+    """Render and judge all views.
+
+    Args:
+        params: the fit, live Gaussians only.
+        scene: views and their splits.
+        store: photographs.
+        render: from `make_renderer`; it knows which Gaussians belong to moving objects.
+        cfg: formation model.
+        reference: view row -> photograph under the common exposure, or None where there is none.
+        radiance: view row -> true linear radiance at the size of the photographs, or None.
+        lpips_weights: adds `lpips` wherever a view is compared with a photograph; None leaves it
+            out.
+        on_view: receives every rendered view.
+        on_progress: views done, views in all.
+
+    Raises:
+        UserError: an image is too small for LPIPS.
+    """
+    judge = Judge(scene, store, params, cfg, lpips_weights, reference)
+    gaussians = jax.device_put(params.gaussians)
+    living = jax.device_put(np.ones(params.gaussians.capacity, bool))
+    seen = functools.partial(render, gaussians, living)
+    with ArrayStore(most_bytes(cfg.data.cache_mb)) as arrays:
+        views = _Views(judge, seen, arrays)
+        judged = functools.partial(_judged, judge, seen, radiance)
+        # In the order of names: the frames of a camera are then in sequence.
+        for found in map_in_order(judged, range(len(scene.views))):
+            on_progress(found.result.index + 1, len(scene.views))
+            views.add(found)
+            on_view(found.result)
+        return views.evaluation()
+
+
+class _Judged(NamedTuple):
+    """A view with its scores, and the references that need all views to compare with.
+
+    Attributes:
+        result: the view.
+        averaged: display image with the mean parameters.
+        mask: which pixels count.
+        scores: of `result.ldr`.
+        scores_averaged: of `averaged`.
+        scores_all: of a held-out view with all fitted that varies per view, or None.
+        radiance: true linear radiance, or None.
+        reference: photograph under the common exposure, or None.
+        readings: of the meters.
+    """
+
+    result: ViewResult
+    averaged: Float32[np.ndarray, "h w 3"]
+    mask: Float32[np.ndarray, "h w"]
+    scores: dict[str, Any]
+    scores_averaged: dict[str, Any]
+    scores_all: dict[str, Any] | None
+    radiance: np.ndarray | None
+    reference: np.ndarray | None
+    readings: Readings
+
+
+def _judged(
+    judge: Judge, seen: Callable[[Camera], Render], radiance: Truth | None, index: int
+) -> _Judged:
+    """Render a view and score it under the protocols that need no other view."""
+    scene, store = judge.scene, judge.store
+    photograph, mask = store.get(index, 1)
+    score = judge.scorer(index, photograph, mask)
+    rendered = seen(camera_of(store, index))
+    linear, alpha = np.asarray(rendered.linear), np.asarray(rendered.alpha)
+    usual = judge.usual(index)
+    averaged = develop(linear, replace(usual, exposure=judge.mean.exposure), alpha=alpha)
+    extra, everything = {}, None
+    if scene.views[index].split == "train":
+        own = display_of_view(judge.small, judge.row_of[index], judge.cfg.photometry)
+        transform = judge.over(own)
+    elif not mask.any():
+        transform = usual
+    else:
+        still = still_mask(scene, index, mask)
+        transform = with_fitted_exposure(usual, linear, photograph, still, alpha)
+        extra = {"exposure": transform.exposure}
+        everything = _all_fitted(linear, photograph, still, transform, score, alpha)
+    ldr = develop(linear, transform, alpha=alpha)
+    depth = np.asarray(rendered.depth)
+    return _Judged(
+        ViewResult(index, linear, alpha, depth, ldr, photograph, transform),
+        averaged,
+        mask,
+        {**score(ldr), **extra},
+        score(averaged),
+        everything,
+        None if radiance is None else radiance(index),
+        None if judge.reference is None else judge.reference(index),
+        meter(linear, alpha),
+    )
+
+
+def _all_fitted(
+    linear, photograph, still, start: DisplayTransform, score, alpha
+) -> dict[str, Any] | None:
+    """Score a held-out view with all solved that varies per view; None: that is one scalar.
+
+    It is solved from what stands still, and starts from the fitted exposure.
+    """
+    tone = start.formation
+    gamma, balance = MODELS[tone.model].gamma == "view", tone.white_balance == "view"
+    if not (gamma or balance):
+        return None
+    given = (linear, photograph, still)
+    how = (start.capture, tone, start.correction, start.matte(alpha))
+    found = fit_capture(*given, *how, gamma=gamma, white_balance=balance)
+    transform = with_capture(start, found)
+    row = {**score(develop(linear, transform, alpha=alpha)), "exposure": transform.exposure}
+    if gamma:
+        row["gamma"] = transform.gamma
+    if balance:
+        row["red_green_ev"], row["blue_green_ev"] = transform.white_balance_ev
+    return row
+
+
+class _Views:
+    """Collects judged views, and what needs all of them."""
+
+    def __init__(self, judge: Judge, seen: Callable[[Camera], Render], arrays: ArrayStore):
+        self._judge, self._arrays = judge, arrays
+        scene, store = judge.scene, judge.store
+        self._drive = DriveScores(scene, store, seen, arrays) if is_drive(scene) else None
+        self._radiance, self._metered = RadianceScores(arrays), MeteredViews(arrays)
+        self._rows: dict[str, dict[str, dict]] = defaultdict(dict)
+        self._videos = {name: VideoScores() for name in ("per_view", "averaged", "photographs")}
+        self._untold = Untold()
+        self._told: list[int] = []
+        self._references: list[tuple[int, tuple[StoredArray, ...]]] = []
+
+    def add(self, found: _Judged) -> None:
+        """Take a view."""
+        result, judge = found.result, self._judge
+        view = judge.scene.views[result.index]
+        if not self._untold.add(view.name, result.photograph, found.mask, judge.cfg.loss):
+            return
+        self._rows[view.split][view.name] = found.scores
+        self._rows[f"{view.split} averaged"][view.name] = found.scores_averaged
+        if found.scores_all is not None:
+            self._rows["all"][view.name] = found.scores_all
+        again = found.radiance is not None or found.reference is not None
+        linear = self._arrays.put(result.linear) if again else result.linear
+        over = judge.store.backdrop is not None
+        if found.radiance is not None:
+            self._radiance.add(view.name, view.split, linear, found.radiance, found.mask)
+        if found.reference is not None:
+            images = (linear, found.reference, found.mask, *([result.alpha] if over else []))
+            self._references.append((result.index, tuple(map(self._arrays.put, images))))
+        if view.split == "train":
+            self._told.append(judge.row_of[result.index])
+            self._metered.add_training(view.name, found.readings)
+        else:
+            images = (linear, result.photograph, found.mask)
+            alpha = result.alpha if over else None
+            self._metered.add_held_out(result.index, found.readings, *images, alpha)
+        if self._drive is not None:
+            images = (result.ldr, result.photograph, found.mask)
+            self._drive.add(result.index, *images, result.depth, result.alpha)
+        exposure = result.transform.exposure
+        self._videos["per_view"].add(view.camera, result.ldr, exposure)
+        self._videos["averaged"].add(view.camera, found.averaged, judge.mean.exposure)
+        self._videos["photographs"].add(view.camera, result.photograph, exposure)
+
+    def evaluation(self) -> Evaluation:
+        """Return all scores."""
+        judge, rows, drive = self._judge, self._rows, self._drive
+        exposures = np.asarray(judge.small.photometry.exposures)
+        train, tone = summary_of(rows["train"]), judge.cfg.photometry
+        per_view = train.pop("per_view", {})
+        metrics: dict[str, Any] = {
+            "train": {**train, "averaged": summary_of(rows["train averaged"])},
+            "test": {
+                "averaged": summary_of(rows["test averaged"]),
+                "exposure_fitted": summary_of(rows["test"]),
+            },
+            **self._untold.to_dict(),
+        }
+        metrics["train"]["per_view"] = per_view
+        if rows["all"]:
+            metrics["test"]["photometry_fitted"] = summary_of(rows["all"])
+        metering = self._metered.fit(exposures[self._told], judge.mean.gamma, tone)
+        if metered := self._metered.scores(metering, self._under_rule):
+            names = {judge.scene.views[index].name: row for index, row in metered.items()}
+            metrics["test"]["metered"] = summary_of(names)
+        metrics["consistency"] = {name: video.summary() for name, video in self._videos.items()}
+        if self._radiance.views:
+            exposed = exposed_at(judge.cfg.loss.saturation, judge.mean.gamma, tone)
+            typical = float(np.median(exposures))
+            metrics["radiance"] = self._radiance.summary(exposed / typical)
+        if drive is not None:
+            metrics |= drive.summary()
+        if self._references:
+            metrics["reference"] = _against_reference(self._references, judge)
+        return Evaluation(metrics, metering, {} if drive is None else drive.unexplained)
+
+    def _under_rule(self, index, linear, exposure, photograph, mask, alpha) -> dict[str, Any]:
+        shown = replace(self._judge.usual(index), exposure=exposure)
+        return self._judge.scorer(index, photograph, mask)(develop(linear, shown, alpha=alpha))
+
+
+def _against_reference(
+    views: list[tuple[int, tuple[StoredArray, ...]]], judge: Judge
+) -> dict[str, Any]:
+    """Score all views against photographs of one common exposure.
+
+    Those are taken to be what no camera in particular sees: without vignetting, and of mean white
+    balance.
+
+    Args:
+        views: row of each; linear radiance, reference photograph and mask, kept; over a background
+            also the opacity.
+        judge: how all are shown, and by which scores they are judged.
+    """
+    shown, mean = judge.usual(None), judge.mean
+
+    def images(view):
+        return (kept.read() for kept in view[1])
+
+    def scale(view) -> float:
+        return with_fitted_exposure(shown, *images(view)).exposure
+
+    scales = list(map_in_order(scale, views))
+    protocols = {
+        "averaged": mean.exposure,
+        "geometric": mean.exposure_geometric,
+        "scale_aligned": float(np.exp(np.median(np.log(scales)))),
+    }
+
+    def judged(view):
+        linear, truth, mask, *alpha = images(view)
+        opacity = next(iter(alpha), None)
+        found = {}
+        for name, exposure in protocols.items():
+            ldr = develop(linear, replace(shown, exposure=exposure), alpha=opacity)
+            found[name] = view_scores(judge.lpips_weights, ldr, truth, mask)
+        return found
+
+    parts: dict[str, dict[str, dict]] = {
+        name: {"all": {}, "train": {}, "test": {}} for name in protocols
+    }
+    for (index, _), rows in zip(views, map_in_order(judged, views), strict=True):
+        view = judge.scene.views[index]
+        for name, row in rows.items():
+            for part in ("all", view.split):
+                parts[name][part][view.name] = row
+    return {
+        name: {
+            **summary_of(parts[name]["all"]),
+            "exposure": exposure,
+            "train": summary_of(parts[name]["train"]),
+            "test": summary_of(parts[name]["test"]),
+        }
+        for name, exposure in protocols.items()
+    }

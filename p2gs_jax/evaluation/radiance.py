@@ -1,0 +1,225 @@
+"""Recovered radiance against HDR truth: stops, PU21, colour, mu law (docs/photometry.md, 6)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from p2gs_jax.core.numerics import LN2
+from p2gs_jax.evaluation.passes import ArrayStore, StoredArray, map_in_order
+from p2gs_jax.evaluation.scores import ssim
+
+Truth = Callable[[int], Float[np.ndarray, "h w 3"] | None]
+
+# PU21, "banding + glare" (Mantiuk and Azimi, Picture Coding Symposium 2021), domain in cd/m^2.
+PU21 = (0.353487901, 0.3734658629, 8.277049286e-05, 0.9062562627, 0.09150303166, 0.9099517204)
+PU21_SCALE = 596.3148142
+PU21_RANGE = (0.005, 10_000.0)
+# PU21 maps 100 cd/m^2, a standard display's white, to this; PSNR and SSIM take it as their peak.
+PU21_PEAK = 256.0
+WHITE_NITS = 100.0
+# GaussHDR (CVPR 2025) and HDR-NeRF (CVPR 2022): log(1 + mu x) / log(1 + mu), mu = 5000.
+MU = 5000.0
+# Least number of evenly spaced pixels of a view for alignment and colour difference. The third
+# bounds, up to a factor of two, what is aligned of all views together: a line needs no more, and
+# 900 views of 160 pixels took 4 GB.
+ALIGNMENT_PIXELS, COLOR_PIXELS, MOST_ALIGNED = 10_000, 20_000, 1_000_000
+STOPS_CAP = 3.0
+
+
+def pu21_encode(nits: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """Return perceptually uniform values of absolute luminance, about 0 to 596."""
+    y = np.clip(nits, *PU21_RANGE) ** PU21[3]
+    ratio = (PU21[0] + PU21[1] * y) / (1 + PU21[2] * y)
+    return PU21_SCALE * (ratio ** PU21[4] - PU21[5])
+
+
+def pu21_psnr(linear, truth, mask: Bool[np.ndarray, "h w"], white: float) -> float:
+    """Return PSNR of PU21-encoded radiance, dB.
+
+    Args:
+        linear: recovered radiance, aligned.
+        truth: true radiance.
+        mask: which pixels count.
+        white: radiance shown as 100 cd/m^2.
+    """
+    a, b = (pu21_encode(x / white * WHITE_NITS) for x in (linear, truth))
+    mse = float(np.mean((a - b)[mask] ** 2)) if mask.any() else float("nan")
+    return float(20 * np.log10(PU21_PEAK) - 10 * np.log10(max(mse, 1e-12)))
+
+
+def pu21_ssim(linear, truth, mask: Bool[np.ndarray, "h w"], white: float) -> float:
+    """Return SSIM of PU21-encoded radiance; see `pu21_psnr`."""
+    a, b = (
+        (pu21_encode(x / white * WHITE_NITS) / PU21_PEAK).astype(np.float32)
+        for x in (linear, truth)
+    )
+    return float(ssim(a, b, np.asarray(mask, np.float32)))
+
+
+def delta_e_itp(linear, truth, mask: Bool[np.ndarray, "h w"], white: float) -> float:
+    """Return the mean colour difference of BT.2124 (1 = just noticeable), sRGB primaries.
+
+    A mean over evenly taken pixels, at least twenty thousand where there are so many.
+    """
+    if not mask.any():
+        return float("nan")
+    shown = np.flatnonzero(mask)
+    shown = shown[:: max(1, len(shown) // COLOR_PIXELS)]
+
+    # Imported here: colour-science is slow to load.
+    import colour
+
+    def encoded(x):
+        nits = np.clip(x.reshape(-1, 3)[shown] / white * WHITE_NITS, 0, PU21_RANGE[1])
+        wide = colour.RGB_to_RGB(nits, "sRGB", "ITU-R BT.2020")
+        return colour.RGB_to_ICtCp(np.maximum(wide, 0))
+
+    return float(np.mean(colour.difference.delta_E_ITP(encoded(linear), encoded(truth))))
+
+
+def mu_law(x: Float[np.ndarray, "..."], mu: float = MU) -> Float[np.ndarray, "..."]:
+    """Return radiance over the brightest, clipped to [0, 1], compressed by the mu law to [0, 1]."""
+    return np.log1p(mu * np.clip(x, 0.0, 1.0)) / np.log1p(mu)
+
+
+def mu_law_psnr(
+    linear: Float[np.ndarray, "h w 3"],
+    truth: Float[np.ndarray, "h w 3"],
+    mask: Bool[np.ndarray, "h w"],
+    mu: float = MU,
+) -> float:
+    """Return PSNR of tone-mapped radiance, dB, as GaussHDR's code computes it for synthetic scenes.
+
+    Both images are divided by the brightest true channel of the view. Its authors write both as
+    8-bit files first, which this does not. NaN where no pixel counts, or the truth is black.
+
+    Args:
+        linear: recovered radiance, aligned to the truth by one scale common to all views.
+        truth: true radiance.
+        mask: which pixels count.
+        mu: of the mu law.
+    """
+    brightest = float(truth[mask].max()) if mask.any() else 0.0
+    if brightest <= 0:
+        return float("nan")
+    a, b = (mu_law(x[mask].astype(np.float64) / brightest, mu) for x in (linear, truth))
+    return float(-10 * np.log10(max(float(np.mean((a - b) ** 2)), 1e-12)))
+
+
+@dataclass
+class RadianceScores:
+    """Collects views, then scores them under one common alignment.
+
+    Attributes:
+        arrays: keeps the images.
+        views: (name, split, recovered, truth, mask) of each view.
+    """
+
+    arrays: ArrayStore = field(default_factory=ArrayStore)
+    views: list[tuple[str, str, StoredArray, StoredArray, StoredArray]] = field(
+        default_factory=list
+    )
+
+    def add(self, name: str, split: str, linear, truth, mask) -> None:
+        """Keep one view; images that the store holds already are not copied."""
+        linear, truth = self.arrays.put(linear), self.arrays.put(truth)
+        self.views.append((name, split, linear, truth, self.arrays.put(np.asarray(mask) > 0.5)))
+
+    def summary(self, brightest: float) -> dict:
+        """Return means over all, training and held-out views.
+
+        Args:
+            brightest: recovered radiance from which on at least half of the training photographs
+                are saturated: pixels above it are left out of the stops.
+
+        Returns:
+            `stops_median` and `stops_rms` after one common scale, `stops_rms_power` after scale
+            and power, `pu21_psnr`, `pu21_ssim`, `delta_e_itp`, `mu_law_psnr`; and the alignment.
+        """
+        if not self.views:
+            return {}
+        logs = self._sample(brightest)
+        shift = float(np.median(logs[1] - logs[0])) if logs.size else 0.0
+        power, offset = _power(logs)
+        scale = float(np.exp(shift))
+
+        def judged(view) -> dict[str, float]:
+            linear, truth, mask = (kept.read() for kept in view[2:])
+            return _view_scores(linear, truth, mask, brightest, shift, power, offset)
+
+        found = map_in_order(judged, self.views)
+        rows = {name: row for (name, *_), row in zip(self.views, found, strict=True)}
+        splits = {name: split for name, split, *_ in self.views}
+        parts = {
+            part: {
+                k: _mean([rows[n][k] for n in rows if part in ("all", splits[n])])
+                for k in next(iter(rows.values()))
+            }
+            for part in ("all", "train", "test")
+            if part == "all" or part in splits.values()
+        }
+        return {
+            **parts["all"],
+            **{k: v for k, v in parts.items() if k != "all"},
+            "scale": scale,
+            "power": power,
+            "per_view": rows,
+        }
+
+    def _sample(self, brightest: float) -> np.ndarray:
+        parts = []
+        each = max(1, min(ALIGNMENT_PIXELS, MOST_ALIGNED // len(self.views)))
+        for _, _, *images in self.views:
+            linear, truth, mask = (kept.read() for kept in images)
+            keep = mask & (truth.min(-1) > 0) & (linear.min(-1) > 0)
+            keep &= linear.max(-1) < brightest
+            pick = np.flatnonzero(keep)
+            pick = pick[:: max(1, len(pick) // each)]
+            parts.append(
+                np.stack([np.log(x.reshape(-1, 3)[pick]).ravel() for x in (linear, truth)])
+            )
+        # Single precision is too coarse for a line through half a million points.
+        return np.concatenate(parts, 1).astype(np.float64) if parts else np.zeros((2, 0))
+
+
+def _view_scores(
+    linear, truth, mask, brightest: float, shift: float, power: float, offset: float
+) -> dict[str, float]:
+    """Return the scores of a view; `shift` and `offset` are natural logarithms."""
+    keep = mask & (truth.min(-1) > 0) & (linear.max(-1) < brightest)
+    a, b = np.log2(np.maximum(linear[keep], 1e-12)), np.log2(truth[keep])
+    stops = np.minimum(np.abs(a + shift / LN2 - b), STOPS_CAP)
+    bent = np.minimum(np.abs(power * a + offset / LN2 - b), STOPS_CAP)
+    scale = float(np.exp(shift))
+    shown = (linear * scale, truth, mask, brightest * scale)
+    return {
+        "stops_median": float(np.median(stops)) if stops.size else float("nan"),
+        "stops_rms": float(np.sqrt(np.mean(stops**2))) if stops.size else float("nan"),
+        "stops_rms_power": float(np.sqrt(np.mean(bent**2))) if bent.size else float("nan"),
+        "pu21_psnr": pu21_psnr(*shown),
+        "pu21_ssim": pu21_ssim(*shown),
+        "delta_e_itp": delta_e_itp(*shown),
+        "mu_law_psnr": mu_law_psnr(*shown[:3]),
+    }
+
+
+def _mean(values: list[float]) -> float:
+    known = [v for v in values if np.isfinite(v)]
+    return float(np.mean(known)) if known else float("nan")
+
+
+def _power(logs: np.ndarray) -> tuple[float, float]:
+    """Return (power, offset) with log truth ~ power log linear + offset, outliers cut once."""
+    if logs.shape[1] < 2 or np.ptp(logs[0]) < 1e-6:
+        return 1.0, 0.0
+    keep = np.ones(logs.shape[1], bool)
+    power, offset = 1.0, 0.0
+    for _ in range(3):
+        power, offset = np.polyfit(logs[0][keep], logs[1][keep], 1)
+        gap = np.abs(power * logs[0] + offset - logs[1])
+        keep = gap < 3 * max(float(np.median(gap)), 1e-3)
+    return float(power), float(offset)

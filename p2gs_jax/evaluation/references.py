@@ -1,0 +1,80 @@
+"""What renders are compared with beside the photographs: one common exposure, true radiance."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.errors import UserError
+from p2gs_jax.evaluation.radiance import Truth
+from p2gs_jax.formats.exr import read_exr
+from p2gs_jax.scene.pixels.store import ImageStore, camera_of
+from p2gs_jax.types import Scene
+
+Reference = Callable[[int], np.ndarray | None]
+
+
+def check_reference(folder: str | Path | None) -> None:
+    """Complain about a folder that is missing, before there are any views; None is fine.
+
+    Raises:
+        UserError: there is no such folder.
+    """
+    if folder is not None and not Path(folder).is_dir():
+        raise UserError(
+            f"{folder} is not a folder.", fix="give --reference a folder of photographs"
+        )
+
+
+def load_reference(folder: str | Path, scene: Scene, cfg: FitConfig) -> Reference:
+    """Return a function from a view's row to its photograph under the common exposure, or None.
+
+    Raises:
+        UserError: the folder does not exist or holds no photograph of any view.
+    """
+    folder = Path(folder)
+    check_reference(folder)
+    rows = {}
+    for row, view in enumerate(scene.views):
+        named = [folder / view.name, *sorted(folder.glob(str(Path(view.name).with_suffix(".*"))))]
+        found = next((p for p in named if p.is_file()), None)
+        if found is not None:
+            rows[row] = dataclasses.replace(view, image_path=found, mask_path=None)
+    if not rows:
+        raise UserError(
+            f"{folder} holds no photograph with the name of a view (for example "
+            f"{scene.views[0].name}).",
+            fix="name the reference photographs as the scene's images",
+        )
+    order = sorted(rows)
+    # Each is looked at once: none is kept beside the photographs.
+    store = ImageStore(tuple(rows[r] for r in order), dataclasses.replace(cfg.data, cache_mb=0))
+    where = {r: i for i, r in enumerate(order)}
+    return lambda row: store.get(where[row], 1)[0] if row in where else None
+
+
+def find_radiance(scene: Scene, store: ImageStore) -> Truth | None:
+    """Return true linear radiance by view row where the scene carries it (`truth/linear`).
+
+    Synthetic scenes do; it is used for judging only.
+    """
+    folder = scene.root / "truth" / "linear"
+    if not folder.is_dir():
+        return None
+
+    def radiance(row: int) -> np.ndarray | None:
+        path = (folder / scene.views[row].name).with_suffix(".exr")
+        if not path.is_file():
+            return None
+        linear, _ = read_exr(path)
+        camera = camera_of(store, row)
+        if linear.shape[:2] == (camera.height, camera.width):
+            return linear
+        return cv2.resize(linear, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+
+    return radiance

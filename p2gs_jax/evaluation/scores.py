@@ -1,0 +1,262 @@
+"""Scores of single views and their means, the same for everything that is judged.
+
+PSNR and SSIM (docs/photometry.md, 6), LPIPS where there are weights; of drives also over static
+pixels and over what moves; HIS and Std-Luminance of videos (paper, appendix Metrics).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Float32
+
+from p2gs_jax.config import LossConfig
+from p2gs_jax.evaluation.lpips import LpipsWeights, lpips
+from p2gs_jax.evaluation.ssim import ssim as _ssim
+from p2gs_jax.evaluation.ssim import ssim_map
+from p2gs_jax.photometry.formation import eotf
+from p2gs_jax.scene.drives.objects import object_mask
+from p2gs_jax.types import LUMINANCE, Scene
+
+PARTS = ("whole", "static", "moving")
+# Parts of fewer pixels get no scores.
+FEWEST_PIXELS = 64
+# A photograph tells its exposure where at least this share lies between black and saturation.
+FEWEST_TELLING = 1e-3
+_NAMED = 8
+
+Masks = Mapping[str, Float32[np.ndarray, "h w"]]
+
+ssim = jax.jit(_ssim)
+
+
+@jax.jit
+def psnr(
+    ldr: Float[Array, "h w 3"], target: Float[Array, "h w 3"], mask: Float[Array, "h w"]
+) -> Float[Array, ""]:
+    """Return the peak signal-to-noise ratio over valid pixels, dB, peak 1."""
+    squared = jnp.sum(mask[..., None] * (ldr - target) ** 2)
+    mse = squared / jnp.maximum(3 * jnp.sum(mask), 1)
+    return -10 * jnp.log10(jnp.maximum(mse, 1e-12))
+
+
+def view_scores(
+    weights: LpipsWeights | None, ldr, target, mask, parts: Masks | None = None
+) -> dict[str, Any]:
+    """Return PSNR and SSIM of an image; LPIPS if there are weights for it; the same of parts."""
+    row: dict[str, Any] = {
+        "psnr": float(psnr(ldr, target, mask)),
+        "ssim": float(ssim(ldr, target, mask)),
+    }
+    if weights is not None:
+        row["lpips"] = float(lpips(weights, ldr, target, mask))
+    return row if parts is None else {**row, **region_scores(weights, ldr, target, parts)}
+
+
+def region_scores(
+    weights: LpipsWeights | None,
+    ldr: Float32[np.ndarray, "h w 3"],
+    target: Float32[np.ndarray, "h w 3"],
+    masks: Masks,
+) -> dict[str, dict[str, float]]:
+    """Return PSNR, SSIM and, with weights, LPIPS of each part (`parts_of`).
+
+    SSIM is the mean of the whole image's map over the part. LPIPS is the distance with the
+    photograph outside of the part, over the part's share of the image.
+    """
+    if not masks:
+        return {}
+    pair = jnp.asarray(ldr), jnp.asarray(target)
+    similar = _similarity(*pair, masks["whole"])
+    out: dict[str, dict[str, float]] = {}
+    for name, mask in masks.items():
+        if name == "static" and "moving" not in masks:
+            out[name] = out["whole"]
+            continue
+        row = {
+            "psnr": float(psnr(*pair, mask)),
+            "ssim": float(jnp.sum(similar * mask) / jnp.sum(mask)),
+        }
+        if weights is not None:
+            row["lpips"] = float(lpips(weights, *pair, jnp.asarray(mask)) / mask.mean())
+        out[name] = row
+    return out
+
+
+@jax.jit
+def _similarity(
+    ldr: Float[Array, "h w 3"], target: Float[Array, "h w 3"], mask: Float[Array, "h w"]
+) -> Float[Array, "h w"]:
+    """Return the SSIM of each pixel; pixels that do not count are alike."""
+    seen = jnp.where(mask[..., None] > 0, ldr, target)
+    return ssim_map(seen.transpose(2, 0, 1), target.transpose(2, 0, 1)).mean(0)
+
+
+def summary_of(rows: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """Return the means of rows of views by name, and the rows as `per_view`; empty without any.
+
+    Of a drive also the means of each part over the views that have it, and how many these are.
+    """
+    if not rows:
+        return {}
+    listed = list(rows.values())
+    keys = [k for k in listed[0] if k not in PARTS]
+    means = {k: float(np.mean([r[k] for r in listed])) for k in keys}
+    return {**means, **mean_of_parts(listed), "per_view": rows}
+
+
+def mean_of_parts(rows: Sequence[Mapping[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
+    """Return the means of the views that have each part, and how many these are."""
+    out = {}
+    for name in PARTS:
+        there = [row[name] for row in rows if name in row]
+        if there:
+            out[name] = {k: float(np.mean([r[k] for r in there])) for k in there[0]}
+            out[name]["views"] = len(there)
+    return out
+
+
+def is_drive(scene: Scene) -> bool:
+    """Return whether views have times: those of drives do."""
+    return any(view.time is not None for view in scene.views)
+
+
+def parts_of(mask: Float32[np.ndarray, "h w"], moving: Bool[np.ndarray, "h w"]) -> Masks:
+    """Return masks by name, without those that have too few pixels.
+
+    Args:
+        mask: 1 = use.
+        moving: covered by the boxes of what moves.
+    """
+    masks = {"whole": mask, "static": mask * ~moving, "moving": mask * moving}
+    return {k: m.astype(np.float32) for k, m in masks.items() if m.sum() >= FEWEST_PIXELS}
+
+
+def masks_of_parts(scene: Scene, index: int, mask: Float32[np.ndarray, "h w"]) -> Masks | None:
+    """Return the masks of a view's whole, static and moving pixels; None where it is no drive's."""
+    if not is_drive(scene):
+        return None
+    height, width = mask.shape
+    return parts_of(mask, object_mask(scene.views[index], scene.objects, width, height))
+
+
+def still_mask(
+    scene: Scene, index: int, mask: Float32[np.ndarray, "h w"]
+) -> Float32[np.ndarray, "h w"]:
+    """Return a mask without what moves, for exposures; as it is where all of it moves."""
+    if not any(thing.moving for thing in scene.objects):
+        return mask
+    height, width = mask.shape
+    boxes = object_mask(scene.views[index], scene.objects, width, height, margin=0.0)
+    still = mask * ~boxes
+    return still if still.any() else mask
+
+
+@dataclass
+class Untold:
+    """Views that cannot be judged, and photographs whose exposure nothing tells.
+
+    Attributes:
+        hidden: names of views of which masks leave nothing: they have no scores.
+        exposures: names of views that are black or saturated everywhere: any exposure that is dark
+            or bright enough explains them.
+    """
+
+    hidden: list[str] = field(default_factory=list)
+    exposures: list[str] = field(default_factory=list)
+
+    def add(
+        self,
+        name: str,
+        photograph: Float32[np.ndarray, "h w 3"],
+        mask: Float32[np.ndarray, "h w"],
+        loss: LossConfig,
+    ) -> bool:
+        """Look at a photograph of display values; return whether its view can be judged."""
+        counted = photograph[mask > 0]
+        if not len(counted):
+            self.hidden.append(name)
+            return False
+        tells = ((counted > loss.black) & (counted < loss.saturation)).any(1)
+        if tells.mean() < FEWEST_TELLING:
+            self.exposures.append(name)
+        return True
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the entries of `metrics.json`; empty where every view tells its exposure."""
+        found = {"hidden": self.hidden, "exposures_unknown": self.exposures}
+        return {key: names for key, names in found.items() if names}
+
+
+def untold_notes(metrics: dict[str, Any]) -> list[str]:
+    """Return what the user should know of these views, from the metrics of an evaluation."""
+    out = []
+    if hidden := metrics.get("hidden"):
+        out.append(
+            f"{len(hidden)} view(s) are hidden by their masks altogether and have no scores "
+            f"({_listed(hidden)})."
+        )
+    if unknown := metrics.get("exposures_unknown"):
+        out.append(
+            f"{len(unknown)} photograph(s) are black or saturated everywhere: their exposures are "
+            f"unknown, whatever photometry.json holds ({_listed(unknown)})."
+        )
+    return out
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names[:_NAMED]) + (", ..." if len(names) > _NAMED else "")
+
+
+@dataclass
+class VideoScores:
+    """Scores of the videos of several cameras, frame by frame.
+
+    Frames of a camera follow each other in time; pairs of frames never mix cameras. HIS is averaged
+    over all pairs of all cameras. All are small for a dark or blurred video, and HIS contains the
+    motion of the scene: never read them without PSNR, and compare with those of the photographs.
+
+    - `his_paper`, as printed: RMS over pixels of the difference of two frames' OETF^-1(R_t) e_t. It
+      multiplies by e where undoing an exposure means dividing, and is 0 for a black video.
+    - `his`, corrected: divided by e and by the mean radiance; invariant to e -> c e.
+    - `std_luminance`, as printed: standard deviation over frames of their mean BT.601 luminance.
+    - `std_luminance_relative`: divided by the mean, so that darkening a video does not improve it.
+    """
+
+    _last: dict[str, tuple[np.ndarray, float]] = field(default_factory=dict)
+    _printed: list[float] = field(default_factory=list)
+    _corrected: list[float] = field(default_factory=list)
+    _radiance: list[float] = field(default_factory=list)
+    _luminance: list[float] = field(default_factory=list)
+
+    def add(self, camera: str, ldr: Float[np.ndarray, "h w 3"], exposure: float) -> None:
+        """Append a frame of display values, taken under an exposure, to the video of a camera."""
+        linear = eotf(np.asarray(ldr), "srgb").astype(np.float64)
+        if camera in self._last and self._last[camera][0].shape == linear.shape:
+            before, e = self._last[camera]
+            self._printed.append(_rms(before * e - linear * exposure))
+            self._corrected.append(_rms(before / e - linear / exposure))
+        self._last[camera] = linear, exposure
+        self._radiance.append(float(np.mean(linear)) / exposure)
+        self._luminance.append(float(np.mean(np.asarray(ldr, np.float64) @ LUMINANCE)))
+
+    def summary(self) -> dict[str, float]:
+        """Return the four scores; empty without any pair of frames."""
+        if not self._printed:
+            return {}
+        spread, level = float(np.std(self._luminance)), float(np.mean(self._luminance))
+        return {
+            "his_paper": float(np.mean(self._printed)),
+            "his": float(np.mean(self._corrected)) / max(float(np.mean(self._radiance)), 1e-12),
+            "std_luminance": spread,
+            "std_luminance_relative": spread / max(level, 1e-12),
+        }
+
+
+def _rms(difference: Float[np.ndarray, "h w 3"]) -> float:
+    return float(np.sqrt(np.mean(difference**2)))

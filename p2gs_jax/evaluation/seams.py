@@ -1,0 +1,276 @@
+"""Seams: the difference of photographs of one surface, as taken and under one display transform.
+
+Pixels of one view are found in a neighbouring one through rendered depth, with an occlusion test
+(render/warp.py). Over the pixels that both show, unsaturated and not near black, the seam is the
+median over pixels and channels of the absolute difference, in 8-bit codes and in stops:
+
+- before: of the photographs as taken. In stops, as if all were taken alike: both are decoded with
+  the common gamma, and no exposure is undone.
+- after: of the photographs developed alike: each is decoded with its own gamma and response,
+  divided by its own exposure, white balance and vignetting, and shown in the common display
+  transform.
+
+The step is the constant part of what is left: the median of the signed difference after, in stops.
+The rest contains misplaced pixels on texture, view-dependent reflection, and what the formation
+model leaves out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+from scipy.sparse import csr_array
+from scipy.spatial.transform import Rotation
+
+from p2gs_jax.config import LossConfig
+from p2gs_jax.core.numerics import evenly_spaced
+from p2gs_jax.photometry.display import DisplayTransform, develop
+from p2gs_jax.photometry.formation import inverse_formation, inverse_tone_map, places
+from p2gs_jax.render.warp import project_points as project
+from p2gs_jax.render.warp import sample_bilinear, surface_depth, unproject, warp
+from p2gs_jax.scene.rigid import moment_of
+from p2gs_jax.scene.visibility import project_points, unoccluded
+from p2gs_jax.types import Camera, Render, Scene
+
+# Least pixels in common.
+FEWEST_PIXELS = 200
+# Least points in common of two views that are compared.
+FEWEST_SHARED = 30
+# Points that overlaps are counted on where there are no tracks.
+MOST_COUNTED = 5000
+# In a picture of a seam, rendered depth is used from this opacity of the halfway view on, and
+# elsewhere this multiple of the largest rendered depth.
+OPAQUE, FAR = 0.5, 100.0
+BLANK = 0.5
+
+
+class Photographed(NamedTuple):
+    """A photograph with camera, depth and display transform.
+
+    Attributes:
+        ldr: display values.
+        mask: 1 = use.
+        camera: at the size of `ldr`.
+        depth: from `surface_depth`, 0 where the view shows no surface.
+        transform: how it was taken.
+    """
+
+    ldr: Float32[np.ndarray, "h w 3"]
+    mask: Float32[np.ndarray, "h w"]
+    camera: Camera
+    depth: Float[np.ndarray, "h w"]
+    transform: DisplayTransform
+
+
+class Seam(NamedTuple):
+    """The difference of two photographs; see the module for the definitions.
+
+    Attributes:
+        before_ev: as taken, stops.
+        after_ev: developed alike, stops.
+        before_codes: as taken, 8-bit codes.
+        after_codes: developed alike, 8-bit codes.
+        step_ev: by which the first is brighter throughout, developed alike, stops.
+        pixels: that both show.
+    """
+
+    before_ev: float
+    after_ev: float
+    before_codes: float
+    after_codes: float
+    step_ev: float
+    pixels: int
+
+
+def neighbouring_pairs(scene: Scene, most: int) -> list[tuple[int, int]]:
+    """Return pairs of training views that should show the same surfaces, rows of `scene.views`.
+
+    On a rig these are different cameras at the same time that share points: of a drive, in the
+    same frame; else, files of the same name in different folders. Elsewhere every view is paired
+    with the one it shares most with. There are at most `most` pairs, spread evenly over the views.
+    """
+    train = scene.train_indices
+    shared = _shared_points(scene)
+    moments = [moment_of(scene.views[i]) for i in train]
+    cameras = [scene.views[i].camera for i in train]
+    together = [
+        (a, b)
+        for a in range(len(train))
+        for b in range(a + 1, len(train))
+        if moments[a] == moments[b] and cameras[a] != cameras[b] and shared[a, b] >= FEWEST_SHARED
+    ]
+    pairs = together or _closest(shared)
+    picked = [pairs[k] for k in evenly_spaced(len(pairs), most)]
+    return [(train[a], train[b]) for a, b in picked]
+
+
+def _closest(shared: np.ndarray) -> list[tuple[int, int]]:
+    """Return every view with the one it shares most with; among equals, the nearest in order."""
+    order = np.arange(len(shared))
+    near = shared - np.abs(order[:, None] - order) / (len(shared) + 1)
+    np.fill_diagonal(near, -np.inf)
+    best = near.argmax(1).tolist() if len(shared) > 1 else []
+    pairs = {(min(a, b), max(a, b)) for a, b in enumerate(best)}
+    return sorted(p for p in pairs if shared[p] >= FEWEST_SHARED)
+
+
+def _shared_points(scene: Scene) -> np.ndarray:
+    """Return how many points two training views have in common, 0 on the diagonal."""
+    train = list(scene.train_indices)
+    if scene.tracks is not None and len(scene.tracks.xy):
+        where = (scene.tracks.view_indices, scene.tracks.point_indices)
+        shape = (len(scene.views), len(scene.points))
+        seen = csr_array((np.ones(len(where[0]), np.float32), where), shape=shape)
+        seen.data[:] = 1
+        seen = seen.tocsr()[train]
+    else:
+        rows = []
+        counted = evenly_spaced(len(scene.points), MOST_COUNTED)
+        for view in (scene.views[i] for i in train):
+            xy, z = project_points(scene.points, view)
+            rows.append(unoccluded(xy, z, view.width, view.height)[counted])
+        seen = csr_array(np.array(rows, np.float32))
+    shared = (seen @ seen.T).toarray()
+    np.fill_diagonal(shared, 0)
+    return shared
+
+
+def measure_seam(
+    first: Photographed, second: Photographed, common: DisplayTransform, cfg: LossConfig
+) -> Seam | None:
+    """Return the seam between two photographs, or None where they have too little in common.
+
+    They are compared in the pixels of the first; `common` is the display transform of "after", and
+    has the gamma of "before". `cfg` says between which display values a pixel is used.
+    """
+    there = warp(jnp.asarray(first.depth), first.camera, jnp.asarray(second.depth), second.camera)
+    ldr = sample_bilinear(jnp.asarray(second.ldr), there.xy)
+    kept = sample_bilinear(jnp.asarray(second.mask)[..., None], there.xy)[..., 0] > 0.99
+    use = np.asarray(there.seen & kept) & (first.mask > 0.99)
+    use &= _informative(first.ldr, cfg) & _informative(np.asarray(ldr), cfg)
+    if use.sum() < FEWEST_PIXELS:
+        return None
+    a, b = first.ldr[use], np.asarray(ldr)[use]
+    where = [np.argwhere(use)[:, ::-1] + np.float32(0.5), np.asarray(there.xy)[use]]
+    plain = [_decoded(values, common) for values in (a, b)]
+    radiance = [
+        radiance_of(values, view.transform, places(xy, view.camera.width, view.camera.height))
+        for values, view, xy in zip((a, b), (first, second), where, strict=True)
+    ]
+    shown = [develop(linear, common) for linear in radiance]
+    return Seam(
+        _apart(np.log2(plain[0]), np.log2(plain[1])),
+        _apart(np.log2(radiance[0]), np.log2(radiance[1])),
+        255 * _apart(a, b),
+        255 * _apart(shown[0], shown[1]),
+        float(np.median(np.log2(radiance[0]) - np.log2(radiance[1]))),
+        int(use.sum()),
+    )
+
+
+def radiance_of(
+    ldr: Float[np.ndarray, "... 3"],
+    transform: DisplayTransform,
+    positions: Float[np.ndarray, "... 2"] | None = None,
+) -> Float32[np.ndarray, "... 3"]:
+    """Return the radiance that a photograph shows: what was done to light undone, on the host.
+
+    Loose pixels of an image need their `positions` where vignetting counts
+    (photometry/cameras.py:places).
+    """
+    ldr = np.asarray(ldr, np.float32)
+    return inverse_formation(ldr, transform.capture, transform.formation, positions)
+
+
+def _decoded(ldr: Float[np.ndarray, "m 3"], common: DisplayTransform):
+    """Return the exposed radiance of a photograph as if all were taken alike."""
+    gamma = np.float32(common.gamma)
+    return inverse_tone_map(np.asarray(ldr, np.float32), gamma, common.formation)
+
+
+def _informative(ldr: Float[np.ndarray, "h w 3"], cfg: LossConfig) -> Bool[np.ndarray, "h w"]:
+    return np.all((ldr > cfg.black) & (ldr < cfg.saturation), axis=-1)
+
+
+def _apart(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.median(np.abs(a - b)))
+
+
+def redeveloped(
+    ldr: Float[np.ndarray, "... 3"], own: DisplayTransform, common: DisplayTransform
+) -> Float32[np.ndarray, "... 3"]:
+    """Return a photograph, taken back to radiance and developed with the common display transform.
+
+    Saturated pixels stay at the value of its white.
+    """
+    return develop(radiance_of(ldr, own), common)
+
+
+class SeamPicture(NamedTuple):
+    """One picture made of two photographs, with a hard edge in the middle.
+
+    Attributes:
+        before: of the photographs as taken.
+        after: of the photographs developed alike.
+        left_first: the left half is the first photograph.
+    """
+
+    before: Float32[np.ndarray, "h w 3"]
+    after: Float32[np.ndarray, "h w 3"]
+    left_first: bool
+
+
+def seam_picture(
+    first: Photographed,
+    second: Photographed,
+    common: DisplayTransform,
+    render: Callable[[Camera], Render],
+) -> SeamPicture:
+    """Warp half of each photograph into a camera halfway between the two.
+
+    There is no occlusion test: beside foreground edges the picture repeats the foreground. Pixels
+    that a photograph does not cover are grey. `common` is the display transform of "after", and
+    `render` renders a camera with depth.
+    """
+    camera = camera_between(first.camera, second.camera)
+    result = render(camera)
+    depth = np.asarray(surface_depth(result, OPAQUE))
+    known = depth > 0
+    far = FAR * (float(depth[known].max()) if known.any() else 1.0)
+    points = unproject(jnp.asarray(np.where(known, depth, far)), camera)
+    reached, before, after = [], [], []
+    for photograph in (first, second):
+        xy, z = project(points, photograph.camera)
+        size = jnp.array([photograph.camera.width, photograph.camera.height])
+        inside = np.asarray((z > 1e-6) & jnp.all((xy >= 0) & (xy < size), axis=-1))
+        ldr = np.asarray(sample_bilinear(jnp.asarray(photograph.ldr), xy))
+        alike = redeveloped(ldr, photograph.transform, common)
+        reached.append(inside)
+        before.append(np.where(inside[..., None], ldr, BLANK))
+        after.append(np.where(inside[..., None], alike, BLANK))
+    edge = camera.width // 2
+    left_first = bool(
+        reached[0][:, :edge].sum() + reached[1][:, edge:].sum()
+        >= reached[1][:, :edge].sum() + reached[0][:, edge:].sum()
+    )
+    left, right = (0, 1) if left_first else (1, 0)
+
+    def joined(images: list[np.ndarray]) -> np.ndarray:
+        return np.concatenate([images[left][:, :edge], images[right][:, edge:]], 1)
+
+    return SeamPicture(joined(before), joined(after), left_first)
+
+
+def camera_between(first: Camera, second: Camera) -> Camera:
+    """Return a camera halfway between two, with the size of the first."""
+    viewmats = np.stack([np.asarray(c.viewmat, np.float64) for c in (first, second)])
+    turns, shifts = viewmats[:, :3, :3], viewmats[:, :3, 3]
+    center = np.mean([-r.T @ t for r, t in zip(turns, shifts, strict=True)], 0)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = Rotation.from_matrix(turns).mean().as_matrix()
+    viewmat[:3, 3] = -viewmat[:3, :3] @ center
+    return Camera(jnp.asarray(viewmat, jnp.float32), first.K, first.width, first.height)

@@ -1,0 +1,305 @@
+"""Depth of one photograph from optical flow to its neighbours, each pixel checked four times.
+
+EDGS (arXiv 2504.13204) triangulates matches of a learned matcher; here DIS flow (Kroeger et al.
+2016, OpenCV) between photographs brought to one exposure, under known poses. A pixel's inverse
+depth r is what puts it nearest to its match: with x(r) = (a + r b) / (a_z + r b_z) the match q
+gives the linear equations (a - q a_z) + r (b - q b_z) = 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+from scipy.spatial import KDTree
+
+from p2gs_jax.gaussians.matching import MatchImage, MatchImages, at_common_exposure
+
+# Pixels, at the size that is matched.
+FORWARD_BACKWARD = 1.0
+EPIPOLAR = 0.7
+# Matches are uncertain by this much, pixels.
+DEVIATION = 0.5
+# Largest relative error of a depth that this may cause in one pair, and in all together.
+PAIR_ERROR, FUSED_ERROR = 0.10, 0.025
+# Two pairs agree within this many standard deviations, and never farther apart than this share.
+SIGMAS, APART = 2.0, 0.05
+# Largest difference of the 8-bit values at both ends of a match, after a small blur.
+COLOUR = 24.0
+# Window of the plane fit, pixels, and what of it must have a depth.
+WINDOW, SUPPORT = 9, 0.4
+# Inverse depths of a flat patch leave its plane by less than this share.
+FLAT = 0.01
+# The start of the flow is interpolated from this many points, on a grid this coarse.
+GUIDES, GUIDE_CELL = 6, 16
+# DIS at full resolution: half the depth error of its preset `medium`, which ends at half of it.
+PATCH, STRIDE, DESCENTS = 8, 4, 16
+# Flows kept: those in the other direction serve the neighbours' own depth.
+KEPT_FLOWS = 128
+
+CHECKS = ("unusable", "forward-backward", "epipolar", "parallax", "colour", "third view", "alone")
+
+
+class DepthMap(NamedTuple):
+    """Depth of one view.
+
+    Attributes:
+        inverse: 1 / z.
+        valid: passed every check.
+        slope: d(1/z)/dx, d(1/z)/dy per pixel, from the plane through the window.
+        flat: the window lies in that plane.
+        agreeing: [k h w] neighbours whose depth agrees, in the order given.
+        counts: pixels that matched at all, then those each of CHECKS refused, then the accepted.
+    """
+
+    inverse: Float32[np.ndarray, "h w"]
+    valid: Bool[np.ndarray, "h w"]
+    slope: Float32[np.ndarray, "h w 2"]
+    flat: Bool[np.ndarray, "h w"]
+    agreeing: Bool[np.ndarray, "k h w"]
+    counts: Int[np.ndarray, " c"]
+
+
+@dataclass(frozen=True)
+class _Geometry:
+    """What projects a pixel of one view into another: x(r) = (a + r b) / (a_z + r b_z)."""
+
+    a: Float32[np.ndarray, "h w 3"]
+    b: Float32[np.ndarray, " 3"]
+
+    def project(self, inverse):
+        x = self.a + inverse[..., None] * self.b
+        z = np.where(x[..., 2] > 1e-6, x[..., 2], np.float32(np.nan))
+        return x[..., :2] / z[..., None], x[..., 2]
+
+
+def pixel_centers(height: int, width: int) -> Float32[np.ndarray, "h w 2"]:
+    """Return positions of pixels, centres at +0.5."""
+    y, x = np.mgrid[:height, :width].astype(np.float32) + np.float32(0.5)
+    return np.stack([x, y], -1)
+
+
+def _geometry(a: MatchImage, b: MatchImage) -> _Geometry:
+    height, width = a.luminance.shape
+    relative = b.viewmat @ np.linalg.inv(a.viewmat)
+    turn = (b.K @ relative[:3, :3] @ np.linalg.inv(a.K)).astype(np.float32)
+    x = np.arange(width, dtype=np.float32)[None, :, None] + np.float32(0.5)
+    y = np.arange(height, dtype=np.float32)[:, None, None] + np.float32(0.5)
+    shift = (b.K @ relative[:3, 3]).astype(np.float32)
+    return _Geometry(x * turn[:, 0] + y * turn[:, 1] + turn[:, 2], shift)
+
+
+def guide(frame: MatchImage, points: Float[np.ndarray, "p 3"]) -> Float32[np.ndarray, "h w"]:
+    """Return inverse depth interpolated between points that the view sees, to start the flow."""
+    height, width = frame.luminance.shape
+    local = points @ frame.viewmat[:3, :3].T + frame.viewmat[:3, 3]
+    local = local[local[:, 2] > 1e-6]
+    if not len(local):
+        return np.zeros((height, width), np.float32)
+    xy = local @ frame.K.T
+    xy = xy[:, :2] / xy[:, 2:]
+    down, across = -(-height // GUIDE_CELL), -(-width // GUIDE_CELL)
+    grid = pixel_centers(down, across).reshape(-1, 2) * [width / across, height / down]
+    nearest = min(GUIDES, len(local))
+    found = KDTree(xy).query(grid, k=nearest)
+    distance, which = (np.asarray(f).reshape(len(grid), nearest) for f in found)
+    weight = 1 / (distance**2 + GUIDE_CELL**2)
+    coarse = (weight / local[which, 2]).sum(1) / weight.sum(1)
+    coarse = coarse.reshape(down, across).astype(np.float32)
+    return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
+
+
+def _squared(v):
+    """Return squared lengths; a sum over an axis of two is slow."""
+    return v[..., 0] ** 2 + v[..., 1] ** 2
+
+
+def _flow(first, second, start) -> Float32[np.ndarray, "h w 2"]:
+    """Return the flow from one image to the other, which may be of another size."""
+    height, width = first.shape
+    tall, wide = np.maximum(first.shape, second.shape).tolist()
+
+    def padded(image):
+        down, right = tall - image.shape[0], wide - image.shape[1]
+        return cv2.copyMakeBorder(image, 0, down, 0, right, cv2.BORDER_REPLICATE)
+
+    matcher = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    matcher.setFinestScale(0)
+    matcher.setPatchSize(PATCH)
+    matcher.setPatchStride(STRIDE)
+    matcher.setGradientDescentIterations(DESCENTS)
+    start = np.ascontiguousarray(padded(start), np.float32)
+    return matcher.calc(padded(first), padded(second), start)[:height, :width]
+
+
+def _sampled(image, xy, how=cv2.INTER_LINEAR):
+    """Sample at pixel positions; outside is 0."""
+    at = np.nan_to_num(xy - np.float32(0.5), nan=-1e4).astype(np.float32)
+    return cv2.remap(image, at[..., 0], at[..., 1], how, borderMode=cv2.BORDER_CONSTANT)
+
+
+def _start(there: _Geometry, inverse, xy):
+    """Return the flow that a depth predicts, 0 where it leads nowhere."""
+    height, width = inverse.shape
+    flow = there.project(inverse)[0] - xy
+    flow = np.nan_to_num(flow, nan=0.0)
+    return np.clip(flow, -max(width, height), max(width, height))
+
+
+class _Pair(NamedTuple):
+    inverse: np.ndarray
+    precision: np.ndarray  # of `inverse`; 0 = refused
+    refused: list[np.ndarray]
+
+
+@dataclass(frozen=True)
+class Flows:
+    """Flows between training views, computed when asked for; from any thread.
+
+    `points` start the flow; `seen` says which training view sees which.
+    """
+
+    images: MatchImages
+    points: Float[np.ndarray, "p 3"]
+    seen: Bool[np.ndarray, "v p"]
+    _kept: tuple = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self):
+        """Keep the last flows, and what starts them."""
+        kept = lru_cache(KEPT_FLOWS)(self._guide), lru_cache(KEPT_FLOWS)(self._flow)
+        object.__setattr__(self, "_kept", kept)
+
+    def between(self, i: int, j: int) -> Float32[np.ndarray, "h w 2"]:
+        """Return the flow from a training view to another."""
+        return self._kept[1](i, j)
+
+    def _guide(self, i: int):
+        return guide(self.images[i], self.points[self.seen[i]])
+
+    def _flow(self, i: int, j: int):
+        a, b = self.images[i], self.images[j]
+        # Always in one order, so that both directions compare the same pictures.
+        first, second = at_common_exposure(a, b) if i < j else at_common_exposure(b, a)[::-1]
+        here = pixel_centers(*a.luminance.shape)
+        return _flow(first, second, _start(_geometry(a, b), self._kept[0](i), here))
+
+
+def _match(flows: Flows, i: int, j: int) -> _Pair:
+    """Return inverse depth of a view from its flow to another."""
+    a, b = flows.images[i], flows.images[j]
+    first, second = at_common_exposure(a, b)
+    here, to_b = pixel_centers(*a.luminance.shape), _geometry(a, b)
+    forward, backward = flows.between(i, j), flows.between(j, i)
+    match = here + forward
+    height, width = second.shape
+    x, y = match[..., 0], match[..., 1]
+    inside = (x > 0.5) & (y > 0.5) & (x < width - 0.5) & (y < height - 0.5)
+    usable = a.usable & inside & (_sampled(b.usable.astype(np.float32), match) > 0.99)
+    back = _sampled(backward, match)
+    returns = _squared(forward + back) < FORWARD_BACKWARD**2
+    u = to_b.b[:2] - match * to_b.b[2]
+    v = to_b.a[..., :2] - match * to_b.a[..., 2:]
+    square = _squared(u)
+    dot = u[..., 0] * v[..., 0] + u[..., 1] * v[..., 1]
+    inverse = -dot / np.maximum(square, 1e-20)
+    predicted, z = to_b.project(inverse)
+    ahead = (inverse > 0) & (z > 1e-6)
+    with np.errstate(invalid="ignore"):
+        on_line = ahead & (_squared(predicted - match) < EPIPOLAR**2)
+    sensitivity = np.sqrt(square) / np.maximum(z, 1e-6)
+    apart = ahead & (sensitivity * inverse > DEVIATION / PAIR_ERROR)
+    blurred = [cv2.blur(i, (3, 3)).astype(np.float32) for i in (first, second)]
+    same = np.abs(blurred[0] - _sampled(blurred[1], match)) < COLOUR
+    refused, left = [], np.ones_like(usable)
+    for passed in (usable, returns, on_line, apart, same):
+        refused.append(left & ~passed)
+        left = left & passed
+    precision = np.where(left, (sensitivity / DEVIATION) ** 2, 0).astype(np.float32)
+    return _Pair(inverse, precision, refused)
+
+
+def depth_map(flows: Flows, row: int, near: Sequence[int]) -> DepthMap:
+    """Return the depth of a view, where at least two of its neighbours `near` agree on it."""
+    pairs = [_match(flows, row, int(j)) for j in near]
+    inverse = np.stack([p.inverse for p in pairs])
+    precision = np.stack([p.precision for p in pairs])
+    fused, agreeing, total = _fuse(inverse, precision)
+    matched = (precision > 0).any(0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sharp = 1 / np.sqrt(total) < FUSED_ERROR * fused
+    third = (agreeing.sum(0) >= 2) & sharp
+    smooth, slope, flat, support = plane_fit(fused, third)
+    valid = third & (support > SUPPORT)
+    # A rejected pixel counts for the last check that any of its neighbours reached.
+    rank = np.arange(5)[:, None, None]
+    last = np.max([(rank * np.stack(p.refused)).sum(0) for p in pairs], axis=0)
+    refused = [int((~matched & (last == i)).sum()) for i in range(5)]
+    refused += [int((matched & ~third).sum()), int((third & ~valid).sum())]
+    counts = np.array([matched.size, *refused, int(valid.sum())])
+    inverse = np.where(flat, smooth, fused)
+    return DepthMap(inverse, valid, slope, flat & valid, agreeing, counts)
+
+
+def _fuse(inverse, precision):
+    """Return the mean of the largest group of agreeing depths, the group, and its precision."""
+    count = len(inverse)
+    variance = 1 / np.maximum(precision, 1e-20)
+    agree = np.zeros((count, *inverse.shape), bool)
+    for i in range(count):
+        agree[i, i] = precision[i] > 0
+        for j in range(i):
+            apart = np.abs(inverse[i] - inverse[j])
+            near = apart < SIGMAS * np.sqrt(variance[i] + variance[j])
+            near &= apart < APART * np.maximum(inverse[i], inverse[j])
+            agree[i, j] = agree[j, i] = near & (precision[i] > 0) & (precision[j] > 0)
+    # The most agreeing first, then the most precise.
+    score = (agree * (1 + 0.1 * precision / np.maximum(precision.sum(0), 1e-20))).sum(1)
+    best = np.argmax(score, axis=0)
+    group = np.take_along_axis(agree, best[None, None], 0)[0]
+    weight = np.where(group, precision, 0)
+    total = weight.sum(0)
+    return (weight * inverse).sum(0) / np.maximum(total, 1e-20), group, total
+
+
+def plane_fit(inverse: Float[np.ndarray, "h w"], valid: Bool[np.ndarray, "h w"]):
+    """Fit a plane to the valid inverse depths about every pixel; planes are linear in them.
+
+    Returns:
+        Inverse depth of the plane at the pixel, its slope per pixel [h w 2], whether the window
+        lies in it, and the share of the window that is valid.
+    """
+    height, width = inverse.shape
+    w = valid.astype(np.float64)
+    values = np.where(valid, inverse, 0).astype(np.float64)
+    y, x = np.mgrid[:height, :width].astype(np.float64)
+
+    def mean(image):
+        return cv2.boxFilter(image, -1, (WINDOW, WINDOW), borderType=cv2.BORDER_CONSTANT)
+
+    share = mean(w)
+    n = np.maximum(share, 1e-9)
+    mx, my, mv = mean(w * x) / n, mean(w * y) / n, mean(values) / n
+    xx = mean(w * x * x) / n - mx**2
+    xy = mean(w * x * y) / n - mx * my
+    yy = mean(w * y * y) / n - my**2
+    xv = mean(values * x) / n - mx * mv
+    yv = mean(values * y) / n - my * mv
+    vv = np.maximum(mean(values**2) / n - mv**2, 0)
+    xx, yy = xx + 0.1, yy + 0.1  # pixels^2; keeps thin windows finite
+    det = np.maximum(xx * yy - xy**2, 1e-9)
+    sx, sy = (yy * xv - xy * yv) / det, (xx * yv - xy * xv) / det
+    left = np.maximum(vv - sx * xv - sy * yv, 0)
+    smooth = mv + sx * (x - mx) + sy * (y - my)
+    flat = (np.sqrt(left) < FLAT * smooth) & (share > SUPPORT) & (smooth > 0)
+    flat &= np.abs(smooth - inverse) < 2 * FLAT * smooth
+    return (
+        smooth.astype(np.float32),
+        np.stack([sx, sy], -1).astype(np.float32),
+        flat,
+        share,
+    )

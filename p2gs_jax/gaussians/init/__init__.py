@@ -1,1 +1,0 @@
-"""Initial Gaussians: from points, from dense depth, and a far shell."""

@@ -1,0 +1,254 @@
+"""Photographs prepared for matching, radiance and usable pixels, and which of them to match."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, UInt8
+
+from p2gs_jax.config import PhotometryConfig
+from p2gs_jax.core.streams import Stream, generator
+from p2gs_jax.gaussians.seeds import camera_centers
+from p2gs_jax.photometry.formation import darkens, log_vignetting, squared_radii
+from p2gs_jax.photometry.observations import Observations
+from p2gs_jax.photometry.response import Response, base_log, log_exposed, spline_of
+from p2gs_jax.scene.pixels.store import ImageStore
+from p2gs_jax.scene.visibility import in_frame, project_points, unoccluded
+from p2gs_jax.types import GAMMA_SRGB, Photometry, Scene
+
+TABLE = 1024
+LUMINANCE = np.array([0.25, 0.6, 0.15], np.float32)
+# Images kept at once: a view, its neighbours, and those of the next views.
+CACHED = 48
+# Quantile of luminance that becomes white in the comparison: lamps may clip.
+WHITE_QUANTILE = 0.995
+LARGEST_GAIN = 30.0
+ROUNDS = 30
+# Angles under which a pair sees its points, degrees: below the first the depth is uncertain, above
+# the second flow begins to fail; it is hopeless some `FADE` later.
+NARROW, WIDE, FADE = 4.0, 12.0, 8.0
+# Exposures this far apart (natural logarithm) share few usable tones.
+EXPOSURE_FADE = 1.5
+FEWEST_SHARED = 5
+MOST_POINTS = 20_000
+# Least points in a view for an occlusion test among them.
+FEWEST_HIDING = 1000
+
+
+@dataclass(frozen=True)
+class Tones:
+    """How display values of each training view become radiance: L = T^-1(y) / (e W V), in numpy.
+
+    Exposures are natural logarithms, white balances log factors on the channels; `formation` has
+    the base curve with its splines, cameras and pivot; `cameras` is the row of each view in
+    `formation.cameras`.
+    """
+
+    log_exposures: Float[np.ndarray, " v"]
+    gammas: Float[np.ndarray, " v"]
+    formation: PhotometryConfig = field(default_factory=PhotometryConfig)
+    white_balance: Float[np.ndarray, "v 3"] | None = None
+    cameras: tuple[int, ...] | None = None
+
+    @classmethod
+    def of(cls, photometry: Photometry, formation: PhotometryConfig) -> Tones:
+        """Return the tones of a fit."""
+        taken: Any = jax.tree.map(np.asarray, photometry)
+        return cls(taken.log_exposures, taken.gammas, formation, taken.white_balance, taken.cameras)
+
+    def log_radiance(
+        self,
+        row: int,
+        ldr: Float32[np.ndarray, "... 3"],
+        positions: Float[np.ndarray, "... 2"] | None = None,
+    ) -> Float32[np.ndarray, "... 3"]:
+        """Return log radiance of an image of a training view, or of loose pixels of one.
+
+        Loose pixels have `positions` where vignetting counts (photometry/cameras.py:places).
+        """
+        camera = None if self.cameras is None else self.cameras[row]
+        y = np.linspace(0.0, 1.0, TABLE)
+        log_pivot = np.log(self.formation.pivot)
+        curves = []
+        for z in self._curves(y, camera):
+            bent = log_pivot + (z - log_pivot) * (self.gammas[row] / GAMMA_SRGB)
+            curves.append(bent - self.log_exposures[row])
+        if len(curves) == 1:
+            logs = np.interp(ldr, y, curves[0])
+        else:
+            logs = np.stack([np.interp(ldr[..., c], y, curves[c]) for c in range(3)], -1)
+        if self.white_balance is not None:
+            logs = logs - self.white_balance[row]
+        if camera is not None and darkens(self.formation):
+            squared = squared_radii(*ldr.shape[:2]) if positions is None else (positions**2).sum(-1)
+            logs = logs - log_vignetting(squared, camera, self.formation)
+        return logs.astype(np.float32)
+
+    def _curves(self, y: Float[np.ndarray, " t"], camera: int | None) -> list[np.ndarray]:
+        """Return log exposed radiance of display values: for all channels, or for each."""
+        curve = self.formation.curve
+        if curve == "linear":
+            return [np.log(np.maximum(y, 0.5 / 255))]
+        if curve == "spline":
+            splines = spline_of(self.formation, camera)
+            return [log_exposed(y, Response("srgb", spline))[0] for spline in splines]
+        return [log_exposed(y, Response("power" if curve == "power" else "srgb"))[0]]
+
+
+def rough_tones(tracks: Observations | None, count: int) -> Tones:
+    """Return tones good enough to compare photographs where no exposures were solved.
+
+    One factor per view under sRGB's curve: residuals of log radiance against each point's mean,
+    averaged by turns. Without tracks of points, all factors are 1.
+    """
+    log_exposures, gammas = np.zeros(count), np.full(count, GAMMA_SRGB)
+    if tracks is None or not len(tracks.points):
+        return Tones(log_exposures, gammas)
+    good = ((tracks.colors > 0.03) & (tracks.colors < 0.95)).all(1)
+    z = base_log(tracks.colors[good], "srgb")[0].mean(1)
+    views, points = tracks.views[good], tracks.points[good]
+    per_view = np.maximum(np.bincount(views, minlength=count), 1)
+    per_point = np.maximum(np.bincount(points, minlength=tracks.point_count), 1)
+    for _ in range(ROUNDS):
+        mean = np.bincount(points, z - log_exposures[views], tracks.point_count) / per_point
+        off = np.clip(z - log_exposures[views] - mean[points], -1.0, 1.0)
+        log_exposures = log_exposures + np.bincount(views, off, count) / per_view
+        log_exposures -= log_exposures.mean()
+    return Tones(log_exposures, gammas)
+
+
+@dataclass(frozen=True)
+class MatchImage:
+    """A training view prepared for matching, at a reduced size.
+
+    `luminance` is linear radiance; `usable` pixels are neither masked, nor clipped, nor black;
+    `log_exposure` is natural.
+    """
+
+    ldr: Float32[np.ndarray, "h w 3"]
+    luminance: Float32[np.ndarray, "h w"]
+    usable: Bool[np.ndarray, "h w"]
+    viewmat: Float[np.ndarray, "4 4"]
+    K: Float[np.ndarray, "3 3"]
+    log_exposure: float
+
+
+@dataclass(frozen=True)
+class MatchImages:
+    """The training views of a scene, loaded when asked for; from any thread.
+
+    Their longest side has `longest` pixels; display values up to `black` and from `saturation` on
+    are not used.
+    """
+
+    scene: Scene
+    store: ImageStore
+    tones: Tones
+    longest: int
+    black: float
+    saturation: float
+    _load: object = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self):
+        """Cache the last images."""
+        object.__setattr__(self, "_load", lru_cache(CACHED)(self._make))
+
+    def __getitem__(self, row: int) -> MatchImage:
+        """Return a training view by its row."""
+        return self._load(row)  # type: ignore[operator]
+
+    def _make(self, row: int) -> MatchImage:
+        index = self.scene.train_indices[row]
+        shrink = max(1.0, max(self.store.camera(index)[2:]) / self.longest)
+        ldr, mask = self.store.get(index, shrink)
+        viewmat, K, _, _ = self.store.camera(index, shrink)
+        brightest = ldr.max(2)
+        usable = (mask > 0) & (brightest < self.saturation) & (brightest > self.black)
+        # Pixels beside clipped ones contain some of their light.
+        usable = cv2.erode(usable.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        luminance = np.exp(self.tones.log_radiance(row, ldr)) @ LUMINANCE
+        return MatchImage(
+            ldr,
+            luminance,
+            usable,
+            viewmat.astype(np.float64),
+            K.astype(np.float64),
+            float(self.tones.log_exposures[row]),
+        )
+
+
+def at_common_exposure(
+    a: MatchImage, b: MatchImage
+) -> tuple[UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h2 w2"]]:
+    """Return two photographs as the longer of their exposures shows them, 8 bits.
+
+    Pixels clipped under that exposure are white in both. Dark pairs are brightened.
+    """
+    exposure = np.exp(max(a.log_exposure, b.log_exposure))
+    bright = max(float(np.quantile(f.luminance[::4, ::4], WHITE_QUANTILE)) for f in (a, b))
+    gain = np.clip(1.0 / max(bright * exposure, 1e-9), 1.0, LARGEST_GAIN) * exposure
+    first, second = (
+        (255 * np.minimum(f.luminance * np.float32(gain), 1) ** np.float32(1 / GAMMA_SRGB)) + 0.5
+        for f in (a, b)
+    )
+    return first.astype(np.uint8), second.astype(np.uint8)
+
+
+def visibility(scene: Scene, seed: int) -> Bool[np.ndarray, "v p"]:
+    """Return which training view sees which point: by tracks, else by projection."""
+    rows = scene.train_indices
+    seen = np.zeros((len(rows), len(scene.points)), bool)
+    if scene.tracks is not None and len(scene.tracks.xy):
+        row_of = np.full(len(scene.views), -1)
+        row_of[list(rows)] = np.arange(len(rows))
+        view = row_of[scene.tracks.view_indices]
+        seen[view[view >= 0], scene.tracks.point_indices[view >= 0]] = True
+        return seen
+    for row, index in enumerate(rows):
+        view = scene.views[index]
+        xy, z = project_points(scene.points, view)
+        seen[row] = in_frame(xy, z, view.width, view.height)
+        if seen[row].sum() >= FEWEST_HIDING:
+            seen[row] = unoccluded(xy, z, view.width, view.height)
+    if len(scene.points) > MOST_POINTS:
+        rng = generator(seed, Stream.SHARED_POINTS)
+        seen[:, rng.permutation(len(scene.points))[MOST_POINTS:]] = False
+    return seen
+
+
+def neighbours(
+    scene: Scene,
+    seen: Bool[np.ndarray, "v p"],
+    log_exposures: Float[np.ndarray, " v"],
+    count: int,
+) -> list[Int[np.ndarray, " k"]]:
+    """Return for every training view the rows of the `count` views to match it with, best first.
+
+    `seen` says which view sees which point.
+    """
+    views = [scene.views[i] for i in scene.train_indices]
+    centers = camera_centers(views)
+    score = np.zeros((len(views), len(views)))
+    shared = seen.astype(np.float32) @ seen.T.astype(np.float32)
+    for i in range(len(views)):
+        to_i = scene.points[seen[i]] - centers[i]
+        to_i /= np.maximum(np.linalg.norm(to_i, axis=1, keepdims=True), 1e-12)
+        for j in np.flatnonzero(shared[i] >= FEWEST_SHARED):
+            if i == j:
+                continue
+            both = seen[j][seen[i]]
+            to_j = scene.points[seen[i]][both] - centers[j]
+            to_j /= np.maximum(np.linalg.norm(to_j, axis=1, keepdims=True), 1e-12)
+            cosine = np.clip((to_i[both] * to_j).sum(1), -1, 1)
+            angle = float(np.degrees(np.median(np.arccos(cosine))))
+            fade = max(angle - WIDE, 0.0) / FADE
+            score[i, j] = shared[i, j] * min(angle / NARROW, 1.0) * np.exp(-(fade**2))
+    apart = np.abs(log_exposures[:, None] - log_exposures[None]) / EXPOSURE_FADE
+    score *= np.exp(-(apart**2))
+    best = np.argsort(-score, axis=1, kind="stable")[:, :count]
+    return [b[score[i, b] > 0] for i, b in enumerate(best)]

@@ -1,0 +1,236 @@
+"""Where Gaussians begin that move: in the frames of boxes, or vibrating at times of their own."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float, Float32, Int
+from scipy.spatial import KDTree
+
+from p2gs_jax.config import DynamicsConfig, FitConfig
+from p2gs_jax.core.numerics import on_device
+from p2gs_jax.core.streams import Stream, generator
+from p2gs_jax.gaussians.seeds import NEIGHBOURS, gaussians_from_points, mean_radiance, merge
+from p2gs_jax.render.project import STILL
+from p2gs_jax.scene.drives.objects import MovingObjects, middle_time, outline_of, painted
+from p2gs_jax.scene.pixels.store import ImageStore
+from p2gs_jax.scene.rigid import interpolated, inverse
+from p2gs_jax.scene.visibility import project_points, unoccluded
+from p2gs_jax.types import Gaussians, Lidar, Photometry, Scene, TrackedObject, Vibration, View
+
+# A view shows an object from this share of its pixels on.
+LEAST_AREA, AREA_WIDTH = 2e-4, 200
+# Points this near to the bottom of a box lie on the ground, scene units.
+GROUND = 0.1
+# Measured points may lie this far outside of their box.
+OUTSIDE = 0.1
+WIDEST = 0.3
+VOXEL_GROWTH = 1.3
+# Initial opacity of what may vibrate: most of it is at places that something stands still at.
+OPACITY = 0.1
+
+
+class Nodes(NamedTuple):
+    """Seeds of moving objects.
+
+    Attributes:
+        moving: the objects, and where they are.
+        points: in the frame of their box, scene units.
+        owner: row of the object in `moving`.
+        left: moving objects that get none: their pixels are left out of the fit.
+        notes: for the user.
+    """
+
+    moving: MovingObjects
+    points: Float32[np.ndarray, "p 3"]
+    owner: Int[np.ndarray, " p"]
+    left: tuple[TrackedObject, ...]
+    notes: tuple[str, ...]
+
+
+def find_nodes(scene: Scene, cfg: DynamicsConfig) -> Nodes | None:
+    """Return the seeds of the objects that move in a scene; None where it has none."""
+    moving = [row for row, thing in enumerate(scene.objects) if thing.moving]
+    views = scene.training_views
+    if cfg.method != "rigid" or not moving:
+        return None
+    if any(view.time is None for view in views):
+        left = tuple(scene.objects[row] for row in moving)
+        said = "Views have no times: where things that move were is not known; they are masked."
+        return Nodes(MovingObjects(()), *_nothing(), left, (said,))
+    kept, left, points, filled = [], [], [], 0
+    for row in moving:
+        thing = scene.objects[row]
+        measured = _measured(thing, row, scene.lidar, cfg)
+        enough = scene.lidar is None or len(measured) >= cfg.least_points
+        if not enough or _views_that_show(thing, views, cfg) < cfg.least_views:
+            left.append(thing)
+            continue
+        if len(measured) < cfg.few_points:
+            measured = np.concatenate([measured, on_surface(thing.size, cfg.few_points)])
+            filled += 1
+        kept.append(thing)
+        points.append(measured.astype(np.float32))
+    owner = np.repeat(np.arange(len(kept), dtype=np.int32), [len(p) for p in points])
+    empty = np.zeros((0, 3), np.float32)
+    notes = [
+        f"{len(kept)} things move as pieces of their own, with {len(owner)} seeds"
+        + (f"; {filled} of them have few laser points: their boxes are filled" if filled else "")
+        + (f"; {len(left)} are seen too little: their pixels are left out" if left else "")
+        + "."
+    ]
+    return Nodes(
+        MovingObjects(tuple(kept)),
+        np.concatenate([empty, *points]),
+        owner,
+        tuple(left),
+        tuple(notes),
+    )
+
+
+def node_gaussians(
+    nodes: Nodes, radiance: Float[np.ndarray, "p 3"], views: Sequence[View], cfg: FitConfig
+) -> Gaussians:
+    """Return the Gaussians of moving objects, in the frames of their boxes.
+
+    `radiance` is that of their points, in the gauge of the exposures.
+    """
+    scales = np.full(len(nodes.points), WIDEST)
+    for row in np.unique(nodes.owner):
+        mine = nodes.owner == row
+        points = nodes.points[mine]
+        if len(points) > NEIGHBOURS:
+            distances, _ = KDTree(points).query(points, k=NEIGHBOURS + 1)
+            scales[mine] = np.sqrt(np.mean(np.asarray(distances)[:, 1:] ** 2, axis=1))
+    scales = np.clip(scales, 1e-3, WIDEST)
+    return gaussians_from_points(nodes.points, radiance, list(views), cfg, scales=scales)
+
+
+def nodes_radiance(
+    nodes: Nodes, scene: Scene, store: ImageStore, photometry: Photometry, cfg: FitConfig
+) -> Float[np.ndarray, "p 3"]:
+    """Return the mean radiance of points of moving objects, where they were in each view."""
+    still = len(scene.points)
+
+    def seen_in(view: View, row: int):
+        assert view.time is not None
+        poses, there = nodes.moving.poses(view.time)
+        rows = np.flatnonzero(there[nodes.owner])
+        pose = poses[nodes.owner[rows]]
+        world = np.einsum("nij,nj->ni", pose[:, :3, :3], nodes.points[rows]) + pose[:, :3, 3]
+        xy, z = project_points(np.concatenate([scene.points, world]), view)
+        seen = np.flatnonzero(unoccluded(xy, z, view.width, view.height))
+        seen = seen[seen >= still]
+        return rows[seen - still], xy[seen]
+
+    return mean_radiance(len(nodes.points), seen_in, scene, store, photometry, cfg)
+
+
+def on_surface(size: tuple[float, float, float], count: int) -> Float[np.ndarray, "p 3"]:
+    """Return about `count` points spread evenly over a box about 0, but for its bottom."""
+    half = np.asarray(size, float) / 2
+    faces = [(axis, sign) for axis in range(3) for sign in (-1, 1) if (axis, sign) != (2, -1)]
+    areas = [4 * np.prod(np.delete(half, axis)) for axis, _ in faces]
+    spacing = np.sqrt(sum(areas) / count)
+    found = []
+    for axis, sign in faces:
+        across = np.delete(half, axis)
+        steps = [max(round(2 * extent / spacing), 1) for extent in across]
+        lines = [
+            (np.arange(n) + 0.5) / n * 2 * extent - extent
+            for n, extent in zip(steps, across, strict=True)
+        ]
+        flat = np.stack(np.meshgrid(*lines, indexing="ij"), -1).reshape(-1, 2)
+        found.append(np.insert(flat, axis, sign * half[axis], axis=1))
+    return np.concatenate(found)
+
+
+def _nothing() -> tuple[np.ndarray, np.ndarray]:
+    return np.zeros((0, 3), np.float32), np.zeros(0, np.int32)
+
+
+def _measured(
+    thing: TrackedObject, row: int, lidar: Lidar | None, cfg: DynamicsConfig
+) -> Float[np.ndarray, "p 3"]:
+    """Return the laser points on an object in its own frame, of all sweeps, thinned."""
+    if lidar is None:
+        return np.zeros((0, 3))
+    mine = lidar.objects == row
+    poses, there = interpolated(thing.times, thing.poses, lidar.times[mine])
+    points = lidar.points[mine].astype(np.float64) - poses[:, :3, 3]
+    local = np.einsum("nij,nj->ni", inverse(poses)[:, :3, :3], points)
+    half = np.asarray(thing.size) / 2
+    inside = there & (np.abs(local) <= half + OUTSIDE).all(1) & (local[:, 2] > GROUND - half[2])
+    local, side = local[inside], cfg.voxel
+    while True:
+        cells = np.floor(local / side).astype(int)
+        kept = np.sort(np.unique(cells, axis=0, return_index=True)[1]) if len(local) else []
+        if len(kept) <= cfg.most_points:
+            return local[kept] if len(local) else local
+        side *= VOXEL_GROWTH
+
+
+def _views_that_show(thing: TrackedObject, views: Sequence[View], cfg: DynamicsConfig) -> int:
+    """Return how many views show an object large enough to learn from; not more than needed."""
+    times = np.array([view.time for view in views], float)
+    poses, there = interpolated(thing.times, thing.poses, times)
+    shown = 0
+    for view, pose in ((views[int(i)], poses[i]) for i in np.flatnonzero(there)):
+        outline = outline_of(pose, thing.size, view, margin=0.0)
+        if outline is None:
+            continue
+        height = max(1, round(AREA_WIDTH * view.height / view.width))
+        shown += painted([outline], view, AREA_WIDTH, height).mean() >= LEAST_AREA
+        if shown >= cfg.least_views:
+            break
+    return shown
+
+
+def vibrates(scene: Scene, cfg: FitConfig) -> bool:
+    """Return whether Gaussians vibrate: it was asked for, and all views have times."""
+    return cfg.dynamics.method == "vibration" and all(v.time is not None for v in scene.views)
+
+
+def clock_of(scene: Scene) -> MovingObjects:
+    """Return the clock of a scene whose Gaussians vibrate: no objects, but times of views."""
+    return MovingObjects((), middle=middle_time(scene))
+
+
+def with_vibration(gaussians: Gaussians, scene: Scene, cfg: FitConfig) -> Gaussians:
+    """Return Gaussians that stand still, and behind them some that may move.
+
+    These are drawn from the laser points, each at its own time, or from the Gaussians themselves at
+    any time where there are none; they look like the nearest one.
+    """
+    times = np.array([view.time for view in scene.views if view.time is not None])
+    middle, rng = middle_time(scene), generator(cfg.train.seed, Stream.VIBRATING)
+    means, count = np.asarray(gaussians.means), cfg.dynamics.vibrating
+    if scene.lidar is not None and len(scene.lidar.points):
+        known = len(scene.lidar.points)
+        drawn = np.sort(rng.choice(known, min(count, known), replace=False))
+        points, at = scene.lidar.points[drawn], scene.lidar.times[drawn]
+        _, near = KDTree(means).query(points)
+    else:
+        near = rng.integers(0, len(means), count)
+        points, at = means[near], rng.uniform(times.min(), times.max(), count)
+    at = np.clip(at, times.min(), times.max()) - middle
+    faint = np.full(len(at), np.log(OPACITY / (1 - OPACITY)))
+    like = jax.tree.map(lambda a: np.asarray(a)[near], gaussians)
+    moving = dataclasses.replace(
+        like,
+        means=on_device(points),
+        opacity_logits=on_device(faint),
+        vibration=_vibration(at, cfg.dynamics.vibration_life),
+    )
+    still = _vibration(np.zeros(len(means)), STILL)
+    return merge(dataclasses.replace(gaussians, vibration=still), moving)
+
+
+def _vibration(peaks: np.ndarray, life: float) -> Vibration:
+    count = len(peaks)
+    velocities, lives = np.zeros((count, 3)), np.full(count, np.log(life))
+    return Vibration(on_device(velocities), on_device(peaks), on_device(lives))

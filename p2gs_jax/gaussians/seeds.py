@@ -1,0 +1,190 @@
+"""Seed points become Gaussians, with the radiance that photographs show at them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import KDTree
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.core.numerics import on_device, srgb_encode
+from p2gs_jax.core.streams import Stream, generator
+from p2gs_jax.photometry.formation import inverse_formation, places
+from p2gs_jax.photometry.sources.sampling import sample
+from p2gs_jax.render.harmonics import C0, coefficient_count, radiance_preactivation
+from p2gs_jax.scene.pixels.store import ImageStore
+from p2gs_jax.scene.visibility import project_points, unoccluded
+from p2gs_jax.types import Gaussians, Photometry, Scene, View
+
+NEIGHBOURS = 3
+# 3DGS: the radius of the camera centres, with ten percent to spare.
+EXTENT_MARGIN = 1.1
+MIN_RADIANCE = 1e-3
+# No seed starts wider than this fraction of its distance from the nearest camera.
+MAX_ANGLE = 0.05
+# Values that say nothing of the radiance count only where there are no others.
+LEAST_WEIGHT = 1e-3
+
+# From a training view and its row to the points that it shows, and where, pixels at its full size.
+SeenIn = Callable[[View, int], tuple[Int[np.ndarray, " s"], Float[np.ndarray, "s 2"]]]
+
+
+def camera_centers(views: tuple[View, ...] | list[View]) -> Float[np.ndarray, "v 3"]:
+    """Return camera centres in world coordinates, in the precision of the view matrices."""
+    return np.stack([-v.viewmat[:3, :3].T @ v.viewmat[:3, 3] for v in views])
+
+
+def cameras_radius(views: list[View], points: Float[np.ndarray, "p 3"]) -> float:
+    """Return the radius of the cameras (3DGS), scene units.
+
+    Where all cameras stand in one place, the median distance of the points is used.
+    """
+    centers = camera_centers(views)
+    middle = centers.mean(0)
+    radius = float(np.linalg.norm(centers - middle, axis=1).max()) * EXTENT_MARGIN
+    if len(points):
+        distance = float(np.median(np.linalg.norm(points - middle, axis=1)))
+        radius = max(radius, 0.05 * distance)
+    return radius if radius > 0 else 1e-3
+
+
+def subsample(count: int, limit: int, seed: int, stream: Stream = Stream.SEED_POINTS) -> np.ndarray:
+    """Return which seeds to keep, sorted, at most `limit`, drawn evenly."""
+    if count <= limit:
+        return np.arange(count)
+    return np.sort(generator(seed, stream).choice(count, limit, replace=False))
+
+
+def neighbour_scales(
+    points: Float[np.ndarray, "p 3"], views: list[View]
+) -> Float[np.ndarray, " p"]:
+    """Return the RMS distance to the three nearest neighbours (3DGS), bounded by the view."""
+    to_camera, _ = KDTree(camera_centers(views)).query(points)
+    if len(points) <= NEIGHBOURS:
+        return MAX_ANGLE * np.asarray(to_camera)
+    distances, _ = KDTree(points).query(points, k=NEIGHBOURS + 1)
+    scales = np.sqrt(np.mean(np.asarray(distances)[:, 1:] ** 2, axis=1))
+    return np.clip(scales, 1e-7, np.maximum(MAX_ANGLE * np.asarray(to_camera), 1e-6))
+
+
+def gaussians_from_points(
+    points: Float[np.ndarray, "p 3"],
+    radiance: Float[np.ndarray, "p 3"],
+    views: list[View],
+    cfg: FitConfig,
+    *,
+    scales: Float[np.ndarray, "p #3"] | Float[np.ndarray, " p"] | None = None,
+    opacity: Float[np.ndarray, " p"] | float | None = None,
+    quats: Float[np.ndarray, "p 4"] | None = None,
+) -> Gaussians:
+    """Return one Gaussian per point.
+
+    Args:
+        points: scene units.
+        radiance: linear radiance in the gauge of the exposures.
+        views: training views, for the distance that bounds the scales.
+        cfg: activation, degree, opacity.
+        scales: standard deviations, of each axis or of all; None takes the mean distance to three
+            neighbours (3DGS).
+        opacity: initial opacity; None takes the configured one.
+        quats: orientations, w x y z; None: none.
+    """
+    count = len(points)
+    if scales is None:
+        scales = neighbour_scales(points, views)
+    scales = np.asarray(scales)
+    axes = np.broadcast_to(scales if scales.ndim == 2 else scales[:, None], (count, 3))
+    start = np.broadcast_to(cfg.init.opacity if opacity is None else opacity, (count,))
+    dc = radiance_preactivation(
+        np.maximum(radiance, MIN_RADIANCE).astype(np.float32), cfg.render.radiance
+    )
+    sh = np.zeros((count, coefficient_count(cfg.render.sh_degree), 3), np.float32)
+    sh[:, 0] = dc / C0
+    if quats is None:
+        quats = np.tile(np.eye(1, 4), (count, 1))
+    return Gaussians(
+        means=on_device(points),
+        quats=on_device(quats),
+        log_scales=on_device(np.log(axes)),
+        opacity_logits=on_device(np.log(start / (1 - start))),
+        sh=on_device(sh),
+    )
+
+
+def merge(a: Gaussians, b: Gaussians) -> Gaussians:
+    """Return both sets of Gaussians, `a` first."""
+    return jax.tree.map(lambda x, y: on_device(np.concatenate([x, y])), a, b)
+
+
+def photographed_radiance(
+    scene: Scene, store: ImageStore, photometry: Photometry, cfg: FitConfig
+) -> Float[np.ndarray, "p 3"]:
+    """Return the mean radiance at the scene's points in the training photographs that see them.
+
+    It is in the gauge of the exposures that the fit starts from. Points that no photograph sees get
+    the median of all others.
+    """
+
+    def seen_in(view: View, row: int):
+        xy, z = project_points(scene.points, view)
+        seen = np.flatnonzero(unoccluded(xy, z, view.width, view.height))
+        return seen, xy[seen]
+
+    return mean_radiance(len(scene.points), seen_in, scene, store, photometry, cfg)
+
+
+def mean_radiance(
+    count: int,
+    seen_in: SeenIn,
+    scene: Scene,
+    store: ImageStore,
+    photometry: Photometry,
+    cfg: FitConfig,
+) -> Float[np.ndarray, "p 3"]:
+    """Return the mean radiance of so many points in the training photographs that see them."""
+    total, weight = np.zeros((count, 3)), np.zeros((count, 3))
+    for at, colors, found in photographed(seen_in, scene, store, photometry, cfg):
+        says = (colors > cfg.loss.black) & (colors < cfg.loss.saturation)
+        share = np.where(says, 1.0, LEAST_WEIGHT)
+        total[at] += share * found
+        weight[at] += share
+    known = weight.min(1) > 0
+    radiance = total / np.maximum(weight, LEAST_WEIGHT / 2)
+    if known.any():
+        radiance[~known] = np.median(radiance[known], axis=0)
+    return radiance.astype(np.float32)
+
+
+def photographed(
+    seen_in: SeenIn,
+    scene: Scene,
+    store: ImageStore,
+    photometry: Photometry,
+    cfg: FitConfig,
+    shrink: int = 1,
+) -> Iterator[tuple[Int[np.ndarray, " s"], Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]]:
+    """Yield points, their display colours and radiance, in each training photograph."""
+    taken: Photometry = jax.tree.map(np.asarray, photometry)
+    for row, index in enumerate(scene.train_indices):
+        view = scene.views[index]
+        seen, xy = seen_in(view, row)
+        if not len(seen):
+            continue
+        ldr, mask = store.get(index, shrink)
+        xy = xy * [mask.shape[1] / view.width, mask.shape[0] / view.height]
+        samples = sample(ldr, mask, xy)
+        valid = samples.valid
+        colors = np.asarray(samples.colors[valid], np.float32)
+        place = places(xy[valid], *mask.shape[::-1])
+        found = inverse_formation(colors, taken.capture(row), cfg.photometry, place)
+        yield seen[valid], colors, np.asarray(found)
+
+
+def with_colors(scene: Scene, radiance: Float[np.ndarray, "p 3"]) -> Scene:
+    """Return the scene with its points coloured, as sRGB of radiance at exposure 1."""
+    shown = np.asarray(srgb_encode(np.clip(radiance, 0, 1)))
+    return dataclasses.replace(scene, point_colors=np.rint(255 * shown).astype(np.uint8))

@@ -1,0 +1,180 @@
+"""A far shell of Gaussians, where views look past every seed point: sky, hills, far facades.
+
+Pixels without any seed nearby could only be covered by stretching distant splats over them. So
+directions that views look into, but in which no seed lies, get a Gaussian each, far behind the
+seeds. Scenes whose views are covered by seeds get none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from p2gs_jax.config import FitConfig, InitConfig
+from p2gs_jax.core.numerics import fibonacci_sphere
+from p2gs_jax.gaussians.seeds import camera_centers, gaussians_from_points, merge, photographed
+from p2gs_jax.scene.pixels.store import ImageStore
+from p2gs_jax.scene.visibility import in_frame, project_points
+from p2gs_jax.types import Gaussians, Photometry, Scene, View
+
+# Each view is cut into cells; a cell with a seed in it or beside it counts as covered.
+CELLS_ACROSS = 16
+# A direction belongs to the shell if fewer of the views that look into it see a seed there.
+COVERED_FRACTION = 0.3
+# Less empty image than this is a gap in the seeds, not a sky.
+EMPTY_IMAGE_FRACTION = 0.04
+# Distance of the shell over that of the far seeds.
+BEHIND_SEEDS = 2.0
+OVERLAP = 0.7
+# Shell colours come from small images: a direction covers many pixels.
+SHELL_SHRINK = 4
+SHELL_OPACITY = 0.5
+
+
+@dataclass(frozen=True)
+class Shell:
+    """Directions to add: positions and standard deviations, scene units.
+
+    Which training view (row) sees each of them, and at which pixel of the full resolution; and the
+    share of image cells with no seed near.
+    """
+
+    points: Float32[np.ndarray, "s 3"]
+    scales: Float[np.ndarray, " s"]
+    seen: Bool[np.ndarray, "s v"]
+    xy: Float32[np.ndarray, "s v 2"]
+    empty_fraction: float
+
+    def note(self) -> str:
+        """Say what it is and how to do without."""
+        return (
+            f"{self.empty_fraction:.0%} of the images look past every seed point: a far shell "
+            f"of {len(self.points)} Gaussians was added (--init.shell off leaves it out)."
+        )
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """Where a shell lies, scene units."""
+
+    middle: Float[np.ndarray, " 3"]
+    radius: float
+
+
+def sphere_behind(
+    views: list[View], points: Float[np.ndarray, "p 3"], radius: float, cfg: InitConfig
+) -> Sphere:
+    """Return where the shell of a scene lies: behind its seeds, beyond the cameras' radius."""
+    middle = camera_centers(views).mean(0)
+    radius *= cfg.shell_radius
+    if len(points):
+        far = float(np.quantile(np.linalg.norm(points - middle, axis=1), 0.98))
+        radius = max(min(radius, 10 * far), BEHIND_SEEDS * far)
+    return Sphere(middle, radius)
+
+
+def _project(view: View, points: Float[np.ndarray, "p 3"]):
+    """Return pixel positions [p 2] and which points are in front and inside the image."""
+    xy, z = project_points(points.astype(np.float64), view)
+    return xy, in_frame(xy, z, view.width, view.height)
+
+
+def covered_cells(view: View, points: Float[np.ndarray, "p 3"]) -> Bool[np.ndarray, "gy gx"]:
+    """Return which cells of a view hold a seed, or touch one that does."""
+    across = CELLS_ACROSS
+    down = max(1, round(across * view.height / view.width))
+    xy, inside = _project(view, points)
+    cells = np.zeros((down + 2, across + 2), bool)
+    column = (xy[inside, 0] * across / view.width).astype(int)
+    row = (xy[inside, 1] * down / view.height).astype(int)
+    cells[row + 1, column + 1] = True
+    near = np.zeros_like(cells)
+    for dy in (-1, 0, 1):
+        for dx in (-1, 0, 1):
+            near |= np.roll(cells, (dy, dx), (0, 1))
+    return near[1:-1, 1:-1]
+
+
+def find_shell(
+    views: list[View],
+    points: Float[np.ndarray, "p 3"],
+    radius: float,
+    cfg: InitConfig,
+    sphere: Sphere | None = None,
+) -> Shell | None:
+    """Return the shell that a scene needs, or None.
+
+    It lies on `sphere`, or behind the seed points, beyond the cameras' radius.
+    """
+    if cfg.shell == "off":
+        return None
+    sphere = sphere or sphere_behind(views, points, radius, cfg)
+    middle, radius = sphere.middle, sphere.radius
+    directions = fibonacci_sphere(cfg.shell_count)
+    candidates = middle + radius * directions
+    covered = [covered_cells(v, points) for v in views]
+    empty_fraction = float(np.mean([1 - c.mean() for c in covered]))
+    if cfg.shell == "auto" and empty_fraction < EMPTY_IMAGE_FRACTION:
+        return None
+    seen = np.zeros((len(candidates), len(views)), bool)
+    explained = np.zeros_like(seen)
+    xy = np.zeros((len(candidates), len(views), 2), np.float32)
+    for k, (view, cells) in enumerate(zip(views, covered, strict=True)):
+        position, inside = _project(view, candidates)
+        xy[:, k], seen[:, k] = position, inside
+        column = (position[inside, 0] * cells.shape[1] / view.width).astype(int)
+        row = (position[inside, 1] * cells.shape[0] / view.height).astype(int)
+        explained[inside, k] = cells[row, column]
+    looked = seen.sum(1)
+    keep = (looked > 0) & (explained.sum(1) < COVERED_FRACTION * looked)
+    if not keep.any():
+        return None
+    spacing = radius * np.sqrt(4 * np.pi / cfg.shell_count)
+    return Shell(
+        candidates[keep].astype(np.float32),
+        np.full(int(keep.sum()), OVERLAP * spacing),
+        (seen & ~explained)[keep],
+        xy[keep],
+        empty_fraction,
+    )
+
+
+def black_gaussians(
+    points: np.ndarray, shell: Shell | None, views: Sequence[View], cfg: FitConfig
+) -> Gaussians:
+    """Return Gaussians of points and shell without colours: enough to compile for."""
+    views = list(views)
+    black = gaussians_from_points(points, np.zeros_like(points), views, cfg)
+    if shell is None:
+        return black
+    far = gaussians_from_points(
+        shell.points, np.zeros_like(shell.points), views, cfg, scales=shell.scales
+    )
+    return merge(black, far)
+
+
+def shell_gaussians(
+    shell: Shell,
+    scene: Scene,
+    store: ImageStore,
+    photometry: Photometry,
+    views: Sequence[View],
+    cfg: FitConfig,
+) -> Gaussians:
+    """Return the Gaussians of a shell, coloured by what the photographs show in its directions."""
+
+    def seen_in(view: View, row: int):
+        seen = np.flatnonzero(shell.seen[:, row])
+        return seen, shell.xy[seen, row]
+
+    total, weight = np.zeros((len(shell.points), 3)), np.zeros(len(shell.points))
+    for at, _, found in photographed(seen_in, scene, store, photometry, cfg, SHELL_SHRINK):
+        total[at] += found
+        weight[at] += 1
+    seen = weight > 0
+    radiance = (total[seen] / weight[seen, None]).astype(np.float32)
+    own = {"scales": shell.scales[seen], "opacity": SHELL_OPACITY}
+    return gaussians_from_points(shell.points[seen], radiance, list(views), cfg, **own)

@@ -1,0 +1,188 @@
+"""Luminance-GS (Cui, Chu and Harada, CVPR 2025): a colour matrix and a curve per photograph.
+
+They map photographs to the enhanced scene and back. As its authors describe it: one curve for all
+photographs, to which a small network adds a bias for each, clipped to [0, 1]; three orthonormal
+colour axes per photograph, along which the curve acts; three numbers per photograph that shape a
+pseudo curve (a power, then an S), towards which the curve is drawn. Ours: the network sees the
+histogram and the mean colour instead of attending to the image and the camera's pose; the curve is
+interpolated, where theirs takes the entry below.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from p2gs_jax.core.numerics import on_device
+from p2gs_jax.core.streams import Stream, generator
+
+# Entries of a curve, as published.
+ENTRIES = 255
+# Width of the network (ours).
+HIDDEN = 32
+# Steps of the cumulative histogram that the network sees, and all that it sees.
+LEVELS = 32
+STATISTICS = LEVELS + 3
+# Parameters of the axes.
+AXES = 5
+# What a raw unit stands for, so that one learning rate serves all (the authors have rates of 1e-3
+# for the curve, 2e-4 for the axes and 1e-5 for the network).
+AXES_UNIT, BIAS_UNIT = 0.2, 0.1
+# Published: power 1 + 0.1 g, turning point 0.5 + 0.002 a, exponent 1 + 0.002 b.
+POWER_UNIT, TURN_UNIT, BEND_UNIT = 0.1, 0.002, 0.002
+DARKEST = 1e-3
+# Least rise of a curve from one entry to the next where it is inverted.
+LEAST_RISE = 1e-5
+
+
+class Curves(eqx.Module):
+    """How one photograph was taken, as Luminance-GS models it."""
+
+    # From the photograph's coordinates to the enhanced ones, at even steps over [0, 1].
+    curve: Float[Array, " k"]
+    axes: Float[Array, "3 3"]  # as rows
+    shape: Float[Array, " 3"]  # of the pseudo curve: raw power, turning point and exponent
+
+
+class Luminance(eqx.Module):
+    """The parameters of all training views."""
+
+    curve: Float[Array, " k"]  # of all photographs
+    hidden: Float[Array, "s n"]  # weights from statistics to the hidden layer
+    hidden_bias: Float[Array, " n"]  # of the hidden layer
+    # Weights from there to the curve's biases and the pseudo curve's shape.
+    out: Float[Array, "n o"]
+    out_bias: Float[Array, " o"]  # of these
+    axes: Float[Array, "v 5"]  # raw, of each view
+    statistics: Float[Array, "v s"]  # of each photograph; not learned
+
+    def view(self, row: Int[Array, ""] | int) -> Curves:
+        """Return what holds for a training view."""
+        curve, shape = self._predicted(self.statistics[row])
+        return Curves(curve, axes_of(AXES_UNIT * jnp.asarray(self.axes[row])), shape)
+
+    def mean(self) -> Curves:
+        """Return the mean over the training views: of curves, and of raw axes."""
+        curves, shapes = self._predicted(self.statistics)
+        axes = axes_of(AXES_UNIT * jnp.asarray(self.axes).mean(0))
+        return Curves(curves.mean(0), axes, shapes.mean(0))
+
+    def _predicted(
+        self, statistics: Float[Array, "*v s"]
+    ) -> tuple[Float[Array, "*v k"], Float[Array, "*v 3"]]:
+        """Return the curves of photographs and the shapes of their pseudo curves."""
+        seen = lax.stop_gradient(jnp.asarray(statistics))
+        inner = jnp.tanh(seen @ self.hidden + self.hidden_bias)
+        found = inner @ self.out + self.out_bias
+        return jnp.clip(self.curve + BIAS_UNIT * found[..., :ENTRIES], 0, 1), found[..., ENTRIES:]
+
+
+def identity(views: int) -> Luminance:
+    """Return parameters that change nothing; the statistics are zero until they are filled in."""
+    # Drawn once for all fits: a network of zeros would never learn.
+    weights = generator(0, Stream.NETWORK).normal(0, STATISTICS**-0.5, (STATISTICS, HIDDEN))
+    outputs = ENTRIES + 3
+    return Luminance(
+        on_device(np.linspace(0.0, 1.0, ENTRIES)),
+        on_device(weights),
+        on_device(np.zeros(HIDDEN)),
+        on_device(np.zeros((HIDDEN, outputs))),
+        on_device(np.zeros(outputs)),
+        on_device(np.zeros((views, AXES))),
+        on_device(np.zeros((views, STATISTICS))),
+    )
+
+
+def axes_of(raw: Float[Array, " 5"]) -> Float[Array, "3 3"]:
+    """Return three orthonormal axes as rows: the identity at zero, as their authors build them.
+
+    Args:
+        raw: three numbers beside (1, 0, 0), then the green and blue parts of the second axis
+            beside (1, 0); its red part makes it orthogonal to the first.
+    """
+    first = raw[:3] + jnp.array([1.0, 0.0, 0.0], raw.dtype)
+    green, blue = raw[3] + 1.0, raw[4]
+    red = -(green * first[1] + blue * first[2]) / first[0]
+    second = jnp.stack([red, green, blue])
+    rows = jnp.stack([first, second, jnp.cross(first, second)])
+    return rows / jnp.linalg.norm(rows, axis=-1, keepdims=True)
+
+
+def spans(axes: Float[Array, "3 3"]) -> tuple[Float[Array, " 3"], Float[Array, " 3"]]:
+    """Return the least and the largest coordinate along each axis of colours in [0, 1]."""
+    return jnp.minimum(axes, 0).sum(-1), jnp.maximum(axes, 0).sum(-1)
+
+
+def enhanced(ldr: Float[Array, "*p 3"], view: Curves) -> Float[Array, "*p 3"]:
+    """Return the enhanced display values that a photograph stands for."""
+    return _along_axes(ldr, view.axes, lambda t: _looked_up(t, view.curve))
+
+
+def as_photographed(ldr: Float[Array, "*p 3"], view: Curves) -> Float[Array, "*p 3"]:
+    """Return how a photograph shows enhanced display values: about the inverse of `enhanced`.
+
+    Where the curve falls it counts as level; level pieces return their lower end. The authors
+    splat a second colour per Gaussian instead.
+    """
+    count = view.curve.shape[0]
+    even = jnp.linspace(0.0, 1.0, count, dtype=view.curve.dtype)
+    rise = LEAST_RISE * (count - 1)
+    rising = (lax.cummax(view.curve) + rise * even) / (1.0 + rise)
+    return _along_axes(ldr, view.axes, lambda t: jnp.interp(t, rising, even))
+
+
+def _along_axes(ldr, axes, change):
+    """Return colours whose coordinates along the axes, scaled to [0, 1], have changed."""
+    low, high = spans(axes)
+    along = (ldr @ axes.T - low) / (high - low)
+    return (change(along) * (high - low) + low) @ axes
+
+
+def _looked_up(t: Float[Array, "*p"], curve: Float[Array, " k"]) -> Float[Array, "*p"]:
+    count = curve.shape[0]
+    at = jnp.clip(t, 0.0, 1.0) * (count - 1)
+    below = jnp.clip(jnp.floor(at), 0, count - 2).astype(jnp.int32)
+    share = at - below
+    return (1 - share) * curve[below] + share * curve[below + 1]
+
+
+def pseudo_curve(shape: Float[Array, " 3"]) -> Float[Array, " k"]:
+    """Return the curve that a power and an S make, as published; about the identity at zero."""
+    x = jnp.linspace(0.0, 1.0, ENTRIES, dtype=shape.dtype)
+    x = jnp.clip(x, DARKEST, 1.0) ** (1.0 + POWER_UNIT * shape[0])
+    turn, bend = 0.5 + TURN_UNIT * shape[1], 1.0 + BEND_UNIT * shape[2]
+    below = jnp.clip(x / turn, 0.0, 1.0 - DARKEST)
+    above = jnp.clip((x - turn) / (1.0 - turn), DARKEST, 1.0 - DARKEST)
+    return jnp.where(
+        x <= turn, turn - turn * (1.0 - below) ** bend, turn + (1.0 - turn) * above**bend
+    )
+
+
+def cumulative(
+    grey: Float[Array, " p"], weight: Float[Array, " p"], steps: int
+) -> Float[Array, " s"]:
+    """Return the share of pixels up to k / (steps - 1), for k from 0 to steps - 1.
+
+    `grey` is the mean of the channels. Without any weight, shares are those of evenly spread
+    values.
+    """
+    bins = jnp.clip(jnp.ceil(grey * (steps - 1)), 0, steps - 1).astype(jnp.int32)
+    counts = jnp.zeros(steps, grey.dtype).at[bins].add(weight)
+    total = counts.sum()
+    even = jnp.linspace(0.0, 1.0, steps, dtype=grey.dtype)
+    return jnp.where(total > 0, jnp.cumsum(counts) / jnp.maximum(total, 1e-9), even)
+
+
+def statistics_of(
+    photograph: Float[Array, "h w 3"], mask: Float[Array, "h w"]
+) -> Float[Array, " s"]:
+    """Return what the network is given of a photograph: its histogram and its mean colour.
+
+    Every fourth pixel along both axes counts, where the mask is 1.
+    """
+    seen, weight = photograph[::4, ::4].reshape(-1, 3), mask[::4, ::4].reshape(-1)
+    mean = (weight[:, None] * seen).sum(0) / jnp.maximum(weight.sum(), 1.0)
+    return jnp.concatenate([cumulative(seen.mean(-1), weight, LEVELS), mean])

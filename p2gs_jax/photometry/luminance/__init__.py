@@ -1,1 +1,0 @@
-"""Luminance-GS (Cui, Chu and Harada, CVPR 2025): a colour matrix and a curve per photograph."""

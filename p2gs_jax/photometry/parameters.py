@@ -1,0 +1,114 @@
+"""Parameters of a fit: what they start from, and the gauge they end in."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.core.numerics import on_device
+from p2gs_jax.core.streams import Stream, generator
+from p2gs_jax.photometry.appearance import Corrections, identity
+from p2gs_jax.photometry.formation import camera_rows, inverse_tone_map
+from p2gs_jax.photometry.luminance import Luminance, statistics_of
+from p2gs_jax.photometry.solution import PhotometricSolution
+from p2gs_jax.render.harmonics import RadianceKind, scaled
+from p2gs_jax.types import GAMMA_SRGB, Params, Photometry, Scene, View
+
+# Exposures drawn at random are at least this.
+LEAST_EXPOSURE = 0.1
+
+
+def initial_photometry(
+    solution: PhotometricSolution | None, taken_by: Sequence[str], cfg: FitConfig
+) -> Photometry:
+    """Return the exposures, gammas and white balances that a fit starts from.
+
+    Without a solution of the bundle adjustment they are drawn at random (paper), or equal.
+    """
+    count = len(taken_by)
+    p = cfg.photometry
+    if solution is not None:
+        log_exposures = np.asarray(solution.log_exposures)
+    elif p.start == "random":
+        draws = generator(cfg.train.seed, Stream.START_EXPOSURES).normal(1.0, p.start_std, count)
+        log_exposures = np.log(np.maximum(draws, LEAST_EXPOSURE))
+    else:
+        log_exposures = np.zeros(count)
+    gammas = np.full(count, GAMMA_SRGB) if solution is None else solution.gammas
+    if p.parameterization == "log":
+        exposures, gammas = log_exposures, np.log(gammas / GAMMA_SRGB)
+    else:
+        exposures = np.exp(log_exposures)
+    balance = None
+    if p.white_balance is not None:
+        balance = on_device(np.zeros((count, 3)) if solution is None else solution.white_balance)
+    rows = camera_rows(taken_by, p)
+    return Photometry(on_device(exposures), on_device(gammas), p.parameterization, balance, rows)
+
+
+def initial_appearance(
+    views: Sequence[View],
+    cfg: FitConfig,
+    photograph: Callable[[int], tuple[np.ndarray, np.ndarray]] | None = None,
+) -> Corrections | None:
+    """Return corrections that change nothing; None: the fit has none.
+
+    `photograph` takes a place in `views` to display values and mask, for corrections that
+    depend on photographs; without it these do not know them yet.
+    """
+    kind = cfg.photometry.appearance
+    if kind is None:
+        return None
+    start = identity(kind, [view.camera for view in views])
+    if isinstance(start, Luminance) and photograph is not None:
+        seen = [statistics_of(*map(jnp.asarray, photograph(k))) for k in range(len(views))]
+        return dataclasses.replace(start, statistics=on_device(np.stack(seen)))
+    return start
+
+
+def point_radiance(
+    scene: Scene, solution: PhotometricSolution | None, cfg: FitConfig
+) -> Float[np.ndarray, "p 3"]:
+    """Return linear radiance of a scene's points: the solution's where it knows, else colours'."""
+    assert scene.point_colors is not None
+    colors = scene.point_colors.astype(np.float32) / np.float32(255)
+    radiance = inverse_tone_map(colors, np.float32(GAMMA_SRGB), cfg.photometry)
+    if solution is not None:
+        known = np.exp(solution.point_log_radiance)
+        radiance = np.where(np.isfinite(known), known, radiance)
+    return radiance.astype(np.float32)
+
+
+def recentre(params: Params, activation: RadianceKind) -> Params:
+    """Return the same photographs with mean log exposure and white balance 0, exactly.
+
+    Radiance moves the other way: it fixes the gauges of scale (docs/photometry.md, 2, scale), of
+    which every channel has one of its own with white balance. `activation` is from spherical
+    harmonics to radiance.
+    """
+    # On the host: once a fit, and every operation would be a program of its own.
+    photometry = jax.tree.map(np.asarray, params.photometry)
+    log_scale = np.mean(photometry.log_exposures)
+    balance = photometry.white_balance
+    tint = np.zeros(3, np.float32) if balance is None else balance.mean(0)
+    sh = scaled(np.asarray(params.gaussians.sh), log_scale + tint, activation)
+    if photometry.parameterization == "log":
+        raw = photometry.raw_exposures - log_scale
+    else:
+        raw = photometry.raw_exposures / np.exp(log_scale)
+    moved = dataclasses.replace(
+        photometry,
+        raw_exposures=raw,
+        raw_white_balance=None if balance is None else balance - tint,
+    )
+    return dataclasses.replace(
+        params,
+        gaussians=dataclasses.replace(params.gaussians, sh=jax.device_put(sh)),
+        photometry=jax.device_put(moved),
+    )

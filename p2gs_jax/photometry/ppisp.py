@@ -1,0 +1,225 @@
+"""PPISP, a camera that is learned beside the splats (Deutsch et al., arXiv 2601.18336).
+
+Radiance passes an exposure per view, vignetting per camera and channel, a homography of
+chromaticities per view, and a response per camera and channel, in this order. Formulas, constants
+and weights are those of the paper and of its reference implementation (github.com/nv-tlabs/ppisp,
+1.2); where the two differ, of the latter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from p2gs_jax.core.numerics import on_device, unit_clip
+
+# Vignetting of a channel: the centre's x and y, and the coefficients of r^2, r^4, r^6.
+COEFFICIENTS = 5
+# Chromaticities of blue, red, green and neutral, homogeneous.
+SOURCES = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [0.0, 1.0, 1.0], [1 / 3, 1 / 3, 1.0]])
+# What a unit of each parameter moves of (r, g) of its point: they whiten the parameters, so that
+# all change the image about equally (paper, B.1; values of the reference implementation).
+PRECONDITIONERS = np.array(
+    [
+        [[0.0480542, -0.0043631], [-0.0043631, 0.0481283]],
+        [[0.0580570, -0.0179872], [-0.0179872, 0.0431061]],
+        [[0.0433336, -0.0180537], [-0.0180537, 0.0580500]],
+        [[0.0128369, -0.0034654], [-0.0034654, 0.0128158]],
+    ]
+)
+# Added to the intensity that is divided by, so that black stays black.
+EPSILON = 1e-5
+# Response of a channel: toe, shoulder, gamma, centre, as the optimiser sees them.
+LEAST_TOE, LEAST_SHOULDER, LEAST_GAMMA = 0.3, 0.3, 0.1
+# Nearer to black or white than this the powers' slopes may be infinite: there they have none.
+FLAT = 1e-6
+# Weights, and where the Huber losses become linear (paper, table 7; the centre's weight is that of
+# the reference implementation, which takes means where the paper takes sums).
+EXPOSURE, EXPOSURE_DELTA = 1.0, 0.1
+COLOR, COLOR_DELTA = 1.0, 0.005
+CHANNELS = 0.1
+CENTRE, BRIGHTENING = 0.02, 0.01
+
+
+class OneView(eqx.Module):
+    """What light passes on its way into one photograph."""
+
+    exposure: Float[Array, ""]  # stops
+    color: Float[Array, " 8"]  # parameters of `homography_of`
+    response: Float[Array, "3 4"]  # of the camera
+    # Of the camera; None: light without a place in an image.
+    vignetting: Float[Array, "3 5"] | None = None
+
+
+class Ppisp(eqx.Module):
+    """The parameters of all training views and cameras; every leaf is learned."""
+
+    exposures: Float[Array, " v"]  # stops
+    colors: Float[Array, "v 8"]  # parameters of `homography_of`
+    responses: Float[Array, "c 3 4"]  # of each camera
+    vignettings: Float[Array, "c 3 5"]  # of each camera
+    names: tuple[str, ...] = eqx.field(static=True)  # of the cameras
+    cameras: tuple[int, ...] = eqx.field(static=True)  # row in `names` of each training view
+
+    def view(self, row: Int[Array, ""] | int) -> OneView:
+        """Return what holds for a training view."""
+        camera = jnp.asarray(self.cameras)[row]
+        return OneView(
+            self.exposures[row], self.colors[row], self.responses[camera], self.vignettings[camera]
+        )
+
+    def mean(self, camera: str | None = None) -> OneView:
+        """Return the mean over the training views, for views that have nothing of their own.
+
+        Response and vignetting are the camera's; of one that is not known, or None, they are the
+        mean response and no vignetting.
+        """
+        exposure, color = self.exposures.mean(axis=0), self.colors.mean(axis=0)
+        if camera not in self.names:
+            return OneView(exposure, color, self.responses.mean(axis=0))
+        c = self.names.index(camera)
+        return OneView(exposure, color, self.responses[c], self.vignettings[c])
+
+
+def identity(cameras: Sequence[str]) -> Ppisp:
+    """Return parameters that change nothing but to clip at 1; `cameras` is of every view."""
+    names = tuple(sorted(set(cameras)))
+    views = len(cameras)
+    return Ppisp(
+        on_device(np.zeros(views)),
+        on_device(np.zeros((views, 2 * len(SOURCES)))),
+        on_device(np.tile(identity_response(), (len(names), 3, 1))),
+        on_device(np.zeros((len(names), 3, COEFFICIENTS))),
+        names,
+        tuple(names.index(camera) for camera in cameras),
+    )
+
+
+def applied(linear: Float[Array, "*p 3"], view: OneView) -> Float[Array, "*p 3"]:
+    """Return display values in [0, 1] of radiance: of an image where the view has vignetting."""
+    light = jnp.exp2(view.exposure) * linear
+    if view.vignetting is not None:
+        height, width, _ = linear.shape
+        light = light * falloff(view.vignetting, height, width)
+    return respond(recolored(light, view.color), view.response)
+
+
+def falloff(
+    parameters: Float[Array, "3 c"], height: int, width: int
+) -> Float[Array, "{height} {width} 3"]:
+    """Return 1 + a1 r^2 + a2 r^4 + a3 r^6 of every pixel and channel, clipped to [0, 1].
+
+    Lengths are in units of the longer side, from the middle of the image. Parameters are the
+    optical centre (x, y) of each channel, and its a1, a2, a3; zeros change nothing.
+    """
+    centre, (a1, a2, a3) = parameters[:, :2], parameters[:, 2:].T
+    longer = max(height, width)
+    x = (jnp.arange(width, dtype=parameters.dtype) + 0.5 - width / 2) / longer
+    y = (jnp.arange(height, dtype=parameters.dtype) + 0.5 - height / 2) / longer
+    r2 = (y[:, None, None] - centre[:, 1]) ** 2 + (x[:, None] - centre[:, 0]) ** 2
+    return unit_clip(1 + r2 * (a1 + r2 * (a2 + r2 * a3)))
+
+
+def offsets(parameters: Float[Array, "... 8"]) -> Float[Array, "... 4 2"]:
+    """Return how far the four chromaticities move."""
+    pairs = parameters.reshape(*parameters.shape[:-1], 4, 2)
+    blocks = jnp.asarray(PRECONDITIONERS, parameters.dtype)
+    return jnp.einsum("...ki,kij->...kj", pairs, blocks)
+
+
+def homography_of(parameters: Float[Array, " 8"]) -> Float[Array, "3 3"]:
+    """Return the map of homogeneous chromaticities that takes `SOURCES` to where they move.
+
+    Colours are taken as homogeneous (R, G, R + G + B), so that (R, G) / (R + G + B) are
+    chromaticities in a plane. With the sources of blue, red, green as the columns of S and their
+    targets as those of T, H S = T diag(k). The neutral source is S (1, 1, 1) / 3, so T k must be
+    the neutral target up to scale: k is its coordinates in the basis T. Each point has two
+    parameters; zeros give the identity.
+    """
+    sources = jnp.asarray(SOURCES, parameters.dtype)
+    targets = sources.at[:, :2].add(offsets(parameters))
+    blue, red, green, neutral = targets
+    # Cramer's rule; the determinant of T is a common factor.
+    k = jnp.stack(
+        [
+            neutral @ jnp.cross(red, green),
+            neutral @ jnp.cross(green, blue),
+            neutral @ jnp.cross(blue, red),
+        ]
+    )
+    inverse = jnp.asarray(np.linalg.inv(SOURCES[:3].T), parameters.dtype)
+    h = (targets[:3].T * k) @ inverse
+    return h / h[2, 2]
+
+
+def recolored(rgb: Float[Array, "... 3"], parameters: Float[Array, " 8"]) -> Float[Array, "... 3"]:
+    """Return linear colours under their homography; R + G + B stays, but for `EPSILON`."""
+    intensity = rgb.sum(-1, keepdims=True)
+    moved = jnp.concatenate([rgb[..., :2], intensity], -1) @ homography_of(parameters).T
+    # Parameters that throw a colour beyond the horizon would turn it negative.
+    moved = moved * intensity / (jnp.maximum(moved[..., 2:], 0.0) + EPSILON)
+    red, green = moved[..., 0], moved[..., 1]
+    return jnp.stack([red, green, moved[..., 2] - red - green], -1)
+
+
+def identity_response() -> Float[np.ndarray, " 4"]:
+    """Return the parameters whose response is y = x: all powers 1, centre 1/2."""
+    least = np.array([LEAST_TOE, LEAST_SHOULDER, LEAST_GAMMA])
+    return np.append(np.log(np.expm1(1.0 - least)), 0.0)
+
+
+def respond(light: Float[Array, "... 3"], raw: Float[Array, "3 4"]) -> Float[Array, "... 3"]:
+    """Return display values of light; 0 stays 0, 1 stays 1, and what lies beyond is clipped.
+
+    y = a (x / c)^t up to the centre c and 1 - (1 - a) ((1 - x) / (1 - c))^s beyond it, to the power
+    of g; a gives both parts the same slope at c.
+
+    Args:
+        light: exposed, after the corrections of colour.
+        raw: of each channel, before softplus (toe t >= 0.3, shoulder s >= 0.3, gamma g >= 0.1) and
+            sigmoid (centre c).
+    """
+    toe = LEAST_TOE + jax.nn.softplus(raw[:, 0])
+    shoulder = LEAST_SHOULDER + jax.nn.softplus(raw[:, 1])
+    gamma = LEAST_GAMMA + jax.nn.softplus(raw[:, 2])
+    centre = jax.nn.sigmoid(raw[:, 3])
+    at_centre = shoulder * centre / (toe + centre * (shoulder - toe))
+    x = unit_clip(light)
+    low = at_centre * _power(x / centre, toe)
+    high = 1.0 - (1.0 - at_centre) * _power((1.0 - x) / (1.0 - centre), shoulder)
+    return _power(jnp.where(x <= centre, low, high), gamma, 0.0)
+
+
+def _power(base: Float[Array, "..."], exponent: Float[Array, "..."], flat: float = FLAT):
+    """Return base^exponent; 0, without a slope, up to `flat`."""
+    on = base > flat
+    return jnp.where(on, jnp.exp(exponent * jnp.log(jnp.where(on, base, 1.0))), 0.0)
+
+
+def regularisation_of(parameters: Ppisp) -> Float[Array, ""]:
+    """Return what keeps parameters where radiance can be told from them (paper, 4.6).
+
+    Means over the views of exposures and of chromaticities are pulled to 0; channels of a camera to
+    one another; optical centres to the middle; coefficients of vignetting that brighten to 0. The
+    weighted sum of these terms is 0 at the identity.
+    """
+    vignettings, responses = parameters.vignettings, parameters.responses
+    moved = offsets(parameters.colors).mean(axis=0)
+    return (
+        EXPOSURE * _huber(parameters.exposures.mean(), EXPOSURE_DELTA)
+        + COLOR * _huber(moved, COLOR_DELTA).mean()
+        + CHANNELS * (vignettings.var(axis=1).mean() + responses.var(axis=1).mean())
+        + CENTRE * (vignettings[..., :2] ** 2).sum(-1).mean()
+        + BRIGHTENING * jnp.maximum(vignettings[..., 2:], 0.0).mean()
+    )
+
+
+def _huber(x: Float[Array, "..."], delta: float) -> Float[Array, "..."]:
+    """Return |x| - delta / 2, made smooth within delta of 0."""
+    size = jnp.abs(x)
+    return jnp.where(size < delta, 0.5 * x**2 / delta, size - 0.5 * delta)

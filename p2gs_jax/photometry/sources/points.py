@@ -1,0 +1,156 @@
+"""Observations of points in all of their views.
+
+Points come from tracks that structure from motion matched, from the points of a scene projected
+into views with a visibility test, or from pixels warped through the depth of a finished fit.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool
+
+from p2gs_jax.config import RenderConfig
+from p2gs_jax.core.streams import Stream, generator
+from p2gs_jax.photometry.observations import Observations
+from p2gs_jax.photometry.sources.sampling import PROJECTED_UNCERTAINTY, point_colors
+from p2gs_jax.render.capacity import make_renderer
+from p2gs_jax.render.warp import project_points as warped_points
+from p2gs_jax.render.warp import surface_depth, unproject, visible
+from p2gs_jax.scene.pixels.store import ImageStore, camera_of
+from p2gs_jax.scene.visibility import project_points, unoccluded
+from p2gs_jax.types import Gaussians, Scene
+
+# Points that are sampled at most, and views of each: of projected and of rendered ones.
+MOST_POINTS, MOST_PER_POINT = 40_000, 16
+RENDERED_POINTS, RENDERED_PER_POINT = 40_000, 8
+# More than `warp.OPAQUE`: a loss averages over a wrong correspondence, a solution gives way to it.
+OPAQUE = 0.98
+
+# Called with the number of views done, and of views in all.
+OnView = Callable[[int, int], None]
+
+
+def _quiet(done: int, count: int) -> None:
+    pass
+
+
+def surface_colors(
+    scene: Scene, store: ImageStore, seed: int, on_view: OnView = _quiet
+) -> Observations:
+    """Return colours of shared points: at the tracks, or of projected points where there are none.
+
+    `seed` is for `projected_colors`.
+    """
+    if has_tracks(scene):
+        return track_colors(scene, store, on_view)
+    return projected_colors(scene, store, seed, on_view)
+
+
+def has_tracks(scene: Scene) -> bool:
+    """Return whether the scene says which pixels show the same point."""
+    return scene.tracks is not None and len(scene.tracks.xy) > 0
+
+
+def track_colors(scene: Scene, store: ImageStore, on_view: OnView = _quiet) -> Observations:
+    """Sample every track in every training view, at its training resolution."""
+    assert scene.tracks is not None
+    order = np.argsort(scene.tracks.view_indices, kind="stable")
+    bounds = np.searchsorted(scene.tracks.view_indices[order], np.arange(len(scene.views) + 1))
+    picks = [order[bounds[i] : bounds[i + 1]] for i in scene.train_indices]
+    points = [scene.tracks.point_indices[pick] for pick in picks]
+    xy = [scene.tracks.xy[pick] for pick in picks]
+    return point_colors(scene, store, points, xy, on_view=on_view)
+
+
+def projected_colors(
+    scene: Scene, store: ImageStore, seed: int = 0, on_view: OnView = _quiet
+) -> Observations:
+    """Sample a scene's points (LiDAR or others) in every training view that sees them.
+
+    The views are sampled at their training resolution; `seed` chooses among the points, and among
+    the views of a point.
+    """
+    rng = generator(seed, Stream.SURFACE_COLORS)
+    chosen = np.arange(len(scene.points))
+    if len(chosen) > MOST_POINTS:
+        chosen = np.sort(rng.choice(len(chosen), MOST_POINTS, replace=False))
+    where, seen = [], []
+    for index in scene.train_indices:
+        view = scene.views[index]
+        # All points hide; only the chosen ones are sampled.
+        xy, z = project_points(scene.points, view)
+        where.append(xy[chosen])
+        seen.append(unoccluded(xy, z, view.width, view.height)[chosen])
+    kept = thinned(np.stack(seen), rng, MOST_PER_POINT)
+    return _sampled_where_seen(scene, store, chosen, where, kept, on_view)
+
+
+def rendered_colors(
+    gaussians: Gaussians,
+    scene: Scene,
+    store: ImageStore,
+    cfg: RenderConfig,
+    seed: int = 0,
+    on_view: OnView = _quiet,
+) -> Observations:
+    """Warp pixels of each training view into the others through rendered depth.
+
+    Points that a view hides are left out by their depth. All Gaussians are alive; photographs
+    are sampled at the resolution of the fit, and `seed` chooses the pixels.
+    """
+    rng = generator(seed, Stream.RENDERED_PIXELS)
+    render = make_renderer(cfg)
+    alive = jnp.ones(gaussians.capacity, bool)
+    cameras = [camera_of(store, index) for index in scene.train_indices]
+    depths, points = [], []
+    each = RENDERED_POINTS // len(scene.train_indices)
+    for done, camera in enumerate(cameras):
+        depth = surface_depth(render(gaussians, alive, camera), OPAQUE)
+        depths.append(depth)
+        pick = rng.permutation(np.flatnonzero(np.asarray(depth) > 0))[:each]
+        points.append(np.asarray(unproject(depth, camera)).reshape(-1, 3)[pick])
+        on_view(done + 1, len(cameras))
+    world = np.concatenate(points)
+    where, seen = [], []
+    for index, camera, depth in zip(scene.train_indices, cameras, depths, strict=True):
+        view = scene.views[index]
+        xy, z = warped_points(jnp.asarray(world), camera)
+        seen.append(np.asarray(visible(xy, z, depth)))
+        where.append(np.asarray(xy) * [view.width / camera.width, view.height / camera.height])
+    kept = thinned(np.stack(seen), rng, RENDERED_PER_POINT)
+    warped = dataclasses.replace(scene, points=world)
+    return _sampled_where_seen(warped, store, np.arange(len(world)), where, kept, _quiet)
+
+
+def _sampled_where_seen(
+    scene: Scene,
+    store: ImageStore,
+    chosen: np.ndarray,
+    where: list[np.ndarray],
+    kept: Bool[np.ndarray, "v c"],
+    on_view: OnView,
+) -> Observations:
+    """Sample chosen points (c rows) where they are in the training views that keep them.
+
+    `where` is their position in each view, (c, 2), at full resolution.
+    """
+    picks = [np.flatnonzero(row) for row in kept]
+    points = [chosen[pick] for pick in picks]
+    xy = [where[row][pick] for row, pick in enumerate(picks)]
+    return point_colors(
+        scene, store, points, xy, uncertainty=PROJECTED_UNCERTAINTY, on_view=on_view
+    )
+
+
+def thinned(
+    seen: Bool[np.ndarray, "v p"], rng: np.random.Generator, most: int
+) -> Bool[np.ndarray, "v p"]:
+    """Return at most `most` of the views that see each point, evenly at random."""
+    order = rng.random(seen.shape)
+    order[~seen] = 2.0
+    rank = np.argsort(np.argsort(order, axis=0), axis=0)
+    return seen & (rank < most)

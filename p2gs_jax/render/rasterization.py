@@ -1,0 +1,183 @@
+"""`rasterization` with the names, shapes and meaning of gsplat, on our own kernel.
+
+After gsplat (Ye et al., arXiv 2409.06765), `gsplat/rendering.py`. Colours are linear radiance and
+are not clamped from above.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from p2gs_jax.config import RenderConfig
+from p2gs_jax.render import count_entries, project, render_splats, view_radiance
+from p2gs_jax.render.capacity import PICTURES, bucket
+from p2gs_jax.render.harmonics import coefficient_count
+from p2gs_jax.render.tiles import with_cutoffs
+from p2gs_jax.render.xla_cpu import compiler_options
+from p2gs_jax.types import Camera, Gaussians
+
+RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
+MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
+# Opacities are kept this far off 0 and 1, where their logits are infinite.
+LEAST_OPACITY = 1e-7
+
+
+def rasterization(
+    means: Float[Array, "n 3"],
+    quats: Float[Array, "n 4"],
+    scales: Float[Array, "n 3"],
+    opacities: Float[Array, " n"],
+    colors: Float[Array, "*c n 3"] | Float[Array, "*c n k 3"],
+    viewmats: Float[Array, "c 4 4"],
+    Ks: Float[Array, "c 3 3"],
+    width: int,
+    height: int,
+    *,
+    near_plane: float = 0.01,
+    eps2d: float = 0.3,
+    sh_degree: int | None = None,
+    backgrounds: Float[Array, "c 3"] | None = None,
+    render_mode: RenderMode = "RGB",
+    capacity: int | None = None,
+    cfg: RenderConfig | None = None,
+) -> tuple[Float[Array, "c h w x"], Float[Array, "c h w 1"], dict[str, Any]]:
+    """Render Gaussians in several cameras of one size; differentiable, also in `jax.jit`.
+
+    Args:
+        means: scene units.
+        quats: w x y z, of any length.
+        scales: standard deviations along the axes, scene units.
+        opacities: in [0, 1].
+        colors: linear radiance, for all cameras or for each; with `sh_degree`, coefficients of
+            spherical harmonics, whose radiance is max(0, value + 1/2).
+        viewmats: world to camera, OpenCV axes.
+        Ks: intrinsics, pixels.
+        width: image width, pixels.
+        height: image height, pixels.
+        near_plane: what is nearer is invisible, scene units.
+        eps2d: variance added to the 2D covariance, pixels^2.
+        sh_degree: highest degree in use; coefficients above it are ignored.
+        backgrounds: radiance of each camera's background; None: black.
+        render_mode: "RGB", "D" (the sum of weights times z), "ED" (that over alpha), or both.
+        capacity: entries of the tile lists, static; None measures it, which only works outside of
+            `jax.jit`: pass `meta["capacity"]` of such a call.
+        cfg: everything else about rendering; default `RenderConfig()`.
+
+    Returns:
+        Colours with depth as their last channel, alphas, and by name: `means2d` (c n 2), `depths`
+        (c n), `radii` (c n 2: half the width and height of what lies above the alpha cutoff,
+        pixels, 0 for what is invisible), `entries` (c), `overflow` (c: the image is incomplete, as
+        it needs a longer tile list), `capacity`, `width` and `height`.
+
+    Raises:
+        ValueError: the mode or a shape is not valid, or the capacity is missing inside `jax.jit`.
+    """
+    if render_mode not in MODES:
+        raise ValueError(f"render_mode {render_mode!r} is not valid: choose {', '.join(MODES)}")
+    count, cameras, kept = means.shape[0], viewmats.shape[0], colors
+    if sh_degree is not None:
+        kept = colors[..., : coefficient_count(sh_degree), :]
+    bands = () if sh_degree is None else (coefficient_count(sh_degree),)
+    shape = (count, *bands, 3)
+    if kept.shape not in (shape, (cameras, *shape)):
+        raise ValueError(f"colors have shape {colors.shape}: {shape} is needed, or one per camera")
+    cfg = dataclasses.replace(
+        cfg or RenderConfig(), near=near_plane, blur=eps2d, radiance="linear", background=None
+    )
+    limited = jnp.clip(opacities, LEAST_OPACITY, 1 - LEAST_OPACITY)
+    no_color = jnp.zeros((count, 1, 3), means.dtype)
+    gaussians = Gaussians(
+        means, quats, jnp.log(scales), jnp.log(limited) - jnp.log1p(-limited), no_color
+    )
+    each = jnp.broadcast_to(kept, (cameras, *shape))
+    arrays, size = (gaussians, each, viewmats, Ks), (width, height)
+    if capacity is None:
+        capacity = _measured(arrays, size, cfg, sh_degree)
+    traced = any(isinstance(a, Tracer) for a in jax.tree.leaves(arrays))
+    run = _compiled(None if traced else jax.default_backend())
+    rgb, alpha, depth, meta = run(*arrays, size, cfg, capacity, sh_degree, render_mode != "RGB")
+    alpha = alpha[..., None]
+    if backgrounds is not None:
+        rgb = rgb + (1 - alpha) * backgrounds[:, None, None]
+    parts = [rgb] if render_mode.startswith("RGB") else []
+    if depth is not None:
+        expected = render_mode.endswith("ED")
+        parts.append(depth[..., None] / jnp.maximum(alpha, 1e-10) if expected else depth[..., None])
+    meta |= {"capacity": capacity, "width": width, "height": height}
+    return jnp.concatenate(parts, -1), alpha, meta
+
+
+def _seen(gaussians, color, camera: Camera, cfg: RenderConfig, sh_degree: int | None):
+    """Return the splats of a view and their radiance."""
+    alive = jnp.ones(gaussians.means.shape[0], bool)
+    splats = project(gaussians, alive, camera, cfg)
+    if sh_degree is not None:
+        color = view_radiance(dataclasses.replace(gaussians, sh=color), camera, cfg)
+    return with_cutoffs(splats, color, cfg), color
+
+
+def _render(gaussians, colors, viewmats, Ks, size, cfg, capacity, sh_degree, with_depth):
+    """Return radiance, alpha, depth (c h w) or None, and what is known of each camera."""
+
+    def one(each):
+        color, viewmat, K = each
+        camera = Camera(viewmat, K, *size)
+        splats, color = _seen(gaussians, color, camera, cfg, sh_degree)
+        result = render_splats(splats, color, camera, cfg, capacity, with_depth=with_depth)
+        reach = jnp.maximum(splats.log_opacities - splats.log_cutoffs, 0)
+        radii = jnp.ceil(jnp.sqrt(2 * reach[:, None] * splats.cov_diagonal))
+        meta = {
+            "means2d": splats.means2d,
+            "depths": splats.depths,
+            "radii": jnp.where(splats.visible[:, None], radii, 0).astype(jnp.int32),
+            "entries": result.count,
+            "overflow": result.overflow,
+        }
+        return result.linear, result.alpha, result.depth, meta
+
+    return jax.lax.map(one, (colors, viewmats, Ks))
+
+
+@functools.cache
+def _compiled(backend: str | None):
+    """Return `_render`, compiled; options are only allowed to the outermost program."""
+    options = None if backend is None else compiler_options()
+    return jax.jit(_render, static_argnums=(4, 5, 6, 7, 8), compiler_options=options)
+
+
+@functools.partial(jax.jit, static_argnums=(4, 5, 6))
+def _needed(gaussians, colors, viewmats, Ks, size, cfg, sh_degree):
+    """Return the entries that the neediest of some cameras needs."""
+
+    def one(each):
+        color, viewmat, K = each
+        splats, _ = _seen(gaussians, color, Camera(viewmat, K, *size), cfg, sh_degree)
+        return count_entries(splats, *size, cfg)
+
+    return jnp.max(jax.lax.map(one, (colors, viewmats, Ks)))
+
+
+def _measured(
+    arrays: tuple, size: tuple[int, int], cfg: RenderConfig, sh_degree: int | None
+) -> int:
+    """Return the length of the tile lists that some cameras need, with some to spare.
+
+    Raises:
+        ValueError: the values are not known yet, inside `jax.jit`.
+    """
+    fixed: tuple = jax.lax.stop_gradient(arrays)
+    try:
+        needed = int(_needed(*fixed, size, cfg, sh_degree))  # pyright: ignore[reportCallIssue]
+    except jax.errors.ConcretizationTypeError as error:
+        raise ValueError(
+            "the capacity of the tile lists cannot be measured inside jax.jit: pass capacity=, "
+            'such as meta["capacity"] of a call outside of it'
+        ) from error
+    return bucket(needed, PICTURES.first)

@@ -1,0 +1,396 @@
+"""The results of a run in sentences: a summary, and warnings that say what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from p2gs_jax.core.clock import whole_run
+from p2gs_jax.evaluation.alignment import ExposureError, exposure_error
+from p2gs_jax.photometry.models import MODELS
+from p2gs_jax.photometry.solution import MIN_OBSERVATIONS, WEAK_GAMMA, Agreement, compare
+from p2gs_jax.report.measurements import SceneMeasurements, seam_medians
+from p2gs_jax.report.run_files import RunFiles, number_at
+
+CURVES = {
+    "srgb": "the sRGB tone curve",
+    "power": "a power-law tone curve",
+    "spline": "a tone curve fitted to this camera",
+    "linear": "no tone curve: display values are splatted as they are",
+}
+DESCRIPTIONS: dict[str, str] = {name: model.description for name, model in MODELS.items()}
+CORRECTIONS = {
+    "affine": "a colour matrix",
+    "bilateral": "a bilateral grid",
+    "curve": "a curve",
+    "luminance": "colour axes and an enhancing curve",
+}
+# How sentences of the photometric selection begin (photometry/calibrate.py).
+REASONS = ("Chosen:", "Simpler (", "Richer (", "What predicts best")
+# Least gap between the PSNR of training and held-out views, dB.
+WIDE_GAP = 4.0
+# Least gap between one held-out view and the median of all, dB.
+OUTLIER = 6.0
+# Least standard error of an exposure, stops.
+WEAK_EV = 0.1
+# Least drift of an exposure from its start, stops; it must exceed three standard errors as well.
+DRIFT_EV = 0.1
+# Gammas of cameras lie between these: two priors' widths about 2.2 (`A_PRIOR` in
+# photometry/adjustment/system.py).
+GAMMAS = (1.65, 3.15)
+# The floor of exposures and gammas in the `linear` parameterisation (types.py).
+FLOOR = 1e-3
+# Least share of clipped pixels of a photograph.
+CLIPPED = 0.25
+# Least rise of the PSNR between the last two tenths of a run, dB.
+STILL_RISING = 0.3
+FINISHED = 0.99
+MOST_NAMES = 5
+
+
+def count(number: float, noun: str) -> str:
+    """Return "1 view" or "1,200 views"."""
+    return f"{number:,.0f} {noun}{'' if number == 1 else 's'}"
+
+
+def duration(seconds: float) -> str:
+    """Return seconds in words, such as `5 min 12 s`."""
+    whole = round(seconds)
+    if whole < 100:
+        return f"{seconds:.0f} s"
+    minutes, rest = divmod(whole, 60)
+    return f"{minutes} min {rest} s" if minutes < 100 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def column(values: Iterable, missing: float = np.nan) -> np.ndarray:
+    """Return numbers as an array, with a number in place of each None."""
+    return np.array([missing if v is None else v for v in values], float)
+
+
+def seconds_of(run: RunFiles) -> float | None:
+    """Return the seconds that the run took, or None where they are unknown."""
+    return whole_run(run.part("seconds"))
+
+
+def summary_sentences(run: RunFiles, scene: SceneMeasurements) -> list[str]:
+    """Return three sentences: what was fitted, what was modelled, how good it is."""
+    return [_what(run), _modelled(run), _how_good(run, scene)]
+
+
+def _what(run: RunFiles) -> str:
+    train, cameras = len(run.train), len(run.cameras)
+    held_out = len(run.views) - train
+    name = run.scene.name or "an unnamed scene"
+    if not train:
+        return f"A fit of {name} with the preset {run.preset}; it left no list of its views."
+    by = f" by {count(cameras, 'camera')}" if cameras else ""
+    split = run.metrics.get("split")
+    how = f": {split}" if isinstance(split, str) else ""
+    rest = f" ({held_out} more were held out{how})" if held_out else ""
+    gaussians, took = run.number("counts", "gaussians"), seconds_of(run)
+    made = "" if gaussians is None else f" with {count(gaussians, 'Gaussian')}"
+    when = "" if took is None else f" in {duration(took)}"
+    return f"{count(train, 'photograph')} of {name}{by}{rest} were fitted{made}{when}."
+
+
+def _modelled(run: RunFiles) -> str:
+    if run.photometry is None:
+        return "What was modelled of the cameras is not known: photometry.json is missing."
+    model, curve = run.photometry["model"], run.photometry["curve"].get("name", "")
+    kind = run.option("photometry", "appearance")
+    if kind == "ppisp":
+        return (
+            f"The preset {run.preset} learns cameras beside the splats: exposure and colours of "
+            "every view, vignetting and response of every camera."
+        )
+    correction = f", with {CORRECTIONS.get(kind, kind)} learned for every view" if kind else ""
+    if curve == "linear" and model == "constant":
+        return (
+            f"The preset {run.preset} models no camera: display values are splatted as they are"
+            f"{correction}."
+        )
+    span = exposure_span(run)
+    spans = "" if span is None or model == "constant" else f"; exposures span {span:.1f} stops"
+    what, under = DESCRIPTIONS.get(model, model), CURVES.get(curve, curve)
+    return f"It models {what} under {under}{correction}, {_why(run)}{spans}."
+
+
+def _why(run: RunFiles) -> str:
+    if any(r.startswith("Chosen:") for r in reasons(run)):
+        return "the simplest choice that predicts held-out colours about as well as any"
+    if run.option("photometry", "select"):
+        return "as there were no shared points to choose by"
+    return f"as the preset {run.preset} or the options say"
+
+
+def _how_good(run: RunFiles, scene: SceneMeasurements) -> str:
+    parts = []
+    train = run.number("train", "psnr")
+    held_out = run.number("test", "exposure_fitted", "psnr")
+    if held_out is not None:
+        against = "" if train is None else f" (training photographs at {train:.1f} dB)"
+        parts.append(f"Held-out photographs are met at {held_out:.1f} dB{against}")
+    elif train is not None:
+        parts.append(f"Training photographs are met at {train:.1f} dB; none was held out")
+    if scene.seams:
+        before, after = seam_medians(scene.seams)
+        parts.append(
+            f"neighbouring photographs differ by {before:.2f} stops as taken and by {after:.2f} "
+            "developed alike"
+        )
+    error = true_error(run, scene.true_exposures)
+    if error is not None:
+        parts.append(f"exposures are within {error['ev']:.3f} stops (RMS) of the true ones")
+    if not parts:
+        return "How good it is cannot be said: metrics.json is missing."
+    text = "; ".join(parts)
+    return text[0].upper() + text[1:] + "."
+
+
+def exposure_span(run: RunFiles) -> float | None:
+    """Return the stops between the darkest and the brightest training exposure."""
+    values = [v["exposure_ev"] for v in run.train if v["exposure_ev"] is not None]
+    return max(values) - min(values) if values else None
+
+
+def true_error(run: RunFiles, true_exposures: dict[str, float]) -> ExposureError | None:
+    """Return the error of the exposures where the scene knows the true ones, by name."""
+    pairs = [
+        (v["exposure"], true_exposures[v["image"]])
+        for v in run.train
+        if v["exposure"] is not None and v["image"] in true_exposures
+    ]
+    if len(pairs) < 2 or any(a <= 0 or b <= 0 for a, b in pairs):
+        return None
+    found, true = np.array(pairs).T
+    return exposure_error(found, true)
+
+
+def reasons(run: RunFiles) -> list[str]:
+    """Return why the photometric model was chosen, in the fit's own words."""
+    return [n for n in _notes(run) if n.startswith(REASONS)]
+
+
+def remarks(run: RunFiles) -> list[str]:
+    """Return all other notes of the fit."""
+    return [n for n in _notes(run) if not n.startswith(REASONS)]
+
+
+def _notes(run: RunFiles) -> list[str]:
+    notes = run.metrics.get("notes")
+    return [str(n) for n in notes] if isinstance(notes, list) else []
+
+
+def against_exif(run: RunFiles) -> Agreement | None:
+    """Return how the exposures agree with EXIF; None where fewer than two views carry it."""
+    views = [v for v in run.train if v["exposure_ev"] is not None]
+    if sum(v["exif_ev"] is not None for v in views) < 2:
+        return None
+    found, stated = (column(v[key] for v in views) for key in ("exposure_ev", "exif_ev"))
+    return compare(found, column((v.get("exposure_ev_error") for v in views), 0.0), stated)
+
+
+class RunWarning(NamedTuple):
+    """A warning about a run: its title in a few words, and what was found and what to do."""
+
+    title: str
+    text: str
+
+
+def run_warnings(run: RunFiles, scene: SceneMeasurements) -> list[RunWarning]:
+    """Return all warnings, the most serious first."""
+    checks = (_on_the_run, _on_held_out_views, _on_exposures, _on_gammas, _on_drift)
+    found = [warning for check in checks for warning in check(run)]
+    return [*found, *_on_clipping(scene), *_on_more_to_gain(run)]
+
+
+def _named(names: Sequence[str]) -> str:
+    """Return the first few names, and how many more there are."""
+    rest = len(names) - MOST_NAMES
+    return ", ".join(names[:MOST_NAMES]) + (f" and {rest} more" if rest > 0 else "")
+
+
+def _on_the_run(run: RunFiles) -> Iterator[RunWarning]:
+    parts = [run.part("train", "per_view"), run.part("test", "exposure_fitted", "per_view")]
+    broken = [n for part in parts for n, s in part.items() if number_at(s, "psnr") is None]
+    steps = [int(r["step"]) for r in run.log if number_at(r, "loss") is None]
+    where = [f"the scores of {_named(broken)}"] if broken else []
+    where += [f"the loss at step {steps[0]}"] if steps else []
+    if where:
+        yield RunWarning(
+            "Not finite",
+            f"{' and '.join(where).capitalize()} are not finite numbers. Do not trust this run; "
+            "fit again with lower learning rates (--optimizer.*).",
+        )
+    progress = number_at(run.log[-1], "progress") if run.log else None
+    if progress is not None and progress < FINISHED:
+        yield RunWarning(
+            "Ended early",
+            f"The log ends at {progress:.0%} of the schedule: the budget was too short, or the "
+            "run was stopped. Continue it with --resume, or give it more time.",
+        )
+    names = [v["image"] for v in run.train if v["exposure"] is None]
+    if names:
+        yield RunWarning(
+            "Views without an exposure",
+            f"{count(len(names), 'training view')} got no exposure ({_named(names)}): nothing ties "
+            "them to the others. They are shown at the mean of the rest.",
+        )
+
+
+def _on_held_out_views(run: RunFiles) -> Iterator[RunWarning]:
+    # The protocol that fits most of a held-out view's photometry.
+    richer = bool(run.part("test", "photometry_fitted"))
+    fitted = "photometry_fitted" if richer else "exposure_fitted"
+    train, held_out = run.number("train", "psnr"), run.number("test", fitted, "psnr")
+    if train is not None and held_out is not None and train - held_out >= WIDE_GAP:
+        solved = "photometry" if richer else "exposure"
+        yield RunWarning(
+            "New views are worse than training views",
+            f"Training photographs are met at {train:.1f} dB, held-out ones at {held_out:.1f} dB, "
+            f"even with {solved} fitted to each. Either the held-out views look where few others "
+            "do, or there are too few photographs for this many Gaussians: add photographs, or "
+            "lower --gaussians.",
+        )
+    per_view = run.part("test", fitted, "per_view")
+    scores = {n: s for n, v in per_view.items() if (s := number_at(v, "psnr")) is not None}
+    middle = float(np.median(list(scores.values()))) if len(scores) >= 3 else -np.inf
+    bad = sorted((n for n in scores if scores[n] < middle - OUTLIER), key=lambda n: scores[n])
+    if bad:
+        yield RunWarning(
+            "Some held-out views fail",
+            f"{_named([f'{n} {scores[n]:.1f} dB' for n in bad])}, against a median of "
+            f"{middle:.1f} dB. Look at them below: often such a view shows a corner that no "
+            "training view sees.",
+        )
+    if run.views and len(run.train) == len(run.views):
+        yield RunWarning(
+            "Nothing was held out",
+            "Every photograph was trained on, so nothing here tells how good new views are. Fit "
+            "with --test-every 8 to find out.",
+        )
+
+
+def _on_exposures(run: RunFiles) -> Iterator[RunWarning]:
+    weight, form = (run.option("loss", "relative_exposure", name) for name in ("weight", "form"))
+    if weight is not None and form == "literal_same_pose":
+        yield RunWarning(
+            "A loss pulls exposures together",
+            "The relative-exposure loss as printed in the paper is smallest when all exposures are "
+            "equal, so the recovered ones are too close to each other. The preset robust leaves it "
+            "out.",
+        )
+    agreement = against_exif(run)
+    if agreement is not None and agreement.disagrees.any():
+        views = [v for v in run.train if v["exposure_ev"] is not None]
+        off = np.flatnonzero(agreement.disagrees)
+        off = off[np.argsort(-np.abs(agreement.gap_ev[off]))]
+        names = [f"{views[i]['image']} {agreement.gap_ev[i]:+.2f}" for i in off]
+        yield RunWarning(
+            "EXIF disagrees with the pixels",
+            f"In {len(off)} of {agreement.views} views the exposure recovered from the pixels "
+            f"differs from EXIF's by more than 0.2 stops ({_named(names)}). EXIF knows nothing of "
+            "flare, vignetting, or what the camera did after the exposure; the fit used the "
+            "pixels.",
+        )
+    weak = [(v["image"], e) for v in run.train if (e := v.get("exposure_ev_error") or 0) > WEAK_EV]
+    if weak:
+        names = [f"{name} ± {error:.2f}" for name, error in sorted(weak, key=lambda w: -w[1])]
+        yield RunWarning(
+            "Exposures are only roughly known",
+            f"{count(len(weak), 'view')} with a standard error above {WEAK_EV:g} stops: "
+            f"{_named(names)}. They share few points with the others; more overlap would help.",
+        )
+    counts = [(v["image"], v.get("observations") or MIN_OBSERVATIONS) for v in run.train]
+    few = [f"{name} ({n})" for name, n in counts if n < MIN_OBSERVATIONS]
+    if few:
+        yield RunWarning(
+            "Views with few shared points",
+            f"{_named(few)}: fewer than {MIN_OBSERVATIONS} usable observations each, so their "
+            "exposures rest on little.",
+        )
+
+
+def _on_gammas(run: RunFiles) -> Iterator[RunWarning]:
+    low, high = GAMMAS
+    model = "" if run.photometry is None else run.photometry["model"]
+    curve = {} if run.photometry is None else run.photometry["curve"]
+    gammas = [(v["image"], v["gamma"]) for v in run.train if v["gamma"] is not None]
+    off = [f"{name} {gamma:.2f}" for name, gamma in gammas if not low < gamma < high]
+    if off and curve.get("name") != "linear":
+        yield RunWarning(
+            "Unusual gammas",
+            f"{_named(off)}: outside {low:g} to {high:g}, where cameras lie. Gamma may have taken "
+            "over what exposure or the tone curve should explain; compare with a model without it "
+            "(--photometry.no-select --photometry.model view_exposure).",
+        )
+    weak = [v["image"] for v in run.train if (v.get("gamma_error") or 0) > WEAK_GAMMA]
+    if weak and model in MODELS and MODELS[model].gamma is not None:
+        yield RunWarning(
+            "Gammas are only roughly known",
+            f"{count(len(weak), 'view')} with a standard error above {WEAK_GAMMA:g} "
+            f"({_named(weak)}): the shared points there have nearly one brightness.",
+        )
+
+
+def _on_drift(run: RunFiles) -> Iterator[RunWarning]:
+    least = [(v["image"], np.nanmin(column([v["exposure"], v["gamma"], 1]))) for v in run.train]
+    lost = [name for name, value in least if value <= 1.01 * FLOOR]
+    if lost:
+        yield RunWarning(
+            "Exposures at their floor",
+            f"The exposure or gamma of {_named(lost)} fell to the smallest value it may have, "
+            f"{FLOOR:g}. The fit lost these views; start exposures from tracks (preset robust).",
+        )
+    moved = []
+    for v in run.train:
+        start, end = v.get("exposure_ev_start"), v["exposure_ev"]
+        enough = max(DRIFT_EV, 3 * (v.get("exposure_ev_error") or 0))
+        if start is not None and end is not None and abs(end - start) > enough:
+            moved.append((v["image"], end - start))
+    if moved:
+        names = [f"{name} {d:+.2f}" for name, d in sorted(moved, key=lambda m: -abs(m[1]))]
+        yield RunWarning(
+            "Exposures left their start",
+            f"In {count(len(moved), 'view')} the fit moved the exposure by more than {DRIFT_EV:g} "
+            f"stops and three standard errors from what the shared points said ({_named(names)}). "
+            "One of the two is wrong; p2gs-jax calibrate RUN solves them anew through the rendered "
+            "depth.",
+        )
+
+
+def _on_clipping(scene: SceneMeasurements) -> Iterator[RunWarning]:
+    bad = sorted(((s, n) for n, s in scene.clipped.items() if s > CLIPPED), reverse=True)
+    if bad:
+        names = _named([f"{n} {s:.0%}" for s, n in bad])
+        yield RunWarning(
+            "Clipped photographs",
+            f"More than {CLIPPED:.0%} of the pixels are clipped in {len(bad)} of the "
+            f"{len(scene.clipped)} photographs looked at ({names}). There the radiance is only "
+            "known to be at least that bright, unless a darker photograph shows the same place.",
+        )
+
+
+def _on_more_to_gain(run: RunFiles) -> Iterator[RunWarning]:
+    refused = run.number("counts", "refused_densifications") or 0
+    if refused > 0:
+        yield RunWarning(
+            "The Gaussians ran out of room",
+            f"{refused:,.0f} times a Gaussian wanted to split and the limit was reached. Raise "
+            "--gaussians if memory allows.",
+        )
+    both = [(number_at(r, "progress"), number_at(r, "psnr")) for r in run.log]
+    rows = [(p, q) for p, q in both if p is not None and q is not None]
+    before, last = [q for p, q in rows if 0.8 <= p < 0.9], [q for p, q in rows if p >= 0.9]
+    if min(len(before), len(last)) >= 5:
+        rise = float(np.mean(last) - np.mean(before))
+        # The rise must exceed the spread between views.
+        noise = float(np.sqrt(np.var(last) / len(last) + np.var(before) / len(before)))
+        if rise >= max(STILL_RISING, 3 * noise):
+            yield RunWarning(
+                "Not finished improving",
+                f"The training PSNR rose by {rise:.1f} dB between the last two tenths of the run. "
+                "More steps, or a longer --budget, would still help.",
+            )

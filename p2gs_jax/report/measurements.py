@@ -1,0 +1,246 @@
+"""What a page needs from the scene itself: seams, clipped photographs, true exposures, renders.
+
+Seams are shown here, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from p2gs_jax.core.progress import Reporter
+from p2gs_jax.errors import UserError
+from p2gs_jax.evaluation.scores import psnr
+from p2gs_jax.evaluation.seams import (
+    Photographed,
+    Seam,
+    SeamPicture,
+    measure_seam,
+    neighbouring_pairs,
+    seam_picture,
+)
+from p2gs_jax.photometry.display import develop
+from p2gs_jax.render.warp import surface_depth
+from p2gs_jax.report.charts import seams_chart
+from p2gs_jax.report.page import figure, folded, paragraph, row, table
+from p2gs_jax.report.pictures import LARGE, ViewComparison, jpeg, spread, without_suffix
+from p2gs_jax.report.run_files import RunFiles
+from p2gs_jax.run.read import Run, load_run
+from p2gs_jax.scene.pixels.store import camera_of
+from p2gs_jax.synth.exposures import read_true_exposures
+
+MOST_PAIRS, MOST_CLIPPED, MOST_RENDERED = 12, 24, 3
+# Seams are measured on images of at most this many pixels across.
+SEAM_WIDTH = 960
+# The pair for the picture of a seam has at least this share of the median overlap.
+LEAST_OVERLAP = 0.5
+
+
+@dataclass(frozen=True)
+class SeamPair:
+    """A seam between two views, by their names."""
+
+    first: str
+    second: str
+    seam: Seam
+
+    @property
+    def name(self) -> str:
+        """Both names without suffixes."""
+        return f"{without_suffix(self.first)} – {without_suffix(self.second)}"
+
+
+@dataclass
+class SceneMeasurements:
+    """What was measured on the scene.
+
+    Attributes:
+        true_exposures: by view, where the scene has them.
+        seams: pairs in the order of the views.
+        tried_pairs: number of pairs that were compared, with or without enough in common.
+        shown: the pair of the picture.
+        picture: of the widest seam, or None.
+        clipped: share of clipped pixels by view, for a sample of the training views.
+        comparisons: rendered training views, where the folder has no held-out ones.
+        missing: sentences on what could not be measured.
+    """
+
+    true_exposures: dict[str, float] = field(default_factory=dict)
+    seams: tuple[SeamPair, ...] = ()
+    tried_pairs: int = 0
+    shown: SeamPair | None = None
+    picture: SeamPicture | None = None
+    clipped: dict[str, float] = field(default_factory=dict)
+    comparisons: tuple[ViewComparison, ...] = ()
+    missing: tuple[str, ...] = ()
+
+
+def measure_scene(files: RunFiles, reporter: Reporter, *, render: bool = True) -> SceneMeasurements:
+    """Load the scene and measure what the page needs; without a scene, say so in `missing`.
+
+    Args:
+        files: the run folder.
+        reporter: receives progress.
+        render: False reads only the true exposures.
+    """
+    out = SceneMeasurements()
+    try:
+        out.true_exposures = read_true_exposures(files.scene)
+    except (OSError, KeyError, ValueError) as error:
+        out.missing += (f"The scene's true exposures cannot be read ({error!r}).",)
+    if not render:
+        out.missing += ("Seams were not measured: the page was made without rendering.",)
+        return out
+    reporter.stage("Reading the scene")
+    try:
+        run = load_run(files.folder, files.given)
+        run.require_photographs()
+        _measure_seams(run, out, reporter)
+        if not files.held_out:
+            out.comparisons = _comparisons(run, reporter)
+        reporter.stage("Looking for clipped pixels")
+        out.clipped = _clipped(run)
+    except UserError as error:
+        why = f"Seams were not measured, and nothing was rendered: {error.message}"
+        return SceneMeasurements(out.true_exposures, missing=(*out.missing, why))
+    return out
+
+
+def _measure_seams(run: Run, out: SceneMeasurements, reporter: Reporter) -> None:
+    """Measure seams between neighbouring photographs, and draw the widest one."""
+    if run.cfg.photometry.appearance is not None:
+        out.missing += (
+            "Seams were not measured: this preset learns corrections of display values, which "
+            "cannot be undone in a photograph.",
+        )
+        return
+    store, names = run.store.leaving_out(run.scene.objects), [v.name for v in run.scene.views]
+    known: dict[int, Photographed] = {}
+
+    def photographed(index: int) -> Photographed:
+        """Return a photograph with rendered depth, rendered once."""
+        if index not in known:
+            shrink = max(1.0, store.camera(index)[2] / SEAM_WIDTH)
+            camera = camera_of(store, index, shrink)
+            depth = np.asarray(surface_depth(run.render(camera)))
+            ldr, mask = store.get(index, shrink)
+            known[index] = Photographed(ldr, mask, camera, depth, run.own_display(index))
+        return known[index]
+
+    pairs = neighbouring_pairs(run.scene, MOST_PAIRS)
+    found: dict[tuple[int, int], Seam] = {}
+    for done, (i, j) in enumerate(pairs):
+        reporter.stage("Measuring seams", done, len(pairs))
+        seam = measure_seam(photographed(i), photographed(j), run.common_display(), run.cfg.loss)
+        if seam is not None:
+            found[i, j] = seam
+    out.tried_pairs = len(pairs)
+    out.seams = tuple(SeamPair(names[i], names[j], seam) for (i, j), seam in found.items())
+    if found:
+        enough = LEAST_OVERLAP * float(np.median([s.pixels for s in found.values()]))
+        good = [pair for pair, seam in found.items() if seam.pixels >= enough]
+        i, j = max(good, key=lambda pair: found[pair].before_ev)
+        out.shown = SeamPair(names[i], names[j], found[i, j])
+        out.picture = seam_picture(
+            photographed(i), photographed(j), run.common_display(), run.render
+        )
+
+
+def _comparisons(run: Run, reporter: Reporter) -> tuple[ViewComparison, ...]:
+    """Return some training views beside their renders."""
+    out = []
+    for index in spread(run.scene.train_indices, MOST_RENDERED):
+        reporter.stage("Rendering views", len(out), MOST_RENDERED)
+        photograph, mask = run.store.get(index)
+        rendered = run.render(camera_of(run.store, index))
+        linear = np.asarray(rendered.linear)
+        shown = develop(linear, run.own_display(index), alpha=rendered.alpha)
+        score, view = float(psnr(shown, photograph, mask)), run.scene.views[index]
+        out.append(ViewComparison(view.name, view.split, photograph, shown, linear, score))
+    return tuple(out)
+
+
+def _clipped(run: Run) -> dict[str, float]:
+    """Return the share of pixels with a clipped channel, for a sample of the training views."""
+    out, store = {}, run.store.only_opaque()
+    for index in spread(run.scene.train_indices, MOST_CLIPPED):
+        ldr, mask = store.get(index)
+        clipped = np.any(ldr >= run.cfg.loss.saturation, axis=-1) & (mask > 0)
+        out[run.scene.views[index].name] = float(clipped.sum() / max(float(mask.sum()), 1.0))
+    return out
+
+
+def seam_medians(seams: Sequence[SeamPair]) -> tuple[float, float]:
+    """Return the median over pairs of the seams before and after, stops."""
+    before = float(np.median([p.seam.before_ev for p in seams]))
+    return before, float(np.median([p.seam.after_ev for p in seams]))
+
+
+def seam_section(scene: SceneMeasurements) -> str:
+    """Return the differences of neighbouring photographs, as taken and developed alike."""
+    seams = scene.seams
+    if not seams:
+        why = " ".join(m for m in scene.missing if m.startswith("Seams"))
+        if not why and scene.tried_pairs:
+            why = (
+                f"None of {scene.tried_pairs} pairs of neighbouring photographs shows enough of "
+                "the same unsaturated surface to compare."
+            )
+        why = why or "No two training views share enough of the scene to be compared."
+        return paragraph(why)
+    before, after = seam_medians(seams)
+    step = float(np.median([abs(p.seam.step_ev) for p in seams]))
+    whole = f"{step:.2f}" if step >= 0.005 else "less than 0.01"
+    pairs = "1 pair" if len(seams) == 1 else f"{len(seams)} pairs"
+    body = paragraph(
+        f"The same surfaces in neighbouring photographs differ by {before:.2f} stops as taken, and "
+        f"by {after:.2f} once each photograph is decoded, divided by its exposure and developed "
+        f"alike (medians over {pairs}). Of what is left, {whole} stops are a step that runs "
+        "through the whole pair; the rest is texture that does not meet exactly, shine, and what "
+        "the formation model leaves out."
+    )
+    if scene.picture is not None and scene.shown is not None:
+        body += _seam_picture(scene.shown, scene.picture)
+    chart = seams_chart(
+        [(p.name, p.seam.before_ev, p.seam.after_ev) for p in seams],
+        label="Difference of pairs of photographs as taken and developed",
+    )
+    body += figure(
+        chart,
+        "Median absolute difference over all pixels that both photographs show, found through the "
+        "rendered depth; saturated and black pixels are left out.",
+    )
+    heads = ["pair", "before, stops", "after, stops", "step after, stops"]
+    heads += ["before, 8-bit levels", "after, 8-bit levels", "pixels"]
+    numbers = []
+    for s in (p.seam for p in seams):
+        cells = [f"{s.before_ev:.3f}", f"{s.after_ev:.3f}", f"{s.step_ev:+.3f}"]
+        cells += [f"{s.before_codes:.1f}", f"{s.after_codes:.1f}", f"{s.pixels:,}"]
+        numbers.append(cells)
+    rows = [[p.name, *cells] for p, cells in zip(seams, numbers, strict=True)]
+    body += folded("Every pair in numbers", table(heads, rows, numbers=range(1, 7), tall=True))
+    return body
+
+
+def _seam_picture(pair: SeamPair, picture: SeamPicture) -> str:
+    names = [without_suffix(pair.first), without_suffix(pair.second)]
+    left, right = names if picture.left_first else names[::-1]
+    seam = pair.seam
+    cells = [
+        (
+            jpeg(picture.before, f"{left} beside {right}, as taken", LARGE),
+            f"As taken: {seam.before_ev:.2f} stops, {seam.before_codes:.0f} 8-bit levels apart",
+        ),
+        (
+            jpeg(picture.after, f"{left} beside {right}, developed alike", LARGE),
+            f"Developed alike: {seam.after_ev:.2f} stops, {seam.after_codes:.1f} levels apart",
+        ),
+    ]
+    caption = (
+        f"Left half: {left}. Right half: {right}. Both as a camera halfway between them would see "
+        "them, with a hard edge in the middle: the widest seam among pairs with a good overlap. "
+        "Clipped skies stay at the value of their white; grey was out of the photograph's sight."
+    )
+    return figure(row(cells, "two"), caption)

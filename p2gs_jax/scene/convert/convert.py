@@ -1,0 +1,439 @@
+"""HEIC, camera raw and files of linear light become PNG in the run's cache, once."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import math
+import os
+import shutil
+import struct
+import zlib
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import platformdirs
+from jaxtyping import UInt
+from PIL import ExifTags, Image
+
+from p2gs_jax.core.atomic import atomic_write, write_text
+from p2gs_jax.errors import broken
+from p2gs_jax.scene.cache import Report, cached_folder, file_fingerprints
+from p2gs_jax.scene.convert.heif import read_heif
+from p2gs_jax.scene.convert.icc import GAIN_MAP_UNUSED, encode_16
+from p2gs_jax.scene.convert.kinds import Kind, Picture, has_gain_map, kind_of
+from p2gs_jax.scene.convert.linear import Balance, read_exr, read_facts, read_float_tiff, read_raw
+from p2gs_jax.scene.masks import mask_of
+from p2gs_jax.types import Scene
+
+# Other results: other folders.
+_VERSION = 1
+_FOLDER, _RECORD = "developed", "photographs.json"
+_NAMES: dict[Kind, str] = {
+    "raw": "camera raw",
+    "heif": "HEIC",
+    "avif": "AVIF",
+    "webp": "WebP",
+    "exr": "linear EXR",
+    "float_tiff": "TIFF of floats",
+}
+# Where one shot has two files, the first of these kinds is used: it holds most of the light.
+_RANK: tuple[Kind, ...] = ("exr", "float_tiff", "raw", "heif", "avif", "webp", "plain")
+_LINEAR = ("exr", "float_tiff")
+# In light of files without a white of their own, what fewer pixels exceed is saturated, percent.
+_BRIGHT = 99.9
+_DARK = 0.25
+# Fast; a better compression saves a tenth of the space and takes five times as long.
+_COMPRESSION = 1
+_SIGNATURE_AND_HEADER = 8 + 25
+# Make and model (structure from motion begins with the focal length of the lens).
+_KEPT = (0x010F, 0x0110)
+# Exposure time, f-number, sensitivities, time, focal length, and that for 35 mm film.
+_KEPT_EXIF = (
+    *(0x829A, 0x829D, 0x8827, 0x8830, 0x8831, 0x8832, 0x8833),
+    *(0x9003, 0x9011, 0x9291, 0x920A, 0xA405),
+)
+
+
+@dataclass(frozen=True)
+class Converted:
+    """Photographs in a folder that structure from motion can read.
+
+    Attributes:
+        folder: what their names are relative to.
+        paths: the files in it, sorted.
+        originals: the user's files, by path relative to `folder`.
+        notes: what the user should know.
+        known: why the response of them all is known, or None.
+    """
+
+    folder: Path
+    paths: list[Path]
+    originals: Mapping[str, Path]
+    notes: tuple[str, ...] = ()
+    known: str | None = None
+
+
+def convert_photographs(
+    folder: Path, paths: Sequence[Path], work_dir: Path | None, report: Report
+) -> Converted:
+    """Return photographs as files that everything can read; if all are, they stay where they are.
+
+    Args:
+        folder: holds the photographs.
+        paths: the photographs, in it or in its subfolders.
+        work_dir: keeps what is converted; None: the user's cache.
+        report: receives progress.
+
+    Raises:
+        UserError: one cannot be decoded, or a package for it is missing.
+    """
+    kinds, notes = _without_twins({path: kind_of(path) for path in paths})
+    names = {path: path.relative_to(folder).as_posix() for path in kinds}
+    if all(kind == "plain" for kind in kinds.values()):
+        originals = {name: path for path, name in names.items()}
+        return Converted(folder, sorted(kinds), originals, tuple(notes))
+    places = {
+        path: name if kinds[path] == "plain" else Path(name).with_suffix(".png").as_posix()
+        for path, name in names.items()
+    }
+    target, record = _converted(folder, kinds, places, work_dir, report)
+    paths = sorted((target / place for place in places.values()), key=lambda p: p.as_posix())
+    known = record["known"] if "plain" not in kinds.values() else None
+    if record["known"] and not known:
+        notes.append(_mixed(kinds.values()))
+    originals = {place: path for path, place in places.items()}
+    return Converted(target, paths, originals, (*notes, *record["notes"]), known)
+
+
+def with_originals(scene: Scene, converted: Converted) -> Scene:
+    """Return a scene of converted photographs with the names and notes of the user's files.
+
+    Files that were only linked are read where they are, also beside a run that has moved.
+    """
+    views = []
+    for view in scene.views:
+        original = converted.originals[view.name]
+        plain = original.suffix == Path(view.name).suffix
+        name = Path(view.name).with_suffix(original.suffix).as_posix()
+        path = original if plain else converted.folder / view.name
+        there = dataclasses.replace(view, name=name, image_path=original)
+        mask = view.mask_path or mask_of(there)
+        views.append(dataclasses.replace(there, image_path=path, mask_path=mask))
+    return dataclasses.replace(
+        scene,
+        views=tuple(views),
+        notes=(*scene.notes, *converted.notes),
+        known_response=converted.known,
+    )
+
+
+def converted_views(scene: Scene, work_dir: Path | None, report: Report) -> Scene:
+    """Return a scene whose views show converted photographs, where a model names others.
+
+    Args:
+        scene: as its reader returns it.
+        work_dir: keeps what is converted; None: the user's cache.
+        report: receives progress.
+
+    Raises:
+        UserError: one cannot be decoded, or a package for it is missing.
+    """
+    kinds: dict[Path, Kind] = {v.image_path: kind_of(v.image_path) for v in scene.views}
+    wanted: dict[Path, Kind] = {path: kind for path, kind in kinds.items() if kind != "plain"}
+    if not wanted:
+        return scene
+    # A suffix more keeps photographs apart that differ in theirs.
+    places = {v.image_path: v.name + ".png" for v in scene.views if v.image_path in wanted}
+    target, record = _converted(scene.root, wanted, places, work_dir, report)
+    views = tuple(
+        dataclasses.replace(
+            view,
+            image_path=target / places[view.image_path],
+            mask_path=view.mask_path or mask_of(view),
+        )
+        if view.image_path in places
+        else view
+        for view in scene.views
+    )
+    whole = len(wanted) == len(kinds)
+    mixed = [_mixed(kinds.values())] if record["known"] and not whole else []
+    return dataclasses.replace(
+        scene,
+        views=views,
+        notes=(*scene.notes, *record["notes"], *mixed),
+        known_response=record["known"] if whole else scene.known_response,
+    )
+
+
+def cache_of(root: Path, work_dir: Path | None) -> Path:
+    """Return where files of a scene may be kept: the run's cache, or else the user's."""
+    if work_dir is not None:
+        return work_dir
+    scene = hashlib.sha256(str(root.resolve()).encode()).hexdigest()[:16]
+    return platformdirs.user_cache_path("p2gs-jax") / "photographs" / scene
+
+
+def _mixed(kinds: Iterable[Kind]) -> str:
+    listed = _listed(_NAMES.get(kind, "others") for kind in kinds)
+    return (
+        f"Photographs are of several kinds ({listed}): the tone curve is not known for all, and is "
+        "chosen for all."
+    )
+
+
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(f"{n} {name}" for name, n in Counter(names).most_common())
+
+
+def _without_twins(kinds: dict[Path, Kind]) -> tuple[dict[Path, Kind], list[str]]:
+    """Leave out all but one file of each shot that was written twice, as raw and JPEG."""
+    shots: dict[Path, list[Path]] = defaultdict(list)
+    for path in kinds:
+        shots[path.with_suffix("")].append(path)
+    readable = {"raw": find_spec("rawpy"), "heif": find_spec("pillow_heif")}
+    dropped: list[Path] = []
+    for files in shots.values():
+        if all(kinds[path] == "plain" for path in files):
+            continue
+        usable = [path for path in files if readable.get(kinds[path], True)] or files
+        best = min(usable, key=lambda path: (_RANK.index(kinds[path]), path.name))
+        dropped += [path for path in files if path != best]
+    if not dropped:
+        return kinds, []
+    note = (
+        f"{len(dropped)} photograph(s) are there twice, as several kinds of file "
+        f"({sorted(dropped)[0].name}, ...); one file is used for each shot."
+    )
+    return {path: kind for path, kind in kinds.items() if path not in set(dropped)}, [note]
+
+
+def _converted(
+    root: Path,
+    kinds: Mapping[Path, Kind],
+    places: Mapping[Path, str],
+    work_dir: Path | None,
+    report: Report,
+) -> tuple[Path, dict[str, Any]]:
+    """Fill a folder with the photographs at their places; return it and the record of it."""
+    key = {
+        "version": _VERSION,
+        "files": file_fingerprints(list(places)),
+        "places": list(places.values()),
+    }
+
+    def build(folder: Path) -> None:
+        _Converter(kinds).fill(folder, places, report)
+
+    with cached_folder(cache_of(root, work_dir), _FOLDER, key, build) as folder:
+        return folder, json.loads((folder / _RECORD).read_text())
+
+
+class _Converter:
+    """Converts photographs that belong together: their white balance and white are common."""
+
+    def __init__(self, kinds: Mapping[Path, Kind]):
+        self._kinds = kinds
+        self._facts = {p: read_facts(p) for p, kind in kinds.items() if kind == "raw"}
+        self._balances = self._common_balances()
+        self._scale = self._common_scale()
+
+    def fill(self, folder: Path, places: Mapping[Path, str], report: Report) -> None:
+        """Write all photographs, and a record of what was done."""
+        records: list[dict[str, Any]] = []
+        total = sum(self._kinds[path] != "plain" for path in places)
+        for path, place in places.items():
+            target = folder / place
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if self._kinds[path] == "plain":
+                _link(path.resolve(), target)
+                continue
+            if len(records) % 5 == 0:
+                report(f"converting photographs: {len(records)} of {total}")
+            records.append(self._write(path, target) | {"file": str(path), "developed": place})
+        known = [r for r in records if r["light"]]
+        names = dict.fromkeys(_NAMES[r["kind"]] for r in known)
+        record = {
+            "known": ", ".join(names) if known and len(known) == len(records) else None,
+            "notes": self._notes(records),
+            "photographs": records,
+        }
+        write_text(folder / _RECORD, json.dumps(record, indent=1))
+
+    def _common_balances(self) -> dict[str, Balance]:
+        """Return one white balance for each camera: the median of what it chose."""
+        chosen: dict[str, list[Balance]] = defaultdict(list)
+        for facts in self._facts.values():
+            if facts.balance is not None:
+                chosen[facts.camera].append(facts.balance)
+        return {
+            camera: tuple(float(x) for x in np.exp(np.median(np.log(balances), axis=0)))  # type: ignore[misc]
+            for camera, balances in chosen.items()
+        }
+
+    def _common_scale(self) -> float:
+        """Return the factor on files of light that have no white of their own, a power of 2."""
+        brightest = 0.0
+        for path, kind in self._kinds.items():
+            if kind in _LINEAR:
+                light = self._read(path).light
+                assert light is not None
+                brightest = max(brightest, float(np.percentile(light[::3, ::3].max(2), _BRIGHT)))
+        if not brightest or _DARK <= brightest <= 1.001:
+            return 1.0
+        return 2.0 ** -math.ceil(math.log2(brightest))
+
+    def _read(self, path: Path) -> Picture:
+        kind = self._kinds[path]
+        if kind == "raw":
+            return read_raw(path, self._balances.get(self._facts[path].camera))
+        if kind in ("heif", "avif", "webp"):
+            return read_heif(path)
+        return read_exr(path) if kind == "exr" else read_float_tiff(path)
+
+    def _write(self, path: Path, target: Path) -> dict[str, Any]:
+        """Convert one photograph; return its entry in the record."""
+        picture, kind = self._read(path), self._kinds[path]
+        lit = picture.light is not None
+        record: dict[str, Any] = {"kind": kind, "light": lit, "gain_map": has_gain_map(path)}
+        if picture.light is None:
+            assert picture.codes is not None
+            write_png(target, picture.codes, picture.exif, picture.profile)
+            return record
+        light = picture.light * np.float32(self._scale if kind in _LINEAR else 1.0)
+        codes = encode_16(light)
+        if picture.alpha is not None:
+            alpha = np.rint(picture.alpha * 65535).astype(np.uint16)[..., None]
+            codes = np.concatenate([codes, alpha], axis=2)
+        write_png(target, codes, picture.exif)
+        saturated = float((light >= 1).any(2).mean())
+        record |= {"saturated": saturated, "invalid": picture.invalid}
+        if kind in _LINEAR:
+            return record | {"scale": self._scale}
+        if path not in self._facts:
+            return record
+        facts = self._facts[path]
+        return record | {
+            "camera": facts.camera,
+            "black": facts.black,
+            "white": facts.white,
+            "white_balance_of_camera": facts.balance,
+            "white_balance": self._balances.get(facts.camera),
+            "matrix": facts.matrix,
+        }
+
+    def _notes(self, records: Sequence[Mapping[str, Any]]) -> list[str]:
+        out = [f"Converted into the run's cache: {_listed(_NAMES[r['kind']] for r in records)}."]
+        for camera, balance in self._balances.items():
+            facts = [f for f in self._facts.values() if f.camera == camera]
+            chosen = np.log2([f.balance for f in facts if f.balance is not None])
+            spread = float(np.ptp(chosen - chosen[:, 1:2], axis=0).max())
+            out.append(
+                f"White balance of {len(facts)} raw photographs ({camera or 'camera unknown'}): "
+                f"red {balance[0]:.3f}, blue {balance[2]:.3f} for all, the median of what the "
+                f"camera chose, which varied by {spread:.2f} EV."
+            )
+        if unbalanced := sum(f.balance is None for f in self._facts.values()):
+            out.append(
+                f"{unbalanced} raw photographs record no white balance: LibRaw's for daylight."
+            )
+        if strange := sum(not f.matrix for f in self._facts.values()):
+            out.append(
+                f"{strange} raw photographs are of a camera whose colours LibRaw does not know: "
+                "they stay in the camera's own primaries."
+            )
+        if self._scale != 1:
+            out.append(
+                f"Linear photographs were multiplied by {self._scale:g}, all alike, so that "
+                f"{_BRIGHT:g} % of each are below white."
+            )
+        if maps := sum(r["gain_map"] for r in records):
+            out.append(f"{maps} of them {GAIN_MAP_UNUSED}")
+        if invalid := sum(r.get("invalid", 0) for r in records):
+            out.append(
+                f"{invalid} pixels of linear photographs are not numbers; they count as black."
+            )
+        return out
+
+
+def _link(source: Path, target: Path) -> None:
+    """Make a file appear at another place; file systems without links copy it."""
+    why: object = None
+    for place in (os.symlink, os.link, shutil.copyfile):
+        try:
+            place(source, target)
+            return
+        except OSError as error:
+            why = error.strerror or error
+    fix = "make room on that disk, or name another --out"
+    raise broken(source, f"cannot be copied to {target}: {why}.", fix)
+
+
+def write_png(
+    path: Path,
+    pixels: UInt[np.ndarray, "h w c"],
+    exif: Image.Exif | None = None,
+    profile: bytes | None = None,
+) -> None:
+    """Write a converted photograph.
+
+    Args:
+        path: the .png.
+        pixels: uint8 or uint16 in the order R G B, perhaps with alpha behind, or one channel.
+        exif: settings are taken from it. Not the orientation: poses belong to the stored raster.
+        profile: ICC profile of the colours, if they are not sRGB.
+
+    Raises:
+        UserError: the disk is full, or cannot be written.
+    """
+    order = {3: [2, 1, 0], 4: [2, 1, 0, 3]}.get(pixels.shape[2], [0])
+    raster = np.ascontiguousarray(pixels[..., order])
+    good, data = cv2.imencode(".png", raster, [cv2.IMWRITE_PNG_COMPRESSION, _COMPRESSION])
+    assert good
+    extra = b""
+    if profile:
+        extra += _chunk(b"iCCP", b"ICC profile\0\0" + zlib.compress(profile))
+    settings = _kept_settings(exif)
+    if settings is not None:
+        extra += _chunk(b"eXIf", settings)
+    whole = data.tobytes()
+    try:
+        with atomic_write(path) as temporary:
+            temporary.write_bytes(
+                whole[:_SIGNATURE_AND_HEADER] + extra + whole[_SIGNATURE_AND_HEADER:]
+            )
+    except OSError as error:
+        why = f"cannot be written: {error.strerror or error}."
+        raise broken(path, why, "make room on that disk, or name another --out") from None
+
+
+def _kept_settings(exif: Image.Exif | None) -> bytes | None:
+    """Return the settings that are kept, as a PNG holds them; None: there are none."""
+    if exif is None:
+        return None
+    out = Image.Exif()
+    try:
+        shot = exif.get_ifd(ExifTags.IFD.Exif)
+        for tag in _KEPT:
+            if tag in exif:
+                out[tag] = exif[tag]
+        kept = {tag: shot[tag] for tag in _KEPT_EXIF if tag in shot}
+        if kept:
+            out.get_ifd(ExifTags.IFD.Exif).update(kept)
+        if not kept and not len(out):
+            return None
+        data = out.tobytes()
+    except Exception:  # malformed EXIF raises many kinds of errors
+        return None
+    return data.removeprefix(b"Exif\0\0")
+
+
+def _chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))

@@ -1,0 +1,277 @@
+"""Colours: transfer functions, primaries and ICC profiles, brought to light or to sRGB.
+
+Sources: ITU-R BT.2100-2 (HLG and PQ, tables 4 and 5), BT.2020, IEC 61966-2-1, ICC.1:2022. Only
+profiles made of a matrix and a curve per channel are applied (ICC.1:2022, 8.3.3): all that cameras
+and phones write are. A photograph with another profile is used as it is, which `fit` reports.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, UInt
+from PIL import Image
+
+from p2gs_jax.core.numerics import srgb_encode
+from p2gs_jax.scene.convert.kinds import has_gain_map
+
+Transfer = Literal["linear", "hlg", "pq"]
+
+PQ_WHITE = 1000.0
+"""Luminance that becomes 1, cd/m^2: what phones and most masters reach; above, it is saturated."""
+_HLG_A = 0.17883277
+_HLG_B, _HLG_C = 1 - 4 * _HLG_A, 0.5 - _HLG_A * np.log(4 * _HLG_A)
+_M1, _M2 = 2610 / 16384, 2523 / 4096 * 128
+_C1, _C2, _C3 = 3424 / 4096, 2413 / 4096 * 32, 2392 / 4096 * 32
+
+# Chromaticities of red, green, blue and white.
+Primaries = tuple[float, float, float, float, float, float, float, float]
+_D65 = (0.3127, 0.3290)
+BT709: Primaries = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, *_D65)
+BT2020: Primaries = (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, *_D65)
+DISPLAY_P3: Primaries = (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, *_D65)
+ADOBE_RGB: Primaries = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, *_D65)
+
+# Bradford's cone responses.
+_BRADFORD = np.array(
+    [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]]
+)
+# The white of the profile connection space, D50.
+_PCS_WHITE = np.array([0.9642, 1.0, 0.8249])
+# Colours that move by less than this, display values, are sRGB's.
+_INVISIBLE = 0.004
+_INTEROPERABILITY, _INTEROP_INDEX = 0xA005, 1
+# How DCF marks Adobe RGB where there is no profile.
+_DCF_OPTION = "R03"
+_ENTRIES = 1024
+GAIN_MAP_UNUSED = (
+    "carry a gain map for bright displays; the photograph itself is used, the map is not."
+)
+
+
+def to_light(signal: Float[np.ndarray, "..."], transfer: Transfer) -> Float[np.ndarray, "..."]:
+    """Return light in [0, 1] of a signal in [0, 1], red, green and blue as coded.
+
+    HLG gives the light of the scene, 1 being the brightest the code can hold; PQ that of the
+    reference display, 1 being `PQ_WHITE`.
+    """
+    x = np.clip(signal, 0.0, 1.0)
+    if transfer == "hlg":
+        return np.where(x <= 0.5, x * x / 3, (np.exp((x - _HLG_C) / _HLG_A) + _HLG_B) / 12)
+    if transfer == "pq":
+        root = x ** (1 / _M2)
+        light = (np.maximum(root - _C1, 0) / (_C2 - _C3 * root)) ** (1 / _M1)
+        return np.minimum(light * (10000 / PQ_WHITE), 1.0)
+    return x
+
+
+def rgb_to_xyz(primaries: Primaries) -> Float[np.ndarray, "3 3"]:
+    """Return the matrix from linear colours to XYZ, white having Y = 1."""
+    xy = np.array(primaries).reshape(4, 2)
+    columns = np.stack([xy[:, 0] / xy[:, 1], np.ones(4), (1 - xy.sum(1)) / xy[:, 1]])
+    scale = np.linalg.solve(columns[:, :3], columns[:, 3])
+    return columns[:, :3] * scale
+
+
+def adapted(
+    from_white: Float[np.ndarray, " 3"], to_white: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, "3 3"]:
+    """Return the matrix that carries XYZ from one white to another (Bradford)."""
+    gain = (_BRADFORD @ to_white) / (_BRADFORD @ from_white)
+    return np.linalg.inv(_BRADFORD) @ np.diag(gain) @ _BRADFORD
+
+
+def to_srgb_matrix(primaries: Primaries) -> Float[np.ndarray, "3 3"]:
+    """Return the matrix from linear colours in other primaries to those in sRGB's."""
+    own, srgb = rgb_to_xyz(primaries), rgb_to_xyz(BT709)
+    return np.linalg.inv(srgb) @ adapted(own.sum(1), srgb.sum(1)) @ own
+
+
+@dataclass(frozen=True)
+class Profile:
+    """A colour space of photographs other than sRGB.
+
+    Attributes:
+        name: as the profile describes itself.
+        decode: light of `_ENTRIES` evenly spaced values from 0 to 1 by channel; None: the profile
+            is made of tables, which are not applied here.
+        matrix: from that light to linear sRGB.
+    """
+
+    name: str
+    decode: Float[np.ndarray, "n 3"] | None = None
+    matrix: Float[np.ndarray, "3 3"] | None = None
+
+
+def profile_of(image: Image.Image) -> Profile | None:
+    """Return the colour space in the header of a photograph; None: sRGB, grey or unknown."""
+    data = image.info.get("icc_profile")
+    if data:
+        return read_profile(bytes(data))
+    try:
+        index = image.getexif().get_ifd(_INTEROPERABILITY).get(_INTEROP_INDEX)
+    except Exception:  # malformed EXIF raises many kinds of errors
+        return None
+    return adobe_rgb() if str(index).strip("\0 ") == _DCF_OPTION else None
+
+
+def adobe_rgb() -> Profile:
+    """Return Adobe RGB (1998)."""
+    curve = np.linspace(0, 1, _ENTRIES)[:, None] ** (563 / 256)
+    matrix = np.linalg.inv(rgb_to_xyz(BT709)) @ rgb_to_xyz(ADOBE_RGB)
+    return Profile("Adobe RGB (1998)", np.repeat(curve, 3, 1), matrix)
+
+
+def read_profile(data: bytes) -> Profile | None:
+    """Return the colour space that an ICC profile describes; None: sRGB, grey or broken."""
+    try:
+        tags = _tags(data)
+        if data[16:20] != b"RGB ":
+            return None
+        name = _text(tags.get(b"desc", b"")) or "unnamed"
+        if not {b"rXYZ", b"gXYZ", b"bXYZ", b"rTRC", b"gTRC", b"bTRC"} <= tags.keys():
+            return Profile(name)
+        columns = [_xyz(tags[key]) for key in (b"rXYZ", b"gXYZ", b"bXYZ")]
+        curves = [_curve(tags[key]) for key in (b"rTRC", b"gTRC", b"bTRC")]
+    except (struct.error, ValueError, IndexError):
+        return None
+    srgb = rgb_to_xyz(BT709)
+    matrix = np.linalg.inv(srgb) @ adapted(_PCS_WHITE, srgb.sum(1)) @ np.stack(columns, 1)
+    profile = Profile(name, np.stack(curves, 1), matrix)
+    return None if _is_srgb(profile) else profile
+
+
+def to_srgb(pixels: UInt[np.ndarray, "h w 3"], profile: Profile) -> UInt[np.ndarray, "h w 3"]:
+    """Return RGB colours in sRGB as 16 bits, since 8 would be rounded twice.
+
+    A profile made of tables leaves them alone. What sRGB cannot show is clipped: such channels
+    count as black or saturated, as if the camera had written sRGB.
+    """
+    if profile.decode is None or profile.matrix is None:
+        return pixels
+    top = np.iinfo(pixels.dtype).max
+    levels = np.arange(top + 1) / top
+    grid = np.linspace(0, 1, _ENTRIES)
+    table = np.stack([np.interp(levels, grid, c) for c in profile.decode.T], 1).astype(np.float32)
+    light = np.stack([table[pixels[..., c], c] for c in range(3)], -1)
+    return encode_16(light @ profile.matrix.T.astype(np.float32))
+
+
+def encode_16(light: Float[np.ndarray, "..."]) -> UInt[np.ndarray, "..."]:
+    """Return light in [0, 1] as sRGB in 16 bits; what is outside is clipped."""
+    return np.rint(srgb_encode(light) * 65535).astype(np.uint16)
+
+
+def with_profile_applied(
+    data: bytes, pixels: UInt[np.ndarray, "h w c"]
+) -> UInt[np.ndarray, "h w c"]:
+    """Return the colours of a photograph in sRGB, by the profile in its file.
+
+    Args:
+        data: the bytes of the file.
+        pixels: as OpenCV decodes them: B G R, perhaps with alpha behind.
+    """
+    if pixels.ndim != 3 or pixels.shape[2] < 3 or pixels.dtype not in (np.uint8, np.uint16):
+        return pixels
+    try:
+        with Image.open(io.BytesIO(data)) as image:
+            profile = profile_of(image)
+    except Exception:  # nothing is known of what Pillow cannot open
+        return pixels
+    if profile is None or profile.decode is None:
+        return pixels
+    colours = to_srgb(pixels[..., 2::-1], profile)[..., ::-1]
+    if pixels.shape[2] == 3:
+        return colours
+    alpha = pixels[..., 3:].astype(np.uint16)
+    return np.concatenate([colours, alpha * 257 if pixels.dtype == np.uint8 else alpha], axis=2)
+
+
+def _is_srgb(profile: Profile) -> bool:
+    assert profile.decode is not None
+    assert profile.matrix is not None
+    grid = np.linspace(0, 1, _ENTRIES)
+    curves_alike = np.abs(srgb_encode(profile.decode) - grid[:, None]).max() < _INVISIBLE
+    return bool(curves_alike and np.abs(profile.matrix - np.eye(3)).max() < _INVISIBLE)
+
+
+def _tags(data: bytes) -> dict[bytes, bytes]:
+    if data[36:40] != b"acsp":
+        raise ValueError("not a profile")
+    (count,) = struct.unpack(">I", data[128:132])
+    rows = (struct.unpack(">4sII", data[132 + 12 * k : 144 + 12 * k]) for k in range(count))
+    return {key: data[start : start + size] for key, start, size in rows}
+
+
+def _text(tag: bytes) -> str:
+    if tag[:4] == b"desc":
+        (size,) = struct.unpack(">I", tag[8:12])
+        return tag[12 : 12 + size].decode("latin-1").strip("\0 ")
+    if tag[:4] == b"mluc":
+        size, start = struct.unpack(">II", tag[20:28])
+        return tag[start : start + size].decode("utf-16-be", "replace").strip("\0 ")
+    return ""
+
+
+def _xyz(tag: bytes) -> Float[np.ndarray, " 3"]:
+    if tag[:4] != b"XYZ ":
+        raise ValueError("not a colour")
+    return np.array(struct.unpack(">3i", tag[8:20])) / 65536
+
+
+def _curve(tag: bytes) -> Float[np.ndarray, " n"]:
+    """Return the light of evenly spaced values."""
+    x = np.linspace(0, 1, _ENTRIES)
+    if tag[:4] == b"curv":
+        (count,) = struct.unpack(">I", tag[8:12])
+        if count == 0:
+            return x
+        values = np.array(struct.unpack(f">{count}H", tag[12 : 12 + 2 * count]), float)
+        if count == 1:
+            return x ** (values[0] / 256)
+        return np.interp(x, np.linspace(0, 1, count), values / 65535)
+    if tag[:4] != b"para":
+        raise ValueError("not a curve")
+    (kind,) = struct.unpack(">H", tag[8:10])
+    count = (1, 3, 4, 5, 7)[kind]
+    p = np.array(struct.unpack(f">{count}i", tag[12 : 12 + 4 * count])) / 65536
+    if kind == 0:
+        return x ** p[0]
+    g, a, b = p[:3]
+    # Below `start` a line, above it a power.
+    slope, start = (0.0, -b / a) if kind <= 2 else p[3:5]
+    lift = {1: 0.0, 2: p[-1], 3: 0.0, 4: p[-2]}[kind]
+    foot = {1: 0.0, 2: p[-1], 3: 0.0, 4: p[-1]}[kind]
+    return np.where(x >= start, np.maximum(a * x + b, 0) ** g + lift, slope * x + foot)
+
+
+def colour_notes(paths: Iterable[Path]) -> tuple[str, ...]:
+    """Return what the user should know of profiles and gain maps; headers are read, no pixels."""
+    applied: Counter[str] = Counter()
+    kept: Counter[str] = Counter()
+    maps = 0
+    for path in paths:
+        maps += has_gain_map(path)
+        try:
+            with Image.open(path) as image:
+                profile = profile_of(image)
+        except Exception:  # whoever decodes it complains
+            continue
+        if profile is not None:
+            (kept if profile.decode is None else applied)[profile.name] += 1
+    out = [
+        f"{n} photographs are in {name}; they are converted to sRGB." for name, n in applied.items()
+    ]
+    out += [
+        f"{n} photographs have the colour profile {name}, made of tables, which is not applied: "
+        "their colours count as sRGB."
+        for name, n in kept.items()
+    ]
+    return (*out, f"{maps} photographs {GAIN_MAP_UNUSED}") if maps else tuple(out)

@@ -1,0 +1,115 @@
+"""Exposures known beforehand: from a CSV file, or from the EXIF of views."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from p2gs_jax.core.numerics import LN2
+from p2gs_jax.errors import UserError, broken
+from p2gs_jax.types import View
+
+KINDS = ("ev", "exposure", "rel_exposure_ev", "exposure_time_s")
+
+
+def read_known_exposures(source: str, views: list[View]) -> Float[np.ndarray, " v"]:
+    """Return natural logarithms of known exposures, NaN where nothing is known.
+
+    Args:
+        source: `exif`, or a CSV file with a column `image` or `file` (name of the view, or its
+            last part) and one of `ev`, `rel_exposure_ev` (stops), `exposure` (linear, > 0) or
+            `exposure_time_s` (seconds).
+        views: the views wanted, in order.
+
+    Raises:
+        UserError: the file cannot be used, or holds none of the views.
+    """
+    if source == "exif":
+        values = _exif_ev(views) * LN2
+        if not np.isfinite(values).any():
+            raise UserError(
+                "no photograph carries exposure time, f-number and ISO in its EXIF.",
+                fix="give a CSV file to --known-exposures, or leave it out",
+            )
+        return values
+    table = _read(Path(source))
+    found = (table.get(view.name, table.get(Path(view.name).name)) for view in views)
+    values = np.array([np.nan if value is None else value for value in found], float)
+    if not np.isfinite(values).any():
+        example = views[0].name if views else "image.jpg"
+        why = f"names none of the {len(views)} training views."
+        raise broken(source, why, f"write names as the scene does, for example {example}")
+    return values
+
+
+def check_source(source: str | None) -> None:
+    """Check that a source of `read_known_exposures`, or none, can be used: before there are views.
+
+    Raises:
+        UserError: the file cannot be used.
+    """
+    if source not in (None, "exif"):
+        _read(Path(source))
+
+
+def stated_ev(source: str | None, views: list[View]) -> Float[np.ndarray, " v"]:
+    """Return stated exposures in stops, up to a constant; NaN where nothing is stated.
+
+    The source is that of `read_known_exposures`; None takes EXIF where there is any.
+
+    Raises:
+        UserError: as of `read_known_exposures`.
+    """
+    if source is None:
+        return _exif_ev(views)
+    return read_known_exposures(source, views) / LN2
+
+
+def _exif_ev(views: list[View]) -> Float[np.ndarray, " v"]:
+    return np.array([np.nan if v.exif_ev is None else v.exif_ev for v in views], float)
+
+
+def _read(path: Path) -> dict[str, float]:
+    """Return the natural logarithms of the exposures in a CSV file, by name."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        why = f"cannot be read: {getattr(error, 'strerror', None) or error}."
+        fix = "name a CSV file with the columns image and ev, or say exif"
+        raise broken(path, why, fix) from error
+    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    reader = csv.DictReader(lines)
+    try:
+        names = [n.strip() for n in reader.fieldnames or []]
+        reader.fieldnames = names
+        rows = list(reader)
+    except csv.Error as error:
+        raise broken(path, f"is not a CSV file: {error}.", "write it again") from None
+    kind = next((n for n in KINDS if n in names), None)
+    name = next((n for n in ("image", "file") if n in names), None)
+    if name is None or kind is None:
+        why = f"has the columns {', '.join(names) or 'none'}."
+        raise broken(path, why, f"it needs `image` and one of {', '.join(KINDS)}")
+    out = {}
+    for number, row in enumerate(rows, 2):
+        if (row[kind] or "").strip():
+            out[(row[name] or "").strip()] = _log_exposure(row[kind], kind, path, number)
+    return out
+
+
+def _log_exposure(text: str, kind: str, path: Path, line: int) -> float:
+    try:
+        value = float(text)
+        if kind.endswith("ev"):
+            log = value * LN2
+        else:
+            log = float(np.log(value)) if value > 0 else np.nan
+    except ValueError:
+        log = np.nan
+    if not np.isfinite(log):
+        fix = "write a finite number, above 0 for exposures"
+        raise broken(f"{path}, line {line}:", f"{kind} is {text!r}.", fix)
+    return log

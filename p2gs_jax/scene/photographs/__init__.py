@@ -1,8 +1,0 @@
-"""Photographs as cameras write them, made into files that everything behind can read.
-
-What a PNG, JPEG or TIFF holds is decoded as it is; a colour profile is applied then (`profiles`).
-HEIC, camera raw and files of linear light are written once, as PNG, into the run's cache
-(`develop`): structure from motion reads nothing else, and they are slow to decode. Where light is
-known, it is encoded as sRGB in 16 bits: the response that the photometry then knows is sRGB's, and
-other photographs stay at 8 bits in memory.
-"""

@@ -1,0 +1,361 @@
+"""Photographs as arrays, and the cameras that took them, at any size."""
+
+from __future__ import annotations
+
+import copy
+import shutil
+import threading
+import weakref
+from collections import OrderedDict
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float32, UInt
+
+from p2gs_jax.config import DataConfig
+from p2gs_jax.core.numerics import on_device
+from p2gs_jax.scene.drives.objects import MARGIN, MovingObjects, outlines, painted
+from p2gs_jax.scene.lens import scale_intrinsics
+from p2gs_jax.scene.masks import RANDOM, background_color
+from p2gs_jax.scene.pixels.cache import DecodersAhead, Key, PixelFiles, file_bytes
+from p2gs_jax.scene.pixels.decode import Decoded, decode, floats
+from p2gs_jax.types import Camera, Placement, TrackedObject, View
+
+# All levels of a schedule together have this many pixels per pixel of the finest.
+_LEVELS = 4 / 3
+# A background shows through what is less opaque.
+OPAQUE = 0.999
+_MAX_PREFETCHED = 4
+
+
+def size_at(view: View, max_width: int | None, shrink: float = 1.0) -> tuple[int, int]:
+    """Return (width, height) in pixels of a view after both reductions.
+
+    Its full size is first reduced to at most `max_width` pixels across, and then divided by
+    `shrink` >= 1.
+    """
+    width = view.width if max_width is None else min(view.width, max_width)
+    scale = width / view.width / max(float(shrink), 1.0)
+    return max(1, round(view.width * scale)), max(1, round(view.height * scale))
+
+
+def camera_at(
+    view: View, max_width: int | None, shrink: float = 1.0
+) -> tuple[Float32[np.ndarray, "3 3"], int, int]:
+    """Return K, width and height of a view at the size of `size_at`.
+
+    Width and height are rounded separately, and K follows each of them exactly.
+    """
+    width, height = size_at(view, max_width, shrink)
+    K = scale_intrinsics(view.K, width / view.width, height / view.height)
+    return K.astype(np.float32), width, height
+
+
+class ImageStore:
+    """The photographs of a scene, and where its moving objects are in them.
+
+    Decoded images are kept up to `cfg.cache_mb`, the rest in files where there is a folder for
+    them. All methods may be called from any thread; an `index` is the row of a view, a `shrink` the
+    factor of `size_at`.
+
+    Attributes:
+        backdrop: display values of the background that photographs with alpha are shown over; None:
+            they are shown over none.
+        random_backdrop: training draws another one for every step.
+    """
+
+    def __init__(
+        self,
+        views: Sequence[View],
+        cfg: DataConfig,
+        objects: Sequence[TrackedObject] = (),
+        moving: MovingObjects | None = None,
+        *,
+        folder: Path | None = None,
+    ):
+        """Begin with nothing in memory.
+
+        Args:
+            views: all views of the scene.
+            cfg: `max_width`, `cache_mb` and `background`.
+            objects: pixels in the boxes of those that move are left out.
+            moving: objects that Gaussians belong to, for the cameras.
+            folder: where decoded photographs go that memory does not hold; None: they are decoded
+                again when they are needed.
+
+        Raises:
+            UserError: the disk of the folder has no room for them.
+        """
+        self.views = tuple(views)
+        self.moving = moving
+        self._max_width = cfg.max_width
+        matted = any(view.alpha == "background" for view in views)
+        self.backdrop = background_color(cfg) if matted else None
+        self.random_backdrop = matted and cfg.background == RANDOM
+        self._only_opaque = False
+        limit = cfg.cache_mb * 2**20
+        files = _files_beyond(limit, views, cfg.max_width, folder)
+        self._photographs = _DecodedPhotographs(self.views, limit, files)
+        self._placements: dict[int, Placement] = {}
+        self._leave_out(objects, MARGIN)
+
+    def leaving_out(self, objects: Sequence[TrackedObject], margin: float = MARGIN) -> ImageStore:
+        """Return a store of the same photographs, decoded once for both, without some pixels.
+
+        Args:
+            objects: pixels in the boxes of those that move are left out; no others are.
+            margin: by which boxes are widened to every side, scene units.
+        """
+        other = copy.copy(self)
+        other._leave_out(objects, margin)
+        return other
+
+    def placing(self, moving: MovingObjects | None) -> ImageStore:
+        """Return a store of the same photographs whose cameras see moving objects."""
+        other = copy.copy(self)
+        other.moving, other._placements = moving, {}
+        return other
+
+    @property
+    def backdrop_values(self) -> tuple[float, float, float] | None:
+        """The backdrop as a display transform has it."""
+        if self.backdrop is None:
+            return None
+        red, green, blue = map(float, self.backdrop)
+        return red, green, blue
+
+    def only_opaque(self) -> ImageStore:
+        """Return a store of the same photographs that leaves out where a background shows through.
+
+        Exposures and seeds come from what is there.
+        """
+        if self.backdrop is None:
+            return self
+        other = copy.copy(self)
+        other._only_opaque = True
+        return other
+
+    @property
+    def cached_bytes(self) -> int:
+        """Bytes of decoded photographs held now."""
+        return self._photographs.cached_bytes
+
+    def get(
+        self, index: int, shrink: float = 1.0
+    ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
+        """Return a photograph and its mask at the size of `size_at`.
+
+        Returns:
+            Display-encoded colours in [0, 1], with alpha over the backdrop, and the mask: 1 = use,
+            0 = ignore (masked, transparent, of an object that is left out, or outside the
+            photograph after undistortion).
+
+        Raises:
+            UserError: the file or its mask is missing, broken or of another size than the model's.
+        """
+        pixels, valid = self.stored(index, shrink)
+        ldr, alpha = floats(pixels), self._decoded(index, shrink).alpha
+        if alpha is not None and self.backdrop is not None:
+            ldr += (1 - floats(alpha)[..., None]) * self.backdrop
+        return ldr, valid.astype(np.float32)
+
+    def stored(
+        self, index: int, shrink: float = 1.0
+    ) -> tuple[UInt[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
+        """Return a photograph as it is cached, read-only: integers whose maximum stands for 1.
+
+        One with alpha is premultiplied by it.
+        """
+        entry = self._decoded(index, shrink)
+        valid = entry.valid
+        if self._only_opaque and entry.alpha is not None:
+            valid = valid & (entry.alpha >= OPAQUE * np.iinfo(entry.alpha.dtype).max)
+        if not self._objects:
+            return entry.pixels, valid
+        view = self.views[index]
+        if index not in self._outlines:
+            self._outlines[index] = outlines(view, self._objects, self._margin)
+        if not self._outlines[index]:
+            return entry.pixels, valid
+        boxes = painted(self._outlines[index], view, *size_at(view, self._max_width, shrink))
+        return entry.pixels, valid & ~boxes
+
+    def alpha(self, index: int, shrink: float = 1.0) -> UInt[np.ndarray, "h w"] | None:
+        """Return the opacity of a photograph as it is cached.
+
+        None: the scene is shown over no background. Photographs without alpha are opaque.
+        """
+        if self.backdrop is None:
+            return None
+        entry = self._decoded(index, shrink)
+        if entry.alpha is None:
+            return np.full(entry.valid.shape, np.iinfo(np.uint16).max, np.uint16)
+        return entry.alpha
+
+    def camera(
+        self, index: int, shrink: float = 1.0
+    ) -> tuple[Float32[np.ndarray, "4 4"], Float32[np.ndarray, "3 3"], int, int]:
+        """Return viewmat, K, width and height of a view at the size that `get` gives it."""
+        view = self.views[index]
+        return (view.viewmat, *camera_at(view, self._max_width, shrink))
+
+    def placement(self, index: int) -> Placement | None:
+        """Return where moving objects are in a view, on the host; None: there are none."""
+        view = self.views[index]
+        if self.moving is None or view.time is None:
+            return None
+        if index not in self._placements:
+            self._placements[index] = self.moving.placement(view.viewmat, view.time)
+        return self._placements[index]
+
+    def prefetch(self, index: int, shrink: float = 1.0) -> None:
+        """Start decoding in the background; `get` then waits only for what is left.
+
+        Requests beyond a short queue are dropped; errors are raised by `get`.
+        """
+        self._photographs.prefetch(self._key(index, shrink))
+
+    def expect(self, shrinks: Sequence[float]) -> None:
+        """Begin to decode photographs that memory does not hold, each at all these sizes."""
+        rows = range(len(self.views))
+        self._photographs.expect([[self._key(row, s) for s in shrinks] for row in rows])
+
+    @property
+    def decodings(self) -> int:
+        """How many photographs this process decoded so far, each size of each counted."""
+        return self._photographs.decodings
+
+    def close(self) -> None:
+        """Stop the background thread and drop everything that is held; files stay."""
+        self._photographs.close()
+
+    def _key(self, index: int, shrink: float) -> Key:
+        return Key(index, *size_at(self.views[index], self._max_width, shrink))
+
+    def _decoded(self, index: int, shrink: float) -> Decoded:
+        return self._photographs.get(self._key(index, shrink))
+
+    def _leave_out(self, objects: Sequence[TrackedObject], margin: float) -> None:
+        self._objects, self._margin = tuple(o for o in objects if o.moving), margin
+        self._outlines: dict[int, list[np.ndarray]] = {}
+
+
+def camera_of(store: ImageStore, index: int, shrink: float = 1.0) -> Camera:
+    """Return the camera of view `index`, on the device, at the resolution that `get` gives it."""
+    viewmat, K, width, height = store.camera(index, shrink)
+    return Camera(on_device(viewmat), on_device(K), width, height, store.placement(index))
+
+
+def _files_beyond(
+    limit: int, views: Sequence[View], max_width: int | None, folder: Path | None
+) -> PixelFiles | None:
+    """Return where photographs go that memory does not hold; None: it holds all, or nowhere."""
+    if folder is None:
+        return None
+    needed = sum(file_bytes(view, size_at(view, max_width)) for view in views)
+    if _LEVELS * needed <= limit:
+        # An earlier start had less memory.
+        shutil.rmtree(folder, ignore_errors=True)
+        return None
+    files = PixelFiles(folder, views)
+    files.require_room(needed)
+    return files
+
+
+class _DecodedPhotographs:
+    """Photographs of some views, decoded on demand and kept up to a limit in bytes.
+
+    The least recently used goes first; the most recent one is always kept. With files, what is kept
+    is mapped from them, and what is not is mapped again when it is needed; without, it is decoded
+    again. Beyond that only images being worked on take memory.
+    """
+
+    def __init__(self, views: Sequence[View], limit: int, files: PixelFiles | None):
+        self.views = views
+        self.decodings = 0
+        self._limit, self._files = limit, files
+        self._cache: OrderedDict[Key, Decoded] = OrderedDict()
+        self._bytes = 0
+        self._pending: dict[Key, Future[Decoded]] = {}
+        self._lock = threading.Lock()
+        self._expected: tuple[tuple[Key, ...], ...] = tuple(() for _ in views)
+        self._ahead: DecodersAhead | None = None
+        self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="decode")
+
+    @property
+    def cached_bytes(self) -> int:
+        with self._lock:
+            return self._bytes
+
+    def get(self, key: Key) -> Decoded:
+        with self._lock:
+            entry = self._cache.get(key)
+            pending = self._pending.get(key)
+            if entry is not None:
+                self._cache.move_to_end(key)
+        if entry is None:
+            entry = self._load(key) if pending is None else pending.result()
+        return entry
+
+    def prefetch(self, key: Key) -> None:
+        with self._lock:
+            if key in self._cache or key in self._pending or len(self._pending) >= _MAX_PREFETCHED:
+                return
+            self._pending[key] = self._worker.submit(self._load_pending, key)
+
+    def expect(self, keys: Sequence[Sequence[Key]]) -> None:
+        """Begin to decode what will be asked for into the files; without files nothing happens."""
+        if self._files is None:
+            return
+        self._expected = tuple(map(tuple, keys))
+        self._ahead = DecodersAhead(self.views, self._files, self._expected)
+        weakref.finalize(self, self._ahead.close)
+
+    def close(self) -> None:
+        if self._ahead is not None:
+            self._ahead.close()
+        self._worker.shutdown(wait=True, cancel_futures=True)
+        with self._lock:
+            self._cache.clear()
+            self._pending.clear()
+            self._bytes = 0
+
+    def _load_pending(self, key: Key) -> Decoded:
+        try:
+            return self._load(key)
+        finally:
+            with self._lock:
+                self._pending.pop(key, None)
+
+    def _load(self, key: Key) -> Decoded:
+        entry = self._decoded(key) if self._files is None else self._filed(key, self._files)
+        with self._lock:
+            if key not in self._cache:
+                self._cache[key] = entry
+                self._bytes += entry.nbytes
+            while self._bytes > self._limit and len(self._cache) > 1:
+                _, dropped = self._cache.popitem(last=False)
+                self._bytes -= dropped.nbytes
+        return entry
+
+    def _decoded(self, *keys: Key) -> Decoded:
+        """Return a photograph; further sizes of it go into the files."""
+        found = decode(self.views[keys[0].view], [(key.width, key.height) for key in keys])
+        with self._lock:
+            self.decodings += len(keys)
+        if self._files is None:
+            return found[0]
+        mapped = [self._files.write(key, one) for key, one in zip(keys, found, strict=True)]
+        return mapped[0]
+
+    def _filed(self, key: Key, files: PixelFiles) -> Decoded:
+        entry = files.read(key)
+        if entry is None and self._ahead is not None:
+            self._ahead.claim(key.view)
+            entry = files.read(key)
+        if entry is None:
+            others = (k for k in self._expected[key.view] if k != key and not files.has(k))
+            entry = self._decoded(key, *others)
+        return entry

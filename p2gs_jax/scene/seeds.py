@@ -1,0 +1,145 @@
+"""Seed points: from a PLY that a scene names, or at random where nothing matches.
+
+3DGS begins NeRF's synthetic scenes with 100,000 points in a cube that is known to hold them. Here
+the volume follows from the cameras: the pixels of all training views between the nearest and the
+farthest depth, as far as at least half as many views as possible see it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+
+from p2gs_jax.core.ply import read_table, refusing
+from p2gs_jax.core.streams import Stream, generator
+from p2gs_jax.errors import broken
+from p2gs_jax.scene.rigid import camera_centers
+from p2gs_jax.scene.visibility import in_frame, project_points
+from p2gs_jax.types import Scene, View
+
+COUNT = 100_000
+# Fewer matched points than this are as good as none.
+FEWEST = 50
+# A point is kept if it is seen by this share of the views that see the most seen one.
+COMMON = 0.5
+# Where the cameras look at no common place: nearest and farthest depth, in their extent.
+APART = (0.5, 10.0)
+# More views than this add nothing.
+MOST_VIEWS = 64
+_ROUNDS = 20
+_FIX = "write it again with the tool that made it"
+
+
+def read_points(path: Path) -> tuple[Float32[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"] | None]:
+    """Return the positions and, where there are any, display colours of the points in a PLY.
+
+    Colours are red, green, blue: 0 to 255, or 0 to 1 as floats.
+
+    Raises:
+        UserError: the file is absent, is not such a PLY, or holds points that are not finite.
+    """
+    if not path.is_file():
+        fix = "put the file there, or take its name out of the .json: seeds are then found"
+        raise broken(f"the seed points {path}", "do not exist", fix)
+    with refusing(path, "points", fix=_FIX):
+        vertex = read_table(path, "vertex")
+        names = vertex.dtype.names or ()
+        points = np.stack([vertex[axis] for axis in "xyz"], 1).astype(np.float32)
+        colors = None
+        if {"red", "green", "blue"} <= set(names):
+            colors = np.stack([vertex[name] for name in ("red", "green", "blue")], 1)
+    bad = int((~np.isfinite(points).all(axis=1)).sum())
+    if bad:
+        raise broken(f"{path}:", f"{bad} of {len(points)} points are not finite", _FIX)
+    if colors is not None:
+        scale = 255.0 if colors.dtype.kind == "f" else 1.0
+        colors = np.rint(np.nan_to_num(colors * scale).clip(0, 255)).astype(np.uint8)
+    return points, colors
+
+
+def with_random_seeds(scene: Scene) -> Scene:
+    """Return a split scene with points drawn in the common volume of its training views.
+
+    Their colours are left to the photographs, and they count as no observations of anything.
+    """
+    few = len(scene.points)
+    why = f"Only {few} points were matched" if few else "Neither points nor matches"
+    views = scene.training_views
+    near, far = depth_range(views) if scene.depths is None else scene.depths
+    points = common_points(views, near, far)
+    note = (
+        f"{why}: {len(points)} seeds were drawn at random where the cameras "
+        f"look, at depths of {near:.3g} to {far:.3g}."
+    )
+    return dataclasses.replace(
+        scene,
+        points=points,
+        point_colors=None,
+        tracks=None,
+        random_seeds=True,
+        notes=(*scene.notes, note),
+    )
+
+
+def depth_range(views: Sequence[View]) -> tuple[float, float]:
+    """Return the depths between which what two or more views look at must lie, scene units."""
+    viewmats = np.stack([view.viewmat for view in views]).astype(np.float64)
+    forward = viewmats[:, 2, :3]
+    centers = camera_centers(viewmats)
+    # The point nearest to all optical axes, in least squares.
+    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
+    focus = np.linalg.lstsq(across.sum(0), np.einsum("vij,vj->i", across, centers), rcond=1e-6)[0]
+    ahead = np.einsum("vi,vi->v", focus - centers, forward)
+    distance = float(np.median(ahead))
+    tangent = max(np.hypot(v.width, v.height) / (2 * min(v.K[0, 0], v.K[1, 1])) for v in views)
+    radius = distance * min(float(tangent), 0.9)
+    missed = np.linalg.norm(np.einsum("vij,vj->vi", across, focus - centers), axis=1)
+    if (ahead > 0).all() and np.median(missed) < radius:
+        return distance - radius, distance + radius
+    extent = max(float(np.linalg.norm(centers - centers.mean(0), axis=1).max()), 1e-3)
+    return APART[0] * extent, APART[1] * extent
+
+
+def common_points(
+    views: Sequence[View], near: float, far: float, count: int = COUNT
+) -> Float32[np.ndarray, "p 3"]:
+    """Return at most `count` points that many views see, evenly in pixels and in 1 / depth.
+
+    Depths are between `near` and `far`, scene units.
+    """
+    rng = generator(0, Stream.RANDOM_SEEDS)
+    step = max(1, -(-len(views) // MOST_VIEWS))
+    judges = views[::step]
+    kept: list[np.ndarray] = []
+    best, found = 0, 0
+    for _ in range(_ROUNDS):
+        points = _drawn(views, near, far, count, rng)
+        seen = np.zeros(len(points), int)
+        for view in judges:
+            seen += in_frame(*project_points(points, view), view.width, view.height)
+        best = max(best, int(seen.max()))
+        chosen = points[seen >= COMMON * best]
+        kept.append(chosen)
+        found += len(chosen)
+        if found >= count:
+            break
+    return np.concatenate(kept)[:count].astype(np.float32)
+
+
+def _drawn(
+    views: Sequence[View], near: float, far: float, count: int, rng: np.random.Generator
+) -> Float[np.ndarray, "n 3"]:
+    """Return random points in front of random views."""
+    rows = rng.integers(len(views), size=count)
+    share = rng.random((count, 2))
+    depth = 1 / rng.uniform(1 / far, 1 / near, count)
+    sizes = np.array([(v.width, v.height) for v in views], float)[rows]
+    K = np.stack([v.K for v in views]).astype(np.float64)[rows]
+    viewmats = np.stack([v.viewmat for v in views]).astype(np.float64)[rows]
+    xy = (share * sizes - K[:, :2, 2]) / np.stack([K[:, 0, 0], K[:, 1, 1]], 1)
+    local = np.concatenate([xy, np.ones((count, 1))], 1) * depth[:, None]
+    return np.einsum("nji,nj->ni", viewmats[:, :3, :3], local - viewmats[:, :3, 3])

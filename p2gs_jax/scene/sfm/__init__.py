@@ -1,0 +1,1 @@
+"""Structure from motion with COLMAP: cameras and points from photographs, or points alone."""

@@ -1,1 +1,0 @@
-"""Videos as scenes: which frames are worth keeping, and these as photographs."""

@@ -1,0 +1,246 @@
+"""Every protocol of an evaluation: LPIPS where there are weights, views that tell nothing."""
+
+import dataclasses
+import json
+
+import chex
+import cv2
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from lpips_files import made_arrays, write_weights
+
+from p2gs_jax.cli.tables import print_metrics
+from p2gs_jax.config import FitConfig, LossConfig, PhotometryConfig
+from p2gs_jax.evaluation import evaluate as evaluation
+from p2gs_jax.evaluation.evaluate import evaluate
+from p2gs_jax.evaluation.lpips import lpips, read_lpips_weights
+from p2gs_jax.evaluation.metered import MeteredViews
+from p2gs_jax.evaluation.passes import ArrayStore
+from p2gs_jax.evaluation.scores import Untold, untold_notes
+from p2gs_jax.jobs.sweep import to_markdown
+from p2gs_jax.photometry.metering import meter
+from p2gs_jax.render.capacity import make_renderer
+from p2gs_jax.run.read import load_run
+from p2gs_jax.scene.pixels.store import ImageStore
+from p2gs_jax.types import Gaussians, Params, Photometry, Render, Scene, View
+
+HEIGHT, WIDTH = 34, 40
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("weights")
+    return read_lpips_weights(write_weights(folder / "alex.npz", made_arrays("alex")))
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """Return two training views and one held out, of noise."""
+    folder, views = tmp_path_factory.mktemp("noise"), []
+    rng = np.random.default_rng(0)
+    K = np.array([[40, 0, 20], [0, 40, 17], [0, 0, 1]], np.float32)
+    for k, split in enumerate(("train", "train", "test")):
+        path = folder / f"{k}.png"
+        cv2.imwrite(str(path), rng.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8))
+        pose = np.eye(4, dtype=np.float32)
+        views.append(View(path.name, path, "0", pose, K, WIDTH, HEIGHT, split=split))
+    points = np.zeros((0, 3), np.float32)
+    return Scene(folder, "colmap", tuple(views), points, points.astype(np.uint8))
+
+
+def judged(scene, *, slope=0.0, **options):
+    """Return the metrics of a grey fit that is darker on one side, against references."""
+    store = ImageStore(scene.views, FitConfig().data)
+
+    def shaded(gaussians, alive, camera):
+        flat = jnp.ones((camera.height, camera.width), jnp.float32)
+        across = jnp.linspace(1 - slope, 1 + slope, camera.width)
+        linear = 0.2 * jnp.tile((flat * across)[..., None], 3)
+        return Render(linear, flat, flat, jnp.int32(0), jnp.bool_(False), alive)
+
+    shapes = ((0, 3), (0, 4), (0, 3), (0,), (0, 1, 3))
+    gaussians = Gaussians(*(jnp.zeros(s, jnp.float32) for s in shapes))
+    return evaluate(
+        Params(gaussians, Photometry(jnp.zeros(2), jnp.zeros(2), "log"), None),
+        scene,
+        store,
+        shaded,
+        FitConfig(),
+        reference=lambda row: store.get(row, 1)[0],
+        **options,
+    ).metrics
+
+
+def test_every_comparison_has_lpips_where_there_are_weights(scene, weights, tmp_path, capsys):
+    metrics = judged(scene, lpips_weights=weights)
+    parts = [
+        (metrics["train"], 2),
+        (metrics["train"]["averaged"], 2),
+        (metrics["test"]["averaged"], 1),
+        (metrics["test"]["exposure_fitted"], 1),
+        (metrics["test"]["photometry_fitted"], 1),
+    ]
+    for part in metrics["reference"].values():
+        parts += [(part, 3), (part["train"], 2), (part["test"], 1)]
+    assert len(parts) == 14
+    for part, views in parts:
+        rows = [row["lpips"] for row in part["per_view"].values()]
+        assert len(rows) == views
+        assert min(rows) > 0
+        assert part["lpips"] == pytest.approx(np.mean(rows))
+    # Every exposure is 1 and every gamma sRGB's, but for the held-out view's own fitted exposure.
+    store = ImageStore(scene.views, FitConfig().data)
+    for row, part in ((0, metrics["train"]), (2, metrics["test"]["averaged"])):
+        photograph, mask = store.get(row, 1)
+        grey = np.full_like(photograph, 1.055 * 0.2 ** (1 / 2.4) - 0.055)
+        expected = float(lpips(weights, grey, photograph, mask))
+        assert part["per_view"][f"{row}.png"]["lpips"] == pytest.approx(expected, rel=1e-3)
+    averaged, fitted = (metrics["test"][name]["lpips"] for name in ("averaged", "exposure_fitted"))
+    assert fitted != pytest.approx(averaged, rel=1e-2)
+
+    print_metrics(metrics, tmp_path)
+    printed = capsys.readouterr().out
+    assert f"{metrics['test']['averaged']['lpips']:.4f}" in printed
+    assert "n/a" not in printed
+
+
+def test_nothing_is_said_without_weights(scene, tmp_path, capsys):
+    metrics = judged(scene)
+    assert "lpips" not in str(metrics)
+    assert metrics["train"]["psnr"] > 0
+    print_metrics(metrics, tmp_path)
+    printed = capsys.readouterr().out
+    rows = [line for line in printed.splitlines() if "training" in line or "held out" in line]
+    assert len(rows) == 8
+    assert all("n/a" in line for line in rows)
+
+
+def test_a_sweep_has_columns_where_runs_have_it():
+    row = {"name": "a", "seed": 0, "status": "done", "train_psnr": 20.0}
+    assert "lpips" not in to_markdown([row])
+    table = to_markdown([row | {"test_lpips_averaged": 0.25}, row | {"name": "b"}])
+    assert "| train_psnr | test_lpips_averaged |" in table
+    assert "| a | 1 of 1 | 20.00 | 0.2500 |" in table
+    assert "| b | 1 of 1 | 20.00 | - |" in table
+
+
+def test_an_evaluation_keeps_no_view_beyond_the_bound(scene, monkeypatch):
+    made = []
+
+    def bounded(most_bytes):
+        def make(usual):
+            made.append(ArrayStore(most_bytes))
+            return made[-1]
+
+        monkeypatch.setattr(evaluation, "ArrayStore", make)
+        store = ImageStore(scene.views, FitConfig().data)
+        return judged(scene, slope=0.5, radiance=lambda row: 0.01 + store.get(row, 1)[0])
+
+    roomy, tight = bounded(1 << 30), bounded(0)
+    assert made[0].bytes_held > 3 * HEIGHT * WIDTH * 3 * 4
+    assert made[1].bytes_held == 0
+    assert {"reference", "radiance"} <= set(tight)
+    chex.assert_trees_all_equal(roomy, tight)
+
+
+SIZE = (20, 30)
+EVERYTHING = np.ones(SIZE, np.float32)
+
+
+def grey(value):
+    return np.full((*SIZE, 3), value, np.float32)
+
+
+@pytest.mark.parametrize(
+    ("photograph", "known"),
+    [(grey(0.0), False), (grey(1.0), False), (grey(0.01), False), (grey(0.5), True)],
+)
+def test_black_and_saturated_photographs_tell_no_exposure(photograph, known):
+    found = Untold()
+    assert found.add("a.png", photograph, EVERYTHING, LossConfig())
+    assert found.to_dict() == ({} if known else {"exposures_unknown": ["a.png"]})
+
+
+def test_one_channel_and_a_few_pixels_are_enough_and_what_is_masked_tells_nothing():
+    few, corner = (slice(0, 1), slice(0, 1), 1), (slice(0, 5), slice(0, 5), slice(None))
+    hidden = np.where(np.arange(30) < 6, 0, EVERYTHING)
+    for change, mask, known in ((few, EVERYTHING, True), (corner, hidden, False)):
+        photograph, found = grey(0.0), Untold()
+        photograph[change] = 0.4
+        found.add("a.png", photograph, np.float32(mask), LossConfig())
+        assert (not found.exposures) == known
+    found = Untold()
+    assert not found.add("a.png", grey(0.0), 0 * EVERYTHING, LossConfig())
+    assert found.to_dict() == {"hidden": ["a.png"]}
+
+
+def test_the_notes_name_the_first_views():
+    names = [f"{k}.png" for k in range(10)]
+    hidden, unknown = untold_notes({"hidden": ["a.png"], "exposures_unknown": names})
+    assert "1 view(s) are hidden" in hidden
+    assert "(a.png)" in hidden
+    assert "10 photograph(s)" in unknown
+    assert "7.png, ...)" in unknown
+    assert untold_notes({"train": {}}) == []
+
+
+def test_hidden_views_are_left_out_of_the_scores(tmp_path, finished_run):
+    run = load_run(finished_run)
+    before = json.loads((finished_run / "metrics.json").read_text())
+    trained = list(before["train"]["per_view"])
+    held_out = list(before["test"]["averaged"]["per_view"])
+
+    def changed(view):
+        mask, black = tmp_path / f"mask_{view.name}", tmp_path / view.name
+        hidden = view.name in (trained[0], held_out[0])
+        cv2.imwrite(str(mask), np.full((view.height, view.width), 0 if hidden else 255, np.uint8))
+        cv2.imwrite(str(black), np.zeros((view.height, view.width, 3), np.uint8))
+        dark = view.name == trained[1]
+        image = black if dark else view.image_path
+        return dataclasses.replace(view, mask_path=mask, image_path=image)
+
+    scene = dataclasses.replace(run.scene, views=tuple(map(changed, run.scene.views)))
+    shown = []
+    now = evaluate(
+        run.params,
+        scene,
+        ImageStore(scene.views, run.cfg.data),
+        make_renderer(run.cfg.render, run.owner),
+        run.cfg,
+        on_view=shown.append,
+    ).metrics
+    assert sorted(now["hidden"]) == sorted([trained[0], held_out[0]])
+    assert now["exposures_unknown"] == [trained[1]]
+    assert list(now["train"]["per_view"]) == trained[1:]
+    for name in trained[2:]:
+        assert now["train"]["per_view"][name] == pytest.approx(before["train"]["per_view"][name])
+    for protocol in ("averaged", "exposure_fitted"):
+        assert list(now["test"][protocol].get("per_view", {})) == held_out[1:]
+    assert len(shown) == len(scene.views), "what is not scored is written all the same"
+
+
+KEY = 0.2
+
+
+@pytest.mark.parametrize("metered", [True, False])
+def test_held_out_views_are_scored_under_the_exposure_of_the_training_views_rule(metered):
+    def picture(level):
+        return np.full((12, 16, 3), level, np.float32), np.ones((12, 16), np.float32)
+
+    levels = np.exp2(np.random.default_rng(0).normal(-2, 1, 24))
+    drawn = np.exp2(np.random.default_rng(3).normal(0, 1, 24))
+    with ArrayStore() as arrays:
+        views = MeteredViews(arrays)
+        for k, level in enumerate(levels):
+            views.add_training(f"{k}.png", meter(*picture(level)))
+        linear, mask = picture(0.4)
+        views.add_held_out(7, meter(linear, mask), linear, linear, mask)
+        exposures = KEY / levels if metered else drawn
+        found = views.fit(exposures, 2.2, PhotometryConfig())
+        scores = views.scores(found, lambda row, image, e, *_: {"level": float(image.mean() * e)})
+    if metered:
+        assert scores[7]["level"] == pytest.approx(KEY, rel=1e-4)
+        assert scores[7]["exposure"] == pytest.approx(KEY / 0.4, rel=1e-4)
+    else:
+        assert scores == {}

@@ -1,0 +1,140 @@
+"""gsplat's `rasterization` on our kernel: against our own renders, float64 and differences."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import camera, street
+
+import p2gs_jax
+from p2gs_jax.config import RenderConfig
+from p2gs_jax.render import render_linear
+from p2gs_jax.render.harmonics import C0
+
+CFG = RenderConfig(pixels_in_flight=2048)
+WIDTH, HEIGHT = 48, 36
+BACK = np.array([[1.0, 0.5, 0.0], [2.0, 2.0, 2.0]], np.float32)
+
+
+def arguments(n=300, dtype=np.float32, seed=4):
+    """Return gsplat's arguments for a street in two cameras."""
+    rng = np.random.default_rng(seed)
+    g, cam = street(n=n, width=WIDTH, height=HEIGHT, degree=0, dtype=dtype)
+    viewmats = np.tile(np.eye(4), (2, 1, 1))
+    viewmats[1, 0, 3] = 0.3
+    return {
+        "means": g.means,
+        "quats": g.quats,
+        "scales": jnp.exp(g.log_scales),
+        "opacities": jax.nn.sigmoid(g.opacity_logits),
+        "colors": jnp.asarray(np.exp(rng.normal(-1, 1, (n, 3))), dtype),
+        "viewmats": jnp.asarray(viewmats, dtype),
+        "Ks": jnp.tile(cam.K, (2, 1, 1)),
+    }
+
+
+def draw(given, **options):
+    options = {"width": WIDTH, "height": HEIGHT, "eps2d": CFG.blur, "cfg": CFG} | options
+    return p2gs_jax.rasterization(**given, **options)
+
+
+def ours(given, k, sh, **changes):
+    """Return our own render of one camera, with the same radiance."""
+    g, _ = street(n=len(given["means"]), width=WIDTH, height=HEIGHT, degree=0)
+    g = dataclasses.replace(g, sh=sh)
+    view = camera(WIDTH, HEIGHT, float(given["Ks"][k, 0, 0]), given["viewmats"][k])
+    cfg = dataclasses.replace(CFG, radiance="linear", near=0.01, **changes)
+    return render_linear(g, jnp.ones(g.capacity, bool), view, cfg, 2**14)
+
+
+def test_two_cameras_show_what_our_own_render_shows():
+    given = arguments()
+    colors, alphas, meta = draw(given, render_mode="RGB+D")
+    assert colors.shape == (2, HEIGHT, WIDTH, 4)
+    assert alphas.shape == (2, HEIGHT, WIDTH, 1)
+    assert meta["radii"].shape == meta["means2d"].shape == (2, 300, 2)
+    assert not meta["overflow"].any()
+    assert (meta["entries"] <= meta["capacity"]).all()
+    sh = ((given["colors"] - 0.5) / C0)[:, None]
+    for k in range(2):
+        r = ours(given, k, sh)
+        np.testing.assert_allclose(colors[k, ..., :3], r.linear, atol=1e-5)
+        np.testing.assert_allclose(alphas[k, ..., 0], r.alpha, atol=1e-5)
+        np.testing.assert_allclose(colors[k, ..., 3], r.depth, atol=1e-3)
+        assert r.visible[meta["radii"][k].max(-1) > 0].all()
+
+
+def test_modes_backgrounds_and_colours_of_each_camera():
+    given = arguments()
+    both, alphas, meta = draw(given, render_mode="RGB+ED")
+    fixed = {"capacity": meta["capacity"]}
+    depth, _, _ = draw(given, render_mode="D", **fixed)
+    np.testing.assert_allclose(both[..., 3:] * jnp.maximum(alphas, 1e-10), depth, rtol=1e-5)
+    each = jnp.stack([given["colors"], 2 * given["colors"]])
+    twice, _, _ = draw(given | {"colors": each}, backgrounds=jnp.asarray(BACK), **fixed)
+    behind = (1 - alphas) * BACK[:, None, None]
+    expected = both[..., :3] * np.array([1, 2])[:, None, None, None] + behind
+    # The stop rule depends on what is brightest.
+    np.testing.assert_allclose(twice, expected, atol=2e-3)
+
+
+def test_coefficients_above_the_degree_are_ignored_and_negative_radiance_is_none():
+    given = arguments()
+    rng = np.random.default_rng(1)
+    sh = jnp.asarray(rng.normal(0, 1.0, (300, 9, 3)), jnp.float32)
+    colors, _, _ = draw(given | {"colors": sh}, sh_degree=1)
+    assert colors.min() >= 0
+    np.testing.assert_allclose(colors[0], ours(given, 0, sh[:, :4]).linear, atol=1e-5)
+
+
+def test_gradients_agree_with_float64_and_with_differences():
+    weights = np.random.default_rng(2).normal(size=(2, HEIGHT, WIDTH, 4))
+    smooth = dataclasses.replace(CFG, alpha_cutoff=1e-9, stop_error=None)
+    names = ("means", "quats", "scales", "opacities", "colors")
+
+    def objective(moving, given, cfg):
+        colors, _, _ = draw(given | moving, render_mode="RGB+D", cfg=cfg, capacity=2**14)
+        return jnp.sum(colors * weights) / weights.size
+
+    def gradient(dtype, cfg):
+        given = arguments(40, dtype)
+        moving = {k: given[k] for k in names}
+        f = jax.jit(functools.partial(objective, given=given, cfg=cfg))
+        return f, moving, jax.jit(jax.grad(f))(moving)
+
+    _, _, found = gradient(np.float32, smooth)
+    with jax.enable_x64(True):
+        exact = dataclasses.replace(smooth, implementation="reference")
+        f, moving, v = gradient(np.float64, exact)
+        for name in names:
+            error = np.linalg.norm(found[name] - v[name]) / np.linalg.norm(v[name])
+            assert error < 1e-3, name
+            direction = np.random.default_rng(3).normal(size=moving[name].shape)
+            step = 1e-6 * direction * (0.1 if name == "opacities" else 1)
+            there, back = (f(moving | {name: moving[name] + s * step}) for s in (1, -1))
+            numeric, analytic = (there - back) / 2, jnp.sum(v[name] * step)
+            assert abs(numeric - analytic) <= 1e-5 * abs(analytic) + 1e-13, name
+
+
+@pytest.mark.parametrize(
+    ("changes", "options", "says"),
+    [
+        ({}, {"render_mode": "RGBD"}, "choose RGB, D, ED"),
+        ({"colors": jnp.zeros((300, 4))}, {}, "(300, 3) is needed"),
+        ({"colors": jnp.zeros((300, 4, 3))}, {"sh_degree": 2}, "(300, 9, 3) is needed"),
+    ],
+)
+def test_what_is_not_valid_is_refused(changes, options, says):
+    with pytest.raises(ValueError, match=says.replace("(", r"\(").replace(")", r"\)")):
+        draw(arguments() | changes, **options)
+
+
+def test_a_capacity_is_wanted_inside_jit_and_an_overflow_is_reported():
+    given = arguments()
+    with pytest.raises(ValueError, match="pass capacity="):
+        jax.jit(lambda given: draw(given)[0])(given)
+    _, _, meta = draw(given, capacity=8)
+    assert meta["overflow"].all()

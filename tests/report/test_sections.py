@@ -1,0 +1,189 @@
+"""Charts, pictures and the sections of drives: what they encode, and that they can be read."""
+
+import dataclasses
+import re
+import xml.etree.ElementTree as ElementTree
+
+import numpy as np
+import pytest
+from page_tools import pictures
+
+from p2gs_jax.formats.frames import write_png
+from p2gs_jax.report.charts import SOURCES, Series, panels_chart, training_chart
+from p2gs_jax.report.photometry_sections import exposure_section
+from p2gs_jax.report.pictures import (
+    GAIN,
+    dynamic_range,
+    jpeg,
+    png,
+    signed_difference,
+    spread,
+    stop_picture,
+    stop_shares,
+)
+from p2gs_jax.report.run_files import RunFiles
+from p2gs_jax.report.run_sections import (
+    depth_section,
+    novel_section,
+    parts_section,
+    unexplained_section,
+)
+from p2gs_jax.report.svg import VARIABLES, spread_apart
+
+
+def grey(values):
+    return np.repeat(np.asarray(values, np.float32)[..., None], 3, -1)
+
+
+def test_a_difference_is_grey_where_both_agree_and_lighter_where_the_render_is_brighter():
+    shown = signed_difference(grey([[0.5, 0.6, 0.4, 0.5 + 1 / GAIN]]), grey([[0.5] * 4]))
+    np.testing.assert_allclose(shown[0, :, 0], [0.5, 0.7, 0.3, 1.0], atol=1e-5)
+
+
+def test_pictures_are_shrunk_and_survive_numbers_that_are_none():
+    shown = pictures(jpeg(np.full((40, 1200, 3), np.nan, np.float32), "a", width=600))["a"]
+    assert shown.shape == (20, 600, 3)
+    assert shown.max() == 0
+    assert pictures(png(grey([[2.0, -1.0]]), "a"))["a"].tolist() == [[[255] * 3, [0] * 3]]
+    assert 'alt="&quot;&lt;&amp;"' in jpeg(grey([[0.0]]), '"<&')
+
+
+def test_shares_of_stops_have_the_colours_of_the_picture_and_these_grow_lighter():
+    linear = grey([[1.5, 1.5, 3.0, 0.6, 1e6, 1e-6, 0.0, 1.0]])
+    shares = {stop: 8 * share for stop, share, _ in stop_shares(linear, middle=1.0)}
+    assert list(shares) == list(range(5, -7, -1))
+    assert {s: n for s, n in shares.items() if n} == {5: 1, 1: 1, 0: 3, -1: 1, -6: 2}
+    steps = grey([2.0 ** (np.arange(-6, 6) + 0.5)])
+    shown = stop_picture(steps, 1.0)[0]
+    legend = [color for *_, color in stop_shares(steps, 1.0)][::-1]
+    np.testing.assert_allclose(shown, legend, atol=1e-6)
+    assert np.all(np.diff(shown @ [0.2126, 0.7152, 0.0722]) > 0)
+
+
+def test_dynamic_range():
+    values = np.repeat(2.0 ** np.arange(0, 8.0), 100).reshape(8, 100)
+    assert dynamic_range(grey(values)) == pytest.approx(7.0, abs=0.01)
+    assert dynamic_range(np.zeros((4, 4, 3))) == 0.0
+
+
+def test_spread_takes_both_ends_and_labels_keep_their_distance():
+    assert spread([1, 2, 3], 5) == [1, 2, 3]
+    assert spread(list(range(11)), 3) == [0, 5, 10]
+    assert spread_apart([0, 50, 100], 15) == [0, 50, 100]
+    assert spread_apart([10, 10, 10], 15) == [-5, 10, 25]
+    places = spread_apart([0, 8, 12, 60], 15)
+    assert np.all(np.diff(places) >= 15 - 1e-9)
+    assert places[3] == 60
+
+
+def chart_of(error=None, second=None):
+    x = np.arange(1.0, 7.0)
+    series = [Series("found", x, np.sin(x), SOURCES["found"], error)]
+    if second is not None:
+        series.append(Series("true", x, second, SOURCES["true"]))
+    return panels_chart([("a", series)], y_label="y", x_label="x", label="l")
+
+
+def test_error_bars_are_drawn_and_missing_values_break_the_line():
+    # Two caps at each of six values, wide and narrow.
+    assert chart_of(np.full(6, 0.2)).count("<use") == chart_of().count("<use") + 24
+    values = np.array([0.0, 1, np.nan, 1, 0, np.nan])
+    line = re.findall(r'd="([^"]*)"[^>]*stroke-dasharray', chart_of(second=values))
+    assert any(path.count("M") == 2 for path in line)
+
+
+def test_charts_are_drawn_twice_in_the_page_s_colours():
+    text = chart_of(second=np.zeros(6))
+    assert text.count('role="img" aria-label="l"') == 2
+    assert not any(placeholder in text for placeholder in VARIABLES)
+    assert "var(--first)" in text
+    for svg in re.findall(r"<svg.*?</svg>", text, flags=re.DOTALL):
+        tree = ElementTree.fromstring(svg.replace("xlink:href", "href"))
+        words = ["".join(t.itertext()) for t in tree.iter("text")]
+        assert {"found", "true", "a", "x", "y"} <= set(words)
+
+
+def test_what_changes_in_a_run_is_marked():
+    steps = np.arange(0.0, 1000, 10)
+
+    def draw(marks):
+        psnr, losses = 20 + steps / 100, {"loss": 1 / (1 + steps)}
+        return training_chart(steps, psnr, losses, steps + 5, marks, label="l")
+
+    marked = draw([(500.0, "full-size images")])
+    assert "full-size images" in marked
+    # A line in each of three panels, wide and narrow.
+    assert marked.count("stroke-dasharray") == draw([]).count("stroke-dasharray") + 6
+
+
+@pytest.fixture
+def drive(tmp_path):
+    """Return a function that makes a run folder of a drive from the metrics of its sections."""
+    empty = RunFiles(tmp_path, tmp_path, None, {}, None, {}, None, [], (), (), ())
+    return lambda **metrics: dataclasses.replace(empty, metrics=metrics)
+
+
+def test_unexplained_pixels_are_counted_and_shown(drive, tmp_path):
+    problems = []
+    assert unexplained_section(drive(), problems) == ""
+    shares = {"front/00.jpg": 0.02, "front/01.jpg": 0.04}
+    write_png(tmp_path / "unexplained" / "front" / "01.png", grey(np.full((8, 12), 0.5)))
+    (tmp_path / "unexplained" / "front" / "02.png").write_text("not a picture")
+    body = unexplained_section(drive(unexplained={"share": 0.03, "per_view": shares}), problems)
+    assert all(words in body for words in ("3.0%", "front/01: 4.0%", "2.00%"))
+    assert body.count("<img") == 1
+    assert len(problems) == 1
+
+
+def test_parts_depth_and_shifted_views_are_tables(drive):
+    part = {"psnr": 30.0, "ssim": 0.9, "lpips": 0.1, "views": 4}
+    moving = {"psnr": 20.0, "ssim": 0.6, "lpips": 0.3, "views": 2}
+    scores = {"psnr": 29.0, "ssim": 0.8, "whole": part, "static": part, "moving": moving}
+    body = parts_section(drive(train=scores, test={"exposure_fitted": scores}))
+    assert body.count(">what moves<") == 2
+    assert "20.00" in body
+    assert "0.3000" in body
+    seen = {"median_m": 0.123, "median_relative": 0.02, "within_10_percent": 0.9}
+    seen |= {"missing": 0.01, "points": 12345}
+    # More than half of the points that move have no surface: their median is infinite, so null.
+    unseen = {**seen, "median_m": None, "median_relative": None, "missing": 0.6}
+    depth = {"static": seen, "moving": unseen, "views": 3}
+    body = depth_section(drive(depth={"all": depth, "held_out": {}}))
+    assert all(words in body for words in ("0.12 m", "none", "12,345"))
+    views = [
+        {"shift_m": -2.0, "unseen": 0.25, "views": 6, "depth": {"static": seen}},
+        {"shift_m": 2.0, "unseen": 0.125, "views": 6, "depth": {}},
+    ]
+    body = novel_section(drive(novel_views=views))
+    assert body.index("2 m to the left") < body.index("2 m to the right")
+    assert "25.0%" in body
+    assert "0.12 m" in body
+    views[0]["depth"] = {}
+    assert "depth error" not in novel_section(drive(novel_views=views))
+    for section in (parts_section, depth_section, novel_section):
+        assert section(drive()) == ""
+
+
+def test_exposures_of_a_drive_are_a_line_a_camera_over_seconds(drive, monkeypatch):
+    cameras = ("front", "front_left", "front_right", "left", "right", "back", "roof")
+    views = [
+        {
+            "image": f"{camera}/{k}.png",
+            "camera": camera,
+            "split": "test" if k == 2 else "train",
+            "exposure": None if k == 2 else 1.0 + k,
+            "exposure_ev": None if k == 2 else float(np.log2(1.0 + k)),
+            "exposure_fitted": 1.5 if k == 2 else None,
+            "exposure_ev_error": 0.05,
+            "exif_ev": None,
+            "gamma": None,
+        }
+        for camera in cameras
+        for k in range(5)
+    ]
+    times = {v["image"]: k / 10 for k, v in enumerate(views)}
+    monkeypatch.setattr("p2gs_jax.report.photometry_sections.read_times", lambda folder: times)
+    run = dataclasses.replace(drive(), photometry={"views": views})
+    chart = exposure_section(run, {}).split("<details>")[0]
+    assert all(f">{camera}<" in chart for camera in cameras)
+    assert "seconds" in chart
