@@ -63,7 +63,7 @@ def write_start(
     )
 
 
-def write_results(
+def write_run(
     folder: RunFolder,
     params: Params,
     scene: Scene,

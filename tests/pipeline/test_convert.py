@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
 
+from p2gs_jax import calibrate_of
 from p2gs_jax.config import PhotometryConfig, RenderConfig
 from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.errors import UserError
@@ -116,8 +117,6 @@ def test_a_model_gives_exposures_and_becomes_radiance(foreign, tmp_path, run_com
 
 
 def test_a_model_of_other_poses_is_refused(foreign, tmp_path):
-    from p2gs_jax.pipeline.calibrate_of import calibrate_of
-
     g = read_ply(foreign / "foreign.ply")
     for name, moved, word in (
         ("behind", dataclasses.replace(g, means=g.means * jnp.array([1.0, 1, -1])), "no surface"),
@@ -126,7 +125,7 @@ def test_a_model_of_other_poses_is_refused(foreign, tmp_path):
         path = tmp_path / f"{name}.ply"
         write_ply(path, moved, [])
         with pytest.raises(UserError, match=word):
-            calibrate_of(path, foreign / "scene", tmp_path / "out")
+            calibrate_of(foreign / "scene", tmp_path / "out", model=path)
     assert not (tmp_path / "out").exists()
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.jobs.configs import with_fields
-from p2gs_jax.pipeline.scale import (
+from p2gs_jax.pipeline.survey import (
     extent_of_rates,
     near_depth,
     near_plane,
@@ -68,9 +68,6 @@ def test_a_near_plane_that_cuts_nothing_stays(scene):
     assert near_plane(nearest(scene), cfg) is None
     assert near_plane(None, cfg) is None
     assert Decisions.as_asked(cfg).resolve(cfg).render.near == 0.5
-    older = Decisions.as_asked(cfg).to_dict()
-    del older["near"]
-    assert Decisions.from_dict(older).near is None
 
 
 def test_points_that_no_view_shows_have_no_depth(scene):
