@@ -169,5 +169,5 @@ def drive_format(seed: int = 0, points: bool = True) -> DriveFormat:
     """Return a reader of such drives, to put in the place of a data set's."""
     return DriveFormat(
         lambda root: (root / "cam0").is_dir(),
-        lambda root, cfg, report: recording(root, seed, points),
+        lambda root, cfg: recording(root, seed, points),
     )

@@ -148,8 +148,8 @@ class RadianceScores:
         scale = float(np.exp(shift))
 
         def judged(view) -> dict[str, float]:
-            images = (kept.read() for kept in view[2:])
-            return _view_scores(*images, brightest, shift, power, offset)
+            linear, truth, mask = (kept.read() for kept in view[2:])
+            return _view_scores(linear, truth, mask, brightest, shift, power, offset)
 
         found = map_in_order(judged, self.views)
         rows = {name: row for (name, *_), row in zip(self.views, found, strict=True)}

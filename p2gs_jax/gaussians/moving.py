@@ -16,8 +16,7 @@ from p2gs_jax.core.numerics import on_device
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.gaussians.seeds import NEIGHBOURS, gaussians_from_points, mean_radiance, merge
 from p2gs_jax.render.project import STILL
-from p2gs_jax.scene.drives.moving import MovingObjects, middle_time
-from p2gs_jax.scene.drives.object_masks import outline_of, painted
+from p2gs_jax.scene.drives.objects import MovingObjects, middle_time, outline_of, painted
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.rigid import interpolated, inverse
 from p2gs_jax.scene.visibility import project_points, unoccluded
@@ -117,7 +116,7 @@ def nodes_radiance(
     """Return the mean radiance of points of moving objects, where they were in each view."""
     still = len(scene.points)
 
-    def seen_in(view: View):
+    def seen_in(view: View, row: int):
         assert view.time is not None
         poses, there = nodes.moving.poses(view.time)
         rows = np.flatnonzero(there[nodes.owner])

@@ -134,14 +134,10 @@ def develop(
 ) -> Float32[np.ndarray, "... 3"]:
     """Return display values in [0, 1] of linear radiance.
 
-    All but the configuration is traced: changing it compiles nothing.
-
-    Args:
-        linear: radiance; an image where there is a correction or vignetting.
-        transform: how to show it.
-        positions: where vignetting takes the pixels to be, if not where they are in `linear`
-            (photometry/formation.py:places).
-        alpha: opacity of the render, for the backdrop of the transform; None puts it over nothing.
+    All but the configuration is traced: changing it compiles nothing. Where there is a
+    correction or vignetting, the radiance is an image, or lies at `positions`
+    (photometry/formation.py:places). The transform's backdrop counts if the opacity `alpha` of
+    the render is given.
     """
     how = (transform.capture, transform.correction, positions, transform.matte(alpha))
     return np.asarray(_develop(linear, *how, transform.formation))
@@ -194,18 +190,12 @@ def with_capture(transform: DisplayTransform, taken: Capture) -> DisplayTransfor
 
 @dataclass(frozen=True)
 class MeanParameters:
-    """Parameters of a view that has none of its own: means over the training views.
+    """Parameters of a view that has none of its own: means over the training views."""
 
-    Attributes:
-        exposure: arithmetic mean (paper, eq. 6).
-        exposure_geometric: geometric mean, which the gauges leave in place.
-        gamma: arithmetic mean.
-        white_balance: mean of the log factors, or None where white balance is not modelled.
-    """
-
-    exposure: float
-    exposure_geometric: float
-    gamma: float
+    exposure: float  # arithmetic mean (paper, eq. 6)
+    exposure_geometric: float  # geometric mean, which the gauges leave in place
+    gamma: float  # arithmetic mean
+    # Mean of the log factors, or None where white balance is not modelled.
     white_balance: tuple[float, float, float] | None = None
 
 
@@ -224,18 +214,12 @@ def mean_parameters(photometry: Photometry) -> MeanParameters:
 def usual_display(
     params: Params, taken_by: Sequence[str], camera: str | None, cfg: PhotometryConfig
 ) -> DisplayTransform:
-    """Return how a view is shown that has no parameters of its own.
+    """Return how a view of a camera (None: of none) is shown that has no parameters of its own.
 
-    Its exposure is the geometric mean over the training views, its gamma and its correction are the
-    mean ones. Its white balance is the mean over all training views, or over those of its camera
-    where it varies by camera only. Its vignetting and its response are its
-    camera's, those of a correction as well.
-
-    Args:
-        params: the fit.
-        taken_by: the camera of every training view.
-        camera: the camera of the view; None: none of them, as for free views.
-        cfg: the formation model.
+    Its exposure is the geometric mean over the training views, its gamma and its correction are
+    the mean ones. Its white balance is the mean over all training views, or over those of its
+    camera where it varies by camera only. Its vignetting and its response are its camera's,
+    those of a correction as well. `taken_by` is the camera of every training view.
     """
     taken: Photometry = jax.tree.map(np.asarray, params.photometry)
     mean = mean_parameters(taken)

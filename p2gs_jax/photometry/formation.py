@@ -23,7 +23,7 @@ from jaxtyping import Array, Float, Int
 
 from p2gs_jax.config import CameraFormation, PhotometryConfig
 from p2gs_jax.core.numerics import Scalar, Values, namespace, positive_pow, safe_log
-from p2gs_jax.photometry.appearance import Correction, corrected
+from p2gs_jax.photometry.appearance import Correction, Formation, corrected
 from p2gs_jax.photometry.response import DARKEST, UNKNOWN, decode, encode
 from p2gs_jax.types import GAMMA_SRGB, Capture
 
@@ -37,20 +37,8 @@ CameraRow = Int[Array, "..."] | int | None
 Positions = Float[Array, "*n 2"] | Float[np.ndarray, "*n 2"] | None
 
 
-def oetf(linear: Values, curve: str) -> Values:
-    """Encode linear values with the base curve; values above 1 continue it."""
-    if curve == "linear":
-        return linear
-    if curve == "power":
-        return positive_pow(linear, 1.0 / GAMMA_SRGB, EXPOSED_FLOOR)
-    xp = namespace(linear)
-    toe = linear <= SRGB_LINEAR_END
-    high = 1.055 * positive_pow(xp.where(toe, 1.0, linear), 1.0 / 2.4, EXPOSED_FLOOR) - 0.055
-    return xp.where(toe, 12.92 * linear, high)
-
-
 def eotf(encoded: Values, curve: str) -> Values:
-    """Decode: the inverse of `oetf` on [0, inf)."""
+    """Return linear values of the base curve's encoding, on [0, inf)."""
     if curve == "linear":
         return encoded
     if curve == "power":
@@ -86,9 +74,9 @@ def vignetting_table(cfg: PhotometryConfig) -> Float[np.ndarray, "c k n"]:
 
     There is one row (K = 1) for all channels, or one for each where any camera has that.
     """
-    rows = max((len(camera.vignetting) for camera in cfg.cameras), default=1)
-    terms = max((len(row) for c in cfg.cameras for row in c.vignetting), default=1)
-    table = np.zeros((len(cfg.cameras) + 1, max(rows, 1), max(terms, 1)), np.float32)
+    rows = max([1, *(len(camera.vignetting) for camera in cfg.cameras)])
+    terms = max([1, *(len(row) for c in cfg.cameras for row in c.vignetting)])
+    table = np.zeros((len(cfg.cameras) + 1, rows, terms), np.float32)
     for place, camera in zip(table, cfg.cameras, strict=False):
         for channel in range(len(place)) if camera.vignetting else ():
             row = camera.vignetting[channel if len(camera.vignetting) > 1 else 0]
@@ -139,11 +127,7 @@ def gain(
 ) -> Any:
     """Return e W V: what exposed radiance is of radiance, shaped to broadcast against it.
 
-    Args:
-        shape: of the radiance: of an image, or of loose pixels.
-        capture: of the view, or of each pixel.
-        cfg: the vignetting of cameras.
-        positions: of loose pixels; None: of an image, or of pixels that have no place.
+    `capture` is of the view, or of each of loose pixels; these have `positions`, or none.
 
     Raises:
         ValueError: vignetting is modelled, and nobody knows where in the image the pixels lie.
@@ -173,13 +157,10 @@ def expose(
 def tone_map(
     exposed: Values, gamma: Scalar, cfg: PhotometryConfig, camera: CameraRow = None
 ) -> Values:
-    """Return the display-encoded image of exposed radiance.
+    """Return the display-encoded image of exposed radiance e L.
 
-    Args:
-        exposed: e L, any value; below 1e-6 it counts as 1e-6 with zero gradient.
-        gamma: > 0; dT/dgamma = -(ln x / gamma^2) x^(1/gamma) in the paper's form.
-        cfg: base curve, pivot, clamping.
-        camera: row in `cfg.cameras`, where cameras have curves of their own.
+    Radiance below 1e-6 counts as 1e-6 with zero gradient. In the paper's form dT/dgamma is -(ln
+    x / gamma^2) x^(1/gamma). `camera` counts where cameras have curves of their own.
     """
     xp = namespace(exposed, gamma)
     if cfg.clamp:
@@ -240,19 +221,17 @@ def formation(
 ) -> Values:
     """Return T(e W V L): what the camera records of radiance `linear`.
 
-    Args:
-        linear: radiance; an image where there is a correction.
-        capture: exposure, gamma, white balance and camera: of the view, or of each pixel.
-        cfg: base curve, pivot, clamping, cameras, kind of correction.
-        correction: of the view's display values, or None.
-        positions: where the pixels lie, if `linear` is no image and vignetting counts; see `gain`.
+    With a `correction` of the view's display values, the radiance is an image. `capture` is of
+    the view, or of each of loose pixels, which need `positions` if vignetting counts (see
+    `gain`).
     """
+    if isinstance(correction, Formation):
+        return correction.apply(linear, capture)
     exposed = expose(linear, capture, cfg, positions)
     ldr: Any = tone_map(exposed, _by_pixel(capture.gamma), cfg, capture.camera)
     if cfg.appearance is None or correction is None:
         return ldr
-    shown: Any = corrected(ldr, correction, cfg.appearance)
-    return shown
+    return corrected(ldr, correction, cfg.appearance)
 
 
 def inverse_formation(
@@ -285,13 +264,10 @@ class Matte(NamedTuple):
     colour T(e L / A), and the picture is A T(e L / A) + (1 - A) B. Whatever the curve, the exposure
     and B, the two agree where A = a and T(e L / A) = c. With a linear curve and e = 1 it is 3DGS's
     L + (1 - A) B. B passes no camera: it is the same under every exposure, as in the photographs.
-
-    Attributes:
-        alpha: opacity A of the render.
-        backdrop: display values B of red, green, blue, of all pixels or of each.
     """
 
-    alpha: Float[Array, "h w"] | Any
+    alpha: Float[Array, "h w"] | Any  # opacity A of the render
+    # Display values B of red, green, blue, of all pixels or of each.
     backdrop: Float[Array, " 3"] | Float[Array, "h w 3"] | Any
 
     def every(self, stride: int) -> Matte:
@@ -314,5 +290,4 @@ def composited(ldr: Values, matte: Matte | None) -> Values:
     if matte is None:
         return ldr
     alpha = matte.alpha[..., None]
-    shown: Any = alpha * ldr + (1 - alpha) * matte.backdrop
-    return shown
+    return alpha * ldr + (1 - alpha) * matte.backdrop

@@ -39,39 +39,25 @@ LEAST_RISE = 1e-5
 
 
 class Curves(eqx.Module):
-    """How one photograph was taken, as Luminance-GS models it.
+    """How one photograph was taken, as Luminance-GS models it."""
 
-    Attributes:
-        curve: from the photograph's coordinates to the enhanced ones, at even steps over [0, 1].
-        axes: as rows.
-        shape: of the pseudo curve: raw power, turning point and exponent.
-    """
-
+    # From the photograph's coordinates to the enhanced ones, at even steps over [0, 1].
     curve: Float[Array, " k"]
-    axes: Float[Array, "3 3"]
-    shape: Float[Array, " 3"]
+    axes: Float[Array, "3 3"]  # as rows
+    shape: Float[Array, " 3"]  # of the pseudo curve: raw power, turning point and exponent
 
 
 class Luminance(eqx.Module):
-    """The parameters of all training views.
+    """The parameters of all training views."""
 
-    Attributes:
-        curve: of all photographs.
-        hidden: weights from statistics to the hidden layer.
-        hidden_bias: of the hidden layer.
-        out: weights from there to the curve's biases and the pseudo curve's shape.
-        out_bias: of these.
-        axes: raw, of each view.
-        statistics: of each photograph; not learned.
-    """
-
-    curve: Float[Array, " k"]
-    hidden: Float[Array, "s n"]
-    hidden_bias: Float[Array, " n"]
+    curve: Float[Array, " k"]  # of all photographs
+    hidden: Float[Array, "s n"]  # weights from statistics to the hidden layer
+    hidden_bias: Float[Array, " n"]  # of the hidden layer
+    # Weights from there to the curve's biases and the pseudo curve's shape.
     out: Float[Array, "n o"]
-    out_bias: Float[Array, " o"]
-    axes: Float[Array, "v 5"]
-    statistics: Float[Array, "v s"]
+    out_bias: Float[Array, " o"]  # of these
+    axes: Float[Array, "v 5"]  # raw, of each view
+    statistics: Float[Array, "v s"]  # of each photograph; not learned
 
     def view(self, row: Int[Array, ""] | int) -> Curves:
         """Return what holds for a training view."""
@@ -164,11 +150,7 @@ def _looked_up(t: Float[Array, "*p"], curve: Float[Array, " k"]) -> Float[Array,
 
 
 def pseudo_curve(shape: Float[Array, " 3"]) -> Float[Array, " k"]:
-    """Return the curve that a power and an S make, as published; about the identity at zero.
-
-    Args:
-        shape: raw power, turning point and exponent.
-    """
+    """Return the curve that a power and an S make, as published; about the identity at zero."""
     x = jnp.linspace(0.0, 1.0, ENTRIES, dtype=shape.dtype)
     x = jnp.clip(x, DARKEST, 1.0) ** (1.0 + POWER_UNIT * shape[0])
     turn, bend = 0.5 + TURN_UNIT * shape[1], 1.0 + BEND_UNIT * shape[2]
@@ -184,10 +166,8 @@ def cumulative(
 ) -> Float[Array, " s"]:
     """Return the share of pixels up to k / (steps - 1), for k from 0 to steps - 1.
 
-    Args:
-        grey: mean of the channels, [0, 1].
-        weight: of the pixels; without any, all shares are those of evenly spread values.
-        steps: number of shares.
+    `grey` is the mean of the channels. Without any weight, shares are those of evenly spread
+    values.
     """
     bins = jnp.clip(jnp.ceil(grey * (steps - 1)), 0, steps - 1).astype(jnp.int32)
     counts = jnp.zeros(steps, grey.dtype).at[bins].add(weight)

@@ -7,7 +7,7 @@ the fitted one is whichever of them predicts the exposures that the camera itsel
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -17,7 +17,6 @@ from jaxtyping import Float
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.photometry.formation import exposed_at
-from p2gs_jax.types import Render
 
 # The meters, and what people call them.
 WORDS: dict[str, str] = {
@@ -58,9 +57,7 @@ WORTH_A_NUMBER = 0.85
 def meter(linear: Float[np.ndarray, "h w 3"], alpha: Float[np.ndarray, "h w"]) -> dict[str, float]:
     """Return what every meter reads, natural logarithm of luminance; NaN where nothing is seen.
 
-    Args:
-        linear: radiance, premultiplied by `alpha`.
-        alpha: opacity.
+    The radiance is premultiplied by the opacity.
     """
     step = max(1, int(np.sqrt(alpha.size / PIXELS)))
     weight = np.asarray(alpha[::step, ::step], np.float64)
@@ -96,20 +93,13 @@ def white_level(gamma: float, cfg: PhotometryConfig) -> float:
 
 @dataclass(frozen=True)
 class Rule:
-    """log e = offset - sum of slope times reading.
+    """log e = offset - sum of slope times reading."""
 
-    Attributes:
-        meters: what is read; none: a constant exposure.
-        slopes: of each meter: 1 keeps its reading constant, 0 ignores it.
-        offset: natural logarithm.
-        residual_ev: RMS of the exposures about it, stops.
-        left_out_ev: the same where each was predicted by a rule that was fitted without it.
-    """
-
-    meters: tuple[str, ...]
-    slopes: tuple[float, ...]
-    offset: float
-    residual_ev: float = float("nan")
+    meters: tuple[str, ...]  # what is read; none: a constant exposure
+    slopes: tuple[float, ...]  # of each meter: 1 keeps its reading constant, 0 ignores it
+    offset: float  # natural logarithm
+    residual_ev: float = float("nan")  # RMS of the exposures about it, stops
+    # The same where each was predicted by a rule that was fitted without it.
     left_out_ev: float = float("nan")
 
     def log_exposure(self, readings: Readings) -> float:
@@ -129,20 +119,13 @@ class Rule:
 
 @dataclass(frozen=True)
 class Metering:
-    """How exposures of new pictures are chosen, and what explains those of the photographs.
+    """How exposures of new pictures are chosen, and what explains those of the photographs."""
 
-    Attributes:
-        rule: what `auto` follows: the rule that explains the photographs, or a constant.
-        candidates: all rules that were compared, best first.
-        white: exposed radiance that is shown just below white.
-        names: of the training views.
-        readings: of their renders, a row a view, a column for each of `METERS`.
-    """
-
-    rule: Rule
-    candidates: tuple[Rule, ...]
-    white: float
-    names: tuple[str, ...]
+    rule: Rule  # what `auto` follows: the rule that explains the photographs, or a constant
+    candidates: tuple[Rule, ...]  # all rules that were compared, best first
+    white: float  # exposed radiance that is shown just below white
+    names: tuple[str, ...]  # of the training views
+    # Of their renders, a row a view, a column for each of `METERS`.
     readings: Float[np.ndarray, "v k"]
 
     @property
@@ -215,15 +198,10 @@ def fit_metering(
 ) -> Metering:
     """Find the metering rule that predicts the exposures of the training views best.
 
-    Every meter competes with slope 1 (the camera kept it constant) and with a free slope, and the
-    log average together with the highlights. Each stretch of views is predicted by rules that were
-    fitted to the others. A constant stays unless a rule leaves clearly less.
-
-    Args:
-        names: of the training views, in order.
-        readings: of their renders, from `meter`.
-        log_exposures: natural logarithm, as fitted.
-        white: exposed radiance that is shown just below white.
+    Every meter competes with slope 1 (the camera kept it constant) and with a free slope, and
+    the log average together with the highlights. Each stretch of views, which are in order, is
+    predicted by rules that were fitted to the others. A constant stays unless a rule leaves
+    clearly less. `white` is the exposed radiance that is shown just below white.
     """
     table = np.array([[r[name] for name in METERS] for r in readings]).reshape(-1, len(METERS))
     taken = np.isfinite(table).all(1)
@@ -242,27 +220,6 @@ def fit_metering(
     rule = best if _explains(best, errors, constant, alone) else constant
     candidates = sorted([constant, *(r for r, _ in tried)], key=lambda r: r.left_out_ev)
     return Metering(rule, tuple(candidates), white, tuple(names), table)
-
-
-def meter_views(
-    names: Sequence[str],
-    rendered: Iterable[Render],
-    exposures: Float[np.ndarray, " v"],
-    gamma: float,
-    cfg: PhotometryConfig,
-) -> Metering:
-    """Render, read and fit: `fit_metering` from pictures of the training views.
-
-    Args:
-        names: of the views.
-        rendered: one for each.
-        exposures: factors on radiance, one for each.
-        gamma: of new views.
-        cfg: tone curve.
-    """
-    readings = [meter(np.asarray(r.linear), np.asarray(r.alpha)) for r in rendered]
-    logs = np.log(np.asarray(exposures, np.float64))
-    return fit_metering(names, readings, logs, white_level(gamma, cfg))
 
 
 def _fitted(

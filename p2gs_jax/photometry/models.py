@@ -42,17 +42,11 @@ def polynomials(vignetting: VignettingKind | None) -> int:
 
 
 class Form(NamedTuple):
-    """Everything that may vary: a model of exposures and gammas, and what cameras do besides.
+    """Everything that may vary: a model of exposures and gammas, and what cameras do besides."""
 
-    Attributes:
-        model: of exposures and gammas.
-        white_balance: per what it varies; per view only where exposures do.
-        vignetting: whether cameras darken towards their corners, each channel in its own way or
-            all in the same.
-    """
-
-    model: ModelName
-    white_balance: Level | None = None
+    model: ModelName  # of exposures and gammas
+    white_balance: Level | None = None  # per what it varies; per view only where exposures do
+    # Whether cameras darken towards their corners, each channel in its own way or all in the same.
     vignetting: VignettingKind | None = None
 
     @property
@@ -128,19 +122,12 @@ class Choice(NamedTuple):
 
 
 class Scope(NamedTuple):
-    """What there is to choose from.
+    """What there is to choose from."""
 
-    Attributes:
-        cameras: number of physical cameras.
-        places: positions in the images are known: vignetting can be told.
-        curves: exposures differ enough to tell a curve by.
-        known: the curve is known, and sRGB's: no other is compared.
-    """
-
-    cameras: int
-    places: bool
-    curves: bool
-    known: bool = False
+    cameras: int  # number of physical cameras
+    places: bool  # positions in the images are known: vignetting can be told
+    curves: bool  # exposures differ enough to tell a curve by
+    known: bool = False  # the curve is known, and sRGB's: no other is compared
 
     def allows(self, choice: Choice) -> bool:
         """Return whether a choice differs from simpler ones and can be solved."""

@@ -23,39 +23,25 @@ COARSEST = 4.0
 
 @dataclass(frozen=True)
 class Observations:
-    """Display-encoded colours of points in views.
+    """Display-encoded colours of points in views."""
 
-    Attributes:
-        views: row of the view.
-        points: row of the point.
-        colors: in [0, 1].
-        spread: standard deviation of `colors` from misplacement and blur, in display values.
-        view_count: number of views.
-        point_count: number of points.
-        cameras: physical camera of each view, 0, 1, ...
-        too_coarse: observations of these points that were left out for their scale (`COARSEST`).
-        names: what people call the views; empty: their rows.
-        positions: in the image, from its centre in units of half its diagonal; None where nobody
-            knows, and nothing depends on the place.
-        camera_names: what people call the cameras; empty: their rows.
-        surroundings: log2 brightness of the photograph about each, as `surroundings` in
-            `sources/sampling.py` measures it; None where nobody knows.
-        brightest: largest display values of the pixels that `colors` are means of; None: those.
-    """
-
-    views: Labels
-    points: Labels
-    colors: PerChannel
-    spread: PerChannel
-    view_count: int
-    point_count: int
-    cameras: Int[np.ndarray, " v"]
-    too_coarse: int = 0
-    names: tuple[str, ...] = ()
+    views: Labels  # row of the view
+    points: Labels  # row of the point
+    colors: PerChannel  # in [0, 1]
+    spread: PerChannel  # standard deviation of `colors` from misplacement and blur
+    view_count: int  # number of views
+    point_count: int  # number of points
+    cameras: Int[np.ndarray, " v"]  # physical camera of each view, 0, 1, ...
+    too_coarse: int = 0  # observations that were left out for their scale (`COARSEST`)
+    names: tuple[str, ...] = ()  # of the views; empty: their rows
+    # In the image, from its centre in units of half its diagonal; None where nobody knows, and
+    # nothing depends on the place.
     positions: Float[np.ndarray, "o 2"] | None = None
-    camera_names: tuple[str, ...] = ()
+    camera_names: tuple[str, ...] = ()  # empty: their rows
+    # Log2 brightness of the photograph about each, as `surroundings` in `sources/sampling.py`
+    # measures it; None where nobody knows.
     surroundings: Float[np.ndarray, " o"] | None = None
-    brightest: PerChannel | None = None
+    brightest: PerChannel | None = None  # largest of the pixels that `colors` are means of
 
     def decoded(self, response: Response) -> tuple[PerChannel, PerChannel, PerChannel]:
         """Return log exposed radiance, its stated standard deviation and dz/dy."""
@@ -108,10 +94,9 @@ class Observations:
 def sample_pairs(
     observations: Observations, count: int, seed: int
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
-    """Draw `count` pairs of observations of the same point in different views, with replacement.
+    """Draw `count` pairs of rows of the same point in different views, with replacement.
 
-    Returns:
-        Rows of `observations`: the first of each pair, the second; none where no point is shared.
+    The first of each pair and the second are returned; none where no point is shared.
     """
     order = np.argsort(observations.points, kind="stable")
     bounds = np.flatnonzero(np.diff(observations.points[order], prepend=-1, append=-1))
@@ -124,18 +109,3 @@ def sample_pairs(
     first = rng.integers(0, lengths[pick])
     second = (first + rng.integers(1, lengths[pick])) % lengths[pick]
     return order[starts[pick] + first], order[starts[pick] + second]
-
-
-def overlapping_views(observations: Observations, fewest: int) -> list[Int[np.ndarray, " k"]]:
-    """Return for every view the others that share at least `fewest` points with it.
-
-    A view that shares fewer with all of them keeps the one it shares most with, if any.
-    """
-    ones = np.ones(len(observations.views), np.float32)
-    shape = (observations.view_count, observations.point_count)
-    seen = sp.csr_array((ones, (observations.views, observations.points)), shape=shape)
-    seen.data[:] = 1
-    shared = (seen @ seen.T).toarray()
-    np.fill_diagonal(shared, 0)
-    enough = np.minimum(fewest, np.maximum(shared.max(1, initial=0), 1))
-    return [np.flatnonzero(row >= least) for row, least in zip(shared, enough, strict=True)]

@@ -29,10 +29,7 @@ def initial_photometry(
 ) -> Photometry:
     """Return the exposures, gammas and white balances that a fit starts from.
 
-    Args:
-        solution: of the bundle adjustment; None: drawn at random (paper), or equal.
-        taken_by: the camera of every training view.
-        cfg: parametrisation and kind of start, and what the scene decided.
+    Without a solution of the bundle adjustment they are drawn at random (paper), or equal.
     """
     count = len(taken_by)
     p = cfg.photometry
@@ -62,11 +59,8 @@ def initial_appearance(
 ) -> Corrections | None:
     """Return corrections that change nothing; None: the fit has none.
 
-    Args:
-        views: training views.
-        cfg: their kind.
-        photograph: place in `views` -> display values and mask, for corrections that depend on
-            photographs; None: these do not know them yet.
+    `photograph` takes a place in `views` to display values and mask, for corrections that
+    depend on photographs; without it these do not know them yet.
     """
     kind = cfg.photometry.appearance
     if kind is None:

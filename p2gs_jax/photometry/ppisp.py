@@ -47,39 +47,24 @@ CENTRE, BRIGHTENING = 0.02, 0.01
 
 
 class OneView(eqx.Module):
-    """What light passes on its way into one photograph.
+    """What light passes on its way into one photograph."""
 
-    Attributes:
-        exposure: stops.
-        color: parameters of `homography_of`.
-        response: of the camera.
-        vignetting: of the camera; None: light without a place in an image.
-    """
-
-    exposure: Float[Array, ""]
-    color: Float[Array, " 8"]
-    response: Float[Array, "3 4"]
+    exposure: Float[Array, ""]  # stops
+    color: Float[Array, " 8"]  # parameters of `homography_of`
+    response: Float[Array, "3 4"]  # of the camera
+    # Of the camera; None: light without a place in an image.
     vignetting: Float[Array, "3 5"] | None = None
 
 
 class Ppisp(eqx.Module):
-    """The parameters of all training views and cameras; every leaf is learned.
+    """The parameters of all training views and cameras; every leaf is learned."""
 
-    Attributes:
-        exposures: stops.
-        colors: parameters of `homography_of`.
-        responses: of each camera.
-        vignettings: of each camera.
-        names: of the cameras.
-        cameras: row in `names` of each training view.
-    """
-
-    exposures: Float[Array, " v"]
-    colors: Float[Array, "v 8"]
-    responses: Float[Array, "c 3 4"]
-    vignettings: Float[Array, "c 3 5"]
-    names: tuple[str, ...] = eqx.field(static=True)
-    cameras: tuple[int, ...] = eqx.field(static=True)
+    exposures: Float[Array, " v"]  # stops
+    colors: Float[Array, "v 8"]  # parameters of `homography_of`
+    responses: Float[Array, "c 3 4"]  # of each camera
+    vignettings: Float[Array, "c 3 5"]  # of each camera
+    names: tuple[str, ...] = eqx.field(static=True)  # of the cameras
+    cameras: tuple[int, ...] = eqx.field(static=True)  # row in `names` of each training view
 
     def view(self, row: Int[Array, ""] | int) -> OneView:
         """Return what holds for a training view."""

@@ -48,18 +48,13 @@ Numbers = Float[np.ndarray, "..."]
 
 @dataclass(frozen=True)
 class Response:
-    """A response: one for all photographs, or one for each camera or channel.
+    """A response: one for all photographs, or one for each camera or channel."""
 
-    Attributes:
-        base: curve that splines are added to.
-        spline: values of log exposure added at `KNOTS`, or None; where several are, their mean.
-        by: what has a spline of its own.
-        splines: of each camera, or of red, green and blue; empty where one is for all.
-    """
-
-    base: Base = "srgb"
+    base: Base = "srgb"  # curve that splines are added to
+    # Values of log exposure added at `KNOTS`, or None; where several are, their mean.
     spline: Spline | None = None
-    by: ResponseKind = "all"
+    by: ResponseKind = "all"  # what has a spline of its own
+    # Of each camera, or of red, green and blue; empty where one is for all.
     splines: tuple[Spline, ...] = ()
 
     @property
@@ -142,12 +137,9 @@ def base_log(y: Numbers, base: Base) -> tuple[Numbers, Numbers]:
 def log_exposed(
     y: Numbers, response: Response, cameras: Int[np.ndarray, " o"] | None = None
 ) -> tuple[Numbers, Numbers]:
-    """Return z = F(y) and dz/dy.
+    """Return z = F(y) and dz/dy of display values, which are (o, 3) where splines are several.
 
-    Args:
-        y: display values; (o, 3) where splines are several.
-        response: the curve.
-        cameras: of each observation, where cameras have splines of their own.
+    `cameras` is of each observation, where cameras have splines of their own.
     """
     z, slope = base_log(y, response.base)
     if response.spline is None:
@@ -168,11 +160,8 @@ def deviation(
 ) -> Numbers:
     """Return the standard deviation of z.
 
-    Args:
-        y: photographed values.
-        slope: dz/dy.
-        spread: standard deviation in display values from misplacement and blur.
-        base: curve by which photon noise is judged.
+    `slope` is dz/dy, `spread` the standard deviation in display values from misplacement and
+    blur; photon noise is judged by the base curve.
     """
     logs, base_slope = base_log(y, base)
     exposed = np.exp(logs)
@@ -194,19 +183,12 @@ def log_slope_minimum(response: Response) -> float:
 
 
 class Tables(NamedTuple):
-    """Display values over equal steps of log x.
+    """Display values over equal steps of log x."""
 
-    Attributes:
-        first: log x of the first entry, of every row.
-        step: between entries.
-        values: display values.
-        channels: rows of one camera: 1 for all channels, or 3.
-    """
-
-    first: Float[np.ndarray, " r"]
-    step: Float[np.ndarray, " r"]
-    values: Float[np.ndarray, "r n"]
-    channels: int
+    first: Float[np.ndarray, " r"]  # log x of the first entry, of every row
+    step: Float[np.ndarray, " r"]  # between entries
+    values: Float[np.ndarray, "r n"]  # display values
+    channels: int  # rows of one camera: 1 for all channels, or 3
 
 
 @functools.lru_cache(64)
@@ -250,9 +232,8 @@ def _rows(splines: tuple[Spline, ...], channels: int) -> tuple[Spline, ...]:
 def spline_of(cfg: PhotometryConfig, camera: int | None = None) -> tuple[Spline, ...]:
     """Return the spline of a camera, on the host: one row for all channels, or one for each.
 
-    Args:
-        cfg: the formation model; without any spline the values are 0, which is sRGB.
-        camera: row in `cfg.cameras`; None or -1: one that is not there.
+    Without any spline the values are 0, which is sRGB. A camera of None or -1 is not in
+    `cfg.cameras`.
     """
     own = () if camera is None or camera < 0 else cfg.cameras[camera].splines
     if own:
@@ -270,11 +251,8 @@ def spline_of(cfg: PhotometryConfig, camera: int | None = None) -> tuple[Spline,
 def encode(log_linear: Values, cfg: PhotometryConfig, camera=None) -> Values:
     """Return display values through the table; linear in x below it, in log x above it.
 
-    Args:
-        log_linear: log exposed radiance; with responses per channel its last axis is the channel.
-        cfg: the splines.
-        camera: row in `cfg.cameras`; None: unknown. One for all, or one for every entry but for
-            the last axis.
+    With responses per channel the last axis of `log_linear` is the channel. `camera` is a row
+    in `cfg.cameras` (None: unknown): one for all, or one for every entry but for the last axis.
     """
     xp, table = namespace(log_linear, camera), tables(cfg)
     if by_camera(cfg):

@@ -33,62 +33,44 @@ PerView = Float[np.ndarray, " v"]
 
 @dataclass(frozen=True)
 class PhotometricSolution:
-    """Exposures, gammas and response, with what is known about their errors.
+    """Exposures, gammas and response, with what is known about their errors."""
 
-    Attributes:
-        model: what varies.
-        response: base curve and spline.
-        log_exposures: natural logarithm; mean 0 over each component unless exposures were known.
-        exposure_errors: standard errors of `log_exposures` (robust, gauge fixed); inf where
-            unobserved or not to be told.
-        gammas: per view.
-        gamma_errors: standard errors; 0 where gamma is not modelled, inf as above.
-        observations_per_view: usable observations.
-        component: views with equal numbers share a scale; others cannot be compared.
-        point_log_radiance: natural logarithm per channel; NaN where unobserved.
-        residual_ev: robust standard deviation of one observation, in stops.
-        view_residual_ev: the same per view.
-        view_balance_ev: median residual of red, green, blue in each view less their mean, stops:
-            what a scalar exposure leaves of a white balance; NaN where unobserved.
-        outliers: share of observations that the robust loss ignores.
-        rounds: iterations.
-        moved: largest change of a parameter in the last of them, log units.
-        converged: that was no more than the tolerance.
-        unknown_errors: observed views whose standard errors cannot be told.
-        warnings: what the user should know.
-        white_balance_level: per what the white balance varies; None: it does not.
-        white_balance: log factors on red, green, blue beside the exposure: mean 0 in every view,
-            and over the views of a component; zeros where it does not vary.
-        white_balance_errors: standard errors, as `exposure_errors`.
-        vignetting: whether cameras darken towards their corners, and each channel in its own way.
-        cameras: what each physical camera does, by its row in `Observations.cameras`; empty where
-            none does anything of its own.
-        corner_errors: standard errors of log V in the corner, per camera and row of `vignetting`.
-    """
-
-    model: ModelName
-    response: Response
+    model: ModelName  # what varies
+    response: Response  # base curve and spline
+    # Natural logarithm; mean 0 over each component unless exposures were known.
     log_exposures: PerView
+    # Standard errors of `log_exposures` (robust, gauge fixed); inf where unobserved or not to be
+    # told.
     exposure_errors: PerView
-    gammas: PerView
-    gamma_errors: PerView
-    observations_per_view: Int[np.ndarray, " v"]
+    gammas: PerView  # per view
+    gamma_errors: PerView  # standard errors; 0 where gamma is not modelled, inf as above
+    observations_per_view: Int[np.ndarray, " v"]  # usable observations
+    # Views with equal numbers share a scale; others cannot be compared.
     component: Int[np.ndarray, " v"]
+    # Natural logarithm per channel; NaN where unobserved.
     point_log_radiance: Float[np.ndarray, "p 3"]
-    residual_ev: float
-    view_residual_ev: PerView
+    residual_ev: float  # robust standard deviation of one observation, in stops
+    view_residual_ev: PerView  # the same per view
+    # Median residual of red, green, blue in each view less their mean, stops: what a scalar
+    # exposure leaves of a white balance; NaN where unobserved.
     view_balance_ev: Float[np.ndarray, "v 3"]
-    outliers: float
-    rounds: int
-    moved: float
-    converged: bool
-    unknown_errors: int
-    warnings: tuple[str, ...]
-    white_balance_level: Level | None
+    outliers: float  # share of observations that the robust loss ignores
+    rounds: int  # iterations
+    moved: float  # largest change of a parameter in the last of them, log units
+    converged: bool  # that was no more than the tolerance
+    unknown_errors: int  # observed views whose standard errors cannot be told
+    warnings: tuple[str, ...]  # what the user should know
+    white_balance_level: Level | None  # per what the white balance varies; None: it does not
+    # Log factors on red, green, blue beside the exposure: mean 0 in every view, and over the views
+    # of a component; zeros where it does not vary.
     white_balance: Float[np.ndarray, "v 3"]
-    white_balance_errors: Float[np.ndarray, "v 3"]
+    white_balance_errors: Float[np.ndarray, "v 3"]  # standard errors, as `exposure_errors`
+    # Whether cameras darken towards their corners, and each channel in its own way.
     vignetting: VignettingKind | None
+    # What each physical camera does, by its row in `Observations.cameras`; empty where none does
+    # anything of its own.
     cameras: tuple[CameraFormation, ...]
+    # Standard errors of log V in the corner, per camera and row of `vignetting`.
     corner_errors: Float[np.ndarray, "c k"]
 
     @property
@@ -108,40 +90,26 @@ class PhotometricSolution:
         return self.exposure_errors / LN2
 
     def exposures_ev_at(self, level: float, pivot: float) -> PerView:
-        """Return exposures in stops as they act on one level of tone.
+        """Return exposures in stops as they act on a linear `level` of tone, 1 = white.
 
-        Where gammas differ between views, "the exposure" depends on where it is read: at the
-        pivot by definition, at another level it includes what gamma does there.
-
-        Args:
-            level: linear value of the base curve, 1 = white.
-            pivot: linear value that gammas leave alone.
+        Where gammas differ between views, "the exposure" depends on where it is read: at
+        the pivot by definition, at another level it includes what gamma does there.
         """
         a = GAMMA_SRGB / self.gammas
         return (self.log_exposures + np.log(level / pivot) * (1 - 1 / a)) / LN2
 
 
 class Agreement(NamedTuple):
-    """Recovered exposures against stated ones (EXIF), scale aligned.
+    """Recovered exposures against stated ones (EXIF), scale aligned."""
 
-    Attributes:
-        views: how many have both.
-        correlation: of the two, in stops; NaN where one of them does not vary.
-        slope: recovered over stated, least squares; other than 1 is the power gauge or tone
-            mapping.
-        rms_ev: RMS gap in stops.
-        offset_ev: what to add to stated exposures to lay them over the recovered ones.
-        gap_ev: recovered minus stated, median removed; NaN where either is missing.
-        disagrees: views whose gap is noticeable and significant.
-    """
-
-    views: int
-    correlation: float
+    views: int  # how many have both
+    correlation: float  # of the two, in stops; NaN where one of them does not vary
+    # Recovered over stated, least squares; other than 1 is the power gauge or tone mapping.
     slope: float
-    rms_ev: float
-    offset_ev: float
-    gap_ev: PerView
-    disagrees: Bool[np.ndarray, " v"]
+    rms_ev: float  # RMS gap in stops
+    offset_ev: float  # what to add to stated exposures to lay them over the recovered ones
+    gap_ev: PerView  # recovered minus stated, median removed; NaN where either is missing
+    disagrees: Bool[np.ndarray, " v"]  # views whose gap is noticeable and significant
 
     def sentence(self, source: str = "EXIF") -> str:
         """Say it in words."""
@@ -162,12 +130,10 @@ class Agreement(NamedTuple):
 
 
 def compare(exposures_ev: PerView, errors_ev: PerView, stated_ev: PerView) -> Agreement:
-    """Compare recovered with stated exposures.
+    """Compare recovered with stated exposures, in stops.
 
-    Args:
-        exposures_ev: recovered, stops.
-        errors_ev: their standard errors; inf where unknown.
-        stated_ev: stated, stops up to a constant; NaN where unknown.
+    Errors are inf where unknown; stated exposures hold up to a constant, and are NaN where
+    unknown.
     """
     both = np.isfinite(stated_ev) & np.isfinite(errors_ev)
     gap = np.full(len(exposures_ev), np.nan)
@@ -197,14 +163,7 @@ def compare(exposures_ev: PerView, errors_ev: PerView, stated_ev: PerView) -> Ag
 def note_on_levels(
     solution: PhotometricSolution, stated_ev: PerView, agreement: Agreement, pivot: float
 ) -> list[str]:
-    """Say at which level stated exposures agree best, where gammas make them depend on it.
-
-    Args:
-        solution: exposures and gammas.
-        stated_ev: stops up to a constant; NaN where unknown.
-        agreement: of the two at the pivot.
-        pivot: linear value that gammas leave alone.
-    """
+    """Say at which level stated exposures agree best, where gammas make them depend on it."""
     if MODELS[solution.model].gamma is None or agreement.views < 3:
         return []
     errors_ev = solution.exposure_errors_ev

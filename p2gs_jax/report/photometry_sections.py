@@ -19,7 +19,7 @@ from p2gs_jax.report.run_files import RunFiles
 from p2gs_jax.report.svg import FIRST, FOURTH, INK, MUTED, SECOND, THIRD
 from p2gs_jax.run.photometry_files import CameraPhotometry, ViewPhotometry, with_curve_of
 from p2gs_jax.run.scene_file import read_times
-from p2gs_jax.scene.drives.choose import short_name
+from p2gs_jax.scene.drives.recording import short_name
 from p2gs_jax.types import GAMMA_SRGB
 
 # More cameras than this, or cameras with fewer views than this, share one panel.
@@ -64,9 +64,7 @@ def _panels(
 ) -> list[tuple[str, Sequence[Series]]]:
     """Return a panel for each camera, or one for all where there are many or small ones.
 
-    Args:
-        run: the run.
-        curves: returns the curves of a panel from its views and their places.
+    `curves` returns those of a panel from its views and their places.
     """
     by_camera = {f"camera {c}": [v for v in run.views if v["camera"] == c] for c in run.cameras}
     small = np.median([len(rows) for rows in by_camera.values()]) < FEWEST_VIEWS

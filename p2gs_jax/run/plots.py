@@ -15,7 +15,7 @@ from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.core.text import names_as_they_are, printable
 from p2gs_jax.evaluation.unexplained import WIDTH, Unexplained
-from p2gs_jax.formats.png import write_png
+from p2gs_jax.formats.frames import write_png
 from p2gs_jax.photometry.response import Response, log_exposed
 from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.scene.pixels.store import ImageStore

@@ -38,7 +38,7 @@ from p2gs_jax.run.photometry_files import (
     read_photometry,
 )
 from p2gs_jax.run.scene_file import read_objects, read_scene
-from p2gs_jax.scene.drives.moving import MovingObjects, middle_time
+from p2gs_jax.scene.drives.objects import MovingObjects, middle_time
 from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 from p2gs_jax.types import GAMMA_SRGB, Camera, Gaussians, Params, Photometry, Render, Scene
 

@@ -20,7 +20,7 @@ from jaxtyping import Int
 from p2gs_jax.core.atomic import BROKEN_ARRAYS, atomic_write
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene.drives.moving import MovingObjects
+from p2gs_jax.scene.drives.objects import MovingObjects
 from p2gs_jax.types import Distortion, Lidar, Scene, TrackedObject, Tracks, View
 
 SCENE_FILE = "scene.npz"
@@ -219,14 +219,14 @@ def write_objects(
         next(row for row, other in enumerate(scene.objects) if other is thing)
         for thing in moving.objects
     ]
-    arrays = {
+    arrays: dict[str, np.ndarray] = {
         "owner": np.asarray([] if owner is None else owner, np.int32),
         "rows": np.array(rows, np.int32),
     }
     if moving.middle is not None:
         arrays["middle"] = np.asarray(moving.middle, np.float64)
     with atomic_write(path) as temporary:
-        np.savez_compressed(temporary, **arrays)
+        np.savez_compressed(temporary, allow_pickle=False, **arrays)
 
 
 def read_objects(

@@ -15,8 +15,8 @@ from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.evaluation.evaluate import ViewResult
 from p2gs_jax.formats.exr import write_exr
+from p2gs_jax.formats.frames import write_png
 from p2gs_jax.formats.ply import write_ply, write_radiance
-from p2gs_jax.formats.png import write_png
 from p2gs_jax.gaussians.bake import bake, display_comments, display_of_splats
 from p2gs_jax.gaussians.posed import posed
 from p2gs_jax.photometry.display import develop, usual_display
@@ -29,7 +29,7 @@ from p2gs_jax.run.folder import RunFolder, remembered
 from p2gs_jax.run.photometry_files import write_appearance, write_fitted, write_metering
 from p2gs_jax.run.plots import write_summary
 from p2gs_jax.run.scene_file import write_objects, write_scene
-from p2gs_jax.scene.drives.moving import MovingObjects, middle_time
+from p2gs_jax.scene.drives.objects import MovingObjects, middle_time
 from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 from p2gs_jax.types import Params, Scene
 
@@ -63,7 +63,7 @@ def write_start(
     )
 
 
-def write_results(
+def write_run(
     folder: RunFolder,
     params: Params,
     scene: Scene,

@@ -22,8 +22,7 @@ from p2gs_jax.scene import PhotographsAlone, Video, find_scene, with_what_lies_b
 from p2gs_jax.scene.cache import Report
 from p2gs_jax.scene.convert.headers import read_exif_ev
 from p2gs_jax.scene.drives.assemble import SWEEP_SLACK_S, assemble
-from p2gs_jax.scene.drives.choose import chosen_frames
-from p2gs_jax.scene.drives.recording import Recording
+from p2gs_jax.scene.drives.recording import Recording, chosen_frames
 from p2gs_jax.scene.files import image_size
 from p2gs_jax.scene.rigid import camera_centers, interpolated, level_ahead, time_order, up_of_drive
 from p2gs_jax.scene.video import expected_frames, video_size

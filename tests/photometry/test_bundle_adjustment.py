@@ -119,16 +119,16 @@ def test_the_fixed_point_minimises_the_robust_loss(loss):
         rows = make_rows(problem, problem.usable, Response())
         bound = (robust.GEMAN_MCCLURE * fit.at.scale) ** 2
         channels = rows.weight.sum(-1)
-        prior, seen = robust.PRIOR_SPREAD, rows.by_row @ (channels / 3)
+        prior, seen = robust.PRIOR_SPREAD, rows.layout.by_row @ (channels / 3)
 
         def total(b):
-            level = fit.at.radiance[rows.row] * fit.theta.a[rows.views][..., None]
-            u = (rows.z - b[rows.views][..., None] - level) / rows.sigma
+            level = fit.at.radiance[rows.layout.row] * fit.theta.a[rows.layout.views][..., None]
+            u = (rows.z - b[rows.layout.views][..., None] - level) / rows.sigma
             square = jnp.sum(u**2 * rows.weight, -1) / jnp.maximum(channels, 1) / bound
             each = bound * channels * square / (1 + square)
             if loss == "geman_mcclure":
                 return 0.5 * jnp.sum(each)
-            of_row = jnp.zeros(rows.count).at[rows.row].add(each) / 3 / fit.at.scale**2
+            of_row = jnp.zeros(rows.layout.rows).at[rows.layout.row].add(each) / 3 / fit.at.scale**2
             weight = (prior + np.maximum(seen - 1, 0)) * 1.5 * fit.at.scale**2
             return jnp.sum(weight * jnp.log(prior + of_row))
 

@@ -13,7 +13,7 @@ from p2gs_jax.core.progress import Silent
 from p2gs_jax.formats.ply import read_ply
 from p2gs_jax.photometry.display import develop
 from p2gs_jax.scene import drives
-from p2gs_jax.scene.drives.object_masks import object_mask
+from p2gs_jax.scene.drives.objects import object_mask
 from p2gs_jax.types import Camera
 
 

@@ -10,7 +10,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.run.scene_file import read_scene, write_scene
 from p2gs_jax.scene import ImageStore, load_scene
 from p2gs_jax.scene.masks import background_color, has_alpha
-from p2gs_jax.train.views import TrainingViews
+from p2gs_jax.train.inputs import TrainingViews
 
 RNG = np.random.default_rng(0)
 

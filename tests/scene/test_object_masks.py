@@ -7,8 +7,7 @@ from moving_box import BOX_TO_WORLD, lens
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.scene import ImageStore
-from p2gs_jax.scene.drives.moving import MovingObjects
-from p2gs_jax.scene.drives.object_masks import object_mask
+from p2gs_jax.scene.drives.objects import MovingObjects, object_mask
 from p2gs_jax.types import TrackedObject, View
 
 WIDTH, HEIGHT = 160, 96

@@ -23,7 +23,7 @@ from p2gs_jax.run.read import load_run
 from p2gs_jax.scene.exposures import check_source
 
 NAME = "broken_drives"
-ABOUT = """Drives of nuScenes, Argoverse 2, Waymo, PandaSet and KITTI (three layouts), tables of
+ABOUT = """Drives of nuScenes, Argoverse 2, Waymo, PandaSet and KITTI, tables of
 exposures, lists of cameras and the files of a finished run, each cut, flipped, out of range, empty
 or gone, and tables whose names lead out of the drive. Each is read whole, or refused with code 2 by
 a message that names file, fault and remedy, within 30 s and 2 GB."""
@@ -33,13 +33,11 @@ DAMAGES = 12
 TESTS = Path(__file__).resolve().parents[3] / "tests"
 # Which of the tests' writers makes a small drive of each set.
 WRITERS = {
-    "nuscenes": ("scene.drives.test_nuscenes", "write_set"),
-    "argoverse": ("scene.drives.test_argoverse", "write_log"),
-    "waymo": ("scene.drives.test_waymo", "write_segment"),
-    "kitti_raw": ("scene.drives.made_kitti", "write_raw"),
-    "kitti_odometry": ("scene.drives.test_kitti_odometry_drives", "write_benchmark"),
-    "kitti_360": ("scene.drives.test_kitti_360_drives", "write_set"),
-    "pandaset": ("scene.drives.test_pandaset_drives", "write_sequence"),
+    "nuscenes": "scene.drives.writers_nuscenes",
+    "argoverse": "scene.drives.writers_argoverse",
+    "waymo": "scene.drives.writers_waymo",
+    "kitti_raw": "scene.drives.writers_kitti",
+    "pandaset": "scene.drives.writers_pandaset",
 }
 RUN_FILES = ("config.json", "photometry.json", "decisions.json", "scene.npz", "radiance.ply")
 # JAX starts in each of these children, and asks for address space that it does not use.
@@ -66,11 +64,10 @@ def trials(made: Path) -> Iterator[Trial]:
 
 def _drives(made: Path) -> Iterator[Trial]:
     sys.path.insert(0, str(TESTS))
-    for number, (name, (module, function)) in enumerate(WRITERS.items()):
+    for number, (name, module) in enumerate(WRITERS.items()):
         whole = made / name
         whole.mkdir(parents=True)
-        written = getattr(importlib.import_module(module), function)(whole / "set")
-        drive = written.relative_to(whole)
+        drive = importlib.import_module(module).write(whole / "set").root.relative_to(whole)
         files = sorted(
             p.relative_to(whole).as_posix()
             for p in whole.rglob("*")

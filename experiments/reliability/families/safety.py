@@ -20,7 +20,7 @@ from reliability.family import Family, Report
 from reliability.reading import FIT, command, read
 from reliability.trials import REFUSED, Trial, run_trials
 
-from p2gs_jax.scene.drives.pickled_tables import read_table
+from p2gs_jax.scene.drives.tables import read_pickled
 
 NAME = "safety"
 ABOUT = """The viewer listens on loopback unless told otherwise, refuses pages of other sites and
@@ -92,7 +92,7 @@ def _asks(outside: bool, path: str, headers: dict[str, str], served: bool) -> Ca
     def act(root: Path) -> int:
         import viser
 
-        from p2gs_jax.viewer.guard import Guard, guard_of, guarded
+        from p2gs_jax.viewer.server import Guard, guard_of, guarded
 
         guard = Guard(None, SECRET) if outside else guard_of(LOOPBACK)
         with guarded(guard):
@@ -112,7 +112,7 @@ def _asks(outside: bool, path: str, headers: dict[str, str], served: bool) -> Ca
 
 def _listens(root: Path) -> int:
     from p2gs_jax.cli.pages import View
-    from p2gs_jax.viewer.guard import guard_of, is_loopback
+    from p2gs_jax.viewer.server import guard_of, is_loopback
 
     host = View(run=root).host
     return forbidden(not is_loopback(host) or guard_of("0.0.0.0").token is None, f"open: {host}")
@@ -181,7 +181,7 @@ def _as_run(root: Path) -> int:
 def _table(path: Path) -> int:
     from p2gs_jax.errors import UserError
 
-    return _refusal(lambda: read_table(path), UserError)
+    return _refusal(lambda: read_pickled(path), UserError)
 
 
 def _refusal(act: Callable[[], object], kind: type[Exception]) -> int:
@@ -225,7 +225,7 @@ def unsafe_calls(package: Path) -> list[str]:
 
 
 # Reads from the pipe of the process that started it, no file.
-TRUSTED = ("scene/pixels/worker.py: pickle.load",)
+TRUSTED = ("scene/pixels/cache.py: pickle.load",)
 
 
 def _forbidden_calls(root: Path) -> int:

@@ -53,19 +53,14 @@ Asked = Callable[[Parameters], Float[np.ndarray, "n c"]]
 
 
 class Uncertainty(NamedTuple):
-    """How sure a solution is.
+    """How sure a solution is."""
 
-    Attributes:
-        roots: columns whose outer products sum to the covariance of all parameters.
-        unknown: directions that the observations do not hold: `roots` knows nothing of them.
-        few: factors on the errors of views that few clusters tell of.
-        system: what was solved.
-    """
-
+    # Columns whose outer products sum to the covariance of all parameters.
     roots: Float[np.ndarray, "d r"]
+    # Directions that the observations do not hold: `roots` knows nothing of them.
     unknown: Float[np.ndarray, "d k"]
-    few: Float[np.ndarray, " v"]
-    system: System
+    few: Float[np.ndarray, " v"]  # factors on the errors of views that few clusters tell of
+    system: System  # what was solved
 
     def of(self, asked: Asked) -> Float[np.ndarray, " n"]:
         """Return the standard deviations of what is asked; inf where nothing is known."""
@@ -81,18 +76,13 @@ def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncerta
     """Return the robust covariance of all parameters: bread, meat, bread (Huber; White).
 
     Residuals of the three channels of an observation, of a point, and of its neighbours are not
-    independent: the meat is summed over clusters, and counts them once. What regions of an image
-    share besides is added to it.
-
-    Args:
-        fit: the solution.
-        system: what it was solved with.
-        observations: what it was solved from.
+    independent: the meat is summed over clusters, and counts them once. What regions of an
+    image share besides is added to it.
     """
     rows = fit.model.rows
-    clusters = side_by_side(observations, rows.row)
+    clusters = side_by_side(observations, rows.layout.row)
     each = summed(fit.model, fit.theta, fit.at, fit.at.weight * fit.at.residual, clusters)
-    if observations.positions is not None and len(rows.row):
+    if observations.positions is not None and len(rows.layout.row):
         labels = regions(observations.positions, observations.views, SHARED_REGION)
         # In all points, also those that count for little: what matte ones share is less.
         alike = weigh(fit.model, fit.theta, fit.at.weight, "geman_mcclure")
@@ -101,7 +91,7 @@ def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncerta
             shared = deviation * _shared_scores(fit.model, fit.theta, fit.at, labels)
             each = sp.csr_array(sp.vstack([each, shared]))
     seen = rows.weight.any(1)
-    few = _small_sample(clusters[seen], rows.views[seen], rows.view_count)
+    few = _small_sample(clusters[seen], rows.layout.views[seen], rows.layout.view_count)
     bread = fit.normal * fit.at.curvature + system.priors.normal
     gauges = np.sqrt(gauge_strength(bread, system.unknowns)) * system.anchors.rows
     if not is_small(system.directions):
@@ -145,12 +135,10 @@ def _drawn(bread, gauges, each, system: System) -> Float[np.ndarray, "d r"]:
 def regions(
     positions: Float[np.ndarray, "n 2"], views: Int[np.ndarray, " n"], side: float
 ) -> Int[np.ndarray, " n"]:
-    """Return labels 0, 1, ... of the regions of images that positions lie in.
+    """Return labels 0, 1, ... of the regions of images (`views`) that positions lie in.
 
-    Args:
-        positions: from the image's centre in units of half its diagonal.
-        views: whose image.
-        side: length of a region, in the same units.
+    Positions are from the image's centre in units of half its diagonal, as is the side of a
+    region.
     """
     x, y = np.floor((positions + 1) / side).astype(np.int64).T
     across = int(np.ceil(2 / side)) + 1
@@ -206,8 +194,8 @@ def _shared_deviation(model: Forward, at: Weighted, labels: Labels) -> float:
     own = (spread / np.maximum(effective - 1, 1))[good]
     excess = (1.4826 * np.median(np.abs(mean[good]))) ** 2 - np.median(own)
     used = weight > 0
-    seen_by = np.bincount(rows.row[used])
-    per_view = good.sum() / max(len(np.unique(rows.views[used])), 1)
+    seen_by = np.bincount(rows.layout.row[used])
+    per_view = good.sum() / max(len(np.unique(rows.layout.views[used])), 1)
     kept = (1 - 1 / np.mean(seen_by[seen_by > 0])) * (1 - 1 / max(per_view, 2))
     return float(np.sqrt(max(excess, 0.0) / kept))
 
@@ -220,10 +208,10 @@ def _shared_scores(model: Forward, theta: Parameters, at: Weighted, labels: Labe
     rows, u = model.rows, model.unknowns
     coupled = coupling(rows, theta, at)
     taken = [
-        at_places(rows, coupled * p.derivative, rows.views, u.views, p.channels).T
+        at_places(rows, coupled * p.derivative, rows.layout.views, u.views, p.channels).T
         for p in of_views(model, at)
     ]
-    terms, place = others(model, theta), 3 * rows.row[:, None] + np.arange(3)
-    more = None if terms is None else terms.sums(coupled, place, 3 * rows.count)
+    terms, place = others(model, theta), 3 * rows.layout.row[:, None] + np.arange(3)
+    more = None if terms is None else terms.sums(coupled, place, 3 * rows.layout.rows)
     of_points = at_places(rows, coupled, labels, int(labels.max(initial=-1)) + 1)
     return summed(model, theta, at, at.weight, labels) - of_points @ over_all(u, taken, more)

@@ -60,17 +60,13 @@ def fit_model(
 
 
 class Explained(NamedTuple):
-    """Radiances of points, and what is left of their observations.
+    """Radiances of points, and what is left of their observations."""
 
-    Attributes:
-        log_radiance: of each point relative to the pivot, gauges not yet set; NaN where unobserved.
-        residual: of each observation in log exposure; 0 where it is not usable.
-        outliers: share of the usable values that the robust loss ignores.
-    """
-
+    # Of each point relative to the pivot, gauges not yet set; NaN where unobserved.
     log_radiance: Float[np.ndarray, "p 3"]
+    # Of each observation in log exposure; 0 where it is not usable.
     residual: Float32[np.ndarray, "o 3"]
-    outliers: float
+    outliers: float  # share of the usable values that the robust loss ignores
 
 
 def explain(fit: Fit, problem: Problem, response: Response) -> Explained:
@@ -141,13 +137,7 @@ def solution_of(
 ) -> PhotometricSolution:
     """Return exposures in their gauge, with errors and warnings.
 
-    Args:
-        problem: all observations.
-        form: what varies.
-        response: what decoded the colours.
-        fit: the parameters.
-        explained: radiances and residuals of all observations.
-        known: how sure the parameters are.
+    The problem holds all observations, whatever part of them `fit` was solved from.
     """
     o, component = problem.observations, problem.component
     per_view = np.bincount(o.views[problem.usable.any(1)], minlength=o.view_count)
@@ -246,7 +236,7 @@ class _Gauge:
 
 def _balance_of_views(fit: Fit, k: Float[np.ndarray, "k c"]) -> Float[np.ndarray, "v 3 c"]:
     """Return the white balance of each view's camera."""
-    features, cameras = fit.model.unknowns.features, fit.model.rows.cameras
+    features, cameras = fit.model.unknowns.features, fit.model.rows.layout.cameras
     return np.stack([features.balance_of(column) for column in k.T], -1)[cameras]
 
 
@@ -337,12 +327,8 @@ def _of_observations(
 ) -> list[str]:
     """Say what the observations do not tell, or tell of more than exposure.
 
-    Args:
-        per_view: usable observations of each view.
-        component: of the views that have any, or a known exposure; those with equal numbers share
-            points.
-        balance: residual of red, green, blue less their mean, stops.
-        names: of all views.
+    `component` is of views that have any, or a known exposure; those of equal numbers share
+    points. `balance` is the residual of red, green, blue less their mean, stops.
     """
     out = []
     few = np.flatnonzero(per_view < MIN_OBSERVATIONS)

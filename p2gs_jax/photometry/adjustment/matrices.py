@@ -51,17 +51,11 @@ def whole(matrix: Matrix) -> Float[np.ndarray, "n n"]:
 
 @dataclass(frozen=True)
 class Terms:
-    """What every value depends on linearly, in a fixed number of terms.
+    """What every value depends on linearly, in a fixed number of terms."""
 
-    Attributes:
-        index: parameter of each term; `count` where there is no term.
-        factor: of that parameter.
-        count: number of parameters.
-    """
-
-    index: Int[np.ndarray, "o 3 m"]
-    factor: Float[np.ndarray, "o 3 m"]
-    count: int
+    index: Int[np.ndarray, "o 3 m"]  # parameter of each term; `count` where there is no term
+    factor: Float[np.ndarray, "o 3 m"]  # of that parameter
+    count: int  # number of parameters
 
     def of(self, parameters: Float[np.ndarray, " k"]) -> Float[np.ndarray, "o 3"]:
         """Return the sums at some parameters."""

@@ -66,7 +66,11 @@ def normal_equations(
 
 def coupling(rows: Rows, theta: Parameters, at: Weighted) -> PerChannel:
     """Return what couples the observations of a point once it is eliminated: its derivatives."""
-    return at.weight * theta.a[rows.views][:, None] / np.sqrt(at.precision + EMPTY)[rows.row]
+    return (
+        at.weight
+        * theta.a[rows.layout.views][:, None]
+        / np.sqrt(at.precision + EMPTY)[rows.layout.row]
+    )
 
 
 def of_views(model: Forward, at: Weighted) -> list[OfView]:
@@ -82,7 +86,7 @@ def others(model: Forward, theta: Parameters) -> Terms | None:
     """Return the derivatives of predictions by k and c."""
     features, basis = model.features, model.basis
     if features is not None:
-        a = theta.a[model.rows.views][:, None, None]
+        a = theta.a[model.rows.layout.views][:, None, None]
         features = replace(features, factor=a * features.factor)
     if basis is not None:
         basis = replace(basis, factor=-basis.factor)
@@ -93,7 +97,7 @@ def others(model: Forward, theta: Parameters) -> Terms | None:
 
 def _per_view(rows: Rows, values: PerChannel, channels: list[int]):
     # Of nothing at all, numpy counts in integers.
-    total = np.bincount(rows.views, values[:, channels].sum(1), rows.view_count)
+    total = np.bincount(rows.layout.views, values[:, channels].sum(1), rows.layout.view_count)
     return total.astype(np.float64)
 
 
@@ -102,15 +106,15 @@ def _with_others(
 ) -> tuple[list[Entries], Float[np.ndarray, " k"]]:
     """Return what k and c add to the equations: entries, and their right side."""
     rows, u = model.rows, model.unknowns
-    place = 3 * rows.row[:, None] + np.arange(3)
-    through = terms.sums(coupled, place, 3 * rows.count)
+    place = 3 * rows.layout.row[:, None] + np.arange(3)
+    through = terms.sums(coupled, place, 3 * rows.layout.rows)
     first = u.per_view
     parts = []
-    at_view = np.broadcast_to(rows.views[:, None], at.weight.shape)
+    at_view = np.broadcast_to(rows.layout.views[:, None], at.weight.shape)
     for x, one in enumerate(per_view):
         acting = np.isin(np.arange(3), one.channels)
         side = terms.sums(at.weight * one.derivative * acting, at_view, u.views)
-        mine = at_places(rows, coupled * one.derivative, rows.views, u.views, one.channels)
+        mine = at_places(rows, coupled * one.derivative, rows.layout.views, u.views, one.channels)
         side -= mine @ through
         across = block(x * u.views, first, side)
         parts += [across, Entries(across.columns, across.rows, across.values)]
@@ -128,9 +132,9 @@ def at_places(
     rows: Rows, values: PerChannel, places: Labels, count: int, channels: Sequence[int] = (0, 1, 2)
 ) -> sp.csr_array:
     """Return the matrix that holds values of channels at places and points: (count, 3 rows)."""
-    at = 3 * rows.row[:, None] + np.array(channels)
+    at = 3 * rows.layout.row[:, None] + np.array(channels)
     where = np.broadcast_to(places[:, None], at.shape)
-    shape = (count, 3 * rows.count)
+    shape = (count, 3 * rows.layout.rows)
     return sp.csr_array((values[:, channels].ravel(), (where.ravel(), at.ravel())), shape=shape)
 
 
@@ -145,7 +149,7 @@ def summed(
     count = int(places.max(initial=-1)) + 1
     per_view = [
         sp.csr_array(
-            ((values * p.derivative)[:, p.channels].sum(1), (places, rows.views)),
+            ((values * p.derivative)[:, p.channels].sum(1), (places, rows.layout.views)),
             shape=(count, u.views),
         )
         for p in of_views(model, at)

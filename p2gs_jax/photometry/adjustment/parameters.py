@@ -7,8 +7,10 @@ curve: like a point's log radiance they are multiplied by a = 2.2 / gamma.
 
 from __future__ import annotations
 
+import functools
+import itertools
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -27,17 +29,11 @@ CHROMA = np.array([[2.0, -1.0, -1.0], [0.0, 1.0, -1.0]]) / np.sqrt([[6.0], [2.0]
 
 @dataclass(frozen=True)
 class Features:
-    """Which features there are; parameters are ordered as these fields are, camera by camera.
+    """Which features there are; parameters are ordered as these fields are, camera by camera."""
 
-    Attributes:
-        cameras: number of physical cameras.
-        balance: whether there is a white balance per camera.
-        vignetting: per camera, or per camera and channel.
-    """
-
-    cameras: int
-    balance: bool = False
-    vignetting: VignettingKind | None = None
+    cameras: int  # number of physical cameras
+    balance: bool = False  # whether there is a white balance per camera
+    vignetting: VignettingKind | None = None  # per camera, or per camera and channel
 
     @property
     def balance_count(self) -> int:
@@ -52,7 +48,7 @@ class Features:
 
     def terms(self, rows: Rows) -> Terms:
         """Return the features of every value."""
-        camera = rows.cameras[rows.views][:, None]
+        camera = rows.layout.cameras[rows.layout.views][:, None]
         shape = (len(camera), 3)
         index, factor = [], []
         if self.balance:
@@ -64,7 +60,7 @@ class Features:
             polynomial = camera * polynomials(self.vignetting) + of_channel
             for k, power in enumerate(VIGNETTING_POWERS):
                 index.append(self.balance_count + polynomial * len(VIGNETTING_POWERS) + k)
-                factor.append(np.broadcast_to(rows.radius2[:, None] ** (power // 2), shape))
+                factor.append(np.broadcast_to(rows.layout.radius2[:, None] ** (power // 2), shape))
         return Terms(np.stack(index, -1), np.stack(factor, -1), self.count)
 
     def balance_of(self, k: Float[np.ndarray, " k"]) -> Float[np.ndarray, "c 3"]:
@@ -152,18 +148,13 @@ class Splines:
 
 
 class Parameters(NamedTuple):
-    """What is solved for.
+    """What is solved for."""
 
-    Attributes:
-        b: a h per view; a column for each channel where the white balance varies per view.
-        a: 2.2 / gamma per view.
-        k: what cameras do besides (`Features`).
-        c: response splines at their free knots; empty where the response is given.
-    """
-
+    # A h per view; a column for each channel where the white balance varies per view.
     b: Float[np.ndarray, "v x"]
-    a: Float[np.ndarray, " v"]
-    k: Float[np.ndarray, " k"]
+    a: Float[np.ndarray, " v"]  # 2.2 / gamma per view
+    k: Float[np.ndarray, " k"]  # what cameras do besides (`Features`)
+    # Response splines at their free knots; empty where the response is given.
     c: Float[np.ndarray, " c"]
 
     def vector(self) -> Float[np.ndarray, " d"]:
@@ -173,68 +164,45 @@ class Parameters(NamedTuple):
 
 @dataclass(frozen=True)
 class Unknowns:
-    """How many parameters of each kind there are, and where they stand in their vector.
-
-    Attributes:
-        views: number of views.
-        channels: columns of b: 1, or 3 where the white balance varies per view.
-        gammas: whether a is free.
-        features: what cameras do besides.
-        splines: the splines that are solved for.
-    """
+    """How many parameters of each kind there are, and where they stand in their vector."""
 
     views: int
-    channels: int
-    gammas: bool
+    channels: int  # columns of b: 1, or 3 where the white balance varies per view
+    gammas: bool  # whether a is free
     features: Features
-    splines: Splines
+    splines: Splines  # that are solved for
+
+    @functools.cached_property
+    def at(self) -> Any:
+        """Where b, a, k and c stand: `Parameters` of slices."""
+        each = (self.channels * self.views, self.views, self.features.count, self.splines.count)
+        ends = itertools.pairwise((0, *itertools.accumulate(each)))
+        return Parameters(*(slice(*pair) for pair in ends))  # pyright: ignore[reportArgumentType]
 
     @property
     def per_view(self) -> int:
         """Parameters of b and a."""
-        return (self.channels + 1) * self.views
+        return self.at.a.stop
 
     @property
     def count(self) -> int:
         """Length of the vector."""
-        return self.per_view + self.features.count + self.splines.count
-
-    @property
-    def of_a(self) -> slice:
-        """Where a stands."""
-        return slice(self.channels * self.views, self.per_view)
-
-    @property
-    def of_k(self) -> slice:
-        """Where k stands."""
-        return slice(self.per_view, self.per_view + self.features.count)
-
-    @property
-    def of_c(self) -> slice:
-        """Where c stands."""
-        return slice(self.per_view + self.features.count, self.count)
+        return self.at.c.stop
 
     def split(self, vector: Float[np.ndarray, "d ..."]) -> Parameters:
         """Return the parts of a vector, or of several as columns."""
-        b = vector[: self.channels * self.views]
+        b, *others = (vector[at] for at in self.at)
         b = np.moveaxis(b.reshape(self.channels, self.views, *vector.shape[1:]), 0, 1)
-        return Parameters(b, vector[self.of_a], vector[self.of_k], vector[self.of_c])
+        return Parameters(b, *others)
 
 
 class Forward(NamedTuple):
-    """Observations and what explains them; `make_forward` lays the terms out.
+    """Observations and what explains them; `make_forward` lays the terms out."""
 
-    Attributes:
-        rows: the observations.
-        unknowns: what is solved for.
-        features: what cameras do, at every value.
-        basis: of the splines, at every value; None where the response is given.
-    """
-
-    rows: Rows
-    unknowns: Unknowns
-    features: Terms | None
-    basis: Terms | None
+    rows: Rows  # the observations
+    unknowns: Unknowns  # what is solved for
+    features: Terms | None  # what cameras do, at every value
+    basis: Terms | None  # of the splines, at every value; None where the response is given
 
 
 def make_forward(rows: Rows, unknowns: Unknowns) -> Forward:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -11,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 
 from p2gs_jax.config import ResponseKind
 from p2gs_jax.photometry.adjustment.matrices import Pairs
-from p2gs_jax.photometry.observations import Labels, Observations, PerChannel
+from p2gs_jax.photometry.observations import Observations, PerChannel
 from p2gs_jax.photometry.response import Response, hat, spline_groups
 
 LONGEST_ROW = 16
@@ -19,33 +20,26 @@ LONGEST_ROW = 16
 
 @dataclass(frozen=True)
 class KnownExposures:
-    """What is known of the exposures besides the photographs.
+    """What is known of the exposures besides the photographs."""
 
-    Attributes:
-        log_exposures: natural logarithm; NaN where nothing is known.
-        deviation_ev: standard deviation in stops; 0 keeps the value.
-    """
-
-    log_exposures: Float[np.ndarray, " v"]
-    deviation_ev: float = 0.0
+    log_exposures: Float[np.ndarray, " v"]  # natural logarithm; NaN where nothing is known
+    deviation_ev: float = 0.0  # standard deviation in stops; 0 keeps the value
 
 
 class Layout:
-    """Which row each observation belongs to.
+    """Which row, view and camera each observation belongs to.
 
     Tracks longer than `slots` are split into interleaved rows with a radiance of their own each,
-    which loses a few degrees of freedom and bounds the number of pairs.
-
-    Attributes:
-        slots: longest row.
-        row: of each observation.
-        rows: their number.
-        point_of_row: the point of each row.
-        by_row: matrix that sums observations over their rows.
+    which loses a few degrees of freedom and bounds the number of pairs. `by_row` sums observations
+    over their rows; `radius2` are squared distances from the image centre, 1 in the corners.
     """
 
     def __init__(self, observations: Observations):
-        points = np.asarray(observations.points)
+        points, places = np.asarray(observations.points), observations.positions
+        self.views, self.view_count = np.asarray(observations.views), observations.view_count
+        self.cameras = np.asarray(observations.cameras)
+        known = places is not None
+        self.radius2 = (places.astype(float) ** 2).sum(1) if known else np.zeros(len(points))
         lengths = np.bincount(points, minlength=observations.point_count)
         used = lengths[lengths > 0]
         typical = int(np.quantile(used, 0.9)) if len(used) else 2
@@ -63,31 +57,23 @@ class Layout:
         self.by_row = sp.csr_array(
             (np.ones(count), (self.row, np.arange(count))), shape=(self.rows, count)
         )
-        self._views, self._view_count = observations.views, observations.view_count
 
     @functools.cached_property
     def pairs(self) -> Pairs:
         """Every pair of observations in a row once, themselves included."""
-        return Pairs(self.row, self._views, self._view_count)
+        return Pairs(self.row, self.views, self.view_count)
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Observations laid out once, for any number of models.
+    """Observations laid out once, for any number of models."""
 
-    Attributes:
-        observations: the colours.
-        usable: which values can be used.
-        component: label of each view; views with different labels cannot be compared.
-        log_pivot: log of the linear value that gamma leaves alone.
-        known: exposures known beforehand, or None.
-    """
-
-    observations: Observations
-    usable: Bool[np.ndarray, "o 3"]
+    observations: Observations  # the colours
+    usable: Bool[np.ndarray, "o 3"]  # which values can be used
+    # Label of each view; views with different labels cannot be compared.
     component: Int[np.ndarray, " v"]
-    log_pivot: float
-    known: KnownExposures | None
+    log_pivot: float  # log of the linear value that gamma leaves alone
+    known: KnownExposures | None  # exposures known beforehand, or None
 
     @functools.cached_property
     def layout(self) -> Layout:
@@ -114,75 +100,26 @@ def make_problem(
     return Problem(observations, usable, component, float(np.log(pivot)), known)
 
 
-@dataclass(frozen=True)
-class Rows:
-    """Observations by row: one point each, or a part of a point that many views saw.
+class Rows(NamedTuple):
+    """Observations by row (one point each, or a part of a long track) under one response."""
 
-    Attributes:
-        views: row of the view.
-        row: which row an observation belongs to.
-        z: log exposed radiance under the base curve, relative to the pivot.
-        sigma: its standard deviation.
-        weight: 1 used, 0 masked or held out.
-        knot: left spline knot.
-        fraction: of the way to the next knot.
-        slope: dz/dy under the base curve.
-        group: which spline decodes a value, where they are solved for.
-        layout: the same observations in the order of their rows, and the pairs of them.
-        cameras: physical camera of each view.
-        radius2: squared distance from the image centre, 1 in the corners.
-    """
-
-    views: Labels
-    row: Labels
-    z: PerChannel
-    sigma: PerChannel
-    weight: PerChannel
-    knot: Int[np.ndarray, "o 3"]
-    fraction: PerChannel
-    slope: PerChannel
-    group: Int[np.ndarray, "o 3"]
     layout: Layout
-    cameras: Int[np.ndarray, " v"]
-    radius2: Float[np.ndarray, " o"]
-
-    @property
-    def count(self) -> int:
-        """Number of rows."""
-        return self.layout.rows
-
-    @property
-    def view_count(self) -> int:
-        """Number of views."""
-        return len(self.cameras)
-
-    @property
-    def by_row(self) -> sp.csr_array:
-        """Matrix that sums observations over their rows."""
-        return self.layout.by_row
+    z: PerChannel  # log exposed radiance under the base curve, relative to the pivot
+    sigma: PerChannel  # its standard deviation
+    weight: PerChannel  # 1 used, 0 masked or held out
+    knot: Int[np.ndarray, "o 3"]  # left spline knot
+    fraction: PerChannel  # of the way to the next knot
+    slope: PerChannel  # dz/dy under the base curve
+    group: Int[np.ndarray, "o 3"]  # which spline decodes a value, where they are solved for
 
 
 def make_rows(
     problem: Problem, weight: PerChannel, response: Response, splines: ResponseKind | None = None
 ) -> Rows:
     """Return rows under one response; `splines` says what gets a spline that is solved for."""
-    observations, layout = problem.observations, problem.layout
-    z, sigma, slope = observations.decoded(response)
-    knot, fraction = hat(np.asarray(observations.colors, np.float64))
-    places = observations.positions
-    radius2 = np.zeros(len(layout.row)) if places is None else (places.astype(float) ** 2).sum(1)
-    cameras = np.asarray(observations.cameras)
-    return Rows(
-        views=np.asarray(observations.views),
-        row=layout.row,
-        z=z - problem.log_pivot,
-        sigma=sigma,
-        weight=np.asarray(weight, np.float64),
-        knot=knot,
-        fraction=fraction,
-        slope=slope,
-        group=spline_groups(splines or "all", cameras[observations.views], z.shape),
-        layout=layout,
-        cameras=cameras,
-        radius2=radius2,
-    )
+    layout, o = problem.layout, problem.observations
+    z, sigma, slope = o.decoded(response)
+    knot, fraction = hat(np.asarray(o.colors, np.float64))
+    group = spline_groups(splines or "all", layout.cameras[layout.views], z.shape)
+    weight = np.asarray(weight, np.float64)
+    return Rows(layout, z - problem.log_pivot, sigma, weight, knot, fraction, slope, group)

@@ -24,29 +24,17 @@ PerObservation = Float[np.ndarray, " o"]
 
 
 class Weighted(NamedTuple):
-    """Everything per observation at given parameters.
+    """Everything per observation at given parameters."""
 
-    Attributes:
-        weight: robust weight over variance.
-        sigma: stated standard deviation of z.
-        slope: dz/dy.
-        residual: of each observation, log units.
-        radiance: log radiance of each row's point relative to the pivot.
-        level: the same at every observation, with what its camera adds.
-        precision: of `radiance`.
-        scale: robust standard deviation of one observation in units of its stated one.
-        curvature: mean second derivative of the robust loss over its weight (1 for squares).
-    """
-
-    weight: PerChannel
-    sigma: PerChannel
-    slope: PerChannel
-    residual: PerChannel
-    radiance: Float[np.ndarray, "r 3"]
-    level: PerChannel
-    precision: Float[np.ndarray, "r 3"]
-    scale: float
-    curvature: float
+    weight: PerChannel  # robust weight over variance
+    sigma: PerChannel  # stated standard deviation of z
+    slope: PerChannel  # dz/dy
+    residual: PerChannel  # of each observation, log units
+    radiance: Float[np.ndarray, "r 3"]  # log radiance of each row's point relative to the pivot
+    level: PerChannel  # the same at every observation, with what its camera adds
+    precision: Float[np.ndarray, "r 3"]  # of `radiance`
+    scale: float  # robust standard deviation of one observation in units of its stated one
+    curvature: float  # mean second derivative of the robust loss over its weight (1 for squares)
 
 
 def noise_weight(rows: Rows) -> PerChannel:
@@ -55,23 +43,19 @@ def noise_weight(rows: Rows) -> PerChannel:
 
 
 def weigh(model: Forward, theta: Parameters, weight: PerChannel, loss: Loss) -> Weighted:
-    """Return residuals and the weights they imply.
+    """Return residuals at some parameters, and the weights that they imply under a loss.
 
-    Args:
-        model: observations, and what explains them.
-        theta: parameters.
-        weight: from the round before; decides the point radiances that residuals are taken from.
-        loss: what the weights are of.
+    The weight of the round before decides the point radiances that residuals are taken from.
     """
     rows = model.rows
     z, sigma, slope = rows.z, rows.sigma, rows.slope
     if theta.c.size:
         z, sigma, slope = model.unknowns.splines.decode(rows, theta.c)
-    a, b = theta.a[rows.views][:, None], theta.b[rows.views]
+    a, b = theta.a[rows.layout.views][:, None], theta.b[rows.layout.views]
     added = 0.0 if model.features is None else model.features.of(theta.k)
     z_of_point = z - (b + a * added)
     radiance, _ = _radiance(rows, a, z_of_point, weight)
-    u = (z_of_point - a * radiance[rows.row]) / sigma
+    u = (z_of_point - a * radiance[rows.layout.row]) / sigma
     scale = max(1.4826 * _median(rows, np.abs(u)), SMALLEST_SCALE)
     # One weight for the whole observation: an outlier is wrong in all channels.
     used = rows.weight.sum(1)
@@ -84,7 +68,7 @@ def weigh(model: Forward, theta: Parameters, weight: PerChannel, loss: Loss) -> 
         factor = of_observation[:, None]
     weight = rows.weight / sigma**2 * factor
     radiance, precision = _radiance(rows, a, z_of_point, weight)
-    of_point = radiance[rows.row]
+    of_point = radiance[rows.layout.row]
     residual = z_of_point - a * of_point
     level = of_point + added
     return Weighted(weight, sigma, slope, residual, radiance, level, precision, scale, curvature)
@@ -95,10 +79,8 @@ def _geman_mcclure(
 ) -> tuple[PerObservation, float]:
     """Return weights, and the mean curvature of the loss over them.
 
-    Args:
-        rows: observations.
-        square: squares of residuals, in widths of the loss.
-        share: share of each observation's channels that count.
+    `square` are squares of residuals, in widths of the loss; `share` is the share of each
+    observation's channels that count.
     """
     robust, second = _derivatives(square)
     seen = share > 0
@@ -117,13 +99,13 @@ def _whole_points(
     """
     alone, curved = _derivatives(square)
     bound = GEMAN_MCCLURE**2
-    losses = rows.by_row @ (share * bound * square / (1 + square))
+    losses = rows.layout.by_row @ (share * bound * square / (1 + square))
     # A point's radiance takes one observation away.
-    freedom = np.maximum(rows.by_row @ share - 1, 0)
+    freedom = np.maximum(rows.layout.by_row @ share - 1, 0)
     of_row = (PRIOR_SPREAD + freedom) / (PRIOR_SPREAD + losses)
-    robust = alone * of_row[rows.row]
-    second = share * curved * of_row[rows.row]
-    pulls = rows.by_row @ (share**2 * bound * square * alone**2)
+    robust = alone * of_row[rows.layout.row]
+    second = share * curved * of_row[rows.layout.row]
+    pulls = rows.layout.by_row @ (share**2 * bound * square * alone**2)
     along = 2 * of_row / (PRIOR_SPREAD + losses) * pulls
     return robust, float((second.sum() - along.sum()) / max((share * robust).sum(), 1e-9))
 
@@ -135,16 +117,16 @@ def _derivatives(square: PerObservation) -> tuple[PerObservation, PerObservation
 
 def _radiance(rows: Rows, a, z, weight):
     """Return the log radiance of each row and its precision; a per observation."""
-    precision = rows.by_row @ (weight * a**2)
-    return rows.by_row @ (weight * a * z) / (precision + EMPTY), precision
+    precision = rows.layout.by_row @ (weight * a**2)
+    return rows.layout.by_row @ (weight * a * z) / (precision + EMPTY), precision
 
 
 def _median(rows: Rows, values: PerChannel) -> float:
     """Return the median of used values; of more rows than MEDIAN_ROWS, of every n-th row."""
     used = rows.weight > 0
-    step = max(1, rows.count // MEDIAN_ROWS)
+    step = max(1, rows.layout.rows // MEDIAN_ROWS)
     if step > 1:
-        used = used & (rows.row % step == 0)[:, None]
+        used = used & (rows.layout.row % step == 0)[:, None]
     picked = values[used]
     if not picked.size:
         return 0.0

@@ -54,22 +54,14 @@ class Held:
 
 @dataclass(frozen=True)
 class System:
-    """Which directions are free, and what is known besides the photographs.
+    """Which directions are free, and what is known besides the photographs."""
 
-    Attributes:
-        unknowns: what the parameters are.
-        basis: columns are the free directions.
-        anchors: the gauges; their precisions are relative (`gauge_strength`).
-        priors: what is known.
-        log_exposure: prior mean of h: where rounds start.
-        smoothness: matrix whose quadratic form keeps a spline smooth, (k, k).
-    """
-
-    unknowns: Unknowns
-    basis: sp.csr_array
-    anchors: Held
-    priors: Held
-    log_exposure: Float[np.ndarray, " v"]
+    unknowns: Unknowns  # what the parameters are
+    basis: sp.csr_array  # columns are the free directions
+    anchors: Held  # the gauges; their precisions are relative (`gauge_strength`)
+    priors: Held  # what is known
+    log_exposure: Float[np.ndarray, " v"]  # prior mean of h: where rounds start
+    # Matrix whose quadratic form keeps a spline smooth, (k, k).
     smoothness: Float[np.ndarray, "k k"]
 
     @property
@@ -150,13 +142,13 @@ def _anchors(problem: Problem, u: Unknowns, log_exposure, precision) -> Held:
                 both = np.concatenate([channel * u.views + members, u.views + members])
                 hold(both, np.repeat([share, -share], len(members)))
         if known.sum() < 2 or np.ptp(log_exposure[members]) < 1e-3:
-            hold(u.of_a.start + members, share, 1.0)
+            hold(u.at.a.start + members, share, 1.0)
     if u.features.balance:
         views_of = np.bincount(problem.observations.cameras, minlength=u.features.cameras)
         for direction in range(u.features.balance_count // u.features.cameras):
-            at = u.of_k.start + direction * u.features.cameras + np.arange(u.features.cameras)
+            at = u.at.k.start + direction * u.features.cameras + np.arange(u.features.cameras)
             hold(at, views_of / views_of.sum())
-    powers = u.of_c.start + u.splines.powers
+    powers = u.at.c.start + u.splines.powers
     if u.splines.by == "channel" and u.channels == 3:
         # No photograph tells the power of a channel with exposures of its own.
         for power in powers:
@@ -171,14 +163,14 @@ def _priors(u: Unknowns, log_exposure, precision) -> Held:
     given, views = np.flatnonzero(precision > 0), np.arange(u.views)
     at = np.arange(len(given))
     b = [(np.full(len(given), 1 / u.channels), c * u.views + given) for c in range(u.channels)]
-    b.append((-log_exposure[given], u.of_a.start + given))
+    b.append((-log_exposure[given], u.at.a.start + given))
     values, columns = (np.concatenate(part) for part in zip(*b, strict=True))
     exposures = sp.csr_array(
         (values, (np.tile(at, u.channels + 1), columns)), shape=(len(given), u.count)
     )
     every = sp.csr_array(sp.eye_array(u.count))
-    of_a = every[u.of_a.start + views] if u.gammas else every[:0]
-    lenses = np.arange(u.of_k.start + u.features.balance_count, u.of_k.stop)
+    of_a = every[u.at.a.start + views] if u.gammas else every[:0]
+    lenses = np.arange(u.at.k.start + u.features.balance_count, u.at.k.stop)
     gammas = of_a.shape[0]
     return Held(
         sp.csr_array(sp.vstack([exposures, of_a, every[lenses]])),
@@ -223,9 +215,9 @@ def with_priors(
     strength = gauge_strength(normal, u)
     right = right + strength * system.anchors.pull(vector)
     if theta.c.size:
-        stiffness = float(np.mean(normal.diagonal()[u.of_c]))
+        stiffness = float(np.mean(normal.diagonal()[u.at.c]))
         smooth = stiffness * system.smoothness
-        before = sp.csr_array((u.of_c.start,) * 2)
+        before = sp.csr_array((u.at.c.start,) * 2)
         normal = normal + sp.block_diag([before, smooth], format="csr")
-        right = right - np.concatenate([np.zeros(u.of_c.start), smooth @ theta.c])
+        right = right - np.concatenate([np.zeros(u.at.c.start), smooth @ theta.c])
     return normal, np.sqrt(strength) * system.anchors.rows, right

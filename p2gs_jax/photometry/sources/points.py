@@ -99,13 +99,8 @@ def rendered_colors(
 ) -> Observations:
     """Warp pixels of each training view into the others through rendered depth.
 
-    Args:
-        gaussians: the fit; all of them are alive.
-        scene: its views; points that they hide are left out by their depth.
-        store: photographs, sampled at the resolution of the fit.
-        cfg: how it is rendered.
-        seed: of the sampled pixels.
-        on_view: progress: depths rendered, views in all.
+    Points that a view hides are left out by their depth. All Gaussians are alive; photographs
+    are sampled at the resolution of the fit, and `seed` chooses the pixels.
     """
     rng = generator(seed, Stream.RENDERED_PIXELS)
     render = make_renderer(cfg)

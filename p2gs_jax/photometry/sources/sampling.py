@@ -31,19 +31,13 @@ DIAGONAL, REACH = 200, 0.12
 
 
 class Samples(NamedTuple):
-    """Colours of an image at some positions.
+    """Colours of an image at some positions."""
 
-    Attributes:
-        colors: averages over patches, display-encoded.
-        spread: standard deviation of `colors` from uncertain positions: gradient times that.
-        brightest: largest display values of the pixels that were averaged.
-        valid: inside the image and its mask.
-    """
-
-    colors: Float32[np.ndarray, "o 3"]
+    colors: Float32[np.ndarray, "o 3"]  # averages over patches, display-encoded
+    # Standard deviation of `colors` from uncertain positions: gradient times that.
     spread: Float32[np.ndarray, "o 3"]
-    brightest: Float32[np.ndarray, "o 3"]
-    valid: Bool[np.ndarray, " o"]
+    brightest: Float32[np.ndarray, "o 3"]  # largest display values of the pixels that were averaged
+    valid: Bool[np.ndarray, " o"]  # inside the image and its mask
 
 
 def sample(
@@ -52,13 +46,9 @@ def sample(
     xy: Float[np.ndarray, "o 2"],
     wider: Float[np.ndarray, " o"] | None = None,
 ) -> Samples:
-    """Sample an image at pixel positions.
+    """Sample an image, where its mask is 1, at pixel positions (centres at +0.5).
 
-    Args:
-        ldr: photograph.
-        mask: 1 = use.
-        xy: positions, pixel centres at +0.5.
-        wider: factors by which the averaged patches are wider than PATCH; None: 1.
+    The averaged patches are wider than PATCH by the factors `wider`; None: 1.
     """
     factors = np.ones(len(xy)) if wider is None else wider
     # Odd, so that patches are centred.

@@ -33,35 +33,23 @@ Image = UInt8[np.ndarray, "h w 3"]
 
 
 class Stack(NamedTuple):
-    """Photographs of one viewpoint.
+    """Photographs of one viewpoint."""
 
-    Attributes:
-        views: the photographs; poses mean nothing.
-        images: 8-bit RGB.
-        valid: pixels that hold data in every frame (a pure blue border is none).
-    """
-
-    views: tuple[View, ...]
-    images: list[Image]
+    views: tuple[View, ...]  # the photographs; poses mean nothing
+    images: list[Image]  # 8-bit RGB
+    # Pixels that hold data in every frame (a pure blue border is none).
     valid: Bool[np.ndarray, "h w"]
 
 
 class StackColors(NamedTuple):
-    """What a stack shows at points.
+    """What a stack shows at points."""
 
-    Attributes:
-        observations: colours, every frame at every point.
-        xy: positions of the points in the first frame, pixel centres at +0.5.
-        shifts: pixels by which each frame was moved to fit the first.
-        black: values up to here were taken as black.
-        signal: frames in which enough pixels are neither black nor saturated.
-    """
-
-    observations: Observations
+    observations: Observations  # colours, every frame at every point
+    # Positions of the points in the first frame, pixel centres at +0.5.
     xy: Float[np.ndarray, "p 2"]
-    shifts: Float[np.ndarray, "v 2"]
-    black: float
-    signal: Bool[np.ndarray, " v"]
+    shifts: Float[np.ndarray, "v 2"]  # pixels by which each frame was moved to fit the first
+    black: float  # values up to here were taken as black
+    signal: Bool[np.ndarray, " v"]  # frames in which enough pixels are neither black nor saturated
 
 
 def read_stack(folder: Path) -> Stack:

@@ -1,8 +1,4 @@
-"""Driving data sets as their authors lay them out; a module a format, all giving a `Recording`.
-
-Each module has `is_NAME(root)`, which opens no more than the names of files, and
-`read_NAME(root, cfg, report)`, which decodes neither photographs nor laser points.
-"""
+"""Readers of driving data sets as their authors lay them out; `recording` states their contract."""
 
 from __future__ import annotations
 
@@ -12,25 +8,18 @@ from typing import NamedTuple
 
 from p2gs_jax.config import DataConfig, SceneFormat
 from p2gs_jax.scene.drives.argoverse import is_argoverse, read_argoverse
-from p2gs_jax.scene.drives.kitti_raw import is_kitti_raw, read_kitti_raw
+from p2gs_jax.scene.drives.kitti import is_kitti_raw, read_kitti_raw
 from p2gs_jax.scene.drives.nuscenes import is_nuscenes, read_nuscenes
 from p2gs_jax.scene.drives.pandaset import is_pandaset, read_pandaset
-from p2gs_jax.scene.drives.recording import Recording
+from p2gs_jax.scene.drives.recording import Recording, Report
 from p2gs_jax.scene.drives.waymo import is_waymo, read_waymo
-
-Report = Callable[[str], None]
 
 
 class DriveFormat(NamedTuple):
-    """A reader.
-
-    Attributes:
-        recognise: whether a folder is of this format.
-        read: reads its tables. Raises UserError where one is broken.
-    """
+    """A reader: whether a folder is of its format, and what reads it (UserError: it is broken)."""
 
     recognise: Callable[[Path], bool]
-    read: Callable[[Path, DataConfig, Report], Recording]
+    read: Callable[[Path, DataConfig], Recording]
 
 
 FORMATS: dict[SceneFormat, DriveFormat] = {
@@ -47,15 +36,11 @@ def read_drive(
 ) -> Recording | None:
     """Return the recording in a folder, or None where it holds no drive of a known format.
 
-    Args:
-        root: folder that the user named.
-        cfg: `format` may name the reader.
-        report: receives progress.
-
-    Raises:
-        UserError: it is one, but broken; the message names the file.
+    `cfg.format` may name the reader, `cfg.drive` one of several drives in the folder. UserError:
+    there are several drives, or a file is missing or broken; the message names it.
     """
     for name, reader in FORMATS.items():
         if cfg.format in (None, name) and reader.recognise(root):
-            return reader.read(root, cfg, report)
+            report(f"Reading the tables of {root} ({name})")
+            return reader.read(root, cfg)
     return None

@@ -17,7 +17,6 @@ Sweeps are moved to where the car was at their first point, which is their time;
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -25,12 +24,11 @@ import numpy as np
 from jaxtyping import Float64, Int, Int64
 
 from p2gs_jax.config import DataConfig
-from p2gs_jax.errors import UserError
+from p2gs_jax.errors import broken
 from p2gs_jax.scene.drives.arrow import read_feather
-from p2gs_jax.scene.drives.choose import chosen_drive
-from p2gs_jax.scene.drives.objects import Box, tracks
+from p2gs_jax.scene.drives.objects import Box, Pose, tracks
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sweep, SweepPoints
-from p2gs_jax.scene.drives.tables import numbered
+from p2gs_jax.scene.drives.tables import chosen_drive, counted, numbered
 from p2gs_jax.scene.lens import intrinsics
 from p2gs_jax.scene.rigid import from_quaternions, interpolated
 from p2gs_jax.types import TrackedObject
@@ -38,6 +36,7 @@ from p2gs_jax.types import TrackedObject
 POSES = "city_SE3_egovehicle.feather"
 INTRINSICS = "calibration/intrinsics.feather"
 EXTRINSICS = "calibration/egovehicle_SE3_sensor.feather"
+LENS = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
 QUATERNION = ("qw", "qx", "qy", "qz")
 POSITION = ("tx_m", "ty_m", "tz_m")
 SIZE = ("length_m", "width_m", "height_m")
@@ -50,37 +49,18 @@ def is_argoverse(root: Path) -> bool:
     return (root / POSES).is_file() or bool(_logs(root))
 
 
-def read_argoverse(root: Path, cfg: DataConfig, report: Callable[[str], None]) -> Recording:
-    """Read a log.
-
-    Args:
-        root: the log's folder, or one that holds logs.
-        cfg: `drive` names the log where there are several; `cameras` may ask for the stereo pair.
-        report: receives progress.
-
-    Raises:
-        UserError: it has to be said which log; a table is missing or broken; the message names it.
-    """
+def read_argoverse(root: Path, cfg: DataConfig) -> Recording:
+    """Read a log; `cfg.cameras` may ask for the stereo pair; UserError: a table is broken."""
     log = root
     if not (root / POSES).is_file():
         log = root / chosen_drive(cfg.drive, [folder.name for folder in _logs(root)], root)
-    report(f"Reading the tables of Argoverse 2, {log.name}")
     car = _Car(log)
     cameras, files, notes = _cameras(log, cfg)
-    photographs, said = _photographs(car, cameras, files)
-    notes += said
-    sweeps, said = _sweeps(car)
-    notes += said
-    objects, said = _objects(car)
-    return Recording(
-        root=root,
-        format="argoverse",
-        cameras=tuple(cameras),
-        photographs=tuple(photographs),
-        sweeps=tuple(sweeps),
-        objects=objects,
-        notes=(*notes, *said),
-    )
+    photographs, photograph_notes = _photographs(car, cameras, files)
+    sweeps, sweep_notes = _sweeps(car)
+    objects, box_notes = _objects(car)
+    notes += [*photograph_notes, *sweep_notes, *box_notes]
+    return Recording(root, "argoverse", cameras, photographs, sweeps, objects, notes)
 
 
 def _logs(root: Path) -> list[Path]:
@@ -95,7 +75,7 @@ class _Car:
         table = read_feather(path, ["timestamp_ns", *QUATERNION, *POSITION])
         stamps = _stamps(table, path)
         if not len(stamps):
-            raise UserError(f"{path} holds no pose", fix="get the file again")
+            raise broken(path, "holds no pose")
         _, rows = np.unique(stamps, return_index=True)
         self.log = log
         self.start = int(stamps.min())
@@ -121,9 +101,7 @@ class _Car:
 def _stamps(table: dict[str, np.ndarray], path: Path) -> Int64[np.ndarray, " n"]:
     stamps = table["timestamp_ns"]
     if stamps.dtype.kind not in "iu":
-        raise UserError(
-            f"{path}: timestamp_ns should be whole numbers, all of them", fix="get the file again"
-        )
+        raise broken(f"{path}:", "timestamp_ns should be whole numbers, all of them")
     return stamps.astype(np.int64)
 
 
@@ -138,8 +116,7 @@ def _cameras(
 ) -> tuple[list[RigCamera], dict[str, dict[int, Path]], list[str]]:
     """Return cameras that have photographs, these by time stamp, and notes."""
     path = log / INTRINSICS
-    names = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
-    table = read_feather(path, names, ["sensor_name"])
+    table = read_feather(path, LENS, ["sensor_name"])
     rows = {str(name): row for row, name in enumerate(table["sensor_name"])}
     folder = log / "sensors" / "cameras"
     found = {
@@ -162,12 +139,10 @@ def _cameras(
     for name in found:
         if name in unknown:
             continue
-        values = np.array([table[column][rows[name]] for column in names], np.float64)
+        values = np.array([table[column][rows[name]] for column in LENS], np.float64)
         if not np.isfinite(values).all() or (values[[0, 1, 4, 5]] <= 0).any():
-            raise UserError(
-                f"{path}: focal lengths and sizes of {name} should be positive numbers",
-                fix="get the file again",
-            )
+            why = f"focal lengths and sizes of {name} should be positive numbers"
+            raise broken(f"{path}:", why)
         fx, fy, cx, cy, width, height = values.tolist()
         # The API takes projections from 0 to width - 1 as inside: pixel centres at integers.
         K = intrinsics(fx, fy, cx + 0.5, cy + 0.5)
@@ -191,25 +166,17 @@ def _photographs(
     most = max(cameras, key=lambda camera: len(files[camera.name]))
     car.moments = np.array(sorted(files[most.name]), np.int64)
     photographs, without = [], 0
-    for camera in cameras:
-        if camera.name not in mounts:
-            raise UserError(f"{path} does not say where {camera.name} is", fix="get the file again")
-        stamps = np.array(list(files[camera.name]), np.int64)
+    for name in (camera.name for camera in cameras):
+        if name not in mounts:
+            raise broken(path, f"does not say where {name} is")
+        stamps = np.array(list(files[name]), np.int64)
         poses, known = car.poses(stamps)
         times, frames = car.seconds(stamps), car.frames(stamps)
         without += int((~known).sum())
-        photographs += [
-            Photograph(
-                camera=camera.name,
-                frame=int(frames[k]),
-                time=float(times[k]),
-                path=files[camera.name][int(stamps[k])],
-                pose=poses[k] @ mounts[camera.name],
-            )
-            for k in np.flatnonzero(known)
-        ]
-    notes = [f"{without} photographs are outside {POSES}: they are left out."] if without else []
-    return photographs, notes
+        for k in np.flatnonzero(known):
+            pose, file = poses[k] @ mounts[name], files[name][int(stamps[k])]
+            photographs.append(Photograph(name, int(frames[k]), float(times[k]), file, pose))
+    return photographs, counted(without, f"photographs are outside {POSES}: they are left out.")
 
 
 def _sweeps(car: _Car) -> tuple[list[Sweep], list[str]]:
@@ -224,11 +191,10 @@ def _sweeps(car: _Car) -> tuple[list[Sweep], list[str]]:
         for k, path in enumerate(files.values())
         if known[k]
     ]
-    without = int((~known).sum())
-    return sweeps, [f"{without} LiDAR sweeps are outside {POSES}."] if without else []
+    return sweeps, counted(int((~known).sum()), f"LiDAR sweeps are outside {POSES}.")
 
 
-def _read_sweep(path: Path, pose: Float64[np.ndarray, "4 4"], start: float) -> SweepPoints:
+def _read_sweep(path: Path, pose: Pose, start: float) -> SweepPoints:
     table = read_feather(path, ["x", "y", "z", "offset_ns"])
     local = np.stack([table[name] for name in "xyz"], 1).astype(np.float64)
     times = start + table["offset_ns"] * 1e-9
@@ -242,27 +208,18 @@ def _objects(car: _Car) -> tuple[tuple[TrackedObject, ...], list[str]]:
     table = read_feather(
         path, ["timestamp_ns", *SIZE, *QUATERNION, *POSITION], ["track_uuid", "category"]
     )
-    stamps = _stamps(table, path)
+    stamps, names = _stamps(table, path), table["track_uuid"]
     size = np.stack([table[name] for name in SIZE], 1).astype(np.float64)
     if not (size > 0).all():
-        raise UserError(f"{path}: a box has no size", fix="get the file again")
+        raise broken(f"{path}:", "a box has no size")
     egos, known = car.poses(stamps)
     poses = egos @ _poses(table, path, "box")
     times = car.seconds(stamps)
-    named = np.array([bool(name) for name in table["track_uuid"]], bool)
+    named = np.array([bool(name) for name in names], bool)
     boxes = [
-        Box(
-            str(table["track_uuid"][k]),
-            str(table["category"][k]),
-            tuple(size[k]),
-            float(times[k]),
-            poses[k],
-        )
+        Box(str(names[k]), str(table["category"][k]), tuple(size[k]), float(times[k]), poses[k])
         for k in np.flatnonzero(known & named)
     ]
-    notes = []
-    if not named.all():
-        notes.append(f"{(~named).sum()} boxes belong to no track: they are left out.")
-    if not known.all():
-        notes.append(f"{(~known).sum()} boxes are outside {POSES}: they are left out.")
+    notes = counted(int((~named).sum()), "boxes belong to no track: they are left out.")
+    notes += counted(int((~known).sum()), f"boxes are outside {POSES}: they are left out.")
     return tracks(boxes), notes

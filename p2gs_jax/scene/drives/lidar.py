@@ -1,11 +1,12 @@
-"""Laser points of a drive: on which moving thing each lies, and which become seeds."""
+"""Laser points of a drive: when a scanner looked where, on which moving thing each point lies, and
+which points become seeds."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Float, Float32, Int
 from scipy.spatial import KDTree
 
 from p2gs_jax.scene.rigid import interpolated, inverse
@@ -13,10 +14,23 @@ from p2gs_jax.types import Lidar, TrackedObject
 
 # Boxes are drawn tightly and scanners scatter: points this near to a box are in it, metres.
 BOX_MARGIN = 0.15
-# Kept of all sweeps together, evenly.
+# Points kept from all sweeps together, evenly.
 MOST_MEASURED = 2_000_000
 # Seeds: one a voxel, whose side grows with the distance from the nearest camera.
 MOST_SEEDS, FINEST_VOXEL, VOXEL_ANGLE, VOXEL_GROWTH = 200_000, 0.05, 0.01, 1.3
+
+
+def turned(azimuth: Float[np.ndarray, "*n"] | float, start: float) -> Float[np.ndarray, "*n"]:
+    """Return the share of a turn, in [0, 1), after which a spinning scanner looks in a direction.
+
+    Things that move are measured, and their boxes drawn, where they were at that time.
+
+    Args:
+        azimuth: directions, radians counterclockwise as seen from above; scanners on cars turn
+            clockwise.
+        start: direction in which the turn begins and ends.
+    """
+    return np.asarray(np.mod(start - azimuth, 2 * np.pi) / (2 * np.pi))
 
 
 def owners(
@@ -26,10 +40,7 @@ def owners(
 ) -> Int[np.ndarray, " n"]:
     """Return the row of the moving object whose box holds each point, -1 for none.
 
-    Args:
-        points: world coordinates at their own time.
-        times: seconds.
-        objects: only the moving ones count.
+    Points are world coordinates, each at its own time.
     """
     found = np.full(len(points), -1, np.int32)
     if not len(points):
@@ -68,13 +79,8 @@ def seeds(
 ) -> tuple[Float32[np.ndarray, "s 3"], float]:
     """Return points of what does not move: one a voxel, near the cameras' path finer than far off.
 
-    Args:
-        lidar: all measurements.
-        cameras: centres.
-        most: voxels grow until no more are left.
-
-    Returns:
-        Points, and the side of a voxel over its distance from the nearest camera.
+    Voxels grow until at most `most` points are left. The second result is the side of a voxel over
+    its distance from the nearest camera.
     """
     points = lidar.points[lidar.objects < 0]
     angle = VOXEL_ANGLE
@@ -92,13 +98,8 @@ def _one_per_voxel(points: Float32[np.ndarray, "n 3"], side: Float[np.ndarray, "
     """Return rows of the first point in every voxel; sides are rounded to powers of 2."""
     level = np.clip(np.rint(np.log2(side / FINEST_VOXEL)), 0, 15).astype(np.uint64)
     cell = np.floor((points - points.min(0)) / np.ldexp(FINEST_VOXEL, level.astype(int))[:, None])
-    # Four bits of level, twenty of each axis: 52 km at the finest.
+    # Four bits of level, twenty for each axis: 52 km at the finest.
     key = level
     for axis in range(3):
         key = (key << np.uint64(20)) | np.minimum(cell[:, axis], 2**20 - 1).astype(np.uint64)
     return np.sort(np.unique(key, return_index=True)[1])
-
-
-def static(lidar: Lidar) -> Bool[np.ndarray, " l"]:
-    """Return which measurements lie on nothing that moves."""
-    return lidar.objects < 0

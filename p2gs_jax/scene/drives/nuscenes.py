@@ -15,7 +15,7 @@ turn begins and ends at azimuth 180 degrees of the scanner's axes (x right, y fo
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
@@ -24,22 +24,35 @@ import numpy as np
 from jaxtyping import Float64
 
 from p2gs_jax.config import DataConfig
-from p2gs_jax.errors import UserError
-from p2gs_jax.scene.drives.choose import chosen_drive
-from p2gs_jax.scene.drives.json_rows import Row, read_rows
-from p2gs_jax.scene.drives.objects import Box, tracks
+from p2gs_jax.errors import broken
+from p2gs_jax.scene.drives.lidar import turned
+from p2gs_jax.scene.drives.objects import Box, Pose, tracks
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sweep, SweepPoints
-from p2gs_jax.scene.drives.spin import turned
-from p2gs_jax.scene.drives.tables import finite_numbers
+from p2gs_jax.scene.drives.tables import (
+    Kinds,
+    Row,
+    chosen_drive,
+    counted,
+    finite_numbers,
+    read_rows,
+)
 from p2gs_jax.scene.files import require_inside
 from p2gs_jax.scene.rigid import from_quaternion, inverse
 from p2gs_jax.types import TrackedObject
 
 NUMBER = (int, float)
-# Of the scanner, seconds a turn (20 Hz), and where it begins.
+# The scanner: seconds a turn (20 Hz), and where a turn begins.
 TURN_S, TURN_START = 0.05, np.pi
 # Numbers a laser point: x y z intensity ring.
 POINT = 5
+PLACED: Kinds = {"translation": list, "rotation": list}
+RECORDED: Kinds = {
+    **dict.fromkeys(("sample_token", "ego_pose_token", "calibrated_sensor_token"), str),
+    "timestamp": NUMBER,
+    "filename": str,
+    "is_key_frame": bool,
+}
+_FIX = "get the tables again, all of one version"
 
 
 def is_nuscenes(root: Path) -> bool:
@@ -47,33 +60,24 @@ def is_nuscenes(root: Path) -> bool:
     return bool(_versions(root))
 
 
-def read_nuscenes(root: Path, cfg: DataConfig, report: Callable[[str], None]) -> Recording:
-    """Read one drive ("scene") of the set.
+def read_nuscenes(root: Path, cfg: DataConfig) -> Recording:
+    """Read one drive ("scene") of a folder with `v1.0-...` and `samples`.
 
-    Args:
-        root: the folder that holds `v1.0-...` and `samples`.
-        cfg: `drive` names the drive where photographs of several are there.
-        report: receives progress.
-
-    Raises:
-        UserError: it has to be said which drive; a table is missing or broken, or a pose in it.
+    `cfg.drive` has to name it only where photographs of several are there. UserError: a table is
+    missing or broken, or a pose in it.
     """
     tables, scene = _chosen_scene(root, cfg.drive)
-    report(f"Reading {tables.name} of nuScenes, {scene['name']}")
     drive = _Drive(root, tables, scene)
     photographs, cameras, left_out = _photographs(drive)
     sweeps, absent = _sweeps(drive)
-    objects, said = _objects(drive)
-    notes = list(said)
+    objects, notes = _objects(drive)
     if (claimed := scene.get("nbr_samples")) not in (None, len(drive.moments)):
         notes.insert(
             0, f"scene.json counts {claimed} samples, sample.json holds {len(drive.moments)}."
         )
-    if left_out:
-        notes.append(f"{left_out} photographs have no pose in ego_pose.json: they are left out.")
-    if absent:
-        notes.append(f"{absent} LiDAR sweeps of the keyframes are missing, or have no pose.")
-    return Recording(root, "nuscenes", cameras, photographs, sweeps, objects, tuple(notes))
+    notes += counted(left_out, "photographs have no pose in ego_pose.json: they are left out.")
+    notes += counted(absent, "LiDAR sweeps of the keyframes are missing, or have no pose.")
+    return Recording(root, "nuscenes", cameras, photographs, sweeps, objects, notes)
 
 
 def _versions(root: Path) -> list[Path]:
@@ -112,7 +116,7 @@ def _photographed(root: Path) -> set[str]:
 class _Sensor(NamedTuple):
     channel: str
     modality: str
-    to_ego: Float64[np.ndarray, "4 4"]
+    to_ego: Pose
     intrinsics: list
 
 
@@ -121,37 +125,26 @@ class _Drive:
 
     def __init__(self, root: Path, tables: Path, scene: Row):
         self.root, self.tables = root, tables
-        samples = read_rows(
-            tables / "sample.json",
-            {"token": str, "timestamp": NUMBER},
-            "scene_token",
-            {scene["token"]},
-        )
+        needs: Kinds = {"token": str, "timestamp": NUMBER}
+        samples = self.rows("sample", needs, "scene_token", {scene["token"]})
         if not samples:
-            raise UserError(
-                f"{tables / 'sample.json'} holds no sample of {scene['name']}",
-                fix="name another drive, or get the tables again",
-            )
+            why = f"holds no sample of {scene['name']}"
+            raise broken(tables / "sample.json", why, "name another drive, or get the tables again")
         samples.sort(key=lambda row: row["timestamp"])
         self.moments = {row["token"]: k for k, row in enumerate(samples)}
         self.start: float = samples[0]["timestamp"]
         self.stamps = {row["token"]: self.seconds(row["timestamp"]) for row in samples}
-        self.data = read_rows(
-            tables / "sample_data.json",
-            {
-                "sample_token": str,
-                "ego_pose_token": str,
-                "calibrated_sensor_token": str,
-                "timestamp": NUMBER,
-                "filename": str,
-                "is_key_frame": bool,
-            },
-            "sample_token",
-            self.moments,
-        )
+        self.data = self.rows("sample_data", RECORDED, "sample_token", self.moments)
         self.data.sort(key=lambda row: row["timestamp"])
-        self._egos = self._read_egos()
+        wanted = {row["ego_pose_token"] for row in self.data}
+        self._egos = {row["token"]: row for row in self.rows("ego_pose", PLACED, "token", wanted)}
         self._sensors = self._read_sensors()
+
+    def path(self, table: str) -> Path:
+        return self.tables / f"{table}.json"
+
+    def rows(self, table: str, needs: Kinds, column: str = "", among=()) -> list[Row]:
+        return read_rows(self.path(table), needs, column, among)
 
     def seconds(self, timestamp: float) -> float:
         """Return a time stamp in seconds since the first sample."""
@@ -161,72 +154,45 @@ class _Drive:
         """Return what recorded a row of sample_data."""
         token = row["calibrated_sensor_token"]
         if token not in self._sensors:
-            raise UserError(
-                f"{self.tables / 'calibrated_sensor.json'} has no sensor {token}, which recorded "
-                f"{row['filename']}",
-                fix="get the tables again, all of one version",
-            )
+            why = f"has no sensor {token}, which recorded {row['filename']}"
+            raise broken(self.path("calibrated_sensor"), why, _FIX)
         return self._sensors[token]
 
-    def pose(self, row: Row) -> Float64[np.ndarray, "4 4"] | None:
+    def pose(self, row: Row) -> Pose | None:
         """Return the pose, sensor to world, of a row of sample_data when it was recorded."""
         ego = self._egos.get(row["ego_pose_token"])
-        if ego is None:
-            return None
-        return _pose(ego, self.tables / "ego_pose.json") @ self.sensor(row).to_ego
+        return None if ego is None else _pose(ego, self.path("ego_pose")) @ self.sensor(row).to_ego
 
     def file(self, row: Row) -> Path:
-        """Return the file of a row of sample_data."""
+        """Return the file of a row of sample_data; UserError: it lies outside of the set."""
         name = PurePosixPath(row["filename"])
-        require_inside(
-            name,
-            self.root,
-            self.tables / "sample_data.json",
-            fix="get the tables again; files of a drive lie below the folder of its set",
-        )
+        fix = "get the tables again; files of a drive lie below the folder of its set"
+        require_inside(name, self.root, self.path("sample_data"), fix=fix)
         return self.root / name
 
     def of(self, modality: str) -> list[Row]:
         """Return the rows of all sensors of a kind, in the order of time."""
         return [row for row in self.data if self.sensor(row).modality == modality]
 
-    def _read_egos(self) -> dict[str, Row]:
-        wanted = {row["ego_pose_token"] for row in self.data}
-        needs = {"translation": list, "rotation": list}
-        rows = read_rows(self.tables / "ego_pose.json", needs, "token", wanted)
-        return {row["token"]: row for row in rows}
-
     def _read_sensors(self) -> dict[str, _Sensor]:
         wanted = {row["calibrated_sensor_token"] for row in self.data}
-        path = self.tables / "calibrated_sensor.json"
-        needs = {
-            "sensor_token": str,
-            "translation": list,
-            "rotation": list,
-            "camera_intrinsic": list,
-        }
-        rows = read_rows(path, needs, "token", wanted)
-        kinds = {
-            row["token"]: row
-            for row in read_rows(
-                self.tables / "sensor.json", {"token": str, "channel": str, "modality": str}
-            )
-        }
+        needs: Kinds = {**PLACED, "sensor_token": str, "camera_intrinsic": list}
+        kinds = dict.fromkeys(("token", "channel", "modality"), str)
+        rows = self.rows("calibrated_sensor", needs, "token", wanted)
+        known = {row["token"]: row for row in self.rows("sensor", kinds)}
         sensors = {}
         for row in rows:
-            kind = kinds.get(row["sensor_token"])
+            kind = known.get(row["sensor_token"])
             if kind is None:
-                raise UserError(
-                    f"{self.tables / 'sensor.json'} has no sensor {row['sensor_token']}",
-                    fix="get the tables again, all of one version",
-                )
+                raise broken(self.path("sensor"), f"has no sensor {row['sensor_token']}", _FIX)
+            pose = _pose(row, self.path("calibrated_sensor"))
             sensors[row["token"]] = _Sensor(
-                kind["channel"], kind["modality"], _pose(row, path), row["camera_intrinsic"]
+                kind["channel"], kind["modality"], pose, row["camera_intrinsic"]
             )
         return sensors
 
 
-def _pose(row: Row, path: Path) -> Float64[np.ndarray, "4 4"]:
+def _pose(row: Row, path: Path) -> Pose:
     what = f"{row['token']}"
     wxyz = _numbers(row["rotation"], 4, path, f"the rotation of {what}")
     position = _numbers(row["translation"], 3, path, f"the translation of {what}")
@@ -236,16 +202,11 @@ def _pose(row: Row, path: Path) -> Float64[np.ndarray, "4 4"]:
 def _numbers(values: Sequence, count: int, path: Path, what: str) -> Float64[np.ndarray, " n"]:
     numbers = finite_numbers(values, path, what)
     if len(numbers) != count:
-        raise UserError(
-            f"{path}: {what} should be {count} numbers, not {len(numbers)}",
-            fix="get the file again",
-        )
+        raise broken(f"{path}:", f"{what} should be {count} numbers, not {len(numbers)}")
     return numbers
 
 
-def _photographs(
-    drive: _Drive,
-) -> tuple[tuple[Photograph, ...], tuple[RigCamera, ...], int]:
+def _photographs(drive: _Drive) -> tuple[list[Photograph], list[RigCamera], int]:
     """Return the photographs of the keyframes, their cameras, and how many have no pose."""
     photographs: list[Photograph] = []
     cameras: dict[str, tuple[RigCamera, str]] = {}
@@ -253,52 +214,37 @@ def _photographs(
     for row in drive.of("camera"):
         if not row["is_key_frame"]:
             continue
-        sensor, token = drive.sensor(row), row["calibrated_sensor_token"]
-        if sensor.channel not in cameras:
-            cameras[sensor.channel] = _camera(drive, row), token
-        if cameras[sensor.channel][1] != token:
-            raise UserError(
-                f"{drive.tables / 'sample_data.json'}: {sensor.channel} has two calibrations in "
-                "one drive",
-                fix="get the tables again",
-            )
+        channel, token = drive.sensor(row).channel, row["calibrated_sensor_token"]
+        if channel not in cameras:
+            cameras[channel] = _camera(drive, row), token
+        if cameras[channel][1] != token:
+            why = f"{channel} has two calibrations in one drive"
+            raise broken(f"{drive.path('sample_data')}:", why)
         pose = drive.pose(row)
         if pose is None:
             without += 1
             continue
-        photographs.append(
-            Photograph(
-                camera=sensor.channel,
-                frame=drive.moments[row["sample_token"]],
-                time=drive.seconds(row["timestamp"]),
-                path=drive.file(row),
-                pose=pose,
-            )
-        )
-    return tuple(photographs), tuple(c for _, (c, _) in sorted(cameras.items())), without
+        frame, time = drive.moments[row["sample_token"]], drive.seconds(row["timestamp"])
+        photographs.append(Photograph(channel, frame, time, drive.file(row), pose))
+    return photographs, [camera for _, (camera, _) in sorted(cameras.items())], without
 
 
 def _camera(drive: _Drive, row: Row) -> RigCamera:
-    sensor = drive.sensor(row)
-    path = drive.tables / "calibrated_sensor.json"
+    sensor, path = drive.sensor(row), drive.path("calibrated_sensor")
     what = f"camera_intrinsic of {sensor.channel}"
     flat = [value for line in sensor.intrinsics for value in np.atleast_1d(line).tolist()]
     K = _numbers(flat, 9, path, what).reshape(3, 3)
     if K[0, 0] <= 0 or K[1, 1] <= 0 or not np.allclose(K[2], [0, 0, 1]):
-        raise UserError(f"{path}: {what} is no camera matrix", fix="get the file again")
+        raise broken(f"{path}:", f"{what} is not a camera matrix")
     # The devkit draws K's products over pixels whose centres lie at integers (`imshow`), and asks
     # for 0 to width - 1; ours are at +0.5.
     K[:2, 2] += 0.5
-    size = _numbers(
-        [row.get("width"), row.get("height")],
-        2,
-        drive.tables / "sample_data.json",
-        f"the size of {row['filename']}",
-    )
-    return RigCamera(sensor.channel, K, int(size[0]), int(size[1]))
+    what, sides = f"the size of {row['filename']}", (row.get("width"), row.get("height"))
+    width, height = _numbers(sides, 2, drive.path("sample_data"), what)
+    return RigCamera(sensor.channel, K, int(width), int(height))
 
 
-def _sweeps(drive: _Drive) -> tuple[tuple[Sweep, ...], int]:
+def _sweeps(drive: _Drive) -> tuple[list[Sweep], int]:
     """Return laser sweeps, and how many of the keyframes' are missing."""
     sweeps, absent = [], 0
     for row in drive.of("lidar"):
@@ -306,19 +252,15 @@ def _sweeps(drive: _Drive) -> tuple[tuple[Sweep, ...], int]:
         if pose is None or not path.is_file():
             absent += row["is_key_frame"]
             continue
-        time = drive.seconds(row["timestamp"])
-        frame = drive.moments[row["sample_token"]]
+        frame, time = drive.moments[row["sample_token"]], drive.seconds(row["timestamp"])
         sweeps.append(Sweep(frame, time, partial(_read_sweep, path, pose, time)))
-    return tuple(sweeps), absent
+    return sweeps, absent
 
 
-def _read_sweep(path: Path, pose: Float64[np.ndarray, "4 4"], end: float) -> SweepPoints:
+def _read_sweep(path: Path, pose: Pose, end: float) -> SweepPoints:
     values = np.fromfile(path, "<f4")
-    if values.size % POINT:
-        raise UserError(
-            f"{path} is no LiDAR sweep: float32 x y z intensity ring",
-            fix="get the file again; it may be cut off",
-        )
+    if values.size % POINT or path.stat().st_size % values.itemsize:
+        raise broken(path, "is not a LiDAR sweep: float32 x y z intensity ring")
     local = values.reshape(-1, POINT)[:, :3].astype(np.float64)
     # Points are already moved to where the car was at the end; the time that they were measured
     # follows from their order.
@@ -328,17 +270,15 @@ def _read_sweep(path: Path, pose: Float64[np.ndarray, "4 4"], end: float) -> Swe
 
 def _objects(drive: _Drive) -> tuple[tuple[TrackedObject, ...], list[str]]:
     """Return what was followed, and notes."""
-    path = drive.tables / "sample_annotation.json"
-    needs = {"translation": list, "rotation": list, "size": list, "sample_token": str}
-    rows = read_rows(path, needs, "sample_token", drive.moments) if path.is_file() else []
+    path = drive.path("sample_annotation")
+    needs: Kinds = {**PLACED, "size": list, "sample_token": str}
+    there = path.is_file()
+    rows = drive.rows("sample_annotation", needs, "sample_token", drive.moments) if there else []
     if not rows:
-        why = "holds no box of this drive" if path.is_file() else "is missing"
+        why = "holds no box of this drive" if there else "is missing"
         return (), [f"{path.name} {why}: what moves is not known."]
-    labels = _labels(drive.tables, {row.get("instance_token") for row in rows})
-    attributes = {
-        row["token"]: row["name"]
-        for row in read_rows(drive.tables / "attribute.json", {"token": str, "name": str})
-    }
+    labels = _labels(drive, {row.get("instance_token") for row in rows})
+    attributes = _names(drive, "attribute")
     scanners = {}
     for row in drive.of("lidar"):
         if row["is_key_frame"] and (pose := drive.pose(row)) is not None:
@@ -352,7 +292,7 @@ def _objects(drive: _Drive) -> tuple[tuple[TrackedObject, ...], list[str]]:
         pose = _pose({"token": f"a box of {name}", **row}, path)
         width, length, height = _numbers(row["size"], 3, path, f"the size of {name}").tolist()
         if min(width, length, height) <= 0:
-            raise UserError(f"{path}: a box of {name} has no size", fix="get the file again")
+            raise broken(f"{path}:", f"a box of {name} has no size")
         sample = row["sample_token"]
         time = drive.stamps[sample]
         if sample in scanners:
@@ -360,21 +300,20 @@ def _objects(drive: _Drive) -> tuple[tuple[TrackedObject, ...], list[str]]:
             to_scanner = scanners[sample]
             x, y, _ = to_scanner[:3, :3] @ pose[:3, 3] + to_scanner[:3, 3]
             time -= TURN_S * float(1 - turned(np.arctan2(y, x), TURN_START))
-        said = [attributes.get(token, "") for token in row.get("attribute_tokens") or ()]
-        boxes.append(Box(name, labels[name], (length, width, height), time, pose, _moving(said)))
-    notes = []
-    if untracked:
-        notes.append(f"{untracked} boxes in {path.name} belong to no instance: they are left out.")
-    return tracks(boxes), notes
+        moving = _moving([attributes.get(t, "") for t in row.get("attribute_tokens") or ()])
+        boxes.append(Box(name, labels[name], (length, width, height), time, pose, moving))
+    words = f"boxes in {path.name} belong to no instance: they are left out."
+    return tracks(boxes), counted(untracked, words)
 
 
-def _labels(tables: Path, instances: set) -> dict[str, str]:
+def _names(drive: _Drive, table: str) -> dict[str, str]:
+    return {row["token"]: row["name"] for row in drive.rows(table, {"token": str, "name": str})}
+
+
+def _labels(drive: _Drive, instances: set) -> dict[str, str]:
     """Return the category of each instance."""
-    categories = {
-        row["token"]: row["name"]
-        for row in read_rows(tables / "category.json", {"token": str, "name": str})
-    }
-    rows = read_rows(tables / "instance.json", {"category_token": str}, "token", instances)
+    categories = _names(drive, "category")
+    rows = drive.rows("instance", {"category_token": str}, "token", instances)
     return {row["token"]: categories.get(row["category_token"], "unknown") for row in rows}
 
 

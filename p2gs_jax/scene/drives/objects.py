@@ -1,17 +1,36 @@
-"""Tracked things, the same way for every data set."""
+"""Tracked things: their tracks, where they are in a view, and which pixels their boxes cover."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
+import cv2
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float, Float64
 
-from p2gs_jax.types import TrackedObject
+from p2gs_jax.core.numerics import on_host
+from p2gs_jax.errors import UserError
+from p2gs_jax.render.project import HIDDEN
+from p2gs_jax.scene.rigid import interpolated
+from p2gs_jax.types import Placement, Scene, TrackedObject, View
 
+# A rigid pose as a matrix.
+Pose = Float64[np.ndarray, "4 4"]
 # Boxes of parked cars jump by a few decimetres from frame to frame; what gets further moves.
 STANDS_WITHIN_M = 1.0
+MOST_LISTED = 12
+# Boxes are cut off this near to the camera, scene units.
+NEAR = 0.1
+# Boxes are widened by this much to every side: they are drawn tightly, and a photograph is not
+# taken in one moment. Scene units.
+MARGIN = 0.15
+
+_SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+# Corners that differ in one coordinate.
+_EDGES = [(a, a | bit) for bit in (4, 2, 1) for a in range(8) if not a & bit]
 
 
 def tracked(
@@ -19,7 +38,7 @@ def tracked(
     label: str,
     size: tuple[float, float, float],
     times: Sequence[float] | Float64[np.ndarray, " k"],
-    poses: Sequence[Float64[np.ndarray, "4 4"]] | Float64[np.ndarray, "k 4 4"],
+    poses: Sequence[Pose] | Float64[np.ndarray, "k 4 4"],
     moving: bool | None,
 ) -> TrackedObject:
     """Return a track in the order of its times, each time once.
@@ -27,9 +46,9 @@ def tracked(
     Args:
         name: of the track.
         label: what it is, in the data set's words.
-        size: length (x), width (y), height (z) of the box, metres.
+        size: see `Box`.
         times: seconds, in any order; of repeated ones the first counts.
-        poses: box to world, the origin in the middle of the box; at least one.
+        poses: see `Box`; at least one.
         moving: what the set says; None: it moves if it gets further than a metre from where it
             was first.
     """
@@ -51,7 +70,7 @@ class Box(NamedTuple):
         label: what it is.
         size: length (x), width (y), height (z), metres.
         time: seconds.
-        pose: box to world.
+        pose: box to world, the origin in the middle of the box.
         moving: what the set says of this moment, or None.
     """
 
@@ -59,7 +78,7 @@ class Box(NamedTuple):
     label: str
     size: tuple[float, float, float]
     time: float
-    pose: Float64[np.ndarray, "4 4"]
+    pose: Pose
     moving: bool | None = None
 
 
@@ -73,16 +92,161 @@ def tracks(boxes: Iterable[Box]) -> tuple[TrackedObject, ...]:
         of.setdefault(box.track, []).append(box)
     things = []
     for name, own in sorted(of.items()):
-        told = [box.moving for box in own if box.moving is not None]
+        known = [box.moving for box in own if box.moving is not None]
         length, width, height = np.median([box.size for box in own], axis=0)
-        things.append(
-            tracked(
-                name,
-                own[0].label,
-                (length, width, height),
-                [box.time for box in own],
-                [box.pose for box in own],
-                any(told) if told else None,
-            )
-        )
+        size = (length, width, height)
+        times, poses = [box.time for box in own], [box.pose for box in own]
+        moving = any(known) if known else None
+        things.append(tracked(name, own[0].label, size, times, poses, moving))
     return tuple(things)
+
+
+@dataclass(frozen=True)
+class MovingObjects:
+    """The objects that Gaussians belong to.
+
+    Attributes:
+        objects: in the order of `Population.owner`.
+        offsets: by which somebody moved them, in the frame of each box, scene units; None: nobody.
+        middle: of the drive, where Gaussians vibrate: the zero of `Placement.time`, seconds.
+    """
+
+    objects: tuple[TrackedObject, ...]
+    offsets: Float[np.ndarray, "k 3"] | None = None
+    middle: float | None = None
+
+    def __len__(self) -> int:
+        return len(self.objects)
+
+    def poses(self, time: float) -> tuple[Float64[np.ndarray, "k 4 4"], Bool[np.ndarray, " k"]]:
+        """Return box-to-world matrices at a time, and which objects are tracked then."""
+        out = np.tile(np.eye(4), (len(self), 1, 1))
+        there = np.zeros(len(self), bool)
+        for row, thing in enumerate(self.objects):
+            poses, covered = interpolated(thing.times, thing.poses, np.array([time]))
+            out[row], there[row] = poses[0], covered[0]
+        if self.offsets is not None:
+            out[:, :3, 3] += np.einsum("kij,kj->ki", out[:, :3, :3], self.offsets)
+        return out, there
+
+    def moved(self, name: str, offset: Sequence[float]) -> MovingObjects:
+        """Return the objects with one of them, named by how its track begins, moved.
+
+        `offset` is forward, left and up in the frame of its box, scene units. UserError: no object
+        has this name, or several.
+        """
+        names = [thing.name for thing in self.objects]
+        exact = [row for row, known in enumerate(names) if known == name]
+        found = exact or [row for row, known in enumerate(names) if known.startswith(name)]
+        if len(found) != 1 or not name:
+            what = "no object" if not found else f"{len(found)} objects"
+            listed = ", ".join(f"{o.name} ({o.label})" for o in self.objects[:MOST_LISTED])
+            rest = len(self.objects) - MOST_LISTED
+            raise UserError(
+                f"{what} with Gaussians of its own has a name that begins with {name!r}.",
+                fix=f"choose one of {listed}" + (f" and {rest} others" if rest > 0 else ""),
+            )
+        offsets = np.zeros((len(self), 3)) if self.offsets is None else self.offsets.copy()
+        offsets[found[0]] += np.asarray(offset, float)
+        return dataclasses.replace(self, offsets=offsets)
+
+    def placement(self, viewmat: Float[np.ndarray, "4 4"], time: float) -> Placement:
+        """Return where the objects are in a view (world-to-camera) at a time, on the host."""
+        poses, there = self.poses(time)
+        viewmats = (np.asarray(viewmat, np.float64) @ poses).astype(np.float32)
+        viewmats[~there] = HIDDEN
+        since = None if self.middle is None else np.float32(time - self.middle)
+        return on_host(Placement, viewmats, since)
+
+
+def middle_time(scene: Scene) -> float:
+    """Return the time of the middle one of the training views that have one, seconds."""
+    times = sorted(view.time for view in scene.training_views if view.time is not None)
+    return times[len(times) // 2]
+
+
+def object_mask(
+    view: View,
+    objects: Sequence[TrackedObject],
+    width: int,
+    height: int,
+    margin: float = MARGIN,
+) -> Bool[np.ndarray, "h w"]:
+    """Return which pixels of a view the boxes of moving objects cover at its time.
+
+    Nothing is covered in a view without a time. The mask has the size that is asked for; boxes are
+    widened by the margin, scene units, to every side.
+    """
+    return painted(outlines(view, objects, margin), view, width, height)
+
+
+def outlines(
+    view: View, objects: Sequence[TrackedObject], margin: float = MARGIN
+) -> list[Float[np.ndarray, "c 2"]]:
+    """Return the convex outlines of the boxes in a view, pixels at its full size; see above."""
+    if view.time is None:
+        return []
+    found = []
+    for thing in objects:
+        if not thing.moving:
+            continue
+        poses, there = interpolated(thing.times, thing.poses, np.array([view.time]))
+        outline = outline_of(poses[0], thing.size, view, margin) if there[0] else None
+        if outline is not None:
+            found.append(outline)
+    return found
+
+
+def outline_of(
+    pose: Float[np.ndarray, "4 4"],
+    size: tuple[float, float, float],
+    view: View,
+    margin: float = MARGIN,
+) -> Float[np.ndarray, "c 2"] | None:
+    """Return the convex outline of a box (`pose`: box to world), pixels of the view at full size.
+
+    None: the image shows nothing of it.
+    """
+    corners = _SIGNS * (np.asarray(size) / 2 + margin)
+    camera = view.viewmat.astype(np.float64) @ pose
+    points = corners @ camera[:3, :3].T + camera[:3, 3]
+    z = points[:, 2]
+    cut = [_crossing(points[a], points[b]) for a, b in _EDGES if (z[a] < NEAR) != (z[b] < NEAR)]
+    points = np.concatenate([points[z >= NEAR], *(c[None] for c in cut)])
+    if len(points) < 3:
+        return None
+    xy = points[:, :2] / points[:, 2:] * view.K[[0, 1], [0, 1]] + view.K[:2, 2]
+    low, high = xy.min(0), xy.max(0)
+    if (high <= 0).any() or (low >= [view.width, view.height]).any():
+        return None
+    return cv2.convexHull(xy.astype(np.float32))[:, 0].astype(np.float64)
+
+
+def _crossing(a: np.ndarray, b: np.ndarray) -> Float[np.ndarray, " 3"]:
+    """Return where an edge meets the near plane."""
+    share = (NEAR - a[2]) / (b[2] - a[2])
+    return a + share * (b - a)
+
+
+def painted(
+    polygons: Sequence[Float[np.ndarray, "c 2"]], view: View, width: int, height: int
+) -> Bool[np.ndarray, "h w"]:
+    """Return which pixel centres lie within convex polygons, in an image of the given size.
+
+    The corners of a polygon are in order, in pixels of the view at its full size.
+    """
+    out = np.zeros((height, width), bool)
+    for polygon in polygons:
+        corners = polygon * [width / view.width, height / view.height]
+        first = np.clip(np.floor(corners.min(0)), 0, [width, height]).astype(int)
+        last = np.clip(np.ceil(corners.max(0)), 0, [width, height]).astype(int)
+        x = np.arange(first[0], last[0]) + 0.5
+        y = np.arange(first[1], last[1])[:, None] + 0.5
+        sides = np.roll(corners, -1, 0) - corners
+        after = np.roll(sides, -1, 0)
+        turn = np.sign(np.sum(sides[:, 0] * after[:, 1] - sides[:, 1] * after[:, 0]))
+        inside = np.ones((len(y), x.size), bool)
+        for corner, side in zip(corners, sides, strict=True):
+            inside &= turn * (side[0] * (y - corner[1]) - side[1] * (x - corner[0])) >= 0
+        out[first[1] : last[1], first[0] : last[0]] |= inside
+    return out

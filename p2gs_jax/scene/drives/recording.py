@@ -1,8 +1,27 @@
-"""What a driving data set holds of one drive, as every reader gives it; nothing is decoded yet."""
+"""The contract between readers of driving data sets and the rest of the program.
+
+A reader is a pair of functions in a module of its own, listed in `FORMATS`: `is_NAME(root)` looks
+at names of files only; `read_NAME(root, cfg)` reads the tables and returns a `Recording`, but
+decodes neither photographs nor laser points. `root` is the folder of a drive, or of several of
+which `cfg.drive` names one. What a reader promises:
+
+- The world is right-handed and metric; its origin may be anywhere. One clock, in seconds, serves
+  photographs, laser points and tracks.
+- A photograph has the time and the pose of its own camera; those of one moment share a frame. K has
+  pixel centres at +0.5. Names of cameras are names of folders.
+- Boxes look along x, y is left, z up, and their origin is the middle. A box has the time at which
+  the scanner passed it, not that of its frame; times of a track rise.
+- Sweeps are in the order of time. Each point lies where it was at its own time.
+- What is incomplete is left out, and a note counts it. What is broken raises UserError with the
+  name of the file, for a sweep when it is read.
+
+tests/scene/drives/test_readers.py asks all of this of every reader.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -10,18 +29,20 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
+from p2gs_jax.errors import UserError
 from p2gs_jax.types import Distortion, TrackedObject
+
+Report = Callable[[str], None]
+# Words that data sets put around the names of their cameras.
+_AROUND = re.compile(r"(?:^|_)(?:camera|cam|ring)(?=_|$)")
 
 
 @dataclass(frozen=True)
 class RigCamera:
-    """One camera of a car.
+    """One camera of a car, as the data set names it; sizes are pixels.
 
     Attributes:
-        name: in the data set.
         K: intrinsics in pixels of the undistorted image, pixel centres at +0.5.
-        width: pixels.
-        height: pixels.
         distortion: what to remove on load, or None.
         readout_s: seconds from the exposure of the first row, or column, to that of the last,
             where the set states a rolling shutter; else None.
@@ -40,12 +61,11 @@ class Photograph:
     """One photograph and where its camera was.
 
     Attributes:
-        camera: name of the camera.
         frame: number of the moment in the drive, the same for all cameras.
-        time: seconds, on one clock for everything in the drive.
-        path: its file; of an embedded one the name that it gets.
+        time: seconds.
+        path: its file; an embedded photograph has none, and gets this name.
         pose: camera to world at `time`, OpenCV axes.
-        embedded: returns the bytes of a photograph that is no file of its own; else None.
+        embedded: returns the bytes of a photograph that has no file; else None.
     """
 
     camera: str
@@ -60,9 +80,9 @@ class SweepPoints(NamedTuple):
     """One sweep of a laser scanner.
 
     Attributes:
-        points: world coordinates, each as of its own time; as the file has them, so they may be no
-            finite numbers (`assemble` counts and drops those).
-        times: seconds; of all points alike where the set gives no more.
+        points: world coordinates, each at its own time; NaN and inf as in the file (`assemble`
+            counts and drops them).
+        times: seconds; the same for all points where the set gives no more.
     """
 
     points: Float64[np.ndarray, "n 3"]
@@ -71,12 +91,9 @@ class SweepPoints(NamedTuple):
 
 @dataclass(frozen=True)
 class Sweep:
-    """A sweep that is read when it is asked for.
+    """A sweep that is read on demand; `time` is seconds.
 
-    Attributes:
-        frame: number of its moment.
-        time: seconds.
-        read: reads it. Raises UserError where its file is broken.
+    `read` raises UserError where its file is broken.
     """
 
     frame: int
@@ -89,19 +106,65 @@ class Recording:
     """One drive.
 
     Attributes:
-        root: folder that the user named.
+        root: folder that the user named, or that of the chosen drive in it.
         format: name of the reader (`DataConfig.format`).
-        cameras: of the car.
+        cameras: all cameras of the car that have photographs.
         photographs: in any order; those without a pose are left out and counted in `notes`.
-        sweeps: of all scanners, in the order of their times.
-        objects: tracked things.
-        notes: what was left out, and what the user should know.
+        sweeps: from all scanners, in the order of their times.
+        notes: sentences: what was left out, and what the user should know.
     """
 
     root: Path
     format: str
-    cameras: tuple[RigCamera, ...]
-    photographs: tuple[Photograph, ...]
-    sweeps: tuple[Sweep, ...] = ()
-    objects: tuple[TrackedObject, ...] = ()
-    notes: tuple[str, ...] = ()
+    cameras: Sequence[RigCamera]
+    photographs: Sequence[Photograph]
+    sweeps: Sequence[Sweep] = ()
+    objects: Sequence[TrackedObject] = ()
+    notes: Sequence[str] = ()
+
+
+def short_name(camera: str) -> str:
+    """Return a camera's name without the words around it: `front_left` for `CAM_FRONT_LEFT`."""
+    return _AROUND.sub("", camera.lower()).strip("_") or camera.lower()
+
+
+def chosen_cameras(asked: Sequence[str], there: Sequence[str]) -> list[str]:
+    """Return the cameras asked for by (short) names, none: all; UserError: one is unknown."""
+    if not asked:
+        return list(there)
+    found = []
+    for name in asked:
+        fits = [c for c in there if c == name] or [
+            c for c in there if short_name(c) == short_name(name)
+        ]
+        if not fits:
+            listed = ", ".join(map(short_name, there))
+            raise UserError(f"there is no camera {name!r}", fix=f"choose one of {listed}")
+        found += [c for c in fits if c not in found]
+    return found
+
+
+def chosen_frames(asked: str | None, there: Sequence[int]) -> list[int]:
+    """Return the frames in a slice FIRST:END[:STEP] of those that are there; nothing asked: all.
+
+    As in Python a part may be empty, and negative numbers count from the end. UserError: this is
+    not a slice, or it holds no frame.
+    """
+    if asked is None:
+        return list(there)
+    parts = asked.split(":")
+    try:
+        numbers = [int(part) if part.strip() else None for part in parts]
+        if len(numbers) not in (2, 3):
+            raise ValueError(asked)
+        found = list(there)[slice(*numbers)]
+    except ValueError:
+        raise UserError(
+            f"--frames {asked!r} is not a valid slice",
+            fix="write FIRST:END or FIRST:END:STEP, as 0:30:2",
+        ) from None
+    if not found:
+        raise UserError(
+            f"--frames {asked} holds no frame of this drive", fix=f"it has {len(there)}, from 0 on"
+        )
+    return found

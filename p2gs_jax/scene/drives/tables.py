@@ -1,8 +1,19 @@
-"""Tables of driving data sets that are text: read whole, with complaints that name the file."""
+"""What readers of driving data sets share: files, numbers, JSON and pickled pandas tables.
+
+A pickle names functions and calls them. Here every name that a table of numbers and texts may hold
+stands for an inert record of what it was called with; other names are refused. What the records
+mean is worked out afterwards, for the layouts that pandas has written since 0.14: nothing in a
+file is ever run.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import gzip
+import io
+import json
+import pickle
+import re
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,37 +21,49 @@ import numpy as np
 from jaxtyping import Float64
 
 from p2gs_jax.core.text import parse_json
-from p2gs_jax.errors import UserError
+from p2gs_jax.errors import UserError, broken
+
+Row = dict[str, Any]
+Kinds = Mapping[str, type | tuple[type, ...]]
+
+_GAP = re.compile(r"[\s,]*")
+_DECODER = json.JSONDecoder()
+# Modules moved between versions of pandas and numpy.
+_IN_TABLES = re.compile(
+    r"pandas(\.\w+)*\.(DataFrame|BlockManager|_unpickle_block|_new_Index|(Range|Int64)?Index)"
+    r"|numpy\.(ndarray|dtype|_?core\.multiarray\._reconstruct|_?core\.numeric\._frombuffer)"
+    r"|(builtins|__builtin__)\.slice"
+)
+# A message lists at most this many drives.
+LISTED = 5
+# A sweep of PandaSet takes 10 MB.
+_MOST_BYTES = 2**28
 
 
-def read_json(path: Path) -> Any:
-    """Return what a JSON file holds.
+def counted(count: int, words: str) -> list[str]:
+    """Return the note `COUNT WORDS`, or none where nothing was counted."""
+    return [f"{count} {words}"] if count else []
 
-    Raises:
-        UserError: it is missing or broken.
+
+def chosen_drive(asked: str | None, there: Sequence[str], root: Path) -> str:
+    """Return the drive among those in `root` whose name was asked for, or how that begins.
+
+    Nothing asked: the only one. UserError: none has this name, or several could be meant.
     """
-    try:
-        return parse_json(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise missing_file(path) from None
-    except (ValueError, RecursionError) as error:
-        raise UserError(
-            f"{path} is no valid JSON: {error}", fix="get the file again; it may be cut off"
-        ) from None
-
-
-def read_json_list(path: Path) -> list[Any]:
-    """Return the list that a JSON file holds.
-
-    Raises:
-        UserError: it is missing or broken, or holds something else.
-    """
-    held = read_json(path)
-    if not isinstance(held, list):
-        raise UserError(
-            f"{path} holds no list with an entry a frame", fix="get the file again as published"
-        )
-    return held
+    fits = [name for name in there if name == asked] or [
+        name for name in there if asked is None or name.startswith(asked)
+    ]
+    if len(fits) == 1:
+        return fits[0]
+    listed = sorted(fits or there)
+    names = ", ".join(listed[:LISTED]) + (", ..." if len(listed) > LISTED else "")
+    if asked is None:
+        message = f"{root} holds {len(there)} drives: {names}"
+    elif fits:
+        message = f"{len(fits)} drives of {root} begin with {asked!r}: {names}"
+    else:
+        message = f"{root} holds no drive {asked!r}; there are {names or 'none'}"
+    raise UserError(message, fix="name one of them: --drive NAME")
 
 
 def missing_file(path: Path) -> UserError:
@@ -49,31 +72,20 @@ def missing_file(path: Path) -> UserError:
 
 
 def finite_numbers(values: Iterable[Any], path: Path, what: str) -> Float64[np.ndarray, " n"]:
-    """Return numbers, all finite.
-
-    Args:
-        values: numbers, or their texts.
-        path: file, for complaints.
-        what: what they are, for complaints.
-
-    Raises:
-        UserError: one is no finite number.
-    """
+    """Return numbers, or their texts, as an array; UserError: one (of `what`) is not finite."""
     try:
         numbers = np.array([float(value) for value in values])
     except (TypeError, ValueError):
         numbers = np.array([np.nan])
     if not np.isfinite(numbers).all():
-        raise UserError(f"{path}: {what} should be finite numbers", fix="get the file again")
+        raise broken(f"{path}:", f"{what} should be finite numbers")
     return numbers
 
 
 def numbered(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
-    """Return the files of a folder whose names are numbers, by these, rising.
+    """Return the files of a folder whose names are numbers before a suffix, by these, rising.
 
-    Args:
-        folder: may be absent.
-        suffixes: endings that count, with the dot (".pkl.gz").
+    The folder may be absent. Suffixes have the dot (".pkl.gz"); the first one that fits counts.
     """
     found: dict[int, Path] = {}
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
@@ -82,3 +94,215 @@ def numbered(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
             if stem != path.name and stem.isdigit():
                 found.setdefault(int(stem), path)
     return dict(sorted(found.items()))
+
+
+def read_lines(path: Path) -> list[str]:
+    """Return the lines of a text, whatever its encoding; UserError: it is missing."""
+    try:
+        return path.read_text(errors="replace").splitlines()
+    except FileNotFoundError:
+        raise missing_file(path) from None
+
+
+def read_json(path: Path) -> Any:
+    """Return what a JSON file holds; UserError: it is missing or broken."""
+    try:
+        return parse_json(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise missing_file(path) from None
+    except (ValueError, RecursionError) as error:
+        raise broken(path, f"is not valid JSON: {error}") from None
+
+
+def read_json_list(path: Path) -> list[Any]:
+    """Return the list that a JSON file holds; UserError: it is missing, broken or not a list."""
+    held = read_json(path)
+    if not isinstance(held, list):
+        raise broken(path, "should hold a list with an entry for each frame")
+    return held
+
+
+def read_rows(path: Path, needs: Kinds, column: str = "", among: Container[Any] = ()) -> list[Row]:
+    """Return rows of a large JSON list of objects; only those wanted are decoded.
+
+    Tables of all of nuScenes' drives are millions of rows; those of one drive are found in the
+    text, which takes a fifth of the time that decoding all does. Rows should hold no objects.
+
+    Args:
+        path: the table.
+        needs: columns that every row returned must have, and their types.
+        column: only rows whose value in it, a text, is `among` these; "": all rows.
+        among: values.
+
+    Raises:
+        UserError: the file is missing, not a list of objects, or cut off, or a row lacks a column.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise missing_file(path) from None
+    except ValueError as error:
+        raise _not_rows(path, error) from None
+    closed = re.search(r"[}\[]\s*\]\s*$", text[-1000:])
+    rows = list(_found(text, column, among)) if column and closed else []
+    # Where nothing is found, the table may be written otherwise, or not be a table.
+    rows = rows or [row for row in _every(text, path) if not column or row.get(column) in among]
+    for row in rows:
+        for name, kind in needs.items():
+            if not isinstance(row.get(name), kind):
+                raise _not_rows(path, f"a row has no valid {name!r}: {json.dumps(row)[:200]}")
+    return rows
+
+
+def _found(text: str, column: str, among: Container[Any]) -> Iterator[Row]:
+    """Yield the rows that hold one of the values; rows are taken to hold no objects."""
+    for match in re.finditer(rf'"{re.escape(column)}"\s*:\s*"([^"]*)"', text):
+        if match[1] not in among:
+            continue
+        try:
+            row, end = _DECODER.raw_decode(text, text.rfind("{", 0, match.start()))
+        except (ValueError, RecursionError):
+            continue
+        if end > match.start() and isinstance(row, dict) and row.get(column) == match[1]:
+            yield row
+
+
+def _every(text: str, path: Path) -> Iterator[Row]:
+    at = _skip(text, 0)
+    if text[at : at + 1] != "[":
+        raise _not_rows(path, "it should be a list of objects")
+    at = _skip(text, at + 1)
+    while text[at : at + 1] != "]":
+        try:
+            row, at = _DECODER.raw_decode(text, at)
+        except (ValueError, RecursionError) as error:
+            raise _not_rows(path, error) from None
+        if not isinstance(row, dict):
+            raise _not_rows(path, "it should be a list of objects")
+        yield row
+        at = _skip(text, at)
+
+
+def _skip(text: str, at: int) -> int:
+    """Return where the next value, or the end of the list, begins."""
+    gap = _GAP.match(text, at)
+    return gap.end() if gap else at
+
+
+def _not_rows(path: Path, why: object) -> UserError:
+    return broken(path, f"is not a valid table: {why}")
+
+
+class _Record:
+    """What one name was called with, and the state it was given."""
+
+    name = ""
+    args: tuple
+    state: Any
+
+    def __new__(cls, *args):
+        made = super().__new__(cls)
+        made.args, made.state = args, None
+        return made
+
+    def __setstate__(self, state):
+        self.state = state
+
+
+class _Records(pickle.Unpickler):
+    """Reads a pickle as a tree of plain values and records."""
+
+    def find_class(self, module: str, name: str):
+        if not _IN_TABLES.fullmatch(f"{module}.{name}"):
+            raise pickle.UnpicklingError(f"it holds a {module}.{name}")
+        return type(name, (_Record,), {"name": name})
+
+
+class Columns(dict[str, np.ndarray]):
+    """Columns of a table by name; UserError where one that is asked for is not there."""
+
+    def __init__(self, columns: dict[str, np.ndarray], path: Path):
+        super().__init__(columns)
+        self.path = path
+
+    def __missing__(self, name: str):
+        raise broken(self.path, f"has no column {name!r}, only {', '.join(self)}")
+
+    def numbers(self, name: str) -> Float64[np.ndarray, " n"]:
+        """Return a column of numbers; UserError: it holds something else."""
+        if self[name].dtype.kind not in "biuf":
+            raise broken(f"{self.path}:", f"its column {name!r} should hold numbers")
+        return self[name].astype(np.float64)
+
+
+def read_pickled(path: Path) -> Columns:
+    """Return the columns of a pickled table (.pkl or .pkl.gz); texts are objects.
+
+    UserError: it is missing or damaged, or holds anything but a table of numbers and texts.
+    """
+    try:
+        content = path.read_bytes()
+        if content[:2] == b"\x1f\x8b":
+            with gzip.open(io.BytesIO(content)) as packed:
+                content = packed.read(_MOST_BYTES + 1)
+            if len(content) > _MOST_BYTES:
+                raise ValueError(f"it unpacks to more than {_MOST_BYTES >> 20} MiB")
+        return Columns(_columns(_Records(io.BytesIO(content)).load()), path)
+    except FileNotFoundError:
+        raise missing_file(path) from None
+    # A damaged pickle ends in whatever its bytes happen to ask for.
+    except Exception as error:
+        fix = "get the file again; tables are pickled pandas DataFrames of numbers and texts"
+        raise broken(path, f"is not a table that can be read: {error}", fix) from error
+
+
+def _columns(table: Any) -> dict[str, np.ndarray]:
+    if not isinstance(table, _Record) or table.name != "DataFrame":
+        raise ValueError("its content is not a DataFrame")
+    manager = table.state.get("_mgr", table.state.get("_data"))
+    if manager.args:
+        blocks, axes = manager.args[:2]
+        blocks = [block.args[:2] for block in blocks]
+    else:
+        # Until pandas 1.2: the last entry of the state holds what versions from 0.14.1 on read.
+        held = manager.state[3]["0.14.1"]
+        blocks, axes = [(b["values"], b["mgr_locs"]) for b in held["blocks"]], held["axes"]
+    names, rows = map(_array, axes)
+    labels = [str(name) for name in names]
+    columns: dict[str, np.ndarray] = {}
+    for values, places in blocks:
+        if isinstance(places, _Record) and places.name == "slice":
+            where = list(range(*slice(*places.args).indices(len(labels))))
+        else:
+            where = [int(place) for place in _array(places)]
+        for row, place in zip(_array(values).reshape(len(where), len(rows)), where, strict=True):
+            columns[labels[place]] = row
+    if len(columns) != len(labels):
+        raise ValueError(f"of {len(labels)} columns {len(columns)} are there")
+    return {label: columns[label] for label in labels}
+
+
+def _array(held: Any) -> np.ndarray:
+    """Return the array that a record stands for."""
+    name = held.name if isinstance(held, _Record) else type(held).__name__
+    if name == "_new_Index":
+        kind, state = held.args
+        if kind.name == "RangeIndex":
+            return np.arange(state["start"], state["stop"], state["step"])
+        return _array(state["data"])
+    if name == "_reconstruct":
+        _, shape, dtype, fortran, data = held.state
+        order = "F" if fortran else "C"
+    elif name == "_frombuffer":
+        data, dtype, shape, order = held.args[:4]
+    else:
+        raise ValueError(f"a {name} where an array was expected")
+    kind, byte_order = dtype.args[0], dtype.state[1]
+    if kind[0] not in "biufO" or len(kind) > 3:
+        raise ValueError(f"values of type {kind}")
+    if kind[0] == "O":
+        values = np.empty(len(data), object)
+        values[:] = data
+    else:
+        values = np.frombuffer(bytes(data), np.dtype(kind).newbyteorder(byte_order))
+    return values.reshape(shape, order=order)

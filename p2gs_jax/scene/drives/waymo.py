@@ -9,66 +9,81 @@
     lidar_box/SEGMENT.parquet           boxes
 
 Schema: https://github.com/waymo-research/waymo-open-dataset, src/waymo_open_dataset/v2/perception/
-{camera_image,context,box,pose}.py; names of columns: v2/component.py. Axes of cameras, lens and
-shutter: wdl_limited/camera/camera_model.cc. Range images: `waymo_lidar`.
+{camera_image,context,box,pose,lidar}.py; names of columns: v2/component.py. Axes of cameras, lens
+and shutter: wdl_limited/camera/camera_model.cc. Geometry of range images:
+utils/range_image_utils.py and v2/perception/utils/lidar_utils.py.
 
 Pixel 0 begins at the image's edge there (v2/perception/lidar.py), so centres are at +0.5 as ours.
 Columns of an image are exposed one after the other, and its pose is not of the middle one's time;
 the set's velocities carry it there.
+
+`frame_timestamp_micros` is when the upper scanner begins its turn; `vehicle_pose` is of another
+time, about the middle of it (issue 464). Pixels of the upper scanner have poses of their own;
+points of the others were moved to where the car is at `vehicle_pose`. That the turn begins at the
+back and is clockwise is not written down: it follows from the order of the columns. When the other
+scanners measured is not known: their points are taken as of the time when the upper one passed, as
+boxes are.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import dataclasses
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float64, Int
 from scipy.spatial.transform import Rotation
 
 from p2gs_jax.config import DataConfig
-from p2gs_jax.errors import UserError
+from p2gs_jax.errors import broken
 from p2gs_jax.scene.drives.arrow import ParquetTable
-from p2gs_jax.scene.drives.choose import chosen_drive
-from p2gs_jax.scene.drives.objects import Box, tracks
-from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera
-from p2gs_jax.scene.drives.spin import turned
-from p2gs_jax.scene.drives.waymo_lidar import (
-    STAMP,
-    TURN_S,
-    TURN_START,
-    Frames,
-    read_sweeps,
-    transform,
-)
+from p2gs_jax.scene.drives.lidar import turned
+from p2gs_jax.scene.drives.objects import Box, Pose, tracks
+from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sweep, SweepPoints
+from p2gs_jax.scene.drives.tables import chosen_drive, counted
 from p2gs_jax.scene.lens import intrinsics, make_distortion
-from p2gs_jax.scene.rigid import LONGEST_BEYOND_S
+from p2gs_jax.scene.rigid import LONGEST_BEYOND_S, rigid
 from p2gs_jax.types import TrackedObject
 
-CAMERA = "key.camera_name"
+STAMP, CAMERA, LASER = "key.frame_timestamp_micros", "key.camera_name", "key.laser_name"
+TRACK = "key.laser_object_id"
 CAMERAS = ("UNKNOWN", "FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIGHT")
 TYPES = ("UNKNOWN", "VEHICLE", "PEDESTRIAN", "SIGN", "CYCLIST")
-LENS = "[CameraCalibrationComponent].intrinsic."
-MOUNT = "[CameraCalibrationComponent].extrinsic.transform"
-SIZE = ("[CameraCalibrationComponent].width", "[CameraCalibrationComponent].height")
-DIRECTION = "[CameraCalibrationComponent].rolling_shutter_direction"
+LENS = "[CameraCalibrationComponent]."
+LENS_NUMBERS = (
+    *(f"{LENS}intrinsic.{k}" for k in ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")),
+    *(f"{LENS}width", f"{LENS}height"),
+)
+DIRECTION, MOUNT = f"{LENS}rolling_shutter_direction", f"{LENS}extrinsic.transform"
 # Readout along rows or columns, from either side; 5 is a global shutter.
 ROLLING = (1, 2, 3, 4)
-JPEG = "[CameraImageComponent].image"
-POSE = "[CameraImageComponent].pose.transform"
-POSE_TIME = "[CameraImageComponent].pose_timestamp"
-LINEAR = tuple(f"[CameraImageComponent].velocity.linear_velocity.{axis}" for axis in "xyz")
-ANGULAR = tuple(f"[CameraImageComponent].velocity.angular_velocity.{axis}" for axis in "xyz")
+IMAGE = "[CameraImageComponent]."
+JPEG, POSE, POSE_TIME = f"{IMAGE}image", f"{IMAGE}pose.transform", f"{IMAGE}pose_timestamp"
+MOTION = tuple(f"{IMAGE}velocity.{k}_velocity.{a}" for k in ("linear", "angular") for a in "xyz")
 SHUTTER = tuple(
-    f"[CameraImageComponent].rolling_shutter_params.{name}"
+    f"{IMAGE}rolling_shutter_params.{name}"
     for name in ("shutter", "camera_trigger_time", "camera_readout_done_time")
 )
 CAR = "[VehiclePoseComponent].world_from_vehicle.transform"
 BOX = "[LiDARBoxComponent]."
 CENTRE = tuple(f"{BOX}box.center.{axis}" for axis in "xyz")
 EXTENT = tuple(f"{BOX}box.size.{axis}" for axis in "xyz")
+HEADING, TYPE = f"{BOX}box.heading", f"{BOX}type"
+SCANNER = "[LiDARCalibrationComponent]."
+LOW, HIGH, BEAMS = (f"{SCANNER}beam_inclination.{name}" for name in ("min", "max", "values"))
+RANGES = tuple(f"[LiDARComponent].range_image_return1.{name}" for name in ("values", "shape"))
+POSES = tuple(f"[LiDARPoseComponent].range_image_return1.{name}" for name in ("values", "shape"))
+# Channels of the two: distance, intensity, elongation, no-label zone; roll, pitch, yaw, x, y, z.
+RANGE_CHANNELS, POSE_CHANNELS = 4, 6
+# The upper scanner: its number, seconds a turn (10 Hz), where the turn begins in the car's axes.
+UPPER, TURN_S, TURN_START = 1, 0.1, np.pi
+# What a segment without these files lacks.
+MISSING = {
+    "vehicle_pose": "there are neither boxes nor LiDAR sweeps",
+    "lidar_box": "what moves is not known",
+}
 # Axes of cameras: x forward, y left, z up; OpenCV's in these.
 OPENCV = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
@@ -78,121 +93,114 @@ def is_waymo(root: Path) -> bool:
     return bool(_segments(root))
 
 
-def read_waymo(root: Path, cfg: DataConfig, report: Callable[[str], None]) -> Recording:
-    """Read a segment.
-
-    Args:
-        root: the folder with `camera_image`, `lidar`, ... in it.
-        cfg: `drive` names the segment where there are several.
-        report: receives progress.
-
-    Raises:
-        UserError: it has to be said which segment; a file is missing or broken; the message names
-            it.
-    """
-    segment = chosen_drive(cfg.drive, _segments(root), root)
-    report(f"Reading the tables of Waymo's segment {segment}")
-    images = ParquetTable(_file(root, "camera_image", segment))
-    stamps = images.numbers([STAMP, CAMERA])
-    frames = Frames(stamps[STAMP], images.path)
-    cameras, mounts, rolling = _cameras(root, segment)
-    photographs, readouts, notes = _photographs(images, frames, mounts, rolling)
-    cars, said = _cars(root, segment)
-    notes += said
-    objects, said = _objects(root, segment, frames, cars)
-    notes += said
-    sweeps, said = read_sweeps(root, segment, frames, cars)
-    notes += said
+def read_waymo(root: Path, cfg: DataConfig) -> Recording:
+    """Read a segment in a folder with `camera_image`, `lidar`, ...; UserError: a file is broken."""
+    segment = _Segment(root, chosen_drive(cfg.drive, _segments(root), root))
+    cameras, mounts, rolling = _cameras(segment.open("camera_calibration"))
+    photographs, readouts, notes = _photographs(segment, mounts, rolling)
+    notes += [
+        f"{name} is missing: {why}." for name, why in MISSING.items() if not segment.has(name)
+    ]
+    cars = _cars(segment.open("vehicle_pose")) if segment.has("vehicle_pose") else {}
+    objects, box_notes = _objects(segment, cars) if segment.has("lidar_box") else ((), [])
+    sweeps, sweep_notes = _sweeps(segment, cars) if cars and segment.has("lidar") else ([], [])
     there = {photograph.camera for photograph in photographs}
-    return Recording(
-        root=root,
-        format="waymo",
-        cameras=tuple(
-            RigCamera(c.name, c.K, c.width, c.height, c.distortion, readouts.get(c.name))
-            for c in cameras
-            if c.name in there
-        ),
-        photographs=tuple(photographs),
-        sweeps=tuple(sweeps),
-        objects=objects,
-        notes=tuple(notes),
-    )
+    rig = [
+        dataclasses.replace(c, readout_s=readouts.get(c.name)) for c in cameras if c.name in there
+    ]
+    notes += [*box_notes, *sweep_notes]
+    return Recording(root, "waymo", rig, photographs, sweeps, objects, notes)
 
 
 def _segments(root: Path) -> list[str]:
     return sorted(path.stem for path in (root / "camera_image").glob("*.parquet"))
 
 
-def _file(root: Path, component: str, segment: str) -> Path:
-    return root / component / f"{segment}.parquet"
+class _Segment:
+    """The files of a segment, its moments, and its clock."""
+
+    def __init__(self, root: Path, name: str):
+        self.root, self.name = root, name
+        self.images = self.open("camera_image")
+        stamps = self.images.columns([STAMP])[STAMP]
+        if stamps.dtype.kind not in "iu" or not len(stamps):
+            raise broken(self.images.path, "holds no photograph")
+        self._stamps = np.unique(stamps.astype(np.int64))
+
+    def path(self, component: str) -> Path:
+        return self.root / component / f"{self.name}.parquet"
+
+    def has(self, component: str) -> bool:
+        return self.path(component).is_file()
+
+    def open(self, component: str) -> ParquetTable:
+        return ParquetTable(self.path(component))
+
+    def frame(self, stamp: int) -> int:
+        """Return the frame nearest to a time stamp, microseconds."""
+        return int(np.abs(self._stamps - stamp).argmin())
+
+    def seconds(self, stamp: float) -> float:
+        """Return a time stamp, microseconds, in seconds since the first frame."""
+        return float(stamp - self._stamps[0]) * 1e-6
 
 
 def _name(names: tuple[str, ...], number: int) -> str:
     return names[number] if 0 <= number < len(names) else str(number)
 
 
-def _cameras(
-    root: Path, segment: str
-) -> tuple[list[RigCamera], dict[str, Float64[np.ndarray, "4 4"]], set[str]]:
+def _transform(values: Any, path: Path, what: str) -> Pose:
+    """Return the matrix of a cell of 16 numbers, row by row; UserError: it is not a rigid pose."""
+    matrix = np.full((4, 4), np.nan)
+    if values is not None and len(values) == matrix.size:
+        matrix = np.array(values, np.float64).reshape(4, 4)
+    return rigid(matrix[:3, :3], matrix[:3, 3], path, what)
+
+
+def _cameras(table: ParquetTable) -> tuple[list[RigCamera], dict[str, Pose], set[str]]:
     """Return cameras, where they are on the car (OpenCV axes), and which roll."""
-    table = ParquetTable(_file(root, "camera_calibration", segment))
-    lens = [LENS + name for name in ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")]
-    columns = table.numbers([CAMERA, *lens, *SIZE, DIRECTION])
-    extrinsics = table.objects([MOUNT])[MOUNT]
+    columns = table.columns([CAMERA, *LENS_NUMBERS, DIRECTION], [MOUNT])
     cameras, mounts, rolling = [], {}, set()
     for row, number in enumerate(columns[CAMERA]):
         name = _name(CAMERAS, int(number))
-        values = np.array([columns[key][row] for key in (*lens, *SIZE)], np.float64)
+        values = np.array([columns[key][row] for key in LENS_NUMBERS], np.float64)
         if not np.isfinite(values).all() or (values[[0, 1, -2, -1]] <= 0).any():
-            raise UserError(
-                f"{table.path}: the lens of {name} should be finite numbers, with positive focal "
-                "lengths and sizes",
-                fix="get the file again",
-            )
+            why = f"the lens of {name} should be finite numbers, with positive focal lengths and "
+            raise broken(f"{table.path}:", f"{why}sizes")
         fu, fv, cu, cv, *bent, width, height = values.tolist()
-        cameras.append(
-            RigCamera(
-                name, intrinsics(fu, fv, cu, cv), int(width), int(height), make_distortion((*bent,))
-            )
-        )
-        mounts[name] = transform(extrinsics[row], table.path, name) @ OPENCV
+        K, distortion = intrinsics(fu, fv, cu, cv), make_distortion((*bent,))
+        cameras.append(RigCamera(name, K, int(width), int(height), distortion))
+        mounts[name] = _transform(columns[MOUNT][row], table.path, name) @ OPENCV
         if columns[DIRECTION][row] in ROLLING:
             rolling.add(name)
     return cameras, mounts, rolling
 
 
 def _photographs(
-    images: ParquetTable,
-    frames: Frames,
-    mounts: dict[str, Float64[np.ndarray, "4 4"]],
-    rolling: set[str],
+    segment: _Segment, mounts: dict[str, Pose], rolling: set[str]
 ) -> tuple[list[Photograph], dict[str, float], list[str]]:
     """Return photographs, seconds of readout of rolling cameras, and notes."""
-    table = images.numbers([STAMP, CAMERA, POSE_TIME, *LINEAR, *ANGULAR, *SHUTTER])
-    poses = images.objects([POSE])[POSE]
-    motion = np.stack([table[name] for name in (*LINEAR, *ANGULAR)], 1).astype(np.float64)
+    images = segment.images
+    table = images.columns([STAMP, CAMERA, POSE_TIME, *MOTION, *SHUTTER], [POSE])
+    motion = np.stack([table[name] for name in MOTION], 1).astype(np.float64)
     shutter, trigger, done = (table[name].astype(np.float64) for name in SHUTTER)
     photographs, without = [], 0
     readouts: dict[str, list[float]] = {}
     for row, number in enumerate(table[CAMERA]):
         name, stamp = _name(CAMERAS, int(number)), int(table[STAMP][row])
         if name not in mounts:
-            raise UserError(
-                f"{images.path.parent.parent / 'camera_calibration' / images.path.name} has no "
-                f"camera {name}",
-                fix="get the file again",
-            )
-        taken = float(table[POSE_TIME][row])
-        if poses[row] is None or not np.isfinite(taken):
+            raise broken(segment.path("camera_calibration"), f"has no camera {name}")
+        posed = float(table[POSE_TIME][row])
+        if table[POSE][row] is None or not np.isfinite(posed):
             without += 1
             continue
-        car = transform(poses[row], images.path, f"photograph {row + 1}")
+        car = _transform(table[POSE][row], images.path, f"photograph {row + 1}")
         # From the trigger to the end of the readout; exposures of the first and last column are
         # in the middle of their shutter times, which cancels.
         middle = (
             (trigger[row] + done[row]) / 2 if name in rolling else trigger[row] + shutter[row] / 2
         )
-        lag = middle - taken
+        lag = middle - posed
         if not (abs(lag) < LONGEST_BEYOND_S and np.isfinite(motion[row]).all()):
             lag = 0.0
         if name in rolling and np.isfinite(readout := done[row] - trigger[row] - shutter[row]):
@@ -200,20 +208,18 @@ def _photographs(
         photographs.append(
             Photograph(
                 camera=name,
-                frame=frames.number(stamp),
-                time=frames.seconds(taken * 1e6) + lag,
+                frame=segment.frame(stamp),
+                time=segment.seconds(posed * 1e6) + lag,
                 path=Path(f"{stamp}.jpg"),
                 pose=_carried(car, motion[row], lag) @ mounts[name],
                 embedded=partial(_jpeg, images, row),
             )
         )
-    notes = [f"{without} photographs have no pose: they are left out."] if without else []
+    notes = counted(without, "photographs have no pose: they are left out.")
     return photographs, {n: float(np.median(r)) for n, r in readouts.items()}, notes
 
 
-def _carried(
-    pose: Float64[np.ndarray, "4 4"], motion: Float[np.ndarray, " 6"], lag: float
-) -> Float64[np.ndarray, "4 4"]:
+def _carried(pose: Pose, motion: Float[np.ndarray, " 6"], lag: float) -> Pose:
     """Return where the car is some seconds later.
 
     Velocities are in world axes, turns about the car's, as the set's camera model takes them
@@ -226,43 +232,34 @@ def _carried(
 
 
 def _jpeg(images: ParquetTable, row: int) -> bytes:
-    held: Any = images.cells(row, [JPEG])[JPEG]
+    (held,) = images.cells(row, [JPEG])
     if not held:
-        raise UserError(f"{images.path}: row {row + 1} holds no image", fix="get the file again")
+        raise broken(f"{images.path}:", f"row {row + 1} holds no image")
     return held
 
 
-def _cars(root: Path, segment: str) -> tuple[dict[int, Float64[np.ndarray, "4 4"]], list[str]]:
-    """Return the pose of the car that boxes refer to, by frame, and notes."""
-    path = _file(root, "vehicle_pose", segment)
-    if not path.is_file():
-        return {}, ["vehicle_pose is missing: there are neither boxes nor LiDAR sweeps."]
-    table = ParquetTable(path)
-    stamps, poses = table.numbers([STAMP])[STAMP], table.objects([CAR])[CAR]
+def _cars(table: ParquetTable) -> dict[int, Pose]:
+    """Return the pose of the car that boxes refer to, by time stamp."""
+    columns = table.columns([STAMP], [CAR])
     return {
-        int(stamp): transform(pose, path, f"frame {stamp}")
-        for stamp, pose in zip(stamps, poses, strict=True)
+        int(stamp): _transform(pose, table.path, f"frame {stamp}")
+        for stamp, pose in zip(columns[STAMP], columns[CAR], strict=True)
         if pose is not None
-    }, []
+    }
 
 
 def _objects(
-    root: Path, segment: str, frames: Frames, cars: dict[int, Float64[np.ndarray, "4 4"]]
+    segment: _Segment, cars: dict[int, Pose]
 ) -> tuple[tuple[TrackedObject, ...], list[str]]:
-    path = _file(root, "lidar_box", segment)
-    if not path.is_file():
-        return (), ["lidar_box is missing: what moves is not known."]
-    table = ParquetTable(path)
-    columns = table.numbers([STAMP, *CENTRE, *EXTENT, f"{BOX}box.heading", f"{BOX}type"])
-    names = table.objects(["key.laser_object_id"])["key.laser_object_id"]
-    centre = np.stack([columns[name] for name in CENTRE], 1).astype(np.float64)
-    extent = np.stack([columns[name] for name in EXTENT], 1).astype(np.float64)
-    heading = columns[f"{BOX}box.heading"].astype(np.float64)
+    table = segment.open("lidar_box")
+    columns = table.columns([STAMP, *CENTRE, *EXTENT, HEADING, TYPE], [TRACK])
+    centre, extent = (
+        np.stack([columns[name] for name in names], 1).astype(np.float64)
+        for names in (CENTRE, EXTENT)
+    )
+    heading = columns[HEADING].astype(np.float64)
     if not (np.isfinite(np.column_stack([centre, extent, heading])).all() and (extent > 0).all()):
-        raise UserError(
-            f"{path}: boxes should have finite positions and positive sizes",
-            fix="get the file again",
-        )
+        raise broken(f"{table.path}:", "boxes should have finite positions and positive sizes")
     local = np.tile(np.eye(4), (len(centre), 1, 1))
     local[:, 0, 0] = local[:, 1, 1] = np.cos(heading)
     local[:, 1, 0], local[:, 0, 1] = np.sin(heading), -np.sin(heading)
@@ -271,24 +268,175 @@ def _objects(
     passed = TURN_S * turned(np.arctan2(centre[:, 1], centre[:, 0]), TURN_START)
     boxes, untracked, lost = [], 0, 0
     for row, stamp in enumerate(map(int, columns[STAMP])):
-        if not names[row]:
+        track = columns[TRACK][row]
+        if not track:
             untracked += 1
         elif stamp not in cars:
             lost += 1
         else:
             length, width, height = extent[row].tolist()
-            boxes.append(
-                Box(
-                    track=names[row],
-                    label=_name(TYPES, int(columns[f"{BOX}type"][row])),
-                    size=(length, width, height),
-                    time=frames.seconds(stamp) + float(passed[row]),
-                    pose=cars[stamp] @ local[row],
-                )
-            )
-    notes = []
-    if untracked:
-        notes.append(f"{untracked} boxes belong to no track: they are left out.")
-    if lost and cars:
-        notes.append(f"{lost} boxes are of frames without a pose: they are left out.")
+            label = _name(TYPES, int(columns[TYPE][row]))
+            time = segment.seconds(stamp) + float(passed[row])
+            boxes.append(Box(track, label, (length, width, height), time, cars[stamp] @ local[row]))
+    notes = counted(untracked, "boxes belong to no track: they are left out.")
+    if cars:
+        notes += counted(lost, "boxes are of frames without a pose: they are left out.")
     return tracks(boxes), notes
+
+
+class _Scanner(NamedTuple):
+    """Where a scanner is on the car, and its beams.
+
+    Attributes:
+        mount: scanner to car.
+        beams: inclinations, radians, from below; empty: evenly between `low` and `high`.
+    """
+
+    mount: Pose
+    beams: Float64[np.ndarray, " h"]
+    low: float
+    high: float
+
+
+def _sweeps(segment: _Segment, cars: dict[int, Pose]) -> tuple[list[Sweep], list[str]]:
+    """Return a sweep a frame, of all scanners together, and notes."""
+    images = segment.open("lidar")
+    rows: dict[int, dict[int, int]] = {}
+    for (stamp, laser), row in _rows(images).items():
+        rows.setdefault(stamp, {})[laser] = row
+    scanners = _scanners(segment.open("lidar_calibration"))
+    poses = segment.open("lidar_pose") if segment.has("lidar_pose") else None
+    posed = {} if poses is None else _rows(poses)
+    unposed = sum(UPPER in own and (stamp, UPPER) not in posed for stamp, own in rows.items())
+    notes = []
+    if unposed:
+        notes.append(
+            f"lidar_pose lacks {unposed} of {len(rows)} turns: their points are as if the car "
+            "had stood still."
+        )
+    lost = sum(stamp not in cars for stamp in rows)
+    notes += counted(lost, "LiDAR sweeps are of frames without a pose: they are left out.")
+    source = _Source(segment, images, poses, scanners)
+    sweeps = []
+    for stamp, own in sorted(rows.items()):
+        if stamp in cars:
+            begin = segment.seconds(stamp)
+            of_pixels = {laser: posed[stamp, laser] for laser in own if (stamp, laser) in posed}
+            read = partial(source.read, own, of_pixels, cars[stamp], begin)
+            sweeps.append(Sweep(segment.frame(stamp), begin + TURN_S / 2, read))
+    return sweeps, notes
+
+
+def _rows(table: ParquetTable) -> dict[tuple[int, int], int]:
+    """Return rows by time stamp and scanner."""
+    keys = table.columns([STAMP, LASER])
+    pairs = zip(keys[STAMP], keys[LASER], strict=True)
+    return {(int(stamp), int(laser)): row for row, (stamp, laser) in enumerate(pairs)}
+
+
+def _scanners(table: ParquetTable) -> dict[int, _Scanner]:
+    mount = f"{SCANNER}extrinsic.transform"
+    columns = table.columns([LASER, LOW, HIGH], [mount, BEAMS])
+    found = {}
+    for row, laser in enumerate(columns[LASER]):
+        pose = _transform(columns[mount][row], table.path, f"scanner {laser}")
+        beams = np.array(columns[BEAMS][row] or [], np.float64)
+        low, high = float(columns[LOW][row]), float(columns[HIGH][row])
+        if not (np.isfinite(beams).all() if len(beams) else np.isfinite([low, high]).all()):
+            raise broken(f"{table.path}:", f"scanner {laser} has no beams")
+        found[int(laser)] = _Scanner(pose, beams, low, high)
+    return found
+
+
+class _Source(NamedTuple):
+    """Tables that sweeps are read from."""
+
+    segment: _Segment
+    images: ParquetTable
+    poses: ParquetTable | None
+    scanners: dict[int, _Scanner]
+
+    def read(
+        self, rows: dict[int, int], posed: dict[int, int], car: Pose, begin: float
+    ) -> SweepPoints:
+        """Return the points of one turn that begins at a time, seconds.
+
+        Range images, and poses of their pixels where there are any, are rows by scanner. For all
+        other pixels `car` leads from car to world.
+        """
+        parts = [self._scanned(laser, row, posed.get(laser), car) for laser, row in rows.items()]
+        points, shares = zip(*parts, strict=True)
+        return SweepPoints(np.concatenate(points), begin + TURN_S * np.concatenate(shares))
+
+    def _scanned(
+        self, laser: int, row: int, posed: int | None, car: Pose
+    ) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, " n"]]:
+        """Return the points of one range image, and after which share of the turn each was."""
+        distances = _image(self.images, row, RANGES, RANGE_CHANNELS)
+        if distances is None:
+            return np.zeros((0, 3)), np.zeros(0)
+        if laser not in self.scanners:
+            raise broken(self.segment.path("lidar_calibration"), f"has no scanner {laser}")
+        at = np.nonzero(distances[..., 0] > 0)
+        local = _vehicle_points(self.scanners[laser], distances[..., 0], at, self.images.path)
+        world = local @ car[:3, :3].T + car[:3, 3]
+        if posed is None or self.poses is None:
+            return world, turned(np.arctan2(local[:, 1], local[:, 0]), TURN_START)
+        pixels = _image(self.poses, posed, POSES, POSE_CHANNELS)
+        if pixels is None or pixels.shape[:2] != distances.shape[:2]:
+            raise broken(f"{self.poses.path}:", f"row {posed + 1} does not fit its range image")
+        six = pixels[at].astype(np.float64)
+        # Pixels that nothing was measured in have no pose.
+        known = six.any(1)
+        world[known] = _rotated(local[known], *six[known][:, :3].T) + six[known][:, 3:]
+        return world, (at[1] + 0.5) / distances.shape[1]
+
+
+def _rotated(
+    points: Float[np.ndarray, "n 3"],
+    roll: Float[np.ndarray, " n"],
+    pitch: Float[np.ndarray, " n"],
+    yaw: Float[np.ndarray, " n"],
+) -> Float64[np.ndarray, "n 3"]:
+    """Turn each point about x, then y, then z by its own angles; scipy takes ten times longer."""
+    x, y, z = points.T
+    y, z = np.cos(roll) * y - np.sin(roll) * z, np.sin(roll) * y + np.cos(roll) * z
+    z, x = np.cos(pitch) * z - np.sin(pitch) * x, np.sin(pitch) * z + np.cos(pitch) * x
+    x, y = np.cos(yaw) * x - np.sin(yaw) * y, np.sin(yaw) * x + np.cos(yaw) * y
+    return np.stack([x, y, z], 1)
+
+
+def _image(table: ParquetTable, row: int, names: tuple[str, ...], channels: int):
+    """Return a range image [h, w, channels], or None where the row holds none."""
+    values, shape = table.cells(row, names)
+    if values is None or shape is None:
+        return None
+    if len(shape) != 3 or shape[2] != channels or values.size != np.prod(shape):
+        why = f"row {row + 1} holds no range image of {channels} channels"
+        raise broken(f"{table.path}:", why)
+    return values.reshape(shape)
+
+
+def _vehicle_points(
+    scanner: _Scanner,
+    distances: Float[np.ndarray, "h w"],
+    at: tuple[Int[np.ndarray, " n"], ...],
+    path: Path,
+) -> Float64[np.ndarray, "n 3"]:
+    """Return points in the car's axes: the first row looks highest, the first column back."""
+    height, width = distances.shape
+    beams = scanner.beams
+    if not len(beams):
+        beams = scanner.low + (np.arange(height) + 0.5) / height * (scanner.high - scanner.low)
+    if len(beams) != height:
+        why = f"a range image has {height} rows, its scanner {len(beams)} beams"
+        raise broken(f"{path}:", why, "get the file and that in lidar_calibration again")
+    inclination = beams[::-1][at[0]]
+    # Columns are numbered in the car's axes; the scanner's may be turned in these.
+    share = (at[1] + 0.5) / width
+    azimuth = np.pi * (1 - 2 * share) - np.arctan2(scanner.mount[1, 0], scanner.mount[0, 0])
+    flat = distances[at].astype(np.float64) * np.cos(inclination)
+    local = np.stack(
+        [flat * np.cos(azimuth), flat * np.sin(azimuth), distances[at] * np.sin(inclination)], 1
+    )
+    return local @ scanner.mount[:3, :3].T + scanner.mount[:3, 3]

@@ -17,8 +17,7 @@ from jaxtyping import Bool, Float32, UInt
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.core.numerics import on_device
-from p2gs_jax.scene.drives.moving import MovingObjects
-from p2gs_jax.scene.drives.object_masks import MARGIN, outlines, painted
+from p2gs_jax.scene.drives.objects import MARGIN, MovingObjects, outlines, painted
 from p2gs_jax.scene.lens import scale_intrinsics
 from p2gs_jax.scene.masks import RANDOM, background_color
 from p2gs_jax.scene.pixels.cache import Key, PixelFiles, decode_ahead, file_bytes, stop

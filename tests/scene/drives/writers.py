@@ -1,8 +1,10 @@
-"""What made drives of all formats share: how the car moves, and small photographs."""
+"""What made drives of all formats share: how the car moves, what is about it, small photographs."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -11,12 +13,46 @@ from scipy.spatial.transform import Rotation
 WIDTH, HEIGHT = 64, 48
 # OpenCV's axes (x right, y down, z forward) in those of cars (x forward, y left, z up).
 FORWARD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+# Boxes about the scanner, in axes x forward, y left: one ahead, one to the right.
+AHEAD, RIGHT = (12.0, 0.0), (0.0, -8.0)
+
+
+class Made(NamedTuple):
+    """A drive, and the truth of what a reader should find in it.
+
+    Attributes:
+        root: of the drive.
+        K: fx, fy, cx, cy with pixel centres at +0.5.
+        photographs: time and camera to world, by camera and frame.
+        sweeps: times of sweeps.
+        error: distances of a frame's points from what they were measured on, metres.
+        count: points of a sweep.
+        boxes: times and box to world of "ahead", "right" and, where there is one, "parked".
+        tables: files without which the drive is not read, below `root` or beside it.
+        optional: tables that may be gone.
+        scans: files of sweeps.
+    """
+
+    root: Path
+    K: tuple[float, float, float, float]
+    photographs: dict[tuple[str, int], tuple[float, np.ndarray]]
+    sweeps: list[float]
+    error: Callable[[np.ndarray], np.ndarray]
+    count: int
+    boxes: dict[str, tuple[np.ndarray, np.ndarray]]
+    tables: list[Path]
+    optional: list[Path]
+    scans: list[Path]
 
 
 def matrix(turn: Rotation, position) -> np.ndarray:
     out = np.eye(4)
     out[:3, :3], out[:3, 3] = turn.as_matrix(), position
     return out
+
+
+def inv(pose: np.ndarray) -> np.ndarray:
+    return np.linalg.inv(pose)
 
 
 def car_at(seconds: float) -> np.ndarray:
@@ -35,6 +71,12 @@ def mounted(azimuth: float, position=(1.5, 0.2, 1.6)) -> np.ndarray:
     return matrix(turn, position)
 
 
+def upright(pose: np.ndarray) -> np.ndarray:
+    """Return a pose without pitch and roll, which sets that annotate only a yaw cannot keep."""
+    yaw = np.arctan2(pose[1, 0], pose[0, 0])
+    return matrix(Rotation.from_euler("z", yaw), pose[:3, 3])
+
+
 def wxyz(pose: np.ndarray) -> list[float]:
     return np.roll(Rotation.from_matrix(pose[:3, :3]).as_quat(), 1).tolist()
 
@@ -49,6 +91,10 @@ def landmarks(count: int = 50) -> np.ndarray:
     return applied(car_at(0.5), rng.uniform([-30, -30, -1], [30, 30, 6], (count, 3)))
 
 
+def off_landmarks(points: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(points[:, None] - landmarks(), axis=2).min(1)
+
+
 def jpeg(seed: int = 0) -> bytes:
     rng = np.random.default_rng(seed)
     picture = rng.integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
@@ -56,8 +102,12 @@ def jpeg(seed: int = 0) -> bytes:
 
 
 def write_jpeg(path: Path, seed: int = 0) -> None:
+    write_bytes(path, jpeg(seed))
+
+
+def write_bytes(path: Path, data: bytes) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(jpeg(seed))
+    path.write_bytes(data)
 
 
 def cut(path: Path) -> None:

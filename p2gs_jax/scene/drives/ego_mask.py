@@ -1,0 +1,355 @@
+"""The ego mask: the car itself in the photographs of its cameras, found once a camera and kept.
+
+The car is what never moves while it drives. Structure that stays where it is says so only where the
+world would have moved: the farthest surface that a pixel can show, the road (above the horizon:
+nothing), is moved by the camera's own motion. Motion counts across an edge, not along it: a lane
+marking that runs with the car stays too. Structure that changes speaks for the world. Smooth
+bonnets, sky and asphalt show no structure and go with their surroundings: a minimal cut through
+the pixels, cheap along edges that stay. Gradients are of logarithms, so exposure does not matter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, UInt8
+from scipy.sparse import coo_array, csr_matrix
+from scipy.sparse.csgraph import breadth_first_order, maximum_flow
+
+from p2gs_jax.core.atomic import atomic_write
+from p2gs_jax.scene.cache import cached_folder
+from p2gs_jax.scene.drives.recording import Photograph, Recording, Report, RigCamera
+from p2gs_jax.scene.files import decode_grey, undecodable
+from p2gs_jax.scene.lens import scale_intrinsics, undistort_points
+from p2gs_jax.scene.rigid import inverse, up_of_drive
+from p2gs_jax.types import Distortion
+
+# Photographs of a camera that are looked at, spread evenly over its way; fewer say too little.
+MOST_LOOKED_AT, FEWEST_LOOKED_AT = 24, 6
+# A turn by one radian counts as this way, metres.
+TURN_AS_WAY = 10.0
+# The version is part of the key of kept results: raise it with every change of what is found.
+_VERSION = 1
+_SAID = "own car"
+# Lengths in the picture are in pixels at this width; so are all thresholds (BUILD_NOTES).
+WIDTH = 480
+# Display values below this are noise; also the blur before gradients, pixels.
+DARK, BLUR = 0.02, 1.0
+# An edge stays if in four frames of five its gradient (of logarithms, per pixel) is at least this,
+# and half as strong as it is in the strongest fifth.
+LEAST_GRADIENT, STEADY = 0.012, (20, 80, 0.5)
+# The road lies this far below the camera at most, metres; what is farther than that counts as so.
+LOWEST_ROAD, FARTHEST = 2.5, 1e4
+# World that moves this far, pixels, shows something else; an edge that stays says nothing before
+# that happened so often, and all that it can say after so often. Motion along an edge within the
+# angle of this sine does not count.
+APART, FEWEST, ENOUGH, ALONG = 3.0, 1.5, 5.5, 0.1
+# Weights of the cut: evidence for the car, for the world; the length of its outline; its area.
+OWN, OUTLINE, THROUGH_EDGES, AREA = 3.0, 2.0, 0.02, 0.004
+# Least change of a gradient that speaks for the world, and where it says all that it can.
+CHANGE = (0.006, 0.018)
+# Parts are kept that are this wide, whose outline is an edge that stays for this share, with this
+# much evidence a pixel of it, and this share of the picture. Gaps up to the last are closed.
+NARROWEST, EDGE_SHARE, EDGE_EVIDENCE, LEAST_SHARE, GAP = 7, 0.5, 0.3, 0.002, 13
+_MOTION_STEP = 8
+_CAPACITY = 1000
+
+
+class EgoMask(NamedTuple):
+    """The car itself in one camera: in the photograph as stored, at a lower resolution.
+
+    `looked_at` counts photographs; it is 0 where the camera hardly moves and nothing can be told.
+    """
+
+    mask: Bool[np.ndarray, "h w"] | None
+    looked_at: int
+
+
+def find_ego_masks(
+    recording: Recording,
+    names: Sequence[str],
+    work_dir: Path | None = None,
+    report: Report = lambda message: None,
+) -> tuple[dict[str, Bool[np.ndarray, "h w"]], list[str]]:
+    """Return where the named cameras see their own car, and notes.
+
+    All photographs of the drive serve, whatever frames are used. Results are kept as pictures below
+    `work_dir` for a resume; None keeps nothing.
+    """
+    cameras = {c.name: c for c in recording.cameras}
+    poses = np.stack([p.pose for p in recording.photographs])
+    up = up_of_drive(inverse(poses), [p.camera for p in recording.photographs])
+    report("Looking for the car itself in the photographs")
+    masks: dict[str, Bool[np.ndarray, "h w"]] = {}
+    standing, without = [], []
+    for name in names:
+        there = [
+            p
+            for p in recording.photographs
+            if p.camera == name and (p.embedded is not None or p.path.is_file())
+        ]
+        spread = spread_over_the_way(sorted(there, key=lambda p: p.frame), MOST_LOOKED_AT)
+        found = _kept(cameras[name], spread, up, work_dir)
+        if found.mask is not None:
+            masks[name] = found.mask
+        else:
+            (without if found.looked_at else standing).append(name)
+    shares = [f"{name} {mask.mean():.1%}" for name, mask in masks.items()]
+    notes = [f"{_SAID}: {', '.join(shares)} of the picture, left out of the fit"] if shares else []
+    if without:
+        notes.append(f"{_SAID}: not seen by {', '.join(without)}")
+    if standing:
+        notes.append(
+            f"{_SAID}: {', '.join(standing)} took too few photographs, or hardly moved, so "
+            "nothing can be told from them; give masks if they show it"
+        )
+    return masks, notes
+
+
+def _kept(
+    camera: RigCamera,
+    photographs: Sequence[Photograph],
+    up: Float[np.ndarray, " 3"],
+    work_dir: Path | None,
+) -> EgoMask:
+    """Return where a camera sees its car, from an earlier run if that found it."""
+
+    def build(folder: Path) -> None:
+        pictures = np.array([_picture(p, camera) for p in photographs])
+        poses = np.array([p.pose for p in photographs]).reshape(-1, 4, 4)
+        result = find_ego_mask(camera, pictures, poses, up)
+        if result.mask is not None:
+            with atomic_write(folder / "car.png") as temporary:
+                cv2.imwrite(str(temporary), result.mask.astype(np.uint8) * 255)
+        (folder / "looked_at").write_text(str(result.looked_at))
+
+    stamps = [
+        (p.path.name, p.frame, 0 if p.embedded else p.path.stat().st_mtime_ns) for p in photographs
+    ]
+    places = [np.round(p.pose, 6).tolist() for p in photographs]
+    key = [_VERSION, camera.name, camera.K.tolist(), stamps, places]
+    with cached_folder(work_dir, f"own_car/{camera.name}", key, build) as folder:
+        looked_at = int((folder / "looked_at").read_text())
+        if not (folder / "car.png").is_file():
+            return EgoMask(None, looked_at)
+        picture = cv2.imread(str(folder / "car.png"), cv2.IMREAD_GRAYSCALE)
+    return EgoMask(np.asarray(picture) > 0, looked_at)
+
+
+def _picture(photograph: Photograph, camera: RigCamera) -> UInt8[np.ndarray, "h w"]:
+    """Return a photograph in grey at `WIDTH`; UserError: its file is broken."""
+    data = photograph.embedded() if photograph.embedded else photograph.path.read_bytes()
+    picture = decode_grey(data, camera.width // WIDTH)
+    if picture is None:
+        raise undecodable(photograph.path)
+    height = max(1, round(picture.shape[0] * WIDTH / picture.shape[1]))
+    return cv2.resize(picture, (WIDTH, height), interpolation=cv2.INTER_AREA)
+
+
+def spread_over_the_way(photographs: Sequence[Photograph], most: int) -> list[Photograph]:
+    """Return at most `most` photographs of one camera, given in the order of time.
+
+    They are spread evenly over its way, not over time: cars wait.
+    """
+    if len(photographs) < 2:
+        return list(photographs)
+    poses = np.stack([p.pose for p in photographs])
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    turned = np.einsum("nij,nij->n", poses[1:, :3, :3], poses[:-1, :3, :3])
+    steps += TURN_AS_WAY * np.arccos(np.clip((turned - 1) / 2, -1, 1))
+    way = np.concatenate([[0.0], np.cumsum(steps)])
+    stops = np.linspace(0, way[-1], most)
+    rows = sorted({int(np.abs(way - stop).argmin()) for stop in stops})
+    return [photographs[row] for row in rows]
+
+
+def find_ego_mask(
+    camera: RigCamera,
+    pictures: UInt8[np.ndarray, "n h w"],
+    poses: Float[np.ndarray, "n 4 4"],
+    up: Float[np.ndarray, " 3"],
+) -> EgoMask:
+    """Return where a camera sees its own car.
+
+    Pictures are grey, `WIDTH` pixels wide and in the order of the drive; poses are camera to world;
+    `up` leads away from the road and has length 1.
+    """
+    if len(pictures) < FEWEST_LOOKED_AT:
+        return EgoMask(None, 0)
+    height = pictures.shape[1]
+    K = scale_intrinsics(camera.K, WIDTH / camera.width, height / camera.height)
+    motion = expected_motion(poses, up, K, camera.distortion, WIDTH, height)
+    # How often the world has moved on at each pixel.
+    if np.minimum(np.linalg.norm(motion, axis=-1) / APART, 1).sum(0).max() < FEWEST:
+        return EgoMask(None, 0)
+    mask = cut(weigh(pictures, motion))
+    return EgoMask(mask if mask.any() else None, len(pictures))
+
+
+class Evidence(NamedTuple):
+    """What frames say of every pixel.
+
+    Attributes:
+        stays: an edge is there in nearly all frames.
+        strength: of this edge, log units a pixel.
+        own: how much it speaks for the car, 0 to 1.
+        change: of gradients between frames, log units a pixel.
+    """
+
+    stays: Bool[np.ndarray, "h w"]
+    strength: Float32[np.ndarray, "h w"]
+    own: Float32[np.ndarray, "h w"]
+    change: Float32[np.ndarray, "h w"]
+
+
+def expected_motion(
+    poses: Float[np.ndarray, "n 4 4"],
+    up: Float[np.ndarray, " 3"],
+    K: Float[np.ndarray, "3 3"],
+    distortion: Distortion | None,
+    width: int,
+    height: int,
+) -> Float32[np.ndarray, "n-1 h w 2"]:
+    """Return how far the farthest surface that a pixel can show moves from frame to frame, pixels.
+
+    Poses are camera to world, in the order of the frames; `up` leads away from the road and has
+    length 1; K is in pixels of the undistorted image of that size.
+    """
+    columns = np.arange(_MOTION_STEP / 2, width, _MOTION_STEP)
+    rows = np.arange(_MOTION_STEP / 2, height, _MOTION_STEP)
+    xs, ys = np.meshgrid(columns, rows)
+    straight = undistort_points(np.stack([xs, ys], -1).reshape(-1, 2), K, distortion)
+    straight = straight.reshape(*xs.shape, 2).astype(np.float64)
+    # Pixels of the photograph for pixels of the undistorted image.
+    jacobian = np.stack([np.gradient(straight, _MOTION_STEP, axis=k) for k in (1, 0)], -1)
+    seen = np.isfinite(jacobian).all((-2, -1)) & (np.linalg.det(jacobian) > 1e-3)
+    jacobian[~seen] = np.eye(2)
+    back = np.linalg.inv(jacobian)
+    focal, centre = K[[0, 1], [0, 1]], K[:2, 2]
+    rays = np.concatenate([(straight - centre) / focal, np.ones((*xs.shape, 1))], -1)
+    out = []
+    for here, there in pairwise(poses):
+        towards = rays @ here[:3, :3].T
+        drop = np.maximum(-(towards @ up), LOWEST_ROAD / FARTHEST)
+        distance = LOWEST_ROAD / drop
+        points = here[:3, 3] + towards * distance[..., None]
+        local = (points - there[:3, 3]) @ there[:3, :3]
+        # Behind the other camera: far out of its image.
+        z = np.maximum(local[..., 2:], 0.05 * distance[..., None])
+        moved = local[..., :2] / z * focal + centre - straight
+        moved = np.einsum("hwij,hwj->hwi", back, moved)
+        moved[~seen] = 0
+        out.append(cv2.resize(moved.astype(np.float32), (width, height)))
+    return np.array(out)
+
+
+def weigh(
+    pictures: UInt8[np.ndarray, "n h w"], motion: Float32[np.ndarray, "n-1 h w 2"]
+) -> Evidence:
+    """Return what grey pictures, one a frame, and their `expected_motion` say of every pixel."""
+    gradients = np.array([_gradient(picture) for picture in pictures])
+    usual = np.median(gradients, axis=0)
+    across = usual / np.maximum(np.linalg.norm(usual, axis=-1, keepdims=True), 1e-6)
+    low, high, share = STEADY
+    least, most = np.percentile((gradients * across).sum(-1), (low, high), axis=0)
+    stays = (least > LEAST_GRADIENT) & (least > share * most)
+    away = np.abs((motion * across).sum(-1)) - ALONG * np.linalg.norm(motion, axis=-1)
+    apart = np.clip(away / APART, 0, 1).sum(0)
+    said = np.clip((apart - FEWEST) / (ENOUGH - FEWEST), 0, 1)
+    change = np.sqrt(np.median(((gradients - usual) ** 2).sum(-1), axis=0))
+    return Evidence(stays, np.where(stays, least, 0), np.where(stays, said, 0), change)
+
+
+def _gradient(picture: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w 2"]:
+    """Return the gradient of the logarithm, per pixel."""
+    logs = cv2.GaussianBlur(np.log(picture.astype(np.float32) / 255 + DARK), (0, 0), BLUR)
+    sides = [cv2.Sobel(logs, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=1 / 8) for dx in (1, 0)]
+    return np.stack(sides, -1)
+
+
+def cut(evidence: Evidence) -> Bool[np.ndarray, "h w"]:
+    """Return the parts of a picture that never move, cleaned; they touch its border."""
+    least, most = CHANGE
+    moves = np.clip((evidence.change - least) / (most - least), 0, 1)
+    gain = OWN * evidence.own - np.where(evidence.stays, 0, moves) - AREA
+    passage = np.exp(-((evidence.strength / (2 * LEAST_GRADIENT)) ** 2))
+    return _solid_parts(_minimal_cut(gain, passage), evidence)
+
+
+def _minimal_cut(gain: np.ndarray, passage: np.ndarray) -> Bool[np.ndarray, "h w"]:
+    """Return the pixels of largest gain less outline; the border of the picture costs nothing.
+
+    `passage` is the share of the full price that an outline through a pixel costs.
+    """
+    h, w = gain.shape
+    count = h * w
+    rows = np.arange(count).reshape(h, w)
+    starts, ends, prices = [], [], []
+    neighbours = ((0, 1, 1.0), (1, 0, 1.0), (1, 1, np.sqrt(0.5)), (1, -1, np.sqrt(0.5)))
+    for dy, dx, price in neighbours:
+        first = np.s_[: h - dy, max(0, -dx) : w - max(0, dx)]
+        second = np.s_[dy:, max(0, dx) : w + min(0, dx)]
+        cost = np.maximum(np.maximum(passage[first], passage[second]), THROUGH_EDGES)
+        a, b, c = rows[first].ravel(), rows[second].ravel(), (OUTLINE / 2 * price * cost).ravel()
+        starts += [a, b]
+        ends += [b, a]
+        prices += [c, c]
+    source, sink = count, count + 1
+    flat = gain.ravel()
+    starts += [np.full(count, source), rows.ravel()]
+    ends += [rows.ravel(), np.full(count, sink)]
+    prices += [np.maximum(flat, 0), np.maximum(-flat, 0)]
+    capacity = np.rint(np.concatenate(prices) * _CAPACITY).astype(np.int32)
+    where = (np.concatenate(starts).astype(np.int32), np.concatenate(ends).astype(np.int32))
+    graph = csr_matrix(coo_array((capacity, where), shape=(count + 2, count + 2)))
+    left = graph - maximum_flow(graph, source, sink).flow
+    left.data[left.data < 0] = 0
+    left.eliminate_zeros()
+    inside = np.zeros(count + 2, bool)
+    inside[breadth_first_order(left, source, return_predecessors=False)] = True
+    return inside[:count].reshape(h, w)
+
+
+def _solid_parts(found: Bool[np.ndarray, "h w"], evidence: Evidence) -> Bool[np.ndarray, "h w"]:
+    """Return the parts that are not lines, touch the border, and end at edges that stay."""
+    opened = _morphology(found, cv2.MORPH_OPEN, NARROWEST)
+    parts, count = _labelled(opened)
+    near = cv2.dilate(evidence.stays.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    kept = np.zeros_like(found)
+    for number in range(1, count + 1):
+        part = parts == number
+        at_border = part[[0, -1]].any() or part[:, [0, -1]].any()
+        if not at_border or part.mean() < LEAST_SHARE:
+            continue
+        grown = np.pad(part, 1, mode="edge")
+        inner = cv2.erode(grown.astype(np.uint8), np.ones((3, 3), np.uint8))[1:-1, 1:-1]
+        rim = part & (inner == 0)
+        length = max(int(rim.sum()), 1)
+        if near[rim].sum() < EDGE_SHARE * length:
+            continue
+        if evidence.own[part].sum() >= EDGE_EVIDENCE * length:
+            kept |= part
+    closed = _morphology(kept, cv2.MORPH_CLOSE, GAP)
+    # Holes too, also those that only the border below closes.
+    holes, _ = _labelled(~closed)
+    around = np.unique(np.concatenate([holes[0], holes[:, 0], holes[:, -1]]))
+    return ~np.isin(holes, around[around > 0])
+
+
+def _labelled(mask: Bool[np.ndarray, "h w"]) -> tuple[Int[np.ndarray, "h w"], int]:
+    """Return the number of each pixel's connected part, 0 outside, and how many there are."""
+    count, parts = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
+    return parts, count - 1
+
+
+def _morphology(mask: Bool[np.ndarray, "h w"], kind: int, side: int) -> Bool[np.ndarray, "h w"]:
+    """Open or close by a disc; the picture goes on beyond its border as it ends there."""
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    padded = np.pad(mask.astype(np.uint8), 2 * side, mode="edge")
+    done = cv2.morphologyEx(padded, kind, disc)[2 * side : -2 * side, 2 * side : -2 * side]
+    return done > 0

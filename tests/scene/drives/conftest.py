@@ -1,0 +1,66 @@
+"""Made drives of each format, to read and to change."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+from scene.drives import (
+    writers_argoverse,
+    writers_kitti,
+    writers_nuscenes,
+    writers_pandaset,
+    writers_waymo,
+)
+
+from p2gs_jax.config import DataConfig
+from p2gs_jax.scene.drives import read_drive
+
+WRITERS = {
+    "argoverse": writers_argoverse,
+    "kitti_raw": writers_kitti,
+    "nuscenes": writers_nuscenes,
+    "pandaset": writers_pandaset,
+    "waymo": writers_waymo,
+}
+
+
+@pytest.fixture(scope="session")
+def write():
+    """Return a function that writes a drive of a format and returns its truth."""
+    return lambda name, root, **options: WRITERS[name].write(root, **options)
+
+
+@pytest.fixture(scope="session")
+def read():
+    """Return a function that reads the drive in a folder, of whatever format it is."""
+
+    def get(root, **choice):
+        recording = read_drive(root, DataConfig(**choice))
+        assert recording is not None
+        return recording
+
+    return get
+
+
+@pytest.fixture(scope="session")
+def kept(tmp_path_factory):
+    """Return a function from a format to a drive that is only read."""
+    made = {}
+
+    def get(name):
+        if name not in made:
+            made[name] = WRITERS[name].write(tmp_path_factory.mktemp(name) / "drive")
+        return made[name]
+
+    return get
+
+
+@pytest.fixture
+def copied(kept, tmp_path):
+    """Return a function from a format to a drive that may be changed."""
+
+    def get(name):
+        made = kept(name)
+        return made._replace(root=Path(shutil.copytree(made.root, tmp_path / made.root.name)))
+
+    return get

@@ -1,0 +1,157 @@
+"""The car itself is found in pictures of a road that passes, and nothing else is."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+
+from p2gs_jax.config import DataConfig
+from p2gs_jax.run.scene_file import read_scene, write_scene
+from p2gs_jax.scene.drives.assemble import assemble
+from p2gs_jax.scene.drives.ego_mask import find_ego_mask, find_ego_masks, spread_over_the_way
+from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera
+from p2gs_jax.scene.pixels.store import ImageStore
+
+W, H, F, HEIGHT = 480, 270, 400.0, 1.6
+K = np.array([[F, 0, W / 2], [0, F, 0.45 * H], [0, 0, 1.0]])
+CAMERA = RigCamera("front", K, W, H)
+UP = np.array([0.0, -1.0, 0.0])
+RNG = np.random.default_rng(3)
+SOIL = cv2.GaussianBlur(RNG.random((512, 512)).astype(np.float32), (0, 0), 1.5)
+SOIL = 0.25 + 0.2 * (SOIL - SOIL.mean()) / SOIL.std() / 3
+CLOUDS = cv2.GaussianBlur(RNG.random((512, 1024)).astype(np.float32), (0, 0), 6)
+
+
+def pose_at(way, turned=0.0):
+    """Camera to world: `way` metres ahead (z), `turned` radians to the right."""
+    pose = np.eye(4)
+    pose[:3, :3] = cv2.Rodrigues(np.array([0.0, turned, 0.0]))[0]
+    pose[2, 3] = way
+    return pose
+
+
+def bonnet():
+    """Where the bonnet is: an arch at the bottom."""
+    x = np.linspace(-1, 1, W)
+    return np.arange(H)[:, None] >= (H - 60 + 30 * x**2)[None]
+
+
+def road(pose):
+    """Linear picture of a plane with texture and, above the horizon, infinitely far clouds."""
+    xs, ys = np.meshgrid(np.arange(W) + 0.5, np.arange(H) + 0.5)
+    rays = np.stack([(xs - K[0, 2]) / F, (ys - K[1, 2]) / F, np.ones_like(xs)], -1)
+    rays = rays @ pose[:3, :3].T
+    ahead = np.maximum(rays[..., 1], 1e-3)
+    at = pose[:3, 3] + rays * (HEIGHT / ahead)[..., None]
+    # Finer than a pixel far away: there it is one grey.
+    tiles = (30 * at[..., [0, 2]]).astype(np.float32) % 512
+    soil = cv2.remap(SOIL, tiles[..., 0], tiles[..., 1], cv2.INTER_LINEAR)
+    near = np.clip(12 * ahead, 0, 1)
+    ground = 0.25 + near * (soil - 0.25)
+    # A marking that runs with the car: structure that stays, and is no part of it.
+    ground[np.abs(at[..., 0] + 1.2) < 0.08] = 0.6
+    azimuth = np.arctan2(rays[..., 0], rays[..., 2])
+    height = rays[..., 1] / np.hypot(rays[..., 0], rays[..., 2])
+    where = [(F * a + 500).astype(np.float32) for a in (azimuth, height)]
+    clouds = 0.2 + cv2.remap(CLOUDS, *where, cv2.INTER_LINEAR)
+    return np.where(rays[..., 1] > 0, ground, clouds)
+
+
+def pictures(poses, *, own=True, exposures=None):
+    """Display pictures, 8 bits, with a smooth bonnet that mirrors a little of what passes."""
+    out = []
+    for k, pose in enumerate(poses):
+        linear = road(pose)
+        if own:
+            glint = 0.02 * np.sin(np.arange(W) / 40 + k)[None]
+            linear = np.where(bonnet(), 0.5 + glint, linear)
+        exposure = 1.0 if exposures is None else exposures[k]
+        shown = np.clip(linear * exposure, 0, 1) ** (1 / 2.2)
+        out.append(np.rint(255 * np.clip(shown + RNG.normal(0, 0.004, shown.shape), 0, 1)))
+    return np.array(out, np.uint8)
+
+
+DRIVEN = np.array([pose_at(0.7 * k) for k in range(12)])
+
+
+def test_the_bonnet_is_found_whatever_the_exposures():
+    exposures = 2.0 ** np.tile([-0.8, 0.3, 0.0], 4)
+    found = find_ego_mask(CAMERA, pictures(DRIVEN, exposures=exposures), DRIVEN, UP)
+    assert found.mask is not None
+    both = (found.mask & bonnet()).sum() / (found.mask | bonnet()).sum()
+    assert both > 0.93
+
+
+def test_a_road_alone_holds_no_car():
+    found = find_ego_mask(CAMERA, pictures(DRIVEN, own=False), DRIVEN, UP)
+    assert found.mask is None
+    assert found.looked_at == len(DRIVEN)
+
+
+def test_a_bonnet_is_told_from_sky_in_turns():
+    poses = np.array([pose_at(0.7 * k, 0.01 * k) for k in range(12)])
+    mask = find_ego_mask(CAMERA, pictures(poses), poses, UP).mask
+    assert mask is not None
+    assert not mask[: H // 2].any()
+
+
+def test_a_car_that_stands_says_nothing():
+    poses = np.array([pose_at(0.001 * k) for k in range(12)])
+    assert find_ego_mask(CAMERA, pictures(poses), poses, UP) == (None, 0)
+    assert find_ego_mask(CAMERA, pictures(DRIVEN[:3]), DRIVEN[:3], UP) == (None, 0)
+
+
+def test_photographs_are_spread_over_the_way_not_over_time(tmp_path):
+    waits = [pose_at(way) for way in [0.0] * 20 + [1.0, 2.0, 3.0]]
+    taken = [Photograph("front", k, 0.1 * k, tmp_path, pose) for k, pose in enumerate(waits)]
+    assert [p.frame for p in spread_over_the_way(taken, 4)] == [0, 20, 21, 22]
+    assert spread_over_the_way(taken[:1], 4) == taken[:1]
+
+
+@pytest.fixture
+def recording(tmp_path):
+    """Two cameras; one sees a bonnet."""
+    photographs = []
+    for name in ("front", "back"):
+        (tmp_path / name).mkdir()
+        for k, picture in enumerate(pictures(DRIVEN, own=name == "front")):
+            path = tmp_path / name / f"{k:02d}.png"
+            cv2.imwrite(str(path), picture)
+            photographs.append(Photograph(name, k, 0.1 * k, path, DRIVEN[k]))
+    cameras = (CAMERA, dataclasses.replace(CAMERA, name="back"))
+    return Recording(tmp_path, "pandaset", cameras, tuple(photographs))
+
+
+def test_drives_leave_it_out_and_runs_remember(recording, tmp_path):
+    scene = assemble(recording, DataConfig(frames="0:4"), tmp_path / "work")
+    said = [note for note in scene.notes if note.startswith("own car")]
+    assert len(said) == 2
+    assert "front 1" in said[0]
+    assert said[1] == "own car: not seen by back"
+    assert (tmp_path / "work" / "own_car" / "front" / "car.png").is_file()
+    by_camera = {view.camera: row for row, view in enumerate(scene.views)}
+    with_masks = dataclasses.replace(
+        scene, points=np.zeros((0, 3), np.float32), point_colors=np.zeros((0, 3), np.uint8)
+    )
+    write_scene(tmp_path, with_masks)
+    again = read_scene(tmp_path, recording.root)
+    assert again is not None
+    for views in (scene.views, again.views):
+        store = ImageStore(views, DataConfig())
+        _, mask = store.get(by_camera["front"])
+        assert not mask[-20:].any()
+        assert mask[: H // 2].all()
+        assert store.get(by_camera["back"])[1].all()
+        store.close()
+    without = assemble(recording, DataConfig(own_car=False))
+    assert all(view.own_car is None for view in without.views)
+
+
+def test_what_was_found_is_kept(recording, tmp_path, monkeypatch):
+    work = tmp_path / "work"
+    masks, notes = find_ego_masks(recording, ["front"], work)
+    monkeypatch.setattr("p2gs_jax.scene.drives.ego_mask.find_ego_mask", None)
+    again, same = find_ego_masks(recording, ["front"], work)
+    np.testing.assert_array_equal(masks["front"], again["front"])
+    assert same == notes

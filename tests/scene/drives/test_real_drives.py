@@ -1,0 +1,194 @@
+"""Real recordings: one keyframe of nuScenes, a sequence of PandaSet, stills of KITTI."""
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from scene.drives import writers_kitti as kitti
+from scene.drives.writers import applied
+
+from p2gs_jax.config import DataConfig
+from p2gs_jax.scene.drives.assemble import assemble
+from p2gs_jax.scene.drives.lidar import owners
+from p2gs_jax.scene.drives.tables import read_pickled
+from p2gs_jax.scene.pixels.store import ImageStore
+from p2gs_jax.scene.rigid import interpolated, inverse
+
+
+@pytest.fixture
+def keyframe(shared_data):
+    return shared_data("nuscenes_one_frame")
+
+
+@pytest.fixture
+def sequence(shared_data, read):
+    return read(shared_data("pandaset_002"))
+
+
+def project(points, to_camera, K):
+    """Return pixels, and depths."""
+    local = applied(to_camera, points)
+    with np.errstate(divide="ignore"):
+        return (local @ K.T)[:, :2] / local[:, 2:], local[:, 2]
+
+
+def test_poses_are_those_of_the_flat_calibration(keyframe, read):
+    drive = read(keyframe)
+    flat = json.loads((keyframe / "calib_flat.json").read_text())
+    assert len(drive.photographs) == 6
+    assert drive.notes[0] == "scene.json counts 39 samples, sample.json holds 1."
+    for photograph in drive.photographs:
+        known = flat[photograph.camera]
+        pose = np.array(known["ego_to_global"]) @ np.array(known["sensor_to_ego"])
+        np.testing.assert_allclose(photograph.pose, pose, atol=1e-6)
+        seconds = (known["timestamp_us"] - flat["LIDAR_TOP"]["timestamp_us"]) * 1e-6
+        assert photograph.time == pytest.approx(seconds, abs=1e-9)
+        assert photograph.path.is_file()
+
+
+def test_laser_points_land_in_the_images_when_those_were_taken(keyframe, read):
+    drive = read(keyframe)
+    points, times = drive.sweeps[0].read()
+    assert len(points) == 34688
+    cameras = {c.name: c for c in drive.cameras}
+    for photograph in drive.photographs:
+        camera, to_camera = cameras[photograph.camera], inverse(photograph.pose)
+        xy, z = project(points, to_camera, camera.K)
+        front = z > 1
+        xy = xy[front]
+        inside = ((xy >= 0) & (xy < [camera.width, camera.height])).all(1)
+        assert 3000 < inside.sum() < 4900
+        # Cameras are triggered as the scanner passes the middle of their images.
+        middle = np.abs(xy[:, 0] / camera.width - 0.5) < 0.05
+        passed = np.median(times[front][inside & middle])
+        assert photograph.time - passed == pytest.approx(0.002, abs=0.0006)
+
+
+def test_pictures_have_edges_where_depth_jumps(keyframe, read):
+    drive = read(keyframe)
+    scene = assemble(drive, DataConfig())
+    assert len(scene.views) == 6
+    assert len(scene.points) > 10_000
+    points = drive.sweeps[0].read().points - scene.origin
+    store = ImageStore(scene.views, DataConfig())
+    ratios = []
+    for index, view in enumerate(scene.views):
+        xy, depth = project(points, view.viewmat.astype(np.float64), view.K)
+        # Neighbours of one beam follow each other 32 apart.
+        near, z = np.stack([xy[:-32], xy[32:]], 1), np.stack([depth[:-32], depth[32:]], 1)
+        inside = ((near >= 0) & (near < [view.width - 1, view.height])).all((1, 2))
+        gap = np.abs(near[:, 1] - near[:, 0])
+        use = inside & (z > 1).all(1) & (gap < [25, 8]).all(1)
+        gradient = np.abs(np.diff(store.get(index, 1)[0].mean(2), axis=1))
+        strongest = np.array(
+            [
+                gradient[int(row), int(min(ends)) : int(max(ends)) + 1].max()
+                for ends, row in zip(near[use, :, 0], near[use, 0, 1], strict=True)
+            ]
+        )
+        jumps = z[use].max(1) > 1.2 * z[use].min(1)
+        ratios.append(strongest[jumps].mean() / strongest[~jumps].mean())
+    # 2.2; with the points 4 pixels to either side below 2.
+    assert np.median(ratios) > 2.1
+
+
+def test_the_real_sequence(sequence):
+    assert sequence.format == "pandaset"
+    assert len(sequence.cameras) == 6
+    assert {(c.width, c.height) for c in sequence.cameras} == {(1920, 1080)}
+    assert len(sequence.photographs) == 180
+    assert [s.frame for s in sequence.sweeps] == [0, 10, 20, 29]
+    assert (len(sequence.objects), sum(thing.moving for thing in sequence.objects)) == (94, 32)
+    assert sequence.notes == ["26 of 30 LiDAR sweeps are missing."]
+    # Cars are longer than wide, and drive about where they look (one turns).
+    for thing in sequence.objects:
+        if thing.label == "Car":
+            assert thing.size[0] > thing.size[1]
+        way = thing.poses[-1, :3, 3] - thing.poses[0, :3, 3]
+        if thing.label == "Car" and np.linalg.norm(way) > 3:
+            assert way @ thing.poses[0, :3, 0] > 0.8 * np.linalg.norm(way)
+
+
+def test_the_scanner_passed_boxes_when_it_is_said_to(sequence):
+    """Points of the spinning scanner carry times; those in a box are of the box's time."""
+    apart = []
+    for sweep in sequence.sweeps:
+        table = read_pickled(sequence.root / f"lidar/{sweep.frame:02d}.pkl.gz")
+        spinning = table["d"] == 0
+        points = np.stack([table[a][spinning] for a in "xyz"], 1)
+        times = table["t"][spinning]
+        row = owners(points, times, sequence.objects)
+        for k in set(row[row >= 0]):
+            nearest = np.abs(sequence.objects[k].times - np.median(times[row == k])).min()
+            apart.append(nearest)
+    assert len(apart) > 50
+    assert np.median(apart) < 0.002
+    assert np.quantile(apart, 0.9) < 0.006
+
+
+def test_boxes_are_where_the_forward_scanner_saw_them_at_another_time(sequence):
+    """Second boxes are left out; they are of other times, to which tracks are interpolated."""
+    things = {thing.name: thing for thing in sequence.objects}
+    ours, unmoved = [], []
+    for sweep in sequence.sweeps:
+        points = read_pickled(sequence.root / f"lidar/{sweep.frame:02d}.pkl.gz")
+        boxes = read_pickled(sequence.root / f"annotations/cuboids/{sweep.frame:02d}.pkl.gz")
+        xyz, forward = np.stack([points[a] for a in "xyz"], 1), points["d"] == 1
+        for k in np.flatnonzero(boxes["cuboids.sensor_id"] == 1):
+            sibling = boxes["cuboids.sibling_id"][k]
+            thing = next((t for name, t in things.items() if name.startswith(sibling)), None)
+            place = np.array([boxes[f"position.{a}"][k] for a in "xyz"])
+            near = forward & (np.linalg.norm(xyz - place, axis=1) < 2)
+            if thing is None or near.sum() < 10:
+                continue
+            way = thing.poses[-1, :3, 3] - thing.poses[0, :3, 3]
+            if np.linalg.norm(way) / np.ptp(thing.times) < 4:
+                continue
+            there, _ = interpolated(thing.times, thing.poses, [np.median(points["t"][near])])
+            frame = np.argmin(np.abs(thing.times - (sweep.time - 0.05)))
+            along = thing.poses[0, :3, 0]
+            ours.append(abs((there[0, :3, 3] - place) @ along))
+            unmoved.append(abs((thing.poses[frame, :3, 3] - place) @ along))
+    assert len(ours) > 20
+    assert np.median(ours) < 0.12
+    assert np.median(unmoved) > 2 * np.median(ours)
+
+
+def test_scans_agree_with_the_disparity_of_the_real_photographs(shared_data, read, tmp_path):
+    """Four stills of KITTI's stereo benchmark as frames of a car that stands."""
+    source = shared_data("kitti2015_stereo_lidar")
+    drive = tmp_path / "2011_09_26" / "2011_09_26_drive_0001_sync"
+    drive.mkdir(parents=True)
+    for path in source.glob("calib_*.txt"):
+        shutil.copy(path, drive.parent)
+    stills = sorted(p.stem for p in (source / "velodyne").iterdir())
+    for name in ("oxts", "image_02", "image_03", "velodyne_points"):
+        (drive / name / "data").mkdir(parents=True)
+        kitti.write_stamps(drive / name / "timestamps.txt", 10.0 * np.arange(len(stills)))
+    for k, still in enumerate(stills):
+        for camera in ("2", "3"):
+            link = drive / f"image_0{camera}/data/{k:010d}.png"
+            link.symlink_to(source / f"image_{camera}/{still}.png")
+        scan = source / f"velodyne/{still}.bin"
+        (drive / f"velodyne_points/data/{k:010d}.bin").symlink_to(scan)
+        (drive / f"oxts/data/{k:010d}.txt").write_text("49 8.4 110 0.01 -0.02 0.7 " + "0 " * 24)
+    recording = read(drive)
+    assert recording.format == "kitti_raw"
+    K = recording.cameras[0].K
+    for sweep, still in zip(recording.sweeps, stills, strict=True):
+        taken = [p for p in recording.photographs if p.frame == sweep.frame]
+        xy, z = project(sweep.read().points, inverse(taken[0].pose), K)
+        truth = cv2.imread(str(source / f"disp_occ_0/{still}.png"), cv2.IMREAD_UNCHANGED) / 256.0
+        height, width = truth.shape
+        inside = (z > 1) & (xy >= 0).all(1) & (xy < [width, height]).all(1)
+        column, row = xy[inside].astype(int).T
+        disparity = truth[row, column]
+        known = disparity > 0
+        # The second camera stands where its projection says: disparities are those of the pair.
+        baseline = np.linalg.norm(taken[0].pose[:3, 3] - taken[1].pose[:3, 3])
+        ratio = z[inside][known] / (K[0, 0] * baseline / disparity[known])
+        assert len(ratio) > 1000
+        assert np.median(ratio) == pytest.approx(1.0, abs=0.01)
+        assert np.mean(np.abs(ratio - 1) < 0.05) > 0.75

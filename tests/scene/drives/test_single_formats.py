@@ -1,0 +1,374 @@
+"""What only one reader has: keyframes, shutters, range images, doubled boxes, what is counted."""
+
+import json
+import shutil
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pyarrow import parquet
+from scene.drives import writers_argoverse as argoverse
+from scene.drives import writers_kitti as kitti
+from scene.drives import writers_nuscenes as nuscenes
+from scene.drives import writers_pandaset as pandaset
+from scene.drives import writers_waymo as waymo
+from scene.drives.writers import car_at, cut, inv, jpeg, write_jpeg
+
+from p2gs_jax.config import DataConfig
+from p2gs_jax.errors import UserError
+from p2gs_jax.scene import load_scene
+from p2gs_jax.scene.drives.assemble import assemble
+
+# ------------------------------------------------------------------------------------ nuScenes
+
+
+def edit(root, table, change):
+    path = root / nuscenes.TABLES / f"{table}.json"
+    path.write_text(json.dumps(change(json.loads(path.read_text()))))
+
+
+def test_points_of_nuscenes_were_measured_in_the_order_of_firing(kept, read):
+    for sweep in read(kept("nuscenes").root).sweeps:
+        times = sweep.read().times
+        assert np.all(np.diff(times) > 0)
+        assert times[0] == pytest.approx(sweep.time - nuscenes.TURN)
+        assert times[-1] < sweep.time
+
+
+def test_a_drive_of_nuscenes_is_named_or_the_one_with_photographs(write, read, tmp_path):
+    root = write("nuscenes", tmp_path, frames=2, scenes=("scene-0001", "scene-0002")).root
+    with pytest.raises(UserError, match="holds 2 drives: scene-0001, scene-0002"):
+        read(root)
+    drive = read(root, drive="scene-0002")
+    assert len(drive.photographs) == 4
+    assert all("scene-0002" in p.path.name for p in drive.photographs)
+    # Of the others only tables are there.
+    for path in root.glob("samples/CAM_*/scene-0001*"):
+        path.unlink()
+    assert all("scene-0002" in p.path.name for p in read(root).photographs)
+
+
+def test_one_of_several_versions_of_nuscenes_serves(write, read, tmp_path):
+    write("nuscenes", tmp_path, frames=1)
+    cut(tmp_path / nuscenes.TABLES / "sample_data.json")
+    write("nuscenes", tmp_path, frames=1, version=Path("v1.0-a"))
+    assert len(read(tmp_path).photographs) == 2
+
+
+def test_what_nuscenes_lacks_is_counted(copied, read):
+    root = copied("nuscenes").root
+    edit(root, "ego_pose", lambda rows: [r for r in rows if "CAM_FRONT" not in r["token"]])
+    edit(root, "scene", lambda rows: [{**rows[0], "nbr_samples": 39}])
+    nameless = {"instance_token": ""}
+    edit(
+        root,
+        "sample_annotation",
+        lambda rows: [{**r, **nameless} if "right" in r["token"] else r for r in rows],
+    )
+    for folder in ("samples", "sweeps"):
+        next(iter((root / folder / "LIDAR_TOP").iterdir())).unlink()
+    drive = read(root)
+    assert (len(drive.photographs), len(drive.sweeps), len(drive.objects)) == (3, 4, 2)
+    assert drive.notes == [
+        "scene.json counts 39 samples, sample.json holds 3.",
+        "3 boxes in sample_annotation.json belong to no instance: they are left out.",
+        "3 photographs have no pose in ego_pose.json: they are left out.",
+        "1 LiDAR sweeps of the keyframes are missing, or have no pose.",
+    ]
+    edit(root, "sample_annotation", lambda rows: [])
+    assert any("holds no box" in note for note in read(root).notes)
+
+
+def test_missing_photographs_of_nuscenes_are_complained_about(copied, read):
+    root = copied("nuscenes").root
+    next(iter((root / "samples" / "CAM_FRONT").iterdir())).unlink()
+    with pytest.raises(UserError, match="CAM_FRONT/scene-0001__CAM_FRONT"):
+        assemble(read(root), DataConfig())
+    assert len(assemble(read(root), DataConfig(allow_missing=True)).views) == 5
+
+
+@pytest.mark.parametrize("name", ["/etc/passwd", "../elsewhere.jpg", "samples/../../x.jpg"])
+@pytest.mark.parametrize("modality", ["CAM_FRONT", "LIDAR_TOP"])
+def test_files_outside_the_set_are_refused(copied, read, name, modality):
+    def moved(rows):
+        row = next(r for r in rows if f"/{modality}/" in r["filename"] and r["is_key_frame"])
+        row["filename"] = name
+        return rows
+
+    root = copied("nuscenes").root
+    edit(root, "sample_data", moved)
+    with pytest.raises(UserError, match=r"sample_data\.json names .* outside of"):
+        read(root)
+
+
+# ----------------------------------------------------------------------------------- Argoverse 2
+
+
+def test_the_grey_pair_is_read_where_it_is_asked_for_and_no_lens_is_removed(kept, read):
+    root = kept("argoverse").root
+    assert "stereo" in read(root).notes[0]
+    drive = read(root, cameras=("stereo_front_left",))
+    assert drive.cameras[-1].name == argoverse.GREY
+    assert not any("stereo" in note for note in drive.notes)
+    # Photographs are published without the lens's distortion, whose terms the tables have.
+    assert {camera.distortion for camera in drive.cameras} == {None}
+    assert [sweep.frame for sweep in drive.sweeps] == [0, 2, 4]
+
+
+def test_a_log_far_from_the_origin_becomes_a_scene_near_it(kept):
+    choice = DataConfig(frames="0:4", cameras=("front_center", "front_left"))
+    scene = load_scene(kept("argoverse").root, choice)
+    assert len(scene.views) == 8
+    assert len(scene.objects) == 3
+    assert max(np.abs(scene.origin)) > 500
+    assert np.abs(scene.points).max() < 100
+
+
+def test_what_argoverse_lacks_is_counted(copied, read):
+    log = copied("argoverse").root
+    cameras = log / "sensors" / "cameras"
+    shutil.rmtree(cameras / "ring_side_right")
+    write_jpeg(cameras / "ring_front_left" / f"{argoverse.ns(-9)}.jpg")
+    write_jpeg(cameras / "ring_rear_left" / f"{argoverse.ns(0)}.jpg")
+    sweep = next(iter((log / "sensors" / "lidar").iterdir()))
+    sweep.rename(sweep.with_name(f"{argoverse.ns(-8)}.feather"))
+    stamps = [argoverse.ns(t) for t in (0, 99, 0.1)]
+    argoverse.write_boxes(log, 1, timestamp_ns=stamps, track_uuid=["a", "c", ""])
+    drive = read(log)
+    assert (len(drive.photographs), len(drive.sweeps)) == (12, 2)
+    assert [t.name for t in drive.objects] == ["a"]
+    assert drive.notes[1:] == [
+        "calibration/intrinsics.feather has no row for ring_rear_left: left out.",
+        "There are no photographs of ring_side_right.",
+        "1 photographs are outside city_SE3_egovehicle.feather: they are left out.",
+        "1 LiDAR sweeps are outside city_SE3_egovehicle.feather.",
+        "1 boxes belong to no track: they are left out.",
+        "1 boxes are outside city_SE3_egovehicle.feather: they are left out.",
+    ]
+
+
+# ----------------------------------------------------------------------------------------- Waymo
+
+
+def test_photographs_of_waymo_come_out_of_the_table_one_at_a_time(copied, read):
+    root = copied("waymo").root
+    drive = read(root)
+    numbers = {name: number for number, name in waymo.NAMES.items()}
+    for photograph in drive.photographs:
+        expected = jpeg(10 * photograph.frame + numbers[photograph.camera])
+        assert photograph.embedded() == expected
+    assert len({p.path.name for p in drive.photographs}) == 3
+    drive = read(root)
+    path = root / waymo.file("camera_image")
+    path.write_bytes(path.read_bytes()[:4] + bytes(596) + path.read_bytes()[600:])
+    with pytest.raises(UserError, match="camera_image"):
+        next(p for p in drive.photographs if p.frame == 0).embedded()
+    rows = [waymo.image_row(0, 1, **{f"{waymo.IMAGE}image": None})]
+    waymo.write_rows(root, "camera_image", rows)
+    with pytest.raises(UserError, match="row 1 holds no image"):
+        read(root).photographs[0].embedded()
+
+
+def test_shutters_of_waymo_roll_or_do_not(copied, read, tmp_path):
+    root = copied("waymo").root
+    for camera in read(root).cameras:
+        assert camera.distortion.coefficients == (0.05, -0.02, 1e-3, -1e-3, 0.0)
+        assert camera.readout_s == pytest.approx(0.042, abs=1e-6)
+    scene = load_scene(root, DataConfig(frames="1:3"), work_dir=tmp_path / "work")
+    assert {view.frame for view in scene.views} == {1, 2}
+    assert any("rolling shutters (up to 42 ms" in note for note in scene.notes)
+    still = {f"{waymo.LENS}rolling_shutter_direction": 5}
+    rows = [waymo.lens_row(camera, **still) for camera in waymo.AZIMUTHS]
+    waymo.write_rows(root, "camera_calibration", rows)
+    drive = read(root)
+    assert {c.readout_s for c in drive.cameras} == {None}
+    at = {p.camera: p.time for p in drive.photographs if p.frame == 0}
+    assert at["FRONT"] == pytest.approx(0.03 - 0.002 - 0.003 + 0.002, abs=1e-6)
+
+
+def test_points_of_waymo_have_the_time_when_the_upper_scanner_passed(kept, read):
+    for k, sweep in enumerate(read(kept("waymo").root).sweeps):
+        points, times = sweep.read()
+        # Right of the car is where the scanner looks after three quarters of its turn.
+        to_car = inv(car_at(waymo.TURN * k + waymo.MIDDLE))
+        local = points @ to_car[:3, :3].T + to_car[:3, 3]
+        share = (np.pi - np.arctan2(local[:, 1], local[:, 0])) / (2 * np.pi)
+        off = np.abs((times - waymo.TURN * k) / waymo.TURN - share)
+        assert np.median(np.minimum(off, 1 - off)) < 0.02
+
+
+def test_a_segment_of_several_is_named(write, read, tmp_path):
+    write("waymo", tmp_path)
+    write("waymo", tmp_path, frames=1, segment="20023947602400723454_1120_000_1140_000")
+    with pytest.raises(UserError, match="holds 2 drives: 10023947602400723454_1120"):
+        read(tmp_path)
+    assert len(read(tmp_path, drive="2002").photographs) == 3
+
+
+def rows_of(root, component):
+    return parquet.read_table(root / waymo.file(component)).to_pylist()
+
+
+def test_what_waymo_lacks_is_counted(copied, read):
+    root = copied("waymo").root
+    images = [waymo.image_row(k, camera) for k in range(3) for camera in (5, 1, 2)]
+    images[4][f"{waymo.IMAGE}pose.transform"] = None
+    images[5][f"{waymo.IMAGE}velocity.linear_velocity.x"] = None
+    waymo.write_rows(root, "camera_image", images)
+    waymo.write_rows(root, "vehicle_pose", rows_of(root, "vehicle_pose")[:-1])
+    boxes = [waymo.box_row(k, track, waymo.box((9, 0))) for k, track in enumerate(("a", "", "a"))]
+    waymo.write_rows(root, "lidar_box", boxes)
+    waymo.write_rows(root, "lidar_pose", rows_of(root, "lidar_pose")[1:])
+    drive = read(root)
+    assert (len(drive.photographs), len(drive.sweeps), len(drive.objects)) == (8, 2, 1)
+    assert drive.notes == [
+        "1 photographs have no pose: they are left out.",
+        "1 boxes belong to no track: they are left out.",
+        "1 boxes are of frames without a pose: they are left out.",
+        "lidar_pose lacks 1 of 3 turns: their points are as if the car had stood still.",
+        "1 LiDAR sweeps are of frames without a pose: they are left out.",
+    ]
+    # Within what the car drives in half a turn.
+    assert 0.1 < waymo.off_walls(drive.sweeps[0].read().points).max() < 1.5
+    for component in ("vehicle_pose", "lidar", "lidar_pose", "lidar_box", "lidar_calibration"):
+        (root / waymo.file(component)).unlink()
+    assert read(root).notes == [
+        "1 photographs have no pose: they are left out.",
+        "vehicle_pose is missing: there are neither boxes nor LiDAR sweeps.",
+        "lidar_box is missing: what moves is not known.",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("component", "changes", "words"),
+    [
+        ("lidar", {f"{waymo.RANGES}shape": [5, 7, 4]}, "holds no range image"),
+        ("lidar", {"key.laser_name": 4}, "has no scanner 4"),
+        (
+            "lidar",
+            {f"{waymo.RANGES}values": [1.0] * 96, f"{waymo.RANGES}shape": [2, 12, 4]},
+            "2 rows",
+        ),
+        (
+            "lidar_pose",
+            {f"{waymo.PIXELS}values": [1.0] * 6, f"{waymo.PIXELS}shape": [1, 1, 6]},
+            "does not fit its range image",
+        ),
+    ],
+)
+def test_senseless_range_images_are_named_when_they_are_read(
+    copied, read, component, changes, words
+):
+    root = copied("waymo").root
+    rows = rows_of(root, component)
+    first = 1 if component == "lidar" else 0
+    waymo.write_rows(root, component, [{**rows[first], **changes}, *rows[first + 1 :]])
+    with pytest.raises(UserError, match=words) as error:
+        read(root).sweeps[0].read()
+    assert waymo.SEGMENT in error.value.message
+
+
+def test_a_scanner_without_returns_has_no_points(copied, read):
+    root = copied("waymo").root
+    gone = dict.fromkeys((f"{waymo.RANGES}values", f"{waymo.RANGES}shape"))
+    waymo.write_rows(root, "lidar", [{**row, **gone} for row in rows_of(root, "lidar")])
+    points, times = read(root).sweeps[0].read()
+    assert points.shape == (0, 3)
+    assert times.shape == (0,)
+
+
+# -------------------------------------------------------------------------------------- PandaSet
+
+
+def test_reading_is_fast_and_decodes_nothing(copied, read):
+    """Six cameras and eighty frames are read within five seconds, also on a busy machine."""
+    root = copied("pandaset").root
+    box = np.eye(4)
+    for k in range(3, 80):
+        rows = [pandaset.cuboid(f"{k % 7}-{n}", box) for n in range(120)]
+        pandaset.write_rows(root / pandaset.CUBOIDS / f"{k:02d}.pkl.gz", rows)
+        (root / f"lidar/{k:02d}.pkl.gz").write_bytes(b"never read")
+    for path in [*root.glob("camera/*/*.json"), *root.glob("lidar/*.json")]:
+        held = json.loads(path.read_text())
+        if isinstance(held, list):
+            times = path.name == "timestamps.json"
+            pandaset.put(
+                path, [held[0] + 0.1 * k for k in range(80)] if times else held + held[-1:] * 77
+            )
+    for name in ("right", "back", "front_left", "front_right"):
+        shutil.copytree(root / "camera/left_camera", root / f"camera/{name}_camera")
+    for camera in root.glob("camera/*"):
+        for k in range(3, 80):
+            (camera / f"{k:02d}.jpg").write_bytes(b"never read")
+    begin = time.process_time()
+    recording = read(root)
+    assert time.process_time() - begin < 5
+    assert (len(recording.photographs), len(recording.sweeps)) == (480, 80)
+
+
+def test_what_pandaset_lacks_is_counted(copied, read):
+    root = copied("pandaset").root
+    for path in root.glob("camera/left_camera/*.jpg"):
+        path.unlink()
+    path = root / pandaset.FRONT / "poses.json"
+    poses = json.loads(path.read_text())
+    pandaset.put(path, [poses[0], None, poses[2]])
+    (root / "lidar/01.pkl.gz").unlink()
+    (root / pandaset.CUBOIDS / "02.pkl.gz").unlink()
+    far = pandaset.beside(0, (30, 20))
+    more = [pandaset.cuboid(None, far), pandaset.cuboid("x", far, sensor=1)]
+    pandaset.write_rows(root / pandaset.CUBOIDS / "00.pkl.gz", [*pandaset.cuboids(0), *more])
+    recording = read(root)
+    assert recording.notes == [
+        "1 photographs of front_camera have no pose or time.",
+        "left_camera has no photographs: it is left out.",
+        "1 of 3 LiDAR sweeps are missing.",
+        "1 of 3 frames have no boxes.",
+        "1 boxes belong to no track: they are left out.",
+        "1 moving things have boxes of the forward scanner only, whose times are known to 0.1 s.",
+    ]
+    assert [p.frame for p in recording.photographs] == [0, 2]
+    assert {thing.name for thing in recording.objects} == {"parked", "ahead", "right", "x"}
+    shutil.rmtree(root / "annotations")
+    shutil.rmtree(root / "lidar")
+    recording = read(root)
+    assert (recording.sweeps, recording.objects) == ([], [])
+    assert "There are no boxes of moving things." in recording.notes
+
+
+# ----------------------------------------------------------------------------------------- KITTI
+
+
+def test_calibration_may_lie_beside_the_images_and_grey_cameras_are_pointed_out(copied, read):
+    date = copied("kitti_raw").root
+    drive = date / kitti.DRIVE
+    assert len(read(drive).photographs) == 6
+    shutil.copytree(drive / "image_02", drive / "image_00")
+    path = date / "calib_cam_to_cam.txt"
+    path.write_text(path.read_text() + f"P_rect_00: {kitti.numbers(kitti.P_RECT['02'])}\n")
+    for file in date.glob("calib_*.txt"):
+        file.rename(drive / file.name)
+    assert any("grey" in note for note in read(drive).notes)
+
+
+def test_what_kitti_lacks_is_counted(write, read, tmp_path):
+    date = write("kitti_raw", tmp_path, frames=8).root
+    drive = date / kitti.DRIVE
+    for k in (4, 5, 6, 7):
+        (drive / f"oxts/data/{k:010d}.txt").unlink()
+    (drive / "velodyne_points/data/0000000001.bin").unlink()
+    for path in drive.glob("image_03/data/*"):
+        path.unlink()
+    late, empty = kitti.tracklet("Car", 7, [[5, 2, 0, 0]] * 3), kitti.tracklet("Car", 0, [])
+    (date / kitti.BOXES).write_bytes(kitti.tracklets(late, empty))
+    recording = read(date)
+    assert recording.notes == [
+        "4 of 8 frames have no GPS measurement.",
+        "3 photographs of image_02 have no pose or time.",
+        "image_03 has no photographs: it is left out.",
+        "4 of 8 LiDAR sweeps are missing.",
+        "1 tracklets have no boxes: they are left out.",
+        "2 boxes are of frames without a LiDAR time: they are left out.",
+    ]
+    assert {p.frame for p in recording.photographs} == {0, 1, 2, 3, 4}

@@ -1,0 +1,185 @@
+"""Tables of drives: rows of large JSON lists, pickled tables with pandas as the oracle, Arrow."""
+
+import contextlib
+import gzip
+import json
+import os
+import pickle
+import sys
+
+import numpy as np
+import pandas as pd
+import pytest
+from scene.drives.writers_pandaset import as_published
+
+from p2gs_jax.errors import UserError
+from p2gs_jax.scene.drives.arrow import read_feather
+from p2gs_jax.scene.drives.tables import chosen_drive, read_pickled, read_rows
+
+ROWS = [
+    {"token": "a", "of": "x", "values": [1, 2.5, [3]]},
+    {"token": "b", "of": "y", "text": 'with "of": "x" and { in it'},
+    {"token": "c", "of": "x", "values": []},
+    {"token": "d"},
+]
+
+
+@pytest.mark.parametrize("style", [{}, {"indent": 4}, {"separators": (",", ":")}])
+def test_rows_are_found_in_the_text_or_decoded_one_after_the_other(tmp_path, style):
+    path = tmp_path / "table.json"
+    path.write_text(json.dumps(ROWS, **style) + "\n")
+    assert read_rows(path, {}) == ROWS
+    assert read_rows(path, {"values": list}, "of", {"x"}) == [ROWS[0], ROWS[2]]
+    assert read_rows(path, {}, "token", {"d", "b", "?"}) == [ROWS[1], ROWS[3]]
+    assert read_rows(path, {}, "of", {"z"}) == []
+    with pytest.raises(UserError, match=r"no valid 'values'.*token"):
+        read_rows(path, {"values": list}, "token", {"d"})
+    path.write_text("[\n]\n")
+    assert read_rows(path, {}, "of", {"x"}) == read_rows(path, {}) == []
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{}", "[1]", '[{"of": "x"', '[{"of": "x"},', "[" * 9999, "\udcff"]
+)
+def test_what_is_not_a_table_of_rows_is_named(tmp_path, text):
+    path = tmp_path / "table.json"
+    path.write_text(text, errors="surrogateescape")
+    for column in ("", "of"):
+        with pytest.raises(UserError, match=r"table\.json is not a valid table"):
+            read_rows(path, {}, column, {"x"})
+
+
+@pytest.mark.parametrize(
+    ("asked", "there", "words"),
+    [
+        (None, ["b-1", "b-2", "a"], "holds 3 drives: a, b-1, b-2"),
+        ("b", ["b-1", "b-2", "a"], "2 drives of set begin with 'b'"),
+        ("other", ["a"], "no drive 'other'; there are a"),
+        ("other", [], "there are none"),
+        (None, [str(i) for i in range(9)], "0, 1, 2, 3, 4, ..."),
+    ],
+)
+def test_a_drive_is_chosen_by_how_its_name_begins(tmp_path, asked, there, words):
+    with pytest.raises(UserError, match="--drive NAME") as error:
+        chosen_drive(asked, there, tmp_path / "set")
+    assert words in error.value.message.replace(str(tmp_path) + "/", "")
+    assert chosen_drive(None, ["a"], tmp_path) == "a"
+    assert chosen_drive("a", ["a", "ab"], tmp_path) == "a"
+    assert chosen_drive("ab", ["a", "abc"], tmp_path) == "abc"
+
+
+def test_without_pyarrow_the_command_is_said(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(UserError, match=r"pip install 'p2gs-jax\[drives\]'"):
+        read_feather(tmp_path / "annotations.feather", [])
+
+
+# -------------------------------------------------------------------------------- pickled tables
+
+TABLE = as_published(
+    [
+        {"uuid": "a", "x": 1.5, "label": "Car", "n": 1, "stationary": True},
+        {"uuid": "bé", "x": 2.5, "label": "", "n": 2, "stationary": False},
+        {"uuid": None, "x": np.nan, "label": "Van", "n": 3, "stationary": True},
+    ]
+).assign(y=np.array([2, 3, 4], np.float32))
+TABLE.columns = TABLE.columns.astype(object)
+VARIANTS = {
+    "all": TABLE,
+    "numbers": TABLE[["x", "n"]],
+    "sliced": TABLE.iloc[1:, ::2],
+    "empty": TABLE.iloc[:0],
+    "indexed": TABLE.set_index("n"),
+    "joined": pd.concat([TABLE, TABLE]),
+    "reordered": TABLE[["n", "y", "x", "label"]],
+}
+
+
+def assert_same(columns, table):
+    assert list(columns) == list(table.columns)
+    for name, found in columns.items():
+        expected = table[name].to_numpy()
+        if found.dtype != object:
+            np.testing.assert_array_equal(found, expected)
+        else:
+            assert len(found) == len(expected)
+            for ours, theirs in zip(found, expected, strict=True):
+                assert ours == theirs or (pd.isna(ours) and pd.isna(theirs)), name
+
+
+@pytest.mark.parametrize("protocol", [3, 4, 5])
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_what_pandas_pickles(tmp_path, protocol, variant):
+    (tmp_path / "t.pkl").write_bytes(pickle.dumps(VARIANTS[variant], protocol=protocol))
+    assert_same(read_pickled(tmp_path / "t.pkl"), VARIANTS[variant])
+
+
+def test_the_real_files_of_an_old_pandas(shared_data):
+    root = shared_data("pandaset_002")
+    for path in [*sorted(root.glob("annotations/cuboids/*.gz"))[:5], root / "lidar/00.pkl.gz"]:
+        assert_same(read_pickled(path), pd.read_pickle(path))
+
+
+class Malicious:
+    def __reduce__(self):
+        return os.system, ("touch malicious",)
+
+
+class InTheTable:
+    def __reduce__(self):
+        return eval, ("__import__('os').system('touch malicious')",)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [Malicious(), pd.DataFrame({"a": [InTheTable()]}), {"a": Malicious()}],
+    ids=["alone", "in a cell", "in a dict"],
+)
+def test_nothing_is_run(tmp_path, monkeypatch, content):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "t.pkl").write_bytes(pickle.dumps(content))
+    with pytest.raises(
+        UserError, match=r"t\.pkl is not a table .*: it holds a (posix|builtins|pan)"
+    ):
+        read_pickled(tmp_path / "t.pkl")
+    assert not (tmp_path / "malicious").exists()
+
+
+CATEGORIES = pd.DataFrame({"c": pd.Categorical(["a"])})
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (pickle.dumps({"a": [1]}), "its content is not a DataFrame"),
+        (pickle.dumps(TABLE)[:200], "is not a table that can be read"),
+        (gzip.compress(pickle.dumps(TABLE))[:300], "is not a table that can be read"),
+        (b"", "is not a table that can be read"),
+        (b"\x1f\x8bno gzip", "is not a table that can be read"),
+        (b"\x17" * 500, "is not a table that can be read"),
+        (pickle.dumps(CATEGORIES), "it holds a pandas"),
+        (gzip.compress(bytes(2**28 + 1), 1), "unpacks to more than 256 MiB"),
+    ],
+    ids=["a dict", "cut", "cut gzip", "empty", "bad gzip", "noise", "categories", "bomb"],
+)
+def test_what_is_not_a_pickled_table_is_refused(tmp_path, content, words):
+    (tmp_path / "00.pkl").write_bytes(content)
+    with pytest.raises(UserError, match=words) as info:
+        read_pickled(tmp_path / "00.pkl")
+    assert "00.pkl" in str(info.value)
+
+
+def test_damaged_bytes_end_in_a_table_or_a_complaint(tmp_path):
+    whole = bytearray(pickle.dumps(TABLE))
+    path = tmp_path / "t.pkl"
+    rng = np.random.default_rng(0)
+    for _ in range(300):
+        damaged = whole.copy()
+        damaged[rng.integers(len(whole))] = rng.integers(256)
+        path.write_bytes(damaged)
+        with contextlib.suppress(UserError):
+            read_pickled(path)
+    for end in range(0, len(whole) - 1, 7):
+        path.write_bytes(whole[:end])
+        with pytest.raises(UserError):
+            read_pickled(path)

@@ -1,0 +1,135 @@
+"""nuScenes: tables by the published schema; beside keyframes a sweep and a photograph between."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+from scene.drives import writers as w
+from scipy.spatial.transform import Rotation
+
+START = 1532402927647951
+TABLES = Path("v1.0-mini")
+CAMERAS = {"CAM_FRONT": 0.0, "CAM_BACK_LEFT": 1.9}
+LAG = {"CAM_FRONT": -0.035, "CAM_BACK_LEFT": -0.001}
+# x to the right, y forward.
+SCANNER = w.matrix(Rotation.from_euler("z", -np.pi / 2), [0.9, 0, 1.8])
+K = [[50.0, 0, 31.5], [0, 51, 23.5], [0, 0, 1]]
+TURN = 0.05
+
+
+def calibrated(channel, pose, K) -> dict:
+    return {
+        "token": f"calibrated {channel}",
+        "sensor_token": channel,
+        "translation": pose[:3, 3].tolist(),
+        "rotation": w.wxyz(pose),
+        "camera_intrinsic": K,
+    }
+
+
+def recorded(root, sample, scene, channel, seconds, key) -> tuple[dict, dict]:
+    """Write a file, and return its rows of sample_data and ego_pose."""
+    stamp = START + round(seconds * 1e6)
+    camera = channel.startswith("CAM")
+    folder, ending = "samples" if key else "sweeps", "jpg" if camera else "pcd.bin"
+    name = f"{folder}/{channel}/{scene}__{channel}__{stamp}.{ending}"
+    ego = w.car_at(seconds)
+    if channel == "LIDAR_TOP":
+        local = w.applied(w.inv(ego @ SCANNER), w.landmarks())
+        data = np.column_stack([local, np.zeros((len(local), 2))]).astype("<f4").tobytes()
+        w.write_bytes(root / name, data)
+    else:
+        w.write_jpeg(root / name)
+    token = f"{scene} {channel} {stamp}"
+    row = {
+        "token": token,
+        "sample_token": sample,
+        "ego_pose_token": token,
+        "calibrated_sensor_token": f"calibrated {channel}",
+        "timestamp": stamp,
+        "filename": name,
+        "is_key_frame": key,
+        "width": w.WIDTH if camera else 0,
+        "height": w.HEIGHT if camera else 0,
+    }
+    placed = {"translation": ego[:3, 3].tolist(), "rotation": w.wxyz(ego)}
+    return row, {"token": token, "timestamp": stamp, **placed}
+
+
+def boxed(scene, sample, instance, pose, attributes) -> dict:
+    return {
+        "token": f"{sample} {instance}",
+        "sample_token": sample,
+        "instance_token": f"{scene} {instance}",
+        "attribute_tokens": attributes,
+        "translation": pose[:3, 3].tolist(),
+        "size": [1.8, 4.2, 1.5],
+        "rotation": w.wxyz(pose),
+    }
+
+
+def beside(seconds: float, place) -> np.ndarray:
+    """Return a box at a place about the scanner, given x forward, y left; it looks along y."""
+    return w.car_at(seconds) @ SCANNER @ w.matrix(Rotation.identity(), [-place[1], place[0], 0])
+
+
+def write(root: Path, frames=3, scenes=("scene-0001",), version=TABLES) -> w.Made:
+    names = "scene sample sample_data ego_pose sample_annotation instance category attribute"
+    tables: dict[str, list] = {name: [] for name in names.split()}
+    kinds = {**dict.fromkeys(CAMERAS, "camera"), "LIDAR_TOP": "lidar", "RADAR": "radar"}
+    tables["sensor"] = [{"token": c, "channel": c, "modality": kinds[c]} for c in kinds]
+    tables["calibrated_sensor"] = [
+        *(calibrated(channel, w.mounted(azimuth), K) for channel, azimuth in CAMERAS.items()),
+        calibrated("LIDAR_TOP", SCANNER, []),
+        calibrated("RADAR", np.eye(4), []),
+    ]
+    tables["category"].append({"token": "car", "name": "vehicle.car"})
+    states = {"moving": "vehicle.moving", "parked": "vehicle.parked", "rider": "cycle.with_rider"}
+    tables["attribute"] = [{"token": token, "name": name} for token, name in states.items()]
+    for scene in scenes:
+        tables["scene"].append({"token": f"scene {scene}", "name": scene, "nbr_samples": frames})
+        for moment in reversed(range(frames)):
+            sample, at = f"{scene} sample {moment}", 0.5 * moment
+            row = {"token": sample, "scene_token": f"scene {scene}"}
+            tables["sample"].append({**row, "timestamp": START + round(at * 1e6)})
+            data = [(c, at + LAG[c], True) for c in CAMERAS]
+            data += [("LIDAR_TOP", at, True), ("LIDAR_TOP", at - TURN, False)]
+            data += [("RADAR", at, True), ("CAM_FRONT", at - 0.1, False)]
+            for channel, when, key in data:
+                row, pose = recorded(root, sample, scene, channel, when, key)
+                tables["sample_data"].append(row)
+                tables["ego_pose"].append(pose)
+            tables["sample_annotation"] += [
+                boxed(scene, sample, "ahead", beside(at, w.AHEAD), ["rider"]),
+                boxed(
+                    scene, sample, "right", beside(at, w.RIGHT), ["moving" if moment else "parked"]
+                ),
+                boxed(scene, sample, "parked", beside(0, w.AHEAD), ["parked"]),
+            ]
+        for instance in ("ahead", "right", "parked"):
+            tables["instance"].append({"token": f"{scene} {instance}", "category_token": "car"})
+    for name, rows in tables.items():
+        w.write_bytes(root / version / f"{name}.json", json.dumps(rows, indent=1).encode())
+    ats = 0.5 * np.arange(frames)
+    # The turn begins at the scanner's left; a sweep's stamp is its end.
+    late = {"ahead": -0.75 * TURN, "right": -0.5 * TURN}
+    return w.Made(
+        root=root,
+        K=(50, 51, 32, 24),
+        photographs={
+            (c, k): (at + LAG[c], w.car_at(at + LAG[c]) @ w.mounted(CAMERAS[c]))
+            for c in CAMERAS
+            for k, at in enumerate(ats)
+        },
+        sweeps=[t for at in ats for t in (at - TURN, at)],
+        error=w.off_landmarks,
+        count=50,
+        boxes={
+            "ahead": (ats + late["ahead"], np.array([beside(at, w.AHEAD) for at in ats])),
+            "right": (ats + late["right"], np.array([beside(at, w.RIGHT) for at in ats])),
+        },
+        tables=[version / f"{name}.json" for name in ("scene", "sample", "ego_pose", "sensor")]
+        + [version / "calibrated_sensor.json"],
+        optional=[version / "sample_annotation.json"],
+        scans=sorted(p.relative_to(root) for p in root.glob("s*/LIDAR_TOP/*")),
+    )
