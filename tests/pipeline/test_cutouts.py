@@ -7,7 +7,7 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from scene.posed import around, blender
+from scene.helpers import around, blender
 
 from p2gs_jax import load_run
 from p2gs_jax.config import preset
