@@ -32,9 +32,9 @@ from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.run.folder import RunFolder, locked, require_free
 from p2gs_jax.run.write import write_start
 from p2gs_jax.train.data_parallel import mesh_of
+from p2gs_jax.train.inputs import TrainingViews
 from p2gs_jax.train.loop import Trainer, TrainResult
-from p2gs_jax.train.programs import StepPrograms
-from p2gs_jax.train.views import TrainingViews
+from p2gs_jax.train.step import StepPrograms
 from p2gs_jax.types import Params, Scene
 
 

@@ -21,13 +21,12 @@ from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.core.runtime import return_freed_memory
 from p2gs_jax.core.streams import Stream
 from p2gs_jax.errors import UserError
-from p2gs_jax.gaussians.dense import DenseSeeds, dense_limit, gaussians_of, match_photographs
+from p2gs_jax.gaussians.dense import DenseSeeds, dense_limit, dense_seeds, gaussians_of
 from p2gs_jax.gaussians.matching import Tones, rough_tones
 from p2gs_jax.gaussians.moving import Nodes, node_gaussians, nodes_radiance, with_vibration
 from p2gs_jax.gaussians.population import Coverage
 from p2gs_jax.gaussians.seeds import merge, photographed_radiance, subsample, with_colors
 from p2gs_jax.gaussians.shell import Shell, Sphere, black_gaussians, find_shell, shell_gaussians
-from p2gs_jax.losses.relative_exposure import ColorPairs
 from p2gs_jax.photometry.calibrate import Selection
 from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.parameters import initial_appearance, initial_photometry, point_radiance
@@ -37,7 +36,7 @@ from p2gs_jax.pipeline.survey import Survey, survey
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.pixels.store import ImageStore
-from p2gs_jax.train.compared_photographs import color_pairs
+from p2gs_jax.train.exposure_loss import ColorPairs, color_pairs
 from p2gs_jax.types import Gaussians, Measured, Params, Scene, View
 
 
@@ -245,17 +244,15 @@ def initialise(found: Survey, exposures: Exposures, reporter: Reporter | None = 
 def _matched(found: Survey, exposures: Exposures, cfg: FitConfig, reporter: Reporter) -> DenseSeeds:
     """Return seeds from matching photographs."""
     scene = found.scene
-    if exposures.solved:
-        tones = Tones.of(exposures.photometry, cfg.photometry)
-    else:
-        tones = rough_tones(exposures.observations, len(scene.training_views))
-    return match_photographs(
+    color = Tones.of(exposures.photometry, cfg.photometry)
+    rough = rough_tones(exposures.observations, len(scene.training_views))
+    return dense_seeds(
         scene,
         found.still,
-        tones,
-        scene.points[found.seeds],
-        exposures.photometry,
+        color if exposures.solved else rough,
+        color,
         cfg,
+        existing=scene.points[found.seeds],
         limit=dense_limit(found.cfg, len(found.seeds), found.coverage),
         on_view=lambda i, n: reporter.stage("Matching photographs", i, n),
     )
