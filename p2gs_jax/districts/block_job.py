@@ -30,7 +30,7 @@ from p2gs_jax.run.folder import RunFolder, locked
 from p2gs_jax.scene.pixels.store import size_at
 from p2gs_jax.scene.visibility import shown_share
 from p2gs_jax.train.data_parallel import mesh_of
-from p2gs_jax.train.programs import StepPrograms
+from p2gs_jax.train.step import StepPrograms
 from p2gs_jax.types import Scene
 
 STATUS = Path("/proc/self/status")

@@ -35,7 +35,7 @@ from p2gs_jax.run.folder import RunFolder, locked
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.exposures import check_source
 from p2gs_jax.scene.pixels.store import ImageStore
-from p2gs_jax.train.programs import StepPrograms
+from p2gs_jax.train.step import StepPrograms
 from p2gs_jax.types import Gaussians, Params, Scene
 
 # Steps of refitting colours and opacities, one view each.

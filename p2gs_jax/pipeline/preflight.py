@@ -28,10 +28,10 @@ from p2gs_jax.evaluation.lpips import LpipsWeights, read_lpips_weights
 from p2gs_jax.evaluation.references import Reference, check_reference, load_reference
 from p2gs_jax.gaussians.dense import seed_bound
 from p2gs_jax.gaussians.population import Coverage
-from p2gs_jax.losses.total import SECOND_RENDER_FORMS
 from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.scene.exposures import check_source, read_known_exposures
 from p2gs_jax.scene.pixels.store import size_at
+from p2gs_jax.train.exposure_loss import SECOND_RENDER_FORMS
 from p2gs_jax.train.schedule import shrinks
 from p2gs_jax.train.strategies import check_spread
 from p2gs_jax.types import Scene, View

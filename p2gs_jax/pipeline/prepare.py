@@ -27,7 +27,6 @@ from p2gs_jax.gaussians.moving import Nodes, node_gaussians, nodes_radiance, wit
 from p2gs_jax.gaussians.population import Coverage
 from p2gs_jax.gaussians.seeds import merge, photographed_radiance, subsample, with_colors
 from p2gs_jax.gaussians.shell import Shell, Sphere, black_gaussians, find_shell, shell_gaussians
-from p2gs_jax.losses.relative_exposure import ColorPairs
 from p2gs_jax.photometry.calibrate import Selection
 from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.parameters import initial_appearance, initial_photometry, point_radiance
@@ -37,7 +36,7 @@ from p2gs_jax.pipeline.survey import Survey, survey
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.pixels.store import ImageStore
-from p2gs_jax.train.compared_photographs import color_pairs
+from p2gs_jax.train.exposure_loss import ColorPairs, color_pairs
 from p2gs_jax.types import Gaussians, Measured, Params, Scene, View
 
 

@@ -20,8 +20,8 @@ from p2gs_jax.gaussians.population import (
     place,
 )
 from p2gs_jax.render import render_linear
-from p2gs_jax.train.demand import demand
 from p2gs_jax.train.optimizer import AdamState
+from p2gs_jax.train.strategies import demand
 from p2gs_jax.types import Camera, Gaussians
 
 CFG = DensifyConfig()

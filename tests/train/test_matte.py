@@ -9,11 +9,11 @@ import pytest
 
 from p2gs_jax.config import FitConfig, LossConfig, PhotometryConfig, preset
 from p2gs_jax.evaluation.alignment import fit_exposure
-from p2gs_jax.losses.image import photometric_loss
-from p2gs_jax.losses.matte import matted_loss
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import formation
-from p2gs_jax.types import Batch, Camera, Capture, Render
+from p2gs_jax.train.image_gradient import compared
+from p2gs_jax.train.terms import loss_terms, photometric_loss
+from p2gs_jax.types import Batch, Camera, Capture, Photometry, Render
 
 RNG = np.random.default_rng(0)
 SIZE = (12, 14)
@@ -53,6 +53,15 @@ def surfaces():
     alpha = RNG.uniform(0.02, 1, SIZE)
     alpha[0], alpha[1] = 0, 1
     return RNG.uniform(0.05, 0.9, (*SIZE, 3)), alpha
+
+
+def matted_loss(render, batch, capture, correction, cfg):
+    """Return the picture over the background and the terms that compare it."""
+    taken = Photometry(capture.exposure[None], capture.gamma[None], "linear")
+    rendered, target = compared(render, batch, taken, correction, cfg)
+    terms = loss_terms(cfg)
+    names = [name for name in ("l1", "dssim", "alpha") if name in terms]
+    return rendered.ldr, {name: terms[name](rendered, target, None) for name in names}
 
 
 def config(curve, **loss):

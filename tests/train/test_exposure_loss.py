@@ -13,11 +13,11 @@ from p2gs_jax.config import (
     PhotometryConfig,
     RelativeExposureConfig,
 )
-from p2gs_jax.losses import relative_exposure as rel
 from p2gs_jax.photometry.formation import formation
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import KNOTS
-from p2gs_jax.train.compared_photographs import color_pairs
+from p2gs_jax.train import exposure_loss as rel
+from p2gs_jax.train.exposure_loss import color_pairs
 from p2gs_jax.types import Photometry
 
 WIDTH, HEIGHT = 48, 32
@@ -90,13 +90,21 @@ def test_a_common_tint_is_a_gauge():
 def test_the_literal_readings_take_the_whole_gain():
     right = dataclasses.replace(truth(), raw_gammas=jnp.zeros(4))
     linear = jnp.full((HEIGHT, WIDTH, 3), 0.2)
-    given = rel.ExposurePairs(linear, linear, jnp.int32(0), jnp.int32(1), right, None)
+    given = ((linear, linear), (jnp.int32(0), jnp.int32(1)), None, right)
     for form in ("literal_same_pose", "literal_pixels"):
         cfg = LossConfig(relative_exposure=RelativeExposureConfig(1.0, form))
-        found = float(rel.relative_exposure_loss(given, cfg, SHADED))
+        found = float(rel.relative_exposure_loss(*given, cfg, SHADED))
         shaded, plain = (np.asarray(formation(linear, right.capture(i), LINEAR)) for i in (0, 1))
         expected = np.abs((plain / shaded - 1) * 0.2).sum(-1).mean()
         assert found == pytest.approx(expected, rel=1e-4)
+
+
+def test_a_reading_that_subtracts_renders_needs_two_of_one_size():
+    cfg = LossConfig(relative_exposure=RelativeExposureConfig(1.0, "literal_pixels"))
+    nothing = jnp.zeros((4, 6, 3))
+    for other, words in ((nothing[:1], "renders of one size"), (None, "second view")):
+        with pytest.raises(ValueError, match=words):
+            rel.relative_exposure_loss((nothing, other), (0, 1), None, truth(), cfg, SHADED)
 
 
 LINEAR = dataclasses.replace(SHADED, curve="linear", pivot=1.0)

@@ -11,22 +11,10 @@ import pytest
 
 from p2gs_jax.config import DataConfig, FitConfig, LossConfig
 from p2gs_jax.errors import UserError
-from p2gs_jax.losses.lidar import CLIP, lidar_loss
-from p2gs_jax.train.measured_depths import MOST_PER_VIEW, KeptDepths, measured_depths
-from p2gs_jax.types import Lidar, Measured, Render, Scene, View
+from p2gs_jax.train.lidar_depths import CLIP, MOST_PER_VIEW, KeptDepths, lidar_loss, measured_depths
+from p2gs_jax.types import Lidar, Measured, Scene, View
 
 HEIGHT, WIDTH = 4, 6
-
-
-def rendered(depth, alpha) -> Render:
-    return Render(
-        linear=jnp.zeros((HEIGHT, WIDTH, 3)),
-        alpha=jnp.asarray(alpha, jnp.float32),
-        depth=jnp.asarray(depth * alpha, jnp.float32),
-        count=jnp.int32(0),
-        overflow=jnp.bool_(False),
-        visible=jnp.zeros(0, bool),
-    )
 
 
 def measured(pixels, depths) -> Measured:
@@ -35,7 +23,8 @@ def measured(pixels, depths) -> Measured:
 
 
 def loss(depth, alpha, m):
-    return lidar_loss(rendered(depth, alpha), m)
+    alpha = jnp.asarray(alpha, jnp.float32)
+    return lidar_loss(alpha, jnp.asarray(depth * alpha, jnp.float32), m)
 
 
 def test_it_is_the_mean_huber_error_of_log_depth():

@@ -1,6 +1,6 @@
-"""Photometric reconstruction: L1 and D-SSIM, masked and censored (paper, eq. 8).
+"""SSIM of two images, masked: what losses and scores share.
 
-SSIM is memory-bound. Its blurs are eleven shifted adds per axis, one colour channel at a time so
+It is memory-bound. Its blurs are eleven shifted adds per axis, one colour channel at a time so
 that its maps stay in cache, and its gradient is written out: three more blurs, done while the
 moments are at hand, instead of autodiff through four (BUILD_NOTES, "SSIM").
 """
@@ -16,7 +16,6 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from p2gs_jax.config import LossConfig
 from p2gs_jax.render.xla_cpu import materialize, opaque_true
 
 WINDOW, SIGMA = 11, 1.5
@@ -135,41 +134,3 @@ def ssim(
 ) -> Float[Array, ""]:
     """Return the mean SSIM over valid pixels; invalid ones are black in both images."""
     return 1 - one_less_ssim(ldr, target, mask)
-
-
-def censor(
-    ldr: Float[Array, "h w 3"], target: Float[Array, "h w 3"], saturation: float
-) -> Float[Array, "h w 3"]:
-    """Replace predictions that a saturated photograph cannot contradict by the photograph.
-
-    Where the photograph is at or above `saturation` it only says "at least this bright": a
-    prediction at least that bright is right and gets no gradient.
-    """
-    agrees = (target >= saturation) & (ldr >= saturation)
-    return jnp.where(agrees, target, ldr)
-
-
-def photometric_loss(
-    ldr: Float[Array, "h w 3"],
-    target: Float[Array, "h w 3"],
-    mask: Float[Array, "h w"],
-    cfg: LossConfig,
-) -> dict[str, Float[Array, ""]]:
-    """Return the weighted terms `l1` and `dssim` (paper, eq. 8).
-
-    Args:
-        ldr: prediction, display-encoded, may exceed 1.
-        target: photograph, [0, 1].
-        mask: 1 = use; masked pixels get exactly zero gradient.
-        cfg: weights and censoring.
-    """
-    if cfg.censored:
-        ldr = censor(ldr, target, cfg.saturation)
-    weight = cfg.dssim_weight or 0.0
-    valid = jnp.maximum(3 * jnp.sum(mask), 1.0)
-    absolute = jnp.where(mask[..., None] > 0, jnp.abs(ldr - target), 0.0)
-    terms = {"l1": (1 - weight) * jnp.sum(absolute * mask[..., None]) / valid}
-    if cfg.dssim_weight is not None:
-        shown = jnp.where(mask[..., None] > 0, ldr, 0.0)
-        terms["dssim"] = weight * one_less_ssim(shown, target, mask)
-    return terms

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import LossConfig
-from p2gs_jax.losses import image
+from p2gs_jax.evaluation import ssim
+from p2gs_jax.train import terms
 
 
 def pair(shape=(20, 31), dtype=np.float64, seed=0):
@@ -28,7 +29,7 @@ def test_map_matches_the_definition():
         expected = ((2 * ma * mb + 1e-4) * (2 * sab + 9e-4)) / (
             (ma**2 + mb**2 + 1e-4) * (sa + sb + 9e-4)
         )
-        np.testing.assert_allclose(image.ssim_map(x, y)[c], expected, atol=2e-5)
+        np.testing.assert_allclose(ssim.ssim_map(x, y)[c], expected, atol=2e-5)
 
 
 def test_gradient_matches_autodiff_and_finite_differences():
@@ -39,10 +40,10 @@ def test_gradient_matches_autodiff_and_finite_differences():
 
         def plain(a):
             a, b = a * mask, y * mask
-            return jnp.sum(image.ssim_map(a, b) * mask) / (3 * jnp.sum(mask))
+            return jnp.sum(ssim.ssim_map(a, b) * mask) / (3 * jnp.sum(mask))
 
         def closed(a):
-            return image.ssim(a.transpose(hwc), y.transpose(hwc), mask)
+            return ssim.ssim(a.transpose(hwc), y.transpose(hwc), mask)
 
         assert float(closed(x)) == pytest.approx(float(plain(x)), rel=1e-12)
         g = jax.grad(closed)(x)
@@ -58,10 +59,10 @@ def test_what_is_fitted_well_keeps_its_digits(apart):
     bright = 0.8 + 0.02 * rng.uniform(size=(48, 64, 3))
     inputs = [np.float32(a) for a in (bright + apart * rng.normal(size=bright.shape), bright)]
     inputs.append(np.ones(bright.shape[:2], np.float32))
-    value, gradient = jax.value_and_grad(image.one_less_ssim)(*map(jnp.asarray, inputs))
+    value, gradient = jax.value_and_grad(ssim.one_less_ssim)(*map(jnp.asarray, inputs))
     with jax.enable_x64(True):
         exact = [jnp.asarray(a, np.float64) for a in inputs]
-        true, slope = map(np.asarray, jax.value_and_grad(image.one_less_ssim)(*exact))
+        true, slope = map(np.asarray, jax.value_and_grad(ssim.one_less_ssim)(*exact))
     assert float(value) == pytest.approx(float(true), rel=1e-5)
     assert np.linalg.norm(gradient - slope) < 2e-4 * np.linalg.norm(slope)
 
@@ -69,19 +70,19 @@ def test_what_is_fitted_well_keeps_its_digits(apart):
 def test_identical_images_and_empty_mask():
     x = pair(dtype=np.float32)[0].transpose(1, 2, 0)
     ones = jnp.ones(x.shape[:2])
-    assert float(image.ssim(x, x, ones)) == pytest.approx(1, abs=1e-5)
-    terms = image.photometric_loss(x, x, ones, LossConfig())
-    assert sum(map(float, terms.values())) == pytest.approx(0, abs=1e-6)
-    empty = image.photometric_loss(x, 1 - x, 0 * ones, LossConfig())
+    assert float(ssim.ssim(x, x, ones)) == pytest.approx(1, abs=1e-5)
+    same = terms.photometric_loss(x, x, ones, LossConfig())
+    assert sum(map(float, same.values())) == pytest.approx(0, abs=1e-6)
+    empty = terms.photometric_loss(x, 1 - x, 0 * ones, LossConfig())
     assert np.isfinite(sum(map(float, empty.values())))
-    assert set(image.photometric_loss(x, x, ones, LossConfig(dssim_weight=None))) == {"l1"}
+    assert set(terms.photometric_loss(x, x, ones, LossConfig(dssim_weight=None))) == {"l1"}
 
 
 def test_a_saturated_photograph_says_at_least_this_bright():
     target = jnp.full((12, 12, 3), 0.99)
     mask = jnp.ones((12, 12))
     pull = jax.jit(
-        jax.grad(lambda ldr: sum(image.photometric_loss(ldr, target, mask, LossConfig()).values()))
+        jax.grad(lambda ldr: sum(terms.photometric_loss(ldr, target, mask, LossConfig()).values()))
     )
     assert not np.asarray(pull(jnp.full((12, 12, 3), 1.7))).any()
     assert (np.asarray(pull(jnp.full((12, 12, 3), 0.9))) < 0).all()

@@ -1,11 +1,13 @@
-"""Which laser measurements each training view is compared with."""
+"""Depths of laser measurements: which each view is compared with, and the loss (ours)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import overload
 
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import on_host
@@ -16,7 +18,11 @@ from p2gs_jax.scene.drives.objects import object_mask
 from p2gs_jax.scene.visibility import project_points, unoccluded
 from p2gs_jax.types import Measured, Scene
 
-# Of a view at most this many count.
+# Errors of log depth beyond this pull no harder: the measurement missed or hit what is behind.
+CLIP = 0.2
+# Less opaque pixels have no depth to speak of; the image decides there.
+LEAST_ALPHA = 0.05
+# Most measurements of a view that count.
 MOST_PER_VIEW = 8192
 # Measurements this near in time tell what hides what; further off, things have moved.
 NEAR_S = 1.0
@@ -24,15 +30,30 @@ NEAR_S = 1.0
 DEPTHS_SHARE = 0.125
 
 
+def lidar_loss(
+    alpha: Float[Array, "h w"], depth: Float[Array, "h w"] | None, measured: Measured
+) -> Float[Array, ""]:
+    """Return the mean Huber error of log depth at the measured pixels.
+
+    `depth` is premultiplied by `alpha`, as in `Render`.
+    """
+    assert depth is not None
+    height, width = alpha.shape
+    column = jnp.clip((measured.places[:, 0] * width).astype(jnp.int32), 0, width - 1)
+    row = jnp.clip((measured.places[:, 1] * height).astype(jnp.int32), 0, height - 1)
+    alpha, depth = alpha[row, column], depth[row, column]
+    known = (measured.depths > 0) & (alpha > LEAST_ALPHA) & (depth > 0)
+    expected = jnp.where(known, depth, 1.0) / jnp.where(known, alpha, 1.0)
+    error = jnp.abs(jnp.log(expected) - jnp.log(jnp.where(known, measured.depths, 1.0)))
+    huber = jnp.where(error < CLIP, 0.5 * error**2 / CLIP, error - 0.5 * CLIP)
+    return jnp.sum(jnp.where(known, huber, 0.0)) / jnp.maximum(jnp.sum(known), 1)
+
+
 class KeptDepths(Sequence[Measured]):
     """The measured depths of some views, in memory up to a bound and on disk beyond it."""
 
     def __init__(self, most: int):
-        """Begin empty.
-
-        Args:
-            most: bytes held in memory.
-        """
+        """Begin empty, with at most so many bytes in memory."""
         self._arrays = ArrayStore(most)
         self._kept: list[tuple[StoredArray, StoredArray]] = []
 
@@ -67,10 +88,6 @@ def measured_depths(scene: Scene, cfg: FitConfig) -> Sequence[Measured] | None:
 
     Only what stands still counts, so that every sweep serves all views; what a nearer measurement
     or a moving object hides is left out.
-
-    Args:
-        scene: with laser measurements.
-        cfg: weight of the loss, and the seed.
 
     Raises:
         UserError: the loss wants them and the scene has none.
