@@ -1,11 +1,10 @@
 """A town in blocks against the same town in one fit: held-out views, seams, peak memory.
 
-python experiments/districts.py [--quick | --middle] [--out DIR] [--dask]
+python experiments/districts.py [--quick] [--out DIR]
 
 Streets one behind another, photographed by three cameras: 300 photographs each over 600 m (quick:
 30 over 60 m), in four blocks (quick: two), one after another. Every fit has a process of its own,
-so that its peak memory is its own. With --dask the blocks are fitted once more by two workers of a
-scheduler on loopback, one of which is killed while it fits. Finished runs are kept.
+so that its peak memory is its own. Finished runs are kept.
 """
 
 from __future__ import annotations
@@ -14,14 +13,10 @@ import argparse
 import contextlib
 import dataclasses
 import json
-import os
 import re
-import signal
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +56,6 @@ class Size:
 
 
 FULL = Size(300, 2.0, 160, 100_000, 6_000, 4)
-MIDDLE = Size(80, 4.0, 160, 40_000, 2_400, 4)
 QUICK = Size(30, 2.0, 96, 12_000, 400, 2)
 
 
@@ -70,10 +64,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("runs/districts"))
     parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--middle", action="store_true")
-    parser.add_argument("--dask", action="store_true", help="once more by Dask, a worker killed")
     args = parser.parse_args()
-    size = QUICK if args.quick else MIDDLE if args.middle else FULL
+    size = QUICK if args.quick else FULL
     folder = args.out / size.name
     town = folder / "town"
     if not town.exists():
@@ -92,17 +84,8 @@ def main() -> None:
     one = fitted(town, folder / "one", size, [])
     blocks = fitted(town, folder / "blocks", size, ["--blocks", str(size.blocks)])
     rows = [row("one fit", one), row(f"{size.blocks} blocks", blocks)]
-    found = [blocks]
-    if args.dask:
-        with cluster(folder) as (address, workers):
-            words = ["--blocks", str(size.blocks), "--engine", f"dask://{address}"]
-            killer = threading.Thread(target=kill_one, args=(folder / "dask", workers), daemon=True)
-            killer.start()
-            found.append(fitted(town, folder / "dask", size, words))
-        rows.append(row(f"{size.blocks} blocks, Dask, a worker killed", found[-1]))
     print(table(HEADER, rows))
-    for run in found:
-        print(seams(run))
+    print(seams(blocks))
 
 
 HEADER = (
@@ -173,35 +156,6 @@ def seams(run: dict[str, Any]) -> str:
         *("step of depth", "spread of depth"),
     )
     return table(header, rows)
-
-
-@contextlib.contextmanager
-def cluster(folder: Path) -> Iterator[tuple[str, list[subprocess.Popen]]]:
-    """Yield the address of a scheduler on loopback and its two workers."""
-    said = (folder / "scheduler.json").absolute()
-    said.unlink(missing_ok=True)
-    here = ["--scheduler-file", str(said), "--no-dashboard", "--host", "127.0.0.1"]
-    python = [sys.executable, "-m"]
-    begun = [subprocess.Popen([*python, "distributed.cli.dask_scheduler", "--port", "0", *here])]
-    try:
-        worker = [*python, "distributed.cli.dask_worker", "--no-nanny", "--nthreads", "1", *here]
-        begun += [subprocess.Popen(worker, cwd=folder) for _ in range(2)]
-        while not said.exists() or not said.read_text():
-            time.sleep(0.2)
-        time.sleep(5)
-        yield json.loads(said.read_text())["address"].removeprefix("tcp://"), begun[1:]
-    finally:
-        for process in begun:
-            process.kill()
-            process.wait()
-
-
-def kill_one(run: Path, workers: list[subprocess.Popen]) -> None:
-    """Kill the first worker (SIGKILL) once a block has left a checkpoint."""
-    while not any(p.name.isdigit() for p in run.glob("blocks/*/checkpoints/*")):
-        time.sleep(0.5)
-    print(f"killing worker {workers[0].pid}", flush=True)
-    os.kill(workers[0].pid, signal.SIGKILL)
 
 
 if __name__ == "__main__":

@@ -20,8 +20,8 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-from judging import configs, measured
-from sensor_town import AtIso8, judged, to_markdown, town, write_sheet
+from judging import configs, measured, to_markdown
+from sensor_town import COLUMNS, AtIso8, judged, town, write_sheet
 
 import p2gs_jax
 from p2gs_jax.core.atomic import atomic_write, write_json, write_text
@@ -94,7 +94,9 @@ def main() -> None:
         tables[spread] = measured(scene, out, configs(args.methods, steps=args.steps), judge)
         if shown:
             write_sheet(args.out / f"{name}.png", shown)
-        text.append(f"### {spread:g} stops, {args.steps} steps\n\n{to_markdown(tables[spread])}")
+        text.append(
+            f"### {spread:g} stops, {args.steps} steps\n\n{to_markdown(tables[spread], COLUMNS)}"
+        )
         print(text[-1], flush=True)
         plot(args.out / "exposure_spread.png", tables)
     write_json(args.out / "exposure_spread.json", tables)

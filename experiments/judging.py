@@ -21,8 +21,8 @@ from jaxtyping import Float
 import p2gs_jax
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import LN2
-from p2gs_jax.formats.png import write_png
-from p2gs_jax.paths.captioned_images import CaptionedImage, stacked
+from p2gs_jax.formats.frames import write_png
+from p2gs_jax.paths.pictures import CaptionedImage, stacked
 from p2gs_jax.photometry.luminance import Luminance
 from p2gs_jax.photometry.ppisp import Ppisp, falloff, recolored
 
@@ -84,6 +84,23 @@ def measured(
         metrics = json.loads((folder / "metrics.json").read_text())
         rows.append({"method": name, **judge(name, p2gs_jax.load_run(folder), metrics)})
     return rows
+
+
+def to_markdown(rows: Sequence[dict[str, Any]], columns: Sequence[tuple[str, str, int]]) -> str:
+    """Return a table of the rows of `measured`; a cell without a value is empty.
+
+    Args:
+        columns: heading, key in a row, digits after the point.
+    """
+    lines = ["| method | " + " | ".join(heading for heading, _, _ in columns) + " |"]
+    lines.append("|---|" + "---:|" * len(columns))
+    for row in rows:
+        values = [(row.get(key), digits) for _, key, digits in columns]
+        cells = ["" if value is None else f"{value:.{digits}f}" for value, digits in values]
+        if "failed" in row:
+            cells = [f"failed: {row['failed']}", *[""] * (len(columns) - 1)]
+        lines.append("| " + " | ".join([row["method"], *cells]) + " |")
+    return "\n".join(lines) + "\n"
 
 
 def contact_sheet(path: Path, rows: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]]) -> None:

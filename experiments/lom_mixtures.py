@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from judging import common_display, configs, contact_sheet, found_by, measured
+from judging import common_display, configs, contact_sheet, found_by, measured, to_markdown
 from mixtures import GROUPS, REFERENCE, read_groups, spread_by_group, write_mixture
 
 import p2gs_jax
@@ -94,7 +94,11 @@ def calibrated(scene: Path, out: Path) -> dict[str, Any]:
         p2gs_jax.calibrate(scene, out)
     views = json.loads((out / "photometry.json").read_text())["views"]
     evs = {v["image"]: v["exposure_ev"] for v in views if v["exposure_ev"] is not None}
-    return {"method": "calibrate", "spread_ev": spread_by_group(evs, read_groups(scene))}
+    return {"method": "calibrate", **_keyed(spread_by_group(evs, read_groups(scene)))}
+
+
+def _keyed(spread: dict[str, float]) -> dict[str, float]:
+    return {f"spread_{group}": ev for group, ev in spread.items()}
 
 
 def spreads(run: p2gs_jax.Run, groups: dict[str, str]) -> dict[str, float]:
@@ -122,7 +126,7 @@ def measure(
         common = shown[method] = under_common_exposure(run, groups)
         test = metrics["test"]
         return {
-            "spread_ev": spreads(run, groups),
+            **_keyed(spreads(run, groups)),
             "own_exposure": test["exposure_fitted"]["psnr"],
             # There where a view has more than an exposure.
             "own_all": test.get("photometry_fitted", test["exposure_fitted"])["psnr"],
@@ -137,33 +141,16 @@ def measure(
 # ------------------------------------------------------------------ what is written
 
 
-def to_markdown(rows: list[dict[str, Any]], groups: Sequence[str]) -> str:
-    """Return the table of one mixture and budget."""
-    header = [
-        "method",
-        *(f"spread {g}, EV" for g in groups),
-        "held out, exposure fitted, dB",
-        "held out, all fitted, dB",
-        "held out, common exposure, dB",
-        "steps",
-        "seconds of steps",
+def columns(groups: Sequence[str]) -> list[tuple[str, str, int]]:
+    """Return the columns of the table of a mixture."""
+    return [
+        *((f"spread {group}, EV", f"spread_{group}", 3) for group in groups),
+        ("held out, exposure fitted, dB", "own_exposure", 2),
+        ("held out, all fitted, dB", "own_all", 2),
+        ("held out, common exposure, dB", "common", 2),
+        ("steps", "steps", 0),
+        ("seconds of steps", "seconds", 0),
     ]
-    lines = ["| " + " | ".join(header) + " |", "|---|" + "---:|" * (len(header) - 1)]
-
-    def number(value: float | None, digits: int) -> str:
-        return "" if value is None else f"{value:.{digits}f}"
-
-    for row in rows:
-        if "failed" in row:
-            lines.append(
-                f"| {row['method']} | failed: {row['failed']} |" + " |" * (len(header) - 2)
-            )
-            continue
-        cells = [row["method"], *(number(row["spread_ev"].get(g), 3) for g in groups)]
-        cells += [number(row.get(k), 2) for k in ("own_exposure", "own_all", "common")]
-        cells += [number(row.get(k), 0) for k in ("steps", "seconds")]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
 
 
 def write_sheet(path: Path, scene: Path, shown: dict[str, Common]) -> None:
@@ -220,7 +207,7 @@ def main() -> None:
             rows, shown = measure(scene, out, under)
             rows.insert(0, of_calibrate)
             tables[f"{scene.name}/{name}"] = rows
-            text.append(f"### {scene.name}, {name}\n\n{to_markdown(rows, args.groups)}")
+            text.append(f"### {scene.name}, {name}\n\n{to_markdown(rows, columns(args.groups))}")
             print(text[-1], flush=True)
             kept = {m: shown[m] for m in SHOWN if m in shown}
             if kept:

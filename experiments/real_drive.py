@@ -16,12 +16,10 @@ Photographs of such sets are not for this project: keep --out outside of it.
 from __future__ import annotations
 
 import argparse
-import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from judging import measured
+from judging import measured, to_markdown
 
 import p2gs_jax
 from p2gs_jax.cli.shared import parse_duration
@@ -31,29 +29,32 @@ from p2gs_jax.core.atomic import write_json, write_text
 DEPTH_WEIGHT = 0.1
 METHOD = "exposure_fitted"
 COLUMNS = (
-    *("variant", "whole, dB", "static, dB", "moving, dB", "SSIM", "depth error, m"),
-    *("depth within 10 %", "Gaussians", "steps", "seconds"),
+    ("whole, dB", "whole", 2),
+    ("static, dB", "static", 2),
+    ("moving, dB", "moving", 2),
+    ("SSIM", "ssim", 3),
+    ("depth error, m", "depth_m", 2),
+    ("depth within 10 %", "depth_within", 2),
+    ("Gaussians", "gaussians", 0),
+    ("steps", "steps", 0),
+    ("seconds", "seconds", 0),
 )
 
 
-def _dynamics(cfg: FitConfig, method: Any) -> FitConfig:
-    return dataclasses.replace(cfg, dynamics=dataclasses.replace(cfg.dynamics, method=method))
-
-
-def _no_lidar(cfg: FitConfig) -> FitConfig:
-    return dataclasses.replace(cfg, data=dataclasses.replace(cfg.data, lidar=False))
-
-
-def _depth(cfg: FitConfig) -> FitConfig:
-    return dataclasses.replace(cfg, loss=dataclasses.replace(cfg.loss, lidar=DEPTH_WEIGHT))
-
-
-OF_ROBUST: dict[str, Callable[[FitConfig], FitConfig]] = {
-    "mask": lambda cfg: _dynamics(cfg, "mask"),
-    "off": lambda cfg: _dynamics(cfg, "off"),
-    "vibration": lambda cfg: _dynamics(cfg, "vibration"),
-    "no_lidar": _no_lidar,
-    "depth": _depth,
+# What variants change of `robust`.
+OF_ROBUST: dict[str, dict[str, Any]] = {
+    "mask": {"dynamics.method": "mask"},
+    "off": {"dynamics.method": "off"},
+    "vibration": {"dynamics.method": "vibration"},
+    "no_lidar": {"data.lidar": False},
+    "depth": {"loss.lidar": DEPTH_WEIGHT},
+}
+GIVEN = {
+    "photometry.select": False,
+    "photometry.model": "view_exposure",
+    "photometry.curve": "power",
+    "photometry.white_balance": "camera",
+    "photometry.vignetting": "camera",
 }
 PRESETS = ("robust", "3dgs", "3dgs_affine", "ppisp")
 
@@ -61,26 +62,17 @@ PRESETS = ("robust", "3dgs", "3dgs_affine", "ppisp")
 def variant(name: str, args: argparse.Namespace) -> FitConfig:
     """Return the configuration of a variant under the common options."""
     preset: Any = "robust" if name in OF_ROBUST else name
-    cfg = OF_ROBUST.get(name, lambda cfg: cfg)(p2gs_jax.preset(preset))
-    data = dataclasses.replace(
-        cfg.data, max_width=args.max_width, frames=args.frames, cameras=tuple(args.cameras)
-    )
-    train = dataclasses.replace(cfg.train, steps=args.steps)
-    if args.budget:
-        train = dataclasses.replace(train, budget_s=parse_duration(args.budget))
-    if args.given and cfg.photometry.select:
-        cfg = dataclasses.replace(
-            cfg,
-            photometry=dataclasses.replace(
-                cfg.photometry,
-                select=False,
-                model="view_exposure",
-                curve="power",
-                white_balance="camera",
-                vignetting="camera",
-            ),
-        )
-    return dataclasses.replace(cfg, data=data, train=train)
+    cfg = p2gs_jax.preset(preset)
+    fields = {
+        "data.max_width": args.max_width,
+        "data.frames": args.frames,
+        "data.cameras": tuple(args.cameras),
+        "train.steps": args.steps,
+        "train.budget_s": parse_duration(args.budget) if args.budget else None,
+        **(GIVEN if args.given and cfg.photometry.select else {}),
+        **OF_ROBUST.get(name, {}),
+    }
+    return p2gs_jax.with_fields(cfg, fields)
 
 
 def judge(name: str, run: p2gs_jax.Run, metrics: dict[str, Any]) -> dict[str, Any]:
@@ -98,20 +90,6 @@ def judge(name: str, run: p2gs_jax.Run, metrics: dict[str, Any]) -> dict[str, An
         "steps": metrics["counts"]["steps"],
         "seconds": metrics["seconds"]["optimisation"],
     }
-
-
-def to_markdown(rows: list[dict[str, Any]]) -> str:
-    """Return the table of a drive."""
-    digits = {"whole": 2, "static": 2, "moving": 2, "ssim": 3, "depth_m": 2, "depth_within": 2}
-    digits |= {"gaussians": 0, "steps": 0, "seconds": 0}
-    lines = ["| " + " | ".join(COLUMNS) + " |", "|---|" + "---:|" * (len(COLUMNS) - 1)]
-    for row in rows:
-        if "failed" in row:
-            lines.append(f"| {row['method']} | failed: {row['failed']} |" + " |" * len(digits))
-            continue
-        cells = ["" if row[k] is None else f"{row[k]:.{d}f}" for k, d in digits.items()]
-        lines.append("| " + " | ".join([row["method"], *cells]) + " |")
-    return "\n".join(lines) + "\n"
 
 
 def main() -> None:
@@ -135,7 +113,7 @@ def main() -> None:
         raise SystemExit("--out is inside this project, where no picture of a data set may be.")
     under = {name: variant(name, args) for name in args.variants}
     rows = measured(args.drive, args.out / "runs", under, judge)
-    text = to_markdown(rows)
+    text = to_markdown(rows, COLUMNS)
     print(text, flush=True)
     write_json(args.out / "real_drive.json", rows)
     write_text(args.out / "real_drive.md", text)

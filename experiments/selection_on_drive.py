@@ -33,7 +33,7 @@ from p2gs_jax.core.atomic import write_json, write_text
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.photometry.adjustment.fit import fit_model
 from p2gs_jax.photometry.adjustment.problem import make_problem
-from p2gs_jax.photometry.selection import select
+from p2gs_jax.photometry.calibrate import CalibrationOptions, calibrate_observations
 from p2gs_jax.photometry.solution import PhotometricSolution
 
 BLACK, SATURATION = 4 / 255, 250 / 255
@@ -45,7 +45,7 @@ HEADER = (
 
 
 class Limits(TypedDict):
-    """Options of the solver: see `select`."""
+    """Options of the solver: see `CalibrationOptions`."""
 
     black: float
     saturation: float
@@ -127,7 +127,8 @@ def measure(index: int, seed: int) -> dict:
     case, drawn = CASES[index], draw(CASES[index], seed)
     limits = Limits(black=BLACK, saturation=SATURATION, pivot=PIVOT)
     begin = time.perf_counter()
-    s = select(drawn.observations, seed=seed, **limits).solution
+    options = CalibrationOptions(**limits, seed=seed)
+    s = calibrate_observations(drawn.observations, options).solution
     seconds = time.perf_counter() - begin
     by_camera = case.responses == "camera"
     ev, after_power = exposure_errors(s.log_exposures, drawn, by_camera=by_camera)

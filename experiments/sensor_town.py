@@ -26,15 +26,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from judging import common_display, configs, contact_sheet, found_by, measured
+from judging import common_display, configs, contact_sheet, found_by, measured, to_markdown
 from scipy.optimize import minimize
 
 import p2gs_jax
 from p2gs_jax.core.atomic import write_json, write_text
 from p2gs_jax.evaluation.references import load_reference
 from p2gs_jax.evaluation.scores import psnr
-from p2gs_jax.synth.sensor import read_true_shots
 from p2gs_jax.synth.rig import image_height
+from p2gs_jax.synth.sensor import read_true_shots
 from p2gs_jax.synth.settings import Sensor
 
 METHODS = ("robust", "ppisp", "ppisp_solved", "3dgs_affine")
@@ -52,9 +52,14 @@ SENSORS: dict[str, Sensor] = {
         noise=1.0,
     ),
 }
-HEADER = (
-    *("method", "EV", "EV, scale and power", "white balance EV", "corners %"),
-    *("own, dB", "ISO 8, dB", "seconds of steps"),
+COLUMNS = (
+    ("EV", "ev", 3),
+    ("EV, scale and power", "ev_scale_power", 3),
+    ("white balance EV", "white_balance_ev", 3),
+    ("corners %", "corner_percent", 1),
+    ("own, dB", "own", 2),
+    ("ISO 8, dB", "iso_8", 2),
+    ("seconds of steps", "seconds", 0),
 )
 # The factors per channel are searched on every n-th pixel along each axis, to this many stops.
 STRIDE, TOLERANCE_EV = 2, 1e-3
@@ -202,22 +207,6 @@ def write_sheet(path: Path, shown: dict[str, AtIso8]) -> None:
     contact_sheet(path, rows)
 
 
-def to_markdown(rows: list[dict[str, Any]]) -> str:
-    """Return the table of one town."""
-    lines = ["| " + " | ".join(HEADER) + " |", "|---|" + "---:|" * (len(HEADER) - 1)]
-    digits = {"ev": 3, "ev_scale_power": 3, "white_balance_ev": 3, "corner_percent": 1}
-    digits |= {"own": 2, "iso_8": 2, "seconds": 0}
-    for row in rows:
-        if "failed" in row:
-            lines.append(
-                f"| {row['method']} | failed: {row['failed']} |" + " |" * (len(HEADER) - 2)
-            )
-            continue
-        cells = ["" if row[k] is None else f"{row[k]:.{d}f}" for k, d in digits.items()]
-        lines.append("| " + " | ".join([row["method"], *cells]) + " |")
-    return "\n".join(lines) + "\n"
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("runs/sensor_town"))
@@ -248,7 +237,7 @@ def main() -> None:
         if shown:
             write_sheet(args.out / f"{scene.name}.png", shown)
         tables[scene.name] = {"sensor": dataclasses.asdict(SENSORS[name]), "rows": rows}
-        text.append(f"### {scene.name}, {args.steps} steps\n\n{to_markdown(rows)}")
+        text.append(f"### {scene.name}, {args.steps} steps\n\n{to_markdown(rows, COLUMNS)}")
         print(text[-1], flush=True)
     write_json(args.out / "sensor_town.json", tables)
     write_text(args.out / "sensor_town.md", "\n".join(text))

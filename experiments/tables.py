@@ -24,6 +24,7 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from towns import (
     CONSTANT,
@@ -50,7 +51,7 @@ from towns import (
 from p2gs_jax.config import FitConfig, preset
 from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.photometry.models import MODELS
-from p2gs_jax.pipeline.decide import without_tracks
+from p2gs_jax.pipeline.exposures import without_tracks
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.run.read import load_run
@@ -168,7 +169,7 @@ def plot_novel_views(runs: Runs) -> Figure:
     return figure
 
 
-def _bars(names: Sequence[str], xlabel: str, height: float) -> tuple[Figure, object]:
+def _bars(names: Sequence[str], xlabel: str, height: float) -> tuple[Figure, Axes]:
     """Return a figure whose vertical axis lists names from top to bottom."""
     figure = Figure(figsize=(8, height), layout="constrained")
     axis = figure.subplots()

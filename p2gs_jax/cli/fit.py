@@ -146,41 +146,32 @@ class Calibrate:
 
     def execute(self) -> int:
         """Solve the photometry alone; print it as a table."""
+        from functools import partial
+
         from p2gs_jax.cli.tables import print_calibration, print_calibration_of, print_stack
         from p2gs_jax.core.progress import TerminalReporter
-        from p2gs_jax.pipeline.calibrate import calibrate
-        from p2gs_jax.pipeline.calibrate_of import STEPS, calibrate_of
-        from p2gs_jax.pipeline.calibrate_run import calibrate_run
-        from p2gs_jax.pipeline.calibrate_stack import calibrate_stack
-        from p2gs_jax.pipeline.calibration import write_calibration
+        from p2gs_jax.pipeline.calibrate import calibrate, calibrate_run, calibrate_stack
+        from p2gs_jax.pipeline.convert import STEPS, calibrate_of
 
-        scene, out, cfg, known = self.scene, self.out, self.checked(), self.config.photometry
-        is_run = (scene / "config.json").is_file() and (scene / "radiance.ply").is_file()
+        scene, out, cfg, steps = self.scene, self.out, self.checked(), self.steps or STEPS
         with TerminalReporter() as reporter:
             how = {"compare_with": self.compare_with, "reporter": reporter}
             if self.static:
-                reporter.stage("Solving the stack")
-                result = calibrate_stack(
-                    scene,
-                    known=known.known,
-                    known_deviation_ev=known.known_deviation_ev,
-                    compare_with=self.compare_with,
-                )
-                write_calibration(result, out)
+                show = partial(print_stack, calibrate_stack(scene, out, cfg, **how), out)
             elif self.of is not None:
-                steps = STEPS if self.steps is None else self.steps
-                found = calibrate_of(self.of, scene, out, cfg, steps=steps, **how)
-            elif is_run:
-                result = calibrate_run(scene, out, cfg.photometry, **how)
+                found = calibrate_of(scene, out, cfg, model=self.of, steps=steps, **how)
+                show = partial(print_calibration_of, found, out)
+            elif self.is_run:
+                show = partial(print_calibration, calibrate_run(scene, out, cfg, **how), out)
             else:
-                result = calibrate(scene, out, cfg, **how)
-        if self.static:
-            print_stack(result, out)
-        elif self.of is not None:
-            print_calibration_of(found, out)
-        else:
-            print_calibration(result, out)
+                show = partial(print_calibration, calibrate(scene, out, cfg, **how), out)
+        show()
         return 0
+
+    @property
+    def is_run(self) -> bool:
+        """Whether the scene is a finished run."""
+        return all((self.scene / name).is_file() for name in ("config.json", "radiance.ply"))
 
     def checked(self) -> FitConfig:
         """Return the configuration.
@@ -188,8 +179,8 @@ class Calibrate:
         Raises:
             UserError: a value makes no sense.
         """
-        scene, own_size = self.scene, self.config.data == FitConfig().data
-        is_run = (scene / "config.json").is_file() and (scene / "radiance.ply").is_file()
+        scene, is_run = self.scene, self.is_run
+        own_size = self.config.data == FitConfig().data
         check(
             not (self.static and self.of),
             "--static and --of exclude each other",

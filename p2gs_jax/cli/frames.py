@@ -12,9 +12,9 @@ from jaxtyping import Float32
 from p2gs_jax.cli.render import FPS, Render
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.frames import OutputFrame
-from p2gs_jax.paths import covering, drive, orbit
-from p2gs_jax.paths.drive import PosePath, frame_count, interpolated
-from p2gs_jax.paths.orbit import find_orbit
+from p2gs_jax.paths.drive import PosePath, beside, beside_shots, drive, frame_count, interpolated
+from p2gs_jax.paths.orbit import find_orbit, orbit
+from p2gs_jax.paths.panorama import covering
 from p2gs_jax.paths.pictures import (
     RunRenderer,
     comparison_frames,
@@ -24,7 +24,6 @@ from p2gs_jax.paths.pictures import (
     wide_frames,
 )
 from p2gs_jax.paths.rig import find_rig
-from p2gs_jax.paths.shift import beside, beside_shots
 from p2gs_jax.paths.shots import Shot, of_camera, view_shots
 from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.run.read import Run

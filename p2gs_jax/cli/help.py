@@ -151,11 +151,12 @@ def _field(
     hint, default = _hints(kind)[name], _default(kind, name, parent)
     extras = (*_settings(kind, name, hint, default, brief and short is not None), *_extras(hint))
     if short is not None:
-        placeholder = SHORT[short][1]
-        shown = {} if placeholder is None else {"metavar": placeholder}
-        dashed = short.replace("_", "-")
-        names = {"name": dashed, "prefix_name": False} if brief else {"aliases": (f"--{dashed}",)}
-        extras = (*extras, tyro.conf.arg(**shown, **names))
+        placeholder, dashed = SHORT[short][1], short.replace("_", "-")
+        shown: dict[str, Any] = {} if placeholder is None else {"metavar": placeholder}
+        if brief:
+            extras = (*extras, tyro.conf.arg(**shown, name=dashed, prefix_name=False))
+        else:
+            extras = (*extras, tyro.conf.arg(**shown, aliases=(f"--{dashed}",)))
     if name == "budget_s":
         extras = (*extras, DURATION)
     return StructFieldSpec(

@@ -124,7 +124,7 @@ def completion_script(shell: Shell) -> str:
     )
     text = help_text.captured(
         lambda: tyro.cli(
-            Union[every],  # noqa: UP007 (built at run time)
+            Union[every],  # type: ignore  # noqa: UP007 (built at run time)
             prog="p2gs-jax",
             args=["--tyro-print-completion", shell],
             registry=help_text.registry(brief=False),

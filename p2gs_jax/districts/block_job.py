@@ -30,7 +30,7 @@ from p2gs_jax.run.folder import RunFolder, locked
 from p2gs_jax.scene.pixels.store import size_at
 from p2gs_jax.scene.visibility import shown_share
 from p2gs_jax.train.data_parallel import mesh_of
-from p2gs_jax.train.programs import StepPrograms
+from p2gs_jax.train.step import StepPrograms
 from p2gs_jax.types import Scene
 
 STATUS = Path("/proc/self/status")
@@ -157,9 +157,10 @@ def _fit(
             cfg,
             reporter,
             clock,
-            lambda known: begin_programs(programs, known, block.scene, folder, mesh),
+            lambda known, curve: begin_programs(programs, known, folder, mesh, curve=curve),
             pixels=folder.pixels,
-            part=block.part,
+            given=block.exposures,
+            sphere=block.shell,
         )
         with begun(folder, Paths(Path(scene), folder.root), cfg, prepared.decisions):
             result = optimise(prepared, folder, reporter, programs, resume=True, mesh=mesh)

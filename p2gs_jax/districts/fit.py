@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import jax
-import numpy as np
 
 from p2gs_jax.config import FitConfig, require_config
 from p2gs_jax.core.atomic import no_empty_folders, write_json
@@ -34,23 +33,21 @@ from p2gs_jax.districts.shared import (
     write_shared,
 )
 from p2gs_jax.errors import UserError
+from p2gs_jax.evaluation.references import Reference
 from p2gs_jax.formats.ply import read_ply
-from p2gs_jax.gaussians.dense import coverage_of
-from p2gs_jax.gaussians.seeds import cameras_radius
 from p2gs_jax.jobs.engines import LOCAL, check_engine, open_engine
 from p2gs_jax.jobs.job import JobState
 from p2gs_jax.jobs.run import run_jobs
-from p2gs_jax.photometry.parameters import recentre
 from p2gs_jax.pipeline import preflight
 from p2gs_jax.pipeline.finish import Account, finish
-from p2gs_jax.pipeline.fit import FitResult, fit
-from p2gs_jax.pipeline.preflight import Paths, Views, check_run_dir
-from p2gs_jax.pipeline.prepare import Prepared, load
+from p2gs_jax.pipeline.fit import FitResult, centred, fit, true_stops
+from p2gs_jax.pipeline.preflight import Paths, check_run_dir
+from p2gs_jax.pipeline.prepare import load
 from p2gs_jax.run.decisions import read_decisions
 from p2gs_jax.run.folder import RunFolder, RunLock, locked, require_free
 from p2gs_jax.run.write import write_start
 from p2gs_jax.scene.pixels.store import ImageStore
-from p2gs_jax.types import Gaussians, Params, Scene
+from p2gs_jax.types import Params, Scene
 
 BLOCKS = "blocks"
 # Under this name in `metrics.json`.
@@ -119,11 +116,11 @@ def fit_blocks(
         check_run_dir(paths.run, resume, cfg)
         scene = load(paths.scene, paths.run, cfg, reporter)
         check_scene(scene, cfg)
-        views = preflight.check_scene(scene, cfg, paths, weights)
+        truth = preflight.check_scene(scene, cfg, paths, weights)
         cut = _cut(scene, cfg, asked, paths.run / BLOCKS, reporter)
         if cut is not None:
             district = _District(paths, cfg, asked, cut, lock, reporter, on_look)
-            return district.fit(scene, views, weights, begin, true_exposures)
+            return district.fit(scene, truth, weights, begin, true_exposures)
     # One block is no block.
     return fit(
         paths.scene,
@@ -180,7 +177,9 @@ class _District:
         self.blocks = paths.run / BLOCKS
         self.clock, self.compiler = Stopwatch(), CompileCounter()
 
-    def fit(self, scene: Scene, views: Views, weights, begin: float, true_exposures) -> FitResult:
+    def fit(
+        self, scene: Scene, truth: Reference | None, weights, begin: float, true_exposures
+    ) -> FitResult:
         """Solve, fit every block, merge and judge."""
         with self.clock("photometry"):
             solved = self._solve(scene)
@@ -188,17 +187,16 @@ class _District:
             self._fit_blocks()
         self.reporter.stage("Merging blocks")
         store = ImageStore(solved.scene.views, self.cfg.data, folder=self.folder.pixels)
-        prepared = self._prepared(solved, store)
+        cfg = solved.shared.decisions.resolve(self.cfg)
         fitted = [
             read_ply(RunFolder(self.blocks / str(k)).radiance) for k in range(len(self.cut.blocks))
         ]
         with self.clock("seams"):
-            fitted, seams = level_seams(
-                solved.scene, prepared.store, self.cut, fitted, prepared.cfg.render
-            )
+            fitted, seams = level_seams(solved.scene, store, self.cut, fitted, cfg.render)
         gaussians, counts = merge_cores(self.cut, fitted)
         fitted.clear()
-        params = self._params(prepared, gaussians)
+        photometry = jax.tree.map(on_device, solved.shared.photometry)
+        params = centred(Params(gaussians, photometry), cfg)
         self._tell(seams)
         self.lock.require()
         account = Account(
@@ -212,18 +210,20 @@ class _District:
             },
             seconds={**self.clock.seconds, "total_until_evaluation": time.monotonic() - begin},
             compiler=self.compiler,
+            selection=solved.selection,
+            notes=[*solved.scene.notes, *solved.notes],
         )
         metrics = finish(
             params,
-            prepared,
+            solved.scene,
+            store,
+            cfg,
             self.folder,
             account,
             self.reporter,
-            truth=views.truth,
+            truth=truth,
             lpips_weights=weights,
-            true_ev=None
-            if true_exposures is None
-            else np.log2([true_exposures[view.name] for view in solved.scene.training_views]),
+            true_ev=true_stops(true_exposures, solved.scene),
             still_ours=self.lock.require,
         )
         metrics[KEY] = self._said(seams, counts)
@@ -279,31 +279,6 @@ class _District:
     def _ended(self, number: int, state: JobState) -> None:
         said = "fitted" if state.status == "done" else state.status
         self.reporter.message(f"{state.name}: {said} after {state.seconds:.0f} s.")
-
-    def _prepared(self, solved: Solved, store: ImageStore) -> Prepared:
-        """Return what `finish` wants to know of a scene, without Gaussians."""
-        scene, shared = solved.scene, solved.shared
-        return Prepared(
-            scene=scene,
-            store=store,
-            fitted=store,
-            params=Params(None, shared.photometry),  # pyright: ignore[reportArgumentType]
-            owner=None,
-            extent=cameras_radius(scene.training_views, scene.points),
-            selection=solved.selection,
-            pairs=None,
-            measured=None,
-            coverage=coverage_of(scene, store),
-            decisions=shared.decisions,
-            cfg=shared.decisions.resolve(self.cfg),
-            notes=[*scene.notes, *solved.notes],
-        )
-
-    def _params(self, prepared: Prepared, gaussians: Gaussians) -> Params:
-        params = Params(gaussians, jax.tree.map(on_device, prepared.params.photometry))
-        if self.cfg.photometry.parameterization == "log" and self.cfg.photometry.known is None:
-            params = recentre(params, prepared.cfg.render.radiance)
-        return params
 
     def _of_block(self, number: int) -> dict:
         return json.loads(RunFolder(self.blocks / str(number)).metrics.read_text(encoding="utf-8"))

@@ -10,7 +10,8 @@ from jaxtyping import Bool, Float, Int
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.districts.cut import Cut, shows, views_of
 from p2gs_jax.districts.shared import Shared
-from p2gs_jax.pipeline.part import Part
+from p2gs_jax.gaussians.shell import Sphere
+from p2gs_jax.pipeline.exposures import Exposures
 from p2gs_jax.types import Photometry, Scene, Tracks
 
 # Points outside a block are thinned to one in a cube whose side is this share of their distance.
@@ -25,12 +26,14 @@ class BlockScene:
 
     Attributes:
         scene: its training views, its points first.
-        part: exposures and radiances, as solved for all blocks.
+        exposures: with radiances, as solved for all blocks.
+        shell: where what lies behind everything is.
         own: how many of the points lie in the block; the others are coarse.
     """
 
     scene: Scene
-    part: Part
+    exposures: Exposures
+    shell: Sphere
     own: int
 
 
@@ -44,13 +47,12 @@ def block_scene(scene: Scene, shared: Shared, cut: Cut, number: int) -> BlockSce
         number: of the block.
     """
     found, keep, own = whole_of(scene, cut, number)
-    part = Part(
+    exposures = Exposures(
         photometry=photometry_of(shared.photometry, np.array(cut.blocks[number].views)),
         decisions=shared.decisions,
         radiance=shared.radiance[keep],
-        shell=shared.shell,
     )
-    return BlockScene(found, part, own)
+    return BlockScene(found, exposures, shared.shell, own)
 
 
 def whole_of(scene: Scene, cut: Cut, number: int) -> tuple[Scene, Int[np.ndarray, " k"], int]:

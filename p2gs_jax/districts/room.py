@@ -8,7 +8,7 @@ from p2gs_jax.districts.block_job import block_config, shown_by
 from p2gs_jax.districts.cut import Cut, cut_scene
 from p2gs_jax.districts.part_of import whole_of
 from p2gs_jax.errors import UserError
-from p2gs_jax.pipeline.memory_needed import memory_needed
+from p2gs_jax.pipeline.preflight import memory_needed
 from p2gs_jax.types import Scene
 
 # More blocks than this are not tried.

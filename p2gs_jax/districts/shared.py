@@ -15,11 +15,10 @@ from p2gs_jax.core.progress import Reporter
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.seeds import cameras_radius, photographed_radiance, with_colors
 from p2gs_jax.gaussians.shell import Sphere, sphere_behind
-from p2gs_jax.photometry.parameters import initial_photometry, point_radiance
-from p2gs_jax.photometry.selection import Selection
-from p2gs_jax.pipeline.decide import decide
-from p2gs_jax.pipeline.prepare import solve
-from p2gs_jax.pipeline.scale import near_depth, near_plane, scale_notes, seen_depths
+from p2gs_jax.photometry.calibrate import Selection
+from p2gs_jax.photometry.parameters import point_radiance
+from p2gs_jax.pipeline.exposures import solve_exposures
+from p2gs_jax.pipeline.survey import near_depth, near_plane, scale_notes, seen_depths
 from p2gs_jax.run.decisions import Decisions, read_decisions, write_decisions
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import Photometry, Scene
@@ -82,10 +81,8 @@ def solve_shared(
         UserError: no point is seen twice.
     """
     still = store.leaving_out(scene.objects, cfg.dynamics.margin).only_opaque()
-    _, selection, notes = solve(
-        scene, still, cfg, reporter, lambda form, response: None, dense=False, kept=kept
-    )
-    if selection is None:
+    solved = solve_exposures(scene, still, cfg, reporter, kept=kept)
+    if solved.selection is None:
         raise UserError(
             f"{scene.root}: no point is seen by two photographs, so that blocks would share no "
             "exposures.",
@@ -95,24 +92,23 @@ def solve_shared(
     depth = near_depth(seen_depths(scene.points, views))
     near = near_plane(depth, cfg)
     decisions = dataclasses.replace(
-        decide(cfg, selection, matched=True, kept=kept),
+        solved.decisions,
         freeze_until=1.0,
         log_exposure_mean=None,
         near=near,
     )
     resolved = decisions.resolve(cfg)
-    notes = [*scale_notes(scene, near, cfg, depth), *notes]
-    taken_by = [view.camera for view in views]
-    photometry = initial_photometry(selection.solution, taken_by, resolved)
+    notes = [*scale_notes(scene, near, cfg, depth), *solved.notes]
+    photometry = solved.photometry
     if scene.point_colors is None:
         scene = with_colors(scene, photographed_radiance(scene, still, photometry, resolved))
     shared = Shared(
         photometry=jax.tree.map(np.asarray, photometry),
         decisions=decisions,
-        radiance=point_radiance(scene, selection.solution, resolved),
+        radiance=point_radiance(scene, solved.selection.solution, resolved),
         shell=sphere_behind(views, scene.points, cameras_radius(views, scene.points), cfg.init),
     )
-    return Solved(scene, shared, selection, tuple(notes))
+    return Solved(scene, shared, solved.selection, tuple(notes))
 
 
 def write_shared(folder: Path, shared: Shared, scene: Scene) -> None:

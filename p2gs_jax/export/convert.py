@@ -17,17 +17,20 @@ from p2gs_jax.core.atomic import atomic_folder, write_json
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.core.progress import Reporter
 from p2gs_jax.errors import UserError
-from p2gs_jax.export.colmap_folder import write_colmap_folder
-from p2gs_jax.export.nerfstudio_folder import write_nerfstudio_folder
+from p2gs_jax.export.folders import write_colmap_folder, write_nerfstudio_folder
 from p2gs_jax.export.page import MEGABYTE, write_page
 from p2gs_jax.export.sidecar import corrections_name, linear_sidecar
-from p2gs_jax.formats.compressed_ply import read_compressed_ply, write_compressed_ply
 from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.formats.gltf import write_gltf
+from p2gs_jax.formats.gsply_files import (
+    read_compressed_ply,
+    read_spz,
+    require_gsply,
+    write_compressed_ply,
+    write_spz,
+)
 from p2gs_jax.formats.ply import write_ply, write_radiance
 from p2gs_jax.formats.splat import read_splat, write_splat
-from p2gs_jax.formats.spz import read_spz, write_spz
-from p2gs_jax.formats.through_gsply import require_gsply
 from p2gs_jax.formats.usd import NamedCamera, require_pxr, write_usd
 from p2gs_jax.gaussians.bake import (
     Target,

@@ -21,9 +21,8 @@ from typing import Any
 from p2gs_jax.core.atomic import plain, write_text
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.errors import UserError
-from p2gs_jax.export.page_error import page_error, true_picture
 from p2gs_jax.export.page_scene import embedded_photographs, page_scene, rounded, uncorrected
-from p2gs_jax.export.page_splats import PageSplats, fit_into
+from p2gs_jax.export.page_splats import PageSplats, fit_into, page_error, true_picture
 from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.read import Run
@@ -39,14 +38,7 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Page:
-    """What was written.
-
-    Attributes:
-        size: of the file, bytes.
-        splats: the Gaussians in it.
-        photographs: how many it embeds.
-        sentences: about it, for the page and the terminal.
-    """
+    """What was written: bytes, Gaussians, photographs, and sentences for page and terminal."""
 
     size: int
     splats: PageSplats
@@ -63,15 +55,9 @@ def write_page(
     photographs: int = 0,
     say: Say = lambda text: None,
 ) -> Page:
-    """Write the page.
+    """Write the page of at most `size_mb` million bytes, with photographs for the split view.
 
-    Args:
-        path: of the file.
-        fitted: the run.
-        look: what the page opens with.
-        size_mb: largest size of the file, millions of bytes.
-        photographs: how many to embed for the split view.
-        say: is told what is going on.
+    The page opens with `look`; `say` receives what is going on.
 
     Raises:
         UserError: too little of the scene fits, or photographs are asked for and gone.
@@ -119,7 +105,7 @@ def page_text(title: str, known: Mapping[str, Any], data: bytes) -> str:
     Args:
         title: of the window; text.
         known: what it reads besides the Gaussians, plain values or arrays.
-        data: the Gaussians (formats/packed.py).
+        data: the Gaussians, packed (formats/packed.py).
     """
     script = '(() => {\n"use strict";\n' + "\n".join(map(_source, SCRIPTS)) + "})();\n"
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
@@ -156,11 +142,7 @@ def _json(value: Any) -> str:
 
 
 def _room(budget: int, empty: str, size_mb: float) -> int:
-    """Return how many bytes of Gaussians fit.
-
-    Raises:
-        UserError: none, as the rest is too large.
-    """
+    """Return how many bytes of Gaussians fit; a UserError says that none do."""
     rest = len(empty.encode()) + RESERVE
     if rest >= budget:
         raise UserError(

@@ -43,11 +43,7 @@ def page_scene(
 ) -> dict[str, Any]:
     """Return what the page reads besides the Gaussians, as plain values or arrays.
 
-    Args:
-        fitted: the run.
-        gaussians: of the run, as of one time.
-        look: what it opens with.
-        photographs: data URLs, by row of the view.
+    It opens with `look`; `photographs` are data URLs by row of the view.
     """
     mean = fitted.mean.exposure_geometric
     return {
@@ -69,14 +65,9 @@ def page_scene(
 
 
 def embedded_photographs(fitted: Run, count: int) -> dict[int, str]:
-    """Return undistorted photographs as data URLs, by row of the view, evenly spread.
+    """Return at most `count` undistorted photographs as data URLs, by row, evenly spread.
 
-    Args:
-        fitted: the run.
-        count: how many at most.
-
-    Raises:
-        UserError: they are gone or broken.
+    A UserError says that they are gone or broken.
     """
     rows = [int(i) for i in evenly_spaced(len(fitted.scene.views), count)] if count else []
     fitted.require_photographs(rows)

@@ -1,4 +1,4 @@
-"""Which Gaussians a page holds: all that can be seen, or the weightiest that fit."""
+"""Which Gaussians a page holds: all that can be seen, or the weightiest that fit; their error."""
 
 from __future__ import annotations
 
@@ -9,16 +9,17 @@ from dataclasses import dataclass, replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Float32
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.errors import UserError
-from p2gs_jax.export.page_error import PageError
+from p2gs_jax.formats.false_color import luminance
 from p2gs_jax.formats.packed import Packed, pack, unpack
 from p2gs_jax.gaussians.posed import chosen
+from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.render import render_linear
-from p2gs_jax.render.capacity import TileCapacity, count_needed, until_it_fits
+from p2gs_jax.render.capacity import RenderView, TileCapacity, count_needed, until_it_fits
 from p2gs_jax.render.harmonics import C0, coefficient_count, degree_of
 from p2gs_jax.render.tiles import smallest_cutoff
 from p2gs_jax.render.xla_cpu import compiler_options
@@ -28,6 +29,44 @@ from p2gs_jax.types import Camera, Gaussians
 LEAST_SHARE = 0.02
 # Attempts to meet a size from below, and how far below the first aims.
 ATTEMPTS, MARGIN = 6, 0.985
+# Stops are compared where the brightest channel is shown as this 8-bit level or more.
+DARKEST_LEVEL = 1.0
+# PSNR of equal pictures: the mean square error counts as this at least.
+LEAST_ERROR = 1e-10
+
+
+@dataclass(frozen=True)
+class TruePicture:
+    """A view as the run renders it: its display transform, radiance, and display values."""
+
+    name: str
+    camera: Camera
+    transform: DisplayTransform
+    linear: Float32[np.ndarray, "h w 3"]
+    display: Float32[np.ndarray, "h w 3"]
+
+
+@dataclass(frozen=True)
+class PageError:
+    """Differences from the run's pictures of some views, each at its own exposure.
+
+    Attributes:
+        views: how many were compared.
+        psnr_median: of developed pictures, dB.
+        psnr_worst: of the worst view, dB.
+        worst_view: its name.
+        stops_median: of |log2| of the ratio of luminances, over pixels that are not black.
+        stops_p99: 99th percentile of it.
+        stops_max: largest.
+    """
+
+    views: int
+    psnr_median: float
+    psnr_worst: float
+    worst_view: str
+    stops_median: float
+    stops_p99: float
+    stops_max: float
 
 
 @dataclass(frozen=True)
@@ -76,14 +115,7 @@ def fit_into(
 
     If all do not fit, as many as do are kept at every degree of the harmonics, those first that
     weigh most in the pictures of `cameras`; of these the one with the highest median PSNR is taken.
-
-    Args:
-        room: bytes.
-        gaussians: of the run, all of them.
-        cfg: rendering options of the run.
-        cameras: of the views that say what weighs most.
-        judge: returns the error of some Gaussians.
-        say: is told what is going on.
+    `judge` returns the error of some Gaussians.
 
     Raises:
         UserError: hardly any would fit, or there are none.
@@ -136,11 +168,6 @@ def weights(
     """Return the sum of each Gaussian's blending weights over the pixels of some views.
 
     Where all radiance is 1 that is the gradient of the pictures' sum by log radiance.
-
-    Args:
-        gaussians: all of them.
-        cameras: of the views.
-        cfg: rendering options of the run.
     """
     plain = replace(cfg, radiance="exp", cutoff_rule="opacity")
     alive = on_device(np.ones(gaussians.capacity), bool)
@@ -184,3 +211,50 @@ def _largest_that_fits(room: int, gaussians: Gaussians, order: np.ndarray) -> Pa
             return packed
         keep = int(keep * room / len(packed.data) * MARGIN)
     return None
+
+
+def true_picture(
+    name: str,
+    gaussians: Gaussians,
+    camera: Camera,
+    transform: DisplayTransform,
+    render: RenderView,
+) -> TruePicture:
+    """Render a view of the run itself, with all of its Gaussians."""
+    linear = _linear(gaussians, camera, render)
+    return TruePicture(name, camera, transform, linear, develop(linear, transform))
+
+
+def page_error(
+    gaussians: Gaussians, pictures: Sequence[TruePicture], render: RenderView
+) -> PageError:
+    """Compare pictures of the page's Gaussians with the true ones, at least one."""
+    psnrs, stops = [], []
+    for true in pictures:
+        linear = _linear(gaussians, true.camera, render)
+        shown = develop(linear, true.transform)
+        square = np.mean((shown - true.display) ** 2, dtype=np.float64)
+        psnrs.append(float(-10 * np.log10(max(square, LEAST_ERROR))))
+        stops.append(_stops(linear, true))
+    # A view may be black all over.
+    apart = np.concatenate([np.zeros(1), *stops])
+    worst = int(np.argmin(psnrs))
+    return PageError(
+        views=len(pictures),
+        psnr_median=float(np.median(psnrs)),
+        psnr_worst=psnrs[worst],
+        worst_view=pictures[worst].name,
+        stops_median=float(np.median(apart)),
+        stops_p99=float(np.percentile(apart, 99)),
+        stops_max=float(apart.max()),
+    )
+
+
+def _stops(linear: Float32[np.ndarray, "h w 3"], true: TruePicture) -> Float[np.ndarray, " p"]:
+    lit = true.display.max(-1) >= DARKEST_LEVEL / 255
+    here, there = (np.maximum(luminance(p[lit]), 1e-12) for p in (linear, true.linear))
+    return np.abs(np.log2(here / there))
+
+
+def _linear(g: Gaussians, camera: Camera, render: RenderView) -> Float32[np.ndarray, "h w 3"]:
+    return np.asarray(render(g, on_device(np.ones(g.capacity), bool), camera).linear)

@@ -61,14 +61,9 @@ def linear_sidecar(
     store: ImageStore,
     photometry: PhotometryFile,
 ) -> dict[str, Any]:
-    """Return the content of the file.
+    """Return the content of the file that stands beside the PLY of these Gaussians.
 
-    Args:
-        gaussians: those of the PLY.
-        cfg: how they were fitted, with the chosen model and curve.
-        scene: the views.
-        store: their cameras at the size of the fit.
-        photometry: what views and cameras did to light.
+    `cfg` has the chosen model and curve, `store` cameras at the size of the fit.
     """
     count, coefficients = gaussians.sh.shape[:2]
     return {

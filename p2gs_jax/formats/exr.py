@@ -43,9 +43,9 @@ def write_exr(
         half: 16-bit floats, unless a value would overflow; then 32-bit.
         depth: alpha-weighted depth, written as expected depth in channel Z.
         alpha: opacity, channel A.
-        taken: how a photograph of it was taken, or a picture developed: the header says so.
-        camera: what saw it.
-        shot: how the photograph of the same view was taken.
+        taken: the display transform of the header.
+        camera: of the header.
+        shot: EXIF settings of the header.
     """
     linear = np.asarray(linear, np.float32)
     small = half and bool(np.all(np.abs(linear) <= HALF_MAX))
@@ -78,11 +78,15 @@ def camera_attributes(camera: Camera) -> dict:
     viewmat, K = np.asarray(camera.viewmat, np.float64), np.asarray(camera.K, np.float64)
     to_y_up = np.diag([1.0, -1.0, 1.0, 1.0])
     # Half the image less the principal point, over the focal length: camera space at z = 1.
+    # Of column vectors in OpenCV's camera space; the third row gives 1 / z.
+    to_ndc = np.zeros((4, 4))
+    to_ndc[:2, :3] = K[:2] / np.array([[camera.width], [camera.height]])
+    to_ndc[2, 3] = to_ndc[3, 2] = 1.0
     right = (camera.width / 2 - K[0, 2]) / K[0, 0]
     up = (K[1, 2] - camera.height / 2) / K[1, 1]
     return {
         "worldToCamera": _for_rows(to_y_up @ viewmat),
-        "worldToNDC": _for_rows(_to_ndc(K, camera.width, camera.height) @ viewmat),
+        "worldToNDC": _for_rows(to_ndc @ viewmat),
         "screenWindowWidth": float(camera.width / K[0, 0]),
         "screenWindowCenter": (float(right), float(up)),
         "p2gsViewmat": np.ascontiguousarray(viewmat, np.float32),
@@ -93,16 +97,6 @@ def camera_attributes(camera: Camera) -> dict:
 def _for_rows(matrix: Float[np.ndarray, "4 4"]) -> Float32[np.ndarray, "4 4"]:
     """Return the matrix for row vectors, laid out as OpenEXR reads it: it ignores strides."""
     return np.ascontiguousarray(matrix.T, np.float32)
-
-
-def _to_ndc(K: Float[np.ndarray, "3 3"], width: int, height: int) -> Float[np.ndarray, "4 4"]:
-    """Return the projection of column vectors in OpenCV camera space; its third row gives 1 / z."""
-    out = np.zeros((4, 4))
-    out[0, :3] = K[0] / width
-    out[1, :3] = K[1] / height
-    out[2, 3] = 1.0
-    out[3, 2] = 1.0
-    return out
 
 
 def _display_attributes(taken: DisplayTransform) -> dict:
@@ -121,21 +115,12 @@ def _display_attributes(taken: DisplayTransform) -> dict:
 
 
 def _shot_attributes(shot: ExifSettings) -> dict:
-    named = {
-        "expTime": shot.time,
-        "aperture": shot.aperture,
-        "isoSpeed": shot.iso,
-        "capDate": shot.taken,
-    }
-    return {name: value for name, value in named.items() if value is not None}
+    named = {"expTime": shot.time, "aperture": shot.aperture, "isoSpeed": shot.iso}
+    return {k: v for k, v in (named | {"capDate": shot.taken}).items() if v is not None}
 
 
 def read_exr(path: Path) -> tuple[Float32[np.ndarray, "h w 3"], dict]:
-    """Return linear radiance and the header.
-
-    Raises:
-        UserError: the file cannot be read or has no R, G, B.
-    """
+    """Return linear radiance and the header; a UserError says that there is no readable R, G, B."""
     linear, _, header = read_exr_with_alpha(path)
     return linear, header
 
@@ -145,8 +130,7 @@ def read_exr_with_alpha(
 ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"] | None, dict]:
     """Return linear radiance, premultiplied by the opacity; that, or None; and the header.
 
-    Raises:
-        UserError: the file cannot be read or has no R, G, B.
+    A UserError says that the file cannot be read or has no R, G, B.
     """
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
@@ -156,6 +140,6 @@ def read_exr_with_alpha(
             return linear, alpha, dict(file.header())
     except (RuntimeError, KeyError, OSError, ValueError) as error:
         raise UserError(
-            f"{path} is no readable RGB OpenEXR file: {error}.",
+            f"{path} is not a readable RGB OpenEXR file: {error}.",
             fix="copy or render it again, or remove it",
         ) from error

@@ -41,12 +41,9 @@ def stops(
 def false_color(
     linear: Float[np.ndarray, "h w 3"], middle: float, limits: tuple[float, float] = STOPS
 ) -> Float32[np.ndarray, "h w 3"]:
-    """Return luminance as colour, one step of the map for each whole stop.
+    """Return luminance as colour, one step of the map for each whole stop from `middle`.
 
-    Args:
-        linear: radiance.
-        middle: luminance shown as 0 stops, in the units of `linear`.
-        limits: stops at the ends of the map; beyond them it stays at its ends.
+    The stops of `limits` are the ends of the map; beyond them it stays at its ends.
     """
     low, high = limits
     whole = np.clip(np.floor(stops(linear, middle)), low, high - 1)
@@ -80,10 +77,8 @@ def depth_color(
 ) -> Float32[np.ndarray, "h w 3"]:
     """Return expected depth as colour, near bright, evenly in 1 / depth; black where there is none.
 
-    Args:
-        depth: alpha-weighted depth, scene units.
-        alpha: opacity.
-        limits: nearest and farthest depth; None takes the 1st and 99th percentile.
+    `depth` is alpha-weighted. `limits` are the nearest and the farthest depth; None takes the 1st
+    and the 99th percentile.
     """
     there = alpha > 0.5
     inverse = np.where(there, alpha / np.maximum(depth, 1e-9), 0)

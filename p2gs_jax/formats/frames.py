@@ -1,20 +1,27 @@
-"""Output frames: rendered pictures as files in a folder, or as one video."""
+"""Output frames: rendered pictures as PNG and EXR in a folder, or as one H.264 video."""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 
+import cv2
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32, UInt8
 
+from p2gs_jax.core.atomic import atomic_write
+from p2gs_jax.errors import UserError
 from p2gs_jax.formats.exr import write_exr
-from p2gs_jax.formats.png import write_png
-from p2gs_jax.formats.video import open_video
 from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.types import Camera
+
+# Constant quality of videos: at 16 compression is hardly visible.
+QUALITY = "16"
+# Least width and height of a video, pixels.
+SMALLEST = 16
 
 
 @dataclass(frozen=True)
@@ -42,16 +49,21 @@ class OutputFrame:
     photograph: Float32[np.ndarray, "h3 w3 3"] | None = None
 
 
-WriteFrame = Callable[[OutputFrame], None]
+def to_uint8(ldr: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
+    """Return display values, clamped to [0, 1] and rounded to 8 bits; NaN becomes black."""
+    return np.rint(np.clip(np.nan_to_num(ldr), 0, 1) * 255).astype(np.uint8)
+
+
+def write_png(path: Path, ldr: Float32[np.ndarray, "h w 3"]) -> None:
+    """Write display values as 8 bits, NaN as black; an OSError says that this failed."""
+    codes = to_uint8(ldr)
+    with atomic_write(Path(path)) as temporary:
+        if not cv2.imwrite(str(temporary), codes[..., ::-1]):
+            raise OSError(f"{path} could not be written")
 
 
 def write_frame(folder: Path, frame: OutputFrame) -> None:
-    """Write `NAME.exr` and `NAME.png`; beside a photograph, `NAME.render.png` and its own.
-
-    Args:
-        folder: it and the subfolders of the name are created.
-        frame: the picture.
-    """
+    """Write `NAME.exr` and `NAME.png`; beside a photograph, `NAME.render.png` and its own."""
     stem = folder / frame.name
     write_exr(
         stem.with_name(f"{stem.name}.exr"),
@@ -69,19 +81,73 @@ def write_frame(folder: Path, frame: OutputFrame) -> None:
 
 
 @contextlib.contextmanager
-def open_frames(out: Path, size: tuple[int, int], fps: float) -> Iterator[WriteFrame]:
-    """Yield a function that takes frames in order: into a video, or into a folder.
+def open_frames(
+    out: Path, size: tuple[int, int], fps: float
+) -> Iterator[Callable[[OutputFrame], None]]:
+    """Yield a function that takes frames in order: into a video (.mp4), or into a folder.
 
-    Args:
-        out: a video where it ends with .mp4, otherwise a folder.
-        size: (width, height) of the largest frame, pixels.
-        fps: frames per second of a video.
-
-    Raises:
-        UserError: see `open_video`.
+    `size` is (width, height) of the largest frame, pixels. Errors are those of `open_video`.
     """
     if out.suffix.lower() == ".mp4":
         with open_video(out, *size, fps) as add:
             yield lambda frame: add(frame.ldr)
     else:
         yield lambda frame: write_frame(out, frame)
+
+
+@contextlib.contextmanager
+def open_video(
+    path: Path, width: int, height: int, fps: float
+) -> Iterator[Callable[[Float32[np.ndarray, "h w 3"]], None]]:
+    """Yield a function that appends display values in [0, 1]; the file appears at the end.
+
+    Smaller frames than `width` by `height` pixels are centred on black. The size is rounded down to
+    even numbers, as the codec requires. Display values are tagged as BT.709 primaries with the sRGB
+    curve. A UserError says that the size is too small, or that PyAV has no encoder.
+    """
+    # Imported here: a fit writes pictures, but no video.
+    import av
+    from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
+
+    size = (width // 2 * 2, height // 2 * 2)
+    if min(size) < SMALLEST:
+        raise UserError(
+            f"{path}: {width}x{height} pixels are too few for a video.",
+            fix=f"choose a larger --width, so that both are at least {SMALLEST}",
+        )
+    if "libx264" not in av.codecs_available:
+        raise UserError(
+            "This build of PyAV cannot encode H.264.",
+            fix="install the wheel of `av` from PyPI, or write frames into a folder",
+        )
+    # The index comes first, so that browsers can play a file while it loads.
+    options = {"movflags": "+faststart"}
+    with (
+        atomic_write(path) as temporary,
+        av.open(str(temporary), "w", options=options) as container,
+    ):
+        rate = Fraction(fps).limit_denominator(1001)
+        stream = container.add_stream("libx264", rate=rate, options={"crf": QUALITY})
+        stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
+        context = stream.codec_context
+        context.color_range, context.colorspace = ColorRange.MPEG, Colorspace.ITU709
+        context.color_primaries = ColorPrimaries.BT709
+        context.color_trc = ColorTrc.IEC61966_2_1
+
+        def add(ldr: Float32[np.ndarray, "h w 3"]) -> None:
+            frame = av.VideoFrame.from_ndarray(_centred(to_uint8(ldr), size), format="rgb24")
+            frame = frame.reformat(format="yuv420p", dst_colorspace=Colorspace.ITU709)
+            container.mux(stream.encode(frame))
+
+        yield add
+        container.mux(stream.encode(None))
+
+
+def _centred(codes: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> np.ndarray:
+    """Return a picture centred on black and cut to (width, height)."""
+    width, height = size
+    codes = codes[:height, :width]
+    above, before = (height - codes.shape[0]) // 2, (width - codes.shape[1]) // 2
+    out = np.zeros((height, width, 3), np.uint8)
+    out[above : above + codes.shape[0], before : before + codes.shape[1]] = codes
+    return out

@@ -17,6 +17,7 @@ from jaxtyping import Float32
 from scipy.special import expit
 
 from p2gs_jax.core.atomic import atomic_write
+from p2gs_jax.formats.ply import unit_quats
 from p2gs_jax.gaussians.posed import half_turn
 from p2gs_jax.render.harmonics import degree_of
 from p2gs_jax.types import Gaussians
@@ -28,14 +29,9 @@ MAGIC, VERSION, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
 
 
 def write_gltf(path: Path, gaussians: Gaussians) -> int:
-    """Write Gaussians with display colours as `.glb`; return how many.
+    """Write Gaussians with display colours and COLMAP's axes as `.glb`; return how many.
 
-    Args:
-        path: the file.
-        gaussians: at least one; COLMAP's axes.
-
-    Raises:
-        ValueError: there is none, which glTF has no words for.
+    A ValueError says that there is none: glTF holds no empty list.
     """
     if gaussians.capacity == 0:
         raise ValueError("glTF holds no empty accessor")
@@ -67,12 +63,10 @@ def write_gltf(path: Path, gaussians: Gaussians) -> int:
 
 
 def _attributes(g: Gaussians) -> dict[str, Float32[np.ndarray, "n k"]]:
-    quats = np.asarray(g.quats, np.float64)
-    quats = quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12)
     sh = np.asarray(g.sh)
     columns = {
         "POSITION": np.asarray(g.means),
-        f"{EXTENSION}:ROTATION": np.roll(quats, -1, axis=1),
+        f"{EXTENSION}:ROTATION": np.roll(unit_quats(g), -1, axis=1),
         f"{EXTENSION}:SCALE": np.exp(np.asarray(g.log_scales)),
         f"{EXTENSION}:OPACITY": expit(np.asarray(g.opacity_logits))[:, None],
     }

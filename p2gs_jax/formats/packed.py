@@ -31,13 +31,10 @@ LOGIT_LIMIT = 16.0
 
 @dataclass(frozen=True)
 class Packed:
-    """Bytes, and what is needed to read them.
+    """Bytes, the number of Gaussians, and of coefficients of the harmonics of each channel.
 
-    Attributes:
-        count: of Gaussians.
-        coefficients: of the harmonics of each channel.
-        data: deflated (zlib): least and largest values as float32, by column and chunk; then of
-            each column its low bytes, and where it has more than 8 bits its high bytes.
+    The bytes are deflated (zlib): least and largest values as float32, by column and chunk; then of
+    each column its low bytes, and where it has more than 8 bits its high bytes.
     """
 
     count: int
@@ -47,21 +44,12 @@ class Packed:
     @property
     def header(self) -> dict[str, Any]:
         """Return what is needed to read the bytes, as plain values."""
-        bits = column_bits(self.coefficients)
-        return {
-            "count": self.count,
-            "chunk": CHUNK,
-            "coefficients": self.coefficients,
-            "bits": bits,
-        }
+        sizes = {"count": self.count, "chunk": CHUNK, "coefficients": self.coefficients}
+        return {**sizes, "bits": column_bits(self.coefficients)}
 
 
 def column_bits(coefficients: int) -> list[int]:
-    """Return the bits of every column.
-
-    Args:
-        coefficients: of the harmonics of each channel.
-    """
+    """Return the bits of every column."""
     geometry = [MEANS] * 3 + [SCALES] * 3 + [ROTATIONS] * 3 + [OPACITY]
     return geometry + [BASE] * 3 + [BANDS] * 3 * (coefficients - 1)
 
@@ -71,9 +59,6 @@ def morton_order(means: Float32[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
 
     Cells halve the Gaussians along each axis, not the lengths: a far sky takes nothing from the
     street.
-
-    Args:
-        means: centres.
     """
     count = max(len(means), 1)
     code = np.zeros(len(means), np.int64)
@@ -87,11 +72,7 @@ def morton_order(means: Float32[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
 
 
 def pack(gaussians: Gaussians) -> Packed:
-    """Return Gaussians as bytes, in another order.
-
-    Args:
-        gaussians: finite ones.
-    """
+    """Return finite Gaussians as bytes, in another order."""
     columns = _columns(gaussians)
     columns = columns[:, morton_order(np.asarray(gaussians.means))]
     count, coefficients = gaussians.capacity, gaussians.sh.shape[1]

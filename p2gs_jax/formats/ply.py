@@ -39,19 +39,21 @@ VIBRATION = ("velocity_x", "velocity_y", "velocity_z", "peak_time", "log_life")
 CHUNK = 65536
 
 
+def unit_quats(gaussians: Gaussians) -> Float[np.ndarray, "n 4"]:
+    """Return rotations as wxyz of length 1, in float64; zeros stay zeros."""
+    quats = np.asarray(gaussians.quats, np.float64)
+    return quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12)
+
+
 def write_ply(
     path: Path,
     gaussians: Gaussians,
     comments: Sequence[str],
     rows: Int[np.ndarray, " k"] | None = None,
 ) -> int:
-    """Write Gaussians as they are, some at a time; return how many.
+    """Write Gaussians, all or some rows of them, as they are; return how many.
 
-    Args:
-        path: the file.
-        gaussians: what to write.
-        comments: header lines; a PLY header is ASCII, other characters are escaped.
-        rows: which; None: all.
+    Comments are header lines: a PLY header is ASCII, other characters are escaped.
     """
     g = jax.tree.map(np.asarray, gaussians)
     names = [*field_names(g.sh.shape[1]), *(() if g.vibration is None else VIBRATION)]
@@ -69,7 +71,10 @@ def _columns(g: Gaussians, rows: slice | Int[np.ndarray, " k"]) -> Float[np.ndar
     """Return some Gaussians as rows of the table."""
     sh = g.sh[rows]
     count = len(sh)
-    moves = [] if g.vibration is None else [_vibration_of(g.vibration, rows)]
+    moves = []
+    if g.vibration is not None:
+        v = g.vibration
+        moves = [v.velocities[rows], v.peaks[rows][:, None], v.log_lives[rows][:, None]]
     columns = [
         g.means[rows],
         np.zeros((count, 3), np.float32),
@@ -103,12 +108,7 @@ RESTORE = "restore it from a copy, or write it again with `p2gs-jax fit ... --re
 def read_ply(path: Path, *, fix: str = RESTORE) -> Gaussians:
     """Read Gaussians back, bit for bit. Normals, which mean nothing, may be missing.
 
-    Args:
-        path: the file.
-        fix: what to do about a file that is none.
-
-    Raises:
-        UserError: the file is no such PLY.
+    A UserError says that the file is not such a PLY, and with `fix` what to do.
     """
     with refusing(path, "Gaussians", fix=fix):
         return _read(read_table(path, "vertex"))
@@ -139,8 +139,3 @@ def _read(vertex: np.ndarray) -> Gaussians:
     # One after another: each is let go where the device has a copy.
     found = [on_device(arrays.pop(0)) for _ in range(len(arrays))]
     return Gaussians(*found[:5], vibration=Vibration(*found[5:]) if found[5:] else None)
-
-
-def _vibration_of(moves: Vibration, rows: slice | Int[np.ndarray, " k"]) -> np.ndarray:
-    parts = moves.velocities[rows], moves.peaks[rows][:, None], moves.log_lives[rows][:, None]
-    return np.concatenate(parts, axis=1)

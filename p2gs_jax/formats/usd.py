@@ -18,11 +18,12 @@ from scipy.special import expit
 
 from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.errors import UserError
+from p2gs_jax.formats.ply import unit_quats
 from p2gs_jax.gaussians.posed import FLIP, half_turn
 from p2gs_jax.render.harmonics import degree_of
 from p2gs_jax.types import Gaussians
 
-# Of a 35 mm film, which focal lengths are usually told for.
+# Width of a 35 mm film, to which focal lengths are usually related.
 APERTURE_MM = 36.0
 TENTHS_PER_MM = 0.01
 MODULES = ("Gf", "Usd", "UsdGeom", "UsdVol", "Vt")
@@ -31,15 +32,7 @@ SPLATS, CAMERAS = "/scene/splats", "/scene/cameras"
 
 @dataclass(frozen=True)
 class NamedCamera:
-    """A pinhole camera of a photograph.
-
-    Attributes:
-        name: of the photograph.
-        viewmat: world-to-camera, OpenCV axes.
-        K: pixels, centres at +0.5.
-        width: pixels.
-        height: pixels.
-    """
+    """The pinhole camera of a photograph: world-to-camera with OpenCV axes; the rest in pixels."""
 
     name: str
     viewmat: Float[np.ndarray, "4 4"]
@@ -49,10 +42,9 @@ class NamedCamera:
 
 
 def require_pxr() -> tuple[Any, ...]:
-    """Return what writes USD: pxr's Gf, Usd, UsdGeom, UsdVol and Vt; they have no types.
+    """Return pxr's Gf, Usd, UsdGeom, UsdVol and Vt, which have no types.
 
-    Raises:
-        UserError: it is not installed, or knows no splats.
+    A UserError says that OpenUSD is not installed, or too old for splats.
     """
     try:
         found = [importlib.import_module(f"pxr.{name}") for name in MODULES]
@@ -70,18 +62,13 @@ def require_pxr() -> tuple[Any, ...]:
 
 
 def write_usd(path: Path, gaussians: Gaussians, cameras: Sequence[NamedCamera] = ()) -> int:
-    """Write Gaussians with display colours, and cameras; return how many Gaussians.
-
-    Args:
-        path: `.usdc`, `.usda` or `.usd`.
-        gaussians: COLMAP's axes.
-        cameras: of the photographs.
-
-    Raises:
-        UserError: OpenUSD is not installed.
-    """
+    """Write Gaussians with display colours and COLMAP's axes, and cameras; return how many."""
     _, Usd, UsdGeom, UsdVol, Vt = require_pxr()
     g = half_turn(gaussians)
+
+    def vectors(values: np.ndarray) -> Any:
+        return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values))
+
     with atomic_write(path) as temporary:
         temporary.unlink()
         stage = Usd.Stage.CreateNew(str(temporary))
@@ -91,24 +78,17 @@ def write_usd(path: Path, gaussians: Gaussians, cameras: Sequence[NamedCamera] =
         field = UsdVol.ParticleField3DGaussianSplat.Define(stage, SPLATS)
         means = np.asarray(g.means, np.float32)
         scales = np.exp(np.asarray(g.log_scales, np.float32))
-        quats = np.asarray(g.quats, np.float32)
-        quats = quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12)
+        quats = unit_quats(g).astype(np.float32)
         sh = np.asarray(g.sh, np.float32)
         values = {
-            "positions": Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(means)),
-            "scales": Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(scales)),
+            "positions": vectors(means),
+            "scales": vectors(scales),
             # Gf keeps the imaginary part first.
-            "orientations": Vt.QuatfArray.FromNumpy(
-                np.ascontiguousarray(np.roll(quats, -1, axis=1))
-            ),
-            "opacities": Vt.FloatArray.FromNumpy(
-                np.ascontiguousarray(expit(np.asarray(g.opacity_logits, np.float32)))
-            ),
+            "orientations": Vt.QuatfArray.FromNumpy(np.roll(quats, -1, axis=1)),
+            "opacities": Vt.FloatArray.FromNumpy(expit(np.asarray(g.opacity_logits, np.float32))),
             "radiance:sphericalHarmonicsDegree": degree_of(sh.shape[1]),
-            "radiance:sphericalHarmonicsCoefficients": Vt.Vec3fArray.FromNumpy(
-                np.ascontiguousarray(sh.reshape(-1, 3))
-            ),
-            "extent": Vt.Vec3fArray.FromNumpy(_extent(means, scales)),
+            "radiance:sphericalHarmonicsCoefficients": vectors(sh.reshape(-1, 3)),
+            "extent": vectors(_extent(means, scales)),
         }
         for name, value in values.items():
             field.GetPrim().GetAttribute(name).Set(value)

@@ -1,8 +1,9 @@
-"""A smooth ride through given poses."""
+"""A smooth ride through given poses, also beside the way that was driven."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
@@ -10,9 +11,9 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.paths.geometry import Poses, angles, rigid
-from p2gs_jax.paths.shots import Shot, common_lens
-from p2gs_jax.scene.rigid import inverse
+from p2gs_jax.paths.shots import Poses, Shot, common_lens, pose_of
+from p2gs_jax.scene.rigid import headings, inverse, level_ahead, up_of_drive
+from p2gs_jax.types import View
 
 # Default number of frames from one pose to the next.
 FRAMES_BETWEEN = 8
@@ -32,31 +33,23 @@ class PosePath:
     """
 
     def __init__(self, poses: Poses):
-        """Fit the splines.
-
-        Args:
-            poses: camera-to-world, at least two.
-        """
-        self.times = _times(poses)
+        """Fit the splines to at least two camera-to-world matrices."""
+        rotations = Rotation.from_matrix(poses[:, :3, :3])
+        steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+        turns = (rotations[1:] * rotations[:-1].inv()).magnitude()
+        gaps = np.sqrt(steps / max(steps.mean(), 1e-12) + turns)
+        gaps = np.maximum(gaps / max(gaps.mean(), 1e-12), SHORTEST)
+        self.times = np.concatenate([[0.0], np.cumsum(gaps / gaps.mean())])
         self._positions = CubicSpline(self.times, poses[:, :3, 3], bc_type="natural")
-        self._rotations = RotationSpline(self.times, Rotation.from_matrix(poses[:, :3, :3]))
+        self._rotations = RotationSpline(self.times, rotations)
 
     def __call__(self, times: Float[np.ndarray, " n"]) -> Poses:
         """Return camera-to-world matrices at times."""
-        return rigid(self._rotations(times).as_matrix(), self._positions(times))
+        return pose_of(self._rotations(times).as_matrix(), self._positions(times))
 
     def evenly(self, frames: int) -> Float[np.ndarray, " n"]:
         """Return `frames` equally spaced times from the first pose to the last."""
         return np.linspace(0.0, self.times[-1], frames)
-
-
-def _times(poses: Poses) -> Float[np.ndarray, " n"]:
-    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-    turns = angles(poses[1:, :3, :3], poses[:-1, :3, :3])
-    apart = steps / max(steps.mean(), 1e-12) + turns
-    gaps = np.sqrt(apart)
-    gaps = np.maximum(gaps / max(gaps.mean(), 1e-12), SHORTEST)
-    return np.concatenate([[0.0], np.cumsum(gaps / gaps.mean())])
 
 
 def frame_count(knots: int, frames: int | None) -> int:
@@ -68,11 +61,7 @@ def drive(knots: Sequence[Shot], frames: int | None = None) -> list[Shot]:
     """Return a smooth path through shots, with their commonest lens.
 
     Exposures (in stops), gammas (their logarithms) and times are interpolated linearly where all
-    shots have them.
-
-    Args:
-        knots: in the order of the ride.
-        frames: how many shots; None takes `FRAMES_BETWEEN` from one knot to the next.
+    shots have them. None takes `FRAMES_BETWEEN` frames from one shot to the next.
 
     Raises:
         UserError: there are fewer than two knots.
@@ -86,9 +75,8 @@ def drive(knots: Sequence[Shot], frames: int | None = None) -> list[Shot]:
     times = path.evenly(frame_count(len(knots), frames))
     evs = interpolated(path.times, [s.exposure_ev for s in knots], times)
     logs = [None if s.gamma is None else float(np.log(s.gamma)) for s in knots]
-    gammas = [
-        None if g is None else float(np.exp(g)) for g in interpolated(path.times, logs, times)
-    ]
+    found = interpolated(path.times, logs, times)
+    gammas = [None if g is None else float(np.exp(g)) for g in found]
     clock = interpolated(path.times, [s.time for s in knots], times)
     K, width, height = common_lens(knots)
     return [
@@ -103,3 +91,23 @@ def interpolated(at, values: Sequence[float | None], times) -> list[float | None
     if len(known) < len(values):
         return [None] * len(times)
     return np.interp(times, at, known).tolist()
+
+
+def beside(poses: Poses, views: Sequence[View], distance: float) -> Poses:
+    """Return poses moved to the left of the driving direction, looking the same way.
+
+    They are camera-to-world (or rig-to-world) in the order of the ride; a negative distance (scene
+    units) is to the right. The views of the scene say what is up, and where a standing car looks.
+    """
+    up = up_of_drive(np.stack([v.viewmat for v in views]), [v.camera for v in views])
+    ahead = headings(poses[:, :3, 3], up, level_ahead(views, up))
+    out = poses.copy()
+    out[:, :3, 3] += distance * np.cross(up, ahead)
+    return out
+
+
+def beside_shots(shots: Sequence[Shot], views: Sequence[View], distance: float) -> list[Shot]:
+    """Return shots moved to the left of the driving direction; see `beside`."""
+    poses = inverse(np.stack([shot.viewmat for shot in shots]))
+    moved = inverse(beside(poses, views, distance))
+    return [replace(shot, viewmat=viewmat) for shot, viewmat in zip(shots, moved, strict=True)]

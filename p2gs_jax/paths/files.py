@@ -9,21 +9,26 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
-from jaxtyping import Float
 
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
-from p2gs_jax.paths.pinhole import LARGEST, as_matrix, checked_lens, orthonormal
-from p2gs_jax.paths.shots import Shot
+from p2gs_jax.paths.shots import LARGEST, Shot, as_matrix, checked_lens, checked_pose
 from p2gs_jax.scene.rigid import inverse
 
 FIELDS = ("name", "viewmat", "K", "width", "height", "exposure_ev", "gamma", "time")
 MOST_STOPS = 60.0
+# Least and largest values of what an entry may leave out.
+LIMITS = {
+    "exposure_ev": (-MOST_STOPS, MOST_STOPS),
+    "gamma": (1e-3, 1e3),
+    "time": (-math.inf, math.inf),
+}
 _FIX = "correct the file; docs/rendering.md has the format"
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -35,11 +40,7 @@ def write_cameras(path: Path, shots: Sequence[Shot]) -> None:
 
 
 def read_cameras(path: Path) -> list[Shot]:
-    """Read a path.
-
-    Raises:
-        UserError: the file is missing or no path; the message names the entry and the field.
-    """
+    """Read a path; a UserError names the entry and the field of a file that is not one."""
     try:
         data = parse_json(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -51,56 +52,42 @@ def read_cameras(path: Path) -> list[Shot]:
         raise UserError(f"{path} is not valid JSON: {error}.", fix=_FIX) from None
     entry = _entry
     if isinstance(data, dict) and "camera_path" in data:
-        entry, data = _nerfstudio(path, data)
+        entry, data = _nerfstudio(path, data), data["camera_path"]
     if not isinstance(data, list) or not data:
         raise UserError(
             f"{path} is neither a list of cameras nor a nerfstudio camera path.", fix=_FIX
         )
-    shots = []
+    shots: dict[str, Shot] = {}
     for index, values in enumerate(data):
         try:
             if not isinstance(values, dict):
-                raise ValueError("is no object with fields")
-            shots.append(entry(values, index))
+                raise ValueError("is not an object with fields")
+            shot = entry(values, index)
         except ValueError as error:
             raise UserError(f"{path}: camera {index} {error}.", fix=_FIX) from None
-    _check_names(path, shots)
-    return shots
-
-
-def _check_names(path: Path, shots: Sequence[Shot]) -> None:
-    first: dict[str, int] = {}
-    for index, shot in enumerate(shots):
-        if shot.name in first:
+        if shot.name in shots:
+            first = list(shots).index(shot.name)
             raise UserError(
-                f"{path}: cameras {first[shot.name]} and {index} have the same name {shot.name!r}.",
+                f"{path}: cameras {first} and {index} have the same name {shot.name!r}.",
                 fix="name every picture differently, or leave the names out",
             )
-        first[shot.name] = index
+        shots[shot.name] = shot
+    return list(shots.values())
 
 
 def _entry(values: dict, index: int) -> Shot:
     unknown = sorted(set(values) - set(FIELDS))
     if unknown:
         raise ValueError(f"has an unknown field {unknown[0]!r} (known are {', '.join(FIELDS)})")
-    viewmat = _matrix(values, "viewmat", 4)
-    K = checked_lens(_matrix(values, "K", 3))
-    return Shot(
-        _name(values, index),
-        orthonormal(viewmat, "viewmat"),
-        K,
-        _pixels(values, "width"),
-        _pixels(values, "height"),
-        _number(values, "exposure_ev", -MOST_STOPS, MOST_STOPS)
-        if "exposure_ev" in values
-        else None,
-        _number(values, "gamma", 1e-3, 1e3) if "gamma" in values else None,
-        time=_number(values, "time", -math.inf, math.inf) if "time" in values else None,
-    )
+    viewmat = checked_pose(_given(values, "viewmat"), "viewmat")
+    K, name = checked_lens(_given(values, "K")), _name(values, index)
+    shot = Shot(name, viewmat, K, _pixels(values, "width"), _pixels(values, "height"))
+    more = {key: _number(values, key, *limits) for key, limits in LIMITS.items() if key in values}
+    return replace(shot, **more)
 
 
-def _nerfstudio(path: Path, data: dict):
-    """Return what reads one entry, and the entries."""
+def _nerfstudio(path: Path, data: dict) -> Callable[[dict, int], Shot]:
+    """Return what reads one entry of a nerfstudio path."""
     kind = str(data.get("camera_type", "perspective")).lower()
     if kind != "perspective":
         raise UserError(
@@ -113,19 +100,20 @@ def _nerfstudio(path: Path, data: dict):
         raise UserError(f"{path} {error}.", fix=_FIX) from None
 
     def entry(values: dict, index: int) -> Shot:
-        c2w = orthonormal(_matrix(values, "camera_to_world", 4) @ _OPENGL, "camera_to_world")
+        pose = as_matrix(_given(values, "camera_to_world"), "camera_to_world", 4) @ _OPENGL
         fov = _number(values, "fov", 0.1, 179.0)
         f = 0.5 * height / math.tan(0.5 * math.radians(fov))
         K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]])
-        return Shot(f"{index:05d}", inverse(c2w), K, width, height)
+        viewmat = inverse(checked_pose(pose, "camera_to_world"))
+        return Shot(f"{index:05d}", viewmat, K, width, height)
 
-    return entry, data["camera_path"]
+    return entry
 
 
-def _matrix(values: dict, key: str, size: int) -> Float[np.ndarray, "n n"]:
+def _given(values: dict, key: str):
     if key not in values:
         raise ValueError(f"has no {key}")
-    return as_matrix(values[key], key, size)
+    return values[key]
 
 
 def _pixels(values: dict, key: str) -> int:

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from p2gs_jax.paths.geometry import look_at
-from p2gs_jax.paths.shots import Shot, common_lens
-from p2gs_jax.scene.rigid import inverse, up_direction
+from p2gs_jax.paths.shots import Pose, Shot, common_lens, pose_of
+from p2gs_jax.scene.rigid import camera_centers, up_direction
 
 FRAMES = 120
 # Optical axes meet where they spread at least this much (sine squared) ...
@@ -68,13 +67,7 @@ class Orbit:
 
 
 def orbit(circle: Orbit, shots: Sequence[Shot], frames: int | None = None) -> list[Shot]:
-    """Return a path that ends where it begins, with the shots' commonest lens.
-
-    Args:
-        circle: from `find_orbit`.
-        shots: whose lens it takes.
-        frames: how many; None takes `FRAMES`.
-    """
+    """Return a path of `frames` shots that ends where it begins, with the commonest lens."""
     count = FRAMES if frames is None else frames
     turn = 2 * np.pi * np.arange(count) / count
     swing = turn if circle.sway >= np.pi else circle.sway * np.sin(turn)
@@ -85,6 +78,20 @@ def orbit(circle: Orbit, shots: Sequence[Shot], frames: int | None = None) -> li
     return [Shot(f"{k:05d}", pose, K, width, height, time=time) for k, pose in enumerate(poses)]
 
 
+def look_at(
+    center: Float[np.ndarray, " 3"], focus: Float[np.ndarray, " 3"], up: Float[np.ndarray, " 3"]
+) -> Pose:
+    """Return world-to-camera of a camera at `center` that looks at `focus`; `up` is shown upwards.
+
+    The line of sight must not run along `up`.
+    """
+    z = (focus - center) / np.linalg.norm(focus - center)
+    x = np.cross(z, up)
+    x /= np.linalg.norm(x)
+    R = np.stack([x, np.cross(z, x), z])
+    return pose_of(R, -R @ center)
+
+
 def find_orbit(
     shots: Sequence[Shot], own: Sequence[Shot], points: Float[np.ndarray, "p 3"]
 ) -> Orbit:
@@ -92,22 +99,17 @@ def find_orbit(
 
     Where the optical axes meet before the cameras, it is around that point at the cameras' median
     distance and elevation: all around if the cameras are, else over the azimuths that they cover.
-    Where the axes do not meet, as on a vehicle, it sways about the median depth before the middle
-    one of `own`.
-
-    Args:
-        shots: all views.
-        own: those of one camera, in order.
-        points: of the scene, for that depth; may be empty.
+    Where the axes do not meet, as on a vehicle, it sways about the median depth of the scene's
+    points, if there are any, before the middle one of `own`: the shots of one camera, in order.
     """
     viewmats = np.stack([s.viewmat for s in shots])
     up = up_direction(viewmats)
-    centers, axes = inverse(viewmats)[:, :3, 3], viewmats[:, 2, :3]
+    centers, axes = camera_centers(viewmats), viewmats[:, 2, :3]
     focus = meeting_point(centers, axes)
     if focus is None:
         middle = own[len(own) // 2]
         distance = _median_depth(middle, points, centers)
-        center = inverse(middle.viewmat)[:3, 3]
+        center = camera_centers(middle.viewmat[None])[0]
         return _around(center + distance * middle.viewmat[2, :3], center[None], up, met=False)
     return _around(focus, centers, up, met=True)
 
@@ -115,12 +117,7 @@ def find_orbit(
 def meeting_point(
     centers: Float[np.ndarray, "n 3"], axes: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, " 3"] | None:
-    """Return the point nearest to all optical axes, or None where they do not meet before it.
-
-    Args:
-        centers: of the cameras.
-        axes: unit vectors, forward.
-    """
+    """Return the point nearest to all optical axes (unit vectors), or None if they do not meet."""
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     A = across.mean(0)
     if np.linalg.eigvalsh(A)[0] < LEAST_SPREAD:

@@ -6,51 +6,137 @@ field is stitched the same way, from narrow slices around one centre.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int
 
-from p2gs_jax.paths.cylinder import Cylinder, project
-from p2gs_jax.paths.geometry import rigid
-from p2gs_jax.paths.shots import Shot
-from p2gs_jax.scene.rigid import inverse
+from p2gs_jax.paths.shots import Pose, Shot, pose_of
+from p2gs_jax.scene.rigid import camera_centers
 
+# Coverage is judged at this many directions per radian, up to this height (tangent of elevation).
+PROBES, HIGHEST = 2 * 180 / np.pi, 3.0
+# A column counts as covered from this share of the tallest column on.
+FULL_COLUMN = 0.75
 # Angle of a slice: the affine approximation of splats is off far from the axis; in narrow slices it
 # is nearly the same on both sides of an edge.
 WIDEST_SLICE = np.deg2rad(20)
 # Opacity from which on expected depth is used; below it the surface counts as infinitely far.
 OPAQUE = 0.5
 
-Layers = tuple[np.ndarray, np.ndarray, np.ndarray]  # linear [h w 3], alpha [h w], depth [h w]
+# Linear radiance [h w 3], alpha [h w] and alpha-weighted depth [h w].
+Layers = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """A camera with a cylindrical image: azimuth across, height on the unit cylinder down.
+
+    Column u, row v of the image look along (sin a, h, cos a) in the camera, with a = left + u /
+    focal and h = top + v / focal; pixel centres are at +0.5.
+
+    Attributes:
+        viewmat: world-to-camera; x right, y down along the axis, z towards azimuth 0.
+        focal: pixels per radian, and per unit of height.
+        left: azimuth of the left edge, radians, positive to the right.
+        top: height of the upper edge, positive down.
+        width: pixels.
+        height: pixels.
+    """
+
+    viewmat: Pose
+    focal: float
+    left: float
+    top: float
+    width: int
+    height: int
+
+    @property
+    def span(self) -> float:
+        """Radians from the left edge to the right."""
+        return self.width / self.focal
+
+    def resized(self, width: int) -> Cylinder:
+        """Return the cylinder with `width` pixels across; the height follows, rounded."""
+        scale = width / self.width
+        height = max(1, round(self.height * scale))
+        return replace(self, focal=self.focal * scale, width=width, height=height)
+
+    def rays(self) -> Float[np.ndarray, "h w 3"]:
+        """Return world directions of all pixels, of length 1 across the axis."""
+        azimuth = self.left + (np.arange(self.width) + 0.5) / self.focal
+        height = self.top + (np.arange(self.height) + 0.5) / self.focal
+        h, a = np.meshgrid(height, azimuth, indexing="ij")
+        return np.stack([np.sin(a), h, np.cos(a)], -1) @ self.viewmat[:3, :3]
+
+
+def _project(
+    shot: Shot,
+    rays: Float[np.ndarray, "h w 3"],
+    shift: Float[np.ndarray, "h w 3"] | float = 0.0,
+) -> tuple[Float[np.ndarray, "h w 2"], Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """Return where a pinhole camera sees what lies along rays of the world.
+
+    The shift is added to the rays in the camera, for what is not infinitely far. Pixels (centres at
+    +0.5) come back, cosines of the angle from the optical axis, and what the camera sees.
+    """
+    local = rays @ shot.viewmat[:3, :3].T + shift
+    z = local[..., 2]
+    front = z > 1e-9
+    xy = local[..., :2] / np.where(front, z, 1.0)[..., None]
+    xy = xy * shot.K[[0, 1], [0, 1]] + shot.K[:2, 2]
+    inside = front & np.all((xy >= 0) & (xy <= (shot.width, shot.height)), axis=-1)
+    return xy, z / np.maximum(np.linalg.norm(local, axis=-1), 1e-12), inside
+
+
+def covering(shots: Iterable[Shot], viewmat: Pose) -> Cylinder:
+    """Return the cylinder that cameras cover, at the finest of their resolutions.
+
+    From side to side it spans all cameras, less what is seen in less than three quarters of their
+    height, or the full circle where they see something all around; up and down it is cut to what is
+    seen in all columns that are covered. Distances between the cameras are neglected.
+    """
+    shots = list(shots)
+    around, tall = round(2 * np.pi * PROBES), 2 * round(HIGHEST * PROBES)
+    probe = Cylinder(viewmat, around / (2 * np.pi), -np.pi, -tall / 2 / PROBES, around, tall)
+    rays = probe.rays()
+    covered = np.any([_project(shot, rays)[2] for shot in shots], axis=0)
+    counts = covered.sum(0)
+    good = counts >= FULL_COLUMN * counts.max()
+    start, count = (0, around) if counts.all() else _without_largest_gap(good)
+    columns = (start + np.arange(count)) % around
+    rows = covered[:, columns[good[columns]]].all(1)
+    if not rows.any():
+        rows = covered.any(1)
+    first, last = np.flatnonzero(rows)[[0, -1]]
+    focal = max(float(max(s.K[0, 0], s.K[1, 1])) for s in shots)
+    # A probe stands for its surroundings: leave one out at every edge.
+    cut = 0 if count == around else 1
+    top = probe.top + (first + 1) / probe.focal
+    bottom = probe.top + last / probe.focal
+    left = probe.left + (start + cut) / probe.focal
+    width = max(1, round((count - 2 * cut) / probe.focal * focal))
+    return Cylinder(viewmat, focal, left, top, width, max(1, round((bottom - top) * focal)))
+
+
+def _without_largest_gap(good: Bool[np.ndarray, " n"]) -> tuple[int, int]:
+    """Return begin and length of the circular range that leaves out the longest run of False."""
+    there = np.flatnonzero(good)
+    gaps = np.diff(np.append(there, there[0] + len(good))) - 1
+    widest = int(np.argmax(gaps))
+    if gaps[widest] == 0:
+        return 0, len(good)
+    return int(there[(widest + 1) % len(there)]), int(len(good) - gaps[widest])
 
 
 class Stitched(NamedTuple):
-    """A cylindrical image, and the camera each pixel was taken from.
-
-    Attributes:
-        image: 0 where no camera sees.
-        source: row of the camera, -1 for none.
-    """
+    """A cylindrical image, 0 where no camera sees, and the row of each pixel's camera, else -1."""
 
     image: Float32[np.ndarray, "h w c"]
     source: Int[np.ndarray, "h w"]
-
-
-class Wide(NamedTuple):
-    """A wide view of the field.
-
-    Attributes:
-        linear: radiance, premultiplied by alpha.
-        alpha: opacity.
-        nearness: 1 / distance from the cylinder's axis, 0 where nothing opaque is seen.
-    """
-
-    linear: Float32[np.ndarray, "h w 3"]
-    alpha: Float32[np.ndarray, "h w"]
-    nearness: Float32[np.ndarray, "h w"]
 
 
 def stitch(
@@ -62,31 +148,35 @@ def stitch(
 ) -> Stitched:
     """Reproject images to a cylinder: every pixel from the one camera that sees it most centrally.
 
-    Nothing is blended, so that differences show.
+    Nothing is blended, so that differences show. Images have at most 4 channels; a ValueError says
+    that one has another size than its camera.
 
     Args:
-        images: of at most 4 channels.
+        images: of the shots.
         shots: their cameras.
-        cylinder: where they go.
+        cylinder: of the result.
         nearness: 1 / distance from the cylinder's axis; None reprojects at infinity, which is
             exact for cameras with a common centre.
         masks: 1 = use, 0 = ignore.
     """
     rays = cylinder.rays()
-    origin = inverse(cylinder.viewmat)[:3, 3]
+    origin = camera_centers(cylinder.viewmat[None])[0]
     out = np.zeros((*rays.shape[:2], images[0].shape[2]), np.float32)
     source = np.full(rays.shape[:2], -1)
     best = np.full(rays.shape[:2], -np.inf)
     for k, (image, shot) in enumerate(zip(images, shots, strict=True)):
         if image.shape[:2] != (shot.height, shot.width):
             raise ValueError(f"image {k} is {image.shape[:2]}, its camera not")
-        seen = project(shot, rays, origin, nearness)
-        at = (seen.xy - 0.5).astype(np.float32)
-        better = seen.inside & (seen.cosine > best)
+        shift = 0.0
+        if nearness is not None:
+            shift = nearness[..., None] * (shot.viewmat[:3, :3] @ origin + shot.viewmat[:3, 3])
+        xy, cosine, inside = _project(shot, rays, shift)
+        at = (xy - 0.5).astype(np.float32)
+        better = inside & (cosine > best)
         if masks is not None:
             better &= _sample(masks[k], at) > 0.99
         out[better] = _sample(image, at)[better]
-        source[better], best[better] = k, seen.cosine[better]
+        source[better], best[better] = k, cosine[better]
     return Stitched(out, source)
 
 
@@ -96,6 +186,14 @@ def _sample(image: np.ndarray, at: Float32[np.ndarray, "h w 2"]) -> np.ndarray:
     x, y = np.ascontiguousarray(at[..., 0]), np.ascontiguousarray(at[..., 1])
     out = cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return out.reshape(*at.shape[:2], *image.shape[2:])
+
+
+def borders(source: Sequence[int] | np.ndarray) -> list[tuple[int, int, int]]:
+    """Return (camera, first column, end column) of the runs of a row of `stitch`'s source map."""
+    row = np.asarray(source)
+    edges = np.flatnonzero(np.diff(row)) + 1
+    starts, ends = np.append(0, edges), np.append(edges, len(row))
+    return [(int(row[s]), int(s), int(e)) for s, e in zip(starts, ends, strict=True) if row[s] >= 0]
 
 
 def slices(cylinder: Cylinder) -> list[Shot]:
@@ -116,27 +214,32 @@ def slices(cylinder: Cylinder) -> list[Shot]:
         middle = cylinder.left + (2 * k + 1) * half
         sine, cosine = np.sin(middle), np.cos(middle)
         turn = np.array([[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]])
-        viewmat = rigid(turn, np.zeros(3)) @ cylinder.viewmat
+        viewmat = pose_of(turn, np.zeros(3)) @ cylinder.viewmat
         out.append(Shot(f"slice_{k}", viewmat, K, width, height))
     return out
 
 
-def render_wide(render: Callable[[Shot], Layers], cylinder: Cylinder) -> Wide:
-    """Render a wide view.
+class Wide(NamedTuple):
+    """A wide view of the field: radiance, premultiplied by alpha; opacity; and nearness.
 
-    Args:
-        render: returns linear radiance, alpha and alpha-weighted depth of a pinhole camera.
-        cylinder: the view.
+    Nearness is 1 / distance from the cylinder's axis, 0 where nothing opaque is seen.
     """
+
+    linear: Float32[np.ndarray, "h w 3"]
+    alpha: Float32[np.ndarray, "h w"]
+    nearness: Float32[np.ndarray, "h w"]
+
+
+def render_wide(render: Callable[[Shot], Layers], cylinder: Cylinder) -> Wide:
+    """Return a wide view; `render` returns the layers of a pinhole camera."""
     shots = slices(cylinder)
-    colours, nearness = [], []
+    layers = []
     for shot in shots:
         linear, alpha, depth = render(shot)
-        colours.append(np.concatenate([linear, alpha[..., None]], -1))
         # From depth along the slice's axis to distance from the cylinder's.
         x = (np.arange(shot.width) + 0.5 - shot.K[0, 2]) / shot.K[0, 0]
-        opaque = alpha > OPAQUE
-        z = np.where(opaque, depth / np.maximum(alpha, OPAQUE), np.inf)
-        nearness.append((1 / (np.maximum(z, 1e-9) * np.sqrt(1 + x**2)))[..., None])
-    colour = stitch(colours, shots, cylinder).image
-    return Wide(colour[..., :3], colour[..., 3], stitch(nearness, shots, cylinder).image[..., 0])
+        z = np.where(alpha > OPAQUE, depth / np.maximum(alpha, OPAQUE), np.inf)
+        near = 1 / (np.maximum(z, 1e-9) * np.sqrt(1 + x**2))
+        layers.append((np.concatenate([linear, alpha[..., None]], -1), near[..., None]))
+    colours, nearness = (stitch(part, shots, cylinder).image for part in zip(*layers, strict=True))
+    return Wide(colours[..., :3], colours[..., 3], nearness[..., 0])

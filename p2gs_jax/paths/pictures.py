@@ -5,20 +5,20 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
 
 import cv2
+import matplotlib
 import numpy as np
 from jaxtyping import Float32
+from PIL import Image, ImageDraw, ImageFont
 
 from p2gs_jax.core.numerics import LN2
-from p2gs_jax.formats.frames import OutputFrame
-from p2gs_jax.paths import Cylinder
-from p2gs_jax.paths.captioned_images import CaptionedImage, stacked, stacked_size
-from p2gs_jax.paths.cylinder import borders
-from p2gs_jax.paths.geometry import Poses
-from p2gs_jax.paths.panorama import Layers, Wide, render_wide, stitch
+from p2gs_jax.formats.frames import OutputFrame, to_uint8
+from p2gs_jax.paths.panorama import Cylinder, Layers, Wide, borders, render_wide, stitch
 from p2gs_jax.paths.rig import Rig, TimeStep
-from p2gs_jax.paths.shots import Shot
+from p2gs_jax.paths.shots import Poses, Shot
 from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
 from p2gs_jax.photometry.metering import ExposureOf, adapted, meter
 from p2gs_jax.run.read import Run
@@ -33,16 +33,13 @@ NOTHING = 0.92
 # Photographs are placed by the field's depth, smoothed over this part of the width, as noise of the
 # depth would fray their edges.
 SMOOTH = 1 / 80
+# Colours of captions, and the font's size as a part of the width, at least so many pixels.
+BACKGROUND, INK, FAINT = (255, 255, 255), (30, 30, 30), (120, 120, 120)
+FONT, SMALLEST_FONT = 1 / 60, 11
 
 
 class RunRenderer:
-    """Renders and develops pictures of a run, and measures the time of both.
-
-    Attributes:
-        run: the run.
-        render_seconds: of every rendered picture.
-        develop_seconds: of every developed picture.
-    """
+    """Renders and develops pictures of a run, and measures the seconds of each."""
 
     def __init__(self, run: Run):
         self.run = run
@@ -57,12 +54,7 @@ class RunRenderer:
         return layers
 
     def wide(self, cylinder: Cylinder, at: float | None = None) -> Wide:
-        """Return a wide view of the field.
-
-        Args:
-            cylinder: the view.
-            at: seconds: what moves is where it was then; None: it is not shown.
-        """
+        """Return a wide view of the field; what moves is where it was `at` seconds, if anywhere."""
         begin = time.perf_counter()
         wide = render_wide(lambda shot: self._layers(replace(shot, time=at)), cylinder)
         self.render_seconds.append(time.perf_counter() - begin)
@@ -94,12 +86,8 @@ def metered_shots(
 ) -> list[Shot]:
     """Return shots with the exposures that a metering rule gives small pictures of them.
 
-    Args:
-        renderer: renders.
-        shots: in the order in which they are shown.
-        of: the rule.
-        exposure_ev: stops more than that.
-        frames: exposures follow what is seen within about this many; 0: each by itself.
+    `exposure_ev` adds stops. Exposures follow what is seen within about `frames` shots, in their
+    order; 0 meters each by itself.
     """
     run = renderer.run
     logs = []
@@ -121,20 +109,13 @@ def shot_frames(
     display_of: Callable[[Shot], DisplayTransform],
     photograph: Callable[[int], Float32[np.ndarray, "h w 3"] | None] | None = None,
 ) -> Iterator[OutputFrame]:
-    """Yield a frame for every shot.
-
-    Args:
-        renderer: renders.
-        shots: what to render.
-        display_of: how to develop each.
-        photograph: returns the photograph to write beside the render of a view, or None.
-    """
+    """Yield a frame for every shot; `photograph` returns what is written beside a view."""
     for shot in shots:
         linear, alpha, depth = renderer.linear(shot)
         transform = display_of(shot)
         ldr = renderer.develop(linear, transform, alpha)
-        taken = None if photograph is None or shot.view is None else photograph(shot.view)
-        yield OutputFrame(shot.name, linear, alpha, ldr, transform, depth, shot.camera(), taken)
+        beside = None if photograph is None or shot.view is None else photograph(shot.view)
+        yield OutputFrame(shot.name, linear, alpha, ldr, transform, depth, shot.camera(), beside)
 
 
 def wide_frames(
@@ -144,14 +125,10 @@ def wide_frames(
     transform: DisplayTransform,
     times: Sequence[float | None],
 ) -> Iterator[OutputFrame]:
-    """Yield wide views of the field.
+    """Yield wide views of the field from rig-to-world poses.
 
-    Args:
-        renderer: renders.
-        cylinder: the view from a rig: its viewmat is rig-to-camera.
-        poses: rig-to-world.
-        transform: how to develop all.
-        times: of the poses, seconds; None: what moves is not shown.
+    The viewmat of the cylinder is rig-to-camera. What moves is shown at the times, seconds, or not
+    at all.
     """
     for k, (pose, at) in enumerate(zip(poses, times, strict=True)):
         wide = renderer.wide(_placed(cylinder, pose), at)
@@ -176,22 +153,15 @@ def comparison_frames(
 
     Photographs stitched as taken; the same, each taken back to radiance by all that its camera did
     and developed with one display transform; the field under the same. Photographs are placed by
-    the field's smoothed depth, and nothing is blended. The frame's `linear` is the field.
-
-    Args:
-        renderer: renders.
-        rig: the cameras.
-        steps: of the rig.
-        cylinder: the view from the rig: its viewmat is rig-to-camera.
-        transform: the common one.
-        store: the photographs.
+    the field's smoothed depth, and nothing is blended. The frame's `linear` is the field. The
+    viewmat of `cylinder` is rig-to-camera.
     """
-    names = list(rig.mounts)
     mean = renderer.run.mean.exposure_geometric
     for step in steps:
         placed = _placed(cylinder, step.pose)
         wide = renderer.wide(placed, step.time)
-        shots = [step.shots[name] for name in names if name in step.shots]
+        names = [name for name in rig.mounts if name in step.shots]
+        shots = [step.shots[name] for name in names]
         rows = [shot.view for shot in shots if shot.view is not None]
         transforms = [renderer.run.own_display(row) for row in rows]
         photographs, masks = zip(*(store.get(row) for row in rows), strict=True)
@@ -201,26 +171,75 @@ def comparison_frames(
         same = stitch(radiance, shots, placed, near, masks)
         seen = taken.source[..., None] >= 0
         stops = [float(np.log2(own.exposure / mean)) for own in transforms]
-        cameras = [name for name in names if name in step.shots]
         captions = [
-            (f"{short_name(cameras[k])} {stops[k]:+.1f} EV".replace("-", "−"), start, end)
+            (f"{short_name(names[k])} {stops[k]:+.1f} EV".replace("-", "−"), start, end)
             for k, start, end in borders(taken.source[cylinder.height // 2])
         ]
+        alike = np.where(seen, develop(same.image, transform), NOTHING)
         field = renderer.develop(wide.linear, transform, wide.alpha)
-        picture = stacked(
-            [
-                CaptionedImage(
-                    "photographs as taken", np.where(seen, taken.image, NOTHING), captions
-                ),
-                CaptionedImage(
-                    "the same photographs, developed to one exposure",
-                    np.where(seen, develop(same.image, transform), NOTHING),
-                ),
-                CaptionedImage("the radiance field at that exposure", field),
-            ]
-        )
-        yield OutputFrame(step.name, wide.linear, wide.alpha, picture, transform)
+        as_taken = np.where(seen, taken.image, NOTHING)
+        panels = [
+            CaptionedImage("photographs as taken", as_taken, captions),
+            CaptionedImage("the same photographs, developed to one exposure", alike),
+            CaptionedImage("the radiance field at that exposure", field),
+        ]
+        yield OutputFrame(step.name, wide.linear, wide.alpha, stacked(panels), transform)
 
 
 def _placed(cylinder: Cylinder, pose) -> Cylinder:
     return replace(cylinder, viewmat=cylinder.viewmat @ inverse(pose))
+
+
+class CaptionedImage(NamedTuple):
+    """An image, display values, with a title above it.
+
+    Captions are (text, first column, end column): written below those columns with a tick at each
+    inner edge, and shortened where they are wider.
+    """
+
+    title: str
+    image: Float32[np.ndarray, "h w 3"]
+    captions: Sequence[tuple[str, int, int]] = ()
+
+
+def _font(width: int) -> ImageFont.FreeTypeFont:
+    path = Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"
+    return ImageFont.truetype(path, max(SMALLEST_FONT, round(FONT * width)))
+
+
+def _line(width: int) -> int:
+    return round(1.7 * _font(width).size)
+
+
+def _shortened(text: str, width: int, font: ImageFont.FreeTypeFont) -> str:
+    """Return the text, or as much of its beginning as fits before an ellipsis."""
+    shorter = [text, *(f"{text[:n]}…" for n in range(len(text) - 1, 0, -1))]
+    return next((t for t in shorter if font.getlength(t) <= width), "")
+
+
+def stacked_size(width: int, heights: Sequence[int], captions: int) -> tuple[int, int]:
+    """Return (width, height) of `stacked` for rows of these heights, some of them with captions."""
+    return width, sum(heights) + (len(heights) + captions) * _line(width)
+
+
+def stacked(rows: Sequence[CaptionedImage]) -> Float32[np.ndarray, "h w 3"]:
+    """Return images of one width below each other, as display values."""
+    width = rows[0].image.shape[1]
+    captions = sum(bool(row.captions) for row in rows)
+    size = stacked_size(width, [row.image.shape[0] for row in rows], captions)
+    font, line = _font(width), _line(width)
+    sheet = Image.new("RGB", size, BACKGROUND)
+    draw = ImageDraw.Draw(sheet)
+    top = 0
+    for row in rows:
+        draw.text((2, top + line / 2), row.title, INK, font, anchor="lm")
+        codes = to_uint8(row.image)
+        sheet.paste(Image.fromarray(codes), (0, top + line))
+        top += line + codes.shape[0]
+        for text, start, end in row.captions:
+            if end < width:
+                draw.line([(end, top), (end, top + line / 2)], INK, max(1, line // 16))
+            place = ((start + end) / 2, top + line / 2)
+            draw.text(place, _shortened(text, end - start, font), FAINT, font, anchor="mm")
+        top += line if row.captions else 0
+    return np.asarray(sheet, np.float32) / 255

@@ -11,11 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.paths.geometry import Pose, Poses, angles, mean_pose, rigid
-from p2gs_jax.paths.shots import Shot
-from p2gs_jax.scene.rigid import inverse, moment_of, up_direction
+from p2gs_jax.paths.shots import Pose, Poses, Shot, pose_of
+from p2gs_jax.scene.rigid import camera_centers, inverse, moment_of, up_direction
 from p2gs_jax.types import View
 
 # Largest median angle between the cameras' relative rotations over time.
@@ -26,12 +26,9 @@ ALL_AROUND = 0.5
 
 @dataclass(frozen=True)
 class TimeStep:
-    """One time step.
+    """What a rig took at one time: its rig-to-world pose, and shots by camera; some may be missing.
 
-    Attributes:
-        name: what its file names have in common, or the number of the frame.
-        pose: rig-to-world.
-        shots: by camera; some may be missing.
+    The name is what the file names have in common, or the number of the frame.
     """
 
     name: str
@@ -67,15 +64,10 @@ class Rig:
 
 
 def find_rig(shots: Sequence[Shot], views: Sequence[View]) -> Rig:
-    """Return the rig that took a scene's views.
+    """Return the rig that took the views of a scene.
 
-    Args:
-        shots: of the scene's views.
-        views: of the scene.
-
-    Raises:
-        UserError: there is one camera, no file names agree between cameras, or they move against
-            each other.
+    A UserError says that there is one camera, that no file names agree between cameras, or that
+    they move against each other.
     """
     cameras = sorted({v.camera for v in views})
     steps: dict[str, dict[str, Shot]] = defaultdict(dict)
@@ -92,28 +84,27 @@ def find_rig(shots: Sequence[Shot], views: Sequence[View]) -> Rig:
             fix="give photographs taken at the same time the same name in a folder per camera, "
             "or leave out --panorama",
         )
-    mounts = _mounts(cameras, common)
-    return Rig(
-        mounts,
-        tuple(
-            TimeStep(name, mean_pose(_poses(found, mounts)), found)
-            for name, found in common.items()
-        ),
-    )
+    mounts = _mounts(cameras, list(common.values()))
+    on_rig = []
+    for name, found in common.items():
+        poses = [inverse(shot.viewmat) @ mounts[c].viewmat for c, shot in found.items()]
+        on_rig.append(TimeStep(name, _mean_pose(np.stack(poses)), found))
+    return Rig(mounts, tuple(on_rig))
 
 
-def _poses(found: dict[str, Shot], mounts: dict[str, Shot]) -> Poses:
-    return np.stack([inverse(shot.viewmat) @ mounts[c].viewmat for c, shot in found.items()])
+def _mean_pose(poses: Poses) -> Pose:
+    """Return the mean of poses that differ little."""
+    rotation = Rotation.from_matrix(poses[:, :3, :3]).mean()
+    return pose_of(rotation.as_matrix(), poses[:, :3, 3].mean(0))
 
 
-def _mounts(cameras: list[str], steps: dict[str, dict[str, Shot]]) -> dict[str, Shot]:
+def _mounts(cameras: list[str], steps: list[dict[str, Shot]]) -> dict[str, Shot]:
     """Return the mean pose of every camera on the rig."""
-    counts = {c: sum(c in found for found in steps.values()) for c in cameras}
-    anchor = max(cameras, key=lambda c: counts[c])
+    anchor = max(cameras, key=lambda c: sum(c in found for found in steps))
     from_anchor: dict[str, Pose] = {}
     lenses: dict[str, Shot] = {}
     for camera in cameras:
-        pairs = [f for f in steps.values() if camera in f and anchor in f]
+        pairs = [f for f in steps if camera in f and anchor in f]
         if not pairs:
             raise UserError(
                 f"No photograph of the camera {camera!r} has the name of one of {anchor!r}.",
@@ -121,36 +112,33 @@ def _mounts(cameras: list[str], steps: dict[str, dict[str, Shot]]) -> dict[str, 
                 "--panorama",
             )
         relative = np.stack([f[camera].viewmat @ inverse(f[anchor].viewmat) for f in pairs])
-        from_anchor[camera], lenses[camera] = mean_pose(relative), pairs[0][camera]
-        if np.median(angles(relative[:, :3, :3], from_anchor[camera][:3, :3])) > LEAST_RIGID:
+        from_anchor[camera], lenses[camera] = _mean_pose(relative), pairs[0][camera]
+        turns = Rotation.from_matrix(relative[:, :3, :3] @ from_anchor[camera][:3, :3].T)
+        if np.median(turns.magnitude()) > LEAST_RIGID:
             raise UserError(
-                f"The cameras {anchor!r} and {camera!r} turn against each other: they are on no "
-                "common rig.",
+                f"The cameras {anchor!r} and {camera!r} turn against each other: they do not sit "
+                "on a common rig.",
                 fix="leave out --panorama",
             )
-    to_rig = inverse(_level(np.stack(list(from_anchor.values())), list(from_anchor)))
+    from_rig = _level(np.stack(list(from_anchor.values())), list(from_anchor))
     return {
-        c: replace(lenses[c], name=c, viewmat=from_anchor[c] @ inverse(to_rig), view=None)
-        for c in cameras
+        c: replace(lens, name=c, viewmat=from_anchor[c] @ from_rig, view=None)
+        for c, lens in lenses.items()
     }
 
 
 def _level(viewmats: Poses, names: Sequence[str]) -> Pose:
     """Return rig-to-anchor: the origin amid the cameras, z where they look on average, x level.
 
-    Where they look all around, z is where the one called "front" looks, else the first one.
-
-    Args:
-        viewmats: anchor-to-camera.
-        names: of the cameras.
+    Where they look all around, z is where the one called "front" looks, else the first one. The
+    viewmats are anchor-to-camera.
     """
     up = up_direction(viewmats)
-    axes = viewmats[:, 2, :3]
-    forward = axes.mean(0) - (axes.mean(0) @ up) * up
+    level = viewmats[:, 2, :3] - np.outer(viewmats[:, 2, :3] @ up, up)
+    forward = level.mean(0)
     fronts = [k for k, name in enumerate(names) if "front" in name.lower()]
     if np.linalg.norm(forward) < ALL_AROUND and (fronts or np.linalg.norm(forward) < 0.1):
-        first = min(fronts, key=lambda k: len(names[k])) if fronts else 0
-        forward = axes[first] - (axes[first] @ up) * up
+        forward = level[min(fronts, key=lambda k: len(names[k])) if fronts else 0]
     z = forward / np.linalg.norm(forward)
     rotation = np.stack([np.cross(z, up), -up, z], axis=1)
-    return rigid(rotation, inverse(viewmats)[:, :3, 3].mean(0))
+    return pose_of(rotation, camera_centers(viewmats).mean(0))

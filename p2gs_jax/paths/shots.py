@@ -1,4 +1,7 @@
-"""Shots: pictures to render of a fitted scene, with pose, lens, exposure and gamma."""
+"""Shots: pictures to render of a fitted scene, with pose, lens, exposure and gamma.
+
+Poses are 4x4 matrices in float64 with OpenCV's axes: x right, y down, z forward.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +13,19 @@ from pathlib import PurePosixPath
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.lens import scale_intrinsics
 from p2gs_jax.scene.pixels.store import camera_at
+from p2gs_jax.scene.rigid import nearest_rotation
 from p2gs_jax.types import Camera, View
+
+Pose = Float[np.ndarray, "4 4"]
+Poses = Float[np.ndarray, "n 4 4"]
+LARGEST = 16384  # pixels
+# Tolerance of rotations that were written with few digits; they are made orthonormal again.
+TOLERANCE = 0.01
 
 
 @dataclass(frozen=True)
@@ -34,7 +45,7 @@ class Shot:
     """
 
     name: str
-    viewmat: Float[np.ndarray, "4 4"]
+    viewmat: Pose
     K: Float[np.ndarray, "3 3"]
     width: int
     height: int
@@ -56,18 +67,12 @@ class Shot:
 
 
 def view_shots(views: Sequence[View], max_width: int | None = None) -> list[Shot]:
-    """Return a shot for every view of a scene, in order.
-
-    Args:
-        views: of the scene.
-        max_width: pixels that a fit reduced them to, or None.
-    """
+    """Return a shot for every view of a scene, in order, at most `max_width` pixels across."""
     out = []
     for row, view in enumerate(views):
         K, width, height = camera_at(view, max_width)
         name = PurePosixPath(view.name).with_suffix("").as_posix()
-        viewmat = np.asarray(view.viewmat, np.float64)
-        K = np.asarray(K, np.float64)
+        viewmat, K = np.asarray(view.viewmat, np.float64), np.asarray(K, np.float64)
         out.append(Shot(name, viewmat, K, width, height, view=row, time=view.time))
     return out
 
@@ -75,13 +80,8 @@ def view_shots(views: Sequence[View], max_width: int | None = None) -> list[Shot
 def of_camera(shots: Sequence[Shot], views: Sequence[View], camera: str | None) -> list[Shot]:
     """Return the shots that one physical camera took, in order of names.
 
-    Args:
-        shots: of the scene's views.
-        views: of the scene.
-        camera: which; None takes that with the most shots, the first of several.
-
-    Raises:
-        UserError: there is no such camera among them.
+    None takes the camera with the most shots, the first of several. A UserError says that a camera
+    took none.
     """
     cameras = [views[s.view].camera for s in shots if s.view is not None]
     counts = Counter(cameras)
@@ -99,3 +99,66 @@ def common_lens(shots: Sequence[Shot]) -> tuple[Float[np.ndarray, "3 3"], int, i
     (width, height), _ = Counter((s.width, s.height) for s in shots).most_common(1)[0]
     same = [s.K for s in shots if (s.width, s.height) == (width, height)]
     return np.median(same, axis=0), width, height
+
+
+def pose_of(rotation: Float[np.ndarray, "... 3 3"], translation: Float[np.ndarray, "... 3"]):
+    """Return 4x4 matrices of rotations and translations."""
+    out = np.zeros((*rotation.shape[:-2], 4, 4))
+    out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = rotation, translation, 1
+    return out
+
+
+def make_camera(K: ArrayLike, viewmat: ArrayLike, width: int, height: int) -> Camera:
+    """Return a pinhole camera to render from.
+
+    Args:
+        K: 3x3, pixels, pixel centres at +0.5, without skew.
+        viewmat: 4x4, world-to-camera, OpenCV axes, in the coordinates of the scene.
+        width: pixels.
+        height: pixels.
+
+    Raises:
+        UserError: an argument has another shape or meaning.
+    """
+    fix = "docs/conventions.md says what K and viewmat are"
+    for name, value in (("width", width), ("height", height)):
+        if not isinstance(value, int | np.integer) or not 1 <= value <= LARGEST:
+            why = f"the camera's {name} {value!r} is not a whole number from 1 to {LARGEST}"
+            raise UserError(f"{why}.", fix=fix)
+    try:
+        lens, pose = checked_lens(K), checked_pose(viewmat, "viewmat")
+    except ValueError as error:
+        raise UserError(f"the camera {error}.", fix=fix) from None
+    return Shot("", pose, lens, int(width), int(height)).camera()
+
+
+def as_matrix(values: ArrayLike, name: str, size: int) -> Float[np.ndarray, "n n"]:
+    """Return a square matrix of finite numbers; a ValueError says that values are not one."""
+    try:
+        out = np.array(values, np.float64)
+    except (TypeError, ValueError):
+        out = np.zeros(0)
+    if out.shape == (size * size,):
+        out = out.reshape(size, size)
+    if out.shape != (size, size) or not np.isfinite(out).all():
+        raise ValueError(f"has a {name} that is not a {size}x{size} matrix of finite numbers")
+    return out
+
+
+def checked_lens(values: ArrayLike) -> Float[np.ndarray, "3 3"]:
+    """Return the camera matrix of a pinhole without skew; a ValueError says what it is not."""
+    K = as_matrix(values, "K", 3)
+    if K[0, 0] <= 0 or K[1, 1] <= 0 or not np.array_equal(K[2], [0, 0, 1]):
+        raise ValueError("has a K with no positive focal lengths, or a last row other than 0 0 1")
+    if K[0, 1] != 0 or K[1, 0] != 0:
+        raise ValueError("has a K with skew, which the renderer does not know")
+    return K
+
+
+def checked_pose(values: ArrayLike, name: str) -> Pose:
+    """Return a pose with an orthonormal rotation; a ValueError says that it is not a pose."""
+    matrix = as_matrix(values, name, 4)
+    rotation = nearest_rotation(matrix[:3, :3], TOLERANCE)
+    if rotation is None or not np.allclose(matrix[3], [0, 0, 0, 1], atol=TOLERANCE):
+        raise ValueError(f"has a {name} that is not a rotation and a translation")
+    return pose_of(rotation, matrix[:3, 3])

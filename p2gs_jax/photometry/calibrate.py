@@ -1,27 +1,59 @@
-"""From observations to exposures, whatever their source: the one way through the adjustment."""
+"""From observations to exposures, whatever their source: model only what the scene needs.
+
+What varies, times curves, is judged on held-out colours. Criterion: expected log predictive density
+of held-out observations in display units, so that models under different curves can be compared.
+The simplest model within max(2 standard errors, 0.01 nat) of the best is taken; the best itself
+over-selects (docs/photometry.md, 5). So is one whose predictions nobody could tell from the best's:
+sharp, noise-free images otherwise earn a gamma per view for differences of a hundredth of a stop
+(BUILD_NOTES). Curve and model are chosen together: a wrong curve fixed first drives every criterion
+to a gamma per view; so would a white balance that is left out.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
+
+import numpy as np
 
 from p2gs_jax.config import FitConfig, PhotometryConfig
+from p2gs_jax.core.numerics import LN2
+from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.photometry.adjustment.fit import fit_model
 from p2gs_jax.photometry.adjustment.problem import KnownExposures, Problem, make_problem
-from p2gs_jax.photometry.adjustment.solve import fit_response
-from p2gs_jax.photometry.models import Curve, Form
+from p2gs_jax.photometry.adjustment.solve import EXPOSURES, MOST_ROUNDS, fit_response
+from p2gs_jax.photometry.candidates import Candidate, Comparison, choose
+from p2gs_jax.photometry.models import (
+    MODELS,
+    Choice,
+    Curve,
+    Form,
+    Scope,
+    channel_powers,
+    neighbours,
+    parameter_count,
+)
 from p2gs_jax.photometry.observations import COARSEST, Observations
-from p2gs_jax.photometry.response import BASES, Response
-from p2gs_jax.photometry.selection import Selection, select
+from p2gs_jax.photometry.response import BASES, Response, spline_parameters
+from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.scene.exposures import read_known_exposures
 from p2gs_jax.types import Scene
 
 # Points of a view that a given kind of curve is fitted to.
 RESPONSE_PER_VIEW = 200
+HELD_OUT = 0.2
+# A response needs this spread of exposures, stops.
+SPLINE_SPREAD_EV = 0.2
+# Candidates are compared on at most this many observations; the chosen one is solved on all.
+MOST_OBSERVATIONS = 40_000
+# A curve has few parameters; its basis is the most expensive one.
+SPLINE_OBSERVATIONS = 12_000
+# Choices that are compared at most.
+MOST_COMPARED = 80
 
-Choice = Literal["held_out", "one_response"] | tuple[Form, Response | Curve]
+OnChosen = Callable[[Form, Response], None]
 
 
 @dataclass(frozen=True)
@@ -31,23 +63,28 @@ class CalibrationOptions:
     black: float  # values up to here say nothing
     saturation: float  # values from here on say nothing
     pivot: float  # linear value that gamma leaves alone
-    known: KnownExposures | None = None  # exposures known beforehand, or None
+    known: KnownExposures | None = None  # used in the final solution only
     seed: int = 0  # which observations are held out
     # What varies, and the curve: those that predict held-out colours, an exposure per view under
     # one fitted response (stacks), or given ones; of a kind of curve, the splines are fitted.
-    choice: Choice = "held_out"
-    # What the photographs are, where their curve is known to be sRGB's (`Scene.known_response`): no
-    # other is compared with held-out colours.
+    choice: Literal["held_out", "one_response"] | tuple[Form, Response | Curve] = "held_out"
+    # What the photographs are, where they are light encoded as sRGB (`Scene.known_response`): no
+    # other curve is compared with held-out colours. None: a camera's own curve is in them.
     known_response: str | None = None
-
-    @property
-    def limits(self) -> dict[str, Any]:
-        """What `make_problem` and `select` are given besides observations."""
-        return {k: getattr(self, k) for k in ("black", "saturation", "pivot", "known")}
 
     def problem(self, observations: Observations) -> Problem:
         """Lay observations out for the adjustment."""
-        return make_problem(observations, **self.limits)
+        limits = {"black": self.black, "saturation": self.saturation, "pivot": self.pivot}
+        return make_problem(observations, **limits, known=self.known)
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What was chosen, and why."""
+
+    solution: PhotometricSolution  # the chosen model on all observations
+    candidates: tuple[Candidate, ...]  # everything compared, the best density first
+    reasons: tuple[str, ...]  # sentences for the user
 
 
 def options_of(cfg: FitConfig, scene: Scene) -> CalibrationOptions:
@@ -69,12 +106,12 @@ def options_of(cfg: FitConfig, scene: Scene) -> CalibrationOptions:
         pivot=p.pivot,
         known=known,
         seed=cfg.train.seed,
-        choice="held_out" if p.select else _given(p),
+        choice="held_out" if p.select else _asked(p),
         known_response=scene.known_response,
     )
 
 
-def _given(p: PhotometryConfig) -> tuple[Form, Response | Curve]:
+def _asked(p: PhotometryConfig) -> tuple[Form, Response | Curve]:
     """Return what varies and the curve as the options say."""
     form = Form(p.model, p.white_balance, p.vignetting)
     if p.curve == "spline" and p.spline is None:
@@ -91,13 +128,18 @@ def _given(p: PhotometryConfig) -> tuple[Form, Response | Curve]:
 def calibrate_observations(
     observations: Observations,
     options: CalibrationOptions,
-    on_chosen: Callable[[Form, Response], None] = lambda form, response: None,
+    on_chosen: OnChosen = lambda form, response: None,
 ) -> Selection:
     """Choose the photometric model and solve it.
 
     `on_chosen` receives a choice by held-out colours before it is solved on all observations.
     """
-    selection = _solved(observations, options, on_chosen)
+    if options.choice == "held_out":
+        selection = _chosen(observations, options, on_chosen)
+    elif options.choice == "one_response":
+        selection = _by_one_response(options.problem(observations))
+    else:
+        selection = _given(observations, options, *options.choice)
     coarse = observations.too_coarse
     if not coarse:
         return selection
@@ -108,27 +150,22 @@ def calibrate_observations(
     return dataclasses.replace(selection, reasons=(said, *selection.reasons))
 
 
-def _solved(observations: Observations, options: CalibrationOptions, on_chosen) -> Selection:
-    if options.choice == "held_out":
-        how = {"known_response": options.known_response, "seed": options.seed}
-        return select(observations, **options.limits, **how, on_chosen=on_chosen)
-    problem = options.problem(observations)
-    if options.choice == "one_response":
-        return _solved_by_one_response(problem)
-    form, response = options.choice
-    notes: tuple[str, ...] = ()
-    if isinstance(response, Curve):
+def _given(
+    observations: Observations, options: CalibrationOptions, form: Form, curve: Response | Curve
+) -> Selection:
+    """Solve a form under a response, or under a kind of curve whose splines are fitted."""
+    problem, notes = options.problem(observations), ()
+    if isinstance(curve, Curve):
         few = problem.part(observations.thinned(RESPONSE_PER_VIEW, options.seed))
-        beside = form._replace(model="view_exposure")
-        by = response.splines or "all"
-        fitted = fit_response(few, Response(response.base), form=beside, by=by)
+        base, beside = Response(curve.base), form._replace(model="view_exposure")
+        fitted = fit_response(few, base, form=beside, by=curve.splines or "all")
         if fitted is None:
-            notes = (f"A fitted response collapsed: {response.base} was used as it is.",)
-        response = fitted or Response(response.base)
-    return Selection(fit_model(problem, form, response), (), notes)
+            notes = (f"A fitted response collapsed: {curve.base} was used as it is.",)
+        curve = fitted or base
+    return Selection(fit_model(problem, form, curve), (), notes)
 
 
-def _solved_by_one_response(problem: Problem) -> Selection:
+def _by_one_response(problem: Problem) -> Selection:
     """Solve an exposure per view under the base curve whose fitted spline leaves least unexplained.
 
     A stack holds every level of tone often, so nothing needs to be chosen by held-out colours.
@@ -139,3 +176,156 @@ def _solved_by_one_response(problem: Problem) -> Selection:
         collapsed = "A fitted response collapsed: sRGB was used as it is."
         return Selection(fit_model(problem, "view_exposure"), (), (collapsed,))
     return Selection(min(options, key=lambda s: s.residual_ev), (), ())
+
+
+def _subset(observations: Observations, seed: int, most: int) -> Observations:
+    """Return the observations of randomly chosen points, not more than `most`."""
+    o = observations
+    if len(o.points) <= most:
+        return o
+    rng = generator(seed, Stream.COMPARED_POINTS)
+    order = rng.permutation(o.point_count)
+    lengths = np.bincount(o.points, minlength=o.point_count)[order]
+    kept = order[np.cumsum(lengths) <= most]
+    chosen = np.zeros(o.point_count, bool)
+    chosen[kept] = True
+    return o.picked(chosen[o.points])
+
+
+def _chosen(
+    observations: Observations, options: CalibrationOptions, on_chosen: OnChosen
+) -> Selection:
+    """Choose what varies and the curve on held-out observations, and solve that on all of them."""
+    seed, blind = options.seed, dataclasses.replace(options, known=None)
+    small = blind.problem(_subset(observations, seed, MOST_OBSERVATIONS))
+    held = generator(seed, Stream.HELD_OUT).random(len(small.observations.points)) < HELD_OUT
+    training = blind.problem(_subset(small.observations.picked(~held), seed, SPLINE_OBSERVATIONS))
+    comparison = Comparison(small, held)
+    search = _Search(comparison, training, known=options.known_response is not None)
+    notes = search.first()
+    if options.known_response is not None:
+        notes = [
+            f"The tone curve is known ({options.known_response}): none was fitted, and of light "
+            "encoded as sRGB it is sRGB's."
+        ]
+    chosen = search.rest()
+    on_chosen(chosen.form, chosen.response)
+    candidates = sorted(comparison.judged(), key=lambda c: -c.density)
+    if loose := sum(not f.converged for f, _ in comparison.fits.values()):
+        notes.append(
+            f"{loose} of the {len(candidates)} models compared had not settled after "
+            f"{MOST_ROUNDS} rounds; they are judged as they were then."
+        )
+    solution = fit_model(options.problem(observations), chosen.form, chosen.response)
+    return Selection(solution, tuple(candidates), (*notes, *_reasons(chosen, candidates)))
+
+
+class _Search:
+    """Choices compared on held-out colours, with splines fitted on some of the others.
+
+    If the curve is `known`, it is sRGB's. `spread` is the standard deviation of the exposures under
+    sRGB, log units; `scope` is what there is to choose from.
+    """
+
+    def __init__(self, comparison: Comparison, training: Problem, *, known: bool):
+        self.comparison, self._training = comparison, training
+        o = comparison.problem.observations
+        cameras = int(o.cameras.max(initial=0)) + 1
+        self._fitted: dict[tuple[Form, Curve], Response | None] = {}
+        exposures = comparison.solve(Choice(EXPOSURES), Response()).theta.b
+        self.spread = float(np.std(exposures))
+        told = self.spread / LN2 >= SPLINE_SPREAD_EV
+        self.scope = Scope(cameras, o.positions is not None, told, known)
+
+    def response(self, choice: Choice) -> Response | None:
+        """Return the curve of a choice, fitted beside what cameras do; None: it collapsed."""
+        curve = choice.curve
+        if curve.splines is None:
+            return Response(curve.base)
+        form = choice.form._replace(model="view_exposure")
+        key = form, curve
+        if key not in self._fitted:
+            base, by = Response(curve.base), curve.splines
+            self._fitted[key] = fit_response(
+                self._training, base, form=form, by=by, spread=self.spread
+            )
+        return self._fitted[key]
+
+    def parameters(self, choice: Choice) -> int:
+        """Return the number of free parameters of a choice, its curve not fitted yet."""
+        views, cameras = self.comparison.problem.observations.view_count, self.scope.cameras
+        count = parameter_count(choice.form, Response(), cameras, views)
+        by = choice.curve.splines
+        return count + spline_parameters(by, cameras) - channel_powers(choice.form, by)
+
+    def solve(self, choices: Iterable[Choice]) -> bool:
+        """Solve choices that are possible and not solved yet; return whether there were any."""
+        found = False
+        for choice in choices:
+            if choice in self.comparison.fits or not self.scope.allows(choice):
+                continue
+            if (response := self.response(choice)) is not None:
+                self.comparison.solve(choice, response)
+                found = True
+        return found
+
+    def first(self) -> list[str]:
+        """Solve models under curves, and exposures with what cameras may do besides.
+
+        What the user should know of curves left out is returned.
+        """
+        curves = [*(Curve(base) for base in BASES), Curve("srgb", "all")]
+        self.solve(Choice(Form(model), curve) for curve in curves for model in MODELS)
+        richest = Form("view_exposure", "view", "camera" if self.scope.places else None)
+        self.solve(Choice(richest, curve) for curve in curves)
+        # One response for different cameras may collapse where theirs would not.
+        for by in ("camera", "channel"):
+            self.solve(Choice(form, Curve("srgb", by)) for form in (EXPOSURES, richest))
+        if not self.scope.curves:
+            return [
+                f"Exposures differ by {self.spread / LN2:.2f} EV (standard deviation): too little "
+                "to tell the shape of the tone curve, so only standard curves were tried."
+            ]
+        if all(response is None for response in self._fitted.values()):
+            return ["A fitted tone curve collapsed; only standard curves were compared."]
+        return []
+
+    def rest(self) -> Candidate:
+        """Compare what is one step from the choice, or simpler than the best; choose."""
+        while True:
+            candidates = self.comparison.judged()
+            chosen = choose(candidates)
+            best = max(candidates, key=lambda c: c.density)
+            near = neighbours(chosen.choice, self.scope)
+            near += [
+                choice
+                for choice in neighbours(best.choice, self.scope)
+                if self.parameters(choice) < best.parameters
+            ]
+            if len(candidates) > MOST_COMPARED or not self.solve(near):
+                return chosen
+
+
+def _reasons(chosen: Candidate, candidates: list[Candidate]) -> list[str]:
+    out = [f"Chosen: {chosen.name} curve."]
+    simpler = [c for c in candidates if c.parameters < chosen.parameters]
+    if simpler:
+        c = max(simpler, key=lambda c: c.density)
+        out.append(
+            f"Simpler ({c.name}) predicts held-out colours worse: log-likelihood lower by "
+            f"{chosen.density - c.density:.3f} per observation (0.01 is little, 1 a lot)."
+        )
+    richer = [c for c in candidates if c.parameters > chosen.parameters]
+    if richer:
+        c = max(richer, key=lambda c: c.density)
+        out.append(
+            f"Richer ({c.name}) would gain {c.density - chosen.density:.3f} of held-out "
+            f"log-likelihood per observation for {c.parameters - chosen.parameters} more "
+            "parameters."
+        )
+    if not chosen.likely:
+        out.append(
+            f"What predicts best ({candidates[0].name}) differs by at most "
+            f"{chosen.difference:.1f} 8-bit levels in any view."
+        )
+    return out

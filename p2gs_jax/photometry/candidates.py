@@ -73,6 +73,13 @@ def choose(candidates: list[Candidate]) -> Candidate:
     return max(as_simple, key=lambda c: c.density)
 
 
+class Predicted(NamedTuple):
+    """What a fit says about held-out observations, NaN where it can say nothing."""
+
+    densities: Densities  # log densities
+    errors: Float[np.ndarray, "h 3"]  # photographed minus predicted display values
+
+
 class Comparison:
     """Choices solved so far, and how well they predict what was `held` out.
 
@@ -105,32 +112,31 @@ class Comparison:
             self._scale, self._predicted = scale, {}
         for choice, (fit, response) in self.fits.items():
             if choice not in self._predicted:
-                predicted = predict_held_out(self.problem, fit, response, self._where, scale)
+                predicted = _predict(self.problem, fit, response, self._where, scale)
                 self._predicted[choice] = predicted
         density = {k: _mean(p.densities) for k, p in self._predicted.items()}
         best = self._predicted[max(density, key=lambda k: density[k])]
-        o = self.problem.observations
+        return [self._candidate(k, density[k], p, best) for k, p in self._predicted.items()]
+
+    def _candidate(
+        self, choice: Choice, density: float, found: Predicted, best: Predicted
+    ) -> Candidate:
+        o, response = self.problem.observations, self.fits[choice][1]
         cameras = int(o.cameras.max(initial=0)) + 1
-        return [
-            Candidate(
-                choice,
-                response := self.fits[choice][1],
-                parameters=parameter_count(choice.form, response, cameras, o.view_count),
-                density=density[choice],
-                difference=largest_difference(best.errors, found.errors, self._views, o.view_count),
-                **self._deficit(best.densities, found.densities),
-            )
-            for choice, found in self._predicted.items()
-        ]
-
-    def _deficit(self, best: Densities, other: Densities):
-        """Return the deficit and its error: neighbours in an image err alike, as do its pixels."""
-
-        def over(labels: Labels):
-            return mean_deficit(best, other, labels, int(labels.max(initial=-1)) + 1)
-
-        (deficit, of_views), (_, of_regions) = over(self._views), over(self._regions)
-        return {"deficit": deficit, "deficit_error": max(of_views, of_regions)}
+        # Neighbours in an image err alike, as do its pixels.
+        lower = best.densities - found.densities
+        (deficit, of_views), (_, of_regions) = (
+            _mean_deficit(lower, labels) for labels in (self._views, self._regions)
+        )
+        return Candidate(
+            choice,
+            response,
+            parameter_count(choice.form, response, cameras, o.view_count),
+            density,
+            deficit,
+            max(of_views, of_regions),
+            _largest_difference(best.errors - found.errors, self._views),
+        )
 
 
 def _mean(densities: Densities) -> float:
@@ -138,14 +144,7 @@ def _mean(densities: Densities) -> float:
     return -np.inf if np.isnan(densities).all() else float(np.nanmean(densities))
 
 
-class Predicted(NamedTuple):
-    """What a fit says about held-out observations, NaN where it can say nothing."""
-
-    densities: Densities  # log densities
-    errors: Float[np.ndarray, "h 3"]  # photographed minus predicted display values
-
-
-def predict_held_out(
+def _predict(
     problem: Problem, fit: Fit, response: Response, held: np.ndarray, scale: float
 ) -> Predicted:
     """Return what a fit says about observations in rows `held`, which it was not fitted to.
@@ -176,25 +175,19 @@ def predict_held_out(
     )
 
 
-def largest_difference(
-    a: Float[np.ndarray, "h 3"], b: Float[np.ndarray, "h 3"], views: Labels, view_count: int
-) -> float:
-    """Return the RMS difference of errors in the view where it is largest, 8-bit levels."""
-    difference = a - b
+def _largest_difference(difference: Float[np.ndarray, "h 3"], views: Labels) -> float:
+    """Return the RMS of differences in the view where it is largest, 8-bit levels."""
     known = np.isfinite(difference)
-    squares = np.bincount(views, (np.where(known, difference, 0.0) ** 2).sum(1), view_count)
-    counts = np.bincount(views, known.sum(1), view_count)
+    squares = np.bincount(views, (np.where(known, difference, 0.0) ** 2).sum(1))
+    counts = np.bincount(views, known.sum(1))
     return float(255 * np.sqrt((squares / np.maximum(counts, 1)).max(initial=0.0)))
 
 
-def mean_deficit(
-    best: Densities, other: Densities, views: Labels, view_count: int
-) -> tuple[float, float]:
-    """Return by how much log densities are lower on average, and its standard error over views."""
-    difference = best - other
-    known = np.isfinite(difference)
+def _mean_deficit(difference: Densities, labels: Labels) -> tuple[float, float]:
+    """Return the mean of what is known, and its standard error over views or regions."""
+    known, count = np.isfinite(difference), int(labels.max(initial=-1)) + 1
     if not known.any():
         return 0.0, np.inf
-    sums = np.bincount(views[known], difference[known], view_count)
-    error = sums.std() * np.sqrt(view_count) / known.sum()
+    sums = np.bincount(labels[known], difference[known], count)
+    error = sums.std() * np.sqrt(count) / known.sum()
     return float(difference[known].mean()), float(error)

@@ -19,7 +19,7 @@ from scipy.special import fdtrc, stdtr, stdtrit
 
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.photometry.adjustment.problem import Problem
-from p2gs_jax.photometry.observations import Labels, Observations, PerChannel
+from p2gs_jax.photometry.observations import Observations, PerChannel
 from p2gs_jax.photometry.response import DARKEST, log_exposed
 from p2gs_jax.photometry.solution import PhotometricSolution
 
@@ -39,6 +39,8 @@ CLIPPED = 3.0
 DARK, SOURCE = 0.35, 250 / 255
 # A veil that is looked for: light where all is light, 1 = white. Its size is then found.
 VEIL = 0.05
+# As many degrees of freedom make a t value normal.
+MANY = 1e6
 # Smooth residuals of a stack above this many stops, at equal brightness, mean local tone mapping.
 LOCAL_EV = 0.075
 # Rows and columns of a stack's regions.
@@ -123,7 +125,11 @@ def neighbourhood(
     around = np.full(len(seen), np.nan) if o.surroundings is None else o.surroundings - 0.0
     for mine in of_view if o.surroundings is not None else ():
         around[mine] -= around[mine].mean() if len(mine) else 0.0
-    moved = around - _point_means(around, o.points, o.point_count)
+    # Less the mean over all views of each observation's point; NaN do not count.
+    known = np.isfinite(around)
+    seen_by = np.bincount(o.points[known], minlength=o.point_count)
+    of_point = np.bincount(o.points[known], around[known], o.point_count) / np.maximum(seen_by, 1)
+    moved = around - of_point[o.points]
     for view, mine in enumerate(of_view):
         good = mine[seen[mine]]
         if len(good) < FEWEST:
@@ -141,14 +147,6 @@ def neighbourhood(
         found["local"][view] = _local(flat, other, around[good], moved[good], block)
         found["flare"][view] = _flare(flat, other, value[good], places, lamps, block)
     return found
-
-
-def _point_means(values: Float[np.ndarray, " o"], points: Labels, count: int):
-    """Return the mean over all views of each observation's point; NaN do not count."""
-    known = np.isfinite(values)
-    total = np.bincount(points[known], values[known], count)
-    seen = np.bincount(points[known], minlength=count)
-    return (total / np.maximum(seen, 1))[points]
 
 
 def _without_value(residual: Values, value: Values) -> Values:
@@ -210,11 +208,7 @@ def _slope(y: Values, x: Values, block: Blocks) -> tuple[float, float]:
     effective = max(1.0 / float(share @ share) - 1, 1.0)
     t = slope / (error + 1e-12)
     chance = float(stdtr(effective, -abs(t)))
-    return slope, float(np.sign(t)) * abs(float(stdtrit(1e6, max(chance, 1e-300))))
-
-
-def _chance(t: float) -> float:
-    return float(stdtr(1e6, -t))
+    return slope, float(np.sign(t)) * abs(float(stdtrit(MANY, max(chance, 1e-300))))
 
 
 def _beside(other: Table, x: Values) -> Values:
@@ -238,7 +232,7 @@ def _local(flat: Values, other: Table, around: Values, moved: Values, block: Blo
     spread = float(_beside(other[:, [0, -2, -1]], around[known]).std())
     for x in (s, w):
         slope, t = _slope(r, x, block[known])
-        chance = min(2 * _chance(-t), 1.0)
+        chance = min(2 * float(stdtr(MANY, t)), 1.0)
         if chance <= best.chance:
             best = Evidence(-2 * slope * spread, chance)
     return best
@@ -255,7 +249,7 @@ def _flare(
     veil = np.log2(1 + VEIL * np.exp(-distance / REACH).mean(1) * 2.0**-value)
     spread = float(veil[value <= np.quantile(value, DARK)].std())
     slope, t = _slope(_beside(other, flat), _beside(other, veil), block)
-    return Evidence(2 * slope * spread, _chance(t))
+    return Evidence(2 * slope * spread, float(stdtr(MANY, -t)))
 
 
 def neighbourhood_warnings(

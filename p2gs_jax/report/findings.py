@@ -27,7 +27,7 @@ CORRECTIONS = {
     "curve": "a curve",
     "luminance": "colour axes and an enhancing curve",
 }
-# How sentences of the photometric selection begin (photometry/selection.py).
+# How sentences of the photometric selection begin (photometry/calibrate.py).
 REASONS = ("Chosen:", "Simpler (", "Richer (", "What predicts best")
 # Least gap between the PSNR of training and held-out views, dB.
 WIDE_GAP = 4.0

@@ -80,10 +80,7 @@ class SceneMeasurements:
 def measure_scene(files: RunFiles, reporter: Reporter, *, render: bool = True) -> SceneMeasurements:
     """Load the scene and measure what the page needs; without a scene, say so in `missing`.
 
-    Args:
-        files: the run folder.
-        reporter: receives progress.
-        render: False reads only the true exposures.
+    Where `render` is False, only the true exposures are read.
     """
     out = SceneMeasurements()
     try:

@@ -15,8 +15,8 @@ from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.evaluation.evaluate import ViewResult
 from p2gs_jax.formats.exr import write_exr
+from p2gs_jax.formats.frames import write_png
 from p2gs_jax.formats.ply import write_ply, write_radiance
-from p2gs_jax.formats.png import write_png
 from p2gs_jax.gaussians.bake import bake, display_comments, display_of_splats
 from p2gs_jax.gaussians.posed import posed
 from p2gs_jax.photometry.display import develop, usual_display
@@ -43,15 +43,7 @@ def write_start(
     cfg: FitConfig,
     decisions: Decisions,
 ) -> None:
-    """Write what was asked and what was decided: the folder is a run's from here on.
-
-    Args:
-        folder: of the run.
-        scene: folder or file that is fitted.
-        reference: photographs of the same views under one common exposure, or None.
-        cfg: as asked.
-        decisions: of the scene.
-    """
+    """Write what was asked and what was decided: the folder is a run's from here on."""
     write_decisions(folder.decisions, decisions)
     write_json(
         folder.config,
@@ -63,7 +55,7 @@ def write_start(
     )
 
 
-def write_results(
+def write_run(
     folder: RunFolder,
     params: Params,
     scene: Scene,

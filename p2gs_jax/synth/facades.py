@@ -7,15 +7,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from p2gs_jax.synth.textures import (
-    Point,
-    as_column,
-    detail,
-    hash1,
-    hash3,
-    slab,
-    smooth,
-)
+from p2gs_jax.synth.textures import Point, as_column, detail, hash1, hash3, slab, smooth
 from p2gs_jax.synth.town import FLOOR_HEIGHT, GROUND_FLOOR_HEIGHT, KERB_HEIGHT
 
 

@@ -13,15 +13,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from p2gs_jax.synth.facades import awning, car_body, car_glass, facade, tiles, wheel
-from p2gs_jax.synth.textures import (
-    Point,
-    Surface,
-    as_column,
-    detail,
-    hash1,
-    smooth,
-    value_noise,
-)
+from p2gs_jax.synth.textures import Point, Surface, as_column, detail, hash1, smooth, value_noise
 from p2gs_jax.synth.town import CROSS_STREET, ROAD_HALF_WIDTH, Material, Town
 
 # Wavelengths of noise by material, m; others have the defaults of `_point`.

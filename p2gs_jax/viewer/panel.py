@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import get_args
+from typing import TYPE_CHECKING, Any, get_args
 
+import numpy as np
 import viser
 
-from p2gs_jax.viewer.legend import note
-from p2gs_jax.viewer.panel_interface import PanelActions, RunInfo
-from p2gs_jax.viewer.picture_modes import Mode
-from p2gs_jax.viewer.save import SAVED_WIDTHS
-from p2gs_jax.viewer.settings import ChosenCurve, Settings
+from p2gs_jax.photometry.formation import darkens
+from p2gs_jax.viewer.pictures import SAVED_WIDTHS, Mode, exposure_legend, note
+from p2gs_jax.viewer.settings import ChosenCurve, Settings, common_settings, exposures_ev
+from p2gs_jax.viewer.viewed_run import ViewedRun
+
+if TYPE_CHECKING:
+    from p2gs_jax.viewer.session import BrowserSession
 
 MODES: dict[str, Mode] = {
     "picture": "display",
@@ -25,21 +28,39 @@ MEAN = "mean of all"
 NOWHERE = "choose ..."
 FULL, SPLATS = "full (linear light)", "browser splats (fast)"
 KEYS = "Drag to orbit, right-drag to pan, scroll to approach; W A S D Q E fly, arrows turn."
+HINTS = {
+    "Show": "The split needs a camera that stands where a photograph was taken.",
+    "Split": "Share of the photograph, from the left.",
+    "Exposure": "Stops (EV) from the mean exposure of the training photographs.",
+    "Auto exposure": "The exposure follows what is seen, as the camera's did; the slider adds.",
+    "Gamma": "2.2 is the curve itself; middle grey stays where it is.",
+    "Red / green": "White balance: gain over green in stops (EV).",
+    "Blue / green": "White balance: gain over green in stops (EV).",
+    "Vignetting": "Darkens towards the corners as the camera of the matched photo does.",
+    "Curve": "The tone curve from exposed light to display values.",
+    "Match photo": "Sets all of this as a photograph was taken.",
+    "Renderer": "Browser splats move at any speed, but mix display values instead of light.",
+    "Go to": "Stands where a photograph was taken, and matches its exposure and gamma.",
+    "Lock exposure": "Go to, previous, next and split leave exposure, gamma and curve as they are.",
+    "FOV": "Vertical field of view, degrees.",
+    "Cameras": "Where photographs were taken; click one to go there.",
+    "Camera size": "Times the usual.",
+    "Speed": "Photographs per second.",
+    "Each photo's exposure": "Plays with the exposure of every photograph, instead of one for all.",
+    "Width": "Pixels across, {} to {}; the height follows the window.".format(*SAVED_WIDTHS),
+}
 
 
 class Panel:
     """The controls of one browser."""
 
-    def __init__(self, gui: viser.GuiApi, info: RunInfo, actions: PanelActions):
-        """Add the controls to the page.
-
-        Args:
-            gui: of the client.
-            info: of the run.
-            actions: called by the controls.
-        """
-        self._gui, self._info, self._actions = gui, info, actions
-        self._taken_as: int | None = info.start.taken_as
+    def __init__(self, gui: viser.GuiApi, viewed: ViewedRun, actions: BrowserSession):
+        """Add the controls to a client's page; they call the actions."""
+        run = viewed.run
+        self._gui, self._viewed, self._actions = gui, viewed, actions
+        self._names = [view.name for view in run.scene.views]
+        start = common_settings(run)
+        self._taken_as: int | None = start.taken_as
         self._status = gui.add_html(note("starting ..."))
         with gui.add_folder("Picture"):
             self._add_picture()
@@ -49,171 +70,105 @@ class Panel:
             self._add_drive()
         with gui.add_folder("Save", expand_by_default=False):
             self._add_save()
-        self.put(info.start)
+        self.put(start)
+
+    def _slider(
+        self, name: str, low: float, high: float, step: float, start: float, **more: Any
+    ) -> viser.GuiInputHandle[float]:
+        more = {"marks": (), "hint": HINTS.get(name), **more}
+        return self._gui.add_slider(name, low, high, step, start, **more)
+
+    def _dropdown(self, name: str, options: list[str], **more: Any) -> viser.GuiDropdownHandle:
+        return self._gui.add_dropdown(name, options, hint=HINTS.get(name), **more)
+
+    def _checkbox(self, name: str, start: bool, **more: Any) -> viser.GuiInputHandle[bool]:
+        return self._gui.add_checkbox(name, start, hint=HINTS.get(name), **more)
 
     def _add_picture(self) -> None:
-        gui, info, actions = self._gui, self._info, self._actions
-        self._mode = gui.add_dropdown(
-            "Show",
-            list(MODES),
-            hint="The split needs a camera that stands where a photograph was taken.",
-        )
-        self._legend = gui.add_html("", visible=False)
-        self._split = gui.add_slider(
-            "Split",
-            0.0,
-            1.0,
-            0.01,
-            0.5,
-            visible=False,
-            hint="Share of the photograph, from the left.",
-        )
-        reach = float(max(8, math.ceil(info.most_ev) + 2))
-        self._exposure = gui.add_slider(
-            "Exposure",
-            -reach,
-            reach,
-            0.05,
-            0.0,
-            hint="Stops (EV) from the mean exposure of the training photographs.",
-            marks=tuple(
-                (float(ev), f"{ev:+d}" if ev else "0") for ev in (-round(reach), 0, round(reach))
-            ),
-        )
-        self._metered = gui.add_checkbox(
-            "Auto exposure",
-            False,
-            hint="The exposure follows what is seen, as the camera's did; the slider adds stops.",
-        )
-        low = min(1.0, math.floor(10 * min(info.gammas)) / 10)
-        high = max(4.0, math.ceil(10 * max(info.gammas)) / 10)
-        self._gamma = gui.add_slider(
-            "Gamma",
-            low,
-            high,
-            0.01,
-            2.2,
-            hint="2.2 is the curve itself; middle grey stays where it is.",
-            marks=((low, f"{low:g}"), (2.2, "2.2"), (high, f"{high:g}")),
-        )
-        self._add_camera_effects()
-        self._curves: dict[str, ChosenCurve] = {f"run's ({info.curve})": "run"}
-        self._curves |= {c: c for c in get_args(ChosenCurve) if c not in ("run", info.curve)}
-        self._curve = gui.add_dropdown(
-            "Curve", list(self._curves), hint="The tone curve from exposed light to display values."
-        )
-        self._match = gui.add_dropdown(
-            "Match photo",
-            [MEAN, *info.names],
-            hint="Sets all of this as a photograph was taken.",
-        )
-        self._renderer = gui.add_dropdown(
-            "Renderer",
-            [FULL, SPLATS],
-            hint="Browser splats move at any speed, but mix display values instead of light.",
-        )
-        for handle in (self._exposure, self._gamma, self._curve, self._split):
+        run, actions = self._viewed.run, self._actions
+        evs = exposures_ev(run).values()
+        gammas = [float(g) for g in np.asarray(run.params.photometry.gammas)]
+        curve = run.cfg.photometry.curve
+        self._mode = self._dropdown("Show", list(MODES))
+        self._legend = self._gui.add_html("", visible=False)
+        self._split = self._slider("Split", 0.0, 1.0, 0.01, 0.5, visible=False)
+        reach = float(max(8, math.ceil(max(map(abs, evs))) + 2))
+        marks = ((-reach, f"{-reach:+g}"), (0.0, "0"), (reach, f"{reach:+g}"))
+        self._exposure = self._slider("Exposure", -reach, reach, 0.05, 0.0, marks=marks)
+        self._metered = self._checkbox("Auto exposure", False)
+        low = min(1.0, math.floor(10 * min(gammas)) / 10)
+        high = max(4.0, math.ceil(10 * max(gammas)) / 10)
+        marks = ((low, f"{low:g}"), (2.2, "2.2"), (high, f"{high:g}"))
+        self._gamma = self._slider("Gamma", low, high, 0.01, 2.2, marks=marks)
+        self._balance: tuple[viser.GuiInputHandle[float], ...] = ()
+        if (balance := self._viewed.most_balance_ev) is not None:
+            most = float(max(2, math.ceil(balance) + 1))
+            marks = ((-most, f"{-most:+g}"), (0.0, "0"), (most, f"{most:+g}"))
+            self._balance = tuple(
+                self._slider(name, -most, most, 0.01, 0.0, marks=marks)
+                for name in ("Red / green", "Blue / green")
+            )
+        self._vignetting = self._checkbox("Vignetting", True, visible=darkens(run.cfg.photometry))
+        self._curves: dict[str, ChosenCurve] = {f"run's ({curve})": "run"}
+        self._curves |= {c: c for c in get_args(ChosenCurve) if c not in ("run", curve)}
+        self._curve = self._dropdown("Curve", list(self._curves))
+        self._match = self._dropdown("Match photo", [MEAN, *self._names])
+        self._renderer = self._dropdown("Renderer", [FULL, SPLATS])
+        look = (self._exposure, self._gamma, self._curve, self._split, self._vignetting)
+        for handle in (*look, *self._balance):
             self._when_chosen(handle, lambda _: actions.display_changed())
         self._when_chosen(self._metered, actions.set_metered)
         for handle in (self._mode, self._renderer):
             self._when_chosen(handle, lambda _: actions.mode_changed())
         self._when_chosen(self._match, lambda name: actions.take_display_of(self._index(name)))
 
-    def _add_camera_effects(self) -> None:
-        """Add white balance and vignetting, where the run models them."""
-        gui, info, changed = self._gui, self._info, self._actions.display_changed
-        self._balance: tuple[viser.GuiInputHandle[float], ...] = ()
-        if info.most_balance_ev is not None:
-            most = float(max(2, math.ceil(info.most_balance_ev) + 1))
-            self._balance = tuple(
-                gui.add_slider(
-                    name,
-                    -most,
-                    most,
-                    0.01,
-                    0.0,
-                    hint="White balance: gain over green in stops (EV).",
-                    marks=((-most, f"{-most:+g}"), (0.0, "0"), (most, f"{most:+g}")),
-                )
-                for name in ("Red / green", "Blue / green")
-            )
-        self._vignetting = gui.add_checkbox(
-            "Vignetting",
-            True,
-            visible=info.vignetting,
-            hint="Darkens towards the corners as the camera of the matched photo does.",
-        )
-        for handle in (*self._balance, self._vignetting):
-            self._when_chosen(handle, lambda _: changed())
-
     def _add_camera(self) -> None:
-        gui, info, actions = self._gui, self._info, self._actions
+        gui, actions, evs = self._gui, self._actions, exposures_ev(self._viewed.run).values()
         gui.add_html(note(KEYS))
-        self._go_to = gui.add_dropdown(
-            "Go to",
-            [NOWHERE, *info.names],
-            hint="Stands where a photograph was taken, and matches its exposure and gamma.",
-        )
+        self._go_to = self._dropdown("Go to", [NOWHERE, *self._names])
         steps = gui.add_button_group("", ["previous", "next"])
-        self._locked = gui.add_checkbox(
-            "Lock exposure",
-            False,
-            hint="Go to, previous, next and split leave exposure, gamma and curve as they are.",
-        )
-        self._fov = gui.add_slider(
-            "FOV", 5.0, 150.0, 0.5, 60.0, hint="Vertical field of view, degrees.", marks=()
-        )
-        self._cameras = gui.add_checkbox(
-            "Cameras", False, hint="Where photographs were taken; click one to go there."
-        )
-        self._size = gui.add_slider(
-            "Camera size", 0.2, 8.0, 0.1, 1.0, visible=False, hint="Times the usual.", marks=()
-        )
-        self._camera_legend = gui.add_html(info.camera_legend, visible=False)
+        self._locked = self._checkbox("Lock exposure", False)
+        fov = self._slider("FOV", 5.0, 150.0, 0.5, 60.0)
+        cameras = self._checkbox("Cameras", False)
+        size = self._slider("Camera size", 0.2, 8.0, 0.1, 1.0, visible=False)
+        legend = gui.add_html(exposure_legend(min(evs), max(evs)), visible=False)
+        self._fov = fov
 
         def choose(name: str) -> None:
             if (index := self._index(name)) is not None:
                 actions.go_to(index)
 
         def step(name: str) -> None:
-            now = self._index(self._go_to.value)
-            by = 1 if name == "next" else -1
-            count = len(info.names)
+            now, by = self._index(self._go_to.value), 1 if name == "next" else -1
+            count = len(self._names)
             actions.go_to((0 if by > 0 else count - 1) if now is None else (now + by) % count)
 
         def show(_: object) -> None:
-            self._size.visible = self._camera_legend.visible = self._cameras.value
-            actions.show_cameras(self._cameras.value, self._size.value)
+            size.visible = legend.visible = cameras.value
+            actions.show_cameras(cameras.value, size.value)
 
         self._when_chosen(self._go_to, choose)
         steps.on_click(lambda event: step(event.target.value))
-        self._when_chosen(self._fov, actions.set_fov)
-        for handle in (self._cameras, self._size):
+        self._when_chosen(fov, actions.set_fov)
+        for handle in (cameras, size):
             self._when_chosen(handle, show)
 
     def _add_drive(self) -> None:
-        gui, info, actions = self._gui, self._info, self._actions
-        names = list(info.cameras)
-        self._drive = gui.add_dropdown("Along", names, visible=len(names) > 1)
-        last = max(info.cameras[names[0]] - 1, 1)
-        self._place = gui.add_slider(
-            "Frame", 0.0, float(last), 0.01, 0.0, marks=((0.0, "0"), (float(last), str(last)))
-        )
-        self._speed = gui.add_slider(
-            "Speed", 0.2, 30.0, 0.1, 2.0, hint="Photographs per second.", marks=()
-        )
-        self._own = gui.add_checkbox(
-            "Each photo's exposure",
-            False,
-            hint="Plays with the exposure of every photograph, instead of one for all.",
-        )
-        self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY)
+        viewed, actions = self._viewed, self._actions
+        names = list(dict.fromkeys(view.camera for view in viewed.run.scene.views))
+        ends = {name: float(max(len(viewed.frames(name)) - 1, 1)) for name in names}
+        last = ends[names[0]]
+        self._drive = self._dropdown("Along", names, visible=len(names) > 1)
+        marks = ((0.0, "0"), (last, f"{last:g}"))
+        self._place = self._slider("Frame", 0.0, last, 0.01, 0.0, marks=marks)
+        self._speed = self._slider("Speed", 0.2, 30.0, 0.1, 2.0)
+        self._own = self._checkbox("Each photo's exposure", False)
+        self._play = self._gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY)
         self._playing = False
 
         def choose(name: str) -> None:
-            end = max(info.cameras[name] - 1, 1)
             self._place.value = 0.0
-            self._place.max = float(end)
+            self._place.max = ends[name]  # type: ignore
             actions.set_place(name, 0.0)
 
         def toggle(_: object) -> None:
@@ -225,23 +180,15 @@ class Panel:
         self._play.on_click(toggle)
 
     def _add_save(self) -> None:
-        gui, actions = self._gui, self._actions
         low, high = SAVED_WIDTHS
-        width = gui.add_number(
-            "Width",
-            1920,
-            min=low,
-            max=high,
-            step=1,
-            hint=f"Pixels across, {low} to {high}; the height follows the window.",
-        )
-        png = gui.add_button("PNG, as shown", icon=viser.Icon.PHOTO_DOWN)
-        exr = gui.add_button("EXR, linear light", icon=viser.Icon.FILE_DOWNLOAD)
-        png.on_click(lambda _: actions.save("png", round(width.value)))
-        exr.on_click(lambda _: actions.save("exr", round(width.value)))
+        width = self._gui.add_number("Width", 1920, min=low, max=high, step=1, hint=HINTS["Width"])
+        png = self._gui.add_button("PNG, as shown", icon=viser.Icon.PHOTO_DOWN)
+        exr = self._gui.add_button("EXR, linear light", icon=viser.Icon.FILE_DOWNLOAD)
+        png.on_click(lambda _: self._actions.save("png", round(width.value)))
+        exr.on_click(lambda _: self._actions.save("exr", round(width.value)))
 
     @staticmethod
-    def _when_chosen(handle, act: Callable) -> None:
+    def _when_chosen(handle: Any, act: Callable[[Any], object]) -> None:
         """Call `act` when a person changes a control, but not when `put` does."""
 
         def on_update(event: viser.GuiEvent) -> None:
@@ -251,16 +198,17 @@ class Panel:
         handle.on_update(on_update)
 
     def _index(self, name: str) -> int | None:
-        return self._info.names.index(name) if name in self._info.names else None
+        return self._names.index(name) if name in self._names else None
 
     def settings(self) -> Settings:
         """Return the present settings."""
+        balance = tuple(handle.value for handle in self._balance)
         return Settings(
             gamma=self._gamma.value,
             exposure_ev=self._exposure.value,
             curve=self._curves[self._curve.value],
             taken_as=self._taken_as,
-            balance_ev=self._balance_ev(),
+            balance_ev=(balance[0], balance[1]) if balance else None,
             vignetting=self._vignetting.value,
             mode=MODES[self._mode.value],
             split=self._split.value,
@@ -268,15 +216,9 @@ class Panel:
             metered=self._metered.value,
         )
 
-    def _balance_ev(self) -> tuple[float, float] | None:
-        if not self._balance:
-            return None
-        red, blue = self._balance
-        return red.value, blue.value
-
     def put(self, settings: Settings) -> None:
         """Set the controls to a display transform; the mode stays."""
-        self._taken_as = settings.taken_as
+        index = self._taken_as = settings.taken_as
         self._metered.value = settings.metered
         self._exposure.value = settings.exposure_ev
         self._gamma.value = settings.gamma
@@ -284,17 +226,16 @@ class Panel:
             handle.value = ev
         names = {value: name for name, value in self._curves.items()}
         self._curve.value = names.get(settings.curve, names["run"])
-        index = settings.taken_as
-        self._match.value = MEAN if index is None else self._info.names[index]
+        self._match.value = MEAN if index is None else self._names[index]
 
     def put_view(self, index: int, degrees: float) -> None:
         """Set the controls to the camera of a view."""
-        self._go_to.value = self._info.names[index]
+        self._go_to.value = self._names[index]
         self._fov.value = degrees
 
     def put_place(self, place: float) -> None:
         """Set the slider to a place on the drive."""
-        self._place.value = min(place, self._place.max)
+        self._place.value = min(place, self._place.max)  # type: ignore
 
     @property
     def drive(self) -> tuple[str, float]:

@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import viser
 
-from p2gs_jax.errors import UserError
-from p2gs_jax.viewer.browser_camera import Pose
-from p2gs_jax.viewer.frusta import Frusta
+from p2gs_jax.viewer.camera import Frusta, Player, Pose, browser_view
+from p2gs_jax.viewer.live import Darkroom, LivePicture, report
 from p2gs_jax.viewer.panel import Panel
-from p2gs_jax.viewer.playback import Player
-from p2gs_jax.viewer.render_loop import RenderLoop, browser_view
-from p2gs_jax.viewer.save import exr_bytes, png_bytes, saved_size
+from p2gs_jax.viewer.pictures import exr_bytes, png_bytes
 from p2gs_jax.viewer.settings import Settings, common_settings, same_display, settings_of_view
 from p2gs_jax.viewer.viewed_run import ViewedRun
 
@@ -26,18 +22,13 @@ SLIDER_S = 0.25
 
 
 class BrowserSession:
-    """One browser's panel, camera, frusta and render loop."""
+    """One browser's panel, camera, frusta and live picture."""
 
     def __init__(self, client: viser.ClientHandle, viewed: ViewedRun):
-        """Add the controls to the page and start rendering.
-
-        Args:
-            client: the browser.
-            viewed: the run.
-        """
+        """Add the controls to the page and start rendering."""
         self._client, self._viewed, self._run = client, viewed, viewed.run
-        self._panel = Panel(client.gui, viewed.info, self)
-        self._render_loop = RenderLoop(client, viewed, self._panel)
+        self._panel = Panel(client.gui, viewed, self)
+        self._live = LivePicture(client, viewed, self._panel)
         self._player = Player(self._play_to)
         self._shown_at = 0.0
         self._stopping = threading.Event()
@@ -50,18 +41,18 @@ class BrowserSession:
         pose = viewed.pose(viewed.first_view, browser_view(client).aspect)
         self._panel.put_view(viewed.first_view, float(np.rad2deg(pose.fov)))
         self._move(pose)
-        self._render_loop.start()
+        self._live.start()
 
     def stop(self) -> None:
         """Stop all threads: the browser has disconnected."""
         self._stopping.set()
         self._player.stop()
-        self._render_loop.stop()
+        self._live.stop()
 
     def _camera_moved(self, camera: viser.CameraHandle) -> None:
         if self._frusta is not None:
             self._frusta.keep_clear(camera.position)
-        self._render_loop.camera_moved()
+        self._live.camera_moved()
 
     def _move(self, pose: Pose) -> None:
         camera = self._client.camera
@@ -75,20 +66,18 @@ class BrowserSession:
 
     def display_changed(self) -> None:
         """Show the frame under the new settings."""
-        self._render_loop.display_changed()
+        self._live.display_changed()
 
     def set_metered(self, metered: bool) -> None:
         """Let the exposure follow what is seen, or keep it where it is now."""
-        now = self._panel.settings()
-        stops = 0.0
+        now, exposure, stops = self._panel.settings(), self._live.darkroom.metered_exposure, 0.0
         if metered:
-            with self._busy("Metering the training views ...", "Auto exposure"):
-                _ = self._run.metering  # of runs of older versions it takes a while
-        else:
-            transform = self._render_loop.frame_cache.transform(replace(now, metered=True))
-            stops = float(np.log2(transform.exposure / self._run.mean.exposure_geometric))
+            text = "Metering the training views ..."  # of runs of older versions it takes a while
+            metered = self._while_shown("Auto exposure", text, lambda: self._run.metering)
+        elif exposure is not None:
+            stops = float(np.log2(exposure / self._run.mean.exposure_geometric))
         self._panel.put(replace(now, metered=metered, exposure_ev=stops))
-        self._render_loop.display_changed()
+        self._live.display_changed()
 
     def mode_changed(self) -> None:
         """Show another mode; `split` moves to the nearest photograph and takes its settings.
@@ -99,24 +88,21 @@ class BrowserSession:
         if now.mode == "split":
             if before is None:
                 self._before_split = now
-            camera = self._render_loop.camera(browser_view(self._client), (64, 64))
-            cache = self._viewed.new_frame_cache()
-            here = cache.view_at(camera)
-            self.go_to(cache.nearest_view(camera) if here is None else here)
+            camera = self._live.camera(browser_view(self._client), (64, 64))
+            here = self._viewed.view_at(camera)
+            self.go_to(self._viewed.nearest_view(camera) if here is None else here)
         elif before is not None:
             self._before_split = None
             if self._taken is not None and same_display(now, self._taken):
                 self._panel.put(before)
-        self._render_loop.camera_moved()
+        self._live.camera_moved()
 
     def take_display_of(self, index: int | None) -> None:
         """Take all that a view was taken with, or the mean."""
-        before = self._panel.settings()
-        if index is None:
-            self._panel.put(common_settings(self._run, before))
-        else:
-            self._panel.put(settings_of_view(self._run, index, before))
-        self._render_loop.display_changed()
+        now, run = self._panel.settings(), self._run
+        same = common_settings(run, now) if index is None else settings_of_view(run, index, now)
+        self._panel.put(same)
+        self._live.display_changed()
 
     # ------------------------------------------------------------------ the camera
 
@@ -136,23 +122,19 @@ class BrowserSession:
         self._client.camera.fov = float(np.deg2rad(degrees))
 
     def show_cameras(self, visible: bool, scale: float) -> None:
-        """Show or hide the photographs' cameras; their pictures are added in the background.
+        """Show or hide the photographs' cameras, times their usual size.
 
-        Args:
-            visible: show them.
-            scale: times their usual size.
+        Their pictures are added in the background.
         """
         with self._one_at_a_time:
             frusta = self._frusta or self._add_frusta()
-            frusta.resize(scale * self._viewed.camera_size)
-            frusta.show(visible)
-        self._render_loop.with_depth = visible
-        self._render_loop.display_changed()
+            frusta.show(visible, scale)
+        self._live.with_depth = visible
+        self._live.display_changed()
 
     def _add_frusta(self) -> Frusta:
         viewed, views = self._viewed, self._run.scene.views
-        size, colors = viewed.camera_size, viewed.camera_colors
-        frusta = Frusta(self._client, views, colors, viewed.space, size, self.go_to)
+        frusta = Frusta(self._client, views, viewed.camera_colors, viewed.space, self.go_to)
         frusta.keep_clear(self._client.camera.position)
         threading.Thread(target=self._add_thumbnails, args=[frusta], daemon=True).start()
         self._frusta = frusta
@@ -200,26 +182,28 @@ class BrowserSession:
     def save(self, kind: str, width: int) -> None:
         """Send the view as a file, rendered at a width of its own."""
         view, settings = browser_view(self._client), self._panel.settings()
-        size = saved_size(width, view.aspect)
-        cache = self._viewed.new_frame_cache()
-        cache.depth_limits = self._render_loop.frame_cache.depth_limits
-        with self._busy(f"Rendering {size[0]} x {size[1]} pixels ..."):
-            cache.render(self._render_loop.camera(view, size), wait=True)
-            if kind == "exr":
-                assert cache.frame is not None
-                shown = cache.transform(settings).without_place()
-                content = exr_bytes(cache.frame, shown)
-            else:
-                content = png_bytes(cache.develop(settings))
-        name = f"{self._run.folder.resolve().name}_{time.strftime('%Y%m%d_%H%M%S')}.{kind}"
-        self._client.send_file_download(name, content, save_immediately=True)
+        size = width, max(1, round(width / view.aspect))
 
-    @contextmanager
-    def _busy(self, text: str, what: str = "Saving") -> Iterator[None]:
+        def render_and_send() -> None:
+            frame = self._viewed.render_now(self._live.camera(view, size))
+            darkroom = Darkroom(self._viewed, self._live.darkroom.depth_limits)
+            if kind == "exr":
+                content = exr_bytes(frame, darkroom.transform(frame, settings).without_place())
+            else:
+                content = png_bytes(darkroom.develop(frame, settings))
+            name = f"{self._run.folder.resolve().name}_{time.strftime('%Y%m%d_%H%M%S')}.{kind}"
+            self._client.send_file_download(name, content, save_immediately=True)
+
+        self._while_shown("Saving", f"Rendering {size[0]} x {size[1]} pixels ...", render_and_send)
+
+    def _while_shown(self, what: str, text: str, work: Callable[[], object]) -> bool:
+        """Do something while a notice says so; return whether it succeeded."""
         notice = self._client.add_notification(what, text, loading=True, with_close_button=False)
         try:
-            yield
-        except UserError as error:
-            self._client.add_notification(f"{what} failed", str(error), color="red")
+            work()
+        except Exception as error:
+            report(self._client, f"{what} failed", error)
+            return False
         finally:
             notice.remove()
+        return True

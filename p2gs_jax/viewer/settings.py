@@ -9,7 +9,7 @@ import numpy as np
 
 from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.run.read import Run
-from p2gs_jax.viewer.picture_modes import Mode
+from p2gs_jax.viewer.pictures import Mode
 
 ChosenCurve = Literal["run", "srgb", "power", "linear"]
 
@@ -46,47 +46,22 @@ class Settings:
 
 
 def common_settings(run: Run, before: Settings | None = None) -> Settings:
-    """Return settings with the mean exposure, gamma and white balance.
-
-    Args:
-        run: the run.
-        before: settings that all other fields are kept from.
-    """
+    """Return settings with the mean exposure, gamma and white balance; the rest is as before."""
     common = run.common_display()
-    return replace(
-        before or Settings(common.gamma),
-        gamma=common.gamma,
-        exposure_ev=0.0,
-        curve="run",
-        taken_as=None,
-        metered=False,
-        balance_ev=_balance_of(common),
-    )
+    return _taken(before or Settings(common.gamma), common, 0.0, None)
 
 
 def settings_of_view(run: Run, index: int, before: Settings) -> Settings:
-    """Return settings with all that a view was taken with.
-
-    Args:
-        run: the run.
-        index: row in `scene.views`.
-        before: settings that all other fields are kept from.
-    """
+    """Return settings as a row of `scene.views` was taken; the rest is as before."""
     own = run.own_display(index)
     ev = float(np.log2(own.exposure / run.mean.exposure_geometric))
-    return replace(
-        before,
-        gamma=own.gamma,
-        exposure_ev=ev,
-        curve="run",
-        taken_as=index,
-        metered=False,
-        balance_ev=_balance_of(own),
-    )
+    return _taken(before, own, ev, index)
 
 
-def _balance_of(transform: DisplayTransform) -> tuple[float, float] | None:
-    return None if transform.white_balance is None else transform.white_balance_ev
+def _taken(before: Settings, shown: DisplayTransform, ev: float, view: int | None) -> Settings:
+    balance = None if shown.white_balance is None else shown.white_balance_ev
+    new = {"gamma": shown.gamma, "exposure_ev": ev, "taken_as": view, "balance_ev": balance}
+    return replace(before, curve="run", metered=False, **new)
 
 
 def same_display(a: Settings, b: Settings) -> bool:

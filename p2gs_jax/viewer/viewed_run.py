@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from functools import cached_property
+from functools import cache, cached_property
 
 import cv2
 import numpy as np
@@ -13,30 +13,33 @@ from jaxtyping import UInt8
 from p2gs_jax.core.numerics import LN2, evenly_spaced, on_device
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.display import develop
-from p2gs_jax.photometry.formation import darkens
 from p2gs_jax.render.project import at_time
 from p2gs_jax.run.read import Run
 from p2gs_jax.scene.pixels.store import size_at
-from p2gs_jax.types import Camera
-from p2gs_jax.viewer.browser_camera import (
+from p2gs_jax.scene.rigid import camera_centers
+from p2gs_jax.types import Camera, Render
+from p2gs_jax.viewer.camera import (
     TYPICAL_DISTANCE,
     Pose,
-    camera_center,
+    Size,
     camera_of_browser,
     distance_seen,
     fov_that_holds,
+    frames_of,
     make_viewer_space,
     pose_of,
+    viewmat_between,
+    viewmats_of,
 )
-from p2gs_jax.viewer.frame_cache import FrameCache
-from p2gs_jax.viewer.frusta import THUMBNAIL_WIDTH, typical_size
-from p2gs_jax.viewer.legend import exposure_colors, exposure_legend
-from p2gs_jax.viewer.panel_interface import RunInfo
-from p2gs_jax.viewer.playback import frames_of, pose_between
-from p2gs_jax.viewer.programs import PROBES, Programs
-from p2gs_jax.viewer.render_sizes import Size
-from p2gs_jax.viewer.settings import common_settings, exposures_ev
-from p2gs_jax.viewer.splats import BrowserSplats, browser_splats
+from p2gs_jax.viewer.pictures import BrowserSplats, RenderedFrame, browser_splats, exposure_colors
+from p2gs_jax.viewer.renderer import Renderer
+from p2gs_jax.viewer.settings import exposures_ev
+
+# Views on which new programs are run.
+PROBES = 4
+THUMBNAIL_WIDTH = 128
+# Cameras closer than this count as being in one place, in typical distances.
+SAME_PLACE = 1e-3
 
 
 class ViewedRun:
@@ -47,36 +50,30 @@ class ViewedRun:
         max_width: widest picture to render, pixels.
         store: its photographs.
         space: scale and orientation of the scene in the viewer.
-        programs: its renderer.
+        renderer: for the sizes that windows need.
         listeners: called when a program was compiled, or is about to be.
     """
 
     def __init__(self, run: Run, max_width: int):
-        """Find scale and orientation of the scene; compile nothing yet.
-
-        Args:
-            run: the run.
-            max_width: widest picture to render, pixels.
-        """
-        self.run, self.max_width = run, max_width
+        """Find scale and orientation of the scene; compile nothing yet."""
+        self.run, self.max_width, self.store = run, max_width, run.store
         self.listeners: list[Callable[[], None]] = []
         self._lock = threading.Lock()
         self._thumbnails: dict[int, UInt8[np.ndarray, "h w 3"]] = {}
-        self._distances: dict[int, float] = {}
-        self.store = run.store
         # The programs of a viewer know no time.
         self._gaussians = at_time(run.as_of(), None)
         self._alive = on_device(np.ones(self._gaussians.capacity), bool)
-        self._points = run.scene.points
-        if not len(self._points):
-            self._points = np.asarray(self._gaussians.means)
+        points = run.scene.points
+        self._points = points if len(points) else np.asarray(self._gaussians.means)
+        self._centers = camera_centers(viewmats_of(run.scene.views))
         self.space = make_viewer_space(run.scene, self._points)
-        rows = evenly_spaced(len(run.scene.views), PROBES)
-        self.programs = Programs(
+        self.distance = cache(self._distance)
+        probes = evenly_spaced(len(run.scene.views), PROBES)
+        self.renderer = Renderer(
             self._gaussians,
             self._alive,
             run.cfg.render,
-            [self._probe(int(row)) for row in rows],
+            [self._probe(int(row)) for row in probes],
             self._notify,
             lambda result: develop(result.linear, run.common_display(), alpha=result.alpha),
         )
@@ -88,15 +85,39 @@ class ViewedRun:
     def _probe(self, index: int) -> Callable[[Size], Camera]:
         def camera(size: Size) -> Camera:
             aspect = size[0] / size[1]
-            pose = self.pose(index, aspect)
-            return camera_of_browser(pose.wxyz, pose.position, pose.fov, aspect, size, self.space)
+            return camera_of_browser(self.pose(index, aspect), aspect, size, self.space)
 
         return camera
 
-    @property
-    def typical(self) -> float:
-        """Typical distance from a camera to what it sees, scene units."""
-        return TYPICAL_DISTANCE / self.space.unit
+    def render(self, camera: Camera) -> RenderedFrame | None:
+        """Return a frame of a compiled size, or None where it is not compiled or overflows."""
+        result = self.renderer.render(camera)
+        return None if result is None else _frame(result, camera)
+
+    def render_now(self, camera: Camera) -> RenderedFrame:
+        """Return a frame of any size, however long its program takes to compile.
+
+        Raises:
+            UserError: it would need more memory than is reasonable.
+        """
+        return _frame(self.renderer.render_now(camera), camera)
+
+    def view_at(self, camera: Camera) -> int | None:
+        """Return the row of the view taken from the place of a camera, or None."""
+        near = np.flatnonzero(self._away(camera) <= SAME_PLACE * TYPICAL_DISTANCE / self.space.unit)
+        if not len(near):
+            return None
+        # Several views may share a place (rigs, panoramas): take the one with the same direction.
+        forward, views = np.asarray(camera.viewmat)[2, :3], self.run.scene.views
+        return int(max(near, key=lambda i: float(views[i].viewmat[2, :3] @ forward)))
+
+    def nearest_view(self, camera: Camera) -> int:
+        """Return the row of the view taken nearest to a camera."""
+        return int(np.argmin(self._away(camera)))
+
+    def _away(self, camera: Camera) -> np.ndarray:
+        center = camera_centers(np.asarray(camera.viewmat)[None])
+        return np.linalg.norm(self._centers - center, axis=1)
 
     @property
     def first_view(self) -> int:
@@ -104,15 +125,13 @@ class ViewedRun:
         return self.run.scene.train_indices[0]
 
     def pose(self, index: int, aspect: float) -> Pose:
-        """Return the browser's camera for a view.
+        """Return the browser's camera for a row of `scene.views`.
 
-        Args:
-            index: row in `scene.views`.
-            aspect: width / height of the canvas; the whole photograph fits into it.
+        The whole photograph fits into a canvas with `aspect` = width / height.
         """
         view = self.run.scene.views[index]
-        fov = fov_that_holds(view.K, view.width, view.height, aspect)
-        return pose_of(view.viewmat, self.space, distance=self._distance(index), fov=fov)
+        fov = fov_that_holds(view, aspect)
+        return pose_of(view.viewmat, self.space, distance=self.distance(index), fov=fov)
 
     def pose_along(self, camera: str, place: float, aspect: float) -> tuple[Pose, int]:
         """Return the browser's camera on a drive, and the row of the view nearest to it.
@@ -124,56 +143,26 @@ class ViewedRun:
         """
         frames, views = self.frames(camera), self.run.scene.views
         nearest = frames[int(np.clip(round(place), 0, len(frames) - 1))]
-        viewmat = pose_between([views[i].viewmat for i in frames], place)
-        fov = self.pose(nearest, aspect).fov
-        distance = self._distance(nearest)
+        viewmat = viewmat_between(viewmats_of([views[i] for i in frames]), place)
+        fov, distance = fov_that_holds(views[nearest], aspect), self.distance(nearest)
         return pose_of(viewmat, self.space, distance=distance, fov=fov), nearest
 
     def _distance(self, index: int) -> float:
         """Return the typical distance to what a view sees, scene units."""
-        if index not in self._distances:
-            viewmat = self.run.scene.views[index].viewmat
-            self._distances[index] = distance_seen(viewmat, self._points)
-        return self._distances[index]
-
-    def new_frame_cache(self) -> FrameCache:
-        """Return an empty cache that renders this run."""
-        return FrameCache(self.run, self.store, self.programs, self.typical)
+        return distance_seen(self.run.scene.views[index].viewmat, self._points)
 
     def frames(self, camera: str) -> tuple[int, ...]:
         """Return the rows of a physical camera's views."""
         return frames_of(self.run.scene, camera)
 
     @cached_property
-    def info(self) -> RunInfo:
-        """What the panel needs to know of the run."""
-        run = self.run
-        views = run.scene.views
-        evs = exposures_ev(run)
-        cameras = dict.fromkeys(view.camera for view in views)
-        return RunInfo(
-            names=[view.name for view in views],
-            cameras={name: len(self.frames(name)) for name in cameras},
-            start=common_settings(run),
-            most_ev=max(map(abs, evs.values())),
-            gammas=[float(g) for g in np.asarray(run.params.photometry.gammas)],
-            curve=run.cfg.photometry.curve,
-            camera_legend=exposure_legend(min(evs.values()), max(evs.values())),
-            most_balance_ev=self._most_balance_ev(),
-            vignetting=darkens(run.cfg.photometry),
-        )
-
-    def _most_balance_ev(self) -> float | None:
+    def most_balance_ev(self) -> float | None:
+        """Largest gain of red or blue over green, stops; None without white balance."""
         balance = self.run.params.photometry.white_balance
         if balance is None:
             return None
         stops = np.asarray(balance) / LN2
         return float(np.abs(stops[:, ::2] - stops[:, 1:2]).max())
-
-    @cached_property
-    def camera_size(self) -> float:
-        """Usual size of the views' cameras, viewer units."""
-        return typical_size(self.run.scene.views, self.space)
 
     @cached_property
     def camera_colors(self) -> UInt8[np.ndarray, "v 3"]:
@@ -205,12 +194,16 @@ class ViewedRun:
 
     @cached_property
     def _splats(self) -> BrowserSplats:
-        run = self.run
-        middle = np.mean([camera_center(view.viewmat) for view in run.scene.views], axis=0)
         return browser_splats(
             self._gaussians,
             np.asarray(self._alive),
-            run.cfg.render,
-            seen_from=middle,
+            self.run.cfg.render,
+            seen_from=self._centers.mean(0),
             unit=self.space.unit,
         )
+
+
+def _frame(result: Render, camera: Camera) -> RenderedFrame:
+    assert result.depth is not None
+    alpha, depth = np.asarray(result.alpha), np.asarray(result.depth)
+    return RenderedFrame(result.linear, alpha, depth, camera)

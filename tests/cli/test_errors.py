@@ -125,7 +125,7 @@ WRONG = [
     ("synth file.txt", "name another folder"),
     ("synth new --layout village", "'street', 'town'"),
     ("sweep none.toml", "docs/sweeps.md"),
-    ("sweep file.txt", "is no TOML"),
+    ("sweep file.txt", "is not valid TOML"),
     ("doctor --jsn", "--json"),
     ("completion ksh", "'bash', 'zsh'"),
 ]

@@ -188,7 +188,7 @@ def test_spz_holds_the_display_colours(finished_run, run_command, tmp_path):
     argv = ("export", finished_run, "--format", "display-ply", "spz", "--out", tmp_path)
     code, text = run_command(*argv, "--bake-steps", "5")
     assert code == 0, text
-    from p2gs_jax.formats.spz import read_spz
+    from p2gs_jax.formats.gsply_files import read_spz
 
     ply, spz = read_ply(tmp_path / "display.ply"), read_spz(tmp_path / "display.spz")
     np.testing.assert_allclose(spz.means, ply.means, atol=1e-3)

@@ -13,7 +13,7 @@ import pytest
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.formats.exr import read_exr
-from p2gs_jax.paths import covering
+from p2gs_jax.paths.panorama import covering
 from p2gs_jax.paths.pictures import RunRenderer
 from p2gs_jax.paths.rig import find_rig
 from p2gs_jax.paths.shots import Shot, view_shots

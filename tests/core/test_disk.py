@@ -17,7 +17,7 @@ from p2gs_jax.core.atomic import (
     write_text,
 )
 from p2gs_jax.formats.exr import write_exr
-from p2gs_jax.formats.png import write_png
+from p2gs_jax.formats.frames import write_png
 from p2gs_jax.run.checkpoint import CheckpointStore
 
 

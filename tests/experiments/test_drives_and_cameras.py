@@ -128,9 +128,3 @@ def test_factors_per_channel_are_those_that_fit_all_pictures():
     targets[1] = targets[1] + 0.5  # masked
     found = sensor_town._fitted_factors(lambda ev: list(linear * 2**ev), targets, masks)
     np.testing.assert_allclose(found, true, atol=3e-3)
-    rows: list[dict[str, Any]] = [
-        dict.fromkeys(("ev", "ev_scale_power", "white_balance_ev", "corner_percent"))
-    ]
-    rows[0] |= {"method": "m", "own": 20.0, "iso_8": 21.0, "seconds": 3.0}
-    lines = sensor_town.to_markdown([*rows, {"method": "n", "failed": "no"}]).splitlines()
-    assert len({line.count("|") for line in lines}) == 1

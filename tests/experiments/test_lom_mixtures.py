@@ -116,12 +116,12 @@ def test_what_cameras_do_is_read_from_where_a_run_keeps_it():
 
 def test_rows_without_a_value_have_empty_cells():
     rows = [
-        {"method": "calibrate", "spread_ev": {"low": 0.01}},
+        {"method": "calibrate", "spread_low": 0.01},
         {"method": "3dgs", "failed": "no light"},
-        {"method": "robust", "spread_ev": {"low": 0.02, "high": 0.03}, "own_exposure": 25.0}
+        {"method": "robust", "spread_low": 0.02, "spread_high": 0.03, "own_exposure": 25.0}
         | {"own_all": 26.0, "common": 24.0, "steps": 600, "seconds": 61.0},
     ]
-    lines = lom_mixtures.to_markdown(rows, ("low", "high")).splitlines()
+    lines = judging.to_markdown(rows, lom_mixtures.columns(("low", "high"))).splitlines()
     assert len({line.count("|") for line in lines}) == 1
     assert lines[2] == "| calibrate | 0.010 |  |  |  |  |  |  |"
     assert "no light" in lines[3]

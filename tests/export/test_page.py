@@ -49,19 +49,14 @@ def test_the_file_is_as_large_as_said_and_holds_every_visible_gaussian(whole, fi
     np.testing.assert_allclose(e[list(rows)], fitted.params.photometry.exposures, rtol=1e-5)
 
 
-def test_its_error_is_small_and_said(whole):
-    _, page = whole
-    error = page.splats.error
+def test_its_error_is_small_and_stated_and_nothing_is_loaded(whole):
+    path, page = whole
+    error, text = page.splats.error, path.read_text()
     assert error.psnr_worst > 40
     assert error.stops_median < 0.01
     assert error.stops_median <= error.stops_p99 <= error.stops_max
     assert any(f"{error.psnr_median:.1f} dB" in s for s in page.sentences)
     assert any(f"{error.stops_max:.2f}" in s for s in page.sentences)
-
-
-def test_nothing_is_loaded_from_elsewhere(whole):
-    path, _ = whole
-    text = path.read_text()
     assert not re.search(r"https?://", text)
     assert not re.search(r'\b(src|href)="(?!data:)', text)
     assert "default-src 'none'" in text
@@ -149,9 +144,6 @@ def test_photographs_are_embedded_only_when_asked_for(fitted, whole):
     assert len(found) == 2
     assert all(url.startswith("data:image/webp;base64,") for url in found.values())
     assert "data:image/webp" not in whole[0].read_text()
-
-
-def test_photographs_that_are_gone_are_an_error(fitted):
     views = tuple(
         replace(v, image_path=v.image_path.with_name("gone.png")) for v in fitted.scene.views
     )
@@ -186,10 +178,3 @@ def test_options_that_make_no_sense_are_refused(finished_run, run_command, tmp_p
     assert status == 2
     assert named in said
     assert list(tmp_path.iterdir()) == []
-
-
-def test_the_scripts_lie_in_the_package():
-    from importlib import resources
-
-    web = resources.files("p2gs_jax.export").joinpath("web")
-    assert {"page.html", "page.css", "main.js"} <= {entry.name for entry in web.iterdir()}

@@ -5,24 +5,12 @@ import os
 import cv2
 import jax.numpy as jnp
 import numpy as np
-import OpenEXR
 import pytest
-from plyfile import PlyData
 
 from p2gs_jax.core.atomic import append_jsonl, atomic_folder, atomic_write, read_jsonl, write_json
 from p2gs_jax.errors import UserError
-from p2gs_jax.formats.exr import read_exr, write_exr
-from p2gs_jax.formats.ply import field_names, read_ply, write_ply, write_radiance
-from p2gs_jax.formats.png import write_png
 from p2gs_jax.run.photometry_files import read_photometry, write_photometry
 from p2gs_jax.run.plots import _lines, _shorten, write_summary
-from p2gs_jax.types import Gaussians
-
-
-def gaussians(n=50, degree=3, seed=0):
-    rng = np.random.default_rng(seed)
-    shapes = [(n, 3), (n, 4), (n, 3), (n,), (n, (degree + 1) ** 2, 3)]
-    return Gaussians(*(jnp.asarray(rng.normal(size=s), jnp.float32) for s in shapes))
 
 
 def test_atomic_write_leaves_the_old_file_on_failure(tmp_path):
@@ -99,75 +87,6 @@ def test_torn_last_line_is_left_out(tmp_path):
     assert read_jsonl(tmp_path / "none.jsonl") == []
 
 
-@pytest.mark.parametrize("degree", [0, 1, 3])
-def test_radiance_ply_round_trip_is_exact(tmp_path, degree):
-    g = gaussians(degree=degree)
-    alive = np.arange(50) % 3 > 0
-    assert write_radiance(tmp_path / "r.ply", g, alive, activation="exp") == alive.sum()
-    back = read_ply(tmp_path / "r.ply")
-    for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
-        np.testing.assert_array_equal(getattr(back, name), np.asarray(getattr(g, name))[alive])
-
-
-def test_ply_field_order_is_the_reference_one(tmp_path):
-    write_radiance(tmp_path / "r.ply", gaussians(), np.ones(50, bool), activation="exp")
-    ply = PlyData.read(str(tmp_path / "r.ply"))
-    names = [p.name for p in ply["vertex"].properties]
-    assert names == field_names(16)
-    assert names[:9] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
-    assert names[9:54] == [f"f_rest_{i}" for i in range(45)]
-    assert names[54:] == [
-        "opacity",
-        *(f"scale_{i}" for i in range(3)),
-        *(f"rot_{i}" for i in range(4)),
-    ]
-    # Red's coefficients come first, all of them.
-    assert ply["vertex"]["f_rest_0"][0] == gaussians().sh[0, 1, 0]
-    assert ply["vertex"]["f_rest_15"][0] == gaussians().sh[0, 1, 1]
-    assert any("linear" in c for c in ply.comments)
-
-
-def test_ply_comments_may_name_any_file(tmp_path):
-    write_ply(tmp_path / "a.ply", gaussians(), ["worst: Straße/夜\n1.jpg"])
-    assert PlyData.read(str(tmp_path / "a.ply")).comments == [r"worst: Stra\xdfe/\u591c\n1.jpg"]
-    np.testing.assert_array_equal(read_ply(tmp_path / "a.ply").sh, gaussians().sh)
-
-
-def test_nobody_alive(tmp_path):
-    dead = np.zeros(50, bool)
-    assert write_radiance(tmp_path / "r.ply", gaussians(), dead, activation="exp") == 0
-    assert read_ply(tmp_path / "r.ply").sh.shape == (0, 16, 3)
-
-
-def test_not_a_ply(tmp_path):
-    (tmp_path / "x.ply").write_text("hello")
-    with pytest.raises(UserError, match=r"x\.ply"):
-        read_ply(tmp_path / "x.ply")
-
-
-def test_exr_never_overflows_half(tmp_path):
-    linear = np.full((4, 4, 3), 1e6, np.float32)
-    write_exr(tmp_path / "a.exr", linear)
-    np.testing.assert_array_equal(read_exr(tmp_path / "a.exr")[0], linear)
-    write_exr(tmp_path / "b.exr", linear / 100, half=False)
-    np.testing.assert_array_equal(read_exr(tmp_path / "b.exr")[0], linear / 100)
-
-
-@pytest.mark.parametrize(("value", "pixel"), [(65504.0, np.float16), (65505.0, np.float32)])
-def test_exr_switches_to_float_where_half_ends(tmp_path, value, pixel):
-    linear = np.full((2, 3, 3), value, np.float32)
-    write_exr(tmp_path / "a.exr", linear, alpha=np.ones((2, 3), np.float32))
-    with OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True) as file:
-        assert {c: file.channels()[c].pixels.dtype for c in "RGBA"} == dict.fromkeys("RGBA", pixel)
-    np.testing.assert_array_equal(read_exr(tmp_path / "a.exr")[0], linear)
-
-
-def test_broken_exr(tmp_path):
-    (tmp_path / "x.exr").write_bytes(b"no")
-    with pytest.raises(UserError, match=r"x\.exr"):
-        read_exr(tmp_path / "x.exr")
-
-
 def test_photometry_round_trip(tmp_path):
     view = {
         "image": "a.png",
@@ -197,13 +116,6 @@ def test_photometry_of_incomplete_views(tmp_path):
     )
     with pytest.raises(UserError, match="view 0: not an object"):
         read_photometry(path)
-
-
-def test_png_rounds_and_keeps_the_channel_order(tmp_path):
-    ldr = np.array([[[1.0, 0.5, 0.0], [2.0, -1.0, np.nan]]], np.float32)
-    write_png(tmp_path / "a.png", ldr)
-    back = cv2.imread(str(tmp_path / "a.png"))[..., ::-1]
-    np.testing.assert_array_equal(back, [[[255, 128, 0], [255, 0, 0]]])
 
 
 @pytest.mark.parametrize("columns", [1, 5])

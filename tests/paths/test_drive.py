@@ -3,8 +3,7 @@ import pytest
 from cameras import shot, turned
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.paths import drive
-from p2gs_jax.paths.drive import PosePath
+from p2gs_jax.paths.drive import PosePath, drive
 from p2gs_jax.paths.shots import Shot, of_camera, view_shots
 from p2gs_jax.scene.rigid import inverse
 from p2gs_jax.types import View

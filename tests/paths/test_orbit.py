@@ -2,9 +2,7 @@ import numpy as np
 import pytest
 from cameras import shot, turned
 
-from p2gs_jax.paths import orbit
-from p2gs_jax.paths.geometry import look_at
-from p2gs_jax.paths.orbit import find_orbit
+from p2gs_jax.paths.orbit import find_orbit, look_at, orbit
 from p2gs_jax.scene.rigid import inverse, up_direction
 
 UP = np.array([0.0, -1, 0])

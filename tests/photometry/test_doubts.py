@@ -9,10 +9,10 @@ from p2gs_jax.photometry.adjustment.errors import uncertainty
 from p2gs_jax.photometry.adjustment.fit import explain, fit_model, solution_of
 from p2gs_jax.photometry.adjustment.problem import make_problem
 from p2gs_jax.photometry.adjustment.solve import TOLERANCE, solve_model
+from p2gs_jax.photometry.calibrate import CalibrationOptions, calibrate_observations
 from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import Response
-from p2gs_jax.photometry.selection import select
 
 LIMITS = {"black": 4 / 255, "saturation": 250 / 255, "pivot": 0.18}
 GROUP, POINTS, SEEN_BY = 20, 800, 6
@@ -75,7 +75,7 @@ def test_what_no_observation_holds_is_unknown_and_said():
 def test_an_end_that_is_none_is_said(monkeypatch, rounds):
     monkeypatch.setattr(solve, "MOST_ROUNDS", rounds)
     o = observe(DRIVE, ISO2)
-    found = select(o, **LIMITS)
+    found = calibrate_observations(o, CalibrationOptions(**LIMITS))
     s = found.solution
     assert s.converged == s.state["converged"] == (rounds == 60)
     assert s.state["rounds"] == s.rounds <= rounds

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import LossConfig, PhotometryConfig
-from p2gs_jax.losses.image import photometric_loss
-from p2gs_jax.losses.regularizers import variance
 from p2gs_jax.photometry.formation import eotf, formation, tone_map
 from p2gs_jax.render.harmonics import radiance_activation, radiance_preactivation
+from p2gs_jax.train.terms import photometric_loss, variance
 from p2gs_jax.types import Capture, Photometry
 
 PAPER = PhotometryConfig(curve="power", pivot=1.0, clamp=True, parameterization="linear")

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import RegularizerConfig
-from p2gs_jax.losses.regularizers import photometry_regularizers
 from p2gs_jax.photometry.parameters import recentre
 from p2gs_jax.render.harmonics import radiance_activation
+from p2gs_jax.train.terms import photometry_regularizers
 from p2gs_jax.types import Gaussians, Params, Photometry
 
 

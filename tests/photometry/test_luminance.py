@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import LossConfig
-from p2gs_jax.losses.luminance import contrast_loss, curve_prior, luminance_terms
 from p2gs_jax.photometry.appearance import corrected
 from p2gs_jax.photometry.luminance import (
     ENTRIES,
@@ -24,6 +23,7 @@ from p2gs_jax.photometry.luminance import (
     spans,
     statistics_of,
 )
+from p2gs_jax.train.terms import CURVE, contrast_loss, curve_prior, enhanced_loss
 
 IMAGE = np.random.default_rng(0).uniform(0.02, 0.98, (24, 32, 3))
 MASK = np.ones(IMAGE.shape[:2])
@@ -144,8 +144,8 @@ def test_gradients_match_finite_differences(name):
 
         def f(value):
             view = dataclasses.replace(at, **{name: value}).view(1)
-            terms = luminance_terms(render, image, mask, view, cfg)
-            return terms["enhanced"] + terms["curve"]
+            compared = enhanced_loss(render, image, mask, view, cfg)
+            return compared + CURVE * curve_prior(view, image, mask)
 
         value = getattr(at, name)
         h = 1e-6
@@ -175,7 +175,8 @@ def test_masked_pixels_get_no_gradient():
     image, view = jnp.asarray(IMAGE, jnp.float32), noisy(0.05).view(0)
 
     def f(render):
-        return sum(luminance_terms(render, image, mask, view, LossConfig()).values())
+        compared = enhanced_loss(render, image, mask, view, LossConfig())
+        return compared + contrast_loss(render, image, mask)
 
     slope = jax.grad(f)(image * 0.5)
     assert float(jnp.abs(slope[:8]).max()) == 0

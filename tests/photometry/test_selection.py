@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from synthetic_drive import make_drive, make_exposures, observe
 
+from p2gs_jax.photometry.calibrate import CalibrationOptions, calibrate_observations
 from p2gs_jax.photometry.candidates import Candidate, choose
 from p2gs_jax.photometry.models import Choice, Form
 from p2gs_jax.photometry.response import Response
-from p2gs_jax.photometry.selection import select
 
 LIMITS = {"black": 4 / 255, "saturation": 250 / 255, "pivot": 0.18}
 DRIVE = make_drive(20, 1200)
@@ -27,7 +27,9 @@ CASES = [
 def test_what_varies_is_found(exposures, curve, gamma, model, response):
     truth = make_exposures(DRIVE, exposures)
     gammas = None if gamma is None else np.array([2.0, 2.2, 2.45])[DRIVE.cameras]
-    s = select(observe(DRIVE, truth, curve=curve, gammas=gammas), **LIMITS)
+    s = calibrate_observations(
+        observe(DRIVE, truth, curve=curve, gammas=gammas), CalibrationOptions(**LIMITS)
+    )
     assert s.solution.model == model
     if response is not None:
         assert s.solution.response.name == response
@@ -40,11 +42,11 @@ def test_a_known_curve_is_not_chosen():
     # A filmic camera would get a spline: here it is said to be none.
     truth = make_exposures(DRIVE, "iso2")
     seen = observe(DRIVE, truth, curve="filmic")
-    s = select(seen, **LIMITS, known_response="camera raw")
+    s = calibrate_observations(seen, CalibrationOptions(**LIMITS, known_response="camera raw"))
     assert s.solution.response == Response("srgb")
     assert {c.response.name for c in s.candidates} == {"srgb"}
     assert "The tone curve is known (camera raw)" in s.reasons[0]
-    free = select(seen, **LIMITS)
+    free = calibrate_observations(seen, CalibrationOptions(**LIMITS))
     assert free.solution.response.name == "spline over srgb"
 
 
@@ -53,7 +55,7 @@ def test_a_known_curve_is_not_chosen():
 def test_photographs_that_tell_nothing_choose_something_and_know_no_exposure(value):
     seen = observe(DRIVE, make_exposures(DRIVE, "constant"), curve="srgb")
     seen = dataclasses.replace(seen, colors=np.full_like(seen.colors, value))
-    s = select(seen, **LIMITS)
+    s = calibrate_observations(seen, CalibrationOptions(**LIMITS))
     assert np.isinf(s.solution.exposure_errors).all()
     assert np.isfinite(s.solution.log_exposures).all()
     assert (s.solution.observations_per_view == 0).all()
@@ -84,7 +86,7 @@ def test_sharp_images_do_not_earn_parameters_for_invisible_differences():
     cameras = np.array([1.0, 1.006, 0.995])[drive.cameras]
     wobble = np.exp2(0.004 * np.sin(np.arange(len(drive.cameras))))
     seen = observe(drive, cameras * wobble, noise=0.0, outliers=0.0, bits=None)
-    found = select(seen, **LIMITS)
+    found = calibrate_observations(seen, CalibrationOptions(**LIMITS))
     assert found.solution.model == "constant"
     assert found.candidates[0].form.model != "constant"
     assert any("8-bit levels in any view" in r for r in found.reasons)

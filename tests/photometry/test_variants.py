@@ -5,8 +5,8 @@ import jax
 import numpy as np
 
 from p2gs_jax.config import LossConfig, PhotometryConfig
-from p2gs_jax.losses.image import photometric_loss
 from p2gs_jax.photometry.formation import formation, inverse_formation
+from p2gs_jax.train.terms import photometric_loss
 from p2gs_jax.types import Capture
 
 CFG = PhotometryConfig()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from page_tools import pictures
 
-from p2gs_jax.formats.png import write_png
+from p2gs_jax.formats.frames import write_png
 from p2gs_jax.report.charts import SOURCES, Series, panels_chart, training_chart
 from p2gs_jax.report.photometry_sections import exposure_section
 from p2gs_jax.report.pictures import (

@@ -116,7 +116,7 @@ def flip(path):
 def test_a_checkpoint_of_another_optimiser_ends_in_advice(tmp_path):
     """Earlier versions counted updates once for all Gaussians, in another structure."""
     now = state(20)
-    moments = now.opt_state.gaussians[0]
+    moments = now.opt_state.gaussians
     earlier = {"mu": moments.mu, "nu": moments.nu, "count": jnp.int32(7)}
     store = CheckpointStore(tmp_path / "c")
     store.save(7, dataclasses.replace(now, opt_state=earlier), {"gaussian_capacity": 20})

@@ -1,5 +1,14 @@
-"""A browser that leaves takes everything with it, whenever it leaves."""
+"""`p2gs-jax view`: wrong input, who may talk to it, browsers that leave, and how it ends."""
 
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,28 +16,178 @@ import pytest
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 
+import viser
+import websockets
+import websockets.sync.client
+
 from p2gs_jax.viewer import server as module
+from p2gs_jax.viewer.server import Guard, guard_of, guarded, is_loopback
+
+ROOT = Path(__file__).resolve().parents[2]
+PROTOCOL = f"viser-v{viser.__version__}"
 
 
-class Server:
-    """Keeps what it is told to call."""
+def test_without_viser_it_says_how_to_get_it(run_command, monkeypatch, tmp_path):
+    for name in [n for n in sys.modules if n.startswith("p2gs_jax.viewer")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "viser", None)
+    code, text = run_command("view", tmp_path)
+    assert code == 2
+    assert "pip install 'p2gs-jax[viewer]'" in text
 
-    def __init__(self):
-        self.gui = SimpleNamespace(configure_theme=lambda **options: None)
-        self.scene = SimpleNamespace(set_up_direction=lambda up: None)
-        self.initial_camera = SimpleNamespace()
 
-    def on_client_connect(self, call):
-        self.connect = call
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ((), "config.json"),
+        (("--port", "70000"), "--port"),
+        (("--host", "no.such.host.invalid"), "--host"),
+        (("--max-width", "3"), "--max-width"),
+    ],
+)
+def test_wrong_input(run_command, tmp_path, options, said):
+    code, text = run_command("view", tmp_path, "--port", "0", *options)
+    assert code == 2
+    assert said in text
 
-    def on_client_disconnect(self, call):
-        self.disconnect = call
+
+def test_busy_port(run_command, tmp_path):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        code, text = run_command("view", tmp_path, "--port", port)
+    assert code == 2
+    assert str(port) in text
+    assert "--port" in text
+
+
+def test_ctrl_c_ends_it_cleanly(finished_run):
+    argv = [sys.executable, "-m", "p2gs_jax.cli", "view", str(finished_run), "--port", "0"]
+    process = subprocess.Popen(
+        argv,
+        cwd=ROOT,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    line = process.stdout.readline()
+    assert re.search(r"http://127\.0\.0\.1:\d+ ", line)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 0, err
+    assert "Traceback" not in out + err
+
+
+@pytest.mark.parametrize(
+    ("host", "alone"),
+    [
+        *((host, True) for host in ("127.0.0.1", "::1", "localhost", "127.8.9.1")),
+        *((host, False) for host in ("0.0.0.0", "::", "", "no.such.host.invalid")),
+    ],
+)
+def test_only_loopback_needs_no_token(host, alone):
+    assert is_loopback(host) == alone
+    guard = guard_of(host)
+    assert (guard.token is None) == alone
+    assert (guard.hosts is not None) == alone
+    assert alone or guard.token != guard_of(host).token
+
+
+def start(guard):
+    with guarded(guard):
+        return viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+
+
+@pytest.fixture(scope="module")
+def servers():
+    """Return servers as for this machine and as for others; both listen on loopback only."""
+    found = [start(guard_of("127.0.0.1")), start(Guard(None, "secret"))]
+    yield found
+    for server in found:
+        server.stop()
+
+
+def get(server, path="/", **headers):
+    """Return the status of a page, and the cookie that is set."""
+    url = f"http://127.0.0.1:{server.get_port()}{path}"
+    request = urllib.request.Request(url, headers=headers)
+    try:
+        with urllib.request.urlopen(request, timeout=20) as answer:
+            return answer.status, answer.headers.get("Set-Cookie", "")
+    except urllib.error.HTTPError as error:
+        return error.code, error.headers.get("Set-Cookie", "")
+
+
+def connects(server, origin=None, **headers):
+    """Return whether a WebSocket is let in.
+
+    Without an event loop: the session's browser keeps one running in this thread.
+    """
+    try:
+        with websockets.sync.client.connect(
+            f"ws://127.0.0.1:{server.get_port()}",
+            origin=origin,
+            additional_headers=headers,
+            subprotocols=[PROTOCOL],
+        ) as channel:
+            return bool(channel.recv(20))
+    except websockets.InvalidStatus as error:
+        return error.response.status_code != 403
+
+
+def test_the_viewer_s_own_page_is_served(servers):
+    server = servers[0]
+    assert get(server) == (200, "")
+    for name in ("127.0.0.1", "localhost"):
+        host = f"{name}:{server.get_port()}"
+        assert get(server, Host=host, Origin=f"http://{host}")[0] == 200
+    assert connects(server)
+    assert connects(server, origin=f"http://127.0.0.1:{server.get_port()}")
+
+
+@pytest.mark.parametrize(
+    "origin", ["http://evil.example", "http://127.0.0.1:1", "null", "http://[", ""]
+)
+def test_pages_of_other_sites_are_refused(servers, origin):
+    assert get(servers[0], Origin=origin)[0] == 403
+    if origin:
+        assert not connects(servers[0], origin=origin)
+
+
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1.evil.example", "["])
+def test_names_that_were_made_to_point_here_are_refused(servers, host):
+    assert get(servers[0], Host=host, Origin=f"http://{host}")[0] == 403
+
+
+def test_others_need_the_token(servers):
+    server = servers[1]
+    for path in ("/", "/?token=", "/?token=wrong", "/?token=secre", "/index.html", "/?t=secret"):
+        assert get(server, path) == (403, "")
+    assert not connects(server)
+    assert not connects(server, Cookie="p2gs_jax_token=wrong")
+    status, cookie = get(server, "/?token=secret")
+    assert status == 200
+    assert "HttpOnly" in cookie
+    assert "SameSite=Strict" in cookie
+    kept = cookie.split(";")[0]
+    assert get(server, "/", Cookie=kept)[0] == 200
+    assert connects(server, Cookie=kept)
+    assert not connects(server, origin="http://evil.example", Cookie=kept)
+
+
+def test_other_servers_are_left_alone():
+    before = websockets.asyncio.server.serve
+    with guarded(Guard(None)):
+        assert websockets.asyncio.server.serve is not before
+    assert websockets.asyncio.server.serve is before
 
 
 @pytest.fixture
 def served(monkeypatch):
-    """Return a server, its sessions, and the ids of those that were made and stopped."""
-    found = SimpleNamespace(server=Server(), sessions={}, made=[], stopped=[], on_made=None)
+    """Return a server's hooks, its sessions, and the ids of those that were made and stopped."""
+    found = SimpleNamespace(sessions={}, made=[], stopped=[], on_made=None)
 
     class Session:
         def __init__(self, client, viewed):
@@ -41,27 +200,33 @@ def served(monkeypatch):
             found.stopped.append(self.client.client_id)
 
     monkeypatch.setattr(module, "BrowserSession", Session)
-    pose = SimpleNamespace(position=np.zeros(3), look_at=np.ones(3), fov=1.0)
-    viewed = SimpleNamespace(
-        space=SimpleNamespace(up="+z"), first_view=0, pose=lambda view, aspect: pose
+    server = SimpleNamespace(
+        gui=SimpleNamespace(configure_theme=lambda **options: None),
+        scene=SimpleNamespace(set_up_direction=lambda up: None),
+        initial_camera=SimpleNamespace(),
+        on_client_connect=lambda call: setattr(found, "connect", call),
+        on_client_disconnect=lambda call: setattr(found, "disconnect", call),
     )
-    module._set_up_server(found.server, viewed, found.sessions)
+    pose = SimpleNamespace(position=np.zeros(3), look_at=np.ones(3), fov=1.0)
+    space, view = SimpleNamespace(up="+z"), lambda view, aspect: pose
+    viewed = SimpleNamespace(space=space, first_view=0, pose=view)
+    module._set_up_server(server, viewed, found.sessions)
     return found
 
 
 def test_a_browser_that_leaves_is_stopped_once(served):
     clients = [SimpleNamespace(client_id=k) for k in range(3)]
     for client in clients:
-        served.server.connect(client)
+        served.connect(client)
     assert sorted(served.sessions) == [0, 1, 2]
-    served.server.disconnect(clients[1])
+    served.disconnect(clients[1])
     assert sorted(served.sessions) == [0, 2]
     assert served.stopped == [1]
 
 
 def test_a_browser_that_leaves_while_its_session_is_made_leaves_nothing(served):
-    served.on_made = served.server.disconnect
+    served.on_made = served.disconnect
     for number in (5, 6):
-        served.server.connect(SimpleNamespace(client_id=number))
+        served.connect(SimpleNamespace(client_id=number))
     assert served.made == served.stopped == [5, 6]
     assert served.sessions == {}

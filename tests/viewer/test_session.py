@@ -1,61 +1,51 @@
-"""What one browser's controls do to its display transform, without a browser."""
+"""What one browser's controls do to its display transform, and files; without a browser."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
-from p2gs_jax.run.read import load_run
-
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 
+from viewer_stubs import CANVAS, Client, FakeRenderer, Panel
+
+from p2gs_jax.errors import UserError
+from p2gs_jax.run.read import load_run
 from p2gs_jax.viewer import session as sessions
 from p2gs_jax.viewer.session import BrowserSession
 from p2gs_jax.viewer.settings import Settings, common_settings, same_display, settings_of_view
-
-
-class Panel:
-    """Controls that hold what they are set to."""
-
-    def __init__(self, start):
-        self.now, self.locked, self.at = start, False, None
-
-    def settings(self):
-        return self.now
-
-    def put(self, settings):
-        self.now = replace(settings, mode=self.now.mode)
-
-    def put_view(self, index, degrees):
-        self.at = index
-
-    def set_playing(self, playing):
-        pass
+from p2gs_jax.viewer.viewed_run import ViewedRun
 
 
 @pytest.fixture(scope="module")
-def run(finished_run):
-    return load_run(finished_run)
+def viewed(finished_run):
+    out = ViewedRun(load_run(finished_run), 1920)
+    out.renderer.stop()
+    out.renderer = FakeRenderer(out.run)
+    yield out
+    out.store.close()
 
 
 @pytest.fixture
-def session(run, monkeypatch):
+def run(viewed):
+    return viewed.run
+
+
+@pytest.fixture
+def client():
+    return Client()
+
+
+@pytest.fixture
+def session(viewed, client, monkeypatch):
     """Return a session at the photograph in row 1, with +1 EV of the person's own."""
-    monkeypatch.setattr(sessions, "browser_view", lambda client: SimpleNamespace(aspect=1.5))
-    out = object.__new__(BrowserSession)
-    pose = SimpleNamespace(fov=1.0)
-    out._run, out._client = run, None
-    cache = SimpleNamespace(view_at=lambda camera: 1, nearest_view=lambda camera: 1)
-    out._viewed = SimpleNamespace(pose=lambda index, aspect: pose, new_frame_cache=lambda: cache)
-    out._render_loop = SimpleNamespace(
-        camera_moved=lambda: None, display_changed=lambda: None, camera=lambda seen, size: None
-    )
-    out._player = SimpleNamespace(stop=lambda: None)
-    out._move = lambda pose: None
-    out._before_split = out._taken = None
-    out._panel = Panel(replace(common_settings(run), exposure_ev=1.0))
-    return out
+    panel = Panel(replace(common_settings(viewed.run), exposure_ev=1.0))
+    monkeypatch.setattr(sessions, "Panel", lambda gui, viewed, actions: panel)
+    out = BrowserSession(client, viewed)
+    out._move(viewed.pose(1, CANVAS[0] / CANVAS[1]))
+    yield out
+    out.stop()
 
 
 def show(session, mode):
@@ -96,8 +86,43 @@ def test_the_exposure_can_be_locked(session):
     assert session._panel.now.taken_as == 2
 
 
+def test_a_metered_exposure_stays_where_it_was_when_switched_off(session, run):
+    session.set_metered(True)
+    assert session._panel.now.metered
+    assert session._panel.now.exposure_ev == 0
+    session._live.darkroom.metered_exposure = 4 * run.mean.exposure_geometric
+    session.set_metered(False)
+    assert session._panel.now.exposure_ev == pytest.approx(2)
+
+
+def test_what_cannot_be_metered_is_not(session, client, monkeypatch):
+    def fail(run):
+        raise UserError("no photographs")
+
+    monkeypatch.setattr(type(session._run), "metering", property(fail))
+    session.set_metered(True)
+    assert client.said[-1] == "no photographs"
+    assert not session._panel.now.metered
+
+
+def test_a_view_is_saved_also_after_a_failure(session, viewed, client):
+    for error in (UserError("too much memory"), RuntimeError("too much memory")):
+        viewed.renderer.broken = error
+        session.save("png", 100)
+        assert "too much memory" in client.said[-1]
+        assert client.files == []
+    viewed.renderer.broken = None
+    session.save("png", 100)
+    session.save("exr", 100)
+    (png, content), (exr, light) = client.files
+    assert png.startswith("run_")
+    assert exr.endswith(".exr")
+    assert light[:4] == b"\x76\x2f\x31\x01"
+    picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+    assert picture.shape == (round(100 * CANVAS[1] / CANVAS[0]), 100, 3)
+
+
 def test_looks_are_compared_without_what_is_shown():
     a = Settings(gamma=2.2, exposure_ev=0.5)
     assert same_display(a, replace(a, mode="split", split=0.1, splats=True))
     assert not same_display(a, replace(a, exposure_ev=0.6))
-    assert np.isclose(a.gamma, 2.2)

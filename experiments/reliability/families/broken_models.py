@@ -27,7 +27,7 @@ from reliability.reading import read
 from reliability.trials import Trial, run_trials
 
 NAME = "broken_models"
-ABOUT = """COLMAP models (binary and text), transforms.json, rigs, seed points, split lists and
+ABOUT = """COLMAP models (binary and text), transforms.json, seed points, split lists and
 masks that are cut at fields, flipped, miscounted or out of range. Each is read whole, or refused
 with code 2 by a message that names file, fault and remedy, within 30 s and 2 GB."""
 _TRANSFORMS = "tests/scene/test_transforms.py"
@@ -45,10 +45,8 @@ def trials() -> Iterator[Trial]:
     for text in (False, True):
         yield Trial(f"colmap whole ({text})", _whole(text), read, refused=False)
     yield Trial("transforms whole", _made(scenes.write_transforms), read, refused=False)
-    yield Trial("rig whole", _made(scenes.write_rig), read, refused=False)
     yield from _colmap()
     yield from _transforms()
-    yield from _rig()
     yield from _masks()
 
 
@@ -132,27 +130,6 @@ def _transforms() -> Iterator[Trial]:
         Broken("a negative count", text.replace(f"vertex {scenes.POINTS}", "vertex -5").encode()),
     ):
         yield _with(scenes.write_transforms, "points.ply", broken)
-
-
-def _rig() -> Iterator[Trial]:
-    rng = np.random.default_rng(SEED + 2)
-    for place, text in (("calib.txt", scenes.calibration()), ("poses.txt", scenes.poses())):
-        for broken in (
-            *wrong_words(text, rng, 12),
-            *wrong_lines(text, rng, 2),
-            *random_bytes(rng),
-            Broken("all zeros", " ".join(["0"] * 12).encode()),
-        ):
-            yield _with(scenes.write_rig, place, broken)
-    data = scenes.scan()
-    extremes = [
-        Broken(f"a value is {value}", np.float32(value).tobytes() + data[4:])
-        for value in (np.nan, np.inf, 1e30, -1e38)
-    ]
-    for broken in (*cuts(data, rng, 6), *flips(data, rng, 8), *random_bytes(rng), *extremes):
-        yield _with(scenes.write_rig, "velodyne/000001.bin", broken)
-    for broken in (*wrong_words(scenes.poses(), rng, 3), *random_bytes(rng)):
-        yield _with(scenes.write_rig, "lidar_poses.txt", broken)
 
 
 def _masks() -> Iterator[Trial]:

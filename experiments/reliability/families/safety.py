@@ -92,7 +92,7 @@ def _asks(outside: bool, path: str, headers: dict[str, str], served: bool) -> Ca
     def act(root: Path) -> int:
         import viser
 
-        from p2gs_jax.viewer.guard import Guard, guard_of, guarded
+        from p2gs_jax.viewer.server import Guard, guard_of, guarded
 
         guard = Guard(None, SECRET) if outside else guard_of(LOOPBACK)
         with guarded(guard):
@@ -112,7 +112,7 @@ def _asks(outside: bool, path: str, headers: dict[str, str], served: bool) -> Ca
 
 def _listens(root: Path) -> int:
     from p2gs_jax.cli.pages import View
-    from p2gs_jax.viewer.guard import guard_of, is_loopback
+    from p2gs_jax.viewer.server import guard_of, is_loopback
 
     host = View(run=root).host
     return forbidden(not is_loopback(host) or guard_of("0.0.0.0").token is None, f"open: {host}")
@@ -225,7 +225,7 @@ def unsafe_calls(package: Path) -> list[str]:
 
 
 # Reads from the pipe of the process that started it, no file.
-TRUSTED = ("scene/pixels/worker.py: pickle.load",)
+TRUSTED = ("scene/pixels/cache.py: pickle.load",)
 
 
 def _forbidden_calls(root: Path) -> int:

@@ -8,7 +8,6 @@ Outliers are weighted away: 0 / 10 / 30 % of them give 0.005 / 0.006 / 0.007 EV 
 from __future__ import annotations
 
 import functools
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +25,6 @@ from p2gs_jax.photometry.adjustment.problem import Problem, Rows, make_rows
 from p2gs_jax.photometry.adjustment.robust import Loss, Weighted, noise_weight, weigh
 from p2gs_jax.photometry.adjustment.system import System, make_system, with_priors
 from p2gs_jax.photometry.models import Form
-from p2gs_jax.photometry.observations import PerChannel
 from p2gs_jax.photometry.response import Response, log_slope_minimum, monotone
 
 # Rounds of both losses together are no more than MOST_ROUNDS.
@@ -47,9 +45,7 @@ LARGEST_STRETCH = 1.6
 SMALLEST_LOG_SLOPE = 0.3
 
 
-@functools.cache
-def _libraries() -> threadpoolctl.ThreadpoolController:
-    return threadpoolctl.ThreadpoolController()
+_libraries = functools.cache(threadpoolctl.ThreadpoolController)
 
 
 def one_thread():
@@ -144,52 +140,36 @@ class Fit(NamedTuple):
     converged: bool  # `moved` was less than the tolerance
 
 
-class _Round(NamedTuple):
-    """Where a round ended, the weights it was computed with, and what it and the last moved."""
-
-    theta: Parameters
-    weight: PerChannel
-    moved: float
-    moved_before: float
-
-
-def _next(model: Forward, system: System, last: _Round, loss: Loss) -> _Round:
-    """Return the next round: weights under a loss, and one Gauss-Newton step with them."""
-    theta, u = last.theta, system.unknowns
-    at = weigh(model, theta, last.weight, loss)
+def _step(
+    model: Forward, system: System, theta: Parameters, at: Weighted
+) -> tuple[Parameters, float]:
+    """Return the parameters after one Gauss-Newton step, and its largest change of one of them."""
     normal, right = normal_equations(model, theta, at, np.float32)
     normal, gauges, right = with_priors(system, theta, normal, right)
-    step = u.split(Balanced(normal, gauges, system.basis).solve(right))
-    new = Parameters(
-        theta.b + step.b,
-        np.clip(theta.a + step.a, *A_RANGE),
-        theta.k + step.k,
-        theta.c + step.c,
-    )
+    step = system.unknowns.split(Balanced(normal, gauges, system.basis).solve(right))
+    new = Parameters(*(x + dx for x, dx in zip(theta, step, strict=True)))
+    new = new._replace(a=np.clip(new.a, *A_RANGE))
     changes = zip(new, theta, strict=True)
-    moved = float(np.max([np.abs(x - y).max(initial=0.0) for x, y in changes]))
-    return _Round(new, at.weight, moved, last.moved)
+    return new, float(np.max([np.abs(x - y).max(initial=0.0) for x, y in changes]))
 
 
 def solve(rows: Rows, system: System, tolerance: float, loss: Loss) -> Fit:
     """Adjust exposures, gammas, cameras and response to observations (float64).
 
-    A largest change of a parameter below the tolerance, log units, counts as none. `loss` is of
-    the rounds after those under L1.
+    A largest change of a parameter below the tolerance, log units, counts as none. `loss` is of the
+    rounds after those under L1.
     """
     model = make_forward(rows, system.unknowns)
-    after = functools.partial(_next, model, system)
-    last = _Round(system.start, noise_weight(rows), np.inf, np.inf)
-    for _ in range(L1_ROUNDS):
-        last = after(last, "l1")
-    # The first of these changes the loss: what it moves says nothing about the next.
-    last, count = after(last, loss), L1_ROUNDS + 1
-    while count < MOST_ROUNDS:
-        last, count = after(last, loss), count + 1
-        if last.moved < tolerance:
+    theta, weight = system.start, noise_weight(rows)
+    moved, before, count = np.inf, np.inf, 0
+    for count in range(1, MOST_ROUNDS + 1):
+        at = weigh(model, theta, weight, "l1" if count <= L1_ROUNDS else loss)
+        weight, before = at.weight, moved
+        theta, moved = _step(model, system, theta, at)
+        # The first round of another loss says nothing of the next.
+        if count > L1_ROUNDS + 1 and moved < tolerance:
             break
-    theta, moved, before = last.theta, last.moved, last.moved_before
-    at = weigh(model, theta, last.weight, loss)
+    at = weigh(model, theta, weight, loss)
     return Fit(
         theta=theta,
         at=at._replace(curvature=max(at.curvature, 0.1)),
@@ -247,15 +227,10 @@ def fit_response(
         plain, _ = solve_model(problem, form, base, tolerance=compared)
         spread = float(np.std(plain.theta.b.mean(1)))
     splines = system.unknowns.splines.values(fit.theta.c)
-    response = Response(base.base, _knots(splines.mean(0)))
-    if by != "all":
-        response = replace(response, by=by, splines=tuple(_knots(s) for s in splines))
+    mean, *each = (tuple(map(float, values)) for values in (splines.mean(0), *splines))
+    response = Response(base.base, mean, by, () if by == "all" else tuple(each))
     stretch = (np.std(fit.theta.b.mean(1)) + 1e-3) / (spread + 1e-3)
     if problem.known is None and not 1 / LARGEST_STRETCH < stretch < LARGEST_STRETCH:
         return None
     rises = monotone(response) and log_slope_minimum(response) > SMALLEST_LOG_SLOPE
     return response if rises else None
-
-
-def _knots(values: Float[np.ndarray, " k"]) -> tuple[float, ...]:
-    return tuple(float(x) for x in values)

@@ -1,0 +1,119 @@
+"""SPZ and compressed PLY, both through the package gsply.
+
+SPZ (https://github.com/nianticlabs/spz) is some ten times smaller than PLY. Its axes are right, up,
+back; splats from COLMAP's world count as right, down, forward. gsply leaves that to its caller, as
+it does the number of fractional bits of positions, beyond which it would clip them. Compressed PLY
+is the format of PlayCanvas and SuperSplat: 16 bytes a Gaussian and its harmonics; blocks of 256
+Gaussians share the ranges that positions, scales and colours are quantised over.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from p2gs_jax.core.atomic import atomic_write
+from p2gs_jax.core.numerics import on_device
+from p2gs_jax.errors import UserError
+from p2gs_jax.formats.ply import unit_quats
+from p2gs_jax.gaussians.posed import half_turn
+from p2gs_jax.types import Gaussians
+
+# Positions are integers of 24 bits with a sign; more than 24 fractional bits are not allowed.
+LARGEST_INTEGER, MOST_FRACTIONAL_BITS = 2**23 - 1, 24
+
+
+def require_gsply() -> ModuleType:
+    """Return the package that writes both formats; a UserError says that it is not installed."""
+    try:
+        import gsply
+    except ImportError as error:
+        raise UserError(
+            f"SPZ and compressed PLY need the package gsply, which cannot be imported ({error}).",
+            fix="pip install 'p2gs-jax[spz]', or convert display.ply with another tool "
+            "(docs/exports.md)",
+        ) from error
+    return gsply
+
+
+def _to_gsply(g: Gaussians) -> Any:
+    return require_gsply().GSData.from_arrays(
+        means=np.asarray(g.means),
+        scales=np.asarray(g.log_scales),
+        quats=unit_quats(g).astype(np.float32),
+        opacities=np.asarray(g.opacity_logits),
+        sh0=np.asarray(g.sh[:, 0]),
+        shN=np.asarray(g.sh[:, 1:]) if g.sh.shape[1] > 1 else None,
+        format="ply",
+    )
+
+
+def _from_gsply(data: Any) -> Gaussians:
+    sh = np.asarray(data.sh0).reshape(-1, 1, 3)
+    if data.shN is not None and np.size(data.shN):
+        sh = np.concatenate([sh, np.asarray(data.shN).reshape(len(sh), -1, 3)], axis=1)
+    parts = data.means, data.quats, data.scales, np.reshape(data.opacities, -1), sh
+    return Gaussians(*map(on_device, parts))
+
+
+def write_compressed_ply(path: Path, gaussians: Gaussians) -> int:
+    """Write Gaussians with display colours into a file `.compressed.ply`; return how many."""
+    content = require_gsply().compress_to_bytes(_to_gsply(gaussians))
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(content)
+    return gaussians.capacity
+
+
+def read_compressed_ply(path: Path) -> Gaussians:
+    """Read Gaussians back, in the order of the file; a UserError says that they cannot be read."""
+    gsply = require_gsply()
+    try:
+        data = gsply.decompress_from_bytes(path.read_bytes())
+    except (OSError, ValueError, KeyError, IndexError) as error:
+        raise UserError(f"{path} is not a readable compressed PLY: {error}.") from error
+    return _from_gsply(data)
+
+
+def write_spz(path: Path, gaussians: Gaussians) -> int:
+    """Write Gaussians with display colours; return how many.
+
+    A UserError says that a position does not fit the format.
+    """
+    require_gsply()
+    from gsply.spz import write_spz as write
+
+    g = half_turn(gaussians)
+    bits = fractional_bits(np.asarray(g.means))
+    with atomic_write(path) as temporary:
+        write(temporary, _to_gsply(g), version=3, fractional_bits=bits)
+    return g.capacity
+
+
+def fractional_bits(means: np.ndarray) -> int:
+    """Return the most fractional bits with which every coordinate fits.
+
+    A UserError says that a coordinate fits with none.
+    """
+    farthest = max(float(np.abs(means).max(initial=0.0)), 1e-12)
+    bits = int(np.floor(np.log2(LARGEST_INTEGER / farthest)))
+    if bits < 1:
+        raise UserError(
+            f"SPZ holds no position as far as {farthest:.3g} scene units from the origin.",
+            fix="move or shrink the scene, or export display-ply",
+        )
+    return min(bits, MOST_FRACTIONAL_BITS)
+
+
+def read_spz(path: Path) -> Gaussians:
+    """Read Gaussians back, as the file holds them; a UserError says that they cannot be read."""
+    require_gsply()
+    from gsply.spz import read_spz as read
+
+    try:
+        data = read(path)
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path} is not a readable SPZ: {error}") from error
+    return half_turn(_from_gsply(data))

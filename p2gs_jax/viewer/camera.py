@@ -1,0 +1,283 @@
+"""Cameras of the browser and ours: conversion, the scene's scale, drives, and what marks them.
+
+Both kinds look along z with x right and y down (OpenCV). viser's poses are camera-to-world; it has
+a vertical field of view instead of K, and lengths in the viewer's own unit.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import viser
+from jaxtyping import Float, UInt8
+from scipy.spatial.transform import Rotation
+
+from p2gs_jax.scene.rigid import camera_centers, interpolated, inverse, up_direction
+from p2gs_jax.types import Camera, Scene, View
+
+Size = tuple[int, int]
+# Typical distance from a camera to what it sees, viewer units: viser's keys move 2 units a second.
+TYPICAL_DISTANCE = 10.0
+SMALLEST_FOV, LARGEST_FOV = 0.05, 2.8
+# Poses sent to the browser per second while a drive is played.
+RATE = 25.0
+# Frusta closer to the camera than this, in sizes of a frustum, are hidden.
+TOO_CLOSE = 2.5
+LINE = 2.0
+
+
+class ViewerSpace(NamedTuple):
+    """Viewer units in a scene unit, and the direction away from the ground, of length 1."""
+
+    unit: float
+    up: Float[np.ndarray, " 3"]
+
+
+class Pose(NamedTuple):
+    """A camera pose in viser's terms: rotation camera-to-world, places in viewer units.
+
+    It orbits `look_at`; `fov` is vertical, radians.
+    """
+
+    wxyz: Float[np.ndarray, " 4"]
+    position: Float[np.ndarray, " 3"]
+    look_at: Float[np.ndarray, " 3"]
+    fov: float
+
+
+@dataclass(frozen=True)
+class BrowserView:
+    """The browser's camera and the size of its canvas, pixels."""
+
+    wxyz: Float[np.ndarray, " 4"]
+    position: Float[np.ndarray, " 3"]
+    fov: float
+    canvas: Size
+
+    @property
+    def aspect(self) -> float:
+        """Width / height of the canvas."""
+        return self.canvas[0] / self.canvas[1]
+
+
+def browser_view(client: viser.ClientHandle) -> BrowserView:
+    """Return the newest camera of a browser."""
+    camera = client.camera
+    canvas = max(camera.image_width, 1), max(camera.image_height, 1)
+    return BrowserView(camera.wxyz, camera.position, camera.fov, canvas)
+
+
+def viewmats_of(views: Sequence[View]) -> Float[np.ndarray, "v 4 4"]:
+    """Return the world-to-camera matrices of views."""
+    return np.stack([view.viewmat for view in views])
+
+
+def make_viewer_space(scene: Scene, points: Float[np.ndarray, "n 3"]) -> ViewerSpace:
+    """Return a scene's scale, by the points of the scene, and its up direction."""
+    viewmats = viewmats_of(scene.views)
+    every = max(1, len(viewmats) // 16)
+    distance = np.median([distance_seen(m, points) for m in viewmats[::every]])
+    up = up_direction(viewmats)
+    upright = np.linalg.norm(up) > 1e-6
+    return ViewerSpace(
+        TYPICAL_DISTANCE / float(distance), up if upright else np.array([0.0, -1.0, 0.0])
+    )
+
+
+def distance_seen(viewmat: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "p 3"]) -> float:
+    """Return the median depth of the points within 45 degrees of the axis; 1 if there are none."""
+    local = points @ viewmat[:3, :3].T + viewmat[:3, 3]
+    z = local[:, 2]
+    ahead = z > np.maximum(np.linalg.norm(local[:, :2], axis=1), 1e-6)
+    return float(np.median(z[ahead])) if ahead.any() else 1.0
+
+
+def pose_of(
+    viewmat: Float[np.ndarray, "4 4"], space: ViewerSpace, *, distance: float, fov: float
+) -> Pose:
+    """Return the browser's camera for a view.
+
+    Args:
+        viewmat: world-to-camera.
+        space: of the scene.
+        distance: from the camera to the centre of its orbit, scene units.
+        fov: vertical field of view, radians.
+    """
+    rotation = viewmat[:3, :3].T.astype(float)
+    position = camera_centers(viewmat[None])[0] * space.unit
+    look_at = position + rotation[:, 2] * distance * space.unit
+    wxyz = Rotation.from_matrix(rotation).as_quat(scalar_first=True)
+    return Pose(wxyz, position, look_at, fov)
+
+
+def camera_of_browser(
+    view: BrowserView | Pose, aspect: float, size: Size, space: ViewerSpace
+) -> Camera:
+    """Return our camera for the browser's.
+
+    Args:
+        view: the browser's.
+        aspect: width / height of the canvas.
+        size: pixels to render; not square where its aspect differs from the canvas's.
+        space: of the scene.
+    """
+    rotation = Rotation.from_quat(np.asarray(view.wxyz, float), scalar_first=True).as_matrix()
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = rotation.T
+    viewmat[:3, 3] = -rotation.T @ (np.asarray(view.position, float) / space.unit)
+    width, height = size
+    tangent = np.tan(np.clip(view.fov, SMALLEST_FOV, LARGEST_FOV) / 2)
+    focal = width / (2 * tangent * aspect), height / (2 * tangent)
+    K = np.array([[focal[0], 0, width / 2], [0, focal[1], height / 2], [0, 0, 1]])
+    return Camera(jnp.asarray(viewmat, jnp.float32), jnp.asarray(K, jnp.float32), width, height)
+
+
+def fov_that_holds(view: View, aspect: float) -> float:
+    """Return the smallest vertical field of view, radians, that shows a whole photograph.
+
+    The canvas has `aspect` = width / height.
+    """
+    K, width, height = view.K, view.width, view.height
+    across = max(K[0, 2], width - K[0, 2]) / K[0, 0]
+    down = max(K[1, 2], height - K[1, 2]) / K[1, 1]
+    fov = 2 * np.arctan(max(down, across / aspect))
+    return float(np.clip(fov, SMALLEST_FOV, LARGEST_FOV))
+
+
+def frames_of(scene: Scene, camera: str) -> tuple[int, ...]:
+    """Return the rows of a physical camera's views, in the order of names."""
+    rows = [i for i, view in enumerate(scene.views) if view.camera == camera]
+    return tuple(sorted(rows, key=lambda i: scene.views[i].name))
+
+
+def viewmat_between(viewmats: Float[np.ndarray, "k 4 4"], place: float) -> Float[np.ndarray, "4 4"]:
+    """Return the matrix at a place along recorded poses: 0 is the first, 1 the second.
+
+    Beyond the ends it stays there.
+    """
+    last = len(viewmats) - 1
+    poses = inverse(np.asarray(viewmats, np.float64))
+    between, _ = interpolated(np.arange(last + 1.0), poses, np.clip([place], 0, last))
+    return inverse(between)[0]
+
+
+class Player:
+    """Moves a place along a drive at a steady speed, in a thread of its own."""
+
+    def __init__(self, move: Callable[[float], None]):
+        """Begin stopped; `move` is called with the place, in frames, `RATE` times a second."""
+        self._move = move
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def play(self, start: float, last: float, speed: Callable[[], float]) -> None:
+        """Play from a place to the last frame, then from the first one, in a loop.
+
+        `speed` returns frames per second, and is called at every step.
+        """
+        self.stop()
+        self._stop = stop = threading.Event()
+
+        def run() -> None:
+            place, before = start, time.monotonic()
+            while not stop.wait(1 / RATE):
+                now = time.monotonic()
+                place, before = place + (now - before) * speed(), now
+                if place > last:
+                    place = 0.0
+                self._move(place)
+
+        self._thread = threading.Thread(target=run, name="play", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop playing, and wait for the thread to end."""
+        self._stop.set()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join()
+        self._thread = None
+
+
+def frustum_size(views: Sequence[View], space: ViewerSpace) -> float:
+    """Return a size at which frusta of neighbouring views hardly touch, viewer units."""
+    names: dict[str, list[View]] = {}
+    for view in views:
+        names.setdefault(view.camera, []).append(view)
+    centers = [camera_centers(viewmats_of(rows)) for rows in names.values()]
+    steps = [np.linalg.norm(a - b) for places in centers for a, b in pairwise(places)]
+    moved = [step for step in steps if step > 0]
+    step = float(np.median(moved)) * space.unit if moved else 1.0
+    return float(np.clip(0.35 * step, 0.02, 1.5))
+
+
+class Frusta:
+    """The photographs' cameras that one browser shows, coloured by exposure."""
+
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        views: Sequence[View],
+        colors: UInt8[np.ndarray, "v 3"],
+        space: ViewerSpace,
+        on_click: Callable[[int], None],
+    ):
+        """Add a hidden frustum without a picture for every view.
+
+        `on_click` is called with the row of a view whose frustum was clicked.
+        """
+        self._positions = camera_centers(viewmats_of(views)) * space.unit
+        self._size, self._visible = frustum_size(views, space), False
+        self._usual_size = self._size
+        self._near = np.zeros(len(views), bool)
+        self._handles = []
+        for index, view in enumerate(views):
+            fov = 2 * float(np.arctan(view.height / 2 / view.K[1, 1]))
+            aspect = float(view.width / view.K[0, 0] / (view.height / view.K[1, 1]))
+            rotation = Rotation.from_matrix(view.viewmat[:3, :3].T.astype(float))
+            handle = client.scene.add_camera_frustum(
+                f"/cameras/{index}",
+                fov,
+                aspect,
+                scale=self._size,
+                thickness=LINE,
+                thickness_units="screen",
+                color=colors[index],
+                wxyz=rotation.as_quat(scalar_first=True),
+                position=self._positions[index],
+                visible=False,
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+            handle.on_click(lambda event, index=index: on_click(index))
+            self._handles.append(handle)
+
+    def show(self, visible: bool, scale: float) -> None:
+        """Show or hide all of them, times their usual size."""
+        self._visible, self._size = visible, scale * self._usual_size
+        for handle in self._handles:
+            handle.scale = self._size
+        self._apply()
+
+    def keep_clear(self, position: Float[np.ndarray, " 3"]) -> None:
+        """Hide the frusta that are too close to a camera at a place in viewer units."""
+        near = np.linalg.norm(self._positions - position, axis=1) < TOO_CLOSE * self._size
+        if (near != self._near).any():
+            self._near = near
+            self._apply()
+
+    def set_thumbnail(self, index: int, image: UInt8[np.ndarray, "h w 3"]) -> None:
+        """Set the picture of a view's frustum."""
+        self._handles[index].image = image
+
+    def _apply(self) -> None:
+        for handle, near in zip(self._handles, self._near, strict=True):
+            visible = self._visible and not near
+            if handle.visible != visible:
+                handle.visible = visible

@@ -1,0 +1,349 @@
+"""The thread that keeps one browser's picture up to date.
+
+Requests wait in a mailbox that holds one: the camera and the settings are read when a frame begins,
+so the newest win. While anything changes, frames are as large as the frame rate allows and are sent
+as JPEG; at rest the canvas is rendered pixel for pixel and sent as PNG. What fails is reported
+once, and nothing is tried again before a request or a newly compiled program.
+"""
+
+from __future__ import annotations
+
+import html
+import math
+import sys
+import threading
+import time
+import traceback
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+import viser
+from jaxtyping import Float32
+
+from p2gs_jax.errors import UserError
+from p2gs_jax.photometry.display import DisplayTransform
+from p2gs_jax.photometry.metering import meter
+from p2gs_jax.scene.pixels.store import camera_of
+from p2gs_jax.types import Camera
+from p2gs_jax.viewer.camera import BrowserView, Size, browser_view, camera_of_browser
+from p2gs_jax.viewer.panel import Panel
+from p2gs_jax.viewer.pictures import (
+    RenderedFrame,
+    WarpedPhotograph,
+    clipping_legend,
+    depth_legend,
+    limits_of_depth,
+    note,
+    picture_of,
+    splat_colors,
+    stops_legend,
+    to_uint8_fast,
+    warp_photograph,
+)
+from p2gs_jax.viewer.renderer import compilation_order, full_size, next_size, render_sizes
+from p2gs_jax.viewer.settings import Settings, display_of
+from p2gs_jax.viewer.viewed_run import ViewedRun
+
+# Nothing has changed for this long: at rest, seconds.
+REST_S = 0.3
+JPEG_QUALITY = 85
+# Depth that is sent along to hide frusta: width in pixels, quantum and maximum in viewer units.
+DEPTH_WIDTH, DEPTH_STEP, FARTHEST = 480, 256e-5, 167.0
+# Least time between two updates of a million splats' colours, seconds.
+SPLATS_S = 1.0
+# A metered exposure comes this close (1/e) to what is seen within this time, seconds.
+ADAPT_S = 0.5
+BLACK = np.zeros((1, 1, 3), np.uint8)
+NO_PHOTOGRAPH = "No photograph was taken from here: choose one under Camera, Go to."
+
+Request = Literal["look", "camera", "rest"]
+
+
+def report(client: viser.ClientHandle, what: str, error: Exception) -> None:
+    """Tell the user of a browser what went wrong."""
+    if isinstance(error, UserError):
+        text = str(error)
+    else:
+        traceback.print_exception(error, file=sys.stderr)
+        text = f"{type(error).__name__}: {error}"
+    client.add_notification(what, text, color="red")
+
+
+class Darkroom:
+    """Develops frames, for one thread: new display settings need no rendering.
+
+    Attributes:
+        depth_limits: nearest and farthest depth of the colour scale, scene units, or None.
+        metered_exposure: the newest that was metered, or None.
+        photograph_error: why the last photograph could not be shown, or None.
+    """
+
+    def __init__(self, viewed: ViewedRun, depth_limits: tuple[float, float] | None = None):
+        """Begin without a photograph."""
+        self.depth_limits = depth_limits
+        self.metered_exposure: float | None = None
+        self.photograph_error: str | None = None
+        self._viewed = viewed
+        self._photograph: tuple[int, Camera, WarpedPhotograph] | None = None
+        # The frame that was metered last, when, and the log exposure that had been reached.
+        self._metered: tuple[RenderedFrame, float, float] | None = None
+
+    def transform(
+        self, frame: RenderedFrame, settings: Settings, *, settled: bool = True
+    ) -> DisplayTransform:
+        """Return a frame's display transform; a metered exposure follows what the frame shows.
+
+        Unless `settled`, the exposure takes its time to adapt.
+        """
+        run = self._viewed.run
+        shown = display_of(run, settings)
+        if not settings.metered:
+            return shown
+        before, now = self._metered, time.monotonic()
+        if before is None or before[0] is not frame or settled:
+            log = run.metering.log_exposure(meter(np.asarray(frame.linear), frame.alpha))
+            if before is not None and not settled:
+                share = 1 - math.exp(-(now - before[1]) / ADAPT_S)
+                log = before[2] + share * (log - before[2])
+            self._metered = before = (frame, now, log)
+        self.metered_exposure = float(np.exp(before[2])) * 2**settings.exposure_ev
+        return replace(shown, exposure=self.metered_exposure)
+
+    def develop(
+        self, frame: RenderedFrame, settings: Settings, *, settled: bool = True
+    ) -> Float32[np.ndarray, "h w 3"]:
+        """Return display values of a frame; `settled` as of `transform`."""
+        if settings.mode == "depth" and self.depth_limits is None:
+            self.depth_limits = limits_of_depth(frame)
+        taken_as = settings.taken_as
+        return picture_of(
+            frame,
+            settings.mode,
+            self.transform(frame, settings, settled=settled),
+            depth_limits=self.depth_limits,
+            photograph=self._photograph_of(frame) if settings.mode == "split" else None,
+            split=settings.split,
+            taken_by=None if taken_as is None else camera_of(self._viewed.store, taken_as),
+        )
+
+    def _photograph_of(self, frame: RenderedFrame) -> WarpedPhotograph | None:
+        self.photograph_error = None
+        index = self._viewed.view_at(frame.camera)
+        if index is None:
+            return None
+        kept, store = self._photograph, self._viewed.store
+        if kept is None or kept[0] != index or kept[1] is not frame.camera:
+            try:
+                ldr, mask = store.get(index)
+            except UserError as error:
+                self.photograph_error = error.message
+                return None
+            seen = warp_photograph(ldr, mask, camera_of(store, index), frame.camera)
+            self._photograph = kept = (index, frame.camera, seen)
+        return kept[2]
+
+    def legend(self, frame: RenderedFrame, settings: Settings) -> str | None:
+        """Return the legend of the last picture as HTML."""
+        if settings.mode == "stops":
+            return stops_legend()
+        if settings.mode == "clipping":
+            return clipping_legend()
+        if settings.mode == "depth" and self.depth_limits is not None:
+            return depth_legend(*self.depth_limits)
+        if settings.mode == "split" and self._viewed.view_at(frame.camera) is None:
+            return note(NO_PHOTOGRAPH)
+        if settings.mode == "split" and self.photograph_error is not None:
+            return note(html.escape(f"The photograph cannot be shown: {self.photograph_error}"))
+        return None
+
+
+class LivePicture:
+    """Renders and sends the picture of one browser, in a thread.
+
+    Attributes:
+        darkroom: develops its frames; others may read its attributes.
+        with_depth: whether depth is sent along, to hide frusta.
+    """
+
+    def __init__(self, client: viser.ClientHandle, viewed: ViewedRun, panel: Panel):
+        """Prepare the thread; `start` starts it."""
+        self._client, self._viewed, self._panel = client, viewed, panel
+        self.darkroom, self.with_depth = Darkroom(viewed), False
+        self._changed = threading.Condition()
+        self._request: Request | None = "camera"
+        self._rest_at: float | None = None  # when a picture at rest is due
+        self._stopping = False
+        self._frame: RenderedFrame | None = None
+        self._stale = True  # whether the frame is of an older camera
+        self._sharp = False  # whether it was shown at rest, and nothing has changed since
+        self._moving: tuple[Size | None, float] = (None, 0.0)  # size and time of the last frame
+        self._last_ms = 0.0
+        self._splats: viser.GaussianSplatHandle | None = None
+        self._colored: Settings | None = None
+        self._thread = threading.Thread(target=self._work, name="draw", daemon=True)
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._viewed.listeners.append(self._renderer_changed)
+        self._update_status()
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop the thread once its present frame is done."""
+        with self._changed:
+            self._stopping = True
+            self._changed.notify_all()
+        if self._renderer_changed in self._viewed.listeners:
+            self._viewed.listeners.remove(self._renderer_changed)
+        self._thread.join()
+
+    def camera_moved(self) -> None:
+        """Render again: the camera has moved."""
+        self._post("camera")
+
+    def display_changed(self) -> None:
+        """Develop the frame again: the display settings have changed."""
+        self._post("look")
+
+    def _post(self, request: Request) -> None:
+        with self._changed:
+            self._request = "camera" if "camera" in (request, self._request) else request
+            self._changed.notify_all()
+
+    def _renderer_changed(self) -> None:
+        """Ask for a picture at rest: with a new program it may be a better one."""
+        with self._changed:
+            if self._rest_at is None:
+                self._rest_at = time.monotonic()
+            self._changed.notify_all()
+        self._update_status()
+
+    def _take(self) -> Request | None:
+        """Wait for a request, or for the time of a picture at rest; None at the end."""
+        with self._changed:
+            while not self._stopping:
+                if self._request is not None:
+                    request, self._request = self._request, None
+                    self._rest_at = time.monotonic() + REST_S
+                    return request
+                wait = None if self._rest_at is None else self._rest_at - time.monotonic()
+                if wait is not None and wait <= 0:
+                    self._rest_at = None  # once, whatever comes of it
+                    return "rest"
+                self._changed.wait(wait)
+        return None
+
+    def _work(self) -> None:
+        while (request := self._take()) is not None:
+            try:
+                settings = self._panel.settings()
+                if settings.splats:
+                    self._draw_splats(settings)
+                else:
+                    self._hide_splats()
+                    self._draw(request, settings)
+            except Exception as error:
+                report(self._client, "This went wrong", error)
+
+    def _draw(self, request: Request, settings: Settings) -> None:
+        begin, view, at_rest = time.perf_counter(), browser_view(self._client), request == "rest"
+        sizes = render_sizes(full_size(view.canvas, self._viewed.max_width))
+        ready, size = self._viewed.renderer.ready, None
+        if request == "camera":
+            self._stale = True
+            size = next_size(sizes, ready, *self._moving)
+        elif at_rest:
+            self._viewed.renderer.request(compilation_order(sizes))
+            usable = [s for s in sizes if s in ready]
+            size = usable[-1] if usable else next_size(sizes, ready, None, 0.0)
+        fits = self._frame is not None and self._frame.size == size and not self._stale
+        if at_rest and fits and self._sharp:
+            return
+        if size is not None and not fits:
+            self._render(view, size, ready)
+        if self._frame is None:
+            return
+        if at_rest:  # done for every frame, the scale would flicker
+            self.darkroom.depth_limits = limits_of_depth(self._frame)
+        self._show(self._frame, settings, sharp=at_rest)
+        self._sharp = at_rest
+        milliseconds = 1e3 * (time.perf_counter() - begin)
+        if request == "camera":
+            self._moving = size, milliseconds
+        if request != "look":
+            self._last_ms = milliseconds
+        self._update_status()
+
+    def _render(self, view: BrowserView, size: Size, ready: frozenset[Size]) -> None:
+        """Render the largest size up to `size` whose tile lists hold the view."""
+        smaller = (s for s in ready if s[0] * s[1] < size[0] * size[1])
+        for candidate in (size, *sorted(smaller, reverse=True)):
+            frame = self._viewed.render(self.camera(view, candidate))
+            if frame is not None:
+                self._frame, self._stale = frame, False
+                return
+
+    def camera(self, view: BrowserView, size: Size) -> Camera:
+        """Return the camera that renders a browser's view."""
+        return camera_of_browser(view, view.aspect, size, self._viewed.space)
+
+    def _show(self, frame: RenderedFrame, settings: Settings, *, sharp: bool) -> None:
+        image = to_uint8_fast(self.darkroom.develop(frame, settings, settled=sharp))
+        self._client.scene.set_background_image(
+            image,
+            "png" if sharp else "jpeg",
+            jpeg_quality=JPEG_QUALITY,
+            depth=_depth_for_browser(frame, self._viewed.space.unit) if self.with_depth else None,
+        )
+        self._client.flush()
+        self._panel.set_legend(self.darkroom.legend(frame, settings))
+
+    def _draw_splats(self, settings: Settings) -> None:
+        if settings == self._colored:
+            return
+        handle = self._splats
+        if handle is None:
+            self._panel.set_status(note("preparing splats ..."))
+        splats = self._viewed.splats()
+        begin = time.monotonic()
+        colors = splat_colors(splats, display_of(self._viewed.run, settings), settings.mode)
+        if handle is None:
+            self._splats = self._client.scene.add_gaussian_splats(
+                "/splats", splats.centers, splats.covariances, colors, splats.opacities
+            )
+        else:
+            handle.rgbs = colors
+            handle.visible = True
+        self._colored, self._sharp = settings, False
+        self._client.scene.set_background_image(BLACK, "png")
+        self._panel.set_legend(stops_legend() if settings.mode == "stops" else None)
+        self._panel.set_status(note(f"{len(colors):,} splats, drawn by the browser"))
+        pause = SPLATS_S * len(colors) / 1e6 - (time.monotonic() - begin)
+        time.sleep(max(0.0, pause))
+
+    def _hide_splats(self) -> None:
+        if self._splats is not None and self._colored is not None:
+            self._splats.visible = False
+            self._colored = None
+
+    def _update_status(self) -> None:
+        if self._panel.settings().splats:
+            return
+        frame, renderer = self._frame, self._viewed.renderer
+        busy, failure, parts = renderer.compiling, renderer.failure, []
+        if frame is not None:
+            parts += [f"{frame.size[0]} x {frame.size[1]}", f"{self._last_ms:.0f} ms"]
+        if busy is not None:
+            parts.append(f"compiling {busy[0]} x {busy[1]} ...")
+        if failure is not None:
+            parts.append(html.escape(failure[:200]))
+        self._panel.set_status(note(" &middot; ".join(parts) or "starting ..."))
+
+
+def _depth_for_browser(frame: RenderedFrame, unit: float) -> Float32[np.ndarray, "h w"]:
+    """Return depth in viewer units, coarse enough to be sent with every frame."""
+    step = max(1, frame.size[0] // DEPTH_WIDTH)
+    alpha, depth = frame.alpha[::step, ::step], frame.depth[::step, ::step]
+    expected = np.where(alpha > 0.5, unit * depth / np.maximum(alpha, 1e-6), FARTHEST)
+    return (np.rint(np.minimum(expected, FARTHEST) / DEPTH_STEP) * DEPTH_STEP).astype(np.float32)

@@ -1,0 +1,350 @@
+"""What the viewer shows of a rendered frame, in every mode, with its legend; also as files.
+
+The browser can draw splats itself: fast, but it composites display values instead of radiance, so
+soft edges differ a little. viser has no spherical harmonics: colours are those seen from one place.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import cv2
+import jax
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+from jaxtyping import Array, Bool, Float, Float32, UInt8
+from scipy.spatial.transform import Rotation
+from scipy.special import expit
+
+from p2gs_jax.config import RenderConfig
+from p2gs_jax.formats.exr import write_exr
+from p2gs_jax.formats.false_color import (
+    DEPTH_MAP,
+    OVER,
+    STOPS,
+    STOPS_MAP,
+    UNDER,
+    clipping_overlay,
+    depth_color,
+    false_color,
+)
+from p2gs_jax.formats.frames import write_png
+from p2gs_jax.gaussians.bake import display_of_splats
+from p2gs_jax.photometry.display import DisplayTransform, develop
+from p2gs_jax.photometry.formation import places
+from p2gs_jax.render import view_radiance
+from p2gs_jax.types import Camera, Gaussians
+
+Mode = Literal["display", "stops", "clipping", "depth", "split"]
+# Exposed radiance at 0 stops.
+MIDDLE_GREY = 0.18
+# Percentiles of depth at the ends of the colour scale.
+DEPTH_TAILS = (1.0, 99.0)
+LINE = 1.0
+# viser sends covariances of splats as 16-bit floats, at most 65504.
+LARGEST_DEVIATION = 250.0
+# Fewest and most pixels across of a saved picture.
+SAVED_WIDTHS = (16, 16384)
+BOX = "margin:0 0.75em 0.75em;font-size:0.75em;line-height:1.4;opacity:0.9"
+COLORS = 12
+
+
+@dataclass(frozen=True)
+class RenderedFrame:
+    """A rendered view, from which every mode is made.
+
+    Attributes:
+        linear: radiance.
+        alpha: opacity.
+        depth: alpha-weighted depth, scene units.
+        camera: of the view.
+    """
+
+    linear: Float[Array, "h w 3"]
+    alpha: Float[np.ndarray, "h w"]
+    depth: Float[np.ndarray, "h w"]
+    camera: Camera
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height, pixels."""
+        return self.camera.width, self.camera.height
+
+
+class WarpedPhotograph(NamedTuple):
+    """Display values of a photograph in a frame's pixels, and which of these it covers."""
+
+    ldr: Float32[np.ndarray, "h w 3"]
+    inside: Bool[np.ndarray, "h w"]
+
+
+def picture_of(
+    frame: RenderedFrame,
+    mode: Mode,
+    transform: DisplayTransform,
+    *,
+    depth_limits: tuple[float, float] | None = None,
+    photograph: WarpedPhotograph | None = None,
+    split: float = 0.5,
+    taken_by: Camera | None = None,
+) -> Float32[np.ndarray, "h w 3"]:
+    """Return display values of a frame in one of the modes.
+
+    Args:
+        frame: the rendered view.
+        mode: `stops` counts from middle grey at the exposure of the transform; `split` without
+            a photograph is `display`.
+        transform: from radiance to display values.
+        depth_limits: nearest and farthest depth of the colour scale, scene units; None takes the
+            frame's own.
+        photograph: for `split`.
+        split: share of the photograph's width that is shown, from the left.
+        taken_by: the camera whose vignetting the transform has; None: that of the frame.
+    """
+    if mode == "stops":
+        return false_color(np.asarray(frame.linear), MIDDLE_GREY / transform.exposure)
+    if mode == "depth":
+        return depth_color(frame.depth, frame.alpha, depth_limits or limits_of_depth(frame))
+    positions = None
+    if taken_by is not None and transform.vignetting:
+        positions = places_in(taken_by, frame.camera)
+    ldr = develop(frame.linear, transform, positions, frame.alpha)
+    if mode == "clipping":
+        return clipping_overlay(ldr)
+    return ldr if mode == "display" or photograph is None else split_picture(photograph, ldr, split)
+
+
+def places_in(taken_by: Camera, frame: Camera) -> Float32[np.ndarray, "h w 2"]:
+    """Return where a photograph's camera in the frame's place would have the frame's pixels.
+
+    Beyond its image they count as its corners, where its vignetting ends.
+    """
+    K, k = np.asarray(taken_by.K, float), np.asarray(frame.K, float)
+    x, y = ((np.arange(n) + 0.5) for n in (frame.width, frame.height))
+    u = (x - k[0, 2]) / k[0, 0] * K[0, 0] + K[0, 2]
+    v = (y - k[1, 2]) / k[1, 1] * K[1, 1] + K[1, 2]
+    at = places(np.stack(np.meshgrid(u, v), -1), taken_by.width, taken_by.height)
+    return (at / np.maximum(np.linalg.norm(at, axis=-1, keepdims=True), 1)).astype(np.float32)
+
+
+def split_picture(
+    photograph: WarpedPhotograph, ldr: Float32[np.ndarray, "h w 3"], split: float
+) -> Float32[np.ndarray, "h w 3"]:
+    """Return the photograph left of a white line, and the render everywhere else.
+
+    The line is at a share `split` of the photograph's width from its left edge.
+    """
+    out = np.array(ldr)
+    columns = np.flatnonzero(photograph.inside.any(0))
+    if not len(columns):
+        return out
+    first, last = int(columns[0]), int(columns[-1]) + 1
+    line = first + round(split * (last - first))
+    left = photograph.inside.copy()
+    left[:, line:] = False
+    out[left] = photograph.ldr[left]
+    if first < line < last:
+        out[:, max(line - 1, 0) : line + 1] = LINE
+    return out
+
+
+def limits_of_depth(frame: RenderedFrame) -> tuple[float, float]:
+    """Return the 1st and 99th percentile of a frame's depth, scene units."""
+    alpha, depth = frame.alpha[::4, ::4], frame.depth[::4, ::4]
+    there = alpha > 0.5
+    if not there.any():
+        return 1.0, 2.0
+    near, far = np.percentile(depth[there] / alpha[there], DEPTH_TAILS)
+    return max(float(near), 1e-6), max(float(far), 1.001 * float(near), 2e-6)
+
+
+def warp_photograph(
+    ldr: Float32[np.ndarray, "h w 3"],
+    mask: Float32[np.ndarray, "h w"],
+    taken_by: Camera,
+    frame: Camera,
+) -> WarpedPhotograph:
+    """Return a photograph resampled into the pixels of another camera at the same place.
+
+    Images of cameras with a common centre are related by a homography. In the mask 1 = use.
+    """
+    turn = np.asarray(taken_by.viewmat, float)[:3, :3] @ np.asarray(frame.viewmat, float)[:3, :3].T
+    K, k = np.asarray(taken_by.K, float), np.asarray(frame.K, float)
+    # OpenCV's first pixel centre is at 0, ours at 0.5.
+    half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])
+    pull = np.linalg.inv(half) @ K @ turn @ np.linalg.inv(k) @ half
+    size = (frame.width, frame.height)
+    how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    shrink = _minification(pull, size)
+    if shrink > 1.0:
+        small = (max(1, round(taken_by.width / shrink)), max(1, round(taken_by.height / shrink)))
+        ldr = cv2.resize(ldr, small, interpolation=cv2.INTER_AREA)
+        mask = cv2.resize(mask, small, interpolation=cv2.INTER_AREA)
+        scale = np.diag([small[0] / taken_by.width, small[1] / taken_by.height, 1.0])
+        pull = np.linalg.inv(half) @ scale @ half @ pull
+    pixels = cv2.warpPerspective(ldr, pull, size, flags=how, borderMode=cv2.BORDER_REPLICATE)
+    inside = cv2.warpPerspective(mask, pull, size, flags=how) > 0.5
+    x, y = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
+    behind = pull[2, 0] * x + pull[2, 1] * y + pull[2, 2] <= 0
+    return WarpedPhotograph(pixels.astype(np.float32), inside & ~behind)
+
+
+def _minification(pull: Float[np.ndarray, "3 3"], size: tuple[int, int]) -> float:
+    """Return how many photograph pixels a frame pixel spans at the middle of the frame."""
+    middle = np.array([size[0] / 2, size[1] / 2, 1.0])
+    steps = (middle + np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])) @ pull.T
+    at = steps[:, :2] / np.where(np.abs(steps[:, 2:]) < 1e-9, 1e-9, steps[:, 2:])
+    return float(min(np.hypot(*(at[1] - at[0])), np.hypot(*(at[2] - at[0]))))
+
+
+def to_uint8_fast(ldr: Float[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Return display values in [0, 1], rounded to 8 bits (cv2: 1 ms for 1920 x 1080, numpy 32)."""
+    return cv2.convertScaleAbs(ldr, alpha=255.0)
+
+
+def png_bytes(ldr: Float32[np.ndarray, "h w 3"]) -> bytes:
+    """Return display values as a PNG file."""
+    return _file_bytes("view.png", lambda path: write_png(path, ldr))
+
+
+def exr_bytes(frame: RenderedFrame, transform: DisplayTransform) -> bytes:
+    """Return a frame as an EXR file with depth, opacity, display transform and camera in it."""
+    return _file_bytes(
+        "view.exr",
+        lambda path: write_exr(
+            path,
+            np.asarray(frame.linear),
+            depth=frame.depth,
+            alpha=frame.alpha,
+            taken=transform,
+            camera=frame.camera,
+        ),
+    )
+
+
+def _file_bytes(name: str, write: Callable[[Path], object]) -> bytes:
+    with tempfile.TemporaryDirectory(prefix="p2gs-view-") as folder:
+        path = Path(folder) / name
+        write(path)
+        return path.read_bytes()
+
+
+class BrowserSplats(NamedTuple):
+    """Splats in viewer units, with peak opacities and the radiance towards one place."""
+
+    centers: Float32[np.ndarray, "n 3"]
+    covariances: Float32[np.ndarray, "n 3 3"]
+    opacities: Float32[np.ndarray, "n 1"]
+    linear: Float32[np.ndarray, "n 3"]
+
+
+def browser_splats(
+    gaussians: Gaussians,
+    alive: Bool[np.ndarray, " n"],
+    cfg: RenderConfig,
+    *,
+    seen_from: Float[np.ndarray, " 3"],
+    unit: float,
+) -> BrowserSplats:
+    """Return live Gaussians as splats in colours seen from a place in scene units.
+
+    `unit` is the number of viewer units in a scene unit.
+    """
+    rows = np.flatnonzero(np.asarray(alive))
+    viewmat = np.eye(4, dtype=np.float32)
+    viewmat[:3, 3] = -np.asarray(seen_from)
+    there = Camera(jnp.asarray(viewmat), jnp.eye(3), 1, 1)
+    quats = np.asarray(gaussians.quats, float)[rows]
+    quats[np.linalg.norm(quats, axis=1) < 1e-30] = (1, 0, 0, 0)
+    scales = np.minimum(np.exp(np.asarray(gaussians.log_scales)[rows]) * unit, LARGEST_DEVIATION)
+    axes = Rotation.from_quat(quats, scalar_first=True).as_matrix() * scales[:, None, :]
+    logits = np.asarray(gaussians.opacity_logits, float)[rows]
+    return BrowserSplats(
+        (np.asarray(gaussians.means)[rows] * unit).astype(np.float32),
+        (axes @ axes.transpose(0, 2, 1)).astype(np.float32),
+        expit(logits)[:, None].astype(np.float32),
+        np.asarray(jax.jit(partial(view_radiance, cfg=cfg))(gaussians, there))[rows],
+    )
+
+
+def splat_colors(
+    splats: BrowserSplats, transform: DisplayTransform, mode: Mode
+) -> UInt8[np.ndarray, "n 3"]:
+    """Return a colour for each splat: false colour in mode `stops`, else display values.
+
+    What depends on the place in the image is left out.
+    """
+    column = splats.linear[:, None]
+    if mode == "stops":
+        return to_uint8_fast(false_color(column, MIDDLE_GREY / transform.exposure))[:, 0]
+    return to_uint8_fast(develop(column, display_of_splats(transform)))[:, 0]
+
+
+def stops_legend() -> str:
+    """Return the legend of false colours as HTML: one box for every stop."""
+    low, high = (int(limit) for limit in STOPS)
+    values = 2.0 ** (np.arange(low, high) + 0.5)
+    colors = false_color(np.repeat(values[None, :, None], 3, -1).astype(np.float32), 1.0)[0]
+    cells = [
+        f'<div style="flex:1;text-align:center;background:{_css(color)};'
+        f'color:{"black" if float(np.mean(color)) > 0.45 else "white"}">'
+        f"{f'{stop:+d}' if stop else '0'}</div>"
+        for stop, color in zip(range(low, high), colors, strict=True)
+    ]
+    text = "stops from middle grey at this exposure; a box holds the stop above its number"
+    return note(f'<div style="display:flex">{"".join(cells)}</div>', text)
+
+
+def clipping_legend() -> str:
+    """Return the legend of the clipping stripes as HTML."""
+    style = "display:inline-block;width:1em;height:0.8em;background:"
+    over, under = (f'<span style="{style}{_css(color)}"></span>' for color in (OVER, UNDER))
+    return note(f"{over} a channel is at its top &ensp; {under} all are at the bottom")
+
+
+def depth_legend(near: float, far: float) -> str:
+    """Return the colour scale of depth in scene units as HTML; near is bright."""
+    return _scale(DEPTH_MAP, (1, 0), f"{near:.3g}", f"{far:.3g}", "depth, scene units")
+
+
+def exposure_legend(low: float, high: float) -> str:
+    """Return the colour scale of the cameras by exposure in stops as HTML."""
+    text = "exposure, EV from the mean; grey: held out"
+    return _scale(STOPS_MAP, (0, 1), f"{low:+.1f}", f"{high:+.1f}", text)
+
+
+def exposure_colors(evs: Sequence[float | None]) -> UInt8[np.ndarray, "n 3"]:
+    """Return a colour for each exposure, lighter the longer it is; grey where there is none."""
+    known = [ev for ev in evs if ev is not None]
+    low, high = (min(known), max(known)) if known else (0.0, 1.0)
+    out = np.full((len(evs), 3), 128, np.uint8)
+    for row, ev in enumerate(evs):
+        if ev is not None:
+            share = (ev - low) / (high - low) if high > low else 0.5
+            out[row] = np.rint(255 * np.array(matplotlib.colormaps[STOPS_MAP](float(share))[:3]))
+    return out
+
+
+def note(*lines: str) -> str:
+    """Return short lines as HTML for the place below a control."""
+    return f'<div style="{BOX}">' + "".join(f"<div>{line}</div>" for line in lines) + "</div>"
+
+
+def _scale(colormap: str, ends: tuple[float, float], left: str, right: str, text: str) -> str:
+    stops = ",".join(map(_css, matplotlib.colormaps[colormap](np.linspace(*ends, COLORS))[:, :3]))
+    return note(
+        f'<div style="height:0.9em;background:linear-gradient(to right,{stops})"></div>',
+        '<div style="display:flex;justify-content:space-between">'
+        f"<span>{left}</span><span>{right}</span></div>",
+        text,
+    )
+
+
+def _css(color: Sequence[float]) -> str:
+    return "rgb({},{},{})".format(*(round(255 * float(c)) for c in color))

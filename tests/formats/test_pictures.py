@@ -1,0 +1,305 @@
+"""EXR, PNG, video and false colour: what others read in them, and what a broken file gives."""
+
+import struct
+
+import av
+import cv2
+import jax.numpy as jnp
+import numpy as np
+import OpenEXR
+import pytest
+from scipy.spatial.transform import Rotation
+
+from p2gs_jax.config import CameraFormation, PhotometryConfig
+from p2gs_jax.errors import UserError
+from p2gs_jax.formats.exr import read_exr, write_exr
+from p2gs_jax.formats.false_color import (
+    OVER,
+    UNDER,
+    clipping,
+    clipping_overlay,
+    depth_color,
+    false_color,
+    luminance,
+    stops,
+)
+from p2gs_jax.formats.frames import open_video, write_png
+from p2gs_jax.photometry.display import DisplayTransform
+from p2gs_jax.scene.convert.headers import ExifSettings
+from p2gs_jax.types import Camera
+
+WIDTH, HEIGHT = 90, 70
+
+
+def camera():
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = Rotation.from_euler("xyz", [0.2, -0.4, 0.1]).as_matrix()
+    viewmat[:3, 3] = [0.5, -1.0, 2.5]
+    K = np.array([[80.0, 0, 41.0], [0, 84.0, 37.0], [0, 0, 1]])
+    return Camera(jnp.asarray(viewmat), jnp.asarray(K), WIDTH, HEIGHT)
+
+
+def written(path, **kwargs):
+    linear = np.full((HEIGHT, WIDTH, 3), 0.25, np.float32)
+    write_exr(path, linear, camera=camera(), **kwargs)
+    with OpenEXR.File(str(path)) as file:
+        return dict(file.header())
+
+
+def attribute_types(path):
+    """Return the type of each attribute as the bytes of the file state it."""
+    data, at, out = path.read_bytes(), 8, {}
+    while data[at]:
+        name_end = data.index(b"\0", at)
+        type_end = data.index(b"\0", name_end + 1)
+        out[data[at:name_end].decode()] = data[name_end + 1 : type_end].decode()
+        at = type_end + 5 + struct.unpack_from("<i", data, type_end + 1)[0]
+    return out
+
+
+def test_exr_holds_radiance_exposure_and_depth(tmp_path):
+    rng = np.random.default_rng(0)
+    linear = np.exp2(rng.uniform(-10, 6, (7, 9, 3))).astype(np.float32)
+    depth, alpha = np.full((7, 9), 4.0, np.float32), np.full((7, 9), 0.5, np.float32)
+    path = tmp_path / "a.exr"
+    taken = DisplayTransform(2.0, 2.1, PhotometryConfig())
+    write_exr(path, linear, depth=depth, alpha=alpha, taken=taken)
+    back, header = read_exr(path)
+    np.testing.assert_allclose(back, linear, rtol=1e-3)
+    assert header["p2gsExposure"] == 2.0
+    assert header["p2gsExposureEV"] == 1.0
+    assert header["p2gsGamma"] == pytest.approx(2.1)
+    np.testing.assert_allclose(
+        header["chromaticities"], (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
+    )
+    np.testing.assert_allclose(header["adoptedNeutral"], (0.3127, 0.329))
+    assert "whiteLuminance" not in header, "radiance is relative"
+    assert "worldToCamera" not in header
+    assert not {"p2gsWhiteBalance", "p2gsVignettingRed"} & set(header)
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        np.testing.assert_allclose(file.channels()["Z"].pixels, 8.0)
+
+
+def test_world_to_ndc_puts_points_where_the_camera_sees_them(tmp_path):
+    header, cam = written(tmp_path / "a.exr"), camera()
+    viewmat, K = np.asarray(cam.viewmat, float), np.asarray(cam.K, float)
+    for local in ([0.3, -0.2, 2.0], [-1.0, 0.8, 5.0], [0.0, 0.0, 1.0]):
+        world = viewmat[:3, :3].T @ (np.array(local) - viewmat[:3, 3])
+        u, v, w = K @ local
+        # Imath: a row vector times the matrix, divided by its last component.
+        x, y, _, weight = np.append(world, 1.0) @ header["worldToNDC"].astype(float)
+        np.testing.assert_allclose(
+            [x / weight, y / weight], [u / w / WIDTH, v / w / HEIGHT], atol=1e-5
+        )
+    # The principal point is 41 pixels from the left and 37 from the top: y points down.
+    centre = viewmat[:3, :3].T @ (np.array([0, 0, 3.0]) - viewmat[:3, 3])
+    x, y, _, weight = np.append(centre, 1.0) @ header["worldToNDC"].astype(float)
+    np.testing.assert_allclose([x / weight, y / weight], [41 / 90, 37 / 70], atol=1e-5)
+
+
+def test_world_to_camera_is_left_handed_with_y_up(tmp_path):
+    header, viewmat = written(tmp_path / "a.exr"), np.asarray(camera().viewmat, float)
+    matrix = header["worldToCamera"].astype(float)
+    right_down_forward = np.array([0.3, 0.2, 2.0])
+    world = viewmat[:3, :3].T @ (right_down_forward - viewmat[:3, 3])
+    np.testing.assert_allclose(np.append(world, 1.0) @ matrix, [0.3, -0.2, 2.0, 1.0], atol=1e-5)
+    assert np.linalg.det(matrix[:3, :3]) == pytest.approx(-1.0)
+    np.testing.assert_allclose(header["p2gsViewmat"], viewmat, atol=1e-6)
+    np.testing.assert_allclose(header["p2gsIntrinsics"], camera().K)
+
+
+def test_the_screen_window_bounds_the_image_at_distance_1(tmp_path):
+    header = written(tmp_path / "a.exr")
+    width, (x, y) = header["screenWindowWidth"], header["screenWindowCenter"]
+    left, right = x - width / 2, x + width / 2
+    assert left == pytest.approx(-41 / 80)
+    assert right == pytest.approx((90 - 41) / 80)
+    assert y == pytest.approx((37 - (70 - 37)) / 2 / 84), "there is more image above the axis"
+
+
+def test_exif_goes_into_the_attributes_of_its_own(tmp_path):
+    shot = ExifSettings(time=1 / 60, aperture=2.8, iso=None, taken="2010:10:12 14:43:07")
+    header = written(tmp_path / "a.exr", shot=shot)
+    assert header["expTime"] == pytest.approx(1 / 60)
+    assert header["aperture"] == pytest.approx(2.8)
+    assert header["capDate"] == "2010:10:12 14:43:07"
+    assert "isoSpeed" not in header
+    assert not {"expTime", "aperture", "capDate"} & set(written(tmp_path / "b.exr"))
+
+
+def test_attributes_have_the_standard_types(tmp_path):
+    path = tmp_path / "a.exr"
+    taken = DisplayTransform(1.0, 2.2, PhotometryConfig())
+    written(path, shot=ExifSettings(0.1, 2.0, 100.0, "2010:10:12 14:43:07"), taken=taken)
+    expected = {
+        "chromaticities": "chromaticities",
+        "adoptedNeutral": "v2f",
+        "worldToCamera": "m44f",
+        "worldToNDC": "m44f",
+        "screenWindowCenter": "v2f",
+        "screenWindowWidth": "float",
+        "expTime": "float",
+        "aperture": "float",
+        "isoSpeed": "float",
+        "capDate": "string",
+        "comments": "string",
+        "p2gsExposure": "float",
+        "p2gsViewmat": "m44f",
+        "p2gsIntrinsics": "m33f",
+    }
+    found = attribute_types(path)
+    assert {name: found[name] for name in expected} == expected
+
+
+def test_the_header_holds_white_balance_and_vignetting(tmp_path):
+    linear, path = np.ones((4, 6, 3), np.float32), tmp_path / "a.exr"
+    for rows in (((-0.3, 0.1, 0.0),), ((-0.3, 0.1, 0.0), (-0.2, 0.0, 0.0), (-0.1, 0.0, 0.05))):
+        cfg = PhotometryConfig(cameras=(CameraFormation("a"), CameraFormation("b", rows)))
+        balance = (0.2, -0.05, -0.15)
+        taken = DisplayTransform(1.0, 2.2, cfg, white_balance=balance, camera=1)
+        write_exr(path, linear, taken=taken)
+        header = read_exr(path)[1]
+        np.testing.assert_allclose(header["p2gsWhiteBalance"], np.exp(balance), rtol=1e-6)
+        for name, row in zip(
+            ("Red", "Green", "Blue"), rows if len(rows) == 3 else rows * 3, strict=True
+        ):
+            np.testing.assert_allclose(header[f"p2gsVignetting{name}"], row, rtol=1e-6)
+    write_exr(path, linear, taken=taken.without_place())
+    assert "p2gsVignettingRed" not in read_exr(path)[1]
+
+
+@pytest.mark.parametrize(("value", "pixel"), [(65504.0, np.float16), (65505.0, np.float32)])
+def test_exr_switches_to_float_where_half_ends(tmp_path, value, pixel):
+    linear = np.full((2, 3, 3), value, np.float32)
+    write_exr(tmp_path / "a.exr", linear, alpha=np.ones((2, 3), np.float32))
+    with OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True) as file:
+        assert {c: file.channels()[c].pixels.dtype for c in "RGBA"} == dict.fromkeys("RGBA", pixel)
+    np.testing.assert_array_equal(read_exr(tmp_path / "a.exr")[0], linear)
+    write_exr(tmp_path / "b.exr", linear / 7, half=False)
+    np.testing.assert_array_equal(read_exr(tmp_path / "b.exr")[0], linear / 7)
+
+
+def test_broken_exr(tmp_path):
+    (tmp_path / "x.exr").write_bytes(b"no")
+    with pytest.raises(UserError, match=r"x\.exr"):
+        read_exr(tmp_path / "x.exr")
+
+
+def test_png_rounds_and_keeps_the_channel_order(tmp_path):
+    ldr = np.array([[[1.0, 0.5, 0.0], [2.0, -1.0, np.nan]]], np.float32)
+    write_png(tmp_path / "a.png", ldr)
+    back = cv2.imread(str(tmp_path / "a.png"))[..., ::-1]
+    np.testing.assert_array_equal(back, [[[255, 128, 0], [255, 0, 0]]])
+
+
+def grey(values):
+    return np.repeat(np.asarray(values, np.float32)[None, :, None], 3, axis=-1)
+
+
+def test_a_stop_is_a_factor_of_two():
+    linear = grey([0.5, 1, 2, 4])
+    np.testing.assert_allclose(stops(linear, middle=1.0)[0], [-1, 0, 1, 2], atol=1e-5)
+    np.testing.assert_allclose(luminance(np.array([0.0, 1, 0])), 0.7152)
+
+
+def test_colours_step_at_whole_stops_and_grow_lighter():
+    shown = false_color(grey([1.0, 1.9, 2.1, 30]), middle=1.0)[0]
+    np.testing.assert_array_equal(shown[0], shown[1])
+    lightness = luminance(shown)
+    assert lightness[1] < lightness[2] < lightness[3]
+
+
+def test_values_beyond_the_limits_take_the_ends():
+    shown = false_color(grey([0, 2.0**-20, 2.0**-5.5, 2.0**5.5, 1e30]), middle=1.0)[0]
+    np.testing.assert_array_equal(shown[0], shown[1])
+    np.testing.assert_array_equal(shown[1], shown[2])
+    np.testing.assert_array_equal(shown[3], shown[4])
+
+
+def test_clipping_follows_eight_bits():
+    ldr = np.array([[[0, 0, 0], [0, 0, 0.01], [0.5, 0.5, 0.999], [1, 0.2, 0.2]]])
+    over, under = clipping(ldr)
+    assert over.tolist() == [[False, False, True, True]]
+    assert under.tolist() == [[True, False, False, False]]
+
+
+def test_overlay_stripes_only_what_is_clipped():
+    ldr = np.full((24, 36, 3), 0.5, np.float32)
+    ldr[:, :12], ldr[:, 24:] = 1, 0
+    shown = clipping_overlay(ldr)
+    np.testing.assert_array_equal(shown[:, 12:24], ldr[:, 12:24])
+    for part, color, value in ((shown[:, :12], OVER, 1), (shown[:, 24:], UNDER, 0)):
+        striped = np.all(np.isclose(part, color), axis=-1)
+        assert 0.3 < striped.mean() < 0.7
+        assert np.all(part[~striped] == value)
+
+
+def test_near_is_bright_and_nothing_is_black():
+    depth, alpha = np.array([[2.0, 8.0, 0.0]]), np.array([[1.0, 1.0, 0.0]])
+    shown = depth_color(depth, alpha)
+    assert luminance(shown)[0, 0] > luminance(shown)[0, 1] > 0
+    assert not shown[0, 2].any()
+    # The same surface, half covered: the expected depth counts.
+    half = depth_color(depth * 0.6, alpha * 0.6)
+    np.testing.assert_allclose(half, shown)
+
+
+def frames_of(path):
+    with av.open(str(path)) as container:
+        frames = [f.to_ndarray(format="rgb24") for f in container.decode(video=0)]
+        stream = container.streams.video[0]
+        return frames, stream.codec_context, float(stream.average_rate or 0)
+
+
+def patches(colours, size=(64, 48)):
+    width, height = size
+    out = np.zeros((height, width, 3), np.float32)
+    for k, c in enumerate(colours):
+        out[:, k * width // len(colours) : (k + 1) * width // len(colours)] = c
+    return out
+
+
+def test_frames_keep_their_number_order_and_colours(tmp_path):
+    colours = np.array([[1, 0, 0], [0, 0.5, 0], [0.2, 0.2, 0.9], [0.5, 0.5, 0.5]])
+    with open_video(tmp_path / "v.mp4", 64, 48, 30) as add:
+        for k in range(5):
+            add(patches(np.roll(colours, k, axis=0)))
+    frames, context, rate = frames_of(tmp_path / "v.mp4")
+    assert len(frames) == 5
+    assert (context.name, rate) == ("h264", 30)
+    for k, frame in enumerate(frames):
+        got = frame[24, 8::16] / 255
+        np.testing.assert_allclose(got, np.roll(colours, k, axis=0), atol=0.03)
+
+
+def test_odd_sizes_are_cut_and_smaller_frames_centred(tmp_path):
+    with open_video(tmp_path / "v.mp4", 65, 49, 24) as add:
+        add(np.ones((49, 65, 3), np.float32))
+        add(np.ones((24, 32, 3), np.float32))
+    (large, small), _, _ = frames_of(tmp_path / "v.mp4")
+    assert large.shape == (48, 64, 3)
+    assert large.min() > 250
+    assert small[12:36, 16:48].min() > 230
+    assert small[:10].max() < 20
+    assert small[:, :14].max() < 20
+
+
+@pytest.mark.parametrize("before", [None, b"old"])
+def test_a_failure_leaves_what_was_there(tmp_path, before):
+    path = tmp_path / "v.mp4"
+    if before is not None:
+        path.write_bytes(before)
+
+    def fail():
+        with open_video(path, 64, 48, 24) as add:
+            add(np.ones((48, 64, 3), np.float32))
+            raise RuntimeError("no light")
+
+    with pytest.raises(RuntimeError, match="no light"):
+        fail()
+    assert [p.read_bytes() for p in tmp_path.iterdir()] == ([] if before is None else [before])
+
+
+def test_a_tiny_video_is_refused(tmp_path):
+    with pytest.raises(UserError, match="too few"), open_video(tmp_path / "v.mp4", 64, 9, 24):
+        pass

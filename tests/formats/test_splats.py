@@ -1,0 +1,350 @@
+"""Splats for other programs: read by their readers, or decoded here from published layouts."""
+
+import gzip
+import struct
+from dataclasses import replace
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pygltflib
+import pytest
+from plyfile import PlyData
+from scipy.spatial.transform import Rotation
+from splats import random_splats
+
+from p2gs_jax.errors import UserError
+from p2gs_jax.formats.gltf import EXTENSION, write_gltf
+from p2gs_jax.formats.gsply_files import (
+    fractional_bits,
+    read_compressed_ply,
+    read_spz,
+    write_compressed_ply,
+    write_spz,
+)
+from p2gs_jax.formats.ply import write_ply
+from p2gs_jax.formats.splat import read_foreign, read_splat, write_splat
+from p2gs_jax.formats.usd import CAMERAS, SPLATS, NamedCamera, write_usd
+from p2gs_jax.render.harmonics import C0, evaluate
+
+FLIP = np.array([1.0, -1.0, -1.0])
+
+
+def covariances(xyzw, scales):
+    R = Rotation.from_quat(np.asarray(xyzw, float)).as_matrix()
+    return np.einsum("nij,nj,nkj->nik", R, np.asarray(scales, float) ** 2, R)
+
+
+def ours(g):
+    """Return covariances and opacities of Gaussians in COLMAP's axes."""
+    xyzw = np.roll(np.asarray(g.quats, float), -1, axis=1)
+    opacities = 1 / (1 + np.exp(-np.asarray(g.opacity_logits, float)))
+    return covariances(xyzw, np.exp(np.asarray(g.log_scales, float))), opacities
+
+
+def harmonics(direction, degree):
+    """Return real harmonics with the Condon-Shortley phase, as glTF's extension tabulates them."""
+    x, y, z = direction
+    table = [
+        0.28209479177387814,
+        -0.4886025119029199 * y,
+        0.4886025119029199 * z,
+        -0.4886025119029199 * x,
+        1.0925484305920792 * x * y,
+        -1.0925484305920792 * y * z,
+        0.31539156525252005 * (2 * z * z - x * x - y * y),
+        -1.0925484305920792 * x * z,
+        0.5462742152960396 * (x * x - y * y),
+        -0.5900435899266435 * y * (3 * x * x - y * y),
+        2.890611442640554 * x * y * z,
+        -0.4570457994644658 * y * (4 * z * z - x * x - y * y),
+        0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y),
+        -0.4570457994644658 * x * (4 * z * z - x * x - y * y),
+        1.445305721320277 * z * (x * x - y * y),
+        -0.5900435899266435 * x * (x * x - 3 * y * y),
+    ]
+    return np.array(table[: (degree + 1) ** 2])
+
+
+def assert_same_colors(sh, g):
+    """Check coefficients of a world that is turned by FLIP, in a direction."""
+    direction = np.array([0.48, -0.6, 0.64])
+    degree = int(np.sqrt(sh.shape[1])) - 1
+    seen = np.einsum("k,nkc->nc", harmonics(direction * FLIP, degree), sh)
+    expected = evaluate(g.sh, tuple(np.tile(direction, (len(sh), 1)).T))
+    np.testing.assert_allclose(seen, expected, atol=2e-5)
+
+
+def gltf_columns(path):
+    """Read the attributes of the one primitive by pygltflib."""
+    document: Any = pygltflib.GLTF2().load(str(path))
+    blob, columns = document.binary_blob(), {}
+    primitive = document.meshes[0].primitives[0]
+    for name, index in vars(primitive.attributes).items():
+        if index is None:
+            continue
+        accessor = document.accessors[index]
+        view = document.bufferViews[accessor.bufferView]
+        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor.type]
+        assert accessor.componentType == pygltflib.FLOAT
+        flat = np.frombuffer(blob, "<f4", accessor.count * width, view.byteOffset)
+        columns[name] = flat.reshape(-1, width)
+    return document, primitive, columns
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_gltf_is_read_by_pygltflib(tmp_path, degree):
+    g = random_splats(degree=degree)
+    assert write_gltf(tmp_path / "a.glb", g) == 50
+    document, primitive, found = gltf_columns(tmp_path / "a.glb")
+    assert document.extensionsUsed == [EXTENSION]
+    assert primitive.mode == pygltflib.POINTS
+    assert primitive.extensions[EXTENSION]["kernel"] == "ellipse"
+    np.testing.assert_allclose(found["POSITION"], np.asarray(g.means) * FLIP)
+    said = document.accessors[primitive.attributes.POSITION]
+    np.testing.assert_array_equal(said.min, found["POSITION"].min(0))
+    np.testing.assert_array_equal(said.max, found["POSITION"].max(0))
+    cov, opacities = ours(g)
+    turned = covariances(found[f"{EXTENSION}:ROTATION"], found[f"{EXTENSION}:SCALE"])
+    np.testing.assert_allclose(turned, cov * np.outer(FLIP, FLIP), rtol=1e-4, atol=1e-3)
+    np.testing.assert_allclose(np.linalg.norm(found[f"{EXTENSION}:ROTATION"], axis=1), 1, atol=1e-6)
+    np.testing.assert_allclose(found[f"{EXTENSION}:OPACITY"][:, 0], opacities, rtol=1e-5)
+    names = [n for n in found if "SH_DEGREE" in n]
+    assert len(names) == (degree + 1) ** 2
+    orders = ((d, k) for d in range(degree + 1) for k in range(2 * d + 1))
+    ordered = [f"{EXTENSION}:SH_DEGREE_{d}_COEF_{k}" for d, k in orders]
+    assert_same_colors(np.stack([found[n] for n in ordered], 1), g)
+
+
+def test_usd_is_read_by_pxr(tmp_path):
+    modules = ("Gf", "Usd", "UsdGeom", "UsdVol")
+    Gf, Usd, UsdGeom, UsdVol = (pytest.importorskip(f"pxr.{name}") for name in modules)
+    g = random_splats(degree=2)
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("yxz", [20, -10, 5], degrees=True).as_matrix()
+    pose[:3, 3] = 0.3, -0.2, 0.5
+    K = np.array([[300.0, 0, 170.0], [0, 330.0, 118.0], [0, 0, 1]])
+    camera = NamedCamera("left/1.jpg", pose, K, 320, 240)
+    write_usd(tmp_path / "a.usdc", g, [camera])
+
+    stage = Usd.Stage.Open(str(tmp_path / "a.usdc"))
+    assert UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y
+    field = UsdVol.ParticleField3DGaussianSplat.Get(stage, SPLATS)
+    assert field
+    read = {a.GetName(): a.Get() for a in field.GetPrim().GetAttributes()}
+    np.testing.assert_allclose(read["positions"], np.asarray(g.means) * FLIP)
+    xyzw = [[*q.GetImaginary(), q.GetReal()] for q in read["orientations"]]
+    cov, opacities = ours(g)
+    turned = covariances(xyzw, read["scales"])
+    np.testing.assert_allclose(turned, cov * np.outer(FLIP, FLIP), rtol=1e-4, atol=1e-3)
+    np.testing.assert_allclose(read["opacities"], opacities, rtol=1e-5)
+    assert read["radiance:sphericalHarmonicsDegree"] == 2
+    sh = np.array(read["radiance:sphericalHarmonicsCoefficients"]).reshape(50, 9, 3)
+    assert_same_colors(sh, g)
+
+    prim = UsdGeom.Camera.Get(stage, f"{CAMERAS}/view_0000")
+    assert prim.GetPrim().GetMetadata("comment") == "left/1.jpg"
+    frustum = prim.GetCamera(Usd.TimeCode.Default()).frustum
+    matrix = frustum.ComputeViewMatrix() * frustum.ComputeProjectionMatrix()
+    for point in np.random.default_rng(0).uniform([-1, -1, 3], [1, 1, 6], (20, 3)):
+        local = pose[:3, :3] @ point + pose[:3, 3]
+        expected = (K @ local)[:2] / local[2]
+        ndc = matrix.Transform(Gf.Vec3d(*(point * FLIP)))
+        seen = [(ndc[0] + 1) / 2 * 320, (1 - ndc[1]) / 2 * 240]
+        np.testing.assert_allclose(seen, expected, atol=1e-3)
+
+
+def unpacked(codes, bits):
+    """Return the fields of whole numbers, from the most significant one on, in [0, 1]."""
+    out, shift = [], 32
+    for b in bits:
+        shift -= b
+        out.append(((codes >> shift) & (2**b - 1)) / (2**b - 1))
+    return np.stack(out, 1)
+
+
+def test_compressed_ply_follows_its_published_layout(tmp_path):
+    """https://blog.playcanvas.com/compressing-gaussian-splats: blocks of 256 with ranges."""
+    g = random_splats(n=600)
+    write_compressed_ply(tmp_path / "a.compressed.ply", g)
+    data = PlyData.read(str(tmp_path / "a.compressed.ply"))
+    chunk, vertex = data["chunk"].data, data["vertex"].data
+    block = np.arange(len(vertex)) // 256
+    assert len(chunk) == 3
+
+    def scaled(name, kind):
+        low, high = (
+            np.stack([chunk[f"{end}_{kind}{axis}"][block] for axis in "xyz"], 1)
+            for end in ("min", "max")
+        )
+        return low + unpacked(vertex[name], (11, 10, 11)) * (high - low)
+
+    position = scaled("packed_position", "")
+    match = np.argmin(((position[:, None] - np.asarray(g.means)) ** 2).sum(-1), 1)
+    assert len(set(match)) == 600
+    np.testing.assert_allclose(position, np.asarray(g.means)[match], atol=0.01)
+    scales = scaled("packed_scale", "scale_")
+    np.testing.assert_allclose(scales, np.asarray(g.log_scales)[match], atol=0.01)
+    color = unpacked(vertex["packed_color"], (8, 8, 8, 8))
+    _, opacities = ours(g)
+    np.testing.assert_allclose(color[:, 3], opacities[match], atol=0.003)
+    back = read_compressed_ply(tmp_path / "a.compressed.ply")
+    np.testing.assert_allclose(back.means, position, atol=1e-5)
+    np.testing.assert_allclose(
+        C0 * np.asarray(back.sh[:, 0]), C0 * np.asarray(g.sh)[match, 0], atol=0.02
+    )
+    np.testing.assert_allclose(
+        back.sh[:, 1:], np.clip(np.asarray(g.sh)[match, 1:], -4, 4), atol=0.1
+    )
+
+
+def by_x(records, x):
+    """Return the order that sorts the records as the Gaussians."""
+    return np.argsort(records)[np.argsort(np.argsort(x))]
+
+
+def test_splat_holds_what_viewers_expect(tmp_path):
+    """32 bytes each; decoded as viser's example does (bytes to [-1, 1] by * 2 / 255 - 1)."""
+    g = random_splats(degree=0)
+    path = tmp_path / "a.splat"
+    assert write_splat(path, g) == 50
+    raw = np.frombuffer(path.read_bytes(), np.uint8).reshape(50, 32)
+    means, scales = raw[:, :12].copy().view("<f4"), raw[:, 12:24].copy().view("<f4")
+    conspicuous = scales.prod(1) * raw[:, 27]
+    assert (np.diff(conspicuous) <= 0.02 * conspicuous[:-1]).all(), "the largest come first"
+    raw, means, scales = (
+        a[by_x(means[:, 0], np.asarray(g.means[:, 0]))] for a in (raw, means, scales)
+    )
+    np.testing.assert_array_equal(means, g.means)
+    np.testing.assert_allclose(scales, np.exp(g.log_scales), rtol=1e-6)
+    colors = np.clip(0.5 + C0 * np.asarray(g.sh[:, 0]), 0, 1)
+    np.testing.assert_allclose(raw[:, 24:27] / 255, colors, atol=0.5 / 255 + 1e-6)
+    np.testing.assert_allclose(raw[:, 27] / 255, ours(g)[1], atol=0.5 / 255 + 1e-6)
+    found = covariances(np.roll(raw[:, 28:32] / 255.0 * 2 - 1, -1, axis=1), scales)
+    largest = np.exp(2 * np.asarray(g.log_scales)).max(1)[:, None, None]
+    assert np.abs(found - ours(g)[0]).max() < 0.05 * largest.max()
+    assert (np.abs(found - ours(g)[0]) < 0.05 * largest).all()
+
+
+def test_splat_read_back(tmp_path):
+    g = random_splats(degree=0)
+    write_splat(tmp_path / "a.splat", g)
+    back = read_splat(tmp_path / "a.splat")
+    order = by_x(np.asarray(back.means[:, 0]), np.asarray(g.means[:, 0]))
+    np.testing.assert_array_equal(back.means[order], g.means)
+    np.testing.assert_allclose(back.log_scales[order], g.log_scales, atol=1e-5)
+    np.testing.assert_allclose(ours(back)[1][order], ours(g)[1], atol=0.5 / 255 + 1e-6)
+    colors = np.clip(0.5 + C0 * np.asarray(g.sh), 0, 1)
+    np.testing.assert_allclose(0.5 + C0 * back.sh[order], colors, atol=0.5 / 255 + 1e-6)
+    # A second trip changes nothing more.
+    write_splat(tmp_path / "b.splat", back)
+    assert (
+        np.abs(np.asarray(read_splat(tmp_path / "b.splat").sh) - np.asarray(back.sh)).max() < 1e-5
+    )
+
+
+@pytest.fixture
+def with_gsply():
+    pytest.importorskip("gsply", reason="the extra `spz` is not installed")
+
+
+def mild(degree):
+    """Return Gaussians within the ranges that SPZ can hold."""
+    g = random_splats(degree=degree)
+    return type(g)(
+        3 * g.means, g.quats, g.log_scales - 2, g.opacity_logits, jnp.clip(0.3 * g.sh, -0.9, 0.9)
+    )
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_spz_read_back(tmp_path, with_gsply, degree):
+    g = mild(degree)
+    assert write_spz(tmp_path / "a.spz", g) == 50
+    back = read_spz(tmp_path / "a.spz")
+    step = 2.0 ** -fractional_bits(np.asarray(g.means))
+    np.testing.assert_allclose(back.means, g.means, atol=0.51 * step)
+    np.testing.assert_allclose(back.log_scales, g.log_scales, atol=0.51 / 16)
+    np.testing.assert_allclose(ours(back)[1], ours(g)[1], atol=0.51 / 255)
+    np.testing.assert_allclose(back.sh[:, 0], g.sh[:, 0], atol=0.51 / (0.15 * 255))
+    np.testing.assert_allclose(back.sh[:, 1:], g.sh[:, 1:], atol=0.51 / 128)
+    turned = ours(replace(back, log_scales=g.log_scales))[0] - ours(g)[0]
+    assert np.abs(turned).max() < 0.01 * np.exp(2 * np.asarray(g.log_scales)).max()
+
+
+def test_spz_follows_its_specification(tmp_path, with_gsply):
+    """Version 3: 16 bytes of header, then positions, alphas, colours, scales, rotations, SH; axes
+    right, up, back."""
+    g = mild(1)
+    write_spz(tmp_path / "a.spz", g)
+    data = gzip.decompress((tmp_path / "a.spz").read_bytes())
+    magic, version, count, degree, bits, flags, _ = struct.unpack_from("<IIIBBBB", data)
+    assert (magic, version, count, degree, flags) == (0x5053474E, 3, 50, 1, 0)
+    at = 16
+    raw = np.frombuffer(data, np.uint8, 9 * count, at).reshape(count, 3, 3).astype(np.int32)
+    fixed = raw[..., 0] | raw[..., 1] << 8 | raw[..., 2] << 16
+    fixed -= (fixed >= 1 << 23) * (1 << 24)
+    np.testing.assert_allclose(fixed / 2**bits, np.asarray(g.means) * FLIP, atol=2.0**-bits)
+    at += 9 * count
+    np.testing.assert_allclose(
+        np.frombuffer(data, np.uint8, count, at) / 255, ours(g)[1], atol=0.51 / 255
+    )
+    at += count + 3 * count
+    scales = np.frombuffer(data, np.uint8, 3 * count, at).reshape(count, 3) / 16.0 - 10
+    np.testing.assert_allclose(scales, g.log_scales, atol=0.51 / 16)
+    at += 3 * count + 4 * count
+    rest = (np.frombuffer(data, np.uint8, 9 * count, at).reshape(count, 3, 3) - 128.0) / 128
+    assert at + 9 * count == len(data)
+    # The same colour in the same direction, each in its own axes.
+    sh = jnp.concatenate([g.sh[:, :1], jnp.asarray(rest, jnp.float32)], 1)
+    d = np.array([0.36, 0.48, 0.8])
+    mine = evaluate(g.sh, tuple(jnp.full(count, v) for v in d))
+    theirs = evaluate(sh, tuple(jnp.full(count, v) for v in d * FLIP))
+    np.testing.assert_allclose(mine, theirs, atol=0.02)
+
+
+def test_spz_never_clips_positions():
+    assert fractional_bits(np.array([[0.0, 0.0, 0.0]])) == 24
+    for farthest in (0.4, 1.0, 2047.0, 3000.0, 1e6):
+        bits = fractional_bits(np.array([[0.0, -farthest, 1e-3]]))
+        assert farthest * 2**bits <= 2**23 - 1 < farthest * 2 ** (bits + 1) or bits == 24
+    with pytest.raises(UserError, match="1e\\+07"):
+        fractional_bits(np.array([[1e7, 0.0, 0.0]]))
+
+
+def test_without_its_package_the_error_names_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "gsply", None)
+    for write in (write_spz, write_compressed_ply):
+        with pytest.raises(UserError, match=r"pip install 'p2gs-jax\[spz\]'"):
+            write(tmp_path / "a", mild(0))
+
+
+@pytest.mark.parametrize("read", [read_splat, read_spz, read_compressed_ply])
+@pytest.mark.parametrize("content", [b"hello, this is not a splat", b"x" * 33, None])
+def test_wrong_files_and_missing_ones_are_refused(tmp_path, with_gsply, read, content):
+    path = tmp_path / "some.file"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(UserError, match=r"some\.file"):
+        read(path)
+
+
+def test_splat_refuses_view_dependence(tmp_path):
+    with pytest.raises(ValueError, match="degree 0"):
+        write_splat(tmp_path / "a.splat", random_splats(degree=1))
+
+
+def test_every_kind_of_foreign_file_is_known_by_its_end(tmp_path, with_gsply):
+    g = mild(0)
+    writers = {
+        "a.ply": lambda path, g: write_ply(path, g, []),
+        "a.compressed.ply": write_compressed_ply,
+        "a.splat": write_splat,
+        "a.SPZ": write_spz,
+    }
+    for name, write in writers.items():
+        write(tmp_path / name, g)
+        found, left_out = read_foreign(tmp_path / name)
+        assert (found.capacity, left_out) == (50, 0)
+        np.testing.assert_allclose(np.linalg.norm(found.quats, axis=1), 1, atol=1e-6)
+        order = by_x(np.asarray(found.means[:, 0]), np.asarray(g.means[:, 0]))
+        np.testing.assert_allclose(found.means[order], g.means, atol=0.02)

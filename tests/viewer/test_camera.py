@@ -1,0 +1,172 @@
+"""The browser's camera and ours see the same pixels."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from p2gs_jax.scene.rigid import camera_centers
+from p2gs_jax.types import Scene, View
+from p2gs_jax.viewer.camera import (
+    TYPICAL_DISTANCE,
+    Pose,
+    ViewerSpace,
+    camera_of_browser,
+    distance_seen,
+    fov_that_holds,
+    frames_of,
+    frustum_size,
+    make_viewer_space,
+    pose_of,
+    viewmat_between,
+)
+
+pytest.importorskip("viser", reason="the extra `viewer` is not installed")
+
+
+SPACE = ViewerSpace(2.5, np.array([0.0, -1.0, 0.0]))
+
+
+def a_viewmat(seed=0):
+    rng = np.random.default_rng(seed)
+    out = np.eye(4)
+    out[:3, :3] = Rotation.random(rng=rng).as_matrix()
+    out[:3, 3] = rng.normal(size=3)
+    return out
+
+
+def pixel(camera, point):
+    local = np.asarray(camera.viewmat, float) @ [*point, 1.0]
+    xy = np.asarray(camera.K, float) @ local[:3]
+    return xy[:2] / xy[2]
+
+
+def a_view(viewmat, name="a"):
+    K = np.array([[100, 0, 60], [0, 100, 40], [0, 0, 1.0]], np.float32)
+    return View(name, None, "0", viewmat.astype(np.float32), K, 120, 80)
+
+
+def scene_of(views, points):
+    return Scene(None, "test", tuple(views), np.asarray(points, np.float32), np.zeros((0, 3)))
+
+
+def test_a_point_is_where_the_browser_draws_it():
+    # What three.js does: camera-to-world with y up and z backwards, vertical field of view, the
+    # canvas from -1 to 1 upwards.
+    rotation = Rotation.from_euler("xyz", [0.2, -0.4, 0.1])
+    position, fov, aspect, size = np.array([1.0, -2.0, 0.5]), 0.9, 1.7, (340, 200)
+    point = position / SPACE.unit + rotation.apply([0.3, 0.2, 4.0])
+    pose = Pose(rotation.as_quat(scalar_first=True), position, position, fov)
+    camera = camera_of_browser(pose, aspect, size, SPACE)
+    x, y, z = rotation.inv().apply(point * SPACE.unit - position) * [1, -1, -1]
+    ndc = np.array([x / aspect, y]) / (-z * np.tan(fov / 2))
+    expected = (ndc * [1, -1] + 1) / 2 * size
+    np.testing.assert_allclose(pixel(camera, point), expected, rtol=1e-5)
+
+
+def test_a_view_survives_the_trip():
+    viewmat = a_viewmat()
+    pose = pose_of(viewmat, SPACE, distance=3.0, fov=0.7)
+    camera = camera_of_browser(pose, 1.5, (300, 200), SPACE)
+    np.testing.assert_allclose(camera.viewmat, viewmat, atol=1e-6)
+    np.testing.assert_allclose(camera.K[0, 0], camera.K[1, 1], rtol=1e-6)
+    ahead = (pose.look_at / SPACE.unit - camera_centers(viewmat[None])[0]) / 3.0
+    np.testing.assert_allclose(ahead, viewmat[2, :3], atol=1e-6)
+
+
+def test_any_size_shows_the_same_part_of_the_world():
+    pose = pose_of(a_viewmat(), SPACE, distance=3.0, fov=0.7)
+    point = camera_centers(a_viewmat()[None])[0] + a_viewmat()[:3, :3].T @ [0.2, -0.1, 2.0]
+    shares = [
+        pixel(camera_of_browser(pose, 1.6, size, SPACE), point) / size
+        for size in ((1280, 800), (328, 200), (480, 480))
+    ]
+    np.testing.assert_allclose(shares, shares[:1] * 3, rtol=1e-5)
+
+
+@pytest.mark.parametrize("aspect", [0.5, 1.0, 1.3, 3.0])
+def test_a_whole_photograph_is_seen(aspect):
+    K = np.array([[90.0, 0, 70], [0, 110, 30], [0, 0, 1]])
+    view = View("a", None, "0", np.eye(4), K, 120, 80)
+    pose = Pose((1, 0, 0, 0), (0, 0, 0), (0, 0, 1), fov_that_holds(view, aspect))
+    size = (round(1000 * aspect), 1000)
+    camera = camera_of_browser(pose, size[0] / size[1], size, SPACE)
+    corners = [(np.linalg.inv(K) @ [x, y, 1.0]) for x in (0, view.width) for y in (0, view.height)]
+    at = np.array([pixel(camera, corner) for corner in corners])
+    assert at.min() > -1
+    assert np.all(at.max(0) < np.array(size) + 1)
+    # ... and as large as that allows: it touches an edge.
+    gaps = np.abs(np.concatenate([at, at - size])).min()
+    assert gaps < 1.5
+
+
+def test_up_is_what_cameras_hold_up_and_distances_are_typical():
+    views = []
+    for roll in (-0.3, 0.1, 0.2):
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = Rotation.from_euler("z", roll).as_matrix()
+        views.append(a_view(viewmat))
+    points = np.random.default_rng(0).uniform([-0.1, -0.1, 4.9], [0.1, 0.1, 5.1], (50, 3))
+    space = make_viewer_space(scene_of(views, points), points)
+    np.testing.assert_allclose(space.up, [0, -1, 0], atol=0.02)
+    np.testing.assert_allclose(space.unit, TYPICAL_DISTANCE / 5, rtol=0.03)
+
+
+def test_a_scene_without_points_is_measured_by_its_gaussians():
+    means = np.array([[0, 0, 2.0], [0.1, 0, 2.0]])
+    space = make_viewer_space(scene_of([a_view(np.eye(4))], np.zeros((0, 3))), means)
+    np.testing.assert_allclose(space.unit, TYPICAL_DISTANCE / 2)
+
+
+def test_what_is_behind_or_beside_has_no_distance():
+    assert distance_seen(np.eye(4), np.array([[0, 0, -3.0], [5, 0, 1.0], [0, 0, 7.0]])) == 7.0
+    assert distance_seen(np.eye(4), np.array([[0, 0, -3.0]])) == 1.0
+
+
+def viewmat(turn, at):
+    out = np.eye(4)
+    out[:3, :3] = Rotation.from_rotvec(turn).as_matrix()
+    out[:3, 3] = -out[:3, :3] @ at
+    return out
+
+
+POSES = np.stack(
+    [
+        viewmat([0, 0, 0], [0, 0, 0]),
+        viewmat([0, 0.8, 0], [2, 0, 4]),
+        viewmat([0, 0, 1], [3, 0, 4]),
+    ]
+)
+
+
+@pytest.mark.parametrize(
+    ("place", "turn", "at"),
+    [
+        (0.0, [0, 0, 0], [0, 0, 0]),
+        (0.25, [0, 0.2, 0], [0.5, 0, 1]),
+        (1.0, [0, 0.8, 0], [2, 0, 4]),
+        (2.0, [0, 0, 1], [3, 0, 4]),
+        (9.0, [0, 0, 1], [3, 0, 4]),
+        (-1.0, [0, 0, 0], [0, 0, 0]),
+    ],
+)
+def test_poses_between_poses(place, turn, at):
+    np.testing.assert_allclose(viewmat_between(POSES, place), viewmat(turn, at), atol=1e-9)
+
+
+def test_a_drive_of_one_pose_stands_still():
+    np.testing.assert_allclose(viewmat_between(POSES[1:2], 0.7), POSES[1], atol=1e-12)
+
+
+def test_a_drive_is_one_camera_in_the_order_of_names():
+    views = [
+        View(name, None, camera, np.eye(4), np.eye(3), 2, 2)
+        for name, camera in (("b/2", "b"), ("a/1", "a"), ("b/1", "b"))
+    ]
+    scene = Scene(None, "test", tuple(views), np.zeros((0, 3)), np.zeros((0, 3)))
+    assert frames_of(scene, "b") == (2, 0)
+
+
+def test_frusta_of_neighbours_hardly_touch():
+    views = [a_view(viewmat([0, 0, 0], [k, 0, 0])) for k in range(4)]
+    assert frustum_size(views, SPACE._replace(unit=1.0)) == pytest.approx(0.35)
+    assert frustum_size(views[:1], SPACE) == pytest.approx(0.35)

@@ -1,0 +1,173 @@
+"""Programs compiled ahead: the renderer's picture, no wait for longer tile lists, and sizes."""
+
+import threading
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from p2gs_jax.config import RenderConfig
+from p2gs_jax.errors import UserError
+from p2gs_jax.render.capacity import make_renderer
+from p2gs_jax.types import Camera, Gaussians
+
+pytest.importorskip("viser", reason="the extra `viewer` is not installed")
+
+from p2gs_jax.viewer import renderer as module
+from p2gs_jax.viewer.renderer import (
+    ENLARGE_WITHIN,
+    SHRINK_BEYOND,
+    TARGET_MS,
+    Renderer,
+    compilation_order,
+    full_size,
+    next_size,
+    render_sizes,
+)
+
+CFG = RenderConfig(sh_degree=0)
+SIZE, LARGE = (64, 48), (160, 120)
+SIZES = ((320, 200), (480, 300), (1280, 800))
+
+
+def gaussians(count=200, scale=-3.0):
+    rng = np.random.default_rng(0)
+    return Gaussians(
+        means=jnp.asarray(rng.uniform((-1, -1, 3), (1, 1, 5), (count, 3)), jnp.float32),
+        quats=jnp.asarray(rng.normal(size=(count, 4)), jnp.float32),
+        log_scales=jnp.full((count, 3), scale),
+        opacity_logits=jnp.zeros(count),
+        sh=jnp.asarray(rng.normal(size=(count, 1, 3)), jnp.float32),
+    )
+
+
+def camera(size, z=0.0):
+    width, height = size
+    K = jnp.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1.0]])
+    return Camera(jnp.eye(4).at[2, 3].set(z), K, width, height)
+
+
+@pytest.fixture
+def made():
+    """Return a function that makes a renderer and the event that it compiled something."""
+    every = []
+
+    def make(scene, z=0.0, alive=True):
+        changed = threading.Event()
+        used = jnp.full(scene.capacity, alive)
+        out = Renderer(scene, used, CFG, [lambda size: camera(size, z)], changed.set)
+        every.append(out)
+        return out, changed
+
+    yield make
+    for renderer in every:
+        renderer.stop()
+
+
+def wait_for(renderer, changed, size):
+    for _ in range(100):
+        if size in renderer.ready:
+            return
+        changed.wait(10)
+        changed.clear()
+    raise AssertionError(f"{size} was never compiled")
+
+
+def test_renders_what_the_renderer_renders(made):
+    scene = gaussians()
+    renderer, changed = made(scene)
+    assert renderer.render(camera(SIZE)) is None
+    renderer.request([SIZE])
+    wait_for(renderer, changed, SIZE)
+    expected = make_renderer(CFG)(scene, jnp.ones(scene.capacity, bool), camera(SIZE, 0.3))
+    shown = renderer.render(camera(SIZE, 0.3))
+    np.testing.assert_allclose(shown.linear, expected.linear, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(shown.depth, expected.depth, rtol=1e-5, atol=1e-6)
+
+
+def test_a_view_that_overflows_comes_as_soon_as_there_is_room(made):
+    renderer, changed = made(gaussians(scale=-0.5), z=-100.0)  # probes look away: short lists
+    renderer.request([LARGE])
+    wait_for(renderer, changed, LARGE)
+    assert renderer.render(camera(LARGE)) is None
+    wait_for(renderer, changed, LARGE)
+    shown = renderer.render(camera(LARGE))
+    assert not bool(shown.overflow)
+    assert float(shown.alpha.max()) > 0.5
+
+
+def test_a_view_to_save_waits_for_its_program(made, monkeypatch):
+    renderer, _ = made(gaussians(scale=-0.5), z=-100.0)
+    shown = renderer.render_now(camera(LARGE))
+    assert not bool(shown.overflow)
+    assert float(shown.alpha.max()) > 0.5
+    monkeypatch.setattr(module, "MOST_ENTRIES", 5000)
+    with pytest.raises(UserError, match="memory"):
+        renderer.render_now(camera(LARGE))
+
+
+def test_what_cannot_be_compiled_is_said_and_the_next_size_is(made, monkeypatch):
+    renderer, changed = made(gaussians())
+    monkeypatch.setattr(renderer, "_probes", [lambda size: 1 / (size != LARGE) and camera(size)])
+    renderer.request([LARGE, SIZE])
+    wait_for(renderer, changed, SIZE)
+    assert renderer.failure.startswith("160 x 120 cannot be compiled")
+
+
+def test_dead_gaussians_and_empty_scenes_are_black(made):
+    dead, _ = made(gaussians(), alive=False)
+    assert float(dead.render_now(camera(SIZE)).alpha.max()) == 0
+    empty, _ = made(jax.tree.map(lambda leaf: leaf[:0], gaussians()))
+    assert not np.asarray(empty.render_now(camera(SIZE)).linear).any()
+
+
+def test_sizes_rise_to_the_canvas_itself_up_to_a_width():
+    assert full_size((1280, 800), 1920) == (1280, 800)
+    assert full_size((3840, 2160), 1920) == (1920, 1080)
+    assert full_size((0, 0), 1920) == (1, 1)
+    for canvas in ((1280, 800), (1920, 950), (600, 1000), (200, 150), (1, 1)):
+        sizes = render_sizes(canvas)
+        areas = [w * h for w, h in sizes]
+        assert areas == sorted(set(areas))
+        assert sizes[-1] == canvas
+        assert set(compilation_order(sizes)) == set(sizes)
+        assert all(w % 8 == h % 8 == 0 for w, h in sizes[:-1])
+
+
+def test_windows_of_nearly_the_same_shape_share_programs_and_pixels_are_almost_square():
+    shared = {size for width in range(1250, 1350) for size in render_sizes((width, 800))[:-1]}
+    assert len(shared) <= 4
+    for width in range(600, 2000, 50):
+        for w, h in render_sizes((width, 900))[:-1]:
+            assert abs(np.log((width / 900) / (w / h))) < 0.12
+
+
+def ms(size, of, share):
+    """Return the time of a frame of one size with which another one takes a share of the target."""
+    return share * TARGET_MS * size[0] * size[1] / (of[0] * of[1])
+
+
+@pytest.mark.parametrize(
+    ("ready", "current", "took", "wanted"),
+    [
+        (SIZES, None, 0.0, SIZES[0]),
+        (SIZES, (640, 400), 1.0, SIZES[0]),  # of another window
+        # One step at a time, where the next is clearly fast enough.
+        (SIZES, SIZES[0], ms(SIZES[0], SIZES[1], ENLARGE_WITHIN - 0.01), SIZES[1]),
+        (SIZES, SIZES[0], ms(SIZES[0], SIZES[1], ENLARGE_WITHIN + 0.01), SIZES[0]),
+        (SIZES, SIZES[0], 0.1, SIZES[1]),
+        (SIZES, SIZES[1], 0.1, SIZES[2]),
+        (SIZES, SIZES[2], 0.1, SIZES[2]),
+        # A size is kept until it is clearly too slow, and left for the largest that keeps up.
+        (SIZES, SIZES[2], (SHRINK_BEYOND - 0.01) * TARGET_MS, SIZES[2]),
+        (SIZES, SIZES[2], 2 * TARGET_MS, SIZES[1]),
+        (SIZES, SIZES[2], 1e5, SIZES[0]),
+        # What is not compiled is not chosen; programs of another window serve until then.
+        (SIZES[1:2], SIZES[1], 0.1, SIZES[1]),
+        ((), None, 0.0, None),
+        (((336, 192), (2000, 1000)), None, 0.0, (336, 192)),
+    ],
+)
+def test_the_next_size_keeps_up(ready, current, took, wanted):
+    assert next_size(SIZES, ready, current, took) == wanted

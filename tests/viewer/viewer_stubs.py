@@ -1,0 +1,111 @@
+"""A browser that only records, controls that hold what they are set to, a renderer as wanted."""
+
+import contextlib
+import threading
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+
+from p2gs_jax.render.capacity import make_renderer
+from p2gs_jax.viewer.renderer import full_size, render_sizes
+from p2gs_jax.viewer.settings import Settings
+
+CANVAS = (560, 400)
+SIZES = render_sizes(full_size(CANVAS, 1920))
+PATIENCE_S = 60
+
+
+class FakeRenderer:
+    """What is compiled, what overflows and what is broken, as a test wants it."""
+
+    def __init__(self, run):
+        self.run, self.renderer = run, make_renderer(run.cfg.render)
+        self.ready, self.compiling, self.failure = frozenset(SIZES), None, None
+        self.rendered, self.wanted, self.refused, self.broken = [], [], set(), None
+
+    def request(self, sizes):
+        self.wanted.append(tuple(sizes))
+
+    def render(self, camera):
+        size = (camera.width, camera.height)
+        if size not in self.ready or size in self.refused:
+            return None
+        return self.render_now(camera)
+
+    def render_now(self, camera):
+        self.rendered.append((camera.width, camera.height))
+        if self.broken is not None:
+            raise self.broken
+        return self.renderer(self.run.params.gaussians, self.run.alive, camera)
+
+
+class Client:
+    """A browser."""
+
+    def __init__(self):
+        self.pictures, self.said, self.files, self.splats = [], [], [], []
+        self.came = threading.Condition()
+        self.scene = SimpleNamespace(
+            set_background_image=self.show, add_gaussian_splats=self.add_splats
+        )
+        self.camera = SimpleNamespace(
+            wxyz=np.array([1.0, 0, 0, 0]),
+            position=np.zeros(3),
+            fov=0.9,
+            image_width=CANVAS[0],
+            image_height=CANVAS[1],
+            on_update=lambda call: None,
+        )
+        self.gui, self.atomic = None, contextlib.nullcontext
+
+    def show(self, image, kind, **more):
+        with self.came:
+            self.pictures.append((kind, image, more))
+            self.came.notify_all()
+
+    def add_splats(self, *content):
+        self.splats.append(SimpleNamespace(rgbs=content[3], visible=True))
+        return self.splats[-1]
+
+    def flush(self):
+        pass
+
+    def add_notification(self, title, body, **more):
+        with self.came:
+            self.said.append(body)
+            self.came.notify_all()
+        return SimpleNamespace(remove=lambda: None)
+
+    def send_file_download(self, name, content, **more):
+        self.files.append((name, content))
+
+    def wait(self, holds):
+        with self.came:
+            assert self.came.wait_for(holds, PATIENCE_S), (len(self.pictures), self.said)
+
+
+class Panel:
+    """Controls that hold what they are set to."""
+
+    def __init__(self, start=None):
+        self.now, self.locked, self.at = start or Settings(gamma=2.2), False, None
+        self.status = self.legend = None
+
+    def settings(self):
+        return self.now
+
+    def put(self, settings):
+        self.now = replace(settings, mode=self.now.mode)
+
+    def put_view(self, index, degrees):
+        self.at = index
+
+    def set_playing(self, playing):
+        pass
+
+    def set_status(self, html):
+        self.status = html
+
+    def set_legend(self, html):
+        self.legend = html
