@@ -1,12 +1,59 @@
-"""Building blocks of procedural textures: noise, hashes, soft edges.
+"""Building blocks of procedural textures: points on surfaces, noise, hashes, soft edges.
 
-Texture finer than a pixel fades to its mean (`detail`). All functions are vectorised over R rays.
+Texture finer than a pixel fades to its mean (`detail`). Arrays are channel-first over R rays:
+points and colours are [3 R].
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
+
+
+class Surface(NamedTuple):
+    """Optical properties at R points.
+
+    Attributes:
+        emission: radiance of its own.
+        gloss: scale of the mirror reflection, 0 to 1.
+        normal: of the geometry, unit.
+        shading_normal: with the texture's relief, unit.
+    """
+
+    albedo: Float[Array, "3 r"]
+    emission: Float[Array, "3 r"]
+    gloss: Float[Array, " r"]
+    normal: Float[Array, "3 r"]
+    shading_normal: Float[Array, "3 r"]
+
+
+class Point(NamedTuple):
+    """One row of the primitives' table per ray, and where on the primitive it is."""
+
+    p: Array  # [3 R]
+    normal: Array  # [3 R]
+    lo: Array  # [3 R]
+    hi: Array  # [3 R]
+    color: Array  # [3 R]
+    accent: Array  # [3 R]
+    style: Array
+    bay: Array
+    use: Array
+    random: Array
+    row: Array
+    footprint: Array  # a pixel's width on the surface, m
+    fine: Array  # [3 R] noise in [-1, 1], wavelength by material
+    coarse: Array  # [3 R]
+
+    def bar(self, x: Array, half: Array | float) -> Array:
+        """Return 1 where |x| < half, with the edge of a pixel; see `slab`."""
+        return slab(x, half, self.footprint)
+
+    def grid(self, x: Array, period: float, half: Array | float) -> Array:
+        """Return bars in every cell of a periodic pattern, about its middle."""
+        return slab(cell_offset(x, period), half, self.footprint)
 
 
 def detail(footprint: Array, wavelength: Array) -> Array:
@@ -43,35 +90,32 @@ def _lattice(x: Array) -> Array:
     return x.astype(jnp.int32).astype(jnp.uint32)
 
 
+def _cell_bits(x: Array, y: Array, z: Array, seed: int) -> Array:
+    salt = jnp.uint32((seed * 0x9E3779B9) & 0xFFFFFFFF)
+    return _bits(_lattice(x), _lattice(y), _lattice(4.0 * z), salt)
+
+
+def _tenth_bits(bits: Array, channel: int) -> Array:
+    """Return ten of 32 bits as a number, 0 to 1023."""
+    return ((bits >> (2 + 10 * channel)) & 1023).astype(jnp.float32)
+
+
 def hash1(x: Array, y: Array, z: Array, seed: int) -> Array:
     """Return a number in [0, 1) for every lattice cell (z in quarters)."""
-    bits = _bits(
-        _lattice(x), _lattice(y), _lattice(4.0 * z), jnp.uint32((seed * 0x9E3779B9) & 0xFFFFFFFF)
-    )
-    return (bits >> 8).astype(jnp.float32) / 2.0**24
+    return (_cell_bits(x, y, z, seed) >> 8).astype(jnp.float32) / 2.0**24
 
 
 def hash3(x: Array, y: Array, z: Array, seed: int) -> Array:
     """Return three numbers in [0, 1) for every lattice cell (z in quarters), [3 R]."""
-    bits = _bits(
-        _lattice(x), _lattice(y), _lattice(4.0 * z), jnp.uint32((seed * 0x9E3779B9) & 0xFFFFFFFF)
-    )
-    return jnp.stack(
-        [((bits >> (2 + 10 * c)) & 1023).astype(jnp.float32) / 1024.0 for c in range(3)]
-    )
+    bits = _cell_bits(x, y, z, seed)
+    return jnp.stack([_tenth_bits(bits, c) / 1024.0 for c in range(3)])
 
 
 def value_noise(x: Array, y: Array, z: Array, seeds: tuple[int, ...]) -> Array:
     """Return smooth value noise, about [-1, 1], wavelength about 2 cells.
 
-    Args:
-        x: coordinates in cells, [S R]; a row for each seed.
-        y: coordinates in cells, [S R].
-        z: coordinates in cells, [S R].
-        seeds: of the S rows.
-
-    Returns:
-        Three independent channels, [3 S R].
+    Coordinates are in cells, [S R], with a row for each seed; the three channels of the result are
+    independent, [3 S R].
     """
     base = [jnp.floor(a) for a in (x, y, z)]
     w = [(a - b) for a, b in zip((x, y, z), base, strict=True)]
@@ -87,8 +131,7 @@ def value_noise(x: Array, y: Array, z: Array, seeds: tuple[int, ...]) -> Array:
         for axis in range(3):
             weight = weight * (w[axis] if offset[axis] else 1.0 - w[axis])
         for c in range(3):
-            value = ((bits >> (2 + 10 * c)) & 1023).astype(jnp.float32) / 511.5 - 1.0
-            total[c] = total[c] + weight * value
+            total[c] = total[c] + weight * (_tenth_bits(bits, c) / 511.5 - 1.0)
     return jnp.stack(total)
 
 
