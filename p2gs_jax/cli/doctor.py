@@ -151,25 +151,18 @@ def check_features(libraries: list[dict[str, Any]], backend: str | None) -> list
     for name, module, fix in FEATURES:
         ready = module not in broken and importlib.util.find_spec(module) is not None
         rows.append((name, ready, module if ready else fix))
-    rows += [_browser(), _gpu(backend)]
-    return [{"name": name, "ready": ready, "remark": remark} for name, ready, remark in rows]
-
-
-def _browser() -> tuple[str, bool, str]:
     try:
         from p2gs_jax.report.page import find_browser
 
-        return "report --pdf", True, find_browser()
+        rows.append(("report --pdf", True, find_browser()))
     except Exception:  # there is none, or a library is broken, which another check reports
-        return "report --pdf", False, "install Chromium or Chrome"
-
-
-def _gpu(backend: str | None) -> tuple[str, bool, str]:
-    if backend in ("gpu", "cuda"):
-        return "NVIDIA GPU", True, "JAX uses it"
-    unused = shutil.which("nvidia-smi") or Path("/proc/driver/nvidia/version").is_file()
-    remark = "there is one that JAX does not use: pip install 'p2gs-jax[cuda]'"
-    return "NVIDIA GPU", False, remark if unused else "none found; everything runs on the CPU"
+        rows.append(("report --pdf", False, "install Chromium or Chrome"))
+    used, driver = backend in ("gpu", "cuda"), Path("/proc/driver/nvidia/version")
+    remark = "JAX uses it" if used else "none found; everything runs on the CPU"
+    if not used and (shutil.which("nvidia-smi") or driver.is_file()):
+        remark = "there is one that JAX does not use: pip install 'p2gs-jax[cuda]'"
+    rows.append(("NVIDIA GPU", used, remark))
+    return [{"name": name, "ready": ready, "remark": remark} for name, ready, remark in rows]
 
 
 def check_machine(folder: Path) -> dict[str, Any]:
@@ -224,19 +217,14 @@ def check_devices() -> dict[str, Any]:
         backend = jax.default_backend()
         # Tile lists as `render.binning` chooses where the configuration says None.
         binning = "counting" if backend == "cpu" else "sorting"
-        names = [f"{d.device_kind}{_memory_of(d)}" for d in jax.devices()]
+        names = [device.device_kind for device in jax.devices()]
+        with suppress(Exception):  # CPUs and some plugins do not tell
+            limits = [d.memory_stats()["bytes_limit"] / 2**30 for d in jax.devices()]
+            names = [f"{n} ({limit:.1f} GiB)" for n, limit in zip(names, limits, strict=True)]
         found |= {"rasterizer": fastest_here(), "binning": binning}
         return found | {"backend": backend, "names": names}
     except Exception as error:  # whatever a broken JAX raises
         return found | {"names": [], "trouble": f"{type(error).__name__}: {error}"}
-
-
-def _memory_of(device: Any) -> str:
-    try:
-        limit = (device.memory_stats() or {}).get("bytes_limit")
-    except Exception:  # CPUs and some plugins do not tell
-        limit = None
-    return f" ({limit / 2**30:.1f} GiB)" if limit else ""
 
 
 def check_render() -> dict[str, Any]:
@@ -294,23 +282,29 @@ def _three_gaussians() -> dict[str, Any]:
 def as_text(found: dict[str, Any]) -> str:
     """Return what `examine` found as text of at most 80 columns, but for paths and errors."""
     m, d, test = (found[k] for k in ("machine", "devices", "self_test"))
+    memory, available, free = (_size(m[k]) for k in ("memory", "available", "free"))
     good = [f"{x['name']} {x['version']}" for x in found["libraries"] if not x["trouble"]]
     good += [f"{name} {version}" for name, version in found["optional"].items() if version]
     bad = [x for x in found["libraries"] if x["trouble"]]
-    rows = [
-        ("p2gs-jax", f"{found['p2gs_jax']}, Python {found['python']}, {m['system']}"),
-        ("JAX runs on", d["trouble"] or ", ".join(d["names"])),
-        ("Cores", str(m["cores"])),
-        ("Memory", f"{_size(m['memory'])}, {_size(m['available'])} of it available"),
-        ("Disk", f"{_size(m['free'])} free in {m['folder']}"),
-        ("Compiled", found["compile_cache"]["remark"]),
-        ("Rasterizer", f"{d['rasterizer']}, tile lists by {d['binning']}"),
-        ("Self-test", test["remark"] if test["ok"] is None else _self_test_text(test)),
-        ("Libraries", ", ".join(good)),
-        *((f"  {x['name']}", f"BROKEN ({x['version']}): {x['trouble']}") for x in bad),
+    tested = test["remark"] if test["ok"] is None else f"FAILED: {test['remark']}"
+    if test["ok"]:
+        tested = (
+            f"ok: {test['remark']} in {test['then_ms']:.1f} ms ({test['first_ms'] / 1e3:.1f} s the "
+            f"first time), within {test['difference']:.0e} of the reference"
+        )
+    lines = [
+        _row("p2gs-jax", f"{found['p2gs_jax']}, Python {found['python']}, {m['system']}"),
+        _row("JAX runs on", d["trouble"] or ", ".join(d["names"])),
+        _row("Cores", str(m["cores"])),
+        _row("Memory", f"{memory}, {available} of it available"),
+        _row("Disk", f"{free} free in {m['folder']}"),
+        _row("Compiled", found["compile_cache"]["remark"]),
+        _row("Rasterizer", f"{d['rasterizer']}, tile lists by {d['binning']}"),
+        _row("Self-test", tested),
+        _row("Libraries", ", ".join(good)),
+        *(_row(f"  {x['name']}", f"BROKEN ({x['version']}): {x['trouble']}") for x in bad),
     ]
     width = max(len(f["name"]) for f in found["features"]) + 4
-    lines = [_row(name, text, 13) for name, text in rows]
     lines += ["", "Feature".ljust(width) + "works"]
     for f in found["features"]:
         works = "yes" if f["ready"] else "no "
@@ -324,24 +318,10 @@ def as_text(found: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _row(name: str, text: str, width: int) -> str:
-    return textwrap.fill(
-        text,
-        80,
-        initial_indent=name.ljust(width),
-        subsequent_indent=" " * width,
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
-
-
-def _self_test_text(test: dict[str, Any]) -> str:
-    if not test["ok"]:
-        return f"FAILED: {test['remark']}"
-    return (
-        f"ok: {test['remark']} in {test['then_ms']:.1f} ms ({test['first_ms'] / 1e3:.1f} s the "
-        f"first time), within {test['difference']:.0e} of the reference"
-    )
+def _row(name: str, text: str, width: int = 13) -> str:
+    wrapper = textwrap.TextWrapper(80, break_long_words=False, break_on_hyphens=False)
+    wrapper.initial_indent, wrapper.subsequent_indent = name.ljust(width), " " * width
+    return wrapper.fill(text)
 
 
 def _size(count: int | None) -> str:

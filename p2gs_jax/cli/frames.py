@@ -12,9 +12,8 @@ from jaxtyping import Float32
 from p2gs_jax.cli.render import FPS, Render
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.frames import OutputFrame
-from p2gs_jax.paths import drive, orbit
-from p2gs_jax.paths.drive import PosePath, beside, beside_shots, frame_count, interpolated
-from p2gs_jax.paths.orbit import find_orbit
+from p2gs_jax.paths.drive import PosePath, beside, beside_shots, drive, frame_count, interpolated
+from p2gs_jax.paths.orbit import find_orbit, orbit
 from p2gs_jax.paths.panorama import covering
 from p2gs_jax.paths.pictures import (
     RunRenderer,

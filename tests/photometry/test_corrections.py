@@ -13,7 +13,6 @@ from solving import check_gradients
 
 from p2gs_jax.config import LossConfig, PhotometryConfig
 from p2gs_jax.evaluation.alignment import fit_exposure
-from p2gs_jax.losses.luminance import contrast_loss, curve_prior, luminance_terms
 from p2gs_jax.photometry import luminance as gs
 from p2gs_jax.photometry import ppisp
 from p2gs_jax.photometry.appearance import (
@@ -25,6 +24,7 @@ from p2gs_jax.photometry.appearance import (
     regularisation,
 )
 from p2gs_jax.photometry.formation import formation
+from p2gs_jax.train.terms import CURVE, contrast_loss, curve_prior, enhanced_loss
 from p2gs_jax.types import LUMINANCE, Capture, Params, Photometry
 
 KINDS = pytest.mark.parametrize("kind", ["affine", "bilateral", "curve"])
@@ -401,8 +401,8 @@ def test_gradients_of_luminance_gs_match_and_pass_nothing_else():
 
         def f(moved):
             view = replace(at, **moved).view(1)
-            terms = luminance_terms(render, jnp.asarray(IMAGE), jnp.asarray(MASK), view, cfg)
-            return terms["enhanced"] + terms["curve"]
+            compared = enhanced_loss(render, jnp.asarray(IMAGE), jnp.asarray(MASK), view, cfg)
+            return compared + CURVE * curve_prior(view, jnp.asarray(IMAGE), jnp.asarray(MASK))
 
         slopes = check_gradients(f, {n: getattr(at, n) for n in LEARNED}, floor=1e-9)
         assert np.abs(slopes).min() > 1e-9
@@ -422,7 +422,8 @@ def test_masked_pixels_get_no_gradient():
     mask, view = MASK.at[:4].set(0), learned(0.05).view(0)
 
     def f(render):
-        return sum(luminance_terms(render, PICTURE, mask, view, LossConfig()).values())
+        compared = enhanced_loss(render, PICTURE, mask, view, LossConfig())
+        return compared + contrast_loss(render, PICTURE, mask)
 
     slope = jax.grad(f)(PICTURE * 0.5)
     assert not np.any(slope[:4])

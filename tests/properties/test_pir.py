@@ -9,17 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from p2gs_jax.config import (
-    LossConfig,
-    PhotometryConfig,
-    RelativeExposureConfig,
-    preset,
-)
+from p2gs_jax.config import LossConfig, PhotometryConfig, RelativeExposureConfig, preset
 from p2gs_jax.evaluation.scores import VideoScores
-from p2gs_jax.losses import relative_exposure as rel
-from p2gs_jax.losses.image import photometric_loss
-from p2gs_jax.losses.regularizers import photometry_regularizers
 from p2gs_jax.photometry.formation import eotf, formation, inverse_tone_map, tone_map
+from p2gs_jax.train import exposure_loss as rel
+from p2gs_jax.train.terms import photometric_loss, photometry_regularizers
 from p2gs_jax.types import LUMINANCE, Capture, Photometry
 
 PAPER = PhotometryConfig(curve="power", pivot=1.0, clamp=True, parameterization="linear")
