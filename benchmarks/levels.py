@@ -26,14 +26,14 @@ from benchmarks.speed_error import (
     reference_workload,
 )
 from p2gs_jax.config import FitConfig
-from p2gs_jax.losses.total import Partner
 from p2gs_jax.render import bin_tiles, project, required_capacity
 from p2gs_jax.render.capacity import Room, bucket
 from p2gs_jax.render.visible import whole_blocks
-from p2gs_jax.train.advance import Controls
+from p2gs_jax.train.exposure_loss import Partner
 from p2gs_jax.train.optimizer import make_optimizer
 from p2gs_jax.train.state import initial_state
 from p2gs_jax.train.step import Step
+from p2gs_jax.train.update import Controls
 from p2gs_jax.types import Batch, Params, Photometry
 
 SCENES: dict[str, Callable[[], BenchScene]] = {

@@ -74,12 +74,14 @@ def _prepared(gaussians: Gaussians, view: Camera, cfg: RenderConfig):
 
 @functools.partial(jax.jit, static_argnames=("cfg",))
 def _block(splats: Splats2D, leaves, radiance, origin, v, cfg: RenderConfig):
+    cfg = dataclasses.replace(cfg, implementation="reference")
+
     def run(leaves, radiance):
         means, factor, opacities = leaves
         s = dataclasses.replace(
             splats, means2d=means - origin, conic_factor=factor, log_opacities=opacities
         )
-        return rasterize(s, radiance, None, *BLOCK, cfg, implementation="reference")[0]
+        return rasterize(s, radiance, None, *BLOCK, cfg)[0]
 
     linear, pull = jax.vjp(run, leaves, radiance)
     return linear, pull(v)

@@ -7,11 +7,14 @@ al. 2023; "ours" is measured, see BUILD_NOTES.md. A weight or option set to None
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+import functools
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal, get_args
+from typing import Any, Literal, TypeVar, get_args
 
 from p2gs_jax.errors import UserError
+
+Record = TypeVar("Record")
 
 Appearance = Literal["affine", "bilateral", "curve", "ppisp", "luminance"]
 PresetName = Literal[
@@ -694,6 +697,52 @@ def require_config(cfg: FitConfig | None) -> FitConfig:
             fix='give a FitConfig, for example p2gs_jax.preset("robust")',
         )
     return cfg
+
+
+def narrowed(record: Record, taken: Mapping[str, Any]) -> Record:
+    """Return a configuration with some of its fields only; reading another raises AttributeError.
+
+    What is compiled for it can therefore be shared by all configurations that agree in these
+    fields, and nothing can depend on one that was forgotten. Two are equal where the fields are.
+
+    Args:
+        record: a frozen dataclass.
+        taken: by the name of a field what of it is taken: None for all, the names of its fields,
+            or again a mapping like this.
+    """
+    kind = _narrowed_type(type(record), tuple(taken))
+    made = object.__new__(kind)
+    for name, inner in taken.items():
+        value = getattr(record, name)
+        if inner is not None:
+            inner = inner if isinstance(inner, Mapping) else dict.fromkeys(inner)
+            value = narrowed(value, inner)
+        object.__setattr__(made, name, value)
+    return made
+
+
+@functools.cache
+def _narrowed_type(kind: type, names: tuple[str, ...]) -> Any:
+    """Return a subclass whose instances have these fields only."""
+
+    def hidden(name: str) -> property:
+        def read(self):
+            raise AttributeError(f"{kind.__name__}.{name} was not given to this program")
+
+        return property(read)
+
+    def values(self) -> tuple:
+        return tuple(getattr(self, name) for name in names)
+
+    def equal(self, other) -> bool:
+        return type(self) is type(other) and values(self) == values(other)
+
+    fields = {f.name: hidden(f.name) for f in dataclasses.fields(kind) if f.name not in names}
+    methods = {"__eq__": equal, "__hash__": lambda self: hash(values(self))}
+    methods["__repr__"] = lambda self: (
+        f"{kind.__name__}{dict(zip(names, values(self), strict=True))}"
+    )
+    return type(kind.__name__, (kind,), fields | methods)
 
 
 def to_dict(config: FitConfig) -> dict:

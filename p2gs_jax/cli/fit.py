@@ -88,7 +88,7 @@ class Fit:
 
         from p2gs_jax.cli.tables import print_metrics
         from p2gs_jax.core.progress import TerminalReporter
-        from p2gs_jax.districts.fit import fit_blocks
+        from p2gs_jax.jobs.blocks.fit import fit_blocks
         from p2gs_jax.jobs.table import JobsTable
 
         console = Console(stderr=True, highlight=False)
@@ -150,30 +150,19 @@ class Calibrate:
 
         from p2gs_jax.cli.tables import print_calibration, print_calibration_of, print_stack
         from p2gs_jax.core.progress import TerminalReporter
-        from p2gs_jax.pipeline.calibrate import calibrate
-        from p2gs_jax.pipeline.calibrate_of import STEPS, calibrate_of
-        from p2gs_jax.pipeline.calibrate_run import calibrate_run
-        from p2gs_jax.pipeline.calibrate_stack import calibrate_stack
-        from p2gs_jax.pipeline.calibration import write_calibration
+        from p2gs_jax.pipeline.calibrate import calibrate, calibrate_run, calibrate_stack
+        from p2gs_jax.pipeline.convert import STEPS, calibrate_of
 
         scene, out, cfg, steps = self.scene, self.out, self.checked(), self.steps or STEPS
         with TerminalReporter() as reporter:
             how = {"compare_with": self.compare_with, "reporter": reporter}
             if self.static:
-                reporter.stage("Solving the stack")
-                known, sigma = cfg.photometry.known, cfg.photometry.known_deviation_ev
-                stack = calibrate_stack(
-                    scene, known=known, known_deviation_ev=sigma, compare_with=self.compare_with
-                )
-                write_calibration(stack, out)
-                show = partial(print_stack, stack, out)
+                show = partial(print_stack, calibrate_stack(scene, out, cfg, **how), out)
             elif self.of is not None:
-                found = calibrate_of(self.of, scene, out, cfg, steps=steps, **how)
+                found = calibrate_of(scene, out, cfg, model=self.of, steps=steps, **how)
                 show = partial(print_calibration_of, found, out)
             elif self.is_run:
-                show = partial(
-                    print_calibration, calibrate_run(scene, out, cfg.photometry, **how), out
-                )
+                show = partial(print_calibration, calibrate_run(scene, out, cfg, **how), out)
             else:
                 show = partial(print_calibration, calibrate(scene, out, cfg, **how), out)
         show()

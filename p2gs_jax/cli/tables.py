@@ -16,9 +16,7 @@ from p2gs_jax.core.numerics import LN2
 from p2gs_jax.core.progress import PlainConsole
 from p2gs_jax.photometry.formation import corner
 from p2gs_jax.photometry.solution import WEAK_GAMMA, PhotometricSolution
-from p2gs_jax.pipeline.calibrate_of import CalibrationOf
-from p2gs_jax.pipeline.calibrate_stack import StackResult
-from p2gs_jax.pipeline.calibration import Calibration, CalibrationResult
+from p2gs_jax.pipeline.calibrate import Calibration
 
 # Columns of words; all others hold numbers.
 WORDS = ("views", "view", "camera", "protocol", "program", "lens", "configuration", "")
@@ -121,9 +119,9 @@ def print_calibration(result: Calibration, out: Path) -> None:
     stdout().print(f"Results: {out} (open {out / 'calibration.png'} first)")
 
 
-def print_calibration_of(found: CalibrationOf, out: Path) -> None:
+def print_calibration_of(found: Calibration, out: Path) -> None:
     """Print the same, and how well somebody's splats fit before and after."""
-    _print_solution(found.calibration, _tone_columns(found.calibration))
+    _print_solution(found, _tone_columns(found))
     for split, name in (("train", "training"), ("test", "held-out")):
         if split not in found.metrics["of"]:
             continue
@@ -138,16 +136,16 @@ def print_calibration_of(found: CalibrationOf, out: Path) -> None:
     stdout().print(f"Results: {out} (a run folder: view, render, export, report read it)")
 
 
-def print_stack(result: StackResult, out: Path) -> None:
+def print_stack(result: Calibration, out: Path) -> None:
     """Print the solved exposures of a stack from one viewpoint, and its response."""
     s = result.solution
     points = [str(count) for count in s.observations_per_view]
-    signal = ["yes" if signal else "little" for signal in result.signal]
+    signal = ["yes" if signal else "little" for signal in result.details["signal"]]
     _print_solution(result, {"usable points": points, "signal": signal})
     stdout().print(f"Response: {s.response.name}; residual {s.residual_ev:.2f} EV. Results: {out}")
 
 
-def _print_solution(result: CalibrationResult, more: Mapping[str, list[str]]) -> None:
+def _print_solution(result: Calibration, more: Mapping[str, list[str]]) -> None:
     """Print exposures with their standard errors, the notes, and each camera's vignetting."""
     console, columns = stdout(), {**_exposure_columns(result), **more}
     rows = zip(*columns.values(), strict=True)
@@ -166,7 +164,7 @@ def _print_solution(result: CalibrationResult, more: Mapping[str, list[str]]) ->
             console.print(f"Camera {camera.name}: {lost} EV in the corners (vignetting).")
 
 
-def _exposure_columns(result: CalibrationResult) -> dict[str, list[str]]:
+def _exposure_columns(result: Calibration) -> dict[str, list[str]]:
     """Return columns by title, without those that are empty or constant."""
     s, views = result.solution, result.views
     errors, stated, gaps = s.exposure_errors_ev, result.stated_ev, result.agreement.gap_ev
@@ -187,7 +185,7 @@ def _exposure_columns(result: CalibrationResult) -> dict[str, list[str]]:
     return columns
 
 
-def _tone_columns(result: CalibrationResult) -> dict[str, list[str]]:
+def _tone_columns(result: Calibration) -> dict[str, list[str]]:
     """Return gammas and white balances with standard errors, and residuals in stops."""
     s, rows = result.solution, range(len(result.views))
     known = np.isfinite(s.exposure_errors)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -16,23 +16,19 @@ from p2gs_jax.photometry.metering import Metering, Readings, fit_metering, white
 class _Kept(NamedTuple):
     """A held-out view until the rule is known, which needs all training views."""
 
-    name: str
+    row: int
     readings: Readings
-    linear: StoredArray
-    photograph: StoredArray
-    mask: StoredArray
+    images: tuple[StoredArray, ...]
     alpha: StoredArray | None
 
 
 class MeteredViews:
-    """Collects what the meters read, fits the rule, and scores held-out views under it."""
+    """Collects what the meters read, fits the rule, and scores held-out views under it.
+
+    Held-out views are kept in `arrays`.
+    """
 
     def __init__(self, arrays: ArrayStore):
-        """Begin empty.
-
-        Args:
-            arrays: keeps held-out views.
-        """
         self._arrays = arrays
         self._names: list[str] = []
         self._readings: list[Readings] = []
@@ -45,22 +41,22 @@ class MeteredViews:
 
     def add_held_out(
         self,
-        name: str,
+        index: int,
         readings: Readings,
         linear: np.ndarray | StoredArray,
         photograph: Float32[np.ndarray, "h w 3"],
         mask: Float32[np.ndarray, "h w"],
         alpha: Float32[np.ndarray, "h w"] | None = None,
     ) -> None:
-        """Keep a held-out view; its opacity where it is put over a background."""
-        put = self._arrays.put
-        opacity = None if alpha is None else put(alpha)
-        self._kept.append(_Kept(name, readings, put(linear), put(photograph), put(mask), opacity))
+        """Keep a held-out view by its row; its opacity where it is put over a background."""
+        images = tuple(map(self._arrays.put, (linear, photograph, mask)))
+        opacity = None if alpha is None else self._arrays.put(alpha)
+        self._kept.append(_Kept(index, readings, images, opacity))
 
     def fit(
         self, exposures: Float[np.ndarray, " v"], gamma: float, tone: PhotometryConfig
     ) -> Metering:
-        """Return the rule that explains the training views.
+        """Return the rule that explains the exposures of the training views, in their order.
 
         Args:
             exposures: of the training views, in the order in which they were added.
@@ -71,22 +67,23 @@ class MeteredViews:
         return fit_metering(self._names, self._readings, logs, white_level(gamma, tone))
 
     def scores(
-        self, metering: Metering, score: Callable[..., dict[str, float]]
-    ) -> dict[str, dict[str, float]]:
-        """Return scores of every held-out view by name; none where the rule is a constant.
+        self, metering: Metering, score: Callable[..., dict[str, Any]]
+    ) -> dict[int, dict[str, Any]]:
+        """Return scores of every held-out view by its row; none where the rule is a constant.
 
         Args:
             metering: from `fit`.
-            score: (name, linear, exposure, photograph, mask, alpha) -> scores by name.
+            score: (row, linear, exposure, photograph, mask, alpha) -> scores by name.
         """
         if not metering.rule.meters:
             return {}
 
-        def judged(view: _Kept) -> dict[str, float]:
+        def judged(view: _Kept) -> dict[str, Any]:
             exposure = metering.exposure(view.readings)
-            given = (view.linear.read(), exposure, view.photograph.read(), view.mask.read())
+            linear, photograph, mask = (image.read() for image in view.images)
             alpha = None if view.alpha is None else view.alpha.read()
-            return {**score(view.name, *given, alpha), "exposure": exposure}
+            row = score(view.row, linear, exposure, photograph, mask, alpha)
+            return {**row, "exposure": exposure}
 
-        names = [view.name for view in self._kept]
-        return dict(zip(names, map_in_order(judged, self._kept), strict=True))
+        rows = [view.row for view in self._kept]
+        return dict(zip(rows, map_in_order(judged, self._kept), strict=True))

@@ -17,8 +17,8 @@ from jaxtyping import Array, Bool, Float, Float32
 
 from p2gs_jax.config import LossConfig
 from p2gs_jax.evaluation.lpips import LpipsWeights, lpips
-from p2gs_jax.losses.image import ssim as _ssim
-from p2gs_jax.losses.image import ssim_map
+from p2gs_jax.evaluation.ssim import ssim as _ssim
+from p2gs_jax.evaluation.ssim import ssim_map
 from p2gs_jax.photometry.formation import eotf
 from p2gs_jax.scene.drives.objects import object_mask
 from p2gs_jax.types import LUMINANCE, Scene

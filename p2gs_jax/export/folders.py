@@ -174,8 +174,7 @@ def _write_mask(path: Path, mask: Bool[np.ndarray, "h w"]) -> None:
 def _write_photograph(path: Path, view: View, ldr: Float[np.ndarray, "h w 3"]) -> None:
     """Copy a photograph that is used as it is; encode a changed one again, EXIF included.
 
-    Raises:
-        UserError: it cannot be written in its own format.
+    A UserError says that its own format cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     height, width = ldr.shape[:2]

@@ -142,11 +142,7 @@ def _json(value: Any) -> str:
 
 
 def _room(budget: int, empty: str, size_mb: float) -> int:
-    """Return how many bytes of Gaussians fit.
-
-    Raises:
-        UserError: none, as the rest is too large.
-    """
+    """Return how many bytes of Gaussians fit; a UserError says that none do."""
     rest = len(empty.encode()) + RESERVE
     if rest >= budget:
         raise UserError(

@@ -67,8 +67,7 @@ def page_scene(
 def embedded_photographs(fitted: Run, count: int) -> dict[int, str]:
     """Return at most `count` undistorted photographs as data URLs, by row, evenly spread.
 
-    Raises:
-        UserError: they are gone or broken.
+    A UserError says that they are gone or broken.
     """
     rows = [int(i) for i in evenly_spaced(len(fitted.scene.views), count)] if count else []
     fitted.require_photographs(rows)

@@ -120,11 +120,7 @@ def _shot_attributes(shot: ExifSettings) -> dict:
 
 
 def read_exr(path: Path) -> tuple[Float32[np.ndarray, "h w 3"], dict]:
-    """Return linear radiance and the header.
-
-    Raises:
-        UserError: the file cannot be read or has no R, G, B.
-    """
+    """Return linear radiance and the header; a UserError says that there is no readable R, G, B."""
     linear, _, header = read_exr_with_alpha(path)
     return linear, header
 
@@ -134,8 +130,7 @@ def read_exr_with_alpha(
 ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"] | None, dict]:
     """Return linear radiance, premultiplied by the opacity; that, or None; and the header.
 
-    Raises:
-        UserError: the file cannot be read or has no R, G, B.
+    A UserError says that the file cannot be read or has no R, G, B.
     """
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:

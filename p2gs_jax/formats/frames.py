@@ -55,11 +55,7 @@ def to_uint8(ldr: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
 
 
 def write_png(path: Path, ldr: Float32[np.ndarray, "h w 3"]) -> None:
-    """Write display values in [0, 1], rounded to 8 bits; NaN becomes black.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """Write display values as 8 bits, NaN as black; an OSError says that this failed."""
     codes = to_uint8(ldr)
     with atomic_write(Path(path)) as temporary:
         if not cv2.imwrite(str(temporary), codes[..., ::-1]):
@@ -88,15 +84,9 @@ def write_frame(folder: Path, frame: OutputFrame) -> None:
 def open_frames(
     out: Path, size: tuple[int, int], fps: float
 ) -> Iterator[Callable[[OutputFrame], None]]:
-    """Yield a function that takes frames in order: into a video, or into a folder.
+    """Yield a function that takes frames in order: into a video (.mp4), or into a folder.
 
-    Args:
-        out: a video where it ends with .mp4, otherwise a folder.
-        size: (width, height) of the largest frame, pixels.
-        fps: frames per second of a video.
-
-    Raises:
-        UserError: see `open_video`.
+    `size` is (width, height) of the largest frame, pixels. Errors are those of `open_video`.
     """
     if out.suffix.lower() == ".mp4":
         with open_video(out, *size, fps) as add:
@@ -111,17 +101,9 @@ def open_video(
 ) -> Iterator[Callable[[Float32[np.ndarray, "h w 3"]], None]]:
     """Yield a function that appends display values in [0, 1]; the file appears at the end.
 
-    Smaller frames are centred on black. The size is rounded down to even numbers, as the codec
-    requires. Display values are tagged as BT.709 primaries with the sRGB curve.
-
-    Args:
-        path: of the .mp4.
-        width: of the largest frame, pixels.
-        height: of the largest frame, pixels.
-        fps: frames per second.
-
-    Raises:
-        UserError: the size is too small, or no encoder was built into PyAV.
+    Smaller frames than `width` by `height` pixels are centred on black. The size is rounded down to
+    even numbers, as the codec requires. Display values are tagged as BT.709 primaries with the sRGB
+    curve. A UserError says that the size is too small, or that PyAV has no encoder.
     """
     # Imported here: a fit writes pictures, but no video.
     import av

@@ -31,8 +31,7 @@ MAGIC, VERSION, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
 def write_gltf(path: Path, gaussians: Gaussians) -> int:
     """Write Gaussians with display colours and COLMAP's axes as `.glb`; return how many.
 
-    Raises:
-        ValueError: there is none: glTF holds no empty list.
+    A ValueError says that there is none: glTF holds no empty list.
     """
     if gaussians.capacity == 0:
         raise ValueError("glTF holds no empty accessor")

@@ -27,11 +27,7 @@ LARGEST_INTEGER, MOST_FRACTIONAL_BITS = 2**23 - 1, 24
 
 
 def require_gsply() -> ModuleType:
-    """Return the package that writes SPZ and compressed PLY.
-
-    Raises:
-        UserError: it is not installed.
-    """
+    """Return the package that writes both formats; a UserError says that it is not installed."""
     try:
         import gsply
     except ImportError as error:
@@ -64,11 +60,7 @@ def _from_gsply(data: Any) -> Gaussians:
 
 
 def write_compressed_ply(path: Path, gaussians: Gaussians) -> int:
-    """Write Gaussians with display colours into a file `.compressed.ply`; return how many.
-
-    Raises:
-        UserError: gsply is not installed.
-    """
+    """Write Gaussians with display colours into a file `.compressed.ply`; return how many."""
     content = require_gsply().compress_to_bytes(_to_gsply(gaussians))
     with atomic_write(path) as temporary:
         temporary.write_bytes(content)
@@ -76,11 +68,7 @@ def write_compressed_ply(path: Path, gaussians: Gaussians) -> int:
 
 
 def read_compressed_ply(path: Path) -> Gaussians:
-    """Read Gaussians back, in the order of the file and as precisely as it holds them.
-
-    Raises:
-        UserError: the file is not a compressed PLY, or gsply is not installed.
-    """
+    """Read Gaussians back, in the order of the file; a UserError says that they cannot be read."""
     gsply = require_gsply()
     try:
         data = gsply.decompress_from_bytes(path.read_bytes())
@@ -92,8 +80,7 @@ def read_compressed_ply(path: Path) -> Gaussians:
 def write_spz(path: Path, gaussians: Gaussians) -> int:
     """Write Gaussians with display colours; return how many.
 
-    Raises:
-        UserError: gsply is not installed, or a position does not fit the format.
+    A UserError says that a position does not fit the format.
     """
     require_gsply()
     from gsply.spz import write_spz as write
@@ -108,8 +95,7 @@ def write_spz(path: Path, gaussians: Gaussians) -> int:
 def fractional_bits(means: np.ndarray) -> int:
     """Return the most fractional bits with which every coordinate fits.
 
-    Raises:
-        UserError: a coordinate fits with none.
+    A UserError says that a coordinate fits with none.
     """
     farthest = max(float(np.abs(means).max(initial=0.0)), 1e-12)
     bits = int(np.floor(np.log2(LARGEST_INTEGER / farthest)))
@@ -122,11 +108,7 @@ def fractional_bits(means: np.ndarray) -> int:
 
 
 def read_spz(path: Path) -> Gaussians:
-    """Read Gaussians back, as precisely as the file holds them.
-
-    Raises:
-        UserError: the file is not an SPZ, or gsply is not installed.
-    """
+    """Read Gaussians back, as the file holds them; a UserError says that they cannot be read."""
     require_gsply()
     from gsply.spz import read_spz as read
 

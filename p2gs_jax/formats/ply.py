@@ -108,8 +108,7 @@ RESTORE = "restore it from a copy, or write it again with `p2gs-jax fit ... --re
 def read_ply(path: Path, *, fix: str = RESTORE) -> Gaussians:
     """Read Gaussians back, bit for bit. Normals, which mean nothing, may be missing.
 
-    Raises:
-        UserError: the file is not such a PLY; `fix` says what to do about it.
+    A UserError says that the file is not such a PLY, and with `fix` what to do.
     """
     with refusing(path, "Gaussians", fix=fix):
         return _read(read_table(path, "vertex"))

@@ -29,8 +29,7 @@ RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), (
 def write_splat(path: Path, gaussians: Gaussians) -> int:
     """Write Gaussians with display colours of degree 0; return how many.
 
-    Raises:
-        ValueError: the colours depend on the direction.
+    A ValueError says that the colours depend on the direction.
     """
     if gaussians.sh.shape[1] != 1:
         raise ValueError(".splat holds colours of degree 0")
@@ -53,11 +52,7 @@ def _bytes(values: np.ndarray) -> np.ndarray:
 
 
 def read_splat(path: Path) -> Gaussians:
-    """Read Gaussians back, as precisely as the file holds them.
-
-    Raises:
-        UserError: the file is not a .splat.
-    """
+    """Read Gaussians back, as the file holds them; a UserError says that it is not a .splat."""
     try:
         records = np.fromfile(path, RECORD)
         size = path.stat().st_size

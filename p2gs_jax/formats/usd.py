@@ -44,8 +44,7 @@ class NamedCamera:
 def require_pxr() -> tuple[Any, ...]:
     """Return pxr's Gf, Usd, UsdGeom, UsdVol and Vt, which have no types.
 
-    Raises:
-        UserError: OpenUSD is not installed, or knows no splats.
+    A UserError says that OpenUSD is not installed, or too old for splats.
     """
     try:
         found = [importlib.import_module(f"pxr.{name}") for name in MODULES]
@@ -63,11 +62,7 @@ def require_pxr() -> tuple[Any, ...]:
 
 
 def write_usd(path: Path, gaussians: Gaussians, cameras: Sequence[NamedCamera] = ()) -> int:
-    """Write Gaussians with display colours and COLMAP's axes, and cameras; return how many.
-
-    Raises:
-        UserError: OpenUSD is not installed.
-    """
+    """Write Gaussians with display colours and COLMAP's axes, and cameras; return how many."""
     _, Usd, UsdGeom, UsdVol, Vt = require_pxr()
     g = half_turn(gaussians)
 

@@ -28,7 +28,7 @@ from p2gs_jax.gaussians.seeds import gaussians_from_points, neighbour_scales
 from p2gs_jax.photometry.formation import places
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.visibility import shown_share
-from p2gs_jax.types import Gaussians, Photometry, Scene, View
+from p2gs_jax.types import Gaussians, Scene, View
 
 # A depth that two neighbours must agree on needs at least three views.
 FEWEST_VIEWS = 3
@@ -124,7 +124,6 @@ def dense_seeds(
     *,
     existing: Float[np.ndarray, "p 3"],
     limit: int,
-    most_views: int = MOST_VIEWS,
     on_view: Callable[[int, int], None] = lambda i, n: None,
 ) -> DenseSeeds:
     """Return seeds from the depths of the training views; the same for the same seed.
@@ -137,16 +136,22 @@ def dense_seeds(
         store: photographs.
         match: tones under which photographs are compared.
         color: tones that make radiance of what a seed shows.
-        cfg: seed of the choices; black and saturation.
+        cfg: seed of the choices; black and saturation; a budget, which bounds the views that give
+            seeds: they are taken evenly, and their neighbours may be any.
         existing: seeds that keep their place.
         limit: most seeds to return.
-        most_views: that give seeds, taken evenly; their neighbours may be any.
         on_view: called with views done and views in all.
     """
     rows = scene.train_indices
+    empty = np.zeros((0, 3), np.float32)
+    nothing = DenseSeeds(empty, empty, empty, np.zeros((0, 4), np.float32))
     if len(rows) < FEWEST_VIEWS or limit < 1 or not len(scene.points):
-        return _none()
+        return nothing
     images = MatchImages(scene, store, match, MATCH_SIDE, cfg.loss.black, cfg.loss.saturation)
+    most_views = MOST_VIEWS
+    if cfg.train.budget_s is not None:
+        affordable = int(DENSE_TIME * cfg.train.budget_s / DENSE_SECONDS)
+        most_views = min(most_views, max(affordable, FEWEST_DENSE_VIEWS))
     seen = visibility(scene, cfg.train.seed)
     near = neighbours(scene, seen, match.log_exposures, NEIGHBOURS)
     wanted = [int(r) for r in evenly_spaced(len(rows), most_views) if len(near[r]) >= 2]
@@ -161,13 +166,8 @@ def dense_seeds(
             found.append(candidates)
             on_view(done + 1, len(wanted))
     if not sum(len(c.xy) for c in found):
-        return _none()
+        return nothing
     return choose_seeds(found, images, np.asarray(existing, np.float64), limit, cfg.train.seed)
-
-
-def _none() -> DenseSeeds:
-    empty = np.zeros((0, 3), np.float32)
-    return DenseSeeds(empty, empty, empty, np.zeros((0, 4), np.float32))
 
 
 def _candidates(row: int, near, flows: Flows, color: Tones, seed: int) -> Candidates:
@@ -328,48 +328,14 @@ def _seeds(candidates: Candidates, images: MatchImages, pick, spacing):
     down /= np.linalg.norm(down, axis=1, keepdims=True)
     axes = np.stack([down, np.cross(normal, down), normal], -1)
     axes = frame.viewmat[:3, :3].T @ axes
-    quats = np.roll(Rotation.from_matrix(axes).as_quat(), 1, axis=1) if len(pick) else axes[:, 0]
-    if not len(pick):
-        quats = np.zeros((0, 4))
+    quats = np.zeros((0, 4))
+    if len(pick):
+        quats = np.roll(Rotation.from_matrix(axes).as_quat(), 1, axis=1)
     across = np.where(flat, THICKNESS / SPREAD, 1.0)
     scales = size[:, None] * np.stack(
         [np.where(flat, 1 / facing, 1), np.ones_like(size), across], 1
     )
     return _world(candidates, images, pick), candidates.radiance[pick], scales, quats
-
-
-def match_photographs(
-    scene: Scene,
-    store: ImageStore,
-    match: Tones,
-    points: np.ndarray,
-    photometry: Photometry,
-    cfg: FitConfig,
-    *,
-    limit: int,
-    on_view: Callable[[int, int], None],
-) -> DenseSeeds:
-    """Find at most `limit` dense seeds, with radiances in the gauge of the starting exposures.
-
-    `match` brings photographs to one brightness for matching; `points` are seeds that are there
-    already.
-    """
-    most_views, budget = MOST_VIEWS, cfg.train.budget_s
-    if budget is not None:
-        affordable = int(DENSE_TIME * budget / DENSE_SECONDS)
-        most_views = min(most_views, max(affordable, FEWEST_DENSE_VIEWS))
-    tones = Tones.of(photometry, cfg.photometry)
-    return dense_seeds(
-        scene,
-        store,
-        match,
-        tones,
-        cfg,
-        existing=points,
-        limit=limit,
-        most_views=most_views,
-        on_view=on_view,
-    )
 
 
 def gaussians_of(
@@ -387,23 +353,17 @@ def gaussians_of(
     views = list(views)
     if dense is None:
         return gaussians_from_points(points, radiance, views, cfg)
-    everything = np.concatenate([points, dense.points])
-    count = len(points)
-    scales = np.repeat(neighbour_scales(everything, views)[:, None], 3, 1)
-    scales[count:] = dense.scales
-    opacity = np.full(len(everything), cfg.init.opacity)
-    opacity[count:] = cfg.init.dense_opacity
-    quats = np.tile(np.eye(1, 4), (len(everything), 1))
-    quats[count:] = dense.quats
-    return gaussians_from_points(
-        everything,
-        np.concatenate([radiance, dense.radiance]),
-        views,
-        cfg,
-        scales=scales,
-        opacity=opacity,
-        quats=quats,
-    )
+    everything, count = np.concatenate([points, dense.points]), len(points)
+    own = {
+        "scales": np.repeat(neighbour_scales(everything, views)[:, None], 3, 1),
+        "opacity": np.full(len(everything), cfg.init.opacity),
+        "quats": np.tile(np.eye(1, 4), (len(everything), 1)),
+    }
+    own["scales"][count:] = dense.scales
+    own["opacity"][count:] = cfg.init.dense_opacity
+    own["quats"][count:] = dense.quats
+    colors = np.concatenate([radiance, dense.radiance])
+    return gaussians_from_points(everything, colors, views, cfg, **own)
 
 
 def coverage_of(scene: Scene, store: ImageStore) -> Coverage:

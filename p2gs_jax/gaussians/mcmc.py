@@ -122,10 +122,7 @@ def _turned(R, local: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
 
 
 def exploration_noise(
-    key: PRNGKeyArray,
-    gaussians: Gaussians,
-    alive: Bool[Array, " n"],
-    rate: Float[Array, ""],
+    key: PRNGKeyArray, gaussians: Gaussians, alive: Bool[Array, " n"], rate: Float[Array, ""]
 ) -> Float[Array, "n 3"]:
     """Return the noise to add to the means after a step.
 
@@ -138,10 +135,7 @@ def exploration_noise(
 
 
 def shaped_noise(
-    normal: Float[Array, "n 3"],
-    gaussians: Gaussians,
-    alive: Bool[Array, " n"],
-    rate: Float[Array, ""],
+    normal: Float[Array, "n 3"], gaussians: Gaussians, alive: Bool[Array, " n"], rate
 ) -> Float[Array, "n 3"]:
     """Return the noise that independent normal numbers give; see `exploration_noise`."""
     gate = jax.nn.sigmoid(NOISE_STEEPNESS * (NOISE_OPACITY - opacities(gaussians)))

@@ -116,7 +116,7 @@ def nodes_radiance(
     """Return the mean radiance of points of moving objects, where they were in each view."""
     still = len(scene.points)
 
-    def seen_in(view: View):
+    def seen_in(view: View, row: int):
         assert view.time is not None
         poses, there = nodes.moving.poses(view.time)
         rows = np.flatnonzero(there[nodes.owner])

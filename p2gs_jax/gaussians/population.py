@@ -100,25 +100,19 @@ def grow(tree, fill):
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), tree, fill)
 
 
-def free_slots(alive: Bool[Array, " n"]) -> Int[Array, " n"]:
-    """Return slot indices, empty ones first, each group in order."""
-    return jnp.argsort(alive, stable=True).astype(jnp.int32)
-
-
 def place(
     requests: Bool[Array, " n"], alive: Bool[Array, " n"]
 ) -> tuple[Int[Array, " n"], Int[Array, ""]]:
-    """Assign an empty slot to each request, in order.
+    """Assign an empty slot to each request, in order; count the requests that found none.
 
-    Returns:
-        The slot of every requester (n, out of bounds, where there is none) and how many requests
-        found no slot.
+    Where there is no slot, it is n, out of bounds.
     """
     n = alive.shape[0]
     rank = jnp.cumsum(requests) - 1
     room = n - jnp.sum(alive)
     granted = requests & (rank < room)
-    slot = jnp.where(granted, free_slots(alive)[jnp.clip(rank, 0, n - 1)], n)
+    free = jnp.argsort(alive, stable=True).astype(jnp.int32)  # empty slots first, in order
+    slot = jnp.where(granted, free[jnp.clip(rank, 0, n - 1)], n)
     return slot, jnp.sum(requests) - jnp.sum(granted)
 
 

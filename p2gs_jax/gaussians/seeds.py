@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import jax
 import numpy as np
@@ -29,8 +29,8 @@ MAX_ANGLE = 0.05
 # Values that say nothing of the radiance count only where there are no others.
 LEAST_WEIGHT = 1e-3
 
-# From a view to the points that it shows, and where, pixels at its full size.
-SeenIn = Callable[[View], tuple[Int[np.ndarray, " s"], Float[np.ndarray, "s 2"]]]
+# From a training view and its row to the points that it shows, and where, pixels at its full size.
+SeenIn = Callable[[View, int], tuple[Int[np.ndarray, " s"], Float[np.ndarray, "s 2"]]]
 
 
 def camera_centers(views: tuple[View, ...] | list[View]) -> Float[np.ndarray, "v 3"]:
@@ -129,7 +129,7 @@ def photographed_radiance(
     the median of all others.
     """
 
-    def seen_in(view: View):
+    def seen_in(view: View, row: int):
         xy, z = project_points(scene.points, view)
         seen = np.flatnonzero(unoccluded(xy, z, view.width, view.height))
         return seen, xy[seen]
@@ -146,20 +146,8 @@ def mean_radiance(
     cfg: FitConfig,
 ) -> Float[np.ndarray, "p 3"]:
     """Return the mean radiance of so many points in the training photographs that see them."""
-    taken: Photometry = jax.tree.map(np.asarray, photometry)
     total, weight = np.zeros((count, 3)), np.zeros((count, 3))
-    for row, index in enumerate(scene.train_indices):
-        view = scene.views[index]
-        seen, xy = seen_in(view)
-        if not len(seen):
-            continue
-        ldr, mask = store.get(index, 1)
-        xy = xy * [mask.shape[1] / view.width, mask.shape[0] / view.height]
-        samples = sample(ldr, mask, xy)
-        valid = samples.valid
-        colors, at = np.asarray(samples.colors[valid], np.float32), seen[valid]
-        place = places(xy[valid], *mask.shape[::-1])
-        found = inverse_formation(colors, taken.capture(row), cfg.photometry, place)
+    for at, colors, found in photographed(seen_in, scene, store, photometry, cfg):
         says = (colors > cfg.loss.black) & (colors < cfg.loss.saturation)
         share = np.where(says, 1.0, LEAST_WEIGHT)
         total[at] += share * found
@@ -169,6 +157,31 @@ def mean_radiance(
     if known.any():
         radiance[~known] = np.median(radiance[known], axis=0)
     return radiance.astype(np.float32)
+
+
+def photographed(
+    seen_in: SeenIn,
+    scene: Scene,
+    store: ImageStore,
+    photometry: Photometry,
+    cfg: FitConfig,
+    shrink: int = 1,
+) -> Iterator[tuple[Int[np.ndarray, " s"], Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]]:
+    """Yield points, their display colours and radiance, in each training photograph."""
+    taken: Photometry = jax.tree.map(np.asarray, photometry)
+    for row, index in enumerate(scene.train_indices):
+        view = scene.views[index]
+        seen, xy = seen_in(view, row)
+        if not len(seen):
+            continue
+        ldr, mask = store.get(index, shrink)
+        xy = xy * [mask.shape[1] / view.width, mask.shape[0] / view.height]
+        samples = sample(ldr, mask, xy)
+        valid = samples.valid
+        colors = np.asarray(samples.colors[valid], np.float32)
+        place = places(xy[valid], *mask.shape[::-1])
+        found = inverse_formation(colors, taken.capture(row), cfg.photometry, place)
+        yield seen[valid], colors, np.asarray(found)
 
 
 def with_colors(scene: Scene, radiance: Float[np.ndarray, "p 3"]) -> Scene:

@@ -10,15 +10,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import jax
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from p2gs_jax.config import FitConfig, InitConfig
 from p2gs_jax.core.numerics import fibonacci_sphere
-from p2gs_jax.gaussians.seeds import camera_centers, gaussians_from_points, merge
-from p2gs_jax.photometry.formation import inverse_formation, places
-from p2gs_jax.photometry.sources.sampling import sample
+from p2gs_jax.gaussians.seeds import camera_centers, gaussians_from_points, merge, photographed
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.visibility import in_frame, project_points
 from p2gs_jax.types import Gaussians, Photometry, Scene, View
@@ -39,14 +36,10 @@ SHELL_OPACITY = 0.5
 
 @dataclass(frozen=True)
 class Shell:
-    """Directions to add.
+    """Directions to add: positions and standard deviations, scene units.
 
-    Attributes:
-        points: positions, scene units.
-        scales: their standard deviations.
-        seen: which training view (row) sees each, and where: [s v] bool.
-        xy: pixel position of each in each view, full resolution.
-        empty_fraction: share of image cells with no seed near.
+    Which training view (row) sees each of them, and at which pixel of the full resolution; and the
+    share of image cells with no seed near.
     """
 
     points: Float32[np.ndarray, "s 3"]
@@ -172,30 +165,16 @@ def shell_gaussians(
     cfg: FitConfig,
 ) -> Gaussians:
     """Return the Gaussians of a shell, coloured by what the photographs show in its directions."""
-    taken: Photometry = jax.tree.map(np.asarray, photometry)
-    total = np.zeros((len(shell.points), 3))
-    weight = np.zeros(len(shell.points))
-    for row, index in enumerate(scene.train_indices):
+
+    def seen_in(view: View, row: int):
         seen = np.flatnonzero(shell.seen[:, row])
-        if not len(seen):
-            continue
-        ldr, mask = store.get(index, SHELL_SHRINK)
-        view = scene.views[index]
-        scale = [mask.shape[1] / view.width, mask.shape[0] / view.height]
-        xy = shell.xy[seen, row] * scale
-        samples = sample(ldr, mask, xy)
-        valid = samples.valid
-        place = places(xy[valid], *mask.shape[::-1])
-        colors = np.asarray(samples.colors[valid], np.float32)
-        total[seen[valid]] += inverse_formation(colors, taken.capture(row), cfg.photometry, place)
-        weight[seen[valid]] += 1
+        return seen, shell.xy[seen, row]
+
+    total, weight = np.zeros((len(shell.points), 3)), np.zeros(len(shell.points))
+    for at, _, found in photographed(seen_in, scene, store, photometry, cfg, SHELL_SHRINK):
+        total[at] += found
+        weight[at] += 1
     seen = weight > 0
-    radiance = total[seen] / weight[seen, None]
-    return gaussians_from_points(
-        shell.points[seen],
-        radiance.astype(np.float32),
-        list(views),
-        cfg,
-        scales=shell.scales[seen],
-        opacity=SHELL_OPACITY,
-    )
+    radiance = (total[seen] / weight[seen, None]).astype(np.float32)
+    own = {"scales": shell.scales[seen], "opacity": SHELL_OPACITY}
+    return gaussians_from_points(shell.points[seen], radiance, list(views), cfg, **own)

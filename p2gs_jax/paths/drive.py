@@ -96,10 +96,8 @@ def interpolated(at, values: Sequence[float | None], times) -> list[float | None
 def beside(poses: Poses, views: Sequence[View], distance: float) -> Poses:
     """Return poses moved to the left of the driving direction, looking the same way.
 
-    Args:
-        poses: camera-to-world (or rig-to-world), in the order of the ride.
-        views: of the scene: what is up, and where ahead is for a car that stands.
-        distance: how far, scene units; negative: to the right.
+    They are camera-to-world (or rig-to-world) in the order of the ride; a negative distance (scene
+    units) is to the right. The views of the scene say what is up, and where a standing car looks.
     """
     up = up_of_drive(np.stack([v.viewmat for v in views]), [v.camera for v in views])
     ahead = headings(poses[:, :3, 3], up, level_ahead(views, up))

@@ -40,11 +40,7 @@ def write_cameras(path: Path, shots: Sequence[Shot]) -> None:
 
 
 def read_cameras(path: Path) -> list[Shot]:
-    """Read a path.
-
-    Raises:
-        UserError: the file is missing or not a path; the message names the entry and the field.
-    """
+    """Read a path; a UserError names the entry and the field of a file that is not one."""
     try:
         data = parse_json(path.read_text(encoding="utf-8"))
     except OSError as error:

@@ -80,13 +80,8 @@ def _project(
 ) -> tuple[Float[np.ndarray, "h w 2"], Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
     """Return where a pinhole camera sees what lies along rays of the world.
 
-    Args:
-        shot: the camera.
-        rays: directions.
-        shift: added to the rays in the camera, for what is not infinitely far.
-
-    Returns:
-        Pixels, centres at +0.5; cosines of the angle from the optical axis; what it sees.
+    The shift is added to the rays in the camera, for what is not infinitely far. Pixels (centres at
+    +0.5) come back, cosines of the angle from the optical axis, and what the camera sees.
     """
     local = rays @ shot.viewmat[:3, :3].T + shift
     z = local[..., 2]
@@ -153,18 +148,16 @@ def stitch(
 ) -> Stitched:
     """Reproject images to a cylinder: every pixel from the one camera that sees it most centrally.
 
-    Nothing is blended, so that differences show.
+    Nothing is blended, so that differences show. Images have at most 4 channels; a ValueError says
+    that one has another size than its camera.
 
     Args:
-        images: of at most 4 channels.
+        images: of the shots.
         shots: their cameras.
         cylinder: of the result.
         nearness: 1 / distance from the cylinder's axis; None reprojects at infinity, which is
             exact for cameras with a common centre.
         masks: 1 = use, 0 = ignore.
-
-    Raises:
-        ValueError: an image has another size than its camera.
     """
     rays = cylinder.rays()
     origin = camera_centers(cylinder.viewmat[None])[0]
@@ -227,12 +220,9 @@ def slices(cylinder: Cylinder) -> list[Shot]:
 
 
 class Wide(NamedTuple):
-    """A wide view of the field.
+    """A wide view of the field: radiance, premultiplied by alpha; opacity; and nearness.
 
-    Attributes:
-        linear: radiance, premultiplied by alpha.
-        alpha: opacity.
-        nearness: 1 / distance from the cylinder's axis, 0 where nothing opaque is seen.
+    Nearness is 1 / distance from the cylinder's axis, 0 where nothing opaque is seen.
     """
 
     linear: Float32[np.ndarray, "h w 3"]

@@ -125,14 +125,10 @@ def wide_frames(
     transform: DisplayTransform,
     times: Sequence[float | None],
 ) -> Iterator[OutputFrame]:
-    """Yield wide views of the field from a rig.
+    """Yield wide views of the field from rig-to-world poses.
 
-    Args:
-        renderer: renders.
-        cylinder: its viewmat is rig-to-camera.
-        poses: rig-to-world.
-        transform: how to develop all.
-        times: of the poses, seconds; None: what moves is not shown.
+    The viewmat of the cylinder is rig-to-camera. What moves is shown at the times, seconds, or not
+    at all.
     """
     for k, (pose, at) in enumerate(zip(poses, times, strict=True)):
         wide = renderer.wide(_placed(cylinder, pose), at)
@@ -195,13 +191,10 @@ def _placed(cylinder: Cylinder, pose) -> Cylinder:
 
 
 class CaptionedImage(NamedTuple):
-    """An image with its title.
+    """An image, display values, with a title above it.
 
-    Attributes:
-        title: above it.
-        image: display values.
-        captions: (text, first column, end column), written below those columns with a tick at
-            each inner edge, and shortened where it is wider than they are.
+    Captions are (text, first column, end column): written below those columns with a tick at each
+    inner edge, and shortened where they are wider.
     """
 
     title: str

@@ -26,12 +26,9 @@ ALL_AROUND = 0.5
 
 @dataclass(frozen=True)
 class TimeStep:
-    """One time step.
+    """What a rig took at one time: its rig-to-world pose, and shots by camera; some may be missing.
 
-    Attributes:
-        name: what its file names have in common, or the number of the frame.
-        pose: rig-to-world.
-        shots: by camera; some may be missing.
+    The name is what the file names have in common, or the number of the frame.
     """
 
     name: str
@@ -69,9 +66,8 @@ class Rig:
 def find_rig(shots: Sequence[Shot], views: Sequence[View]) -> Rig:
     """Return the rig that took the views of a scene.
 
-    Raises:
-        UserError: there is one camera, no file names agree between cameras, or they move against
-            each other.
+    A UserError says that there is one camera, that no file names agree between cameras, or that
+    they move against each other.
     """
     cameras = sorted({v.camera for v in views})
     steps: dict[str, dict[str, Shot]] = defaultdict(dict)

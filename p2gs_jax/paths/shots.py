@@ -80,10 +80,8 @@ def view_shots(views: Sequence[View], max_width: int | None = None) -> list[Shot
 def of_camera(shots: Sequence[Shot], views: Sequence[View], camera: str | None) -> list[Shot]:
     """Return the shots that one physical camera took, in order of names.
 
-    None takes the camera with the most shots, the first of several.
-
-    Raises:
-        UserError: there is no such camera among them.
+    None takes the camera with the most shots, the first of several. A UserError says that a camera
+    took none.
     """
     cameras = [views[s.view].camera for s in shots if s.view is not None]
     counts = Counter(cameras)
@@ -135,11 +133,7 @@ def make_camera(K: ArrayLike, viewmat: ArrayLike, width: int, height: int) -> Ca
 
 
 def as_matrix(values: ArrayLike, name: str, size: int) -> Float[np.ndarray, "n n"]:
-    """Return values as a square matrix.
-
-    Raises:
-        ValueError: they have another shape, or are not finite.
-    """
+    """Return a square matrix of finite numbers; a ValueError says that values are not one."""
     try:
         out = np.array(values, np.float64)
     except (TypeError, ValueError):
@@ -152,11 +146,7 @@ def as_matrix(values: ArrayLike, name: str, size: int) -> Float[np.ndarray, "n n
 
 
 def checked_lens(values: ArrayLike) -> Float[np.ndarray, "3 3"]:
-    """Return a camera matrix, checked to be that of a pinhole without skew.
-
-    Raises:
-        ValueError: it is not.
-    """
+    """Return the camera matrix of a pinhole without skew; a ValueError says what it is not."""
     K = as_matrix(values, "K", 3)
     if K[0, 0] <= 0 or K[1, 1] <= 0 or not np.array_equal(K[2], [0, 0, 1]):
         raise ValueError("has a K with no positive focal lengths, or a last row other than 0 0 1")
@@ -166,11 +156,7 @@ def checked_lens(values: ArrayLike) -> Float[np.ndarray, "3 3"]:
 
 
 def checked_pose(values: ArrayLike, name: str) -> Pose:
-    """Return a pose with its rotation made orthonormal.
-
-    Raises:
-        ValueError: it is not a rotation and a translation.
-    """
+    """Return a pose with an orthonormal rotation; a ValueError says that it is not a pose."""
     matrix = as_matrix(values, name, 4)
     rotation = nearest_rotation(matrix[:3, :3], TOLERANCE)
     if rotation is None or not np.allclose(matrix[3], [0, 0, 0, 1], atol=TOLERANCE):

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,12 +24,26 @@ from p2gs_jax.core.numerics import LN2, on_device
 from p2gs_jax.photometry import luminance, ppisp
 from p2gs_jax.photometry.luminance import Curves, Luminance
 from p2gs_jax.photometry.ppisp import OneView, Ppisp
-from p2gs_jax.types import LUMINANCE, Params
+from p2gs_jax.types import LUMINANCE, Capture, Params
 
-# Of all training views: a row for each, or what PPISP or Luminance-GS learns.
-Corrections = Float[Array, "v ..."] | Ppisp | Luminance
+
+@runtime_checkable
+class Formation(Protocol):
+    """An image formation of yours, in the place of the tone curve and of corrections.
+
+    A pytree (an `equinox.Module`) whose arrays are its initial parameters: they are learned at the
+    rate `OptimizerConfig.appearance`, the same for all views.
+    """
+
+    def apply(self, radiance: Float[Array, "h w 3"], capture: Capture) -> Float[Array, "h w 3"]:
+        """Return display values, not clamped, of linear radiance under a view's exposure."""
+        ...
+
+
+# Of all training views: a row for each, or what PPISP, Luminance-GS or a formation learns.
+Corrections = Float[Array, "v ..."] | Ppisp | Luminance | Formation
 # Of one view.
-Correction = Float[Array, "..."] | OneView | Curves
+Correction = Float[Array, "..."] | OneView | Curves | Formation
 
 # Luminance levels, rows and columns of a bilateral grid, as its authors use.
 GRID = (8, 16, 16)
@@ -49,6 +64,8 @@ def correction_of(appearance: Corrections | None, row: Int[Array, ""] | int) -> 
     """Return the correction of the training view in a row of `Photometry`, or None."""
     if isinstance(appearance, Ppisp | Luminance):
         return appearance.view(row)
+    if isinstance(appearance, Formation):
+        return appearance
     return None if appearance is None else appearance[row]
 
 
@@ -58,6 +75,8 @@ def mean_correction(appearance: Corrections | None, camera: str | None = None) -
         return appearance.mean(camera)
     if isinstance(appearance, Luminance):
         return appearance.mean()
+    if isinstance(appearance, Formation):
+        return appearance
     return None if appearance is None else appearance.mean(axis=0)
 
 

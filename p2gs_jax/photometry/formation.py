@@ -23,7 +23,7 @@ from jaxtyping import Array, Float, Int
 
 from p2gs_jax.config import CameraFormation, PhotometryConfig
 from p2gs_jax.core.numerics import Scalar, Values, namespace, positive_pow, safe_log
-from p2gs_jax.photometry.appearance import Correction, corrected
+from p2gs_jax.photometry.appearance import Correction, Formation, corrected
 from p2gs_jax.photometry.response import DARKEST, UNKNOWN, decode, encode
 from p2gs_jax.types import GAMMA_SRGB, Capture
 
@@ -225,6 +225,8 @@ def formation(
     the view, or of each of loose pixels, which need `positions` if vignetting counts (see
     `gain`).
     """
+    if isinstance(correction, Formation):
+        return correction.apply(linear, capture)
     exposed = expose(linear, capture, cfg, positions)
     ldr: Any = tone_map(exposed, _by_pixel(capture.gamma), cfg, capture.camera)
     if cfg.appearance is None or correction is None:

@@ -1,21 +1,115 @@
-"""Photometry alone: exposures, gammas and tone curve of a scene in seconds, without splatting."""
+"""Photometry alone: exposures, gammas and tone curve in seconds, without splatting.
+
+From the tracks of a scene, through the rendered depth of a finished run, or from a stack of
+exposures of one fixed viewpoint; `convert.py` does it for somebody else's splats.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
 
 from p2gs_jax.config import FitConfig, require_config
-from p2gs_jax.core.atomic import no_empty_folders
+from p2gs_jax.core.atomic import no_empty_folders, write_json
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
-from p2gs_jax.photometry.calibrate import calibrate_observations, options_of
-from p2gs_jax.photometry.sources.points import has_tracks, surface_colors
-from p2gs_jax.pipeline.calibration import Calibration, with_stated, write_calibration
+from p2gs_jax.gaussians.posed import standing
+from p2gs_jax.photometry.adjustment.problem import KnownExposures
+from p2gs_jax.photometry.calibrate import (
+    CalibrationOptions,
+    Selection,
+    calibrate_observations,
+    options_of,
+)
+from p2gs_jax.photometry.observations import Observations
+from p2gs_jax.photometry.solution import Agreement, PhotometricSolution, compare, note_on_levels
+from p2gs_jax.photometry.sources.points import has_tracks, rendered_colors, surface_colors
+from p2gs_jax.photometry.sources.stack import SATURATED, StackColors, read_stack, stack_colors
+from p2gs_jax.photometry.unmodelled import LOCAL_EV, Unexplained, residuals, unexplained
+from p2gs_jax.run.photometry_files import write_solution
+from p2gs_jax.run.plots import write_calibration_plot
+from p2gs_jax.run.read import load_run
 from p2gs_jax.scene import load_scene
-from p2gs_jax.scene.exposures import check_source
+from p2gs_jax.scene.exposures import check_source, read_known_exposures, stated_ev
 from p2gs_jax.scene.pixels.store import ImageStore
+from p2gs_jax.types import Scene, View
+
+STACK_PIVOT = 0.18
+MEAN_GAUGE = "mean log exposure is 0 over each connected group of views"
+STACK_GAUGE = "mean log exposure is 0; exposures and response can be stretched together"
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What a calibration finds.
+
+    Attributes:
+        views: the photographs, in the order of the solution; of a stack poses mean nothing.
+        selection: model, exposures, gammas, errors, reasons.
+        stated_ev: exposures from EXIF or a file, stops, laid over the recovered ones; NaN where
+            unknown.
+        agreement: of stated and recovered exposures.
+        known: where known exposures came from, or None.
+        gauge: what fixes the scale where none are known, in words.
+        pivot: linear value that gammas leave alone.
+        messages: what the user should know, in plain words.
+        details: the content of `calibration.json`.
+        observations: how many were used.
+        seconds: of `reading` and sampling, and of the `adjustment`.
+        metrics: of `calibrate_of`: what `metrics.json` holds; `of` has the scores of the model as
+            it was.
+    """
+
+    views: tuple[View, ...]
+    selection: Selection
+    stated_ev: Float[np.ndarray, " v"]
+    agreement: Agreement
+    known: str | None
+    gauge: str
+    pivot: float
+    messages: tuple[str, ...]
+    details: dict[str, Any]
+    observations: int = 0
+    seconds: dict[str, float] = field(default_factory=dict)
+    metrics: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def solution(self) -> PhotometricSolution:
+        """Exposures, gammas, response and their errors, in natural logarithms."""
+        return self.selection.solution
+
+    @property
+    def exposures_ev(self) -> Float[np.ndarray, " v"]:
+        """Recovered exposures, stops."""
+        return self.solution.exposures_ev
+
+    @property
+    def errors_ev(self) -> Float[np.ndarray, " v"]:
+        """Standard errors of the recovered exposures, stops; infinite where they are unknown."""
+        return self.solution.exposure_errors_ev
+
+
+def write_calibration(result: Calibration, out: Path) -> None:
+    """Write `photometry.json`, `calibration.json` and `calibration.png`."""
+    gauge = result.gauge if result.known is None else f"known exposures ({result.known})"
+    views, pivot = result.views, result.pivot
+    path = out / "photometry.json"
+    write_solution(path, result.solution, views=views, pivot=pivot, gauge=gauge)
+    write_json(out / "calibration.json", result.details)
+    write_calibration_plot(
+        out / "calibration.png",
+        result.solution,
+        cameras=[v.camera for v in views],
+        stated_ev=result.stated_ev,
+        pivot=pivot,
+    )
 
 
 def calibrate(
@@ -26,7 +120,7 @@ def calibrate(
     compare_with: str | None = None,
     reporter: Reporter | None = None,
 ) -> Calibration:
-    """Solve the photometry of a scene and write `photometry.json` and `calibration.png`.
+    """Solve the photometry of a scene and write the files of a calibration.
 
     Args:
         scene_dir: COLMAP model, transforms.json, or folder of photographs.
@@ -41,11 +135,9 @@ def calibrate(
     """
     cfg = require_config(cfg)
     cfg = dataclasses.replace(cfg, data=dataclasses.replace(cfg.data, test_every=0))
-    reporter = reporter or Silent()
-    out = Path(out)
-    begin = time.monotonic()
-    check_source(cfg.photometry.known)
-    check_source(compare_with)
+    reporter, out, begin = reporter or Silent(), Path(out), time.monotonic()
+    for source in (cfg.photometry.known, compare_with):
+        check_source(source)
     reporter.stage("Reading the scene")
     with no_empty_folders(out):
         scene = load_scene(Path(scene_dir), cfg.data, out / "cache", reporter.message)
@@ -59,16 +151,216 @@ def calibrate(
         observations = surface_colors(
             scene, store, cfg.train.seed, lambda i, n: reporter.stage("Sampling colours", i, n)
         )
-        sampled = time.monotonic()
-    reporter.stage("Photometric bundle adjustment")
-    selection = calibrate_observations(observations, options_of(cfg, scene))
-    result = with_stated(
-        scene,
-        selection,
-        cfg.photometry,
-        observations=len(observations.views),
-        seconds={"reading": sampled - begin, "adjustment": time.monotonic() - sampled},
-        compare_with=compare_with,
-    )
+    result = solved(scene, observations, cfg, begin, compare_with, reporter)
     write_calibration(result, out)
     return result
+
+
+def calibrate_run(
+    run_dir: str | Path,
+    out: str | Path,
+    cfg: FitConfig | None = None,
+    *,
+    scene: str | Path | None = None,
+    compare_with: str | None = None,
+    reporter: Reporter | None = None,
+) -> Calibration:
+    """Solve the photometry of a finished run's training views anew, through its rendered depth.
+
+    Args:
+        run_dir: the run folder; it is not changed.
+        out: folder for the results; created.
+        cfg: its photometry says what to choose from and what is known; default `robust`. The run's
+            own choice is not used.
+        scene: see `load_run`.
+        compare_with: see `calibrate`.
+        reporter: receives progress.
+
+    Raises:
+        UserError: see `load_run`; the photographs are gone, the fit is opaque nowhere, or its views
+            do not overlap.
+    """
+    begin, reporter = time.monotonic(), reporter or Silent()
+    asked, run = require_config(cfg), load_run(run_dir, scene)
+    cfg = dataclasses.replace(run.cfg, photometry=asked.photometry)
+    run.require_photographs(run.scene.train_indices)
+    # Of what stands still: the same pixel of something that moves is elsewhere in another view.
+    observations = rendered_colors(
+        standing(run.params.gaussians, run.owner),
+        run.scene,
+        run.store.leaving_out(run.scene.objects),
+        cfg.render,
+        cfg.train.seed,
+        lambda i, n: reporter.stage("Rendering depth", i, n),
+    )
+    if not len(observations.views):
+        raise UserError(
+            f"{run.folder}: no pixel of one view is visible in another.",
+            fix="fit longer, or calibrate from the scene's tracks",
+        )
+    result = solved(run.scene, observations, cfg, begin, compare_with, reporter)
+    write_calibration(result, Path(out))
+    return result
+
+
+def solved(
+    scene: Scene,
+    observations: Observations,
+    cfg: FitConfig,
+    begin: float,
+    compare_with: str | None,
+    reporter: Reporter,
+) -> Calibration:
+    """Solve the photometry of the training views, and compare it with stated exposures."""
+    sampled = time.monotonic()
+    reporter.stage("Photometric bundle adjustment")
+    selection = calibrate_observations(observations, options_of(cfg, scene))
+    seconds = {"reading": sampled - begin, "adjustment": time.monotonic() - sampled}
+    views, s, pivot = tuple(scene.training_views), selection.solution, cfg.photometry.pivot
+    stated = stated_ev(compare_with, list(views))
+    agreement = compare(s.exposures_ev, s.exposure_errors_ev, stated)
+    messages = [*scene.notes, *selection.reasons, *s.warnings]
+    if agreement.views:
+        by = "EXIF" if compare_with in (None, "exif") else Path(str(compare_with)).name
+        messages += [agreement.sentence(by), *note_on_levels(s, stated, agreement, pivot)]
+    count = len(observations.views)
+    return Calibration(
+        views=views,
+        selection=selection,
+        stated_ev=stated + agreement.offset_ev,
+        agreement=agreement,
+        known=cfg.photometry.known,
+        gauge=MEAN_GAUGE,
+        pivot=pivot,
+        messages=tuple(messages),
+        details=_details(messages, count, seconds, selection, agreement),
+        observations=count,
+        seconds=seconds,
+    )
+
+
+def _details(
+    messages: Sequence[str],
+    observations: int,
+    seconds: dict[str, float],
+    selection: Selection,
+    agreement: Agreement,
+) -> dict[str, Any]:
+    s = selection.solution
+    return {
+        "messages": messages,
+        "observations": observations,
+        "seconds": seconds,
+        "solution": s.state,
+        "residual_ev": s.residual_ev,
+        "view_residual_ev": s.view_residual_ev,
+        "view_balance_ev": s.view_balance_ev,
+        "outliers": s.outliers,
+        "component": s.component,
+        "observations_per_view": s.observations_per_view,
+        "agreement": agreement._asdict(),
+        "candidates": [
+            {
+                "model": c.form.model,
+                "white_balance": c.form.white_balance,
+                "vignetting": c.form.vignetting,
+                "curve": c.response.name,
+                "parameters": c.parameters,
+                "density": c.density,
+                "behind": c.deficit,
+                "behind_error": c.deficit_error,
+                "codes": c.difference,
+            }
+            for c in selection.candidates
+        ],
+    }
+
+
+def calibrate_stack(
+    folder: str | Path,
+    out: str | Path | None = None,
+    cfg: FitConfig | None = None,
+    *,
+    compare_with: str | None = None,
+    reporter: Reporter | None = None,
+) -> Calibration:
+    """Solve exposures and the common response of a stack: one fixed viewpoint, no poses needed.
+
+    Without known exposures, their logarithms are found up to a factor: exposures and response
+    can be stretched together (the power gauge), which the standard curves' mid tones settle.
+
+    Args:
+        folder: photographs of one viewpoint.
+        out: folder for the results; None: nothing is written.
+        cfg: its photometry names known exposures, with which the response is then solved, and its
+            seed draws the sampled positions; default `robust`.
+        compare_with: stated exposures to report beside the recovered ones; default EXIF.
+        reporter: receives progress.
+
+    Raises:
+        UserError: see `read_stack` and `read_known_exposures`.
+    """
+    cfg = require_config(cfg)
+    p, seed = cfg.photometry, cfg.train.seed
+    (reporter or Silent()).stage("Solving the stack")
+    stack = read_stack(Path(folder))
+    views = list(stack.views)
+    given = None
+    if p.known is not None:
+        given = KnownExposures(read_known_exposures(p.known, views), p.known_deviation_ev)
+    stated = stated_ev(compare_with, views)
+    found = stack_colors(stack, seed)
+    options = CalibrationOptions(found.black, SATURATED, STACK_PIVOT, given, seed, "one_response")
+    selection = calibrate_observations(found.observations, options)
+    s, problem = selection.solution, options.problem(found.observations)
+    left = unexplained(problem, residuals(problem, s), found.xy, stack.valid.shape, found.signal)
+    errors_ev = np.where(found.signal, s.exposure_errors_ev, np.inf)
+    agreement = compare(s.exposures_ev, errors_ev, stated)
+    messages = [*selection.reasons, *s.warnings, *_stack_messages(stack.views, found, left)]
+    if agreement.views >= 2:
+        messages.append(agreement.sentence("The stated exposures"))
+    result = Calibration(
+        views=stack.views,
+        selection=selection,
+        stated_ev=stated + agreement.offset_ev,
+        agreement=agreement,
+        known=p.known,
+        gauge=STACK_GAUGE,
+        pivot=STACK_PIVOT,
+        messages=tuple(messages),
+        details={
+            "messages": messages,
+            "signal": found.signal,
+            "shifts": found.shifts,
+            "black": found.black,
+            "one_response": left.local_ev <= LOCAL_EV,
+            "local_ev": left.local_ev,
+            "curve_ev": left.curve_ev,
+            "residual_ev": s.residual_ev,
+        },
+    )
+    if out is not None:
+        write_calibration(result, Path(out))
+    return result
+
+
+def _stack_messages(views: tuple[View, ...], found: StackColors, left: Unexplained) -> list[str]:
+    """Say which frames are dark, that frames were moved, and that one response is not enough."""
+    out = []
+    dark = [view.name for view, signal in zip(views, found.signal, strict=True) if not signal]
+    if dark:
+        out.append(
+            f"{len(dark)} frame(s) carry little signal (black or saturated nearly everywhere): "
+            f"{', '.join(dark[:6])}."
+        )
+    moved = np.abs(found.shifts).max()
+    if moved > 0:
+        out.append(f"Frames were moved by up to {moved:.0f} pixel(s).")
+    if left.local_ev > LOCAL_EV:
+        out.append(
+            f"One response does not explain this stack: between frames, regions of equal "
+            f"brightness change by {left.local_ev:.2f} EV (RMS; {LOCAL_EV:g} at most for one "
+            "camera pipeline). The frames were tone-mapped by region, or the light changed; do not "
+            "trust the exposures."
+        )
+    return out

@@ -9,20 +9,22 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.clock import CompileCounter, Stopwatch, over_budget
 from p2gs_jax.core.progress import Reporter
 from p2gs_jax.core.runtime import return_freed_memory
-from p2gs_jax.evaluation.evaluate import ViewResult, evaluate
+from p2gs_jax.evaluation.evaluate import Evaluation, ViewResult, evaluate
 from p2gs_jax.evaluation.lpips import LpipsWeights
 from p2gs_jax.evaluation.references import Reference, find_radiance
-from p2gs_jax.evaluation.scores import untold_notes
-from p2gs_jax.pipeline.prepare import Prepared
+from p2gs_jax.evaluation.scores import is_drive, untold_notes
+from p2gs_jax.photometry.calibrate import Selection
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.run.plots import write_unexplained
-from p2gs_jax.run.write import summary_rows, write_results, write_view
-from p2gs_jax.types import Params
+from p2gs_jax.run.write import summary_rows, write_run, write_view
+from p2gs_jax.scene.pixels.store import ImageStore, size_at
+from p2gs_jax.types import Params, Scene
 
 
 @dataclass(frozen=True)
@@ -33,50 +35,55 @@ class Account:
         counts: numbers.
         seconds: times, by name.
         compiler: counts what was compiled for this fit.
+        selection: what the bundle adjustment found, or None.
+        notes: what the user was told; what the evaluation finds is added.
         of: scores of the model that was converted, as it was; None: this is a fit.
     """
 
     counts: dict[str, int]
     seconds: dict[str, float]
     compiler: CompileCounter = field(default_factory=CompileCounter)
+    selection: Selection | None = None
+    notes: list[str] = field(default_factory=list)
     of: dict | None = None
 
 
 def finish(
     params: Params,
-    prepared: Prepared,
+    scene: Scene,
+    store: ImageStore,
+    cfg: FitConfig,
     folder: RunFolder,
     account: Account,
     reporter: Reporter,
     *,
-    truth: Reference | None,
-    lpips_weights: LpipsWeights | None,
-    true_ev: np.ndarray | None = None,
     owner: np.ndarray | None = None,
+    truth: Reference | None = None,
+    lpips_weights: LpipsWeights | None = None,
+    true_ev: np.ndarray | None = None,
     still_ours: Callable[[], None] = lambda: None,
 ) -> dict:
-    """Evaluate, export and return what `metrics.json` holds.
+    """Evaluate, write all results and return what `metrics.json` holds.
 
     Args:
         params: live Gaussians and photometry.
-        prepared: scene and photographs.
+        scene: views and points.
+        store: photographs.
+        cfg: what the fit computed under.
         folder: of the run.
         account: of the fit.
         reporter: receives progress.
+        owner: the moving object that each Gaussian belongs to, or None.
         truth: photographs under one common exposure, or None.
         lpips_weights: for LPIPS, or None to leave it out.
-        true_ev: true exposures of the training views for the plot, or None.
-        owner: the moving object that each Gaussian belongs to, or None.
+        true_ev: true exposures of the training views for the plot, stops, or None.
         still_ours: raises where the run folder is no longer this run's.
     """
     watch = Stopwatch()
     return_freed_memory()
     _import_ahead("matplotlib.figure")
-    scene, cfg = prepared.scene, prepared.cfg
-    moving, store = prepared.store.moving, prepared.store
     fitted: dict[int, float] = {}
-    shown: dict[int, ViewResult] = {}
-    picks = summary_rows(scene)
+    shown: dict[int, ViewResult | None] = dict.fromkeys(summary_rows(scene))
 
     def on_view(result: ViewResult) -> None:
         view = scene.views[result.index]
@@ -84,7 +91,7 @@ def finish(
             fitted[result.index] = result.transform.exposure
             with watch("files"):
                 write_view(folder.renders, view.name, result, store)
-        if result.index in picks:
+        if result.index in shown:
             shown[result.index] = result
 
     with watch("evaluation"):
@@ -100,42 +107,48 @@ def finish(
             on_view=on_view,
             on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
         )
-    metrics, metering = found.metrics, found.metering
-    hidden = metrics.get("hidden", ())
-    fitted = {row: e for row, e in fitted.items() if scene.views[row].name not in hidden}
-    for note in untold_notes(metrics):
-        prepared.notes.append(note)
-        reporter.message(note)
-    if metering.telling:
-        prepared.notes.append(metering.sentence)
-        reporter.message(metering.sentence)
+    _tell(_findings(found), account, reporter)
     # Views are written while they are judged.
     watch.add("evaluation", -watch.seconds.get("files", 0.0))
     reporter.stage("Writing files")
+    hidden = found.metrics.get("hidden", ())
     with watch("files"):
-        write_results(
+        write_run(
             folder,
             params,
             scene,
             cfg,
             owner=owner,
-            moving=moving,
-            fitted=fitted,
-            unknown=metrics.get("exposures_unknown", ()),
-            solution=None if prepared.selection is None else prepared.selection.solution,
-            shown=[shown[i] for i in picks],
-            metering=metering,
+            moving=store.moving,
+            fitted={r: e for r, e in fitted.items() if scene.views[r].name not in hidden},
+            unknown=found.metrics.get("exposures_unknown", ()),
+            solution=None if account.selection is None else account.selection.solution,
+            shown=[result for result in shown.values() if result is not None],
+            metering=found.metering,
             true_ev=true_ev,
         )
         if found.unexplained:
             write_unexplained(folder.unexplained, scene, store, found.unexplained)
-    metrics |= _accounted(account, watch, prepared, reporter)
+    metrics = found.metrics | _accounted(account, watch, scene, cfg, reporter)
     still_ours()
     write_json(folder.metrics, metrics)
     return metrics
 
 
-def _accounted(account: Account, watch: Stopwatch, prepared: Prepared, reporter: Reporter) -> dict:
+def _findings(found: Evaluation) -> list[str]:
+    metered = [found.metering.sentence] if found.metering.telling else []
+    return [*untold_notes(found.metrics), *metered]
+
+
+def _tell(notes: list[str], account: Account, reporter: Reporter) -> None:
+    account.notes.extend(notes)
+    for note in notes:
+        reporter.message(note)
+
+
+def _accounted(
+    account: Account, watch: Stopwatch, scene: Scene, cfg: FitConfig, reporter: Reporter
+) -> dict:
     """Return what `metrics.json` says of the fit itself."""
     seconds = {
         **account.seconds,
@@ -143,25 +156,47 @@ def _accounted(account: Account, watch: Stopwatch, prepared: Prepared, reporter:
         "evaluation_and_files": watch.seconds["evaluation"] + watch.seconds["files"],
         "compiler_in_all_threads": account.compiler.seconds,
     }
-    late = over_budget(prepared.cfg.train.budget_s, seconds)
-    if late is not None:
-        prepared.notes.append(late)
-        reporter.message(late)
+    late = over_budget(cfg.train.budget_s, seconds)
+    _tell([] if late is None else [late], account, reporter)
     steps = max(int(account.counts.get("steps", 0)), 1)
-    said = {
-        "split": prepared.scene.split_by,
+    entries = {
+        "split": scene.split_by,
         "counts": {**account.counts, "programs": account.compiler.programs},
         "seconds": seconds,
         "seconds_per_step": account.seconds.get("optimisation", 0.0) / steps,
-        "notes": prepared.notes,
+        "notes": account.notes,
     }
-    if prepared.selection is not None:
-        said["photometry"] = prepared.selection.solution.state
-    if account.of is not None:
-        said["of"] = account.of
-    return said
+    if account.selection is not None:
+        entries["photometry"] = account.selection.solution.state
+    return entries if account.of is None else {**entries, "of": account.of}
 
 
 def _import_ahead(module: str) -> None:
     """Import what is needed later in a thread: while programs compile, Python has time for it."""
     threading.Thread(target=importlib.import_module, args=(module,), daemon=True).start()
+
+
+def seconds_to_finish(
+    scene: Scene, cfg: FitConfig, lpips_weights: LpipsWeights | None, *, reference: bool
+) -> float:
+    """Return a guess of the seconds that evaluation and files will take, for the time budget.
+
+    At most a quarter of the budget is kept. With `reference` each view is compared with a reference
+    photograph as well.
+    """
+    if cfg.train.budget_s is None:
+        return 0.0
+    pixels = 0
+    for view in scene.views:
+        width, height = size_at(view, cfg.data.max_width)
+        pixels += width * height
+    # Measured (BUILD_NOTES, "Reserve for evaluation"): programs, then every view, and every pixel.
+    per_view, per_pixel = (0.13, 0.35e-6) if reference else (0.09, 0.25e-6)
+    start, times = 6.0, 5 if reference else 2
+    if is_drive(scene):
+        # Parts of every view, and views from beside the way; LPIPS of static and moving pixels.
+        start, per_view, times = start + 6.0, per_view + 0.1, 3 * times
+    if lpips_weights is not None:
+        # Under two protocols (three where views have gammas), and three more against a reference.
+        per_pixel += times * lpips_weights.network.seconds_per_pixel
+    return min(start + per_view * len(scene.views) + per_pixel * pixels, 0.25 * cfg.train.budget_s)

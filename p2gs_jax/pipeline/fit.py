@@ -20,114 +20,25 @@ from p2gs_jax.core.atomic import no_empty_folders
 from p2gs_jax.core.clock import CompileCounter, Stopwatch
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
-from p2gs_jax.evaluation.lpips import LpipsWeights
-from p2gs_jax.photometry.appearance import exposures_apart
+from p2gs_jax.photometry.appearance import Formation, exposures_apart
 from p2gs_jax.photometry.calibrate import Selection
 from p2gs_jax.photometry.parameters import recentre
-from p2gs_jax.pipeline.decide import kept_choice
-from p2gs_jax.pipeline.finish import Account, finish
-from p2gs_jax.pipeline.memory_needed import memory_named
-from p2gs_jax.pipeline.preflight import Paths, check_run_dir, check_scene, preflight
-from p2gs_jax.pipeline.prepare import Expected, Prepared, load, prepare
-from p2gs_jax.pipeline.reserve import seconds_to_finish
+from p2gs_jax.pipeline.exposures import kept_choice
+from p2gs_jax.pipeline.finish import Account, finish, seconds_to_finish
+from p2gs_jax.pipeline.preflight import Paths, check_run_dir, check_scene, memory_named, preflight
+from p2gs_jax.pipeline.prepare import Prepared, load, prepare
 from p2gs_jax.run.checkpoint import saved_steps
 from p2gs_jax.run.decisions import Decisions
-from p2gs_jax.run.folder import RunFolder, RunLock, locked, require_free
+from p2gs_jax.run.folder import RunFolder, locked, require_free
 from p2gs_jax.run.write import write_start
 from p2gs_jax.train.data_parallel import mesh_of
+from p2gs_jax.train.inputs import TrainingViews
 from p2gs_jax.train.loop import Trainer, TrainResult
-from p2gs_jax.train.programs import StepPrograms
-from p2gs_jax.train.views import TrainingViews
+from p2gs_jax.train.make_step import AS_CONFIGURED, Own
+from p2gs_jax.train.step import StepPrograms
+from p2gs_jax.train.strategies import Strategy
+from p2gs_jax.train.terms import LossTerm
 from p2gs_jax.types import Params, Scene
-
-
-def optimise(
-    prepared: Prepared,
-    folder: RunFolder,
-    reporter: Reporter,
-    programs: StepPrograms,
-    *,
-    resume: bool,
-    spent_s: float = 0.0,
-    reserve_s: float = 0.0,
-    mesh: Mesh | None = None,
-) -> TrainResult:
-    """Run the optimisation, from the start or from the newest checkpoint.
-
-    Args:
-        prepared: from `prepare`.
-        folder: of the run: where the log and checkpoints go.
-        reporter: receives progress.
-        programs: compiled steps, some of them perhaps begun.
-        resume: continue from the newest checkpoint.
-        spent_s: seconds of the budget that are already gone.
-        reserve_s: seconds of the budget to keep for evaluation and files.
-        mesh: the devices of a step of several views; None: the default one.
-    """
-    cfg = prepared.cfg
-    views = TrainingViews(
-        prepared.fitted,
-        prepared.scene.train_indices,
-        cfg.train.seed,
-        prepared.measured,
-    )
-
-    def say(text: str) -> None:
-        prepared.notes.append(text)
-        reporter.message(text)
-
-    trainer = Trainer(
-        cfg,
-        views,
-        prepared.extent,
-        prepared.pairs,
-        prepared.coverage,
-        folder.root,
-        programs,
-        prepared.decisions,
-        on_log=reporter.log,
-        on_message=say,
-        mesh=mesh,
-    )
-    alive = np.ones(prepared.params.gaussians.capacity, bool)
-    return trainer.run(
-        prepared.params,
-        alive,
-        prepared.owner,
-        resume=resume,
-        spent_s=spent_s,
-        finish_s=reserve_s,
-    )
-
-
-def begin_programs(
-    programs: StepPrograms, known: Expected, scene: Scene, folder: RunFolder, mesh: Mesh | None
-) -> None:
-    """Begin to compile steps while the exposures are solved, mostly on one core."""
-    views = TrainingViews(
-        known.store, scene.train_indices, known.cfg.train.seed, measured=known.measured
-    )
-    trainer = Trainer(
-        known.cfg,
-        views,
-        known.extent,
-        None,
-        known.coverage,
-        folder.root,
-        programs,
-        known.decisions,
-        mesh=mesh,
-    )
-    trainer.expect(known.params, known.owner, known.images)
-
-
-def compact(result: TrainResult) -> tuple[Params, np.ndarray | None]:
-    """Return the parameters with only the live Gaussians, in slot order, and whose they are."""
-    population, params = result.state.population, result.state.params
-    alive = np.flatnonzero(np.asarray(population.alive))
-    gaussians = jax.tree.map(lambda a: jax.device_put(np.asarray(a)[alive]), params.gaussians)
-    owner = None if population.owner is None else np.asarray(population.owner)[alive]
-    return dataclasses.replace(params, gaussians=gaussians), owner
 
 
 @dataclass(frozen=True)
@@ -162,6 +73,9 @@ def fit(
     true_exposures: Mapping[str, float] | None = None,
     spent_s: float = 0.0,
     devices: int | Literal["all"] = 1,
+    terms: Mapping[str, LossTerm | None] | None = None,
+    formation: Formation | None = None,
+    strategy: Strategy | None = None,
 ) -> FitResult:
     """Fit a scene and write a run folder.
 
@@ -176,86 +90,205 @@ def fit(
         spent_s: seconds of the budget that were gone before the call.
         devices: how many share the views of a step; with several, `train.batch` is a multiple of
             them.
+        terms: loss terms of yours, by name; as for `make_step`, and so are the next two. The run
+            folder does not remember them: `--resume` needs them again, and `load_run` shows
+            pictures through the tone curve of `cfg`.
+        formation: an image formation of yours.
+        strategy: a densification of yours.
 
     Raises:
         UserError: something the user can mend.
         Interrupted: Ctrl-C, SIGTERM or SIGHUP came; once there are steps, after a checkpoint.
         OSError: something cannot be read or written; `filename` names it.
     """
-    cfg = require_config(cfg)
-    reporter = reporter or Silent()
+    cfg, reporter = require_config(cfg), reporter or Silent()
     paths = Paths(Path(scene_dir), Path(run_dir), None if reference is None else Path(reference))
-    begin = time.monotonic() - spent_s
+    folder, begin = RunFolder(paths.run), time.monotonic() - spent_s
     require_free(paths.run)
-    lpips_weights = preflight(cfg, paths, resume=resume)
-    mesh = mesh_of(cfg, devices)
+    weights = preflight(cfg, paths, resume=resume)
+    mesh, clock, compiler = mesh_of(cfg, devices), Stopwatch(), CompileCounter()
+    own = Own(terms, formation, strategy)
     with no_empty_folders(paths.run), locked(paths.run) as lock, memory_named():
         check_run_dir(paths.run, resume, cfg)  # another may have ended since
-        return _fit(
-            paths,
-            cfg,
-            lock,
+        scene = _read(paths, cfg, reporter, clock)
+        truth = check_scene(scene, cfg, paths, weights)
+        with contextlib.closing(StepPrograms()) as programs:
+            start = prepare(
+                scene,
+                cfg,
+                reporter,
+                clock,
+                lambda known, curve: begin_programs(
+                    programs, known, folder, mesh, curve=curve, own=own
+                ),
+                kept=kept_choice(cfg, folder) if resume else None,
+                pixels=folder.pixels,
+            )
+            lock.require()
+            with begun(folder, paths, cfg, start.decisions), memory_named():
+                result = optimise(
+                    start,
+                    folder,
+                    reporter,
+                    programs,
+                    resume=resume,
+                    mesh=mesh,
+                    spent_s=time.monotonic() - begin,
+                    reserve_s=seconds_to_finish(scene, cfg, weights, reference=truth is not None),
+                    own=own,
+                )
+        params, owner = compact(result)
+        params = centred(exposures_apart(params), cfg)
+        lock.require()
+        starting = {"starting": spent_s} if spent_s else {}
+        metrics = finish(
+            params,
+            start.scene,
+            start.store,
+            start.cfg,
+            folder,
+            _account(params, scene, start, result, {**starting, **clock.seconds}, begin, compiler),
             reporter,
-            lpips_weights,
-            begin,
-            mesh,
-            resume=resume,
-            true_exposures=true_exposures,
-            spent_s=spent_s,
+            owner=owner,
+            truth=truth,
+            lpips_weights=weights,
+            true_ev=true_stops(true_exposures, scene),
+            still_ours=lock.require,
         )
+        start.store.close()
+        shutil.rmtree(folder.pixels, ignore_errors=True)
+    return FitResult(params, scene, metrics, paths.run, start.selection, start.decisions)
 
 
-def _fit(
-    paths: Paths,
-    cfg: FitConfig,
-    lock: RunLock,
-    reporter: Reporter,
-    lpips_weights: LpipsWeights | None,
-    begin: float,
-    mesh: Mesh | None,
-    *,
-    resume: bool,
-    true_exposures: Mapping[str, float] | None,
-    spent_s: float,
-) -> FitResult:
-    """Fit into a folder that is locked; see `fit`."""
-    folder = RunFolder(paths.run)
-    clock, compiler = Stopwatch(), CompileCounter()
+def _read(paths: Paths, cfg: FitConfig, reporter: Reporter, clock: Stopwatch) -> Scene:
+    """Read the scene and say where the time went."""
     reading = time.monotonic()
     scene = load(paths.scene, paths.run, cfg, reporter)
     # Without a model, nearly all of it is finding and matching features.
     found = scene.format in ("images", "transforms")
     clock.add("structure_from_motion" if found else "reading", time.monotonic() - reading)
-    views = check_scene(scene, cfg, paths, lpips_weights)
-    with contextlib.closing(StepPrograms()) as programs:
-        prepared = prepare(
-            scene,
-            cfg,
-            reporter,
-            clock,
-            lambda known: begin_programs(programs, known, scene, folder, mesh),
-            kept=kept_choice(cfg, folder) if resume else None,
-            pixels=folder.pixels,
-        )
-        lock.require()
-        with begun(folder, paths, cfg, prepared.decisions), memory_named():
-            result = optimise(
-                prepared,
-                folder,
-                reporter,
-                programs,
-                resume=resume,
-                mesh=mesh,
-                spent_s=time.monotonic() - begin,
-                reserve_s=seconds_to_finish(
-                    scene, cfg, lpips_weights, reference=views.truth is not None
-                ),
-            )
-    params, owner = compact(result)
-    params = exposures_apart(params)
+    return scene
+
+
+def trainer_of(
+    start: Prepared,
+    folder: RunFolder,
+    programs: StepPrograms,
+    reporter: Reporter | None = None,
+    mesh: Mesh | None = None,
+    own: Own = AS_CONFIGURED,
+) -> Trainer:
+    """Return what runs the steps of a fit; its messages are noted in `start` as well."""
+    reporter = reporter or Silent()
+
+    def say(text: str) -> None:
+        start.notes.append(text)
+        reporter.message(text)
+
+    rows, seed = start.scene.train_indices, start.cfg.train.seed
+    return Trainer(
+        start.cfg,
+        TrainingViews(start.fitted, rows, seed, start.measured),
+        start.extent,
+        start.pairs,
+        start.coverage,
+        folder.root,
+        programs,
+        start.decisions,
+        on_log=reporter.log,
+        on_message=say,
+        mesh=mesh,
+        terms=own.terms,
+        strategy=own.strategy,
+    )
+
+
+def optimise(
+    start: Prepared,
+    folder: RunFolder,
+    reporter: Reporter,
+    programs: StepPrograms,
+    *,
+    resume: bool,
+    spent_s: float = 0.0,
+    reserve_s: float = 0.0,
+    mesh: Mesh | None = None,
+    own: Own = AS_CONFIGURED,
+) -> TrainResult:
+    """Run the optimisation, from the start or from the newest checkpoint.
+
+    Args:
+        start: from `prepare`.
+        folder: of the run: where the log and checkpoints go.
+        reporter: receives progress.
+        programs: compiled steps, some of them perhaps begun.
+        resume: continue from the newest checkpoint.
+        spent_s: seconds of the budget that are already gone.
+        reserve_s: seconds of the budget to keep for evaluation and files.
+        mesh: the devices of a step of several views; None: the default one.
+        own: what the caller of `fit` brought.
+    """
+    alive = np.ones(start.params.gaussians.capacity, bool)
+    return trainer_of(start, folder, programs, reporter, mesh, own).run(
+        own.among(start.params),
+        alive,
+        start.owner,
+        resume=resume,
+        spent_s=spent_s,
+        finish_s=reserve_s,
+    )
+
+
+def begin_programs(
+    programs: StepPrograms,
+    known: Prepared,
+    folder: RunFolder,
+    mesh: Mesh | None,
+    *,
+    curve: bool,
+    own: Own = AS_CONFIGURED,
+) -> None:
+    """Begin to compile steps while the exposures are solved, mostly on one core.
+
+    With `curve`, the tone curve of what is known is chosen.
+    """
+    trainer = trainer_of(known, folder, programs, mesh=mesh, own=own)
+    trainer.expect(own.among(known.params), known.owner, curve)
+
+
+def compact(result: TrainResult) -> tuple[Params, np.ndarray | None]:
+    """Return the parameters with only the live Gaussians, in slot order, and whose they are."""
+    population, params = result.state.population, result.state.params
+    alive = np.flatnonzero(np.asarray(population.alive))
+    gaussians = jax.tree.map(lambda a: jax.device_put(np.asarray(a)[alive]), params.gaussians)
+    owner = None if population.owner is None else np.asarray(population.owner)[alive]
+    return dataclasses.replace(params, gaussians=gaussians), owner
+
+
+def centred(params: Params, cfg: FitConfig) -> Params:
+    """Return parameters in the gauge of results: exposures of mean 1, unless some are known."""
     if cfg.photometry.parameterization == "log" and cfg.photometry.known is None:
-        params = recentre(params, cfg.render.radiance)
-    account = Account(
+        return recentre(params, cfg.render.radiance)
+    return params
+
+
+def true_stops(true_exposures: Mapping[str, float] | None, scene: Scene) -> np.ndarray | None:
+    """Return true exposures of the training views in stops, where they are known by name."""
+    if true_exposures is None:
+        return None
+    return np.log2([true_exposures[view.name] for view in scene.training_views])
+
+
+def _account(
+    params: Params,
+    scene: Scene,
+    start: Prepared,
+    result: TrainResult,
+    seconds: dict[str, float],
+    begin: float,
+    compiler: CompileCounter,
+) -> Account:
+    return Account(
         counts={
             "gaussians": params.gaussians.capacity,
             "seed_points": len(scene.points),
@@ -266,37 +299,15 @@ def _fit(
             "tile_lists_grown": result.host.overflows,
         },
         seconds={
-            **({"starting": spent_s} if spent_s else {}),
-            **clock.seconds,
+            **seconds,
             **result.seconds,
             "total_until_evaluation": time.monotonic() - begin,
             "optimisation": result.host.elapsed_s,
         },
         compiler=compiler,
+        selection=start.selection,
+        notes=start.notes,
     )
-    lock.require()
-    metrics = finish(
-        params,
-        prepared,
-        folder,
-        account,
-        reporter,
-        truth=views.truth,
-        lpips_weights=lpips_weights,
-        true_ev=None
-        if true_exposures is None
-        else np.log2([true_exposures[view.name] for view in scene.training_views]),
-        owner=owner,
-        still_ours=lock.require,
-    )
-    _close_pixels(prepared, folder)
-    return FitResult(params, scene, metrics, paths.run, prepared.selection, prepared.decisions)
-
-
-def _close_pixels(prepared: Prepared, folder: RunFolder) -> None:
-    """Forget the decoded photographs."""
-    prepared.store.close()
-    shutil.rmtree(folder.pixels, ignore_errors=True)
 
 
 @contextlib.contextmanager

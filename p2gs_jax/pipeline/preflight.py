@@ -1,27 +1,48 @@
-"""What can be refused is refused before anything is written: a wrong option costs no run folder."""
+"""What can be refused is refused before anything is written: a wrong option costs no run folder.
+
+Memory is foretold as well: a fit that dies after an hour helps nobody. A model from above, measured
+on fits of 1,000 and 300,000 Gaussians: programs and libraries, so much for every parameter of a
+Gaussian, for every pixel of the largest view and for every pixel of the photographs that are kept
+decoded. On a GPU Gaussians and the pixels of a view are the device's, and are not foretold.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
+
+import jax
 
 from p2gs_jax.config import FitConfig, PhotometryConfig
 from p2gs_jax.config import from_dict as config_from_dict
 from p2gs_jax.config import to_dict as config_to_dict
 from p2gs_jax.core.atomic import plain
+from p2gs_jax.core.memory import left_to_process, ran_out, resident
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.lpips import LpipsWeights, read_lpips_weights
 from p2gs_jax.evaluation.references import Reference, check_reference, load_reference
-from p2gs_jax.losses.total import SECOND_RENDER_FORMS
+from p2gs_jax.gaussians.dense import seed_bound
+from p2gs_jax.gaussians.population import Coverage
 from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.scene.exposures import check_source, read_known_exposures
 from p2gs_jax.scene.pixels.store import size_at
+from p2gs_jax.train.exposure_loss import SECOND_RENDER_FORMS
 from p2gs_jax.train.schedule import shrinks
 from p2gs_jax.train.strategies import check_spread
 from p2gs_jax.types import Scene, View
+
+# Bytes.
+OF_PROGRAMS = 0.8e9
+A_PARAMETER = 37  # with its moments, gradient and the copies of a densification
+A_PIXEL = 650
+A_PHOTOGRAPH_PIXEL = 7
+FEWEST_GAUSSIANS = 1000
+OPTIONS = "--gaussians, --max-width or --data.cache-mb"
 
 
 @dataclass(frozen=True)
@@ -42,11 +63,6 @@ class Paths:
 def preflight(cfg: FitConfig, paths: Paths, *, resume: bool = False) -> LpipsWeights | None:
     """Refuse what can be refused without the scene; nothing is written.
 
-    Args:
-        cfg: everything.
-        paths: of the fit.
-        resume: continue the run that the folder holds.
-
     Returns:
         The weights of LPIPS, where they are asked for.
 
@@ -63,27 +79,13 @@ def preflight(cfg: FitConfig, paths: Paths, *, resume: bool = False) -> LpipsWei
     return None if path is None else read_lpips_weights(path)
 
 
-@dataclass(frozen=True)
-class Views:
-    """What a scene's views are to a fit.
-
-    Attributes:
-        truth: photographs under one common exposure, or None.
-    """
-
-    truth: Reference | None
-
-
 def check_scene(
     scene: Scene, cfg: FitConfig, paths: Paths, lpips_weights: LpipsWeights | None
-) -> Views:
+) -> Reference | None:
     """Refuse what can be refused before exposures are solved; nothing is written.
 
-    Args:
-        scene: from `prepare.load`.
-        cfg: everything.
-        paths: of the fit.
-        lpips_weights: from `preflight`.
+    Returns:
+        The photographs under one common exposure, where there are any.
 
     Raises:
         UserError: the options do not suit the views.
@@ -94,16 +96,11 @@ def check_scene(
     if cfg.photometry.known is not None:
         read_known_exposures(cfg.photometry.known, training)
     check_sizes(training, cfg)
-    truth = None if paths.reference is None else load_reference(paths.reference, scene, cfg)
-    return Views(truth)
+    return None if paths.reference is None else load_reference(paths.reference, scene, cfg)
 
 
 def check_start(p: PhotometryConfig, preset: str) -> None:
     """Refuse a start of the exposures that the rest of the photometry contradicts.
-
-    Args:
-        p: the image formation model.
-        preset: what the options started from.
 
     Raises:
         UserError: known exposures or the curve do not go with it.
@@ -134,10 +131,6 @@ def check_start(p: PhotometryConfig, preset: str) -> None:
 
 def check_sizes(views: Sequence[View], cfg: FitConfig) -> None:
     """Refuse to subtract images of different sizes.
-
-    Args:
-        views: training views.
-        cfg: which reading of the relative-exposure loss there is, and the sizes of a run.
 
     Raises:
         UserError: the reading subtracts renders of two views, and their sizes differ.
@@ -213,3 +206,102 @@ def _differences(saved: dict, now: dict, prefix: str = "") -> list[str]:
         elif a != b:
             out.append(f"{prefix}{key} was {a}, now {b}")
     return out
+
+
+class MemoryNeeded(NamedTuple):
+    """Bytes that a fit takes at its peak.
+
+    Attributes:
+        programs: Python, libraries, compiling.
+        gaussians: parameters, moments, gradients, of the largest population.
+        photographs: decoded and kept.
+        view: pictures of the largest view and their gradients.
+        population: the largest there may be.
+    """
+
+    programs: float
+    gaussians: float
+    photographs: float
+    view: float
+    population: int
+
+    @property
+    def total(self) -> float:
+        """Bytes of all parts."""
+        return self.programs + self.gaussians + self.photographs + self.view
+
+
+def memory_needed(scene: Scene, cfg: FitConfig, coverage: Coverage) -> MemoryNeeded:
+    """Return the bytes that a fit will take at its peak."""
+    count = max(seed_bound(cfg, min(len(scene.points), cfg.init.max_seeds), coverage), 1)
+    parameters = 11 + 3 * (cfg.render.sh_degree + 1) ** 2
+    here = jax.default_backend() == "cpu"
+    sizes = [size_at(view, cfg.data.max_width) for view in scene.views]
+    decoded = sum(w * h for w, h in sizes) * A_PHOTOGRAPH_PIXEL
+    return MemoryNeeded(
+        programs=OF_PROGRAMS,
+        gaussians=float(here * count * parameters * A_PARAMETER),
+        photographs=float(min(decoded, cfg.data.cache_mb * 2**20)),
+        view=float(here * coverage.pixels * A_PIXEL),
+        population=count,
+    )
+
+
+def require_memory(needed: MemoryNeeded) -> None:
+    """Refuse a fit that will not find its memory.
+
+    Raises:
+        UserError: more is needed than is left; names the option that helps.
+    """
+    left = left_to_process()
+    if left is None or needed.total <= left + resident():
+        return
+    room = left + resident()
+    raise UserError(
+        f"this fit would take about {_gb(needed.total)} of memory at its peak ({needed.population} "
+        f"Gaussians {_gb(needed.gaussians)}, photographs {_gb(needed.photographs)}, pixels of a "
+        f"view {_gb(needed.view)}, programs {_gb(needed.programs)}), and there are {_gb(room)}.",
+        fix=_way_on(needed, room),
+    )
+
+
+@contextlib.contextmanager
+def memory_named() -> Iterator[None]:
+    """Let memory that runs out in a `with` block say what helps.
+
+    Raises:
+        UserError: it ran out. Other errors stay as they are.
+    """
+    try:
+        yield
+    except (MemoryError, RuntimeError, OSError) as error:
+        if not ran_out(error):
+            raise
+        said = str(error).splitlines()[0][:160] if str(error) else "an allocation failed"
+        raise UserError(
+            f"memory ran out ({said}).",
+            fix=f"lower {OPTIONS}, in a new folder, or end other programs and add --resume",
+        ) from error
+
+
+def _way_on(needed: MemoryNeeded, room: float) -> str:
+    """Return which option brings a fit into the room there is, the largest part's first."""
+    ways = {
+        "gaussians": (needed.gaussians, "--gaussians {}", needed.population, FEWEST_GAUSSIANS),
+        "photographs": (needed.photographs, "--data.cache-mb {}", needed.photographs / 2**20, 1),
+    }
+    for part, option, now, least in sorted(ways.values(), key=lambda way: -way[0]):
+        share = 1 - (needed.total - room) / part if part else 0.0
+        if share * now >= least:
+            return f"add {option.format(_rounded(share * now))}, or end other programs"
+    return f"lower {OPTIONS}, or end other programs"
+
+
+def _rounded(value: float) -> int:
+    """Return a whole number of two digits, not above."""
+    step = 10 ** max(len(str(int(value))) - 2, 0)
+    return int(value) // step * step
+
+
+def _gb(size: float) -> str:
+    return f"{size / 1e9:.1f} GB"

@@ -1,13 +1,15 @@
-"""Everything before the first optimisation step: scene, exposures, radiances, Gaussians."""
+"""Everything before the first optimisation step: scene, exposures, radiances, Gaussians.
+
+`survey` finds what a scene offers without its exposures, `solve_exposures` solves these, and
+`initialise` makes Gaussians of both; `prepare` is the three in a row.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -15,60 +17,26 @@ import numpy as np
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.core.numerics import on_device
-from p2gs_jax.core.progress import Reporter
+from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.core.runtime import return_freed_memory
 from p2gs_jax.core.streams import Stream
 from p2gs_jax.errors import UserError
-from p2gs_jax.gaussians.dense import (
-    DenseSeeds,
-    coverage_of,
-    dense_limit,
-    gaussians_of,
-    match_photographs,
-    wants_dense,
-)
+from p2gs_jax.gaussians.dense import DenseSeeds, dense_limit, dense_seeds, gaussians_of
 from p2gs_jax.gaussians.matching import Tones, rough_tones
-from p2gs_jax.gaussians.moving import (
-    Nodes,
-    clock_of,
-    find_nodes,
-    node_gaussians,
-    nodes_radiance,
-    vibrates,
-    with_vibration,
-)
+from p2gs_jax.gaussians.moving import Nodes, node_gaussians, nodes_radiance, with_vibration
 from p2gs_jax.gaussians.population import Coverage
-from p2gs_jax.gaussians.seeds import (
-    cameras_radius,
-    merge,
-    photographed_radiance,
-    subsample,
-    with_colors,
-)
-from p2gs_jax.gaussians.shell import black_gaussians, find_shell, shell_gaussians
-from p2gs_jax.losses.relative_exposure import ColorPairs
-from p2gs_jax.photometry.calibrate import Selection, calibrate_observations, options_of
+from p2gs_jax.gaussians.seeds import merge, photographed_radiance, subsample, with_colors
+from p2gs_jax.gaussians.shell import Shell, Sphere, black_gaussians, find_shell, shell_gaussians
+from p2gs_jax.photometry.calibrate import Selection
 from p2gs_jax.photometry.models import Form
-from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.parameters import initial_appearance, initial_photometry, point_radiance
 from p2gs_jax.photometry.response import Response
-from p2gs_jax.photometry.sources.points import has_tracks, surface_colors
-from p2gs_jax.pipeline.decide import decide, likely, with_choice
-from p2gs_jax.pipeline.memory_needed import memory_needed, require_memory
-from p2gs_jax.pipeline.part import Part
-from p2gs_jax.pipeline.scale import (
-    extent_of_rates,
-    near_depth,
-    near_plane,
-    scale_notes,
-    seen_depths,
-)
+from p2gs_jax.pipeline.exposures import Exposures, likely, solve_exposures, with_choice
+from p2gs_jax.pipeline.survey import Survey, survey
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.pixels.store import ImageStore
-from p2gs_jax.train.compared_photographs import color_pairs
-from p2gs_jax.train.measured_depths import measured_depths
-from p2gs_jax.train.schedule import shrinks
+from p2gs_jax.train.exposure_loss import ColorPairs, color_pairs
 from p2gs_jax.types import Gaussians, Measured, Params, Scene, View
 
 
@@ -81,14 +49,14 @@ class Prepared:
         store: photographs, whole; its cameras see what moves.
         fitted: the same photographs without the pixels that are left out of the fit.
         params: initial parameters.
-        owner: the moving object that each Gaussian belongs to (`Population.owner`), or None.
         extent: what rates of the means are shares of, scene units.
-        selection: photometric model, exposures and their errors from the tracks, or None.
-        pairs: corresponding observations, or None.
-        measured: of every training view the depths that the loss compares with, or None.
         coverage: how much of the scene the views show.
         decisions: what the scene settled.
         cfg: the options that the fit computes under: as asked, with `decisions` filled in.
+        owner: the moving object that each Gaussian belongs to (`Population.owner`), or None.
+        selection: photometric model, exposures and their errors from the tracks, or None.
+        pairs: corresponding observations, or None.
+        measured: of every training view the depths that the loss compares with, or None.
         notes: what the user should know.
     """
 
@@ -96,41 +64,15 @@ class Prepared:
     store: ImageStore
     fitted: ImageStore
     params: Params
-    owner: np.ndarray | None
     extent: float
-    selection: Selection | None
-    pairs: ColorPairs | None
-    measured: Sequence[Measured] | None
     coverage: Coverage
     decisions: Decisions
     cfg: FitConfig
+    owner: np.ndarray | None = None
+    selection: Selection | None = None
+    pairs: ColorPairs | None = None
+    measured: Sequence[Measured] | None = None
     notes: list[str] = field(default_factory=list)
-
-
-class Expected(NamedTuple):
-    """What is known of a fit before its exposures: enough to compile for.
-
-    Attributes:
-        store: photographs.
-        params: of the right shapes; the Gaussians are the scene's points, without colours.
-        owner: the moving object that each belongs to, or None.
-        extent: what rates of the means are shares of, scene units.
-        coverage: how much of the scene the views show.
-        decisions: what most scenes decide.
-        cfg: the options under these.
-        images: its tone curve is chosen.
-        measured: of every training view the depths that the loss compares with, or None.
-    """
-
-    store: ImageStore
-    params: Params
-    owner: np.ndarray | None
-    extent: float
-    coverage: Coverage
-    decisions: Decisions
-    cfg: FitConfig
-    images: bool
-    measured: Sequence[Measured] | None
 
 
 def load(scene_dir: Path, run_dir: Path, cfg: FitConfig, reporter: Reporter) -> Scene:
@@ -161,11 +103,12 @@ def prepare(
     cfg: FitConfig,
     reporter: Reporter,
     clock: Stopwatch | None = None,
-    on_expected: Callable[[Expected], None] = lambda expected: None,
+    on_expected: Callable[[Prepared, bool], None] = lambda expected, curve_known: None,
     *,
     kept: Decisions | None = None,
     pixels: Path | None = None,
-    part: Part | None = None,
+    given: Exposures | None = None,
+    sphere: Sphere | None = None,
 ) -> Prepared:
     """Start exposures, radiances and Gaussians from what the scene offers.
 
@@ -174,192 +117,166 @@ def prepare(
         cfg: as asked.
         reporter: receives progress.
         clock: receives the seconds of `photometry` and `seeds`.
-        on_expected: receives what can be told before the exposures are solved, where that is much.
+        on_expected: receives what can be told before the exposures are solved, where that is much:
+            parameters of the right shapes, and whether their tone curve is chosen.
         kept: what the checkpoints of a run that is resumed remember: its model and curve stay.
         pixels: folder for decoded photographs that are more than memory holds, or None.
-        part: what was solved for a whole of which `scene` is a part, or None.
+        given: what was solved for a whole of which `scene` is a part, or None.
+        sphere: where the whole puts what lies behind everything, or None.
 
     Raises:
         UserError: there is not the memory for it, nothing to see, no room on the disk for
             decoded photographs, or two backgrounds.
     """
     clock = clock or Stopwatch()
-    begin = time.monotonic()
-    nodes = find_nodes(scene, cfg.dynamics)
-    vibrating = vibrates(scene, cfg)
-    moving = clock_of(scene) if vibrating else None if nodes is None else nodes.moving
-    store = ImageStore(scene.views, cfg.data, moving=moving, folder=pixels)
-    store.expect(shrinks(cfg.train))
-    fitted, still = _without_what_moves(scene, store, nodes, cfg)
-    _require_something_to_see(scene, fitted)
-    views = scene.training_views
-    taken_by = [view.camera for view in views]
-    radius = cameras_radius(views, scene.points)
-    depths = seen_depths(scene.points, views)
-    extent = extent_of_rates(radius, depths, cfg)
-    coverage = coverage_of(scene, store)
-    require_memory(memory_needed(scene, cfg, coverage))
-    measured = measured_depths(scene, cfg)
-    dense = wants_dense(scene, coverage, cfg)
-    seeds = _choose_points(scene, cfg)
-    init = cfg.init
-    behind = cfg.render.background is not None
-    if store.backdrop is not None and behind:
-        raise UserError(
-            "render.background is light behind the splats, and the photographs' alpha shows "
-            "data.background there.",
-            fix="leave one of them out: --render.background None, or --data.alpha mask",
-        )
-    if (store.backdrop is not None or behind) and init.shell == "auto":
-        # What lies behind everything is the background.
-        init = dataclasses.replace(init, shell="off")
-    depth = near_depth(depths)
-    near = near_plane(depth, cfg)
-    # Dense seeds cover some of what the points do not.
-    sphere = None if part is None else part.shell
-    shell = None if dense else find_shell(views, scene.points, radius, init, sphere)
+    with clock("photometry"):
+        found = survey(scene, cfg, pixels=pixels, sphere=sphere)
+        guess = likely(cfg, kept) if given is None else given.decisions
+        expected: Prepared | None = None
+        if guess is not None:
+            expected = expect(
+                found, guess if given else dataclasses.replace(guess, near=found.near)
+            )
+            on_expected(expected, bool(kept or given) or not cfg.photometry.select)
 
-    guess = likely(cfg, kept, matched=has_tracks(scene) or dense)
-    guess = None if guess is None else dataclasses.replace(guess, near=near)
-    if part is not None:
-        guess = part.decisions
-    expected: Expected | None = None
-    if guess is not None:
-        black = black_gaussians(scene.points[seeds.keep], shell, views, cfg)
-        if vibrating:
-            black = with_vibration(black, scene, cfg)
-        owner = None
-        if nodes is not None:
-            colors = np.zeros_like(nodes.points)
-            black, owner = _with_nodes(black, nodes, colors, views, cfg)
-        params = Params(
-            black,
-            initial_photometry(None, taken_by, guess.resolve(cfg)),
-            initial_appearance(views, cfg),
-        )
-        known = kept is not None or part is not None or not cfg.photometry.select
-        under = guess.resolve(cfg)
-        expected = Expected(fitted, params, owner, extent, coverage, guess, under, known, measured)
-        on_expected(expected)
+        def chosen(form: Form, response: Response) -> None:
+            # What cameras do enters the programs, and is only solved now.
+            if expected is not None and form.vignetting is None and response.by == "all":
+                decisions = with_choice(expected.decisions, form, response)
+                on_expected(_under(expected, decisions, cfg), True)
 
-    def chosen(form: Form, response: Response) -> None:
-        # What cameras do enters the programs, and is only solved now.
-        if expected is None or form.vignetting is not None or response.by != "all":
-            return
-        told = with_choice(expected.decisions, form, response)
-        under = told.resolve(cfg)
-        start = initial_photometry(None, taken_by, under)
-        params = dataclasses.replace(expected.params, photometry=start)
-        on_expected(expected._replace(params=params, decisions=told, cfg=under, images=True))
+        exposures = given
+        if exposures is None:
+            exposures = solve_exposures(
+                scene, found.still, cfg, reporter, on_chosen=chosen, dense=found.dense, kept=kept
+            )
+        return_freed_memory()
+    with clock("seeds"):
+        return initialise(found, exposures, reporter)
 
-    if part is None:
-        tracks, selection, notes = solve(
-            scene, still, cfg, reporter, chosen, dense=dense, kept=kept
-        )
-        matched = tracks is not None and len(tracks.points) > 0
-        decisions = decide(cfg, selection, matched=matched, kept=kept)
-        decisions = dataclasses.replace(decisions, near=near)
-    else:
-        tracks, selection, notes, decisions = None, None, [], part.decisions
-    resolved = decisions.resolve(cfg)
-    solution = None if selection is None else selection.solution
-    photometry = initial_photometry(solution, taken_by, resolved)
-    if part is not None:
-        photometry = jax.tree.map(on_device, part.photometry)
-    return_freed_memory()
-    solved = time.monotonic()
-    clock.add("photometry", solved - begin)
 
-    added: DenseSeeds | None = None
-    if dense:
-        added = match_photographs(
-            scene,
-            still,
-            rough_tones(tracks, len(views))
-            if solution is None and part is None
-            else Tones.of(photometry, resolved.photometry),
-            scene.points[seeds.keep],
-            photometry,
-            resolved,
-            limit=dense_limit(cfg, len(seeds.keep), coverage),
-            on_view=lambda i, n: reporter.stage("Matching photographs", i, n),
-        )
-        covering = np.concatenate([scene.points, added.points])
-        shell = find_shell(views, covering, radius, init, sphere)
-    if scene.point_colors is None:
-        scene = with_colors(scene, photographed_radiance(scene, still, photometry, resolved))
-    radiance = point_radiance(scene, solution, resolved) if part is None else part.radiance
-    gaussians = gaussians_of(scene.points[seeds.keep], radiance[seeds.keep], added, views, resolved)
-    if shell is not None:
-        far = shell_gaussians(shell, scene, still, photometry, views, resolved)
-        gaussians = merge(gaussians, far)
-    if vibrating:
-        gaussians = with_vibration(gaussians, scene, resolved)
+def expect(found: Survey, decisions: Decisions) -> Prepared:
+    """Return what a fit will start from in its shapes: black Gaussians, exposures of 1."""
+    scene, cfg, views = found.scene, found.cfg, found.scene.training_views
+    black = black_gaussians(scene.points[found.seeds], found.shell, views, cfg)
+    if found.vibrating:
+        black = with_vibration(black, scene, cfg)
     owner = None
-    if nodes is not None:
-        found = nodes_radiance(nodes, scene, fitted, photometry, resolved)
-        gaussians, owner = _with_nodes(gaussians, nodes, found, views, resolved)
-    gaussians, owner, thinned = _bounded(gaussians, owner, cfg)
-    notes = [*scene.notes, *scale_notes(scene, near, cfg, depth), *notes, *seeds.notes]
-    notes += [] if nodes is None else nodes.notes
-    notes += [] if added is None else [added.note()]
-    notes += [] if shell is None else [shell.note()]
-    notes += thinned
-    if cfg.dynamics.method == "vibration" and not vibrating:
-        notes.append("Views have no times: everything is fitted as if it stood still.")
-    for note in notes:
-        reporter.message(note)
-    clock.add("seeds", time.monotonic() - solved)
+    if found.nodes is not None:
+        black, owner = _with_nodes(
+            black, found.nodes, np.zeros_like(found.nodes.points), views, cfg
+        )
+    photometry = initial_photometry(None, [v.camera for v in views], decisions.resolve(cfg))
     return Prepared(
-        scene,
-        store,
-        fitted,
-        Params(
-            gaussians,
-            photometry,
-            initial_appearance(views, resolved, lambda k: fitted.get(scene.train_indices[k])),
-        ),
-        owner,
-        extent,
-        selection,
-        color_pairs(tracks, resolved),
-        measured,
-        coverage,
-        decisions,
-        resolved,
-        notes,
+        scene=scene,
+        store=found.store,
+        fitted=found.fitted,
+        params=Params(black, photometry, initial_appearance(views, cfg)),
+        extent=found.extent,
+        coverage=found.coverage,
+        decisions=decisions,
+        cfg=decisions.resolve(cfg),
+        owner=owner,
+        measured=found.measured,
     )
 
 
-def _require_something_to_see(scene: Scene, store: ImageStore) -> None:
-    """Refuse masks that hide everything; of most scenes the first photograph is looked at."""
-    if not any(store.stored(index)[1].any() for index in scene.train_indices):
-        raise UserError(
-            f"the masks hide every pixel of all {len(scene.train_indices)} training views.",
-            fix="masks are black where pixels are to be ignored: invert them, or take them away",
-        )
+def _under(expected: Prepared, decisions: Decisions, cfg: FitConfig) -> Prepared:
+    """Return what is expected under other decisions."""
+    under = decisions.resolve(cfg)
+    taken_by = [view.camera for view in expected.scene.training_views]
+    photometry = initial_photometry(None, taken_by, under)
+    params = dataclasses.replace(expected.params, photometry=photometry)
+    return dataclasses.replace(expected, params=params, decisions=decisions, cfg=under)
 
 
-def _without_what_moves(
-    scene: Scene, store: ImageStore, nodes: Nodes | None, cfg: FitConfig
-) -> tuple[ImageStore, ImageStore]:
-    """Return the photographs that are fitted, and those of what stands still and is opaque.
+def initialise(found: Survey, exposures: Exposures, reporter: Reporter | None = None) -> Prepared:
+    """Make Gaussians of the seeds of a scene whose exposures are known."""
+    reporter, scene, nodes = reporter or Silent(), found.scene, found.nodes
+    decisions = exposures.decisions
+    if exposures.radiance is None:
+        decisions = dataclasses.replace(decisions, near=found.near)
+    cfg, views = decisions.resolve(found.cfg), scene.training_views
+    photometry = jax.tree.map(on_device, exposures.photometry)
+    added, shell = None, found.shell
+    if found.dense:
+        added = _matched(found, exposures, cfg, reporter)
+        covering = np.concatenate([scene.points, added.points])
+        shell = find_shell(views, covering, found.radius, found.init, found.sphere)
+    if scene.point_colors is None:
+        scene = with_colors(scene, photographed_radiance(scene, found.still, photometry, cfg))
+    radiance = exposures.radiance
+    if radiance is None:
+        solution = None if exposures.selection is None else exposures.selection.solution
+        radiance = point_radiance(scene, solution, cfg)
+    seeds, owner = found.seeds, None
+    gaussians = gaussians_of(scene.points[seeds], radiance[seeds], added, views, cfg)
+    if shell is not None:
+        far = shell_gaussians(shell, scene, found.still, photometry, views, cfg)
+        gaussians = merge(gaussians, far)
+    if found.vibrating:
+        gaussians = with_vibration(gaussians, scene, cfg)
+    if nodes is not None:
+        colors = nodes_radiance(nodes, scene, found.fitted, photometry, cfg)
+        gaussians, owner = _with_nodes(gaussians, nodes, colors, views, cfg)
+    gaussians, owner, thinned = _bounded(gaussians, owner, found.cfg)
+    notes = _notes(found, exposures, added, shell, thinned)
+    for note in notes:
+        reporter.message(note)
+    appearance = initial_appearance(views, cfg, lambda k: found.fitted.get(scene.train_indices[k]))
+    return Prepared(
+        scene=scene,
+        store=found.store,
+        fitted=found.fitted,
+        params=Params(gaussians, photometry, appearance),
+        extent=found.extent,
+        coverage=found.coverage,
+        decisions=decisions,
+        cfg=cfg,
+        owner=owner,
+        selection=exposures.selection,
+        pairs=color_pairs(exposures.observations, cfg),
+        measured=found.measured,
+        notes=notes,
+    )
 
-    Exposures and seeds come from the latter.
-    """
-    still = store.leaving_out(scene.objects, cfg.dynamics.margin)
-    if cfg.dynamics.method == "mask":
-        return still, still.only_opaque()
-    left = () if nodes is None else nodes.left
-    return store.leaving_out(left, cfg.dynamics.margin), still.only_opaque()
+
+def _matched(found: Survey, exposures: Exposures, cfg: FitConfig, reporter: Reporter) -> DenseSeeds:
+    """Return seeds from matching photographs."""
+    scene = found.scene
+    color = Tones.of(exposures.photometry, cfg.photometry)
+    rough = rough_tones(exposures.observations, len(scene.training_views))
+    return dense_seeds(
+        scene,
+        found.still,
+        color if exposures.solved else rough,
+        color,
+        cfg,
+        existing=scene.points[found.seeds],
+        limit=dense_limit(found.cfg, len(found.seeds), found.coverage),
+        on_view=lambda i, n: reporter.stage("Matching photographs", i, n),
+    )
+
+
+def _notes(
+    found: Survey,
+    exposures: Exposures,
+    added: DenseSeeds | None,
+    shell: Shell | None,
+    thinned: list[str],
+) -> list[str]:
+    notes = [*found.scene.notes, *found.scale_notes, *exposures.notes, *found.seed_notes]
+    notes += [] if found.nodes is None else found.nodes.notes
+    notes += [] if added is None else [added.note()]
+    notes += [] if shell is None else [shell.note()]
+    notes += thinned
+    if found.cfg.dynamics.method == "vibration" and not found.vibrating:
+        notes.append("Views have no times: everything is fitted as if it stood still.")
+    return notes
 
 
 def _with_nodes(
-    gaussians: Gaussians,
-    nodes: Nodes,
-    radiance: np.ndarray,
-    views: list[View],
-    cfg: FitConfig,
+    gaussians: Gaussians, nodes: Nodes, radiance: np.ndarray, views: list[View], cfg: FitConfig
 ) -> tuple[Gaussians, np.ndarray | None]:
     """Return Gaussians with those of moving objects behind them, and to what each belongs."""
     if not len(nodes.moving):
@@ -369,81 +286,14 @@ def _with_nodes(
     return merge(gaussians, node_gaussians(nodes, radiance, views, cfg)), owner
 
 
-class _Seeds(NamedTuple):
-    """Which of the scene's points become seeds, and what to say of it."""
-
-    keep: np.ndarray
-    notes: list[str]
-
-
-def _choose_points(scene: Scene, cfg: FitConfig) -> _Seeds:
-    """Keep at most as many points as the options allow."""
-    bound, most, option = cfg.densify.max_gaussians, cfg.init.max_seeds, "--init.max-seeds"
-    if isinstance(bound, int) and bound <= most:
-        most, option = bound, "--gaussians"
-    keep = subsample(len(scene.points), most, cfg.train.seed)
-    if len(keep) == len(scene.points):
-        return _Seeds(keep, [])
-    said = f"{len(scene.points)} seed points were thinned to {len(keep)} ({option})."
-    return _Seeds(keep, [said])
-
-
-def solve(
-    scene: Scene,
-    store: ImageStore,
-    cfg: FitConfig,
-    reporter: Reporter,
-    on_chosen: Callable[[Form, Response], None],
-    *,
-    dense: bool,
-    kept: Decisions | None,
-) -> tuple[Observations | None, Selection | None, list[str]]:
-    """Sample colours of shared points, and solve the photometry from them; both where possible.
-
-    Args:
-        scene: views, points, tracks.
-        store: photographs of what stands still and is opaque.
-        cfg: as asked.
-        reporter: receives progress.
-        on_chosen: receives the choice before it is solved.
-        dense: the fit wants observations even where it starts from no exposures.
-        kept: see `prepare`.
-    """
-    from_tracks = cfg.photometry.start == "tracks"
-    if not (has_tracks(scene) or from_tracks or dense):
-        return None, None, []
-    notes = []
-    if scene.random_seeds:
-        notes = ["Seeds at random show nothing twice: exposures start at 1 and are learned."]
-        return None, None, notes if from_tracks else []
-    if not has_tracks(scene):
-        notes.append("No tracks: seed points are projected into the views instead.")
-    tracks = surface_colors(
-        scene, store, cfg.train.seed, lambda i, n: reporter.stage("Sampling colours", i, n)
-    )
-    if not from_tracks:
-        return tracks, None, notes
-    if not len(tracks.points):
-        notes.append(
-            "No point is seen twice: exposures start at 1 and are learned from the first step."
-        )
-        return tracks, None, notes
-    reporter.stage("Photometric bundle adjustment")
-    under = cfg if kept is None else kept.resolve(cfg)
-    selection = calibrate_observations(tracks, options_of(under, scene), on_chosen)
-    if kept is not None:
-        selection = dataclasses.replace(selection, reasons=kept.reasons)
-    return tracks, selection, [*notes, *selection.reasons, *selection.solution.warnings]
-
-
 def _bounded(
     gaussians: Gaussians, owner: np.ndarray | None, cfg: FitConfig
 ) -> tuple[Gaussians, np.ndarray | None, list[str]]:
     """Return at most as many Gaussians as the options allow, whose they are, and what to say."""
     bound = cfg.densify.max_gaussians
-    if not isinstance(bound, int) or gaussians.capacity <= bound:
+    if bound is None or gaussians.capacity <= bound:
         return gaussians, owner, []
     kept = subsample(gaussians.capacity, bound, cfg.train.seed, Stream.SEED_GAUSSIANS)
-    said = f"{gaussians.capacity} Gaussians were thinned to {bound} (--gaussians)."
+    note = f"{gaussians.capacity} Gaussians were thinned to {bound} (--gaussians)."
     gaussians = jax.tree.map(lambda a: on_device(np.asarray(a)[kept]), gaussians)
-    return gaussians, None if owner is None else owner[kept], [said]
+    return gaussians, None if owner is None else owner[kept], [note]

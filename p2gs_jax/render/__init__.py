@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -42,27 +40,18 @@ def rasterize(
     width: int,
     height: int,
     cfg: RenderConfig,
-    *,
-    implementation: Literal["reference"] | TileImplementation | None = None,
     with_depth: bool = True,
 ) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"], Float[Array, "h w"] | None]:
     """Composite splats of linear HDR radiance into radiance, alpha and alpha-weighted depth.
 
-    Args:
-        splats: projected Gaussians.
-        radiance: of each, >= 0.
-        tiles: tile list; only `reference` does without.
-        width: image width, pixels.
-        height: image height, pixels.
-        cfg: tile, chunk, cutoff, termination.
-        implementation: `reference` (dense, any precision), `xla` (lane queue), `pallas` (a GPU
-            block per tile), or None for the fastest that runs here.
-        with_depth: render depth too; without it, None in its place and about 5 % less work.
+    Radiance is >= 0. `cfg.implementation` is `reference` (dense, any precision, without a tile
+    list), `xla` (lane queue), `pallas` (a GPU block per tile), or None for the fastest that runs
+    here. Without depth there is None in its place, and about 5 % less work.
 
     Raises:
         ValueError: no such implementation, or one of tiles without a tile list.
     """
-    name = implementation or fastest_here()
+    name = cfg.implementation or fastest_here()
     if name == "reference":
         linear, alpha, depth = rasterize_reference(splats, radiance, width, height, cfg)
         return linear, alpha, depth if with_depth else None
@@ -135,16 +124,9 @@ def render_splats(
         tiles = bin_tiles(splats, camera.width, camera.height, capacity, cfg)
         count, overflow = tiles.count, tiles.overflow
     linear, alpha, depth = rasterize(
-        splats,
-        radiance,
-        tiles,
-        camera.width,
-        camera.height,
-        cfg,
-        implementation=cfg.implementation,
-        with_depth=with_depth,
+        splats, radiance, tiles, camera.width, camera.height, cfg, with_depth
     )
-    linear = _before(linear, alpha, cfg)
+    linear = _over_background(linear, alpha, cfg)
     return Render(linear, alpha, depth, count, overflow, splats.visible)
 
 
@@ -166,7 +148,7 @@ def required_capacity(
     return count_entries(splats, camera.width, camera.height, cfg)
 
 
-def _before(
+def _over_background(
     linear: Float[Array, "h w 3"], alpha: Float[Array, "h w"], cfg: RenderConfig
 ) -> Float[Array, "h w 3"]:
     """Return radiance with that of the background, where it shows through."""
@@ -178,7 +160,7 @@ def _before(
 def _nothing(camera: Camera, cfg: RenderConfig, with_depth: bool) -> Render:
     blank = jnp.zeros((camera.height, camera.width))
     return Render(
-        linear=_before(jnp.zeros((*blank.shape, 3)), blank, cfg),
+        linear=_over_background(jnp.zeros((*blank.shape, 3)), blank, cfg),
         alpha=blank,
         depth=blank if with_depth else None,
         count=jnp.int32(0),

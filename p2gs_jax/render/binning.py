@@ -97,6 +97,21 @@ def _count_by_sorting(
     return jnp.where(_too_many(entries), 2**30, jnp.sum(entries))
 
 
+def _smallest_exponent(factor, left, right, top, bottom):
+    """Return the smallest |factor (x, y)|^2 over rectangles."""
+    a11, a12, a22 = factor
+    A, B, C = a11 * a11, a11 * a12, a12 * a12 + a22 * a22
+
+    def quadratic(x, y):
+        return (a11 * x + a12 * y) ** 2 + (a22 * y) ** 2
+
+    near_x, near_y = jnp.clip(0.0, left, right), jnp.clip(0.0, top, bottom)
+    return jnp.minimum(
+        quadratic(near_x, jnp.clip(-B / C * near_x, top, bottom)),
+        quadratic(jnp.clip(-B / A * near_y, left, right), near_y),
+    )
+
+
 def _bin_by_sorting(
     splats: Splats2D, width: int, height: int, capacity: int, cfg: RenderConfig
 ) -> TileList:
@@ -133,20 +148,11 @@ def _bin_by_sorting(
     down = jnp.floor((nth + 0.5) / across_)
     col, line = x0_ + nth - down * across_, y0_ + down
 
-    # Smallest exponent over the tile's rectangle of pixel centres, about the splat's centre.
+    # The tile's rectangle of pixel centres, about the splat's centre.
     half_x, half_y = (tile_x - 1) / 2, (tile_y - 1) / 2
     dx, dy = col * tile_x + tile_x / 2 - mean_x, line * tile_y + tile_y / 2 - mean_y
-    left, right, top, bottom = dx - half_x, dx + half_x, dy - half_y, dy + half_y
-    A, B, C = a11 * a11, a11 * a12, a12 * a12 + a22 * a22
-
-    def quadratic(x, y):
-        return (a11 * x + a12 * y) ** 2 + (a22 * y) ** 2
-
-    near_x, near_y = jnp.clip(0.0, left, right), jnp.clip(0.0, top, bottom)
-    smallest = jnp.minimum(
-        quadratic(near_x, jnp.clip(-B / C * near_x, top, bottom)),
-        quadratic(jnp.clip(-B / A * near_y, left, right), near_y),
-    )
+    edges = dx - half_x, dx + half_x, dy - half_y, dy + half_y
+    smallest = _smallest_exponent((a11, a12, a22), *edges)
     keep = (position < count) & (0.5 * smallest <= reach + 1e-4)
     tile_id = jnp.where(keep, (line * across_tiles + col).astype(jnp.int32), tile_count)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -25,6 +25,8 @@ STEP = 1.25
 SMALLEST = 4096
 
 Result = TypeVar("Result")
+# Renders one view: (gaussians, alive, camera, owner=None), as of `render_linear`.
+RenderView = Callable[..., Render]
 
 
 class Margins(NamedTuple):
@@ -136,20 +138,6 @@ class Room(NamedTuple):
         lists = TileCapacity(self.entries, TRAINING).grown(entries)
         shown = TileCapacity(self.visible, TRAINING_VISIBLE).grown(visible)
         return Room(lists.entries, shown.entries)
-
-
-class RenderView(Protocol):
-    """Render one view; arguments as of `render_linear`."""
-
-    def __call__(
-        self,
-        gaussians: Gaussians,
-        alive: Bool[Array, " n"],
-        camera: Camera,
-        owner: Int[Array, " n"] | None = None,
-    ) -> Render:
-        """Return the render."""
-        ...
 
 
 count_needed = jax.jit(required_capacity, static_argnames="cfg")

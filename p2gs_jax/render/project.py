@@ -114,10 +114,7 @@ def rotation_matrices(quats: Float[Array, "n 4"]) -> list[list[Float[Array, " n"
 
 
 def project(
-    gaussians: Gaussians,
-    alive: Bool[Array, " n"],
-    camera: Camera | Frustum,
-    cfg: RenderConfig,
+    gaussians: Gaussians, alive: Bool[Array, " n"], camera: Camera | Frustum, cfg: RenderConfig
 ) -> Splats2D:
     """Project Gaussians into a view.
 

@@ -247,6 +247,13 @@ def _padded(ids_list, plan: Plan):
     return jnp.concatenate([ids_list, jnp.full((plan.chunk,), plan.gaussians, jnp.int32)])
 
 
+def _opaque(channels, transmittance, brightest, plan: Plan):
+    """Return whether what lies behind can be left out (RenderConfig.stop_error)."""
+    so_far = functools.reduce(jnp.maximum, channels[:3]) / brightest
+    hidden = transmittance - (plan.stop_error or 0.0) * jnp.maximum(so_far, DARKEST)
+    return jnp.max(hidden, -1) <= 0
+
+
 def forward(rows, ids_list, offsets, plan: Plan):
     """Return the channels of the image and the transmittance, [T P] each, and what backward needs.
 
@@ -262,16 +269,9 @@ def forward(rows, ids_list, offsets, plan: Plan):
     radiance = rows[:, GEOMETRY : GEOMETRY + 3]
     brightest = jnp.maximum(jnp.max(radiance), 1e-30)
 
-    def opaque(channels, transmittance):
-        """Return whether what lies behind can be left out (RenderConfig.stop_error)."""
-        so_far = functools.reduce(jnp.maximum, channels[:3]) / brightest
-        hidden = transmittance - (plan.stop_error or 0.0) * jnp.maximum(so_far, DARKEST)
-        return jnp.max(hidden, -1) <= 0
-
     def body(state):
         turn, slot, position, fresh, sums, image, stops = state
-        end = queue.ends[slot]
-        center = queue.centers[slot]
+        end, center = queue.ends[slot], queue.centers[slot]
         entries = _gather(rows, ids_list, center, position, end, local, plan, turn > 0)
         transmittance = jnp.where(fresh[:, None], 1.0, sums[-1])
         channels = [jnp.where(fresh[:, None], 0.0, a) for a in sums[:-1]]
@@ -285,7 +285,7 @@ def forward(rows, ids_list, offsets, plan: Plan):
         position = jnp.minimum(position + plan.chunk, end)
         done = position >= end
         if plan.stop_error is not None:
-            done = done | opaque(channels, transmittance)
+            done = done | _opaque(channels, transmittance, brightest, plan)
         target = jnp.where(done, slot, slots + lanes)
         image = tuple(
             a.at[target].set(b, mode="drop", unique_indices=True)
@@ -295,23 +295,19 @@ def forward(rows, ids_list, offsets, plan: Plan):
         turn, slot, position = queue.advance(turn, slot, position, done)
         return turn, slot, position, done, sums, image, stops
 
-    state = (
-        jnp.int32(lanes),
-        slot,
-        queue.starts[slot],
-        jnp.ones(lanes, bool),
-        tuple(jnp.zeros((lanes, pixels), rows.dtype) for _ in range(plan.channels + 1)),
-        tuple(
-            jnp.full((slots + lanes, pixels), float(k == plan.channels), rows.dtype)
-            for k in range(plan.channels + 1)
-        ),
-        jnp.concatenate([segments.starts, jnp.zeros(lanes, jnp.int32)]),
+    begin = jnp.int32(lanes), slot, queue.starts[slot], jnp.ones(lanes, bool)
+    sums = tuple(jnp.zeros((lanes, pixels), rows.dtype) for _ in range(plan.channels + 1))
+    image = tuple(
+        jnp.full((slots + lanes, pixels), float(k == plan.channels), rows.dtype)
+        for k in range(plan.channels + 1)
     )
+    stops = jnp.concatenate([segments.starts, jnp.zeros(lanes, jnp.int32)])
+    state = (*begin, sums, image, stops)
     state = lax.while_loop(lambda s: jnp.any(s[1] < slots), body, state)
     composited, stops = tuple(a[:slots] for a in state[5]), state[6][:slots]
     image, before = merge(composited, segments, plan)
     if plan.stop_error is not None:
-        hidden = opaque(before[:-1], before[-1])
+        hidden = _opaque(before[:-1], before[-1], brightest, plan)
         starts = segments.starts[plan.tile_count :]
         stops = stops.at[plan.tile_count :].set(jnp.where(hidden, starts, stops[plan.tile_count :]))
     return image, (segments, stops, before)
@@ -326,6 +322,66 @@ def _prefixes(first, values, step, group: int):
             state = step(state, values[:, start + j])
         states.append(state)
     return jnp.stack(states, 1)
+
+
+def _through(entries: _Entries, v_out, transmittance, remaining, within, plan: Plan, always):
+    """Follow light through the next entries of every lane; `within` numbers those of a group.
+
+    Returns:
+        Weights and gradients to the exponents, [B C P]; transmittance and light still to come
+        behind the entries, [B P].
+    """
+    alpha, row = entries.alpha, entries.rows
+    lanes, chunk, pixels = alpha.shape
+    group = within.shape[0]
+    # Transmittance before each entry in two levels: across groups, then within.
+    grouped = alpha.reshape(lanes, -1, group, pixels)
+    t_groups = materialize(
+        always, lambda: _prefixes(transmittance, alpha, lambda t, a: t * (1 - a), group)
+    )
+
+    def weights():
+        before = t_groups[:, :, None]
+        for j in range(group - 1):
+            before = before * jnp.where(within > j, 1 - grouped[:, :, j : j + 1], 1.0)
+        return (grouped * before).reshape(lanes, chunk, pixels)
+
+    def light():
+        channels = range(plan.channels)
+        return w * sum(row[:, :, GEOMETRY + k, None] * v_out[:, k, None] for k in channels)
+
+    w = materialize(always, weights)
+    q = materialize(always, light)
+    q_grouped = q.reshape(lanes, -1, group, pixels)
+    r_groups = materialize(always, lambda: _prefixes(remaining, q, lambda r, x: r - x, group))
+    after = r_groups[:, :, None]
+    for j in range(group):
+        after = after - jnp.where(within >= j, q_grouped[:, :, j : j + 1], 0.0)
+    v_exponent = jnp.where(
+        grouped < plan.alpha_max, q_grouped - after * (grouped / (1 - grouped)), 0.0
+    ).reshape(lanes, chunk, pixels)
+    remaining, transmittance = r_groups[:, -1], t_groups[:, -1]
+    for j in range(chunk - group, chunk):
+        remaining = remaining - q[:, j]
+        transmittance = transmittance * (1 - alpha[:, j])
+    return w, v_exponent, transmittance, remaining
+
+
+def _row_gradient(entries: _Entries, w, v_exponent, v_out, features, plan: Plan):
+    """Return the gradient to the rows of entries, [B C row], from moments over the pixels."""
+    lanes, chunk, pixels = w.shape
+    moments = (v_exponent.reshape(lanes * chunk, pixels) @ features).reshape(lanes, chunk, 8)
+    v_geometry = jnp.stack(
+        geometry_gradient(
+            [moments[..., i] for i in range(6)],
+            [entries.rows[..., i] for i in (2, 3, 4)],
+            (entries.u0, entries.v0, entries.dx0, entries.dy0),
+            plan.exponent_scale,
+        ),
+        -1,
+    )
+    v_color = jnp.einsum("bcp,bkp->bck", w, v_out)
+    return jnp.concatenate([v_geometry, v_color], -1)
 
 
 def backward(rows, ids_list, residuals, image, v_image, plan: Plan):
@@ -349,95 +405,37 @@ def backward(rows, ids_list, residuals, image, v_image, plan: Plan):
     v_channels = jnp.stack(v_image[:-1], 1)
     # The light still to come and the transmittance where each segment begins.
     behind = segments.tiles[plan.tile_count :]
-    light = jnp.concatenate(
-        [
-            light,
-            light[behind]
-            - sum(b * v[behind] for b, v in zip(before[:-1], v_image[:-1], strict=True)),
-        ]
+    there = light[behind] - sum(
+        b * v[behind] for b, v in zip(before[:-1], v_image[:-1], strict=True)
     )
-    ahead = before[-1]
+    light, ahead = jnp.concatenate([light, there]), before[-1]
     slot = queue.first()
-    group = PREFIX_GROUP if chunk % PREFIX_GROUP == 0 else 1
-    within = jnp.arange(group)[:, None]
+    within = jnp.arange(PREFIX_GROUP if chunk % PREFIX_GROUP == 0 else 1)[:, None]
 
     def body(state):
         turn, slot, position, fresh, transmittance, remaining, v_rows = state
         always = turn > 0
-        end = queue.ends[slot]
-        center = queue.centers[slot]
+        end, center = queue.ends[slot], queue.centers[slot]
         entries = _gather(rows, ids_list, center, position, end, (local_x, local_y), plan, always)
-        alpha, row = entries.alpha, entries.rows
         v_out = v_channels.at[tiles[slot]].get(mode="promise_in_bounds")
         extra = slot - plan.tile_count
         start = jnp.where(extra[:, None] < 0, 1.0, ahead.at[extra].get(mode="clip"))
         transmittance = jnp.where(fresh[:, None], start, transmittance)
         remaining = jnp.where(fresh[:, None], light.at[slot].get(mode="clip"), remaining)
-
-        # Transmittance before each entry in two levels: across groups, then within.
-        grouped = alpha.reshape(lanes, -1, group, pixels)
-        t_groups = materialize(
-            always, lambda: _prefixes(transmittance, alpha, lambda t, a: t * (1 - a), group)
+        w, v_exponent, transmittance, remaining = _through(
+            entries, v_out, transmittance, remaining, within, plan, always
         )
-
-        def weights():
-            before = t_groups[:, :, None]
-            for j in range(group - 1):
-                before = before * jnp.where(within > j, 1 - grouped[:, :, j : j + 1], 1.0)
-            return (grouped * before).reshape(lanes, chunk, pixels)
-
-        w = materialize(always, weights)
-        q = materialize(
-            always,
-            lambda: (
-                w
-                * sum(
-                    row[:, :, GEOMETRY + k, None] * v_out[:, k, None] for k in range(plan.channels)
-                )
-            ),
-        )
-        q_grouped = q.reshape(lanes, -1, group, pixels)
-        r_groups = materialize(always, lambda: _prefixes(remaining, q, lambda r, x: r - x, group))
-        after = r_groups[:, :, None]
-        for j in range(group):
-            after = after - jnp.where(within >= j, q_grouped[:, :, j : j + 1], 0.0)
-        v_exponent = jnp.where(
-            grouped < plan.alpha_max, q_grouped - after * (grouped / (1 - grouped)), 0.0
-        ).reshape(lanes, chunk, pixels)
-        remaining, transmittance = r_groups[:, -1], t_groups[:, -1]
-        for j in range(chunk - group, chunk):
-            remaining = remaining - q[:, j]
-            transmittance = transmittance * (1 - alpha[:, j])
-
-        moments = (v_exponent.reshape(lanes * chunk, pixels) @ features).reshape(lanes, chunk, 8)
-        v_geometry = jnp.stack(
-            geometry_gradient(
-                [moments[..., i] for i in range(6)],
-                [row[..., i] for i in (2, 3, 4)],
-                (entries.u0, entries.v0, entries.dx0, entries.dy0),
-                plan.exponent_scale,
-            ),
-            -1,
-        )
-        v_color = jnp.einsum("bcp,bkp->bck", w, v_out)
-        v_rows = v_rows.at[entries.ids].add(
-            jnp.concatenate([v_geometry, v_color], -1), mode="promise_in_bounds"
-        )
+        v_row = _row_gradient(entries, w, v_exponent, v_out, features, plan)
+        v_rows = v_rows.at[entries.ids].add(v_row, mode="promise_in_bounds")
         position = jnp.minimum(position + chunk, end)
         done = position >= end
         turn, slot, position = queue.advance(turn, slot, position, done)
         return turn, slot, position, done, transmittance, remaining, v_rows
 
     blank = jnp.zeros((lanes, pixels), rows.dtype)
-    state = (
-        jnp.int32(lanes),
-        slot,
-        queue.starts[slot],
-        jnp.ones(lanes, bool),
-        blank,
-        blank,
-        jnp.zeros((rows.shape[0], GEOMETRY + plan.channels), rows.dtype),
-    )
+    begin = jnp.int32(lanes), slot, queue.starts[slot], jnp.ones(lanes, bool)
+    v_rows = jnp.zeros((rows.shape[0], GEOMETRY + plan.channels), rows.dtype)
+    state = (*begin, blank, blank, v_rows)
     v_rows = lax.while_loop(lambda s: jnp.any(s[1] < queue.slots), body, state)[6]
     # A splat's own cutoff has no gradient.
     return jnp.pad(v_rows, ((0, 0), (0, rows.shape[1] - v_rows.shape[1])))

@@ -9,6 +9,7 @@ took as long as projecting them (BUILD_NOTES, "The step costs what a view shows"
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import jax
@@ -114,14 +115,8 @@ def take_rows(gaussians: Gaussians, ids: Int[Array, " v"], bands: int) -> Gaussi
     def rows(a):
         return a.at[ids].get(mode="clip")
 
-    return Gaussians(
-        means=rows(gaussians.means),
-        quats=rows(gaussians.quats),
-        log_scales=rows(gaussians.log_scales),
-        opacity_logits=rows(gaussians.opacity_logits),
-        sh=gaussians.sh.at[ids, :bands].get(mode="clip"),
-        vibration=jax.tree.map(rows, gaussians.vibration),
-    )
+    rest = jax.tree.map(rows, dataclasses.replace(gaussians, sh=None))
+    return dataclasses.replace(rest, sh=gaussians.sh.at[ids, :bands].get(mode="clip"))
 
 
 def put_rows(gaussians: Gaussians, ids: Int[Array, " v"], new: Gaussians) -> Gaussians:
@@ -133,15 +128,9 @@ def put_rows(gaussians: Gaussians, ids: Int[Array, " v"], new: Gaussians) -> Gau
     def rows(a, b):
         return a.at[ids].set(b, mode="drop", unique_indices=True)
 
-    bands = new.sh.shape[1]
-    return Gaussians(
-        means=rows(gaussians.means, new.means),
-        quats=rows(gaussians.quats, new.quats),
-        log_scales=rows(gaussians.log_scales, new.log_scales),
-        opacity_logits=rows(gaussians.opacity_logits, new.opacity_logits),
-        sh=gaussians.sh.at[ids, :bands].set(new.sh, mode="drop", unique_indices=True),
-        vibration=jax.tree.map(rows, gaussians.vibration, new.vibration),
-    )
+    rest = jax.tree.map(rows, *(dataclasses.replace(g, sh=None) for g in (gaussians, new)))
+    sh = gaussians.sh.at[ids, : new.sh.shape[1]].set(new.sh, mode="drop", unique_indices=True)
+    return dataclasses.replace(rest, sh=sh)
 
 
 def block_size(length: int) -> int:

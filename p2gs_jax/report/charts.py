@@ -89,14 +89,9 @@ def panels_chart(
     label: str,
     band: float | None = None,
 ) -> str:
-    """Return panels above each other with common axes.
+    """Return panels above each other, each with a title and curves, on common axes.
 
-    Args:
-        panels: title and curves of each, from top to bottom.
-        y_label: with its unit.
-        x_label: with its unit.
-        label: text alternative of the chart.
-        band: height of a horizontal line.
+    Labels of axes have their units; `label` is the text alternative; `band` a horizontal line.
     """
     every = [s for _, series in panels for s in series]
     values = [_reach(s) for s in every]
@@ -186,12 +181,7 @@ def response_chart(curves: Sequence[Series], *, label: str) -> str:
 
 
 def seams_chart(rows: Sequence[tuple[str, float, float]], *, label: str) -> str:
-    """Return a line per pair of photographs, from their difference as taken to that after.
-
-    Args:
-        rows: name, before and after, stops.
-        label: text alternative of the chart.
-    """
+    """Return a line per pair of photographs: name, and stops of difference before and after."""
     most = max(max(before, after) for _, before, after in rows)
 
     def draw(wide: bool) -> Figure:
@@ -227,15 +217,9 @@ def training_chart(
     *,
     label: str,
 ) -> str:
-    """Return PSNR, loss and Gaussians over the steps.
+    """Return PSNR (dB), losses by name, and numbers of Gaussians over the steps.
 
-    Args:
-        steps: of the log's lines.
-        psnr: dB.
-        losses: the whole loss and its largest terms, by name.
-        gaussians: how many there are.
-        marks: step, and what changes there.
-        label: text alternative of the chart.
+    `marks` are steps, and what changes there.
     """
     window = max(3, 2 * round(SMOOTHING * len(steps)) + 1)
     styles = [(INK, "-"), (FIRST, "--"), (SECOND, "-."), (THIRD, ":"), (FOURTH, (0, (5, 1, 1, 1)))]
@@ -293,12 +277,9 @@ def _plain(value: float, _: int) -> str:
 def against_chart(
     panels: Sequence[tuple[str, np.ndarray, np.ndarray]], *, first: str, label: str
 ) -> str:
-    """Return scatter plots of the exposures of several runs over those of the first one.
+    """Return scatter plots of exposures of several runs over those of the first one, stops.
 
-    Args:
-        panels: name of a run, exposures of the first run, exposures of this one, stops.
-        first: name of the first run.
-        label: text alternative of the chart.
+    A panel has the name of a run, exposures of the first run, and exposures of this one.
     """
     every = np.concatenate([v for _, x, y in panels for v in (x, y)])
     low, high = float(every.min()), float(every.max())

@@ -18,19 +18,13 @@ from p2gs_jax.report.page import figure, listed, paragraph, text
 from p2gs_jax.report.pictures import jpeg, read_png, spread
 from p2gs_jax.report.run_files import RunFiles, read_run
 from p2gs_jax.report.run_sections import flat, option_text
-from p2gs_jax.synth.exposures import read_true_exposures
+from p2gs_jax.synth.sensor import read_true_exposures
 
 MOST_VIEWS = 4
 
 
 class TableRow(NamedTuple):
-    """One line of a table.
-
-    Attributes:
-        name: with its unit.
-        cells: text for every run; empty where it has none.
-        best: runs that are best in it.
-    """
+    """A name with its unit; text for every run, empty where it has none; the runs that are best."""
 
     name: str
     cells: tuple[str, ...]
@@ -39,17 +33,17 @@ class TableRow(NamedTuple):
 
 @dataclass(frozen=True)
 class Comparison:
-    """A comparison of several runs.
+    """Several runs, in the order given, side by side.
 
     Attributes:
-        runs: in the order given.
+        runs: what their folders hold.
         labels: a short name for each, all different.
         remarks: sentences on what cannot be compared.
         same_scene: whether scores can be compared.
         scores: the table.
         options: options that differ.
-        exposures: label of each later run, and exposures of the first and of it in stops, of the
-            views that both have, means removed.
+        exposures: label of each later run; exposures of the first and of it in stops, of the views
+            that both have, means removed.
     """
 
     runs: tuple[RunFiles, ...]
@@ -240,11 +234,7 @@ def _markdown_table(head: str, labels: Sequence[str], rows: Sequence[TableRow]) 
 
 
 def write_comparison(found: Comparison, out: Path) -> tuple[Path, Path]:
-    """Write the page and, beside it, its tables as Markdown; return both paths.
-
-    Raises:
-        UserError: the page cannot be written.
-    """
+    """Write the page and, beside it, its tables as Markdown; return both paths."""
     markdown = out.with_suffix(".md")
     html.write_page(out, comparison_page(found))
     write_text(markdown, to_markdown(found))

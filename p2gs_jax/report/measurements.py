@@ -29,7 +29,7 @@ from p2gs_jax.report.pictures import LARGE, ViewComparison, jpeg, spread, withou
 from p2gs_jax.report.run_files import RunFiles
 from p2gs_jax.run.read import Run, load_run
 from p2gs_jax.scene.pixels.store import camera_of
-from p2gs_jax.synth.exposures import read_true_exposures
+from p2gs_jax.synth.sensor import read_true_exposures
 
 MOST_PAIRS, MOST_CLIPPED, MOST_RENDERED = 12, 24, 3
 # Seams are measured on images of at most this many pixels across.
@@ -80,10 +80,7 @@ class SceneMeasurements:
 def measure_scene(files: RunFiles, reporter: Reporter, *, render: bool = True) -> SceneMeasurements:
     """Load the scene and measure what the page needs; without a scene, say so in `missing`.
 
-    Args:
-        files: the run folder.
-        reporter: receives progress.
-        render: False reads only the true exposures.
+    Where `render` is False, only the true exposures are read.
     """
     out = SceneMeasurements()
     try:

@@ -59,11 +59,7 @@ def _read(name: str) -> str:
 
 
 def check_place(path: Path) -> None:
-    """Check the name of a page before any work is done.
-
-    Raises:
-        UserError: it is a folder, or does not end in .html.
-    """
+    """Raise a UserError where a page cannot have this name: a folder, or not an .html file."""
     if path.suffix.lower() not in (".html", ".htm") or path.is_dir():
         raise UserError(
             f"{path} is not a valid name for a page.", fix="name a file that ends in .html"
@@ -71,11 +67,7 @@ def check_place(path: Path) -> None:
 
 
 def write_page(path: Path, html_text: str) -> None:
-    """Write a page.
-
-    Raises:
-        UserError: the file cannot be written, or does not end in .html.
-    """
+    """Write a page; a UserError says why it cannot be written."""
     check_place(path)
     try:
         write_text(path, html_text)
@@ -87,11 +79,7 @@ def write_page(path: Path, html_text: str) -> None:
 
 
 def find_browser() -> str:
-    """Return the path of a browser that prints.
-
-    Raises:
-        UserError: there is none.
-    """
+    """Return the path of a browser that prints; a UserError says what was looked for."""
     path = next(filter(None, map(shutil.which, BROWSERS)), None)
     if path is None:
         raise UserError(
@@ -102,11 +90,7 @@ def find_browser() -> str:
 
 
 def print_pdf(page: Path, out: Path, browser: str) -> Path:
-    """Print a page into a PDF file with a browser from `find_browser`.
-
-    Raises:
-        UserError: the browser did not print.
-    """
+    """Print a page into a PDF file; a UserError says why the browser did not."""
     with atomic_write(out) as temporary, tempfile.TemporaryDirectory() as profile:
         command = [
             *(browser, "--headless", "--disable-gpu", "--no-first-run", "--no-pdf-header-footer"),
@@ -160,11 +144,9 @@ def figure(content: str, caption: str) -> str:
 
 
 def row(cells: Sequence[tuple[str, str]], columns: str) -> str:
-    """Return pictures beside each other; above each other on narrow screens.
+    """Return pictures (HTML) with captions beside each other; above each other on narrow screens.
 
-    Args:
-        cells: picture as HTML, and its caption.
-        columns: `two`, `three`, or `many` where there may be more.
+    The columns are `two`, `three`, or `many` where there may be more.
     """
     inner = "".join(f"<div>{picture}<span>{text(under)}</span></div>" for picture, under in cells)
     return f'<div class="row {columns}">{inner}</div>'

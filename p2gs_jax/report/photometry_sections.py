@@ -64,9 +64,7 @@ def _panels(
 ) -> list[tuple[str, Sequence[Series]]]:
     """Return a panel for each camera, or one for all where there are many or small ones.
 
-    Args:
-        run: the run.
-        curves: returns the curves of a panel from its views and their places.
+    `curves` returns those of a panel from its views and their places.
     """
     by_camera = {f"camera {c}": [v for v in run.views if v["camera"] == c] for c in run.cameras}
     small = np.median([len(rows) for rows in by_camera.values()]) < FEWEST_VIEWS

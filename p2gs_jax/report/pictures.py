@@ -31,15 +31,9 @@ MID_GREY = 0.18
 
 @dataclass(frozen=True)
 class ViewComparison:
-    """A photograph and its render.
+    """A photograph and its render, display values, with radiance and PSNR (dB) where known.
 
-    Attributes:
-        name: of the view.
-        split: train or test.
-        photograph: display values.
-        render: under the view's own exposure, or that fitted to its photograph.
-        linear: radiance, or None.
-        psnr: of the render, dB, or None if unknown.
+    The render is under the view's own exposure, or under that fitted to its photograph.
     """
 
     name: str
@@ -51,12 +45,9 @@ class ViewComparison:
 
 
 def held_out_comparisons(run: RunFiles, most: int, problems: list[str]) -> list[ViewComparison]:
-    """Return held-out views from files: evenly over all of them, the worst first.
+    """Return at most so many held-out views from files: evenly over all, the worst first.
 
-    Args:
-        run: the folder.
-        most: views at most.
-        problems: receives a sentence for every view that could not be read.
+    `problems` receives a sentence for every view that could not be read.
     """
     scores = run.part("test", "exposure_fitted", "per_view")
     psnr = {h.name: number_at(scores, h.name, "psnr") for h in run.held_out}
@@ -84,11 +75,7 @@ def spread(items: Sequence, most: int) -> list:
 
 
 def read_png(path: Path) -> Float32[np.ndarray, "h w 3"]:
-    """Return display values of a PNG or JPEG.
-
-    Raises:
-        UserError: it cannot be read.
-    """
+    """Return display values of a PNG or JPEG; a UserError says that it cannot be read."""
     try:
         raw = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR)
     except (OSError, cv2.error):

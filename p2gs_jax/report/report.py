@@ -55,12 +55,7 @@ def write_report(
 
 
 def report_page(run: RunFiles, scene: SceneMeasurements) -> str:
-    """Return the page of a run.
-
-    Args:
-        run: what its folder holds.
-        scene: what was measured on its scene.
-    """
+    """Return the page of a run from what its folder holds and what was measured on its scene."""
     problems: list[str] = []
     truth = scene.true_exposures
     views = pictures.held_out_comparisons(run, MOST_COMPARED, problems) or list(scene.comparisons)

@@ -16,13 +16,9 @@ from p2gs_jax.run.photometry_files import PhotometryFile, ViewPhotometry, read_p
 
 
 class HeldOutFiles(NamedTuple):
-    """Files of a held-out view.
+    """Files of a held-out view: photograph, render fitted to it, and radiance or None.
 
-    Attributes:
-        name: of the view, as `metrics.json` knows it; without suffix where it does not.
-        photograph: PNG.
-        render: PNG, under the exposure fitted to the photograph.
-        exr: linear radiance, or None.
+    The name is that of `metrics.json`; without suffix where it does not know the view.
     """
 
     name: str
@@ -114,14 +110,9 @@ def number_at(values: Any, *path: str) -> float | None:
 
 
 def read_run(folder: Path, scene: Path | None = None) -> RunFiles:
-    """Read everything that a run folder holds.
+    """Read everything that a run folder holds; a UserError says that it is not one.
 
-    Args:
-        folder: the run.
-        scene: where its scene lies now; None looks where it was.
-
-    Raises:
-        UserError: it is not a run folder.
+    The scene is looked for where it was, unless the caller says where it lies now.
     """
     path = folder / "config.json"
     if not path.is_file():

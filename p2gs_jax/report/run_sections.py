@@ -182,9 +182,7 @@ def _shift(item: Any) -> float:
 def unexplained_section(run: RunFiles, problems: list[str]) -> str:
     """Return pixels of training views that no static scene explains.
 
-    Args:
-        run: the folder.
-        problems: receives a sentence for every picture that could not be read.
+    `problems` receives a sentence for every picture that could not be read.
     """
     share, folder = run.number("unexplained", "share"), RunFolder(run.folder).unexplained
     if share is None:

@@ -33,53 +33,34 @@ LEFT, NARROW_LEFT, RIGHT, NARROW_RIGHT, GAP = 58, 40, 74, 56, 34
 LABEL_GAP = 15.0
 # Width of a character over the size of the text, with a margin.
 CHARACTER = 0.62
-# Placeholders: what matplotlib draws with, and what the page has for it.
+# Placeholders that matplotlib draws with, and the variables that the page has for them.
 INK, MUTED, GRID = "#100001", "#100002", "#100003"
 FIRST, SECOND, THIRD, FOURTH, PAPER = "#100004", "#100005", "#100006", "#100007", "#100008"
-VARIABLES = {
-    INK: "--ink",
-    MUTED: "--muted",
-    GRID: "--grid",
-    FIRST: "--first",
-    SECOND: "--second",
-    THIRD: "--third",
-    FOURTH: "--fourth",
-    PAPER: "--paper",
-}
+VARIABLES = {INK: "--ink", MUTED: "--muted", GRID: "--grid", FIRST: "--first", SECOND: "--second"}
+VARIABLES |= {THIRD: "--third", FOURTH: "--fourth", PAPER: "--paper"}
 RC: dict[Any, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "p2gs-jax",
     "font.family": "DejaVu Sans",
-    "font.size": TEXT,
+    "text.color": INK,
+    "grid.color": GRID,
     "axes.edgecolor": MUTED,
     "axes.labelcolor": MUTED,
-    "axes.linewidth": 0.8,
     "axes.spines.top": False,
     "axes.spines.right": False,
-    "axes.unicode_minus": True,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": GRID,
-    "grid.linewidth": 0.8,
-    "text.color": INK,
-    "xtick.color": MUTED,
-    "ytick.color": MUTED,
-    "xtick.labelcolor": MUTED,
-    "ytick.labelcolor": MUTED,
-    "figure.facecolor": "none",
-    "axes.facecolor": "none",
-    "savefig.facecolor": "none",
     "lines.solid_capstyle": "round",
 }
+RC |= dict.fromkeys(("axes.linewidth", "grid.linewidth"), 0.8)
+RC |= dict.fromkeys(("axes.grid", "axes.axisbelow", "axes.unicode_minus"), True)
+RC |= dict.fromkeys(("figure.facecolor", "axes.facecolor", "savefig.facecolor"), "none")
+RC |= {f"{axis}tick.{part}": MUTED for axis in "xy" for part in ("color", "labelcolor")}
 _NUMBERS = itertools.count(1)
 
 
 def chart(draw: Callable[[bool], Figure], label: str) -> str:
-    """Return a chart as HTML, wide and narrow.
+    """Return a chart as HTML: `draw` returns the wide figure (True) or the narrow one.
 
-    Args:
-        draw: returns the figure; True asks for the wide one. Called with the page's settings.
-        label: text alternative of the chart.
+    `label` is the text alternative.
     """
     parts = []
     for wide in (True, False):
@@ -148,15 +129,8 @@ def stack(
 ) -> tuple[Figure, list[Axes], float]:
     """Return a figure of `count` panels above each other, their axes, and the panels' width.
 
-    Args:
-        wide: which of the two widths.
-        count: number of panels.
-        each: height of a panel, CSS pixels, as all that follow.
-        top: above the first panel.
-        below: below the last one's gap.
-        left: margin; None: that for numbers.
-        right: margin at least.
-        widest: largest width of a panel.
+    `each` is the height of a panel; `right` is the least, `widest` the largest of what they name.
+    All are CSS pixels.
     """
     left = (LEFT if wide else NARROW_LEFT) if left is None else left
     right = max(RIGHT if wide else NARROW_RIGHT, right)
@@ -184,26 +158,16 @@ def set_ticks(axes: Axes, across: int, down: int | None = None, *, whole: bool =
 
 
 def label_ends(axes: Axes, labels: Sequence[tuple[str, float, str]]) -> None:
-    """Write names of curves beside their ends, moved apart where they would overlap.
+    """Write names of curves to the right of their ends, moved apart where they would overlap.
 
-    Args:
-        axes: of the curves; the names are written to their right.
-        labels: text, height of the curve's end in data, colour.
+    A label is its text, the height of the curve's end in data, and the colour.
     """
-    low, high = axes.get_ylim()
-    figure = axes.get_figure()
-    assert isinstance(figure, Figure)
-    tall = axes.get_position().height * figure.get_size_inches()[1] * 72
-    forward = axes.yaxis.get_transform().transform
-    backward = axes.yaxis.get_transform().inverted().transform
-    bottom, top = forward(low), forward(high)
-    wanted = [(float(forward(y)) - bottom) / (top - bottom) * tall for _, y, _ in labels]
-    order = sorted(range(len(labels)), key=lambda i: wanted[i])
-    for i, at in zip(order, spread_apart([wanted[i] for i in order], LABEL_GAP), strict=True):
-        text, _, color = labels[i]
-        value = float(backward(bottom + at / tall * (top - bottom)))
-        where = {"va": "center", "ha": "left", "transform": axes.get_yaxis_transform()}
-        axes.text(1.012, value, text, color=color, **where)
+    heights = [float(axes.transData.transform((0, y))[1]) for _, y, _ in labels]
+    order = sorted(range(len(labels)), key=lambda i: heights[i])
+    for i, at in zip(order, spread_apart([heights[i] for i in order], LABEL_GAP), strict=True):
+        share = (at - axes.bbox.y0) / axes.bbox.height
+        where = {"va": "center", "ha": "left", "transform": axes.transAxes}
+        axes.text(1.012, share, labels[i][0], color=labels[i][2], **where)
 
 
 def spread_apart(heights: list[float], gap: float) -> list[float]:

@@ -67,7 +67,9 @@ class CheckpointStore:
             naming(self.folder, size=sum(part.nbytes for part in parts)),
             atomic_folder(self.folder / str(step)) as folder,
         ):
-            np.savez(folder / FILE, *parts, **{TABLE: np.array(values)})
+            arrays = {f"arr_{i}": part for i, part in enumerate(parts)}
+            arrays[TABLE] = np.array(values)
+            np.savez(folder / FILE, allow_pickle=False, **arrays)
         for older in saved_steps(self.folder)[: -self.keep]:
             shutil.rmtree(self.folder / str(older))
 

@@ -25,7 +25,6 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core.streams import noise_key
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.mcmc import shaped_noise
-from p2gs_jax.losses.total import Partner
 from p2gs_jax.render.capacity import Room
 from p2gs_jax.render.harmonics import coefficient_count
 from p2gs_jax.render.visible import (
@@ -39,12 +38,12 @@ from p2gs_jax.render.visible import (
 )
 from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.train import image_gradient
-from p2gs_jax.train.advance import Moved, StepReport, is_healthy, settled
+from p2gs_jax.train.exposure_loss import Partner
 from p2gs_jax.train.image_gradient import ImageGradient, Listed, differentiable
 from p2gs_jax.train.optimizer import learning_rates, means_rate
 from p2gs_jax.train.state import Fault, FitState
-from p2gs_jax.train.step import Step, per_gaussian, static_sizes
-from p2gs_jax.train.update import update_listed
+from p2gs_jax.train.step import Step, frusta_of, per_gaussian, static_sizes
+from p2gs_jax.train.update import StepReport, is_healthy, settled, update_listed
 from p2gs_jax.types import Batch, Frustum, Gaussians
 
 VIEWS = "views"
@@ -236,23 +235,14 @@ def advance(
     cfg,
     optimizer,
     extent: float,
+    noise: float | None,
     degree: int,
     views: int,
 ) -> tuple[FitState, StepReport]:
-    """Move everything by one step, on each device alike; see `train.advance.advance`.
+    """Move everything by one step, on each device alike; see `update.advance`.
 
-    Args:
-        state: before the step; donated.
-        ids: from `show`, for the device's views.
-        visible: likewise.
-        gradient: from `differentiate`.
-        frusta: as in `show`.
-        controls: of the schedule.
-        cfg: rendering, rates, noise.
-        optimizer: from `make_optimizer`.
-        extent: scene extent, scene units.
-        degree: highest spherical-harmonics degree that moves.
-        views: of the step.
+    `ids` and `visible` are those of the device's views, from `show`; `views` counts those of the
+    step.
     """
     gaussians, population = state.params.gaussians, state.population
     alive, n, bands = population.alive, gaussians.capacity, coefficient_count(degree)
@@ -266,10 +256,9 @@ def advance(
     progress, rate = controls.progress, controls.rate
     rates = learning_rates(progress, rate, extent, state.params, cfg, bands)
     rates = jax.tree.map(lambda r: r * views**0.5, rates)
-    mcmc = cfg.densify.method == "mcmc"
     updated = update_listed(
         gaussians,
-        state.opt_state.gaussians[0],
+        state.opt_state.gaussians,
         alive,
         seen,
         count,
@@ -278,18 +267,18 @@ def advance(
         # Their gradient is known: a Gaussian is what it is made of.
         seen=lambda block, on, owner: block,
         v_seen=jax.tree.map(lambda g: g / views, take_rows(sums.gradient, seen, bands)),
-        optimizer=optimizer.gaussians,
+        adam=optimizer.gaussians,
         rates=rates.gaussians,
-        noise=_noise(state, controls, cfg, extent, views) if mcmc else None,
+        noise=None if noise is None else _noise(noise, state, controls, cfg, extent, views),
         owner=population.owner,
     )
-    if not mcmc:
+    if noise is None:
         population = dataclasses.replace(
             population,
             grad2d_sum=population.grad2d_sum + jnp.where(healthy, sums.grad2d, 0),
             seen_count=population.seen_count + jnp.where(healthy, sums.pulled, 0),
         )
-    moved = Moved(updated, population)
+    moved = (updated, population)
     return settled(
         state, moved, gradient, fits, most, rates, cfg=cfg, optimizer=optimizer, views=views
     )
@@ -340,10 +329,10 @@ def _sums(state, ids, visible, gradient, frusta, controls, cfg, bands: int) -> S
     return lax.psum(sums, VIEWS)
 
 
-def _noise(state, controls, cfg, extent: float, views: int):
+def _noise(scale: float, state, controls, cfg, extent: float, views: int):
     """Return the noise of `update_listed`; each Gaussian's is its own, whatever else is listed."""
     key = noise_key(controls.seed, state.step)
-    rate = cfg.densify.noise * means_rate(controls.progress, controls.rate, extent, cfg)
+    rate = scale * means_rate(controls.progress, controls.rate, extent, cfg)
     rate = rate * views**0.5
 
     def noise(block, rows, moved, on):
@@ -442,7 +431,7 @@ class ParallelStep:
                 width=np.full(every, frustum.width, np.float32),
                 height=np.full(every, frustum.height, np.float32),
             )
-            for frustum in self.single.frusta(batch, partner)
+            for frustum in frusta_of(batch, partner)
         )
 
     def _shapes(self, tree, spec: P):

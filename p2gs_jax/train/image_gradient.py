@@ -3,19 +3,28 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from p2gs_jax.config import FitConfig, RenderConfig
-from p2gs_jax.losses.total import Partner, decoded, image_loss
-from p2gs_jax.photometry.appearance import Corrections
+from p2gs_jax.config import FitConfig
+from p2gs_jax.photometry.appearance import Correction, Corrections, correction_of
+from p2gs_jax.photometry.formation import Matte, composited, formation, uncovered
+from p2gs_jax.photometry.luminance import Curves
+from p2gs_jax.render import render_splats
 from p2gs_jax.render.harmonics import coefficient_count
 from p2gs_jax.render.project import camera_of_each
-from p2gs_jax.render.visible import Shown, compact, in_view, splat_listed, whole_blocks
-from p2gs_jax.types import Batch, Frustum, Gaussians, Photometry
+from p2gs_jax.render.visible import Shown, compact, in_view, splat, splat_listed, whole_blocks
+from p2gs_jax.train.exposure_loss import Partner
+from p2gs_jax.train.terms import Aux, LossTerm, Rendered, Target, censor
+from p2gs_jax.types import Batch, Frustum, Gaussians, Params, Photometry, Render
+
+# Photographed colours of pixels that are less opaque are black.
+LEAST_SEEN = 0.5 / 255
 
 
 class Listed(NamedTuple):
@@ -30,6 +39,24 @@ class Listed(NamedTuple):
     ids: Int[Array, " v"]
     visible: Int[Array, ""]
     shown: tuple[Shown, ...]
+
+
+class LossAux(NamedTuple):
+    """What a step reports beside the loss.
+
+    Attributes:
+        terms: weighted terms by name.
+        render: of the training view.
+        ldr: its display image, unclamped.
+        entries: tile-list entries that the larger of the renders needed.
+        overflow: a tile list did not fit.
+    """
+
+    terms: dict[str, Float[Array, ""]]
+    render: Render
+    ldr: Float[Array, "h w 3"]
+    entries: Int[Array, ""]
+    overflow: Bool[Array, ""]
 
 
 class ImageGradient(NamedTuple):
@@ -63,8 +90,7 @@ def show(
     active_degree: Int[Array, ""],
     owner: Int[Array, " n"] | None = None,
     *,
-    cfg: RenderConfig,
-    visible_only: bool,
+    cfg: FitConfig,
     room: int,
     degree: int,
 ) -> Listed:
@@ -76,22 +102,155 @@ def show(
         frusta: the views.
         active_degree: spherical-harmonics degree in use.
         owner: the moving object that each Gaussian belongs to, or None.
-        cfg: rendering options.
-        visible_only: leave out what no view may show (`OptimizerConfig.visible_only`).
+        cfg: rendering; whether what no view may show is left out.
         room: length of the list; what finds no place is counted, not listed.
         degree: highest spherical-harmonics degree that is evaluated.
     """
-    n = gaussians.capacity
-    if visible_only:
+    n, render = gaussians.capacity, cfg.render
+    if cfg.optimizer.visible_only:
         views = (camera_of_each(f, owner) for f in frusta)
-        may = functools.reduce(jnp.logical_or, (in_view(gaussians, alive, v, cfg) for v in views))
+        may = functools.reduce(
+            jnp.logical_or, (in_view(gaussians, alive, v, render) for v in views)
+        )
         ids, count = compact(may, whole_blocks(min(room, n)))
     else:
         index = jnp.arange(whole_blocks(n), dtype=jnp.int32)
         ids, count = jnp.minimum(index, n), jnp.int32(n)
     bands = coefficient_count(degree)
-    shown = splat_listed(gaussians, alive, ids, count, frusta, cfg, active_degree, bands, owner)
+    shown = splat_listed(gaussians, alive, ids, count, frusta, render, active_degree, bands, owner)
     return Listed(ids, count, shown)
+
+
+def decoded(batch: Batch) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"]]:
+    """Return a photograph in [0, 1] and its mask as floats; they travel as they are stored.
+
+    One with alpha is put over its backdrop. Both have the precision of the camera.
+    """
+    kind = batch.camera.K.dtype
+    ldr = batch.ldr.astype(kind)
+    scale = float(np.iinfo(batch.ldr.dtype).max) if batch.ldr.dtype.kind == "u" else 1.0
+    ldr = ldr / scale
+    if batch.alpha is not None and batch.backdrop is not None:
+        ldr = ldr + (1 - unit(batch.alpha)[..., None]) * batch.backdrop
+    return ldr, batch.mask.astype(kind)
+
+
+def unit(stored: Array) -> Float[Array, "..."]:
+    """Return stored integers as floats, the largest as 1; floats as they are."""
+    scale = float(jnp.iinfo(stored.dtype).max) if stored.dtype.kind == "u" else 1.0
+    return stored.astype(jnp.float32) / scale
+
+
+def compared(
+    render: Render,
+    batch: Batch,
+    photometry: Photometry,
+    correction: Correction | None,
+    cfg: FitConfig,
+) -> tuple[Rendered, Target]:
+    """Return a view as it is rendered and its photograph, as loss terms take them.
+
+    A photograph with alpha and the render are put over one background. What a saturated photograph
+    cannot contradict is decided before that: a white background saturates nothing.
+    """
+    capture = photometry.capture(batch.view_index)
+    loss, formed = cfg.loss, cfg.photometry
+    if batch.alpha is None:
+        target = Target(*decoded(batch), None, batch.measured)
+        matte, there = None, render.linear
+        own = formation(there, capture, formed, correction)
+        ldr, held = own, target.ldr
+    else:
+        assert batch.backdrop is not None
+        pixels, alpha = unit(batch.ldr), unit(batch.alpha)
+        photograph = pixels + (1 - alpha[..., None]) * batch.backdrop
+        target = Target(photograph, batch.mask.astype(jnp.float32), alpha, batch.measured)
+        matte = Matte(render.alpha, batch.backdrop)
+        there = uncovered(render.linear, matte)
+        own = formation(there, capture, formed, correction)
+        ldr = composited(own, matte)
+        seen = alpha[..., None] > LEAST_SEEN
+        held = jnp.where(seen, pixels / jnp.maximum(alpha, LEAST_SEEN)[..., None], 0.0)
+    judged = ldr
+    if loss.censored:
+        judged = composited(censor(own, held, loss.saturation), matte)
+    uncorrected = None
+    if isinstance(correction, Curves):
+        uncorrected = composited(formation(there, capture, formed), matte)
+    rendered = Rendered(render.linear, render.alpha, render.depth, ldr, judged, uncorrected)
+    return rendered, target
+
+
+def image_loss(
+    shown: tuple[Shown, ...],
+    photometry: Photometry,
+    appearance: Corrections | None,
+    batch: Batch,
+    partner: Partner,
+    cfg: FitConfig,
+    terms: Mapping[str, LossTerm],
+    capacity: int,
+) -> tuple[Float[Array, ""], LossAux]:
+    """Return the loss of one view and its terms.
+
+    Args:
+        shown: splats and radiance in the view and in each of `partner.cameras`.
+        photometry: exposures and gammas of all views.
+        appearance: corrections of display values, or None.
+        batch: the photograph.
+        partner: the second view of the relative-exposure loss.
+        cfg: rendering, formation model, what a saturated pixel tells.
+        terms: by name.
+        capacity: tile-list entries.
+    """
+    deep = any(getattr(term, "needs_depth", False) for term in terms.values())
+    cameras = (batch.camera, *partner.cameras)
+    render, *others = (
+        render_splats(*splats, camera, cfg.render, capacity, with_depth=deep and k == 0)
+        for k, (splats, camera) in enumerate(zip(shown, cameras, strict=True))
+    )
+    correction = correction_of(appearance, batch.view_index)
+    rendered, target = compared(render, batch, photometry, correction, cfg)
+    aux = Aux(
+        batch.view_index,
+        photometry.capture(batch.view_index),
+        photometry,
+        appearance,
+        correction,
+        partner.view_index,
+        others[0].linear if others else None,
+        partner.pairs,
+    )
+    found = {name: term(rendered, target, aux) for name, term in terms.items()}
+    values = {name: value for name, value in found.items() if value is not None}
+    entries, overflow = render.count, render.overflow
+    for other in others:
+        entries, overflow = jnp.maximum(entries, other.count), overflow | other.overflow
+    loss = jax.tree.reduce(jnp.add, values)
+    return loss, LossAux(values, render, rendered.ldr, entries, overflow)
+
+
+def total_loss(
+    params: Params,
+    alive: Bool[Array, " n"],
+    batch: Batch,
+    partner: Partner,
+    cfg: FitConfig,
+    terms: Mapping[str, LossTerm],
+    *,
+    capacity: int,
+    active_degree: Int[Array, ""] | int,
+    owner: Int[Array, " n"] | None = None,
+) -> tuple[Float[Array, ""], LossAux]:
+    """Return the loss of one view and its terms, as one function of the parameters.
+
+    The step computes the same in blocks (train/step.py). Arguments are those of `image_loss` and
+    `show`.
+    """
+    cameras = (batch.camera, *partner.cameras)
+    shown = splat(params.gaussians, alive, cameras, cfg.render, active_degree, owner)
+    given = (params.photometry, params.appearance, batch, partner, cfg, terms, capacity)
+    return image_loss(shown, *given)
 
 
 def differentiate(
@@ -102,6 +261,7 @@ def differentiate(
     partner: Partner,
     *,
     cfg: FitConfig,
+    terms: tuple[tuple[str, LossTerm], ...],
     room: int,
 ) -> ImageGradient:
     """Composite a view, compare it with its photograph and return the gradient of the loss.
@@ -112,12 +272,13 @@ def differentiate(
         appearance: corrections of all views, or None.
         batch: the view and its photograph.
         partner: the second view, as the loss needs it.
-        cfg: rendering, loss and formation model.
+        cfg: see `image_loss`.
+        terms: by name.
         room: length of the tile lists.
     """
     (loss, aux), (v_shown, *v_rest) = jax.value_and_grad(
         image_loss, argnums=(0, 1, 2), has_aux=True, allow_int=True
-    )(shown, photometry, appearance, batch, partner, cfg, room)
+    )(shown, photometry, appearance, batch, partner, cfg, dict(terms), room)
     photograph, mask = decoded(batch)
     squared = mask[..., None] * (jnp.clip(aux.ldr, 0, 1) - photograph) ** 2
     mse = jnp.sum(squared) / jnp.maximum(3 * jnp.sum(mask), 1)

@@ -1,22 +1,152 @@
-"""What a step is given beside its state: a photograph, a second view, the schedule."""
+"""What a step is given beside its state: photographs, a second view, the schedule.
+
+All of it follows from the seed and the step number.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Hashable, Sequence
+from typing import NamedTuple, TypeVar
 
+import jax
 import numpy as np
+from jaxtyping import Float32, Int
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import on_host
-from p2gs_jax.core.streams import device_seed
-from p2gs_jax.losses.relative_exposure import ColorPairs
-from p2gs_jax.losses.total import Partner
+from p2gs_jax.core.streams import Stream, device_seed, generator, view_order
+from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.train import schedule
-from p2gs_jax.train.advance import Controls
-from p2gs_jax.train.batches import stacked
-from p2gs_jax.train.partner import partner_at
-from p2gs_jax.train.views import TrainingViews
-from p2gs_jax.types import Batch
+from p2gs_jax.train.exposure_loss import SECOND_RENDER_FORMS, ColorPairs, Partner
+from p2gs_jax.train.update import Controls
+from p2gs_jax.types import Batch, Camera, Measured
+
+Tree = TypeVar("Tree")
+
+# Observations that a step compares.
+PAIRS_PER_STEP = 4096
+
+
+class TrainingViews:
+    """Photographs of the training views at any level of the coarse-to-fine schedule.
+
+    Args:
+        store: decodes and caches photographs.
+        rows: rows of the training views in the scene, in the order of `Photometry`.
+        seed: decides the order of every epoch.
+        measured: of every training view the depths that the loss compares with, or None.
+    """
+
+    def __init__(
+        self,
+        store: ImageStore,
+        rows: Sequence[int],
+        seed: int,
+        measured: Sequence[Measured] | None = None,
+    ):
+        self.store, self.rows = store, tuple(rows)
+        self.seed, self.measured = seed, measured
+        self._orders: dict[int, np.ndarray] = {}
+        self._per_epoch: dict[int, int] = {}
+        self._batched: tuple[int, int, list[tuple[int, ...]]] = (-1, 0, [])
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def index_at(self, step: int) -> int:
+        """Return the row in `Photometry` of the view of a step; every epoch is a permutation."""
+        epoch, position = divmod(step, len(self.rows))
+        if epoch not in self._orders:
+            self._orders = {epoch: view_order(self.seed, epoch, len(self.rows))}
+        return int(self._orders[epoch][position])
+
+    def indices_at(self, step: int, count: int) -> tuple[int, ...]:
+        """Return the rows of the views that a step of `count` views takes; they have one size.
+
+        `step` counts the views taken before it.
+        """
+        if count == 1:
+            return (self.index_at(step),)
+        if count not in self._per_epoch:
+            self._per_epoch[count] = len(self._batches(0, count))
+        epoch, position = divmod(step // count, self._per_epoch[count])
+        return self._batches(epoch, count)[position]
+
+    def _batches(self, epoch: int, count: int) -> list[tuple[int, ...]]:
+        if self._batched[:2] != (epoch, count):
+            views = [self.store.views[row] for row in self.rows]
+            kinds = [(v.width, v.height) for v in views]
+            order = view_order(self.seed, epoch, len(self.rows))
+            self._batched = (epoch, count, batches_of(order, kinds, count))
+        return self._batched[2]
+
+    def partner_at(self, step: int, index: int) -> int:
+        """Return a second view, different from that of the step where there are two."""
+        rng = generator(self.seed, Stream.PARTNER, step)
+        count = len(self.rows)
+        return (index + int(rng.integers(1, max(count, 2)))) % count
+
+    def prefetch(self, index: int, shrink: int) -> None:
+        """Begin decoding a view in the background."""
+        self.store.prefetch(self.rows[index], shrink)
+
+    def camera(self, index: int, shrink: int) -> Camera:
+        """Return the camera of a training view at a level, on the host."""
+        row = self.rows[index]
+        return on_host(Camera, *self.store.camera(row, shrink), self.store.placement(row))
+
+    def batch(self, index: int, shrink: int, step: int = 0) -> Batch:
+        """Return a training view, on the host: a compiled step takes it from there.
+
+        `step` draws the background, where every step has another.
+        """
+        row = self.rows[index]
+        ldr, mask = self.store.stored(row, shrink)
+        measured = None if self.measured is None else self.measured[index]
+        given = (self.camera(index, shrink), ldr, mask, np.int32(index), measured)
+        return on_host(Batch, *given, self.store.alpha(row, shrink), self._backdrop(step))
+
+    def _backdrop(self, step: int) -> Float32[np.ndarray, " 3"] | None:
+        if not self.store.random_backdrop:
+            return self.store.backdrop
+        return generator(self.seed, Stream.BACKDROP, step).random(3).astype(np.float32)
+
+
+def batches_of(
+    order: Int[np.ndarray, " v"], kinds: Sequence[Hashable], count: int
+) -> list[tuple[int, ...]]:
+    """Return an epoch as batches of views that one program can take, each view once at least.
+
+    Views of a kind stay in their order. What is left over of a kind is filled up from its
+    beginning; batches take the turn of their first view.
+
+    Args:
+        order: the views of the epoch.
+        kinds: of every view; those of one kind have images of one size.
+        count: views of a batch.
+    """
+    by_kind: dict[Hashable, list[int]] = {}
+    for view in order:
+        by_kind.setdefault(kinds[view], []).append(int(view))
+    place = {int(view): at for at, view in enumerate(order)}
+    batches: list[tuple[int, ...]] = []
+    for views in by_kind.values():
+        whole = np.resize(views, -(-len(views) // count) * count)
+        batches += [tuple(row.tolist()) for row in whole.reshape(-1, count)]
+    return sorted(batches, key=lambda batch: place[batch[0]])
+
+
+def stacked(trees: Sequence[Tree]) -> Tree:
+    """Return host records as one, along a new first axis; photographs keep the finer type."""
+    return jax.tree.map(lambda *arrays: np.stack(_of_one_type(arrays)), *trees)
+
+
+def _of_one_type(arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Return pixels of 8 bits as of 16 where others are: 255 and 65535 both stand for 1."""
+    arrays = [np.asarray(a) for a in arrays]
+    if {a.dtype for a in arrays} == {np.dtype(np.uint8), np.dtype(np.uint16)}:
+        return [a.astype(np.uint16) * 257 if a.dtype == np.uint8 else a for a in arrays]
+    return arrays
 
 
 class Inputs(NamedTuple):
@@ -38,56 +168,75 @@ class Inputs(NamedTuple):
         return self.batch.camera.width, self.batch.camera.height
 
 
-class InputSource:
-    """The inputs of every step of a fit; they follow from the seed and the step number.
+def controls_at(progress: float, pace: float, shown: float, cfg: FitConfig) -> Controls:
+    """Return what the schedule says at this point of a run.
 
     Args:
-        cfg: everything.
-        views: the training views.
-        pairs: corresponding observations, for the relative-exposure readings that need them.
+        progress: fraction of the run completed.
+        pace: progress of one step.
         shown: share of the scene that a view shows.
+        cfg: schedules, seed.
     """
+    degree = schedule.sh_degree_at(progress, cfg.train, cfg.render.sh_degree)
+    rate = schedule.rate_factor(pace, shown, cfg.optimizer.settled)
+    given = (np.float32(progress), np.int32(degree), np.float32(rate))
+    return on_host(Controls, *given, device_seed(cfg.train.seed))
 
-    def __init__(
-        self,
-        cfg: FitConfig,
-        views: TrainingViews,
-        pairs: ColorPairs | None,
-        shown: float,
-    ):
-        self.cfg, self.views, self.pairs, self.shown = cfg, views, pairs, shown
 
-    def at(self, step: int, progress: float, pace: float, shrink: int) -> Inputs:
-        """Return the inputs of a step.
+def inputs_at(
+    step: int,
+    controls: Controls,
+    shrink: int,
+    views: TrainingViews,
+    pairs: ColorPairs | None,
+    cfg: FitConfig,
+) -> Inputs:
+    """Return the inputs of a step.
 
-        Args:
-            step: its number.
-            progress: fraction of the run completed before it.
-            pace: progress of one step.
-            shrink: factor by which images are shrunk.
-        """
-        cfg = self.cfg
-        degree = schedule.sh_degree_at(progress, cfg.train, cfg.render.sh_degree)
-        rate = schedule.rate_factor(pace, self.shown, cfg.optimizer.settled)
-        controls = on_host(
-            Controls,
-            np.float32(progress),
-            np.int32(degree),
-            np.float32(rate),
-            device_seed(cfg.train.seed),
+    Args:
+        step: views taken before it.
+        controls: of the schedule.
+        shrink: factor by which images are shrunk.
+        views: the training views.
+        pairs: corresponding observations, where the relative-exposure loss compares photographs.
+        cfg: the reading of that loss, views of a step, the seed.
+    """
+    rows = views.indices_at(step, cfg.train.batch)
+    each = [
+        (
+            views.batch(row, shrink, step + k),
+            partner_at(step + k, row, shrink, views, pairs, cfg),
         )
-        rows = self.views.indices_at(step, cfg.train.batch)
-        each = [self._of_view(step + k, row, shrink) for k, row in enumerate(rows)]
-        if len(each) == 1:
-            return Inputs(*each[0], controls)
-        batches, partners = zip(*each, strict=True)
-        return Inputs(stacked(batches), stacked(partners), controls)
+        for k, row in enumerate(rows)
+    ]
+    if len(each) == 1:
+        return Inputs(*each[0], controls)
+    batches, partners = zip(*each, strict=True)
+    return Inputs(stacked(batches), stacked(partners), controls)
 
-    def _of_view(self, step: int, row: int, shrink: int) -> tuple[Batch, Partner]:
-        batch = self.views.batch(row, shrink, step)
-        return batch, partner_at(step, row, shrink, self.views, self.pairs, self.cfg)
 
-    def prefetch(self, step: int, shrink: int) -> None:
-        """Begin decoding the photographs of a step in the background."""
-        for row in self.views.indices_at(step, self.cfg.train.batch):
-            self.views.prefetch(row, shrink)
+def partner_at(
+    step: int,
+    index: int,
+    shrink: int,
+    views: TrainingViews,
+    pairs: ColorPairs | None,
+    cfg: FitConfig,
+) -> Partner:
+    """Return the partner of a step's view, as much of it as the reading of the loss needs.
+
+    `index` is the row of the view; for the others see `inputs_at`.
+    """
+    relative = cfg.loss.relative_exposure
+    if relative.weight is None:
+        return on_host(Partner, np.int32(0))
+    other = views.partner_at(step, index)
+    camera, drawn = None, None
+    if relative.form in SECOND_RENDER_FORMS:
+        camera = views.camera(other, shrink)
+    elif pairs is not None:
+        count = pairs.views_i.shape[0]
+        rng = generator(cfg.train.seed, Stream.STEP_PAIRS, step)
+        pick = rng.integers(0, count, min(PAIRS_PER_STEP, count))
+        drawn = jax.tree.map(lambda a: np.asarray(a)[pick], pairs)
+    return on_host(Partner, np.int32(other), camera, drawn)

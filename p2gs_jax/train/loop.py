@@ -9,11 +9,12 @@ their sums repeat (`RenderConfig.deterministic`).
 
 from __future__ import annotations
 
-import dataclasses
 import functools
-from collections.abc import Callable
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -24,28 +25,36 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core import interrupts
 from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.core.progress import LogRecord
+from p2gs_jax.core.runtime import return_freed_memory
+from p2gs_jax.errors import DivergenceError
 from p2gs_jax.gaussians.population import STEP_SECONDS_PER_PIXEL, Coverage
-from p2gs_jax.losses.relative_exposure import ColorPairs
+from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.run.decisions import Decisions
-from p2gs_jax.train import room, schedule
-from p2gs_jax.train.burst import Bursts
-from p2gs_jax.train.checkpoints import RunCheckpoints, pause_between
+from p2gs_jax.train import room, schedule, strategies
 from p2gs_jax.train.data_parallel import ParallelStep, Spread, default_mesh
-from p2gs_jax.train.host import HostState
-from p2gs_jax.train.inputs import InputSource
-from p2gs_jax.train.level_programs import LevelPrograms
-from p2gs_jax.train.log import RunLog, record_of
+from p2gs_jax.train.exposure_loss import ColorPairs
+from p2gs_jax.train.inputs import Inputs, TrainingViews, controls_at, inputs_at
 from p2gs_jax.train.optimizer import make_optimizer
-from p2gs_jax.train.programs import StepPrograms
-from p2gs_jax.train.schedule import Pace
-from p2gs_jax.train.session import Session
-from p2gs_jax.train.state import FitState, count_alive, initial_state
-from p2gs_jax.train.step import Step
-from p2gs_jax.train.strategies import RunContext, Strategy, make_strategy
-from p2gs_jax.train.views import TrainingViews
+from p2gs_jax.train.records import RunCheckpoints, RunLog, pause_between, record_of
+from p2gs_jax.train.schedule import RunClock
+from p2gs_jax.train.state import (
+    FAULT_NONFINITE,
+    FAULT_OVERFLOW,
+    FitState,
+    HostState,
+    alive_in,
+    initial_state,
+)
+from p2gs_jax.train.step import Key, Step, StepPrograms
+from p2gs_jax.train.strategies import Strategy
+from p2gs_jax.train.terms import LossTerm
+from p2gs_jax.train.update import StepReport, finite_names
 from p2gs_jax.types import Gaussians, Params
 
 NEARLY_DONE = 0.99
+MAX_BURST = 50
+# Share of a new pace in its running estimate.
+PACE_SHARE = 0.3
 
 
 @dataclass(frozen=True)
@@ -63,7 +72,7 @@ class TrainResult:
     state: FitState
     host: HostState
     max_gaussians: int
-    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
 
 
 class Trainer:
@@ -73,7 +82,7 @@ class Trainer:
         cfg: everything.
         views: the training views.
         extent: scene extent, scene units.
-        pairs: corresponding observations, for the relative-exposure readings that need them.
+        pairs: corresponding observations, where the relative-exposure loss compares photographs.
         coverage: how much of the scene the views show.
         run_dir: where `log.jsonl` and `checkpoints/` go.
         programs: compiled steps, some of them perhaps begun.
@@ -81,6 +90,12 @@ class Trainer:
         on_log: called with every log record.
         on_message: called with everything the user must know.
         mesh: the devices of a step of several views; None: the default one.
+        terms: loss terms to add to those of `cfg`, or to replace; None takes one away.
+        strategy: decides when and how the population changes; None: as `cfg` says.
+        now: seconds on a clock that never goes back.
+        store: of the checkpoints; None: `checkpoints/`.
+
+    A formation of yours is passed as `params.appearance` of `run`.
     """
 
     def __init__(
@@ -96,44 +111,35 @@ class Trainer:
         on_log: Callable[[LogRecord], None] = lambda record: None,
         on_message: Callable[[str], None] = lambda text: None,
         mesh: Mesh | None = None,
+        terms: Mapping[str, LossTerm | None] | None = None,
+        strategy: Strategy | None = None,
+        now: Callable[[], float] = time.monotonic,
+        store: CheckpointStore | None = None,
     ):
-        self.cfg, self.views, self.coverage = cfg, views, coverage
-        self.programs, self.on_message = programs, on_message
+        self.cfg, self.views, self.extent, self.pairs = cfg, views, extent, pairs
+        self.coverage, self.programs, self.on_message, self.now = (
+            coverage,
+            programs,
+            on_message,
+            now,
+        )
         sizes = [views.camera(i, 1) for i in range(len(views))]
         width, height = min(c.width for c in sizes), min(c.height for c in sizes)
         self.levels = schedule.levels(cfg.train, width, height)
-        self.clock = Stopwatch()
+        self.stopwatch = Stopwatch()
         self.log = RunLog(run_dir, on_log)
-        self.checkpoints = RunCheckpoints(run_dir, cfg, decided, on_message)
+        store = store or CheckpointStore(run_dir / "checkpoints")
+        self.checkpoints = RunCheckpoints(store, cfg, decided, on_message)
         self.asked = interrupts.Held()
         self.optimizer = make_optimizer(cfg)
+        self.strategy = strategy or strategies.make_strategy(cfg, coverage, self.levels)
         if cfg.train.batch > 1:
             mesh = mesh or default_mesh()
-        step = Step(cfg, self.optimizer, extent)
-        step = step if mesh is None else ParallelStep(step, mesh)
+        noise = getattr(self.strategy, "noise", None)
+        self.step: Any = Step(cfg, self.optimizer, extent, noise, terms or {})
+        if mesh is not None:
+            self.step = ParallelStep(self.step, mesh)
         self.spread = Spread(mesh)
-        self.source = InputSource(cfg, views, pairs, coverage.shown)
-        self.steps = LevelPrograms(cfg, step, programs, self.levels)
-        self.bursts = Bursts(
-            cfg.train,
-            self.levels,
-            self.source,
-            self.steps,
-            self.spread,
-            self.checkpoints,
-            self.clock,
-        )
-        self.context = RunContext(
-            cfg=cfg,
-            extent=extent,
-            coverage=coverage,
-            levels=self.levels,
-            views=views,
-            programs=programs,
-            spread=self.spread,
-            clock=self.clock,
-            on_message=on_message,
-        )
 
     def run(
         self,
@@ -160,32 +166,36 @@ class Trainer:
             UserError: no Gaussian is left, or checkpoints cannot be continued from.
             Interrupted: a signal asked for the end; a checkpoint is written first.
         """
-        strategy = make_strategy(self.context, int(np.sum(np.asarray(alive))))
-        state = initial_state(params, alive, self.optimizer, strategy.slots, owner)
-        pace = Pace.from_config(self.cfg.train, spent_s + finish_s)
-        host = HostState(pace=pace.per_step)
+        self.slots = strategies.started(self.strategy, int(np.sum(np.asarray(alive))))
+        state = initial_state(params, alive, self.optimizer, self.slots.slots, owner)
+        host = HostState(pace=1.0 / max(self.cfg.train.steps, 1))
         restored = self.checkpoints.restore(state) if resume else None
         if restored is None:
             self.log.clear()
         else:
             state, host = restored
             self.log.truncate(host.step)
-            pace = dataclasses.replace(pace, per_step=host.pace)
-        full_step_s = STEP_SECONDS_PER_PIXEL * self.coverage.pixels
-        session = Session(pace, host, finish_s=finish_s, full_step_s=full_step_s)
+        clock = RunClock(
+            self.cfg.train,
+            host,
+            spent_s=spent_s,
+            finish_s=finish_s,
+            full_step_s=STEP_SECONDS_PER_PIXEL * self.coverage.pixels,
+            now=self.now,
+        )
         population = state.population
-        self._allocate(state.params.gaussians, population.alive, population.owner, host, strategy)
+        self._allocate(state.params.gaussians, population.alive, population.owner, host)
         state = self.spread.spread(state)
-        self._expect(state, host, strategy)
+        self._expect(state, host)
         with interrupts.held() as self.asked:
-            state = self._loop(state, host, session, strategy)
+            state = self._loop(state, host, clock)
             state = self.spread.whole(state)
             self._save(state, host)
         return TrainResult(
             state,
             host,
-            strategy.limit or state.params.gaussians.capacity,
-            {"compiling": self.programs.waited_s, **self.clock.seconds},
+            self.slots.limit or state.params.gaussians.capacity,
+            {"compiling": self.programs.waited_s, **self.stopwatch.seconds},
         )
 
     def expect(self, params: Params, owner, images: bool) -> None:
@@ -197,24 +207,30 @@ class Trainer:
             images: the tone curve is known.
         """
         seeds = params.gaussians.capacity
-        strategy = make_strategy(self.context, seeds)
+        self.slots = strategies.started(self.strategy, seeds)
         alive, host = np.ones(seeds, bool), HostState(rooms=dict(self.programs.rooms))
-        self._allocate(params.gaussians, alive, owner, host, strategy)
+        self._allocate(params.gaussians, alive, owner, host)
         self.programs.rooms = dict(host.rooms)
-        start = functools.partial(initial_state, optimizer=self.optimizer, slots=strategy.slots)
-        self._expect(jax.eval_shape(start, params, alive, owner=owner), host, strategy, images)
+        start = functools.partial(initial_state, optimizer=self.optimizer, slots=self.slots.slots)
+        self._expect(jax.eval_shape(start, params, alive, owner=owner), host, images)
 
-    def _loop(
-        self, state: FitState, host: HostState, session: Session, strategy: Strategy
-    ) -> FitState:
+    # ------------------------------------------------------------------ bursts of steps
+
+    def _loop(self, state: FitState, host: HostState, clock: RunClock) -> FitState:
         """Take bursts until the run is complete, or its time over."""
-        saved, pause = host.elapsed_s, self.cfg.train.checkpoint_every_s
+        every_s = self.cfg.train.checkpoint_every_s
+        saved, pause = host.elapsed_s, every_s
         while not schedule.is_over(host.progress, host.pace):
-            state, stepped = self._take_burst(state, host, session)
-            if stepped:
-                state = strategy.update(state, host)
-            session.replan(host)
-            if session.over(host):
+            state, reports = self._take_burst(state, host)
+            clock.tick(host)
+            if reports:
+                alive, left_s = alive_in(state.population), clock.left(host, self.levels)
+                self.log.append(record_of(reports, host, alive, left_s))
+                # From here on a signal waits for the next place to continue from.
+                self.asked.begin()
+                state = self._densified(state, host)
+            clock.replan(host)
+            if clock.over(host):
                 if host.progress < NEARLY_DONE:
                     self.on_message(
                         f"The budget ended the run at {host.progress:.0%} of its schedule: fit "
@@ -225,9 +241,9 @@ class Trainer:
             if asked is not None or host.elapsed_s - saved > pause:
                 begun = host.elapsed_s
                 self._save(self.spread.whole(state), host)
-                session.tick(host)
+                clock.tick(host)
                 saved = host.elapsed_s
-                pause = pause_between(self.cfg.train.checkpoint_every_s, saved - begun)
+                pause = pause_between(every_s, saved - begun)
             if asked is not None:
                 self.on_message(
                     f"{interrupts.name_of(asked)}: the run stops after step {host.step} "
@@ -236,28 +252,105 @@ class Trainer:
                 self.asked.deliver()
         return state
 
-    def _take_burst(
-        self, state: FitState, host: HostState, session: Session
-    ) -> tuple[FitState, bool]:
-        """Take a burst of steps and log it; return the state, and whether there were any."""
-        state, reports = self.bursts.take(state, host)
-        session.tick(host)
-        if reports:
-            left_s = session.left(host, self.levels)
-            alive = count_alive(state)
-            record = record_of(reports, host, alive, host.shrink, left_s=left_s)
-            self.log.append(record)
-            # From here on a signal waits for the next place to continue from.
-            self.asked.begin()
-        return state, bool(reports)
+    def _take_burst(self, state: FitState, host: HostState) -> tuple[FitState, list[StepReport]]:
+        """Dispatch steps up to the next line of the log, then read how they went.
+
+        Where a view finds no room, the steps that the device refused do not count, and the room
+        grows.
+
+        Args:
+            state: to start from; donated.
+            host: counters; changed.
+
+        Returns:
+            The state, and a report of every step that was taken.
+
+        Raises:
+            DivergenceError: a loss term or gradient is not finite.
+        """
+        shrink = schedule.shrink_at(host.progress, self.levels)
+        if shrink != host.shrink:
+            host.shrink, host.step_s = shrink, 0.0
+            return_freed_memory()
+        begin, waited = self.now(), self.programs.waited_s
+        state, reports, sizes = self._dispatched(state, host)
+        kind = int(state.fault.kind)
+        done = int(state.step) - host.step
+        taken = done // self.cfg.train.batch
+        seconds = self.now() - begin - (self.programs.waited_s - waited)
+        self.stopwatch.add("steps", seconds)
+        if kind == FAULT_NONFINITE:
+            name = finite_names(reports[taken].terms, state.params)[int(state.fault.term)]
+            raise DivergenceError(
+                f"Step {host.step + done + 1}: the {name} is not finite; "
+                f"{self.checkpoints.last_good()}.",
+                fix="lower the learning rates (--optimizer.*) or report the scene; "
+                "--resume continues from the last good checkpoint",
+            )
+        if kind == FAULT_OVERFLOW:
+            needed, visible = int(state.fault.needed), int(state.fault.visible)
+            host.rooms = room.grown(host.rooms, sizes[taken], needed, visible)
+            host.overflows += 1
+            state = self.spread.healed(state)
+        elif done:
+            pace, known = seconds / done, host.step_s > 0
+            host.step_s = (1 - PACE_SHARE) * host.step_s + PACE_SHARE * pace if known else pace
+        host.step += done
+        for _ in range(done):
+            host.progress += host.pace
+        return state, reports[:taken]
+
+    def _dispatched(
+        self, state: FitState, host: HostState
+    ) -> tuple[FitState, list[StepReport], list[tuple[int, int]]]:
+        """Dispatch the steps of a burst; return the state, and report and image size of each."""
+        progress, reports, sizes = host.progress, [], []
+        every, views = self.cfg.train.log_every, self.cfg.train.batch
+        end = host.step + min(every - host.step % every, MAX_BURST)
+        for step in range(host.step, end, views):
+            if schedule.is_over(progress, host.pace):
+                break
+            if schedule.shrink_at(progress, self.levels) != host.shrink:
+                break
+            for row in self.views.indices_at(step + views, views):
+                self.views.prefetch(row, host.shrink)
+            inputs = self._inputs(step, progress, host.pace, host.shrink)
+            key = self._key(state, inputs, host, host.shrink)
+            state, report = self.programs.get(self.step, key, state, *inputs)(state, *inputs)
+            reports.append(report)
+            sizes.append(inputs.size)
+            for _ in range(views):
+                progress = progress + host.pace
+        return state, reports, sizes
+
+    def _inputs(self, step: int, progress: float, pace: float, shrink: int) -> Inputs:
+        controls = controls_at(progress, pace, self.coverage.shown, self.cfg)
+        return inputs_at(step, controls, shrink, self.views, self.pairs, self.cfg)
+
+    # ---------------------------------------------------------------- between the bursts
+
+    def _densified(self, state: FitState, host: HostState) -> FitState:
+        """Return the state with another population, where it is time to change it."""
+        with self.stopwatch("densification"):
+            if not strategies.is_due(self.strategy, self.cfg.densify, host):
+                return state
+            host.densified_at = host.progress
+            state = strategies.densified(
+                self.strategy,
+                self.spread.whole(state),
+                host,
+                self.cfg,
+                self.extent,
+                self.slots.limit,
+                self.on_message,
+            )
+            return self.spread.spread(state)
 
     def _save(self, state: FitState, host: HostState) -> None:
-        with self.clock("checkpoints"):
+        with self.stopwatch("checkpoints"):
             self.checkpoints.save(state, host)
 
-    def _allocate(
-        self, gaussians: Gaussians, alive: Bool, owner, host: HostState, strategy: Strategy
-    ) -> None:
+    def _allocate(self, gaussians: Gaussians, alive: Bool, owner, host: HostState) -> None:
         """Make room for the image sizes to come."""
         host.rooms = room.allocate(
             host.rooms,
@@ -266,26 +359,43 @@ class Trainer:
             schedule.shrinks_left(host.progress, self.levels),
             gaussians,
             alive,
-            strategy.most,
+            self.slots.most,
             self.cfg.render,
             owner,
         )
 
-    def _expect(
-        self, state: FitState, host: HostState, strategy: Strategy, images: bool = True
-    ) -> None:
+    def _expect(self, state: FitState, host: HostState, images: bool = True) -> None:
         """Begin to compile what is known of the steps to come.
+
+        Levels with images of several sizes are left out: it is not known which comes first.
 
         Args:
             state: to start from, or its shapes.
             host: how far the run is, and its rooms.
-            strategy: whether slots stay; it may have programs of its own.
             images: see `expect`.
         """
-        if not strategy.slots_stay:
+        if not getattr(self.strategy, "slots_stay", True):
             return
-        for number, shrink in enumerate(self.steps.ahead(host.progress, self.views)):
-            inputs = self.source.at(host.step, 0.0, host.pace, shrink)
-            self.steps.expect(state, inputs, host, shrink, images)
-            if number == 0:
-                strategy.expect(state)  # wanted soon after the first step
+        left = schedule.shrinks_left(host.progress, self.levels)
+        ahead = [shrink for shrink in left if len(room.cameras_by_size(self.views, shrink)) == 1]
+        for number, shrink in enumerate(ahead):
+            inputs = self._inputs(host.step, 0.0, host.pace, shrink)
+            key = self._key(state, inputs, host, shrink)
+            self.programs.expect(self.step, key, state, *inputs, images=images)
+            expect = getattr(self.strategy, "expect", None)
+            if number == 0 and expect is not None:
+                expect(self.programs, state)  # wanted soon after the first step
+
+    def _key(self, state: FitState, inputs: Inputs, host: HostState, shrink: int) -> Key:
+        """Return what a step of a level is compiled for."""
+        batch, cfg = inputs.batch, self.cfg
+        degree = schedule.highest_degree(shrink, self.levels, cfg.train, cfg.render.sh_degree)
+        comes_with = (batch.measured, batch.alpha, batch.camera.objects, inputs.partner.pairs)
+        return Key(
+            inputs.size,
+            state.params.gaussians.capacity,
+            host.rooms[room.size_name(inputs.size)],
+            degree,
+            str(batch.ldr.dtype),
+            jax.tree.structure((state, comes_with)),
+        )

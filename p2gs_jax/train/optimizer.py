@@ -8,12 +8,10 @@ it was seen. Everything else has one count.
 from __future__ import annotations
 
 import dataclasses
-import functools
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import optax
 from jaxtyping import Array, Bool, Float, Int
 
 from p2gs_jax.config import FitConfig
@@ -21,8 +19,6 @@ from p2gs_jax.gaussians.population import grow
 from p2gs_jax.photometry.models import MODELS
 from p2gs_jax.types import Gaussians, Params, Photometry, Vibration
 
-# For exposures, gammas and corrections (Kingma and Ba).
-B1, B2 = 0.9, 0.999
 # Of a rate that warms up, what it starts from (PPISP: 0.01).
 WARMUP_START = 0.01
 
@@ -49,90 +45,72 @@ class OptState(NamedTuple):
         rest: of photometry and appearance.
     """
 
-    gaussians: tuple[AdamState, optax.EmptyState]
-    rest: tuple[AdamState, optax.EmptyState]
+    gaussians: AdamState
+    rest: AdamState
 
 
-def scale_by_adam(
-    b1: float, b2: float, eps: float, *, by_row: bool
-) -> optax.GradientTransformation:
-    """Return Adam (Kingma and Ba 2015).
+class Adam(NamedTuple):
+    """Adam (Kingma and Ba 2015), as a static argument of compiled functions.
 
-    Args:
+    Attributes:
         b1: share of the old mean of the gradients.
         b2: share of the old mean of their squares.
         eps: added to the root of the second moment.
         by_row: count updates of every row, which the first axes of all parameters share.
     """
 
-    def init(params) -> AdamState:
-        rows = jax.tree.leaves(params)[0].shape[:1] if by_row else ()
+    b1: float = 0.9
+    b2: float = 0.999
+    eps: float = 1e-15
+    by_row: bool = False
+
+    def init(self, params: Any) -> AdamState:
+        """Return the state before the first update."""
+        rows = jax.tree.leaves(params)[0].shape[:1] if self.by_row else ()
         zeros = (jax.tree.map(jnp.zeros_like, params) for _ in range(2))
         return AdamState(jnp.zeros(rows, jnp.int32), *zeros)
 
-    def update(updates, state: AdamState, params=None):
-        del params
+    def update(
+        self, grads: Any, state: AdamState, params: Any, rates: Any
+    ) -> tuple[Any, AdamState]:
+        """Return parameters and state after an update; `rates` broadcast against the leaves."""
+        b1, b2 = self.b1, self.b2
         counts = state.counts + 1
-        mu = jax.tree.map(lambda m, g: b1 * m + (1 - b1) * g, state.mu, updates)
-        nu = jax.tree.map(lambda v, g: b2 * v + (1 - b2) * g * g, state.nu, updates)
+        mu = jax.tree.map(lambda m, g: b1 * m + (1 - b1) * g, state.mu, grads)
+        nu = jax.tree.map(lambda v, g: b2 * v + (1 - b2) * g * g, state.nu, grads)
         kind = jax.tree.leaves(mu)[0].dtype
         first = 1 / (1 - b1 ** counts.astype(kind))
         second = 1 / (1 - b2 ** counts.astype(kind))
 
-        def scaled(m, v):
-            shape = counts.shape + (1,) * (m.ndim - counts.ndim) if by_row else ()
-            return first.reshape(shape) * m / (jnp.sqrt(second.reshape(shape) * v) + eps)
+        def moved(p, m, v, rate):
+            shape = counts.shape + (1,) * (m.ndim - counts.ndim) if self.by_row else ()
+            scaled = first.reshape(shape) * m / (jnp.sqrt(second.reshape(shape) * v) + self.eps)
+            return (p + -rate * scaled).astype(p.dtype)
 
-        return jax.tree.map(scaled, mu, nu), AdamState(counts, mu, nu)
-
-    return optax.GradientTransformation(init, update)  # pyright: ignore[reportArgumentType]
-
-
-def scale_by_rates() -> optax.GradientTransformationExtraArgs:
-    """Multiply each update by minus its own learning rate, given at update time as `rates`."""
-
-    def update(updates, state, params=None, **extra: Any):
-        del params
-        rates = extra["rates"]
-        return jax.tree.map(lambda u, r: -r * u, updates, rates), state
-
-    return optax.GradientTransformationExtraArgs(lambda params: optax.EmptyState(), update)
+        return jax.tree.map(moved, params, mu, nu, rates), AdamState(counts, mu, nu)
 
 
 class Optimizer(NamedTuple):
-    """Two optax chains over the parameters.
+    """Adam over the parameters; equal for equal constants.
 
     Attributes:
         gaussians: for any rows of the Gaussians.
         rest: for (photometry, appearance).
     """
 
-    gaussians: optax.GradientTransformationExtraArgs
-    rest: optax.GradientTransformationExtraArgs
+    gaussians: Adam
+    rest: Adam
 
     def init(self, params: Params) -> OptState:
         """Return the state before the first step."""
-        # optax annotates trees as nests of containers and does not know our records.
-        return OptState(
-            self.gaussians.init(params.gaussians),  # pyright: ignore[reportArgumentType]
-            self.rest.init((params.photometry, params.appearance)),  # pyright: ignore
-        )
+        rest = (params.photometry, params.appearance)
+        return OptState(self.gaussians.init(params.gaussians), self.rest.init(rest))
 
 
 def make_optimizer(cfg: FitConfig) -> Optimizer:
-    """Return Adam followed by the group rates; the same object for the same constants.
-
-    So it can be a static argument of compiled functions.
-    """
-    return _adam_with_rates(cfg.optimizer.b1, cfg.optimizer.b2, cfg.optimizer.eps)
-
-
-@functools.cache
-def _adam_with_rates(b1: float, b2: float, eps: float) -> Optimizer:
-    return Optimizer(
-        optax.chain(scale_by_adam(b1, b2, eps, by_row=True), scale_by_rates()),
-        optax.chain(scale_by_adam(B1, B2, eps, by_row=False), scale_by_rates()),
-    )
+    """Return the optimiser of a fit; exposures, gammas and corrections keep Adam's own betas."""
+    o = cfg.optimizer
+    return Optimizer(Adam(o.b1, o.b2, o.eps, by_row=True), Adam(eps=o.eps))
 
 
 def means_rate(progress: Array, rate: Array, extent: float, cfg: FitConfig) -> Float[Array, ""]:
@@ -210,18 +188,11 @@ def learning_rates(
     )
 
 
-def _changed(opt_state: OptState, change, counts) -> OptState:
-    adam, *others = opt_state.gaussians
-    moments = AdamState(counts, change(adam.mu), change(adam.nu))
-    return opt_state._replace(gaussians=(moments, *others))
-
-
 def grow_moments(opt_state: OptState, empty: Gaussians) -> OptState:
     """Append zero moments for new slots, as many as `empty` has."""
-    adam, *others = opt_state.gaussians
     zeros = jax.tree.map(jnp.zeros_like, empty)
-    none = AdamState(jnp.zeros(empty.capacity, adam.counts.dtype), zeros, zeros)
-    return opt_state._replace(gaussians=(grow(adam, none), *others))
+    none = AdamState(jnp.zeros(empty.capacity, opt_state.gaussians.counts.dtype), zeros, zeros)
+    return opt_state._replace(gaussians=grow(opt_state.gaussians, none))
 
 
 def zero_moments(opt_state: OptState, where: Bool[Array, " n"]) -> OptState:
@@ -232,13 +203,16 @@ def zero_moments(opt_state: OptState, where: Bool[Array, " n"]) -> OptState:
             lambda a: jnp.where(where.reshape((-1,) + (1,) * (a.ndim - 1)), 0.0, a), moment
         )
 
-    return _changed(opt_state, zero, jnp.where(where, 0, opt_state.gaussians[0].counts))
+    adam = opt_state.gaussians
+    counts = jnp.where(where, 0, adam.counts)
+    return opt_state._replace(gaussians=AdamState(counts, zero(adam.mu), zero(adam.nu)))
 
 
 def zero_opacity_moments(opt_state: OptState) -> OptState:
     """Forget the opacity moments of all slots (3DGS, at an opacity reset)."""
-    return _changed(
-        opt_state,
-        lambda m: dataclasses.replace(m, opacity_logits=jnp.zeros_like(m.opacity_logits)),
-        opt_state.gaussians[0].counts,
-    )
+
+    def zero(m: Gaussians) -> Gaussians:
+        return dataclasses.replace(m, opacity_logits=jnp.zeros_like(m.opacity_logits))
+
+    adam = opt_state.gaussians
+    return opt_state._replace(gaussians=adam._replace(mu=zero(adam.mu), nu=zero(adam.nu)))

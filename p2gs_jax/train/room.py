@@ -1,6 +1,6 @@
 """How much room the views of a run need, estimated on the host from above.
 
-In numpy: counting exactly would be one more program to compile for every image size.
+It is done in numpy: counting exactly would be one more program to compile for every image size.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from p2gs_jax.render.capacity import Room
 from p2gs_jax.render.project import LOG_SCALE_RANGE, TANGENT_LIMIT, at_time, camera_of_each
 from p2gs_jax.render.tiles import smallest_cutoff
 from p2gs_jax.render.visible import in_view
-from p2gs_jax.train.views import TrainingViews
+from p2gs_jax.train.inputs import TrainingViews
 from p2gs_jax.types import Camera, Gaussians
 
-# Of the first of these many views, evenly spread.
+# Views of one size that are counted, evenly spread.
 SAMPLED_VIEWS = 32
 
 
@@ -34,14 +34,8 @@ def count_view(
 ) -> tuple[int, int]:
     """Return (tile-list entries, visible Gaussians) that a view needs at most, up to rounding.
 
-    Entries are the tiles of all bounding boxes, visible is the count of `in_view`.
-
-    Args:
-        gaussians: the scene, on the host.
-        alive: slots in use.
-        camera: the view, on the host.
-        cfg: near plane, blur, cutoffs, tile size.
-        owner: the moving object that each Gaussian belongs to, or None.
+    Entries are the tiles of all bounding boxes, visible is the count of `in_view`. Everything is on
+    the host; `owner` is the moving object that each Gaussian belongs to.
     """
     gaussians = at_time(gaussians, camera.objects)
     camera = camera_of_each(camera, owner)  # pyright: ignore[reportArgumentType]
@@ -89,13 +83,8 @@ def room_for(
 ) -> Room:
     """Return room for all views of one image size, to the end of a run.
 
-    Args:
-        gaussians: the population, on the host.
-        alive: slots in use.
-        cameras: the views, on the host; some of them are counted.
-        limit: the largest population to come; the share that a view shows is taken to stay.
-        cfg: see `count_view`.
-        owner: likewise.
+    Some of the cameras are counted. `limit` is the largest population to come; the share of it that
+    a view shows is taken to stay.
     """
     picks = evenly_spaced(len(cameras), SAMPLED_VIEWS)
     counts = [count_view(gaussians, alive, cameras[i], cfg, owner) for i in picks]
@@ -143,8 +132,8 @@ def allocate(
         gaussians: the population.
         alive: slots in use.
         limit: the largest population to come.
-        cfg: see `count_view`.
-        owner: likewise.
+        cfg: near plane, blur, cutoffs, tile size.
+        owner: see `count_view`.
     """
     found = dict(rooms)
     gaussians, alive, owner = jax.tree.map(np.asarray, (gaussians, alive, owner))
@@ -159,14 +148,7 @@ def allocate(
 
 
 def grown(rooms: Mapping[str, Room], size: tuple[int, int], entries: int, visible: int) -> Rooms:
-    """Return rooms after a view found none.
-
-    Args:
-        rooms: before.
-        size: of the view's image.
-        entries: that it needs.
-        visible: Gaussians that it shows.
-    """
+    """Return rooms after a view of this size found none for its entries or visible Gaussians."""
     name = size_name(size)
     return _sharing_visible({**rooms, name: rooms[name].grown(entries, visible)})
 

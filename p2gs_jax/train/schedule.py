@@ -6,17 +6,20 @@ wall-clock budget by changing only how much progress one step makes.
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from dataclasses import dataclass
+import time
+from collections.abc import Callable
 
 from p2gs_jax.config import TrainConfig
+from p2gs_jax.train.state import HostState
 
 MIN_LEVEL_PIXELS = 96
 MIN_STEPS_LEFT = 8
 MAX_SPEED_UP = 1.5
 # Seconds of a step over those at half the width, late in it (ours: 1.6 to 2.8 on photographs).
 COST_OF_A_LEVEL = 2.0
+# How many times slower than an unloaded machine this one may be taken for.
+MOST_SLOWNESS = 3.0
 
 # End of each level as a progress, and the factor by which its images are shrunk; in order.
 Levels = tuple[tuple[float, int], ...]
@@ -70,18 +73,19 @@ def seconds_left(progress: float, per_step: float, step_s: float, plan: Levels) 
 
 
 def is_over(progress: float, per_step: float) -> bool:
-    """Return whether a run is complete, up to half a step.
-
-    Args:
-        progress: fraction completed.
-        per_step: progress of one step.
-    """
+    """Return whether a run is complete, up to half a step; `per_step` is the progress of one."""
     return progress >= 1.0 - 0.5 * per_step
 
 
 def sh_degree_at(progress: float, cfg: TrainConfig, highest: int) -> int:
     """Return the spherical-harmonics degree in use (3DGS: one more every 1000 of 30k steps)."""
     return min(highest, int(progress / cfg.sh_every + 1e-9))
+
+
+def highest_degree(shrink: int, plan: Levels, cfg: TrainConfig, highest: int) -> int:
+    """Return the highest spherical-harmonics degree that a level uses."""
+    end = next((end for end, factor in plan if factor == shrink), 1.0)
+    return sh_degree_at(end, cfg, highest)
 
 
 def rate_factor(per_step: float, shown: float, settled: float | None) -> float:
@@ -100,44 +104,87 @@ def rate_factor(per_step: float, shown: float, settled: float | None) -> float:
     return min(1.0, (settled * per_step / shown) ** 0.5)
 
 
-@dataclass(frozen=True)
-class Pace:
-    """How much progress a step makes, and what is known about its cost.
+def replanned(per_step: float, progress: float, left_s: float, step_s: float) -> float:
+    """Return the progress of a step with which the run ends on time.
+
+    Under a budget, progress is the share of time: every level of the schedule gets its share
+    of the seconds, whatever its steps cost, and compilation counts like any other second.
+
+    Args:
+        per_step: progress of a step until now.
+        progress: where the run is.
+        left_s: seconds until the deadline.
+        step_s: measured seconds per step at the present level.
+    """
+    wanted = (1.0 - progress) * step_s / max(left_s, 1e-3)
+    # One slow burst (another program, a page fault) must not use up the schedule.
+    bounded = min(wanted, MAX_SPEED_UP * per_step, (1.0 - progress) / MIN_STEPS_LEFT)
+    return max(bounded, 1e-9)
+
+
+class RunClock:
+    """The clock of one session, and the deadline of the run that it continues.
+
+    Args:
+        cfg: the budget.
+        host: seconds of earlier sessions.
+        spent_s: seconds of the budget that were gone before the run.
+        finish_s: seconds of it to leave for what follows, on an unloaded machine.
+        full_step_s: seconds of a step at full size there.
+        now: seconds on a clock that never goes back.
 
     Attributes:
-        per_step: progress of one step.
-        deadline_s: seconds into the run at which optimisation must end, or None.
+        deadline_s: seconds into the run at which optimisation must end; None without a budget.
     """
 
-    per_step: float
-    deadline_s: float | None = None
+    def __init__(
+        self,
+        cfg: TrainConfig,
+        host: HostState,
+        *,
+        spent_s: float = 0.0,
+        finish_s: float = 0.0,
+        full_step_s: float = 1.0,
+        now: Callable[[], float] = time.monotonic,
+    ):
+        self.deadline_s = None
+        if cfg.budget_s is not None:
+            self.deadline_s = max(cfg.budget_s - spent_s - finish_s, 5.0)
+        self.now, self._finish_s, self._full_step_s = now, finish_s, full_step_s
+        self._before, self._begun = host.elapsed_s, now()
 
-    @classmethod
-    def from_config(cls, cfg: TrainConfig, reserve_s: float) -> Pace:
-        """Return the pace before anything was measured.
+    def tick(self, host: HostState) -> None:
+        """Write down how much time has passed."""
+        host.elapsed_s = self._before + self.now() - self._begun
 
-        Args:
-            cfg: steps or budget.
-            reserve_s: seconds to keep for evaluation and files after the last step.
+    def replan(self, host: HostState) -> None:
+        """Set the pace with which the run ends on time; without a budget it stays."""
+        if self.deadline_s is None or host.step_s <= 0:
+            return
+        left = self.deadline_s - self._passed(host)
+        host.pace = replanned(host.pace, host.progress, left, host.step_s)
+
+    def left(self, host: HostState, plan: Levels) -> float | None:
+        """Return about how many seconds optimisation still takes, None where no step was timed."""
+        if self.deadline_s is not None:
+            return max(self.deadline_s - self._passed(host), 0.0)
+        if host.step_s <= 0:
+            return None
+        return seconds_left(host.progress, host.pace, host.step_s, plan)
+
+    def over(self, host: HostState) -> bool:
+        """Return whether the time that optimisation may take is used up."""
+        return self._passed(host) > (self.deadline_s or math.inf)
+
+    def _passed(self, host: HostState) -> float:
+        """Return the seconds so far, and by how much what follows will exceed its reserve.
+
+        Evaluation is taken to be as much slower than expected as the steps are.
         """
-        deadline = None if cfg.budget_s is None else max(cfg.budget_s - reserve_s, 5.0)
-        return cls(1.0 / max(cfg.steps, 1), deadline)
+        return host.elapsed_s + self._finish_s * (self._slowness(host) - 1)
 
-    def replan(self, progress: float, elapsed_s: float, step_s: float) -> Pace:
-        """Return the pace at which the run ends on time.
-
-        Under a budget, progress is the share of time: every level of the schedule gets its share
-        of the seconds, whatever its steps cost, and compilation counts like any other second.
-
-        Args:
-            progress: where the run is.
-            elapsed_s: seconds since the run began.
-            step_s: measured seconds per step at the present level.
-        """
-        if self.deadline_s is None:
-            return self
-        left = max(self.deadline_s - elapsed_s, 1e-3)
-        wanted = (1.0 - progress) * step_s / left
-        # One slow burst (another program, a page fault) must not use up the schedule.
-        bounded = min(wanted, MAX_SPEED_UP * self.per_step, (1.0 - progress) / MIN_STEPS_LEFT)
-        return dataclasses.replace(self, per_step=max(bounded, 1e-9))
+    def _slowness(self, host: HostState) -> float:
+        """Return how many times slower than expected full-size steps are, from 1 to 3."""
+        if host.shrink != 1 or host.step_s <= 0:
+            return 1.0
+        return min(max(host.step_s / self._full_step_s, 1.0), MOST_SLOWNESS)

@@ -1,9 +1,13 @@
-"""The state of a fit: what a step maps to its successor and a checkpoint holds."""
+"""The state of a fit: what a step maps to its successor, and what the host remembers beside it.
+
+A checkpoint holds both.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+from dataclasses import dataclass, field
 
 import equinox as eqx
 import jax
@@ -11,6 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from p2gs_jax.gaussians.population import empty_gaussians, empty_population, fresh_population, grow
+from p2gs_jax.render.capacity import Room
 from p2gs_jax.train.optimizer import Optimizer, OptState, grow_moments
 from p2gs_jax.types import Gaussians, Params, Population
 
@@ -43,7 +48,7 @@ class FitState(eqx.Module):
 
     Attributes:
         params: the differentiable pytree.
-        opt_state: optax's.
+        opt_state: the optimiser's.
         population: who is alive.
         step: steps completed, a view each.
         fault: while it is set, steps leave the state as it is.
@@ -54,6 +59,43 @@ class FitState(eqx.Module):
     population: Population
     step: Int[Array, ""]
     fault: Fault
+
+
+@dataclass
+class HostState:
+    """What the host remembers between bursts; saved with every checkpoint.
+
+    Attributes:
+        step: steps completed, a view each.
+        progress: fraction of the run completed.
+        pace: progress per step.
+        elapsed_s: seconds of earlier sessions and of this one.
+        densified_at: progress of the last densification.
+        reset_at: progress of the last opacity reset.
+        refused: densification requests that found no slot, summed.
+        overflows: tile lists grown.
+        rooms: room of a view for every "WxH".
+        shrink: factor by which images are shrunk at the present level.
+        step_s: running estimate of the seconds a step takes at this level, compiling apart; 0:
+            none was timed yet.
+    """
+
+    step: int = 0
+    progress: float = 0.0
+    pace: float = 0.0
+    elapsed_s: float = 0.0
+    densified_at: float = 0.0
+    reset_at: float = 0.0
+    refused: int = 0
+    overflows: int = 0
+    rooms: dict[str, Room] = field(default_factory=dict)
+    shrink: int = 0
+    step_s: float = 0.0
+
+    @classmethod
+    def from_dict(cls, values: dict) -> HostState:
+        """Return what a checkpoint holds."""
+        return cls(**{**values, "rooms": {k: Room(*room) for k, room in values["rooms"].items()}})
 
 
 def initial_state(
@@ -77,21 +119,15 @@ def initial_state(
 
 
 @functools.partial(jax.jit, static_argnames=("optimizer", "slots"))
-def _initial_state(
-    params: Params,
-    alive: Array,
-    optimizer: Optimizer,
-    slots: int,
-    owner: Int[Array, " n"] | None,
-) -> FitState:
+def _initial_state(params: Params, alive, optimizer: Optimizer, slots: int, owner) -> FitState:
     population = fresh_population(alive, owner)
     state = FitState(params, optimizer.init(params), population, jnp.int32(0), Fault.none())
     return grow_state(state, slots)
 
 
-def count_alive(state: FitState) -> int:
-    """Return the population, read from the device."""
-    return int(_sum(state.population.alive))
+def alive_in(population: Population) -> int:
+    """Return how many Gaussians are alive, read from the device."""
+    return int(_sum(population.alive))
 
 
 _sum = jax.jit(jnp.sum)

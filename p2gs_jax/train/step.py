@@ -1,4 +1,4 @@
-"""One optimisation step: three pure jitted functions, one after the other.
+"""One optimisation step: three pure jitted functions, one after the other, compiled ahead.
 
 The first and the last work per Gaussian and know no image size, so all levels of a fit share them;
 the one between knows neither the population nor the optimiser. In one program, every level compiled
@@ -9,36 +9,60 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any
+import os
+import time
+from collections.abc import Callable, Hashable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, NamedTuple
 
 import jax
 
-from p2gs_jax.config import FitConfig, PhotometryConfig
+from p2gs_jax.config import FitConfig, narrowed
 from p2gs_jax.core.numerics import on_host
-from p2gs_jax.losses.total import Partner, partner_cameras
 from p2gs_jax.render.capacity import Room
 from p2gs_jax.render.xla_cpu import compiler_options
-from p2gs_jax.train.advance import Controls, StepReport, advance
+from p2gs_jax.train.exposure_loss import Partner
 from p2gs_jax.train.image_gradient import differentiate, show
 from p2gs_jax.train.optimizer import Optimizer
 from p2gs_jax.train.state import FitState
+from p2gs_jax.train.terms import LossTerm, loss_terms
+from p2gs_jax.train.update import Controls, StepReport, advance
 from p2gs_jax.types import Batch, Frustum
 
 PARTS = ("show", "differentiate", "advance")
 
+# What each program takes of the configuration; None: all of it. Fits that differ elsewhere share
+# the program, and a program that reads anything else raises AttributeError.
+FORMED = ("curve", "spline", "pivot", "clamp", "cameras", "appearance")
+TAKEN: dict[str, dict[str, Any]] = {
+    "show": {"render": None, "optimizer": ("visible_only",)},
+    "differentiate": {
+        "render": None,
+        "photometry": FORMED,
+        "loss": ("censored", "saturation"),
+    },
+    "advance": {
+        "render": None,
+        "optimizer": None,
+        "photometry": ("model", "start", "freeze_until", "white_balance"),
+        "loss": {"regularizers": ("log_exposure_mean",)},
+    },
+}
+
+# The first step waits for two programs of about equal size; but XLA itself compiles on several
+# cores, and two at once on two cores take three times as long each (ours: BUILD_NOTES).
+WORKERS = 1 if (os.cpu_count() or 1) <= 2 else 2
+
 
 @functools.cache
 def _compiled(name: str) -> Any:
-    """Return a part of a step, jitted; on first use, since its options depend on the backend.
-
-    What a part takes from the configuration is static: steps of several fits share programs.
-    """
+    """Return a part of a step, jitted; on first use, since its options depend on the backend."""
     options: dict[str, Any] = {"compiler_options": compiler_options()}
     if name == "show":
-        return jax.jit(show, static_argnames=("cfg", "visible_only", "room", "degree"), **options)
+        return jax.jit(show, static_argnames=("cfg", "room", "degree"), **options)
     if name == "differentiate":
-        return jax.jit(differentiate, static_argnames=("cfg", "room"), **options)
-    static = ("cfg", "optimizer", "extent", "degree")
+        return jax.jit(differentiate, static_argnames=("cfg", "terms", "room"), **options)
+    static = ("cfg", "optimizer", "extent", "noise", "degree")
     return jax.jit(advance, static_argnames=static, donate_argnames="state", **options)
 
 
@@ -51,17 +75,21 @@ class Step:
 
     The loss is that of `total_loss`. What is done per Gaussian is done in blocks, for those that
     the view may show; the others rest (`OptimizerConfig.visible_only`). What happens where
-    something does not fit or is not finite: `train/advance.py`.
+    something does not fit or is not finite: `train/update.py`.
 
     Attributes:
         cfg: everything.
         optimizer: from `make_optimizer`.
         extent: scene extent, scene units.
+        noise: scale of the exploration noise, or None (`strategies.Strategy`).
+        terms: loss terms that differ from those of `cfg`; see `loss_terms`.
     """
 
     cfg: FitConfig
     optimizer: Optimizer
     extent: float
+    noise: float | None = None
+    terms: Mapping[str, LossTerm | None] = dataclasses.field(default_factory=dict)
 
     def __call__(
         self,
@@ -75,10 +103,8 @@ class Step:
     ) -> tuple[FitState, StepReport]:
         """Take a step, compiling it on first use."""
         parts = (
-            functools.partial(
-                _compiled(name), **self.settings(name), **static_sizes(name, room, degree)
-            )
-            for name in PARTS
+            functools.partial(_compiled(n), **self.settings(n), **static_sizes(n, room, degree))
+            for n in PARTS
         )
         return self.chained(*parts)(state, batch, partner, controls)
 
@@ -86,7 +112,7 @@ class Step:
         """Return the step made of its three programs, compiled or not."""
 
         def step(state: FitState, batch: Batch, partner: Partner, controls: Controls):
-            params, frusta = state.params, self.frusta(batch, partner)
+            params, frusta = state.params, frusta_of(batch, partner)
             listed = show(*per_gaussian(state, frusta, controls))
             gradient = differentiate(
                 listed.shown, params.photometry, params.appearance, batch, partner
@@ -96,41 +122,27 @@ class Step:
         return step
 
     def settings(self, name: str) -> dict[str, Any]:
-        """Return what one of the three programs takes from the configuration, by argument.
-
-        Everything else is as in `FitConfig()`: programs are shared by fits that differ there.
-        Neither knows the curve but `differentiate`; that does not know which exposures move. White
-        balance and cameras decide what `Photometry` consists of, which both take.
-        """
-        cfg, p = self.cfg, self.cfg.photometry
+        """Return what one of the three programs takes from the configuration, by argument."""
+        cfg = narrowed(self.cfg, TAKEN[name])
         if name == "show":
-            return {"cfg": cfg.render, "visible_only": cfg.optimizer.visible_only}
-        known = dataclasses.replace(FitConfig(), render=cfg.render, loss=cfg.loss)
+            return {"cfg": cfg}
         if name == "differentiate":
-            photometry = dataclasses.replace(p, model="constant")
-            return {"cfg": dataclasses.replace(known, photometry=photometry)}
-        moving = PhotometryConfig(
-            model=p.model,
-            start=p.start,
-            freeze_until=p.freeze_until,
-            white_balance=p.white_balance,
-            cameras=p.cameras,
-        )
-        known = dataclasses.replace(
-            known,
-            densify=cfg.densify,
-            optimizer=cfg.optimizer,
-            photometry=moving,
-        )
-        return {"cfg": known, "optimizer": self.optimizer, "extent": self.extent}
+            known = dataclasses.replace(self.cfg, photometry=cfg.photometry)
+            return {"cfg": cfg, "terms": tuple(loss_terms(known, self.terms).items())}
+        return {
+            "cfg": cfg,
+            "optimizer": self.optimizer,
+            "extent": self.extent,
+            "noise": self.noise,
+        }
 
     def lowered(
         self, name: str, state: FitState, batch, partner, controls, *, room: Room, degree: int
     ):
         """Return one of the three programs, by its name, traced for arguments of these shapes."""
-        program = {name: _compiled(name) for name in PARTS}
+        program = {n: _compiled(n) for n in PARTS}
         static = {n: self.settings(n) | static_sizes(n, room, degree) for n in PARTS}
-        params, frusta = state.params, self.frusta(batch, partner)
+        params, frusta = state.params, frusta_of(batch, partner)
         arguments = per_gaussian(state, frusta, controls)
         if name == "show":
             return program[name].lower(*arguments, **static[name])
@@ -142,14 +154,15 @@ class Step:
         moved = (state, listed.ids, listed.visible, gradient, frusta, controls)
         return program[name].lower(*moved, **static[name])
 
-    def frusta(self, batch: Batch, partner: Partner) -> tuple[Frustum, ...]:
-        """Return the views of a step, for the programs that know no image size."""
-        cameras = (batch.camera, *partner_cameras(partner, self.cfg))
-        sizes = (map(c.K.dtype.type, (c.width, c.height)) for c in cameras)
-        return tuple(
-            on_host(Frustum, c.viewmat, c.K, width, height, c.objects)
-            for c, (width, height) in zip(cameras, sizes, strict=True)
-        )
+
+def frusta_of(batch: Batch, partner: Partner) -> tuple[Frustum, ...]:
+    """Return the views of a step, for the programs that know no image size."""
+    cameras = (batch.camera, *partner.cameras)
+    sizes = (map(c.K.dtype.type, (c.width, c.height)) for c in cameras)
+    return tuple(
+        on_host(Frustum, c.viewmat, c.K, width, height, c.objects)
+        for c, (width, height) in zip(cameras, sizes, strict=True)
+    )
 
 
 def static_sizes(name: str, room: Room, degree: int) -> dict[str, int]:
@@ -162,13 +175,133 @@ def static_sizes(name: str, room: Room, degree: int) -> dict[str, int]:
 def per_gaussian(state: FitState, frusta: tuple[Frustum, ...], controls: Controls) -> tuple:
     """Return the arguments of `show`."""
     params, population = state.params, state.population
-    degree = controls.active_degree
-    return params.gaussians, population.alive, frusta, degree, population.owner
+    return params.gaussians, population.alive, frusta, controls.active_degree, population.owner
 
 
 def compilations() -> int:
-    """Return of the most often compiled part of steps how often it was, in this process.
+    """Return the largest number of times that this process compiled one of the three programs.
 
     Programs that `StepPrograms` compiled are not counted.
     """
     return max(_compiled(name)._cache_size() for name in PARTS)
+
+
+# ----------------------------------------------------------------------- compiled ahead
+
+
+class Key(NamedTuple):
+    """What a step is compiled for.
+
+    Attributes:
+        size: image width and height, pixels.
+        slots: room of the population.
+        room: of a view.
+        degree: highest spherical-harmonics degree in use.
+        pixels: type of the photograph as it is stored.
+        structure: what the state, and what comes with a photograph, consist of.
+    """
+
+    size: tuple[int, int]
+    slots: int
+    room: Room
+    degree: int
+    pixels: str
+    structure: Hashable = None
+
+
+class StepPrograms:
+    """The compiled steps of a fit, made in the background ahead of their turn.
+
+    XLA holds no lock of Python's while it compiles, so the program of the next level is made while
+    the present one runs. Levels and populations share those of the three programs of a step that
+    they can, and so do a step that was made before the exposures were known and the one that was
+    made after.
+
+    Attributes:
+        rooms: of the image sizes, by name, for which programs were begun before the start.
+        waited_s: seconds for which a program was waited for; they never count as pace.
+    """
+
+    def __init__(self):
+        self.rooms: dict[str, Room] = {}
+        self._made: dict[Hashable, Future] = {}
+        self._ready: dict[tuple[Any, Key], Callable] = {}
+        self._worker = ThreadPoolExecutor(WORKERS, thread_name_prefix="compile")
+        self.waited_s = 0.0
+
+    def expect(self, step: Any, key: Key, *arguments: Any, images: bool = True) -> None:
+        """Begin to compile a step in the background.
+
+        Args:
+            step: of the fit: a `Step`, or one of several views.
+            key: what for.
+            arguments: of the step, or their shapes.
+            images: the program between as well, which knows the tone curve.
+        """
+        self._parts(step, key, arguments, images)
+
+    def _parts(self, step: Any, key: Key, arguments, images: bool = True) -> list[Future]:
+        """Return the programs of a step in their order, those yet unknown on their way."""
+        visible_only = step.settings("show")["cfg"].optimizer.visible_only
+        rows = min(key.room.visible, key.slots) if visible_only else key.slots
+        of_gaussians = (key.slots, rows, key.degree)
+        shapes = {
+            "show": of_gaussians,
+            "differentiate": (key.size, key.room.entries, rows, key.pixels),
+            "advance": of_gaussians,
+        }
+        keys = {
+            name: (name, tuple(step.settings(name).values()), shape, key.structure)
+            for name, shape in shapes.items()
+        }
+        # The longest first.
+        wanted = ("differentiate", "show", "advance") if images else ("advance", "show")
+        for name in wanted:
+            if keys[name] not in self._made:
+                lowered = functools.partial(step.lowered, name, *_shapes(arguments))
+                self._made[keys[name]] = self._worker.submit(
+                    lambda lowered=lowered: lowered(room=key.room, degree=key.degree).compile()
+                )
+        return [self._made[keys[name]] for name in shapes if name in wanted]
+
+    def ahead(self, key: Hashable, program, *arguments: Any, **static: Any) -> Callable:
+        """Begin to compile another program in the background, and return it.
+
+        Args:
+            key: tells it from others.
+            program: a jitted function.
+            arguments: its arguments, or their shapes.
+            static: its static arguments, which the returned function is called without.
+        """
+        if key not in self._made:
+            self._made[key] = self._worker.submit(
+                lambda: program.lower(*_shapes(arguments), **static).compile()
+            )
+        future = self._made[key]
+        return lambda *given: self._wait(future)(*given)
+
+    def get(self, step: Any, key: Key, *arguments: Any):
+        """Return a compiled step, `(state, batch, partner, controls) -> (state, report)`."""
+        if (step, key) not in self._ready:
+            parts = self._parts(step, key, arguments)
+            self._ready[step, key] = step.chained(*(self._wait(part) for part in parts))
+        return self._ready[step, key]
+
+    def _wait(self, future: Future):
+        if future.done():
+            return future.result()
+        begin = time.monotonic()
+        try:
+            return future.result()
+        finally:
+            self.waited_s += time.monotonic() - begin
+
+    def close(self) -> None:
+        """Forget programs whose compilation has not begun."""
+        self._worker.shutdown(wait=False, cancel_futures=True)
+
+
+def _shapes(arguments):
+    return jax.tree.map(
+        lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype, weak_type=False), arguments
+    )

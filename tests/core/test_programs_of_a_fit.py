@@ -43,12 +43,12 @@ def test_a_fit_without_its_steps_compiles_few_programs(scene, tmp_path):
     assert counter.programs == 0
     metrics = finish(
         params,
-        prepared,
+        prepared.scene,
+        prepared.store,
+        prepared.cfg,
         RunFolder(tmp_path),
-        Account(counts={}, seconds={"reading": 1.0}, compiler=counter),
+        Account({}, {"reading": 1.0}, counter, prepared.selection, prepared.notes),
         Silent(),
-        truth=None,
-        lpips_weights=None,
     )
     # Counting tiles, rendering, developing (images; colours of splats), fitting an exposure, PSNR,
     # SSIM, and the basis of spherical harmonics.

@@ -12,8 +12,8 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.population import Coverage
 from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.pipeline import fit as pipeline
-from p2gs_jax.pipeline import memory_needed as module
-from p2gs_jax.pipeline.memory_needed import MemoryNeeded, memory_needed, require_memory
+from p2gs_jax.pipeline import preflight as module
+from p2gs_jax.pipeline.preflight import MemoryNeeded, memory_needed, require_memory
 from p2gs_jax.run.checkpoint import CheckpointStore
 
 GB = 1e9

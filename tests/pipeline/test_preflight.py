@@ -14,14 +14,13 @@ from p2gs_jax.cli import main
 from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import DivergenceError, UserError
 from p2gs_jax.jobs.configs import with_fields
-from p2gs_jax.losses.relative_exposure import ExposurePairs, relative_exposure_loss
 from p2gs_jax.pipeline import fit as pipeline
-from p2gs_jax.pipeline.decide import kept_choice
+from p2gs_jax.pipeline.exposures import kept_choice
 from p2gs_jax.pipeline.preflight import Paths, check_run_dir, check_sizes, preflight
 from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.run.decisions import KEY, Decisions
 from p2gs_jax.run.folder import RunFolder
-from p2gs_jax.types import Photometry, View
+from p2gs_jax.types import View
 
 
 @pytest.fixture(scope="module")
@@ -166,10 +165,6 @@ def test_a_reading_that_subtracts_images_needs_one_size(tmp_path):
     check_sizes(unequal[:2], subtracting)
     check_sizes(unequal, cfg)
     check_sizes(unequal, with_fields(subtracting, {"loss.relative_exposure.weight": None}))
-    nothing = np.zeros((4, 6, 3), np.float32)
-    pairs = ExposurePairs(nothing, nothing[:1], 0, 1, Photometry(np.zeros(2), np.zeros(2)), None)
-    with pytest.raises(ValueError, match="renders of one size"):
-        relative_exposure_loss(pairs, subtracting.loss, subtracting.photometry)
 
 
 def test_the_config_of_a_run_is_what_the_user_gave(finished_run):

@@ -1,4 +1,4 @@
-"""Projection against its definition in numpy: the oracle of the rasterizer shares `project`."""
+"""Projection and harmonics against definitions: the oracle of the rasterizer shares them."""
 
 import dataclasses
 
@@ -7,22 +7,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes import camera, street
+from scipy.spatial.transform import Rotation
+from scipy.special import sph_harm_y
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render import project
+from p2gs_jax.render.harmonics import MAX_DEGREE, basis
 
 CFG = RenderConfig()
 
 
 def rotation(quat):
-    w, x, y, z = quat / np.linalg.norm(quat)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return Rotation.from_quat(quat, scalar_first=True).as_matrix()
 
 
 def by_definition(g, cam, i):
@@ -72,3 +68,19 @@ def test_a_camera_of_another_place_sees_the_scene_move_the_other_way():
     expected = 0.1 * float(cam.K[0, 0]) / np.asarray(first.depths)[both]
     np.testing.assert_allclose(shift[:, 0], expected, rtol=1e-3, atol=1e-3)
     np.testing.assert_allclose(shift[:, 1], 0, atol=1e-3)
+
+
+def test_the_basis_is_scipys_in_the_signs_of_3dgs():
+    rng = np.random.default_rng(0)
+    d = rng.normal(size=(50, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    polar, azimuth = np.arccos(d[:, 2]), np.arctan2(d[:, 1], d[:, 0])
+    found = basis(tuple(d.astype(np.float32).T), MAX_DEGREE)
+    expected = []
+    for degree in range(MAX_DEGREE + 1):
+        for order in range(-degree, degree + 1):
+            y = sph_harm_y(degree, abs(order), polar, azimuth)
+            expected.append(
+                y.real if order == 0 else np.sqrt(2) * (y.imag if order < 0 else y.real)
+            )
+    np.testing.assert_allclose(np.stack(found), np.stack(expected), atol=2e-6)

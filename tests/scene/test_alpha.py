@@ -10,7 +10,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.run.scene_file import read_scene, write_scene
 from p2gs_jax.scene import ImageStore, load_scene
 from p2gs_jax.scene.masks import background_color, has_alpha
-from p2gs_jax.train.views import TrainingViews
+from p2gs_jax.train.inputs import TrainingViews
 
 RNG = np.random.default_rng(0)
 
@@ -85,10 +85,7 @@ def test_as_a_mask_and_not_at_all(cutouts):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (
-            {},
-            "3 of 4 photographs have an alpha channel: photographs and renders are shown",
-        ),
+        ({}, "3 of 4 photographs have an alpha channel: photographs and renders are shown"),
         ({"background": "random"}, "shown over a random colour at every step, and white to judge"),
         ({"alpha": "mask"}, "transparent pixels are left out"),
         ({"alpha": "ignore"}, "it is ignored"),

@@ -13,15 +13,15 @@ import numpy as np
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import on_host
-from p2gs_jax.losses.total import Partner
 from p2gs_jax.render import xla_cpu
 from p2gs_jax.render.capacity import Room
-from p2gs_jax.train.advance import Controls
-from p2gs_jax.train.batches import stacked
 from p2gs_jax.train.data_parallel import ParallelStep, Spread, default_mesh
+from p2gs_jax.train.exposure_loss import Partner
+from p2gs_jax.train.inputs import stacked
 from p2gs_jax.train.optimizer import make_optimizer
 from p2gs_jax.train.state import initial_state
 from p2gs_jax.train.step import PARTS, Step
+from p2gs_jax.train.update import Controls
 from p2gs_jax.types import Batch, Camera, Gaussians, Params, Photometry
 
 COUNT, VIEWS = 500, 4
@@ -76,7 +76,7 @@ def alive() -> np.ndarray:
 
 
 def first_moments(state):
-    return state.opt_state.gaussians[0].mu, state.opt_state.rest[0].mu[0].raw_exposures
+    return state.opt_state.gaussians.mu, state.opt_state.rest.mu[0].raw_exposures
 
 
 def of_one_view() -> dict:

@@ -14,10 +14,10 @@ from p2gs_jax.core.numerics import on_host
 from p2gs_jax.gaussians.population import Coverage
 from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.run.decisions import Decisions
-from p2gs_jax.train import burst, checkpoints, loop, session, state
-from p2gs_jax.train.advance import StepReport
-from p2gs_jax.train.state import FAULT_NONFINITE, FAULT_OVERFLOW, Fault, FitState
-from p2gs_jax.types import Batch, Camera, Gaussians, Params, Photometry, Population
+from p2gs_jax.train import loop
+from p2gs_jax.train.state import FAULT_NONFINITE, FAULT_OVERFLOW, Fault
+from p2gs_jax.train.update import StepReport
+from p2gs_jax.types import Batch, Camera, Gaussians, Params, Photometry
 
 VIEWS, SEEDS = 4, 10
 SHORT = with_fields(
@@ -128,35 +128,18 @@ def gaussians(count):
     return on_host(Gaussians, *values)
 
 
-def state_of(count, slots):
-    alive = np.arange(slots) < count
-    zeros = [np.zeros(slots, np.float32) for _ in range(2)]
-    photometry = on_host(Photometry, np.zeros(VIEWS, np.float32), np.zeros(VIEWS, np.float32))
-    return FitState(
-        Params(gaussians(slots), photometry),
-        (),
-        on_host(Population, alive, *zeros),
-        np.int32(0),
-        Fault(*(np.int32(0) for _ in range(4))),
-    )
+def params():
+    zeros = np.zeros(VIEWS, np.float32)
+    return Params(gaussians(SEEDS), on_host(Photometry, zeros, zeros))
 
 
 class Harness:
     """A run folder, a clock, and trainers on them one after the other."""
 
-    def __init__(self, monkeypatch, folder):
+    def __init__(self, folder):
         self.clock = SimpleNamespace(now=0.0)
         self.folder, self.checkpoints = folder, Checkpoints()
         self.said, self.records = [], []
-        stopped = SimpleNamespace(monotonic=lambda: self.clock.now)
-        for module in (burst, session):
-            monkeypatch.setattr(module, "time", stopped)
-        monkeypatch.setattr(checkpoints, "CheckpointStore", lambda folder: self.checkpoints)
-        monkeypatch.setattr(
-            loop, "initial_state", lambda p, a, o, slots, owner: state_of(SEEDS, slots)
-        )
-        # Sums on the host compile nothing.
-        monkeypatch.setattr(state, "_sum", np.sum)
 
     def run(self, cfg=SHORT, *, resume=False, programs=None, pixels=None, **options):
         """Run to the end; return the result and the programs."""
@@ -172,10 +155,10 @@ class Harness:
             Decisions.as_asked(cfg),
             on_log=self.records.append,
             on_message=self.said.append,
+            now=lambda: self.clock.now,
+            store=self.checkpoints,
         )
-        result = trainer.run(
-            state_of(SEEDS, SEEDS).params, np.ones(SEEDS, bool), resume=resume, **options
-        )
+        result = trainer.run(params(), np.ones(SEEDS, bool), resume=resume, **options)
         return result, programs
 
     def log(self, name="log.jsonl"):

@@ -12,8 +12,8 @@ import pytest
 from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.jobs.configs import with_fields
-from p2gs_jax.train.batches import batches_of, stacked
 from p2gs_jax.train.data_parallel import mesh_of, with_a_view_each
+from p2gs_jax.train.inputs import batches_of, stacked
 from p2gs_jax.train.state import FAULT_OVERFLOW
 
 HERE = Path(__file__).parent

@@ -16,8 +16,8 @@ LEVELS = with_fields(SHORT, {"train.coarse_to_fine": [0.33]})
 
 
 @pytest.fixture
-def harness(monkeypatch, tmp_path):
-    return Harness(monkeypatch, tmp_path)
+def harness(tmp_path):
+    return Harness(tmp_path)
 
 
 def pace_of(lines):

@@ -5,10 +5,10 @@ import numpy as np
 from tiny_scene import make_scene
 
 from p2gs_jax.config import DataConfig
-from p2gs_jax.losses.total import decoded
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.pixels.store import ImageStore
-from p2gs_jax.train.views import TrainingViews
+from p2gs_jax.train.image_gradient import decoded
+from p2gs_jax.train.inputs import TrainingViews
 
 
 def test_photographs_travel_as_integers(tmp_path):

@@ -8,10 +8,9 @@ import pytest
 
 from p2gs_jax.config import FitConfig, TrainConfig
 from p2gs_jax.train import schedule
-from p2gs_jax.train.host import HostState
 from p2gs_jax.train.optimizer import learning_rates
-from p2gs_jax.train.schedule import Pace
-from p2gs_jax.train.session import Session
+from p2gs_jax.train.schedule import RunClock
+from p2gs_jax.train.state import HostState
 from p2gs_jax.types import Gaussians, Params, Photometry
 
 
@@ -30,28 +29,28 @@ def test_levels_and_degrees():
 def test_a_replanned_run_ends_on_time(step_s, compile_s):
     """Simulated: levels cost what they cost, compilation interrupts, and replanning copes."""
     plan = ((0.25, 4), (0.5, 2), (1.0, 1))
-    pace, elapsed, progress, shrinks = Pace(1 / 2000, 60.0), 0.0, 0.0, []
-    while progress < 1 - 0.5 * pace.per_step and elapsed < 60:
+    pace, elapsed, progress, shrinks = 1 / 2000, 0.0, 0.0, []
+    while progress < 1 - 0.5 * pace and elapsed < 60:
         shrink = schedule.shrink_at(progress, plan)
         cost = step_s / shrink**1.6
         elapsed += 10 * cost + (compile_s if shrink not in shrinks else 0.0)
-        progress += 10 * pace.per_step
+        progress += 10 * pace
         shrinks.append(shrink)
-        pace = pace.replan(progress, elapsed, cost)
+        pace = schedule.replanned(pace, progress, 60.0 - elapsed, cost)
     assert 50 < elapsed < 60 + 10 * step_s + compile_s
     assert progress > 0.8
     assert set(shrinks) == {4, 2, 1}
 
 
 def test_one_slow_burst_does_not_use_up_the_schedule():
-    pace = Pace(1 / 1000, 60.0).replan(0.1, 10.0, 30.0)
-    assert pace.per_step <= 1.5 / 1000
+    assert schedule.replanned(1 / 1000, 0.1, 50.0, 30.0) <= 1.5 / 1000
 
 
 def test_without_a_budget_the_pace_is_fixed():
-    pace = Pace.from_config(TrainConfig(steps=400), reserve_s=9.0)
-    assert pace.per_step == 1 / 400
-    assert pace.replan(0.1, 1.0, 1.0) is pace
+    host = HostState(progress=0.1, pace=1 / 400, step_s=1.0)
+    clock = RunClock(TrainConfig(steps=400), host, finish_s=9.0)
+    clock.replan(host)
+    assert host.pace == 1 / 400
 
 
 def test_long_fits_take_lower_rates():
@@ -86,10 +85,10 @@ def test_finer_levels_count_for_more_in_the_time_left():
     assert left(1.0) == 0
 
 
-def test_a_session_says_what_is_left_of_its_steps_or_of_its_budget():
+def test_a_clock_says_what_is_left_of_its_steps_or_of_its_budget():
     host = HostState(progress=0.5, pace=0.01, step_s=0.2, shrink=1, elapsed_s=10.0)
-    free = Session(Pace(0.01), host, finish_s=0.0, full_step_s=0.2)
+    free = RunClock(TrainConfig(), host, full_step_s=0.2)
     assert free.left(host, ((1.0, 1),)) == pytest.approx(10.0)
-    bound = Session(Pace(0.01, deadline_s=40.0), host, finish_s=0.0, full_step_s=0.2)
+    bound = RunClock(TrainConfig(budget_s=40.0), host, full_step_s=0.2)
     assert bound.left(host, ((1.0, 1),)) == pytest.approx(30.0)
     assert free.left(HostState(pace=0.01), ((1.0, 1),)) is None

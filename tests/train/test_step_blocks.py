@@ -12,15 +12,17 @@ import pytest
 from tiny_scene import make_scene
 
 from p2gs_jax.config import FitConfig
-from p2gs_jax.losses.total import Partner, image_loss, total_loss
 from p2gs_jax.pipeline.fit import fit
 from p2gs_jax.render.capacity import Room
 from p2gs_jax.render.visible import BLOCK, in_view, splat
-from p2gs_jax.train import advance, image_gradient
-from p2gs_jax.train.advance import Controls, finite_names
-from p2gs_jax.train.optimizer import B1, learning_rates, make_optimizer
+from p2gs_jax.train import image_gradient, update
+from p2gs_jax.train.exposure_loss import Partner
+from p2gs_jax.train.image_gradient import image_loss, total_loss
+from p2gs_jax.train.optimizer import learning_rates, make_optimizer
 from p2gs_jax.train.state import FAULT_NONE, FAULT_NONFINITE, FAULT_OVERFLOW, initial_state
 from p2gs_jax.train.step import Step
+from p2gs_jax.train.terms import loss_terms
+from p2gs_jax.train.update import Controls, finite_names
 from p2gs_jax.types import Batch, Camera, Gaussians, Params, Photometry
 
 COUNT, HIDDEN = 6000, 600
@@ -88,12 +90,9 @@ def made():
         shown = splat(params.gaussians, alive, (batch.camera,), cfg.render, DEGREE)
         ((splats, radiance),) = shown
         splats = dataclasses.replace(splats, means2d=splats.means2d + probe)
-        loss, _ = image_loss(
-            ((splats, radiance),), params.photometry, None, batch, partner, cfg, 2**16
-        )
-        whole, _ = total_loss(
-            params, alive, batch, partner, cfg, capacity=2**16, active_degree=DEGREE
-        )
+        given, terms = (batch, partner, cfg), loss_terms(cfg)
+        loss, _ = image_loss(((splats, radiance),), params.photometry, None, *given, terms, 2**16)
+        whole, _ = total_loss(params, alive, *given, terms, capacity=2**16, active_degree=DEGREE)
         return whole + loss, (whole, loss)
 
     # Both losses are the same here: their sum has twice the gradient.
@@ -159,7 +158,7 @@ def test_one_step_is_an_adam_update_of_the_gradient_of_the_total_loss(made, whic
     o = made.cfg.optimizer
     adam = optax.scale_by_adam(o.b1, o.b2, o.eps)
     updates, _ = adam.update(made.gradient, adam.init(made.params))
-    moments = state.opt_state.gaussians[0]
+    moments = state.opt_state.gaussians
     for name in FIELDS:
         g = rows_of(made.gradient.gaussians, name, made.seen)
         mu = rows_of(moments.mu, name, made.seen) / (1 - o.b1)
@@ -173,10 +172,10 @@ def test_one_step_is_an_adam_update_of_the_gradient_of_the_total_loss(made, whic
         np.testing.assert_allclose(new, expected, rtol=1e-6, atol=2e-3 * rate.max())
         moved = np.abs(new - old).max()
         assert moved > 0.5 * rate.max(), name
-    got, v = state.opt_state.rest[0].mu[0], made.gradient.photometry
+    got, v = state.opt_state.rest.mu[0], made.gradient.photometry
     for name in ("raw_exposures", "raw_gammas"):
         np.testing.assert_allclose(
-            getattr(got, name) / (1 - B1), getattr(v, name), rtol=1e-4, atol=1e-8
+            getattr(got, name) / (1 - 0.9), getattr(v, name), rtol=1e-4, atol=1e-8
         )
 
 
@@ -202,9 +201,9 @@ def test_a_step_agrees_with_one_in_float64(made, wide):
     (state, report), (exact, exact_report) = made.after, wide
     assert float(report.loss) == pytest.approx(float(exact_report.loss), rel=1e-6)
     assert float(report.loss) != float(exact_report.loss)  # it is computed otherwise
-    a, b = (s.opt_state.gaussians[0].mu for s in (state, exact))
+    a, b = (s.opt_state.gaussians.mu for s in (state, exact))
     pairs = {name: (getattr(a, name), getattr(b, name)) for name in FIELDS}
-    a, b = (s.opt_state.rest[0].mu[0] for s in (state, exact))
+    a, b = (s.opt_state.rest.mu[0] for s in (state, exact))
     pairs |= {
         name: (getattr(a, name), getattr(b, name)) for name in ("raw_exposures", "raw_gammas")
     }
@@ -217,7 +216,7 @@ def test_out_of_view_nothing_is_touched(made):
     state, _ = made.after
     hidden = ~made.seen
     assert hidden.sum() > HIDDEN / 2
-    moments = state.opt_state.gaussians[0]
+    moments = state.opt_state.gaussians
     for name in FIELDS:
         before = rows_of(made.params.gaussians, name, hidden)
         assert rows_of(state.params.gaussians, name, hidden).tobytes() == before.tobytes(), name
@@ -318,7 +317,7 @@ def test_a_short_fit_traces_its_step_once_per_image_size(tmp_path, monkeypatch):
     # Once more before exposures are known, for the shapes that the last program of a step takes.
     monkeypatch.setattr(image_gradient, "image_loss", chex.assert_max_traces(counted, n=3))
     # What is done per Gaussian knows no image size, and the view's list no exposures; rates do.
-    for module, name, n in ((image_gradient, "splat_listed", 1), (advance, "update_listed", 2)):
+    for module, name, n in ((image_gradient, "splat_listed", 1), (update, "update_listed", 2)):
         few = chex.assert_max_traces(getattr(module, name), n=n)
         monkeypatch.setattr(module, name, few)
     fit(scene, tmp_path / "run", cfg)

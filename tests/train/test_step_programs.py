@@ -8,15 +8,39 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from p2gs_jax.config import FitConfig
+from p2gs_jax.config import FitConfig, narrowed, preset
+from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.render.capacity import Room
 from p2gs_jax.train.optimizer import make_optimizer
-from p2gs_jax.train.programs import Key, StepPrograms
-from p2gs_jax.train.step import Step
+from p2gs_jax.train.step import PARTS, Key, Step, StepPrograms
 
 COARSE = Key((120, 80), 500, Room(4096, 4096), 3, "uint16")
 FULL = COARSE._replace(size=(240, 160), room=Room(8192, 4096), pixels="uint8")
 SHAPES = tuple(np.zeros(k) for k in range(1, 5))
+
+
+def test_a_program_that_reads_what_it_was_not_given_raises():
+    """Fits share programs: a default must never stand in for the value of a fit."""
+    step = Step(preset("robust"), make_optimizer(FitConfig()), 1.0)
+    for name in PARTS:
+        cfg = step.settings(name)["cfg"]
+        assert cfg.render == FitConfig().render
+        for missing in ("train", "densify", "data"):
+            with pytest.raises(AttributeError, match=missing):
+                getattr(cfg, missing)
+    with pytest.raises(AttributeError, match=r"PhotometryConfig\.model"):
+        _ = step.settings("differentiate")["cfg"].photometry.model
+    with pytest.raises(AttributeError, match=r"PhotometryConfig\.curve"):
+        _ = step.settings("advance")["cfg"].photometry.curve
+
+
+def test_what_was_taken_is_equal_where_the_values_are():
+    cfg = FitConfig()
+    other = with_fields(cfg, {"photometry.curve": "power", "train.seed": 3})
+    for taken, same in (({"render": None}, True), ({"photometry": ("curve", "pivot")}, False)):
+        a, b = narrowed(cfg, taken), narrowed(other, taken)
+        assert (a == b, hash(a) == hash(b)) == (same, same)
+        assert isinstance(a, FitConfig)
 
 
 class Traced:

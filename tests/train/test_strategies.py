@@ -1,7 +1,5 @@
 """Which strategy a configuration means, its bounds, and what its programs are shared by."""
 
-from types import SimpleNamespace
-
 import chex
 import jax
 import numpy as np
@@ -9,36 +7,21 @@ import pytest
 from splats import random_splats
 
 from p2gs_jax.config import FitConfig
-from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.gaussians.population import Coverage, default_max_gaussians
 from p2gs_jax.jobs.configs import with_fields
-from p2gs_jax.train.host import HostState
+from p2gs_jax.train import strategies
 from p2gs_jax.train.optimizer import make_optimizer
-from p2gs_jax.train.state import count_alive, initial_state
-from p2gs_jax.train.strategies import make_strategy, mcmc
-from p2gs_jax.train.strategies.adaptive import Adaptive
-from p2gs_jax.train.strategies.base import Strategy
-from p2gs_jax.train.strategies.mcmc import SLOTS, Mcmc
+from p2gs_jax.train.state import HostState, alive_in, initial_state
+from p2gs_jax.train.strategies import SLOTS, Adaptive, Keep, Mcmc, Slots
 from p2gs_jax.types import Params, Photometry
 
 SEEDS, COVERAGE = 50, Coverage(400 * 300, 1.0)
 DEFAULT = default_max_gaussians(SEEDS, COVERAGE, FitConfig().train)
 
 
-def of(seeds=SEEDS, **densify):
+def of(**densify):
     cfg = with_fields(FitConfig(), {f"densify.{k}": v for k, v in densify.items()})
-    said = []
-    run = SimpleNamespace(
-        cfg=cfg,
-        extent=1.0,
-        coverage=COVERAGE,
-        levels=((1.0, 1),),
-        views=None,
-        clock=Stopwatch(),
-        on_message=said.append,
-        said=said,
-    )
-    return make_strategy(run, seeds)
+    return strategies.make_strategy(cfg, COVERAGE, ((1.0, 1),)), cfg
 
 
 def state():
@@ -54,39 +37,43 @@ def state():
         ({}, Mcmc, DEFAULT, -(-DEFAULT // SLOTS) * SLOTS, True),
         ({"method": "adaptive"}, Adaptive, None, SEEDS, False),
         ({"method": "adaptive", "max_gaussians": 300}, Adaptive, 300, SEEDS, False),
-        ({"method": None, "max_gaussians": 300}, Strategy, 300, SEEDS, True),
+        ({"method": None, "max_gaussians": 300}, Keep, 300, SEEDS, True),
     ],
 )
 def test_a_configuration_means_a_strategy_with_its_bounds(densify, kind, limit, slots, ahead):
-    strategy = of(**densify)
+    strategy, _ = of(**densify)
+    found = strategies.started(strategy, SEEDS)
     assert type(strategy) is kind
-    assert (strategy.limit, strategy.slots, strategy.slots_stay) == (limit, slots, ahead)
-    assert strategy.most == max(limit or 0, slots)
+    assert (found, strategy.slots_stay) == (Slots(limit, slots), ahead)
+    assert found.most == max(limit or 0, slots)
+    assert (strategy.noise is not None) == (kind is Mcmc)
 
 
 def test_it_is_due_within_its_time_and_not_too_often():
-    strategy = of(start=0.1, stop=0.5, every=0.05, min_every_steps=10)
+    strategy, cfg = of(start=0.1, stop=0.5, every=0.05, min_every_steps=10)
 
-    def due(progress, densified_at, pace=0.001):
-        return strategy.is_due(HostState(progress=progress, densified_at=densified_at, pace=pace))
+    def due(progress, densified_at, pace=0.001, strategy=strategy):
+        host = HostState(progress=progress, densified_at=densified_at, pace=pace)
+        return strategies.is_due(strategy, cfg.densify, host)
 
     assert due(0.2, 0.1)
     assert not due(0.2, 0.16)
     assert not due(0.2, 0.1, pace=0.02)
     assert not due(0.05, 0.0)
     assert not due(0.5, 0.1)
-    assert not of(method=None).is_due(HostState(progress=0.2, pace=0.001))
+    assert not due(0.2, 0.0, strategy=of(method=None)[0])
 
 
 def test_fits_share_the_relocation_and_count_what_found_no_slot(monkeypatch):
     chex.clear_trace_counter()
     jax.clear_caches()
-    monkeypatch.setattr(mcmc, "demand", chex.assert_max_traces(mcmc.demand, n=1))
+    monkeypatch.setattr(strategies, "demand", chex.assert_max_traces(strategies.demand, n=1))
     for _ in range(2):
-        strategy, host = of(max_gaussians=150), HostState(step=7, progress=0.4999, pace=0.01)
+        strategy, cfg = of(max_gaussians=3 * SEEDS)
+        host, said = HostState(step=7, progress=0.4999, pace=0.01), []
+        grown = strategies.densified(strategy, state(), host, cfg, 1.0, 3 * SEEDS, said.append)
         # Nothing was seen yet, so nothing pulls, and nobody is born.
-        state_ = strategy.densify(state(), host)
-        assert count_alive(state_) == SEEDS
+        assert alive_in(grown.population) == SEEDS
         assert host.refused == SEEDS
-        assert len(strategy.run.said) == 1
-        assert "Step 7: 50 Gaussians wanted to grow" in strategy.run.said[0]
+        assert len(said) == 1
+        assert "Step 7: 50 Gaussians wanted to grow" in said[0]

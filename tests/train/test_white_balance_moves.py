@@ -1,6 +1,5 @@
 """White balance is learned like exposures where it varies per view, and nowhere else."""
 
-import dataclasses
 import itertools
 import json
 
@@ -11,17 +10,16 @@ import pytest
 from tiny_scene import make_scene
 
 from p2gs_jax.cli import main
-from p2gs_jax.config import CameraFormation, FitConfig
+from p2gs_jax.config import FitConfig
 from p2gs_jax.evaluation.seams import Photographed, measure_seam
 from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.photometry.formation import corner, squared_radii
-from p2gs_jax.pipeline.decide import decide, likely, unsolved
+from p2gs_jax.pipeline.exposures import decide, likely, unsolved
 from p2gs_jax.render.warp import surface_depth
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.run.read import load_run
-from p2gs_jax.train.advance import _recentered, finite_names
-from p2gs_jax.train.optimizer import learning_rates, make_optimizer
-from p2gs_jax.train.step import Step
+from p2gs_jax.train.optimizer import learning_rates
+from p2gs_jax.train.update import _recentered, finite_names
 from p2gs_jax.types import Gaussians, Params, Photometry
 
 GAUSSIANS = Gaussians(
@@ -62,18 +60,6 @@ def test_faults_name_what_there_is():
     names = finite_names({"l1": 0}, params(jnp.zeros((2, 3))))
     assert names[-1] == "gradient of white balances"
     assert len(names) == len(finite_names({"l1": 0}, params(None))) + 1
-
-
-def test_programs_know_what_photometry_consists_of():
-    """A program that was compiled ahead must not be taken for another structure."""
-    plain = FitConfig()
-    balanced = with_fields(plain, {"photometry.white_balance": "view"})
-    photometry = dataclasses.replace(plain.photometry, cameras=(CameraFormation("a"),))
-    shaded = dataclasses.replace(plain, photometry=photometry)
-    steps = [Step(cfg, make_optimizer(cfg), 1.0) for cfg in (plain, balanced, shaded)]
-    for name in ("differentiate", "advance"):
-        settings = [step.settings(name)["cfg"] for step in steps]
-        assert len(set(settings)) == 3, name
 
 
 def test_without_a_solution_only_views_learn():

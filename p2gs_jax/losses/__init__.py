@@ -1,1 +1,0 @@
-"""What a step minimises: the photograph, relative exposures, gauges."""

@@ -1,0 +1,212 @@
+"""Exposures of photographs against somebody else's splats, and these as linear radiance."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from p2gs_jax.config import FitConfig, require_config
+from p2gs_jax.core.atomic import no_empty_folders
+from p2gs_jax.core.clock import Stopwatch
+from p2gs_jax.core.progress import Reporter, Silent
+from p2gs_jax.errors import UserError
+from p2gs_jax.evaluation.against import score_foreign
+from p2gs_jax.formats.splat import read_foreign
+from p2gs_jax.gaussians.bake import relit, viewer_config
+from p2gs_jax.gaussians.dense import coverage_of
+from p2gs_jax.gaussians.seeds import cameras_radius
+from p2gs_jax.photometry.calibrate import Selection
+from p2gs_jax.photometry.display import usual_display
+from p2gs_jax.photometry.observations import Observations
+from p2gs_jax.photometry.parameters import initial_photometry
+from p2gs_jax.photometry.sources.points import has_tracks, rendered_colors, track_colors
+from p2gs_jax.pipeline.calibrate import Calibration, solved, write_calibration
+from p2gs_jax.pipeline.exposures import decide
+from p2gs_jax.pipeline.finish import Account, finish
+from p2gs_jax.pipeline.fit import begun, compact, optimise
+from p2gs_jax.pipeline.preflight import Paths, check_run_dir
+from p2gs_jax.pipeline.prepare import Prepared
+from p2gs_jax.run.folder import RunFolder, locked
+from p2gs_jax.scene import load_scene
+from p2gs_jax.scene.exposures import check_source
+from p2gs_jax.scene.pixels.store import ImageStore
+from p2gs_jax.train.step import StepPrograms
+from p2gs_jax.types import Gaussians, Params, Scene
+
+# Steps of refitting colours and opacities, one view each.
+STEPS = 600
+# Below this correlation of renders with photographs a model belongs to other poses, most likely.
+LEAST_AGREEMENT = 0.5
+
+
+def calibrate_of(
+    scene_dir: str | Path,
+    out: str | Path,
+    cfg: FitConfig | None = None,
+    *,
+    model: str | Path,
+    steps: int = STEPS,
+    compare_with: str | None = None,
+    reporter: Reporter | None = None,
+) -> Calibration:
+    """Solve exposures of somebody's splats' photographs, and refit the splats as linear radiance.
+
+    Exposures come from the scene's tracks, or, where it has none, through the model's depth.
+    Places, shapes and number of the Gaussians stay; colours and opacities are fitted under the
+    exposures found. `out` becomes a run folder that has the files of a calibration as well.
+
+    Args:
+        scene_dir: see `fit`; the views that it holds out judge the result.
+        out: created; it must hold no run.
+        cfg: options (data, photometry, loss, rendering); default `robust`.
+        model: display colours, in the coordinates of the scene's poses.
+        steps: of refitting colours and opacities, one view each.
+        compare_with: see `calibrate`.
+        reporter: receives progress.
+
+    Raises:
+        UserError: something the user can mend.
+    """
+    begin, cfg = time.monotonic(), converting(require_config(cfg), steps)
+    reporter, folder, scene_dir = reporter or Silent(), RunFolder(Path(out)), Path(scene_dir)
+    check_run_dir(folder.root, False, cfg)
+    for source in (cfg.photometry.known, compare_with):
+        check_source(source)
+    reporter.stage("Reading the model")
+    foreign, dropped = read_foreign(Path(model))
+    with no_empty_folders(folder.root), locked(folder.root):
+        scene = load_scene(scene_dir, cfg.data, folder.root / "cache", reporter.message)
+        if len(scene.train_indices) < 2:
+            raise UserError(
+                f"{scene_dir} has {len(scene.train_indices)} training view(s); exposures need two.",
+                fix="add photographs that were posed together with the model",
+            )
+        store = ImageStore(scene.views, cfg.data)
+        reporter.stage("Judging the model")
+        before, agreement = score_foreign(foreign, scene, store, viewer_config(cfg.render))
+        observations = _seen_through(foreign, scene, store, cfg, reporter)
+        _check(observations, agreement, Path(model), scene_dir)
+        found = solved(scene, observations, cfg, begin, compare_with, reporter)
+        start = _converted(foreign, scene, store, found.selection, cfg)
+        start.notes += [*scene.notes, *found.selection.reasons, *found.solution.warnings]
+        if dropped:
+            start.notes.append(f"{dropped} Gaussians of the model are not finite: left out.")
+        for note in start.notes:
+            reporter.message(note)
+        metrics = _refit(start, folder, Paths(scene_dir, folder.root), cfg, found, before, reporter)
+        write_calibration(found, folder.root)
+        store.close()
+    return dataclasses.replace(found, metrics=metrics)
+
+
+def _refit(
+    start: Prepared,
+    folder: RunFolder,
+    paths: Paths,
+    cfg: FitConfig,
+    found: Calibration,
+    before: dict[str, Any],
+    reporter: Reporter,
+) -> dict[str, Any]:
+    """Fit colours and opacities under the exposures found; return what `metrics.json` holds."""
+    clock = Stopwatch()
+    clock.add("reading", found.seconds["reading"])
+    clock.add("photometry", found.seconds["adjustment"])
+    with (
+        contextlib.closing(StepPrograms()) as programs,
+        begun(folder, paths, cfg, start.decisions),
+    ):
+        result = optimise(start, folder, reporter, programs, resume=False)
+    params, _ = compact(result)
+    account = Account(
+        counts={
+            "gaussians": params.gaussians.capacity,
+            "train_views": len(start.scene.train_indices),
+            "test_views": len(start.scene.test_indices),
+            "steps": result.host.step,
+        },
+        seconds={**clock.seconds, **result.seconds, "optimisation": result.host.elapsed_s},
+        selection=start.selection,
+        notes=start.notes,
+        of=before,
+    )
+    return finish(params, start.scene, start.store, start.cfg, folder, account, reporter)
+
+
+def _seen_through(
+    foreign: Gaussians, scene: Scene, store: ImageStore, cfg: FitConfig, reporter: Reporter
+) -> Observations:
+    """Sample colours at tracks where the scene has any: what a model shows of depth is coarser."""
+    still = store.leaving_out(scene.objects).only_opaque()
+    if has_tracks(scene):
+        return track_colors(scene, still, lambda i, n: reporter.stage("Sampling colours", i, n))
+    return rendered_colors(
+        foreign,
+        scene,
+        still,
+        viewer_config(cfg.render),
+        cfg.train.seed,
+        lambda i, n: reporter.stage("Rendering depth", i, n),
+    )
+
+
+def converting(cfg: FitConfig, steps: int) -> FitConfig:
+    """Return the options under which colours and opacities move, and nothing else of a model."""
+    replace = dataclasses.replace
+    still = dict.fromkeys(("means", "scales", "quats"), 0.0)
+    return replace(
+        cfg,
+        optimizer=replace(cfg.optimizer, **still),
+        densify=replace(cfg.densify, method=None, max_gaussians=None),
+        dynamics=replace(cfg.dynamics, method="mask"),
+        train=replace(cfg.train, steps=steps, budget_s=None, coarse_to_fine=()),
+    )
+
+
+def _check(observations: Observations, agreement: float, model: Path, scene: Path) -> None:
+    """Refuse a model that does not show what the photographs do.
+
+    Raises:
+        UserError: no pixel is seen twice, or renders look like something else.
+    """
+    fix = "export the model in the coordinates of these poses (docs/photometry.md)"
+    if not len(observations.views):
+        raise UserError(
+            f"{model} has no surface that two photographs of {scene} see: its coordinates are not "
+            "those of the poses, or it is transparent everywhere.",
+            fix=fix,
+        )
+    if not agreement >= LEAST_AGREEMENT:
+        raise UserError(
+            f"renders of {model} do not look like the photographs of {scene} (correlation "
+            f"{agreement:.2f}, where {LEAST_AGREEMENT:g} is needed): its coordinates are not those "
+            "of the poses, most likely.",
+            fix=fix,
+        )
+
+
+def _converted(
+    foreign: Gaussians, scene: Scene, store: ImageStore, selection: Selection, cfg: FitConfig
+) -> Prepared:
+    """Return what a fit starts from: the model's Gaussians as radiance, and exposures."""
+    decisions = decide(cfg, selection)
+    resolved = decisions.resolve(cfg)
+    taken_by = [view.camera for view in scene.training_views]
+    plain = Params(foreign, initial_photometry(selection.solution, taken_by, resolved))
+    shown = usual_display(plain, taken_by, None, resolved.photometry)
+    return Prepared(
+        scene=scene,
+        store=store,
+        fitted=store.leaving_out(scene.objects),
+        params=dataclasses.replace(plain, gaussians=relit(foreign, shown, resolved.render)),
+        extent=cameras_radius(scene.training_views, np.asarray(foreign.means)),
+        coverage=coverage_of(scene, store),
+        decisions=decisions,
+        cfg=resolved,
+        selection=selection,
+    )

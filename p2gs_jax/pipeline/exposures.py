@@ -1,0 +1,231 @@
+"""Exposures before the first step, and what a scene decides that the options leave open.
+
+Colours of shared points are sampled from the photographs, model and curve are chosen and solved
+from them; where nothing is shared, exposures start at 1 and are learned.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.core.progress import Reporter, Silent
+from p2gs_jax.photometry.calibrate import Selection, calibrate_observations, options_of
+from p2gs_jax.photometry.models import Form
+from p2gs_jax.photometry.observations import Observations
+from p2gs_jax.photometry.parameters import initial_photometry
+from p2gs_jax.photometry.response import Response
+from p2gs_jax.photometry.sources.points import has_tracks, surface_colors
+from p2gs_jax.run.checkpoint import CheckpointStore
+from p2gs_jax.run.decisions import KEY, Decisions
+from p2gs_jax.run.folder import RunFolder
+from p2gs_jax.scene.pixels.store import ImageStore
+from p2gs_jax.types import Photometry, Scene
+
+# Exposures that are learned from nothing move this many times faster (docs/photometry.md, 4).
+FROM_NOTHING = 10.0
+
+OnChosen = Callable[[Form, Response], None]
+
+
+@dataclass(frozen=True)
+class Exposures:
+    """What is known of the light of a scene's photographs before the first step.
+
+    Attributes:
+        photometry: parameters of the training views to start from.
+        decisions: what the scene settled.
+        observations: colours of shared points, or None.
+        selection: model, exposures and their errors, or None where nothing was solved here.
+        radiance: linear, of the scene's points; None: it follows from the selection.
+        notes: what the user should know.
+    """
+
+    photometry: Photometry
+    decisions: Decisions
+    observations: Observations | None = None
+    selection: Selection | None = None
+    radiance: Float32[np.ndarray, "p 3"] | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def solved(self) -> bool:
+        """Whether exposures are known, here or for a whole of which the scene is a part."""
+        return self.selection is not None or self.radiance is not None
+
+
+def solve_exposures(
+    scene: Scene,
+    still: ImageStore,
+    cfg: FitConfig,
+    reporter: Reporter | None = None,
+    *,
+    on_chosen: OnChosen = lambda form, response: None,
+    dense: bool = False,
+    kept: Decisions | None = None,
+) -> Exposures:
+    """Sample colours of shared points, and solve the photometry from them; both where possible.
+
+    Args:
+        scene: views, points, tracks.
+        still: photographs of what stands still and is opaque.
+        cfg: as asked.
+        reporter: receives progress.
+        on_chosen: receives model and curve before they are solved.
+        dense: observations are wanted even where the fit starts from no exposures.
+        kept: what the checkpoints of a run that is resumed remember: its model and curve stay.
+    """
+    observations, selection, notes = _solve(
+        scene, still, cfg, reporter or Silent(), on_chosen, dense=dense, kept=kept
+    )
+    decisions = decide(cfg, selection, kept=kept)
+    resolved = decisions.resolve(cfg)
+    solution = None if selection is None else selection.solution
+    taken_by = [view.camera for view in scene.training_views]
+    photometry = initial_photometry(solution, taken_by, resolved)
+    return Exposures(photometry, decisions, observations, selection, notes=tuple(notes))
+
+
+def _solve(
+    scene: Scene,
+    store: ImageStore,
+    cfg: FitConfig,
+    reporter: Reporter,
+    on_chosen: OnChosen,
+    *,
+    dense: bool,
+    kept: Decisions | None,
+) -> tuple[Observations | None, Selection | None, list[str]]:
+    from_tracks = cfg.photometry.start == "tracks"
+    if not (has_tracks(scene) or from_tracks or dense):
+        return None, None, []
+    notes = []
+    if scene.random_seeds:
+        notes = ["Seeds at random show nothing twice: exposures start at 1 and are learned."]
+        return None, None, notes if from_tracks else []
+    if not has_tracks(scene):
+        notes.append("No tracks: seed points are projected into the views instead.")
+    tracks = surface_colors(
+        scene, store, cfg.train.seed, lambda i, n: reporter.stage("Sampling colours", i, n)
+    )
+    if not from_tracks:
+        return tracks, None, notes
+    if not len(tracks.points):
+        notes.append(
+            "No point is seen twice: exposures start at 1 and are learned from the first step."
+        )
+        return tracks, None, notes
+    reporter.stage("Photometric bundle adjustment")
+    under = cfg if kept is None else kept.resolve(cfg)
+    selection = calibrate_observations(tracks, options_of(under, scene), on_chosen)
+    if kept is not None:
+        selection = dataclasses.replace(selection, reasons=kept.reasons)
+    return tracks, selection, [*notes, *selection.reasons, *selection.solution.warnings]
+
+
+def decide(
+    cfg: FitConfig, selection: Selection | None, *, kept: Decisions | None = None
+) -> Decisions:
+    """Return what the photographs decided.
+
+    Args:
+        cfg: as asked.
+        selection: what the bundle adjustment chose and solved, or None.
+        kept: from the checkpoints of a run that is resumed: what its cameras do stays to the digit.
+    """
+    decided = Decisions.as_asked(cfg)
+    if selection is None:
+        decided = unsolved(decided)
+        return without_tracks(decided) if cfg.photometry.start == "tracks" else decided
+    s = selection.solution
+    form = Form(s.model, s.white_balance_level, s.vignetting)
+    decided = dataclasses.replace(
+        with_choice(decided, form, s.response),
+        reasons=tuple(selection.reasons),
+        cameras=s.cameras if kept is None else kept.cameras,
+    )
+    if cfg.photometry.known is None:
+        return decided
+    # Known exposures that are to be kept are not learned, and nothing pulls at their mean.
+    keep = cfg.photometry.known_deviation_ev == 0
+    return dataclasses.replace(
+        decided,
+        log_exposure_mean=None,
+        freeze_until=1.0 if keep else decided.freeze_until,
+    )
+
+
+def likely(cfg: FitConfig, kept: Decisions | None) -> Decisions | None:
+    """Return what most scenes decide, to compile for it beforehand; None: who knows.
+
+    Args:
+        cfg: as asked.
+        kept: from the checkpoints of a run that is resumed, or None.
+    """
+    p, relative = cfg.photometry, cfg.loss.relative_exposure
+    if p.known is not None or relative.weight is not None or cfg.densify.method != "mcmc":
+        return None
+    # What cameras do enters the programs, and is not solved yet.
+    solved = p.start == "tracks" and (p.vignetting is not None or p.responses != "all")
+    if kept is None and not p.select and solved:
+        return None
+    decided = Decisions.as_asked(cfg)
+    if kept is not None:
+        chosen = ("model", "curve", "spline", "white_balance", "vignetting", "responses", "cameras")
+        return dataclasses.replace(decided, **{name: getattr(kept, name) for name in chosen})
+    if p.start != "tracks":
+        return unsolved(decided)
+    if p.select:
+        return dataclasses.replace(
+            decided, model="view_exposure", white_balance=None, vignetting=None, responses="all"
+        )
+    return decided
+
+
+def with_choice(decided: Decisions, form: Form, response: Response) -> Decisions:
+    """Return the decisions under a form and a curve; what cameras do follows from the solution."""
+    return dataclasses.replace(
+        decided,
+        model=form.model,
+        curve=response.curve,
+        spline=response.spline,
+        white_balance=form.white_balance,
+        vignetting=form.vignetting,
+        responses=response.by,
+    )
+
+
+def unsolved(decided: Decisions) -> Decisions:
+    """Return the decisions without what only a solution can give; views may still learn theirs."""
+    by_view = decided.white_balance == "view"
+    return dataclasses.replace(
+        decided,
+        white_balance="view" if by_view else None,
+        vignetting=None,
+        responses="all",
+    )
+
+
+def without_tracks(decided: Decisions) -> Decisions:
+    """Return the decisions for exposures learned from nothing: from the first step, and fast."""
+    return dataclasses.replace(
+        decided,
+        freeze_until=0.0,
+        exposure_rate=FROM_NOTHING * decided.exposure_rate,
+        gamma_rate=FROM_NOTHING * decided.gamma_rate,
+    )
+
+
+def kept_choice(cfg: FitConfig, folder: RunFolder) -> Decisions | None:
+    """Return what the checkpoints of a run remember; None: nothing was found, or there are none."""
+    p = cfg.photometry
+    solved = p.vignetting is not None or p.responses != "all"
+    if not ((p.select or solved) and p.start == "tracks"):
+        return None
+    saved = (CheckpointStore(folder.checkpoints).latest_meta() or {}).get(KEY)
+    return None if saved is None else Decisions.from_dict(saved)

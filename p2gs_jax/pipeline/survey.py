@@ -1,0 +1,212 @@
+"""What a scene offers before its exposures are known: photographs, size, places of seeds."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from p2gs_jax.config import FitConfig, InitConfig
+from p2gs_jax.core.numerics import evenly_spaced
+from p2gs_jax.errors import UserError
+from p2gs_jax.gaussians.dense import coverage_of, wants_dense
+from p2gs_jax.gaussians.moving import Nodes, clock_of, find_nodes, vibrates
+from p2gs_jax.gaussians.population import Coverage
+from p2gs_jax.gaussians.seeds import camera_centers, cameras_radius, subsample
+from p2gs_jax.gaussians.shell import Shell, Sphere, find_shell
+from p2gs_jax.pipeline.preflight import memory_needed, require_memory
+from p2gs_jax.scene.pixels.store import ImageStore
+from p2gs_jax.scene.visibility import SHARE_POINTS, SHARE_VIEWS, in_frame, project_points
+from p2gs_jax.train.lidar_depths import measured_depths
+from p2gs_jax.train.schedule import shrinks
+from p2gs_jax.types import Measured, Scene, View
+
+# The near plane is not farther than this share of the depth of near points (their percentile).
+NEAR_SHARE, NEAR_PERCENTILE = 0.2, 1.0
+# What a view shows near: this percentile of its points, many of which others hide.
+EXTENT_PERCENTILE = 10.0
+# Steps of float32 at the scene's place, as a share of that depth; beyond, surfaces jitter.
+COARSE = 1e-4
+
+
+@dataclass(frozen=True)
+class Survey:
+    """A scene before its exposures are known.
+
+    Attributes:
+        scene: views, points, tracks.
+        cfg: as asked.
+        store: photographs, whole; its cameras see what moves.
+        fitted: the same photographs without the pixels that are left out of the fit.
+        still: those of what stands still and is opaque: exposures and seeds come from them.
+        nodes: moving objects and their points, or None.
+        vibrating: Gaussians move by themselves.
+        radius: of the cameras, scene units.
+        extent: what rates of the means are shares of, scene units.
+        near: near plane, scene units, where the one asked for would cut the scene, or None.
+        coverage: how much of the scene the views show.
+        measured: of every training view the depths that the loss compares with, or None.
+        dense: seeds come from matching photographs as well.
+        seeds: rows of the scene's points that become Gaussians.
+        init: options of seeds; no shell where a background lies behind everything.
+        sphere: where a shell lies, where that is given.
+        shell: what lies behind all points; None: nothing, or dense seeds decide it.
+        scale_notes: what the user should know of units and place.
+        seed_notes: likewise of the seeds.
+    """
+
+    scene: Scene
+    cfg: FitConfig
+    store: ImageStore
+    fitted: ImageStore
+    still: ImageStore
+    nodes: Nodes | None
+    vibrating: bool
+    radius: float
+    extent: float
+    near: float | None
+    coverage: Coverage
+    measured: Sequence[Measured] | None
+    dense: bool
+    seeds: Int[np.ndarray, " s"]
+    init: InitConfig
+    sphere: Sphere | None
+    shell: Shell | None
+    scale_notes: list[str]
+    seed_notes: list[str]
+
+
+def survey(
+    scene: Scene, cfg: FitConfig, *, pixels: Path | None = None, sphere: Sphere | None = None
+) -> Survey:
+    """Find what a scene offers without its exposures; see `prepare`.
+
+    Raises:
+        UserError: there is not the memory for a fit, nothing to see, or two backgrounds.
+    """
+    nodes, vibrating = find_nodes(scene, cfg.dynamics), vibrates(scene, cfg)
+    moving = clock_of(scene) if vibrating else None if nodes is None else nodes.moving
+    store = ImageStore(scene.views, cfg.data, moving=moving, folder=pixels)
+    store.expect(shrinks(cfg.train))
+    still = store.leaving_out(scene.objects, cfg.dynamics.margin)
+    fitted = still
+    if cfg.dynamics.method != "mask":
+        left = () if nodes is None else nodes.left
+        fitted = store.leaving_out(left, cfg.dynamics.margin)
+    _require_something_to_see(scene, fitted)
+    radius = cameras_radius(scene.training_views, scene.points)
+    depths = seen_depths(scene.points, scene.training_views)
+    near = near_plane(near_depth(depths), cfg)
+    coverage = coverage_of(scene, store)
+    require_memory(memory_needed(scene, cfg, coverage))
+    seeds, thinned = _choose_points(scene, cfg)
+    dense, init = wants_dense(scene, coverage, cfg), _shell_options(store, cfg)
+    views = scene.training_views
+    return Survey(
+        scene=scene,
+        cfg=cfg,
+        store=store,
+        fitted=fitted,
+        still=still.only_opaque(),
+        nodes=nodes,
+        vibrating=vibrating,
+        radius=radius,
+        extent=extent_of_rates(radius, depths, cfg),
+        near=near,
+        coverage=coverage,
+        measured=measured_depths(scene, cfg),
+        dense=dense,
+        seeds=seeds,
+        init=init,
+        sphere=sphere,
+        # Dense seeds cover some of what the points do not.
+        shell=None if dense else find_shell(views, scene.points, radius, init, sphere),
+        scale_notes=scale_notes(scene, near, cfg, near_depth(depths)),
+        seed_notes=thinned,
+    )
+
+
+def _require_something_to_see(scene: Scene, store: ImageStore) -> None:
+    """Refuse masks that hide everything; of most scenes the first photograph is looked at."""
+    if not any(store.stored(index)[1].any() for index in scene.train_indices):
+        raise UserError(
+            f"the masks hide every pixel of all {len(scene.train_indices)} training views.",
+            fix="masks are black where pixels are to be ignored: invert them, or take them away",
+        )
+
+
+def _shell_options(store: ImageStore, cfg: FitConfig) -> InitConfig:
+    """Return the options of seeds: what lies behind everything is the background, or a shell."""
+    behind = cfg.render.background is not None
+    if store.backdrop is not None and behind:
+        raise UserError(
+            "render.background is light behind the splats, and the photographs' alpha shows "
+            "data.background there.",
+            fix="leave one of them out: --render.background None, or --data.alpha mask",
+        )
+    if (store.backdrop is not None or behind) and cfg.init.shell == "auto":
+        return dataclasses.replace(cfg.init, shell="off")
+    return cfg.init
+
+
+def _choose_points(scene: Scene, cfg: FitConfig) -> tuple[np.ndarray, list[str]]:
+    """Return at most as many rows of points as the options allow, and what to say of it."""
+    bound, most, option = cfg.densify.max_gaussians, cfg.init.max_seeds, "--init.max-seeds"
+    if bound is not None and bound <= most:
+        most, option = bound, "--gaussians"
+    keep = subsample(len(scene.points), most, cfg.train.seed)
+    if len(keep) == len(scene.points):
+        return keep, []
+    return keep, [f"{len(scene.points)} seed points were thinned to {len(keep)} ({option})."]
+
+
+def seen_depths(points: Float[np.ndarray, "p 3"], views: Sequence[View]) -> Float[np.ndarray, " n"]:
+    """Return depths of some points in the frusta of some views, scene units."""
+    sample = points[:: max(1, len(points) // SHARE_POINTS)]
+    depths = []
+    for row in evenly_spaced(len(views), SHARE_VIEWS):
+        xy, z = project_points(sample, views[row])
+        depths.append(z[in_frame(xy, z, views[row].width, views[row].height)])
+    return np.concatenate(depths) if depths else np.zeros(0)
+
+
+def near_depth(depths: Float[np.ndarray, " n"]) -> float | None:
+    """Return how deep the nearest points lie, scene units; None where none is seen."""
+    return float(np.percentile(depths, NEAR_PERCENTILE)) if len(depths) else None
+
+
+def extent_of_rates(radius: float, depths: Float[np.ndarray, " n"], cfg: FitConfig) -> float:
+    """Return the length that rates of the means are shares of, from the cameras' radius."""
+    if cfg.optimizer.extent == "cameras" or not len(depths):
+        return radius
+    return min(radius, float(np.percentile(depths, EXTENT_PERCENTILE)))
+
+
+def near_plane(depth: float | None, cfg: FitConfig) -> float | None:
+    """Return a near plane for scenes that the one asked for would cut; None: it stays."""
+    if depth is None or cfg.render.near <= NEAR_SHARE * depth:
+        return None
+    return float(f"{NEAR_SHARE * depth:.2g}")
+
+
+def scale_notes(scene: Scene, near: float | None, cfg: FitConfig, depth: float | None) -> list[str]:
+    """Return what the user should know of the scene's units and place."""
+    out = []
+    if near is not None:
+        out.append(
+            f"The near plane is {near:g} scene units instead of {cfg.render.near:g}, which would "
+            "cut off what the photographs show."
+        )
+    away = float(np.abs(camera_centers(scene.training_views)).max())
+    step = away * float(np.finfo(np.float32).eps)
+    if depth is not None and step > COARSE * depth:
+        out.append(
+            f"The cameras are up to {away:.2g} scene units from the origin, where float32 has "
+            f"steps of {step:.1g}, {step / depth:.1%} of the way to the nearest surfaces: "
+            "these may jitter. Subtract a common offset from poses and points."
+        )
+    return out

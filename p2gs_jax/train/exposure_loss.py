@@ -1,0 +1,188 @@
+"""Relative exposure consistency: L_exp and its readings (paper, eq. 9; docs/photometry.md, 3).
+
+Printed: L_exp = (1/M) sum |alpha_ij L_i - L_j|_1 with alpha_ij = e_j / e_i and L free of exposure.
+At the truth L_i = L_j for the same surface, so the printed formula is zero only where all
+exposures are equal; each reading below is one way of making sense of it. Where white balance and
+vignetting are modelled, e W V stands for e.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from p2gs_jax.config import FitConfig, LossConfig, PhotometryConfig
+from p2gs_jax.core.numerics import on_device
+from p2gs_jax.errors import UserError
+from p2gs_jax.photometry.formation import darkens, expose, gain, inverse_formation, tone_map
+from p2gs_jax.photometry.observations import Observations, sample_pairs
+from p2gs_jax.types import Camera, Photometry
+
+# The readings that subtract renders from two poses.
+SECOND_RENDER_FORMS = ("literal_pixels",)
+# Where less than this share of the pairs is valid, the mean is taken as if that many were.
+FEWEST_VALID = 0.01
+# Pairs that the steps of a fit draw from.
+PAIR_POOL = 200_000
+
+
+class ColorPairs(eqx.Module):
+    """Photographed colours of the same surface points in two training views.
+
+    Attributes:
+        colors_i: display-encoded colours in the first view.
+        colors_j: and in the second.
+        views_i: rows in `Photometry`.
+        views_j: likewise.
+        valid: 1 = use.
+        positions_i: where in the first view's image, from its centre in units of half its
+            diagonal; None where nothing depends on it.
+        positions_j: likewise in the second.
+    """
+
+    colors_i: Float[Array, "m 3"]
+    colors_j: Float[Array, "m 3"]
+    views_i: Int[Array, " m"]
+    views_j: Int[Array, " m"]
+    valid: Float[Array, " m"]
+    positions_i: Float[Array, "m 2"] | None = None
+    positions_j: Float[Array, "m 2"] | None = None
+
+
+class Partner(eqx.Module):
+    """What the relative-exposure loss compares the training view with.
+
+    Attributes:
+        view_index: a second view, drawn at random.
+        camera: its camera, for the reading that subtracts renders; same size as the training
+            view's.
+        pairs: track observations, for the reading that compares photographs.
+    """
+
+    view_index: Int[Array, ""]
+    camera: Camera | None = None
+    pairs: ColorPairs | None = None
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """The camera of the second render, if there is one."""
+        return () if self.camera is None else (self.camera,)
+
+
+def _per_pixel_l1(difference: Float[Array, "h w 3"]) -> Float[Array, ""]:
+    """(1/M) times the L1 norm over pixels and channels, M the number of pixels."""
+    return jnp.mean(jnp.sum(jnp.abs(difference), -1))
+
+
+def literal_same_pose(linear_i, e_i, e_j) -> Float[Array, ""]:
+    """Both radiances at one pose: |e_j/e_i - 1| L. Zero iff the exposures are equal."""
+    return _per_pixel_l1((e_j / e_i - 1) * linear_i)
+
+
+def literal_pixels(linear_i, linear_j, e_i, e_j) -> Float[Array, ""]:
+    """Renders of two poses, pixel by pixel: compares unrelated surface points."""
+    return _per_pixel_l1(e_j / e_i * linear_i - linear_j)
+
+
+def usable(colors: Float[Array, "m 3"], cfg: LossConfig) -> Float[Array, "m 3"]:
+    """Return 1 where a photographed value is neither near black nor saturated."""
+    return ((colors > cfg.black) & (colors < cfg.saturation)).astype(colors.dtype)
+
+
+def huber(x: Float[Array, "..."], delta: float) -> Float[Array, "..."]:
+    """Return the Huber loss with slope 1 in its tails."""
+    a = jnp.abs(x)
+    return jnp.where(a < delta, 0.5 * a * a / delta, a - 0.5 * delta)
+
+
+def observed_ldr(
+    pairs: ColorPairs, photometry: Photometry, loss: LossConfig, cfg: PhotometryConfig
+) -> Float[Array, ""]:
+    """Huber(T_j(alpha T_i^-1(I_i(u))) - I_j(w(u))): PIR in display units, scale-invariant.
+
+    The mean is over valid pairs; values near black or saturated count as zero.
+    """
+    capture_i, capture_j = photometry.capture(pairs.views_i), photometry.capture(pairs.views_j)
+    radiance = inverse_formation(pairs.colors_i, capture_i, cfg, pairs.positions_i)
+    predicted = expose(radiance, capture_j, cfg, pairs.positions_j)
+    shown = tone_map(predicted, capture_j.gamma[:, None], cfg, capture_j.camera)
+    error = huber(shown - pairs.colors_j, loss.relative_exposure.huber_delta)
+    weight = usable(pairs.colors_i, loss) * usable(pairs.colors_j, loss) * pairs.valid[:, None]
+    fewest = FEWEST_VALID * pairs.valid.size
+    return jnp.sum(weight * error) / jnp.maximum(jnp.sum(pairs.valid), fewest)
+
+
+def relative_exposure_loss(
+    linears: tuple[Float[Array, "h w 3"], Float[Array, "h w 3"] | None],
+    views: tuple[Int[Array, ""], Int[Array, ""]],
+    pairs: ColorPairs | None,
+    photometry: Photometry,
+    loss: LossConfig,
+    cfg: PhotometryConfig,
+) -> Float[Array, ""]:
+    """Return the configured reading, unweighted.
+
+    Args:
+        linears: renders of both views, the second for `literal_pixels` only.
+        views: their rows in `photometry`.
+        pairs: corresponding observations, for `observed_ldr`.
+        photometry: what every view did to light.
+        loss: the reading, and which values tell of exposure.
+        cfg: the image formation model.
+
+    Raises:
+        ValueError: the reading needs a second render or observations that were not given, or
+            renders of one size.
+    """
+    form = loss.relative_exposure.form
+    if form == "observed_ldr":
+        if pairs is None:
+            raise ValueError(f"the reading {form!r} needs corresponding observations")
+        return observed_ldr(pairs, photometry, loss, cfg)
+    linear_i, linear_j = linears
+    e_i, e_j = (gain(linear_i.shape, photometry.capture(row), cfg) for row in views)
+    if form == "literal_same_pose":
+        return literal_same_pose(linear_i, e_i, e_j)
+    if linear_j is None:
+        raise ValueError(f"the reading {form!r} needs the render of a second view")
+    if linear_j.shape != linear_i.shape:
+        sizes = f"{linear_i.shape} and {linear_j.shape}"
+        raise ValueError(f"the reading {form!r} subtracts renders of one size, not {sizes}")
+    return literal_pixels(linear_i, linear_j, e_i, e_j)
+
+
+def color_pairs(tracks: Observations | None, cfg: FitConfig) -> ColorPairs | None:
+    """Return pairs of colours of one point in two views; None where the loss uses none.
+
+    Raises:
+        UserError: the loss wants them and the scene has no tracks.
+    """
+    relative = cfg.loss.relative_exposure
+    if relative.weight is None or relative.form != "observed_ldr":
+        return None
+    if tracks is None or not len(tracks.points):
+        raise UserError(
+            "the relative-exposure loss was to compare photographs at tracks, and this scene has "
+            "none.",
+            fix="use --loss.relative-exposure.form literal_same_pose, or a scene with tracks",
+        )
+    first, second = sample_pairs(tracks, PAIR_POOL, cfg.train.seed)
+    return ColorPairs(
+        on_device(tracks.colors[first]),
+        on_device(tracks.colors[second]),
+        on_device(tracks.views[first], np.int32),
+        on_device(tracks.views[second], np.int32),
+        on_device(np.ones(len(first))),
+        *_positions(tracks, (first, second), cfg),
+    )
+
+
+def _positions(tracks: Observations, picks, cfg: FitConfig):
+    """Return where in their images observations lie; nothing where no camera has vignetting."""
+    if not darkens(cfg.photometry):
+        return ()
+    if tracks.positions is None:
+        raise ValueError("vignetting is modelled, and nobody knows where in the images points lie")
+    return tuple(on_device(tracks.positions[pick]) for pick in picks)

@@ -1,0 +1,126 @@
+"""Depths of laser measurements: which each view is compared with, and the loss (ours)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import overload
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.core.numerics import on_host
+from p2gs_jax.core.streams import Stream, generator
+from p2gs_jax.errors import UserError
+from p2gs_jax.evaluation.passes import ArrayStore, StoredArray, most_bytes
+from p2gs_jax.scene.drives.objects import object_mask
+from p2gs_jax.scene.visibility import project_points, unoccluded
+from p2gs_jax.types import Measured, Scene
+
+# Errors of log depth beyond this pull no harder: the measurement missed or hit what is behind.
+CLIP = 0.2
+# Less opaque pixels have no depth to speak of; the image decides there.
+LEAST_ALPHA = 0.05
+# Most measurements of a view that count.
+MOST_PER_VIEW = 8192
+# Measurements this near in time tell what hides what; further off, things have moved.
+NEAR_S = 1.0
+# They may take this share of the memory that photographs may.
+DEPTHS_SHARE = 0.125
+
+
+def lidar_loss(
+    alpha: Float[Array, "h w"], depth: Float[Array, "h w"] | None, measured: Measured
+) -> Float[Array, ""]:
+    """Return the mean Huber error of log depth at the measured pixels.
+
+    `depth` is premultiplied by `alpha`, as in `Render`.
+    """
+    assert depth is not None
+    height, width = alpha.shape
+    column = jnp.clip((measured.places[:, 0] * width).astype(jnp.int32), 0, width - 1)
+    row = jnp.clip((measured.places[:, 1] * height).astype(jnp.int32), 0, height - 1)
+    alpha, depth = alpha[row, column], depth[row, column]
+    known = (measured.depths > 0) & (alpha > LEAST_ALPHA) & (depth > 0)
+    expected = jnp.where(known, depth, 1.0) / jnp.where(known, alpha, 1.0)
+    error = jnp.abs(jnp.log(expected) - jnp.log(jnp.where(known, measured.depths, 1.0)))
+    huber = jnp.where(error < CLIP, 0.5 * error**2 / CLIP, error - 0.5 * CLIP)
+    return jnp.sum(jnp.where(known, huber, 0.0)) / jnp.maximum(jnp.sum(known), 1)
+
+
+class KeptDepths(Sequence[Measured]):
+    """The measured depths of some views, in memory up to a bound and on disk beyond it."""
+
+    def __init__(self, most: int):
+        """Begin empty, with at most so many bytes in memory."""
+        self._arrays = ArrayStore(most)
+        self._kept: list[tuple[StoredArray, StoredArray]] = []
+
+    @property
+    def bytes_held(self) -> int:
+        """Bytes in memory."""
+        return self._arrays.bytes_held
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    @overload
+    def __getitem__(self, row: int) -> Measured: ...
+
+    @overload
+    def __getitem__(self, row: slice) -> list[Measured]: ...
+
+    def __getitem__(self, row: int | slice) -> Measured | list[Measured]:
+        if isinstance(row, slice):
+            return [self[k] for k in range(*row.indices(len(self)))]
+        places, depths = self._kept[row]
+        return on_host(Measured, places.read(), depths.read())
+
+    def add(self, measured: Measured) -> None:
+        """Keep those of one more view."""
+        put = self._arrays.put
+        self._kept.append((put(np.asarray(measured.places)), put(np.asarray(measured.depths))))
+
+
+def measured_depths(scene: Scene, cfg: FitConfig) -> Sequence[Measured] | None:
+    """Return the measured depths of every training view; None where the loss asks for none.
+
+    Only what stands still counts, so that every sweep serves all views; what a nearer measurement
+    or a moving object hides is left out.
+
+    Raises:
+        UserError: the loss wants them and the scene has none.
+    """
+    if cfg.loss.lidar is None:
+        return None
+    if scene.lidar is None:
+        raise UserError(
+            f"{scene.root} has no laser measurements for --loss.lidar.",
+            fix="leave the option out, or name a drive with LiDAR sweeps",
+        )
+    rng = generator(cfg.train.seed, Stream.MEASURED_DEPTHS)
+    static = scene.lidar.objects < 0
+    points, times = scene.lidar.points[static], scene.lidar.times[static]
+    kept = KeptDepths(most_bytes(cfg.data.cache_mb, DEPTHS_SHARE))
+    for view in scene.training_views:
+        kept.add(_of_view(points, times, view, scene.objects, rng))
+    return kept
+
+
+def _of_view(points, times, view, objects, rng) -> Measured:
+    if view.time is not None:
+        nearest = np.abs(times - view.time)
+        points = points[nearest <= max(NEAR_S, nearest.min() + NEAR_S / 4)]
+    xy, z = project_points(points, view)
+    seen = np.flatnonzero(unoccluded(xy, z, view.width, view.height))
+    hidden = object_mask(view, objects, view.width, view.height)
+    column, row = xy[seen].astype(int).T
+    seen = seen[~hidden[row, column]]
+    if len(seen) > MOST_PER_VIEW:
+        seen = np.sort(rng.choice(seen, MOST_PER_VIEW, replace=False))
+    places = np.zeros((MOST_PER_VIEW, 2), np.float32)
+    depths = np.zeros(MOST_PER_VIEW, np.float32)
+    places[: len(seen)] = xy[seen] / [view.width, view.height]
+    depths[: len(seen)] = z[seen]
+    return on_host(Measured, places, depths)

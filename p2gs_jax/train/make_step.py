@@ -1,0 +1,181 @@
+"""The training step for loops of your own, with your own loss, image formation and densification.
+
+None of these needs a change of this package; the same arguments go to `fit`, which does everything
+else. docs/api.md, "Ablations", has examples.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, UInt
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.core.numerics import on_device
+from p2gs_jax.errors import DivergenceError
+from p2gs_jax.gaussians.population import Coverage
+from p2gs_jax.photometry.appearance import Formation
+from p2gs_jax.render.capacity import Room
+from p2gs_jax.train import strategies
+from p2gs_jax.train.exposure_loss import Partner
+from p2gs_jax.train.inputs import controls_at
+from p2gs_jax.train.optimizer import make_optimizer
+from p2gs_jax.train.room import room_for
+from p2gs_jax.train.state import (
+    FAULT_NONFINITE,
+    FAULT_OVERFLOW,
+    Fault,
+    FitState,
+    HostState,
+    initial_state,
+)
+from p2gs_jax.train.step import Step
+from p2gs_jax.train.strategies import Strategy
+from p2gs_jax.train.terms import LossTerm
+from p2gs_jax.train.update import StepReport, finite_names
+from p2gs_jax.types import Batch, Camera, Gaussians, Params, Photometry
+
+# Without a bound in `cfg`, populations are bounded as in a fit of views of this many pixels.
+PIXELS = 640 * 480
+
+
+class Own(NamedTuple):
+    """What a caller brings to a fit, in the place of what its configuration says; see `make_step`.
+
+    Attributes:
+        terms: loss terms by name.
+        formation: an image formation, or None.
+        strategy: a densification, or None.
+    """
+
+    terms: Mapping[str, LossTerm | None] | None = None
+    formation: Formation | None = None
+    strategy: Strategy | None = None
+
+    def among(self, params: Params) -> Params:
+        """Return parameters with those of the formation, if there is one."""
+        if self.formation is None:
+            return params
+        return dataclasses.replace(params, appearance=jax.tree.map(on_device, self.formation))
+
+
+AS_CONFIGURED = Own()
+
+
+class TrainingStep:
+    """A step of a view, and a densification; made by `make_step`.
+
+    Tile lists get room when a view of a new size comes, and more where one overflows.
+    """
+
+    def __init__(self, cfg: FitConfig, own: Own, extent: float):
+        self.cfg, self.extent, self.own = cfg, extent, own
+        chosen = strategies.make_strategy(cfg, Coverage(PIXELS, 1.0), ((1.0, 1),))
+        self.strategy = own.strategy or chosen
+        self.optimizer = make_optimizer(cfg)
+        noise = getattr(self.strategy, "noise", None)
+        self._step = Step(cfg, self.optimizer, extent, noise, own.terms or {})
+        self._host = HostState(pace=1.0 / max(cfg.train.steps, 1))
+        self._rooms: dict[tuple[int, int], Room] = {}
+
+    def start(self, gaussians: Gaussians, photometry: Photometry) -> FitState:
+        """Return the state before the first step; the Gaussians are the seeds."""
+        self._slots = strategies.started(self.strategy, gaussians.capacity)
+        params = self.own.among(Params(gaussians, photometry))
+        alive = jnp.ones(gaussians.capacity, bool)
+        return initial_state(params, alive, self.optimizer, self._slots.slots)
+
+    def __call__(
+        self,
+        state: FitState,
+        camera: Camera,
+        photograph: Float[Array, "h w 3"] | UInt[Array, "h w 3"],
+        view: int = 0,
+        *,
+        mask: Bool[Array, "h w"] | None = None,
+        progress: float = 0.0,
+    ) -> tuple[FitState, StepReport]:
+        """Return the state after a step of one view, and what the step reports.
+
+        Args:
+            state: before; donated.
+            camera: of the view.
+            photograph: display values in [0, 1], or integers of which the largest is 1.
+            view: row in `Photometry`.
+            mask: 1 = use; None: all pixels.
+            progress: fraction of the run completed, for the schedules of rates and harmonics.
+
+        Raises:
+            DivergenceError: a loss term or gradient is not finite.
+        """
+        cfg, size = self.cfg, (camera.width, camera.height)
+        mask = jnp.ones(size[::-1], bool) if mask is None else jnp.asarray(mask)
+        batch = Batch(camera, jnp.asarray(photograph), mask, jnp.int32(view))
+        controls = controls_at(progress, self._host.pace, 1.0, cfg)
+        if size not in self._rooms:
+            given = (state.params.gaussians, state.population.alive, camera)
+            gaussians, alive, seen = jax.tree.map(np.asarray, given)
+            most = self._slots.most
+            self._rooms[size] = room_for(gaussians, alive, [seen], most, cfg.render)
+        while True:
+            state, report = self._step(
+                state,
+                batch,
+                Partner(jnp.int32(0)),
+                controls,
+                room=self._rooms[size],
+                degree=cfg.render.sh_degree,
+            )
+            kind = int(state.fault.kind)
+            if kind == FAULT_NONFINITE:
+                name = finite_names(report.terms, state.params)[int(state.fault.term)]
+                raise DivergenceError(
+                    f"Step {int(state.step) + 1}: the {name} is not finite.",
+                    fix="lower the learning rates (optimizer.*)",
+                )
+            if kind != FAULT_OVERFLOW:
+                return state, report
+            needed = int(state.fault.needed), int(state.fault.visible)
+            self._rooms[size] = self._rooms[size].grown(*needed)
+            state = dataclasses.replace(state, fault=Fault.none())
+
+    def densify(self, state: FitState, progress: float) -> FitState:
+        """Return the state with the population that the strategy gives; the state is donated."""
+        self._host.step, self._host.progress = int(state.step), progress
+        return strategies.densified(
+            self.strategy,
+            state,
+            self._host,
+            self.cfg,
+            self.extent,
+            self._slots.limit,
+            lambda text: None,
+        )
+
+
+def make_step(
+    cfg: FitConfig,
+    *,
+    terms: Mapping[str, LossTerm | None] | None = None,
+    formation: Formation | None = None,
+    strategy: Strategy | None = None,
+    extent: float = 1.0,
+) -> TrainingStep:
+    """Return the training step of a configuration.
+
+    Args:
+        cfg: everything that is not replaced below.
+        terms: loss terms by name, added to those of `cfg` or in their place; None takes one away.
+            A term is a function of (Rendered, Target, Aux); see `train/terms.py`.
+        formation: an image formation in the place of the tone curve: a pytree with
+            `apply(radiance, capture)`, whose arrays are learned.
+        strategy: densification: an object with `start(seeds)` and `densify(gaussians, population,
+            now)`; see `train/strategies.py`.
+        extent: of the scene, scene units: rates of the means are shares of it.
+    """
+    return TrainingStep(cfg, Own(terms, formation, strategy), extent)

@@ -1,0 +1,150 @@
+"""What a run writes while it is optimised: the lines of `log.jsonl`, and checkpoints."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.core.atomic import append_jsonl, read_jsonl, write_text
+from p2gs_jax.core.progress import LogRecord
+from p2gs_jax.run.checkpoint import CheckpointStore
+from p2gs_jax.run.decisions import KEY, Decisions
+from p2gs_jax.train.state import FitState, HostState, grow_state
+from p2gs_jax.train.update import StepReport
+
+# Share of a run's time that writing checkpoints may take, and by what factor they may come later
+# for it.
+SHARE, LATEST = 0.01, 20.0
+
+
+def record_of(
+    reports: Sequence[StepReport], host: HostState, gaussians: int, left_s: float | None
+) -> LogRecord:
+    """Return what is logged of a burst.
+
+    Args:
+        reports: of its steps, one at least.
+        host: after it.
+        gaussians: population after it.
+        left_s: seconds that optimisation still takes, about; None: not known yet.
+    """
+    last = reports[-1]
+    return LogRecord(
+        step=host.step,
+        progress=round(host.progress, 6),
+        loss=_mean(r.loss for r in reports),
+        psnr=_mean(r.psnr for r in reports),
+        gaussians=gaussians,
+        shrink=host.shrink,
+        entries=int(last.entries),
+        seconds=round(host.elapsed_s, 3),
+        step_seconds=round(host.step_s, 5),
+        left_s=None if left_s is None else round(left_s, 1),
+        terms={k: _mean(r.terms[k] for r in reports) for k in last.terms},
+    )
+
+
+def _mean(values) -> float:
+    return float(np.mean([float(v) for v in values]))
+
+
+class RunLog:
+    """`log.jsonl` of a run folder; `on_record` is called with every record."""
+
+    def __init__(self, run_dir: Path, on_record: Callable[[LogRecord], None]):
+        self.path, self.on_record = run_dir / "log.jsonl", on_record
+
+    def clear(self) -> None:
+        """Begin anew."""
+        self.path.unlink(missing_ok=True)
+
+    def truncate(self, step: int) -> None:
+        """Drop the lines after a step, which a resumed run takes again."""
+        if self.path.exists():
+            kept = [line for line in read_jsonl(self.path) if line["step"] <= step]
+            write_text(self.path, "".join(json.dumps(line) + "\n" for line in kept))
+
+    def append(self, record: LogRecord) -> None:
+        """Write a record down and pass it on."""
+        append_jsonl(self.path, dataclasses.asdict(record))
+        self.on_record(record)
+
+
+def pause_between(every_s: float, took_s: float) -> float:
+    """Return how long a run goes on after a checkpoint, seconds.
+
+    `every_s` is what was asked (`train.checkpoint_every_s`), `took_s` what the last one took.
+    """
+    return max(every_s, min(took_s / SHARE, LATEST * every_s))
+
+
+class RunCheckpoints:
+    """State and counters of a run, what its scene decided, and how it continues from them.
+
+    Args:
+        store: where they lie.
+        cfg: what the run is optimised under.
+        decided: what the scene settled; a run that is resumed must have settled the same.
+        on_message: told what the user must know.
+    """
+
+    def __init__(
+        self,
+        store: CheckpointStore,
+        cfg: FitConfig,
+        decided: Decisions,
+        on_message: Callable[[str], None],
+    ):
+        self.cfg, self.on_message = cfg, on_message
+        self._decided, self._store = decided, store
+
+    def save(self, state: FitState, host: HostState) -> None:
+        """Write a checkpoint."""
+        meta = {
+            "host": dataclasses.asdict(host),
+            "gaussian_capacity": state.params.gaussians.capacity,
+            KEY: self._decided.to_dict(),
+        }
+        self._store.save(host.step, state, meta)
+
+    def restore(self, template: FitState) -> tuple[FitState, HostState] | None:
+        """Return the newest checkpoint, or None where there is none; what is newer is removed.
+
+        `template` is a state of the same structure, of any population.
+
+        Raises:
+            UserError: none can be read, or the scene decides otherwise now.
+        """
+        found = self._store.restore_latest(
+            lambda meta: jax.eval_shape(lambda: grow_state(template, meta["gaussian_capacity"])),
+            self.on_message,
+        )
+        if found is None:
+            return None
+        self._decided.require_same(found[1][KEY], self._store.folder)
+        state = jax.tree.map(jnp.asarray, found[0])
+        host = HostState.from_dict(found[1]["host"])
+        self._store.discard_after(host.step)
+        self.on_message(f"Resuming after step {host.step} ({host.progress:.0%}).")
+        # The same steps give the same bits only where sums come in a fixed order.
+        if jax.default_backend() != "cpu" and not self.cfg.render.deterministic:
+            self.on_message(
+                "Sums on this device come in no fixed order: the rest of the run is as good as "
+                "without the interruption, but not the same bit for bit "
+                "(--render.deterministic from the start fixes the order of the renderer's)."
+            )
+        return state, host
+
+    def last_good(self) -> str:
+        """Return in words where the newest checkpoint is."""
+        latest = self._store.latest_step()
+        if latest is None:
+            return "no checkpoint was written yet"
+        return f"the last good checkpoint is step {latest} in {self._store.folder}"

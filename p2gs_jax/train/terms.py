@@ -1,0 +1,364 @@
+"""The composed loss (paper, eq. 7) as a dictionary of terms, each a function of one rendered view.
+
+The loss is the sum of the dictionary. A term that is a function of yours is passed by name to
+`make_step` or `fit`, and is logged, checked for NaN and drawn like the built-in ones:
+
+    def dark(rendered, target, aux):
+        return 0.1 * jnp.mean(rendered.linear)
+
+    step = make_step(cfg, terms={"dark": dark})
+
+Terms are called while a step is traced, so they are pure and see shapes, not values.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from p2gs_jax.config import FitConfig, LossConfig, PhotometryConfig, RegularizerConfig
+from p2gs_jax.evaluation.ssim import one_less_ssim
+from p2gs_jax.photometry.appearance import Correction, Corrections, regularisation
+from p2gs_jax.photometry.luminance import ENTRIES, Curves, cumulative, enhanced, pseudo_curve
+from p2gs_jax.train.exposure_loss import ColorPairs, relative_exposure_loss
+from p2gs_jax.train.lidar_depths import lidar_loss
+from p2gs_jax.types import GAMMA_SRGB, Capture, Measured, Photometry
+
+# Published weights of Luminance-GS.
+ENHANCED, CURVE = 0.5, 10.0
+# Published: 1 in the first three of ten thousand steps, then 0.1; ours: 0.1 throughout.
+EQUALIZED = 0.1
+PSEUDO, PSEUDO_EQUALIZED, SMOOTH = 0.5, 0.01, 0.1
+# Mean brightness that contrast is raised to, and the side of the squares, pixels.
+CONTRAST_LEVEL, POOL = 0.5, 4
+
+
+class Rendered(NamedTuple):
+    """A training view as it was rendered.
+
+    Attributes:
+        linear: linear HDR radiance, premultiplied by alpha.
+        alpha: accumulated opacity.
+        depth: alpha-weighted camera z, scene units; None where no term has `needs_depth`.
+        ldr: display values, over the photograph's background where it has one; not clamped.
+        judged: the same where a saturated photograph can contradict it, and elsewhere the
+            photograph itself, from which no gradient comes (`LossConfig.censored`).
+        uncorrected: `ldr` without the learned correction; None unless Luminance-GS learns one.
+    """
+
+    linear: Float[Array, "h w 3"]
+    alpha: Float[Array, "h w"]
+    depth: Float[Array, "h w"] | None
+    ldr: Float[Array, "h w 3"]
+    judged: Float[Array, "h w 3"]
+    uncorrected: Float[Array, "h w 3"] | None
+
+
+class Target(NamedTuple):
+    """The photograph of the view.
+
+    Attributes:
+        ldr: display values in [0, 1], over its background where it has one.
+        mask: 1 = use, 0 = ignore.
+        alpha: its opacity, or None.
+        measured: depths that a laser scanner measured, or None.
+    """
+
+    ldr: Float[Array, "h w 3"]
+    mask: Float[Array, "h w"]
+    alpha: Float[Array, "h w"] | None
+    measured: Measured | None
+
+
+class Aux(NamedTuple):
+    """What else a term may know.
+
+    Attributes:
+        view: row of the view in `Photometry`.
+        capture: what its camera did to the light.
+        photometry: of all training views.
+        appearance: learned corrections of all training views, or None.
+        correction: that of this view, or None.
+        other_view: row of a second view, drawn at random.
+        other_linear: its render, where `relative_exposure` subtracts renders; else None.
+        pairs: photographed colours of the same points in two views, where it compares them.
+    """
+
+    view: Int[Array, ""]
+    capture: Capture
+    photometry: Photometry
+    appearance: Corrections | None
+    correction: Correction | None
+    other_view: Int[Array, ""]
+    other_linear: Float[Array, "h w 3"] | None
+    pairs: ColorPairs | None
+
+
+LossTerm = Callable[[Rendered, Target, Aux], Float[Array, ""] | None]
+"""A weighted term of the loss of one view; None where it says nothing of a view like this.
+
+The attribute `needs_depth = True` on it makes `Rendered.depth` known.
+"""
+
+
+@dataclass(frozen=True)
+class Term:
+    """A built-in term; equal to another where its parts are, so that fits share programs.
+
+    Attributes:
+        of: a function of (rendered, target, aux, *given).
+        weight: factor on its value.
+        given: what else it is given.
+        needs_depth: see `LossTerm`.
+    """
+
+    of: Callable[..., Float[Array, ""] | None]
+    weight: float = 1.0
+    given: tuple[Any, ...] = ()
+    needs_depth: bool = False
+
+    def __call__(self, rendered: Rendered, target: Target, aux: Aux) -> Float[Array, ""] | None:
+        """Return the weighted value."""
+        value = self.of(rendered, target, aux, *self.given)
+        return value if value is None or self.weight == 1.0 else self.weight * value
+
+
+def loss_terms(
+    cfg: FitConfig, changed: Mapping[str, LossTerm | None] | None = None
+) -> dict[str, LossTerm]:
+    """Return the terms that a configuration asks for, by name.
+
+    Args:
+        cfg: weights; None leaves a term out.
+        changed: terms to add, or to put in the place of those of the same name; None takes the
+            term of that name away.
+    """
+    loss, photometry = cfg.loss, cfg.photometry
+    found: dict[str, LossTerm] = {"l1": Term(_l1, given=(1 - (loss.dssim_weight or 0.0),))}
+    if loss.dssim_weight is not None:
+        found["dssim"] = Term(_dssim, loss.dssim_weight)
+    if photometry.appearance == "luminance":
+        found["enhanced"] = Term(_enhanced, given=(loss,))
+        found["contrast"] = Term(_contrast)
+        found["curve"] = Term(_curve, CURVE)
+    if loss.alpha is not None:
+        found["alpha"] = Term(_alpha, loss.alpha)
+    if loss.lidar is not None:
+        found["lidar"] = Term(_lidar, loss.lidar, needs_depth=True)
+    if loss.relative_exposure.weight is not None:
+        weight = loss.relative_exposure.weight
+        found["relative_exposure"] = Term(_relative_exposure, weight, (loss, photometry))
+    for name in PRIORS:
+        weight = getattr(loss.regularizers, name)
+        if weight is not None:
+            found[name] = Term(_prior, weight, (name,))
+    if photometry.appearance is not None and loss.regularizers.appearance is not None:
+        found["appearance"] = Term(
+            _appearance, loss.regularizers.appearance, (photometry.appearance,)
+        )
+    everything: dict[str, LossTerm | None] = {**found, **(changed or {})}
+    return {name: term for name, term in everything.items() if term is not None}
+
+
+# ------------------------------------------------------------- photographs against renders
+
+
+def censor(
+    ldr: Float[Array, "h w 3"], target: Float[Array, "h w 3"], saturation: float
+) -> Float[Array, "h w 3"]:
+    """Replace predictions that a saturated photograph cannot contradict by the photograph.
+
+    Where the photograph is at or above `saturation` it only says "at least this bright": a
+    prediction at least that bright is right and gets no gradient.
+    """
+    agrees = (target >= saturation) & (ldr >= saturation)
+    return jnp.where(agrees, target, ldr)
+
+
+def absolute_error(
+    ldr: Float[Array, "h w 3"],
+    target: Float[Array, "h w 3"],
+    mask: Float[Array, "h w"],
+    weight: float = 1.0,
+) -> Float[Array, ""]:
+    """Return the weighted mean absolute difference over valid pixels; 0 without any."""
+    valid = jnp.maximum(3 * jnp.sum(mask), 1.0)
+    absolute = jnp.where(mask[..., None] > 0, jnp.abs(ldr - target), 0.0)
+    return weight * jnp.sum(absolute * mask[..., None]) / valid
+
+
+def photometric_loss(
+    ldr: Float[Array, "h w 3"],
+    target: Float[Array, "h w 3"],
+    mask: Float[Array, "h w"],
+    cfg: LossConfig,
+) -> dict[str, Float[Array, ""]]:
+    """Return the weighted terms `l1` and `dssim` (paper, eq. 8) of a prediction, censored if asked.
+
+    `ldr` may exceed 1; pixels with mask 0 get exactly zero gradient.
+    """
+    if cfg.censored:
+        ldr = censor(ldr, target, cfg.saturation)
+    weight = cfg.dssim_weight
+    terms = {"l1": absolute_error(ldr, target, mask, 1 - (weight or 0.0))}
+    if weight is not None:
+        shown = jnp.where(mask[..., None] > 0, ldr, 0.0)
+        terms["dssim"] = weight * one_less_ssim(shown, target, mask)
+    return terms
+
+
+def _l1(rendered: Rendered, target: Target, aux: Aux, weight: float):
+    return absolute_error(rendered.judged, target.ldr, target.mask, weight)
+
+
+def _dssim(rendered: Rendered, target: Target, aux: Aux):
+    shown = jnp.where(target.mask[..., None] > 0, rendered.judged, 0.0)
+    return one_less_ssim(shown, target.ldr, target.mask)
+
+
+def _alpha(rendered: Rendered, target: Target, aux: Aux):
+    """Return the mean difference of opacities; None for photographs without alpha."""
+    if target.alpha is None:
+        return None
+    apart = jnp.sum(target.mask * jnp.abs(rendered.alpha - target.alpha))
+    return apart / jnp.maximum(jnp.sum(target.mask), 1.0)
+
+
+def _lidar(rendered: Rendered, target: Target, aux: Aux):
+    if target.measured is None:
+        return None
+    return lidar_loss(rendered.alpha, rendered.depth, target.measured)
+
+
+def _relative_exposure(
+    rendered: Rendered, target: Target, aux: Aux, loss: LossConfig, formed: PhotometryConfig
+):
+    views = (aux.view, aux.other_view)
+    linears = (rendered.linear, aux.other_linear)
+    return relative_exposure_loss(linears, views, aux.pairs, aux.photometry, loss, formed)
+
+
+# ------------------------------------------------------------------------------- priors
+
+
+def variance(x: Float[Array, " v"]) -> Float[Array, ""]:
+    """Return the population variance in two passes: exact at large means, smooth at zero."""
+    return jnp.mean((x - jnp.mean(x)) ** 2)
+
+
+# The paper's three (eq. 10) resolve: global scale; spread (which also shrinks true spread, see
+# docs/photometry.md, 3); tone. Ours resolve: the scale gauge alone; the power gauge.
+PRIORS: dict[str, Callable[[Photometry], Float[Array, ""]]] = {
+    "exposure_scale": lambda p: jnp.mean((p.exposures - 1) ** 2),
+    "exposure_variance": lambda p: variance(p.exposures),
+    "gamma_prior": lambda p: jnp.mean((p.gammas - GAMMA_SRGB) ** 2),
+    "log_exposure_mean": lambda p: jnp.mean(p.log_exposures) ** 2,
+    "gamma_mean_variance": lambda p: (jnp.mean(p.gammas) - GAMMA_SRGB) ** 2 + variance(p.gammas),
+}
+
+
+def photometry_regularizers(
+    photometry: Photometry, cfg: RegularizerConfig
+) -> dict[str, Float[Array, ""]]:
+    """Return the weighted terms on exposures and gammas, by name."""
+    weights = {name: getattr(cfg, name) for name in PRIORS}
+    return {k: w * PRIORS[k](photometry) for k, w in weights.items() if w is not None}
+
+
+def _prior(rendered: Rendered, target: Target, aux: Aux, name: str):
+    return PRIORS[name](aux.photometry)
+
+
+def _appearance(rendered: Rendered, target: Target, aux: Aux, kind):
+    assert aux.appearance is not None
+    return regularisation(aux.appearance, kind)
+
+
+# ------------------------------------------------------------------------- Luminance-GS
+#
+# As published: half the photometric loss between the render and the enhanced photograph, a
+# contrast term between neighbouring squares of 4x4 pixels, and ten times the prior on the curve.
+# Ours: the render meets the photograph itself through the inverse curve, through which nothing is
+# learned of it (published: a second colour per Gaussian), and D-SSIM moves the Gaussians only.
+
+
+def enhanced_loss(
+    rendered: Float[Array, "h w 3"],
+    photograph: Float[Array, "h w 3"],
+    mask: Float[Array, "h w"],
+    view: Curves,
+    cfg: LossConfig,
+) -> Float[Array, ""]:
+    """Return the weighted photometric loss of enhanced display values against the photograph's."""
+    compared = photometric_loss(rendered, enhanced(photograph, view), mask, cfg)
+    return ENHANCED * sum(compared.values(), jnp.zeros(()))
+
+
+def curve_prior(
+    view: Curves, photograph: Float[Array, "h w 3"], mask: Float[Array, "h w"]
+) -> Float[Array, ""]:
+    """Return how far a curve is from histogram equalisation and its pseudo curve, and how rough.
+
+    The histogram is the photograph's, over pixels of mask 1.
+    """
+    grey = photograph[::4, ::4].mean(-1).reshape(-1)
+    equalized = lax.stop_gradient(cumulative(grey, mask[::4, ::4].reshape(-1), ENTRIES))
+    pseudo = pseudo_curve(view.shape)
+
+    def apart(a, b):
+        return jnp.mean((a - b) ** 2)
+
+    return (
+        EQUALIZED * apart(view.curve, equalized)
+        + SMOOTH * jnp.mean(jnp.diff(view.curve) ** 2)
+        + PSEUDO * (apart(pseudo, view.curve) + PSEUDO_EQUALIZED * apart(pseudo, equalized))
+    )
+
+
+def contrast_loss(
+    rendered: Float[Array, "h w 3"], photograph: Float[Array, "h w 3"], mask: Float[Array, "h w"]
+) -> Float[Array, ""]:
+    """Return how far steps between neighbouring squares are from the photograph's, brightened.
+
+    `rendered` are enhanced display values. Squares with a masked pixel do not count.
+    """
+    whole = _pooled(mask) > 1.0 - 1e-3
+    mean = (mask[..., None] * photograph).sum() / jnp.maximum(3 * mask.sum(), 1.0)
+    raised = CONTRAST_LEVEL / jnp.maximum(mean, 1e-3)
+    apart = jnp.where(whole, _pooled((raised * photograph - rendered).mean(-1)), 0.0)
+    total = jnp.zeros(())
+    for axis in (0, 1):
+        both = _both(whole, axis)
+        total += 2 * jnp.sum(jnp.where(both, jnp.diff(apart, axis=axis) ** 2, 0.0))
+    return total / jnp.maximum(whole.sum(), 1)
+
+
+def _enhanced(rendered: Rendered, target: Target, aux: Aux, loss: LossConfig):
+    assert isinstance(aux.correction, Curves)
+    assert rendered.uncorrected is not None
+    return enhanced_loss(rendered.uncorrected, target.ldr, target.mask, aux.correction, loss)
+
+
+def _contrast(rendered: Rendered, target: Target, aux: Aux):
+    assert rendered.uncorrected is not None
+    return contrast_loss(rendered.uncorrected, target.ldr, target.mask)
+
+
+def _curve(rendered: Rendered, target: Target, aux: Aux):
+    assert isinstance(aux.correction, Curves)
+    return curve_prior(aux.correction, target.ldr, target.mask)
+
+
+def _both(whole, axis: int):
+    return whole[1:] & whole[:-1] if axis == 0 else whole[:, 1:] & whole[:, :-1]
+
+
+def _pooled(image: Float[Array, "h w"]) -> Float[Array, "y x"]:
+    height, width = (n // POOL * POOL for n in image.shape)
+    squares = image[:height, :width].reshape(height // POOL, POOL, width // POOL, POOL)
+    return squares.mean((1, 3))

@@ -1,0 +1,108 @@
+"""Scenes in millimetres and kilometres, and a long way from the origin."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.jobs.configs import with_fields
+from p2gs_jax.pipeline.survey import (
+    extent_of_rates,
+    near_depth,
+    near_plane,
+    scale_notes,
+    seen_depths,
+)
+from p2gs_jax.run.decisions import Decisions
+from p2gs_jax.scene import load_scene
+from p2gs_jax.types import Scene
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Scene:
+    from tiny_scene import make_scene
+
+    root = make_scene(tmp_path_factory.mktemp("scale") / "scene", views=4, points=60)
+    return load_scene(root, FitConfig().data, root.parent / "cache", lambda text: None)
+
+
+def scaled(scene, factor, offset=0.0):
+    def placed(view):
+        pose = view.viewmat.copy()
+        pose[:3, 3] *= factor
+        pose[:3, 3] -= pose[:3, :3] @ np.full(3, offset)
+        return dataclasses.replace(view, viewmat=pose)
+
+    points = scene.points * factor + offset
+    return dataclasses.replace(scene, points=points, views=tuple(map(placed, scene.views)))
+
+
+def nearest(scene):
+    return near_depth(seen_depths(scene.points, scene.training_views))
+
+
+@pytest.mark.parametrize("factor", [1e-6, 1e-3, 1.0, 1e3])
+def test_the_near_plane_follows_scenes_that_it_would_cut(scene, factor):
+    some = scaled(scene, factor)
+    depth = nearest(some)
+    assert depth == pytest.approx(factor * nearest(scene), rel=1e-3)
+    assert 3 * factor < depth < 3.5 * factor
+    cfg = FitConfig()
+    near = near_plane(depth, cfg)
+    notes = scale_notes(some, near, cfg, depth)
+    if factor >= 1:
+        assert near is None
+        assert notes == []
+        return
+    assert near == pytest.approx(0.2 * depth, rel=0.1)
+    assert len(notes) == 1
+    assert f"{near:g} scene units instead of 0.05" in notes[0]
+    decided = dataclasses.replace(Decisions.as_asked(cfg), near=near)
+    assert decided.resolve(cfg).render.near == near
+    assert Decisions.from_dict(decided.to_dict()) == decided
+
+
+def test_a_near_plane_that_cuts_nothing_stays(scene):
+    cfg = with_fields(FitConfig(), {"render.near": 0.5})
+    assert near_plane(nearest(scene), cfg) is None
+    assert near_plane(None, cfg) is None
+    assert Decisions.as_asked(cfg).resolve(cfg).render.near == 0.5
+
+
+def test_points_that_no_view_shows_have_no_depth(scene):
+    for points in (-scene.points, scene.points[:0]):
+        depths = seen_depths(points, scene.training_views)
+        assert near_depth(depths) is None
+        assert extent_of_rates(300.0, depths, FitConfig()) == 300.0
+
+
+def test_a_scene_far_from_the_origin_is_said_to_be_coarse(scene):
+    depth = nearest(scene)
+    for offset, said in ((0.0, False), (1e3, False), (1e5, True)):
+        notes = scale_notes(scaled(scene, 1.0, offset), None, FitConfig(), depth)
+        assert bool(notes) == said
+    assert "1e+05 scene units from the origin" in notes[0]
+    assert "Subtract a common offset" in notes[0]
+
+
+def test_rates_of_a_long_drive_are_those_of_its_streets(scene):
+    cfg, views, points = FitConfig(), scene.training_views, scene.points
+    far = [np.array([60.0 * k, 0, 0]) for k in range(10)]
+    drive = [
+        dataclasses.replace(view, viewmat=_moved(view.viewmat, by)) for by in far for view in views
+    ]
+    street = np.concatenate([points + by for by in far]).astype(np.float32)
+    narrow, wide = seen_depths(points, views), seen_depths(street, drive)
+    own = extent_of_rates(300.0, narrow, cfg)
+    assert 3 < own < 6
+    assert extent_of_rates(300.0, wide, cfg) == pytest.approx(own, rel=0.2)
+    assert extent_of_rates(0.5, narrow, cfg) == 0.5
+    cameras = with_fields(cfg, {"optimizer.extent": "cameras"})
+    assert extent_of_rates(300.0, wide, cameras) == 300.0
+
+
+def _moved(viewmat, by):
+    pose = viewmat.copy()
+    pose[:3, 3] -= pose[:3, :3] @ by
+    return pose

@@ -1,0 +1,106 @@
+"""Rendered depth against laser measurements."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from p2gs_jax.config import DataConfig, FitConfig, LossConfig
+from p2gs_jax.errors import UserError
+from p2gs_jax.train.lidar_depths import CLIP, MOST_PER_VIEW, KeptDepths, lidar_loss, measured_depths
+from p2gs_jax.types import Lidar, Measured, Scene, View
+
+HEIGHT, WIDTH = 4, 6
+
+
+def measured(pixels, depths) -> Measured:
+    places = (np.asarray(pixels) + 0.5) / [WIDTH, HEIGHT]
+    return Measured(jnp.asarray(places, jnp.float32), jnp.asarray(depths, jnp.float32))
+
+
+def loss(depth, alpha, m):
+    alpha = jnp.asarray(alpha, jnp.float32)
+    return lidar_loss(alpha, jnp.asarray(depth * alpha, jnp.float32), m)
+
+
+def test_it_is_the_mean_huber_error_of_log_depth():
+    depth, alpha = np.full((HEIGHT, WIDTH), 10.0), np.full((HEIGHT, WIDTH), 0.7)
+    m = measured([(1, 2), (5, 3), (0, 0)], [10 * np.exp(0.1), 10 * np.exp(-1.0), 0.0])
+    small, large = 0.5 * 0.1**2 / CLIP, 1.0 - 0.5 * CLIP
+    assert float(loss(depth, alpha, m)) == pytest.approx((small + large) / 2, rel=1e-5)
+
+
+def test_its_gradient_is_that_of_finite_differences_and_nothing_is_pulled_elsewhere():
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(5, 20, (HEIGHT, WIDTH))
+    alpha = rng.uniform(0.3, 0.99, (HEIGHT, WIDTH))
+    m = measured([(1, 2), (5, 3), (3, 1), (3, 1)], [7.0, 12.0, 9.0, 0.0])
+    found = np.asarray(jax.grad(loss)(jnp.asarray(depth), jnp.asarray(alpha), m))
+    step = 1e-2
+    for row, column in ((2, 1), (3, 5), (1, 3), (0, 0)):
+        shift = np.zeros_like(depth)
+        shift[row, column] = step
+        difference = (loss(depth + shift, alpha, m) - loss(depth - shift, alpha, m)) / (2 * step)
+        assert found[row, column] == pytest.approx(float(difference), abs=2e-4)
+    assert np.count_nonzero(found) == 3
+
+
+def test_where_nothing_is_opaque_or_measured_it_is_zero_and_finite():
+    depth, alpha = np.full((HEIGHT, WIDTH), 10.0), np.zeros((HEIGHT, WIDTH))
+    value, slope = jax.value_and_grad(loss)(jnp.asarray(depth), alpha, measured([(1, 1)], [5.0]))
+    assert float(value) == 0
+    assert not np.asarray(slope).any()
+    value, slope = jax.value_and_grad(loss)(
+        jnp.asarray(depth), alpha + 0.9, measured([(1, 1)], [0.0])
+    )
+    assert float(value) == 0
+    assert not np.asarray(slope).any()
+
+
+def wall_scene(**lidar) -> Scene:
+    K = np.array([[50, 0, 32], [0, 50, 24], [0, 0, 1]], np.float32)
+    views = tuple(
+        View(f"{k}.png", Path("none"), "0", np.eye(4, dtype=np.float32), K, 64, 48, time=float(k))
+        for k in range(2)
+    )
+    points = np.zeros((0, 3), np.float32)
+    return Scene(
+        Path("drive"), "test", views, points, None, lidar=Lidar(**lidar) if lidar else None
+    )
+
+
+def test_views_get_what_stands_still_near_in_time_and_is_not_hidden():
+    rng = np.random.default_rng(0)
+    wall = np.column_stack([rng.uniform(-4, 4, (500, 2)), np.full(500, 10.0)])
+    behind = wall * [1, 1, 3]
+    points = np.concatenate([wall, behind, wall - np.array([0, 0, 5])]).astype(np.float32)
+    # In front of the wall something moves.
+    owner = np.repeat([-1, -1, 0], 500).astype(np.int32)
+    scene = wall_scene(points=points, times=np.zeros(1500), objects=owner)
+    cfg = FitConfig(loss=LossConfig(lidar=0.1))
+    found = measured_depths(scene, cfg)
+    assert found is not None
+    first, second = found
+    depths = np.asarray(first.depths)
+    assert depths.shape == (MOST_PER_VIEW,)
+    seen = depths[depths > 0]
+    assert len(seen) > 300
+    assert np.median(seen) == pytest.approx(10)
+    assert np.mean(seen > 25) < 0.1
+    assert ((np.asarray(first.places) >= 0) & (np.asarray(first.places) < 1)).all()
+    assert (np.asarray(second.depths) > 0).sum() == len(seen)
+    # Beyond what memory may hold they wait on disk, and are the same.
+    waiting = measured_depths(scene, replace(cfg, data=DataConfig(cache_mb=0)))
+    assert isinstance(waiting, KeptDepths)
+    assert waiting.bytes_held == 0
+    chex.assert_trees_all_equal(waiting[:], found[:])
+
+
+def test_a_loss_without_measurements_is_refused():
+    with pytest.raises(UserError, match=r"no laser measurements"):
+        measured_depths(wall_scene(), FitConfig(loss=LossConfig(lidar=0.1)))
+    assert measured_depths(wall_scene(), FitConfig()) is None

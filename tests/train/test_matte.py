@@ -1,0 +1,192 @@
+"""Photographs with alpha and renders over one background: they agree wherever they should."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from p2gs_jax.config import FitConfig, LossConfig, PhotometryConfig, preset
+from p2gs_jax.evaluation.alignment import fit_exposure
+from p2gs_jax.photometry.display import DisplayTransform, develop
+from p2gs_jax.photometry.formation import formation
+from p2gs_jax.train.image_gradient import compared
+from p2gs_jax.train.terms import loss_terms, photometric_loss
+from p2gs_jax.types import Batch, Camera, Capture, Photometry, Render
+
+RNG = np.random.default_rng(0)
+SIZE = (12, 14)
+CURVES = {
+    "3dgs": preset("3dgs").photometry,
+    "srgb": PhotometryConfig(),
+    "paper": preset("paper").photometry,
+}
+BACKDROPS = [(1.0, 1.0, 1.0), (0.0, 0.0, 0.0), (0.2, 0.7, 0.4)]
+
+
+def render_of(radiance, alpha):
+    """Return a render of surfaces of a radiance that cover `alpha` of each pixel."""
+    none, zero = jnp.zeros(0, bool), jnp.int32(0)
+    linear = jnp.asarray(radiance * alpha[..., None], jnp.float32)
+    return Render(linear, jnp.asarray(alpha, jnp.float32), None, zero, jnp.bool_(False), none)
+
+
+def batch_of(color, alpha, backdrop, mask=None):
+    camera = Camera(jnp.eye(4), jnp.eye(3), SIZE[1], SIZE[0])
+    mask = np.ones(SIZE, np.float32) if mask is None else mask
+    given = (np.float32(color * alpha[..., None]), mask, np.int32(0), None, np.float32(alpha))
+    return Batch(
+        camera,
+        *map(lambda a: None if a is None else jnp.asarray(a), given),
+        jnp.asarray(backdrop, jnp.float32),
+    )
+
+
+def capture_of(exposure=0.7, gamma=2.2):
+    return Capture(jnp.float32(exposure), jnp.float32(gamma))
+
+
+@pytest.fixture
+def surfaces():
+    """Return radiance and cover: nothing, everything, and all between."""
+    alpha = RNG.uniform(0.02, 1, SIZE)
+    alpha[0], alpha[1] = 0, 1
+    return RNG.uniform(0.05, 0.9, (*SIZE, 3)), alpha
+
+
+def matted_loss(render, batch, capture, correction, cfg):
+    """Return the picture over the background and the terms that compare it."""
+    taken = Photometry(capture.exposure[None], capture.gamma[None], "linear")
+    rendered, target = compared(render, batch, taken, correction, cfg)
+    terms = loss_terms(cfg)
+    names = [name for name in ("l1", "dssim", "alpha") if name in terms]
+    return rendered.ldr, {name: terms[name](rendered, target, None) for name in names}
+
+
+def config(curve, **loss):
+    cfg = FitConfig(photometry=CURVES[curve])
+    return dataclasses.replace(cfg, loss=dataclasses.replace(LossConfig(), **loss))
+
+
+@pytest.mark.parametrize("curve", CURVES)
+@pytest.mark.parametrize("backdrop", BACKDROPS)
+def test_they_agree_at_every_opacity(surfaces, curve, backdrop):
+    radiance, alpha = surfaces
+    cfg, capture = config(curve, alpha=1.0), capture_of()
+    color = np.asarray(formation(jnp.float32(radiance), capture, cfg.photometry)).clip(0, 1)
+    batch = batch_of(color, alpha, backdrop)
+    ldr, terms = matted_loss(render_of(radiance, alpha), batch, capture, None, cfg)
+    expected = alpha[..., None] * color + (1 - alpha[..., None]) * np.array(backdrop)
+    np.testing.assert_allclose(ldr, expected, atol=2e-5)
+    assert float(terms["l1"]) < 1e-5
+    assert float(terms["dssim"]) < 1e-3
+    assert float(terms["alpha"]) < 1e-6
+    # Evaluation shows the same picture.
+    transform = DisplayTransform(0.7, 2.2, cfg.photometry, backdrop=backdrop)
+    shown = develop(radiance * alpha[..., None], transform, alpha=alpha)
+    np.testing.assert_allclose(shown, expected, atol=2e-5)
+
+
+@pytest.mark.parametrize("backdrop", BACKDROPS)
+def test_display_values_are_composited_as_3dgs_does(surfaces, backdrop):
+    color, alpha = surfaces
+    linear = np.float32(color * alpha[..., None])
+    transform = DisplayTransform(1.0, 2.2, CURVES["3dgs"], backdrop=backdrop)
+    expected = linear + (1 - alpha[..., None]) * np.array(backdrop)
+    np.testing.assert_allclose(develop(linear, transform, alpha=alpha), expected, atol=1e-5)
+
+
+def test_without_a_backdrop_nothing_changes(surfaces):
+    radiance, alpha = surfaces
+    linear = np.float32(radiance)
+    plain = DisplayTransform(0.7, 2.0, PhotometryConfig())
+    np.testing.assert_array_equal(develop(linear, plain, alpha=alpha), develop(linear, plain))
+    over = dataclasses.replace(plain, backdrop=(1.0, 1.0, 1.0))
+    np.testing.assert_array_equal(develop(linear, over), develop(linear, plain))
+
+
+@pytest.mark.parametrize("curve", CURVES)
+def test_gradients_of_the_picture(surfaces, curve):
+    radiance, alpha = surfaces
+    inner = np.clip(alpha, 0.3, 1)
+    batch = batch_of(radiance, inner, (0.2, 0.7, 0.4))
+    weight = jnp.float32(RNG.normal(size=radiance.shape))
+
+    def shown(linear, opacity):
+        render = dataclasses.replace(render_of(radiance, inner), linear=linear, alpha=opacity)
+        return jnp.sum(weight * matted_loss(render, batch, capture_of(), None, config(curve))[0])
+
+    given = (jnp.float32(radiance * inner[..., None]), jnp.float32(inner))
+    for k, gradient in enumerate(jax.grad(shown, (0, 1))(*given)):
+        direction, step = jnp.sign(gradient), 1e-3
+        up, down = (
+            [value + sign * step * direction if i == k else value for i, value in enumerate(given)]
+            for sign in (1, -1)
+        )
+        numeric = float(shown(*up) - shown(*down)) / (2 * step)
+        assert float(jnp.sum(gradient * direction)) == pytest.approx(numeric, rel=0.02)
+
+
+def test_masked_pixels_get_no_gradient(surfaces):
+    radiance, alpha = surfaces
+    mask = np.ones(SIZE, np.float32)
+    mask[3:6] = 0
+    batch = batch_of(RNG.uniform(0.1, 0.9, (*SIZE, 3)), np.full(SIZE, 0.6), (1, 1, 1), mask)
+    cfg = config("srgb", alpha=1.0)
+
+    def loss(linear, opacity):
+        render = dataclasses.replace(render_of(radiance, alpha), linear=linear, alpha=opacity)
+        return sum(matted_loss(render, batch, capture_of(), None, cfg)[1].values())
+
+    of_light, of_opacity = jax.grad(loss, (0, 1))(
+        jnp.float32(radiance * alpha[..., None]), jnp.float32(alpha)
+    )
+    assert np.abs(of_light[3:6]).max() == np.abs(of_opacity[3:6]).max() == 0
+    assert np.isfinite(of_light).all()
+    assert np.isfinite(of_opacity).all()
+
+
+def test_a_white_background_hides_nothing_brighter_than_it():
+    """Where nothing is, a white backdrop is not a saturated photograph of something bright."""
+    cfg = config("srgb")
+    bright = render_of(np.full((*SIZE, 3), 40.0), np.full(SIZE, 0.5))
+    nothing = batch_of(np.zeros((*SIZE, 3)), np.zeros(SIZE), (1, 1, 1))
+    _, terms = matted_loss(bright, nothing, capture_of(1.0), None, cfg)
+    assert float(terms["l1"]) > 0.1
+    # What is there and saturated still only says "at least as bright".
+    clipped = batch_of(np.ones((*SIZE, 3)), np.full(SIZE, 0.5), (1, 1, 1))
+    _, terms = matted_loss(bright, clipped, capture_of(1.0), None, cfg)
+    assert float(terms["l1"]) < 1e-5
+
+
+def test_opaque_photographs_lose_what_they_lost_without_alpha(surfaces):
+    radiance, _ = surfaces
+    target, one = np.float32(RNG.uniform(0, 1, (*SIZE, 3))), np.ones(SIZE)
+    cfg = config("srgb")
+    render = render_of(radiance, one)
+    ldr, terms = matted_loss(render, batch_of(target, one, (1, 1, 1)), capture_of(), None, cfg)
+    plain = formation(render.linear, capture_of(), cfg.photometry)
+    expected = photometric_loss(plain, jnp.asarray(target), jnp.ones(SIZE), cfg.loss)
+    np.testing.assert_allclose(ldr, plain, rtol=1e-6)
+    assert {k: float(v) for k, v in terms.items()} == pytest.approx(
+        {k: float(v) for k, v in expected.items()}, rel=1e-5
+    )
+
+
+def test_the_weight_of_alpha_counts_the_difference(surfaces):
+    radiance, _ = surfaces
+    batch = batch_of(radiance, np.full(SIZE, 0.25), (1, 1, 1))
+    given = (render_of(radiance, np.full(SIZE, 0.75)), batch, capture_of(), None)
+    assert float(matted_loss(*given, config("srgb", alpha=0.1))[1]["alpha"]) == pytest.approx(0.05)
+    assert "alpha" not in matted_loss(*given, config("srgb"))[1]
+
+
+def test_exposures_are_fitted_over_the_background(surfaces):
+    radiance, alpha = surfaces
+    tone = PhotometryConfig()
+    over = DisplayTransform(1.7, 2.2, tone, backdrop=(1.0, 1.0, 1.0))
+    linear = np.float32(radiance * alpha[..., None])
+    photograph = develop(linear, over, alpha=alpha)
+    given = (linear, photograph, np.ones(SIZE, np.float32), over.capture, tone, None)
+    assert float(fit_exposure(*given, over.matte(alpha))) == pytest.approx(1.7, rel=2e-3)
