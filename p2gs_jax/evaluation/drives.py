@@ -74,15 +74,10 @@ class DriveScores:
         depth: Float32[np.ndarray, "h w"],
         alpha: Float32[np.ndarray, "h w"],
     ) -> None:
-        """Take a view.
+        """Take a view by its row.
 
-        Args:
-            index: its row.
-            ldr: its render, under its own exposure or one fitted to the photograph.
-            photograph: display values.
-            mask: 1 = use.
-            depth: alpha-weighted camera z.
-            alpha: opacity.
+        `ldr` is its render, under its own exposure or one fitted to the photograph; the depth is
+        alpha-weighted camera z.
         """
         if self._scene.views[index].split == "train":
             K = self._store.camera(index)[1]

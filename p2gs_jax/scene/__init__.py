@@ -35,31 +35,18 @@ __all__ = ["ImageStore", "camera_at", "load_scene", "size_at"]
 
 
 def load_scene(
-    root: Path,
-    cfg: DataConfig,
-    work_dir: Path | None = None,
-    report: Report = lambda message: None,
+    root: Path, cfg: DataConfig, work_dir: Path | None = None, report: Report = lambda message: None
 ) -> Scene:
     """Read a scene; the format is found from what lies in the folder.
 
     In this order, unless `cfg.format` names one: a COLMAP model in `sparse/0`, `sparse` or the
     folder itself; `transforms.json` in it, or `root` itself where that is a .json file;
     `transforms_train.json` with those of the other parts of the split; LLFF's `poses_bounds.npy`; a
-    drive as a data set lays it out (`drives`); photographs in `images/` or the folder itself, whose
-    cameras are then found by structure from motion. Poses without points get theirs by
-    triangulation, or at random where hardly anything matches.
-
-    Args:
-        root: folder, .json file, or video.
-        cfg: which photographs are used, and how.
-        work_dir: results of long computations are kept here for a resume; None keeps nothing.
-        report: receives progress, a line at a time.
-
-    Returns:
-        Views sorted by name, with split, masks and EXIF exposures; points; tracks; notes.
-
-    Raises:
-        UserError: there is no scene, or it is broken; the message names the file.
+    drive as a data set lays it out (`drives`); photographs in `images/` or the folder itself, or a
+    video, whose cameras are then found by structure from motion. Poses without points get theirs by
+    triangulation, or at random where hardly anything matches. Views are sorted by name. Long
+    computations keep their results in `work_dir` for a resume. Raises UserError: there is no scene,
+    or it is broken; the message names the file.
     """
     found = find_scene(root, cfg, report)
     if isinstance(found, Recording):
@@ -96,8 +83,7 @@ def load_scene(
 def with_what_lies_beside(scene: Scene, cfg: DataConfig) -> Scene:
     """Return a scene with masks, EXIF exposures and split.
 
-    Raises:
-        UserError: so many views cannot be held out, or a list of those that are is wrong.
+    Raises UserError: so many views cannot be held out, or a list of those that are is wrong.
     """
     views, mask_notes = attach_masks(scene.views)
     views = tuple(
@@ -126,8 +112,7 @@ def find_scene(
 ) -> Scene | Recording | PhotographsAlone | Video:
     """Return what a folder holds, as `load_scene` finds it; nothing long is computed.
 
-    Raises:
-        UserError: there is no scene, or it is broken; the message names the file.
+    Raises UserError: there is no scene, or it is broken; the message names the file.
     """
     root = Path(root)
     if not root.exists():

@@ -26,14 +26,9 @@ def cached_folder(
 ) -> Iterator[Path]:
     """Provide a folder that `build` has filled, now or in an earlier run.
 
-    The folder counts as finished once a marker with the hash of `key` has been moved into it; one
-    that was interrupted half-way, or made from other inputs, is emptied and filled again.
-
-    Args:
-        work_dir: where the folder lives; None uses a temporary one, gone after the `with` block.
-        name: name of the folder.
-        key: JSON-serialisable; everything the result depends on.
-        build: fills the empty folder it is given.
+    It counts as finished once a marker with the hash of `key`, JSON of everything the result
+    depends on, has been moved into it; one that was interrupted half-way, or made from other
+    inputs, is emptied and filled again. A `work_dir` of None makes it a temporary folder.
     """
     if work_dir is None:
         with tempfile.TemporaryDirectory(prefix="p2gs_") as temporary:

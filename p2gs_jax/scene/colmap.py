@@ -1,35 +1,49 @@
-"""A COLMAP model and its photographs as a Scene."""
+"""A COLMAP model, binary or text, and its photographs as a Scene.
+
+Why not `pycolmap.Reconstruction`: version 4.2.1 accepts a truncated `cameras.bin` without an error
+and never returns from a truncated `points3D.bin`. Here every count is checked against the size of
+the file. Newer models' `rigs.bin` and `frames.bin` are not needed: `images.bin` still holds every
+registered image with its own pose. Format: https://colmap.github.io/format.html
+"""
 
 from __future__ import annotations
 
+import struct
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int, UInt8
 from scipy.spatial.transform import Rotation
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError, broken
-from p2gs_jax.scene.colmap_model import (
-    CameraRecord,
-    ImageRecord,
-    Model,
-    is_model,
-    read_model,
-    unsupported_camera,
-)
 from p2gs_jax.scene.files import HUGE, at_file_size, check_missing, image_folder, require_inside
 from p2gs_jax.scene.lens import intrinsics, make_distortion, undistort_points
 from p2gs_jax.types import Distortion, Scene, Tracks, View
 
 _FIX = "export the model again from COLMAP"
-# Number of focal lengths in the parameters of the supported camera models.
-_FOCALS = {
-    **dict.fromkeys(("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"), 1),
-    **dict.fromkeys(("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"), 1),
-    **dict.fromkeys(("PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"), 2),
+_FIX_FILES = "copy the model again from where it was made, or export it again from COLMAP"
+_LARGEST_ID = 2**63 - 1
+_STEMS = ("cameras", "images", "points3D")
+_KEYPOINT = np.dtype([("xy", "<f8", 2), ("id", "<i8")])
+# Number of parameters and of focal lengths among them, in the order of COLMAP's model ids; 0: the
+# model is not supported.
+_MODELS = {
+    "SIMPLE_PINHOLE": (3, 1),
+    "PINHOLE": (4, 2),
+    "SIMPLE_RADIAL": (4, 1),
+    "RADIAL": (5, 1),
+    "OPENCV": (8, 2),
+    "OPENCV_FISHEYE": (8, 2),
+    "FULL_OPENCV": (12, 2),
+    "FOV": (5, 0),
+    "SIMPLE_RADIAL_FISHEYE": (4, 1),
+    "RADIAL_FISHEYE": (5, 1),
+    "THIN_PRISM_FISHEYE": (12, 0),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (16, 0),
 }
 
 
@@ -40,16 +54,10 @@ def find_model(root: Path) -> Path | None:
 
 
 def load_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
-    """Read a COLMAP model; views have no split, masks or EXIF yet.
+    """Read the COLMAP model in a folder; views have no split, masks or EXIF yet.
 
-    Args:
-        root: the folder the user named.
-        folder: where the model lies.
-        cfg: where the images are, and whether some may be missing.
-
-    Raises:
-        UserError: a file is broken, images are missing or of another size, the camera model is
-            not supported, or there is nothing in the model.
+    Raises UserError: a file is broken, images are missing or of another size, the camera model is
+    not supported, or there is nothing in the model.
     """
     model = read_model(folder)
     _check_model(model)
@@ -71,18 +79,9 @@ def load_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
         K, width, height = at_file_size(path, K, size, model.file("cameras"))
         if (width, height) != size:
             resized.append(f"{width}x{height} instead of {camera.width}x{camera.height}")
-        views.append(
-            View(
-                name=image.name,
-                image_path=path,
-                camera=subfolder(image.name) or fallback[image.camera_id],
-                viewmat=_viewmat(image, model.file("images")),
-                K=K,
-                width=width,
-                height=height,
-                distortion=distortion,
-            )
-        )
+        name = subfolder(image.name) or fallback[image.camera_id]
+        viewmat = _viewmat(image, model.file("images"))
+        views.append(View(image.name, path, name, viewmat, K, width, height, distortion))
     if resized:
         notes.append(
             f"{len(resized)} images have another size than their camera (the first: {resized[0]}): "
@@ -91,26 +90,16 @@ def load_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
     others = sorted(p.name for p in folder.parent.iterdir() if p != folder and is_model(p))
     if folder.name == "0" and others:
         notes.append(f"used the model {folder}; beside it lie {', '.join(others)}, not used")
-    return Scene(
-        root=root,
-        format="colmap",
-        views=tuple(views),
-        points=model.xyz.astype(np.float32),
-        point_colors=model.rgb,
-        tracks=tracks_of(model, views),
-        notes=tuple(notes),
-    )
+    points, tracks = model.xyz.astype(np.float32), tracks_of(model, views)
+    return Scene(root, "colmap", tuple(views), points, model.rgb, tracks, tuple(notes))
 
 
 def tracks_of(model: Model, views: Sequence[View]) -> Tracks | None:
     """Return every observation of the model's points, in undistorted pixels of the views.
 
+    Views are matched by name, and keypoints rescaled from the resolution of the model's cameras.
     Observations of points that the model does not have (some tools thin points3D without touching
     the images file) and of images that are not among the views are left out.
-
-    Args:
-        model: what COLMAP wrote; keypoints are at the resolution of its cameras.
-        views: matched by name; keypoints are rescaled to their size.
     """
     if len(model.point_ids) == 0:
         return None
@@ -132,11 +121,8 @@ def tracks_of(model: Model, views: Sequence[View]) -> Tracks | None:
         view_rows.append(np.full(int(seen.sum()), row))
     if not positions:
         return None
-    return Tracks(
-        view_indices=np.concatenate(view_rows).astype(np.int32),
-        point_indices=np.concatenate(point_rows).astype(np.int32),
-        xy=np.concatenate(positions),
-    )
+    seen_in, seen_points = (np.concatenate(at).astype(np.int32) for at in (view_rows, point_rows))
+    return Tracks(seen_in, seen_points, np.concatenate(positions))
 
 
 def subfolder(name: str) -> str | None:
@@ -149,7 +135,7 @@ def _camera_names(images: Sequence[ImageRecord]) -> dict[int, str]:
     """Name cameras by id; a model with one camera per image does not identify the same ones."""
     uses = Counter(image.camera_id for image in images)
     alone = len(uses) > 1 and max(uses.values()) == 1
-    return {camera_id: "0" if alone else str(camera_id) for camera_id in uses}
+    return {camera: "0" if alone else str(camera) for camera in uses}
 
 
 def _check_model(model: Model) -> None:
@@ -158,9 +144,9 @@ def _check_model(model: Model) -> None:
     if not model.images:
         fix = "COLMAP's mapping found nothing; run it again on these photographs"
         raise broken(model.file("images"), "holds no registered images", fix)
-    twice = [name for name, n in Counter(i.name for i in model.images).items() if n > 1]
-    if twice:
-        raise broken(model.file("images"), f"lists {twice[0]} more than once", _FIX)
+    ((name, most),) = Counter(image.name for image in model.images).most_common(1)
+    if most > 1:
+        raise broken(model.file("images"), f"lists {name} more than once", _FIX)
     for image in model.images:
         if image.camera_id not in model.cameras:
             why = f"{image.name} was taken by camera {image.camera_id}, which "
@@ -199,9 +185,9 @@ def _viewmat(image: ImageRecord, path: Path) -> Float[np.ndarray, "4 4"]:
 
 def _lens(path: Path, camera: CameraRecord) -> tuple[Float[np.ndarray, "3 3"], Distortion | None]:
     """Return K and distortion: COLMAP's terms are OpenCV's, and absent ones are 0."""
-    if camera.model not in _FOCALS:
-        raise unsupported_camera(path, camera.model)
-    focals, p = _FOCALS[camera.model], camera.params
+    focals, p = _MODELS.get(camera.model, (0, 0))[1], camera.params
+    if not focals:
+        raise _unsupported(path, camera.model)
     fx, fy, (cx, cy) = p[0], p[focals - 1], p[focals : focals + 2]
     if not ((np.abs(p) < HUGE).all() and fx > 0 and fy > 0 and camera.width and camera.height):
         why = f"a {camera.model} camera of {camera.width}x{camera.height} pixels has "
@@ -209,3 +195,227 @@ def _lens(path: Path, camera: CameraRecord) -> tuple[Float[np.ndarray, "3 3"], D
     terms = p[focals + 2 :]
     model = "fisheye" if "FISHEYE" in camera.model else "radial"
     return intrinsics(fx, fy, cx, cy), make_distortion((*terms, *[0.0] * (4 - len(terms))), model)
+
+
+class CameraRecord(NamedTuple):
+    """One entry of `cameras`: COLMAP's model name, size in pixels, parameters in its order."""
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+
+class ImageRecord(NamedTuple):
+    """One entry of `images`, its name relative to the image folder.
+
+    Pose (wxyz and scene units) are world-to-camera; `xy` are the keypoints that have a 3D point,
+    pixels of the photograph with centres at +0.5, and `point_ids` their points' ids.
+    """
+
+    name: str
+    camera_id: int
+    qvec: Float[np.ndarray, " 4"]
+    tvec: Float[np.ndarray, " 3"]
+    xy: Float[np.ndarray, "n 2"]
+    point_ids: Int[np.ndarray, " n"]
+
+
+class Model(NamedTuple):
+    """A COLMAP model as files of the suffix `kind` state it.
+
+    Cameras are by id, images in the file's order, `point_ids` ascending; `xyz` are scene units,
+    `rgb` display-encoded.
+    """
+
+    folder: Path
+    kind: str
+    cameras: dict[int, CameraRecord]
+    images: tuple[ImageRecord, ...]
+    point_ids: Int[np.ndarray, " p"]
+    xyz: Float[np.ndarray, "p 3"]
+    rgb: UInt8[np.ndarray, "p 3"]
+
+    def file(self, stem: str) -> Path:
+        """Return a file of the model, for messages."""
+        return self.folder / f"{stem}.{self.kind}"
+
+
+def is_model(folder: Path) -> bool:
+    """Return whether the folder looks like a COLMAP model, complete or not."""
+    stems = ("cameras", "points3D")
+    return any((folder / f"{stem}.{ext}").is_file() for stem in stems for ext in ("bin", "txt"))
+
+
+def read_model(folder: Path) -> Model:
+    """Read the model in a folder; binary files win where both kinds are complete.
+
+    Raises UserError: a file is missing, truncated or malformed; the message names it.
+    """
+    files = {ext: [folder / f"{stem}.{ext}" for stem in _STEMS] for ext in ("bin", "txt")}
+    whole = [ext for ext, paths in files.items() if all(path.is_file() for path in paths)]
+    if not whole:
+        paths = files["txt" if (folder / "cameras.txt").is_file() else "bin"]
+        absent = ", ".join(str(path) for path in paths if not path.is_file())
+        raise broken("incomplete COLMAP model:", f"{absent} does not exist", _FIX_FILES)
+    ext, paths = whole[0], files[whole[0]]
+    text = (_text_cameras, _text_images, _text_points)
+    binary = (_binary_cameras, _binary_images, _binary_points)
+    cameras, images, points = binary if ext == "bin" else text
+    ids, xyz, rgb = points(paths[2])
+    order = np.argsort(ids, kind="stable")
+    known, taken = cameras(paths[0]), tuple(images(paths[1]))
+    return Model(folder, ext, known, taken, ids[order], xyz[order], rgb[order])
+
+
+class _Cursor:
+    """A position in a binary file; reading past the end is an error."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        self.data = path.read_bytes()
+        self.position = 0
+
+    def unpack(self, layout: str) -> tuple:
+        return struct.unpack_from(layout, self.data, self.skip(struct.calcsize(layout)))
+
+    def skip(self, size: int) -> int:
+        """Move on by `size` bytes and return where they start."""
+        start = self.position
+        if start + size > len(self.data):
+            raise self.cut("record")
+        self.position = start + size
+        return start
+
+    def string(self) -> str:
+        end = self.data.find(b"\0", self.position)
+        if end < 0:
+            raise self.cut("name")
+        start, self.position = self.position, end + 1
+        return self.data[start:end].decode("utf-8", "replace")
+
+    def count(self, record_size: int) -> int:
+        """Read a number of records that need at least `record_size` bytes each."""
+        (n,) = self.unpack("<Q")
+        if n * record_size > len(self.data) - self.position:
+            why = f"is truncated: it announces {n} entries and has {len(self.data)} bytes in all"
+            raise broken(self.path, why, _FIX_FILES)
+        return n
+
+    def cut(self, what: str) -> UserError:
+        why = f"is truncated: it ends at byte {len(self.data)} in the middle of a {what}"
+        return broken(self.path, why, _FIX_FILES)
+
+
+def _binary_cameras(path: Path) -> dict[int, CameraRecord]:
+    cursor = _Cursor(path)
+    cameras = {}
+    for _ in range(cursor.count(24)):
+        camera_id, model_id, width, height = cursor.unpack("<iiQQ")
+        if not 0 <= model_id < len(_MODELS):
+            raise _unsupported(path, f"number {model_id}")
+        model, (n, _) = list(_MODELS.items())[model_id]
+        cameras[camera_id] = CameraRecord(model, width, height, cursor.unpack(f"<{n}d"))
+    return cameras
+
+
+def _binary_images(path: Path) -> Iterator[ImageRecord]:
+    cursor = _Cursor(path)
+    for _ in range(cursor.count(73)):
+        _, *pose, camera_id = cursor.unpack("<I7dI")
+        name = cursor.string()
+        n = cursor.count(_KEYPOINT.itemsize)
+        start = cursor.skip(n * _KEYPOINT.itemsize)
+        keypoints = np.frombuffer(cursor.data, _KEYPOINT, n, start)
+        yield _image(name, camera_id, pose, keypoints["xy"], keypoints["id"])
+
+
+def _binary_points(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    cursor = _Cursor(path)
+    n = cursor.count(51)
+    ids, xyz, rgb = np.empty(n, np.int64), np.empty((n, 3)), np.empty((n, 3), np.uint8)
+    for i in range(n):
+        ids[i], *rest = cursor.unpack("<q3d3Bd")
+        xyz[i], rgb[i] = rest[:3], rest[3:6]
+        cursor.skip(8 * cursor.count(8))  # tracks: the images file has them too
+    return ids, xyz, rgb
+
+
+def _text_cameras(path: Path) -> dict[int, CameraRecord]:
+    cameras = {}
+    for number, line in _text_lines(path):
+        try:
+            camera_id, model, width, height, *params = line.split()
+            values = tuple(map(float, params))
+            cameras[int(camera_id)] = CameraRecord(model, int(width), int(height), values)
+        except ValueError as error:
+            raise _malformed(path, number, error) from None
+        if _MODELS.get(model, (len(values),))[0] != len(values):
+            raise _malformed(path, number, f"{len(values)} parameters for the model {model}")
+    return cameras
+
+
+def _text_images(path: Path) -> Iterator[ImageRecord]:
+    lines = _text_lines(path, blank=True)
+    for number, line in lines:
+        if not line:
+            continue
+        try:
+            _, *pose, camera_id, name = line.split(maxsplit=9)
+            values = [float(value) for value in pose]
+            if len(values) != 7:
+                raise ValueError("an image line needs 10 fields")
+            # An image without keypoints has an empty second line, which editors may have cut.
+            number, line = next(lines, (number, ""))
+            keypoints = np.array(line.split(), np.float64).reshape(-1, 3)
+            record = _image(name, int(camera_id), values, keypoints[:, :2], keypoints[:, 2])
+        except ValueError as error:
+            raise _malformed(path, number, error) from None
+        yield record
+
+
+def _text_points(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    ids: list[int] = []
+    xyz: list[list[float]] = []
+    rgb: list[list[int]] = []
+    for number, line in _text_lines(path):
+        fields = line.split(maxsplit=8)
+        try:
+            if len(fields) < 8:
+                raise ValueError("a point line needs at least 8 fields")
+            ids.append(int(fields[0]))
+            if abs(ids[-1]) > _LARGEST_ID:
+                raise ValueError(f"{ids[-1]} is not a valid id of a point")
+            xyz.append([float(value) for value in fields[1:4]])
+            rgb.append([int(value) & 255 for value in fields[4:7]])
+        except ValueError as error:
+            raise _malformed(path, number, error) from None
+    colors = np.array(rgb, np.uint8).reshape(-1, 3)
+    return np.array(ids, np.int64), np.array(xyz, np.float64).reshape(-1, 3), colors
+
+
+def _text_lines(path: Path, *, blank: bool = False) -> Iterator[tuple[int, str]]:
+    """Yield (line number, stripped line) without comments."""
+    with path.open(encoding="utf-8", errors="replace") as file:
+        for number, raw in enumerate(file, 1):
+            line = raw.strip()
+            if not line.startswith("#") and (line or blank):
+                yield number, line
+
+
+def _image(
+    name: str, camera_id: int, pose: list[float], xy: np.ndarray, ids: np.ndarray
+) -> ImageRecord:
+    tracked, (qvec, tvec) = ids >= 0, np.split(np.array(pose), [4])
+    xy, ids = np.asarray(xy[tracked], np.float64), ids[tracked].astype(np.int64)
+    return ImageRecord(name.replace("\\", "/"), camera_id, qvec, tvec, xy, ids)
+
+
+def _malformed(path: Path, line: int, what: object) -> UserError:
+    return broken(path, f"is malformed in line {line}: {what}", _FIX_FILES)
+
+
+def _unsupported(path: Path, model: str) -> UserError:
+    supported = ", ".join(sorted(name for name, (_, focals) in _MODELS.items() if focals))
+    why = f"uses the camera model {model}; supported are {supported}"
+    return broken(path, why, "run `colmap image_undistorter` and use the folder it writes")

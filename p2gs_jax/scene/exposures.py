@@ -16,16 +16,11 @@ KINDS = ("ev", "exposure", "rel_exposure_ev", "exposure_time_s")
 
 
 def read_known_exposures(source: str, views: list[View]) -> Float[np.ndarray, " v"]:
-    """Return natural logarithms of known exposures, NaN where nothing is known.
+    """Return natural logarithms of known exposures of views, NaN where nothing is known.
 
-    Args:
-        source: `exif`, or a CSV file with a column `image` or `file` (name of the view, or its
-            last part) and one of `ev`, `rel_exposure_ev` (stops), `exposure` (linear, > 0) or
-            `exposure_time_s` (seconds).
-        views: the views wanted, in order.
-
-    Raises:
-        UserError: the file cannot be used, or holds none of the views.
+    The source is `exif`, or a CSV file with a column `image` or `file` (name of the view, or its
+    last part) and one of `ev`, `rel_exposure_ev` (stops), `exposure` (linear, > 0) or
+    `exposure_time_s` (seconds). Raises UserError: it cannot be used, or holds none of the views.
     """
     if source == "exif":
         values = _exif_ev(views) * LN2
@@ -46,11 +41,7 @@ def read_known_exposures(source: str, views: list[View]) -> Float[np.ndarray, " 
 
 
 def check_source(source: str | None) -> None:
-    """Check that a source of `read_known_exposures`, or none, can be used: before there are views.
-
-    Raises:
-        UserError: the file cannot be used.
-    """
+    """Raise UserError where a source of `read_known_exposures` cannot be used; None can."""
     if source not in (None, "exif"):
         _read(Path(source))
 
@@ -58,10 +49,7 @@ def check_source(source: str | None) -> None:
 def stated_ev(source: str | None, views: list[View]) -> Float[np.ndarray, " v"]:
     """Return stated exposures in stops, up to a constant; NaN where nothing is stated.
 
-    The source is that of `read_known_exposures`; None takes EXIF where there is any.
-
-    Raises:
-        UserError: as of `read_known_exposures`.
+    A source of None takes EXIF where there is any. Raises UserError: as `read_known_exposures`.
     """
     if source is None:
         return _exif_ev(views)

@@ -20,6 +20,7 @@ from p2gs_jax.errors import UserError, broken
 from p2gs_jax.scene.convert.headers import size_of
 from p2gs_jax.scene.convert.kinds import CONVERTED_SUFFIXES
 from p2gs_jax.scene.lens import scale_intrinsics
+from p2gs_jax.scene.masks import first_few
 
 IMAGE_SUFFIXES = CONVERTED_SUFFIXES | {*(".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm")}
 # Ratios of width to height that differ by more than this are different shapes.
@@ -35,11 +36,9 @@ MOST_PIXELS = 2 * (Image.MAX_IMAGE_PIXELS or 2**26)
 
 
 def list_images(folder: Path, *, recursive: bool = True) -> list[Path]:
-    """Return the images in a folder, sorted by relative path; hidden ones are left out.
+    """Return the images in a folder, which may be absent; hidden ones are left out.
 
-    Args:
-        folder: may be absent.
-        recursive: look into its subfolders too.
+    They are sorted by their relative path.
     """
     if not folder.is_dir():
         return []
@@ -51,11 +50,7 @@ def list_images(folder: Path, *, recursive: bool = True) -> list[Path]:
 
 
 def read_json(path: Path, fix: str) -> Any:
-    """Return what a JSON file holds.
-
-    Raises:
-        UserError: it is absent, not text, or not valid JSON.
-    """
+    """Return what a JSON file holds; UserError: it is absent, not text, or not valid JSON."""
     try:
         return parse_json(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -71,9 +66,6 @@ def require_inside(name: PurePath, folder: Path, source: Path, fix: str = _MOVED
     """Refuse a name in the file `source` that leads out of the folder it is relative to.
 
     Links below the folder are followed: whoever made it put them there.
-
-    Raises:
-        UserError: it leads out.
     """
     normal = os.path.normpath(name.as_posix())
     if os.path.isabs(normal) or normal.split("/")[0] == "..":
@@ -81,40 +73,25 @@ def require_inside(name: PurePath, folder: Path, source: Path, fix: str = _MOVED
 
 
 def require_plain(name: str, source: Path) -> None:
-    """Refuse a name of a camera, found in the file `source`, that is a path.
-
-    Raises:
-        UserError: it is a path.
-    """
+    """Refuse a name of a camera, found in the file `source`, that is a path."""
     if name in ("", ".", "..") or any(c in name for c in "/\\\0"):
-        raise broken(
-            source,
-            f"has a camera by the name of {name!r}, which is no name of a folder",
-            "get its tables again, or name the camera otherwise in all of them",
-        )
+        why = f"has a camera by the name of {name!r}, which is no name of a folder"
+        raise broken(source, why, "get its tables again, or rename the camera in all of them")
 
 
 def image_folder(root: Path, cfg: DataConfig) -> Path | None:
-    """Return the image folder that the user names, or None.
-
-    Raises:
-        UserError: it does not exist.
-    """
-    if cfg.images is None:
-        return None
-    folder = root / cfg.images
-    if not folder.is_dir():
-        fix = "correct the option --images"
-        raise UserError(f"the image folder {folder} does not exist", fix=fix)
+    """Return the image folder that the user names, or None; UserError: it does not exist."""
+    folder = None if cfg.images is None else root / cfg.images
+    if folder is not None and not folder.is_dir():
+        raise broken(f"the image folder {folder}", "does not exist", "correct the option --images")
     return folder
 
 
 def image_size(path: Path) -> tuple[int, int]:
     """Return (width, height) as stored, before any EXIF rotation.
 
-    Raises:
-        UserError: the file is not an image, or is too large; its name is not UTF-8; or a package
-            that opens it is missing.
+    Raises UserError: the file is not an image, or is too large; its name is not UTF-8; or a package
+    that opens it is missing.
     """
     try:
         str(path).encode()  # no other name can be written into the files of a run
@@ -170,24 +147,14 @@ def undecodable(path: Path) -> UserError:
 
 
 def check_missing(missing: Sequence[str], total: int, source: Path, cfg: DataConfig) -> list[str]:
-    """Reject a model whose images are missing on disk, unless `cfg.allow_missing` allows that.
+    """Return notes about images that a model of `total` images names and the disk lacks.
 
-    Args:
-        missing: their names.
-        total: number of images of the model.
-        source: the file or folder that names them.
-        cfg: has the option.
-
-    Returns:
-        Notes for the user: none or one.
-
-    Raises:
-        UserError: images are missing and that is not allowed, or no image is left.
+    Raises UserError: images are missing and `allow_missing` is not set, or no image is left.
     """
     if not missing:
         return []
-    listed = ", ".join(missing[:5]) + (", ..." if len(missing) > 5 else "")
-    message = f"{len(missing)} of the {total} images named by {source} do not exist: {listed}"
+    message = f"{len(missing)} of the {total} images named by {source} do not exist: "
+    message += first_few(missing)
     if not cfg.allow_missing:
         fix = "add them, name their folder with --images, or skip them with --allow-missing"
         raise UserError(message, fix=fix)
@@ -199,16 +166,9 @@ def check_missing(missing: Sequence[str], total: int, source: Path, cfg: DataCon
 def at_file_size(
     path: Path, K: Float[np.ndarray, "3 3"], size: tuple[int, int], source: Path
 ) -> tuple[Float32[np.ndarray, "3 3"], int, int]:
-    """Return K, width and height of an image file, of which a model may have a larger copy.
+    """Return K, width and height of an image file; K and size (pixels) are the model's.
 
-    Args:
-        path: the image.
-        K: intrinsics according to the model, pixels.
-        size: width and height according to the model, pixels.
-        source: the file of the model.
-
-    Raises:
-        UserError: the file is not an image, or has another shape than the camera.
+    Raises UserError: the file is not an image, or has another shape than `source` says.
     """
     w, h = image_size(path)
     sx, sy = w / size[0], h / size[1]

@@ -1,7 +1,7 @@
 """Lenses and intrinsics, shared by the readers and the image store.
 
-Everything here uses pixel centres at +0.5. The algebra of a pinhole with OpenCV's distortion does
-not depend on where centres lie, so points need no shift; only OpenCV's *rasters* (remap) do, and
+Pixel centres are at +0.5. The algebra of a pinhole with OpenCV's distortion does not depend on
+where centres lie, so points need no shift; only OpenCV's *rasters* (remap) do, and
 `undistortion_maps` is the one place that converts.
 """
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -24,8 +25,7 @@ _OPAQUE = frozenset({".jpg", ".jpeg", ".ppm"})
 def attach_masks(views: tuple[View, ...]) -> tuple[tuple[View, ...], list[str]]:
     """Find masks in `masks/` beside the image folder or in it, where a reader named none.
 
-    Returns:
-        The views with them, and a note about those that have none.
+    Returns the views with them, and a note about those that have none.
     """
     masked = tuple(
         view if view.mask_path else dataclasses.replace(view, mask_path=mask_of(view))
@@ -34,8 +34,12 @@ def attach_masks(views: tuple[View, ...]) -> tuple[tuple[View, ...], list[str]]:
     bare = [view.name for view in masked if view.mask_path is None]
     if not bare or len(bare) == len(masked):
         return masked, []
-    listed = ", ".join(bare[:5]) + (", ..." if len(bare) > 5 else "")
-    return masked, [f"{len(bare)} of {len(masked)} views have no mask: {listed}"]
+    return masked, [f"{len(bare)} of {len(masked)} views have no mask: {first_few(bare)}"]
+
+
+def first_few(names: Sequence[str]) -> str:
+    """Return the first of some names for a message."""
+    return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
 
 
 def mask_of(view: View) -> Path | None:
@@ -60,8 +64,7 @@ def image_folder_of(view: View) -> Path:
 def background_color(cfg: DataConfig) -> Float32[np.ndarray, " 3"]:
     """Return the display values that photographs with alpha are shown and judged over.
 
-    Raises:
-        UserError: the option is not a colour.
+    Raises UserError: the option is not a colour.
     """
     text = JUDGED if cfg.background == RANDOM else cfg.background
     if text in NAMED:
@@ -92,8 +95,7 @@ def has_alpha(path: Path) -> bool:
 def with_alpha(scene: Scene, cfg: DataConfig) -> Scene:
     """Return a scene whose views know what their alpha channel means.
 
-    Raises:
-        UserError: the option is not a colour.
+    Raises UserError: the option is not a colour.
     """
     background_color(cfg)
     found = [has_alpha(view.image_path) for view in scene.views]

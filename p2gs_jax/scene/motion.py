@@ -41,11 +41,11 @@ _FIRST = 6
 
 @dataclass(frozen=True)
 class Motion:
-    """How far a frame is from the reference.
+    """How far a frame is from the reference, in longer sides of the picture.
 
     Attributes:
-        displacement: median displacement of the corners, in longer sides.
-        parallax: upper quartile of what the best rotation leaves of it, in longer sides.
+        displacement: median displacement of the corners.
+        parallax: upper quartile of what the best rotation leaves of it.
         kept: share of the reference's corners that are still seen.
     """
 
@@ -56,24 +56,14 @@ class Motion:
 
 @dataclass(frozen=True)
 class Chosen:
-    """A frame that was chosen.
+    """A frame that was chosen; its sharpness compares with neighbours only.
 
-    Attributes:
-        sharpness: compares with neighbours only.
-        way: motion since the frame chosen before, or None.
+    `way` is the motion since the frame chosen before.
     """
 
     number: int
     sharpness: float
     way: Motion | None
-
-
-@dataclass(frozen=True)
-class _Candidate:
-    number: int
-    grey: UInt8[np.ndarray, "h w"]
-    sharpness: float
-    way: Motion | None = None
 
 
 def normalised(grey: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
@@ -154,34 +144,34 @@ def choose_frames(frames: Iterable[tuple[int, UInt8[np.ndarray, "h w"]]]) -> lis
     """Return the frames that are worth keeping, in order, from numbers and small grey pictures."""
     chosen: list[Chosen] = []
     tracker: Tracker | None = None
-    waiting: list[_Candidate] = []
+    waiting: list[tuple[Chosen, UInt8[np.ndarray, "h w"]]] = []
 
     def take() -> Tracker:
         """Choose the sharpest candidate; follow from it to the newest frame."""
-        best = max(range(len(waiting)), key=lambda k: waiting[k].sharpness)
-        one, later = waiting[best], waiting[best + 1 :]
-        chosen.append(Chosen(one.number, one.sharpness, one.way))
+        best = max(range(len(waiting)), key=lambda k: waiting[k][0].sharpness)
+        (one, grey), later = waiting[best], waiting[best + 1 :]
+        chosen.append(one)
         waiting.clear()
-        begun = Tracker(one.grey)
-        for frame in later:
-            consider(begun, frame.number, frame.grey, frame.sharpness)
+        begun = Tracker(grey)
+        for candidate, grey in later:
+            consider(begun, candidate.number, grey, candidate.sharpness)
         return begun
 
     def sharp_enough() -> bool:
-        return max(one.sharpness for one in waiting) >= _BLURRED * chosen[-1].sharpness
+        return max(one.sharpness for one, _ in waiting) >= _BLURRED * chosen[-1].sharpness
 
     def consider(tracker: Tracker, number: int, grey: np.ndarray, sharp: float) -> float:
         way = tracker.follow(grey)
         share = progress(way)
         if share >= _CANDIDATE:
-            waiting.append(_Candidate(number, grey, sharp, way))
+            waiting.append((Chosen(number, sharp, way), grey))
         return share
 
     for number, grey in frames:
         grey = normalised(grey)
         sharp = sharpness(grey)
         if tracker is None:
-            waiting.append(_Candidate(number, grey, sharp))
+            waiting.append((Chosen(number, sharp, None), grey))
             if len(waiting) == _FIRST:
                 tracker = take()
             continue

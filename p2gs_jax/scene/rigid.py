@@ -42,14 +42,8 @@ def rigid(
 ) -> Float64[np.ndarray, "4 4"]:
     """Return the matrix of a rotation and a position; rounding is taken out of the rotation.
 
-    Args:
-        rotation: 3x3.
-        position: scene units.
-        source: the file, for messages.
-        what: the thing that has this pose, for messages.
-
-    Raises:
-        UserError: it is not finite, or not a rotation.
+    `source` and `what` name the file and the thing that has this pose. Raises UserError: it is not
+    finite, or not a rotation.
     """
     rotation, position = np.asarray(rotation, np.float64), np.asarray(position, np.float64)
     finite = np.isfinite(rotation).all() and np.isfinite(position).all()
@@ -69,8 +63,7 @@ def from_quaternions(
 ) -> Float64[np.ndarray, "n 4 4"]:
     """Return the matrices of quaternions (w x y z) and positions.
 
-    Raises:
-        UserError: a quaternion is not of length 1 within a hundredth, or something is not finite.
+    Raises UserError: a quaternion has not length 1 within a hundredth, or something is not finite.
     """
     wxyz = np.asarray(wxyz, np.float64)
     bad = ~(np.abs(np.linalg.norm(wxyz, axis=1) - 1) < 1e-2) | ~np.isfinite(positions).all(1)
@@ -87,11 +80,7 @@ def from_quaternions(
 def from_quaternion(
     wxyz: Float[np.ndarray, " 4"], position: Float[np.ndarray, " 3"], source: Path, what: str
 ) -> Float64[np.ndarray, "4 4"]:
-    """Return the matrix of one quaternion (w x y z) and a position.
-
-    Raises:
-        UserError: the quaternion is not of length 1 within a hundredth, or something is not finite.
-    """
+    """Return the matrix of one quaternion and a position; errors are as of `from_quaternions`."""
     wxyz = np.asarray(wxyz, np.float64)
     if wxyz.shape != (4,) or not abs(np.linalg.norm(wxyz) - 1) < 1e-2:
         why = f"the pose of {what} has a rotation that is no unit quaternion"
@@ -121,19 +110,11 @@ def interpolated(
     at: Float[np.ndarray, " n"],
     beyond_s: float = LONGEST_BEYOND_S,
 ) -> tuple[Float64[np.ndarray, "n 4 4"], np.ndarray]:
-    """Return poses at given times, and which of these times the track covers.
+    """Return poses at times, and which of these times [n] the track covers.
 
     Positions are linear in time, rotations turn evenly. Past an end the motion of the nearest two
-    poses goes on.
-
-    Args:
-        times: seconds, rising.
-        poses: at these times.
-        at: seconds.
-        beyond_s: how far past the ends a time still counts as covered.
-
-    Returns:
-        Poses (at uncovered times that of the nearest end) and flags [n].
+    poses goes on for `beyond_s`; uncovered times get the pose there. Times are seconds, those of
+    the track rising.
     """
     times, at = np.asarray(times, np.float64), np.asarray(at, np.float64)
     covered = (at >= times[0] - beyond_s) & (at <= times[-1] + beyond_s)
@@ -176,9 +157,7 @@ def up_of_drive(
 ) -> Float[np.ndarray, " 3"]:
     """Return up, away from the road: square to the way that the cameras went, where they did.
 
-    Args:
-        viewmats: world-to-camera.
-        cameras: the camera that took each view.
+    Poses are world-to-camera; `cameras` names the camera of each.
     """
     up = up_direction(viewmats)
     centers = -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
@@ -200,11 +179,8 @@ def headings(
     """Return the level direction in which a camera drives at each of its places, of length 1.
 
     It is taken over at least `HEADING_WAY` where the way is so long: at a stop poses jitter.
-
-    Args:
-        centers: positions of one camera in the order of time.
-        up: away from the road, of length 1.
-        otherwise: level direction for a camera that goes nowhere.
+    Centers are in the order of time, `up` has length 1, and a camera that goes nowhere drives
+    `otherwise`.
     """
     level = centers - np.outer(centers @ up, up)
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(level, axis=0), axis=1))])

@@ -37,10 +37,8 @@ _FIX = "write it again with the tool that made it"
 def read_points(path: Path) -> tuple[Float32[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"] | None]:
     """Return the positions and, where there are any, display colours of the points in a PLY.
 
-    Colours are red, green, blue: 0 to 255, or 0 to 1 as floats.
-
-    Raises:
-        UserError: the file is absent, is not such a PLY, or holds points that are not finite.
+    Colours are red, green, blue: 0 to 255, or 0 to 1 as floats. Raises UserError: the file is
+    absent, is not such a PLY, or holds points that are not finite.
     """
     if not path.is_file():
         fix = "put the file there, or take its name out of the .json: seeds are then found"
@@ -75,14 +73,9 @@ def with_random_seeds(scene: Scene) -> Scene:
         f"{why}: {len(points)} seeds were drawn at random where the cameras "
         f"look, at depths of {near:.3g} to {far:.3g}."
     )
-    return dataclasses.replace(
-        scene,
-        points=points,
-        point_colors=None,
-        tracks=None,
-        random_seeds=True,
-        notes=(*scene.notes, note),
-    )
+    notes = (*scene.notes, note)
+    unseen = {"point_colors": None, "tracks": None, "random_seeds": True}
+    return dataclasses.replace(scene, points=points, notes=notes, **unseen)
 
 
 def depth_range(views: Sequence[View]) -> tuple[float, float]:

@@ -14,32 +14,26 @@ import dataclasses
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
 import numpy as np
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError, broken
 from p2gs_jax.scene.files import read_json
-from p2gs_jax.scene.masks import image_folder_of
+from p2gs_jax.scene.masks import first_few, image_folder_of
 from p2gs_jax.types import Scene, Tracks, View
 
 EVERY = "every"
-_TEXT_FILES = {"train": "train.txt", "test": "test.txt"}
 _INSTEAD = "--split every holds out every n-th view instead"
 
 
 def split_scene(scene: Scene, cfg: DataConfig) -> Scene:
     """Return a scene whose views are split, and that says by what.
 
-    A file that the user names comes first, then what the data set says, then every n-th view;
-    `test_every` 0 holds out none in any case.
-
-    Args:
-        scene: as it was read; where the data set decides, `split_by` and the views say so.
-        cfg: `split` and `test_every`.
-
-    Raises:
-        UserError: the file is broken or names what is not there, or so many cannot be held out.
+    A file that the user names comes first, then what the data set says (`split_by` and the views),
+    then every n-th view; `test_every` 0 holds out none in any case. Raises UserError: the file is
+    broken or names what is not there, or so many cannot be held out.
     """
     if cfg.split is not None and cfg.split != EVERY and cfg.test_every:
         lists = read_split(Path(cfg.split))
@@ -59,10 +53,8 @@ def assign_split(views: tuple[View, ...], test_every: int) -> tuple[View, ...]:
 
     Within each camera, sorted by name, views 0, n, 2n, ... are `test`, as in 3DGS; where views have
     frames, the frames 0, n, 2n, ... among all of them are. A camera that would be left without a
-    training view holds out none; n = 0 holds out none.
-
-    Raises:
-        UserError: n is negative, or 1, which would leave nothing to train on.
+    training view holds out none; n = 0 holds out none. Raises UserError: n is negative, or 1, which
+    would leave nothing to train on.
     """
     if test_every < 0 or test_every == 1:
         raise UserError(
@@ -89,40 +81,26 @@ def _with_test(views: Sequence[View], test: set[int]) -> tuple[View, ...]:
     )
 
 
-@dataclasses.dataclass(frozen=True)
-class SplitLists:
-    """Names of photographs.
+class SplitLists(NamedTuple):
+    """Names of photographs that are trained on or held out; None: the rest.
 
-    Attributes:
-        source: the file, or the files, in words.
-        folder: that holds it or them.
-        train: what is trained on; None: the rest.
-        test: what is held out; None or empty: `val` if there is one, else the rest.
-        val: held out by others while they train; here it takes the place of `test` or is left out.
+    `where` is the file; of several, their folder and names.
     """
 
-    source: str
-    folder: Path
-    train: tuple[str, ...] | None = None
-    test: tuple[str, ...] | None = None
-    val: tuple[str, ...] | None = None
-
-    @property
-    def where(self) -> str:
-        """The file, or the files, with their folder."""
-        return str(self.folder / self.source)
+    where: Path
+    train: Sequence[str] | None = None
+    test: Sequence[str] | None = None
 
 
 def read_split(path: Path) -> SplitLists:
     """Read the lists that a user names: .json, or text with the names of what is held out.
 
-    Raises:
-        UserError: it is absent, or holds no such lists.
+    Raises UserError: it is absent, or holds no such lists.
     """
     if not path.exists():
         raise broken(path, "does not exist", "correct the option --split")
     if path.suffix.lower() != ".json":
-        return SplitLists(path.name, path.parent, test=_lines(path))
+        return SplitLists(path, test=_lines(path))
     data = read_json(path, "correct the file")
     found = lists_in(path, data, {name: name for name in ("train", "test", "val")})
     if found is None:
@@ -134,88 +112,73 @@ def read_split(path: Path) -> SplitLists:
 def lists_in(path: Path, data: object, keys: dict[str, str]) -> SplitLists | None:
     """Return the lists in the data of a .json, or None where it holds none.
 
-    Args:
-        path: the file.
-        data: what it holds.
-        keys: what `train`, `test` and `val` are called in it.
-
-    Raises:
-        UserError: one of them is not a list of names.
+    `keys` are what `train`, `test` and `val` are called in it; `val` is held out where `test` is
+    absent or empty, and else left out. Raises UserError: one of them is not a list of names.
     """
-    lists: dict[str, tuple[str, ...]] = {}
+    lists: dict[str, list[str]] = {}
     for name, key in keys.items():
         given = data.get(key) if isinstance(data, dict) else None
         if given is None:
             continue
         if not isinstance(given, list) or not all(isinstance(n, str) and n for n in given):
             raise broken(f"{path}:", f'"{key}" is not a list of names', "correct the file")
-        lists[name] = tuple(given)
-    return SplitLists(path.name, path.parent, **lists) if lists else None
+        lists[name] = given
+    # Tools write empty lists for what they lack.
+    held = lists.get("test") or lists.get("val") or None
+    return SplitLists(path, lists.get("train"), held) if lists else None
 
 
 def lists_beside(*folders: Path) -> SplitLists | None:
     """Return the lists in `train.txt` and `test.txt` of the first folder that has one of them."""
     for folder in folders:
-        files = {name: folder / file for name, file in _TEXT_FILES.items()}
-        found = {name: path for name, path in files.items() if path.is_file()}
-        if found:
-            source = " and ".join(path.name for path in found.values())
-            names = {name: _lines(path) for name, path in found.items()}
-            return SplitLists(source, folder, **names)
+        train, test = folder / "train.txt", folder / "test.txt"
+        if found := [path for path in (train, test) if path.is_file()]:
+            where = folder / " and ".join(path.name for path in found)
+            return SplitLists(where, *(_lines(p) if p in found else None for p in (train, test)))
     return None
 
 
 def split_as_listed(scene: Scene, lists: SplitLists, *, allow_missing: bool = False) -> Scene:
     """Return a scene whose views are split as lists say; what is in none of them is left out.
 
-    Args:
-        scene: as it was read.
-        lists: which views are which.
-        allow_missing: names that no photograph has are left out instead of an error.
-
-    Raises:
-        UserError: a name belongs to no photograph, or to several; it is in two lists; or nothing is
-            left to train on.
+    Names that no photograph has are an error unless `allow_missing`. Raises UserError: a name
+    belongs to no photograph, or to several; it is in two lists; or nothing is left to train on.
     """
-    views, notes, unused = scene.views, [], []
+    views, where, name, notes = scene.views, lists.where, lists.where.name, []
     rows_of = _rows_by_name(views)
-    # Tools write empty lists for what they lack.
-    held = lists.test or lists.val or None
-    rows: dict[str, set[int]] = {}
-    for part, names in (("train", lists.train), ("test", held)):
-        if names is not None:
-            found = [_row(name, views, rows_of, lists, unused) for name in names]
-            rows[part] = {row for row in found if row is not None}
+    found = [
+        None if names is None else {n: _row(n, views, rows_of, where) for n in names}
+        for names in (lists.train, lists.test)
+    ]
+    unused = [n for rows in found for n, row in (rows or {}).items() if row is None]
     if unused:
-        absent = [name for name in unused if not _lies_there(name, views)]
+        absent = [n for n in unused if not _lies_there(n, views)]
         if absent and not allow_missing:
             why = f"lists {absent[0]}, which the scene does not have"
-            raise broken(lists.where, why, f"correct the name, or add the photograph; {_INSTEAD}")
-        notes.append(
-            f"{lists.source} lists {len(unused)} photographs that are not views of the scene: "
-            + ", ".join(unused[:5])
-            + (", ..." if len(unused) > 5 else "")
-        )
+            raise broken(where, why, f"correct the name, or add the photograph; {_INSTEAD}")
+        why = f"{name} lists {len(unused)} photographs that are not views of the scene"
+        notes.append(f"{why}: {first_few(unused)}")
     everything = set(range(len(views)))
-    train = rows.get("train", everything - rows.get("test", set()))
-    test = rows.get("test", everything - train)
+    train, test = (
+        None if rows is None else {row for row in rows.values() if row is not None}
+        for rows in found
+    )
+    train = everything - (test or set()) if train is None else train
+    test = everything - train if test is None else test
     if both := sorted(train & test):
         why = f"{views[both[0]].name} is both trained on and held out"
-        raise broken(f"{lists.where}:", why, f"take it out of one of the lists; {_INSTEAD}")
+        raise broken(f"{where}:", why, f"take it out of one of the lists; {_INSTEAD}")
     if not train:
-        raise broken(lists.where, "leaves no view to train on", f"correct the lists; {_INSTEAD}")
-    scene = dataclasses.replace(scene, views=_with_test(views, test), split_by=lists.source)
-    left = sorted(everything - train - test)
-    if left:
-        notes.append(
-            f"{len(left)} views are neither trained on nor held out by {lists.source}: they are "
-            "not used"
-        )
+        raise broken(where, "leaves no view to train on", f"correct the lists; {_INSTEAD}")
+    scene = dataclasses.replace(scene, views=_with_test(views, test), split_by=name)
+    if left := sorted(everything - train - test):
+        why = f"{len(left)} views are neither trained on nor held out by {name}"
+        notes.append(f"{why}: they are not used")
         scene = _without_views(scene, left)
     if not test:
         notes.append(
-            f"{lists.source} holds no view out: nothing says how good views are that are not "
-            "trained on. --split every holds out every n-th."
+            f"{name} holds no view out: nothing says how good views are that are not trained on. "
+            "--split every holds out every n-th."
         )
     return dataclasses.replace(scene, notes=(*scene.notes, *notes))
 
@@ -228,11 +191,8 @@ def _without_views(scene: Scene, rows: Sequence[int]) -> Scene:
         place = np.full(len(scene.views), -1)
         place[kept] = np.arange(len(kept))
         seen = place[tracks.view_indices] >= 0
-        tracks = Tracks(
-            place[tracks.view_indices[seen]].astype(tracks.view_indices.dtype),
-            tracks.point_indices[seen],
-            tracks.xy[seen],
-        )
+        rows_seen = place[tracks.view_indices[seen]].astype(tracks.view_indices.dtype)
+        tracks = Tracks(rows_seen, tracks.point_indices[seen], tracks.xy[seen])
     return dataclasses.replace(scene, views=tuple(scene.views[i] for i in kept), tracks=tracks)
 
 
@@ -265,14 +225,8 @@ def _rows_by_name(views: Sequence[View]) -> dict[str, set[int]]:
     return rows
 
 
-def _row(
-    name: str,
-    views: Sequence[View],
-    rows_of: dict[str, set[int]],
-    lists: SplitLists,
-    unused: list[str],
-) -> int | None:
-    """Return the view of a name; one that has none is added to `unused`."""
+def _row(name: str, views: Sequence[View], rows_of: dict[str, set[int]], where: Path) -> int | None:
+    """Return the view of a name, or None."""
     normal = _normal(name)
     rows = rows_of.get(normal.lstrip("/"), set())
     whole = {row: views[row].name for row in rows}
@@ -281,11 +235,8 @@ def _row(
     if len(rows) > 1:
         names = " and ".join(views[row].name for row in sorted(rows)[:2])
         fix = "write more of the path into the list"
-        raise broken(f"{lists.where}:", f"{name} may be {names}", fix)
-    if not rows:
-        unused.append(name)
-        return None
-    return next(iter(rows))
+        raise broken(f"{where}:", f"{name} may be {names}", fix)
+    return next(iter(rows), None)
 
 
 def _lies_there(name: str, views: Sequence[View]) -> bool:

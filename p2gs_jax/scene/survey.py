@@ -6,8 +6,8 @@ Nothing long is computed. In the picture the drive goes to the right.
 from __future__ import annotations
 
 import dataclasses
-from collections import Counter
-from collections.abc import Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -43,7 +43,6 @@ class SurveyedCamera:
     """One physical camera, or photographs of one size where nothing else is known.
 
     Attributes:
-        name: empty where nothing is known.
         size: width and height, pixels.
         focal: length in pixels.
         across: angle of view from side to side, degrees.
@@ -64,19 +63,15 @@ class SurveyedCamera:
 
 @dataclass(frozen=True)
 class Survey:
-    """What there is.
+    """What there is; `scene` is None for photographs alone.
 
     Attributes:
-        root: the folder.
         format: as `DataConfig.format` names it.
-        cameras: by name.
-        scene: views, points, boxes; None: photographs alone.
         frames: moments in a drive, or None where views have none.
-        seconds: from the first photograph to the last, or None.
-        way: length of the way of the camera with the most photographs, scene units; None where
-            views have no frames.
+        seconds: from the first photograph to the last.
+        way: length of the way of the camera with the most photographs, scene units.
         missing: photographs that the cameras lack in these frames.
-        sweeps: sweeps of laser scanners, or None.
+        sweeps: sweeps of laser scanners.
         lacks: what a drive may have and this scene lacks, in words.
     """
 
@@ -109,8 +104,7 @@ def _metric(name: str) -> bool:
 def survey(root: Path, cfg: DataConfig, report: Report = lambda message: None) -> Survey:
     """Return what a folder holds, with the options of a fit; missing photographs are counted.
 
-    Raises:
-        UserError: there is no scene, or it is broken.
+    Raises UserError: there is no scene, or it is broken.
     """
     cfg = dataclasses.replace(cfg, allow_missing=True)
     found = find_scene(root, cfg, report)
@@ -143,18 +137,13 @@ def _survey_of(scene: Scene, frames: int | None, sweeps: int | None) -> Survey:
     }
     longest = camera_centers(_viewmats(max(by_camera.values(), key=len)))
     way = float(np.linalg.norm(np.diff(longest, axis=0), axis=1).sum())
-    return Survey(
-        scene.root,
-        scene.format,
-        tuple(_camera(name, views) for name, views in by_camera.items()),
-        scene,
-        frames,
-        max(times) - min(times) if times else None,
-        way if frames else None,
-        frames * len(by_camera) - len(views) if frames else 0,
-        sweeps,
-        tuple(what for what, absent in lacking.items() if absent),
-    )
+    cameras = tuple(_camera(name, taken) for name, taken in by_camera.items())
+    seconds = max(times) - min(times) if times else None
+    missing = frames * len(by_camera) - len(views) if frames else 0
+    lacks = tuple(what for what, absent in lacking.items() if absent)
+    way = way if frames else None
+    found = (cameras, scene, frames, seconds, way, missing, sweeps, lacks)
+    return Survey(scene.root, scene.format, *found)
 
 
 def _by_camera(views: Sequence[View]) -> dict[str, list[View]]:
@@ -169,17 +158,12 @@ def _viewmats(views: Sequence[View]) -> np.ndarray:
 
 def _camera(name: str, views: Sequence[View]) -> SurveyedCamera:
     view = views[0]
-    focal = float(view.K[0, 0])
-    return SurveyedCamera(
-        name,
-        len(views),
-        (view.width, view.height),
-        focal,
-        float(np.rad2deg(2 * np.arctan(view.width / 2 / focal))),
-        "" if view.distortion is None else view.distortion.model,
-        None if view.own_car is None else float(view.own_car.mean()),
-        _range([v.exif_ev for v in views]),
-    )
+    size, focal = (view.width, view.height), float(view.K[0, 0])
+    across = float(np.rad2deg(2 * np.arctan(view.width / 2 / focal)))
+    lens = "" if view.distortion is None else view.distortion.model
+    bonnet = None if view.own_car is None else float(view.own_car.mean())
+    ev = _range([v.exif_ev for v in views])
+    return SurveyedCamera(name, len(views), size, focal, across, lens, bonnet, ev)
 
 
 def _range(values: Sequence[float | None]) -> tuple[float, float] | None:
@@ -189,12 +173,12 @@ def _range(values: Sequence[float | None]) -> tuple[float, float] | None:
 
 def _sizes(found: PhotographsAlone) -> tuple[SurveyedCamera, ...]:
     """Return photographs by size: more is not known before their cameras are."""
-    sizes = {path: image_size(path) for path in found.paths}
+    by_size: dict[tuple[int, int], list[Path]] = defaultdict(list)
+    for path in found.paths:
+        by_size[image_size(path)].append(path)
     return tuple(
-        SurveyedCamera(
-            "", count, size, ev=_range([read_exif_ev(p) for p, s in sizes.items() if s == size])
-        )
-        for size, count in Counter(sizes.values()).most_common()
+        SurveyedCamera("", len(paths), size, ev=_range([read_exif_ev(path) for path in paths]))
+        for size, paths in sorted(by_size.items(), key=lambda item: -len(item[1]))
     )
 
 
@@ -205,31 +189,24 @@ def labels_of(scene: Scene) -> list[tuple[str, int, int]]:
     return [(label, count, moving[label]) for label, count in counts.most_common()]
 
 
-class _Plane:
-    """The ground, with the drive from left to right."""
-
-    def __init__(self, views: Sequence[View]):
-        up = up_of_drive(_viewmats(views), [view.camera for view in views])
-        longest = camera_centers(_viewmats(max(_by_camera(views).values(), key=len)))
-        way = longest[-1] - longest[0]
-        way -= up * (up @ way)
-        if np.linalg.norm(way) < 1e-6:
-            way = level_ahead(views, up)
-        along = way / max(np.linalg.norm(way), 1e-12)
-        self.axes = np.stack([along, np.cross(up, along)])
-        self.start = longest[0]
-
-    def __call__(self, points: np.ndarray) -> np.ndarray:
-        """Return positions [... 2] of points [... 3]."""
-        return (np.asarray(points, np.float64) - self.start) @ self.axes.T
+def _ground(views: Sequence[View]) -> Callable[[np.ndarray], np.ndarray]:
+    """Return a function from points [n 3] to the ground [n 2], the drive from left to right."""
+    up = up_of_drive(_viewmats(views), [view.camera for view in views])
+    longest = camera_centers(_viewmats(max(_by_camera(views).values(), key=len)))
+    way = longest[-1] - longest[0]
+    way -= up * (up @ way)
+    if np.linalg.norm(way) < 1e-6:
+        way = level_ahead(views, up)
+    along = way / max(np.linalg.norm(way), 1e-12)
+    axes = np.stack([along, np.cross(up, along)])
+    return lambda points: (np.asarray(points, np.float64) - longest[0]) @ axes.T
 
 
 @names_as_they_are()
 def draw_plan(path: Path, survey: Survey) -> None:
     """Write a PNG of a scene from above: cameras with their directions, points, boxes.
 
-    Raises:
-        ValueError: the survey has no cameras.
+    Raises ValueError: the survey has no cameras.
     """
     # Imported here: it takes as long to load as a small scene to read.
     from matplotlib.figure import Figure
@@ -237,32 +214,31 @@ def draw_plan(path: Path, survey: Survey) -> None:
     scene = survey.scene
     if scene is None:
         raise ValueError("photographs alone have no plan")
-    plane, by_camera = _Plane(scene.views), _by_camera(scene.views)
-    points = scene.points if scene.lidar is None else scene.lidar.points
-    low, high = _limits(plane(camera_centers(_viewmats(scene.views))), plane(points), scene.format)
+    ground = _ground(scene.views)
+    points = ground(scene.points if scene.lidar is None else scene.lidar.points)
+    low, high = _limits(ground(camera_centers(_viewmats(scene.views))), points, scene.format)
     across, down = high - low
     tall = float(np.clip(13.0 * down / max(across, 1e-9), 4.0, 11.0))
     figure = Figure(figsize=(13.0, tall + 0.9), layout="constrained", dpi=110)
     axes = figure.subplots()
-    _draw_points(axes, plane(points), scene, low, high)
+    _draw_points(axes, points, scene, low, high)
     times = [view.time for view in scene.views if view.time is not None]
     for thing in scene.objects if times else ():
-        _draw_box(axes, plane, thing, min(times), max(times))
-    for k, (name, views) in enumerate(by_camera.items()):
-        reach = 0.055 * float(max(across, down))
-        _draw_camera(axes, plane, name, views, COLORS[k % len(COLORS)], reach)
+        _draw_box(axes, ground, thing, min(times), max(times))
+    for k, (name, views) in enumerate(_by_camera(scene.views).items()):
+        color, reach = COLORS[k % len(COLORS)], 0.055 * float(max(across, down))
+        _draw_camera(axes, ground, f"{printable(name)} ({len(views)})", views, color, reach)
     if survey.frames is not None:
         axes.plot(0, 0, "o", mec="black", mew=1.3, mfc="none", ms=9, zorder=6, label="start")
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xticks=[], yticks=[])
-    _draw_scale(axes, low, high, survey.unit)
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel=survey.unit)
     title = f"{printable(survey.root.resolve().name)} from above"
     if survey.way:
         title += f": {survey.way:.1f} {survey.unit} to the right"
         title += "" if survey.seconds is None else f" in {survey.seconds:.1f} s"
     axes.set_title(title, loc="left", fontsize=11)
     handles, labels = axes.get_legend_handles_labels()
-    columns = {"ncols": min(6, len(labels)), "fontsize": 8, "frameon": False, "markerscale": 1.6}
-    figure.legend(handles, labels, loc="outside lower left", **columns)
+    how = {"ncols": min(6, len(labels)), "fontsize": 8, "frameon": False, "markerscale": 1.6}
+    figure.legend(handles, labels, loc="outside lower left", **how)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, format="png")
 
@@ -273,8 +249,7 @@ def _limits(places: np.ndarray, points: np.ndarray, name: str) -> tuple[np.ndarr
     way = float(np.linalg.norm(high - low))
     reach = 0.3 * way
     if len(points):
-        beside = np.abs(np.clip(points, low, high) - points).max(1)
-        reach = float(np.quantile(beside, SHARE))
+        reach = float(np.quantile(np.abs(np.clip(points, low, high) - points).max(1), SHARE))
     most = max(AROUND, AROUND_WAYS * way) if _metric(name) else 5 * max(way, 1e-6)
     margin = max(min(reach, most), 0.1 * way, 1e-6)
     return low - margin, high + margin
@@ -295,50 +270,33 @@ def _draw_points(axes, points: np.ndarray, scene: Scene, low, high) -> None:
             axes.plot([], [], "s", color=color, ms=4, label=label)
 
 
-def _draw_box(axes, plane: _Plane, thing: TrackedObject, first: float, last: float) -> None:
+def _draw_box(axes, ground, thing: TrackedObject, first: float, last: float) -> None:
     """Draw where a box was first and last while photographs were taken, and its track."""
     within = thing.times[(thing.times >= first) & (thing.times <= last)]
     if not len(within):
         return
     color = MOVING if thing.moving else STANDING
     label = "moving boxes and their tracks" if thing.moving else "standing boxes"
+    known = label in axes.get_legend_handles_labels()[1]
     corners = np.concatenate([_CORNERS * thing.size[:2], np.zeros((5, 1))], 1)
     track = interpolated(thing.times, thing.poses, within)[0]
-    for pose in track[[0, -1]] if thing.moving else track[:1]:
-        known = label in axes.get_legend_handles_labels()[1]
-        outline = plane(corners @ pose[:3, :3].T + pose[:3, 3])
-        named = None if known else label
-        axes.plot(*outline.T, color=color, lw=0.9, zorder=3, label=named)
+    for k, pose in enumerate(track[[0, -1]] if thing.moving else track[:1]):
+        outline, named = ground(corners @ pose[:3, :3].T + pose[:3, 3]), not known and k == 0
+        axes.plot(*outline.T, color=color, lw=0.9, zorder=3, label=label if named else None)
     if thing.moving:
-        axes.plot(*plane(track[:, :3, 3]).T, color=color, lw=0.7, ls=(0, (3, 2)), zorder=3)
+        axes.plot(*ground(track[:, :3, 3]).T, color=color, lw=0.7, ls=(0, (3, 2)), zorder=3)
 
 
-def _draw_camera(
-    axes, plane: _Plane, name: str, views: Sequence[View], color: str, reach: float
-) -> None:
+def _draw_camera(axes, ground, label: str, views: Sequence[View], color: str, reach: float) -> None:
     """Draw the way of a camera, and what it sees from some places of it."""
-    places = plane(camera_centers(_viewmats(views)))
-    label = f"{printable(name)} ({len(views)})"
-    axes.plot(*places.T, ".-", color=color, ms=3, lw=0.8, zorder=5, label=label)
+    centers = camera_centers(_viewmats(views))
+    axes.plot(*ground(centers).T, ".-", color=color, ms=3, lw=0.8, zorder=5, label=label)
     for k in evenly_spaced(len(views), MOST_DIRECTIONS):
-        view = views[k]
+        view, place = views[k], ground(centers[k])
         sides = (np.array([0.0, view.width]) - view.K[0, 2]) / view.K[0, 0]
         rays = np.stack([sides, np.zeros(2), np.ones(2)], -1) @ view.viewmat[:3, :3]
-        rays = rays.astype(np.float64) @ plane.axes.T
+        rays = ground(centers[k] + rays) - place
         rays *= reach / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-9)
-        corners = np.stack([places[k], places[k] + rays[0], places[k] + rays[1]])
+        corners = np.stack([place + rays[0], place, place + rays[1]])
         axes.fill(*corners.T, color=color, alpha=0.16, lw=0, zorder=2)
-        axes.plot(*corners[[1, 0, 2]].T, color=color, lw=0.6, zorder=4)
-
-
-def _draw_scale(axes, low, high, unit: str) -> None:
-    """Draw a bar of a round length in the lower right corner."""
-    across, down = high - low
-    target = 0.2 * across
-    power = 10.0 ** np.floor(np.log10(target))
-    length = max(step * power for step in (1, 2, 5) if step * power <= target)
-    right, base = high[0] - 0.02 * across, low[1] + 0.03 * down
-    ends = [right - length, right]
-    axes.plot(ends, [base, base], color="black", lw=3, solid_capstyle="butt", zorder=7)
-    where = {"ha": "center", "va": "bottom", "fontsize": 9, "zorder": 7}
-    axes.text(right - length / 2, base + 0.012 * down, f"{length:g} {unit}", **where)
+        axes.plot(*corners.T, color=color, lw=0.6, zorder=4)

@@ -2,9 +2,8 @@
 
 nerfstudio and instant-ngp write one `transforms.json`, Blender's scenes one for each part of the
 split. Poses are camera-to-world with OpenGL axes (x right, y up, z backwards); intrinsics follow
-COLMAP (pixel centres at +0.5), from which both tools take them. Of nerfstudio's other fields
-`ply_file_path` names seed points in the axes of the poses, `train_filenames`, `test_filenames` and
-`val_filenames` the split; `aabb_scale` means nothing to splats.
+COLMAP (pixel centres at +0.5). Of nerfstudio's other fields `ply_file_path` names seed points in
+the axes of the poses, `train_filenames`, `test_filenames` and `val_filenames` the split.
 
 LLFF's table has a row for each photograph, in the order of their names: a 3x5 matrix, row by row,
 and the nearest and the farthest depth. The matrix is the camera-to-world pose with the axes (down,
@@ -18,9 +17,9 @@ import math
 import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float64
@@ -59,19 +58,11 @@ _UNDISTORT = "undistort the images to pinhole ones (colmap image_undistorter) an
 _LISTS = {"train": "train_filenames", "test": "test_filenames", "val": "val_filenames"}
 
 
-@dataclass(frozen=True)
-class _Frame:
-    """A frame before its image has been looked at.
-
-    Attributes:
-        path: relative to the json's folder.
-        values: fields of the frame, over those of its file.
-        source: the file.
-        split: part of the split that all frames of the file belong to.
-    """
+class _Frame(NamedTuple):
+    """A frame of the file `source`: `path` is relative to its folder."""
 
     path: Path
-    values: Mapping
+    values: Mapping[str, Any]
     source: Path
     split: Split
 
@@ -84,14 +75,8 @@ def is_blender(root: Path) -> bool:
 def load_transforms(root: Path, json_path: Path, cfg: DataConfig) -> Scene:
     """Read the poses and intrinsics; the scene has no tracks yet, and points if the file names any.
 
-    Args:
-        root: what the user named.
-        json_path: the file.
-        cfg: the image folder, and whether images may be missing.
-
-    Raises:
-        UserError: the file is malformed (the line or the frame is named), its lens model is not
-            supported, images are missing or of another size, or it lists views that it lacks.
+    Raises UserError: the file is malformed (the line or the frame is named), its lens model is not
+    supported, images are missing or of another size, or it lists views that it lacks.
     """
     data = _parse(json_path)
     scene = _assembled(root, "transforms", _frames(json_path, data), cfg)
@@ -113,11 +98,9 @@ def load_transforms(root: Path, json_path: Path, cfg: DataConfig) -> Scene:
 def load_blender(root: Path, cfg: DataConfig) -> Scene:
     """Read the views of NeRF's synthetic scenes, and of all that are laid out as they are.
 
-    `transforms_train.json` is trained on and `transforms_test.json` held out;
-    `transforms_val.json` takes its place where there is none. One camera took all views.
-
-    Raises:
-        UserError: as of `load_transforms`; or a photograph is listed in both.
+    `transforms_train.json` is trained on and `transforms_test.json` held out; `transforms_val.json`
+    takes its place where there is none. One camera took all views. Raises UserError: as of
+    `load_transforms`; or a photograph is listed in both.
     """
     train = root / "transforms_train.json"
     others = [root / f"transforms_{name}.json" for name in ("test", "val")]
@@ -132,25 +115,17 @@ def load_blender(root: Path, cfg: DataConfig) -> Scene:
 def load_llff(root: Path, cfg: DataConfig) -> Scene:
     """Read LLFF's poses, intrinsics and bounds; the scene has no points and no tracks yet.
 
-    Args:
-        root: the folder with poses_bounds.npy.
-        cfg: the image folder, such as `images_4`.
-
-    Raises:
-        UserError: the file is broken, has not a row for each photograph, or photographs have
-            another shape than it says.
+    Raises UserError: the file is broken, has not a row for each photograph, or photographs have
+    another shape than it says.
     """
     path = root / LLFF_FILE
     rows = _read_llff(path)
     folder = root / (cfg.images or "images")
     photographs = list_images(folder, recursive=False)
     if len(photographs) != len(rows):
-        raise broken(
-            path,
-            f"has {len(rows)} rows, and {folder} holds {len(photographs)} photographs",
-            "put all photographs of the poses there and no others, or name their folder with "
-            "--images",
-        )
+        why = f"has {len(rows)} rows, and {folder} holds {len(photographs)} photographs"
+        fix = "put all photographs of the poses there and no others, or name their folder with "
+        raise broken(path, why, fix + "--images")
     views, resized = [], 0
     for k, (image, row) in enumerate(zip(photographs, rows, strict=True)):
         matrix, what = row[:15].reshape(3, 5), f"row {k}"
@@ -165,18 +140,12 @@ def load_llff(root: Path, cfg: DataConfig) -> Scene:
         viewmat = _viewmat(rotation, matrix[:, 3], path, what, _LLFF_FIX)
         views.append(View(image.name, image, "0", viewmat, K, w, h))
     bounds = (float(rows[:, 15].min()), float(rows[:, 16].max()))
-    return _scene(root, "llff", views, _rescaled(resized, LLFF_FILE), bounds)
+    return replace(_scene(root, "llff", views, _rescaled(resized, LLFF_FILE)), depths=bounds)
 
 
-def _scene(
-    root: Path,
-    name: str,
-    views: Sequence[View],
-    notes: Sequence[str],
-    depths: tuple[float, float] | None = None,
-) -> Scene:
+def _scene(root: Path, name: str, views: Sequence[View], notes: Sequence[str]) -> Scene:
     points, colors = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
-    return Scene(root, name, tuple(views), points, colors, notes=tuple(notes), depths=depths)
+    return Scene(root, name, tuple(views), points, colors, notes=tuple(notes))
 
 
 def _rescaled(count: int, source: str) -> list[str]:
@@ -213,11 +182,10 @@ def _read_llff(path: Path) -> Float64[np.ndarray, "v 17"]:
         shape = "x".join(map(str, table.shape))
         raise broken(path, f"holds {shape} numbers, not N x {_LLFF_COLUMNS}", _LLFF_FIX)
     table = table.astype(np.float64)
-    for k, row in enumerate(table):
-        if not np.isfinite(row[:15]).all():
+    for k, (*pose, near, far) in enumerate(table):
+        if not np.isfinite(pose).all():
             raise broken(f"{path}:", f"the pose in row {k} is not finite", _LLFF_FIX)
-        near, far = row[15:]
-        if not (np.isfinite([near, far]).all() and 0 < near < far):
+        if not 0 < near < far < math.inf:
             why = f"row {k} has impossible bounds: {near:g} to {far:g}"
             raise broken(f"{path}:", why, _LLFF_FIX)
     return table
@@ -235,18 +203,13 @@ def _assembled(root: Path, name: str, frames: Sequence[_Frame], cfg: DataConfig)
             require_inside(frame.path, folder, frame.source)
         else:
             require_inside(frame.path.relative_to(common), asked, frame.source)
-    found: list[tuple[str, _Frame]] = []
+    located = [(_with_suffix(place, f.path.relative_to(common)), f) for f in frames]
     notes: list[str] = []
     for source in dict.fromkeys(frame.source for frame in frames):
-        listed = [frame for frame in frames if frame.source == source]
-        missing = []
-        for frame in listed:
-            where = _with_suffix(place, frame.path.relative_to(common))
-            if where is None:
-                missing.append(frame.path.as_posix())
-            else:
-                found.append((where, frame))
+        listed = [(where, frame) for where, frame in located if frame.source == source]
+        missing = [frame.path.as_posix() for where, frame in listed if where is None]
         notes += check_missing(missing, len(listed), source, cfg)
+    found = [(where, frame) for where, frame in located if where is not None]
     _require_once(found)
     views, resized = [], 0
     for where, frame in sorted(found, key=lambda item: item[0]):
@@ -311,9 +274,8 @@ def _frames(path: Path, data: dict, split: Split = "train") -> list[_Frame]:
 def _relative(source: Path, name: str) -> Path:
     """Return a path in a file as one from its folder."""
     normal = os.path.normpath(name.replace("\\", "/"))
-    if os.path.isabs(normal):
-        normal = os.path.relpath(normal, source.parent.resolve())
-    return Path(normal)
+    absolute = os.path.isabs(normal)
+    return Path(os.path.relpath(normal, source.parent.resolve()) if absolute else normal)
 
 
 def _beside(source: Path, name: str) -> Path:
@@ -355,19 +317,10 @@ def _view(frame: _Frame, folder: Path, name: str) -> tuple[View, bool]:
         raise broken(f"{path}:", f"the mask {mask_path} of {name} does not exist", _FIX)
     c2w = _finite_pose(path, values.get("transform_matrix"), name)
     rotation, what = c2w[:, :3] * np.array([1.0, -1.0, -1.0]), f"the transform_matrix of {name}"
-    view = View(
-        name=name,
-        image_path=image_path,
-        camera=subfolder(name) or "0",
-        viewmat=_viewmat(rotation, c2w[:, 3], path, what, _FIX),
-        K=K,
-        width=width,
-        height=height,
-        distortion=distortion,
-        mask_path=mask_path,
-        split=frame.split,
-    )
-    return view, (width, height) != size
+    viewmat = _viewmat(rotation, c2w[:, 3], path, what, _FIX)
+    camera = subfolder(name) or "0"
+    view = View(name, image_path, camera, viewmat, K, width, height, distortion, mask_path)
+    return replace(view, split=frame.split), (width, height) != size
 
 
 def _finite_pose(path: Path, matrix: object, name: str) -> Float64[np.ndarray, "3 4"]:

@@ -53,13 +53,10 @@ _SMALLEST_HD = 720
 
 @dataclass(frozen=True)
 class Frame:
-    """A decoded frame.
+    """A decoded frame, `turn` quarter turns against the clock from upright.
 
-    Attributes:
-        number: counts from 0 in the order in which frames are shown.
-        time: seconds from the beginning.
-        turn: quarter turns against the clock that put it upright.
-        square: width over height of a pixel.
+    Numbers count from 0 in the order in which frames are shown, `time` is seconds from the
+    beginning, and `square` the width over height of a pixel.
     """
 
     number: int
@@ -111,8 +108,7 @@ class Frame:
 def frames_of(path: Path) -> Iterator[Frame]:
     """Yield all frames of a video.
 
-    Raises:
-        UserError: it is not a video, holds none, changes its size, or breaks off before two frames.
+    Raises UserError: it is not one, holds none, changes its size, or breaks off before two frames.
     """
     with _opened(path) as (container, stream):
         stream.thread_type = "AUTO"
@@ -154,11 +150,7 @@ def expected_frames(path: Path) -> int | None:
 
 
 def video_size(path: Path) -> tuple[int, int]:
-    """Return (width, height) of the first frame, upright.
-
-    Raises:
-        UserError: as `frames_of`.
-    """
+    """Return (width, height) of the first frame, upright; errors are those of `frames_of`."""
     for frame in frames_of(path):
         return frame.size
     raise no_frames(path, 0)
@@ -167,9 +159,8 @@ def video_size(path: Path) -> tuple[int, int]:
 def no_frames(path: Path, count: int) -> UserError:
     """Return the error for a video that is too short."""
     held = "no frame" if count == 0 else "one frame" if count == 1 else f"{count} frames"
-    return broken(
-        path, f"holds {held}; a scene needs several, taken from different places.", _SHORT
-    )
+    why = f"holds {held}; a scene needs several, taken from different places."
+    return broken(path, why, _SHORT)
 
 
 @contextmanager
@@ -205,36 +196,25 @@ def _signal(frame: av.VideoFrame) -> Float[np.ndarray, "h w 3"]:
     if coded.shape[0] == 3 and coded.shape[2] != 3:
         coded = np.moveaxis(coded, 0, -1)
     y, u, v = np.moveaxis(coded.astype(np.float32) / 256, -1, 0)
-    if full:
-        y, u, v = y / 255, (u - 128) / 255, (v - 128) / 255
-    else:
-        y, u, v = (y - 16) / 219, (u - 128) / 224, (v - 128) / 224
+    foot, luma, chroma = (0, 255, 255) if full else (16, 219, 224)
+    y, u, v = (y - foot) / luma, (u - 128) / chroma, (v - 128) / chroma
     usual = 1 if min(frame.width, frame.height) >= _SMALLEST_HD else 5
     kr, kb = _LUMA.get(int(cast(int, frame.colorspace)), _LUMA[usual])
     red, blue = y + 2 * (1 - kr) * v, y + 2 * (1 - kb) * u
     return np.stack([red, (y - kr * red - kb * blue) / (1 - kr - kb), blue], axis=-1)
 
 
-def is_video(path: Path) -> bool:
-    """Return whether a file counts as a video, by its name."""
-    return path.suffix.lower() in VIDEO_SUFFIXES
-
-
 def read_video(path: Path, cfg: DataConfig, work_dir: Path | None, report: Report) -> Converted:
     """Return the chosen frames of a video as photographs, kept in `work_dir` or the user's cache.
 
-    Raises:
-        UserError: it is not a video, holds none, changes its size, or shows too little.
+    Raises UserError: it is not a video, holds none, changes its size, or shows too little.
     """
-    key = {
-        "version": _VERSION,
-        "file": file_fingerprints([path]),
-        "every": cfg.every,
-        "max_frames": cfg.max_frames,
-    }
+    key = {"version": _VERSION, "file": file_fingerprints([path])}
+    key |= {"every": cfg.every, "max_frames": cfg.max_frames}
 
     def build(folder: Path) -> None:
-        _build(path, cfg, folder, report)
+        record = _keep(path, cfg, folder, report)
+        write_text(folder / RECORD, json.dumps(record, indent=1))
 
     with cached_folder(cache_of(path, work_dir), "video", key, build) as folder:
         record = json.loads((folder / RECORD).read_text())
@@ -243,9 +223,9 @@ def read_video(path: Path, cfg: DataConfig, work_dir: Path | None, report: Repor
     return Converted(folder, paths, originals, tuple(record["notes"]), record["known"])
 
 
-def _build(path: Path, cfg: DataConfig, folder: Path, report: Report) -> None:
-    expected = expected_frames(path)
-    seen = 0
+def _keep(path: Path, cfg: DataConfig, folder: Path, report: Report) -> dict[str, Any]:
+    """Choose frames and write them; return a record of it."""
+    expected, seen = expected_frames(path), 0
 
     def watched() -> Iterator[tuple[int, np.ndarray]]:
         nonlocal seen
@@ -257,69 +237,46 @@ def _build(path: Path, cfg: DataConfig, folder: Path, report: Report) -> None:
             yield frame.number, frame.grey(WIDTH)
 
     if cfg.every is None:
-        found = choose_frames(watched())
+        found = {one.number: one for one in choose_frames(watched())}
+        how = "sharp ones, each from a new place"
     else:
-        found = [Chosen(n, 0.0, None) for n, _ in watched() if n % cfg.every == 0]
+        found = {n: Chosen(n, 0.0, None) for n, _ in watched() if n % cfg.every == 0}
+        how = "all of them" if cfg.every == 1 else f"every {cfg.every}th"
     if seen < 2:
         raise no_frames(path, seen)
-    by_number = {one.number: one for one in found}
-    numbers = thinned(list(by_number), cfg.max_frames)
-    notes = [_note(seen, len(found), len(numbers), cfg)]
+    kept = {n: found[n] for n in thinned(list(found), cfg.max_frames)}
+    thin = f", thinned from {len(found)} (--max-frames)" if len(kept) < len(found) else ""
+    notes = [f"Of {seen} frames of the video {len(kept)} are used: {how}{thin}."]
     if expected is not None and seen < expected - 2:
         notes.append(f"The video breaks off: {seen} of {expected} frames could be decoded.")
-    if len(numbers) < 2:
-        why = f"{len(numbers)} of {seen} frames would be used; a scene needs several, taken from "
+    if len(kept) < 2:
+        why = f"{len(kept)} of {seen} frames would be used; a scene needs several, taken from "
         fix = f"{_SHORT}, or take frames by number with --every"
         raise broken(f"{path}:", why + "different places.", fix)
-    records, transfers = _write(path, set(numbers), by_number, folder, report)
-    if transfers - {None} and None in transfers:
+    records, transfers = _write(path, kept, folder, report)
+    if len(transfers) > 1 and None in transfers:
         notes.append("The transfer function changes within the video: its curve is not known.")
     known = None if None in transfers else ", ".join(_TRANSFER_NAMES[t] for t in sorted(transfers))  # type: ignore[index, type-var]
-    record = {"known": known, "notes": notes, "frames": records}
-    write_text(folder / RECORD, json.dumps(record, indent=1))
+    return {"known": known, "notes": notes, "frames": records}
 
 
 def _write(
-    path: Path,
-    wanted: set[int],
-    chosen: dict[int, Chosen],
-    folder: Path,
-    report: Report,
-) -> tuple[list[dict], set[str | None]]:
-    records: list[dict] = []
+    path: Path, kept: dict[int, Chosen], folder: Path, report: Report
+) -> tuple[list[dict[str, Any]], set[str | None]]:
+    """Write frames as PNG; return a record of each, and their transfer functions."""
+    records: list[dict[str, Any]] = []
     transfers: set[str | None] = set()
     for frame in frames_of(path):
-        if frame.number not in wanted:
+        if (one := kept.get(frame.number)) is None:
             continue
         if len(records) % 10 == 0:
-            report(f"keeping frames: {len(records)} of {len(wanted)}")
-        name = f"{frame.number:06d}.png"
-        write_png(folder / name, frame.codes())
+            report(f"keeping frames: {len(records)} of {len(kept)}")
+        record = {"file": f"{frame.number:06d}.png", "frame": frame.number}
+        write_png(folder / record["file"], frame.codes())
         transfers.add(frame.transfer)
-        one = chosen[frame.number]
+        record |= {"time": round(frame.time, 6), "turn": 90 * frame.turn}
         way = None if one.way is None else vars(one.way)
-        records.append(
-            {
-                "file": name,
-                "frame": frame.number,
-                "time": round(frame.time, 6),
-                "turn": 90 * frame.turn,
-                "sharpness": one.sharpness,
-                "way": way,
-            }
-        )
-        if len(records) == len(wanted):
+        records.append(record | {"sharpness": one.sharpness, "way": way})
+        if len(records) == len(kept):
             break
     return records, transfers
-
-
-def _note(seen: int, found: int, kept: int, cfg: DataConfig) -> str:
-    how = (
-        "sharp ones, each from a new place"
-        if cfg.every is None
-        else "all of them"
-        if cfg.every == 1
-        else f"every {cfg.every}th"
-    )
-    thin = f", thinned from {found} (--max-frames)" if kept < found else ""
-    return f"Of {seen} frames of the video {kept} are used: {how}{thin}."

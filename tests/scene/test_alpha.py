@@ -85,10 +85,7 @@ def test_as_a_mask_and_not_at_all(cutouts):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (
-            {},
-            "3 of 4 photographs have an alpha channel: photographs and renders are shown",
-        ),
+        ({}, "3 of 4 photographs have an alpha channel: photographs and renders are shown"),
         ({"background": "random"}, "shown over a random colour at every step, and white to judge"),
         ({"alpha": "mask"}, "transparent pixels are left out"),
         ({"alpha": "ignore"}, "it is ignored"),

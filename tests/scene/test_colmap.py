@@ -141,10 +141,7 @@ def test_tiny_model_and_names_with_blanks(tmp_path):
         ({"pose": "0 0 0 0 0 0 0"}, "images.txt: the pose of im 0.png is not finite"),
         ({"points": f"{10**30} 0 0 4 1 2 3 0.5 1 0\n"}, "points3D.txt is malformed in line 1"),
         ({"points": "7 nan 0 4 1 2 3 0.5 1 0\n"}, "points3D.txt: 1 of 1 points are not finite"),
-        (
-            {"cameras": "1 FOV 40 30 50 50 20 15 0.1\n"},
-            "cameras.txt uses the camera model FOV",
-        ),
+        ({"cameras": "1 FOV 40 30 50 50 20 15 0.1\n"}, "cameras.txt uses the camera model FOV"),
         ({"cameras": "1 PINHOLE 40 30 50 50 20\n"}, "cameras.txt is malformed in line 2"),
         ({"cameras": "1 PINHOLE 40 30 0 50 20 15\n"}, "cameras.txt: .* impossible parameters"),
         ({"cameras": "2 PINHOLE 40 30 50 50 20 15\n"}, "taken by camera 1"),

@@ -34,7 +34,7 @@ from p2gs_jax.scene.masks import mask_of
 from p2gs_jax.types import Scene
 
 # Other results: other folders.
-_VERSION = 1
+_VERSION = 2
 _FOLDER, _RECORD = "developed", "photographs.json"
 _NAMES: dict[Kind, str] = {
     "raw": "camera raw",
@@ -60,6 +60,7 @@ _KEPT_EXIF = (
     *(0x829A, 0x829D, 0x8827, 0x8830, 0x8831, 0x8832, 0x8833),
     *(0x9003, 0x9011, 0x9291, 0x920A, 0xA405),
 )
+_NO_ROOM = "make room on that disk, or name another --out"
 
 
 @dataclass(frozen=True)
@@ -67,10 +68,8 @@ class Converted:
     """Photographs in a folder that structure from motion can read.
 
     Attributes:
-        folder: what their names are relative to.
-        paths: the files in it, sorted.
+        paths: the files in `folder`, sorted.
         originals: the user's files, by path relative to `folder`.
-        notes: what the user should know.
         known: why the response of them all is known, or None.
     """
 
@@ -84,16 +83,10 @@ class Converted:
 def convert_photographs(
     folder: Path, paths: Sequence[Path], work_dir: Path | None, report: Report
 ) -> Converted:
-    """Return photographs as files that everything can read; if all are, they stay where they are.
+    """Return the photographs of a folder as files that everything can read.
 
-    Args:
-        folder: holds the photographs.
-        paths: the photographs, in it or in its subfolders.
-        work_dir: keeps what is converted; None: the user's cache.
-        report: receives progress.
-
-    Raises:
-        UserError: one cannot be decoded, or a package for it is missing.
+    If all are, they stay where they are; else they are kept in `work_dir`, or the user's cache.
+    Raises UserError: one cannot be decoded, or a package for it is missing.
     """
     kinds, notes = _without_twins({path: kind_of(path) for path in paths})
     names = {path: path.relative_to(folder).as_posix() for path in kinds}
@@ -106,11 +99,9 @@ def convert_photographs(
     }
     target, record = _converted(folder, kinds, places, work_dir, report)
     paths = sorted((target / place for place in places.values()), key=lambda p: p.as_posix())
-    known = record["known"] if "plain" not in kinds.values() else None
-    if record["known"] and not known:
-        notes.append(_mixed(kinds.values()))
+    known, mixed = _known(record, kinds)
     originals = {place: path for path, place in places.items()}
-    return Converted(target, paths, originals, (*notes, *record["notes"]), known)
+    return Converted(target, paths, originals, (*notes, *record["notes"], *mixed), known)
 
 
 def with_originals(scene: Scene, converted: Converted) -> Scene:
@@ -127,24 +118,16 @@ def with_originals(scene: Scene, converted: Converted) -> Scene:
         there = dataclasses.replace(view, name=name, image_path=original)
         mask = view.mask_path or mask_of(there)
         views.append(dataclasses.replace(there, image_path=path, mask_path=mask))
-    return dataclasses.replace(
-        scene,
-        views=tuple(views),
-        notes=(*scene.notes, *converted.notes),
-        known_response=converted.known,
-    )
+    notes = (*scene.notes, *converted.notes)
+    known = converted.known
+    return dataclasses.replace(scene, views=tuple(views), notes=notes, known_response=known)
 
 
 def converted_views(scene: Scene, work_dir: Path | None, report: Report) -> Scene:
     """Return a scene whose views show converted photographs, where a model names others.
 
-    Args:
-        scene: as its reader returns it.
-        work_dir: keeps what is converted; None: the user's cache.
-        report: receives progress.
-
-    Raises:
-        UserError: one cannot be decoded, or a package for it is missing.
+    They are kept in `work_dir`, or the user's cache. Raises UserError: one cannot be decoded, or a
+    package for it is missing.
     """
     kinds: dict[Path, Kind] = {v.image_path: kind_of(v.image_path) for v in scene.views}
     wanted: dict[Path, Kind] = {path: kind for path, kind in kinds.items() if kind != "plain"}
@@ -153,24 +136,16 @@ def converted_views(scene: Scene, work_dir: Path | None, report: Report) -> Scen
     # A suffix more keeps photographs apart that differ in theirs.
     places = {v.image_path: v.name + ".png" for v in scene.views if v.image_path in wanted}
     target, record = _converted(scene.root, wanted, places, work_dir, report)
-    views = tuple(
-        dataclasses.replace(
-            view,
-            image_path=target / places[view.image_path],
-            mask_path=view.mask_path or mask_of(view),
-        )
-        if view.image_path in places
-        else view
-        for view in scene.views
-    )
-    whole = len(wanted) == len(kinds)
-    mixed = [_mixed(kinds.values())] if record["known"] and not whole else []
-    return dataclasses.replace(
-        scene,
-        views=views,
-        notes=(*scene.notes, *record["notes"], *mixed),
-        known_response=record["known"] if whole else scene.known_response,
-    )
+    views = list(scene.views)
+    for k, view in enumerate(views):
+        if view.image_path in places:
+            path, mask = target / places[view.image_path], view.mask_path or mask_of(view)
+            views[k] = dataclasses.replace(view, image_path=path, mask_path=mask)
+    known, mixed = _known(record, kinds)
+    notes = (*scene.notes, *record["notes"], *mixed)
+    if len(wanted) < len(kinds):
+        known = scene.known_response
+    return dataclasses.replace(scene, views=tuple(views), notes=notes, known_response=known)
 
 
 def cache_of(root: Path, work_dir: Path | None) -> Path:
@@ -181,12 +156,13 @@ def cache_of(root: Path, work_dir: Path | None) -> Path:
     return platformdirs.user_cache_path("p2gs-jax") / "photographs" / scene
 
 
-def _mixed(kinds: Iterable[Kind]) -> str:
-    listed = _listed(_NAMES.get(kind, "others") for kind in kinds)
-    return (
-        f"Photographs are of several kinds ({listed}): the tone curve is not known for all, and is "
-        "chosen for all."
-    )
+def _known(record: dict[str, Any], kinds: Mapping[Path, Kind]) -> tuple[str | None, list[str]]:
+    """Return why the response of all photographs is known, or None, and what there is to say."""
+    if not record["known"] or "plain" not in kinds.values():
+        return record["known"], []
+    listed = _listed(_NAMES.get(kind, "others") for kind in kinds.values())
+    note = f"Photographs are of several kinds ({listed}): the tone curve is not known for all, "
+    return None, [note + "and is chosen for all."]
 
 
 def _listed(names: Iterable[str]) -> str:
@@ -199,20 +175,19 @@ def _without_twins(kinds: dict[Path, Kind]) -> tuple[dict[Path, Kind], list[str]
     for path in kinds:
         shots[path.with_suffix("")].append(path)
     readable = {"raw": find_spec("rawpy"), "heif": find_spec("pillow_heif")}
-    dropped: list[Path] = []
+    dropped: set[Path] = set()
     for files in shots.values():
-        if all(kinds[path] == "plain" for path in files):
-            continue
-        usable = [path for path in files if readable.get(kinds[path], True)] or files
-        best = min(usable, key=lambda path: (_RANK.index(kinds[path]), path.name))
-        dropped += [path for path in files if path != best]
+        if any(kinds[path] != "plain" for path in files):
+            usable = [path for path in files if readable.get(kinds[path], True)] or files
+            best = min(usable, key=lambda path: (_RANK.index(kinds[path]), path.name))
+            dropped.update(path for path in files if path != best)
     if not dropped:
         return kinds, []
     note = (
         f"{len(dropped)} photograph(s) are there twice, as several kinds of file "
-        f"({sorted(dropped)[0].name}, ...); one file is used for each shot."
+        f"({min(dropped).name}, ...); one file is used for each shot."
     )
-    return {path: kind for path, kind in kinds.items() if path not in set(dropped)}, [note]
+    return {path: kind for path, kind in kinds.items() if path not in dropped}, [note]
 
 
 def _converted(
@@ -223,14 +198,12 @@ def _converted(
     report: Report,
 ) -> tuple[Path, dict[str, Any]]:
     """Fill a folder with the photographs at their places; return it and the record of it."""
-    key = {
-        "version": _VERSION,
-        "files": file_fingerprints(list(places)),
-        "places": list(places.values()),
-    }
+    names = list(places.values())
+    key = {"version": _VERSION, "files": file_fingerprints(list(places)), "places": names}
 
     def build(folder: Path) -> None:
-        _Converter(kinds).fill(folder, places, report)
+        record = _Converter(kinds).fill(folder, places, report)
+        write_text(folder / _RECORD, json.dumps(record, indent=1))
 
     with cached_folder(cache_of(root, work_dir), _FOLDER, key, build) as folder:
         return folder, json.loads((folder / _RECORD).read_text())
@@ -242,11 +215,19 @@ class _Converter:
     def __init__(self, kinds: Mapping[Path, Kind]):
         self._kinds = kinds
         self._facts = {p: read_facts(p) for p, kind in kinds.items() if kind == "raw"}
-        self._balances = self._common_balances()
+        chosen: dict[str, list[Balance]] = defaultdict(list)
+        for facts in self._facts.values():
+            if facts.balance is not None:
+                chosen[facts.camera].append(facts.balance)
+        # One for each camera: the median of what it chose.
+        self._balances: dict[str, Balance] = {}
+        for camera, balances in chosen.items():
+            red, green, blue = np.exp(np.median(np.log(balances), axis=0)).tolist()
+            self._balances[camera] = (red, green, blue)
         self._scale = self._common_scale()
 
-    def fill(self, folder: Path, places: Mapping[Path, str], report: Report) -> None:
-        """Write all photographs, and a record of what was done."""
+    def fill(self, folder: Path, places: Mapping[Path, str], report: Report) -> dict[str, Any]:
+        """Write all photographs; return a record of what was done."""
         records: list[dict[str, Any]] = []
         total = sum(self._kinds[path] != "plain" for path in places)
         for path, place in places.items():
@@ -257,26 +238,10 @@ class _Converter:
                 continue
             if len(records) % 5 == 0:
                 report(f"converting photographs: {len(records)} of {total}")
-            records.append(self._write(path, target) | {"file": str(path), "developed": place})
-        known = [r for r in records if r["light"]]
-        names = dict.fromkeys(_NAMES[r["kind"]] for r in known)
-        record = {
-            "known": ", ".join(names) if known and len(known) == len(records) else None,
-            "notes": self._notes(records),
-            "photographs": records,
-        }
-        write_text(folder / _RECORD, json.dumps(record, indent=1))
-
-    def _common_balances(self) -> dict[str, Balance]:
-        """Return one white balance for each camera: the median of what it chose."""
-        chosen: dict[str, list[Balance]] = defaultdict(list)
-        for facts in self._facts.values():
-            if facts.balance is not None:
-                chosen[facts.camera].append(facts.balance)
-        return {
-            camera: tuple(float(x) for x in np.exp(np.median(np.log(balances), axis=0)))  # type: ignore[misc]
-            for camera, balances in chosen.items()
-        }
+            records.append(self._write(path, target) | {"file": str(path), "converted": place})
+        names = dict.fromkeys(_NAMES[r["kind"]] for r in records)
+        known = ", ".join(names) if records and all(r["light"] for r in records) else None
+        return {"known": known, "notes": self._notes(records), "photographs": records}
 
     def _common_scale(self) -> float:
         """Return the factor on files of light that have no white of their own, a power of 2."""
@@ -307,27 +272,19 @@ class _Converter:
             assert picture.codes is not None
             write_png(target, picture.codes, picture.exif, picture.profile)
             return record
-        light = picture.light * np.float32(self._scale if kind in _LINEAR else 1.0)
+        scale = self._scale if kind in _LINEAR else 1.0
+        light = picture.light * np.float32(scale)
         codes = encode_16(light)
         if picture.alpha is not None:
             alpha = np.rint(picture.alpha * 65535).astype(np.uint16)[..., None]
             codes = np.concatenate([codes, alpha], axis=2)
         write_png(target, codes, picture.exif)
         saturated = float((light >= 1).any(2).mean())
-        record |= {"saturated": saturated, "invalid": picture.invalid}
-        if kind in _LINEAR:
-            return record | {"scale": self._scale}
-        if path not in self._facts:
-            return record
-        facts = self._facts[path]
-        return record | {
-            "camera": facts.camera,
-            "black": facts.black,
-            "white": facts.white,
-            "white_balance_of_camera": facts.balance,
-            "white_balance": self._balances.get(facts.camera),
-            "matrix": facts.matrix,
-        }
+        record |= {"saturated": saturated, "invalid": picture.invalid, "scale": scale}
+        if path in self._facts:
+            facts = self._facts[path]
+            record |= vars(facts) | {"applied_balance": self._balances.get(facts.camera)}
+        return record
 
     def _notes(self, records: Sequence[Mapping[str, Any]]) -> list[str]:
         out = [f"Converted into the run's cache: {_listed(_NAMES[r['kind']] for r in records)}."]
@@ -340,25 +297,22 @@ class _Converter:
                 f"red {balance[0]:.3f}, blue {balance[2]:.3f} for all, the median of what the "
                 f"camera chose, which varied by {spread:.2f} EV."
             )
-        if unbalanced := sum(f.balance is None for f in self._facts.values()):
-            out.append(
-                f"{unbalanced} raw photographs record no white balance: LibRaw's for daylight."
-            )
-        if strange := sum(not f.matrix for f in self._facts.values()):
-            out.append(
-                f"{strange} raw photographs are of a camera whose colours LibRaw does not know: "
-                "they stay in the camera's own primaries."
-            )
+        counted = {
+            "raw photographs record no white balance: LibRaw's for daylight.": sum(
+                f.balance is None for f in self._facts.values()
+            ),
+            "raw photographs are of a camera whose colours LibRaw does not know: they stay in the "
+            "camera's own primaries.": sum(not f.matrix for f in self._facts.values()),
+            f"of them {GAIN_MAP_UNUSED}": sum(r["gain_map"] for r in records),
+            "pixels of linear photographs are not numbers; they count as black.": sum(
+                r.get("invalid", 0) for r in records
+            ),
+        }
+        out += [f"{n} {what}" for what, n in counted.items() if n]
         if self._scale != 1:
             out.append(
                 f"Linear photographs were multiplied by {self._scale:g}, all alike, so that "
                 f"{_BRIGHT:g} % of each are below white."
-            )
-        if maps := sum(r["gain_map"] for r in records):
-            out.append(f"{maps} of them {GAIN_MAP_UNUSED}")
-        if invalid := sum(r.get("invalid", 0) for r in records):
-            out.append(
-                f"{invalid} pixels of linear photographs are not numbers; they count as black."
             )
         return out
 
@@ -372,8 +326,7 @@ def _link(source: Path, target: Path) -> None:
             return
         except OSError as error:
             why = error.strerror or error
-    fix = "make room on that disk, or name another --out"
-    raise broken(source, f"cannot be copied to {target}: {why}.", fix)
+    raise broken(source, f"cannot be copied to {target}: {why}.", _NO_ROOM)
 
 
 def write_png(
@@ -382,16 +335,10 @@ def write_png(
     exif: Image.Exif | None = None,
     profile: bytes | None = None,
 ) -> None:
-    """Write a converted photograph.
+    """Write a converted photograph, uint8 or uint16 in the order R G B (A), or one channel.
 
-    Args:
-        path: the .png.
-        pixels: uint8 or uint16 in the order R G B, perhaps with alpha behind, or one channel.
-        exif: settings are taken from it. Not the orientation: poses belong to the stored raster.
-        profile: ICC profile of the colours, if they are not sRGB.
-
-    Raises:
-        UserError: the disk is full, or cannot be written.
+    Settings are taken from `exif`, but not the orientation: poses belong to the stored raster. The
+    ICC profile says which colours, if not sRGB. Raises UserError: the disk cannot be written.
     """
     order = {3: [2, 1, 0], 4: [2, 1, 0, 3]}.get(pixels.shape[2], [0])
     raster = np.ascontiguousarray(pixels[..., order])
@@ -400,39 +347,28 @@ def write_png(
     extra = b""
     if profile:
         extra += _chunk(b"iCCP", b"ICC profile\0\0" + zlib.compress(profile))
-    settings = _kept_settings(exif)
-    if settings is not None:
+    if settings := _kept_settings(exif):
         extra += _chunk(b"eXIf", settings)
-    whole = data.tobytes()
+    whole, at = data.tobytes(), _SIGNATURE_AND_HEADER
     try:
         with atomic_write(path) as temporary:
-            temporary.write_bytes(
-                whole[:_SIGNATURE_AND_HEADER] + extra + whole[_SIGNATURE_AND_HEADER:]
-            )
+            temporary.write_bytes(whole[:at] + extra + whole[at:])
     except OSError as error:
         why = f"cannot be written: {error.strerror or error}."
-        raise broken(path, why, "make room on that disk, or name another --out") from None
+        raise broken(path, why, _NO_ROOM) from None
 
 
-def _kept_settings(exif: Image.Exif | None) -> bytes | None:
-    """Return the settings that are kept, as a PNG holds them; None: there are none."""
-    if exif is None:
-        return None
+def _kept_settings(exif: Image.Exif | None) -> bytes:
+    """Return the settings that are kept, as a PNG holds them; empty: there are none."""
     out = Image.Exif()
     try:
-        shot = exif.get_ifd(ExifTags.IFD.Exif)
-        for tag in _KEPT:
-            if tag in exif:
-                out[tag] = exif[tag]
-        kept = {tag: shot[tag] for tag in _KEPT_EXIF if tag in shot}
-        if kept:
+        shot = {} if exif is None else exif.get_ifd(ExifTags.IFD.Exif)
+        out.update({tag: exif[tag] for tag in _KEPT if exif is not None and tag in exif})
+        if kept := {tag: shot[tag] for tag in _KEPT_EXIF if tag in shot}:
             out.get_ifd(ExifTags.IFD.Exif).update(kept)
-        if not kept and not len(out):
-            return None
-        data = out.tobytes()
+        return out.tobytes().removeprefix(b"Exif\0\0") if kept or len(out) else b""
     except Exception:  # malformed EXIF raises many kinds of errors
-        return None
-    return data.removeprefix(b"Exif\0\0")
+        return b""
 
 
 def _chunk(kind: bytes, data: bytes) -> bytes:

@@ -22,11 +22,7 @@ _DEFAULT_ISO = 100.0
 
 
 def size_of(path: Path) -> tuple[int, int] | None:
-    """Return (width, height) as converted; None: the file needs no conversion.
-
-    Raises:
-        UserError: it cannot be opened, or the package for it is missing.
-    """
+    """Return (width, height) as converted; None: no need. UserError: it cannot be opened."""
     kind = kind_of(path)
     if kind in ("heif", "avif", "webp"):
         with opened(path) as image:
@@ -52,14 +48,7 @@ def exif_of(path: Path) -> Image.Exif | None:
 
 @dataclass(frozen=True)
 class ExifSettings:
-    """Settings of a photograph, as far as its EXIF has them.
-
-    Attributes:
-        time: exposure time, seconds.
-        aperture: f-number.
-        iso: sensitivity.
-        taken: local date and time, `YYYY:MM:DD hh:mm:ss`.
-    """
+    """Exposure time in seconds, f-number, sensitivity and local date, as far as EXIF has them."""
 
     time: float | None = None
     aperture: float | None = None

@@ -24,8 +24,7 @@ _MODES = {1: "L", 2: "LA", 3: "RGB", 4: "RGBA"}
 def opened(path: Path) -> Iterator[Any]:
     """Provide an opened file: its `info`, its `size` in pixels as shown, and pixels when asked for.
 
-    Raises:
-        UserError: the library is missing or too old, or the file is broken.
+    Raises UserError: the library is missing or too old, or the file is broken.
     """
     try:
         with _open(path) as image:
@@ -64,8 +63,7 @@ def _open(path: Path) -> Iterator[Any]:
 def read_heif(path: Path) -> Picture:
     """Return display values, or the light of a HEIC whose transfer function is HLG or PQ.
 
-    Raises:
-        UserError: the library is missing or too old, or the file is broken.
+    Raises UserError: the library is missing or too old, or the file is broken.
     """
     with opened(path) as image:
         exif, info = exif_in(image.info), dict(image.info)

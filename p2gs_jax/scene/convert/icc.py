@@ -99,7 +99,6 @@ class Profile:
     """A colour space of photographs other than sRGB.
 
     Attributes:
-        name: as the profile describes itself.
         decode: light of `_ENTRIES` evenly spaced values from 0 to 1 by channel; None: the profile
             is made of tables, which are not applied here.
         matrix: from that light to linear sRGB.
@@ -172,11 +171,9 @@ def encode_16(light: Float[np.ndarray, "..."]) -> UInt[np.ndarray, "..."]:
 def with_profile_applied(
     data: bytes, pixels: UInt[np.ndarray, "h w c"]
 ) -> UInt[np.ndarray, "h w c"]:
-    """Return the colours of a photograph in sRGB, by the profile in its file.
+    """Return a photograph in sRGB, by the profile in the bytes of its file.
 
-    Args:
-        data: the bytes of the file.
-        pixels: as OpenCV decodes them: B G R, perhaps with alpha behind.
+    Pixels are as OpenCV decodes them: B G R, perhaps with alpha behind.
     """
     if pixels.ndim != 3 or pixels.shape[2] < 3 or pixels.dtype not in (np.uint8, np.uint16):
         return pixels

@@ -36,16 +36,15 @@ _START_OF_SCAN = 0xDA
 
 @dataclass(frozen=True)
 class Picture:
-    """A decoded photograph, of display values or of light.
+    """A decoded photograph, of display values (`codes`) or of light.
 
     Attributes:
-        codes: display values, unsigned integers of which the largest is 1: R G B, perhaps with
-            alpha behind, or one channel; None where `light` is known.
-        light: linear, in the primaries of sRGB; None where `codes` are known.
+        codes: unsigned integers of which the largest is 1: R G B, perhaps with alpha behind, or one
+            channel.
+        light: linear, in the primaries of sRGB.
         alpha: opacity beside `light`.
-        exif: settings that it was taken with.
         profile: ICC profile of `codes`.
-        invalid: number of pixels that were not finite or below 0; they count as black.
+        invalid: number of pixels that are not a number; they count as black.
     """
 
     codes: UInt[np.ndarray, "h w c"] | None = None
@@ -81,10 +80,9 @@ def _floating(path: Path) -> bool:
 
 
 def has_gain_map(path: Path) -> bool:
-    """Return whether a JPEG or HEIC carries a gain map for bright displays; it is not applied.
+    """Return whether a JPEG or HEIC carries a gain map for bright displays.
 
-    The map says how a display may brighten the photograph, place by place; it undoes the phone's
-    tone mapping only as far as the phone chose to.
+    It is not applied: it undoes the phone's tone mapping only as far as the phone chose to.
     """
     try:
         with path.open("rb") as file:

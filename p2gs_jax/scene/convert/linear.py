@@ -40,8 +40,7 @@ class RawFacts:
         size: width and height in pixels, as the sensor lies.
         camera: make and model, as far as they are known; photographs of one share white balance.
         balance: factors on red, green and blue that the camera chose, green 1; None: not recorded.
-        black: levels that are subtracted, by colour of the filter.
-        white: level that becomes 1.
+        black: levels that are subtracted, by colour of the filter; `white` becomes 1.
         matrix: whether the camera's colours are known; otherwise its primaries are kept.
     """
 
@@ -56,33 +55,25 @@ class RawFacts:
 def read_facts(path: Path) -> RawFacts:
     """Return what a raw file states about itself; pixels are not read.
 
-    Raises:
-        UserError: rawpy is not installed, or LibRaw does not know this file.
+    Raises UserError: rawpy is not installed, or LibRaw does not know this file.
     """
     with _raw(path) as raw:
         chosen = [float(x) for x in raw.camera_whitebalance[:3]]
         exif = _raw_exif(path, raw)
         names = (str(exif.get(tag, "")).strip("\0 ") for tag in (0x010F, 0x0110))
         green = chosen[1]
-        return RawFacts(
-            (raw.sizes.width, raw.sizes.height),
-            " ".join(name for name in names if name),
-            (chosen[0] / green, 1.0, chosen[2] / green) if min(chosen) > 0 else None,
-            tuple(float(x) for x in raw.black_level_per_channel),
-            float(raw.white_level),
-            bool(np.any(raw.color_matrix) or np.any(raw.rgb_xyz_matrix)),
-        )
+        balance = (chosen[0] / green, 1.0, chosen[2] / green) if min(chosen) > 0 else None
+        black = tuple(float(x) for x in raw.black_level_per_channel)
+        matrix = bool(np.any(raw.color_matrix) or np.any(raw.rgb_xyz_matrix))
+        size, camera = (raw.sizes.width, raw.sizes.height), " ".join(n for n in names if n)
+        return RawFacts(size, camera, balance, black, float(raw.white_level), matrix)
 
 
 def read_raw(path: Path, balance: Balance | None) -> Picture:
     """Return the light of a raw photograph, saturated at 1, unrotated.
 
-    Args:
-        path: the file.
-        balance: factors on red, green and blue; None: LibRaw's for daylight.
-
-    Raises:
-        UserError: rawpy is not installed, or LibRaw cannot decode this file.
+    The factors on red, green and blue are `balance`, or LibRaw's for daylight. Raises UserError:
+    rawpy is not installed, or LibRaw cannot decode this file.
     """
     with _raw(path) as raw:
         pixels = raw.postprocess(
@@ -99,11 +90,7 @@ def read_raw(path: Path, balance: Balance | None) -> Picture:
 
 
 def read_raw_exif(path: Path) -> Image.Exif:
-    """Return how a raw photograph was taken.
-
-    Raises:
-        UserError: as `read_facts`.
-    """
+    """Return how a raw photograph was taken; errors are as of `read_facts`."""
     with _raw(path) as raw:
         return _raw_exif(path, raw)
 
@@ -168,22 +155,14 @@ def _exr(path: Path, **how: bool) -> Iterator[Any]:
 
 
 def exr_size(path: Path) -> tuple[int, int]:
-    """Return (width, height) of the data window.
-
-    Raises:
-        UserError: the file is not a readable OpenEXR.
-    """
+    """Return (width, height) of the data window; UserError: it is not a readable OpenEXR."""
     with _exr(path, header_only=True) as file:
         low, high = file.header()["dataWindow"]
     return int(high[0] - low[0] + 1), int(high[1] - low[1] + 1)
 
 
 def read_exr_exif(path: Path) -> Image.Exif | None:
-    """Return how an OpenEXR was taken, from its standard attributes, or None.
-
-    Raises:
-        UserError: the file is not a readable OpenEXR.
-    """
+    """Return how an OpenEXR was taken, from its standard attributes; errors as of `exr_size`."""
     with _exr(path, header_only=True) as file:
         return _exr_exif(dict(file.header()))
 
@@ -192,9 +171,7 @@ def read_exr(path: Path) -> Picture:
     """Return the light of an OpenEXR: channels R, G, B (of its only layer, too) or Y.
 
     Chromaticities in the header are converted. What is premultiplied by A is divided by it again.
-
-    Raises:
-        UserError: the file is not a readable OpenEXR, or has no such channels.
+    Raises UserError: the file is not a readable OpenEXR, or has no such channels.
     """
     with _exr(path, separate_channels=True) as file:
         channels: dict[str, Any] = {k: c.pixels for k, c in file.channels().items()}
@@ -221,11 +198,7 @@ def read_exr(path: Path) -> Picture:
 
 
 def read_float_tiff(path: Path) -> Picture:
-    """Return the light of a TIFF of floats.
-
-    Raises:
-        UserError: it cannot be decoded.
-    """
+    """Return the light of a TIFF of floats; UserError: it cannot be decoded."""
     raw = cv2.imread(str(path), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
     if raw is None or raw.dtype not in (np.float32, np.float64):
         raise broken(path, "cannot be decoded.", "export it as 16-bit TIFF or as OpenEXR")

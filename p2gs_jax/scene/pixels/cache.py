@@ -1,41 +1,34 @@
 """Decoded photographs in files that are mapped into memory: the system drops and reads pages.
 
-There is a folder for every size and a file for every photograph, named by all that its pixels
-depend on: what another photograph, mask or lens left behind is never read. Processes fill the files
-before they are asked for. They run this module: `multiprocessing` would run the caller's script
-again, which then needs a guard, or fork a process in which JAX has threads.
+There is a folder for every size and a file for every photograph, a record of NumPy's, named by all
+that its pixels depend on: what another photograph, mask or lens left behind is never read.
+Processes fill the files before they are asked for. They run this module: `multiprocessing` would
+run the caller's script again, which then needs a guard, or fork a process in which JAX has threads.
 """
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
-import mmap
 import os
 import pickle
 import shutil
-import struct
 import subprocess
 import sys
-import threading
-from collections import deque
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from p2gs_jax.core.atomic import atomic_write
+from p2gs_jax.core.atomic import BROKEN_ARRAYS, atomic_write
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.pixels.decode import Decoded, decode, resamples
 from p2gs_jax.types import View
 
 # Any change of what pixels come out of `decode` raises it.
-_VERSION = 1
-_MAGIC = b"P2GSPX\0\1"
-# Magic, width, height, bytes of a sample, whether there is an alpha channel.
-_HEADER = struct.Struct("<8sIIII")
-_ALIGNED = 64
+_VERSION = 2
 MOST_PROCESSES = 4
 # Starting a process takes as long as decoding some dozens.
 FEWEST = 64
@@ -64,31 +57,30 @@ class PixelFiles:
             if path.name not in known:
                 path.unlink(missing_ok=True)
 
-    def has(self, key: Key) -> bool:
-        """Return whether there is a file of a photograph; it may be damaged."""
-        return self.path(key).exists()
+    def path(self, key: Key) -> Path:
+        """Return where a photograph is, or goes."""
+        return self.folder / f"{key.width}x{key.height}" / f"{self._names[key.view]}.px"
 
     def read(self, key: Key) -> Decoded | None:
         """Return a photograph, mapped; None: it is not there, or damaged."""
         try:
-            with self.path(key).open("rb") as file:
-                data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        except (OSError, ValueError):
+            records = np.load(self.path(key), mmap_mode="r")
+            fields = [np.asarray(records[name][0]) for name in records.dtype.names]
+        except BROKEN_ARRAYS:
             return None
-        return _parsed(data, key)
+        return Decoded(*fields) if fields[1].shape == (key.height, key.width) else None
 
     def write(self, key: Key, photograph: Decoded) -> Decoded:
         """Keep a photograph, and return it mapped.
 
-        Raises:
-            UserError: the disk is full, or cannot be written.
+        Raises UserError: the disk is full, or cannot be written.
         """
         try:
             write_photograph(self.path(key), photograph)
         except OSError as error:
-            why = error.strerror or error
             raise UserError(
-                f"decoded photographs cannot be written to {self.folder}: {why}",
+                f"decoded photographs cannot be written to {self.folder}: "
+                f"{error.strerror or error}",
                 fix="make room on that disk or name another --out; or give --data.cache-mb the "
                 "memory that all photographs take, a smaller --max-width, or both",
             ) from None
@@ -97,8 +89,7 @@ class PixelFiles:
     def require_room(self, needed: int) -> None:
         """Refuse a disk that cannot take `needed` bytes of photographs, before hours go into them.
 
-        Raises:
-            UserError: it has less room.
+        Raises UserError: it has less room.
         """
         place = next(p for p in (self.folder, *self.folder.parents) if p.exists())
         there = sum(path.stat().st_size for path in self.folder.glob("*/*.px"))
@@ -112,25 +103,16 @@ class PixelFiles:
                 "if there is so much memory, or a smaller --max-width",
             )
 
-    def path(self, key: Key) -> Path:
-        """Return where a photograph is, or goes."""
-        return self.folder / f"{key.width}x{key.height}" / f"{self._names[key.view]}.px"
-
 
 def write_photograph(path: Path, photograph: Decoded) -> None:
-    """Write a file of a decoded photograph: header, pixels, mask, alpha; each begins aligned.
-
-    Raises:
-        OSError: the disk is full, or cannot be written.
-    """
-    (height, width), alpha = photograph.valid.shape, photograph.alpha
-    itemsize = photograph.pixels.dtype.itemsize
-    header = _HEADER.pack(_MAGIC, width, height, itemsize, int(alpha is not None))
-    parts: list[bytes | memoryview] = [header + bytes(-len(header) % _ALIGNED)]
-    for array in (photograph.pixels, photograph.valid, *([] if alpha is None else [alpha])):
-        parts += [np.ascontiguousarray(array).data.cast("B"), bytes(-array.nbytes % _ALIGNED)]
+    """Write a decoded photograph as a record; raises OSError where the disk cannot be written."""
+    arrays = {name: array for name, array in vars(photograph).items() if array is not None}
+    kind = np.dtype([(name, array.dtype, array.shape) for name, array in arrays.items()])
+    header: dict[str, Any] = {"fortran_order": False, "shape": (1,)}
+    header["descr"] = np.lib.format.dtype_to_descr(kind)
     with atomic_write(path, durable=False) as temporary, temporary.open("wb") as file:
-        file.writelines(parts)
+        np.lib.format.write_array_header_1_0(file, header)
+        file.writelines(np.ascontiguousarray(array).data.cast("B") for array in arrays.values())
 
 
 def file_bytes(view: View, size: tuple[int, int]) -> int:
@@ -152,14 +134,8 @@ def _digest(view: View, bonnets: dict[int, str]) -> str:
             bonnets[mask] = f"{view.own_car.shape} {hashlib.sha256(packed).hexdigest()}"
         bonnet = bonnets[mask]
     lens = None if view.distortion is None else (view.distortion, view.K.tolist())
-    parts = (
-        _VERSION,
-        _fingerprint(view.image_path),
-        None if view.mask_path is None else _fingerprint(view.mask_path),
-        (view.width, view.height, view.alpha),
-        lens,
-        bonnet,
-    )
+    files = [path and _fingerprint(path) for path in (view.image_path, view.mask_path)]
+    parts = (_VERSION, *files, (view.width, view.height, view.alpha), lens, bonnet)
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]
 
 
@@ -172,134 +148,65 @@ def _fingerprint(path: Path) -> tuple[str, int, int]:
     return os.path.abspath(path), stat.st_size, stat.st_mtime_ns
 
 
-def _parsed(data: mmap.mmap, key: Key) -> Decoded | None:
-    """Return the arrays of a mapped file; None where it is not whole."""
-    if len(data) < _HEADER.size:
-        return None
-    magic, width, height, itemsize, matted = _HEADER.unpack_from(data)
-    if (magic, width, height) != (_MAGIC, key.width, key.height) or itemsize not in (1, 2):
-        return None
-    kind = np.dtype(np.uint8 if itemsize == 1 else np.uint16)
-    shapes = [((height, width, 3), kind), ((height, width), np.dtype(bool))]
-    shapes += [((height, width), kind)] if matted else []
-    arrays, at = [], _ALIGNED
-    for shape, dtype in shapes:
-        count = int(np.prod(shape))
-        if at + count * dtype.itemsize > len(data):
-            return None
-        arrays.append(np.frombuffer(data, dtype, count, at).reshape(shape))
-        at += -(-count * dtype.itemsize // _ALIGNED) * _ALIGNED
-    return Decoded(*arrays)
-
-
-class DecodersAhead:
-    """Processes that decode photographs into files in order, and the threads that wait for them.
+def decode_ahead(
+    views: Sequence[View], files: PixelFiles, keys: Sequence[Sequence[Key]]
+) -> list[subprocess.Popen[bytes]]:
+    """Start processes that decode into files, in order, what they lack; none for a few photographs.
 
     What a process cannot decode is left to the caller that asks for it, and that gets the error.
+
+    Args:
+        views: all views of the scene.
+        files: where the photographs go.
+        keys: for every view the sizes that will be asked for.
     """
-
-    def __init__(
-        self,
-        views: Sequence[View],
-        files: PixelFiles,
-        keys: Sequence[Sequence[Key]],
-        processes: int | None = None,
-    ):
-        """Begin.
-
-        Args:
-            views: all views of the scene.
-            files: where the photographs go.
-            keys: for every view the sizes that will be asked for.
-            processes: how many; None: half as many as there are processors, at most four.
-        """
-        self._views, self._files, self._keys = views, files, keys
-        self._changed = threading.Condition()
-        self._busy: set[int] = set()
-        self._closed = False
-        missing = (row for row, sizes in enumerate(keys) if not all(map(files.has, sizes)))
-        self._waiting = deque(missing)
-        self._processes: list[subprocess.Popen[bytes]] = []
-        if len(self._waiting) >= FEWEST:
-            wanted = max(1, (os.cpu_count() or 1) // 2) if processes is None else processes
-            for _ in range(min(wanted, MOST_PROCESSES)):
-                self._start()
-
-    def claim(self, row: int) -> None:
-        """Take a view that is about to be decoded by the caller, or wait until it is decoded."""
-        with self._changed:
-            with contextlib.suppress(ValueError):
-                self._waiting.remove(row)
-            self._changed.wait_for(lambda: row not in self._busy)
-
-    def close(self) -> None:
-        """End the processes; what they had not begun is left."""
-        with self._changed:
-            self._closed = True
-            self._waiting.clear()
-        for process in self._processes:
-            process.terminate()
-        for process in self._processes:
-            process.wait(_STOPPING_S)
-
-    def _start(self) -> None:
-        # In a session of its own: an interrupt at the terminal is the caller's to handle.
-        process = subprocess.Popen(
-            [sys.executable, "-m", "p2gs_jax.scene.pixels.cache"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-            start_new_session=True,
-        )
-        self._processes.append(process)
-        threading.Thread(target=self._feed, args=(process,), daemon=True, name="decode").start()
-
-    def _feed(self, process: subprocess.Popen[bytes]) -> None:
-        """Give a process one view after another, until none is left or it has died."""
-        assert process.stdin is not None
-        assert process.stdout is not None
-        alive = True
-        while alive and (row := self._next()) is not None:
-            try:
-                keys = [key for key in self._keys[row] if not self._files.has(key)]
-                sizes = [(key.width, key.height) for key in keys]
-                job = (self._views[row], sizes, [self._files.path(key) for key in keys])
-                pickle.dump(job, process.stdin)
-                process.stdin.flush()
-                alive = bool(process.stdout.read(1))
-            except (OSError, ValueError):
-                alive = False
-            finally:
-                with self._changed:
-                    self._busy.discard(row)
-                    self._changed.notify_all()
-        with contextlib.suppress(OSError):
-            process.stdin.close()
-
-    def _next(self) -> int | None:
-        with self._changed:
-            if self._closed or not self._waiting:
-                return None
-            row = self._waiting.popleft()
-            self._busy.add(row)
-            return row
+    jobs = []
+    for view, sizes in zip(views, keys, strict=True):
+        lacking = [key for key in sizes if not files.path(key).exists()]
+        if lacking:
+            jobs.append((view, [key[1:] for key in lacking], [files.path(key) for key in lacking]))
+    if len(jobs) < FEWEST:
+        return []
+    count = min(max(1, (os.cpu_count() or 1) // 2), MOST_PROCESSES)
+    processes = []
+    for first in range(count):
+        with tempfile.TemporaryFile() as given:
+            pickle.dump(jobs[first::count], given)
+            given.seek(0)
+            # In a session of its own: an interrupt at the terminal is the caller's to handle.
+            process = subprocess.Popen(
+                [sys.executable, "-m", "p2gs_jax.scene.pixels.cache"],
+                stdin=given,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+                start_new_session=True,
+            )
+            processes.append(process)
+    return processes
 
 
-def serve(jobs: BinaryIO, answers: BinaryIO) -> None:
-    """Decode the pickled (view, sizes, paths) in `jobs` and answer each with a byte, to the end."""
-    while True:
-        try:
-            view, sizes, paths = pickle.load(jobs)
-        except EOFError:
+def stop(processes: Sequence[subprocess.Popen[bytes]]) -> None:
+    """End the processes; what they had not begun is left."""
+    for process in processes:
+        process.terminate()
+    for process in processes:
+        process.wait(_STOPPING_S)
+
+
+def _serve() -> None:
+    """Decode the pickled jobs in standard input, as long as whoever started this process lives."""
+    caller = os.getppid()
+    for view, sizes, paths in pickle.load(sys.stdin.buffer):
+        if os.getppid() != caller:
             return
+        if all(path.exists() for path in paths):
+            continue
         # The caller that asks for the photograph meets the same error, and reports it.
         with contextlib.suppress(UserError, OSError):
             for path, photograph in zip(paths, decode(view, sizes), strict=True):
                 write_photograph(path, photograph)
-        answers.write(b".")
-        answers.flush()
 
 
 if __name__ == "__main__":
-    serve(sys.stdin.buffer, sys.stdout.buffer)
+    _serve()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,11 +25,8 @@ _ALPHA_VALID = 0.5
 class Decoded:
     """A photograph as it is cached: as decoded, or as 16 bits where it was resampled.
 
-    Attributes:
-        pixels: unsigned integers; the largest is 1.0.
-        valid: where it shows something.
-        alpha: opacity of a photograph that is shown over a background; its pixels are
-            premultiplied by it.
+    The largest integer of `pixels` is 1.0; `valid` is where they count. A photograph that is shown
+    over a background has `alpha`, and its pixels are premultiplied by it.
     """
 
     pixels: UInt[np.ndarray, "h w 3"]
@@ -57,9 +54,8 @@ def resamples(view: View, size: tuple[int, int]) -> bool:
 def decode(view: View, sizes: Sequence[tuple[int, int]]) -> list[Decoded]:
     """Return a photograph at some (width, height) in pixels; its file is opened once.
 
-    Raises:
-        UserError: the file or its mask is missing, broken or of another size than the model's; or
-            there is too little memory for it.
+    Raises UserError: the file or its mask is missing, broken or of another size than the model's;
+    or there is too little memory for it.
     """
     try:
         return _decoded(view, sizes)
@@ -89,12 +85,10 @@ def _decoded(view: View, sizes: Sequence[tuple[int, int]]) -> list[Decoded]:
     whole = (view.width, view.height)
     as_stored = view.distortion is None and matte is None
     if as_stored and all(size == whole for size in sizes):
-        return [_read_only(pixels, valid, None) for _ in sizes]
+        return [_read_only(pixels, valid) for _ in sizes]
     ldr, straight = _straightened(view, pixels, matte, valid)
     return [
-        _read_only(pixels, valid, None)
-        if as_stored and size == whole
-        else _at_size(ldr, straight, size, matted=matte is not None)
+        _read_only(pixels, valid) if as_stored and size == whole else _at_size(ldr, straight, size)
         for size in sizes
     ]
 
@@ -112,36 +106,31 @@ def _straightened(
         return ldr, valid
     maps = undistortion_maps(view.K, view.distortion, view.width, view.height)
     ldr = cv2.remap(ldr, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return ldr, _resample_valid(valid, lambda v: cv2.remap(v, *maps, cv2.INTER_LINEAR))
+    return ldr, cv2.remap(valid.astype(np.float32), *maps, cv2.INTER_LINEAR) >= _FULL
 
 
 def _at_size(
-    ldr: Float32[np.ndarray, "h w c"],
-    valid: Bool[np.ndarray, "h w"],
-    size: tuple[int, int],
-    *,
-    matted: bool,
+    ldr: Float32[np.ndarray, "h w c"], valid: Bool[np.ndarray, "h w"], size: tuple[int, int]
 ) -> Decoded:
     if size != ldr.shape[1::-1]:
         ldr = cv2.resize(ldr, size, interpolation=cv2.INTER_AREA)
-        valid = _resample_valid(valid, lambda v: cv2.resize(v, size, interpolation=cv2.INTER_AREA))
+        valid = _resized(valid, size, cv2.INTER_AREA)
     pixels = np.rint(ldr * np.float32(np.iinfo(np.uint16).max)).astype(np.uint16)
-    if not matted:
-        return _read_only(pixels, valid, None)
+    if pixels.shape[2] == 3:
+        return _read_only(pixels, valid)
     return _read_only(np.ascontiguousarray(pixels[..., :3]), valid, pixels[..., 3].copy())
 
 
-def _read_only(pixels: np.ndarray, valid: np.ndarray, alpha: np.ndarray | None) -> Decoded:
-    pixels.flags.writeable = valid.flags.writeable = False
-    if alpha is not None:
-        alpha.flags.writeable = False
-    return Decoded(pixels, valid, alpha)
+def _read_only(*arrays: np.ndarray) -> Decoded:
+    for array in arrays:
+        array.flags.writeable = False
+    return Decoded(*arrays)
 
 
-def _resample_valid(
-    valid: Bool[np.ndarray, "h w"], resample: Callable[[np.ndarray], np.ndarray]
+def _resized(
+    valid: Bool[np.ndarray, "h w"], size: tuple[int, int], how: int
 ) -> Bool[np.ndarray, "h2 w2"]:
-    return np.asarray(resample(valid.astype(np.float32))) >= _FULL
+    return cv2.resize(valid.astype(np.float32), size, interpolation=how) >= _FULL
 
 
 def _decode(path: Path) -> tuple[np.ndarray, UInt[np.ndarray, "h w"] | None]:
@@ -179,9 +168,7 @@ def _decode_mask(view: View) -> Bool[np.ndarray, "h w"]:
     if (w, h) == (view.width, view.height):
         return mask
     how = cv2.INTER_AREA if w > view.width else cv2.INTER_LINEAR
-    return _resample_valid(
-        mask, lambda v: cv2.resize(v, (view.width, view.height), interpolation=how)
-    )
+    return _resized(mask, (view.width, view.height), how)
 
 
 def _read_raster(path: Path, *, colours: bool = False) -> np.ndarray:

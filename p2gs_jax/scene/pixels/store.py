@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import shutil
+import subprocess
 import threading
 import weakref
 from collections import OrderedDict
@@ -19,7 +20,7 @@ from p2gs_jax.core.numerics import on_device
 from p2gs_jax.scene.drives.objects import MARGIN, MovingObjects, outlines, painted
 from p2gs_jax.scene.lens import scale_intrinsics
 from p2gs_jax.scene.masks import RANDOM, background_color
-from p2gs_jax.scene.pixels.cache import DecodersAhead, Key, PixelFiles, file_bytes
+from p2gs_jax.scene.pixels.cache import Key, PixelFiles, decode_ahead, file_bytes, stop
 from p2gs_jax.scene.pixels.decode import Decoded, decode, floats
 from p2gs_jax.types import Camera, Placement, TrackedObject, View
 
@@ -31,11 +32,7 @@ _MAX_PREFETCHED = 4
 
 
 def size_at(view: View, max_width: int | None, shrink: float = 1.0) -> tuple[int, int]:
-    """Return (width, height) in pixels of a view after both reductions.
-
-    Its full size is first reduced to at most `max_width` pixels across, and then divided by
-    `shrink` >= 1.
-    """
+    """Return (width, height) in pixels: at most `max_width` across, divided by `shrink` >= 1."""
     width = view.width if max_width is None else min(view.width, max_width)
     scale = width / view.width / max(float(shrink), 1.0)
     return max(1, round(view.width * scale)), max(1, round(view.height * scale))
@@ -44,10 +41,7 @@ def size_at(view: View, max_width: int | None, shrink: float = 1.0) -> tuple[int
 def camera_at(
     view: View, max_width: int | None, shrink: float = 1.0
 ) -> tuple[Float32[np.ndarray, "3 3"], int, int]:
-    """Return K, width and height of a view at the size of `size_at`.
-
-    Width and height are rounded separately, and K follows each of them exactly.
-    """
+    """Return K, width and height at the size of `size_at`; K follows each rounding exactly."""
     width, height = size_at(view, max_width, shrink)
     K = scale_intrinsics(view.K, width / view.width, height / view.height)
     return K.astype(np.float32), width, height
@@ -82,11 +76,8 @@ class ImageStore:
             cfg: `max_width`, `cache_mb` and `background`.
             objects: pixels in the boxes of those that move are left out.
             moving: objects that Gaussians belong to, for the cameras.
-            folder: where decoded photographs go that memory does not hold; None: they are decoded
-                again when they are needed.
-
-        Raises:
-            UserError: the disk of the folder has no room for them.
+            folder: takes decoded photographs that memory does not hold (UserError: it has no room);
+                None: they are decoded again when they are needed.
         """
         self.views = tuple(views)
         self.moving = moving
@@ -102,11 +93,9 @@ class ImageStore:
         self._leave_out(objects, MARGIN)
 
     def leaving_out(self, objects: Sequence[TrackedObject], margin: float = MARGIN) -> ImageStore:
-        """Return a store of the same photographs, decoded once for both, without some pixels.
+        """Return a store of the same photographs that leaves out pixels in other boxes.
 
-        Args:
-            objects: pixels in the boxes of those that move are left out; no others are.
-            margin: by which boxes are widened to every side, scene units.
+        These are the boxes of the objects that move, widened by `margin` scene units to every side.
         """
         other = copy.copy(self)
         other._leave_out(objects, margin)
@@ -127,10 +116,7 @@ class ImageStore:
         return red, green, blue
 
     def only_opaque(self) -> ImageStore:
-        """Return a store of the same photographs that leaves out where a background shows through.
-
-        Exposures and seeds come from what is there.
-        """
+        """Return a store of the same photographs without pixels that a background shows through."""
         if self.backdrop is None:
             return self
         other = copy.copy(self)
@@ -145,15 +131,11 @@ class ImageStore:
     def get(
         self, index: int, shrink: float = 1.0
     ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
-        """Return a photograph and its mask at the size of `size_at`.
+        """Return a photograph, display-encoded in [0, 1] and over the backdrop, and its mask.
 
-        Returns:
-            Display-encoded colours in [0, 1], with alpha over the backdrop, and the mask: 1 = use,
-            0 = ignore (masked, transparent, of an object that is left out, or outside the
-            photograph after undistortion).
-
-        Raises:
-            UserError: the file or its mask is missing, broken or of another size than the model's.
+        The mask is 1 where pixels count and 0 where they are masked, transparent, of an object that
+        is left out, or outside the photograph after undistortion. Raises UserError: the file or its
+        mask is missing, broken or of another size than the model's.
         """
         pixels, valid = self.stored(index, shrink)
         ldr, alpha = floats(pixels), self._decoded(index, shrink).alpha
@@ -164,10 +146,7 @@ class ImageStore:
     def stored(
         self, index: int, shrink: float = 1.0
     ) -> tuple[UInt[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-        """Return a photograph as it is cached, read-only: integers whose maximum stands for 1.
-
-        One with alpha is premultiplied by it.
-        """
+        """Return what is cached, read-only: integers whose maximum is 1, premultiplied by alpha."""
         entry = self._decoded(index, shrink)
         valid = entry.valid
         if self._only_opaque and entry.alpha is not None:
@@ -183,10 +162,7 @@ class ImageStore:
         return entry.pixels, valid & ~boxes
 
     def alpha(self, index: int, shrink: float = 1.0) -> UInt[np.ndarray, "h w"] | None:
-        """Return the opacity of a photograph as it is cached.
-
-        None: the scene is shown over no background. Photographs without alpha are opaque.
-        """
+        """Return the opacity that is cached, or None if the scene is shown over no background."""
         if self.backdrop is None:
             return None
         entry = self._decoded(index, shrink)
@@ -211,10 +187,7 @@ class ImageStore:
         return self._placements[index]
 
     def prefetch(self, index: int, shrink: float = 1.0) -> None:
-        """Start decoding in the background; `get` then waits only for what is left.
-
-        Requests beyond a short queue are dropped; errors are raised by `get`.
-        """
+        """Start decoding in the background, unless the short queue is full; `get` raises errors."""
         self._photographs.prefetch(self._key(index, shrink))
 
     def expect(self, shrinks: Sequence[float]) -> None:
@@ -267,9 +240,8 @@ def _files_beyond(
 class _DecodedPhotographs:
     """Photographs of some views, decoded on demand and kept up to a limit in bytes.
 
-    The least recently used goes first; the most recent one is always kept. With files, what is kept
-    is mapped from them, and what is not is mapped again when it is needed; without, it is decoded
-    again. Beyond that only images being worked on take memory.
+    The least recently used goes first; the most recent one is always kept. What is not kept is
+    mapped again from files, or without files decoded again, when it is needed.
     """
 
     def __init__(self, views: Sequence[View], limit: int, files: PixelFiles | None):
@@ -281,7 +253,7 @@ class _DecodedPhotographs:
         self._pending: dict[Key, Future[Decoded]] = {}
         self._lock = threading.Lock()
         self._expected: tuple[tuple[Key, ...], ...] = tuple(() for _ in views)
-        self._ahead: DecodersAhead | None = None
+        self._ahead: list[subprocess.Popen[bytes]] = []
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="decode")
 
     @property
@@ -303,31 +275,24 @@ class _DecodedPhotographs:
         with self._lock:
             if key in self._cache or key in self._pending or len(self._pending) >= _MAX_PREFETCHED:
                 return
-            self._pending[key] = self._worker.submit(self._load_pending, key)
+            pending = self._pending[key] = self._worker.submit(self._load, key)
+        pending.add_done_callback(lambda _: self._pending.pop(key, None))
 
     def expect(self, keys: Sequence[Sequence[Key]]) -> None:
         """Begin to decode what will be asked for into the files; without files nothing happens."""
         if self._files is None:
             return
         self._expected = tuple(map(tuple, keys))
-        self._ahead = DecodersAhead(self.views, self._files, self._expected)
-        weakref.finalize(self, self._ahead.close)
+        self._ahead = decode_ahead(self.views, self._files, self._expected)
+        weakref.finalize(self, stop, self._ahead)
 
     def close(self) -> None:
-        if self._ahead is not None:
-            self._ahead.close()
+        stop(self._ahead)
         self._worker.shutdown(wait=True, cancel_futures=True)
         with self._lock:
             self._cache.clear()
             self._pending.clear()
             self._bytes = 0
-
-    def _load_pending(self, key: Key) -> Decoded:
-        try:
-            return self._load(key)
-        finally:
-            with self._lock:
-                self._pending.pop(key, None)
 
     def _load(self, key: Key) -> Decoded:
         entry = self._decoded(key) if self._files is None else self._filed(key, self._files)
@@ -352,10 +317,7 @@ class _DecodedPhotographs:
 
     def _filed(self, key: Key, files: PixelFiles) -> Decoded:
         entry = files.read(key)
-        if entry is None and self._ahead is not None:
-            self._ahead.claim(key.view)
-            entry = files.read(key)
         if entry is None:
-            others = (k for k in self._expected[key.view] if k != key and not files.has(k))
-            entry = self._decoded(key, *others)
+            sizes = (k for k in self._expected[key.view] if k != key)
+            entry = self._decoded(key, *(k for k in sizes if not files.path(k).exists()))
         return entry

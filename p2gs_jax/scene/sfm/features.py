@@ -65,18 +65,11 @@ def extract(
     enlarge: bool = True,
     camera: int | None = None,
 ) -> None:
-    """Detect SIFT features on the CPU and store them.
+    """Detect SIFT features of images on the CPU and store them in a new or an existing database.
 
-    Args:
-        database: created where it does not exist.
-        image_folder: what `names` are relative to.
-        names: images to read.
-        mode: how the images share cameras.
-        enlarge: look for features in images of twice the size as well.
-        camera: id of the camera in the database that took them; None: a new one, or more.
-
-    Raises:
-        UserError: COLMAP failed.
+    `mode` says how they share cameras, `camera` the id of one in the database that took them all;
+    with `enlarge` features are found in images of twice the size as well. Raises UserError: COLMAP
+    failed.
     """
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size = MAX_IMAGE_SIZE
@@ -128,16 +121,10 @@ def _quotable(names: Iterable[str]) -> bool:
 def kept_features(
     folder: Path, image_folder: Path, groups: Mapping[tuple, Sequence[str]], report: Report
 ) -> Path:
-    """Return a database with the features of all photographs, of which some may be there already.
+    """Return a database, kept in `folder`, with the features of photographs; some may be there.
 
-    Args:
-        folder: keeps it.
-        image_folder: what names are relative to.
-        groups: names of the photographs by what those of one camera have in common.
-        report: receives progress.
-
-    Raises:
-        UserError: COLMAP failed.
+    `groups` holds the names of those of one camera by what they have in common. Raises UserError:
+    COLMAP failed.
     """
     record = _record(image_folder, groups)
     database = folder / DATABASE

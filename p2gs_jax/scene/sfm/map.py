@@ -12,7 +12,7 @@ from typing import Any
 
 import pycolmap
 
-from p2gs_jax.config import DataConfig, Mapper
+from p2gs_jax.config import DataConfig
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.errors import UserError
@@ -48,21 +48,12 @@ def load_images(
     work_dir: Path | None,
     report: Report,
 ) -> Scene:
-    """Run COLMAP's structure from motion on the CPU and read the largest model.
+    """Run COLMAP's structure from motion on the photographs in a folder; read the largest model.
 
-    Args:
-        root: the folder the user named.
-        image_folder: holds the photographs.
-        paths: the photographs, in it or in its subfolders.
-        cfg: passed on to the COLMAP reader.
-        work_dir: keeps the result under `sfm/`; it is reused while names, sizes and modification
-            times of the photographs stay the same. Features and matches stay under `features/`
-            and serve what is done again with more photographs or another mapper.
-        report: receives progress.
-
-    Raises:
-        UserError: fewer than two photographs, one of them is not an image, none registered, or
-            pycolmap lacks the mapper.
+    `work_dir` keeps it under `sfm/`, reused while names, sizes and modification times of the
+    photographs stay the same, and features and matches under `features/`, which serve more
+    photographs or another mapper. Raises UserError: fewer than two photographs, one of them is not
+    an image, none registered, or pycolmap lacks the mapper.
     """
     names = [path.relative_to(image_folder).as_posix() for path in paths]
     if len(paths) < 2:
@@ -76,7 +67,11 @@ def load_images(
     key: dict[str, Any] = {"pycolmap": pycolmap.__version__, "files": file_fingerprints(paths)}
     if cfg.mapper != "incremental":
         key["mapper"] = cfg.mapper
-    require_mapper(cfg.mapper)
+    if cfg.mapper == "global" and not hasattr(pycolmap, "global_mapping"):
+        raise UserError(
+            f"pycolmap {pycolmap.__version__} has no global mapper.",
+            fix="pip install --upgrade pycolmap, or leave out --data.mapper global",
+        )
 
     def build(folder: Path) -> None:
         kept = (folder if work_dir is None else work_dir) / KEPT
@@ -88,28 +83,13 @@ def load_images(
         why = json.loads((folder / ACCOUNT).read_text())["left_out"]
     registered = {view.name for view in scene.views}
     left_out = [name for name in names if name not in registered]
-    notes = list(scene.notes)
+    notes = scene.notes
     if left_out:
         known = {name: why.get(name, "no reason is known") for name in left_out}
-        notes.append(
-            f"{len(left_out)} of {len(names)} images could not be registered and are not used: "
-            f"{sentence(known)}; {_ADVICE}"
-        )
+        note = f"{len(left_out)} of {len(names)} images could not be registered and are not used: "
+        notes = (*notes, f"{note}{sentence(known)}; {_ADVICE}")
     report(f"registered {len(registered)} of {len(names)} images, {len(scene.points)} points")
-    return dataclasses.replace(scene, format="images", notes=tuple(notes))
-
-
-def require_mapper(mapper: Mapper) -> None:
-    """Refuse a mapper that this pycolmap does not have.
-
-    Raises:
-        UserError: it has no global one.
-    """
-    if mapper == "global" and not hasattr(pycolmap, "global_mapping"):
-        raise UserError(
-            f"pycolmap {pycolmap.__version__} has no global mapper.",
-            fix="pip install --upgrade pycolmap, or leave out --data.mapper global",
-        )
+    return dataclasses.replace(scene, format="images", notes=notes)
 
 
 def _build(
@@ -136,19 +116,14 @@ def _build(
         models = sorted(found, key=lambda m: (m.num_reg_images(), m.num_points3D()), reverse=True)
     why = reasons(database, names, models)
     if not models:
-        raise UserError(
-            f"none of the {len(names)} images in {image_folder} could be registered: "
-            f"{sentence(why)}",
-            fix=_ADVICE,
-        )
+        none = f"none of the {len(names)} images in {image_folder} could be registered"
+        raise UserError(f"{none}: {sentence(why)}", fix=_ADVICE)
     (folder / "model").mkdir()
     models[0].write(folder / "model")
     spent = ", ".join(f"{stage} {seconds:.0f}" for stage, seconds in watch.seconds.items())
     report(f"structure from motion of {len(names)} images and {pairs} pairs, seconds: {spent}")
-    write_json(
-        folder / ACCOUNT,
-        {"images": len(names), "pairs": pairs, "seconds": watch.seconds, "left_out": why},
-    )
+    account = {"images": len(names), "pairs": pairs, "seconds": watch.seconds, "left_out": why}
+    write_json(folder / ACCOUNT, account)
     shutil.rmtree(models_folder)
 
 
@@ -194,13 +169,7 @@ def _map_globally(
 def reasons(
     database: Path, names: Sequence[str], models: Sequence[pycolmap.Reconstruction]
 ) -> dict[str, str]:
-    """Return for every photograph that is not in the first model why not, in words.
-
-    Args:
-        database: features and matches.
-        names: of all photographs.
-        models: what was reconstructed; the first is used.
-    """
+    """Return why photographs are not in the first model, in words, from the database of matches."""
     parts = [{model.image(i).name for i in model.reg_image_ids()} for model in models]
     used = parts[0] if parts else set()
     left = [name for name in names if name not in used]

@@ -12,8 +12,7 @@ import pycolmap
 
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.cache import Report, cached_folder, file_fingerprints
-from p2gs_jax.scene.colmap import tracks_of
-from p2gs_jax.scene.colmap_model import read_model
+from p2gs_jax.scene.colmap import read_model, tracks_of
 from p2gs_jax.scene.sfm.features import extract, match, opened, pairs_by_pose, quiet_colmap
 from p2gs_jax.types import Scene, View
 
@@ -26,18 +25,10 @@ LINKS = "photographs"
 def triangulate(
     scene: Scene, work_dir: Path | None, report: Report, *, only_training: bool = False
 ) -> Scene:
-    """Return the scene with points and tracks; poses and intrinsics stay as they are.
+    """Return the scene of posed views with points and tracks, none where nothing matches.
 
-    There are none where nothing matches.
-
-    Args:
-        scene: posed views.
-        work_dir: keeps the result under `triangulated/`.
-        report: receives progress.
-        only_training: leave held-out views out.
-
-    Raises:
-        UserError: there is only one view, or a photograph cannot be read.
+    `work_dir` keeps the result under `triangulated/`. Raises UserError: there is only one view, or
+    a photograph cannot be read.
     """
     views = tuple(scene.training_views) if only_training else scene.views
     if len(views) < 2:

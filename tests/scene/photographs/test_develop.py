@@ -111,7 +111,7 @@ def test_one_white_balance_for_all_raws_of_a_camera(folder: Path) -> None:
     result = developed(folder)
     colours = [light_of(path)[32, 48] for path in result.paths]
     np.testing.assert_allclose(colours, np.broadcast_to((0.2, 0.3, 0.25), (3, 3)), atol=2e-3)
-    chosen = [r["white_balance_of_camera"] for r in record_of(result)]
+    chosen = [r["balance"] for r in record_of(result)]
     assert chosen[1] == pytest.approx((2.2, 1, 1.4), rel=1e-3)
     (note,) = (note for note in result.notes if note.startswith("White balance of 3"))
     assert "red 2.000, blue 1.500" in note
