@@ -17,14 +17,9 @@ from p2gs_jax.gaussians.seeds import camera_centers
 from p2gs_jax.photometry.formation import darkens, log_vignetting, squared_radii
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import Response, base_log, log_exposed, spline_of
-from p2gs_jax.render.warp import (
-    project_points,
-)
+from p2gs_jax.render.warp import project_points
 from p2gs_jax.scene.pixels.store import ImageStore
-from p2gs_jax.scene.visibility import (
-    in_frame,
-    unoccluded,
-)
+from p2gs_jax.scene.visibility import in_frame, unoccluded
 from p2gs_jax.types import GAMMA_SRGB, Photometry, Scene
 
 TABLE = 1024

@@ -4,7 +4,7 @@
     reference/<camera>/<frame>.png   the same views at ISO 8, without gains, vignetting and noise
     truth/linear/<camera>/<frame>.exr   radiance R G B (half), camera z Z (float; inf: sky)
     truth/sky_masks/<camera>/<frame>.png   255 where the pixel's centre sees the sky
-    truth/exposures.csv              how every photograph was taken, see `exposures`
+    truth/exposures.csv              how every photograph was taken, see `sensor`
     sparse/0/*.bin                   PINHOLE cameras, poses, seed points with tracks
     dataset.json                     every parameter
 
@@ -17,70 +17,26 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import OpenEXR
-from jaxtyping import Float32, Float64, Int, UInt8
+from jaxtyping import UInt8
 from PIL import Image
 
 from p2gs_jax.core.atomic import atomic_folder
 from p2gs_jax.core.streams import SceneStream, generator
 from p2gs_jax.errors import UserError
-from p2gs_jax.synth.build_town import build_town
-from p2gs_jax.synth.colmap_files import DriveViews, write_colmap
-from p2gs_jax.synth.exposures import write_true_exposures
+from p2gs_jax.synth.colmap_files import DriveViews, observe_seeds, sample_seeds, write_colmap
+from p2gs_jax.synth.furnish import build_town
 from p2gs_jax.synth.rig import MOUNTS, camera_viewmat, drive, intrinsics
-from p2gs_jax.synth.seed_points import observe_seeds, sample_seeds
-from p2gs_jax.synth.sensor import ISO_REFERENCE, draw_shots, photograph
+from p2gs_jax.synth.sensor import ISO_REFERENCE, Shots, draw_shots, photograph, write_true_exposures
 from p2gs_jax.synth.settings import Layout, Sensor
 from p2gs_jax.synth.town import STREET_END, Town
 from p2gs_jax.synth.tracer import Tracer
 
 FORMAT = "p2gs-jax street, version 2"
-
-
-@dataclass(frozen=True)
-class StreetTruth:
-    """The true parameters of a data set, one row per photograph, sorted by name.
-
-    Attributes:
-        root: the scene folder.
-        names: relative to `images/`.
-        cameras: physical camera of each photograph.
-        viewmats: world-to-camera, OpenCV axes, m.
-        K: intrinsics of all cameras, pixels, centres at +0.5.
-        width: pixels.
-        height: pixels.
-        iso: drawn ISO.
-        exposures: iso / 8 times the gains, mean over the channels.
-        points: number of seed points.
-        observations: number of their observations.
-    """
-
-    root: Path
-    names: tuple[str, ...]
-    cameras: tuple[str, ...]
-    viewmats: Float64[np.ndarray, "v 4 4"]
-    K: Float64[np.ndarray, "3 3"]
-    width: int
-    height: int
-    iso: Int[np.ndarray, " v"]
-    exposures: Float64[np.ndarray, " v"]
-    points: int
-    observations: int
-
-    def linear(self, row: int) -> Float32[np.ndarray, "h w 3"]:
-        """Return the true linear radiance of a view; 1 is white at ISO 8."""
-        return read_truth(self._truth(row))[0]
-
-    def depth(self, row: int) -> Float32[np.ndarray, "h w"]:
-        """Return the true camera z at the pixel centres, m; inf: sky."""
-        return read_truth(self._truth(row))[1]
-
-    def _truth(self, row: int) -> Path:
-        return (self.root / "truth" / "linear" / self.names[row]).with_suffix(".exr")
 
 
 def write_street(
@@ -97,13 +53,13 @@ def write_street(
     hold_out: int = 8,
     sensor: Sensor | None = None,
     layout: Layout = "street",
-    report: Callable[[str], None] | None = None,
-) -> StreetTruth:
-    """Render a drive along the procedural street and write it as a scene folder.
+    report: Callable[[str], None] = lambda line: None,
+) -> Path:
+    """Render a drive along the procedural street and write it as a scene folder, which is returned.
 
     Args:
         out: the folder to make; it must not exist, or be empty.
-        frames: of each of the three cameras.
+        frames: photographs of each of the three cameras.
         width: pixels (paper: 1920).
         height: pixels (paper: 1300).
         iso_std: spread of the ISO (paper: 2 and 4); 0 writes ISO-Const. `sensor` replaces it.
@@ -120,51 +76,26 @@ def write_street(
     Raises:
         UserError: a parameter is impossible, or `out` is in the way.
     """
-    out = Path(out)
-    sensor = sensor or Sensor(iso_std=iso_std)
+    out, sensor = Path(out), sensor or Sensor(iso_std=iso_std)
     _check(out, frames, width, height, sensor.iso_std, supersample)
     _check_way(frames, step, layout)
-    say = report or (lambda line: None)
     town = build_town(seed, layout, frames * step)
-    names = tuple(f"{camera}/{f:06d}.png" for camera in sorted(MOUNTS) for f in range(frames))
-    cameras = tuple(name.split("/")[0] for name in names)
-    frame = np.tile(np.arange(frames), len(MOUNTS))
-    track = drive(frames, step=step)
-    viewmats = np.stack(
-        [camera_viewmat(MOUNTS[c], track[f]) for c, f in zip(cameras, frame, strict=True)]
-    )
+    views, frame = _views(frames, width, height, step)
     shots = draw_shots(sensor, frames, len(MOUNTS), seed)
-    K = intrinsics(width, height)
     with atomic_folder(out) as temporary:
-        photographs, depths = [], []
-        say(f"rendering {len(names)} views of a street with {town.size} solids")
-        for row, (linear, depth) in enumerate(
-            _render_all(town, viewmats, K, width, height, supersample)
-        ):
-            rng = generator(seed, SceneStream.PHOTOGRAPH, row)
-            shot = photograph(
-                linear,
-                shots.exposures[row],
-                shots.sensor(sensor, row),
-                balance=shots.balance[row],
-                rng=rng,
-            )
-            reference = photograph(linear, 1.0, Sensor(curve=sensor.curve))
-            _write_view(temporary, names[row], shot, reference, linear, depth)
-            photographs.append(shot)
-            depths.append(depth)
-            if (row + 1) % 10 == 0:
-                say(f"rendered {row + 1} of {len(names)} views")
+        report(f"rendering {len(views.names)} views of a street with {town.size} solids")
+        photographs, depths = _photograph(
+            temporary, town, views, shots, sensor, supersample, seed, report
+        )
         sampled = np.ones(frames, bool)
         if hold_out and frames > 1:
             sampled[::hold_out] = False
-        xyz, rgb = sample_seeds(viewmats, K, photographs, depths, sampled[frame], points, seed)
-        xy, seen = observe_seeds(xyz, viewmats, K, depths)
+        xyz, rgb = sample_seeds(views, photographs, depths, sampled[frame], points, seed)
+        xy, seen = observe_seeds(xyz, views, depths)
         kept = seen.sum(0) >= 2
         xyz, rgb, xy, seen = xyz[kept], rgb[kept], xy[:, kept], seen[:, kept]
-        views = DriveViews(names, cameras, viewmats, K, width, height)
         write_colmap(temporary / "sparse" / "0", views, xyz, rgb, xy, seen)
-        write_true_exposures(temporary, names, cameras, shots)
+        write_true_exposures(temporary, views.names, views.cameras, shots)
         card = {
             "format": FORMAT,
             "seed": seed,
@@ -172,7 +103,7 @@ def write_street(
             "cameras": {name: asdict(mount) for name, mount in MOUNTS.items()},
             "width": width,
             "height": height,
-            "K": K.tolist(),
+            "K": views.K.tolist(),
             "supersample": supersample,
             "step_m": step,
             "layout": layout,
@@ -188,27 +119,46 @@ def write_street(
         }
         (temporary / "dataset.json").write_text(json.dumps(card, indent=2) + "\n")
         _require_free(out)
-    say(f"wrote {out}: {len(names)} photographs, {len(xyz)} points, {int(seen.sum())} observations")
-    return StreetTruth(
-        root=out,
-        names=names,
-        cameras=cameras,
-        viewmats=viewmats,
-        K=K,
-        width=width,
-        height=height,
-        iso=shots.iso,
-        exposures=shots.mean_exposures,
-        points=len(xyz),
-        observations=int(seen.sum()),
+    count = f"{len(xyz)} points, {int(seen.sum())} observations"
+    report(f"wrote {out}: {len(views.names)} photographs, {count}")
+    return out
+
+
+def _views(frames: int, width: int, height: int, step: float):
+    """Return the cameras of a drive, and the frame of each view."""
+    names = tuple(f"{camera}/{f:06d}.png" for camera in sorted(MOUNTS) for f in range(frames))
+    cameras = tuple(name.split("/")[0] for name in names)
+    frame = np.tile(np.arange(frames), len(MOUNTS))
+    track = drive(frames, step=step)
+    viewmats = np.stack(
+        [camera_viewmat(MOUNTS[c], track[f]) for c, f in zip(cameras, frame, strict=True)]
     )
+    return DriveViews(names, cameras, viewmats, intrinsics(width, height), width, height), frame
 
 
-def read_truth(path: Path) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
-    """Return linear radiance and camera z (m, inf: sky) from a truth EXR."""
-    with OpenEXR.File(str(path), separate_channels=True) as file:
-        pixels = {name: np.array(c.pixels, np.float32) for name, c in file.channels().items()}
-    return np.stack([pixels[c] for c in "RGB"], axis=-1), pixels["Z"]
+def _photograph(
+    root: Path,
+    town: Town,
+    views: DriveViews,
+    shots: Shots,
+    sensor: Sensor,
+    supersample: int,
+    seed: int,
+    report: Callable[[str], None],
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Render and write all views; return photographs and depths."""
+    photographs, depths = [], []
+    for row, (linear, depth) in enumerate(_render_all(town, views, supersample)):
+        rng, own = generator(seed, SceneStream.PHOTOGRAPH, row), shots.sensor(sensor, row)
+        exposure, balance = shots.exposures[row], shots.balance[row]
+        shot = photograph(linear, exposure, own, balance=balance, rng=rng)
+        reference = photograph(linear, 1.0, Sensor(curve=sensor.curve))
+        _write_view(root, views.names[row], shot, reference, linear, depth)
+        photographs.append(shot)
+        depths.append(depth)
+        if (row + 1) % 10 == 0:
+            report(f"rendered {row + 1} of {len(views.names)} views")
+    return photographs, depths
 
 
 def _check(
@@ -239,18 +189,18 @@ def _require_free(out: Path) -> None:
 
 
 def _render_all(
-    town: Town, viewmats: np.ndarray, K: np.ndarray, width: int, height: int, supersample: int
+    town: Town, views: DriveViews, supersample: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield (linear as half floats, depth) of every view; two views are rendered at a time."""
     tracer = Tracer(town)
 
     def one(viewmat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        linear, depth = tracer.render(viewmat, K, width, height, supersample)
+        linear, depth = tracer.render(viewmat, views.K, views.width, views.height, supersample)
         return linear.astype(np.float16), depth
 
-    yield one(viewmats[0])  # compiles once, not once a thread
+    yield one(views.viewmats[0])  # compiles once, not once a thread
     with ThreadPoolExecutor(2) as pool:
-        yield from pool.map(one, viewmats[1:])
+        yield from pool.map(one, views.viewmats[1:])
 
 
 def _write_view(
@@ -262,11 +212,8 @@ def _write_view(
     depth: np.ndarray,
 ) -> None:
     sky = np.where(np.isinf(depth), np.uint8(255), np.uint8(0))
-    for folder, pixels in (
-        ("images", shot),
-        ("reference", reference),
-        ("truth/sky_masks", sky),
-    ):
+    pictures = {"images": shot, "reference": reference, "truth/sky_masks": sky}
+    for folder, pixels in pictures.items():
         path = root / folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(pixels).save(path, compress_level=4)

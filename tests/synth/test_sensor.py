@@ -9,9 +9,15 @@ import pytest
 
 from p2gs_jax.core.numerics import srgb_decode
 from p2gs_jax.errors import UserError
-from p2gs_jax.synth.build_town import build_town
-from p2gs_jax.synth.exposures import read_true_exposures, read_true_shots
-from p2gs_jax.synth.sensor import draw_shots, encode, photograph, vignette
+from p2gs_jax.synth.furnish import build_town
+from p2gs_jax.synth.sensor import (
+    draw_shots,
+    encode,
+    photograph,
+    read_true_exposures,
+    read_true_shots,
+    vignette,
+)
 from p2gs_jax.synth.settings import Sensor
 from p2gs_jax.synth.town import UNDERPASS, Material
 from p2gs_jax.synth.write import write_street
@@ -143,18 +149,19 @@ def test_the_data_set_card_and_table_say_what_was_done(tmp_path):
     street = write_street(
         tmp_path / "scene", frames=2, width=64, height=48, points=200, sensor=sensor, seed=5
     )
-    card = json.loads((street.root / "dataset.json").read_text())
+    card = json.loads((street / "dataset.json").read_text())
     assert card["sensor"]["camera_gain_ev"] == 0.3
-    with (street.root / "truth" / "exposures.csv").open(newline="") as file:
+    with (street / "truth" / "exposures.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert [float(r["exposure"]) for r in rows] == pytest.approx(street.exposures, rel=1e-5)
-    read = read_true_exposures(street.root)
-    assert tuple(read) == street.names
+    exposures = draw_shots(sensor, 2, 3, seed=5).mean_exposures
+    assert [float(r["exposure"]) for r in rows] == pytest.approx(exposures, rel=1e-5)
+    read = read_true_exposures(street)
+    assert list(read) == [r["image"] for r in rows]
     assert list(read.values()) == [float(r["exposure"]) for r in rows]
     assert {r["red"] for r in rows if r["camera"] == "front"} != {
         r["red"] for r in rows if r["camera"] == "front_left"
     }
-    true = read_true_shots(street.root)
+    true = read_true_shots(street)
     assert [s.exposure for s in true.values()] == list(read.values())
     assert {s.corners for s in true.values()} == {0.8}
     assert all(np.prod(s.balance) == pytest.approx(1, abs=1e-4) for s in true.values())

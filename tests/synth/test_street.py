@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pycolmap
 import pytest
 from PIL import Image
@@ -14,17 +15,39 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.core.numerics import srgb_decode, srgb_encode
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.colmap import load_colmap
-from p2gs_jax.synth.build_town import STREET_M, build_town
-from p2gs_jax.synth.rig import MOUNTS, camera_viewmat, carla_rotation, image_height, intrinsics
+from p2gs_jax.synth.furnish import STREET_M, build_town
+from p2gs_jax.synth.rig import (
+    MOUNTS,
+    camera_viewmat,
+    carla_rotation,
+    drive,
+    image_height,
+    intrinsics,
+)
 from p2gs_jax.synth.sensor import draw_iso, photograph
 from p2gs_jax.synth.town import Material
-from p2gs_jax.synth.write import read_truth, write_street
+from p2gs_jax.synth.write import write_street
 
 SIZE = {"frames": 3, "width": 192, "height": 128, "points": 4000, "seed": 3}
 
 
 def read_png(path: Path) -> np.ndarray:
     return np.asarray(Image.open(path))
+
+
+NAMES = [f"{camera}/{f:06d}.png" for camera in sorted(MOUNTS) for f in range(SIZE["frames"])]
+
+
+def truth(street, name):
+    """Return linear radiance, and camera z (m, inf: sky)."""
+    path = (street / "truth" / "linear" / name).with_suffix(".exr")
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        pixels = {k: np.array(c.pixels, np.float32) for k, c in file.channels().items()}
+    return np.stack([pixels[c] for c in "RGB"], axis=-1), pixels["Z"]
+
+
+def card_of(street):
+    return json.loads((street / "dataset.json").read_text())
 
 
 @pytest.fixture(scope="module")
@@ -34,15 +57,15 @@ def street(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def scene(street):
-    return load_colmap(street.root, street.root / "sparse" / "0", DataConfig())
+    return load_colmap(street, street / "sparse" / "0", DataConfig())
 
 
 def test_every_file_is_deterministic_in_the_seed(street, tmp_path):
     again = write_street(tmp_path / "scene", **SIZE)
-    files = sorted(p.relative_to(street.root) for p in street.root.rglob("*") if p.is_file())
-    assert files == sorted(p.relative_to(again.root) for p in again.root.rglob("*") if p.is_file())
+    files = sorted(p.relative_to(street) for p in street.rglob("*") if p.is_file())
+    assert files == sorted(p.relative_to(again) for p in again.rglob("*") if p.is_file())
     for file in files:
-        assert (street.root / file).read_bytes() == (again.root / file).read_bytes(), file
+        assert (street / file).read_bytes() == (again / file).read_bytes(), file
     assert not list(tmp_path.glob(".scene-*"))
 
 
@@ -90,29 +113,30 @@ def test_heights_keep_the_papers_proportions():
 
 
 def test_photographs_are_the_exposed_truth(street):
-    with (street.root / "truth" / "exposures.csv").open(newline="") as file:
+    with (street / "truth" / "exposures.csv").open(newline="") as file:
         rows = {row["image"]: row for row in csv.DictReader(file)}
+    assert list(rows) == NAMES
     checked = 0
-    for i, name in enumerate(street.names):
-        linear = street.linear(i)
-        reference = read_png(street.root / "reference" / name)
-        shot = read_png(street.root / "images" / name)
-        assert shot.shape == (street.height, street.width, 3)
+    for name in NAMES:
+        linear, _ = truth(street, name)
+        reference = read_png(street / "reference" / name)
+        shot = read_png(street / "images" / name)
+        assert shot.shape == (SIZE["height"], SIZE["width"], 3)
         np.testing.assert_allclose(255 * srgb_encode(linear), reference, atol=0.51)
         np.testing.assert_array_equal(shot, photograph(linear, float(rows[name]["exposure"])))
         e = float(rows[name]["exposure"])
-        assert e == street.exposures[i] == int(rows[name]["iso"]) / 8
+        assert e == int(rows[name]["iso"]) / 8
         assert float(rows[name]["exposure_ev"]) == pytest.approx(np.log2(e), abs=1e-5)
         good = (reference > 40) & (reference < 250) & (shot > 40) & (shot < 250)
         if good.sum() > 500:
             ratio = srgb_decode(shot[good] / 255) / srgb_decode(reference[good] / 255)
             assert np.median(ratio) == pytest.approx(e, rel=0.01)
             checked += 1
-    assert checked >= len(street.names) // 2
+    assert checked >= len(NAMES) // 2
 
 
 def test_radiance_spans_three_orders_and_is_well_exposed(street):
-    linear = np.stack([street.linear(i) for i in range(len(street.names))])
+    linear = np.stack([truth(street, name)[0] for name in NAMES])
     assert np.isfinite(linear).all()
     assert (linear >= 0).all()
     low, high = np.percentile(linear, [0.05, 99.95])
@@ -122,26 +146,28 @@ def test_radiance_spans_three_orders_and_is_well_exposed(street):
 
 
 def test_sky_masks_and_depth_agree(street):
-    for i, name in enumerate(street.names):
-        depth = street.depth(i)
-        mask = read_png(street.root / "truth" / "sky_masks" / name)
+    for name in NAMES:
+        _, depth = truth(street, name)
+        mask = read_png(street / "truth" / "sky_masks" / name)
         np.testing.assert_array_equal(mask == 255, np.isinf(depth))
         assert set(np.unique(mask)) <= {0, 255}
         assert depth.min() > 0.5
 
 
 def test_colmap_model_is_what_pycolmap_reads(street, scene):
-    model = pycolmap.Reconstruction(str(street.root / "sparse" / "0"))
+    model = pycolmap.Reconstruction(str(street / "sparse" / "0"))
     assert model.is_valid()
     assert model.num_cameras() == 3
-    assert model.num_points3D() == street.points
-    assert model.compute_num_observations() == street.observations
+    assert model.num_points3D() == card_of(street)["points"]
+    assert model.compute_num_observations() == card_of(street)["observations"]
     model.update_point_3d_errors()
     assert model.compute_mean_reprojection_error() < 1e-6
-    assert [v.name for v in scene.views] == list(street.names)
-    for view, viewmat in zip(scene.views, street.viewmats, strict=True):
+    assert [v.name for v in scene.views] == NAMES
+    K, track = intrinsics(SIZE["width"], SIZE["height"]), drive(SIZE["frames"])
+    for view in scene.views:
+        viewmat = camera_viewmat(MOUNTS[view.camera], track[int(Path(view.name).stem)])
         np.testing.assert_allclose(view.viewmat, viewmat, atol=1e-5)
-        np.testing.assert_allclose(view.K, street.K, rtol=1e-6)
+        np.testing.assert_allclose(view.K, K, rtol=1e-6)
 
 
 def test_tracks_land_on_their_points_and_see_one_radiance(street, scene):
@@ -152,7 +178,7 @@ def test_tracks_land_on_their_points_and_see_one_radiance(street, scene):
         p = scene.points[tracks.point_indices[rows]] @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
         xy = (p / p[:, 2:]) @ view.K.T
         np.testing.assert_allclose(xy[:, :2], tracks.xy[rows], atol=0.02)
-        reference = srgb_decode(read_png(street.root / "reference" / view.name) / 255.0)
+        reference = srgb_decode(read_png(street / "reference" / view.name) / 255.0)
         u, v = tracks.xy[rows].T - 0.5
         value = map_coordinates(reference[..., 1], [v, u], order=1, mode="nearest")
         usable = (value > 0.01) & (value < 0.95)
@@ -180,13 +206,9 @@ def test_seed_colours_are_from_photographs_of_views_that_are_not_held_out(street
 
 
 def test_card_and_refusals(street, tmp_path):
-    card = json.loads((street.root / "dataset.json").read_text())
-    assert card["seed"] == SIZE["seed"]
-    assert card["points"] == street.points
-    linear, depth = read_truth(street.root / "truth" / "linear" / "front" / "000001.exr")
-    assert linear.shape == (*depth.shape, 3)
+    assert card_of(street)["seed"] == SIZE["seed"]
     with pytest.raises(UserError, match="not an empty folder"):
-        write_street(street.root)
+        write_street(street)
     with pytest.raises(UserError, match="cannot render"):
         write_street(tmp_path / "x", frames=0)
     assert not (tmp_path / "x").exists()
