@@ -15,9 +15,10 @@ from p2gs_jax.photometry.observations import Observations, sample_pairs
 from p2gs_jax.photometry.response import Response
 from p2gs_jax.photometry.sources.points import MOST_PER_POINT, projected_colors, track_colors
 from p2gs_jax.photometry.sources.sampling import sample
+from p2gs_jax.render.warp import project_points
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.pixels.store import ImageStore
-from p2gs_jax.scene.visibility import project_points, unoccluded
+from p2gs_jax.scene.visibility import unoccluded
 from p2gs_jax.types import Scene, Tracks, View
 
 

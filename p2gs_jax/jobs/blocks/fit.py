@@ -17,14 +17,21 @@ from p2gs_jax.core.clock import CompileCounter, Stopwatch
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.core.runtime import return_freed_memory
-from p2gs_jax.districts.block_job import block_job, peak_bytes
-from p2gs_jax.districts.cut import Cut, cut_scene
-from p2gs_jax.districts.level import level_seams
-from p2gs_jax.districts.merge import merge_cores
-from p2gs_jax.districts.plan import check_options, check_scene, read_plan, write_plan
-from p2gs_jax.districts.room import fewest_blocks, require_room
-from p2gs_jax.districts.seams import Seam
-from p2gs_jax.districts.shared import (
+from p2gs_jax.errors import UserError
+from p2gs_jax.evaluation.references import Reference
+from p2gs_jax.formats.ply import read_ply
+from p2gs_jax.jobs.blocks.block import block_job, peak_bytes
+from p2gs_jax.jobs.blocks.cut import Cut, cut_scene
+from p2gs_jax.jobs.blocks.plan import (
+    check_options,
+    check_scene,
+    fewest_blocks,
+    read_plan,
+    require_room,
+    write_plan,
+)
+from p2gs_jax.jobs.blocks.seams import Seam, level_seams, merge_cores
+from p2gs_jax.jobs.blocks.shared import (
     ARRAYS,
     DECISIONS,
     Solved,
@@ -32,9 +39,6 @@ from p2gs_jax.districts.shared import (
     solve_shared,
     write_shared,
 )
-from p2gs_jax.errors import UserError
-from p2gs_jax.evaluation.references import Reference
-from p2gs_jax.formats.ply import read_ply
 from p2gs_jax.jobs.engines import LOCAL, check_engine, open_engine
 from p2gs_jax.jobs.job import JobState
 from p2gs_jax.jobs.run import run_jobs
@@ -83,20 +87,15 @@ def fit_blocks(
     on_look: Callable[[Sequence[JobState]], None] = lambda states: None,
     true_exposures: Mapping[str, float] | None = None,
 ) -> FitResult:
-    """Fit a scene in blocks and write a run folder as `fit` does.
+    """Fit a scene in blocks and write a run folder as `fit` does, whose arguments it shares.
 
     Args:
-        scene_dir: see `fit`.
-        run_dir: see `fit`; the blocks are in its folder `blocks`.
-        cfg: options of the whole; None takes the `robust` preset.
+        run_dir: the blocks are in its folder `blocks`.
         blocks: how many, or `auto`: as few as memory allows; with one, this is `fit`.
         parallel: blocks at a time on this machine.
         engine: where they are fitted: local, dask://HOST:PORT or slurm (docs/sweeps.md).
-        reference: see `fit`.
         resume: continue after an interruption; blocks that are finished stay.
-        reporter: receives progress.
         on_look: receives how far the blocks are, twice a second.
-        true_exposures: see `fit`.
 
     Raises:
         UserError: something the user can mend; a block that failed is named, with its reason.
@@ -119,8 +118,8 @@ def fit_blocks(
         truth = preflight.check_scene(scene, cfg, paths, weights)
         cut = _cut(scene, cfg, asked, paths.run / BLOCKS, reporter)
         if cut is not None:
-            district = _District(paths, cfg, asked, cut, lock, reporter, on_look)
-            return district.fit(scene, truth, weights, begin, true_exposures)
+            whole = _Blocks(paths, cfg, asked, cut, lock, reporter, on_look)
+            return whole.fit(scene, truth, weights, begin, true_exposures)
     # One block is no block.
     return fit(
         paths.scene,
@@ -158,7 +157,7 @@ def _cut(
     return cut
 
 
-class _District:
+class _Blocks:
     """A scene that is fitted in blocks, its folder locked."""
 
     def __init__(
@@ -226,7 +225,7 @@ class _District:
             true_ev=true_stops(true_exposures, solved.scene),
             still_ours=self.lock.require,
         )
-        metrics[KEY] = self._said(seams, counts)
+        metrics[KEY] = self._summary(seams, counts)
         write_json(self.folder.metrics, metrics)
         store.close()
         shutil.rmtree(self.folder.pixels, ignore_errors=True)
@@ -277,8 +276,8 @@ class _District:
             )
 
     def _ended(self, number: int, state: JobState) -> None:
-        said = "fitted" if state.status == "done" else state.status
-        self.reporter.message(f"{state.name}: {said} after {state.seconds:.0f} s.")
+        how = "fitted" if state.status == "done" else state.status
+        self.reporter.message(f"{state.name}: {how} after {state.seconds:.0f} s.")
 
     def _of_block(self, number: int) -> dict:
         return json.loads(RunFolder(self.blocks / str(number)).metrics.read_text(encoding="utf-8"))
@@ -293,7 +292,7 @@ class _District:
                 f"{worst.spread_stops:.3f} stops, {worst.spread_depth:.1%} of depth."
             )
 
-    def _said(self, seams: Sequence[Seam], counts: Sequence[int]) -> dict:
+    def _summary(self, seams: Sequence[Seam], counts: Sequence[int]) -> dict:
         """Return what `metrics.json` says of the blocks."""
         rows = []
         for number, (block, kept) in enumerate(zip(self.cut.blocks, counts, strict=True)):

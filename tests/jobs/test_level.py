@@ -9,10 +9,9 @@ from hypothesis import strategies as st
 from walls import GROUND, INF, halves, wall
 
 from p2gs_jax.config import DataConfig, RenderConfig
-from p2gs_jax.districts import seams as measuring
-from p2gs_jax.districts.cut import OVERLAP, Block, Cut
-from p2gs_jax.districts.level import INWARDS, level_seams, shifts
-from p2gs_jax.districts.merge import merge_cores
+from p2gs_jax.jobs.blocks import seams as measuring
+from p2gs_jax.jobs.blocks.cut import OVERLAP, Block, Cut
+from p2gs_jax.jobs.blocks.seams import INWARDS, level_seams, merge_cores, shifts
 from p2gs_jax.render.harmonics import C0
 from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 

@@ -1,4 +1,4 @@
-"""A scene's ground cut into cells with as many photographs each, and which views see a cell.
+"""A scene's ground cut into cells with as many photographs each, and a cell as a scene.
 
 The cells are rectangles along the two axes in which the cameras spread most; the outer ones have no
 outer edge, so that every point of space is in the core of exactly one block.
@@ -7,16 +7,18 @@ outer edge, so that every point of space is in the core of exactly one block.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.seeds import camera_centers
-from p2gs_jax.scene.visibility import in_frame, project_points
-from p2gs_jax.types import Scene, View
+from p2gs_jax.render.warp import project_points
+from p2gs_jax.scene.visibility import in_frame
+from p2gs_jax.types import Scene, Tracks, View
 
 # A block reaches beyond its core by this share of the shortest core.
 OVERLAP = 0.15
@@ -25,6 +27,10 @@ LEAST_SEEN = 0.1
 FEWEST_VIEWS = 2
 # Of points without tracks at most so many are projected.
 MOST_PROJECTED = 20_000
+# Points outside a block are thinned to one in a cube whose side is this share of their distance.
+DETAIL = 0.02
+# Views that are asked what they see of points without tracks.
+MOST_LOOKED = 48
 
 
 @dataclass(frozen=True)
@@ -96,10 +102,8 @@ class Cut:
         for a, first in enumerate(self.blocks):
             for b in range(a + 1, len(self.blocks)):
                 second = self.blocks[b]
-                low, high = (
-                    np.maximum(first.lower, second.lower),
-                    np.minimum(first.upper, second.upper),
-                )
+                low = np.maximum(first.lower, second.lower)
+                high = np.minimum(first.upper, second.upper)
                 if (high >= low).all():
                     found.append((a, b))
         return found
@@ -133,11 +137,7 @@ def _edge(values: Sequence[float | None], outer: float) -> tuple[float, float]:
 
 
 def cut_scene(scene: Scene, count: int) -> Cut:
-    """Cut a scene into blocks.
-
-    Args:
-        scene: training views and points.
-        count: of blocks.
+    """Cut a scene into so many blocks.
 
     Raises:
         UserError: there are too few photographs, or places, for so many blocks.
@@ -182,12 +182,7 @@ def ground_of(centers: Float[np.ndarray, "v 3"]) -> Ground:
 
 
 def split(places: Float[np.ndarray, "v 2"], count: int) -> list[Block]:
-    """Return cells with about as many places each.
-
-    Args:
-        places: of the cameras.
-        count: of cells; at least so many places differ.
-    """
+    """Return cells with about as many places each; at least `count` places differ."""
     return _split(places, count, Block((-np.inf, -np.inf), (np.inf, np.inf)))
 
 
@@ -221,11 +216,7 @@ def _length(places: Float[np.ndarray, "v 2"]) -> float:
 
 
 def seen_points(scene: Scene) -> list[Int[np.ndarray, " k"]]:
-    """Return which points each training view sees: by tracks, else by projection of some points.
-
-    Args:
-        scene: views, points, tracks.
-    """
+    """Return which points each training view sees: by tracks, else by projection of some points."""
     rows = scene.train_indices
     if scene.tracks is not None and len(scene.tracks.xy):
         row_of = np.full(len(scene.views), len(rows))
@@ -245,11 +236,6 @@ def looked_at(
     """Return where each training view counts: half way from its camera to the points it sees.
 
     Cameras that all look ahead fill what lies before them, not what they stand on.
-
-    Args:
-        scene: points.
-        seen: by each view.
-        centers: of the cameras.
     """
     half = np.array(centers, np.float64)
     for row, points in enumerate(seen):
@@ -266,3 +252,73 @@ def shows(view: View, points: Float[np.ndarray, "p 3"]) -> Bool[np.ndarray, " p"
 def views_of(scene: Scene, block: Block) -> Int[np.ndarray, " k"]:
     """Return the rows in `scene.views` of a block's views."""
     return np.asarray(scene.train_indices)[list(block.views)]
+
+
+def whole_of(scene: Scene, cut: Cut, number: int) -> tuple[Scene, Int[np.ndarray, " k"], int]:
+    """Return a block as a scene: its views, its points, and coarse ones of what lies around it.
+
+    Also which points of the whole it has, and how many of them (the first) lie in the block.
+    """
+    block = cut.blocks[number]
+    places = cut.ground.place(scene.points)
+    near = block.holds(places, cut.margin)
+    rows = views_of(scene, block)
+    beyond = np.flatnonzero(~near & _seen(scene, rows))
+    distance = block.distance(places[beyond]) - cut.margin
+    coarse = beyond[thinned(scene.points[beyond], distance)]
+    keep = np.concatenate([np.flatnonzero(near), coarse])
+    colors = scene.point_colors
+    found = replace(
+        scene,
+        views=tuple(scene.views[i] for i in rows),
+        points=scene.points[keep],
+        point_colors=None if colors is None else colors[keep],
+        tracks=_tracks(scene, rows, keep),
+        notes=(),
+    )
+    return found, keep, int(near.sum())
+
+
+def _seen(scene: Scene, rows: Int[np.ndarray, " k"]) -> Bool[np.ndarray, " p"]:
+    """Return which points some of the views see: by tracks, else by projection into a few."""
+    seen = np.zeros(len(scene.points), bool)
+    if scene.tracks is not None and len(scene.tracks.xy):
+        seen[scene.tracks.point_indices[np.isin(scene.tracks.view_indices, rows)]] = True
+        return seen
+    for k in evenly_spaced(len(rows), MOST_LOOKED):
+        seen |= shows(scene.views[rows[k]], scene.points)
+    return seen
+
+
+def thinned(
+    points: Float[np.ndarray, "p 3"], distance: Float[np.ndarray, " p"]
+) -> Int[np.ndarray, " k"]:
+    """Return points of which no two share a cube; cubes grow with the distance from the block.
+
+    Sides are powers of two; all lengths are in scene units.
+    """
+    if not len(points):
+        return np.zeros(0, int)
+    least = max(float(np.ptp(points, axis=0).max()), 1e-9) * 1e-6
+    level = np.floor(np.log2(np.maximum(DETAIL * distance, least)))
+    cube = np.floor(points / np.exp2(level)[:, None])
+    keys = np.concatenate([level[:, None], cube], 1)
+    _, first = np.unique(keys, axis=0, return_index=True)
+    return np.sort(first)
+
+
+def _tracks(
+    scene: Scene, rows: Int[np.ndarray, " k"], keep: Int[np.ndarray, " p"]
+) -> Tracks | None:
+    """Return the observations that are left, under the new rows of views and points."""
+    tracks = scene.tracks
+    if tracks is None:
+        return None
+    view, point = np.full(len(scene.views), -1), np.full(len(scene.points), -1)
+    view[rows], point[keep] = np.arange(len(rows)), np.arange(len(keep))
+    left: Bool[np.ndarray, " o"] = (view[tracks.view_indices] >= 0) & (
+        point[tracks.point_indices] >= 0
+    )
+    return Tracks(
+        view[tracks.view_indices[left]], point[tracks.point_indices[left]], tracks.xy[left]
+    )

@@ -9,14 +9,14 @@ from tiny_scene import make_scene
 
 import p2gs_jax
 from p2gs_jax.core.progress import Silent
-from p2gs_jax.districts import fit as module
-from p2gs_jax.districts import room
-from p2gs_jax.districts.block_job import block_config, shown_by
-from p2gs_jax.districts.cut import cut_scene
-from p2gs_jax.districts.plan import check_options, read_plan, write_plan
-from p2gs_jax.districts.shared import read_shared
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.population import default_max_gaussians
+from p2gs_jax.jobs.blocks import fit as module
+from p2gs_jax.jobs.blocks import plan as room
+from p2gs_jax.jobs.blocks.block import block_config, shown_by
+from p2gs_jax.jobs.blocks.cut import cut_scene
+from p2gs_jax.jobs.blocks.plan import check_options, read_plan, write_plan
+from p2gs_jax.jobs.blocks.shared import read_shared
 from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.jobs.job import JobState
 from p2gs_jax.pipeline.prepare import load

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from p2gs_jax.districts.cut import Block, Cut, Ground
+from p2gs_jax.jobs.blocks.cut import Block, Cut, Ground
 from p2gs_jax.render.harmonics import C0
 from p2gs_jax.types import Gaussians
 

@@ -8,10 +8,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from p2gs_jax.districts.cut import Cut, cut_scene, ground_of, seen_points, split
-from p2gs_jax.districts.part_of import DETAIL, photometry_of, thinned, whole_of
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.seeds import camera_centers
+from p2gs_jax.jobs.blocks.cut import (
+    DETAIL,
+    Cut,
+    cut_scene,
+    ground_of,
+    seen_points,
+    split,
+    thinned,
+    whole_of,
+)
+from p2gs_jax.jobs.blocks.shared import photometry_of
 from p2gs_jax.types import Photometry, Scene, Tracks, View
 
 LENGTH = 100.0

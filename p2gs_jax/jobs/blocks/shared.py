@@ -7,7 +7,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Int
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import atomic_write
@@ -68,14 +68,7 @@ def solve_shared(
     *,
     kept: Decisions | None = None,
 ) -> Solved:
-    """Solve the photometry of a scene.
-
-    Args:
-        scene: from `prepare.load`.
-        store: its photographs.
-        cfg: as asked.
-        reporter: receives progress.
-        kept: what was decided before, of a run that is resumed.
+    """Solve the photometry of a scene; `kept` is what a run that is resumed decided before.
 
     Raises:
         UserError: no point is seen twice.
@@ -92,10 +85,7 @@ def solve_shared(
     depth = near_depth(seen_depths(scene.points, views))
     near = near_plane(depth, cfg)
     decisions = dataclasses.replace(
-        solved.decisions,
-        freeze_until=1.0,
-        log_exposure_mean=None,
-        near=near,
+        solved.decisions, freeze_until=1.0, log_exposure_mean=None, near=near
     )
     resolved = decisions.resolve(cfg)
     notes = [*scale_notes(scene, near, cfg, depth), *solved.notes]
@@ -132,12 +122,7 @@ def write_shared(folder: Path, shared: Shared, scene: Scene) -> None:
 
 
 def read_shared(folder: Path, scene: Scene, cfg: FitConfig) -> tuple[Shared, Scene]:
-    """Return what the blocks share, and the scene with the colours of its points.
-
-    Args:
-        folder: of the blocks.
-        scene: as `prepare.load` read it again.
-        cfg: as asked.
+    """Return what the blocks share, and the scene, read again, with the colours of its points.
 
     Raises:
         UserError: the files are broken, or of another scene.
@@ -174,3 +159,15 @@ def read_shared(folder: Path, scene: Scene, cfg: FitConfig) -> tuple[Shared, Sce
     if "point_colors" in a:
         scene = dataclasses.replace(scene, point_colors=a["point_colors"])
     return Shared(photometry, decisions, radiance, shell), scene
+
+
+def photometry_of(photometry: Photometry, rows: Int[np.ndarray, " k"]) -> Photometry:
+    """Return the photometry of some training views."""
+    balance, cameras = photometry.raw_white_balance, photometry.cameras
+    return dataclasses.replace(
+        photometry,
+        raw_exposures=photometry.raw_exposures[rows],
+        raw_gammas=photometry.raw_gammas[rows],
+        raw_white_balance=None if balance is None else balance[rows],
+        cameras=None if cameras is None else tuple(cameras[k] for k in rows),
+    )

@@ -17,12 +17,13 @@ from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.core.memory import text_of
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.core.runtime import tune_process, use_compile_cache
-from p2gs_jax.districts.cut import Cut
-from p2gs_jax.districts.part_of import BlockScene, block_scene
-from p2gs_jax.districts.shared import read_shared
 from p2gs_jax.formats.ply import write_radiance
 from p2gs_jax.gaussians.population import Coverage, default_max_gaussians
+from p2gs_jax.gaussians.shell import Sphere
+from p2gs_jax.jobs.blocks.cut import Cut, whole_of
+from p2gs_jax.jobs.blocks.shared import Shared, photometry_of, read_shared
 from p2gs_jax.jobs.job import Job
+from p2gs_jax.pipeline.exposures import Exposures
 from p2gs_jax.pipeline.fit import begin_programs, begun, compact, optimise
 from p2gs_jax.pipeline.preflight import Paths
 from p2gs_jax.pipeline.prepare import load, prepare
@@ -40,18 +41,46 @@ STATUS = Path("/proc/self/status")
 OUTSIDE = 1.6
 
 
+@dataclasses.dataclass(frozen=True)
+class BlockScene:
+    """A block as a scene of its own.
+
+    Attributes:
+        scene: its training views, its points first.
+        exposures: with radiances, as solved for all blocks.
+        shell: where what lies behind everything is.
+        own: how many of the points lie in the block; the others are coarse.
+    """
+
+    scene: Scene
+    exposures: Exposures
+    shell: Sphere
+    own: int
+
+
+def block_scene(scene: Scene, shared: Shared, cut: Cut, number: int) -> BlockScene:
+    """Return what a block is fitted to."""
+    found, keep, own = whole_of(scene, cut, number)
+    exposures = Exposures(
+        photometry=photometry_of(shared.photometry, np.array(cut.blocks[number].views)),
+        decisions=shared.decisions,
+        radiance=shared.radiance[keep],
+    )
+    return BlockScene(found, exposures, shared.shell, own)
+
+
 def block_job(scene: Path, run: Path, folder: Path, cut: Cut, number: int, cfg: FitConfig) -> Job:
     """Return the job of a block.
 
     Args:
-        scene: what is fitted.
+        scene: folder of the scene.
         run: run folder of the whole; its cache is read.
         folder: of the blocks, with what they share.
         cut: of the scene.
         number: of the block.
         cfg: of the whole.
     """
-    said = {
+    arguments = {
         "scene": str(scene.absolute()),
         "run": str(run.absolute()),
         "shared": str(folder.absolute()),
@@ -59,7 +88,7 @@ def block_job(scene: Path, run: Path, folder: Path, cut: Cut, number: int, cfg: 
         "number": number,
         "fit": to_dict(cfg),
     }
-    return Job(f"block {number}", folder / str(number), fit_block, said)
+    return Job(f"block {number}", folder / str(number), fit_block, arguments)
 
 
 def block_config(
@@ -73,7 +102,7 @@ def block_config(
         number: of the block.
         block: its scene.
         own: how many of its points lie in the block.
-        train_views: of the whole.
+        train_views: number of training views of the whole.
     """
     share = len(cut.blocks[number].views) / train_views
     train, densify = cfg.train, cfg.densify
@@ -104,24 +133,14 @@ def _population(cfg: FitConfig, block: Scene, own: int) -> int:
 
 
 def shown_by(scene: Scene, cfg: FitConfig) -> Coverage:
-    """Return how much of a scene its training views show, without their photographs.
-
-    Args:
-        scene: views and points.
-        cfg: largest width of a photograph.
-    """
+    """Return how much of a scene its training views show, without their photographs."""
     views = scene.training_views
     pixels = max(w * h for w, h in (size_at(v, cfg.data.max_width) for v in views))
     return Coverage(pixels, shown_share(scene.points, views))
 
 
 def fit_block(folder: Path, arguments: dict[str, Any], reporter: Reporter) -> None:
-    """Fit a block, or go on with it; leaves `radiance.ply` and `metrics.json`.
-
-    Args:
-        folder: of the block's run.
-        arguments: of a `block_job`.
-        reporter: receives progress.
+    """Fit the block of a `block_job`, or go on with it; leaves `radiance.ply` and `metrics.json`.
 
     Raises:
         UserError: the scene cannot be read, or memory is short.
@@ -168,10 +187,7 @@ def _fit(
     count = params.gaussians.capacity
     reporter.stage("Writing files")
     write_radiance(
-        folder.radiance,
-        params.gaussians,
-        np.ones(count, bool),
-        activation=cfg.render.radiance,
+        folder.radiance, params.gaussians, np.ones(count, bool), activation=cfg.render.radiance
     )
     prepared.store.close()
     shutil.rmtree(folder.pixels, ignore_errors=True)

@@ -8,9 +8,8 @@ import pytest
 from walls import halves, wall
 
 from p2gs_jax.config import DataConfig, RenderConfig
-from p2gs_jax.districts.merge import merge_cores
-from p2gs_jax.districts.seams import measure_seams, unprojected
 from p2gs_jax.errors import UserError
+from p2gs_jax.jobs.blocks.seams import measure_seams, merge_cores, unprojected
 from p2gs_jax.render.harmonics import C0
 from p2gs_jax.scene.pixels.store import ImageStore
 
