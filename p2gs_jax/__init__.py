@@ -15,11 +15,12 @@ if TYPE_CHECKING:
     from p2gs_jax.config import FitConfig as FitConfig
     from p2gs_jax.config import RenderConfig as RenderConfig
     from p2gs_jax.config import preset as preset
-    from p2gs_jax.districts.fit import fit_blocks as fit_blocks
     from p2gs_jax.errors import DivergenceError as DivergenceError
     from p2gs_jax.errors import UserError as UserError
     from p2gs_jax.evaluation.alignment import exposure_error as exposure_error
     from p2gs_jax.evaluation.evaluate import evaluate as evaluate
+    from p2gs_jax.gaussians.population import Outcome as Outcome
+    from p2gs_jax.jobs.blocks.fit import fit_blocks as fit_blocks
     from p2gs_jax.jobs.configs import grid as grid
     from p2gs_jax.jobs.configs import read_sweep as read_sweep
     from p2gs_jax.jobs.configs import with_fields as with_fields
@@ -43,6 +44,8 @@ if TYPE_CHECKING:
     from p2gs_jax.run.write import write_run as write_run
     from p2gs_jax.scene import load_scene as load_scene
     from p2gs_jax.synth.write import write_street as write_street
+    from p2gs_jax.train.make_step import make_step as make_step
+    from p2gs_jax.train.terms import loss_terms as loss_terms
     from p2gs_jax.types import Camera as Camera
     from p2gs_jax.types import Gaussians as Gaussians
     from p2gs_jax.types import Params as Params

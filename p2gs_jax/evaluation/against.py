@@ -211,12 +211,6 @@ def score_foreign(
 ) -> tuple[dict[str, Any], float]:
     """Render and judge a model of display colours in all views of a scene.
 
-    Args:
-        gaussians: display colours.
-        scene: views and their splits.
-        store: photographs.
-        cfg: of a viewer of display colours.
-
     Returns:
         `test` and `train`, each with `as_it_is` and `exposure_fitted` (one gain on display values,
         solved from the photograph), as in `metrics.json`; and the median over the views of the

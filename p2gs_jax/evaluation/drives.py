@@ -18,10 +18,10 @@ from jaxtyping import Bool, Float, Float32
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.evaluation.passes import ArrayStore
 from p2gs_jax.evaluation.unexplained import Residuals, Surface, Unexplained, shares_by_view
-from p2gs_jax.render.warp import OPAQUE
+from p2gs_jax.render.warp import OPAQUE, project_points
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.rigid import interpolated, inverse, left_of_way
-from p2gs_jax.scene.visibility import project_points, unoccluded
+from p2gs_jax.scene.visibility import unoccluded
 from p2gs_jax.types import Camera, Lidar, Render, Scene, TrackedObject, View
 
 # Points within half a turn of a scanner at 10 Hz are the sweep of a view, seconds.
@@ -74,15 +74,10 @@ class DriveScores:
         depth: Float32[np.ndarray, "h w"],
         alpha: Float32[np.ndarray, "h w"],
     ) -> None:
-        """Take a view.
+        """Take a view by its row.
 
-        Args:
-            index: its row.
-            ldr: its render, under its own exposure or one fitted to the photograph.
-            photograph: display values.
-            mask: 1 = use.
-            depth: alpha-weighted camera z.
-            alpha: opacity.
+        `ldr` is its render, under its own exposure or one fitted to the photograph; the depth is
+        alpha-weighted camera z.
         """
         if self._scene.views[index].split == "train":
             K = self._store.camera(index)[1]

@@ -188,14 +188,10 @@ def lpips(
     target: Float[Array, "h w 3"],
     mask: Float[Array, "h w"],
 ) -> Float[Array, ""]:
-    """Return the distance of two images; 0 where they agree.
+    """Return the distance of a rendered image from a photograph, of display values in [0, 1].
 
-    Args:
-        weights: the network.
-        ldr: a rendered image, display values in [0, 1].
-        target: the photograph, display values in [0, 1].
-        mask: 1 = use; elsewhere the photograph takes the rendered image's place. The mean over the
-            image keeps those pixels, so that a masked area lowers the distance.
+    Where the mask is 0, the photograph takes the render's place. The mean over the image keeps
+    those pixels, so that a masked area lowers the distance.
 
     Raises:
         UserError: the images are too small for the network.

@@ -38,14 +38,7 @@ def pu21_encode(nits: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
 
 
 def pu21_psnr(linear, truth, mask: Bool[np.ndarray, "h w"], white: float) -> float:
-    """Return PSNR of PU21-encoded radiance, dB.
-
-    Args:
-        linear: recovered radiance, aligned.
-        truth: true radiance.
-        mask: which pixels count.
-        white: radiance shown as 100 cd/m^2.
-    """
+    """Return PSNR of PU21-encoded aligned radiance, dB; `white` is shown as 100 cd/m^2."""
     a, b = (pu21_encode(x / white * WHITE_NITS) for x in (linear, truth))
     mse = float(np.mean((a - b)[mask] ** 2)) if mask.any() else float("nan")
     return float(20 * np.log10(PU21_PEAK) - 10 * np.log10(max(mse, 1e-12)))
@@ -95,13 +88,8 @@ def mu_law_psnr(
     """Return PSNR of tone-mapped radiance, dB, as GaussHDR's code computes it for synthetic scenes.
 
     Both images are divided by the brightest true channel of the view. Its authors write both as
-    8-bit files first, which this does not. NaN where no pixel counts, or the truth is black.
-
-    Args:
-        linear: recovered radiance, aligned to the truth by one scale common to all views.
-        truth: true radiance.
-        mask: which pixels count.
-        mu: of the mu law.
+    8-bit files first, which this does not. `linear` is aligned to the truth by one scale common to
+    all views. NaN where no pixel counts, or the truth is black.
     """
     brightest = float(truth[mask].max()) if mask.any() else 0.0
     if brightest <= 0:

@@ -10,7 +10,7 @@ times, and against the usual one where no other photograph shows it.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -110,9 +110,7 @@ def regions(
 ) -> Bool[np.ndarray, "h w"]:
     """Return the regions that are surely wrong, without specks.
 
-    Args:
-        residual: from `residual_over_noise`.
-        usual: of the same surfaces at other times, 0 where unknown.
+    `usual` is the residual of the same surfaces at other times, 0 where unknown.
     """
     excess = residual > MORE_THAN_USUAL * usual
     possible = _morphology((residual > POSSIBLE) & excess, cv2.MORPH_CLOSE, GAP)
@@ -159,15 +157,10 @@ class Residuals:
         depth: Float32[np.ndarray, "h w"],
         K: Float32[np.ndarray, "3 3"],
     ) -> None:
-        """Take a view.
+        """Take a view by its row: its render under its own exposure, and its photograph.
 
-        Args:
-            index: row of the view.
-            render: under the view's own exposure, display values.
-            photograph: display values.
-            mask: 1 = use.
-            depth: of the surface, 0 where there is none (render/warp.py:surface_depth).
-            K: intrinsics at the size of the images.
+        The depth is that of the surface, 0 where there is none (render/warp.py:surface_depth); K is
+        for the size of the images.
         """
         height, width = mask.shape
         shrink = max(1.0, width / WIDTH)
@@ -184,25 +177,13 @@ class Residuals:
         residual, counted, surface = map(self._arrays.put, arrays)
         self._seen[index] = _Seen(size, residual, counted, surface, scaled)
 
-    def find(
-        self,
-        on_progress: Callable[[int, int], None] = lambda done, count: None,
-        *,
-        known_only: bool = False,
-    ) -> dict[int, Unexplained]:
-        """Return what is unexplained, by row of the view.
-
-        Args:
-            on_progress: views done, views in all.
-            known_only: nothing of surfaces that no other photograph shows.
-        """
-        unknown = np.inf if known_only else 0.0
+    def find(self) -> dict[int, Unexplained]:
+        """Return what is unexplained, by row of the view."""
         found = {}
-        for done, (index, others) in enumerate(self._compared()):
-            on_progress(done, len(self._seen))
+        for index, others in self._compared():
             seen = self._seen[index]
             residual, valid = seen.residual.read().astype(np.float32), seen.valid.read()
-            mask = regions(residual, self._usual(index, others, unknown)) & valid
+            mask = regions(residual, self._usual(index, others)) & valid
             found[index] = Unexplained(mask, float(mask.sum() / max(int(valid.sum()), 1)))
         return found
 
@@ -223,10 +204,8 @@ class Residuals:
                 there = [k + step for step in COMPARED if 0 <= k + step < len(rows)]
                 yield index, [rows[j] for j in there]
 
-    def _usual(
-        self, index: int, others: Sequence[int], unknown: float
-    ) -> Float32[np.ndarray, "h w"]:
-        """Return the median residual of a view's surfaces in others, or `unknown`."""
+    def _usual(self, index: int, others: Sequence[int]) -> Float32[np.ndarray, "h w"]:
+        """Return the median residual of a view's surfaces in others, 0 where unknown."""
         here = self._seen[index]
         values = np.full((len(others) + 1, *here.size[::-1]), np.nan, np.float32)
         for k, other in enumerate(others):
@@ -242,7 +221,7 @@ class Residuals:
                 there.valid.read().astype(np.uint8), xy[..., 0], xy[..., 1], cv2.INTER_NEAREST
             )
             values[k] = np.where(np.asarray(to.seen) & (counts > 0), carried, np.nan)
-        values[-1] = np.where(np.isnan(values[:-1]).all(0), unknown, np.nan)
+        values[-1] = np.where(np.isnan(values[:-1]).all(0), 0.0, np.nan)
         return np.nanmedian(values, axis=0)
 
     def _camera(self, index: int) -> Camera:

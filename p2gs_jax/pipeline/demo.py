@@ -14,8 +14,8 @@ from p2gs_jax.core.progress import Reporter
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.alignment import ExposureError, exposure_error
 from p2gs_jax.pipeline.fit import fit
-from p2gs_jax.synth.exposures import read_true_exposures
 from p2gs_jax.synth.rig import image_height
+from p2gs_jax.synth.sensor import read_true_exposures
 from p2gs_jax.synth.write import write_street
 
 
@@ -46,16 +46,10 @@ def run_demo(
     seed: int,
     reporter: Reporter,
 ) -> DemoResult:
-    """Make the street (unless it is there), fit it and compare the exposures.
+    """Make a street, fit it and compare the exposures.
 
-    Args:
-        out: `out/street` and `out/run` are written; an earlier run there is replaced.
-        cfg: options of the fit.
-        frames: per camera.
-        width: image width, pixels.
-        iso_std: standard deviation of the ISO about 8.
-        seed: of the street and its exposures.
-        reporter: receives progress.
+    `out/street` and `out/run` are written; an earlier demo there is replaced. The street has
+    `frames` per camera, pictures `width` pixels wide, and exposures of ISO `iso_std` about 8.
 
     Raises:
         UserError: `out` holds something that the demo did not make.

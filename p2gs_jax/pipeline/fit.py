@@ -20,7 +20,7 @@ from p2gs_jax.core.atomic import no_empty_folders
 from p2gs_jax.core.clock import CompileCounter, Stopwatch
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
-from p2gs_jax.photometry.appearance import exposures_apart
+from p2gs_jax.photometry.appearance import Formation, exposures_apart
 from p2gs_jax.photometry.calibrate import Selection
 from p2gs_jax.photometry.parameters import recentre
 from p2gs_jax.pipeline.exposures import kept_choice
@@ -34,7 +34,10 @@ from p2gs_jax.run.write import write_start
 from p2gs_jax.train.data_parallel import mesh_of
 from p2gs_jax.train.inputs import TrainingViews
 from p2gs_jax.train.loop import Trainer, TrainResult
+from p2gs_jax.train.make_step import AS_CONFIGURED, Own
 from p2gs_jax.train.step import StepPrograms
+from p2gs_jax.train.strategies import Strategy
+from p2gs_jax.train.terms import LossTerm
 from p2gs_jax.types import Params, Scene
 
 
@@ -70,6 +73,9 @@ def fit(
     true_exposures: Mapping[str, float] | None = None,
     spent_s: float = 0.0,
     devices: int | Literal["all"] = 1,
+    terms: Mapping[str, LossTerm | None] | None = None,
+    formation: Formation | None = None,
+    strategy: Strategy | None = None,
 ) -> FitResult:
     """Fit a scene and write a run folder.
 
@@ -84,6 +90,11 @@ def fit(
         spent_s: seconds of the budget that were gone before the call.
         devices: how many share the views of a step; with several, `train.batch` is a multiple of
             them.
+        terms: loss terms of yours, by name; as for `make_step`, and so are the next two. The run
+            folder does not remember them: `--resume` needs them again, and `load_run` shows
+            pictures through the tone curve of `cfg`.
+        formation: an image formation of yours.
+        strategy: a densification of yours.
 
     Raises:
         UserError: something the user can mend.
@@ -96,6 +107,7 @@ def fit(
     require_free(paths.run)
     weights = preflight(cfg, paths, resume=resume)
     mesh, clock, compiler = mesh_of(cfg, devices), Stopwatch(), CompileCounter()
+    own = Own(terms, formation, strategy)
     with no_empty_folders(paths.run), locked(paths.run) as lock, memory_named():
         check_run_dir(paths.run, resume, cfg)  # another may have ended since
         scene = _read(paths, cfg, reporter, clock)
@@ -106,7 +118,9 @@ def fit(
                 cfg,
                 reporter,
                 clock,
-                lambda known, curve: begin_programs(programs, known, folder, mesh, curve=curve),
+                lambda known, curve: begin_programs(
+                    programs, known, folder, mesh, curve=curve, own=own
+                ),
                 kept=kept_choice(cfg, folder) if resume else None,
                 pixels=folder.pixels,
             )
@@ -121,6 +135,7 @@ def fit(
                     mesh=mesh,
                     spent_s=time.monotonic() - begin,
                     reserve_s=seconds_to_finish(scene, cfg, weights, reference=truth is not None),
+                    own=own,
                 )
         params, owner = compact(result)
         params = centred(exposures_apart(params), cfg)
@@ -161,6 +176,7 @@ def trainer_of(
     programs: StepPrograms,
     reporter: Reporter | None = None,
     mesh: Mesh | None = None,
+    own: Own = AS_CONFIGURED,
 ) -> Trainer:
     """Return what runs the steps of a fit; its messages are noted in `start` as well."""
     reporter = reporter or Silent()
@@ -182,6 +198,8 @@ def trainer_of(
         on_log=reporter.log,
         on_message=say,
         mesh=mesh,
+        terms=own.terms,
+        strategy=own.strategy,
     )
 
 
@@ -195,6 +213,7 @@ def optimise(
     spent_s: float = 0.0,
     reserve_s: float = 0.0,
     mesh: Mesh | None = None,
+    own: Own = AS_CONFIGURED,
 ) -> TrainResult:
     """Run the optimisation, from the start or from the newest checkpoint.
 
@@ -207,22 +226,34 @@ def optimise(
         spent_s: seconds of the budget that are already gone.
         reserve_s: seconds of the budget to keep for evaluation and files.
         mesh: the devices of a step of several views; None: the default one.
+        own: what the caller of `fit` brought.
     """
     alive = np.ones(start.params.gaussians.capacity, bool)
-    return trainer_of(start, folder, programs, reporter, mesh).run(
-        start.params, alive, start.owner, resume=resume, spent_s=spent_s, finish_s=reserve_s
+    return trainer_of(start, folder, programs, reporter, mesh, own).run(
+        own.among(start.params),
+        alive,
+        start.owner,
+        resume=resume,
+        spent_s=spent_s,
+        finish_s=reserve_s,
     )
 
 
 def begin_programs(
-    programs: StepPrograms, known: Prepared, folder: RunFolder, mesh: Mesh | None, *, curve: bool
+    programs: StepPrograms,
+    known: Prepared,
+    folder: RunFolder,
+    mesh: Mesh | None,
+    *,
+    curve: bool,
+    own: Own = AS_CONFIGURED,
 ) -> None:
     """Begin to compile steps while the exposures are solved, mostly on one core.
 
     With `curve`, the tone curve of what is known is chosen.
     """
-    trainer = trainer_of(known, folder, programs, mesh=mesh)
-    trainer.expect(known.params, known.owner, curve)
+    trainer = trainer_of(known, folder, programs, mesh=mesh, own=own)
+    trainer.expect(own.among(known.params), known.owner, curve)
 
 
 def compact(result: TrainResult) -> tuple[Params, np.ndarray | None]:

@@ -97,11 +97,9 @@ class Decisions:
         return cfg
 
     def require_same(self, saved: dict[str, Any], folder: Path) -> None:
-        """Refuse to continue a run whose scene decides otherwise than it did; reasons may differ.
+        """Refuse to continue a run whose checkpoints, in `folder`, have other decisions.
 
-        Args:
-            saved: decisions in the checkpoint.
-            folder: where the checkpoints lie.
+        Reasons may differ.
 
         Raises:
             UserError: a decision differs.

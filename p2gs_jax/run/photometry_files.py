@@ -41,26 +41,7 @@ _OPTIONAL = frozenset(
 
 
 class ViewPhotometry(TypedDict):
-    """One view.
-
-    Attributes:
-        image: name in the scene.
-        camera: physical camera.
-        exposure: e > 0, or null for a held-out view, which has none.
-        exposure_ev: log2 of it.
-        gamma: gamma, or null.
-        exif_ev: log2(t ISO / N^2) from EXIF, or null.
-        split: train or test.
-        exposure_fitted: for a held-out view, the scalar solved from its photograph.
-        exposure_unknown: true where the photograph is black or saturated everywhere.
-        exposure_ev_error: standard error of `exposure_ev` from the bundle adjustment, or null.
-        gamma_error: standard error of `gamma`, or null.
-        exposure_ev_start: `exposure_ev` before the first step, where a bundle adjustment gave it.
-        observations: usable observations of shared points that it had in this view.
-        white_balance: factors on red, green and blue beside the exposure, of geometric mean 1; null
-            where it is not modelled, and of a held-out view.
-        white_balance_ev_error: standard errors of their log2 from the bundle adjustment, or null.
-    """
+    """One view; docs/files.md says what each number is, and where it is null."""
 
     image: str
     camera: str
@@ -80,16 +61,7 @@ class ViewPhotometry(TypedDict):
 
 
 class CameraPhotometry(TypedDict):
-    """What one physical camera does besides; rows are one for all channels, or one for each.
-
-    Attributes:
-        name: as `camera` of its views.
-        vignetting: rows of k1, k2, k3 in log V(r) = k1 r^2 + k2 r^4 + k3 r^6, with r = 1 in the
-            corners; null: none.
-        corner: V in the corners, of every row, or null.
-        corner_ev_error: standard errors of their log2 from the bundle adjustment, or null.
-        splines: rows of a response of its own, as `curve.spline`; null: that one.
-    """
+    """What one physical camera does besides; rows are one for all channels, or one for each."""
 
     name: str
     vignetting: list[list[float]] | None
@@ -238,6 +210,23 @@ def write_fitted(
     )
 
 
+def _row(view: View, split: str, values: Sequence[float | None]) -> ViewPhotometry:
+    """Return the row of a view: exposure, its logarithm and gamma, and what everything has."""
+    exposure, ev, gamma = (None if v is None else float(v) for v in values)
+    return {
+        "image": view.name,
+        "camera": view.camera,
+        "exposure": exposure,
+        "exposure_ev": ev,
+        "gamma": gamma,
+        "exif_ev": view.exif_ev,
+        "split": split,
+        "exposure_fitted": None,
+        "white_balance": None,
+        "white_balance_ev_error": None,
+    }
+
+
 def _fitted_rows(
     params: Params,
     scene: Scene,
@@ -247,29 +236,22 @@ def _fitted_rows(
 ) -> list[ViewPhotometry]:
     """Return the `views` of a fit; held-out views have no exposure of their own."""
     taken: Photometry = jax.tree.map(np.asarray, params.photometry)
-    exposures, gammas, balances = taken.exposures, taken.gammas, taken.white_balance
     rows = {index: k for k, index in enumerate(scene.train_indices)}
     out: list[ViewPhotometry] = []
     for index, view in enumerate(scene.views):
         k = rows.get(index)
-        e = None if k is None else float(exposures[k])
-        balance = None if k is None or balances is None else np.exp(balances[k]).tolist()
-        row: ViewPhotometry = {
-            "image": view.name,
-            "camera": view.camera,
-            "exposure": e,
-            "exposure_ev": None if e is None else float(np.log2(e)),
-            "gamma": None if k is None else float(gammas[k]),
-            "exif_ev": view.exif_ev,
-            "split": view.split,
-            "exposure_fitted": fitted.get(index),
-            "white_balance": balance,
-            "white_balance_ev_error": None,
-        }
+        own = (None, None, None)
+        if k is not None:
+            e = taken.exposures[k]
+            own = (e, np.log2(float(e)), taken.gammas[k])
+        row = _row(view, view.split, own)
+        row["exposure_fitted"] = fitted.get(index)
+        if k is not None and taken.white_balance is not None:
+            row["white_balance"] = np.exp(taken.white_balance[k]).tolist()
         if view.name in unknown:
             row["exposure_unknown"] = True
         if k is not None and solution is not None and np.isfinite(solution.exposure_errors[k]):
-            row["exposure_ev_error"] = float(solution.exposure_errors[k] / LN2)
+            row["exposure_ev_error"] = float(solution.exposure_errors_ev[k])
             row["gamma_error"] = float(solution.gamma_errors[k])
             row["exposure_ev_start"] = float(solution.exposures_ev[k])
             row["observations"] = int(solution.observations_per_view[k])
@@ -288,43 +270,18 @@ def write_solution(
 ) -> None:
     """Write `photometry.json` of a bundle adjustment; views it knows nothing about get nulls.
 
-    Args:
-        path: of the file.
-        solution: exposures, gammas, response.
-        views: its views, in order.
-        pivot: linear value that gammas leave alone.
-        gauge: what fixes the scale, in words.
+    `pivot` is the linear value that gammas leave alone, and `gauge` says what fixes the scale.
     """
-    s = solution
+    s, rows = solution, []
     seen = np.isfinite(s.exposure_errors)
     e = np.exp(s.log_exposures[seen])
-    rows: list[ViewPhotometry] = []
     for i, view in enumerate(views):
-        values = (
-            np.exp(s.log_exposures[i]),
-            s.exposures_ev[i],
-            s.exposure_errors[i] / LN2,
-            s.gammas[i],
-            s.gamma_errors[i],
-        )
-        exposure, ev, ev_error, gamma, gamma_error = (float(v) if seen[i] else None for v in values)
-        balance, balance_error = _balance(s, i)
-        rows.append(
-            {
-                "image": view.name,
-                "camera": view.camera,
-                "exposure": exposure,
-                "exposure_ev": ev,
-                "exposure_ev_error": ev_error,
-                "gamma": gamma,
-                "gamma_error": gamma_error,
-                "exif_ev": view.exif_ev,
-                "split": "train",
-                "exposure_fitted": None,
-                "white_balance": balance,
-                "white_balance_ev_error": balance_error,
-            }
-        )
+        values = (np.exp(s.log_exposures[i]), s.exposures_ev[i], s.gammas[i])
+        row = _row(view, "train", values if seen[i] else (None, None, None))
+        row["exposure_ev_error"] = float(s.exposure_errors_ev[i]) if seen[i] else None
+        row["gamma_error"] = float(s.gamma_errors[i]) if seen[i] else None
+        row["white_balance"], row["white_balance_ev_error"] = _balance(s, i)
+        rows.append(row)
     write_photometry(
         path,
         model=s.model,

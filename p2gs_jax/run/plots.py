@@ -58,16 +58,8 @@ def write_summary(
 ) -> None:
     """Draw photographs, re-exposed renders, common-exposure renders, and exposures over views.
 
-    Args:
-        path: of the PNG.
-        photographs: one per column.
-        rendered: the same views with their own exposure.
-        linear_tonemapped: the same views under one exposure.
-        names: of the columns.
-        exposures_ev: recovered, per training view, in stops.
-        cameras: physical camera of each training view.
-        true_ev: truth in stops up to a constant, NaN where it is not known.
-        exif_ev: from EXIF, likewise.
+    Photographs and renders have a column for each of some views. Exposures and cameras are those of
+    the training views; true ones and EXIF's are stops up to a constant, NaN where unknown.
     """
     # Imported here: it takes as long to load as a small scene to read.
     from matplotlib.figure import Figure
@@ -179,12 +171,8 @@ def write_calibration_plot(
 ) -> None:
     """Draw exposures with error bars, residuals, and tone curves of a calibration.
 
-    Args:
-        path: of the PNG.
-        solution: exposures, gammas, response and residuals.
-        cameras: physical camera of each view.
-        stated_ev: EXIF or a file, stops, laid over the recovered ones; NaN where unknown.
-        pivot: linear value that gammas leave alone.
+    Stated exposures (EXIF or a file) are laid over the recovered ones, NaN where unknown; `pivot`
+    is the linear value that gammas leave alone.
     """
     # Imported here: it takes as long to load as a small scene to read.
     from matplotlib.figure import Figure
@@ -265,11 +253,7 @@ def write_unexplained(
 ) -> None:
     """Write photographs of a drive with the pixels marked that no static scene explains.
 
-    Args:
-        folder: receives them, under the names of the views; what lies there is removed.
-        scene: its views.
-        store: photographs.
-        found: by row of the view.
+    They lie under the names of the views; what lies in the folder is removed.
     """
     shutil.rmtree(folder, ignore_errors=True)
     for row in worst_rows(scene, found):

@@ -92,10 +92,8 @@ class Run:
     def render(self, camera: Camera, time: float | None = None) -> Render:
         """Return linear radiance, opacity and depth that a camera sees.
 
-        Args:
-            camera: of a view, or one's own (`make_camera`).
-            time: seconds; what moves is shown where it was then. None: where the camera says; one's
-                own says nothing and shows nothing that moves.
+        What moves is shown where it was at `time`, seconds; None: where the camera says. A camera
+        of one's own (`make_camera`) says nothing and shows nothing that moves.
         """
         if time is not None and self.moving is not None:
             placement = self.moving.placement(np.asarray(camera.viewmat), time)
@@ -150,8 +148,7 @@ class Run:
     def as_of(self, time: float | None = None) -> Gaussians:
         """Return all Gaussians in world coordinates, for programs that know no motion.
 
-        Args:
-            time: what moves is where it was then, seconds; None: the middle of the drive.
+        What moves is where it was at `time`, seconds; None: in the middle of the drive.
         """
         if self.owner is None or self.moving is None:
             return self.params.gaussians
@@ -215,8 +212,7 @@ class Run:
     def common_display(self, exposure_ev: float = 0.0) -> DisplayTransform:
         """Return one look for all views: of no camera in particular, without vignetting.
 
-        Args:
-            exposure_ev: stops from the geometric mean of the training views' exposures.
+        Its exposure is in stops from the geometric mean of the training views' exposures.
         """
         usual = self._usual(None)
         return replace(usual, exposure=usual.exposure * 2**exposure_ev)
@@ -254,13 +250,10 @@ class Run:
     def metered_display(
         self, rendered: Render, of: ExposureOf = "auto", exposure_ev: float = 0.0
     ) -> DisplayTransform:
-        """Return the display transform of a new picture, with its exposure metered.
+        """Return the display transform of a new picture (`render`), with its exposure metered.
 
-        Args:
-            rendered: the picture, from `render`.
-            of: `auto`: as the camera that took the photographs would have chosen, where a rule
-                explains it, else the mean; or a given rule.
-            exposure_ev: stops more than that.
+        `of` says how: `auto`: as the camera that took the photographs would have chosen, where a
+        rule explains it, else the mean; or a given rule. `exposure_ev` is added, stops.
         """
         readings = meter(np.asarray(rendered.linear), np.asarray(rendered.alpha))
         exposure = self.metering.exposure(readings, of) * 2**exposure_ev

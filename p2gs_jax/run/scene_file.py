@@ -26,29 +26,20 @@ from p2gs_jax.types import Distortion, Lidar, Scene, TrackedObject, Tracks, View
 SCENE_FILE = "scene.npz"
 # Folder of a run in which developed photographs lie.
 CACHE = "cache"
+# Fields that are kept in JSON as they are.
+_OF_SCENES = ("format", "notes", "origin", "split_by", "random_seeds", "known_response")
+_OF_VIEWS = ("name", "camera", "split", "exif_ev", "frame", "time", "alpha")
+_OF_OBJECTS = ("name", "label", "size", "moving")
 
 
 def write_scene(folder: Path, scene: Scene) -> None:
-    """Write what a run must know of its scene.
-
-    Args:
-        folder: the run folder.
-        scene: as it was read.
-    """
+    """Write into a run folder what the run must know of its scene."""
     base = _base(scene.root)
     own_cars = {v.camera: v.own_car for v in scene.views if v.own_car is not None}
     table = {
-        "format": scene.format,
-        "notes": scene.notes,
+        **{name: getattr(scene, name) for name in _OF_SCENES},
         "views": [_view_row(view, folder, base) for view in scene.views],
-        "objects": [
-            {"name": o.name, "label": o.label, "size": o.size, "moving": o.moving}
-            for o in scene.objects
-        ],
-        "origin": scene.origin,
-        "split_by": scene.split_by,
-        "random_seeds": scene.random_seeds,
-        "known_response": scene.known_response,
+        "objects": [{name: getattr(o, name) for name in _OF_OBJECTS} for o in scene.objects],
         "own_cars": list(own_cars),
     }
     arrays = {
@@ -77,28 +68,19 @@ def write_scene(folder: Path, scene: Scene) -> None:
 
 def _view_row(view: View, folder: Path, base: Path) -> dict[str, Any]:
     in_run = view.image_path.resolve().is_relative_to((folder / CACHE).resolve())
+    lens = view.distortion
     return {
-        "name": view.name,
-        "camera": view.camera,
-        "split": view.split,
-        "exif_ev": view.exif_ev,
+        **{name: getattr(view, name) for name in _OF_VIEWS},
         "image": _relative(view.image_path, folder if in_run else base),
         "in_run": in_run,
         "mask": None if view.mask_path is None else _relative(view.mask_path, base),
-        "distortion": None if view.distortion is None else view.distortion.coefficients,
-        "lens": None if view.distortion is None else view.distortion.model,
-        "frame": view.frame,
-        "time": view.time,
-        "alpha": view.alpha,
+        "distortion": None if lens is None else lens.coefficients,
+        "lens": None if lens is None else lens.model,
     }
 
 
 def read_scene(folder: Path, root: Path) -> Scene:
-    """Return the scene of a run.
-
-    Args:
-        folder: the run folder.
-        root: the scene's folder now; it need not exist.
+    """Return the scene of a run folder; its own folder, `root`, need not exist any more.
 
     Raises:
         UserError: the file is missing or broken.
@@ -125,9 +107,8 @@ def _scene_from(a: Mapping[str, np.ndarray], table: dict, folder: Path, root: Pa
     own_cars = {camera: a[f"own_car_{k}"] for k, camera in enumerate(table["own_cars"])}
     views = tuple(
         View(
-            name=v["name"],
+            **{name: v[name] for name in _OF_VIEWS},
             image_path=(folder if v["in_run"] else base) / v["image"],
-            camera=v["camera"],
             viewmat=a["viewmats"][i],
             K=a["Ks"][i],
             width=int(a["sizes"][i, 0]),
@@ -136,23 +117,15 @@ def _scene_from(a: Mapping[str, np.ndarray], table: dict, folder: Path, root: Pa
             if v["distortion"] is None
             else Distortion(tuple(v["distortion"]), v["lens"]),
             mask_path=None if v["mask"] is None else base / v["mask"],
-            exif_ev=v["exif_ev"],
-            split=v["split"],
-            frame=v["frame"],
-            time=v["time"],
             own_car=own_cars.get(v["camera"]),
-            alpha=v["alpha"],
         )
         for i, v in enumerate(table["views"])
     )
     objects = tuple(
         TrackedObject(
-            name=thing["name"],
-            label=thing["label"],
-            size=tuple(thing["size"]),
+            **{**{name: thing[name] for name in _OF_OBJECTS}, "size": tuple(thing["size"])},
             times=a[f"object_{row}_times"],
             poses=a[f"object_{row}_poses"],
-            moving=thing["moving"],
         )
         for row, thing in enumerate(table["objects"])
     )
@@ -161,20 +134,17 @@ def _scene_from(a: Mapping[str, np.ndarray], table: dict, folder: Path, root: Pa
         tracks = Tracks(a["track_views"], a["track_points"], a["track_xy"])
     if "lidar_points" in a:
         lidar = Lidar(a["lidar_points"], a["lidar_times"], a["lidar_objects"])
+    kept = {name: table[name] for name in _OF_SCENES}
+    kept |= {"notes": tuple(kept["notes"]), "origin": tuple(kept["origin"])}
     return Scene(
+        **kept,
         root=root,
-        format=table["format"],
         views=views,
         points=a["points"],
         point_colors=a.get("point_colors"),
         tracks=tracks,
-        notes=tuple(table["notes"]),
         objects=objects,
         lidar=lidar,
-        origin=tuple(table["origin"]),
-        split_by=table["split_by"],
-        random_seeds=table["random_seeds"],
-        known_response=table["known_response"],
     )
 
 
@@ -207,13 +177,9 @@ def _relative(path: Path, base: Path) -> str:
 def write_objects(
     path: Path, owner: Int[np.ndarray, " n"] | None, moving: MovingObjects, scene: Scene
 ) -> None:
-    """Write the owners of a run's Gaussians.
+    """Write the owner of each Gaussian, a row of `moving`, -1: none; None: nothing has a box.
 
-    Args:
-        path: of the file.
-        owner: of each Gaussian, a row of `moving`, -1: none; None: nothing has a box.
-        moving: some of the scene's objects.
-        scene: with all of them.
+    `moving` has some of the scene's objects.
     """
     rows = [
         next(row for row, other in enumerate(scene.objects) if other is thing)
@@ -232,12 +198,7 @@ def write_objects(
 def read_objects(
     path: Path, scene: Scene, count: int
 ) -> tuple[Int[np.ndarray, " n"] | None, MovingObjects | None]:
-    """Return what `write_objects` wrote; None where nothing moves.
-
-    Args:
-        path: of the file.
-        scene: of the run.
-        count: of its Gaussians.
+    """Return what `write_objects` wrote for `count` Gaussians; None where nothing moves.
 
     Raises:
         UserError: the file is broken, or belongs to another run.

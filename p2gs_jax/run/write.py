@@ -43,15 +43,7 @@ def write_start(
     cfg: FitConfig,
     decisions: Decisions,
 ) -> None:
-    """Write what was asked and what was decided: the folder is a run's from here on.
-
-    Args:
-        folder: of the run.
-        scene: folder or file that is fitted.
-        reference: photographs of the same views under one common exposure, or None.
-        cfg: as asked.
-        decisions: of the scene.
-    """
+    """Write what was asked and what was decided: the folder is a run's from here on."""
     write_decisions(folder.decisions, decisions)
     write_json(
         folder.config,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -43,35 +44,50 @@ from p2gs_jax.types import Batch, Camera, Gaussians, Params, Photometry
 PIXELS = 640 * 480
 
 
+class Own(NamedTuple):
+    """What a caller brings to a fit, in the place of what its configuration says; see `make_step`.
+
+    Attributes:
+        terms: loss terms by name.
+        formation: an image formation, or None.
+        strategy: a densification, or None.
+    """
+
+    terms: Mapping[str, LossTerm | None] | None = None
+    formation: Formation | None = None
+    strategy: Strategy | None = None
+
+    def among(self, params: Params) -> Params:
+        """Return parameters with those of the formation, if there is one."""
+        if self.formation is None:
+            return params
+        return dataclasses.replace(params, appearance=jax.tree.map(on_device, self.formation))
+
+
+AS_CONFIGURED = Own()
+
+
 class TrainingStep:
     """A step of a view, and a densification; made by `make_step`.
 
     Tile lists get room when a view of a new size comes, and more where one overflows.
     """
 
-    def __init__(
-        self,
-        cfg: FitConfig,
-        terms: Mapping[str, LossTerm | None],
-        formation: Formation | None,
-        strategy: Strategy | None,
-        extent: float,
-    ):
-        self.cfg, self.extent = cfg, extent
-        self.formation = None if formation is None else jax.tree.map(on_device, formation)
+    def __init__(self, cfg: FitConfig, own: Own, extent: float):
+        self.cfg, self.extent, self.own = cfg, extent, own
         chosen = strategies.make_strategy(cfg, Coverage(PIXELS, 1.0), ((1.0, 1),))
-        self.strategy = strategy or chosen
+        self.strategy = own.strategy or chosen
         self.optimizer = make_optimizer(cfg)
         noise = getattr(self.strategy, "noise", None)
-        self._step = Step(cfg, self.optimizer, extent, noise, terms)
+        self._step = Step(cfg, self.optimizer, extent, noise, own.terms or {})
         self._host = HostState(pace=1.0 / max(cfg.train.steps, 1))
         self._rooms: dict[tuple[int, int], Room] = {}
 
     def start(self, gaussians: Gaussians, photometry: Photometry) -> FitState:
         """Return the state before the first step; the Gaussians are the seeds."""
         self._slots = strategies.started(self.strategy, gaussians.capacity)
-        params = Params(gaussians, photometry, self.formation)
-        alive = np.ones(gaussians.capacity, bool)
+        params = self.own.among(Params(gaussians, photometry))
+        alive = jnp.ones(gaussians.capacity, bool)
         return initial_state(params, alive, self.optimizer, self._slots.slots)
 
     def __call__(
@@ -102,9 +118,10 @@ class TrainingStep:
         batch = Batch(camera, jnp.asarray(photograph), mask, jnp.int32(view))
         controls = controls_at(progress, self._host.pace, 1.0, cfg)
         if size not in self._rooms:
-            given = jax.tree.map(np.asarray, (state.params.gaussians, state.population.alive))
-            seen = jax.tree.map(np.asarray, camera)
-            self._rooms[size] = room_for(*given, [seen], self._slots.most, cfg.render)
+            given = (state.params.gaussians, state.population.alive, camera)
+            gaussians, alive, seen = jax.tree.map(np.asarray, given)
+            most = self._slots.most
+            self._rooms[size] = room_for(gaussians, alive, [seen], most, cfg.render)
         while True:
             state, report = self._step(
                 state,
@@ -161,4 +178,4 @@ def make_step(
             now)`; see `train/strategies.py`.
         extent: of the scene, scene units: rates of the means are shares of it.
     """
-    return TrainingStep(cfg, terms or {}, formation, strategy, extent)
+    return TrainingStep(cfg, Own(terms, formation, strategy), extent)

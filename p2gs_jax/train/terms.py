@@ -161,8 +161,8 @@ def loss_terms(
         found["appearance"] = Term(
             _appearance, loss.regularizers.appearance, (photometry.appearance,)
         )
-    found |= changed or {}
-    return {name: term for name, term in found.items() if term is not None}
+    everything: dict[str, LossTerm | None] = {**found, **(changed or {})}
+    return {name: term for name, term in everything.items() if term is not None}
 
 
 # ------------------------------------------------------------- photographs against renders

@@ -139,13 +139,11 @@ def advance(
     healthy = is_healthy(state, gradient, fits)
     progress, rate = controls.progress, controls.rate
     rates = learning_rates(progress, rate, extent, state.params, cfg, bands)
-    add_noise = None
-    if noise is not None:
-        key = noise_key(controls.seed, state.step)
-        noise_rate = noise * means_rate(progress, rate, extent, cfg)
+    key = noise_key(controls.seed, state.step)
+    noise_rate = (noise or 0.0) * means_rate(progress, rate, extent, cfg)
 
-        def add_noise(block, _, moved, on):
-            return exploration_noise(jax.random.fold_in(key, block), moved, on, noise_rate)
+    def exploring(block, _, moved, on):
+        return exploration_noise(jax.random.fold_in(key, block), moved, on, noise_rate)
 
     updated = update_listed(
         gaussians,
@@ -161,7 +159,7 @@ def advance(
         v_seen=gradient.v_shown,
         adam=optimizer.gaussians,
         rates=rates.gaussians,
-        noise=add_noise,
+        noise=None if noise is None else exploring,
         owner=population.owner,
     )
     if noise is None:
