@@ -7,9 +7,9 @@ import jax
 import numpy as np
 import pytest
 
-from p2gs_jax.config import preset
 from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
 from p2gs_jax.photometry.response import KNOTS
+from p2gs_jax.presets import preset
 
 SRGB = preset("robust").photometry
 SPLINE = tuple(0.2 * np.sin(4 * KNOTS))
