@@ -319,14 +319,3 @@ def gap(case: HardCase, cfg: RenderConfig, oracle=None) -> Gap:
         finite=all(bool(np.all(np.isfinite(a))) for a in leaves),
         silent=not any(np.any(a) for a in leaves),
     )
-
-
-def table(gaps: dict[str, Gap]) -> tuple[list[str], list[list[str]]]:
-    """Return header and rows: what must happen, and how far float32 is from float64."""
-    rows = []
-    for case in CASES:
-        g = gaps[case.name]
-        values = "zero" if g.silent else "finite" if g.finite else "NOT FINITE"
-        numbers = f"{g.value:.1e}", f"{g.gradient:.1e}", str(g.undecided)
-        rows.append([f"{case.name}: {case.expect}", *numbers, values])
-    return ["case", "image", "gradient", "undecided pairs", "values"], rows

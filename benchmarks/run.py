@@ -1,11 +1,11 @@
-"""Measure the renderer: milliseconds against error, levels of a fit, hard cases.
+"""Measure the renderer: milliseconds against error, and the levels of a fit.
 
 python benchmarks/run.py --quick
 python benchmarks/run.py speed_error levels --quick --baseline experiments/bench/baseline.json
 python benchmarks/run.py levels --set chunk=32 --out runs/bench
 
-Tables go to OUT/bench.md, figures to OUT/bench.json. The exit code is 1 where `speed_error` or
-`levels` is worse than the baseline allows, 2 where the arguments are wrong.
+Tables go to OUT/bench.md, figures to OUT/bench.json. The exit code is 1 where something is worse
+than the baseline allows, 2 where the arguments are wrong. `hard_cases` is what the tests share.
 """
 
 from __future__ import annotations
@@ -24,16 +24,14 @@ import jax
 # Benchmarks find each other however they are started.
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks import gate, hard_cases, levels, speed_error
+from benchmarks import gate, levels, speed_error
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.atomic import write_json, write_text
 from p2gs_jax.core.progress import TerminalReporter
 from p2gs_jax.errors import UserError
 from p2gs_jax.presets import preset
 
-PARTS = ("speed_error", "levels", "hard_cases")
-# What a baseline holds.
-GATED = PARTS[:2]
+PARTS = ("speed_error", "levels")
 
 
 def stamp() -> dict:
@@ -106,13 +104,6 @@ def run(options: argparse.Namespace, on_progress) -> tuple[str, list[str]]:
             return rows | levels.gate_rows(of_levels([k for k in names if k in fits]))
 
         complaints = gate.settle(options.baseline, gated, anew)
-    if "hard_cases" in parts:
-        gaps = {}
-        for i, case in enumerate(hard_cases.CASES):
-            on_progress("hard cases", i, len(hard_cases.CASES))
-            gaps[case.name] = hard_cases.gap(case, hard_cases.CONFIG)
-        sections.append(_section("Hard cases against float64", *hard_cases.table(gaps)))
-        data["hard_cases"] = {k: g._asdict() for k, g in gaps.items()}
     text = "\n\n".join(sections) + "\n"
     write_text(options.out / "bench.md", text)
     write_json(options.out / "bench.json", data)
@@ -151,11 +142,8 @@ def options_of(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     options = parser.parse_args(arguments)
     if unknown := set(options.parts) - set(PARTS):
         parser.error(f"there is no part {unknown.pop()!r}; choose {', '.join(PARTS)}")
-    if options.baseline or options.write_baseline:
-        if options.parts and not set(GATED) & set(options.parts):
-            parser.error(f"a baseline concerns {' and '.join(GATED)}: name one of these as well")
-        if options.baseline and not options.baseline.is_file():
-            parser.error(f"there is no file {options.baseline}: make one with --write-baseline")
+    if options.baseline and not options.baseline.is_file():
+        parser.error(f"there is no file {options.baseline}: make one with --write-baseline")
     return options
 
 

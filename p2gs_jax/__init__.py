@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from p2gs_jax.config import FitConfig as FitConfig
     from p2gs_jax.config import RenderConfig as RenderConfig
-    from p2gs_jax.districts.fit import fit_blocks as fit_blocks
     from p2gs_jax.errors import DivergenceError as DivergenceError
     from p2gs_jax.errors import UserError as UserError
     from p2gs_jax.evaluation.alignment import exposure_error as exposure_error
     from p2gs_jax.evaluation.evaluate import evaluate as evaluate
     from p2gs_jax.gaussians.population import Outcome as Outcome
+    from p2gs_jax.jobs.blocks.fit import fit_blocks as fit_blocks
     from p2gs_jax.jobs.configs import grid as grid
     from p2gs_jax.jobs.configs import read_sweep as read_sweep
     from p2gs_jax.jobs.configs import with_fields as with_fields

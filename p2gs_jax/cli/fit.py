@@ -88,7 +88,7 @@ class Fit:
 
         from p2gs_jax.cli.tables import print_metrics
         from p2gs_jax.core.progress import TerminalReporter
-        from p2gs_jax.districts.fit import fit_blocks
+        from p2gs_jax.jobs.blocks.fit import fit_blocks
         from p2gs_jax.jobs.table import JobsTable
 
         console = Console(stderr=True, highlight=False)

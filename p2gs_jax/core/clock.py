@@ -82,7 +82,6 @@ class CompileCounter:
     """
 
     def __init__(self):
-        _listen()
         self._begin = _totals()
 
     @property
@@ -103,24 +102,13 @@ class CompileCounter:
 
 _lock = threading.Lock()
 _sums = [0.0, 0.0, 0.0]
-_listening = False
 
 
 def _totals() -> tuple[float, float, float]:
-    """Return (programs, seconds, programs read back) since listening began."""
+    """Return (programs, seconds, programs read back) since this module was loaded."""
     with _lock:
         programs, seconds, read_back = _sums
     return programs, seconds, read_back
-
-
-def _listen() -> None:
-    global _listening
-    with _lock:
-        if _listening:
-            return
-        _listening = True
-    monitoring.register_event_duration_secs_listener(_on_duration)
-    monitoring.register_event_listener(_on_event)
 
 
 def _on_duration(event: str, duration_secs: float, **_) -> None:
@@ -134,3 +122,7 @@ def _on_event(event: str, **_) -> None:
     if event == _READ_BACK:
         with _lock:
             _sums[2] += 1
+
+
+monitoring.register_event_duration_secs_listener(_on_duration)
+monitoring.register_event_listener(_on_event)

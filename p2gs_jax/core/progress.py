@@ -6,7 +6,7 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.live import Live
@@ -55,42 +55,24 @@ class LogRecord:
 
     def summary(self) -> str:
         """Return where the run is, as text."""
-        parts = [
-            f"step {self.step}",
-            f"PSNR {self.psnr:.2f} dB",
-            f"{self.gaussians} Gaussians",
-            *([] if self.left_s is None else [f"{clock(self.left_s)} left"]),
-        ]
-        return ", ".join(parts)
+        left = "" if self.left_s is None else f", {clock(self.left_s)} left"
+        return f"step {self.step}, PSNR {self.psnr:.2f} dB, {self.gaussians} Gaussians{left}"
 
 
-class Reporter(Protocol):
-    """Receives the progress and the messages of a fit."""
+class Reporter:
+    """Receives the progress and the messages of a fit; this one ignores them."""
 
     def message(self, text: str) -> None:
         """Say something the user must know."""
-        ...
 
     def stage(self, name: str, done: int = 0, total: int = 0) -> None:
         """Begin or advance a stage."""
-        ...
 
     def log(self, record: LogRecord) -> None:
         """Show the state of the optimisation."""
-        ...
 
 
-class Silent:
-    """A reporter that says nothing."""
-
-    def message(self, text: str) -> None:
-        """Ignore."""
-
-    def stage(self, name: str, done: int = 0, total: int = 0) -> None:
-        """Ignore."""
-
-    def log(self, record: LogRecord) -> None:
-        """Ignore."""
+Silent = Reporter
 
 
 def clock(seconds: float) -> str:
@@ -100,7 +82,7 @@ def clock(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
-class TerminalReporter:
+class TerminalReporter(Reporter):
     """Messages as lines; progress as one live line in a terminal, elsewhere as a line now and then.
 
     Use as a context manager.

@@ -22,49 +22,29 @@ from jaxtyping import Array, Int, PRNGKeyArray, UInt32
 class Stream(IntEnum):
     """What a fit draws on the host, beside the order of its views."""
 
-    PARTNER = 1
-    """Second view of a step."""
-    STEP_PAIRS = 2
-    """Track observations that a step compares."""
+    PARTNER = 1  # second view of a step
+    STEP_PAIRS = 2  # track observations that a step compares
     START_EXPOSURES = 3
-    COMPARED_POINTS = 5
-    """Points whose observations choose the photometric model."""
-    HELD_OUT = 7
-    """Observations that judge it."""
-    COLOR_PAIRS = 11
-    """Track observations that steps draw from."""
+    COMPARED_POINTS = 5  # points whose observations choose the photometric model
+    HELD_OUT = 7  # observations that judge it
+    COLOR_PAIRS = 11  # track observations that steps draw from
     STACK_PIXELS = 13
-    SURFACE_COLORS = 17
-    """Points without tracks, and the views they are sampled in."""
-    SOLVED_POINTS = 19
-    """Points that exposures are solved from."""
-    MATCHED_PIXELS = 23
-    """Pixels of a view that may become dense seeds."""
+    SURFACE_COLORS = 17  # points without tracks, and the views they are sampled in
+    SOLVED_POINTS = 19  # points that exposures are solved from
+    MATCHED_PIXELS = 23  # pixels of a view that may become dense seeds
     DENSE_SEEDS = 29
-    SEED_POINTS = 31
-    """Points of the scene that start as Gaussians."""
-    SEED_GAUSSIANS = 37
-    """Of these and the shell's, those that are kept."""
-    SHARED_POINTS = 41
-    """Points that tell which views to match."""
-    RENDERED_PIXELS = 43
-    """Pixels of a fit that are looked for in other views."""
-    LIDAR = 53
-    """Laser measurements that are kept."""
-    MEASURED_DEPTHS = 59
-    """Laser measurements that a view is compared with."""
-    PLAN_POINTS = 61
-    """Points that a plan from above shows."""
-    RANDOM_SEEDS = 67
-    """Seeds of scenes without points and matches."""
-    BACKDROP = 71
-    """What a step composites a photograph with alpha over."""
-    VIBRATING = 73
-    """Laser points that start as Gaussians that vibrate."""
-    NETWORK = 79
-    """First weights of the network that reads photographs (Luminance-GS)."""
-    SCORE_SIGNS = 47
-    """Signs of residuals, from which standard errors of many views are drawn."""
+    SEED_POINTS = 31  # points of the scene that start as Gaussians
+    SEED_GAUSSIANS = 37  # those of these and of the shell that are kept
+    SHARED_POINTS = 41  # points that tell which views to match
+    RENDERED_PIXELS = 43  # pixels of a fit that are looked for in other views
+    LIDAR = 53  # laser measurements that are kept
+    MEASURED_DEPTHS = 59  # laser measurements that a view is compared with
+    PLAN_POINTS = 61  # points that a plan from above shows
+    RANDOM_SEEDS = 67  # seeds of scenes without points and matches
+    BACKDROP = 71  # what a step composites a photograph with alpha over
+    VIBRATING = 73  # laser points that start as Gaussians that vibrate
+    NETWORK = 79  # first weights of the network that reads photographs (Luminance-GS)
+    SCORE_SIGNS = 47  # signs of residuals, from which standard errors of many views are drawn
 
 
 @unique
@@ -77,8 +57,7 @@ class SceneStream(IntEnum):
     CAMERAS = 4
     LIGHT = 5
     PHOTOGRAPH = 6
-    OPTICS = 7
-    """Lenses, and the white balance of every photograph."""
+    OPTICS = 7  # lenses, and the white balance of every photograph
 
 
 def generator(seed: int, stream: Stream | SceneStream, *more: int) -> np.random.Generator:

@@ -138,7 +138,7 @@ def read_reason(folder: Path) -> str:
         return "it left no result and no reason"
 
 
-class ProgressFile:
+class ProgressFile(Reporter):
     """A reporter that keeps the newest state of a fit in a file, which others watch."""
 
     def __init__(self, path: Path):

@@ -26,7 +26,7 @@ from p2gs_jax.jobs.worker import run_in_process
 from p2gs_jax.pipeline.fit import fit
 from p2gs_jax.pipeline.preflight import check_run_dir
 from p2gs_jax.run.folder import RunFolder, locked
-from p2gs_jax.synth.exposures import read_true_exposures
+from p2gs_jax.synth.sensor import read_true_exposures
 
 TABLE, TABLE_TEXT, JOBS = "sweep.json", "sweep.md", "jobs"
 

@@ -126,7 +126,7 @@ def render_splats(
     linear, alpha, depth = rasterize(
         splats, radiance, tiles, camera.width, camera.height, cfg, with_depth
     )
-    linear = _before(linear, alpha, cfg)
+    linear = _over_background(linear, alpha, cfg)
     return Render(linear, alpha, depth, count, overflow, splats.visible)
 
 
@@ -148,7 +148,7 @@ def required_capacity(
     return count_entries(splats, camera.width, camera.height, cfg)
 
 
-def _before(
+def _over_background(
     linear: Float[Array, "h w 3"], alpha: Float[Array, "h w"], cfg: RenderConfig
 ) -> Float[Array, "h w 3"]:
     """Return radiance with that of the background, where it shows through."""
@@ -160,7 +160,7 @@ def _before(
 def _nothing(camera: Camera, cfg: RenderConfig, with_depth: bool) -> Render:
     blank = jnp.zeros((camera.height, camera.width))
     return Render(
-        linear=_before(jnp.zeros((*blank.shape, 3)), blank, cfg),
+        linear=_over_background(jnp.zeros((*blank.shape, 3)), blank, cfg),
         alpha=blank,
         depth=blank if with_depth else None,
         count=jnp.int32(0),

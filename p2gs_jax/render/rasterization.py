@@ -59,12 +59,12 @@ def rasterization(
             spherical harmonics, whose radiance is max(0, value + 1/2).
         viewmats: world to camera, OpenCV axes.
         Ks: intrinsics, pixels.
-        width: image width, pixels.
-        height: image height, pixels.
-        near_plane: what is nearer is invisible, scene units.
+        width: pixels.
+        height: pixels.
+        near_plane: nearer Gaussians are invisible, scene units.
         eps2d: variance added to the 2D covariance, pixels^2.
-        sh_degree: highest degree in use; coefficients above it are ignored.
-        backgrounds: radiance of each camera's background; None: black.
+        sh_degree: coefficients above this degree are ignored.
+        backgrounds: radiance; None: black.
         render_mode: "RGB", "D" (the sum of weights times z), "ED" (that over alpha), or both.
         capacity: entries of the tile lists, static; None measures it, which only works outside of
             `jax.jit`: pass `meta["capacity"]` of such a call.

@@ -18,7 +18,7 @@ from p2gs_jax.report.page import figure, listed, paragraph, text
 from p2gs_jax.report.pictures import jpeg, read_png, spread
 from p2gs_jax.report.run_files import RunFiles, read_run
 from p2gs_jax.report.run_sections import flat, option_text
-from p2gs_jax.synth.exposures import read_true_exposures
+from p2gs_jax.synth.sensor import read_true_exposures
 
 MOST_VIEWS = 4
 

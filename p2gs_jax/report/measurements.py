@@ -29,7 +29,7 @@ from p2gs_jax.report.pictures import LARGE, ViewComparison, jpeg, spread, withou
 from p2gs_jax.report.run_files import RunFiles
 from p2gs_jax.run.read import Run, load_run
 from p2gs_jax.scene.pixels.store import camera_of
-from p2gs_jax.synth.exposures import read_true_exposures
+from p2gs_jax.synth.sensor import read_true_exposures
 
 MOST_PAIRS, MOST_CLIPPED, MOST_RENDERED = 12, 24, 3
 # Seams are measured on images of at most this many pixels across.

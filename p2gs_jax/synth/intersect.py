@@ -13,6 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from p2gs_jax.synth.textures import as_column
 from p2gs_jax.synth.town import Material, Town
 
 _UNROLL = 4
@@ -39,14 +40,9 @@ def nearest_hit(
 def in_shadow(
     town: Town, o: Float[Array, "3 r"], to_sun: np.ndarray, lower: Array, upper: Array
 ) -> Float[Array, " r"]:
-    """Return 1 where a primitive lies between o and the sun.
+    """Return 1 where a primitive lies between points o and the sun, a unit vector.
 
-    Args:
-        town: the scene.
-        o: points, m.
-        to_sun: unit vector.
-        lower: bounds of the points; primitives whose shadow misses them are skipped.
-        upper: bounds of the points.
+    Primitives whose shadow misses the bounds of the points are skipped.
     """
     side = np.cross(to_sun, (0.0, 0.0, 1.0))
     axes = np.stack([side, np.cross(side, to_sun)])  # the plane the sun projects on
@@ -65,7 +61,7 @@ def in_shadow(
     def blocked(shadow, entry: Array, leave: Array, row: Array):
         return jnp.where((entry <= leave) & (leave > 1e-4), 1.0, shadow)
 
-    return _intersect(town, o, column(to_sun), among, jnp.zeros(o.shape[1]), blocked)
+    return _intersect(town, o, as_column(to_sun), among, jnp.zeros(o.shape[1]), blocked)
 
 
 def _intersect(town: Town, o: Array, d: Array, among: Array, carry, update: Callable):
@@ -107,14 +103,9 @@ def _intersect(town: Town, o: Array, d: Array, among: Array, carry, update: Call
 def open_sky(
     town: Town, p: Float[Array, "3 r"], n: Float[Array, "3 r"], lower: Array, upper: Array
 ) -> Float[Array, " r"]:
-    """Return how much ambient light reaches p, 0.12 to 1, from the distance field along n.
+    """Return how much ambient light reaches points, 0.12 to 1, from the distance field along n.
 
-    Args:
-        town: the scene.
-        p: points, m.
-        n: unit normals.
-        lower: bounds of the points.
-        upper: bounds of the points.
+    `n` are unit normals, `lower` and `upper` the bounds of the points.
     """
     probes = [p + reach * n for reach in _REACH]
     far = p + _CANYON_REACH * n
@@ -150,10 +141,11 @@ def open_sky(
     bodies = map(nearer, (to_box, to_taper, to_ellipsoid))
     best = _over(town, within(2 * _REACH[-1]), best, *bodies)
     houses = within(2 * _CANYON_REACH) & (town.material == Material.FACADE)
-    canyon = _over(
-        town, houses, jnp.maximum(far[2], 0.0) ** 2,
-        lambda best, row, lo, hi: jnp.minimum(best, to_box(far, lo, hi)),
-    )  # fmt: skip
+
+    def nearer_house(best, row: Array, lo: Array, hi: Array):
+        return jnp.minimum(best, to_box(far, lo, hi))
+
+    canyon = _over(town, houses, jnp.maximum(far[2], 0.0) ** 2, nearer_house)
     light = 1.0 - _CANYON_WEIGHT * (1.0 - jnp.minimum(jnp.sqrt(canyon) / _CANYON_REACH, 1.0))
     for squared, reach, weight in zip(best, _REACH, _WEIGHT, strict=True):
         light = light - weight * (1.0 - jnp.minimum(jnp.sqrt(squared) / reach, 1.0))
@@ -197,8 +189,3 @@ def _fold(function: Callable, values) -> Array:
     for value in rest:
         first = function(first, value)
     return first
-
-
-def column(values) -> Array:
-    """Return values as a column, to be broadcast over rays."""
-    return jnp.asarray(values, jnp.float32)[:, None]

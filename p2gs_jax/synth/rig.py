@@ -23,12 +23,7 @@ _FLIP = np.diag([1.0, -1.0, 1.0])  # CARLA's left-handed axes to ours, and back
 
 @dataclass(frozen=True)
 class Mount:
-    """A camera on the vehicle, in CARLA's axes.
-
-    Attributes:
-        location: x forward, y right, z up, m.
-        rotation: roll, pitch, yaw, degrees, Unreal's sense.
-    """
+    """A camera on the vehicle, in CARLA's axes: m; roll, pitch, yaw in degrees, Unreal's sense."""
 
     location: tuple[float, float, float]
     rotation: tuple[float, float, float]
@@ -45,10 +40,7 @@ MOUNTS: dict[str, Mount] = {
 def carla_rotation(roll: float, pitch: float, yaw: float) -> Float[np.ndarray, "3 3"]:
     """Return Unreal's rotation; its columns are the forward, right and up axes, left-handed.
 
-    Args:
-        roll: degrees.
-        pitch: degrees, positive up.
-        yaw: degrees, positive to the right.
+    Angles are degrees; pitch is positive up, yaw to the right.
     """
     (cr, cp, cy), (sr, sp, sy) = np.cos(a := np.deg2rad([roll, pitch, yaw])), np.sin(a)
     return np.array(
@@ -63,12 +55,7 @@ def carla_rotation(roll: float, pitch: float, yaw: float) -> Float[np.ndarray, "
 def camera_viewmat(
     mount: Mount, vehicle: Float[np.ndarray, " 3"] | tuple[float, float, float]
 ) -> Float[np.ndarray, "4 4"]:
-    """Return world-to-camera (OpenCV) of a camera on a vehicle that heads along +x.
-
-    Args:
-        mount: where the camera sits.
-        vehicle: the vehicle's origin in our world, m.
-    """
+    """Return world-to-camera (OpenCV) of a camera on a vehicle at a place that heads along +x."""
     forward, right, up = (_FLIP @ carla_rotation(*mount.rotation)).T
     R = np.stack([right, -up, forward])
     center = np.asarray(vehicle) + _FLIP @ np.asarray(mount.location)
@@ -81,9 +68,7 @@ def camera_viewmat(
 def image_height(width: int, *, multiple: int = 1) -> int:
     """Return the height, pixels, that gives images of a width the proportions of the paper's.
 
-    Args:
-        width: pixels.
-        multiple: the height is rounded to a multiple of it, and is not 0.
+    It is rounded to a multiple of a number, and is not 0.
     """
     return max(round(width * IMAGE_HEIGHT / IMAGE_WIDTH / multiple), 1) * multiple
 
@@ -97,13 +82,9 @@ def intrinsics(width: int, height: int) -> Float[np.ndarray, "3 3"]:
 def drive(
     frames: int, *, step: float = 0.9, lane: float = -1.75, start: float = 0.0
 ) -> Float[np.ndarray, "frames 3"]:
-    """Return the vehicle's origin at every frame, m.
+    """Return the vehicle's origin at every frame, `step` m apart, from x `start` on.
 
-    Args:
-        frames: how many.
-        step: metres a frame.
-        lane: y of the lane's middle; negative is the right-hand side.
-        start: x of the first frame.
+    `lane` is y of the lane's middle; negative is the right-hand side.
     """
     x = start + step * np.arange(frames)
     return np.stack([x, np.full(frames, lane), np.zeros(frames)], axis=1)

@@ -3,11 +3,18 @@ Control"), and on request what real ones add: a filmic curve, gains, drift, vign
 balance, a lens and a curve per camera, noise.
 
 Exposure is ISO / 8 times the gains: ISO-Const photographs (ISO 8) show the truth with e = 1.
+
+How every photograph was taken is kept in `truth/exposures.csv`: image, camera, iso, exposure,
+exposure_ev, red, green, blue (factors beside the exposure; their product is 1), corners (share of
+the light that reaches them), curve.
 """
 
 from __future__ import annotations
 
+import csv
 import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -25,18 +32,14 @@ SHOT_NOISE, READ_NOISE = 2e-4, 1e-6
 DRIFT_PERIODS = 1.3
 # Lenses lose no more than this in their corners, whatever was drawn.
 MOST_LOST = 0.8
+FILE = Path("truth", "exposures.csv")
+NUMBERS = ("exposure", "red", "green", "blue", "corners")
+COLUMNS = ("image", "camera", "iso", "exposure", "exposure_ev", *NUMBERS[1:], "curve")
 
 
 class Shots(NamedTuple):
-    """How every photograph was taken.
-
-    Attributes:
-        iso: drawn ISO.
-        exposures: factor on radiance, ISO-Const without gains = 1.
-        balance: factors on red, green, blue.
-        corner_loss: share of the light lost in the corners.
-        curves: response.
-    """
+    """How every photograph was taken: factors on radiance (ISO-Const without gains: 1), and on red,
+    green, blue; share of the light lost in the corners; response."""
 
     iso: Int[np.ndarray, " v"]
     exposures: Float[np.ndarray, " v"]
@@ -61,29 +64,13 @@ class Shots(NamedTuple):
 
 
 def draw_iso(shape: tuple[int, ...], std: float, seed: int) -> Int[np.ndarray, "..."]:
-    """Return ISO ~ N(8, std), rounded, at least 1; 8 everywhere where std is 0.
-
-    Args:
-        shape: e.g. (frames, cameras); every photograph has its own draw.
-        std: standard deviation before rounding (paper: 2 and 4).
-        seed: of the draw.
-    """
+    """Return ISO ~ N(8, std) (paper: 2 and 4), rounded, at least 1; each photograph has a draw."""
     noise = generator(seed, SceneStream.ISO).standard_normal(shape)
     return np.maximum(np.rint(ISO_REFERENCE + std * noise), ISO_MINIMUM).astype(np.int64)
 
 
 def draw_shots(sensor: Sensor, frames: int, cameras: int, seed: int) -> Shots:
-    """Return how all photographs are taken, camera by camera, frame by frame.
-
-    Args:
-        sensor: the pipeline.
-        frames: of each camera.
-        cameras: how many.
-        seed: of everything drawn.
-
-    Raises:
-        UserError: there are curves for another number of cameras.
-    """
+    """Return how all photographs are taken, camera by camera, frame by frame."""
     if len(sensor.curves) not in (0, cameras):
         raise UserError(
             f"there are {cameras} cameras, but {len(sensor.curves)} curves.",
@@ -140,14 +127,9 @@ def photograph(
     balance: Float[np.ndarray, " 3"] | None = None,
     rng: np.random.Generator | None = None,
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the eight-bit photograph of linear radiance.
+    """Return the eight-bit photograph of linear radiance times an exposure.
 
-    Args:
-        linear: radiance.
-        exposure: factor on it.
-        sensor: curve, vignetting and noise; None is plain sRGB.
-        balance: factors on red, green, blue.
-        rng: of the noise; needed where there is any.
+    No sensor is plain sRGB; `balance` are factors on red, green, blue; noise needs an `rng`.
     """
     sensor = sensor or Sensor()
     exposed = np.asarray(linear, np.float64) * exposure
@@ -160,3 +142,51 @@ def photograph(
         deviation = sensor.noise * np.sqrt(SHOT_NOISE * exposed + READ_NOISE)
         exposed = np.maximum(exposed + deviation * rng.standard_normal(exposed.shape), 0.0)
     return np.rint(255.0 * encode(exposed, sensor.curve)).astype(np.uint8)
+
+
+def write_true_exposures(
+    root: Path, names: Sequence[str], cameras: Sequence[str], shots: Shots
+) -> None:
+    """Write how the photographs were taken below a scene folder, which has `truth/`."""
+    with (root / FILE).open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        exposures, tints = shots.mean_exposures, shots.tints
+        for row, (name, camera) in enumerate(zip(names, cameras, strict=True)):
+            e = exposures[row]
+            factors = (f"{factor:.6g}" for factor in tints[row])
+            corners = f"{1 - shots.corner_loss[row]:.6g}"
+            exposure = (f"{e:.6g}", f"{np.log2(e):.6f}")
+            iso = int(shots.iso[row])
+            writer.writerow((name, camera, iso, *exposure, *factors, corners, shots.curves[row]))
+
+
+def read_true_exposures(root: Path) -> dict[str, float]:
+    """Return image name -> true exposure; empty where the scene folder has no such file."""
+    return {row["image"]: float(row["exposure"]) for row in _rows(root)}
+
+
+class TrueShot(NamedTuple):
+    """How a photograph was taken; the columns of `truth/exposures.csv`."""
+
+    camera: str
+    exposure: float
+    balance: tuple[float, float, float]
+    corners: float
+
+
+def read_true_shots(root: Path) -> dict[str, TrueShot]:
+    """Return image name -> how it was taken; empty where the scene folder has no such file."""
+    found = {}
+    for row in _rows(root):
+        e, red, green, blue, corners = (float(row[name]) for name in NUMBERS)
+        found[row["image"]] = TrueShot(row["camera"], e, (red, green, blue), corners)
+    return found
+
+
+def _rows(root: Path) -> list[dict[str, str]]:
+    path = root / FILE
+    if not path.is_file():
+        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))

@@ -1,4 +1,4 @@
-"""A town: primitives with materials under a sun and a sky.
+"""A town: primitives with materials under a sun and a sky; and what places them one by one.
 
 World: right-handed, metres, x along the street (the driving direction), y to the left, z up, the
 road surface at z = 0. Primitives are axis-aligned boxes, tapered boxes (car cabins, roofs) and
@@ -7,7 +7,7 @@ axis-aligned ellipsoids (foliage, wheels); the ground plane and the sky belong t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 
 import numpy as np
@@ -18,46 +18,26 @@ Vec3 = tuple[float, float, float]
 ROAD_HALF_WIDTH = 5.6
 KERB_HEIGHT = 0.14
 FACADE_LINE = 9.0
-CROSS_STREET = (27.0, 36.0)
-"""The side street's extent along x, between the buildings' corners."""
-UNDERPASS = (54.0, 68.0)
-"""Where a house stands across the street, along x."""
-STREET_END = 100.0
-"""How far one can drive: behind it stands the tower that closes the view."""
-UNDERPASS_HEIGHT = 5.2
-FLOOR_HEIGHT = 3.2
-GROUND_FLOOR_HEIGHT = 4.0
+# Along x: the side street, between the buildings' corners; the house across the street; how far
+# one can drive, as behind it stands the tower that closes the view.
+CROSS_STREET, UNDERPASS, STREET_END = (27.0, 36.0), (54.0, 68.0), 100.0
+UNDERPASS_HEIGHT, FLOOR_HEIGHT, GROUND_FLOOR_HEIGHT = 5.2, 3.2, 4.0
 
 
-class Material(IntEnum):
-    """What `tracer` paints a primitive with; ROAD is the ground plane."""
-
-    ROAD = 0
-    PAVEMENT = 1
-    FACADE = 2
-    PLAIN = 3
-    CAR_BODY = 4
-    CAR_GLASS = 5
-    WHEEL = 6
-    BARK = 7
-    FOLIAGE = 8
-    METAL = 9
-    EMISSIVE = 10
-    SIGN = 11
-    TILES = 12
-    AWNING = 13
+# What `tracer` paints a primitive with; ROAD is the ground plane.
+Material = IntEnum(
+    "Material",
+    "ROAD PAVEMENT FACADE PLAIN CAR_BODY CAR_GLASS WHEEL BARK FOLIAGE METAL EMISSIVE SIGN TILES "
+    "AWNING",
+    start=0,
+)
 
 
 @dataclass(frozen=True)
 class Light:
-    """The sun and the sky, fixed for a town.
+    """Radiance of sky and lit ground (`bounce`), and a sun in a unit direction.
 
-    Attributes:
-        sun_direction: unit vector towards the sun.
-        sun: sun's irradiance over pi, so that a white wall facing it has this radiance.
-        zenith: sky radiance overhead.
-        horizon: sky radiance at the horizon.
-        bounce: radiance of the lit ground and walls as ambient light from below.
+    `sun` is its irradiance over pi, so that a white wall facing it has this radiance.
     """
 
     sun_direction: Vec3 = (-0.46, -0.50, 0.735)
@@ -69,19 +49,10 @@ class Light:
 
 @dataclass(frozen=True)
 class Town:
-    """P primitives, ordered boxes, tapered boxes, ellipsoids.
+    """P primitives, ordered boxes, tapered boxes, ellipsoids; columns as in `Solid`.
 
     Attributes:
-        n_boxes: number of boxes.
-        n_tapered: number of tapered boxes.
-        lo: lower corners of the bounding boxes, m.
-        hi: upper corners, m.
         planes: (n, d) of the tapered boxes' six faces; inside is n . p <= d, n unit.
-        material: values of `Material`.
-        color: base albedo; radiance for EMISSIVE.
-        accent: second colour: window surrounds, stripes, sign faces.
-        params: (style, bay width m, ground-floor use, random number in [0, 1)).
-        light: sun and sky.
         seed: of the textures' noise.
         underpass: its extent along x, or None.
     """
@@ -105,5 +76,121 @@ class Town:
         return len(self.material)
 
 
-STONE: Vec3 = (0.60, 0.57, 0.50)
-STEEL: Vec3 = (0.06, 0.07, 0.075)
+@dataclass
+class Solid:
+    """One primitive.
+
+    Attributes:
+        kind: 0 box, 1 tapered box, 2 ellipsoid.
+        lo: lower corner of the bounding box, m; `hi`: the upper one.
+        color: base albedo; radiance for EMISSIVE.
+        accent: second colour: window surrounds, stripes, sign faces.
+        params: (style, bay width m, ground-floor use, random number in [0, 1)).
+        top: x0, x1, y0, y1 of a tapered box's upper face.
+    """
+
+    kind: int
+    lo: Vec3
+    hi: Vec3
+    material: Material
+    color: Vec3
+    accent: Vec3
+    params: tuple[float, float, float, float]
+    top: tuple[float, float, float, float] | None
+
+
+@dataclass
+class Builder:
+    """Places solids; their order decides which random numbers they get.
+
+    Nothing but houses stands within `clear`, an extent along x.
+    """
+
+    rng: np.random.Generator
+    clear: tuple[float, float] | None = None
+    solids: list[Solid] = field(default_factory=list)
+
+    def add(
+        self,
+        lo: Vec3,
+        hi: Vec3,
+        material: Material,
+        color: Vec3,
+        *,
+        kind: int = 0,
+        accent: Vec3 = (0.5, 0.5, 0.5),
+        style: float = 0.0,
+        bay: float = 3.0,
+        use: float = 0.0,
+        top: tuple[float, float, float, float] | None = None,
+    ) -> None:
+        """Place a solid between two corners; with a `top`, a tapered box."""
+        params = (style, bay, use, float(self.rng.random()))
+        a = tuple(min(p, q) for p, q in zip(lo, hi, strict=True))
+        b = tuple(max(p, q) for p, q in zip(lo, hi, strict=True))
+        self.solids.append(
+            Solid(1 if top else kind, a, b, material, color, accent, params, top)  # pyright: ignore[reportArgumentType]
+        )
+
+    def is_clear(self, x: float, reach: float) -> bool:
+        """Return whether nothing may stand within reach of x."""
+        return self.clear is not None and (self.clear[0] - reach < x < self.clear[1] + reach)
+
+    def post(
+        self, at: tuple[float, float], half: float, top: float, material: Material, color: Vec3
+    ) -> None:
+        """Place an upright box of a square section about x, y, on the ground."""
+        x, y = at
+        self.add((x - half, y - half, 0.0), (x + half, y + half, top), material, color)
+
+    def blob(self, center: Vec3, radii: Vec3, material: Material, color: Vec3) -> None:
+        """Place an ellipsoid."""
+        c, r = np.array(center), np.array(radii)
+        self.add(tuple(c - r), tuple(c + r), material, color, kind=2)
+
+    def uniform(self, low: float, high: float) -> float:
+        """Return a random number."""
+        return float(self.rng.uniform(low, high))
+
+    def pick(self, items: list[Vec3]) -> Vec3:
+        """Return a random choice."""
+        return items[int(self.rng.integers(len(items)))]
+
+
+def _taper_planes(solid: Solid) -> np.ndarray:
+    """Six (n, d) of a tapered box, outward unit normals: -x, +x, -y, +y, bottom, top."""
+    (x0, y0, z0), (x1, y1, z1) = solid.lo, solid.hi
+    assert solid.top is not None
+    tx0, tx1, ty0, ty1 = solid.top
+    rise = z1 - z0
+    along_x = [(-rise, 0, tx0 - x0), (rise, 0, x1 - tx1)]
+    along_y = [(0, -rise, ty0 - y0), (0, rise, y1 - ty1)]
+    normals = np.array([*along_x, *along_y, (0, 0, -1), (0, 0, 1)], np.float64)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    first = (x0, y0, z0)
+    anchors = np.array([first, (x1, y0, z0), first, (x0, y1, z0), first, (x0, y0, z1)])
+    return np.concatenate([normals, (normals * anchors).sum(1, keepdims=True)], axis=1)
+
+
+def pack(build: Builder, seed: int, light: Light) -> Town:
+    """Return the town of all solids, ordered boxes, tapered boxes, ellipsoids."""
+    solids = sorted(build.solids, key=lambda s: s.kind)
+    tapered = [s for s in solids if s.kind == 1]
+
+    def column(name: str) -> np.ndarray:
+        return np.array([getattr(s, name) for s in solids], np.float32)
+
+    return Town(
+        n_boxes=sum(s.kind == 0 for s in solids),
+        n_tapered=len(tapered),
+        lo=column("lo"),
+        hi=column("hi"),
+        planes=np.array([_taper_planes(s) for s in tapered], np.float32),
+        material=np.array([s.material for s in solids], np.int32),
+        color=column("color"),
+        accent=column("accent"),
+        params=column("params"),
+        light=light,
+        underpass=build.clear,
+        seed=seed,
+    )

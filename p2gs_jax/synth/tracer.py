@@ -18,9 +18,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Float32, Int
 
-from p2gs_jax.synth.intersect import column, in_shadow, nearest_hit, open_sky
+from p2gs_jax.synth.intersect import in_shadow, nearest_hit, open_sky
 from p2gs_jax.synth.paint import paint, sky
-from p2gs_jax.synth.surface import Surface
+from p2gs_jax.synth.textures import Surface, as_column
 from p2gs_jax.synth.town import FACADE_LINE, UNDERPASS_HEIGHT, Town
 
 _TILE = 32  # pixels: a tile's rays stay in the second-level cache and share a list of primitives
@@ -55,20 +55,11 @@ class Tracer:
     ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
         """Return linear radiance, and camera z at the pixel centres (inf: sky), m.
 
-        Args:
-            viewmat: world-to-camera, OpenCV axes.
-            K: intrinsics in pixels, centres at +0.5.
-            width: pixels.
-            height: pixels.
-            supersample: samples a pixel along each axis; the pixel is their mean.
+        `viewmat` is world-to-camera, OpenCV axes; K is in pixels, centres at +0.5; a pixel is the
+        mean of `supersample` samples along each axis.
         """
-        linear, depth = self._render(
-            jnp.asarray(viewmat, jnp.float32),
-            jnp.asarray(K, jnp.float32),
-            width,
-            height,
-            supersample,
-        )
+        cameras = (jnp.asarray(viewmat, jnp.float32), jnp.asarray(K, jnp.float32))
+        linear, depth = self._render(*cameras, width, height, supersample)
         return np.asarray(linear), np.asarray(depth)
 
     def _render_tiles(
@@ -115,13 +106,8 @@ def radiance(
 ) -> Float[Array, "3 r"]:
     """Return the linear radiance that arrives along rays.
 
-    Args:
-        town: the scene.
-        origin: of all rays, m.
-        direction: not normalised.
-        t: where they hit; inf: sky.
-        index: what they hit.
-        pixel_angle: width of a pixel at unit camera z; finer texture than that fades out.
+    Directions are not normalised; `t` is where a ray hits (inf: sky) and `index` what; a pixel is
+    `pixel_angle` wide at unit camera z, and finer texture fades out.
     """
     hit = jnp.isfinite(t)
     p = origin[:, None] + jnp.where(hit, t, 1.0) * direction
@@ -135,7 +121,7 @@ def radiance(
 def _light(town: Town, p: Array, view: Array, surface: Surface, hit: Array) -> Array:
     light = town.light
     direction = np.array(light.sun_direction) / np.linalg.norm(light.sun_direction)
-    to_sun = column(direction)
+    to_sun = as_column(direction)
     lower = jnp.min(jnp.where(hit, p, jnp.inf), axis=1)
     upper = jnp.max(jnp.where(hit, p, -jnp.inf), axis=1)
     n = surface.normal
@@ -144,20 +130,22 @@ def _light(town: Town, p: Array, view: Array, surface: Surface, hit: Array) -> A
     facing = jnp.where(jnp.sum(n * to_sun, 0) > 0, facing, 0.0)
     sun = facing * (1.0 - in_shadow(town, start, direction, lower, upper))
     up = surface.shading_normal[2]
-    ambient = column(_AMBIENT_UP) * (0.56 + 0.44 * up) + column(light.bounce) * (0.5 - 0.5 * up)
+    ambient = as_column(_AMBIENT_UP) * (0.56 + 0.44 * up) + as_column(light.bounce) * (
+        0.5 - 0.5 * up
+    )
     ambient = ambient * open_sky(town, p, n, lower, upper)
     if town.underpass is not None:
         ambient = ambient * _daylight(p, town.underpass)
-    diffuse = surface.albedo * (column(light.sun) * sun + ambient)
+    diffuse = surface.albedo * (as_column(light.sun) * sun + ambient)
     # Glossy paint and glass: the sky and, below it, a nondescript street; a broad sun highlight.
     cosine = jnp.clip(-jnp.sum(view * n, 0), 0.0, 1.0)
     mirrored = view + 2.0 * cosine * n
     fresnel = surface.gloss * (0.06 + 0.94 * (1.0 - cosine) ** 5)
-    street = column((0.13, 0.115, 0.10))
+    street = as_column((0.13, 0.115, 0.10))
     blend = jnp.clip((mirrored[2] - 0.12) / 0.35, 0.0, 1.0)
     seen = street + blend * (sky(town, mirrored, clouds=False) - street)
     lobe = jnp.maximum(jnp.sum(mirrored * to_sun, 0), 0.0) ** 80
-    highlight = column(light.sun) * (6.0 * lobe * (sun > 0))
+    highlight = as_column(light.sun) * (6.0 * lobe * (sun > 0))
     return diffuse + fresnel * (seen + highlight) + surface.emission
 
 

@@ -4,7 +4,7 @@
     reference/<camera>/<frame>.png   the same views at ISO 8, without gains, vignetting and noise
     truth/linear/<camera>/<frame>.exr   radiance R G B (half), camera z Z (float; inf: sky)
     truth/sky_masks/<camera>/<frame>.png   255 where the pixel's centre sees the sky
-    truth/exposures.csv              how every photograph was taken, see `exposures`
+    truth/exposures.csv              how every photograph was taken, see `sensor`
     sparse/0/*.bin                   PINHOLE cameras, poses, seed points with tracks
     dataset.json                     every parameter
 
@@ -17,70 +17,27 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenEXR
-from jaxtyping import Float32, Float64, Int, UInt8
+from jaxtyping import UInt8
 from PIL import Image
 
 from p2gs_jax.core.atomic import atomic_folder
 from p2gs_jax.core.streams import SceneStream, generator
 from p2gs_jax.errors import UserError
-from p2gs_jax.synth.build_town import build_town
-from p2gs_jax.synth.colmap_files import DriveViews, write_colmap
-from p2gs_jax.synth.exposures import write_true_exposures
+from p2gs_jax.synth.colmap_files import DriveViews, sample_seeds, write_seeds
+from p2gs_jax.synth.furnish import build_town
 from p2gs_jax.synth.rig import MOUNTS, camera_viewmat, drive, intrinsics
-from p2gs_jax.synth.seed_points import observe_seeds, sample_seeds
-from p2gs_jax.synth.sensor import ISO_REFERENCE, draw_shots, photograph
+from p2gs_jax.synth.sensor import ISO_REFERENCE, Shots, draw_shots, photograph, write_true_exposures
 from p2gs_jax.synth.settings import Layout, Sensor
 from p2gs_jax.synth.town import STREET_END, Town
 from p2gs_jax.synth.tracer import Tracer
 
 FORMAT = "p2gs-jax street, version 2"
-
-
-@dataclass(frozen=True)
-class StreetTruth:
-    """The true parameters of a data set, one row per photograph, sorted by name.
-
-    Attributes:
-        root: the scene folder.
-        names: relative to `images/`.
-        cameras: physical camera of each photograph.
-        viewmats: world-to-camera, OpenCV axes, m.
-        K: intrinsics of all cameras, pixels, centres at +0.5.
-        width: pixels.
-        height: pixels.
-        iso: drawn ISO.
-        exposures: iso / 8 times the gains, mean over the channels.
-        points: number of seed points.
-        observations: number of their observations.
-    """
-
-    root: Path
-    names: tuple[str, ...]
-    cameras: tuple[str, ...]
-    viewmats: Float64[np.ndarray, "v 4 4"]
-    K: Float64[np.ndarray, "3 3"]
-    width: int
-    height: int
-    iso: Int[np.ndarray, " v"]
-    exposures: Float64[np.ndarray, " v"]
-    points: int
-    observations: int
-
-    def linear(self, row: int) -> Float32[np.ndarray, "h w 3"]:
-        """Return the true linear radiance of a view; 1 is white at ISO 8."""
-        return read_truth(self._truth(row))[0]
-
-    def depth(self, row: int) -> Float32[np.ndarray, "h w"]:
-        """Return the true camera z at the pixel centres, m; inf: sky."""
-        return read_truth(self._truth(row))[1]
-
-    def _truth(self, row: int) -> Path:
-        return (self.root / "truth" / "linear" / self.names[row]).with_suffix(".exr")
 
 
 def write_street(
@@ -97,15 +54,14 @@ def write_street(
     hold_out: int = 8,
     sensor: Sensor | None = None,
     layout: Layout = "street",
-    report: Callable[[str], None] | None = None,
-) -> StreetTruth:
-    """Render a drive along the procedural street and write it as a scene folder.
+    report: Callable[[str], None] = lambda line: None,
+) -> Path:
+    """Render a drive along the procedural street and write it as a scene folder, which is returned.
 
     Args:
         out: the folder to make; it must not exist, or be empty.
-        frames: of each of the three cameras.
-        width: pixels (paper: 1920).
-        height: pixels (paper: 1300).
+        frames: photographs of each of the three cameras.
+        width: pixels (paper: 1920), as is the height (1300).
         iso_std: spread of the ISO (paper: 2 and 4); 0 writes ISO-Const. `sensor` replaces it.
         seed: of the town, the ISO and the points.
         supersample: samples a pixel along each axis.
@@ -115,17 +71,52 @@ def write_street(
         sensor: what the cameras do to the light.
         layout: `town` adds an underpass and draws the sun's place from the seed; `long` is as many
             streets one behind another as the drive is long.
-        report: receives a line of progress now and then.
 
     Raises:
         UserError: a parameter is impossible, or `out` is in the way.
     """
-    out = Path(out)
-    sensor = sensor or Sensor(iso_std=iso_std)
-    _check(out, frames, width, height, sensor.iso_std, supersample)
-    _check_way(frames, step, layout)
-    say = report or (lambda line: None)
+    out, sensor = Path(out), sensor or Sensor(iso_std=iso_std)
+    asked = {
+        **{"seed": seed, "frames": frames, "width": width, "height": height},
+        **{"supersample": supersample, "step_m": step, "layout": layout},
+        **{"hold_out": hold_out, "points_sampled": points, "iso_std": sensor.iso_std},
+    }
+    _check(out, asked)
     town = build_town(seed, layout, frames * step)
+    views, frame = _views(frames, width, height, step)
+    shots = draw_shots(sensor, frames, len(MOUNTS), seed)
+    with atomic_folder(out) as temporary:
+        report(f"rendering {len(views.names)} views of a street with {town.size} solids")
+        photographs, depths = [], []
+        for row, (linear, depth) in enumerate(_render_all(town, views, supersample)):
+            shot = _photographed(linear, shots, sensor, row, seed)
+            reference = photograph(linear, 1.0, Sensor(curve=sensor.curve))
+            _write_view(temporary, views.names[row], shot, reference, linear, depth)
+            photographs.append(shot)
+            depths.append(depth)
+            if (row + 1) % 10 == 0:
+                report(f"rendered {row + 1} of {len(views.names)} views")
+        sampled = np.ones(frames, bool)
+        if hold_out and frames > 1:
+            sampled[::hold_out] = False
+        xyz, rgb = sample_seeds(views, photographs, depths, sampled[frame], points, seed)
+        observed = write_seeds(temporary / "sparse" / "0", views, xyz, rgb, depths)
+        write_true_exposures(temporary, views.names, views.cameras, shots)
+        card = {
+            **{"format": FORMAT, **asked, **observed, "iso_reference": ISO_REFERENCE},
+            **{"K": views.K.tolist(), "solids": town.size, "sensor": asdict(sensor)},
+            "cameras": {name: asdict(mount) for name, mount in MOUNTS.items()},
+            "light": asdict(town.light),
+        }
+        (temporary / "dataset.json").write_text(json.dumps(card, indent=2) + "\n")
+        _require_free(out)
+    counts = f"{observed['points']} points, {observed['observations']} observations"
+    report(f"wrote {out}: {len(views.names)} photographs, {counts}")
+    return out
+
+
+def _views(frames: int, width: int, height: int, step: float):
+    """Return the cameras of a drive, and the frame of each view."""
     names = tuple(f"{camera}/{f:06d}.png" for camera in sorted(MOUNTS) for f in range(frames))
     cameras = tuple(name.split("/")[0] for name in names)
     frame = np.tile(np.arange(frames), len(MOUNTS))
@@ -133,99 +124,27 @@ def write_street(
     viewmats = np.stack(
         [camera_viewmat(MOUNTS[c], track[f]) for c, f in zip(cameras, frame, strict=True)]
     )
-    shots = draw_shots(sensor, frames, len(MOUNTS), seed)
-    K = intrinsics(width, height)
-    with atomic_folder(out) as temporary:
-        photographs, depths = [], []
-        say(f"rendering {len(names)} views of a street with {town.size} solids")
-        for row, (linear, depth) in enumerate(
-            _render_all(town, viewmats, K, width, height, supersample)
-        ):
-            rng = generator(seed, SceneStream.PHOTOGRAPH, row)
-            shot = photograph(
-                linear,
-                shots.exposures[row],
-                shots.sensor(sensor, row),
-                balance=shots.balance[row],
-                rng=rng,
-            )
-            reference = photograph(linear, 1.0, Sensor(curve=sensor.curve))
-            _write_view(temporary, names[row], shot, reference, linear, depth)
-            photographs.append(shot)
-            depths.append(depth)
-            if (row + 1) % 10 == 0:
-                say(f"rendered {row + 1} of {len(names)} views")
-        sampled = np.ones(frames, bool)
-        if hold_out and frames > 1:
-            sampled[::hold_out] = False
-        xyz, rgb = sample_seeds(viewmats, K, photographs, depths, sampled[frame], points, seed)
-        xy, seen = observe_seeds(xyz, viewmats, K, depths)
-        kept = seen.sum(0) >= 2
-        xyz, rgb, xy, seen = xyz[kept], rgb[kept], xy[:, kept], seen[:, kept]
-        views = DriveViews(names, cameras, viewmats, K, width, height)
-        write_colmap(temporary / "sparse" / "0", views, xyz, rgb, xy, seen)
-        write_true_exposures(temporary, names, cameras, shots)
-        card = {
-            "format": FORMAT,
-            "seed": seed,
-            "frames": frames,
-            "cameras": {name: asdict(mount) for name, mount in MOUNTS.items()},
-            "width": width,
-            "height": height,
-            "K": K.tolist(),
-            "supersample": supersample,
-            "step_m": step,
-            "layout": layout,
-            "sensor": asdict(sensor),
-            "iso_std": sensor.iso_std,
-            "iso_reference": ISO_REFERENCE,
-            "hold_out": hold_out,
-            "points_sampled": points,
-            "points": len(xyz),
-            "observations": int(seen.sum()),
-            "solids": town.size,
-            "light": asdict(town.light),
-        }
-        (temporary / "dataset.json").write_text(json.dumps(card, indent=2) + "\n")
-        _require_free(out)
-    say(f"wrote {out}: {len(names)} photographs, {len(xyz)} points, {int(seen.sum())} observations")
-    return StreetTruth(
-        root=out,
-        names=names,
-        cameras=cameras,
-        viewmats=viewmats,
-        K=K,
-        width=width,
-        height=height,
-        iso=shots.iso,
-        exposures=shots.mean_exposures,
-        points=len(xyz),
-        observations=int(seen.sum()),
+    return DriveViews(names, cameras, viewmats, intrinsics(width, height), width, height), frame
+
+
+def _photographed(linear: np.ndarray, shots: Shots, sensor: Sensor, row: int, seed: int):
+    rng, own = generator(seed, SceneStream.PHOTOGRAPH, row), shots.sensor(sensor, row)
+    return photograph(linear, shots.exposures[row], own, balance=shots.balance[row], rng=rng)
+
+
+def _check(out: Path, asked: dict[str, Any]) -> None:
+    frames, width, height, samples, std, step = (
+        asked[name] for name in ("frames", "width", "height", "supersample", "iso_std", "step_m")
     )
-
-
-def read_truth(path: Path) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
-    """Return linear radiance and camera z (m, inf: sky) from a truth EXR."""
-    with OpenEXR.File(str(path), separate_channels=True) as file:
-        pixels = {name: np.array(c.pixels, np.float32) for name, c in file.channels().items()}
-    return np.stack([pixels[c] for c in "RGB"], axis=-1), pixels["Z"]
-
-
-def _check(
-    out: Path, frames: int, width: int, height: int, iso_std: float, supersample: int
-) -> None:
-    if frames < 1 or width < 16 or height < 16 or iso_std < 0 or supersample < 1:
+    if frames < 1 or width < 16 or height < 16 or std < 0 or samples < 1:
         raise UserError(
-            f"cannot render {frames} frames of {width}x{height} with {supersample} samples a side "
-            f"and ISO std {iso_std}",
+            f"cannot render {frames} frames of {width}x{height} with {samples} samples a side "
+            f"and ISO std {std}",
             fix="use at least 1 frame, 16x16 pixels, 1 sample, and a spread of 0 or more",
         )
     _require_free(out)
-
-
-def _check_way(frames: int, step: float, layout: Layout) -> None:
     way = (frames - 1) * step
-    if layout != "long" and way > STREET_END:
+    if asked["layout"] != "long" and way > STREET_END:
         raise UserError(
             f"{frames} frames of {step:g} m go on for {way:.0f} m; the street ends after "
             f"{STREET_END:.0f}.",
@@ -239,18 +158,18 @@ def _require_free(out: Path) -> None:
 
 
 def _render_all(
-    town: Town, viewmats: np.ndarray, K: np.ndarray, width: int, height: int, supersample: int
+    town: Town, views: DriveViews, supersample: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield (linear as half floats, depth) of every view; two views are rendered at a time."""
     tracer = Tracer(town)
 
     def one(viewmat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        linear, depth = tracer.render(viewmat, K, width, height, supersample)
+        linear, depth = tracer.render(viewmat, views.K, views.width, views.height, supersample)
         return linear.astype(np.float16), depth
 
-    yield one(viewmats[0])  # compiles once, not once a thread
+    yield one(views.viewmats[0])  # compiles once, not once a thread
     with ThreadPoolExecutor(2) as pool:
-        yield from pool.map(one, viewmats[1:])
+        yield from pool.map(one, views.viewmats[1:])
 
 
 def _write_view(
@@ -262,11 +181,8 @@ def _write_view(
     depth: np.ndarray,
 ) -> None:
     sky = np.where(np.isinf(depth), np.uint8(255), np.uint8(0))
-    for folder, pixels in (
-        ("images", shot),
-        ("reference", reference),
-        ("truth/sky_masks", sky),
-    ):
+    pictures = {"images": shot, "reference": reference, "truth/sky_masks": sky}
+    for folder, pixels in pictures.items():
         path = root / folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(pixels).save(path, compress_level=4)

@@ -14,8 +14,9 @@ from p2gs_jax.core.numerics import on_host
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.passes import ArrayStore, StoredArray, most_bytes
+from p2gs_jax.render.warp import project_points
 from p2gs_jax.scene.drives.objects import object_mask
-from p2gs_jax.scene.visibility import project_points, unoccluded
+from p2gs_jax.scene.visibility import unoccluded
 from p2gs_jax.types import Measured, Scene
 
 # Errors of log depth beyond this pull no harder: the measurement missed or hit what is behind.

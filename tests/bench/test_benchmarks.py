@@ -72,7 +72,6 @@ def test_accuracy_counts_as_measured_first(baseline, step):
     [
         ("sped", "choose speed_error"),
         ("speed_error --baseline none.json", "--write-baseline"),
-        ("hard_cases --write-baseline x.json", "name one of these as well"),
         ("levels --set chunks=3", "no field 'chunks'"),
     ],
 )

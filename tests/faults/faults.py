@@ -46,7 +46,7 @@ FAULTS = (
     ),
     Fault(
         "pixel centres lie at integers",
-        "render/rasterize_reference.py",
+        "render/tiles.py",
         "x = jnp.arange(width) + 0.5",
         "x = jnp.arange(width) + 0.0",
         ORACLE,
@@ -68,8 +68,8 @@ FAULTS = (
     Fault(
         "a segment begins with all the light of its tile",
         "render/rasterize_xla.py",
-        "            light[behind]\n            - sum(",
-        "            light[behind]\n            - 0 * sum(",
+        "there = light[behind] - sum(",
+        "there = light[behind] - 0 * sum(",
         ORACLE,
     ),
     Fault(
@@ -81,10 +81,10 @@ FAULTS = (
     ),
     Fault(
         "one band of the harmonics has the other sign",
-        "render/spherical_harmonics.py",
+        "render/harmonics.py",
         "values += [-C1 * y, C1 * z, -C1 * x]",
         "values += [-C1 * y, C1 * z, C1 * x]",
-        "render/test_spherical_harmonics.py",
+        "render/test_project.py",
     ),
     Fault(
         "the view list leaves out what touches the left edge",
@@ -126,28 +126,28 @@ FAULTS = (
         "photometry/parameters.py",
         "log_scale + tint, activation)",
         "0.0 * (log_scale + tint), activation)",
-        "photometry/test_gauge.py",
+        "photometry/test_formation.py::test_photographs_stay_and_the_mean_goes",
     ),
     Fault(
         "saturated pixels count as observations of radiance",
         "photometry/observations.py",
         "(self.colors > black) & (brightest < saturation)",
         "(self.colors > black) & (brightest < 2 + saturation)",
-        "photometry/test_bundle_adjustment.py::test_saturation_must_be_masked",
+        "photometry/test_adjustment.py::test_saturation_must_be_masked",
     ),
     Fault(
         "a mean counts where one of its pixels is saturated",
         "photometry/observations.py",
         "brightest = self.colors if self.brightest is None else self.brightest",
         "brightest = self.colors",
-        "gaussians/test_correspondence.py::test_exposures_are_right_where_a_surface_has_highlights",
+        "gaussians/test_sampling.py::test_exposures_are_right_where_a_surface_has_highlights",
     ),
     Fault(
         "an exposure ratio is turned over",
         "losses/relative_exposure.py",
         "photometry.capture(pairs.views_i), photometry.capture(pairs.views_j)",
         "photometry.capture(pairs.views_j), photometry.capture(pairs.views_i)",
-        "properties/test_pir.py::test_11_observed_readings",
+        "properties/test_pir.py::test_11_observed_reading",
     ),
     Fault(
         "over-bright predictions of saturated pixels are punished",

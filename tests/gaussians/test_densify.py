@@ -202,8 +202,11 @@ def test_births_go_where_they_are_needed():
     np.testing.assert_array_equal(out.gaussians.means[10:14], np.tile(g.means[7], (4, 1)))
     # Where nothing is needed yet, nobody is born; those without a place are not put anywhere.
     none = relocate_and_grow(jax.random.key(0), grown, p, jnp.int32(4), together, 0 * needed)
-    assert int(none.population.alive.sum()) == 10
-    np.testing.assert_array_equal(none.gaussians.means, grown.means)
+    faint = dataclasses.replace(grown, opacity_logits=jnp.full(16, -9.0))
+    nobody = relocate_and_grow(jax.random.key(0), faint, p, jnp.int32(4), together, needed)
+    for out in (none, nobody):
+        assert int(out.population.alive.sum()) == 10
+        np.testing.assert_array_equal(out.gaussians.means, grown.means)
 
 
 def test_demand_is_the_mean_pull_on_what_was_seen():
@@ -215,13 +218,6 @@ def test_demand_is_the_mean_pull_on_what_was_seen():
     means = jnp.zeros((3, 3)).at[:, 0].set(jnp.array(nu))
     moments = moments._replace(nu=dataclasses.replace(moments.nu, means=means))
     np.testing.assert_allclose(demand(g, moments, b2), [3 * 2, 5 * 4, 0], rtol=1e-5)
-
-
-def test_relocation_with_nobody_healthy_changes_nothing():
-    g = made(opacity=0.001)
-    p = fresh_population(jnp.ones(8, bool))
-    out = relocate_and_grow(jax.random.key(1), g, p, jnp.int32(0), CFG)
-    np.testing.assert_array_equal(out.gaussians.means, g.means)
 
 
 def test_noise_reaches_only_the_transparent_and_has_their_shape():
@@ -241,43 +237,31 @@ def test_noise_reaches_only_the_transparent_and_has_their_shape():
     assert float(jnp.abs(quiet).max()) < 1e-6
 
 
-def owned(g, alive):
-    """Return a population whose Gaussians belong to objects, in turn."""
-    owner = np.where(np.asarray(alive), np.arange(g.capacity) % 4 - 1, -1)
-    return fresh_population(jnp.asarray(alive), jnp.asarray(owner, jnp.int32)), owner
+def families(n, alive):
+    """Return Gaussians of objects in turn, whose colours tell the object, and their population."""
+    owner = np.where(alive, np.arange(n) % 4 - 1, -1)
+    g = dataclasses.replace(made(n), sh=on_device(np.where(alive, owner, -9))[:, None, None])
+    return g, fresh_population(jnp.asarray(alive), jnp.asarray(owner, jnp.int32))
 
 
-def test_relocated_and_newborn_gaussians_belong_to_what_their_parents_did():
-    """Colours tell who the parent was: each object has its own."""
-    n = 120
-    g = made(n)
-    alive = np.arange(n) < 90
-    population, owner = owned(g, alive)
-    sh = jnp.asarray(np.where(alive, owner, -9), jnp.float32)[:, None, None] * jnp.ones((1, 1, 3))
-    opacity = jnp.where(jnp.arange(n) % 5 == 0, -9.0, 2.0)
-    g = dataclasses.replace(g, sh=sh, opacity_logits=opacity)
-    outcome = relocate_and_grow(jax.random.key(0), g, population, jnp.int32(20), CFG)
+def check_families(outcome, count):
     living = np.asarray(outcome.population.alive)
-    assert living.sum() == 110
-    got = np.asarray(outcome.population.owner)
-    np.testing.assert_array_equal(got[living], np.asarray(outcome.gaussians.sh)[living, 0, 0])
-    moved = np.asarray(outcome.reset_moments)
-    assert (got[moved] >= 0).any()
+    assert living.sum() == count
+    owner = np.asarray(outcome.population.owner)
+    np.testing.assert_array_equal(owner[living], np.asarray(outcome.gaussians.sh)[living, 0, 0])
+    assert (owner[np.asarray(outcome.reset_moments)] >= 0).any()
 
 
-def test_clones_and_splits_belong_to_what_their_parents_did():
-    n = 60
-    g = made(n)
-    alive = np.arange(n) < 30
-    population, owner = owned(g, alive)
-    sh = jnp.asarray(np.where(alive, owner, -9), jnp.float32)[:, None, None] * jnp.ones((1, 1, 3))
-    g = dataclasses.replace(g, sh=sh)
-    hot = jnp.asarray(alive & (np.arange(n) % 3 == 0))
-    clone = hot & (jnp.arange(n) % 2 == 0)
-    none = jnp.zeros(n, bool)
-    proposal = adaptive.Proposal(none, clone, hot & ~clone, jnp.int32(40))
-    outcome = apply(jax.random.key(0), g, population, proposal)
-    living = np.asarray(outcome.population.alive)
-    assert living.sum() == 40
-    got = np.asarray(outcome.population.owner)
-    np.testing.assert_array_equal(got[living], np.asarray(outcome.gaussians.sh)[living, 0, 0])
+def test_gaussians_belong_to_the_object_of_their_parents():
+    """Relocated, newborn, cloned and split ones."""
+    index = np.arange(120)
+    g, population = families(120, index < 90)
+    g = dataclasses.replace(g, opacity_logits=jnp.where(index % 5 == 0, -9.0, 2.0))
+    born = relocate_and_grow(jax.random.key(0), g, population, jnp.int32(20), CFG)
+    check_families(born, 110)
+    g, population = families(120, index < 30)
+    hot, even = (index < 30) & (index % 3 == 0), index % 2 == 0
+    none, *chosen = (jnp.asarray(c) for c in (index < 0, hot & even, hot & ~even))
+    check_families(
+        apply(jax.random.key(0), g, population, adaptive.Proposal(none, *chosen, jnp.int32(40))), 40
+    )

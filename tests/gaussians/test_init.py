@@ -1,4 +1,4 @@
-"""Seeds, samples and the far shell."""
+"""Seeds and the far shell."""
 
 from pathlib import Path
 
@@ -7,11 +7,8 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import FitConfig, InitConfig
-from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.gaussians.seeds import cameras_radius, gaussians_from_points, subsample
 from p2gs_jax.gaussians.shell import find_shell
-from p2gs_jax.photometry.observations import Observations, sample_pairs
-from p2gs_jax.photometry.sources.sampling import sample
 from p2gs_jax.presets import preset
 from p2gs_jax.render import view_radiance
 from p2gs_jax.types import Camera, View
@@ -24,45 +21,6 @@ def view(x=0.0, width=160, height=90, yaw=0.0):
     viewmat[:3, 3] = -viewmat[:3, :3] @ [x, 0, 0]
     K = np.array([[100, 0, 80], [0, 100, 45], [0, 0, 1]], np.float32)
     return View(f"{x}.png", Path("none"), "0", viewmat, K, width, height)
-
-
-def test_samples_sit_at_pixel_centres():
-    rng = np.random.default_rng(0)
-    # A ramp of light: patches are averaged linearly.
-    ramp = srgb_encode(np.linspace(0.2, 1, 50))[None, :, None]
-    image = np.tile(ramp, (40, 1, 3)).astype(np.float32)
-    xy = rng.uniform(9, 31, (100, 2))
-    light = 0.2 + 0.8 * (xy[:, 0] - 0.5) / 49
-    # Half a pixel of misplacement on a ramp of 0.8/49 a pixel.
-    slope = (srgb_encode(light + 1e-4) - srgb_encode(light - 1e-4)) / 2e-4
-    for wider in (None, np.full(100, 2.0), np.full(100, 4.0)):
-        colors, spread, _, valid = sample(image, np.ones((40, 50), np.float32), xy, wider)
-        assert valid.all()
-        np.testing.assert_allclose(colors[:, 0], srgb_encode(light), atol=2e-4)
-        np.testing.assert_allclose(spread[:, 0], 0.5 * slope * 0.8 / 49, rtol=5e-3)
-
-
-def test_samples_outside_and_masked_are_invalid():
-    mask = np.ones((40, 50), np.float32)
-    mask[:20] = 0
-    xy = np.array([[-3.0, 30], [25, 10], [25, 30], [60, 30], [25, 20.4]])
-    valid = sample(np.zeros((40, 50, 3), np.float32), mask, xy).valid
-    assert valid.tolist() == [False, False, True, False, False]
-
-
-def observations(views, points):
-    colors = np.zeros((len(views), 3))
-    return Observations(views, points, colors, colors, 20, 50, np.zeros(20, int))
-
-
-def test_pairs_are_two_views_of_one_point():
-    rng = np.random.default_rng(0)
-    tracks = observations(rng.permutation(200) % 20, np.repeat(np.arange(50), 4))
-    i, j = sample_pairs(tracks, 1000, 0)
-    assert np.all(tracks.points[i] == tracks.points[j])
-    assert np.all(i != j)
-    lonely = observations(np.arange(5), np.arange(5))
-    assert len(sample_pairs(lonely, 10, 0)[0]) == 0
 
 
 def street_points(ground_only):

@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pycolmap
 import pytest
 from PIL import Image
@@ -14,17 +15,46 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.core.numerics import srgb_decode, srgb_encode
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.colmap import load_colmap
-from p2gs_jax.synth.build_town import STREET_M, build_town
-from p2gs_jax.synth.rig import MOUNTS, camera_viewmat, carla_rotation, image_height, intrinsics
-from p2gs_jax.synth.sensor import draw_iso, photograph
+from p2gs_jax.synth.furnish import STREET_M, build_town
+from p2gs_jax.synth.rig import (
+    MOUNTS,
+    camera_viewmat,
+    carla_rotation,
+    drive,
+    image_height,
+    intrinsics,
+)
+from p2gs_jax.synth.sensor import (
+    draw_shots,
+    photograph,
+    read_true_exposures,
+    read_true_shots,
+    write_true_exposures,
+)
+from p2gs_jax.synth.settings import Sensor
 from p2gs_jax.synth.town import Material
-from p2gs_jax.synth.write import read_truth, write_street
+from p2gs_jax.synth.write import write_street
 
 SIZE = {"frames": 3, "width": 192, "height": 128, "points": 4000, "seed": 3}
 
 
 def read_png(path: Path) -> np.ndarray:
     return np.asarray(Image.open(path))
+
+
+NAMES = [f"{camera}/{f:06d}.png" for camera in sorted(MOUNTS) for f in range(SIZE["frames"])]
+
+
+def truth(street, name):
+    """Return linear radiance, and camera z (m, inf: sky)."""
+    path = (street / "truth" / "linear" / name).with_suffix(".exr")
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        pixels = {k: np.array(c.pixels, np.float32) for k, c in file.channels().items()}
+    return np.stack([pixels[c] for c in "RGB"], axis=-1), pixels["Z"]
+
+
+def card_of(street):
+    return json.loads((street / "dataset.json").read_text())
 
 
 @pytest.fixture(scope="module")
@@ -34,36 +64,21 @@ def street(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def scene(street):
-    return load_colmap(street.root, street.root / "sparse" / "0", DataConfig())
+    return load_colmap(street, street / "sparse" / "0", DataConfig())
 
 
 def test_every_file_is_deterministic_in_the_seed(street, tmp_path):
     again = write_street(tmp_path / "scene", **SIZE)
-    files = sorted(p.relative_to(street.root) for p in street.root.rglob("*") if p.is_file())
-    assert files == sorted(p.relative_to(again.root) for p in again.root.rglob("*") if p.is_file())
+    files = sorted(p.relative_to(street) for p in street.rglob("*") if p.is_file())
+    assert files == sorted(p.relative_to(again) for p in again.rglob("*") if p.is_file())
     for file in files:
-        assert (street.root / file).read_bytes() == (again.root / file).read_bytes(), file
+        assert (street / file).read_bytes() == (again / file).read_bytes(), file
     assert not list(tmp_path.glob(".scene-*"))
 
 
 def test_another_seed_makes_another_town():
     a, b = build_town(0), build_town(1)
     assert a.size != b.size or not np.array_equal(a.hi, b.hi)
-
-
-@pytest.mark.parametrize("std", [2.0, 4.0])
-def test_iso_is_rounded_normal_with_a_floor(std):
-    iso = draw_iso((20_000,), std, seed=0)
-    assert iso.dtype.kind == "i"
-    assert iso.min() >= 1
-    assert np.mean(iso) == pytest.approx(8.0, abs=0.15)
-    assert np.std(iso) == pytest.approx(std, rel=0.06)
-    np.testing.assert_array_equal(draw_iso((5, 3), 0.0, seed=1), 8)
-
-
-def test_srgb_round_trip():
-    x = np.linspace(0, 1, 1001)
-    np.testing.assert_allclose(srgb_decode(srgb_encode(x)), x, atol=1e-12)
 
 
 def test_rig_follows_the_papers_mounts():
@@ -90,29 +105,30 @@ def test_heights_keep_the_papers_proportions():
 
 
 def test_photographs_are_the_exposed_truth(street):
-    with (street.root / "truth" / "exposures.csv").open(newline="") as file:
+    with (street / "truth" / "exposures.csv").open(newline="") as file:
         rows = {row["image"]: row for row in csv.DictReader(file)}
+    assert list(rows) == NAMES
     checked = 0
-    for i, name in enumerate(street.names):
-        linear = street.linear(i)
-        reference = read_png(street.root / "reference" / name)
-        shot = read_png(street.root / "images" / name)
-        assert shot.shape == (street.height, street.width, 3)
+    for name in NAMES:
+        linear, _ = truth(street, name)
+        reference = read_png(street / "reference" / name)
+        shot = read_png(street / "images" / name)
+        assert shot.shape == (SIZE["height"], SIZE["width"], 3)
         np.testing.assert_allclose(255 * srgb_encode(linear), reference, atol=0.51)
         np.testing.assert_array_equal(shot, photograph(linear, float(rows[name]["exposure"])))
         e = float(rows[name]["exposure"])
-        assert e == street.exposures[i] == int(rows[name]["iso"]) / 8
+        assert e == int(rows[name]["iso"]) / 8
         assert float(rows[name]["exposure_ev"]) == pytest.approx(np.log2(e), abs=1e-5)
         good = (reference > 40) & (reference < 250) & (shot > 40) & (shot < 250)
         if good.sum() > 500:
             ratio = srgb_decode(shot[good] / 255) / srgb_decode(reference[good] / 255)
             assert np.median(ratio) == pytest.approx(e, rel=0.01)
             checked += 1
-    assert checked >= len(street.names) // 2
+    assert checked >= len(NAMES) // 2
 
 
 def test_radiance_spans_three_orders_and_is_well_exposed(street):
-    linear = np.stack([street.linear(i) for i in range(len(street.names))])
+    linear = np.stack([truth(street, name)[0] for name in NAMES])
     assert np.isfinite(linear).all()
     assert (linear >= 0).all()
     low, high = np.percentile(linear, [0.05, 99.95])
@@ -122,26 +138,28 @@ def test_radiance_spans_three_orders_and_is_well_exposed(street):
 
 
 def test_sky_masks_and_depth_agree(street):
-    for i, name in enumerate(street.names):
-        depth = street.depth(i)
-        mask = read_png(street.root / "truth" / "sky_masks" / name)
+    for name in NAMES:
+        _, depth = truth(street, name)
+        mask = read_png(street / "truth" / "sky_masks" / name)
         np.testing.assert_array_equal(mask == 255, np.isinf(depth))
         assert set(np.unique(mask)) <= {0, 255}
         assert depth.min() > 0.5
 
 
 def test_colmap_model_is_what_pycolmap_reads(street, scene):
-    model = pycolmap.Reconstruction(str(street.root / "sparse" / "0"))
+    model = pycolmap.Reconstruction(str(street / "sparse" / "0"))
     assert model.is_valid()
     assert model.num_cameras() == 3
-    assert model.num_points3D() == street.points
-    assert model.compute_num_observations() == street.observations
+    assert model.num_points3D() == card_of(street)["points"]
+    assert model.compute_num_observations() == card_of(street)["observations"]
     model.update_point_3d_errors()
     assert model.compute_mean_reprojection_error() < 1e-6
-    assert [v.name for v in scene.views] == list(street.names)
-    for view, viewmat in zip(scene.views, street.viewmats, strict=True):
+    assert [v.name for v in scene.views] == NAMES
+    K, track = intrinsics(SIZE["width"], SIZE["height"]), drive(SIZE["frames"])
+    for view in scene.views:
+        viewmat = camera_viewmat(MOUNTS[view.camera], track[int(Path(view.name).stem)])
         np.testing.assert_allclose(view.viewmat, viewmat, atol=1e-5)
-        np.testing.assert_allclose(view.K, street.K, rtol=1e-6)
+        np.testing.assert_allclose(view.K, K, rtol=1e-6)
 
 
 def test_tracks_land_on_their_points_and_see_one_radiance(street, scene):
@@ -152,7 +170,7 @@ def test_tracks_land_on_their_points_and_see_one_radiance(street, scene):
         p = scene.points[tracks.point_indices[rows]] @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
         xy = (p / p[:, 2:]) @ view.K.T
         np.testing.assert_allclose(xy[:, :2], tracks.xy[rows], atol=0.02)
-        reference = srgb_decode(read_png(street.root / "reference" / view.name) / 255.0)
+        reference = srgb_decode(read_png(street / "reference" / view.name) / 255.0)
         u, v = tracks.xy[rows].T - 0.5
         value = map_coordinates(reference[..., 1], [v, u], order=1, mode="nearest")
         usable = (value > 0.01) & (value < 0.95)
@@ -179,27 +197,6 @@ def test_seed_colours_are_from_photographs_of_views_that_are_not_held_out(street
     assert found.all()
 
 
-def test_card_and_refusals(street, tmp_path):
-    card = json.loads((street.root / "dataset.json").read_text())
-    assert card["seed"] == SIZE["seed"]
-    assert card["points"] == street.points
-    linear, depth = read_truth(street.root / "truth" / "linear" / "front" / "000001.exr")
-    assert linear.shape == (*depth.shape, 3)
-    with pytest.raises(UserError, match="not an empty folder"):
-        write_street(street.root)
-    with pytest.raises(UserError, match="cannot render"):
-        write_street(tmp_path / "x", frames=0)
-    assert not (tmp_path / "x").exists()
-
-
-@pytest.mark.parametrize("layout", ["street", "town"])
-def test_a_drive_does_not_go_through_the_tower(tmp_path, layout):
-    with pytest.raises(UserError, match=r"101 frames of 1\.2 m go on for 120 m") as error:
-        write_street(tmp_path / "x", frames=101, step=1.2, layout=layout)
-    assert "--layout long" in str(error.value.fix)
-    assert not (tmp_path / "x").exists()
-
-
 @pytest.mark.parametrize("way", [90.0, 100.0, 120.0, 226.0, 300.0])
 def test_the_last_street_of_a_long_town_ends_behind_the_drive(way):
     town = build_town(3, "long", way)
@@ -221,3 +218,37 @@ def test_a_long_town_goes_on_as_far_as_the_drive():
     # No two streets are alike.
     first = long.color[houses & (long.lo[:, 0] < STREET_M - 22)]
     assert not np.array_equal(first, long.color[houses][len(first) : 2 * len(first)])
+
+
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        ({"frames": 0}, "cannot render"),
+        ({"frames": 101, "step": 1.2}, r"101 frames of 1\.2 m go on for 120 m"),
+        ({"frames": 101, "step": 1.2, "layout": "town"}, "use --layout long"),
+    ],
+)
+def test_what_cannot_be_made_is_refused(street, tmp_path, asked, words):
+    with pytest.raises(UserError, match=words):
+        write_street(tmp_path / "x", **asked)
+    assert not (tmp_path / "x").exists()
+    with pytest.raises(UserError, match="not an empty folder"):
+        write_street(street)
+
+
+def test_the_card_and_the_table_say_what_was_done(street, tmp_path):
+    assert card_of(street)["seed"] == SIZE["seed"]
+    assert card_of(street)["sensor"]["iso_std"] == 4.0
+    sensor = Sensor(iso_std=2.0, camera_gain_ev=0.3, white_balance_ev=0.1, vignetting=0.2)
+    shots = draw_shots(sensor, SIZE["frames"], 3, seed=5)
+    (tmp_path / "truth").mkdir()
+    write_true_exposures(tmp_path, NAMES, [name.split("/")[0] for name in NAMES], shots)
+    read = read_true_exposures(tmp_path)
+    assert list(read) == NAMES
+    assert list(read.values()) == pytest.approx(shots.mean_exposures, rel=1e-5)
+    shots = read_true_shots(tmp_path)
+    assert [s.exposure for s in shots.values()] == list(read.values())
+    assert {s.corners for s in shots.values()} == {0.8}
+    assert all(np.prod(s.balance) == pytest.approx(1, abs=1e-4) for s in shots.values())
+    assert len({s.balance for s in shots.values()}) == 3
+    assert read_true_shots(street / "images") == {}

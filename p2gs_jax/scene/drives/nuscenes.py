@@ -177,7 +177,7 @@ class _Drive:
     def _read_sensors(self) -> dict[str, _Sensor]:
         wanted = {row["calibrated_sensor_token"] for row in self.data}
         needs: Kinds = {**PLACED, "sensor_token": str, "camera_intrinsic": list}
-        kinds = dict.fromkeys(("token", "channel", "modality"), str)
+        kinds: Kinds = {"token": str, "channel": str, "modality": str}
         rows = self.rows("calibrated_sensor", needs, "token", wanted)
         known = {row["token"]: row for row in self.rows("sensor", kinds)}
         sensors = {}

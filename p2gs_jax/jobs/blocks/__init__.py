@@ -1,0 +1,1 @@
+"""A scene fitted in blocks, of which each is a job."""

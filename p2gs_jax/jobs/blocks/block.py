@@ -1,0 +1,211 @@
+"""The fit of one block, as a job: exposures given, everything of the block and around it fitted."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import shutil
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from p2gs_jax.config import FitConfig, from_dict, to_dict
+from p2gs_jax.core.atomic import write_json
+from p2gs_jax.core.clock import Stopwatch
+from p2gs_jax.core.memory import text_of
+from p2gs_jax.core.progress import Reporter, Silent
+from p2gs_jax.core.runtime import tune_process, use_compile_cache
+from p2gs_jax.formats.ply import write_radiance
+from p2gs_jax.gaussians.population import Coverage, default_max_gaussians
+from p2gs_jax.gaussians.shell import Sphere
+from p2gs_jax.jobs.blocks.cut import Cut, whole_of
+from p2gs_jax.jobs.blocks.shared import Shared, photometry_of, read_shared
+from p2gs_jax.jobs.job import Job
+from p2gs_jax.pipeline.exposures import Exposures
+from p2gs_jax.pipeline.fit import begin_programs, begun, compact, optimise
+from p2gs_jax.pipeline.preflight import Paths
+from p2gs_jax.pipeline.prepare import load, prepare
+from p2gs_jax.run.folder import RunFolder, locked
+from p2gs_jax.scene.pixels.store import size_at
+from p2gs_jax.scene.visibility import shown_share
+from p2gs_jax.train.data_parallel import mesh_of
+from p2gs_jax.train.step import StepPrograms
+from p2gs_jax.types import Scene
+
+STATUS = Path("/proc/self/status")
+# Gaussians for a coarse point outside a block, which stands for many, to one for a point inside.
+# With 1, cores of a town had 5 % fewer Gaussians than one fit and .18 dB less; with 1.6, on another
+# town, 13 % more and .09 dB less (BUILD_NOTES, "Districts").
+OUTSIDE = 1.6
+
+
+@dataclasses.dataclass(frozen=True)
+class BlockScene:
+    """A block as a scene of its own.
+
+    Attributes:
+        scene: its training views, its points first.
+        exposures: with radiances, as solved for all blocks.
+        shell: where what lies behind everything is.
+        own: how many of the points lie in the block; the others are coarse.
+    """
+
+    scene: Scene
+    exposures: Exposures
+    shell: Sphere
+    own: int
+
+
+def block_scene(scene: Scene, shared: Shared, cut: Cut, number: int) -> BlockScene:
+    """Return what a block is fitted to."""
+    found, keep, own = whole_of(scene, cut, number)
+    exposures = Exposures(
+        photometry=photometry_of(shared.photometry, np.array(cut.blocks[number].views)),
+        decisions=shared.decisions,
+        radiance=shared.radiance[keep],
+    )
+    return BlockScene(found, exposures, shared.shell, own)
+
+
+def block_job(scene: Path, run: Path, folder: Path, cut: Cut, number: int, cfg: FitConfig) -> Job:
+    """Return the job of a block.
+
+    Args:
+        scene: folder of the scene.
+        run: run folder of the whole; its cache is read.
+        folder: of the blocks, with what they share.
+        cut: of the scene.
+        number: of the block.
+        cfg: of the whole.
+    """
+    arguments = {
+        "scene": str(scene.absolute()),
+        "run": str(run.absolute()),
+        "shared": str(folder.absolute()),
+        "cut": cut.to_dict(),
+        "number": number,
+        "fit": to_dict(cfg),
+    }
+    return Job(f"block {number}", folder / str(number), fit_block, arguments)
+
+
+def block_config(
+    cfg: FitConfig, cut: Cut, number: int, block: Scene, own: int, *, train_views: int
+) -> FitConfig:
+    """Return the options of a block: its share of the steps and of the Gaussians.
+
+    Args:
+        cfg: of the whole.
+        cut: of the scene.
+        number: of the block.
+        block: its scene.
+        own: how many of its points lie in the block.
+        train_views: number of training views of the whole.
+    """
+    share = len(cut.blocks[number].views) / train_views
+    train, densify = cfg.train, cfg.densify
+    steps = max(1, round(share * train.steps))
+    budget = None
+    if train.budget_s is not None:
+        budget = train.budget_s * share / sum(len(b.views) / train_views for b in cut.blocks)
+    most = densify.max_gaussians
+    if isinstance(most, int):
+        most = max(1, round(share * most))
+    elif most is None and densify.method == "mcmc":
+        most = _population(cfg, block, own)
+    return dataclasses.replace(
+        cfg,
+        train=dataclasses.replace(train, steps=steps, budget_s=budget),
+        densify=dataclasses.replace(densify, max_gaussians=most),
+    )
+
+
+def _population(cfg: FitConfig, block: Scene, own: int) -> int:
+    """Return how many Gaussians a block may have, so that it is as dense as the whole would be.
+
+    The whole's steps see a Gaussian as often as the block's do. What lies outside the block grows
+    as well, and is thrown away: its share is beside the block's.
+    """
+    seeds = own + round(OUTSIDE * (len(block.points) - own))
+    return default_max_gaussians(seeds, shown_by(block, cfg), cfg.train)
+
+
+def shown_by(scene: Scene, cfg: FitConfig) -> Coverage:
+    """Return how much of a scene its training views show, without their photographs."""
+    views = scene.training_views
+    pixels = max(w * h for w, h in (size_at(v, cfg.data.max_width) for v in views))
+    return Coverage(pixels, shown_share(scene.points, views))
+
+
+def fit_block(folder: Path, arguments: dict[str, Any], reporter: Reporter) -> None:
+    """Fit the block of a `block_job`, or go on with it; leaves `radiance.ply` and `metrics.json`.
+
+    Raises:
+        UserError: the scene cannot be read, or memory is short.
+    """
+    use_compile_cache()
+    tune_process()
+    begin = time.monotonic()
+    whole, cut = from_dict(arguments["fit"]), Cut.from_dict(arguments["cut"])
+    reporter.stage("Reading the scene")
+    scene = load(Path(arguments["scene"]), Path(arguments["run"]), whole, Silent())
+    shared, scene = read_shared(Path(arguments["shared"]), scene, whole)
+    number = arguments["number"]
+    block = block_scene(scene, shared, cut, number)
+    train_views = len(scene.train_indices)
+    cfg = block_config(whole, cut, number, block.scene, block.own, train_views=train_views)
+    del scene, shared
+    folder.mkdir(parents=True, exist_ok=True)
+    with locked(folder):
+        counts, seconds = _fit(RunFolder(folder), block, cfg, reporter, arguments["scene"])
+    seconds["total"] = time.monotonic() - begin
+    metrics = {"counts": counts, "seconds": seconds, "peak_bytes": peak_bytes()}
+    write_json(RunFolder(folder).metrics, metrics)
+
+
+def _fit(
+    folder: RunFolder, block: BlockScene, cfg: FitConfig, reporter: Reporter, scene: str
+) -> tuple[dict[str, int], dict[str, float]]:
+    """Fit a block's scene and write its Gaussians; return counts and seconds."""
+    clock, mesh = Stopwatch(), mesh_of(cfg)
+    with contextlib.closing(StepPrograms()) as programs:
+        prepared = prepare(
+            block.scene,
+            cfg,
+            reporter,
+            clock,
+            lambda known, curve: begin_programs(programs, known, folder, mesh, curve=curve),
+            pixels=folder.pixels,
+            given=block.exposures,
+            sphere=block.shell,
+        )
+        with begun(folder, Paths(Path(scene), folder.root), cfg, prepared.decisions):
+            result = optimise(prepared, folder, reporter, programs, resume=True, mesh=mesh)
+    params, _ = compact(result)
+    count = params.gaussians.capacity
+    reporter.stage("Writing files")
+    write_radiance(
+        folder.radiance, params.gaussians, np.ones(count, bool), activation=cfg.render.radiance
+    )
+    prepared.store.close()
+    shutil.rmtree(folder.pixels, ignore_errors=True)
+    counts = {
+        "gaussians": count,
+        "seed_points": len(block.scene.points),
+        "seed_points_outside": len(block.scene.points) - block.own,
+        "train_views": len(block.scene.views),
+        "steps": result.host.step,
+    }
+    return counts, {**clock.seconds, **result.seconds, "optimisation": result.host.elapsed_s}
+
+
+def peak_bytes() -> int | None:
+    """Return the most memory that this process has held, or None where the system does not say.
+
+    From /proc: `getrusage` counts what the process was before it became this one.
+    """
+    rows = dict(line.split(":", 1) for line in text_of(STATUS).splitlines() if ":" in line)
+    found = rows.get("VmHWM", "").split()
+    return int(found[0]) * 1024 if found else None

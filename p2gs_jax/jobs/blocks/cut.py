@@ -1,0 +1,324 @@
+"""A scene's ground cut into cells with as many photographs each, and a cell as a scene.
+
+The cells are rectangles along the two axes in which the cameras spread most; the outer ones have no
+outer edge, so that every point of space is in the core of exactly one block.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from p2gs_jax.core.numerics import evenly_spaced
+from p2gs_jax.errors import UserError
+from p2gs_jax.gaussians.seeds import camera_centers
+from p2gs_jax.render.warp import project_points
+from p2gs_jax.scene.visibility import in_frame
+from p2gs_jax.types import Scene, Tracks, View
+
+# A block reaches beyond its core by this share of the shortest core.
+OVERLAP = 0.15
+# A view belongs to a block if this share of the points it sees lies in it.
+LEAST_SEEN = 0.1
+FEWEST_VIEWS = 2
+# Of points without tracks at most so many are projected.
+MOST_PROJECTED = 20_000
+# Points outside a block are thinned to one in a cube whose side is this share of their distance.
+DETAIL = 0.02
+# Views that are asked what they see of points without tracks.
+MOST_LOOKED = 48
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The plane in which cells lie.
+
+    Attributes:
+        origin: middle of the cameras, scene units.
+        axes: unit vectors, the one along which cameras spread most first.
+    """
+
+    origin: Float[np.ndarray, " 3"]
+    axes: Float[np.ndarray, "2 3"]
+
+    def place(self, points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 2"]:
+        """Return where in the plane points lie."""
+        return (np.asarray(points, np.float64) - self.origin) @ self.axes.T
+
+
+@dataclass(frozen=True)
+class Block:
+    """A cell, and the photographs that show it.
+
+    Attributes:
+        lower: least coordinates in the plane; -inf at an outer edge.
+        upper: greatest ones, which belong to the neighbour.
+        views: rows among the training views.
+    """
+
+    lower: tuple[float, float]
+    upper: tuple[float, float]
+    views: tuple[int, ...] = ()
+
+    def holds(
+        self, places: Float[np.ndarray, "p 2"], margin: float = 0.0
+    ) -> Bool[np.ndarray, " p"]:
+        """Return which places lie in the core, or within a margin of it."""
+        low, high = np.array(self.lower) - margin, np.array(self.upper) + margin
+        inside = (places >= low) & (places < high)
+        return inside[:, 0] & inside[:, 1]
+
+    def distance(self, places: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, " p"]:
+        """Return how far from the core places lie, scene units; 0 inside."""
+        beyond = np.maximum(np.array(self.lower) - places, places - np.array(self.upper))
+        return np.linalg.norm(np.maximum(beyond, 0.0), axis=1)
+
+
+@dataclass(frozen=True)
+class Cut:
+    """A scene's blocks.
+
+    Attributes:
+        ground: the plane of the cells.
+        margin: how far blocks reach beyond their cores, scene units.
+        blocks: with their views.
+    """
+
+    ground: Ground
+    margin: float
+    blocks: tuple[Block, ...]
+
+    def core(self, number: int, points: Float[np.ndarray, "p 3"]) -> Bool[np.ndarray, " p"]:
+        """Return which points lie in the core of a block."""
+        return self.blocks[number].holds(self.ground.place(points))
+
+    def neighbours(self) -> list[tuple[int, int]]:
+        """Return the pairs of blocks whose cores touch, be it at a corner."""
+        found = []
+        for a, first in enumerate(self.blocks):
+            for b in range(a + 1, len(self.blocks)):
+                second = self.blocks[b]
+                low = np.maximum(first.lower, second.lower)
+                high = np.minimum(first.upper, second.upper)
+                if (high >= low).all():
+                    found.append((a, b))
+        return found
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values; edges that are none become null."""
+        return {
+            "origin": self.ground.origin.tolist(),
+            "axes": self.ground.axes.tolist(),
+            "margin": self.margin,
+            "blocks": [
+                {"lower": list(b.lower), "upper": list(b.upper), "views": list(b.views)}
+                for b in self.blocks
+            ],
+        }
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> Cut:
+        """Return what `to_dict` and JSON made of it."""
+        ground = Ground(np.array(values["origin"]), np.array(values["axes"]))
+        blocks = tuple(
+            Block(_edge(b["lower"], -np.inf), _edge(b["upper"], np.inf), tuple(b["views"]))
+            for b in values["blocks"]
+        )
+        return cls(ground, float(values["margin"]), blocks)
+
+
+def _edge(values: Sequence[float | None], outer: float) -> tuple[float, float]:
+    first, second = (outer if v is None else float(v) for v in values)
+    return first, second
+
+
+def cut_scene(scene: Scene, count: int) -> Cut:
+    """Cut a scene into so many blocks.
+
+    Raises:
+        UserError: there are too few photographs, or places, for so many blocks.
+    """
+    seen = seen_points(scene)
+    centers = camera_centers(scene.training_views)
+    ground = ground_of(centers)
+    places = ground.place(looked_at(scene, seen, centers))
+    if count < 1:
+        raise UserError(f"--blocks {count}.", fix="write a whole number from 1, or auto")
+    distinct = len(np.unique(np.round(places, 9), axis=0))
+    if count * FEWEST_VIEWS > len(places) or count > distinct:
+        raise UserError(
+            f"{len(places)} training photographs from {distinct} places are too few for {count} "
+            "blocks.",
+            fix=f"use --blocks {max(1, min(len(places) // FEWEST_VIEWS, distinct))} or fewer",
+        )
+    cells = split(places, count)
+    margin = OVERLAP * min(_length(places[cell.holds(places)]) for cell in cells)
+    inside = [cell.holds(ground.place(scene.points), margin) for cell in cells]
+    blocks = []
+    for cell, near in zip(cells, inside, strict=True):
+        share = np.array([near[points].mean() if len(points) else 0.0 for points in seen])
+        belongs = cell.holds(places, margin) | (share >= LEAST_SEEN)
+        blocks.append(Block(cell.lower, cell.upper, tuple(np.flatnonzero(belongs).tolist())))
+    few = [len(b.views) for b in blocks if len(b.views) < FEWEST_VIEWS]
+    if few:
+        raise UserError(
+            f"cut into {count} blocks, one is shown by {few[0]} photograph(s); a fit needs two.",
+            fix=f"use --blocks {count - 1} or fewer",
+        )
+    return Cut(ground, float(margin), tuple(blocks))
+
+
+def ground_of(centers: Float[np.ndarray, "v 3"]) -> Ground:
+    """Return the plane in which cameras spread most."""
+    middle = np.asarray(centers, np.float64).mean(0)
+    _, _, axes = np.linalg.svd(centers - middle, full_matrices=True)
+    # A sign that does not depend on the library.
+    signs = np.sign(axes[np.arange(3), np.abs(axes).argmax(1)])
+    return Ground(middle, (axes * signs[:, None])[:2])
+
+
+def split(places: Float[np.ndarray, "v 2"], count: int) -> list[Block]:
+    """Return cells with about as many places each; at least `count` places differ."""
+    return _split(places, count, Block((-np.inf, -np.inf), (np.inf, np.inf)))
+
+
+def _split(places: Float[np.ndarray, "v 2"], count: int, cell: Block) -> list[Block]:
+    if count == 1:
+        return [cell]
+    less = count // 2
+    axis = int(np.ptp(places, axis=0).argmax())
+    values = np.sort(places[:, axis])
+    edges = np.flatnonzero(np.diff(values) > 0)
+    if not len(edges):
+        raise UserError(
+            f"the photographs of a part of the scene show one place, which {count} blocks would "
+            "share.",
+            fix="use fewer --blocks",
+        )
+    wanted = less / count * len(values) - 1
+    at = edges[np.abs(edges - wanted).argmin()]
+    edge = float((values[at] + values[at + 1]) / 2)
+    lower, upper = list(cell.lower), list(cell.upper)
+    lower[axis] = upper[axis] = edge
+    near = places[:, axis] < edge
+    return [
+        *_split(places[near], less, Block(cell.lower, (upper[0], upper[1]))),
+        *_split(places[~near], count - less, Block((lower[0], lower[1]), cell.upper)),
+    ]
+
+
+def _length(places: Float[np.ndarray, "v 2"]) -> float:
+    return float(np.ptp(places, axis=0).max()) if len(places) else 0.0
+
+
+def seen_points(scene: Scene) -> list[Int[np.ndarray, " k"]]:
+    """Return which points each training view sees: by tracks, else by projection of some points."""
+    rows = scene.train_indices
+    if scene.tracks is not None and len(scene.tracks.xy):
+        row_of = np.full(len(scene.views), len(rows))
+        row_of[list(rows)] = np.arange(len(rows))
+        row = row_of[scene.tracks.view_indices]
+        order = np.argsort(row, kind="stable")
+        starts = np.searchsorted(row[order], np.arange(len(rows) + 1))
+        points = scene.tracks.point_indices[order]
+        return [points[starts[k] : starts[k + 1]] for k in range(len(rows))]
+    picked = np.arange(0, len(scene.points), max(1, len(scene.points) // MOST_PROJECTED))
+    return [picked[shows(scene.views[i], scene.points[picked])] for i in rows]
+
+
+def looked_at(
+    scene: Scene, seen: Sequence[Int[np.ndarray, " k"]], centers: Float[np.ndarray, "v 3"]
+) -> Float[np.ndarray, "v 3"]:
+    """Return where each training view counts: half way from its camera to the points it sees.
+
+    Cameras that all look ahead fill what lies before them, not what they stand on.
+    """
+    half = np.array(centers, np.float64)
+    for row, points in enumerate(seen):
+        if len(points):
+            half[row] = (half[row] + np.median(scene.points[points], axis=0)) / 2
+    return half
+
+
+def shows(view: View, points: Float[np.ndarray, "p 3"]) -> Bool[np.ndarray, " p"]:
+    """Return which points lie in the frustum of a view."""
+    return in_frame(*project_points(points, view), view.width, view.height)
+
+
+def views_of(scene: Scene, block: Block) -> Int[np.ndarray, " k"]:
+    """Return the rows in `scene.views` of a block's views."""
+    return np.asarray(scene.train_indices)[list(block.views)]
+
+
+def whole_of(scene: Scene, cut: Cut, number: int) -> tuple[Scene, Int[np.ndarray, " k"], int]:
+    """Return a block as a scene: its views, its points, and coarse ones of what lies around it.
+
+    Also which points of the whole it has, and how many of them (the first) lie in the block.
+    """
+    block = cut.blocks[number]
+    places = cut.ground.place(scene.points)
+    near = block.holds(places, cut.margin)
+    rows = views_of(scene, block)
+    beyond = np.flatnonzero(~near & _seen(scene, rows))
+    distance = block.distance(places[beyond]) - cut.margin
+    coarse = beyond[thinned(scene.points[beyond], distance)]
+    keep = np.concatenate([np.flatnonzero(near), coarse])
+    colors = scene.point_colors
+    found = replace(
+        scene,
+        views=tuple(scene.views[i] for i in rows),
+        points=scene.points[keep],
+        point_colors=None if colors is None else colors[keep],
+        tracks=_tracks(scene, rows, keep),
+        notes=(),
+    )
+    return found, keep, int(near.sum())
+
+
+def _seen(scene: Scene, rows: Int[np.ndarray, " k"]) -> Bool[np.ndarray, " p"]:
+    """Return which points some of the views see: by tracks, else by projection into a few."""
+    seen = np.zeros(len(scene.points), bool)
+    if scene.tracks is not None and len(scene.tracks.xy):
+        seen[scene.tracks.point_indices[np.isin(scene.tracks.view_indices, rows)]] = True
+        return seen
+    for k in evenly_spaced(len(rows), MOST_LOOKED):
+        seen |= shows(scene.views[rows[k]], scene.points)
+    return seen
+
+
+def thinned(
+    points: Float[np.ndarray, "p 3"], distance: Float[np.ndarray, " p"]
+) -> Int[np.ndarray, " k"]:
+    """Return points of which no two share a cube; cubes grow with the distance from the block.
+
+    Sides are powers of two; all lengths are in scene units.
+    """
+    if not len(points):
+        return np.zeros(0, int)
+    least = max(float(np.ptp(points, axis=0).max()), 1e-9) * 1e-6
+    level = np.floor(np.log2(np.maximum(DETAIL * distance, least)))
+    cube = np.floor(points / np.exp2(level)[:, None])
+    keys = np.concatenate([level[:, None], cube], 1)
+    _, first = np.unique(keys, axis=0, return_index=True)
+    return np.sort(first)
+
+
+def _tracks(
+    scene: Scene, rows: Int[np.ndarray, " k"], keep: Int[np.ndarray, " p"]
+) -> Tracks | None:
+    """Return the observations that are left, under the new rows of views and points."""
+    tracks = scene.tracks
+    if tracks is None:
+        return None
+    view, point = np.full(len(scene.views), -1), np.full(len(scene.points), -1)
+    view[rows], point[keep] = np.arange(len(rows)), np.arange(len(keep))
+    left: Bool[np.ndarray, " o"] = (view[tracks.view_indices] >= 0) & (
+        point[tracks.point_indices] >= 0
+    )
+    return Tracks(
+        view[tracks.view_indices[left]], point[tracks.point_indices[left]], tracks.xy[left]
+    )

@@ -1,0 +1,314 @@
+"""A scene fitted in blocks: photometry once, blocks as jobs, one run folder."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import jax
+
+from p2gs_jax.config import FitConfig, require_config
+from p2gs_jax.core.atomic import no_empty_folders, write_json
+from p2gs_jax.core.clock import CompileCounter, Stopwatch
+from p2gs_jax.core.numerics import on_device
+from p2gs_jax.core.progress import Reporter, Silent
+from p2gs_jax.core.runtime import return_freed_memory
+from p2gs_jax.errors import UserError
+from p2gs_jax.evaluation.references import Reference
+from p2gs_jax.formats.ply import read_ply
+from p2gs_jax.jobs.blocks.block import block_job, peak_bytes
+from p2gs_jax.jobs.blocks.cut import Cut, cut_scene
+from p2gs_jax.jobs.blocks.plan import (
+    check_options,
+    check_scene,
+    fewest_blocks,
+    read_plan,
+    require_room,
+    write_plan,
+)
+from p2gs_jax.jobs.blocks.seams import Seam, level_seams, merge_cores
+from p2gs_jax.jobs.blocks.shared import (
+    ARRAYS,
+    DECISIONS,
+    Solved,
+    read_shared,
+    solve_shared,
+    write_shared,
+)
+from p2gs_jax.jobs.engines import LOCAL, check_engine, open_engine
+from p2gs_jax.jobs.job import JobState
+from p2gs_jax.jobs.run import run_jobs
+from p2gs_jax.pipeline import preflight
+from p2gs_jax.pipeline.finish import Account, finish
+from p2gs_jax.pipeline.fit import FitResult, centred, fit, true_stops
+from p2gs_jax.pipeline.preflight import Paths, check_run_dir
+from p2gs_jax.pipeline.prepare import load
+from p2gs_jax.run.decisions import read_decisions
+from p2gs_jax.run.folder import RunFolder, RunLock, locked, require_free
+from p2gs_jax.run.write import write_start
+from p2gs_jax.scene.pixels.store import ImageStore
+from p2gs_jax.types import Params, Scene
+
+BLOCKS = "blocks"
+# Under this name in `metrics.json`.
+KEY = "districts"
+
+
+@dataclasses.dataclass(frozen=True)
+class Asked:
+    """How a scene is to be fitted in blocks.
+
+    Attributes:
+        blocks: how many, or `auto`: as few as memory allows.
+        parallel: how many at a time on this machine.
+        engine: where they are fitted (`jobs.engines.open_engine`).
+    """
+
+    blocks: int | str = "auto"
+    parallel: int = 1
+    engine: str = LOCAL
+
+
+def fit_blocks(
+    scene_dir: str | Path,
+    run_dir: str | Path,
+    cfg: FitConfig | None = None,
+    *,
+    blocks: int | str = "auto",
+    parallel: int = 1,
+    engine: str = LOCAL,
+    reference: str | Path | None = None,
+    resume: bool = False,
+    reporter: Reporter | None = None,
+    on_look: Callable[[Sequence[JobState]], None] = lambda states: None,
+    true_exposures: Mapping[str, float] | None = None,
+) -> FitResult:
+    """Fit a scene in blocks and write a run folder as `fit` does, whose arguments it shares.
+
+    Args:
+        run_dir: the blocks are in its folder `blocks`.
+        blocks: how many, or `auto`: as few as memory allows; with one, this is `fit`.
+        parallel: blocks at a time on this machine.
+        engine: where they are fitted: local, dask://HOST:PORT or slurm (docs/sweeps.md).
+        resume: continue after an interruption; blocks that are finished stay.
+        on_look: receives how far the blocks are, twice a second.
+
+    Raises:
+        UserError: something the user can mend; a block that failed is named, with its reason.
+        Interrupted: a signal came; blocks under way write their checkpoints first.
+    """
+    cfg, reporter = require_config(cfg), reporter or Silent()
+    asked = Asked(blocks, parallel, engine)
+    paths = Paths(Path(scene_dir), Path(run_dir), None if reference is None else Path(reference))
+    if isinstance(blocks, str) and blocks != "auto":
+        raise UserError(f"--blocks {blocks}.", fix="write a whole number from 1, or auto")
+    check_options(cfg)
+    check_engine(engine)
+    require_free(paths.run)
+    weights = preflight.preflight(cfg, paths, resume=resume)
+    begin = time.monotonic()
+    with no_empty_folders(paths.run), locked(paths.run) as lock:
+        check_run_dir(paths.run, resume, cfg)
+        scene = load(paths.scene, paths.run, cfg, reporter)
+        check_scene(scene, cfg)
+        truth = preflight.check_scene(scene, cfg, paths, weights)
+        cut = _cut(scene, cfg, asked, paths.run / BLOCKS, reporter)
+        if cut is not None:
+            whole = _Blocks(paths, cfg, asked, cut, lock, reporter, on_look)
+            return whole.fit(scene, truth, weights, begin, true_exposures)
+    # One block is no block.
+    return fit(
+        paths.scene,
+        paths.run,
+        cfg,
+        reference=paths.reference,
+        resume=resume,
+        reporter=reporter,
+        true_exposures=true_exposures,
+        spent_s=time.monotonic() - begin,
+    )
+
+
+def _cut(
+    scene: Scene, cfg: FitConfig, asked: Asked, folder: Path, reporter: Reporter
+) -> Cut | None:
+    """Return how the scene is cut, as before where it was; None: one block holds all."""
+    cut = read_plan(folder, str(asked.blocks))
+    if cut is None:
+        count = asked.blocks
+        if isinstance(count, str):
+            count = fewest_blocks(scene, cfg, asked.parallel)
+        if count == 1:
+            reporter.message("One block: memory holds the scene whole.")
+            return None
+        cut = cut_scene(scene, count)
+    # Elsewhere there is other memory.
+    if asked.engine == LOCAL:
+        require_room(scene, cfg, cut, asked.parallel)
+    sizes = [len(block.views) for block in cut.blocks]
+    reporter.message(
+        f"{len(sizes)} blocks of {min(sizes)} to {max(sizes)} of {len(scene.train_indices)} "
+        f"training photographs, which reach {cut.margin:.3g} beyond their cores."
+    )
+    return cut
+
+
+class _Blocks:
+    """A scene that is fitted in blocks, its folder locked."""
+
+    def __init__(
+        self,
+        paths: Paths,
+        cfg: FitConfig,
+        asked: Asked,
+        cut: Cut,
+        lock: RunLock,
+        reporter: Reporter,
+        on_look: Callable[[Sequence[JobState]], None],
+    ):
+        self.paths, self.cfg, self.asked, self.cut = paths, cfg, asked, cut
+        self.lock, self.reporter, self.on_look = lock, reporter, on_look
+        self.folder = RunFolder(paths.run)
+        self.blocks = paths.run / BLOCKS
+        self.clock, self.compiler = Stopwatch(), CompileCounter()
+
+    def fit(
+        self, scene: Scene, truth: Reference | None, weights, begin: float, true_exposures
+    ) -> FitResult:
+        """Solve, fit every block, merge and judge."""
+        with self.clock("photometry"):
+            solved = self._solve(scene)
+        with self.clock("blocks"):
+            self._fit_blocks()
+        self.reporter.stage("Merging blocks")
+        store = ImageStore(solved.scene.views, self.cfg.data, folder=self.folder.pixels)
+        cfg = solved.shared.decisions.resolve(self.cfg)
+        fitted = [
+            read_ply(RunFolder(self.blocks / str(k)).radiance) for k in range(len(self.cut.blocks))
+        ]
+        with self.clock("seams"):
+            fitted, seams = level_seams(solved.scene, store, self.cut, fitted, cfg.render)
+        gaussians, counts = merge_cores(self.cut, fitted)
+        fitted.clear()
+        photometry = jax.tree.map(on_device, solved.shared.photometry)
+        params = centred(Params(gaussians, photometry), cfg)
+        self._tell(seams)
+        self.lock.require()
+        account = Account(
+            counts={
+                "gaussians": gaussians.capacity,
+                "seed_points": len(scene.points),
+                "train_views": len(scene.train_indices),
+                "test_views": len(scene.test_indices),
+                "steps": sum(self._of_block(k)["counts"]["steps"] for k in range(len(counts))),
+                "blocks": len(counts),
+            },
+            seconds={**self.clock.seconds, "total_until_evaluation": time.monotonic() - begin},
+            compiler=self.compiler,
+            selection=solved.selection,
+            notes=[*solved.scene.notes, *solved.notes],
+        )
+        metrics = finish(
+            params,
+            solved.scene,
+            store,
+            cfg,
+            self.folder,
+            account,
+            self.reporter,
+            truth=truth,
+            lpips_weights=weights,
+            true_ev=true_stops(true_exposures, solved.scene),
+            still_ours=self.lock.require,
+        )
+        metrics[KEY] = self._summary(seams, counts)
+        write_json(self.folder.metrics, metrics)
+        store.close()
+        shutil.rmtree(self.folder.pixels, ignore_errors=True)
+        return FitResult(
+            params,
+            solved.scene,
+            metrics,
+            self.paths.run,
+            solved.selection,
+            solved.shared.decisions,
+        )
+
+    def _solve(self, scene: Scene) -> Solved:
+        store = ImageStore(scene.views, self.cfg.data, folder=self.folder.pixels)
+        kept = read_decisions(self.blocks / DECISIONS)
+        solved = solve_shared(scene, store, self.cfg, self.reporter, kept=kept)
+        store.close()
+        return_freed_memory()
+        for note in (*scene.notes, *solved.notes):
+            self.reporter.message(note)
+        self.lock.require()
+        shared = solved.shared
+        write_start(self.folder, self.paths.scene, self.paths.reference, self.cfg, shared.decisions)
+        if (self.blocks / ARRAYS).exists():
+            # What blocks were fitted under stays, to the digit.
+            shared, scene = read_shared(self.blocks, scene, self.cfg)
+            return dataclasses.replace(solved, shared=shared, scene=scene)
+        write_plan(self.blocks, self.cut, str(self.asked.blocks))
+        write_shared(self.blocks, shared, solved.scene)
+        return solved
+
+    def _fit_blocks(self) -> None:
+        left = [
+            block_job(self.paths.scene, self.paths.run, self.blocks, self.cut, k, self.cfg)
+            for k in range(len(self.cut.blocks))
+            if not RunFolder(self.blocks / str(k)).metrics.exists()
+        ]
+        if not left:
+            return
+        jobs = self.blocks / "jobs"
+        with open_engine(self.asked.engine, self.asked.parallel, jobs) as workers:
+            states = run_jobs(left, workers, jobs, on_end=self._ended, on_look=self.on_look)
+        failed = [f"{s.name}: {s.reason}" for s in states if s.status != "done"]
+        if failed:
+            raise UserError(
+                f"{len(failed)} of {len(self.cut.blocks)} blocks failed. " + "; ".join(failed),
+                fix="mend that and add --resume: blocks that are finished stay",
+            )
+
+    def _ended(self, number: int, state: JobState) -> None:
+        how = "fitted" if state.status == "done" else state.status
+        self.reporter.message(f"{state.name}: {how} after {state.seconds:.0f} s.")
+
+    def _of_block(self, number: int) -> dict:
+        return json.loads(RunFolder(self.blocks / str(number)).metrics.read_text(encoding="utf-8"))
+
+    def _tell(self, seams: Sequence[Seam]) -> None:
+        seen = [s for s in seams if s.step_stops is not None]
+        if seen:
+            worst = max(seen, key=lambda s: abs(s.step_stops or 0.0))
+            self.reporter.message(
+                f"The largest step of radiance left between blocks: {worst.step_stops:+.4f} stops "
+                f"(blocks {worst.blocks[0]} and {worst.blocks[1]}); median difference "
+                f"{worst.spread_stops:.3f} stops, {worst.spread_depth:.1%} of depth."
+            )
+
+    def _summary(self, seams: Sequence[Seam], counts: Sequence[int]) -> dict:
+        """Return what `metrics.json` says of the blocks."""
+        rows = []
+        for number, (block, kept) in enumerate(zip(self.cut.blocks, counts, strict=True)):
+            found = self._of_block(number)
+            rows.append(
+                {
+                    "views": len(block.views),
+                    "gaussians_in_core": kept,
+                    **found["counts"],
+                    "seconds": found["seconds"]["total"],
+                    "peak_bytes": found["peak_bytes"],
+                }
+            )
+        return {
+            "blocks": rows,
+            "seams": [dataclasses.asdict(seam) for seam in seams],
+            "margin": self.cut.margin,
+            "peak_bytes_merging": peak_bytes(),
+        }

@@ -1,0 +1,258 @@
+"""Where blocks meet: how their radiance and depth differ, made equal, and merged.
+
+The same views are rendered by each block along a boundary. A difference in one direction is a step;
+one both ways is what two fits of anything differ by. Exposures drift along a drive by thousandths
+of a stop a block, and each block's radiance follows its photographs. The step is spread over the
+blocks beside it, less and less inwards, as seams of textures are levelled (Lempitsky and Ivanov
+2007; Waechter et al. 2014); docs/districts.md says what that does and does not do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from p2gs_jax.config import RenderConfig
+from p2gs_jax.core.numerics import evenly_spaced, on_device
+from p2gs_jax.errors import UserError
+from p2gs_jax.jobs.blocks.cut import OVERLAP, Cut
+from p2gs_jax.render.capacity import RenderView, make_renderer
+from p2gs_jax.render.harmonics import scaled
+from p2gs_jax.scene.pixels.store import ImageStore, camera_of
+from p2gs_jax.types import Gaussians, Scene
+
+# Views of a boundary that are rendered at most. With 12 a step was .018 stop, with 48 .005.
+MOST_VIEWS = 48
+# Where either block shows less, nothing is compared.
+OPAQUE = 0.9
+DARKEST = 1e-3
+# How far into a core its radiance is moved, as a share of the shortest core.
+INWARDS = 0.5
+# A view with fewer pixels of the strip says little.
+FEWEST_PIXELS = 50
+
+
+@dataclass(frozen=True)
+class Seam:
+    """How two blocks differ in the strip around their boundary.
+
+    Attributes:
+        blocks: their numbers.
+        views: that show the strip.
+        pixels: that were compared.
+        step_stops: median of the second's radiance over the first's, stops: what one sees as a
+            seam. None where nothing was compared.
+        spread_stops: median size of that ratio.
+        step_depth: median of the second's depth over the first's, less one.
+        spread_depth: median size of that.
+        levelled_stops: the step that was taken out before, as other views told it; None: nothing.
+    """
+
+    blocks: tuple[int, int]
+    views: int
+    pixels: int
+    step_stops: float | None
+    spread_stops: float | None
+    step_depth: float | None
+    spread_depth: float | None
+    levelled_stops: float | None = None
+
+
+def measure_seams(
+    scene: Scene,
+    store: ImageStore,
+    cut: Cut,
+    fitted: Sequence[Gaussians],
+    cfg: RenderConfig,
+    *,
+    which: slice = slice(None),
+) -> list[Seam]:
+    """Compare neighbouring blocks, by all Gaussians of each, in training views of both.
+
+    Args:
+        scene: the whole.
+        store: its photographs; only their cameras are used.
+        cut: of the scene.
+        fitted: all Gaussians of each block.
+        cfg: rendering options.
+        which: selects among the views that two blocks share, in the order of the scene.
+    """
+    return [
+        _seam(scene, store, cut, (a, b), (fitted[a], fitted[b]), cfg, which)
+        for a, b in cut.neighbours()
+    ]
+
+
+def _seam(
+    scene: Scene,
+    store: ImageStore,
+    cut: Cut,
+    pair: tuple[int, int],
+    fitted: tuple[Gaussians, Gaussians],
+    cfg: RenderConfig,
+    which: slice,
+) -> Seam:
+    first, second = (cut.blocks[k] for k in pair)
+    both = sorted(set(first.views) & set(second.views))[which]
+    renderers = make_renderer(cfg), make_renderer(cfg)
+    stops, depths, views = [], [], 0
+    for row in (both[k] for k in evenly_spaced(len(both), MOST_VIEWS)):
+        index = scene.train_indices[row]
+        found = _compared(store, index, cut, pair, fitted, renderers)
+        if len(found[0]) >= FEWEST_PIXELS:
+            views += 1
+            stops.append(found[0])
+            depths.append(found[1])
+    if not views:
+        return Seam(pair, 0, 0, None, None, None, None)
+    ratio, depth = np.concatenate(stops), np.concatenate(depths)
+    return Seam(
+        pair,
+        views,
+        len(ratio),
+        float(np.median(ratio)),
+        float(np.median(np.abs(ratio))),
+        float(np.median(depth)),
+        float(np.median(np.abs(depth))),
+    )
+
+
+def _compared(
+    store: ImageStore,
+    index: int,
+    cut: Cut,
+    pair: tuple[int, int],
+    fitted: tuple[Gaussians, Gaussians],
+    renderers: tuple[RenderView, RenderView],
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+    """Return log2 ratios of radiance and relative ones of depth where a view shows the strip."""
+    camera = camera_of(store, index)
+    shown = []
+    for gaussians, render in zip(fitted, renderers, strict=True):
+        drawn = render(gaussians, jax.numpy.ones(gaussians.capacity, bool), camera)
+        linear, alpha = np.asarray(drawn.linear), np.asarray(drawn.alpha)
+        assert drawn.depth is not None
+        opaque = np.maximum(alpha, 1e-6)
+        shown.append((linear.mean(-1) / opaque, np.asarray(drawn.depth) / opaque, alpha))
+    (one, near, solid), (other, far, covered) = shown
+    # Chosen by one of the depths, pixels would be those in which the other is farther off.
+    middle = np.sqrt(np.maximum(near * far, 0.0))
+    points = unprojected(middle, np.asarray(camera.K), np.asarray(camera.viewmat))
+    places = cut.ground.place(points.reshape(-1, 3))
+    strip = np.ones(len(places), bool)
+    for number in pair:
+        strip &= cut.blocks[number].holds(places, cut.margin)
+    good = strip.reshape(near.shape) & (solid > OPAQUE) & (covered > OPAQUE)
+    good &= (near > 0) & (far > 0)
+    ratio = np.log2(np.maximum(other[good], DARKEST) / np.maximum(one[good], DARKEST))
+    return ratio, far[good] / near[good] - 1
+
+
+def unprojected(
+    depth: Float[np.ndarray, "h w"], K: Float[np.ndarray, "3 3"], viewmat: Float[np.ndarray, "4 4"]
+) -> Float[np.ndarray, "h w 3"]:
+    """Return where in the world the pixels of a depth map lie."""
+    height, width = depth.shape
+    y, x = np.mgrid[:height, :width] + 0.5
+    rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], -1)
+    return (rays * depth[..., None] - viewmat[:3, 3]) @ viewmat[:3, :3]
+
+
+def level_seams(
+    scene: Scene, store: ImageStore, cut: Cut, fitted: Sequence[Gaussians], cfg: RenderConfig
+) -> tuple[list[Gaussians], list[Seam]]:
+    """Take steps between blocks out, and say what is left of them.
+
+    Every second view of a boundary tells the step, the others judge: what is left is measured where
+    nothing was fitted to.
+
+    Args:
+        scene: the whole.
+        store: its photographs; only their cameras are used.
+        cut: of the scene.
+        fitted: all Gaussians of each block.
+        cfg: rendering options.
+
+    Returns:
+        All Gaussians of each block, and its seams, with what was taken out of each.
+    """
+    told = measure_seams(scene, store, cut, fitted, cfg, which=slice(0, None, 2))
+    steps = {s.blocks: s.step_stops for s in told if s.step_stops is not None}
+    levelled = []
+    for number, gaussians in enumerate(fitted):
+        shift = shifts(cut, number, np.asarray(gaussians.means), steps) * np.log(2)
+        sh = scaled(np.asarray(gaussians.sh), shift[:, None], cfg.radiance)
+        levelled.append(replace(gaussians, sh=on_device(sh)))
+    left = measure_seams(scene, store, cut, levelled, cfg, which=slice(1, None, 2))
+    return levelled, [replace(s, levelled_stops=steps.get(s.blocks)) for s in left]
+
+
+def shifts(
+    cut: Cut,
+    number: int,
+    means: Float[np.ndarray, "n 3"],
+    steps: Mapping[tuple[int, int], float],
+) -> Float[np.ndarray, " n"]:
+    """Return by how many stops a block's radiance is to grow at some places.
+
+    Where several blocks are near, their radiance becomes the mean of what each has, with weights
+    that fall with the distance from its core: two blocks come out alike wherever no third is near,
+    and a block's own radiance stays where none is.
+
+    Args:
+        cut: of the scene.
+        number: of the block.
+        means: places, scene units.
+        steps: second block over first, stops; pairs without one have no part in each other's mean.
+    """
+    places = cut.ground.place(means)
+    reach = INWARDS * cut.margin / OVERLAP
+    weight = _near(cut.blocks[number].distance(places), reach)
+    total, moved = weight.copy(), np.zeros(len(places))
+    for (first, second), step in steps.items():
+        if number in (first, second):
+            other, more = (second, step) if number == first else (first, -step)
+            weight = _near(cut.blocks[other].distance(places), reach)
+            total += weight
+            moved += weight * more
+    return moved / np.maximum(total, np.finfo(float).tiny)
+
+
+def _near(distance: Float[np.ndarray, " n"], reach: float) -> Float[np.ndarray, " n"]:
+    return np.maximum(1 - distance / reach, 0.0)
+
+
+def merge_cores(cut: Cut, fitted: Sequence[Gaussians]) -> tuple[Gaussians, list[int]]:
+    """Return the Gaussians whose centres lie in the core of the block that fitted them.
+
+    Cores cover space once: nothing is there twice, and nothing is left out.
+
+    Args:
+        cut: of the scene.
+        fitted: of each block, in its order.
+
+    Returns:
+        All of them, block after block, and how many each gave.
+
+    Raises:
+        UserError: there are none.
+    """
+    kept = [
+        np.flatnonzero(cut.core(number, np.asarray(gaussians.means)))
+        for number, gaussians in enumerate(fitted)
+    ]
+    counts = [len(rows) for rows in kept]
+    if not sum(counts):
+        raise UserError(
+            "no block has a Gaussian in its core.", fix="use fewer --blocks, or more --steps"
+        )
+
+    def joined(*arrays) -> jax.Array:
+        parts = [np.asarray(a)[rows] for a, rows in zip(arrays, kept, strict=True)]
+        return on_device(np.concatenate(parts))
+
+    return jax.tree.map(joined, *fitted), counts

@@ -1,0 +1,173 @@
+"""The photometry of a whole scene, solved once before any block is fitted, kept for all jobs."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import jax
+import numpy as np
+from jaxtyping import Float32, Int
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.core.atomic import atomic_write
+from p2gs_jax.core.progress import Reporter
+from p2gs_jax.errors import UserError
+from p2gs_jax.gaussians.seeds import cameras_radius, photographed_radiance, with_colors
+from p2gs_jax.gaussians.shell import Sphere, sphere_behind
+from p2gs_jax.photometry.calibrate import Selection
+from p2gs_jax.photometry.parameters import point_radiance
+from p2gs_jax.pipeline.exposures import solve_exposures
+from p2gs_jax.pipeline.survey import near_depth, near_plane, scale_notes, seen_depths
+from p2gs_jax.run.decisions import Decisions, read_decisions, write_decisions
+from p2gs_jax.scene.pixels.store import ImageStore
+from p2gs_jax.types import Photometry, Scene
+
+ARRAYS, DECISIONS = "shared.npz", "decisions.json"
+
+
+@dataclasses.dataclass(frozen=True)
+class Shared:
+    """What all blocks share: one gauge of radiance.
+
+    Attributes:
+        photometry: of all training views, on the host.
+        decisions: what the scene settled; exposures stay.
+        radiance: of all points, linear.
+        shell: where what lies behind everything is.
+    """
+
+    photometry: Photometry
+    decisions: Decisions
+    radiance: Float32[np.ndarray, "p 3"]
+    shell: Sphere
+
+
+@dataclasses.dataclass(frozen=True)
+class Solved:
+    """A scene whose exposures are solved.
+
+    Attributes:
+        scene: with colours of the points.
+        shared: what the blocks are given.
+        selection: exposures with their errors.
+        notes: what the user should know.
+    """
+
+    scene: Scene
+    shared: Shared
+    selection: Selection
+    notes: tuple[str, ...]
+
+
+def solve_shared(
+    scene: Scene,
+    store: ImageStore,
+    cfg: FitConfig,
+    reporter: Reporter,
+    *,
+    kept: Decisions | None = None,
+) -> Solved:
+    """Solve the photometry of a scene; `kept` is what a run that is resumed decided before.
+
+    Raises:
+        UserError: no point is seen twice.
+    """
+    still = store.leaving_out(scene.objects, cfg.dynamics.margin).only_opaque()
+    solved = solve_exposures(scene, still, cfg, reporter, kept=kept)
+    if solved.selection is None:
+        raise UserError(
+            f"{scene.root}: no point is seen by two photographs, so that blocks would share no "
+            "exposures.",
+            fix="fit it without --blocks, or with a structure-from-motion model",
+        )
+    views = scene.training_views
+    depth = near_depth(seen_depths(scene.points, views))
+    near = near_plane(depth, cfg)
+    decisions = dataclasses.replace(
+        solved.decisions, freeze_until=1.0, log_exposure_mean=None, near=near
+    )
+    resolved = decisions.resolve(cfg)
+    notes = [*scale_notes(scene, near, cfg, depth), *solved.notes]
+    photometry = solved.photometry
+    if scene.point_colors is None:
+        scene = with_colors(scene, photographed_radiance(scene, still, photometry, resolved))
+    shared = Shared(
+        photometry=jax.tree.map(np.asarray, photometry),
+        decisions=decisions,
+        radiance=point_radiance(scene, solved.selection.solution, resolved),
+        shell=sphere_behind(views, scene.points, cameras_radius(views, scene.points), cfg.init),
+    )
+    return Solved(scene, shared, solved.selection, tuple(notes))
+
+
+def write_shared(folder: Path, shared: Shared, scene: Scene) -> None:
+    """Write what the blocks share; the scene's points gain colours on the way."""
+    write_decisions(folder / DECISIONS, shared.decisions)
+    p = shared.photometry
+    arrays = {
+        "exposures": p.raw_exposures,
+        "gammas": p.raw_gammas,
+        "radiance": shared.radiance,
+        "shell": np.array([*shared.shell.middle, shared.shell.radius]),
+    }
+    if p.raw_white_balance is not None:
+        arrays["white_balance"] = p.raw_white_balance
+    if p.cameras is not None:
+        arrays["cameras"] = np.array(p.cameras, np.int64)
+    if scene.point_colors is not None:
+        arrays["point_colors"] = scene.point_colors
+    with atomic_write(folder / ARRAYS) as temporary:
+        np.savez(temporary, **arrays)
+
+
+def read_shared(folder: Path, scene: Scene, cfg: FitConfig) -> tuple[Shared, Scene]:
+    """Return what the blocks share, and the scene, read again, with the colours of its points.
+
+    Raises:
+        UserError: the files are broken, or of another scene.
+    """
+    path = folder / ARRAYS
+    decisions = read_decisions(folder / DECISIONS)
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            a = dict(file)
+        if decisions is None:
+            raise ValueError(f"{DECISIONS} is missing")
+        photometry = Photometry(
+            a["exposures"],
+            a["gammas"],
+            cfg.photometry.parameterization,
+            a.get("white_balance"),
+            tuple(a["cameras"].tolist()) if "cameras" in a else None,
+        )
+        shell = Sphere(a["shell"][:3], float(a["shell"][3]))
+        radiance = a["radiance"]
+    except (OSError, ValueError, KeyError) as error:
+        raise UserError(
+            f"{path} cannot be read ({error}).",
+            fix=f"remove {folder} and fit again: exposures are solved anew",
+        ) from error
+    held = (len(radiance), len(a["exposures"]))
+    now = (len(scene.points), len(scene.train_indices))
+    if held != now:
+        raise UserError(
+            f"{scene.root} has {now[0]} points and {now[1]} training photographs, and had "
+            f"{held[0]} and {held[1]} when its exposures were solved.",
+            fix="restore the scene as it was, or start again in another folder with --out",
+        )
+    if "point_colors" in a:
+        scene = dataclasses.replace(scene, point_colors=a["point_colors"])
+    return Shared(photometry, decisions, radiance, shell), scene
+
+
+def photometry_of(photometry: Photometry, rows: Int[np.ndarray, " k"]) -> Photometry:
+    """Return the photometry of some training views."""
+    balance, cameras = photometry.raw_white_balance, photometry.cameras
+    return dataclasses.replace(
+        photometry,
+        raw_exposures=photometry.raw_exposures[rows],
+        raw_gammas=photometry.raw_gammas[rows],
+        raw_white_balance=None if balance is None else balance[rows],
+        cameras=None if cameras is None else tuple(cameras[k] for k in rows),
+    )

@@ -1,0 +1,229 @@
+"""Points projected into views: positions, occlusion, samples, and exposures without tracks."""
+
+import csv
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from p2gs_jax.core.numerics import srgb_decode, srgb_encode
+from p2gs_jax.evaluation.alignment import exposure_error
+from p2gs_jax.photometry.calibrate import calibrate_observations, options_of
+from p2gs_jax.photometry.observations import Observations, sample_pairs
+from p2gs_jax.photometry.response import Response
+from p2gs_jax.photometry.sources.points import MOST_PER_POINT, projected_colors, track_colors
+from p2gs_jax.photometry.sources.sampling import sample
+from p2gs_jax.presets import preset
+from p2gs_jax.render.warp import project_points
+from p2gs_jax.scene import load_scene
+from p2gs_jax.scene.pixels.store import ImageStore
+from p2gs_jax.scene.visibility import unoccluded
+from p2gs_jax.types import Scene, Tracks, View
+
+
+def test_a_wall_hides_what_is_behind_it():
+    rng = np.random.default_rng(0)
+    wall = np.concatenate([rng.uniform(20, 60, (600, 2)), np.full((600, 1), 5.0)], 1)
+    far = np.concatenate([rng.uniform(0, 100, (800, 2)), np.full((800, 1), 20.0)], 1)
+    every = np.concatenate([wall, far])
+    visible = unoccluded(every[:, :2], every[:, 2], 100, 100)
+    assert visible[:600].all()
+    inner = np.all((far[:, :2] > 25) & (far[:, :2] < 55), 1)
+    outer = np.any((far[:, :2] < 10) | (far[:, :2] > 70), 1)
+    assert visible[600:][inner].mean() < 0.02
+    assert visible[600:][outer].mean() > 0.98
+
+
+def test_behind_and_outside_are_invisible():
+    xy = np.array([[5.0, 5.0], [5.0, 5.0], [-1.0, 5.0], [5.0, 11.0]])
+    z = np.array([2.0, -2.0, 2.0, 2.0])
+    assert unoccluded(xy, z, 10, 10).tolist() == [True, False, False, False]
+    assert not unoccluded(xy[1:2], z[1:2], 10, 10).any()
+
+
+def test_positions_are_those_of_the_tracks(noisy_street, tmp_path):
+    cfg = preset("robust")
+    scene = load_scene(noisy_street, cfg.data, tmp_path, lambda text: None)
+    tracks = scene.tracks
+    mine = tracks.view_indices == 3
+    xy, z = project_points(scene.points[tracks.point_indices[mine]], scene.views[3])
+    assert np.all(z > 0)
+    assert np.median(np.abs(xy - tracks.xy[mine])) < 0.5
+
+
+def test_exposures_without_tracks(noisy_street, tmp_path):
+    cfg = preset("robust")
+    scene = load_scene(noisy_street, cfg.data, tmp_path, lambda text: None)
+    scene = dataclasses.replace(scene, tracks=None)
+    observations = projected_colors(scene, ImageStore(scene.views, cfg.data))
+    assert np.bincount(observations.points).max() <= MOST_PER_POINT
+    solved = calibrate_observations(observations, options_of(cfg, scene)).solution
+    with (noisy_street / "truth" / "exposures.csv").open(newline="") as file:
+        truth = {r["image"]: float(r["exposure"]) for r in csv.DictReader(file)}
+    expected = np.array([truth[scene.views[i].name] for i in scene.train_indices])
+    assert exposure_error(np.exp(solved.log_exposures), expected)["ev"] < 0.03
+
+
+GREY_K = np.array([[50.0, 0, 30], [0, 50, 20], [0, 0, 1]], np.float32)
+
+
+class Grey:
+    """Photographs of one grey."""
+
+    def get(self, index):
+        return np.full((40, 60, 3), 0.5, np.float32), np.ones((40, 60), np.float32)
+
+    def camera(self, index):
+        return np.eye(4, dtype=np.float32), GREY_K, 60, 40
+
+
+def seen_from(distances):
+    """Return a scene of one point and a view at every distance from it; behind where negative."""
+    views = []
+    for k, distance in enumerate(distances):
+        viewmat = np.eye(4, dtype=np.float32)
+        viewmat[2, 3] = distance
+        views.append(View(f"{k}.png", Path(f"{k}.png"), "0", viewmat, GREY_K, 60, 40))
+    count = len(distances)
+    tracks = Tracks(np.arange(count), np.zeros(count, int), np.full((count, 2), 20.0, np.float32))
+    points = np.zeros((1, 3), np.float32)
+    return Scene(Path("."), "made", tuple(views), points, np.zeros((1, 3), np.uint8), tracks)
+
+
+def test_observations_from_too_far_away_are_left_out_and_counted():
+    found = track_colors(seen_from([2.0, 7.9, 8.1, 30.0]), Grey())
+    assert found.views.tolist() == [0, 1]
+    assert found.too_coarse == 2
+
+
+def test_a_track_behind_its_camera_is_not_the_closest():
+    found = track_colors(seen_from([-1.0, 3.0, 5.0]), Grey())
+    assert found.views.tolist() == [1, 2]
+    assert found.too_coarse == 1
+
+
+def test_a_track_behind_all_of_its_cameras_is_left_out():
+    found = track_colors(seen_from([-1.0, -3.0]), Grey())
+    assert len(found.views) == 0
+    assert found.too_coarse == 2
+
+
+def encoded(linear):
+    return srgb_encode(linear).astype(np.float32)
+
+
+def test_a_surface_has_the_same_colour_from_near_and_from_far():
+    """Near, far (a pixel covers 3x3 of the near ones) and far at a quarter of the exposure."""
+    fine = np.exp(0.5 * np.random.default_rng(0).standard_normal((240, 240, 3))) * 0.1
+    fine = np.minimum(fine, 1.0).astype(np.float32)
+    coarse = fine.reshape(80, 3, 80, 3, 3).mean((1, 3))
+    far_xy = np.stack(np.meshgrid(*[np.arange(10, 70) + 0.5] * 2), -1).reshape(-1, 2)
+    near, far = np.ones((240, 240), np.float32), np.ones((80, 80), np.float32)
+    wide = sample(encoded(fine), near, 3 * far_xy, np.full(len(far_xy), 3.0))
+    narrow = sample(encoded(fine), near, 3 * far_xy)
+    dark = sample(encoded(0.25 * coarse), far, far_xy)
+    expected = 4 * srgb_decode(dark.colors)
+    np.testing.assert_allclose(srgb_decode(wide.colors), expected, rtol=1e-4)
+    gap = np.log(srgb_decode(narrow.colors) / expected)
+    assert np.std(gap) > 0.1
+    assert np.std(np.log(expected)) < 0.5 * np.std(np.log(srgb_decode(narrow.colors)))
+
+
+@pytest.mark.parametrize("wider", [1.0, 2.0])
+def test_the_brightest_pixel_of_a_patch_is_known(wider):
+    image = np.random.default_rng(0).uniform(0, 1, (24, 30, 3)).astype(np.float32)
+    xy = np.random.default_rng(1).uniform(6, 18, (50, 2))
+    found = sample(image, np.ones((24, 30), np.float32), xy, np.full(50, wider))
+    reach = 1 if wider == 1 else 2  # patches of 3 and 5 pixels
+    for k, (x, y) in enumerate(np.floor(xy - 0.5).astype(int)):
+        patch = image[y - reach : y + reach + 2, x - reach : x + reach + 2]
+        np.testing.assert_array_equal(found.brightest[k], patch.max((0, 1)))
+
+
+def test_exposures_are_right_where_a_surface_has_highlights():
+    """Means of patches with clipped pixels are too dark: as if the exposure were shorter."""
+    rng = np.random.default_rng(0)
+    radiance = 0.05 * np.exp(0.2 * rng.standard_normal((120, 120, 1)))
+    radiance[rng.uniform(size=radiance.shape) < 0.01] = 0.8
+    xy = rng.uniform(5, 115, (3000, 2))
+    mask, gains = np.ones((120, 120), np.float32), (1.0, 4.0)
+    seen = [sample(np.repeat(encoded(np.minimum(g * radiance, 1)), 3, 2), mask, xy) for g in gains]
+    observations = Observations(
+        np.repeat([0, 1], 3000),
+        np.tile(np.arange(3000), 2),
+        np.concatenate([s.colors for s in seen]),
+        np.concatenate([s.spread for s in seen]),
+        2,
+        3000,
+        np.zeros(2, int),
+        brightest=np.concatenate([s.brightest for s in seen]),
+    )
+    for kept, right in (
+        (observations, True),
+        (dataclasses.replace(observations, brightest=None), False),
+    ):
+        usable = kept.usable(4 / 255, 250 / 255)[:, 0].reshape(2, 3000).all(0)
+        light = srgb_decode(kept.colors[:, 0]).reshape(2, 3000)[:, usable]
+        ratio = np.mean(np.log2(light[1] / light[0]))
+        assert (abs(ratio - 2) < 1e-3) == right
+        assert usable.mean() > 0.5
+    few = observations.picked(np.arange(7))
+    np.testing.assert_array_equal(few.brightest, observations.brightest[:7])
+
+
+def test_wide_patches_keep_away_from_the_border():
+    image, mask = np.full((20, 20, 3), 0.5, np.float32), np.ones((20, 20), np.float32)
+    xy = np.array([[3.5, 10.0], [10.0, 10.0]])
+    assert sample(image, mask, xy).valid.tolist() == [True, True]
+    assert sample(image, mask, xy, np.full(2, 4.0)).valid.tolist() == [False, True]
+
+
+def test_what_was_left_out_is_said(noisy_street, tmp_path):
+    cfg = preset("robust")
+    scene = load_scene(noisy_street, cfg.data, tmp_path, lambda text: None)
+    observations = track_colors(scene, ImageStore(scene.views, cfg.data))
+    options = dataclasses.replace(options_of(cfg, scene), choice=("view_exposure", Response()))
+    reasons = calibrate_observations(observations, options).reasons
+    assert not any("left out" in r for r in reasons)
+    some = dataclasses.replace(observations, too_coarse=7)
+    assert calibrate_observations(some, options).reasons[0].startswith("7 of ")
+
+
+def test_samples_sit_at_pixel_centres():
+    rng = np.random.default_rng(0)
+    # A ramp of light: patches are averaged linearly.
+    ramp = srgb_encode(np.linspace(0.2, 1, 50))[None, :, None]
+    image = np.tile(ramp, (40, 1, 3)).astype(np.float32)
+    xy = rng.uniform(9, 31, (100, 2))
+    light = 0.2 + 0.8 * (xy[:, 0] - 0.5) / 49
+    # Half a pixel of misplacement on a ramp of 0.8/49 a pixel.
+    slope = (srgb_encode(light + 1e-4) - srgb_encode(light - 1e-4)) / 2e-4
+    for wider in (None, np.full(100, 2.0), np.full(100, 4.0)):
+        colors, spread, _, valid = sample(image, np.ones((40, 50), np.float32), xy, wider)
+        assert valid.all()
+        np.testing.assert_allclose(colors[:, 0], srgb_encode(light), atol=2e-4)
+        np.testing.assert_allclose(spread[:, 0], 0.5 * slope * 0.8 / 49, rtol=5e-3)
+
+
+def test_samples_outside_and_masked_are_invalid():
+    mask = np.ones((40, 50), np.float32)
+    mask[:20] = 0
+    xy = np.array([[-3.0, 30], [25, 10], [25, 30], [60, 30], [25, 20.4]])
+    valid = sample(np.zeros((40, 50, 3), np.float32), mask, xy).valid
+    assert valid.tolist() == [False, False, True, False, False]
+
+
+def observations(views, points):
+    colors = np.zeros((len(views), 3))
+    return Observations(views, points, colors, colors, 20, 50, np.zeros(20, int))
+
+
+def test_pairs_are_two_views_of_one_point():
+    rng = np.random.default_rng(0)
+    tracks = observations(rng.permutation(200) % 20, np.repeat(np.arange(50), 4))
+    i, j = sample_pairs(tracks, 1000, 0)
+    assert np.all(tracks.points[i] == tracks.points[j])
+    assert np.all(i != j)
+    lonely = observations(np.arange(5), np.arange(5))
+    assert len(sample_pairs(lonely, 10, 0)[0]) == 0

@@ -1,0 +1,190 @@
+"""A cut covers space once, shares photographs out evenly, and gives each block what sees it."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from p2gs_jax.errors import UserError
+from p2gs_jax.gaussians.seeds import camera_centers
+from p2gs_jax.jobs.blocks.cut import (
+    DETAIL,
+    Cut,
+    cut_scene,
+    ground_of,
+    seen_points,
+    split,
+    thinned,
+    whole_of,
+)
+from p2gs_jax.jobs.blocks.shared import photometry_of
+from p2gs_jax.types import Photometry, Scene, Tracks, View
+
+LENGTH = 100.0
+
+
+def make_road(views=40, points=4000, seed=0, tracks=False, turned=0.0):
+    """Return a road along x (or turned about z) with cameras that look across it at a wall."""
+    rng = np.random.default_rng(seed)
+    c, s = np.cos(turned), np.sin(turned)
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
+    wall = np.stack(
+        [rng.uniform(0, LENGTH, points), np.full(points, 5.0), rng.uniform(-1, 2, points)], 1
+    )
+    looks = np.array([[1, 0, 0], [0, 0, -1], [0, 1.0, 0]])  # z of the camera along y
+    K = np.array([[50, 0, 50], [0, 50, 40], [0, 0, 1]], np.float32)
+    made = []
+    for k in range(views):
+        center = np.array([LENGTH * (k + 0.5) / views, 0, 0])
+        rotation = looks @ turn.T
+        viewmat = np.eye(4, dtype=np.float32)
+        viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ turn @ center
+        test = "test" if k % 8 == 7 else "train"
+        made.append(View(f"{k:03d}.png", None, "0", viewmat, K, 100, 80, split=test))
+    scene = Scene(None, "made", tuple(made), (wall @ turn.T).astype(np.float32), None)
+    if not tracks:
+        return scene
+    seen = [
+        (scene.train_indices[row], p) for row, found in enumerate(seen_points(scene)) for p in found
+    ]
+    view, point = np.array(seen).T
+    return dataclasses.replace(
+        scene, tracks=Tracks(view, point, np.zeros((len(view), 2), np.float32))
+    )
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    count=st.integers(1, 9),
+    seed=st.integers(0, 99),
+    height=st.sampled_from([0.0, 1.0, 100.0]),
+)
+def test_cells_cover_the_plane_once_and_are_as_full(count, seed, height):
+    rng = np.random.default_rng(seed)
+    places = rng.uniform(0, 1, (90, 2)) * [100.0, height]
+    cells = split(places, count)
+    assert len(cells) == count
+    held = [int(cell.holds(places).sum()) for cell in cells]
+    assert sum(held) == len(places)
+    assert max(held) - min(held) <= 3
+    anywhere = rng.normal(0, 300, (500, 2))
+    inside = np.stack([cell.holds(anywhere) for cell in cells])
+    assert (inside.sum(0) == 1).all()
+    for cell, mine in zip(cells, inside, strict=True):
+        away = cell.distance(anywhere)
+        assert (away[mine] == 0).all()
+        assert (away[~mine] > 0).all()
+
+
+def test_places_that_coincide_stay_together():
+    places = np.repeat([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]], [50, 2, 2], axis=0)
+    cells = split(places, 2)
+    assert [int(c.holds(places).sum()) for c in cells] == [50, 4]
+    with pytest.raises(UserError, match="show one place"):
+        split(places[:50], 2)
+
+
+@pytest.mark.parametrize("tracks", [False, True])
+@pytest.mark.parametrize("turned", [0.0, 2.0])
+def test_blocks_of_a_road_follow_it(tracks, turned):
+    scene = make_road(tracks=tracks, turned=turned)
+    cut = cut_scene(scene, 4)
+    assert cut.neighbours() == [(0, 1), (1, 2), (2, 3)]
+    centers = cut.ground.place(camera_centers(scene.training_views))
+    for block in cut.blocks:
+        # A view reaches 5 m to either side, at 45 degrees.
+        stands = block.distance(centers)
+        assert (stands[list(block.views)] <= cut.margin + 5.5).all()
+        assert set(np.flatnonzero(stands == 0)) <= set(block.views)
+    sizes = [len(block.views) for block in cut.blocks]
+    assert max(sizes) <= 1.5 * min(sizes)
+    names = {scene.training_views[k].name for block in cut.blocks for k in block.views}
+    assert names == {view.name for view in scene.training_views}
+
+
+def test_a_cut_survives_json():
+    cut = cut_scene(make_road(), 3)
+    again = Cut.from_dict(json.loads(json.dumps(_plain(cut.to_dict()))))
+    assert again.blocks == cut.blocks
+    assert again.margin == cut.margin
+    np.testing.assert_array_equal(again.ground.axes, cut.ground.axes)
+
+
+def _plain(values):
+    from p2gs_jax.core.atomic import plain
+
+    return plain(values)
+
+
+def test_too_many_blocks_are_refused_with_how_many_there_may_be():
+    scene = make_road(views=8)
+    with pytest.raises(UserError, match=r"too few for 5[\s\S]*--blocks 3 or fewer"):
+        cut_scene(scene, 5)
+    with pytest.raises(UserError, match="whole number"):
+        cut_scene(scene, 0)
+
+
+def test_the_ground_is_where_cameras_spread():
+    rng = np.random.default_rng(0)
+    centers = rng.normal(0, 1, (200, 3)) * [10.0, 0.1, 3.0] + 5.0
+    ground = ground_of(centers)
+    assert abs(ground.axes[0][0]) > 0.99
+    assert abs(ground.axes[1][2]) > 0.99
+
+
+@pytest.mark.parametrize("tracks", [False, True])
+def test_a_block_has_its_points_whole_and_those_around_it_coarse(tracks):
+    scene = make_road(tracks=tracks, points=20_000)
+    cut = cut_scene(scene, 4)
+    found, keep, own = whole_of(scene, cut, 1)
+    places = cut.ground.place(found.points)
+    near = cut.blocks[1].holds(places, cut.margin)
+    assert near[:own].all()
+    assert not near[own:].any()
+    assert own == cut.blocks[1].holds(cut.ground.place(scene.points), cut.margin).sum()
+    np.testing.assert_array_equal(found.points, scene.points[keep])
+    assert len(found.train_indices) == len(found.views) == len(cut.blocks[1].views)
+    if tracks:
+        # Every observation is still of the same point in the same view.
+        view = found.tracks.view_indices[::50]
+        point = found.tracks.point_indices[::50]
+        names = [v.name for v in scene.views]
+        pairs = set(
+            zip(
+                scene.tracks.view_indices.tolist(), scene.tracks.point_indices.tolist(), strict=True
+            )
+        )
+        for v, p in zip(view, point, strict=True):
+            assert (names.index(found.views[v].name), keep[p]) in pairs
+
+
+def test_points_far_away_are_fewer():
+    rng = np.random.default_rng(1)
+    points = rng.uniform(0, 1, (20_000, 3)) * [100.0, 10.0, 10.0]
+    kept = thinned(points, points[:, 0])
+    x = points[kept][:, 0]
+    counts, _ = np.histogram(x, [1, 10, 25, 50, 100])
+    density = counts / np.diff([1, 10, 25, 50, 100])
+    assert (np.diff(density) < 0).all()
+    # No place is left without: a point within two cubes of any that was there.
+    side = 2 * DETAIL * points[:, 0]
+    for k in range(0, len(points), 997):
+        assert np.linalg.norm(points[kept] - points[k], axis=1).min() <= max(2 * side[k], 1e-9)
+    assert len(thinned(np.zeros((0, 3)), np.zeros(0))) == 0
+
+
+def test_photometry_of_some_views():
+    whole = Photometry(
+        np.arange(5.0), np.arange(5.0) / 10, "log", np.arange(15.0).reshape(5, 3), (0, 1, 0, 1, 0)
+    )
+    some = photometry_of(whole, np.array([3, 1]))
+    assert some.raw_exposures.tolist() == [3, 1]
+    assert some.raw_gammas.tolist() == [0.3, 0.1]
+    assert some.raw_white_balance.tolist() == [[9, 10, 11], [3, 4, 5]]
+    assert some.cameras == (1, 1)
+    bare = photometry_of(Photometry(np.arange(5.0), np.arange(5.0)), np.array([0]))
+    assert bare.raw_white_balance is None
+    assert bare.cameras is None

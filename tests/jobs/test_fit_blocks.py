@@ -1,0 +1,191 @@
+"""A scene in two blocks is a run as any other, with the exposures that were solved for all."""
+
+import json
+
+import numpy as np
+import pytest
+from test_cut import make_road
+from tiny_scene import make_scene
+
+import p2gs_jax
+from p2gs_jax.core.progress import Silent
+from p2gs_jax.errors import UserError
+from p2gs_jax.gaussians.population import default_max_gaussians
+from p2gs_jax.jobs.blocks import fit as module
+from p2gs_jax.jobs.blocks import plan as room
+from p2gs_jax.jobs.blocks.block import block_config, shown_by
+from p2gs_jax.jobs.blocks.cut import cut_scene
+from p2gs_jax.jobs.blocks.plan import check_options, read_plan, write_plan
+from p2gs_jax.jobs.blocks.shared import read_shared
+from p2gs_jax.jobs.configs import with_fields
+from p2gs_jax.jobs.job import JobState
+from p2gs_jax.pipeline.prepare import load
+
+SMALL = with_fields(
+    p2gs_jax.preset("robust"),
+    {
+        "train.steps": 20,
+        "train.coarse_to_fine": [],
+        "data.test_every": 4,
+        "densify.max_gaussians": 400,
+        "render.sh_degree": 0,
+        "init.dense": "off",
+        "init.shell": "off",
+    },
+)
+
+
+@pytest.fixture
+def in_this_process(monkeypatch):
+    """Run blocks here, one after another; return which, and a set of those that are to fail."""
+    begun, fail = [], set()
+
+    def run_jobs(jobs, engine, folder, *, on_end, on_look):
+        states = []
+        for number, job in enumerate(jobs):
+            begun.append(job.name)
+            state = JobState(job.name, "done")
+            if job.name in fail:
+                state = JobState(job.name, "failed", reason="the disk is full")
+            else:
+                from p2gs_jax.core.atomic import plain
+
+                job.task(job.folder, json.loads(json.dumps(plain(job.arguments))), Silent())
+            on_end(number, state)
+            states.append(state)
+        return states
+
+    monkeypatch.setattr(module, "run_jobs", run_jobs)
+    return begun, fail
+
+
+def test_two_blocks_become_one_run(tmp_path, in_this_process):
+    begun, fail = in_this_process
+    scene, run = make_scene(tmp_path / "scene", views=8), tmp_path / "run"
+    fail.add("block 1")
+    with pytest.raises(UserError, match=r"1 of 2 blocks failed\. block 1: the disk is full"):
+        p2gs_jax.fit_blocks(scene, run, SMALL, blocks=2)
+    with pytest.raises(UserError, match="begun with --blocks 2"):
+        p2gs_jax.fit_blocks(scene, run, SMALL, blocks=3, resume=True)
+    fail.clear()
+    result = p2gs_jax.fit_blocks(scene, run, SMALL, blocks=2, resume=True)
+    # What was finished stays.
+    assert begun == ["block 0", "block 1", "block 1"]
+    said = json.loads((run / "metrics.json").read_text())
+    blocks = said["districts"]["blocks"]
+    assert [b["views"] <= 6 for b in blocks] == [True, True]
+    assert sum(b["gaussians_in_core"] for b in blocks) == said["counts"]["gaussians"]
+    (seam,) = said["districts"]["seams"]
+    assert seam["blocks"] == [0, 1]
+    opened = p2gs_jax.load_run(run)
+    assert opened.params.gaussians.capacity == said["counts"]["gaussians"]
+    # The exposures are those of the bundle adjustment, bit for bit, whatever the blocks did.
+    shared, _ = read_shared(run / "blocks", load(scene, run, SMALL, Silent()), SMALL)
+    solved = shared.photometry.exposures
+    np.testing.assert_allclose(
+        np.asarray(result.params.photometry.exposures), solved / np.exp(np.log(solved).mean()), 1e-5
+    )
+    assert said["test"]["exposure_fitted"]["psnr"] > 15
+
+
+def test_one_block_is_an_ordinary_fit(tmp_path, monkeypatch):
+    asked = {}
+
+    def fit(scene, run, cfg, **options):
+        asked.update(options, cfg=cfg)
+        return "fitted"
+
+    monkeypatch.setattr(module, "fit", fit)
+    scene = make_scene(tmp_path / "scene")
+    assert p2gs_jax.fit_blocks(scene, tmp_path / "run", SMALL, blocks="auto") == "fitted"
+    assert asked["cfg"] == SMALL
+    assert not (tmp_path / "run" / "blocks").exists()
+
+
+def test_a_block_has_the_population_of_the_whole_and_more_for_what_is_outside():
+    scene = make_road(points=20_000)
+    whole = with_fields(SMALL, {"densify.max_gaussians": None, "train.steps": 600})
+    cut, count, views = cut_scene(scene, 4), len(scene.points), len(scene.train_indices)
+
+    def most(own, **densify):
+        cfg = with_fields(whole, {f"densify.{name}": value for name, value in densify.items()})
+        return block_config(cfg, cut, 0, scene, own, train_views=views).densify.max_gaussians
+
+    assert most(count) == default_max_gaussians(count, shown_by(scene, whole), whole.train)
+    assert most(count // 2) > most(count)
+    share = len(cut.blocks[0].views) / views
+    assert (
+        most(count, max_gaussians=1000)
+        == most(count // 2, max_gaussians=1000)
+        == round(1000 * share)
+    )
+    assert most(count, method="adaptive") is None
+
+
+def test_less_memory_than_a_block_needs_is_said_with_how_many_would_fit(monkeypatch):
+    scene = make_road()
+    four = room.largest_block(scene, SMALL, cut_scene(scene, 4))
+    assert four < room.bytes_needed(scene, SMALL)
+    # Room for the blocks of four, and not for those of two.
+    monkeypatch.setattr(room, "left_to_process", lambda: four * 1.00001)
+    count = room.fewest_blocks(scene, SMALL, 1)
+    assert count in (3, 4)
+    assert room.largest_block(scene, SMALL, cut_scene(scene, count)) <= four * 1.00001
+    room.require_room(scene, SMALL, cut_scene(scene, 4), 1)
+    with pytest.raises(UserError, match=f"--blocks {count}"):
+        room.require_room(scene, SMALL, cut_scene(scene, 2), 1)
+    with pytest.raises(UserError, match="2 at a time"):
+        room.require_room(scene, SMALL, cut_scene(scene, 4), 2)
+    monkeypatch.setattr(room, "left_to_process", lambda: 1e6)
+    with pytest.raises(UserError, match="however the scene is cut"):
+        room.fewest_blocks(scene, SMALL, 1)
+    monkeypatch.setattr(room, "left_to_process", lambda: None)
+    assert room.fewest_blocks(scene, SMALL, 1) == 1
+
+
+@pytest.mark.parametrize(
+    ("cfg", "said"),
+    [
+        (p2gs_jax.preset("3dgs"), "'3dgs' learns them"),
+        (p2gs_jax.preset("paper"), "learns them"),
+        (with_fields(SMALL, {"loss.relative_exposure.weight": 0.1}), "nothing to move"),
+        (with_fields(SMALL, {"dynamics.method": "vibration"}), "what stands still"),
+    ],
+)
+def test_options_under_which_blocks_would_share_nothing_are_refused(cfg, said):
+    with pytest.raises(UserError, match=said):
+        check_options(cfg)
+
+
+def test_a_broken_plan_is_named(tmp_path):
+    assert read_plan(tmp_path, "2") is None
+    (tmp_path / "plan.json").write_text('{"asked": "2"}')
+    with pytest.raises(UserError, match=r"plan\.json cannot be read"):
+        read_plan(tmp_path, "2")
+
+
+def test_a_plan_is_kept_also_where_its_number_was_chosen(tmp_path):
+    scene = load(make_scene(tmp_path / "scene", views=12), tmp_path, SMALL, Silent())
+    cut = cut_scene(scene, 3)
+    write_plan(tmp_path, cut, "auto")
+    for asked in ("auto", "3"):
+        assert read_plan(tmp_path, asked).blocks == cut.blocks
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--blocks", "0"), "no number of blocks"),
+        (("--blocks", "many"), "no number of blocks"),
+        (("--jobs", "2"), "--jobs and --engine are of blocks"),
+        (("--blocks", "2", "--jobs", "0"), "--jobs must be at least 1"),
+        (("--blocks", "2", "--devices", "2"), "on one device"),
+        (("--blocks", "2", "--engine", "ray"), "no engine 'ray'"),
+        (("--blocks", "2", "--preset", "3dgs"), "learns them"),
+    ],
+)
+def test_wrong_words_end_with_a_message(run_command, tmp_path, words, said):
+    code, text = run_command("fit", tmp_path, "--out", tmp_path / "run", *words)
+    assert code == 2
+    assert said in text
+    assert not (tmp_path / "run").exists()

@@ -1,0 +1,64 @@
+"""Known exposures: CSV in several spellings, EXIF, and what is wrong with a file."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scene.helpers import make_view, refused
+
+from p2gs_jax.scene.exposures import check_source, read_known_exposures
+
+
+def views(*names, exif=None):
+    return [
+        dataclasses.replace(make_view(Path(n), size=(4, 4), exif_ev=exif), name=n) for n in names
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("image,exposure\na.png,2\nb.png,0.5\n", [1, -1]),
+        ("image,ev\na.png,1\nb.png,-1\n", [1, -1]),
+        ("\ufefffile, exposure_time_s\na.png,4\nb.png,1\n", [2, 0]),
+        ("# comment\nimage,exposure\nb.png,0.5\nz.png,3\n", [np.nan, -1]),
+    ],
+)
+def test_csv(tmp_path, text, expected):
+    path = tmp_path / "e.csv"
+    path.write_text(text, encoding="utf-8")
+    found = read_known_exposures(str(path), views("front/a.png", "b.png")) / np.log(2)
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_exif():
+    found = read_known_exposures("exif", [*views("a", exif=1.5), *views("b")])
+    np.testing.assert_allclose(found / np.log(2), [1.5, np.nan])
+    with refused("EXIF"):
+        read_known_exposures("exif", views("a"))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("image,value\na.png,1\n", "columns image, value"),
+        ("image,exposure\na.png,-1\n", "line 2"),
+        ("image,exposure\na.png,bright\n", "'bright'"),
+        ("image,exposure\nother.png,1\n", "names none of the 1"),
+        ("", "columns none"),
+    ],
+)
+def test_bad_files_are_explained(tmp_path, text, words):
+    (tmp_path / "e.csv").write_text(text)
+    with refused(words):
+        read_known_exposures(str(tmp_path / "e.csv"), views("a.png"))
+    with refused("cannot be read"):
+        read_known_exposures("nowhere.csv", views("a"))
+
+
+def test_a_field_beyond_the_limit_is_refused(tmp_path):
+    path = tmp_path / "exposures.csv"
+    path.write_text(f"image,ev\n{'x' * 200_000},1\n")
+    with refused(r"exposures.csv is not a CSV file"):
+        check_source(str(path))
