@@ -1,22 +1,21 @@
 """A fit of photographs with alpha, from the folder to the scores."""
 
-import dataclasses
 import json
 import shutil
 
 import cv2
 import numpy as np
 import pytest
-from scene.posed import around, blender
+from scene.helpers import around, blender
 
-from p2gs_jax import load_run
-from p2gs_jax.config import preset
+from p2gs_jax import load_run, with_fields
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.against import check_renders, judge_renders
 from p2gs_jax.evaluation.evaluate import Judge
 from p2gs_jax.evaluation.renders_of_others import find_renders
 from p2gs_jax.formats.exr import read_exr, write_exr
 from p2gs_jax.pipeline.fit import fit
+from p2gs_jax.presets import preset
 
 SIZE, COLOR = 48, np.array([0.8, 0.3, 0.2])
 
@@ -38,20 +37,23 @@ def write_ball(root, count, part):
         assert cv2.imwrite(str(root / part / f"r_{k}.png"), image)
 
 
-@pytest.fixture(scope="module", params=["3dgs", "robust"])
-def ball(request, tmp_path_factory):
-    """Return the run of a ball over green, 200 steps from seeds at random."""
+SHORT = {
+    "data.background": "0.1,0.9,0.1",
+    "init.dense": "off",
+    "densify.max_gaussians": 1500,
+    "train.steps": 100,
+    "train.coarse_to_fine": (),
+    "render.sh_degree": 1,
+}
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory):
+    """Return the run of a ball over green, a few steps from seeds at random."""
     root = tmp_path_factory.mktemp("ball")
     write_ball(root, 12, "train")
     write_ball(root, 4, "test")
-    cfg = preset(request.param)
-    cfg = dataclasses.replace(
-        cfg,
-        data=dataclasses.replace(cfg.data, background="0.1,0.9,0.1"),
-        init=dataclasses.replace(cfg.init, dense="off"),
-        densify=dataclasses.replace(cfg.densify, max_gaussians=1500),
-        train=dataclasses.replace(cfg.train, steps=200, coarse_to_fine=()),
-    )
+    cfg = with_fields(preset("robust"), SHORT)
     result = fit(root, root / "run", cfg)
     return result, load_run(root / "run")
 
@@ -127,9 +129,7 @@ def test_an_exposure_moves_what_is_there_and_not_what_is_behind_it(twin):
 
 def test_light_behind_the_splats_and_a_background_are_one_too_many(ball, tmp_path):
     _, run = ball
-    cfg = dataclasses.replace(
-        run.cfg, render=dataclasses.replace(run.cfg.render, background=(1.0,) * 3)
-    )
+    cfg = with_fields(run.cfg, {"render.background": (1.0,) * 3})
     with pytest.raises(UserError, match=r"render.background is light behind the splats"):
         fit(run.scene.root, tmp_path / "run", cfg)
 

@@ -13,10 +13,10 @@ from reliability.families._scenes import SMALL_FIT, Made, in_a_row, write_scene
 from reliability.family import Failure, Family, Report
 
 from p2gs_jax import UserError, fit
-from p2gs_jax.config import preset
 from p2gs_jax.core.progress import Silent
 from p2gs_jax.formats.ply import read_ply
 from p2gs_jax.jobs.configs import with_fields
+from p2gs_jax.presets import preset
 
 NAME = "hard_numbers"
 ABOUT = """

@@ -1,7 +1,8 @@
-"""A drive before which a box crosses, from its folder to files, pictures and other places."""
+"""A drive before which a box crosses, with its box and without, from its folder to files."""
 
 import dataclasses
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -9,9 +10,13 @@ from moving_box import FRAMES, INTERVAL, SIZE, drive_format, pose_at, write_phot
 
 from p2gs_jax import FitConfig, UserError, fit, load_run, make_camera, with_fields
 from p2gs_jax.cli import main as cli
-from p2gs_jax.core.progress import Silent
+from p2gs_jax.core.atomic import read_jsonl
+from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.formats.ply import read_ply
 from p2gs_jax.photometry.display import develop
+from p2gs_jax.render.project import STILL, at_time
+from p2gs_jax.run.checkpoint import saved_steps
+from p2gs_jax.run.scene_file import read_objects
 from p2gs_jax.scene import drives
 from p2gs_jax.scene.drives.objects import object_mask
 from p2gs_jax.types import Camera
@@ -33,7 +38,7 @@ SHORT = with_fields(
         "train.log_every": 5,
         "train.coarse_to_fine": (),
         "train.checkpoint_every_s": 0.0,
-        "render.sh_degree": 1,
+        "render.sh_degree": 0,
         "densify.max_gaussians": 3000,
         "densify.min_every_steps": 5,
         "init.dense": "off",
@@ -42,6 +47,10 @@ SHORT = with_fields(
         "photometry.model": "view_exposure",
     },
 )
+METHODS = {
+    "rigid": SHORT,
+    "vibration": with_fields(SHORT, {"dynamics.method": "vibration", "dynamics.vibrating": 600}),
+}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -57,32 +66,37 @@ def folder(made_once):
 
 
 @pytest.fixture(scope="module")
-def result(folder, tmp_path_factory):
-    return fit(folder, tmp_path_factory.mktemp("moving") / "run", SHORT)
+def fitted(folder, made_once):
+    """Return a function from a method to its finished run, which every test only reads."""
+
+    def run_of(method):
+        return made_once(f"moving_{method}", lambda run: fit(folder, run, METHODS[method]))
+
+    return run_of
 
 
 @pytest.fixture(scope="module")
-def run(result):
-    return load_run(result.run_dir)
+def run(fitted):
+    return load_run(fitted("rigid"))
 
 
-def test_the_run_remembers_whose_gaussians_are_and_where_boxes_were(run, result):
+def test_the_run_remembers_whose_gaussians_are_and_where_boxes_were(run):
     assert run.owner is not None
     assert run.moving is not None
     assert set(run.owner) == {-1, 0}
     assert (
         len(run.owner)
         == run.params.gaussians.capacity
-        == len(read_ply(result.run_dir / "radiance.ply").means)
+        == len(read_ply(run.folder / "radiance.ply").means)
     )
     (box,) = run.moving.objects
     assert box is run.scene.objects[0]
     assert box.size == SIZE
     mine = np.asarray(run.params.gaussians.means)[run.owner == 0]
     assert (np.abs(mine) < np.array(SIZE)).all(1).mean() > 0.95
-    scores = result.metrics["test"]["exposure_fitted"]
-    assert {"whole", "static", "moving"} <= set(scores)
-    said = " ".join(result.metrics["notes"])
+    metrics = json.loads((run.folder / "metrics.json").read_text())
+    assert {"whole", "static", "moving"} <= set(metrics["test"]["exposure_fitted"])
+    said = " ".join(metrics["notes"])
     assert "1 things move as pieces of their own" in said
 
 
@@ -202,49 +216,58 @@ def test_exports_hold_the_middle_of_the_drive(run, tmp_path):
     np.testing.assert_allclose(shown.means, everything.means, atol=1e-5)
 
 
-def test_scores_can_be_computed_again(run, result, capsys):
-    assert main(["eval", str(run.folder)]) == 0
-    again = json.loads((run.folder / "metrics.json").read_text())
-    for split in ("train", "test"):
-        a, b = (
-            m[split] if split == "train" else m[split]["exposure_fitted"]
-            for m in (again, result.metrics)
+def test_scores_can_be_computed_again(run, tmp_path):
+    before = json.loads((run.folder / "metrics.json").read_text())
+    again = tmp_path / "run"
+    shutil.copytree(run.folder, again)
+    assert main(["eval", str(again)]) == 0
+    after = json.loads((again / "metrics.json").read_text())
+    for part in (lambda m: m["train"], lambda m: m["test"]["exposure_fitted"]):
+        assert part(after)["moving"]["psnr"] == pytest.approx(
+            part(before)["moving"]["psnr"], abs=1e-3
         )
-        assert a["moving"]["psnr"] == pytest.approx(b["moving"]["psnr"], abs=1e-3)
 
 
-class Stopped(Exception):
-    """An interruption."""
-
-
-class Stopping(Silent):
-    """Ends a fit after some lines of its log."""
-
-    def __init__(self, lines: int):
-        self.left = lines
-
-    def log(self, record) -> None:
-        self.left -= 1
-        if self.left == 0:
-            raise Stopped
-
-
-def test_a_resumed_run_is_the_one_that_was_never_stopped(result, folder, tmp_path):
-    out = tmp_path / "run"
-    with pytest.raises(Stopped):
-        fit(folder, out, SHORT, reporter=Stopping(5))
-    fit(folder, out, SHORT, resume=True)
+@pytest.mark.parametrize("method", METHODS)
+def test_a_resumed_run_is_the_one_that_was_never_stopped(fitted, folder, tmp_path, method):
+    whole, out = fitted(method), tmp_path / "run"
+    shutil.copytree(whole, out)
+    steps = saved_steps(out / "checkpoints")
+    assert steps[-1] == SHORT.train.steps
+    shutil.rmtree(out / "checkpoints" / str(steps[-1]))
+    for name in ("radiance.ply", "photometry.json", "objects.npz", "metrics.json"):
+        (out / name).unlink()
+    fit(folder, out, METHODS[method], resume=True)
     for name in ("radiance.ply", "photometry.json"):
-        assert (out / name).read_bytes() == (result.run_dir / name).read_bytes(), name
-    with np.load(out / "objects.npz") as a, np.load(result.run_dir / "objects.npz") as b:
+        assert (out / name).read_bytes() == (whole / name).read_bytes(), name
+    with np.load(out / "objects.npz") as a, np.load(whole / "objects.npz") as b:
         assert set(a) == set(b)
         for key in a:
             np.testing.assert_array_equal(a[key], b[key])
+    steps = [line["step"] for line in read_jsonl(out / "log.jsonl")]
+    assert steps == list(range(5, SHORT.train.steps + 1, 5))
+
+
+def test_gaussians_that_vibrate_are_shown_at_the_time_of_each_view(fitted):
+    run = load_run(fitted("vibration"))
+    moves = run.params.gaussians.vibration
+    still = np.asarray(moves.log_lives) > np.log(STILL) - 1e-3
+    assert 0.2 < still.mean() < 0.9
+    assert not np.any(np.asarray(moves.velocities)[still])
+    assert np.abs(np.asarray(moves.velocities)[~still]).max() > 0.5
+    index = run.scene.test_indices[0]
+    shown = np.asarray(run.render(run.camera(index)).linear)
+    name = run.scene.views[index].name.rsplit(".", 1)[0]
+    stored, _ = read_exr(run.folder / "renders" / f"{name}.exr")
+    np.testing.assert_allclose(stored, shown, atol=2e-3)
+    later = np.asarray(run.render(run.camera(index), run.scene.views[index].time + 0.5).linear)
+    assert np.abs(later - shown).max() > 0.02
+    # Files for other programs are of one moment.
+    assert read_ply(run.folder / "splats.ply").vibration is None
+    assert at_time(run.as_of(), None).vibration is None
 
 
 def test_broken_or_foreign_owners_are_said(run, tmp_path):
-    from p2gs_jax.run.scene_file import read_objects
-
     path = tmp_path / "objects.npz"
     path.write_bytes((run.folder / "objects.npz").read_bytes()[:100])
     with pytest.raises(UserError, match="cannot be read"):
