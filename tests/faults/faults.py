@@ -126,14 +126,14 @@ FAULTS = (
         "photometry/parameters.py",
         "log_scale + tint, activation)",
         "0.0 * (log_scale + tint), activation)",
-        "photometry/test_gauge.py",
+        "photometry/test_formation.py::test_photographs_stay_and_the_mean_goes",
     ),
     Fault(
         "saturated pixels count as observations of radiance",
         "photometry/observations.py",
         "(self.colors > black) & (brightest < saturation)",
         "(self.colors > black) & (brightest < 2 + saturation)",
-        "photometry/test_bundle_adjustment.py::test_saturation_must_be_masked",
+        "photometry/test_adjustment.py::test_saturation_must_be_masked",
     ),
     Fault(
         "a mean counts where one of its pixels is saturated",
@@ -147,7 +147,7 @@ FAULTS = (
         "losses/relative_exposure.py",
         "photometry.capture(pairs.views_i), photometry.capture(pairs.views_j)",
         "photometry.capture(pairs.views_j), photometry.capture(pairs.views_i)",
-        "properties/test_pir.py::test_11_observed_readings",
+        "properties/test_pir.py::test_11_observed_reading",
     ),
     Fault(
         "over-bright predictions of saturated pixels are punished",

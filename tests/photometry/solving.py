@@ -1,0 +1,55 @@
+"""What tests of the adjustment share: a drive, its exposures, and how it is solved."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from synthetic_drive import make_drive, make_exposures, observe
+
+from p2gs_jax.evaluation.alignment import exposure_error
+from p2gs_jax.photometry.adjustment.fit import fit_model
+from p2gs_jax.photometry.adjustment.problem import make_problem
+from p2gs_jax.photometry.calibrate import CalibrationOptions, calibrate_observations
+
+LIMITS = {"black": 4 / 255, "saturation": 250 / 255, "pivot": 0.18}
+DRIVE = make_drive(12, 1000)
+ISO4 = make_exposures(DRIVE, "iso4")
+PLAIN = observe(DRIVE, ISO4)
+
+
+def problem_of(observations=PLAIN, **more):
+    return make_problem(observations, **{**LIMITS, **more})
+
+
+def adjust(observations=PLAIN, form="view_exposure", response=None, **more):
+    return fit_model(problem_of(observations, **more), form, response)
+
+
+def select(observations, **more):
+    return calibrate_observations(observations, CalibrationOptions(**LIMITS, **more))
+
+
+def ev(solved, truth=ISO4):
+    return exposure_error(np.exp(solved.log_exposures), truth)["ev"]
+
+
+def rms(values):
+    return np.sqrt(np.mean(np.square(values)))
+
+
+def check_gradients(f, *at, step=1e-6, rel=1e-4, floor=1e-6):
+    """Compare the slope of f along a random direction of every leaf with finite differences."""
+    leaves, tree = jax.tree.flatten(at)
+    value = jax.jit(lambda *leaves: f(*jax.tree.unflatten(tree, leaves)))
+    exact = jax.jit(jax.grad(value, argnums=tuple(range(len(leaves)))))(*leaves)
+    rng = np.random.default_rng(4)
+    slopes = []
+    for k, leaf in enumerate(leaves):
+        along = jnp.asarray(rng.normal(size=leaf.shape), leaf.dtype)
+        high, low = (
+            value(*leaves[:k], leaf + sign * step * along, *leaves[k + 1 :]) for sign in (1, -1)
+        )
+        slopes.append(float(jnp.sum(exact[k] * along)))
+        numeric = float(high - low) / (2 * step)
+        assert slopes[-1] == pytest.approx(numeric, rel=rel, abs=floor), k
+    return slopes

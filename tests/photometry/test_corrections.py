@@ -1,0 +1,430 @@
+"""Corrections of display values: nothing at the start, what they claim elsewhere, gradients."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.interpolate import RegularGridInterpolator
+from solving import check_gradients
+
+from p2gs_jax.config import LossConfig, PhotometryConfig
+from p2gs_jax.evaluation.alignment import fit_exposure
+from p2gs_jax.photometry import luminance as gs
+from p2gs_jax.photometry import ppisp
+from p2gs_jax.photometry.appearance import (
+    GRID,
+    corrected,
+    correction_of,
+    exposures_apart,
+    identity,
+    regularisation,
+)
+from p2gs_jax.photometry.formation import formation
+from p2gs_jax.train.terms import CURVE, contrast_loss, curve_prior, enhanced_loss
+from p2gs_jax.types import LUMINANCE, Capture, Params, Photometry
+
+KINDS = pytest.mark.parametrize("kind", ["affine", "bilateral", "curve"])
+RNG = np.random.default_rng(0)
+IMAGE = RNG.uniform(0.02, 0.9, (12, 20, 3))
+PICTURE = jnp.asarray(IMAGE, jnp.float32)
+MASK = jnp.ones(IMAGE.shape[:2], jnp.float32)
+
+
+def noisy(kind, size=0.1):
+    zero = identity(kind, ["a"])[0]
+    return jnp.asarray(np.random.default_rng(1).normal(0, size, zero.shape), jnp.float32)
+
+
+@KINDS
+def test_zeros_change_nothing(kind):
+    zeros = identity(kind, ["a"] * 3)[1]
+    np.testing.assert_allclose(corrected(PICTURE, zeros, kind), PICTURE, atol=1e-6)
+
+
+@KINDS
+def test_gradients_match_finite_differences(kind):
+    with jax.enable_x64(True):
+        weight = jnp.asarray(RNG.normal(size=IMAGE.shape))
+
+        def f(parameters, ldr):
+            return jnp.sum(weight * corrected(ldr, parameters, kind))
+
+        at = (jnp.asarray(np.asarray(noisy(kind)), jnp.float64), jnp.asarray(IMAGE))
+        check_gradients(f, *at, step=1e-7, rel=1e-3)
+
+
+def test_a_bilateral_grid_is_sliced_trilinearly():
+    grid = noisy("bilateral")
+    height, width, _ = IMAGE.shape
+    axes = [np.linspace(0, 1, n) for n in GRID]
+    y, x = np.mgrid[:height, :width]
+    where = np.stack([IMAGE @ np.array(LUMINANCE), y / (height - 1), x / (width - 1)], -1)
+    entries = [RegularGridInterpolator(axes, np.asarray(g))(where) for g in grid]
+    matrix = np.stack(entries, -1).reshape(height, width, 3, 4)
+    expected = IMAGE + np.einsum("hwij,hwj->hwi", matrix[..., :3], IMAGE) + matrix[..., 3]
+    np.testing.assert_allclose(corrected(PICTURE, grid, "bilateral"), expected, atol=1e-5)
+
+
+def test_a_curve_rises_and_goes_on():
+    x = jnp.linspace(0, 1.5, 400)[:, None, None] * jnp.ones(3)
+    y = np.asarray(corrected(x, noisy("curve", 1.0), "curve"))[:, 0, 0]
+    assert np.all(np.diff(y) > 0)
+    assert y[0] == 0
+    assert np.abs(np.diff(y, 2)).max() < 0.05
+
+
+def test_only_grids_are_kept_smooth():
+    smooth = jnp.ones_like(identity("bilateral", ["a", "b"]))
+    assert float(regularisation(smooth, "bilateral")) == 0
+    assert float(regularisation(noisy("bilateral")[None], "bilateral")) > 1e-3
+    assert regularisation(noisy("affine")[None], "affine") is None
+
+
+def test_a_correction_is_part_of_the_image_and_of_the_fitted_exposure():
+    cfg = PhotometryConfig(curve="linear", appearance="affine")
+    correction = noisy("affine", 0.05)
+    photo = formation(0.5 * PICTURE, Capture(jnp.float32(1.4), jnp.float32(2.2)), cfg, correction)
+    np.testing.assert_allclose(photo, corrected(0.7 * PICTURE, correction, "affine"), atol=1e-6)
+    usual = Capture(jnp.float32(1.0), jnp.float32(2.2))
+    found = fit_exposure(0.5 * PICTURE, jnp.clip(photo, 0, 1), MASK, usual, cfg, correction)
+    assert float(found) == pytest.approx(1.4, rel=0.01)
+
+
+# ------------------------------------------------------- PPISP, as published, in numpy
+
+
+def some_view(seed=1, size=0.3, dtype=np.float32) -> ppisp.OneView:
+    rng = np.random.default_rng(seed)
+    vignetting = rng.normal(0, 0.1 * size, (3, 5)) - [0, 0, 0.3, 0.3, 0.3]
+    response = ppisp.identity_response() + rng.normal(0, size, (3, 4))
+    values = (rng.normal(0, size) - 0.5, rng.normal(0, size, 8), response, vignetting)
+    return ppisp.OneView(*(jnp.asarray(v, dtype) for v in values))
+
+
+def four_point_homography(targets):
+    """Solve the direct linear transformation of four pairs by its null space."""
+    rows = []
+    for (x, y, w), (u, v, _) in zip(ppisp.SOURCES, targets, strict=True):
+        rows.append([x, y, w, 0, 0, 0, -u * x, -u * y, -u * w])
+        rows.append([0, 0, 0, x, y, w, -v * x, -v * y, -v * w])
+    h = np.linalg.svd(np.array(rows))[2][-1].reshape(3, 3)
+    return h / h[2, 2]
+
+
+def oracle(linear, view: ppisp.OneView):
+    height, width, _ = linear.shape
+    exposure, color, response, vignetting = (np.asarray(x, float) for x in jax.tree.leaves(view))
+    light = linear * 2.0**exposure
+    for i, j, c in np.ndindex(*linear.shape):
+        place = (np.array([j, i]) + 0.5 - np.array([width, height]) / 2) / max(width, height)
+        r = np.linalg.norm(place - vignetting[c, :2])
+        dark = 1 + sum(a * r ** (2 * k + 2) for k, a in enumerate(vignetting[c, 2:]))
+        light[i, j, c] *= np.clip(dark, 0, 1)
+    targets = ppisp.SOURCES.copy()
+    targets[:, :2] += np.asarray(ppisp.offsets(jnp.asarray(color)))
+    intensity = light.sum(-1)
+    moved = np.stack([light[..., 0], light[..., 1], intensity], -1)
+    moved = moved @ four_point_homography(targets).T
+    moved *= (intensity / (moved[..., 2] + 1e-5))[..., None]
+    moved[..., 2] -= moved[..., 0] + moved[..., 1]
+    out = np.empty_like(linear)
+    for c in range(3):
+        toe, shoulder = 0.3 + np.log1p(np.exp(response[c, :2]))
+        gamma, centre = 0.1 + np.log1p(np.exp(response[c, 2])), 1 / (1 + np.exp(-response[c, 3]))
+        x = np.clip(moved[..., c], 0, 1)
+        a = shoulder * centre / (toe * (1 - centre) + shoulder * centre)
+        low = a * (x / centre) ** toe
+        high = 1 - (1 - a) * ((1 - x) / (1 - centre)) ** shoulder
+        out[..., c] = np.where(x <= centre, low, high) ** gamma
+    return out
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_ppisp_computes_what_the_paper_says(seed):
+    view = some_view(seed)
+    ours = jax.jit(ppisp.applied)(PICTURE, view)
+    np.testing.assert_allclose(ours, oracle(IMAGE, view), atol=3e-5)
+
+
+def test_the_identity_changes_nothing_within_the_range_of_display_values():
+    parameters = ppisp.identity(["left", "right", "left"])
+    assert parameters.names == ("left", "right")
+    for view in (parameters.view(1), parameters.mean("left"), parameters.mean()):
+        np.testing.assert_allclose(ppisp.applied(PICTURE, view), PICTURE, atol=2e-5)
+        np.testing.assert_allclose(ppisp.applied(PICTURE + 2, view), 1.0, atol=1e-6)
+
+
+def test_a_view_has_its_own_exposure_and_its_cameras_response():
+    parameters = jax.tree.map(
+        lambda x: jnp.arange(x.size, dtype=x.dtype).reshape(x.shape),
+        ppisp.identity(["b", "a", "b"]),
+    )
+    for view, row, exposure in (
+        (parameters.view(jnp.int32(2)), 1, 2),
+        (parameters.mean("a"), 0, 1),
+    ):
+        assert float(view.exposure) == exposure
+        np.testing.assert_array_equal(view.color, parameters.colors[exposure])
+        np.testing.assert_array_equal(view.response, parameters.responses[row])
+        np.testing.assert_array_equal(view.vignetting, parameters.vignettings[row])
+    assert parameters.mean("unknown").vignetting is None
+
+
+def test_vignetting_is_measured_from_its_centre_in_units_of_the_longer_side():
+    wide = np.zeros((3, 5), np.float32)
+    wide[1] = [0.25, -0.1, -0.8, 0, 0]
+    dark = np.asarray(ppisp.falloff(jnp.asarray(wide), 20, 40))
+    np.testing.assert_array_equal(dark[..., [0, 2]], 1)
+    i, j = np.unravel_index(dark[..., 1].argmax(), (20, 40))
+    assert abs(j + 0.5 - (20 + 0.25 * 40)) <= 0.5
+    assert abs(i + 0.5 - (10 - 0.1 * 40)) <= 0.5
+    r2 = ((0.5 - 30) ** 2 + (0.5 - 6) ** 2) / 40**2
+    assert dark[0, 0, 1] == pytest.approx(1 - 0.8 * r2, abs=1e-6)
+    # The same part of the lens at another size.
+    larger = np.asarray(ppisp.falloff(jnp.asarray(wide), 40, 80)).reshape(20, 2, 40, 2, 3)
+    np.testing.assert_allclose(larger.mean((1, 3)), dark, atol=1e-3)
+    bright = jnp.zeros((3, 5)).at[:, 2].set(0.5)
+    assert np.asarray(ppisp.falloff(bright, 20, 40)).max() == 1
+
+
+def three(size, largest):
+    """Draw three lists of numbers, which are mapped over at once."""
+    each = st.lists(st.floats(-largest, largest), min_size=size, max_size=size)
+    return st.lists(each, min_size=3, max_size=3)
+
+
+@settings(max_examples=30, deadline=None)
+@given(three(8, 2))
+def test_homographies_map_the_control_points_and_keep_intensity(parameters):
+    latent = jnp.asarray(parameters, jnp.float32)
+    h = np.asarray(jax.vmap(ppisp.homography_of)(latent), float)
+    moved = np.einsum("bij,kj->bki", h, ppisp.SOURCES)
+    expected = ppisp.SOURCES[None, :, :2] + np.asarray(ppisp.offsets(latent))
+    np.testing.assert_allclose(moved[..., :2] / moved[..., 2:], expected, atol=2e-5)
+    assert h[:, 2, 2] == pytest.approx(1.0)
+    colored = jax.vmap(ppisp.recolored, in_axes=(None, 0))(PICTURE, latent)
+    sums = np.broadcast_to(IMAGE.sum(-1), colored.shape[:-1])
+    # EPSILON of an intensity that the projection may have made smaller.
+    np.testing.assert_allclose(np.asarray(colored).sum(-1), sums, rtol=1e-3)
+
+
+@settings(max_examples=30, deadline=None)
+@given(three(12, 4))
+def test_responses_rise_from_black_to_white(raw):
+    with jax.enable_x64(True):
+        x = jnp.linspace(0.0, 1.0, 301, dtype=jnp.float64)[:, None] * jnp.ones(3)
+        many = jnp.asarray(raw, jnp.float64).reshape(3, 3, 4)
+        y = np.asarray(jax.vmap(ppisp.respond, in_axes=(None, 0))(x, many))
+    np.testing.assert_array_equal(y[:, 0], 0)
+    np.testing.assert_array_equal(y[:, -1], 1)
+    assert np.all(np.diff(y, axis=1) >= -1e-12)
+    assert np.all(np.diff(y[:, ::50], axis=1) > 0)
+
+
+def test_both_parts_of_a_response_meet_with_one_slope():
+    with jax.enable_x64(True):
+        raw = jnp.asarray(np.tile([1.5, -0.5, 0.3, 0.7], (3, 1)))
+        x = jnp.asarray(1 / (1 + np.exp(-0.7)) + np.array([-2e-6, -1e-6, 1e-6, 2e-6]))
+        y = np.asarray(ppisp.respond(x[:, None] * jnp.ones(3), raw))[:, 0]
+    assert (y[1] - y[0]) == pytest.approx(y[3] - y[2], rel=1e-4)
+
+
+def test_gradients_of_ppisp_match_and_are_finite_at_black_and_white():
+    with jax.enable_x64(True):
+        weight = jnp.asarray(RNG.normal(size=IMAGE.shape))
+
+        def f(view, linear):
+            return jnp.sum(weight * ppisp.applied(linear, view))
+
+        check_gradients(f, some_view(dtype=np.float64), jnp.asarray(IMAGE), step=1e-7)
+    image = jnp.asarray([[[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [3.0, 0.0, 1e-9]]], jnp.float32)
+    slope = jax.jit(jax.grad(lambda v, x: jnp.sum(ppisp.applied(x, v)), (0, 1)))
+    gradient = slope(some_view(2, 1.5), image)
+    assert all(bool(jnp.all(jnp.isfinite(g))) for g in jax.tree.leaves(gradient))
+    # At the identity the clips stand on their bounds; their parameters must be able to leave.
+    at_start = slope(ppisp.identity(["a"]).view(0), PICTURE)[0]
+    y, x = np.mgrid[:12, :20] + 0.5
+    r2 = ((y - 6) ** 2 + (x - 10) ** 2) / 20**2
+    expected = (IMAGE * r2[..., None]).sum((0, 1))
+    np.testing.assert_allclose(at_start.vignetting[:, 2], expected, rtol=1e-3)
+
+
+def test_the_regularisation_is_what_is_published():
+    start = ppisp.identity(["a", "a", "b"])
+    assert float(ppisp.regularisation_of(start)) == pytest.approx(0, abs=1e-7)
+    moved = jax.tree.map(lambda x: x + jnp.asarray(RNG.normal(0, 0.4, x.shape), x.dtype), start)
+
+    def huber(x, delta):
+        x = np.abs(x)
+        return np.where(x < delta, x**2 / (2 * delta), x - delta / 2)
+
+    exposures, colors, responses, vignettings = (
+        np.asarray(x, float) for x in jax.tree.leaves(moved)
+    )
+    offsets = np.asarray(ppisp.offsets(jnp.asarray(colors, jnp.float32)), float).mean(0)
+    expected = (
+        huber(exposures.mean(), 0.1)
+        + huber(offsets, 0.005).mean()
+        + 0.1 * (vignettings.var(1).mean() + responses.var(1).mean())
+        + 0.02 * (vignettings[..., :2] ** 2).sum(-1).mean()
+        + 0.01 * np.maximum(vignettings[..., 2:], 0).mean()
+    )
+    assert float(ppisp.regularisation_of(moved)) == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize("parameterization", ["log", "linear"])
+def test_exposures_are_handed_on_and_photographs_stay(parameterization):
+    learned = replace(ppisp.identity(["a", "b"]), exposures=jnp.asarray([0.7, -1.2], jnp.float32))
+    raw = (jnp.zeros(2),) * 2 if parameterization == "log" else (jnp.ones(2), jnp.full(2, 2.2))
+    photometry = Photometry(*raw, parameterization)
+    before = Params(None, photometry, learned)  # pyright: ignore[reportArgumentType]
+    after = exposures_apart(before)
+    np.testing.assert_allclose(after.photometry.exposures, [2**0.7, 2**-1.2], rtol=1e-5)
+    cfg, light = PhotometryConfig(curve="linear", appearance="ppisp"), 0.4 * PICTURE
+    for row in range(2):
+        pictures = [
+            formation(light, p.photometry.capture(row), cfg, correction_of(p.appearance, row))
+            for p in (before, after)
+        ]
+        np.testing.assert_allclose(*pictures, atol=1e-5)
+        assert float(jnp.abs(pictures[0] - light).max()) > 0.05
+
+
+# ---------------------------------------------------------------------- Luminance-GS
+
+# Of what is learned; statistics are not.
+LEARNED = ("curve", "hidden", "hidden_bias", "out", "out_bias", "axes")
+
+
+def learned(size, dtype=jnp.float32) -> gs.Luminance:
+    """Return parameters about the identity, with the statistics of noise."""
+    rng = np.random.default_rng(1)
+    start = gs.identity(2)
+    moved = {n: getattr(start, n) + rng.normal(0, size, getattr(start, n).shape) for n in LEARNED}
+    both = replace(start, **moved, statistics=rng.uniform(0, 1, (2, gs.STATISTICS)))
+    return jax.tree.map(lambda x: jnp.asarray(x, dtype), both)
+
+
+def test_at_the_start_nothing_changes():
+    start = replace(gs.identity(3), statistics=learned(0).statistics[:1].repeat(3, 0))
+    for view in (start.view(1), start.mean()):
+        np.testing.assert_allclose(gs.enhanced(PICTURE, view), PICTURE, atol=1e-6)
+        np.testing.assert_allclose(corrected(PICTURE, view, "luminance"), PICTURE, atol=1e-5)
+    even = np.linspace(0, 1, gs.ENTRIES)
+    np.testing.assert_allclose(gs.pseudo_curve(jnp.zeros(3)), even, atol=2.1e-3)
+
+
+def test_new_views_get_the_mean_also_of_host_arrays():
+    at = learned(0.05)
+    each = [at.view(k).curve for k in range(2)]
+    on_host = jax.tree.map(np.asarray, at)
+    for found in (at.mean(), on_host.mean()):
+        np.testing.assert_allclose(found.curve, (each[0] + each[1]) / 2, atol=1e-6)
+        np.testing.assert_allclose(found.axes @ found.axes.T, np.eye(3), atol=1e-6)
+    np.testing.assert_allclose(on_host.view(1).curve, each[1], atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [0.3, 3.0, 100.0])
+def test_curves_stay_in_bounds_whatever_is_learned(size):
+    view = learned(size).view(0)
+    assert 0 <= float(view.curve.min()) < float(view.curve.max()) <= 1
+    # The clip is at work.
+    assert float(view.curve.min()) == 0 or size < 1
+    assert bool(jnp.isfinite(gs.enhanced(PICTURE, view)).all())
+
+
+def test_a_rising_curve_is_undone_and_any_gives_a_rising_display():
+    start = gs.identity(1)
+    view = replace(start, curve=start.curve**0.4, axes=start.axes + 0.7).view(0)
+    again = gs.as_photographed(gs.enhanced(PICTURE, view), view)
+    np.testing.assert_allclose(again, PICTURE, atol=0.03)
+    grey = jnp.tile(jnp.linspace(0, 1, 50)[:, None], 3)
+    shown = gs.as_photographed(grey, replace(start, curve=1 - start.curve).view(0))
+    assert bool((jnp.diff(shown, axis=0) >= -1e-6).all())
+
+
+def test_axes_are_orthonormal_and_their_spans_hold_all_colours():
+    axes = gs.axes_of(jnp.asarray([0.2, -0.3, 0.1, 0.4, -0.2]))
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-6)
+    corners = np.array(list(np.ndindex(2, 2, 2))) @ np.asarray(axes).T
+    low, high = gs.spans(axes)
+    np.testing.assert_allclose(low, corners.min(0), atol=1e-6)
+    np.testing.assert_allclose(high, corners.max(0), atol=1e-6)
+
+
+def test_histogram_equalisation_is_what_it_is_called():
+    grey = jnp.asarray([0.1, 0.1, 0.5, 0.9])
+    found = gs.cumulative(grey, jnp.asarray([1.0, 1.0, 1.0, 0.0]), 11)
+    np.testing.assert_allclose(found, [0, *[2 / 3] * 4, *[1] * 6], atol=1e-6)
+    np.testing.assert_allclose(gs.cumulative(grey, jnp.zeros(4), 5), [0, 0.25, 0.5, 0.75, 1])
+    seen = gs.statistics_of(PICTURE, MASK)
+    np.testing.assert_allclose(seen[-3:], IMAGE[::4, ::4].mean((0, 1)), rtol=1e-5)
+
+
+def test_a_dark_photograph_asks_for_a_curve_that_brightens():
+    start = gs.identity(1)
+
+    def prior(curve, power=1.0):
+        out_bias = start.out_bias.at[gs.ENTRIES].set((power - 1) / gs.POWER_UNIT)
+        moved = replace(start, curve=curve, out_bias=out_bias)
+        return curve_prior(moved.view(0), 0.1 * PICTURE, MASK)
+
+    assert float(jax.grad(prior)(start.curve)[10:80].max()) < 0
+    # The pseudo curve, which follows, holds it back.
+    bent = start.curve**0.4
+    assert float(prior(bent, 0.4)) < float(prior(start.curve)) < float(prior(bent))
+
+
+def test_contrast_compares_with_the_brightened_photograph():
+    dark = 0.1 * PICTURE
+    bright = dark * (0.5 / dark.mean())
+    # Brightness itself is not its business.
+    for same in (bright, bright + 0.2):
+        assert float(contrast_loss(same, dark, MASK)) == pytest.approx(0, abs=1e-9)
+    assert float(contrast_loss(dark, dark, MASK)) > 1e-3
+    half = MASK.at[:, :10].set(0)
+    raised = dark * 0.5 / dark[:, 10:].mean()
+    aligned = jnp.where(half[..., None] > 0, raised, 9.0 * (jnp.arange(20) < 7)[:, None])
+    assert float(contrast_loss(aligned, dark, half)) == pytest.approx(0, abs=1e-9)
+
+
+def test_gradients_of_luminance_gs_match_and_pass_nothing_else():
+    with jax.enable_x64(True):
+        at = learned(0.05, jnp.float64)
+        render = jnp.asarray(RNG.uniform(1.5, 2.0, IMAGE.shape))
+        # D-SSIM moves the Gaussians only.
+        cfg = LossConfig(dssim_weight=None, censored=False)
+
+        def f(moved):
+            view = replace(at, **moved).view(1)
+            compared = enhanced_loss(render, jnp.asarray(IMAGE), jnp.asarray(MASK), view, cfg)
+            return compared + CURVE * curve_prior(view, jnp.asarray(IMAGE), jnp.asarray(MASK))
+
+        slopes = check_gradients(f, {n: getattr(at, n) for n in LEARNED}, floor=1e-9)
+        assert np.abs(slopes).min() > 1e-9
+    at = learned(0.05)
+
+    def shown(parameters):
+        return jnp.sum(corrected(PICTURE, parameters.view(0), "luminance"))
+
+    def both(parameters):
+        return shown(parameters) + jnp.sum(gs.enhanced(PICTURE, parameters.view(0)))
+
+    assert not np.any(jax.grad(both)(at).statistics)
+    assert not any(np.any(v) for v in jax.tree.leaves(jax.grad(shown)(at)))
+
+
+def test_masked_pixels_get_no_gradient():
+    mask, view = MASK.at[:4].set(0), learned(0.05).view(0)
+
+    def f(render):
+        compared = enhanced_loss(render, PICTURE, mask, view, LossConfig())
+        return compared + contrast_loss(render, PICTURE, mask)
+
+    slope = jax.grad(f)(PICTURE * 0.5)
+    assert not np.any(slope[:4])
+    assert np.any(slope[4:])

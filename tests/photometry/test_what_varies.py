@@ -1,0 +1,192 @@
+"""The model is as rich as the scene needs: solved right, told apart, and chosen with reasons."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from solving import DRIVE, ISO4, adjust, problem_of, rms, select
+from synthetic_drive import make_drive, make_exposures, observe
+
+from p2gs_jax.photometry.adjustment.solve import fit_response
+from p2gs_jax.photometry.candidates import Candidate, choose
+from p2gs_jax.photometry.models import (
+    Choice,
+    Curve,
+    Form,
+    Scope,
+    neighbours,
+    parameter_count,
+    possible,
+)
+from p2gs_jax.photometry.response import FREE, HELD, Response, log_exposed
+
+# Log factors on red, green, blue: dark photographs are bluer; each camera has its own.
+DARK = np.where(np.median(ISO4) > ISO4, 1.0, -1.0)[:, None] * [-0.06, -0.06, 0.12]
+OF_CAMERA = np.array([[0.1, 0.0, -0.1], [-0.05, 0.0, 0.05], [-0.05, 0.0, 0.05]])
+LOST = np.array([[0.45], [0.15], [0.3]]) * [1.0, 1.0, 1.0]
+LONG = make_drive(20, 1200)
+
+
+def of_balance(log_factors):
+    """Return a white balance in its gauge: mean 0 over channels, then over views."""
+    chroma = log_factors - log_factors.mean(1, keepdims=True)
+    return chroma - chroma.mean(0)
+
+
+def test_a_white_balance_per_view_is_solved_and_exposures_keep_their_errors():
+    o = observe(DRIVE, ISO4[:, None] * np.exp(DARK))
+    s, truth = adjust(o, Form("view_exposure", "view")), of_balance(DARK)
+    assert rms(s.white_balance - truth) / np.log(2) < 0.012
+    assert np.abs(s.white_balance.sum(1)).max() < 1e-9
+    assert 0.5 < rms((s.white_balance - truth) / s.white_balance_errors) < 1.6
+    plain = adjust(o)
+    assert plain.white_balance_level is None
+    assert not plain.white_balance.any()
+    # Tinted photographs leave less to explain where the tint is part of the model.
+    assert np.nanmax(np.abs(s.view_balance_ev)) < 0.03 < np.nanmax(np.abs(plain.view_balance_ev))
+
+
+def test_a_white_balance_per_camera_goes_with_gammas_per_view():
+    gammas = np.random.default_rng(1).normal(2.2, 0.1, len(ISO4))
+    truth = OF_CAMERA[DRIVE.cameras]
+    how = {"curve": "power", "gammas": gammas, "pivot": 0.18, "seed": 4}
+    o = observe(DRIVE, ISO4[:, None] * np.exp(truth), **how)
+    s = adjust(o, Form("view_exposure_gamma", "camera"), Response("power"))
+    assert np.abs(s.white_balance - of_balance(truth)).max() < 0.02
+    assert np.ptp(s.white_balance[DRIVE.cameras == 0], axis=0).max() < 1e-9
+    assert np.std(s.gammas - gammas) < 0.04
+
+
+@pytest.mark.parametrize("kind", ["camera", "channel"])
+def test_corners_are_solved_for_each_camera(kind):
+    lost = LOST if kind == "camera" else LOST * [1.0, 0.7, 0.4]
+    o = observe(DRIVE, ISO4, corner_loss=lost)
+    s = adjust(o, Form("view_exposure", None, kind))
+    corners = np.array([[np.exp(sum(row)) for row in c.vignetting] for c in s.cameras])
+    expected = 1 - lost[:, : corners.shape[1]]
+    assert np.abs(corners - expected).max() < (0.05 if kind == "camera" else 0.08)
+    assert np.abs((np.log(corners) - np.log(expected)) / s.corner_errors).max() < 4
+    assert [c.name for c in s.cameras] == list(o.camera_names)
+    # Nobody else explains the corners: exposures are wrong without them.
+    assert np.std(s.log_exposures - np.log(ISO4)) / np.log(2) < 0.015
+
+
+def test_cameras_may_have_responses_of_their_own():
+    drive = make_drive(16, 1500)
+    curves = np.array([["srgb"] * 3, ["filmic"] * 3, ["srgb"] * 3])
+    o = observe(drive, make_exposures(drive, "iso4"), curve=curves, outliers=0.02)
+    found = fit_response(problem_of(o), Response(), by="camera")
+    assert found is not None
+    assert found.name == "spline per camera over srgb"
+    y = np.repeat(np.linspace(0.2, 0.85, 20)[:, None], 3, 1)
+    first, bent, third = (log_exposed(y, found, np.full(20, c))[0][:, 0] for c in range(3))
+    assert np.ptp((first - third) - (first - third).mean()) < 0.5 * np.ptp(first - bent)
+    s = adjust(o, "view_exposure", found)
+    assert [c.splines for c in s.cameras] == [(spline,) for spline in found.splines]
+
+
+def test_channels_with_exposures_of_their_own_have_no_powers_of_their_own():
+    # Dark photographs are bluer; a power per channel would explain that as well, and any tint of
+    # a view with it: the mean of the white balances would be no white balance.
+    o = observe(DRIVE, ISO4[:, None] * np.exp(DARK), seed=2)
+    form = Form("view_exposure", "view")
+    response = fit_response(problem_of(o), Response(), form=form, by="channel")
+    assert response is not None
+    np.testing.assert_allclose(np.array(response.splines)[:, HELD[1]], 0, atol=1e-3)
+    s = adjust(o, form, response)
+    assert rms(s.white_balance - of_balance(DARK)) / np.log(2) < 0.02
+    apart = parameter_count(form, response, 3, 36) - parameter_count(form, Response(), 3, 36)
+    assert apart == 3 * len(FREE)
+
+
+def test_choices_one_step_apart():
+    scope = Scope(cameras=3, places=True, curves=True)
+    plain = Choice(Form("view_exposure"))
+    near = neighbours(plain, scope)
+    assert {
+        Choice(Form("view_exposure", "view")),
+        Choice(Form("view_exposure", None, "camera")),
+        Choice(Form("camera_exposure")),
+        Choice(Form("view_exposure"), Curve("srgb", "all")),
+    } <= set(near)
+    assert not {plain, Choice(Form("view_exposure"), Curve("srgb", "camera"))} & set(near)
+    assert all(plain in neighbours(choice, scope) for choice in near)
+    nowhere = Scope(cameras=1, places=False, curves=False)
+    for form, curve in neighbours(plain, nowhere):
+        assert form.vignetting is curve.splines is None
+        assert "camera" not in form.model
+
+
+def test_a_white_balance_per_view_needs_exposures_per_view():
+    assert possible(Form("view_exposure", "view"), 3)
+    assert not possible(Form("camera_exposure", "view"), 3)
+    assert not possible(Form("view_exposure", "camera"), 1)
+    count = parameter_count(Form("view_exposure", "view", "channel"), Response(), 3, 10)
+    assert count == 9 + 2 * 9 + 27
+
+
+@pytest.mark.parametrize(
+    ("exposures", "curve", "gamma", "model", "response"),
+    [
+        ("constant", "srgb", None, "constant", None),
+        ("cameras", "power", None, "camera_exposure", "power"),
+        ("iso4", "srgb", None, "view_exposure", "srgb"),
+        ("iso2", "power", "camera", "view_exposure_camera_gamma", "power"),
+    ],
+)
+def test_what_varies_is_found(exposures, curve, gamma, model, response):
+    gammas = None if gamma is None else np.array([2.0, 2.2, 2.45])[LONG.cameras]
+    s = select(observe(LONG, make_exposures(LONG, exposures), curve=curve, gammas=gammas))
+    assert s.solution.model == model
+    assert response is None or s.solution.response.name == response
+    assert any(r.startswith("Chosen:") for r in s.reasons)
+    if exposures == "constant":
+        assert any("too little to tell the shape" in r for r in s.reasons)
+
+
+def test_a_filmic_camera_gets_a_spline_unless_its_curve_is_known():
+    seen = observe(LONG, make_exposures(LONG, "iso2"), curve="filmic")
+    free = select(seen).solution
+    assert (free.model, free.response.name) == ("view_exposure", "spline over srgb")
+    s = select(seen, known_response="camera raw")
+    assert s.solution.response == Response("srgb")
+    assert {c.response.name for c in s.candidates} == {"srgb"}
+    assert "The tone curve is known (camera raw)" in s.reasons[0]
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("value", [0.0, 1.0])
+def test_photographs_that_tell_nothing_choose_something_and_know_no_exposure(value):
+    seen = observe(LONG, make_exposures(LONG, "constant"), curve="srgb")
+    s = select(dataclasses.replace(seen, colors=np.full_like(seen.colors, value))).solution
+    assert np.isinf(s.exposure_errors).all()
+    assert np.isfinite(s.log_exposures).all()
+    assert (s.observations_per_view == 0).all()
+
+
+def test_the_simplest_that_is_not_clearly_worse_wins():
+    def candidate(model, parameters, density, deficit, error, difference=9.0):
+        choice = Choice(Form(model))
+        return Candidate(choice, Response(), parameters, density, deficit, error, difference)
+
+    simple = candidate("constant", 0, -1.0, 0.5, 0.01)
+    middle = candidate("camera_exposure", 2, -0.51, 0.008, 0.001)
+    rich = candidate("view_exposure", 40, -0.5, 0.0, 0.0)
+    assert choose([rich, simple, middle]) is middle
+    # Two standard errors count, where they are more than the smallest gain.
+    noisy = candidate("constant", 0, -0.6, 0.1, 0.06)
+    assert choose([rich, noisy, middle]) is noisy
+    # A difference that nobody can see does not count, however sure it is.
+    unseen = candidate("constant", 0, -0.9, 0.4, 0.01, 0.8)
+    assert choose([rich, unseen, middle]).parameters == 0
+
+
+def test_sharp_images_do_not_earn_parameters_for_invisible_differences():
+    """Noise-free, 160 views' worth of observations, exposures a hundredth of a stop apart."""
+    drive = make_drive(20, 6000, 1)
+    cameras = np.array([1.0, 1.006, 0.995])[drive.cameras]
+    wobble = np.exp2(0.004 * np.sin(np.arange(len(drive.cameras))))
+    found = select(observe(drive, cameras * wobble, noise=0.0, outliers=0.0, bits=None))
+    assert found.solution.model == "constant"
+    assert found.candidates[0].form.model != "constant"
+    assert any("8-bit levels in any view" in r for r in found.reasons)
