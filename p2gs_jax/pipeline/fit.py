@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import shutil
 import time
 from collections.abc import Iterator, Mapping
@@ -118,9 +119,7 @@ def fit(
                 cfg,
                 reporter,
                 clock,
-                lambda known, curve: begin_programs(
-                    programs, known, folder, mesh, curve=curve, own=own
-                ),
+                functools.partial(begin_programs, programs, folder=folder, mesh=mesh, own=own),
                 kept=kept_choice(cfg, folder) if resume else None,
                 pixels=folder.pixels,
             )
@@ -242,15 +241,15 @@ def optimise(
 def begin_programs(
     programs: StepPrograms,
     known: Prepared,
-    folder: RunFolder,
-    mesh: Mesh | None,
-    *,
     curve: bool,
+    *,
+    folder: RunFolder,
+    mesh: Mesh | None = None,
     own: Own = AS_CONFIGURED,
 ) -> None:
     """Begin to compile steps while the exposures are solved, mostly on one core.
 
-    With `curve`, the tone curve of what is known is chosen.
+    `curve` says whether the tone curve of what is known is chosen.
     """
     trainer = trainer_of(known, folder, programs, mesh=mesh, own=own)
     trainer.expect(own.among(known.params), known.owner, curve)

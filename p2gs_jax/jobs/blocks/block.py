@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import shutil
 import time
 from pathlib import Path
@@ -176,7 +177,7 @@ def _fit(
             cfg,
             reporter,
             clock,
-            lambda known, curve: begin_programs(programs, known, folder, mesh, curve=curve),
+            functools.partial(begin_programs, programs, folder=folder, mesh=mesh),
             pixels=folder.pixels,
             given=block.exposures,
             sphere=block.shell,
