@@ -117,10 +117,7 @@ def _refit(
     clock = Stopwatch()
     clock.add("reading", found.seconds["reading"])
     clock.add("photometry", found.seconds["adjustment"])
-    with (
-        contextlib.closing(StepPrograms()) as programs,
-        begun(folder, paths, cfg, start.decisions),
-    ):
+    with contextlib.closing(StepPrograms()) as programs, begun(folder, paths, cfg, start.decisions):
         result = optimise(start, folder, reporter, programs, resume=False)
     params, _ = compact(result)
     account = Account(
