@@ -121,7 +121,7 @@ class Comparison:
     def _candidate(
         self, choice: Choice, density: float, found: Predicted, best: Predicted
     ) -> Candidate:
-        o, response = self.problem.observations, self.fits[choice][1]
+        o = self.problem.observations
         cameras = int(o.cameras.max(initial=0)) + 1
         # Neighbours in an image err alike, as do its pixels.
         lower = best.densities - found.densities
@@ -130,8 +130,8 @@ class Comparison:
         )
         return Candidate(
             choice,
-            response,
-            parameter_count(choice.form, response, cameras, o.view_count),
+            self.fits[choice][1],
+            parameter_count(choice.form, choice.curve.splines, cameras, o.view_count),
             density,
             deficit,
             max(of_views, of_regions),
