@@ -122,10 +122,7 @@ def base_log(y: Numbers, base: Base) -> tuple[Numbers, Numbers]:
 def log_exposed(
     y: Numbers, response: Response, cameras: Int[np.ndarray, " o"] | None = None
 ) -> tuple[Numbers, Numbers]:
-    """Return z = F(y) and dz/dy of display values, which are (o, 3) where splines are several.
-
-    `cameras` is of each observation, where cameras have splines of their own.
-    """
+    """Return z = F(y) and dz/dy; y is (o, 3) where splines are several."""
     z, slope = base_log(y, response.base)
     if response.spline is None:
         return z, slope
@@ -212,11 +209,7 @@ def _rows(splines: tuple[Spline, ...], channels: int) -> tuple[Spline, ...]:
 
 
 def spline_of(cfg: PhotometryConfig, camera: int | None = None) -> tuple[Spline, ...]:
-    """Return the spline of a camera, on the host: one row for all channels, or one for each.
-
-    Without any spline the values are 0, which is sRGB. A camera of None or -1 is not in
-    `cfg.cameras`.
-    """
+    """Return the spline of a camera (None, -1: unknown): a row for all channels, or each."""
     own = () if camera is None or camera < 0 else cfg.cameras[camera].splines
     if own:
         return own

@@ -131,10 +131,7 @@ def solution_of(
     explained: Explained,
     known: Uncertainty,
 ) -> PhotometricSolution:
-    """Return exposures in their gauge, with errors and warnings.
-
-    The problem holds all observations, whatever part of them `fit` was solved from.
-    """
+    """Return exposures in their gauge, with errors and warnings; the problem holds everything."""
     o, used, residual = problem.observations, problem.usable, explained.residual
     seen = used.any(1)
     per_view = np.bincount(o.views[seen], minlength=o.view_count)
@@ -180,10 +177,7 @@ def solution_of(
 def _exposures(
     fit: Fit, known: Uncertainty, active: Bool[np.ndarray, " v"], scale: _Gauge, color: _Gauge
 ) -> tuple[dict[str, np.ndarray], Float[np.ndarray, "v x"], Bool[np.ndarray, " v"]]:
-    """Return what a solution says of exposures, gammas and white balances, with errors.
-
-    Besides, how their gauges were shifted, and which active views have no errors.
-    """
+    """Return exposures, gammas and tints with errors; shifts; views that have no errors."""
     a, light = fit.theta.a, fit.theta.b / fit.theta.a[:, None]
     h, balance = light.mean(1), light - light.mean(1, keepdims=True)
     shift = scale.shift(h)

@@ -56,10 +56,9 @@ def one_thread():
 
 
 class Balanced:
-    """A symmetric matrix over its free directions, its diagonal scaled to 1, ready to be solved.
+    """A symmetric matrix over its free directions (columns of `basis`), its diagonal scaled to 1.
 
-    Outer products of few rows, the gauges, are added to it. Columns of `basis` are the
-    directions.
+    Outer products of few rows, the gauges, are added to it.
     """
 
     def __init__(self, normal: Matrix, gauges: sp.csr_array, basis: sp.csr_array):
