@@ -18,10 +18,10 @@ from jaxtyping import Bool, Float, Float32
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.evaluation.passes import ArrayStore
 from p2gs_jax.evaluation.unexplained import Residuals, Surface, Unexplained, shares_by_view
-from p2gs_jax.render.warp import OPAQUE
+from p2gs_jax.render.warp import OPAQUE, project_points
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.rigid import interpolated, inverse, left_of_way
-from p2gs_jax.scene.visibility import project_points, unoccluded
+from p2gs_jax.scene.visibility import unoccluded
 from p2gs_jax.types import Camera, Lidar, Render, Scene, TrackedObject, View
 
 # Points within half a turn of a scanner at 10 Hz are the sweep of a view, seconds.

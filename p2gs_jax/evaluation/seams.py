@@ -30,10 +30,10 @@ from p2gs_jax.config import LossConfig
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import inverse_formation, inverse_tone_map, places
+from p2gs_jax.render.warp import project_points, sample_bilinear, surface_depth, unproject, warp
 from p2gs_jax.render.warp import project_points as project
-from p2gs_jax.render.warp import sample_bilinear, surface_depth, unproject, warp
 from p2gs_jax.scene.rigid import moment_of
-from p2gs_jax.scene.visibility import project_points, unoccluded
+from p2gs_jax.scene.visibility import unoccluded
 from p2gs_jax.types import Camera, Render, Scene
 
 # Least pixels in common.

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float, UInt8
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.numerics import fibonacci_sphere, on_device
 from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
-from p2gs_jax.render import render_linear
+from p2gs_jax.render import harmonics, render_linear
 from p2gs_jax.render.capacity import (
     RenderView,
     TileCapacity,
@@ -31,15 +31,7 @@ from p2gs_jax.render.capacity import (
     make_renderer,
     until_it_fits,
 )
-from p2gs_jax.render.harmonics import (
-    C0,
-    RadianceKind,
-    basis,
-    coefficient_count,
-    degree_of,
-    radiance_activation,
-    radiance_preactivation,
-)
+from p2gs_jax.render.harmonics import C0, RadianceKind, coefficient_count, degree_of
 from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.types import Camera, Gaussians, Render
 
@@ -137,13 +129,13 @@ def display_sh(
         part = sh[start : start + CHUNK]
         values = np.zeros((CHUNK, DIRECTIONS, 3), np.float32)
         values[: len(part)] = np.einsum("dk,nkc->ndc", table, part, optimize=True)
-        colors = tone(np.asarray(radiance_activation(values, activation)))[: len(part)]
+        colors = tone(np.asarray(harmonics.radiance_activation(values, activation)))[: len(part)]
         shown = np.clip(colors, 0, 1) - 0.5
         out[start : start + CHUNK] = np.einsum("kd,ndc->nkc", inverse, shown, optimize=True)
     return out
 
 
-_basis = jax.jit(basis, static_argnums=1)
+_basis = jax.jit(harmonics.basis, static_argnums=1)
 
 
 def viewer_config(cfg: RenderConfig) -> RenderConfig:
@@ -281,5 +273,5 @@ def relit(gaussians: Gaussians, shown: DisplayTransform, cfg: RenderConfig) -> G
     """
     colors = np.clip(0.5 + C0 * np.asarray(gaussians.sh[:, 0]), 0.0, BRIGHTEST)
     sh = np.zeros((len(colors), coefficient_count(cfg.sh_degree), 3), np.float32)
-    sh[:, 0] = radiance_preactivation(undevelop(colors, shown), cfg.radiance) / C0
+    sh[:, 0] = harmonics.radiance_preactivation(undevelop(colors, shown), cfg.radiance) / C0
     return replace(gaussians, sh=on_device(sh))

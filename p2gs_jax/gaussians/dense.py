@@ -50,7 +50,7 @@ SAME_DEPTH = 0.05
 PLAIN = 0.5
 # Bound met within this share, in at most so many attempts.
 SLACK, ATTEMPTS = 0.05, 5
-# Of a time budget at most this share goes into dense seeds, if two idle cores need so long a view.
+# Dense seeds take at most this share of a time budget, where two idle cores need so long a view.
 DENSE_TIME, DENSE_SECONDS, FEWEST_DENSE_VIEWS = 0.25, 0.6, 8
 # Seeds may take this share of the bound on the population; the rest grows where it is needed.
 DENSE_SHARE = 0.6

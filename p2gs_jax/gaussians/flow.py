@@ -9,7 +9,7 @@ gives the linear equations (a - q a_z) + r (b - q b_z) = 0.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -157,36 +157,27 @@ class _Pair(NamedTuple):
     refused: list[np.ndarray]
 
 
-@dataclass(frozen=True)
 class Flows:
     """Flows between training views, computed when asked for; from any thread.
 
-    `points` start the flow; `seen` says which training view sees which.
+    `points` (scene units) start the flow; `seen` says which training view sees which. The last
+    flows, and what starts them, are kept.
     """
 
-    images: MatchImages
-    points: Float[np.ndarray, "p 3"]
-    seen: Bool[np.ndarray, "v p"]
-    _kept: tuple = field(init=False, repr=False, compare=False)
+    def __init__(
+        self, images: MatchImages, points: Float[np.ndarray, "p 3"], seen: Bool[np.ndarray, "v p"]
+    ):
+        self.images = images
+        self._guide = lru_cache(KEPT_FLOWS)(lambda i: guide(images[i], points[seen[i]]))
+        self.between = lru_cache(KEPT_FLOWS)(self._flow)
 
-    def __post_init__(self):
-        """Keep the last flows, and what starts them."""
-        kept = lru_cache(KEPT_FLOWS)(self._guide), lru_cache(KEPT_FLOWS)(self._flow)
-        object.__setattr__(self, "_kept", kept)
-
-    def between(self, i: int, j: int) -> Float32[np.ndarray, "h w 2"]:
+    def _flow(self, i: int, j: int) -> Float32[np.ndarray, "h w 2"]:
         """Return the flow from a training view to another."""
-        return self._kept[1](i, j)
-
-    def _guide(self, i: int):
-        return guide(self.images[i], self.points[self.seen[i]])
-
-    def _flow(self, i: int, j: int):
         a, b = self.images[i], self.images[j]
         # Always in one order, so that both directions compare the same pictures.
         first, second = at_common_exposure(a, b) if i < j else at_common_exposure(b, a)[::-1]
         here = pixel_centers(*a.luminance.shape)
-        return _flow(first, second, _start(_geometry(a, b), self._kept[0](i), here))
+        return _flow(first, second, _start(_geometry(a, b), self._guide(i), here))
 
 
 def _match(flows: Flows, i: int, j: int) -> _Pair:

@@ -17,8 +17,9 @@ from p2gs_jax.gaussians.seeds import camera_centers
 from p2gs_jax.photometry.formation import darkens, log_vignetting, squared_radii
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import Response, base_log, log_exposed, spline_of
+from p2gs_jax.render.warp import project_points
 from p2gs_jax.scene.pixels.store import ImageStore
-from p2gs_jax.scene.visibility import in_frame, project_points, unoccluded
+from p2gs_jax.scene.visibility import in_frame, unoccluded
 from p2gs_jax.types import GAMMA_SRGB, Photometry, Scene
 
 TABLE = 1024
@@ -69,7 +70,7 @@ class Tones:
     ) -> Float32[np.ndarray, "... 3"]:
         """Return log radiance of an image of a training view, or of loose pixels of one.
 
-        Loose pixels have `positions` where vignetting counts (photometry/cameras.py:places).
+        Loose pixels have `positions` where vignetting counts (photometry/formation.py:places).
         """
         camera = None if self.cameras is None else self.cameras[row]
         y = np.linspace(0.0, 1.0, TABLE)
@@ -138,29 +139,28 @@ class MatchImage:
     log_exposure: float
 
 
-@dataclass(frozen=True)
 class MatchImages:
-    """The training views of a scene, loaded when asked for; from any thread.
+    """The training views of a scene, loaded when asked for by their rows; from any thread.
 
     Their longest side has `longest` pixels; display values up to `black` and from `saturation` on
-    are not used.
+    are not used. The last images are kept.
     """
 
-    scene: Scene
-    store: ImageStore
-    tones: Tones
-    longest: int
-    black: float
-    saturation: float
-    _load: object = field(init=False, repr=False, compare=False)
-
-    def __post_init__(self):
-        """Cache the last images."""
-        object.__setattr__(self, "_load", lru_cache(CACHED)(self._make))
+    def __init__(
+        self,
+        scene: Scene,
+        store: ImageStore,
+        tones: Tones,
+        longest: int,
+        black: float,
+        saturation: float,
+    ):
+        self.scene, self.store, self.tones = scene, store, tones
+        self.longest, self.black, self.saturation = longest, black, saturation
+        self._load = lru_cache(CACHED)(self._make)
 
     def __getitem__(self, row: int) -> MatchImage:
-        """Return a training view by its row."""
-        return self._load(row)  # type: ignore[operator]
+        return self._load(row)
 
     def _make(self, row: int) -> MatchImage:
         index = self.scene.train_indices[row]
@@ -172,14 +172,9 @@ class MatchImages:
         # Pixels beside clipped ones contain some of their light.
         usable = cv2.erode(usable.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
         luminance = np.exp(self.tones.log_radiance(row, ldr)) @ LUMINANCE
-        return MatchImage(
-            ldr,
-            luminance,
-            usable,
-            viewmat.astype(np.float64),
-            K.astype(np.float64),
-            float(self.tones.log_exposures[row]),
-        )
+        viewmat, K = viewmat.astype(np.float64), K.astype(np.float64)
+        exposure = float(self.tones.log_exposures[row])
+        return MatchImage(ldr, luminance, usable, viewmat, K, exposure)
 
 
 def at_common_exposure(

@@ -16,10 +16,11 @@ from p2gs_jax.core.numerics import on_device
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.gaussians.seeds import NEIGHBOURS, gaussians_from_points, mean_radiance, merge
 from p2gs_jax.render.project import STILL
+from p2gs_jax.render.warp import project_points
 from p2gs_jax.scene.drives.objects import MovingObjects, middle_time, outline_of, painted
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.rigid import interpolated, inverse
-from p2gs_jax.scene.visibility import project_points, unoccluded
+from p2gs_jax.scene.visibility import unoccluded
 from p2gs_jax.types import Gaussians, Lidar, Photometry, Scene, TrackedObject, Vibration, View
 
 # A view shows an object from this share of its pixels on.

@@ -105,7 +105,7 @@ def place(
 ) -> tuple[Int[Array, " n"], Int[Array, ""]]:
     """Assign an empty slot to each request, in order; count the requests that found none.
 
-    Where there is no slot, it is n, out of bounds.
+    A request without a slot gets n, out of bounds.
     """
     n = alive.shape[0]
     rank = jnp.cumsum(requests) - 1

@@ -16,8 +16,9 @@ from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.photometry.formation import inverse_formation, places
 from p2gs_jax.photometry.sources.sampling import sample
 from p2gs_jax.render.harmonics import C0, coefficient_count, radiance_preactivation
+from p2gs_jax.render.warp import project_points
 from p2gs_jax.scene.pixels.store import ImageStore
-from p2gs_jax.scene.visibility import project_points, unoccluded
+from p2gs_jax.scene.visibility import unoccluded
 from p2gs_jax.types import Gaussians, Photometry, Scene, View
 
 NEIGHBOURS = 3

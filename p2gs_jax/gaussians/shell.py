@@ -16,8 +16,9 @@ from jaxtyping import Bool, Float, Float32
 from p2gs_jax.config import FitConfig, InitConfig
 from p2gs_jax.core.numerics import fibonacci_sphere
 from p2gs_jax.gaussians.seeds import camera_centers, gaussians_from_points, merge, photographed
+from p2gs_jax.render.warp import project_points
 from p2gs_jax.scene.pixels.store import ImageStore
-from p2gs_jax.scene.visibility import in_frame, project_points
+from p2gs_jax.scene.visibility import in_frame
 from p2gs_jax.types import Gaussians, Photometry, Scene, View
 
 # Each view is cut into cells; a cell with a seed in it or beside it counts as covered.

@@ -162,10 +162,8 @@ def _around(focus, centers, up, *, met: bool) -> Orbit:
 def _median_depth(shot: Shot, points, centers) -> float:
     """Return the median depth of the points in a shot; without any, the cameras' spread."""
     local = points @ shot.viewmat[:3, :3].T + shot.viewmat[:3, 3]
-    local = local[local[:, 2] > 1e-6]
-    xy = local[:, :2] / local[:, 2:] * shot.K[[0, 1], [0, 1]] + shot.K[:2, 2]
-    inside = np.all((xy >= 0) & (xy <= (shot.width, shot.height)), axis=1)
-    if inside.any():
-        return float(np.median(local[inside, 2]))
+    depths = local[shot.project(local)[1], 2]
+    if len(depths):
+        return float(np.median(depths))
     spread = float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
     return spread if spread > 0 else 1.0

@@ -73,25 +73,6 @@ class Cylinder:
         return np.stack([np.sin(a), h, np.cos(a)], -1) @ self.viewmat[:3, :3]
 
 
-def _project(
-    shot: Shot,
-    rays: Float[np.ndarray, "h w 3"],
-    shift: Float[np.ndarray, "h w 3"] | float = 0.0,
-) -> tuple[Float[np.ndarray, "h w 2"], Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Return where a pinhole camera sees what lies along rays of the world.
-
-    The shift is added to the rays in the camera, for what is not infinitely far. Pixels (centres at
-    +0.5) come back, cosines of the angle from the optical axis, and what the camera sees.
-    """
-    local = rays @ shot.viewmat[:3, :3].T + shift
-    z = local[..., 2]
-    front = z > 1e-9
-    xy = local[..., :2] / np.where(front, z, 1.0)[..., None]
-    xy = xy * shot.K[[0, 1], [0, 1]] + shot.K[:2, 2]
-    inside = front & np.all((xy >= 0) & (xy <= (shot.width, shot.height)), axis=-1)
-    return xy, z / np.maximum(np.linalg.norm(local, axis=-1), 1e-12), inside
-
-
 def covering(shots: Iterable[Shot], viewmat: Pose) -> Cylinder:
     """Return the cylinder that cameras cover, at the finest of their resolutions.
 
@@ -103,7 +84,7 @@ def covering(shots: Iterable[Shot], viewmat: Pose) -> Cylinder:
     around, tall = round(2 * np.pi * PROBES), 2 * round(HIGHEST * PROBES)
     probe = Cylinder(viewmat, around / (2 * np.pi), -np.pi, -tall / 2 / PROBES, around, tall)
     rays = probe.rays()
-    covered = np.any([_project(shot, rays)[2] for shot in shots], axis=0)
+    covered = np.any([s.project(rays @ s.viewmat[:3, :3].T)[1] for s in shots], axis=0)
     counts = covered.sum(0)
     good = counts >= FULL_COLUMN * counts.max()
     start, count = (0, around) if counts.all() else _without_largest_gap(good)
@@ -167,10 +148,12 @@ def stitch(
     for k, (image, shot) in enumerate(zip(images, shots, strict=True)):
         if image.shape[:2] != (shot.height, shot.width):
             raise ValueError(f"image {k} is {image.shape[:2]}, its camera not")
-        shift = 0.0
+        R = shot.viewmat[:3, :3]
+        local = rays @ R.T
         if nearness is not None:
-            shift = nearness[..., None] * (shot.viewmat[:3, :3] @ origin + shot.viewmat[:3, 3])
-        xy, cosine, inside = _project(shot, rays, shift)
+            local = local + nearness[..., None] * (R @ origin + shot.viewmat[:3, 3])
+        xy, inside = shot.project(local)
+        cosine = local[..., 2] / np.maximum(np.linalg.norm(local, axis=-1), 1e-12)
         at = (xy - 0.5).astype(np.float32)
         better = inside & (cosine > best)
         if masks is not None:

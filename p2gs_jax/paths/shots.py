@@ -12,7 +12,7 @@ from pathlib import PurePosixPath
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from p2gs_jax.errors import UserError
@@ -59,6 +59,15 @@ class Shot:
         height = max(1, round(self.height * width / self.width))
         K = scale_intrinsics(self.K, width / self.width, height / self.height)
         return replace(self, K=K, width=width, height=height)
+
+    def project(
+        self, local: Float[np.ndarray, "*n 3"]
+    ) -> tuple[Float[np.ndarray, "*n 2"], Bool[np.ndarray, "*n"]]:
+        """Return pixels of points in camera space, centres at +0.5, and which of them it sees."""
+        front = local[..., 2] > 1e-9
+        xy = local[..., :2] / np.where(front, local[..., 2], 1.0)[..., None]
+        xy = xy * self.K[[0, 1], [0, 1]] + self.K[:2, 2]
+        return xy, front & np.all((xy >= 0) & (xy <= (self.width, self.height)), axis=-1)
 
     def camera(self) -> Camera:
         """Return the renderer's camera."""

@@ -19,8 +19,9 @@ from p2gs_jax.gaussians.population import Coverage
 from p2gs_jax.gaussians.seeds import camera_centers, cameras_radius, subsample
 from p2gs_jax.gaussians.shell import Shell, Sphere, find_shell
 from p2gs_jax.pipeline.preflight import memory_needed, require_memory
+from p2gs_jax.render.warp import project_points
 from p2gs_jax.scene.pixels.store import ImageStore
-from p2gs_jax.scene.visibility import SHARE_POINTS, SHARE_VIEWS, in_frame, project_points
+from p2gs_jax.scene.visibility import SHARE_POINTS, SHARE_VIEWS, in_frame
 from p2gs_jax.train.lidar_depths import measured_depths
 from p2gs_jax.train.schedule import shrinks
 from p2gs_jax.types import Measured, Scene, View

@@ -54,6 +54,14 @@ def sort_payloads(keys: UInt32[Array, " n"], payload_bits: int) -> Int[Array, " 
     return (lax.sort(keys, is_stable=False) & mask).astype(jnp.int32)
 
 
+def longest_first(lengths: Int[Array, " n"]) -> Int[Array, " n"]:
+    """Return the indices of lengths, largest first; of very long ones the index decides."""
+    bits = bits_for(lengths.shape[0])
+    limit = 2 ** (32 - bits) - 1
+    key = jnp.uint32(limit) - jnp.minimum(lengths, limit).astype(jnp.uint32)
+    return sort_payloads(key << bits | jnp.arange(lengths.shape[0], dtype=jnp.uint32), bits)
+
+
 def depth_order(depths: Float[Array, " n"], visible: Bool[Array, " n"]) -> Int[Array, " n"]:
     """Return a stable argsort of positive depths, invisible ones last.
 

@@ -51,7 +51,7 @@ ANYWHERE = Margins(1.5, 1.5)
 TRAINING = Margins(1.5, 1.5)
 # Gaussians that a training view shows: only views between the sampled ones may show more.
 TRAINING_VISIBLE = Margins(1.1, 1.2)
-# Of training, whatever was counted.
+# Lists of training are not shorter than this, whatever was counted.
 ENTRIES_PER_GAUSSIAN, FEWEST_ENTRIES = 4, 16_384
 
 

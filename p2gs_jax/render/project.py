@@ -183,7 +183,7 @@ def view_radiance(
     if camera.viewmat.ndim == 2:
         center = -camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3]
     else:
-        # Of each Gaussian in its own axes.
+        # The camera in the axes of each Gaussian.
         R, t = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
         center = [-sum(R[i, k] * t[i] for i in range(3)) for k in range(3)]
     offset = [m - c for m, c in zip(columns(gaussians.means), center, strict=True)]

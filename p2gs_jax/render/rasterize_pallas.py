@@ -26,7 +26,7 @@ from jax import lax
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plt
 
-from p2gs_jax.render.binning import bits_for, sort_payloads
+from p2gs_jax.render.binning import longest_first
 from p2gs_jax.render.tiles import DARKEST, GEOMETRY, Plan, geometry_gradient
 
 # Entries whose rows are loaded together; the stop rule is looked at once for each such group.
@@ -60,15 +60,6 @@ def _check(plan: Plan) -> None:
             f"the pallas rasterizer needs tiles with a power of two of pixels, not "
             f"{plan.tile_x}x{plan.tile_y}: set RenderConfig.tile to (16, 8) or (16, 16)"
         )
-
-
-def _longest_first(starts, ends, plan: Plan):
-    """Return the tiles, longest lists first."""
-    bits = bits_for(plan.tile_count)
-    limit = 2 ** (32 - bits) - 1
-    length = jnp.minimum(ends - starts, limit).astype(jnp.uint32)
-    tiles = jnp.arange(plan.tile_count, dtype=jnp.uint32)
-    return sort_payloads((jnp.uint32(limit) - length) << bits | tiles, bits)
 
 
 class _Tile:
@@ -160,7 +151,7 @@ def forward(rows, ids, offsets, plan: Plan):
         rows,
         ids,
         offsets,
-        _longest_first(offsets[:-1], offsets[1:], plan),
+        longest_first(offsets[1:] - offsets[:-1]),
         jnp.maximum(jnp.max(radiance), 1e-30)[None],
     )
     return tuple(image), (offsets, stops)
@@ -255,7 +246,7 @@ def backward(rows, ids, residuals, image, v_image, plan: Plan):
         ids,
         offsets,
         stops,
-        _longest_first(offsets[:-1], stops, plan),
+        longest_first(stops - offsets[:-1]),
         *image,
         *v_image,
         blank,

@@ -30,7 +30,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from p2gs_jax.render.binning import bits_for, sort_payloads
+from p2gs_jax.render.binning import longest_first
 from p2gs_jax.render.tiles import DARKEST, GEOMETRY, Plan, geometry_gradient
 from p2gs_jax.render.xla_cpu import compiled_loop, materialize
 
@@ -144,11 +144,7 @@ class Queue(NamedTuple):
         """Queue the segments; `ends` is where each is composited to, at most its own end."""
         count, lanes = segments.starts.shape[0], plan.lanes
         lane = jnp.arange(lanes, dtype=jnp.int32)
-        bits = bits_for(count)
-        limit = 2 ** (32 - bits) - 1
         lengths = ends - segments.starts
-        key = jnp.uint32(limit) - jnp.minimum(lengths, limit).astype(jnp.uint32)
-        key = key << bits | jnp.arange(count, dtype=jnp.uint32)
         parked = jnp.zeros(lanes, jnp.int32)
         tiles = jnp.concatenate([segments.tiles, parked])
         column, line = tiles % plan.across, tiles // plan.across
@@ -156,7 +152,7 @@ class Queue(NamedTuple):
             [column * plan.tile_x + plan.tile_x / 2, line * plan.tile_y + plan.tile_y / 2], -1
         )
         return cls(
-            jnp.concatenate([sort_payloads(key, bits), count + lane]),
+            jnp.concatenate([longest_first(lengths), count + lane]),
             jnp.sum(lengths > 0, dtype=jnp.int32),
             jnp.concatenate([segments.starts, parked]),
             jnp.concatenate([ends, parked]),

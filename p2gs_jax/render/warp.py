@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from p2gs_jax.types import Camera, Render
+from p2gs_jax.core.numerics import namespace
+from p2gs_jax.types import Camera, Render, View
 
 # A pixel has a surface where the render is this opaque, unless the caller asks for more.
 OPAQUE = 0.95
@@ -50,13 +52,17 @@ def unproject(depth: Float[Array, "h w"], camera: Camera) -> Float[Array, "h w 3
 
 
 def project_points(
-    points: Float[Array, "*n 3"], camera: Camera
-) -> tuple[Float[Array, "*n 2"], Float[Array, "*n"]]:
-    """Return pixel positions (centres at +0.5) and camera z; valid where z > 0."""
+    points: Float[Array | np.ndarray, "*n 3"], camera: Camera | View
+) -> tuple[Float[Any, "*n 2"], Float[Any, "*n"]]:
+    """Return pixel positions at full resolution (centres at +0.5) and camera z; valid where z > 0.
+
+    NumPy arrays give NumPy results.
+    """
+    xp = namespace(points, camera.K)
     local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     z = local[..., 2]
-    ahead = jnp.where(z > 1e-6, z, 1.0)
-    return local[..., :2] / ahead[..., None] * jnp.diag(camera.K)[:2] + camera.K[:2, 2], z
+    ahead = xp.where(z > 1e-6, z, 1.0)
+    return local[..., :2] / ahead[..., None] * xp.diag(camera.K)[:2] + camera.K[:2, 2], z
 
 
 def visible(

@@ -25,14 +25,13 @@ from p2gs_jax.types import GAMMA_SRGB
 # More cameras than this, or cameras with fewer views than this, share one panel.
 MOST_PANELS, FEWEST_VIEWS = 6, 3
 MID_GREY = 0.18
-ORDER = "photograph, in the order of names"
 CHANNELS = ("red", "green", "blue")
 MARKED = (
     Style(SECOND, "^", "-", order=4),
     Style(THIRD, "o", "-", order=3),
     Style(FIRST, "s", "-", order=2),
 )
-PLAIN = Style(FIRST, "", "-")
+PLAIN, DASHED = Style(FIRST, "", "-"), Style(INK, "", (0, (4, 4)), width=1.6)
 LINES = (Style(SECOND, "", "-"), Style(THIRD, "", "--"), Style(FIRST, "", ":"))
 # Lines of the cameras of a drive, in turn.
 CAMERA_COLORS, CAMERA_MARKERS = (FIRST, SECOND, THIRD, FOURTH, INK, MUTED), "osD^vPX*"
@@ -59,9 +58,14 @@ def model_section(run: RunFiles) -> str:
     return body + paragraph(f"Scale: {run.photometry['gauge']}.", "note")
 
 
-def _panels(
-    run: RunFiles, curves: Callable[[list[ViewPhotometry], np.ndarray], Sequence[Series]]
-) -> list[tuple[str, Sequence[Series]]]:
+def _chart(
+    run: RunFiles,
+    curves: Callable[[list[ViewPhotometry], np.ndarray], Sequence[Series]],
+    *,
+    y_label: str,
+    label: str,
+    band: float = 0.0,
+) -> str:
     """Return a panel for each camera, or one for all where there are many or small ones.
 
     `curves` returns those of a panel from its views and their places.
@@ -72,10 +76,9 @@ def _panels(
         by_camera = {"all photographs": run.views}
     elif len(by_camera) == 1:
         by_camera = {"": run.views}
-    return [
-        (title, curves(rows, np.arange(1, len(rows) + 1, dtype=float)))
-        for title, rows in by_camera.items()
-    ]
+    panels = [(title, curves(v, np.arange(1.0, len(v) + 1))) for title, v in by_camera.items()]
+    order = "photograph, in the order of names"
+    return charts.panels_chart(panels, y_label=y_label, x_label=order, label=label, band=band)
 
 
 def exposure_section(run: RunFiles, truth: dict[str, float]) -> str:
@@ -107,12 +110,11 @@ def exposure_section(run: RunFiles, truth: dict[str, float]) -> str:
         every = [Series(n, x, y, charts.SOURCES[n], errors.get(n)) for n, y in stops(rows).items()]
         return [s for s in every if np.isfinite(s.y).any()]
 
-    chart = charts.panels_chart(
-        _panels(run, curves),
+    chart = _chart(
+        run,
+        curves,
         y_label="exposure, stops from the mean",
-        x_label=ORDER,
         label="Exposures of the photographs of each camera, in stops",
-        band=0.0,
     )
     body = figure(chart, " ".join(_exposure_caption(run, truth)))
     times = read_times(run.folder)
@@ -218,12 +220,11 @@ def white_balance_section(run: RunFiles) -> str:
         names = enumerate(CHANNELS)
         return [Series(name, x, y[:, c], MARKED[c], errors[:, c]) for c, name in names]
 
-    chart = charts.panels_chart(
-        _panels(run, curves),
+    chart = _chart(
+        run,
+        curves,
         y_label="gain beside the exposure, stops",
-        x_label=ORDER,
         label="White balance of the photographs of each camera, in stops",
-        band=0.0,
     )
     most = views[int(np.argmax(np.ptp(stops(views), axis=1)))]
     body = figure(
@@ -265,10 +266,10 @@ def gamma_section(run: RunFiles) -> str:
         errors = 2 * column(v.get("gamma_error") for v in rows)
         return [Series("", x, column(v["gamma"] for v in rows), charts.FOUND, errors)]
 
-    chart = charts.panels_chart(
-        _panels(run, curves),
+    chart = _chart(
+        run,
+        curves,
         y_label="gamma",
-        x_label=ORDER,
         label="Gammas of the photographs of each camera",
         band=GAMMA_SRGB,
     )
@@ -306,7 +307,7 @@ def response_section(run: RunFiles) -> str:
     standard = _stops(VALUES, replace(PhotometryConfig(), curve="srgb"))
     broad = Style(FIRST, "", "-", width=5.0, opacity=0.45)
     curves.append(Series("this run", own, VALUES, broad))
-    curves.append(Series("sRGB", standard, VALUES, Style(INK, "", (0, (4, 4)), width=1.6)))
+    curves.append(Series("sRGB", standard, VALUES, DASHED))
     apart = np.abs(own - standard)[VALUES > 0.05].max()
     caption = "How exposed radiance becomes a value in the photograph. "
     if apart < 0.01:
@@ -349,7 +350,7 @@ def responses_section(run: RunFiles) -> str:
             style = Style(COLORS[color % len(COLORS)], "", DASHES[line % len(DASHES)], width=1.6)
             curves.append(Series(label, stops[:, c], VALUES, style))
     srgb = _stops(VALUES, PhotometryConfig())
-    curves.append(Series("sRGB", srgb, VALUES, Style(INK, "", (0, (4, 4)), width=1.6)))
+    curves.append(Series("sRGB", srgb, VALUES, DASHED))
     what = "cameras" if len(formations) > 1 else "channels"
     chart = charts.response_chart(curves, label=f"Responses of the {what} against sRGB")
     apart = np.ptp([c.x for c in curves[:-1]], axis=0)[VALUES > 0.05].max()

@@ -17,8 +17,9 @@ from jaxtyping import Float, Float32, UInt8
 from p2gs_jax.core.ply import read_table, refusing
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.errors import broken
+from p2gs_jax.render.warp import project_points
 from p2gs_jax.scene.rigid import camera_centers
-from p2gs_jax.scene.visibility import in_frame, project_points
+from p2gs_jax.scene.visibility import in_frame
 from p2gs_jax.types import Scene, View
 
 COUNT = 100_000

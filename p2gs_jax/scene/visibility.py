@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import minimum_filter
 
 from p2gs_jax.core.numerics import evenly_spaced
+from p2gs_jax.render.warp import project_points
 from p2gs_jax.types import View
 
 # A point is hidden where a nearer one lies within about this many point spacings in the image.
@@ -17,17 +18,6 @@ SPACINGS = 1.5
 DEPTH_MARGIN = 0.05
 # Evenly taken where there are more.
 SHARE_VIEWS, SHARE_POINTS = 32, 20_000
-
-
-def project_points(
-    points: Float[np.ndarray, "p 3"], view: View
-) -> tuple[Float[np.ndarray, "p 2"], Float[np.ndarray, " p"]]:
-    """Return pixel positions at full resolution (centres at +0.5) and camera z."""
-    local = points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
-    z = local[:, 2]
-    ahead = np.where(z > 1e-6, z, 1.0)
-    focal, center = view.K[[0, 1], [0, 1]], view.K[[0, 1], [2, 2]]
-    return local[:, :2] / ahead[:, None] * focal + center, z
 
 
 def in_frame(

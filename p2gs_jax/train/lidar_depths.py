@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import overload
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,8 +14,9 @@ from p2gs_jax.core.numerics import on_host
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.passes import ArrayStore, StoredArray, most_bytes
+from p2gs_jax.render.warp import project_points
 from p2gs_jax.scene.drives.objects import object_mask
-from p2gs_jax.scene.visibility import project_points, unoccluded
+from p2gs_jax.scene.visibility import unoccluded
 from p2gs_jax.types import Measured, Scene
 
 # Errors of log depth beyond this pull no harder: the measurement missed or hit what is behind.
@@ -65,13 +66,7 @@ class KeptDepths(Sequence[Measured]):
     def __len__(self) -> int:
         return len(self._kept)
 
-    @overload
-    def __getitem__(self, row: int) -> Measured: ...
-
-    @overload
-    def __getitem__(self, row: slice) -> list[Measured]: ...
-
-    def __getitem__(self, row: int | slice) -> Measured | list[Measured]:
+    def __getitem__(self, row: Any) -> Any:
         if isinstance(row, slice):
             return [self[k] for k in range(*row.indices(len(self)))]
         places, depths = self._kept[row]

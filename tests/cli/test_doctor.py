@@ -10,8 +10,10 @@ import jax.numpy as jnp
 import pytest
 from packaging.requirements import Requirement
 
+import p2gs_jax.render as rendering
 from p2gs_jax.cli import doctor, main
 from p2gs_jax.cli.doctor import Doctor
+from p2gs_jax.core import runtime
 
 PROJECT = Path(__file__).resolve().parents[2] / "pyproject.toml"
 
@@ -20,7 +22,7 @@ def library(name, trouble=None):
     return {"name": name, "version": "1.0", "trouble": trouble}
 
 
-def features(libraries, backend):
+def features(libraries, backend="cpu"):
     return {f["name"]: f for f in doctor.check_features(libraries, backend)}
 
 
@@ -40,24 +42,19 @@ def test_everything_here_is_well(capsys):
 
 
 def test_the_self_test_can_be_skipped(capsys, monkeypatch):
-    def never():
-        raise AssertionError
-
-    monkeypatch.setattr(doctor, "check_render", never)
+    monkeypatch.setattr(doctor, "check_render", None)
     with pytest.raises(SystemExit) as stop:
         main(["doctor", "--skip-self-test"])
     assert stop.value.code == 0
     assert "skipped" in capsys.readouterr().out
 
 
-def test_every_dependency_can_be_tried():
+def test_every_dependency_can_be_tried(monkeypatch):
     """A dependency whose module is called otherwise must be in MODULES."""
     project = tomllib.loads(PROJECT.read_text())["project"]
     for name in [Requirement(line).name for line in project["dependencies"]]:
         assert find_spec(doctor.module_of(name)) is not None, name
 
-
-def test_without_metadata_the_core_is_tried(monkeypatch):
     def unknown(name):
         raise importlib.metadata.PackageNotFoundError(name)
 
@@ -70,10 +67,11 @@ def test_a_broken_library_is_said_and_costs_the_exit_code(capsys, monkeypatch, t
     monkeypatch.syspath_prepend(tmp_path)
     wanted = dict.fromkeys(["numpy", "broken_splats", "absent_splats"])
     monkeypatch.setattr(doctor, "requirements", lambda: wanted)
+    monkeypatch.setattr(doctor, "check_render", lambda: {"ok": False, "remark": "XLA said no"})
     assert Doctor().execute() == 1
     text = " ".join(capsys.readouterr().out.split())
-    assert "libsplat.so: no such file" in text
-    assert "No module named 'absent_splats'" in text
+    for said in ("libsplat.so: no such file", "No module named 'absent_splats'", "XLA said no"):
+        assert said in text
     assert "'absent_splats' 'broken_splats'" in text
     assert "no pip install --force-reinstall" in text
 
@@ -85,55 +83,35 @@ def test_an_old_library_is_said(monkeypatch):
     assert found["trouble"] == "too old: numpy>=999 is needed"
 
 
-def test_a_wrong_image_fails_the_self_test(monkeypatch):
-    import p2gs_jax.render as rendering
-
+@pytest.mark.parametrize(("wrong", "said"), [(True, "the image is wrong"), (False, "XLA said no")])
+def test_a_wrong_image_or_an_error_fails_the_self_test(monkeypatch, wrong, said):
     true = rendering.render_linear
 
-    def wrong(gaussians, alive, camera, cfg, capacity):
+    def broken(gaussians, alive, camera, cfg, capacity):
+        if not wrong:
+            raise RuntimeError("XLA said no")
         scale = 1.0 if cfg.implementation == "reference" else 1.01
         result = true(gaussians, alive, camera, cfg, capacity)
         return result.__class__(
             scale * result.linear, result.alpha, result.depth, *(jnp.int32(0), False, False)
         )
 
-    monkeypatch.setattr(rendering, "render_linear", wrong)
+    monkeypatch.setattr(rendering, "render_linear", broken)
     found = doctor.check_render()
     assert not found["ok"]
-    assert "image" in found["remark"]
-
-
-def test_a_renderer_that_raises_fails_the_self_test(monkeypatch):
-    import p2gs_jax.render as rendering
-
-    def broken(*args):
-        raise RuntimeError("XLA said no")
-
-    monkeypatch.setattr(rendering, "render_linear", broken)
-    assert "XLA said no" in doctor.check_render()["remark"]
+    assert said in found["remark"]
 
 
 def test_features_say_what_to_install(monkeypatch):
     monkeypatch.setattr(doctor.importlib.util, "find_spec", lambda name: None)
     monkeypatch.setattr(doctor.shutil, "which", lambda name: None)
-    found = features([library("jax")], "cpu")
-    assert found["fit, calibrate, render, eval"]["ready"]
-    assert not found["view"]["ready"]
-    assert "p2gs-jax[viewer]" in found["view"]["remark"]
-    assert "Chromium" in found["report --pdf"]["remark"]
-    assert not found["videos (fit x.mp4, render --out x.mp4)"]["ready"]
-
-
-def test_pycolmap_is_only_for_photographs_without_poses():
-    found = features([library("pycolmap", "no"), library("jax")], "cpu")
+    found = features([library("jax"), library("pycolmap", "no")])
     assert found["fit, calibrate, render, eval"]["ready"]
     assert not found["photographs without poses"]["ready"]
-
-
-def test_a_gpu_that_jax_does_not_use(monkeypatch):
+    assert "p2gs-jax[viewer]" in found["view"]["remark"]
+    assert "Chromium" in found["report --pdf"]["remark"]
     monkeypatch.setattr(doctor.shutil, "which", lambda name: f"/usr/bin/{name}")
-    remark = features([], "cpu")["NVIDIA GPU"]["remark"]
-    assert "p2gs-jax[cuda]" in remark
+    assert "p2gs-jax[cuda]" in features([])["NVIDIA GPU"]["remark"]
     assert features([], "gpu")["NVIDIA GPU"]["ready"]
 
 
@@ -147,13 +125,11 @@ def test_cores_of_a_container(tmp_path, monkeypatch):
 
 
 def test_an_unwritable_cache_is_said(monkeypatch, tmp_path):
-    import p2gs_jax.core.runtime as compile_cache
-
-    monkeypatch.setattr(compile_cache, "use_compile_cache", lambda: None)
-    monkeypatch.setattr(compile_cache, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(runtime, "use_compile_cache", lambda: None)
+    monkeypatch.setattr(runtime, "cache_folder", lambda: tmp_path)
     (tmp_path / "program").write_bytes(b"x" * 2_000_000)
     assert doctor.check_cache()["remark"].startswith("2 MB of at most")
     monkeypatch.setattr(doctor.os, "access", lambda folder, mode: False)
     assert "JAX_COMPILATION_CACHE_DIR" in doctor.check_cache()["remark"]
-    monkeypatch.setattr(compile_cache, "cache_folder", lambda: None)
+    monkeypatch.setattr(runtime, "cache_folder", lambda: None)
     assert "nothing is kept" in doctor.check_cache()["remark"]

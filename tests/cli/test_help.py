@@ -1,14 +1,19 @@
-"""Help that a person can work from: at once, at 80 columns, with examples that are right."""
+"""Help that a person can work from: at once, at 80 columns, with examples that are right.
+
+And completion: scripts that the shells can read, with commands, options and paths.
+"""
 
 import os
 import shlex
+import shutil
 import subprocess
 import sys
 
 import pytest
 
 from p2gs_jax.cli import main
-from p2gs_jax.cli.parser import COMMANDS, GROUPS, parse
+from p2gs_jax.cli.parser import COMMANDS, GROUPS, completion_script, parse
+from p2gs_jax.cli.shared import SHORT
 
 HEAVY = ("jax", "numpy", "cv2", "equinox", "rich")
 
@@ -26,20 +31,17 @@ def wide(text):
     return [line for line in text.splitlines() if len(line) > 80 and not line.startswith("usage:")]
 
 
-def examples(text):
-    return [line.strip() for line in text.splitlines() if line.strip().startswith("p2gs-jax ")]
-
-
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_of_every_command(capsys, monkeypatch, name):
     code, text = shown(capsys, monkeypatch, name, "--help")
     assert code == 0
-    assert not wide(text.partition("Examples:")[0])
+    options, _, examples = text.partition("Examples:")
+    assert not wide(options)
     assert "@" not in text
+    # In a command's own options None says nothing.
     assert "{None}" not in text
-    # In a command's own options None says nothing; in the configuration it is a value like others.
-    assert "default: None" not in text.partition("--render.")[0]
-    found = examples(text.partition("Examples:")[2])
+    assert "default: None" not in text
+    found = [line for line in examples.splitlines() if line.strip().startswith("p2gs-jax ")]
     assert found
     for line in found:
         words = shlex.split(line.partition(">")[0])
@@ -50,20 +52,11 @@ def test_overview_names_every_command_once_and_in_order(capsys, monkeypatch):
     code, text = shown(capsys, monkeypatch, "--help")
     assert code == 0
     assert not wide(text)
-    assert "Other" not in text
     names = [line.split()[0] for line in text.splitlines() if line.startswith("  ")]
-    wanted = [name for group in GROUPS.values() for name in group if name in COMMANDS]
+    wanted = [name for group in GROUPS.values() for name in group]
     assert [n for n in names if n in COMMANDS] == wanted
     assert set(wanted) == set(COMMANDS)
-
-
-def test_nothing_asked_is_answered_by_the_overview_and_2(capsys, monkeypatch):
-    code, text = shown(capsys, monkeypatch)
-    assert code == 2
-    assert "From photographs" in text
-
-
-def test_version(capsys, monkeypatch):
+    assert shown(capsys, monkeypatch) == (2, text)
     code, text = shown(capsys, monkeypatch, "--version")
     assert code == 0
     assert text.startswith("p2gs-jax ")
@@ -78,18 +71,16 @@ def test_common_options_come_first_and_the_rest_on_request(capsys, monkeypatch):
         assert option in whole
     assert "--help-all" in brief
     assert "--render.tile" not in brief
-    assert "--render.tile N N" in whole
+    for option in ("--render.tile N N", "--loss.dssim-weight", "--densify.method", "--train.batch"):
+        assert option in whole
     assert not wide(whole.partition("Examples:")[0])
     assert brief.index("--budget") < brief.index("--seed")
 
 
-def test_a_preset_decides_the_defaults_that_help_names(capsys, monkeypatch):
+def test_a_preset_decides_defaults(capsys, monkeypatch):
     _, text = shown(capsys, monkeypatch, "fit", "--preset", "paper", "--help-all")
     of_robust = shown(capsys, monkeypatch, "fit", "--help-all")[1]
     assert text.count("(default: 30000)") == of_robust.count("(default: 30000)") + 1
-
-
-def test_a_preset_decides_the_values():
     _, options = parse(["fit", "a", "--out", "b", "--preset=paper", "--render.near", "0.1"])
     assert options.config.preset == "paper"
     assert options.config.train.steps == 30_000
@@ -97,12 +88,28 @@ def test_a_preset_decides_the_values():
 
 
 def test_options_are_read_as_what_they_are():
-    argv = "fit a --out b --steps 7 --render.stop-error None"
-    _, options = parse([*argv.split(), "--train.coarse-to-fine", ".1", ".2", "--resume"])
-    assert options.config.train.steps == 7
+    argv = "fit a --out b --render.stop-error None --train.coarse-to-fine .1 .2 --resume"
+    _, options = parse(argv.split())
     assert options.resume
     assert options.config.render.stop_error is None
     assert options.config.train.coarse_to_fine == (0.1, 0.2)
+
+
+VALUES = {"budget": ("90s", 90.0), "cameras": ("front", ("front",)), "known_deviation_ev": ("2", 2)}
+VALUES |= {name: ("a", "a") for name in ("split", "background", "images", "drive", "frames")}
+VALUES |= {name: ("a", "a") for name in ("known_exposures", "lpips_weights")}
+
+
+@pytest.mark.parametrize("name", SHORT)
+def test_short_names_and_long_ones_are_one_option(name):
+    path = SHORT[name][0]
+    group, field = path.split(".")
+    word, value = VALUES.get(name, ("64", 64))
+    for option in (name, path):
+        words = [f"--{option.replace('_', '-')}", *([] if name == "allow_missing" else [word])]
+        cfg = parse(["fit", "a", "--out", "b", *words])[1].config
+        wanted = True if name == "allow_missing" else value
+        assert getattr(getattr(cfg, group), field) == wanted
 
 
 @pytest.mark.parametrize("argv", [["--help"], ["fit", "--help-all"], ["synth", "--help"]])
@@ -124,12 +131,9 @@ def broken(tmp_path):
     def run(module, *argv):
         (tmp_path / f"{module}.py").write_text("raise ImportError('libfoo.so.1 is missing')")
         path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
-        return subprocess.run(
-            [sys.executable, "-m", "p2gs_jax.cli", *argv],
-            env=os.environ | {"PYTHONPATH": path},
-            capture_output=True,
-            text=True,
-        )
+        argv = [sys.executable, "-m", "p2gs_jax.cli", *argv]
+        env = os.environ | {"PYTHONPATH": path}
+        return subprocess.run(argv, env=env, capture_output=True, text=True)
 
     return run
 
@@ -150,3 +154,72 @@ def test_doctor_survives_what_it_looks_for(broken, module):
     assert "libfoo.so.1 is missing" in done.stdout
     assert "Traceback" not in done.stderr + done.stdout
     assert "force-reinstall" in done.stdout
+
+
+TRY = """
+source {script}
+try() {{
+  COMP_WORDS=("$@"); COMP_CWORD=$(( $# - 1 )); COMPREPLY=()
+  _p2gs_jax
+  echo "${{#COMPREPLY[@]}} ${{COMPREPLY[*]}}"
+}}
+"""
+
+
+@pytest.fixture(scope="module")
+def bash(tmp_path_factory):
+    """Return a function from the words before the cursor to what bash would offer."""
+    if shutil.which("bash") is None:
+        pytest.skip("there is no bash here")
+    folder = tmp_path_factory.mktemp("bash")
+    (folder / "completion").write_text(completion_script("bash"))
+    (folder / "elsewhere").mkdir()  # a checkout has `runs/` once the README was followed
+
+    def run(code):
+        argv = ["bash", "--norc", "-c", TRY.format(script=folder / "completion") + code]
+        done = subprocess.run(
+            argv, capture_output=True, text=True, check=True, cwd=folder / "elsewhere"
+        )
+        assert done.stderr == ""
+        return done.stdout.split()
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("words", "offered"),
+    [
+        ("re", "2 render report"),
+        ("cal", "1 calibrate"),
+        ("fit --pre", "1 --preset"),
+        ("fit --max-w", "1 --max-width"),
+        ("fit castle --photometry.cu", "1 --photometry.curve"),
+        ("synth town --sensor.curve f", "1 filmic"),
+        # A path of cameras is a word or a file; files are left to bash.
+        ('render RUN --path ""', "3 views drive orbit"),
+        ("render RUN --path dr", "1 drive"),
+        ("render RUN --path cameras.j", "0"),
+        ("fit cast", "0"),
+        ("fit castle --out ru", "0"),
+    ],
+)
+def test_bash_completes_commands_options_and_values(bash, words, offered):
+    assert bash(f"try p2gs-jax {words}") == offered.split()
+
+
+def test_bash_completes_presets_and_files(bash):
+    assert "paper_appendix" in bash('try p2gs-jax fit castle --preset ""')
+    assert "default" in bash("complete -p p2gs-jax")
+
+
+@pytest.mark.parametrize(("shell", "check"), [("zsh", "-n"), ("fish", "--no-execute")])
+def test_other_shells(tmp_path, shell, check):
+    text = completion_script(shell)
+    assert "--preset" in text
+    assert "calibrate" in text
+    assert "'choices': ['views', 'drive', 'orbit']" in text
+    path = tmp_path / "completion"
+    path.write_text(text)
+    if shutil.which(shell) is None:
+        pytest.skip(f"there is no {shell} here")
+    subprocess.run([shell, check, str(path)], check=True)

@@ -8,8 +8,10 @@ import pytest
 
 from p2gs_jax.core import interrupts
 
+TERM, INT = signal.SIGTERM, signal.SIGINT
 
-def send(number=signal.SIGTERM):
+
+def send(number=TERM):
     os.kill(os.getpid(), number)
 
 
@@ -26,55 +28,39 @@ def test_a_signal_raises_within_the_block_and_the_former_handler_is_back_after_i
 
 def test_python_s_own_ctrl_c_has_the_code_of_the_shell():
     assert interrupts.exit_code(KeyboardInterrupt()) == 130
-    assert interrupts.name_of(signal.SIGINT) == "Ctrl-C"
-    assert interrupts.name_of(signal.SIGTERM) == "SIGTERM"
+    assert interrupts.name_of(INT) == "Ctrl-C"
+    assert interrupts.name_of(TERM) == "SIGTERM"
 
 
-def test_a_held_signal_waits_until_it_is_delivered():
-    passed = []
-
-    def work():
-        with interrupts.held() as waiting:
-            waiting.begin()
-            send()
-            passed.append(waiting.arrived)
-            waiting.deliver()
-            passed.append("never")
-
-    with pytest.raises(interrupts.Interrupted) as stop:
-        work()
-    assert passed == [signal.SIGTERM]
-    assert stop.value.number == signal.SIGTERM
-
-
-def test_a_held_signal_that_nobody_asks_for_is_raised_at_the_end():
-    passed = []
+@pytest.mark.parametrize(
+    ("begun", "sent", "delivered", "passed", "raised"),
+    [
+        (True, [TERM], True, 1, TERM),  # waits until it is delivered
+        (True, [TERM], False, 2, TERM),  # raised at the end of the block
+        (False, [TERM], False, 0, TERM),  # before there is something to lose nothing waits
+        (True, [TERM, INT], False, 1, INT),  # nor does the second
+    ],
+)
+def test_a_held_signal_waits_until_the_program_can_be_continued(
+    begun, sent, delivered, passed, raised
+):
+    went = []
 
     def work():
-        with interrupts.held() as waiting:
-            waiting.begin()
-            send()
-            passed.append("to the end")
-
-    with pytest.raises(interrupts.Interrupted):
-        work()
-    assert passed
-
-
-def test_before_there_is_something_to_lose_and_at_the_second_time_nothing_waits():
-    def work(*numbers, begun):
         with interrupts.held() as waiting:
             if begun:
                 waiting.begin()
-            for number in numbers:
+            for number in sent:
                 send(number)
-            pytest.fail("it waited")
+                went.append(waiting.arrived)
+            if delivered:
+                waiting.deliver()
+            went.append("to the end")
 
-    with pytest.raises(interrupts.Interrupted):
-        work(signal.SIGTERM, begun=False)
     with pytest.raises(interrupts.Interrupted) as stop:
-        work(signal.SIGTERM, signal.SIGINT, begun=True)
-    assert stop.value.number == signal.SIGINT
+        work()
+    assert went == [TERM, "to the end"][:passed]
+    assert stop.value.number == raised
 
 
 def test_handlers_of_others_stay():
@@ -93,9 +79,9 @@ def test_other_threads_set_no_handlers():
 
     def work():
         with interrupts.raised(), interrupts.held() as waiting:
-            found.append((waiting.arrived, signal.getsignal(signal.SIGTERM)))
+            found.append((waiting.arrived, signal.getsignal(TERM)))
 
-    before = signal.getsignal(signal.SIGTERM)
+    before = signal.getsignal(TERM)
     thread = threading.Thread(target=work)
     thread.start()
     thread.join()

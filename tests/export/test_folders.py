@@ -21,19 +21,13 @@ EXPOSURES = {"0.png": 0.5, "1.png": 2.0, "2.png": 1.25}
 
 def rows(scene):
     """Return photometry of the views: one held out with a fitted exposure, one without."""
-    return [
-        {
-            "image": v.name,
-            "camera": v.camera,
-            "exposure": EXPOSURES.get(v.name) if v.name != "0.png" else None,
-            "exposure_ev": None,
-            "gamma": 2.2,
-            "exif_ev": None,
-            "split": "test" if v.name == "0.png" else "train",
-            "exposure_fitted": EXPOSURES["0.png"] if v.name == "0.png" else None,
-        }
-        for v in scene.views
-    ]
+    out = []
+    for v in scene.views:
+        e, test = EXPOSURES.get(v.name), v.name == "0.png"
+        fitted = {"exposure": None if test else e, "exposure_fitted": e if test else None}
+        common = {"image": v.name, "camera": v.camera, "split": "test" if test else "train"}
+        out.append({**common, **fitted, "exposure_ev": None, "gamma": 2.2, "exif_ev": None})
+    return out
 
 
 def export(root, cfg):
@@ -44,16 +38,16 @@ def export(root, cfg):
 
 
 def camera_with_distortion(root):
-    """Give the scene an OPENCV camera, and two photographs a folder with EXIF in JPEG."""
+    """Give the scene an OPENCV camera, and photographs in JPEG with EXIF, in a folder."""
     path = root / "sparse" / "0" / "cameras.txt"
     _, _, *numbers = path.read_text().split()
     path.write_text(" ".join(["1", "OPENCV", *numbers, "0.08", "0.01", "0.001", "-0.002"]) + "\n")
     listed = root / "sparse" / "0" / "images.txt"
     text = listed.read_text()
+    (root / "images" / "left").mkdir()
     for v in range(6):
         exif = Image.Exif()
         exif.get_ifd(0x8769).update({0x829A: 1 / (10 + v), 0x829D: 4.0, 0x8827: 100})
-        (root / "images" / "left").mkdir(exist_ok=True)
         with Image.open(root / "images" / f"{v}.png") as image:
             image.save(root / "images" / "left" / f"{v}.jpg", exif=exif, quality=95)
         text = text.replace(f"{v}.png", f"left/{v}.jpg")
@@ -61,12 +55,17 @@ def camera_with_distortion(root):
     return root
 
 
-def test_an_undistorted_scene_comes_back_as_it_was(tmp_path):
-    before, _, after = export(make_scene(tmp_path), DataConfig())
-    assert [v.name for v in after.views] == [v.name for v in before.views]
-    assert [v.camera for v in after.views] == [v.camera for v in before.views]
-    assert [v.split for v in after.views] == [v.split for v in before.views]
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    root = tmp_path_factory.mktemp("plain")
+    before, _, after = export(make_scene(root), DataConfig())
+    return root / "out", before, after
+
+
+def test_an_undistorted_scene_comes_back_as_it_was(exported):
+    out, before, after = exported
     for a, b in zip(after.views, before.views, strict=True):
+        assert (a.name, a.camera, a.split) == (b.name, b.camera, b.split)
         np.testing.assert_allclose(a.viewmat, b.viewmat, atol=1e-7)
         np.testing.assert_array_equal(a.K, b.K)
         assert (a.width, a.height, a.distortion) == (b.width, b.height, None)
@@ -75,15 +74,41 @@ def test_an_undistorted_scene_comes_back_as_it_was(tmp_path):
     np.testing.assert_array_equal(after.point_colors, before.point_colors)
     for name in ("view_indices", "point_indices", "xy"):
         np.testing.assert_array_equal(getattr(after.tracks, name), getattr(before.tracks, name))
-    assert not (tmp_path / "out" / "masks").exists()
+    assert not (out / "masks").exists()
+
+
+def test_pycolmap_reads_the_model(exported):
+    out, before, _ = exported
+    model = pycolmap.Reconstruction(str(out / "sparse" / "0"))
+    assert model.num_reg_images() == 6
+    assert {c.model.name for c in model.cameras.values()} == {"PINHOLE"}
+    assert model.num_points3D() == len(before.points)
+    assert model.compute_num_observations() == len(before.tracks.xy)
+    written = {k: p.error for k, p in model.points3D.items()}
+    model.update_point_3d_errors()
+    # Observations travel as float32, and are moved a little to be told from zero.
+    assert all(0 < e < 1e-3 for e in written.values())
+    assert written == pytest.approx({k: p.error for k, p in model.points3D.items()}, abs=1e-9)
+    assert model.compute_mean_reprojection_error() < 1e-3, "the dots lie where points project"
+
+
+def test_exposures_are_what_known_exposures_reads(exported):
+    out, _, after = exported
+    found = read_known_exposures(str(out / "exposures.csv"), list(after.views))
+    expected = [EXPOSURES.get(v.name, np.nan) for v in after.views]
+    np.testing.assert_allclose(np.exp(found), expected, rtol=1e-12)
+    with (out / "exposures.csv").open() as file:
+        first = next(csv.DictReader(file))
+    assert first["split"] == "test"
+    assert float(first["ev"]) == -1.0
 
 
 def test_distorted_and_shrunk_photographs_become_pinhole_ones(tmp_path):
-    root = camera_with_distortion(make_scene(tmp_path))
-    cfg = DataConfig(max_width=80)
-    before, store, after = export(root, cfg)
+    before, ours, after = export(
+        camera_with_distortion(make_scene(tmp_path)), DataConfig(max_width=80)
+    )
     assert [v.name for v in after.views] == [f"left/{v}.jpg" for v in range(6)]
-    ours, theirs = store, ImageStore(after.views, DataConfig())
+    theirs = ImageStore(after.views, DataConfig())
     for index, (a, b) in enumerate(zip(after.views, before.views, strict=True)):
         viewmat, K, width, height = ours.camera(index)
         assert (a.width, a.height, a.distortion) == (width, height, None) == (80, 71, None)
@@ -99,41 +124,20 @@ def test_distorted_and_shrunk_photographs_become_pinhole_ones(tmp_path):
     np.testing.assert_allclose(after.tracks.xy, before.tracks.xy * scale, rtol=1e-5)
 
 
-def test_pycolmap_reads_the_model(tmp_path):
-    before, *_ = export(make_scene(tmp_path), DataConfig())
-    model = pycolmap.Reconstruction(str(tmp_path / "out" / "sparse" / "0"))
-    assert model.num_reg_images() == 6
-    assert {c.model.name for c in model.cameras.values()} == {"PINHOLE"}
-    assert model.num_points3D() == len(before.points)
-    assert model.compute_num_observations() == len(before.tracks.xy)
-    written = {k: p.error for k, p in model.points3D.items()}
-    model.update_point_3d_errors()
-    # Observations travel as float32, and are moved a little to be told from zero.
-    assert all(0 < e < 1e-3 for e in written.values())
-    assert written == pytest.approx({k: p.error for k, p in model.points3D.items()}, abs=1e-9)
-    assert model.compute_mean_reprojection_error() < 1e-3, "the dots lie where points project"
-
-
-def test_errors_of_points_are_those_of_their_tracks(tmp_path):
-    root = make_scene(tmp_path)
-    scene = load_scene(root, DataConfig())
+def test_points_keep_the_errors_of_their_tracks_and_need_none(tmp_path):
+    scene = load_scene(make_scene(tmp_path), DataConfig())
+    store = ImageStore(scene.views, DataConfig())
     first = scene.tracks.point_indices == 0
     moved = np.where(first[:, None], scene.tracks.xy + np.float32(0.5), scene.tracks.xy)
     noisy = dataclasses.replace(scene, tracks=dataclasses.replace(scene.tracks, xy=moved))
-    write_colmap_folder(root / "out", noisy, ImageStore(scene.views, DataConfig()), rows(scene))
-    model = pycolmap.Reconstruction(str(root / "out" / "sparse" / "0"))
+    write_colmap_folder(tmp_path / "out", noisy, store, rows(scene))
+    model = pycolmap.Reconstruction(str(tmp_path / "out" / "sparse" / "0"))
     errors = [p.error for _, p in sorted(model.points3D.items())]
     assert errors[0] == pytest.approx(0.5 * 2**0.5, abs=1e-3)
     assert max(errors[1:]) < 1e-3
-
-
-def test_points_without_tracks_are_kept(tmp_path):
-    root = make_scene(tmp_path)
-    scene = load_scene(root, DataConfig())
-    bare = type(scene)(root, "rig", scene.views, scene.points, scene.point_colors)
-    store = ImageStore(scene.views, DataConfig())
-    write_colmap_folder(root / "out", bare, store, rows(bare))
-    after = load_scene(root / "out", DataConfig())
+    bare = dataclasses.replace(scene, tracks=None)
+    write_colmap_folder(tmp_path / "bare", bare, store, rows(bare))
+    after = load_scene(tmp_path / "bare", DataConfig())
     np.testing.assert_array_equal(after.points, scene.points)
     assert after.tracks is None
 
@@ -153,48 +157,33 @@ def test_masks_are_written_for_all_views_once_one_has_any(tmp_path):
     assert again.get(2)[1].mean() == pytest.approx(0.5)
 
 
-def test_exposures_are_what_known_exposures_reads(tmp_path):
-    _, _, after = export(make_scene(tmp_path), DataConfig())
-    table = tmp_path / "out" / "exposures.csv"
-    found = read_known_exposures(str(table), list(after.views))
-    expected = [EXPOSURES.get(v.name, np.nan) for v in after.views]
-    np.testing.assert_allclose(np.exp(found), expected, rtol=1e-12)
-    with table.open() as file:
-        first = next(csv.DictReader(file))
-    assert first["split"] == "test"
-    assert float(first["ev"]) == -1.0
-
-
 def test_a_failure_leaves_nothing_behind(tmp_path):
     root = make_scene(tmp_path)
     scene = load_scene(root, DataConfig())
-    store = ImageStore(scene.views, DataConfig())
     (root / "images" / "3.png").write_bytes(b"broken")
-    with pytest.raises(Exception, match=r"3\.png"):
-        write_colmap_folder(root / "out", scene, store, rows(scene))
+    for write in (write_colmap_folder, write_nerfstudio_folder):
+        store = ImageStore(scene.views, DataConfig())
+        with pytest.raises(Exception, match=r"3\.png"):
+            write(root / "out", scene, store, rows(scene))
     assert sorted(p.name for p in root.iterdir()) == ["images", "sparse"]
 
 
 def test_nerfstudio_has_the_same_scene(tmp_path):
-    root = camera_with_distortion(make_scene(tmp_path / "scene"))
     cfg = DataConfig(max_width=80, test_every=3)
-    scene = load_scene(root, cfg)
+    scene = load_scene(camera_with_distortion(make_scene(tmp_path / "scene")), cfg)
     store = ImageStore(scene.views, cfg)
     write_nerfstudio_folder(tmp_path / "out", scene, store, rows(scene))
     back = load_scene(tmp_path / "out", DataConfig())
     again = ImageStore(back.views, DataConfig())
     assert back.format == "transforms"
-    assert len(back.views) == len(scene.views)
     for index, (view, old) in enumerate(zip(back.views, scene.views, strict=True)):
         assert old.name.endswith(view.name)
         assert view.split == old.split
         np.testing.assert_allclose(view.viewmat, old.viewmat, atol=1e-6)
         for new, kept in zip(again.camera(index)[1:], store.camera(index)[1:], strict=True):
             np.testing.assert_allclose(new, kept, rtol=1e-6)
-        here, there = again.get(index)[0], store.get(index)[0]
-        assert np.abs(here - there).mean() < 0.02
+        assert np.abs(again.get(index)[0] - store.get(index)[0]).mean() < 0.02
     np.testing.assert_allclose(back.points, scene.points, atol=1e-6)
-
     written = json.loads((tmp_path / "out" / "transforms.json").read_text())
     assert len(written["val_filenames"]) == len(scene.test_indices)
     cloud = PlyData.read(str(tmp_path / "out" / written["ply_file_path"]))["vertex"]

@@ -97,15 +97,23 @@ def test_what_few_views_show_is_left_to_the_mask(scene):
     assert len(nodes.left) == 1
 
 
-@pytest.mark.parametrize("method", ["mask", "off"])
-def test_other_methods_have_no_nodes(scene, method):
-    assert find_nodes(scene, dataclasses.replace(CFG, method=method)) is None
-
-
-def test_nothing_that_moves_is_no_node(scene):
-    still = tuple(dataclasses.replace(o, moving=False) for o in scene.objects)
-    assert find_nodes(dataclasses.replace(scene, objects=still), CFG) is None
-    assert find_nodes(dataclasses.replace(scene, objects=()), CFG) is None
+@pytest.mark.parametrize(
+    "nothing",
+    [
+        lambda s: (s, dataclasses.replace(CFG, method="mask")),
+        lambda s: (s, dataclasses.replace(CFG, method="off")),
+        lambda s: (dataclasses.replace(s, objects=()), CFG),
+        lambda s: (
+            dataclasses.replace(
+                s, objects=tuple(dataclasses.replace(o, moving=False) for o in s.objects)
+            ),
+            CFG,
+        ),
+    ],
+    ids=["mask", "off", "no objects", "all stand"],
+)
+def test_other_methods_and_scenes_in_which_nothing_moves_have_no_nodes(scene, nothing):
+    assert find_nodes(*nothing(scene)) is None
 
 
 def test_without_times_what_moves_is_masked(scene):

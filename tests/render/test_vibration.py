@@ -58,6 +58,8 @@ def test_it_is_where_and_as_opaque_as_the_formula_says():
     # About the peak it moves at its velocity.
     a, b = (at_time(g, placement(peak + d)).means[0, 0] for d in (-0.01, 0.01))
     assert float(b - a) / 0.02 == pytest.approx(2 * still, rel=1e-2)
+    standing = dataclasses.replace(g, vibration=None)
+    assert at_time(standing, placement(0.3)) is standing
 
 
 def test_without_a_time_it_is_the_middle_of_the_drive():
@@ -95,11 +97,6 @@ def test_what_lives_for_ever_stands_and_no_gradient_moves_it():
         # Far below the epsilon of the optimiser, 1e-15.
         assert np.abs(gradient).max() < 1e-18
         assert np.isfinite(gradient).all()
-
-
-def test_what_does_not_vibrate_is_given_back_as_it_is():
-    g = dataclasses.replace(gaussians(), vibration=None)
-    assert at_time(g, placement(0.3)) is g
 
 
 def test_far_from_its_peak_it_is_out_of_view_and_all_stays_finite():

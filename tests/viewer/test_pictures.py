@@ -1,5 +1,7 @@
 """One frame, many pictures: modes, and a photograph that lines up with the render."""
 
+from dataclasses import replace
+
 import cv2
 import jax.numpy as jnp
 import numpy as np
@@ -33,6 +35,7 @@ from p2gs_jax.viewer.pictures import (
 )
 
 TRANSFORM = DisplayTransform(2.0, 2.2, PhotometryConfig())
+SIZE = (24, 40)
 
 
 def camera(width=40, height=24, focal=50.0, rotation=(0, 0, 0), K=None):
@@ -44,79 +47,71 @@ def camera(width=40, height=24, focal=50.0, rotation=(0, 0, 0), K=None):
     return Camera(jnp.asarray(viewmat), jnp.asarray(K), width, height)
 
 
-def frame(seed=0):
-    rng = np.random.default_rng(seed)
-    linear = np.exp2(rng.uniform(-8, 3, (24, 40, 3))).astype(np.float32)
-    alpha = rng.uniform(0, 1, (24, 40)).astype(np.float32)
-    depth = alpha * rng.uniform(2, 9, (24, 40)).astype(np.float32)
+@pytest.fixture
+def frame():
+    rng = np.random.default_rng(0)
+    linear = np.exp2(rng.uniform(-8, 3, (*SIZE, 3))).astype(np.float32)
+    alpha = rng.uniform(0, 1, SIZE).astype(np.float32)
+    depth = alpha * rng.uniform(2, 9, SIZE).astype(np.float32)
     return RenderedFrame(jnp.asarray(linear), alpha, depth, camera())
 
 
-def test_every_mode_shows_what_it_says():
-    f = frame()
-    linear = np.asarray(f.linear)
-    shown = develop(linear, TRANSFORM)
-    np.testing.assert_array_equal(picture_of(f, "display", TRANSFORM), shown)
-    np.testing.assert_array_equal(picture_of(f, "clipping", TRANSFORM), clipping_overlay(shown))
-    limits = (2.0, 9.0)
-    np.testing.assert_array_equal(
-        picture_of(f, "depth", TRANSFORM, depth_limits=limits),
-        depth_color(f.depth, f.alpha, limits),
-    )
-    np.testing.assert_array_equal(
-        picture_of(f, "stops", TRANSFORM), false_color(linear, MIDDLE_GREY / TRANSFORM.exposure)
-    )
-    assert np.any(np.all(np.isclose(picture_of(f, "clipping", TRANSFORM), OVER), axis=-1))
+def test_every_mode_shows_what_it_says(frame):
+    linear = np.asarray(frame.linear)
+    shown, limits = develop(linear, TRANSFORM), (2.0, 9.0)
+    wanted = {
+        "display": shown,
+        "split": shown,  # without a photograph
+        "clipping": clipping_overlay(shown),
+        "depth": depth_color(frame.depth, frame.alpha, limits),
+        "stops": false_color(linear, MIDDLE_GREY / TRANSFORM.exposure),
+    }
+    for mode, picture in wanted.items():
+        found = picture_of(frame, mode, TRANSFORM, depth_limits=limits)
+        np.testing.assert_array_equal(found, picture)
+    assert np.any(np.all(np.isclose(wanted["clipping"], OVER), axis=-1))
+    # Stops count at the exposure of the transform.
+    brighter = picture_of(frame, "stops", replace(TRANSFORM, exposure=4.0))
+    twice = picture_of(replace(frame, linear=2 * frame.linear), "stops", TRANSFORM)
+    np.testing.assert_array_equal(brighter, twice)
+    assert np.any(brighter != wanted["stops"])
 
 
-def test_stops_count_from_middle_grey_at_the_exposure():
-    grey = jnp.full((4, 4, 3), 1.01 * MIDDLE_GREY / TRANSFORM.exposure)
-    f = RenderedFrame(grey, np.ones((4, 4)), np.ones((4, 4)), camera(4, 4))
-    one_up = DisplayTransform(2 * TRANSFORM.exposure, TRANSFORM.gamma, TRANSFORM.formation)
-    twice = RenderedFrame(2 * grey, f.alpha, f.depth, f.camera)
-    np.testing.assert_array_equal(
-        picture_of(f, "stops", one_up), picture_of(twice, "stops", TRANSFORM)
-    )
-    assert np.any(picture_of(f, "stops", TRANSFORM) != picture_of(f, "stops", one_up))
-
-
-def test_the_limits_of_depth_hold_almost_everything():
-    f = frame()
-    near, far = limits_of_depth(f)
+def test_the_limits_of_depth_hold_almost_everything(frame):
+    near, far = limits_of_depth(frame)
     assert 2 <= near < 3
     assert 8 < far <= 9
-    nothing = RenderedFrame(f.linear, 0 * f.alpha, 0 * f.depth, f.camera)
-    near, far = limits_of_depth(nothing)
+    near, far = limits_of_depth(replace(frame, alpha=0 * frame.alpha, depth=0 * frame.depth))
     assert 0 < near < far
 
 
-def test_split_without_a_photograph_is_the_picture():
-    np.testing.assert_array_equal(
-        picture_of(frame(), "split", TRANSFORM), develop(frame().linear, TRANSFORM)
-    )
-
-
 def test_photograph_left_render_right():
-    inside = np.zeros((24, 40), bool)
+    inside = np.zeros(SIZE, bool)
     inside[4:20, 10:30] = True
-    photo = WarpedPhotograph(np.full((24, 40, 3), 0.25, np.float32), inside)
-    out = split_picture(photo, np.full((24, 40, 3), 0.75, np.float32), 0.5)
+    photo = WarpedPhotograph(np.full((*SIZE, 3), 0.25, np.float32), inside)
+    render = np.full((*SIZE, 3), 0.75, np.float32)
+    out = split_picture(photo, render, 0.5)
     assert np.all(out[4:20, 10:19] == 0.25)
     assert np.all(out[:, 21:] == 0.75)
     assert np.all(out[:, :10] == 0.75)
     assert np.all(out[:4, :19] == 0.75)
     assert np.all(out[:, 19:21] == 1)
-    whole = split_picture(photo, np.full((24, 40, 3), 0.75, np.float32), 1.0)
-    assert np.all(whole[inside] == 0.25)
-    none = split_picture(photo, np.full((24, 40, 3), 0.75, np.float32), 0.0)
-    assert np.all(none == 0.75)
+    assert np.all(split_picture(photo, render, 1.0)[inside] == 0.25)
+    assert np.all(split_picture(photo, render, 0.0) == 0.75)
 
 
-def test_a_photograph_in_its_own_camera_stays_as_it_is():
-    ldr = np.random.default_rng(0).uniform(0, 1, (24, 40, 3)).astype(np.float32)
-    seen = warp_photograph(ldr, np.ones((24, 40), np.float32), camera(), camera())
+def test_a_photograph_in_its_own_camera_stays_as_it_is_and_nothing_is_seen_behind():
+    ldr = np.random.default_rng(0).uniform(0, 1, (*SIZE, 3)).astype(np.float32)
+    mask = np.ones(SIZE, np.float32)
+    seen = warp_photograph(ldr, mask, camera(), camera())
     np.testing.assert_allclose(seen.ldr, ldr, atol=1e-4)
     assert seen.inside[1:-1, 1:-1].all()
+    back = camera(rotation=(0, np.pi, 0))
+    assert not warp_photograph(ldr, mask, camera(), back).inside.any()
+    mask[:, :20] = 0
+    seen = warp_photograph(ldr, mask, camera(), camera())
+    assert not seen.inside[:, :19].any()
+    assert seen.inside[2:-2, 21:-2].all()
 
 
 @pytest.mark.parametrize("size", [(120, 90), (33, 21)])
@@ -145,34 +140,17 @@ def test_a_photograph_lines_up_with_a_turned_camera(size):
     assert within.any()
 
 
-def test_nothing_is_seen_behind_oneself():
-    back = camera(rotation=(0, np.pi, 0))
-    seen = warp_photograph(np.ones((24, 40, 3), np.float32), np.ones((24, 40)), camera(), back)
-    assert not seen.inside.any()
-
-
-def test_masked_pixels_are_not_shown():
-    mask = np.ones((24, 40), np.float32)
-    mask[:, :20] = 0
-    seen = warp_photograph(np.ones((24, 40, 3), np.float32), mask, camera(), camera())
-    assert not seen.inside[:, :19].any()
-    assert seen.inside[2:-2, 21:-2].all()
-
-
 def test_codes_are_rounded_and_kept_in_range():
-    np.testing.assert_array_equal(
-        to_uint8_fast(np.array([[[0.0, 1.4 / 255, 1.6 / 255], [1.0, 1.2, 0.5]]], np.float32))[0],
-        [[0, 1, 2], [255, 255, 128]],
-    )
+    values = np.array([[[0.0, 1.4 / 255, 1.6 / 255], [1.0, 1.2, 0.5]]], np.float32)
+    np.testing.assert_array_equal(to_uint8_fast(values)[0], [[0, 1, 2], [255, 255, 128]])
 
 
 def test_vignetting_is_where_the_photograph_has_it():
     """The window's shape is not the photograph's; beyond its corners nothing darkens further."""
     K = np.array([[50.0, 0, 40], [0, 50.0, 30], [0, 0, 1]], np.float32)
     taken_by = Camera(np.eye(4, dtype=np.float32), K, 80, 60)
-    np.testing.assert_allclose(
-        (places_in(taken_by, taken_by) ** 2).sum(-1), squared_radii(60, 80), atol=1e-6
-    )
+    radii = (places_in(taken_by, taken_by) ** 2).sum(-1)
+    np.testing.assert_allclose(radii, squared_radii(60, 80), atol=1e-6)
     wide = Camera(taken_by.viewmat, K + np.array([[0, 0, 40], [0, 0, 0], [0, 0, 0]]), 160, 60)
     seen = places_in(taken_by, wide)
     np.testing.assert_allclose(seen[:, 40:120], places_in(taken_by, taken_by), atol=1e-6)
@@ -182,61 +160,53 @@ def test_vignetting_is_where_the_photograph_has_it():
     grey = np.full((60, 160, 3), 0.2, np.float32)
     window = RenderedFrame(grey, np.ones((60, 160)), np.ones((60, 160)), wide)
     shown = picture_of(window, "display", transform, taken_by=taken_by)
-    photograph = develop(grey[:, :80], transform)
-    np.testing.assert_allclose(shown[:, 40:120], photograph, atol=1e-5)
+    np.testing.assert_allclose(shown[:, 40:120], develop(grey[:, :80], transform), atol=1e-5)
     flat = picture_of(window, "display", transform.without_place(), taken_by=taken_by)
     assert np.ptp(flat) < 1e-6
     assert np.ptp(shown) > 0.1
 
 
-def splat_scene(n=5):
+def splats_of(n=5, *, alive=True, cfg=None, **place):
     rng = np.random.default_rng(0)
-    return Gaussians(
+    g = Gaussians(
         means=jnp.asarray(rng.normal((0, 0, 5), 1, (n, 3)), jnp.float32),
         quats=jnp.asarray(rng.normal(size=(n, 4)), jnp.float32).at[0].set(0),
         log_scales=jnp.asarray(rng.normal(size=(n, 3)), jnp.float32).at[-1].set(20.0),
         opacity_logits=jnp.asarray(rng.normal(size=n), jnp.float32),
         sh=jnp.asarray(rng.normal(size=(n, 4, 3)), jnp.float32),
     )
+    place = {"seen_from": np.zeros(3), "unit": 1.0} | place
+    return g, browser_splats(g, np.broadcast_to(alive, n), cfg or RenderConfig(), **place)
 
 
 def test_browser_splats_are_the_gaussians_in_viewer_units():
-    g, cfg = splat_scene(), RenderConfig(sh_degree=1)
-    seen_from = np.array([0.5, -0.2, 1.0])
+    seen_from, cfg = np.array([0.5, -0.2, 1.0]), RenderConfig(sh_degree=1)
     alive = np.array([True, True, True, False, True])
-    splats = browser_splats(g, alive, cfg, seen_from=seen_from, unit=2.0)
+    g, splats = splats_of(alive=alive, cfg=cfg, seen_from=seen_from, unit=2.0)
     np.testing.assert_allclose(splats.centers, 2 * np.asarray(g.means)[alive], rtol=1e-6)
     rotation = Rotation.from_quat(np.asarray(g.quats[1], float), scalar_first=True).as_matrix()
-    variances = (2 * np.exp(np.asarray(g.log_scales[1], float))) ** 2
-    expected = rotation @ np.diag(variances) @ rotation.T
+    variances = (2 * np.exp(np.asarray(g.log_scales, float))) ** 2
+    expected = rotation @ np.diag(variances[1]) @ rotation.T
     np.testing.assert_allclose(splats.covariances[1], expected, rtol=1e-4)
-    np.testing.assert_allclose(
-        splats.covariances[0], np.diag((2 * np.exp(np.asarray(g.log_scales[0]))) ** 2), rtol=1e-4
-    )
-    np.testing.assert_allclose(
-        splats.opacities[:, 0], 1 / (1 + np.exp(-np.asarray(g.opacity_logits)[alive])), rtol=1e-5
-    )
+    np.testing.assert_allclose(splats.covariances[0], np.diag(variances[0]), rtol=1e-4)
+    opacities = 1 / (1 + np.exp(-np.asarray(g.opacity_logits)[alive]))
+    np.testing.assert_allclose(splats.opacities[:, 0], opacities, rtol=1e-5)
     # Half floats end at 65504.
     assert np.isfinite(splats.covariances.astype(np.float16)).all()
-    np.testing.assert_allclose(
-        np.linalg.eigvalsh(splats.covariances[-1].astype(float)), LARGEST_DEVIATION**2, rtol=1e-3
-    )
+    largest = np.linalg.eigvalsh(splats.covariances[-1].astype(float))
+    np.testing.assert_allclose(largest, LARGEST_DEVIATION**2, rtol=1e-3)
     towards = Camera(jnp.eye(4).at[:3, 3].set(-seen_from), jnp.eye(3), 1, 1)
-    np.testing.assert_allclose(
-        splats.linear, np.asarray(view_radiance(g, towards, cfg))[alive], rtol=1e-6
-    )
+    radiance = np.asarray(view_radiance(g, towards, cfg))[alive]
+    np.testing.assert_allclose(splats.linear, radiance, rtol=1e-6)
 
 
 def test_splat_colours_are_developed_without_what_depends_on_the_place():
-    splats = browser_splats(
-        splat_scene(), np.ones(5, bool), RenderConfig(), seen_from=np.zeros(3), unit=1.0
-    )
-    plain = DisplayTransform(0.5, 2.2, PhotometryConfig())
-    shown = splat_colors(splats, plain, "display").astype(float)
-    assert np.abs(shown - np.rint(255 * np.asarray(develop(splats.linear, plain)))).max() <= 1
-    assert np.any(splat_colors(splats, plain, "stops") != shown)
+    _, splats = splats_of()
+    shown = splat_colors(splats, TRANSFORM, "display").astype(float)
+    assert np.abs(shown - np.rint(255 * np.asarray(develop(splats.linear, TRANSFORM)))).max() <= 1
+    assert np.any(splat_colors(splats, TRANSFORM, "stops") != shown)
     bilateral = PhotometryConfig(appearance="bilateral")
-    grid = DisplayTransform(0.5, 2.2, bilateral, np.ones((12, 8, 16, 16)))
+    grid = DisplayTransform(2.0, 2.2, bilateral, np.ones((12, 8, 16, 16)))
     np.testing.assert_array_equal(splat_colors(splats, grid, "display"), shown)
 
 
@@ -247,22 +217,17 @@ def test_longer_exposures_are_lighter_and_unknown_ones_grey():
     np.testing.assert_array_equal(colors[2], 128)
     assert exposure_colors([0.0, 0.0]).shape == (2, 3)
     assert exposure_colors([None]).tolist() == [[128, 128, 128]]
+    assert all(f">{name}<" in stops_legend() for name in ("-6", "-1", "0", "+1", "+5"))
 
 
-def test_the_legend_names_every_stop():
-    text = stops_legend()
-    assert all(f">{name}<" in text for name in ("-6", "-1", "0", "+1", "+5"))
-
-
-def test_saved_files_hold_what_is_shown(tmp_path):
-    shown = frame()
-    linear = np.asarray(shown.linear)
+def test_saved_files_hold_what_is_shown(frame, tmp_path):
+    linear = np.asarray(frame.linear)
     ldr = np.clip(linear, 0, 1)
     png = cv2.imdecode(np.frombuffer(png_bytes(ldr), np.uint8), cv2.IMREAD_COLOR)
     np.testing.assert_array_equal(png[..., ::-1], np.rint(ldr * 255))
-    (tmp_path / "a.exr").write_bytes(exr_bytes(shown, TRANSFORM))
+    (tmp_path / "a.exr").write_bytes(exr_bytes(frame, TRANSFORM))
     back, header = read_exr(tmp_path / "a.exr")
     np.testing.assert_allclose(back, linear, rtol=1e-3)
     assert header["p2gsExposureEV"] == pytest.approx(1.0)
     viewmat = np.asarray(header["p2gsViewmat"]).reshape(4, 4)
-    np.testing.assert_allclose(viewmat, np.asarray(shown.camera.viewmat), atol=1e-5)
+    np.testing.assert_allclose(viewmat, np.asarray(frame.camera.viewmat), atol=1e-5)

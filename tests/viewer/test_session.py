@@ -1,6 +1,7 @@
 """What one browser's controls do to its display transform, and files; without a browser."""
 
 from dataclasses import replace
+from unittest.mock import MagicMock
 
 import cv2
 import numpy as np
@@ -8,11 +9,13 @@ import pytest
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 
+import viser
 from viewer_stubs import CANVAS, Client, FakeRenderer, Panel
 
 from p2gs_jax.errors import UserError
 from p2gs_jax.run.read import load_run
 from p2gs_jax.viewer import session as sessions
+from p2gs_jax.viewer.panel import Panel as RealPanel
 from p2gs_jax.viewer.session import BrowserSession
 from p2gs_jax.viewer.settings import Settings, common_settings, same_display, settings_of_view
 from p2gs_jax.viewer.viewed_run import ViewedRun
@@ -120,6 +123,26 @@ def test_a_view_is_saved_also_after_a_failure(session, viewed, client):
     assert light[:4] == b"\x76\x2f\x31\x01"
     picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
     assert picture.shape == (round(100 * CANVAS[1] / CANVAS[0]), 100, 3)
+
+
+def test_the_panel_holds_what_it_is_set_to(viewed, run):
+    server, actions = viser.ViserServer(port=0, verbose=False), MagicMock()
+    try:
+        panel = RealPanel(server.gui, viewed, actions)
+        assert panel.settings() == common_settings(run)
+        wanted = settings_of_view(run, 1, panel.settings())
+        panel.put(wanted)
+        panel.put_view(2, 50.0)
+        panel.put_place(1.0)
+        panel.set_playing(True)
+        panel.set_status("status")
+        panel.set_legend("legend")
+        assert panel.settings() == replace(wanted, exposure_ev=pytest.approx(wanted.exposure_ev))
+        assert panel.drive == (run.scene.views[0].camera, 1.0)
+        assert (panel.speed, panel.locked, panel.own_exposures) == (2.0, False, False)
+    finally:
+        server.stop()
+    assert not actions.method_calls  # these are a person's alone
 
 
 def test_looks_are_compared_without_what_is_shown():

@@ -16,7 +16,8 @@ from jaxtyping import Bool, Float, Int
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.seeds import camera_centers
-from p2gs_jax.scene.visibility import in_frame, project_points
+from p2gs_jax.render.warp import project_points
+from p2gs_jax.scene.visibility import in_frame
 from p2gs_jax.types import Scene, Tracks, View
 
 # A block reaches beyond its core by this share of the shortest core.

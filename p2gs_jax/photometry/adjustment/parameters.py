@@ -21,14 +21,7 @@ from p2gs_jax.photometry.adjustment.matrices import Terms
 from p2gs_jax.photometry.adjustment.problem import Rows
 from p2gs_jax.photometry.models import VIGNETTING_POWERS, polynomials
 from p2gs_jax.photometry.observations import PerChannel
-from p2gs_jax.photometry.response import (
-    FLOOR,
-    FREE,
-    FREE_OF_EACH,
-    HELD,
-    KNOTS,
-    SMALLEST_SLOPE,
-)
+from p2gs_jax.photometry.response import FLOOR, FREE, FREE_OF_EACH, HELD, KNOTS, SMALLEST_SLOPE
 
 # Two directions that change the ratios of red, green and blue, and not their mean.
 CHROMA = np.array([[2.0, -1.0, -1.0], [0.0, 1.0, -1.0]]) / np.sqrt([[6.0], [2.0]])

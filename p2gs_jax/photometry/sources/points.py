@@ -18,10 +18,10 @@ from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.sources.sampling import PROJECTED_UNCERTAINTY, point_colors
 from p2gs_jax.render.capacity import make_renderer
+from p2gs_jax.render.warp import project_points, surface_depth, unproject, visible
 from p2gs_jax.render.warp import project_points as warped_points
-from p2gs_jax.render.warp import surface_depth, unproject, visible
 from p2gs_jax.scene.pixels.store import ImageStore, camera_of
-from p2gs_jax.scene.visibility import project_points, unoccluded
+from p2gs_jax.scene.visibility import unoccluded
 from p2gs_jax.types import Gaussians, Scene
 
 # Points that are sampled at most, and views of each: of projected and of rendered ones.

@@ -13,8 +13,8 @@ from p2gs_jax.core.numerics import srgb_decode, srgb_encode
 from p2gs_jax.photometry.formation import places
 from p2gs_jax.photometry.observations import COARSEST, Observations
 from p2gs_jax.photometry.response import DARKEST
+from p2gs_jax.render.warp import project_points
 from p2gs_jax.scene.pixels.store import ImageStore
-from p2gs_jax.scene.visibility import project_points
 from p2gs_jax.types import Scene
 
 # Averaging a few pixels quiets noise and hides the misplacement of a fraction of a pixel.
