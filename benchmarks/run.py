@@ -25,10 +25,11 @@ import jax
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks import gate, levels, speed_error
-from p2gs_jax.config import RenderConfig, preset
+from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.atomic import write_json, write_text
 from p2gs_jax.core.progress import TerminalReporter
 from p2gs_jax.errors import UserError
+from p2gs_jax.presets import preset
 
 PARTS = ("speed_error", "levels")
 

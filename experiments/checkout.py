@@ -9,11 +9,7 @@ HERE = Path(__file__).parent
 
 
 def commit() -> str:
-    """Return the short commit of this checkout, "unknown" without git, and whether files differ.
-
-    Kept figures (`experiments/**.json`) and the pages written from them differ with every figure,
-    and do not count.
-    """
+    """Return the short commit of this checkout and whether files differ, figures aside."""
     kept = [f":(top,exclude)experiments/**.{suffix}" for suffix in ("json", "md")]
     changed = _git("status", "--porcelain", "-uno", "--", ":/", *kept)
     return (_git("rev-parse", "--short", "HEAD") or "unknown") + (" and changes" if changed else "")

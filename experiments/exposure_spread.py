@@ -11,7 +11,6 @@ PSNR against spread.
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +19,8 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-from judging import configs, measured, to_markdown
-from sensor_town import COLUMNS, AtIso8, judged, town, write_sheet
+from sensor_town import fit_town, options, parsed
 
-import p2gs_jax
 from p2gs_jax.core.atomic import atomic_write, write_json, write_text
 from p2gs_jax.synth.settings import Sensor
 
@@ -40,12 +37,7 @@ def sensor(spread: float) -> Sensor:
 
 
 def plot(path: Path, tables: dict[float, list[dict[str, Any]]]) -> None:
-    """Write PSNR against spread, a line a method.
-
-    Args:
-        path: PNG or SVG file.
-        tables: rows by spread, stops.
-    """
+    """Write PSNR against spread, a line a method."""
     figure, axes = plt.subplots(figsize=SIZE_INCHES, layout="constrained")
     methods = dict.fromkeys(row["method"] for rows in tables.values() for row in rows)
     for method in methods:
@@ -67,37 +59,13 @@ def plot(path: Path, tables: dict[float, list[dict[str, Any]]]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("runs/exposure_spread"))
+    parser = options(__doc__, "exposure_spread", METHODS)
     parser.add_argument("--spreads", nargs="+", type=float, default=list(SPREADS), help="stops")
-    parser.add_argument("--methods", nargs="+", default=list(METHODS), help="presets")
-    parser.add_argument("--steps", type=int, default=600)
-    parser.add_argument("--frames", type=int, default=20)
-    parser.add_argument("--width", type=int, default=240)
-    parser.add_argument("--points", type=int, default=12_000)
-    parser.add_argument("--seed", type=int, default=3, help="of the town and the cameras")
-    parser.add_argument("--quick", action="store_true", help="a small town, few steps")
-    args = parser.parse_args()
-    if args.quick:
-        args.steps, args.frames, args.width, args.points = 150, 8, 128, 3000
+    args = parsed(parser)
     tables, text = {}, []
     for spread in args.spreads:
-        name = f"{spread:g}_stops_{args.width}_{args.frames}x3_seed_{args.seed}"
-        scene = town(args.out / "towns" / name, sensor(spread), args)
-        out = args.out / "runs" / name / f"steps_{args.steps}"
-        shown: dict[str, AtIso8] = {}
-
-        def judge(method: str, run: p2gs_jax.Run, metrics: dict[str, Any], shown=shown):
-            row, shown[method] = judged(run, metrics)
-            return row
-
-        tables[spread] = measured(scene, out, configs(args.methods, steps=args.steps), judge)
-        if shown:
-            write_sheet(args.out / f"{name}.png", shown)
-        text.append(
-            f"### {spread:g} stops, {args.steps} steps\n\n{to_markdown(tables[spread], COLUMNS)}"
-        )
-        print(text[-1], flush=True)
+        tables[spread], part = fit_town(f"{spread:g}_stops", sensor(spread), args)
+        text.append(part)
         plot(args.out / "exposure_spread.png", tables)
     write_json(args.out / "exposure_spread.json", tables)
     write_text(args.out / "exposure_spread.md", "\n".join(text))

@@ -31,12 +31,7 @@ GREY = 0.18
 
 
 def configs(names: Sequence[str], **train: Any) -> dict[str, FitConfig]:
-    """Return presets under a budget; those that this version has not are named on stderr.
-
-    Args:
-        names: of presets.
-        train: fields of `TrainConfig`.
-    """
+    """Return presets under a budget; those that this version has not are named on stderr."""
     found = {}
     for name in names:
         try:
@@ -58,10 +53,7 @@ def measured(
 
     Args:
         scene: photographs of one exposure, if there are any, are in its folder `reference`.
-        out: folder of the runs.
-        under: configuration of each method.
-        judge: returns what is to be said of a method, from its name, its run and its scores
-            (`metrics.json`).
+        judge: returns the cells of a method, from its name, its run and its `metrics.json`.
 
     Returns:
         A row of each method; of one that failed, why.
@@ -87,11 +79,7 @@ def measured(
 
 
 def to_markdown(rows: Sequence[dict[str, Any]], columns: Sequence[tuple[str, str, int]]) -> str:
-    """Return a table of the rows of `measured`; a cell without a value is empty.
-
-    Args:
-        columns: heading, key in a row, digits after the point.
-    """
+    """Return a table of the rows of `measured`; a cell without a value is empty."""
     lines = ["| method | " + " | ".join(heading for heading, _, _ in columns) + " |"]
     lines.append("|---|" + "---:|" * len(columns))
     for row in rows:
@@ -150,12 +138,7 @@ def mean_of_rows(run: p2gs_jax.Run, rows: Sequence[int]) -> p2gs_jax.Run:
 def common_display(
     run: p2gs_jax.Run, rows: Sequence[int]
 ) -> Callable[[int], p2gs_jax.DisplayTransform]:
-    """Return how any view is shown under the mean parameters of some training views.
-
-    Args:
-        run: the run.
-        rows: of the training views.
-    """
+    """Return how any view is shown under the mean parameters of some training views."""
     averaged, views = mean_of_rows(run, rows), run.scene.views
     of_camera = {views[i].camera: i for i in reversed(run.scene.train_indices)}
     return lambda index: averaged.own_display(of_camera[views[index].camera])

@@ -113,13 +113,7 @@ def spreads(run: p2gs_jax.Run, groups: dict[str, str]) -> dict[str, float]:
 def measure(
     scene: Path, out: Path, under: dict[str, FitConfig]
 ) -> tuple[list[dict[str, Any]], dict[str, Common]]:
-    """Return the rows of all methods, fitted to a mixture, and the pictures of those that ended.
-
-    Args:
-        scene: the mixture.
-        out: folder of the runs.
-        under: configuration of each method.
-    """
+    """Return the rows of all methods, fitted to a mixture, and the pictures of those that ended."""
     groups, shown = read_groups(scene), dict[str, Common]()
 
     def judge(method: str, run: p2gs_jax.Run, metrics: dict[str, Any]) -> dict[str, Any]:
@@ -154,13 +148,7 @@ def columns(groups: Sequence[str]) -> list[tuple[str, str, int]]:
 
 
 def write_sheet(path: Path, scene: Path, shown: dict[str, Common]) -> None:
-    """Write held-out views: as photographed, under the common exposure, and the reference.
-
-    Args:
-        path: PNG file.
-        scene: the mixture.
-        shown: pictures of the methods.
-    """
+    """Write held-out views: as photographed, under the common exposure, and the reference."""
     run, groups = next(iter(shown.values())).run, read_groups(scene)
     reference = load_reference(scene / "reference", run.scene, run.cfg)
     held = run.scene.test_indices

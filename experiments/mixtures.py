@@ -61,12 +61,7 @@ def read_groups(scene: Path) -> dict[str, str]:
 def spread_by_group(
     exposures_ev: Mapping[str, float], groups: Mapping[str, str]
 ) -> dict[str, float]:
-    """Return the standard deviation of exposures within every group, EV.
-
-    Args:
-        exposures_ev: by the name of the view.
-        groups: name of a view without its suffix -> group.
-    """
+    """Return the standard deviation of exposures within every group, EV."""
     found = _by_group(exposures_ev, groups)
     return {group: float(np.std(evs)) for group, evs in found.items()}
 

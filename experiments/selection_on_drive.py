@@ -1,7 +1,6 @@
-"""How often what cameras do to the light is found: synthetic drives, and real sets.
+"""How often what cameras do to the light is found, on synthetic drives.
 
 python experiments/selection_on_drive.py --seeds 0 1 2 --out runs/drives [--only REGEX]
-python experiments/selection_on_drive.py --seeds --scenes A B ...
 
 Synthetic: the cases of `drive_cases.py`. Right means the exposures and gammas that made the
 photographs, the white balance, the vignetting (for all channels alike or for each) and, where
@@ -9,7 +8,6 @@ exposures vary enough to tell, the curve and whether cameras or channels have cu
 "Plain" is the error of the same model without white balance and vignetting, where it has none.
 "Over stated" is the RMS of errors of exposures, after scale and power, over their stated errors: 1
 where error bars are right.
-Scenes given are calibrated and the reasons are printed.
 """
 
 from __future__ import annotations
@@ -19,7 +17,6 @@ import multiprocessing
 import os
 import re
 import sys
-import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
@@ -88,13 +85,7 @@ def exposure_errors(
 
 
 def over_stated(solution: PhotometricSolution, drawn: Drawn, *, by_camera: bool) -> float | None:
-    """Return the RMS of errors over their stated standard deviations; None where none are stated.
-
-    Args:
-        solution: what was found.
-        drawn: the truth.
-        by_camera: see `exposure_errors`.
-    """
+    """Return the RMS of errors over their stated deviations; None where none are stated."""
     stated = solution.exposure_errors
     known = np.isfinite(stated) & (stated > 0)
     if not known.any() or by_camera:
@@ -199,14 +190,7 @@ def to_markdown(rows: list[dict]) -> str:
 
 
 def synthetic(seeds: list[int], only: str, processes: int, kept: Path | None = None) -> list[dict]:
-    """Return what was found in every case and seed.
-
-    Args:
-        seeds: of drives and everything drawn.
-        only: regular expression that names of cases match.
-        processes: cases at a time.
-        kept: file that gets every row when it is known.
-    """
+    """Return what was found in every case and seed."""
     jobs = [(i, s) for i, c in enumerate(CASES) if re.search(only, c.name) for s in seeds]
     rows: dict[tuple[int, int], dict] = {}
     # A process per case and core is faster than threads within one.
@@ -228,20 +212,6 @@ def synthetic(seeds: list[int], only: str, processes: int, kept: Path | None = N
     return [rows[job] for job in jobs]
 
 
-def real(scenes: list[Path]) -> None:
-    """Print what is chosen for every scene, and why."""
-    for folder in scenes:
-        with tempfile.TemporaryDirectory() as out:
-            try:
-                result = p2gs_jax.calibrate(folder, Path(out) / "calibration")
-            except p2gs_jax.UserError as error:
-                print(f"\n{folder.name}: not calibrated ({error})", flush=True)
-                continue
-        print(f"\n{folder.name}:")
-        for reason in result.selection.reasons:
-            print(f"  {reason}", flush=True)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1, 2])
@@ -249,20 +219,18 @@ def main() -> None:
     parser.add_argument("--list", action="store_true", help="print the cases and end")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--out", type=Path, help="folder that gets the table and its rows")
-    parser.add_argument("--scenes", type=Path, nargs="+", default=[], help="scene folders")
     args = parser.parse_args()
     if args.list:
         print("\n".join(case.name for case in CASES))
         return
-    if args.seeds:
-        if args.out:
-            args.out.mkdir(parents=True, exist_ok=True)
-        kept = args.out / "selection_on_drive.json" if args.out else None
-        table = to_markdown(synthetic(args.seeds, args.only, args.processes, kept))
-        print(table)
-        if args.out:
-            write_text(args.out / "selection_on_drive.md", table)
-    real(args.scenes)
+    kept = None
+    if args.out:
+        args.out.mkdir(parents=True, exist_ok=True)
+        kept = args.out / "selection_on_drive.json"
+    table = to_markdown(synthetic(args.seeds, args.only, args.processes, kept))
+    print(table)
+    if args.out:
+        write_text(args.out / "selection_on_drive.md", table)
 
 
 if __name__ == "__main__":

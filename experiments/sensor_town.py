@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -187,12 +187,7 @@ def judged(run: p2gs_jax.Run, metrics: dict[str, Any]) -> tuple[dict[str, Any], 
 
 
 def write_sheet(path: Path, shown: dict[str, AtIso8]) -> None:
-    """Write held-out views: as photographed, by each method at ISO 8, and the photograph at ISO 8.
-
-    Args:
-        path: PNG file.
-        shown: by method.
-    """
+    """Write held-out views: as photographed, by each method at ISO 8, and so photographed."""
     run = next(iter(shown.values())).run
     held, shots = run.scene.test_indices, read_true_shots(run.scene.root)
     rows = []
@@ -207,38 +202,56 @@ def write_sheet(path: Path, shown: dict[str, AtIso8]) -> None:
     contact_sheet(path, rows)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("runs/sensor_town"))
-    parser.add_argument("--sensors", nargs="+", choices=SENSORS, default=["all"])
-    parser.add_argument("--methods", nargs="+", default=list(METHODS), help="presets")
+def options(description: str | None, name: str, methods: Sequence[str]) -> argparse.ArgumentParser:
+    """Return the options of experiments that fit all methods to one town."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--out", type=Path, default=Path("runs") / name)
+    parser.add_argument("--methods", nargs="+", default=list(methods), help="presets")
     parser.add_argument("--steps", type=int, default=600)
     parser.add_argument("--frames", type=int, default=20)
     parser.add_argument("--width", type=int, default=240)
     parser.add_argument("--points", type=int, default=12_000)
     parser.add_argument("--seed", type=int, default=3, help="of the town and the cameras")
     parser.add_argument("--quick", action="store_true", help="a small town, few steps")
+    return parser
+
+
+def parsed(parser: argparse.ArgumentParser) -> argparse.Namespace:
+    """Return what the command line asks for."""
     args = parser.parse_args()
     if args.quick:
         args.steps, args.frames, args.width, args.points = 150, 8, 128, 3000
+    return args
+
+
+def fit_town(name: str, sensor: Sensor, args: argparse.Namespace) -> tuple[list[dict], str]:
+    """Fit all methods to the town as a sensor sees it; return their rows and the table of them."""
+    name = f"{name}_{args.width}_{args.frames}x3_seed_{args.seed}"
+    scene = town(args.out / "towns" / name, sensor, args)
+    shown: dict[str, AtIso8] = {}
+
+    def judge(method: str, run: p2gs_jax.Run, metrics: dict[str, Any]) -> dict[str, Any]:
+        row, shown[method] = judged(run, metrics)
+        return row
+
+    out = args.out / "runs" / name / f"steps_{args.steps}"
+    rows = measured(scene, out, configs(args.methods, steps=args.steps), judge)
+    if shown:
+        write_sheet(args.out / f"{name}.png", shown)
+    text = f"### {name}, {args.steps} steps\n\n{to_markdown(rows, COLUMNS)}"
+    print(text, flush=True)
+    return rows, text
+
+
+def main() -> None:
+    parser = options(__doc__, "sensor_town", METHODS)
+    parser.add_argument("--sensors", nargs="+", choices=SENSORS, default=["all"])
+    args = parsed(parser)
     tables, text = {}, []
     for name in args.sensors:
-        size = f"{args.width}_{args.frames}x3_seed_{args.seed}"
-        scene = town(args.out / "towns" / f"{name}_{size}", SENSORS[name], args)
-        under = configs(args.methods, steps=args.steps)
-        out = args.out / "runs" / scene.name / f"steps_{args.steps}"
-        shown: dict[str, AtIso8] = {}
-
-        def judge(method: str, run: p2gs_jax.Run, metrics: dict[str, Any], shown=shown):
-            row, shown[method] = judged(run, metrics)
-            return row
-
-        rows = measured(scene, out, under, judge)
-        if shown:
-            write_sheet(args.out / f"{scene.name}.png", shown)
-        tables[scene.name] = {"sensor": dataclasses.asdict(SENSORS[name]), "rows": rows}
-        text.append(f"### {scene.name}, {args.steps} steps\n\n{to_markdown(rows, COLUMNS)}")
-        print(text[-1], flush=True)
+        rows, part = fit_town(name, SENSORS[name], args)
+        tables[name] = {"sensor": dataclasses.asdict(SENSORS[name]), "rows": rows}
+        text.append(part)
     write_json(args.out / "sensor_town.json", tables)
     write_text(args.out / "sensor_town.md", "\n".join(text))
 

@@ -48,10 +48,11 @@ from towns import (
     write,
 )
 
-from p2gs_jax.config import FitConfig, preset
+from p2gs_jax.config import FitConfig
 from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.photometry.models import MODELS
 from p2gs_jax.pipeline.exposures import without_tracks
+from p2gs_jax.presets import preset
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.run.read import load_run

@@ -171,12 +171,7 @@ def execute(job: Job, work: Path) -> dict[str, Any]:
 
 
 def true_ev(photometry: Mapping[str, Any], truth: Mapping[str, float]) -> float | None:
-    """Return the RMS error of a run's exposures, EV, after one common scale; None without truth.
-
-    Args:
-        photometry: a run's photometry.json.
-        truth: image name -> true exposure.
-    """
+    """Return the RMS error of a run's exposures, EV, after one common scale; None without truth."""
     pairs = [
         (2.0 ** view["exposure_ev"], truth[view["image"]])
         for view in photometry.get("views", ())

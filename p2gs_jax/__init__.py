@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from p2gs_jax.config import FitConfig as FitConfig
     from p2gs_jax.config import RenderConfig as RenderConfig
-    from p2gs_jax.config import preset as preset
     from p2gs_jax.errors import DivergenceError as DivergenceError
     from p2gs_jax.errors import UserError as UserError
     from p2gs_jax.evaluation.alignment import exposure_error as exposure_error
@@ -36,6 +35,7 @@ if TYPE_CHECKING:
     from p2gs_jax.pipeline.fit import fit as fit
     from p2gs_jax.pipeline.prepare import initialise as initialise
     from p2gs_jax.pipeline.survey import survey as survey
+    from p2gs_jax.presets import preset as preset
     from p2gs_jax.render import render_linear as render_linear
     from p2gs_jax.render import required_capacity as required_capacity
     from p2gs_jax.render.rasterization import rasterization as rasterization

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, TypeVar, get_args
+from typing import Any, Literal, TypeVar
 
 from p2gs_jax.errors import UserError
 
@@ -502,187 +502,6 @@ class FitConfig:
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
 
 
-# Of PPISP's parameters. Published: 2e-3 over 30,000 steps; ours: for fits of some hundred to some
-# thousand (BUILD_NOTES, "PPISP").
-PPISP_RATE = 1e-1
-# Of bilateral grids. Published: 2e-3, likewise; that leaves them short of exposures that spread
-# wide (BUILD_NOTES, "Learned corrections at size").
-BILATERAL_RATE = 1e-2
-
-
-def _robust() -> FitConfig:
-    return FitConfig()
-
-
-def _paper(exposure_weight: float, name: PresetName) -> FitConfig:
-    """Return the method exactly as printed; BUILD_NOTES.md says what it does."""
-    return FitConfig(
-        preset=name,
-        render=RenderConfig(radiance="linear", blur=0.3),
-        photometry=PhotometryConfig(
-            select=False,
-            curve="power",
-            pivot=1.0,
-            clamp=True,
-            parameterization="linear",
-            start="random",
-            freeze_until=0.0,
-        ),
-        loss=LossConfig(
-            censored=False,
-            relative_exposure=RelativeExposureConfig(weight=exposure_weight),
-            regularizers=RegularizerConfig(
-                exposure_scale=0.01,
-                exposure_variance=0.1,
-                gamma_prior=0.1,
-                log_exposure_mean=None,
-                gamma_mean_variance=None,
-            ),
-        ),
-        # The paper prints no rates for e and gamma: 1e-3, as 3DGS's exposure compensation ends at.
-        optimizer=OptimizerConfig(
-            means=1.6e-4,
-            means_final=1.6e-6,
-            scales=5e-3,
-            sh_dc=2.5e-3,
-            sh_rest=1.25e-4,
-            opacities=5e-2,
-            quats=1e-3,
-            final=1.0,
-            settled=None,
-            exposures=1e-3,
-            gammas=1e-3,
-            photometry_final=1.0,
-            extent="cameras",
-            b1=0.9,
-            b2=0.999,
-            visible_only=False,
-        ),
-        densify=DensifyConfig(method="adaptive"),
-        init=InitConfig(opacity=0.1, shell="off", dense="off"),
-        train=TrainConfig(steps=30_000, coarse_to_fine=()),
-    )
-
-
-def _ldr(
-    name: PresetName,
-    *,
-    appearance: Appearance | None = None,
-    gain: bool = False,
-    rate: float = 1e-2,
-) -> FitConfig:
-    """Return 3DGS in display values under the schedule, renderer and budget of `robust`.
-
-    Exposures start at 1; without `gain` they stay there. Rates of the colours: the best of three
-    (BUILD_NOTES, "LDR splatting"), times four, unmeasured (BUILD_NOTES, "Rates").
-    """
-    robust = _robust()
-    return dataclasses.replace(
-        robust,
-        preset=name,
-        render=dataclasses.replace(robust.render, radiance="linear"),
-        photometry=PhotometryConfig(
-            select=False,
-            model="view_exposure" if gain else "constant",
-            curve="linear",
-            start="random",
-            start_std=0.0,
-            freeze_until=0.0,
-            appearance=appearance,
-        ),
-        loss=dataclasses.replace(robust.loss, censored=False),
-        optimizer=dataclasses.replace(
-            robust.optimizer, sh_dc=2e-2, sh_rest=1e-3, exposures=1e-2, appearance=rate
-        ),
-    )
-
-
-def _published_3dgs() -> FitConfig:
-    """Return 3DGS as published: the schedule, rates and blur that P2GS took over from it."""
-    display = _ldr("3dgs_published")
-    return dataclasses.replace(
-        _paper(0.0, "3dgs_published"), photometry=display.photometry, loss=display.loss
-    )
-
-
-def _ppisp() -> FitConfig:
-    """Return PPISP without its controller, under the schedule, renderer and budget of `robust`."""
-    base = _ldr("ppisp", appearance="ppisp", rate=PPISP_RATE)
-    return dataclasses.replace(
-        base,
-        loss=dataclasses.replace(
-            base.loss, regularizers=dataclasses.replace(base.loss.regularizers, appearance=1.0)
-        ),
-        optimizer=dataclasses.replace(
-            base.optimizer, appearance_final=0.01, appearance_warmup=500 / 30_000
-        ),
-    )
-
-
-def _ppisp_solved() -> FitConfig:
-    """Return what PPISP models, solved beforehand: neither chosen nor learned from nothing."""
-    robust = _robust()
-    photometry = dataclasses.replace(
-        robust.photometry,
-        select=False,
-        model="view_exposure",
-        curve="spline",
-        white_balance="view",
-        vignetting="channel",
-        responses="camera",
-    )
-    return dataclasses.replace(robust, preset="ppisp_solved", photometry=photometry)
-
-
-def _luminance_gs() -> FitConfig:
-    """Return Luminance-GS's curves under the schedule, renderer and budget of `robust`.
-
-    Published: 10,000 steps, rates that decay to a hundredth. The rate is ours: ten times the
-    published one of the curve, for fits of some hundred to some thousand steps.
-    """
-    base = _ldr("luminance_gs", appearance="luminance")
-    return dataclasses.replace(
-        base, optimizer=dataclasses.replace(base.optimizer, appearance_final=0.01)
-    )
-
-
-def preset(name: PresetName) -> FitConfig:
-    """Return the configuration of a preset.
-
-    Args:
-        name: `robust`; `paper` (as printed, lambda_exp 0.01) or `paper_appendix` (0.1); baselines
-            that splat display values: `3dgs` under our own schedule, `3dgs_published` under that
-            of Kerbl et al. 2023 (adaptive, 30,000 steps); ours with a gain per view `3dgs_gain`, or
-            with a learned correction per view `3dgs_affine`, `3dgs_bilateral`, `3dgs_curve`;
-            `ppisp`, a camera learned beside the splats, and `ppisp_solved`, about the same camera
-            solved before; `luminance_gs`, a curve that enhances every photograph.
-
-    Raises:
-        UserError: there is no such preset.
-    """
-    known: dict[str, Callable[[], FitConfig]] = {
-        "robust": _robust,
-        "paper": lambda: _paper(0.01, "paper"),
-        "paper_appendix": lambda: _paper(0.1, "paper_appendix"),
-        "3dgs": lambda: _ldr("3dgs"),
-        "3dgs_published": _published_3dgs,
-        "3dgs_gain": lambda: _ldr("3dgs_gain", gain=True),
-        "3dgs_affine": lambda: _ldr("3dgs_affine", appearance="affine"),
-        "3dgs_bilateral": lambda: _ldr(
-            "3dgs_bilateral", appearance="bilateral", rate=BILATERAL_RATE
-        ),
-        "3dgs_curve": lambda: _ldr("3dgs_curve", appearance="curve"),
-        "ppisp": _ppisp,
-        "ppisp_solved": _ppisp_solved,
-        "luminance_gs": _luminance_gs,
-    }
-    if name not in known:
-        raise UserError(
-            f"there is no preset {name!r}.", fix=f"choose {', '.join(get_args(PresetName))}"
-        )
-    return known[name]()
-
-
 def require_config(cfg: FitConfig | None) -> FitConfig:
     """Return a configuration as it was given; None takes `robust`.
 
@@ -743,6 +562,16 @@ def _narrowed_type(kind: type, names: tuple[str, ...]) -> Any:
         f"{kind.__name__}{dict(zip(names, values(self), strict=True))}"
     )
     return type(kind.__name__, (kind,), fields | methods)
+
+
+def with_values(record: Record, values: Mapping[str, Any]) -> Record:
+    """Return a configuration with other values, by dotted names of fields; nothing is checked."""
+    for place, value in values.items():
+        name, _, inner = place.partition(".")
+        if inner:
+            value = with_values(getattr(record, name), {inner: value})
+        record = dataclasses.replace(record, **{name: value})  # pyright: ignore
+    return record
 
 
 def to_dict(config: FitConfig) -> dict:

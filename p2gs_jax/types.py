@@ -33,17 +33,11 @@ LUMINANCE = (0.299, 0.587, 0.114)
 
 
 class Vibration(eqx.Module):
-    """How Gaussians come, move and go (render/vibration.py).
+    """How Gaussians come, move and go (render/vibration.py)."""
 
-    Attributes:
-        velocities: at the peak, scene units per second.
-        peaks: when each is most opaque, seconds from the middle of the drive.
-        log_lives: log standard deviations of the opacity over time, log seconds.
-    """
-
-    velocities: Float[Array, "n 3"]
-    peaks: Float[Array, " n"]
-    log_lives: Float[Array, " n"]
+    velocities: Float[Array, "n 3"]  # at the peak, scene units per second
+    peaks: Float[Array, " n"]  # when each is most opaque, seconds from the middle of the drive
+    log_lives: Float[Array, " n"]  # log standard deviations of the opacity over time, log seconds
 
 
 class Gaussians(eqx.Module):
@@ -150,7 +144,7 @@ class Photometry(eqx.Module):
 
 
 class Params(eqx.Module):
-    """The one differentiable pytree: what optax sees."""
+    """The one differentiable pytree."""
 
     gaussians: Gaussians
     photometry: Photometry
@@ -159,14 +153,11 @@ class Params(eqx.Module):
 
 
 class Placement(eqx.Module):
-    """Where the moving objects are in one view.
+    """Where the moving objects are in one view."""
 
-    Attributes:
-        viewmats: box-to-camera of each, OpenCV axes; what is not there is behind the camera.
-        time: of the view, seconds from the middle of the drive, where Gaussians vibrate.
-    """
-
+    # box-to-camera of each, OpenCV axes; what is not there is behind the camera
     viewmats: Float[Array, "k 4 4"]
+    # of the view, seconds from the middle of the drive, where Gaussians vibrate
     time: Float[Array, ""] | None = None
 
 
@@ -191,12 +182,7 @@ class Camera(eqx.Module):
 class Frustum(eqx.Module):
     """A camera whose image size is data: what is done per Gaussian is compiled once for all sizes.
 
-    Attributes:
-        viewmat: world-to-camera, OpenCV axes; or of each Gaussian its own, from `camera_of_each`.
-        K: intrinsics in pixels, pixel centres at +0.5.
-        width: pixels.
-        height: pixels.
-        objects: where moving objects are; None: it shows none of them.
+    Attributes are those of `Camera`.
     """
 
     viewmat: Float[Array, "4 4"] | Float[Array, "4 4 n"]
@@ -211,39 +197,26 @@ class Splats2D(eqx.Module):
 
     The inverse 2D covariance is kept as its Cholesky factor: with u = a11 dx + a12 dy and
     v = a22 dy the exponent is log o - (u^2 + v^2) / 2.
-
-    Attributes:
-        means2d: projected centres, pixels.
-        conic_factor: (a11, a12, a22), 1 / pixels.
-        cov_diagonal: (Sxx, Syy) of the 2D covariance, pixels^2: the extent of the box.
-        log_opacities: log peak opacity (-100 where not visible).
-        depths: z in the camera, scene units.
-        visible: in front of the near plane and well defined.
-        log_cutoffs: log opacity below which a contribution is skipped.
     """
 
-    means2d: Float[Array, "n 2"]
-    conic_factor: Float[Array, "n 3"]
+    means2d: Float[Array, "n 2"]  # projected centres, pixels
+    conic_factor: Float[Array, "n 3"]  # (a11, a12, a22), 1 / pixels
+    # (Sxx, Syy) of the 2D covariance, pixels^2: the extent of the box
     cov_diagonal: Float[Array, "n 2"]
-    log_opacities: Float[Array, " n"]
-    depths: Float[Array, " n"]
-    visible: Bool[Array, " n"]
-    log_cutoffs: Float[Array, " n"]
+    log_opacities: Float[Array, " n"]  # log peak opacity (-100 where not visible)
+    depths: Float[Array, " n"]  # z in the camera, scene units
+    visible: Bool[Array, " n"]  # in front of the near plane and well defined
+    log_cutoffs: Float[Array, " n"]  # log opacity below which a contribution is skipped
 
 
 class TileList(eqx.Module):
-    """Which Gaussians each tile composites, in depth order, as one flat list.
+    """Which Gaussians each tile composites, in depth order, as one flat list."""
 
-    Attributes:
-        gaussian_ids: ids sorted by (tile, depth), padded to the capacity M.
-        offsets: start of every tile in `gaussian_ids`; the last is the number of entries used.
-        count: what the capacity must hold for the list to be complete.
-        overflow: count > M; the list is then incomplete and the result must be discarded.
-    """
-
-    gaussian_ids: Int[Array, " m"]
+    gaussian_ids: Int[Array, " m"]  # ids sorted by (tile, depth), padded to the capacity M
+    # start of every tile in `gaussian_ids`; the last is the number of entries used
     offsets: Int[Array, " t1"]
-    count: Int[Array, ""]
+    count: Int[Array, ""]  # what the capacity must hold for the list to be complete
+    # count > M; the list is then incomplete and the result must be discarded
     overflow: Bool[Array, ""]
 
 
@@ -269,28 +242,21 @@ class Render(eqx.Module):
 
 
 class Population(eqx.Module):
-    """Which slots are alive, and the statistics densification needs; never differentiated.
+    """Which slots are alive, and the statistics densification needs; never differentiated."""
 
-    Attributes:
-        alive: slots in use.
-        grad2d_sum: summed norms of the screen-space mean gradients, in units of half the image.
-        seen_count: number of views that contributed to `grad2d_sum`.
-        owner: row of the moving object in whose box frame a Gaussian lives, -1: in the world; None
-            where nothing moves.
-    """
-
-    alive: Bool[Array, " n"]
+    alive: Bool[Array, " n"]  # slots in use
+    # summed norms of the screen-space mean gradients, in units of half the image
     grad2d_sum: Float[Array, " n"]
-    seen_count: Float[Array, " n"]
+    seen_count: Float[Array, " n"]  # number of views that contributed to `grad2d_sum`
+    # row of the moving object in whose box frame a Gaussian lives, -1: in the world; None where
+    # nothing moves
     owner: Int[Array, " n"] | None = None
 
 
 class Measured(eqx.Module):
-    """Depths that a laser scanner measured in a view.
+    """Depths that a laser scanner measured in a view: camera z, scene units, 0 fills the list up.
 
-    Attributes:
-        places: where in the image, as shares of its width and height.
-        depths: camera z, scene units; 0 fills the list up.
+    `places` say where in the image, as shares of its width and height.
     """
 
     places: Float[Array, "k 2"]
@@ -298,26 +264,18 @@ class Measured(eqx.Module):
 
 
 class Batch(eqx.Module):
-    """One training view on the device.
+    """One training view on the device."""
 
-    Attributes:
-        camera: its camera, at the resolution of `ldr`.
-        ldr: the photograph, display-encoded: in [0, 1], or integers of which the largest is 1.
-        mask: 1 = use, 0 = ignore.
-        view_index: its row in `Photometry`.
-        measured: depths for the loss, or None where it asks for none.
-        alpha: opacity of the photograph, stored as `ldr`, which is then premultiplied by it; None:
-            the scene is shown over no background.
-        backdrop: display values of that background, or None.
-    """
-
-    camera: Camera
+    camera: Camera  # its camera, at the resolution of `ldr`
+    # the photograph, display-encoded: in [0, 1], or integers of which the largest is 1
     ldr: Float[Array, "h w 3"] | UInt[Array, "h w 3"]
-    mask: Float[Array, "h w"] | Bool[Array, "h w"]
-    view_index: Int[Array, ""]
-    measured: Measured | None = None
+    mask: Float[Array, "h w"] | Bool[Array, "h w"]  # 1 = use, 0 = ignore
+    view_index: Int[Array, ""]  # its row in `Photometry`
+    measured: Measured | None = None  # depths for the loss, or None where it asks for none
+    # opacity of the photograph, stored as `ldr`, which is then premultiplied by it; None: the scene
+    # is shown over no background
     alpha: Float[Array, "h w"] | UInt[Array, "h w"] | None = None
-    backdrop: Float[Array, " 3"] | None = None
+    backdrop: Float[Array, " 3"] | None = None  # display values of that background, or None
 
 
 # ------------------------------------------------------------------ host records
@@ -327,10 +285,8 @@ class Batch(eqx.Module):
 class Distortion:
     """Lens distortion; a `radial` lens of all zeros is a pinhole.
 
-    Attributes:
-        coefficients: OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]] (`radial`, rational from k4 on),
-            or its k1, k2, k3, k4 of the angle (`fisheye`).
-        model: which.
+    `coefficients` are OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]] (`radial`, rational from k4 on),
+    or its k1, k2, k3, k4 of the angle (`fisheye`).
     """
 
     coefficients: tuple[float, ...]
@@ -339,73 +295,48 @@ class Distortion:
 
 @dataclass(frozen=True)
 class View:
-    """One photograph and how it was taken.
+    """One photograph and how it was taken."""
 
-    Attributes:
-        name: path relative to the image folder; views are sorted by it.
-        image_path: where the pixels are.
-        camera: name of the physical camera that took it ("0", "front_left").
-        viewmat: world-to-camera, OpenCV axes.
-        K: pinhole intrinsics of the *undistorted* image, at `width` x `height`.
-        width: pixels.
-        height: pixels.
-        distortion: what to remove on load, or None.
-        mask_path: optional mask (0 = ignore).
-        exif_ev: log2(time * ISO / N^2) from EXIF, or None where it is incomplete.
-        split: `train` or `test`.
-        frame: its number in a drive, the same for all cameras, or None.
-        time: seconds on the clock of `Scene.objects` and `Scene.lidar`, or None.
-        own_car: where the photograph shows the car that carries the camera, at any resolution; the
-            same for all photographs of a camera; None: nowhere that is known of.
-        alpha: what its alpha channel means, if it has one (`DataConfig.alpha`).
-    """
-
-    name: str
-    image_path: Path
-    camera: str
-    viewmat: Float32[np.ndarray, "4 4"]
+    name: str  # path relative to the image folder; views are sorted by it
+    image_path: Path  # where the pixels are
+    camera: str  # name of the physical camera that took it ("0", "front_left")
+    viewmat: Float32[np.ndarray, "4 4"]  # world-to-camera, OpenCV axes
+    # pinhole intrinsics of the *undistorted* image, at `width` x `height`
     K: Float32[np.ndarray, "3 3"]
-    width: int
-    height: int
-    distortion: Distortion | None = None
-    mask_path: Path | None = None
-    exif_ev: float | None = None
-    split: Split = "train"
-    frame: int | None = None
-    time: float | None = None
+    width: int  # pixels
+    height: int  # pixels
+    distortion: Distortion | None = None  # what to remove on load, or None
+    mask_path: Path | None = None  # optional mask (0 = ignore)
+    exif_ev: float | None = None  # log2(time * ISO / N^2) from EXIF, or None where it is incomplete
+    split: Split = "train"  # `train` or `test`
+    frame: int | None = None  # its number in a drive, the same for all cameras, or None
+    time: float | None = None  # seconds on the clock of `Scene.objects` and `Scene.lidar`, or None
+    # where the photograph shows the car that carries the camera, at any resolution; the same for
+    # all photographs of a camera; None: nowhere that is known of
     own_car: Bool[np.ndarray, "a b"] | None = None
-    alpha: AlphaUse = "mask"
+    alpha: AlphaUse = "mask"  # what its alpha channel means, if it has one (`DataConfig.alpha`)
 
 
 @dataclass(frozen=True)
 class TrackedObject:
-    """A rigid thing that somebody followed through a drive, as a box.
+    """A rigid thing that somebody followed through a drive, as a box."""
 
-    Attributes:
-        name: of its track in the data set.
-        label: what it is, in the data set's words ("Car").
-        size: length (x, forward), width (y, left), height (z, up) of the box, scene units.
-        times: seconds, rising.
-        poses: box to world at these times; the origin is the middle of the box.
-        moving: it moves at some time.
-    """
-
-    name: str
-    label: str
+    name: str  # of its track in the data set
+    label: str  # what it is, in the data set's words ("Car")
+    # length (x, forward), width (y, left), height (z, up) of the box, scene units
     size: tuple[float, float, float]
-    times: Float64[np.ndarray, " k"]
+    times: Float64[np.ndarray, " k"]  # seconds, rising
+    # box to world at these times; the origin is the middle of the box
     poses: Float64[np.ndarray, "k 4 4"]
-    moving: bool
+    moving: bool  # it moves at some time
 
 
 @dataclass(frozen=True)
 class Lidar:
     """What laser scanners measured, as it was measured: not thinned to one point a place.
 
-    Attributes:
-        points: world coordinates at their own time.
-        times: seconds.
-        objects: row in `Scene.objects` of the moving object a point lies on, -1: on none.
+    Points are in world coordinates at their own time, seconds; `objects` is the row in
+    `Scene.objects` of the moving object that a point lies on, -1: on none.
     """
 
     points: Float32[np.ndarray, "l 3"]
@@ -417,10 +348,7 @@ class Lidar:
 class Tracks:
     """Observations of seed points in views, in undistorted pixels at full resolution.
 
-    Attributes:
-        view_indices: row in `Scene.views`.
-        point_indices: row in `Scene.points`.
-        xy: pixel position, centres at +0.5.
+    Indices are rows in `Scene.views` and `Scene.points`; pixel centres are at +0.5.
     """
 
     view_indices: Int[np.ndarray, " o"]

@@ -9,12 +9,9 @@ project: keep --out outside of it.
 
 from __future__ import annotations
 
-import argparse
-import tempfile
-from pathlib import Path
 from typing import Any
 
-from published_rows import Key, fitted, measure, of_fit
+from published_rows import Key, fitted, measure, of_fit, options
 
 BLUR = ("--render.blur", "0.3")
 # Of each method its options; `3dgs` and `robust` densify by `mcmc`.
@@ -24,30 +21,21 @@ METHODS = {
     "robust": ("--preset", "robust"),
     "3dgs, blur of 3DGS": ("--preset", "3dgs", *BLUR),
     "robust, blur of 3DGS": ("--preset", "robust", *BLUR),
-    "3dgs, adaptive, blur of 3DGS": (
-        *("--preset", "3dgs", "--densify.method", "adaptive"),
-        *BLUR,
-    ),
+    "3dgs, adaptive, blur of 3DGS": ("--preset", "3dgs", "--densify.method", "adaptive", *BLUR),
 }
 STEPS = (7_000, 30_000)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("scene", type=Path, help="nerf_synthetic_lego")
-    parser.add_argument("--out", type=Path, default=Path(tempfile.gettempdir(), "published_lego"))
-    parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=METHODS)
-    parser.add_argument("--steps", type=int, nargs="+", default=list(STEPS))
-    parser.add_argument("--again", action="store_true", help="measure also what is there")
-    args = parser.parse_args()
+    args = options(__doc__, "lego", METHODS, STEPS).parse_args()
 
     def row(key: Key) -> dict[str, Any]:
-        options = (*METHODS[key.method], "--steps", str(key.steps), "--background", "white")
+        said = (*METHODS[key.method], "--steps", str(key.steps), "--background", "white")
         name = f"{key.method.replace(', ', '_').replace(' ', '_')}_{key.steps}"
-        fit = fitted(args.scene, args.out / name, options, args.again)
+        fit = fitted(args.scenes[0], args.out / name, said, args.again)
         test = fit.metrics["test"]["averaged"]
         figures = {k: test[k] for k in ("psnr", "ssim", "lpips") if k in test}
-        return {"figures": figures, **of_fit(fit, f"p2gs-jax fit LEGO {' '.join(options)}")}
+        return {"figures": figures, **of_fit(fit, f"p2gs-jax fit LEGO {' '.join(said)}")}
 
     measure([Key("lego", "lego", m, s) for s in args.steps for m in args.methods], row, args.again)
 

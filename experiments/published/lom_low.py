@@ -21,17 +21,15 @@ project: keep --out outside of it.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import json
 import sys
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from published_rows import HERE, Key, fitted, measure, of_fit
+from published_rows import HERE, Key, fitted, measure, of_fit, options
 
 import p2gs_jax
 from p2gs_jax.evaluation.alignment import fit_capture, with_fitted_exposure
@@ -69,11 +67,7 @@ class Aligned:
     """How a run's views are shown, after each alignment."""
 
     def __init__(self, run: p2gs_jax.Run):
-        """Render the training views once.
-
-        Args:
-            run: fitted to the dark photographs.
-        """
+        """Render the training views once."""
         self.run = run
         self._usual = dataclasses.replace(run.common_display(), exposure=run.mean.exposure)
         # What is compared with `high` is the field, not how dark photographs show it.
@@ -146,13 +140,7 @@ def figures(run: p2gs_jax.Run, stems: Sequence[str]) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("scenes", type=Path, nargs="+", help="LOM scene folders")
-    parser.add_argument("--out", type=Path, default=Path(tempfile.gettempdir(), "published_lom"))
-    parser.add_argument("--methods", nargs="+", default=list(METHODS), help="presets")
-    parser.add_argument("--steps", type=int, nargs="+", default=[600])
-    parser.add_argument("--again", action="store_true", help="measure also what is there")
-    args = parser.parse_args()
+    args = options(__doc__, "lom", METHODS, (600,)).parse_args()
     if args.out.resolve().is_relative_to(HERE.parents[1].resolve()):
         raise SystemExit("--out is inside this project, where no picture of these scenes may be.")
     folders = {lom.resolve().name.removeprefix("lom_"): lom for lom in args.scenes}

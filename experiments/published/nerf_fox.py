@@ -7,29 +7,20 @@ No paper prints a figure for it; the rows say where we are. One at a time, resum
 
 from __future__ import annotations
 
-import argparse
-import tempfile
-from pathlib import Path
 from typing import Any
 
-from published_rows import Key, fitted, measure, of_fit
+from published_rows import Key, fitted, measure, of_fit, options
 
 METHODS = ("robust", "3dgs")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("scene", type=Path, help="nerf_fox")
-    parser.add_argument("--out", type=Path, default=Path(tempfile.gettempdir(), "published_fox"))
-    parser.add_argument("--methods", nargs="+", default=list(METHODS), help="presets")
-    parser.add_argument("--steps", type=int, nargs="+", default=[7_000])
-    parser.add_argument("--again", action="store_true", help="measure also what is there")
-    args = parser.parse_args()
+    args = options(__doc__, "fox", METHODS, (7_000,)).parse_args()
 
     def row(key: Key) -> dict[str, Any]:
-        options = ("--preset", key.method, "--steps", str(key.steps))
+        said = ("--preset", key.method, "--steps", str(key.steps))
         run = args.out / f"{key.method}_{key.steps}"
-        fit = fitted(args.scene, run, options, args.again)
+        fit = fitted(args.scenes[0], run, said, args.again)
         test = fit.metrics["test"]
         figures = {
             "psnr": test["averaged"]["psnr"],
@@ -37,7 +28,7 @@ def main() -> None:
         }
         if "photometry_fitted" in test:
             figures["psnr_photometry_fitted"] = test["photometry_fitted"]["psnr"]
-        return {"figures": figures, **of_fit(fit, f"p2gs-jax fit FOX {' '.join(options)}")}
+        return {"figures": figures, **of_fit(fit, f"p2gs-jax fit FOX {' '.join(said)}")}
 
     wanted = [Key("nerf_fox", "fox", m, s) for s in args.steps for m in args.methods]
     measure(wanted, row, args.again)

@@ -6,14 +6,16 @@ and steps; measured again, it replaces the old one.
 
 from __future__ import annotations
 
+import argparse
 import datetime
 import json
 import os
 import shutil
 import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -68,12 +70,7 @@ class Fit(NamedTuple):
 
 
 def of_fit(fit: Fit, command: str) -> dict[str, Any]:
-    """Return what every row says of its fit.
-
-    Args:
-        fit: from `fitted`.
-        command: that measures the row, without folders of this machine.
-    """
+    """Return what every row says of its fit."""
     metrics = fit.metrics
     seconds = metrics["seconds"]
     # Of a resumed fit, "optimisation" is that of all its processes, all else of the last.
@@ -142,14 +139,7 @@ def measure(
     again: bool = False,
     path: Path = ROWS,
 ) -> None:
-    """Measure rows one after another and keep each; those that are there are left.
-
-    Args:
-        wanted: which.
-        row_of: measures one.
-        again: measure also what is there.
-        path: where they are kept.
-    """
+    """Measure rows one after another and keep each; those that are there are left."""
     for key in wanted:
         if key in read_rows(path) and not again:
             print(f"{' '.join(map(str, key))}: there already", file=sys.stderr, flush=True)
@@ -158,3 +148,18 @@ def measure(
         add_row(key, row_of(key), path)
         took = time.monotonic() - begin
         print(f"{' '.join(map(str, key))}: {took:.0f} s", file=sys.stderr, flush=True)
+
+
+def options(
+    description: str | None, name: str, methods: Iterable[str], steps: Sequence[int]
+) -> argparse.ArgumentParser:
+    """Return the options that all benchmarks have."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("scenes", type=Path, nargs="+", help="scene folders")
+    parser.add_argument(
+        "--out", type=Path, default=Path(tempfile.gettempdir(), f"published_{name}")
+    )
+    parser.add_argument("--methods", nargs="+", default=list(methods))
+    parser.add_argument("--steps", type=int, nargs="+", default=list(steps))
+    parser.add_argument("--again", action="store_true", help="measure also what is there")
+    return parser

@@ -47,13 +47,7 @@ def table(header: list[str], rows: list[list[str]]) -> list[str]:
 def section(
     name: str, benchmark: Mapping[str, Any], rows: Mapping[Key, Mapping[str, Any]]
 ) -> list[str]:
-    """Return the lines of a benchmark: published figures, ours, and how they came about.
-
-    Args:
-        name: of the benchmark.
-        benchmark: from `published.json`.
-        rows: of all benchmarks.
-    """
+    """Return the lines of a benchmark: published figures, ours, and how they came about."""
     lines = [f"## {benchmark['title']}", ""]
     if benchmark["published"]:
         lines += ["Published:", ""]
@@ -98,11 +92,7 @@ def _cells(key: Key, row: Mapping[str, Any], benchmark: Mapping[str, Any]) -> li
 
 
 def hdr_section(rows: Mapping[Key, Mapping[str, Any]]) -> list[str]:
-    """Return the lines of the HDR score, of the towns at size whose true radiance is known.
-
-    Args:
-        rows: of `experiments/at_size.json`.
-    """
+    """Return the lines of the HDR score, of the towns at size whose true radiance is known."""
     found = {key: row for key, row in sorted(rows.items()) if HDR in row["figures"]}
     header = ["photographed at", "method", "steps", "mu law, novel views, dB", "commit", "command"]
     cells = [
@@ -121,11 +111,6 @@ def page(
     at_size: Mapping[Key, Mapping[str, Any]],
 ) -> str:
     """Return the whole page.
-
-    Args:
-        published: as `published.json`.
-        rows: from `read_rows`.
-        at_size: likewise, of the towns at size.
 
     Raises:
         SystemExit: a row belongs to no benchmark.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import sys
 from pathlib import Path
 
@@ -95,15 +94,6 @@ def _finite(*arrays: np.ndarray) -> bool:
 def _nonsense(what: str) -> int:
     print(f"not finite, or out of range: {what}", file=sys.stderr)
     return NONSENSE
-
-
-def fit(root: Path) -> int:
-    """Fit a scene for a few steps, into a folder that is removed again."""
-    run = root.parent / "run"
-    try:
-        return fit_into(root, run)
-    finally:
-        shutil.rmtree(run, ignore_errors=True)
 
 
 def fit_into(root: Path, run: Path) -> int:

@@ -9,11 +9,11 @@ from typing import Annotated, ClassVar, Literal
 
 import tyro
 
-from p2gs_jax import config as configs
 from p2gs_jax.cli.shared import SHORT, check
-from p2gs_jax.config import FitConfig
+from p2gs_jax.config import FitConfig, PresetName
+from p2gs_jax.presets import preset
 
-Preset = Annotated[configs.PresetName, tyro.conf.arg(metavar="NAME")]
+Preset = Annotated[PresetName, tyro.conf.arg(metavar="NAME")]
 Config = Annotated[FitConfig, tyro.conf.arg(name="")]
 Folder = Annotated[Path, tyro.conf.arg(metavar="DIR")]
 
@@ -285,4 +285,4 @@ def named_preset(name: str) -> FitConfig:
     Raises:
         UserError: there is none of that name.
     """
-    return configs.preset(name)  # pyright: ignore[reportArgumentType]
+    return preset(name)  # pyright: ignore[reportArgumentType]

@@ -52,7 +52,7 @@ from p2gs_jax.photometry.display import (
 from p2gs_jax.photometry.formation import exposed_at
 from p2gs_jax.photometry.metering import Metering, Readings, meter
 from p2gs_jax.photometry.models import MODELS
-from p2gs_jax.render.capacity import RenderView
+from p2gs_jax.render.capacity import RenderView, make_renderer
 from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 from p2gs_jax.types import Camera, Params, Render, Scene
 
@@ -145,9 +145,9 @@ def evaluate(
     params: Params,
     scene: Scene,
     store: ImageStore,
-    render: RenderView,
     cfg: FitConfig,
     *,
+    render: RenderView | None = None,
     reference: Reference | None = None,
     radiance: Truth | None = None,
     lpips_weights: LpipsWeights | None = None,
@@ -160,8 +160,8 @@ def evaluate(
         params: the fit, live Gaussians only.
         scene: views and their splits.
         store: photographs.
-        render: from `make_renderer`; it knows which Gaussians belong to moving objects.
         cfg: formation model.
+        render: from `make_renderer`, where it knows which Gaussians belong to moving objects.
         reference: view row -> photograph under the common exposure, or None where there is none.
         radiance: view row -> true linear radiance at the size of the photographs, or None.
         lpips_weights: adds `lpips` wherever a view is compared with a photograph; None leaves it
@@ -175,7 +175,7 @@ def evaluate(
     judge = Judge(scene, store, params, cfg, lpips_weights, reference)
     gaussians = jax.device_put(params.gaussians)
     living = jax.device_put(np.ones(params.gaussians.capacity, bool))
-    seen = functools.partial(render, gaussians, living)
+    seen = functools.partial(render or make_renderer(cfg.render), gaussians, living)
     with ArrayStore(most_bytes(cfg.data.cache_mb)) as arrays:
         views = _Views(judge, seen, arrays)
         judged = functools.partial(_judged, judge, seen, radiance)

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from p2gs_jax.config import FitConfig, preset
+from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
+from p2gs_jax.presets import preset
 
 KEYS = ("scene", "reference", "out", "preset", "seeds", "max_parallel", "set", "grid", "case")
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from jaxtyping import Float32
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.clock import Stopwatch
@@ -35,9 +36,9 @@ from p2gs_jax.pipeline.exposures import Exposures, likely, solve_exposures, with
 from p2gs_jax.pipeline.survey import Survey, survey
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.scene import load_scene
-from p2gs_jax.scene.pixels.store import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 from p2gs_jax.train.exposure_loss import ColorPairs, color_pairs
-from p2gs_jax.types import Gaussians, Measured, Params, Scene, View
+from p2gs_jax.types import Camera, Gaussians, Measured, Params, Scene, View
 
 
 @dataclass
@@ -73,6 +74,10 @@ class Prepared:
     pairs: ColorPairs | None = None
     measured: Sequence[Measured] | None = None
     notes: list[str] = field(default_factory=list)
+
+    def view(self, index: int) -> tuple[Camera, Float32[np.ndarray, "h w 3"], np.ndarray]:
+        """Return the camera, the photograph (display values) and the mask that a step takes."""
+        return camera_of(self.fitted, index), *self.fitted.get(index)
 
 
 def load(scene_dir: Path, run_dir: Path, cfg: FitConfig, reporter: Reporter) -> Scene:
@@ -143,7 +148,7 @@ def prepare(
             # What cameras do enters the programs, and is only solved now.
             if expected is not None and form.vignetting is None and response.by == "all":
                 decisions = with_choice(expected.decisions, form, response)
-                on_expected(_under(expected, decisions, cfg), True)
+                on_expected(expect(found, decisions), True)
 
         exposures = given
         if exposures is None:
@@ -179,15 +184,6 @@ def expect(found: Survey, decisions: Decisions) -> Prepared:
         owner=owner,
         measured=found.measured,
     )
-
-
-def _under(expected: Prepared, decisions: Decisions, cfg: FitConfig) -> Prepared:
-    """Return what is expected under other decisions."""
-    under = decisions.resolve(cfg)
-    taken_by = [view.camera for view in expected.scene.training_views]
-    photometry = initial_photometry(None, taken_by, under)
-    params = dataclasses.replace(expected.params, photometry=photometry)
-    return dataclasses.replace(expected, params=params, decisions=decisions, cfg=under)
 
 
 def initialise(found: Survey, exposures: Exposures, reporter: Reporter | None = None) -> Prepared:

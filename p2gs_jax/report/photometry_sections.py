@@ -31,7 +31,7 @@ MARKED = (
     Style(THIRD, "o", "-", order=3),
     Style(FIRST, "s", "-", order=2),
 )
-PLAIN = Style(FIRST, "", "-")
+PLAIN, DASHED = Style(FIRST, "", "-"), Style(INK, "", (0, (4, 4)), width=1.6)
 LINES = (Style(SECOND, "", "-"), Style(THIRD, "", "--"), Style(FIRST, "", ":"))
 # Lines of the cameras of a drive, in turn.
 CAMERA_COLORS, CAMERA_MARKERS = (FIRST, SECOND, THIRD, FOURTH, INK, MUTED), "osD^vPX*"
@@ -307,7 +307,7 @@ def response_section(run: RunFiles) -> str:
     standard = _stops(VALUES, replace(PhotometryConfig(), curve="srgb"))
     broad = Style(FIRST, "", "-", width=5.0, opacity=0.45)
     curves.append(Series("this run", own, VALUES, broad))
-    curves.append(Series("sRGB", standard, VALUES, Style(INK, "", (0, (4, 4)), width=1.6)))
+    curves.append(Series("sRGB", standard, VALUES, DASHED))
     apart = np.abs(own - standard)[VALUES > 0.05].max()
     caption = "How exposed radiance becomes a value in the photograph. "
     if apart < 0.01:
@@ -350,7 +350,7 @@ def responses_section(run: RunFiles) -> str:
             style = Style(COLORS[color % len(COLORS)], "", DASHES[line % len(DASHES)], width=1.6)
             curves.append(Series(label, stops[:, c], VALUES, style))
     srgb = _stops(VALUES, PhotometryConfig())
-    curves.append(Series("sRGB", srgb, VALUES, Style(INK, "", (0, (4, 4)), width=1.6)))
+    curves.append(Series("sRGB", srgb, VALUES, DASHED))
     what = "cameras" if len(formations) > 1 else "channels"
     chart = charts.response_chart(curves, label=f"Responses of the {what} against sRGB")
     apart = np.ptp([c.x for c in curves[:-1]], axis=0)[VALUES > 0.05].max()

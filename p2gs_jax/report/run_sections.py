@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from p2gs_jax.config import preset, to_dict
+from p2gs_jax.config import to_dict
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.protocols import PROTOCOLS
+from p2gs_jax.presets import preset
 from p2gs_jax.report.charts import training_chart
 from p2gs_jax.report.findings import column, duration, seconds_of
 from p2gs_jax.report.page import figure, folded, paragraph, row, table, text
@@ -54,19 +55,21 @@ def _scores(run: RunFiles, *path: str) -> list[str]:
     return [_shown(run.number(*path, name), digits) for name, digits in SCORES.items()]
 
 
-def _table_without_empty(names: list[str], rows: list[list[str]], at: int, first: int) -> str:
-    """Return a table with numbers from column `first` on, without column `at` if it is empty."""
-    if not any(r[at] for r in rows):
-        names, rows = [*names[:at], *names[at + 1 :]], [[*r[:at], *r[at + 1 :]] for r in rows]
-    return table(names, rows, numbers=range(first, len(names)))
+def _numbers(names: list[str], rows: list[list[str]], first: int, note: str = "") -> str:
+    """Return a table with numbers from column `first` on, without empty columns, and a note."""
+    if not rows:
+        return ""
+    kept = [i for i in range(len(names)) if i < first or any(r[i] for r in rows)]
+    rows = [[r[i] for i in kept] for r in rows]
+    body = table([names[i] for i in kept], rows, numbers=range(first, len(kept)))
+    return body + (paragraph(note, "note") if note else "")
 
 
 def score_section(run: RunFiles) -> str:
     """Return every score, by protocol."""
     rows = [[p.views, p.shown, *_scores(run, *p.path)] for p in PROTOCOLS.values()]
-    rows = [r for r in rows if r[2] or r[3]]
     names = ["views", "shown with", "PSNR, dB", "SSIM", "LPIPS"]
-    body = _table_without_empty(names, rows, 4, 2) if rows else ""
+    body = _numbers(names, [r for r in rows if r[2] or r[3]], 2)
     return body + _radiance(run) + _steadiness(run)
 
 
@@ -86,19 +89,14 @@ def _steadiness(run: RunFiles) -> str:
     found = {n: run.part("consistency", key) for key, n in VIDEOS.items()}
     keys = ("his", "std_luminance_relative")
     rows = [[n, *(_shown(number_at(part, k), 3) for k in keys)] for n, part in found.items()]
-    rows = [r for r in rows if r[1]]
-    if not rows:
-        return ""
-    return (
-        "<h3>Steadiness of the views played as a video</h3>"
-        + table(["video", "HIS", "brightness, deviation"], rows, numbers=(1, 2))
-        + paragraph(
-            "HIS: change of exposure-free radiance from frame to frame, relative; deviation: of "
-            "the mean brightness of the frames, relative. Both contain the scene's own motion, so "
-            "compare them with the photographs'; lower is steadier.",
-            "note",
-        )
+    note = (
+        "HIS: change of exposure-free radiance from frame to frame, relative; deviation: of the "
+        "mean brightness of the frames, relative. Both contain the scene's own motion, so compare "
+        "them with the photographs'; lower is steadier."
     )
+    names = ["video", "HIS", "brightness, deviation"]
+    body = _numbers(names, [r for r in rows if r[1]], 1, note)
+    return f"<h3>Steadiness of the views played as a video</h3>{body}" if body else ""
 
 
 def parts_section(run: RunFiles) -> str:
@@ -109,15 +107,12 @@ def parts_section(run: RunFiles) -> str:
         scores, seen = _scores(run, *path, part), run.number(*path, part, "views")
         if scores[0] and seen is not None:
             rows.append([views, shown, what, *scores, f"{seen:.0f}"])
-    if not rows:
-        return ""
     names = ["views", "shown with", "pixels", "PSNR, dB", "SSIM", "LPIPS", "views that show any"]
     note = (
         "Moving: within the boxes of what moves at some time. SSIM is the mean of the whole "
         "image's map over the part."
     )
-    body = _table_without_empty(names, rows, 5, 3) + paragraph(note, "note")
-    return body
+    return _numbers(names, rows, 3, note)
 
 
 def depth_section(run: RunFiles) -> str:
@@ -129,16 +124,13 @@ def depth_section(run: RunFiles) -> str:
         if points is not None:
             cells = [_depth(found, name) for name in DEPTH]
             rows.append([views, PARTS[part], *cells, f"{points:,.0f}"])
-    if not rows:
-        return ""
     names = ["views", "points", "median error", "relative", "within 10 %", "no surface", "count"]
     note = (
         "Rendered depth at the points of the sweep nearest in time to each view, without those "
         "that nearer points hide; points on moving boxes are carried to the time of the view. "
         "Where the render shows no surface, the error counts as infinite."
     )
-    body = table(names, rows, numbers=range(2, len(names))) + paragraph(note, "note")
-    return body
+    return _numbers(names, rows, 2, note)
 
 
 def _depth(found: dict[str, Any], name: str) -> str:
@@ -150,29 +142,21 @@ def _depth(found: dict[str, Any], name: str) -> str:
 
 def novel_section(run: RunFiles) -> str:
     """Return views from beside the way."""
-    items = run.metrics.get("novel_views")
-    rows, with_depth = [], False
-    items = sorted(items if isinstance(items, list) else [], key=_shift, reverse=True)
-    for item in items:
+    items, rows = run.metrics.get("novel_views"), []
+    for item in sorted(items if isinstance(items, list) else [], key=_shift, reverse=True):
         unseen, found = number_at(item, "unseen"), part_at(item, "depth", "static")
-        if number_at(item, "shift_m") is None or unseen is None:
-            continue
-        known = number_at(found, "points") is not None
-        with_depth |= known
-        depth = [_depth(found, n) if known else "" for n in ("median_m", "within_10_percent")]
-        side = "left" if _shift(item) > 0 else "right"
-        rows.append([f"{abs(_shift(item)):g} m to the {side}", f"{unseen:.1%}", *depth])
-    if not items:
-        return ""
-    names = ["camera", "pixels that no training view shows"]
-    names += ["median depth error", "depth within 10 %"] if with_depth else []
+        if number_at(item, "shift_m") is not None and unseen is not None:
+            known = number_at(found, "points") is not None
+            depth = [_depth(found, n) if known else "" for n in ("median_m", "within_10_percent")]
+            side = "left" if _shift(item) > 0 else "right"
+            rows.append([f"{abs(_shift(item)):g} m to the {side}", f"{unseen:.1%}", *depth])
+    names = ["camera", "pixels that no training view shows", "median depth error"]
     note = (
         "Some views moved sideways, seen from the driving direction. There are no photographs to "
         "compare with: the first number is what must be invented there, by the rendered depth; "
         "depth is held against LiDAR as above, what stands only."
     )
-    body = table(names, [r[: len(names)] for r in rows], numbers=range(1, len(names)))
-    return body + paragraph(note, "note")
+    return _numbers([*names, "depth within 10 %"], rows, 1, note)
 
 
 def _shift(item: Any) -> float:

@@ -210,7 +210,7 @@ def write_fitted(
     )
 
 
-def _row(view: View, split: str, values: Sequence[float | None]) -> ViewPhotometry:
+def _row(view: View, split: str, values: Sequence[Any]) -> ViewPhotometry:
     """Return the row of a view: exposure, its logarithm and gamma, and what everything has."""
     exposure, ev, gamma = (None if v is None else float(v) for v in values)
     return {
@@ -240,7 +240,7 @@ def _fitted_rows(
     out: list[ViewPhotometry] = []
     for index, view in enumerate(scene.views):
         k = rows.get(index)
-        own = (None, None, None)
+        own: tuple[Any, ...] = (None, None, None)
         if k is not None:
             e = taken.exposures[k]
             own = (e, np.log2(float(e)), taken.gammas[k])
@@ -261,12 +261,7 @@ def _fitted_rows(
 
 
 def write_solution(
-    path: Path,
-    solution: PhotometricSolution,
-    *,
-    views: Sequence[View],
-    pivot: float,
-    gauge: str,
+    path: Path, solution: PhotometricSolution, *, views: Sequence[View], pivot: float, gauge: str
 ) -> None:
     """Write `photometry.json` of a bundle adjustment; views it knows nothing about get nulls.
 
@@ -424,7 +419,7 @@ def read_appearance(path: Path, kind: Appearance, views: Sequence[View]) -> Corr
         ) from error
     except (KeyError, TypeError, AttributeError) as error:
         raise UserError(f"{path} does not belong to this run.", fix="fit again") from error
-    if corrections.shape != like.shape:
+    if corrections.shape != np.asarray(like).shape:
         raise UserError(f"{path} does not belong to this run.", fix="fit again")
     return on_device(corrections)
 

@@ -37,11 +37,7 @@ SUMMARY_VIEWS = 4
 
 
 def write_start(
-    folder: RunFolder,
-    scene: Path,
-    reference: Path | None,
-    cfg: FitConfig,
-    decisions: Decisions,
+    folder: RunFolder, scene: Path, reference: Path | None, cfg: FitConfig, decisions: Decisions
 ) -> None:
     """Write what was asked and what was decided: the folder is a run's from here on."""
     write_decisions(folder.decisions, decisions)
@@ -56,36 +52,43 @@ def write_start(
 
 
 def write_run(
-    folder: RunFolder,
+    folder: RunFolder | str | Path,
     params: Params,
     scene: Scene,
     cfg: FitConfig,
     *,
     owner: np.ndarray | None = None,
     moving: MovingObjects | None = None,
-    fitted: Mapping[int, float],
-    unknown: Sequence[str] = (),
-    solution: PhotometricSolution | None,
-    shown: Sequence[ViewResult],
     metering: Metering,
+    decisions: Decisions | None = None,
+    fitted: Mapping[int, float] | None = None,
+    unknown: Sequence[str] = (),
+    solution: PhotometricSolution | None = None,
+    shown: Sequence[ViewResult] = (),
     true_ev: np.ndarray | None = None,
 ) -> None:
-    """Write the scene, the Gaussians, the photometry and the summary.
+    """Write the scene, the Gaussians, the photometry and the summary, for `load_run` to open.
 
     Args:
-        folder: of the run.
+        folder: of the run; created.
         params: live Gaussians and photometry.
         scene: its views.
         cfg: what the fit computed under.
         owner: the moving object that each Gaussian belongs to, or None.
-        moving: these objects.
+        moving: these objects, with their poses.
+        metering: what explains the exposures, from an evaluation.
+        decisions: of a fit that wrote no `config.json`: it is written as well.
         fitted: exposures solved for held-out views, by row.
         unknown: names of photographs that tell no exposure.
         solution: what the fit started from, or None.
-        shown: views of the summary.
-        metering: what explains the exposures.
+        shown: views of the summary; none: there is no summary.
         true_ev: true exposures of the training views for the plot, stops, or None.
     """
+    if not isinstance(folder, RunFolder):
+        folder = RunFolder(Path(folder))
+    folder.root.mkdir(parents=True, exist_ok=True)
+    if decisions is not None:
+        write_start(folder, scene.root, None, cfg, decisions)
     write_scene(folder.root, scene)
     if moving is not None and (owner is not None or moving.middle is not None):
         write_objects(folder.objects, owner, moving, scene)
@@ -95,7 +98,7 @@ def write_run(
         params,
         scene,
         cfg,
-        fitted=fitted,
+        fitted=fitted or {},
         unknown=unknown,
         solution=solution,
     )
@@ -103,7 +106,8 @@ def write_run(
     kind = cfg.photometry.appearance
     if kind is not None:
         write_appearance(folder.appearance(kind), params.appearance, scene.training_views)
-    _write_summary(folder.summary, shown, params, scene, cfg, true_ev)
+    if shown:
+        _write_summary(folder.summary, shown, params, scene, cfg, true_ev)
 
 
 def write_view(folder: Path, name: str, result: ViewResult, store: ImageStore) -> None:
@@ -159,8 +163,7 @@ def _write_summary(
     true_ev: np.ndarray | None,
 ) -> None:
     common = usual_display(params, (), None, cfg.photometry)
-    if shown:
-        common = dataclasses.replace(common, backdrop=shown[0].transform.backdrop)
+    common = dataclasses.replace(common, backdrop=shown[0].transform.backdrop)
     train = scene.training_views
     exif = [v.exif_ev for v in train]
     write_summary(

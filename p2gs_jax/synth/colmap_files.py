@@ -34,6 +34,20 @@ class DriveViews(NamedTuple):
     height: int
 
 
+def write_seeds(
+    folder: Path,
+    views: DriveViews,
+    xyz: Float[np.ndarray, "p 3"],
+    rgb: UInt8[np.ndarray, "p 3"],
+    depths: Sequence[np.ndarray],
+) -> dict[str, int]:
+    """Write the model of the points that two views see; return how many points and observations."""
+    xy, seen = observe_seeds(xyz, views, depths)
+    kept = seen.sum(0) >= 2
+    write_colmap(folder, views, xyz[kept], rgb[kept], xy[:, kept], seen[:, kept])
+    return {"points": int(kept.sum()), "observations": int(seen[:, kept].sum())}
+
+
 def write_colmap(
     folder: Path,
     views: DriveViews,

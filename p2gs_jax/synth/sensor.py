@@ -33,22 +33,13 @@ DRIFT_PERIODS = 1.3
 # Lenses lose no more than this in their corners, whatever was drawn.
 MOST_LOST = 0.8
 FILE = Path("truth", "exposures.csv")
-COLUMNS = (
-    *("image", "camera", "iso", "exposure", "exposure_ev", "red", "green", "blue"),
-    *("corners", "curve"),
-)
+NUMBERS = ("exposure", "red", "green", "blue", "corners")
+COLUMNS = ("image", "camera", "iso", "exposure", "exposure_ev", *NUMBERS[1:], "curve")
 
 
 class Shots(NamedTuple):
-    """How every photograph was taken.
-
-    Attributes:
-        iso: drawn ISO.
-        exposures: factor on radiance, ISO-Const without gains = 1.
-        balance: factors on red, green, blue.
-        corner_loss: share of the light lost in the corners.
-        curves: response.
-    """
+    """How every photograph was taken: factors on radiance (ISO-Const without gains: 1), and on red,
+    green, blue; share of the light lost in the corners; response."""
 
     iso: Int[np.ndarray, " v"]
     exposures: Float[np.ndarray, " v"]
@@ -73,19 +64,13 @@ class Shots(NamedTuple):
 
 
 def draw_iso(shape: tuple[int, ...], std: float, seed: int) -> Int[np.ndarray, "..."]:
-    """Return ISO ~ N(8, std), rounded, at least 1; 8 everywhere where std is 0.
-
-    `std` is the standard deviation before rounding (paper: 2 and 4); every photograph has a draw.
-    """
+    """Return ISO ~ N(8, std) (paper: 2 and 4), rounded, at least 1; each photograph has a draw."""
     noise = generator(seed, SceneStream.ISO).standard_normal(shape)
     return np.maximum(np.rint(ISO_REFERENCE + std * noise), ISO_MINIMUM).astype(np.int64)
 
 
 def draw_shots(sensor: Sensor, frames: int, cameras: int, seed: int) -> Shots:
-    """Return how all photographs are taken, camera by camera, frame by frame.
-
-    UserError: there are curves for another number of cameras.
-    """
+    """Return how all photographs are taken, camera by camera, frame by frame."""
     if len(sensor.curves) not in (0, cameras):
         raise UserError(
             f"there are {cameras} cameras, but {len(sensor.curves)} curves.",
@@ -182,13 +167,7 @@ def read_true_exposures(root: Path) -> dict[str, float]:
 
 
 class TrueShot(NamedTuple):
-    """How a photograph was taken.
-
-    Attributes:
-        exposure: factor on radiance, mean over the channels.
-        balance: factors on red, green, blue beside it; their product is 1.
-        corners: share of the light that reaches the corners.
-    """
+    """How a photograph was taken; the columns of `truth/exposures.csv`."""
 
     camera: str
     exposure: float
@@ -198,15 +177,11 @@ class TrueShot(NamedTuple):
 
 def read_true_shots(root: Path) -> dict[str, TrueShot]:
     """Return image name -> how it was taken; empty where the scene folder has no such file."""
-    return {
-        row["image"]: TrueShot(
-            row["camera"],
-            float(row["exposure"]),
-            (float(row["red"]), float(row["green"]), float(row["blue"])),
-            float(row["corners"]),
-        )
-        for row in _rows(root)
-    }
+    found = {}
+    for row in _rows(root):
+        e, red, green, blue, corners = (float(row[name]) for name in NUMBERS)
+        found[row["image"]] = TrueShot(row["camera"], e, (red, green, blue), corners)
+    return found
 
 
 def _rows(root: Path) -> list[dict[str, str]]:

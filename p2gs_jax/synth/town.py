@@ -18,45 +18,26 @@ Vec3 = tuple[float, float, float]
 ROAD_HALF_WIDTH = 5.6
 KERB_HEIGHT = 0.14
 FACADE_LINE = 9.0
-CROSS_STREET = (27.0, 36.0)
-"""The side street's extent along x, between the buildings' corners."""
-UNDERPASS = (54.0, 68.0)
-"""Where a house stands across the street, along x."""
-STREET_END = 100.0
-"""How far one can drive: behind it stands the tower that closes the view."""
-UNDERPASS_HEIGHT = 5.2
-FLOOR_HEIGHT = 3.2
-GROUND_FLOOR_HEIGHT = 4.0
+# Along x: the side street, between the buildings' corners; the house across the street; how far
+# one can drive, as behind it stands the tower that closes the view.
+CROSS_STREET, UNDERPASS, STREET_END = (27.0, 36.0), (54.0, 68.0), 100.0
+UNDERPASS_HEIGHT, FLOOR_HEIGHT, GROUND_FLOOR_HEIGHT = 5.2, 3.2, 4.0
 
 
-class Material(IntEnum):
-    """What `tracer` paints a primitive with; ROAD is the ground plane."""
-
-    ROAD = 0
-    PAVEMENT = 1
-    FACADE = 2
-    PLAIN = 3
-    CAR_BODY = 4
-    CAR_GLASS = 5
-    WHEEL = 6
-    BARK = 7
-    FOLIAGE = 8
-    METAL = 9
-    EMISSIVE = 10
-    SIGN = 11
-    TILES = 12
-    AWNING = 13
+# What `tracer` paints a primitive with; ROAD is the ground plane.
+Material = IntEnum(
+    "Material",
+    "ROAD PAVEMENT FACADE PLAIN CAR_BODY CAR_GLASS WHEEL BARK FOLIAGE METAL EMISSIVE SIGN TILES "
+    "AWNING",
+    start=0,
+)
 
 
 @dataclass(frozen=True)
 class Light:
-    """The sun and the sky of a town.
+    """Radiance of sky and lit ground (`bounce`), and a sun in a unit direction.
 
-    Attributes:
-        sun_direction: unit vector towards the sun.
-        sun: its irradiance over pi, so that a white wall facing it has this radiance.
-        zenith: sky radiance overhead; `horizon`: at the horizon.
-        bounce: radiance of the lit ground and walls as ambient light from below.
+    `sun` is its irradiance over pi, so that a white wall facing it has this radiance.
     """
 
     sun_direction: Vec3 = (-0.46, -0.50, 0.735)
@@ -102,7 +83,6 @@ class Solid:
     Attributes:
         kind: 0 box, 1 tapered box, 2 ellipsoid.
         lo: lower corner of the bounding box, m; `hi`: the upper one.
-        material: what it is painted with.
         color: base albedo; radiance for EMISSIVE.
         accent: second colour: window surrounds, stripes, sign faces.
         params: (style, bay width m, ground-floor use, random number in [0, 1)).
@@ -183,21 +163,12 @@ def _taper_planes(solid: Solid) -> np.ndarray:
     assert solid.top is not None
     tx0, tx1, ty0, ty1 = solid.top
     rise = z1 - z0
-    normals = np.array(
-        [
-            (-rise, 0, tx0 - x0),
-            (rise, 0, x1 - tx1),
-            (0, -rise, ty0 - y0),
-            (0, rise, y1 - ty1),
-            (0, 0, -1),
-            (0, 0, 1),
-        ],
-        np.float64,
-    )
+    along_x = [(-rise, 0, tx0 - x0), (rise, 0, x1 - tx1)]
+    along_y = [(0, -rise, ty0 - y0), (0, rise, y1 - ty1)]
+    normals = np.array([*along_x, *along_y, (0, 0, -1), (0, 0, 1)], np.float64)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    anchors = np.array(
-        [(x0, y0, z0), (x1, y0, z0), (x0, y0, z0), (x0, y1, z0), (x0, y0, z0), (x0, y0, z1)]
-    )
+    first = (x0, y0, z0)
+    anchors = np.array([first, (x1, y0, z0), first, (x0, y1, z0), first, (x0, y0, z1)])
     return np.concatenate([normals, (normals * anchors).sum(1, keepdims=True)], axis=1)
 
 

@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenEXR
@@ -28,7 +29,7 @@ from PIL import Image
 from p2gs_jax.core.atomic import atomic_folder
 from p2gs_jax.core.streams import SceneStream, generator
 from p2gs_jax.errors import UserError
-from p2gs_jax.synth.colmap_files import DriveViews, observe_seeds, sample_seeds, write_colmap
+from p2gs_jax.synth.colmap_files import DriveViews, sample_seeds, write_seeds
 from p2gs_jax.synth.furnish import build_town
 from p2gs_jax.synth.rig import MOUNTS, camera_viewmat, drive, intrinsics
 from p2gs_jax.synth.sensor import ISO_REFERENCE, Shots, draw_shots, photograph, write_true_exposures
@@ -60,8 +61,7 @@ def write_street(
     Args:
         out: the folder to make; it must not exist, or be empty.
         frames: photographs of each of the three cameras.
-        width: pixels (paper: 1920).
-        height: pixels (paper: 1300).
+        width: pixels (paper: 1920), as is the height (1300).
         iso_std: spread of the ISO (paper: 2 and 4); 0 writes ISO-Const. `sensor` replaces it.
         seed: of the town, the ISO and the points.
         supersample: samples a pixel along each axis.
@@ -71,56 +71,47 @@ def write_street(
         sensor: what the cameras do to the light.
         layout: `town` adds an underpass and draws the sun's place from the seed; `long` is as many
             streets one behind another as the drive is long.
-        report: receives a line of progress now and then.
 
     Raises:
         UserError: a parameter is impossible, or `out` is in the way.
     """
     out, sensor = Path(out), sensor or Sensor(iso_std=iso_std)
-    _check(out, frames, width, height, sensor.iso_std, supersample)
-    _check_way(frames, step, layout)
+    asked = {
+        **{"seed": seed, "frames": frames, "width": width, "height": height},
+        **{"supersample": supersample, "step_m": step, "layout": layout},
+        **{"hold_out": hold_out, "points_sampled": points, "iso_std": sensor.iso_std},
+    }
+    _check(out, asked)
     town = build_town(seed, layout, frames * step)
     views, frame = _views(frames, width, height, step)
     shots = draw_shots(sensor, frames, len(MOUNTS), seed)
     with atomic_folder(out) as temporary:
         report(f"rendering {len(views.names)} views of a street with {town.size} solids")
-        photographs, depths = _photograph(
-            temporary, town, views, shots, sensor, supersample, seed, report
-        )
+        photographs, depths = [], []
+        for row, (linear, depth) in enumerate(_render_all(town, views, supersample)):
+            shot = _photographed(linear, shots, sensor, row, seed)
+            reference = photograph(linear, 1.0, Sensor(curve=sensor.curve))
+            _write_view(temporary, views.names[row], shot, reference, linear, depth)
+            photographs.append(shot)
+            depths.append(depth)
+            if (row + 1) % 10 == 0:
+                report(f"rendered {row + 1} of {len(views.names)} views")
         sampled = np.ones(frames, bool)
         if hold_out and frames > 1:
             sampled[::hold_out] = False
         xyz, rgb = sample_seeds(views, photographs, depths, sampled[frame], points, seed)
-        xy, seen = observe_seeds(xyz, views, depths)
-        kept = seen.sum(0) >= 2
-        xyz, rgb, xy, seen = xyz[kept], rgb[kept], xy[:, kept], seen[:, kept]
-        write_colmap(temporary / "sparse" / "0", views, xyz, rgb, xy, seen)
+        observed = write_seeds(temporary / "sparse" / "0", views, xyz, rgb, depths)
         write_true_exposures(temporary, views.names, views.cameras, shots)
         card = {
-            "format": FORMAT,
-            "seed": seed,
-            "frames": frames,
+            **{"format": FORMAT, **asked, **observed, "iso_reference": ISO_REFERENCE},
+            **{"K": views.K.tolist(), "solids": town.size, "sensor": asdict(sensor)},
             "cameras": {name: asdict(mount) for name, mount in MOUNTS.items()},
-            "width": width,
-            "height": height,
-            "K": views.K.tolist(),
-            "supersample": supersample,
-            "step_m": step,
-            "layout": layout,
-            "sensor": asdict(sensor),
-            "iso_std": sensor.iso_std,
-            "iso_reference": ISO_REFERENCE,
-            "hold_out": hold_out,
-            "points_sampled": points,
-            "points": len(xyz),
-            "observations": int(seen.sum()),
-            "solids": town.size,
             "light": asdict(town.light),
         }
         (temporary / "dataset.json").write_text(json.dumps(card, indent=2) + "\n")
         _require_free(out)
-    count = f"{len(xyz)} points, {int(seen.sum())} observations"
-    report(f"wrote {out}: {len(views.names)} photographs, {count}")
+    counts = f"{observed['points']} points, {observed['observations']} observations"
+    report(f"wrote {out}: {len(views.names)} photographs, {counts}")
     return out
 
 
@@ -136,46 +127,24 @@ def _views(frames: int, width: int, height: int, step: float):
     return DriveViews(names, cameras, viewmats, intrinsics(width, height), width, height), frame
 
 
-def _photograph(
-    root: Path,
-    town: Town,
-    views: DriveViews,
-    shots: Shots,
-    sensor: Sensor,
-    supersample: int,
-    seed: int,
-    report: Callable[[str], None],
-) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Render and write all views; return photographs and depths."""
-    photographs, depths = [], []
-    for row, (linear, depth) in enumerate(_render_all(town, views, supersample)):
-        rng, own = generator(seed, SceneStream.PHOTOGRAPH, row), shots.sensor(sensor, row)
-        exposure, balance = shots.exposures[row], shots.balance[row]
-        shot = photograph(linear, exposure, own, balance=balance, rng=rng)
-        reference = photograph(linear, 1.0, Sensor(curve=sensor.curve))
-        _write_view(root, views.names[row], shot, reference, linear, depth)
-        photographs.append(shot)
-        depths.append(depth)
-        if (row + 1) % 10 == 0:
-            report(f"rendered {row + 1} of {len(views.names)} views")
-    return photographs, depths
+def _photographed(linear: np.ndarray, shots: Shots, sensor: Sensor, row: int, seed: int):
+    rng, own = generator(seed, SceneStream.PHOTOGRAPH, row), shots.sensor(sensor, row)
+    return photograph(linear, shots.exposures[row], own, balance=shots.balance[row], rng=rng)
 
 
-def _check(
-    out: Path, frames: int, width: int, height: int, iso_std: float, supersample: int
-) -> None:
-    if frames < 1 or width < 16 or height < 16 or iso_std < 0 or supersample < 1:
+def _check(out: Path, asked: dict[str, Any]) -> None:
+    frames, width, height, samples, std, step = (
+        asked[name] for name in ("frames", "width", "height", "supersample", "iso_std", "step_m")
+    )
+    if frames < 1 or width < 16 or height < 16 or std < 0 or samples < 1:
         raise UserError(
-            f"cannot render {frames} frames of {width}x{height} with {supersample} samples a side "
-            f"and ISO std {iso_std}",
+            f"cannot render {frames} frames of {width}x{height} with {samples} samples a side "
+            f"and ISO std {std}",
             fix="use at least 1 frame, 16x16 pixels, 1 sample, and a spread of 0 or more",
         )
     _require_free(out)
-
-
-def _check_way(frames: int, step: float, layout: Layout) -> None:
     way = (frames - 1) * step
-    if layout != "long" and way > STREET_END:
+    if asked["layout"] != "long" and way > STREET_END:
         raise UserError(
             f"{frames} frames of {step:g} m go on for {way:.0f} m; the street ends after "
             f"{STREET_END:.0f}.",

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from typing import Any, Literal, NamedTuple, cast
 
 import jax
@@ -25,7 +24,6 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core.streams import noise_key
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.mcmc import shaped_noise
-from p2gs_jax.render.capacity import Room
 from p2gs_jax.render.harmonics import coefficient_count
 from p2gs_jax.render.visible import (
     block_size,
@@ -38,16 +36,17 @@ from p2gs_jax.render.visible import (
 )
 from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.train import image_gradient
-from p2gs_jax.train.exposure_loss import Partner
 from p2gs_jax.train.image_gradient import ImageGradient, Listed, differentiable
 from p2gs_jax.train.optimizer import learning_rates, means_rate
 from p2gs_jax.train.state import Fault, FitState
 from p2gs_jax.train.step import Step, frusta_of, per_gaussian, static_sizes
 from p2gs_jax.train.update import StepReport, is_healthy, settled, update_listed
-from p2gs_jax.types import Batch, Frustum, Gaussians
+from p2gs_jax.types import Gaussians
 
 VIEWS = "views"
 EVERYWHERE, OF_VIEWS = P(), P(VIEWS)
+
+Count = int | Literal["all"]
 
 
 def default_mesh(count: int = 1) -> Mesh:
@@ -55,12 +54,7 @@ def default_mesh(count: int = 1) -> Mesh:
     return Mesh(np.array(jax.devices()[:count]), (VIEWS,))
 
 
-def _counted(devices: int | Literal["all"]) -> int:
-    """Return a number of devices.
-
-    Raises:
-        UserError: there are not so many.
-    """
+def _counted(devices: Count) -> int:
     there = jax.device_count()
     if devices == "all":
         return there
@@ -78,7 +72,7 @@ def _counted(devices: int | Literal["all"]) -> int:
     return devices
 
 
-def with_a_view_each(cfg: FitConfig, devices: int | Literal["all"]) -> FitConfig:
+def with_a_view_each(cfg: FitConfig, devices: Count) -> FitConfig:
     """Return a configuration that gives every device a view where it says nothing of batches.
 
     Raises:
@@ -90,7 +84,7 @@ def with_a_view_each(cfg: FitConfig, devices: int | Literal["all"]) -> FitConfig
     return dataclasses.replace(cfg, train=dataclasses.replace(cfg.train, batch=count))
 
 
-def mesh_of(cfg: FitConfig, devices: int | Literal["all"] = 1) -> Mesh | None:
+def mesh_of(cfg: FitConfig, devices: Count = 1) -> Mesh | None:
     """Return the mesh of a fit; None for one view a step on one device.
 
     Raises:
@@ -111,11 +105,7 @@ def mesh_of(cfg: FitConfig, devices: int | Literal["all"] = 1) -> Mesh | None:
 
 @dataclasses.dataclass(frozen=True)
 class Spread:
-    """How a state lies on the devices of a fit: on each of them, or where JAX puts it.
-
-    Attributes:
-        mesh: the devices; None: one, where nothing is moved.
-    """
+    """How a state lies on the devices of a fit: whole on each of `mesh`, or, None, on one."""
 
     mesh: Mesh | None
 
@@ -143,23 +133,11 @@ def placed(tree: Any, mesh: Mesh, spec: P) -> Any:
     return jax.tree.map(lambda a: jax.device_put(np.asarray(a), sharding), tree)
 
 
-# -------------------------------------------------------------- what each device does
+# ------------------------------------------------- what each device does, with its own views
 
 
-def show(gaussians, alive, frusta: tuple[Frustum, ...], active_degree, owner, **given) -> Listed:
-    """List and project what each of the device's views may show; see `image_gradient.show`.
-
-    Args:
-        gaussians: the scene.
-        alive: slots in use.
-        frusta: the device's views, stacked.
-        active_degree: spherical-harmonics degree in use.
-        owner: the moving object that each Gaussian belongs to, or None.
-        given: static arguments.
-
-    Returns:
-        Stacked, one for each view; `visible` has a second axis of length 1.
-    """
+def _show(gaussians, alive, frusta, active_degree, owner, **given) -> Listed:
+    """List and project what each view may show; everything is stacked, `visible` as [b, 1]."""
 
     def one(views):
         return image_gradient.show(gaussians, alive, views, active_degree, owner, **given)
@@ -168,21 +146,12 @@ def show(gaussians, alive, frusta: tuple[Frustum, ...], active_degree, owner, **
     return listed._replace(visible=listed.visible[:, None])
 
 
-def differentiate(
-    shown, photometry, appearance, batch: Batch, partner: Partner, *, views: int, **given
+def _differentiate(
+    shown, photometry, appearance, batch, partner, *, views: int, **given
 ) -> ImageGradient:
-    """Return the mean loss of all views, and its gradient; by splats, those of the own views.
+    """Return the mean loss of all `views` of the step, and its gradient.
 
-    Gradients by splats are those of a view's own loss; `advance` takes their mean.
-
-    Args:
-        shown: from `show`.
-        photometry: of all views of the fit.
-        appearance: corrections, or None.
-        batch: the device's views, stacked.
-        partner: of each.
-        views: of the step.
-        given: static arguments of `image_gradient.differentiate`.
+    Gradients by splats are those of the device's views, each of its own loss.
     """
 
     def one(own):
@@ -209,53 +178,50 @@ def differentiate(
 
 
 class Sums(NamedTuple):
-    """What the views of a step add up to.
+    """What the views of a step add up to."""
 
-    Attributes:
-        gradient: of the sum of the views' losses.
-        shown: views that may show each.
-        grad2d: norms of the gradients by the place on the screen, in units of half the image.
-        pulled: views in which that was not zero.
-    """
-
-    gradient: Gaussians
-    shown: Int[Array, " n"]
+    gradient: Gaussians  # of the sum of the views' losses
+    shown: Int[Array, " n"]  # views that may show each
+    # norms of the gradients by the place on the screen, in units of half the image
     grad2d: Float[Array, " n"]
-    pulled: Float[Array, " n"]
+    pulled: Float[Array, " n"]  # views in which that was not zero
 
 
-def advance(
+def _advance(
     state: FitState,
     ids: Int[Array, "b v"],
     visible: Int[Array, "b 1"],
     gradient: ImageGradient,
-    frusta: tuple[Frustum, ...],
+    frusta,
     controls,
     *,
-    cfg,
+    cfg: FitConfig,
     optimizer,
     extent: float,
     noise: float | None,
     degree: int,
     views: int,
 ) -> tuple[FitState, StepReport]:
-    """Move everything by one step, on each device alike; see `update.advance`.
-
-    `ids` and `visible` are those of the device's views, from `show`; `views` counts those of the
-    step.
-    """
+    """Move everything by one step, on each device alike; see `update.advance`."""
     gaussians, population = state.params.gaussians, state.population
     alive, n, bands = population.alive, gaussians.capacity, coefficient_count(degree)
     most = lax.pmax(jnp.max(visible), VIEWS)
     fits = ~gradient.overflow & (most <= ids.shape[1])
     healthy = is_healthy(state, gradient, fits)
-
     sums = _sums(state, ids, visible, gradient, frusta, controls, cfg, bands)
     seen, count = compact((sums.shown > 0) & alive, whole_blocks(n))
-
     progress, rate = controls.progress, controls.rate
     rates = learning_rates(progress, rate, extent, state.params, cfg, bands)
     rates = jax.tree.map(lambda r: r * views**0.5, rates)
+    noise_rate = (noise or 0.0) * means_rate(progress, rate, extent, cfg) * views**0.5
+    key = noise_key(controls.seed, state.step)
+
+    def exploring(block, rows, moved, on):
+        # Each Gaussian's noise is its own, whatever else is listed.
+        keys = jax.vmap(functools.partial(jax.random.fold_in, key))(rows)
+        normal = jax.vmap(lambda k: jax.random.normal(k, (3,)))(keys)
+        return shaped_noise(normal, moved, on, noise_rate)
+
     updated = update_listed(
         gaussians,
         state.opt_state.gaussians,
@@ -269,7 +235,7 @@ def advance(
         v_seen=jax.tree.map(lambda g: g / views, take_rows(sums.gradient, seen, bands)),
         adam=optimizer.gaussians,
         rates=rates.gaussians,
-        noise=None if noise is None else _noise(noise, state, controls, cfg, extent, views),
+        noise=None if noise is None else exploring,
         owner=population.owner,
     )
     if noise is None:
@@ -329,53 +295,48 @@ def _sums(state, ids, visible, gradient, frusta, controls, cfg, bands: int) -> S
     return lax.psum(sums, VIEWS)
 
 
-def _noise(scale: float, state, controls, cfg, extent: float, views: int):
-    """Return the noise of `update_listed`; each Gaussian's is its own, whatever else is listed."""
-    key = noise_key(controls.seed, state.step)
-    rate = scale * means_rate(controls.progress, controls.rate, extent, cfg)
-    rate = rate * views**0.5
-
-    def noise(block, rows, moved, on):
-        del block
-        keys = jax.vmap(functools.partial(jax.random.fold_in, key))(rows)
-        normal = jax.vmap(lambda k: jax.random.normal(k, (3,)))(keys)
-        return shaped_noise(normal, moved, on, rate)
-
-    return noise
-
-
 # ---------------------------------------------------------------------------- the step
 
-# Where the results lie; records annotate arrays.
-LISTED: Any = cast(Any, Listed)(ids=OF_VIEWS, visible=OF_VIEWS, shown=OF_VIEWS)
 GRADIENT: Any = cast(Any, ImageGradient)(
     **{name: EVERYWHERE for name in ImageGradient._fields}
     | {"v_shown": OF_VIEWS, "visible": OF_VIEWS}
 )
-# Along which axis the arguments and the results of each program are divided.
-SPECS: dict[str, tuple[Any, Any]] = {
-    "show": ((EVERYWHERE, EVERYWHERE, OF_VIEWS, EVERYWHERE, EVERYWHERE), LISTED),
-    "differentiate": ((OF_VIEWS, EVERYWHERE, EVERYWHERE, OF_VIEWS, OF_VIEWS), GRADIENT),
+# Each program, and along which axis its arguments and its results are divided.
+PROGRAMS: dict[str, tuple[Any, Any, Any]] = {
+    "show": (_show, (EVERYWHERE, EVERYWHERE, OF_VIEWS, EVERYWHERE, EVERYWHERE), OF_VIEWS),
+    "differentiate": (
+        _differentiate,
+        (OF_VIEWS, EVERYWHERE, EVERYWHERE, OF_VIEWS, OF_VIEWS),
+        GRADIENT,
+    ),
     "advance": (
+        _advance,
         (EVERYWHERE, OF_VIEWS, OF_VIEWS, GRADIENT, OF_VIEWS, EVERYWHERE),
-        (EVERYWHERE, EVERYWHERE),
+        EVERYWHERE,
     ),
 }
 
 
+@functools.cache
+def _compiled(name: str, *, mesh: Mesh, **static: Any) -> Any:
+    """Return a part of a step, divided over the mesh and jitted."""
+    part, into, out = PROGRAMS[name]
+    body = jax.shard_map(
+        functools.partial(part, **static), mesh=mesh, in_specs=into, out_specs=out, check_vma=False
+    )
+    donated = (0,) if name == "advance" else ()
+    return jax.jit(body, compiler_options=compiler_options(), donate_argnums=donated)
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class ParallelStep:
-    """The step `(state, batch, partner, controls, ...)` of `train/step.py`, of several views.
+    """The step `(state, batch, partner, controls)` of `train/step.py`, of several views.
 
     Batches and partners come stacked, states spread (`Spread`).
-
-    Attributes:
-        single: the step of one view; its `train.batch` is a multiple of the devices.
-        mesh: the devices.
     """
 
-    single: Step
-    mesh: Mesh
+    single: Step  # the step of one view; its `train.batch` is a multiple of the devices
+    mesh: Mesh  # the devices
 
     def settings(self, name: str) -> dict[str, Any]:
         """Return what one of the three programs takes from the configuration, by argument."""
@@ -386,8 +347,8 @@ class ParallelStep:
         """Return the step made of its three programs, compiled or not."""
 
         def step(state: FitState, batch, partner, controls):
-            frusta = self._frusta(batch, partner)
-            batch, partner, frusta = placed((batch, partner, frusta), self.mesh, OF_VIEWS)
+            views = (batch, partner, self._frusta(batch, partner))
+            batch, partner, frusta = placed(views, self.mesh, OF_VIEWS)
             controls = placed(controls, self.mesh, EVERYWHERE)
             params = state.params
             listed = show(*per_gaussian(state, frusta, controls))
@@ -398,14 +359,11 @@ class ParallelStep:
 
         return step
 
-    def lowered(
-        self, name: str, state: FitState, batch, partner, controls, *, room: Room, degree: int
-    ):
+    def lowered(self, name: str, state: FitState, batch, partner, controls, *, room, degree: int):
         """Return one of the three programs, by its name, traced for arguments of these shapes."""
 
         def program(part: str):
-            static = self.settings(part) | static_sizes(part, room, degree)
-            return _compiled(part, **static)
+            return _compiled(part, **self.settings(part), **static_sizes(part, room, degree))
 
         frusta = jax.eval_shape(self._frusta, batch, partner)
         frusta, batch, partner = self._shapes((frusta, batch, partner), OF_VIEWS)
@@ -422,17 +380,15 @@ class ParallelStep:
         moved = (state, listed.ids, listed.visible, ImageGradient(*gradient), frusta, controls)
         return program(name).lower(*moved)
 
-    def _frusta(self, batch: Batch, partner: Partner) -> tuple[Frustum, ...]:
+    def _frusta(self, batch, partner):
         """Return the views of a step, stacked."""
         every = (self.single.cfg.train.batch,)
-        return tuple(
-            dataclasses.replace(
-                frustum,
-                width=np.full(every, frustum.width, np.float32),
-                height=np.full(every, frustum.height, np.float32),
-            )
-            for frustum in frusta_of(batch, partner)
-        )
+
+        def of_all(f):
+            sizes = (np.full(every, size, np.float32) for size in (f.width, f.height))
+            return dataclasses.replace(f, **dict(zip(("width", "height"), sizes, strict=True)))
+
+        return tuple(map(of_all, frusta_of(batch, partner)))
 
     def _shapes(self, tree, spec: P):
         """Return shapes with where their arrays lie."""
@@ -440,23 +396,3 @@ class ParallelStep:
         return jax.tree.map(
             lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype, sharding=sharding), tree
         )
-
-
-@functools.cache
-def _compiled(name: str, *, mesh: Mesh, **static: Any) -> Any:
-    """Return a part of a step, divided over the mesh and jitted."""
-    parts: dict[str, Callable] = {
-        "show": show,
-        "differentiate": differentiate,
-        "advance": advance,
-    }
-    into, out = SPECS[name]
-    body = jax.shard_map(
-        functools.partial(parts[name], **static),
-        mesh=mesh,
-        in_specs=into,
-        out_specs=out,
-        check_vma=False,
-    )
-    donated = (0,) if name == "advance" else ()
-    return jax.jit(body, compiler_options=compiler_options(), donate_argnums=donated)

@@ -29,41 +29,26 @@ PAIR_POOL = 200_000
 
 
 class ColorPairs(eqx.Module):
-    """Photographed colours of the same surface points in two training views.
+    """Photographed colours of the same surface points in two training views."""
 
-    Attributes:
-        colors_i: display-encoded colours in the first view.
-        colors_j: and in the second.
-        views_i: rows in `Photometry`.
-        views_j: likewise.
-        valid: 1 = use.
-        positions_i: where in the first view's image, from its centre in units of half its
-            diagonal; None where nothing depends on it.
-        positions_j: likewise in the second.
-    """
-
-    colors_i: Float[Array, "m 3"]
-    colors_j: Float[Array, "m 3"]
-    views_i: Int[Array, " m"]
-    views_j: Int[Array, " m"]
-    valid: Float[Array, " m"]
+    colors_i: Float[Array, "m 3"]  # display-encoded colours in the first view
+    colors_j: Float[Array, "m 3"]  # and in the second
+    views_i: Int[Array, " m"]  # rows in `Photometry`
+    views_j: Int[Array, " m"]  # likewise
+    valid: Float[Array, " m"]  # 1 = use
+    # where in the first view's image, from its centre in units of half its diagonal; None where
+    # nothing depends on it
     positions_i: Float[Array, "m 2"] | None = None
-    positions_j: Float[Array, "m 2"] | None = None
+    positions_j: Float[Array, "m 2"] | None = None  # likewise in the second
 
 
 class Partner(eqx.Module):
-    """What the relative-exposure loss compares the training view with.
+    """What the relative-exposure loss compares the training view with."""
 
-    Attributes:
-        view_index: a second view, drawn at random.
-        camera: its camera, for the reading that subtracts renders; same size as the training
-            view's.
-        pairs: track observations, for the reading that compares photographs.
-    """
-
-    view_index: Int[Array, ""]
+    view_index: Int[Array, ""]  # a second view, drawn at random
+    # its camera, for the reading that subtracts renders; same size as the training view's
     camera: Camera | None = None
-    pairs: ColorPairs | None = None
+    pairs: ColorPairs | None = None  # track observations, for the reading that compares photographs
 
     @property
     def cameras(self) -> tuple[Camera, ...]:
@@ -124,13 +109,8 @@ def relative_exposure_loss(
 ) -> Float[Array, ""]:
     """Return the configured reading, unweighted.
 
-    Args:
-        linears: renders of both views, the second for `literal_pixels` only.
-        views: their rows in `photometry`.
-        pairs: corresponding observations, for `observed_ldr`.
-        photometry: what every view did to light.
-        loss: the reading, and which values tell of exposure.
-        cfg: the image formation model.
+    `linears` are renders of both `views`, the second for `literal_pixels` only; `pairs` are
+    corresponding observations, for `observed_ldr`.
 
     Raises:
         ValueError: the reading needs a second render or observations that were not given, or

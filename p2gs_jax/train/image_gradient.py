@@ -28,28 +28,17 @@ LEAST_SEEN = 0.5 / 255
 
 
 class Listed(NamedTuple):
-    """What a step shows.
+    """The Gaussians that the views of a step may show."""
 
-    Attributes:
-        ids: of the Gaussians that the views may show, from `compact`.
-        visible: how many there are.
-        shown: splats and radiance of the listed ones in each view.
-    """
-
-    ids: Int[Array, " v"]
-    visible: Int[Array, ""]
-    shown: tuple[Shown, ...]
+    ids: Int[Array, " v"]  # from `compact`
+    visible: Int[Array, ""]  # how many there are; more than `ids` hold where there was no room
+    shown: tuple[Shown, ...]  # splats and radiance of the listed ones in each view
 
 
 class LossAux(NamedTuple):
     """What a step reports beside the loss.
 
-    Attributes:
-        terms: weighted terms by name.
-        render: of the training view.
-        ldr: its display image, unclamped.
-        entries: tile-list entries that the larger of the renders needed.
-        overflow: a tile list did not fit.
+    `ldr` is the unclamped display image, `entries` are those that the larger of the renders needed.
     """
 
     terms: dict[str, Float[Array, ""]]
@@ -60,27 +49,16 @@ class LossAux(NamedTuple):
 
 
 class ImageGradient(NamedTuple):
-    """The loss of the images and its gradients.
+    """The loss of the images and its gradients."""
 
-    Attributes:
-        loss: sum of the terms.
-        terms: by name, weighted.
-        v_shown: gradient by what `differentiable` takes of the splats.
-        v_rest: by photometry and appearance.
-        entries: tile-list entries that were needed.
-        overflow: they did not fit.
-        visible: which of the listed Gaussians are in the training view.
-        psnr: of the view, dB.
-    """
-
-    loss: Float[Array, ""]
-    terms: dict[str, Float[Array, ""]]
-    v_shown: Any
-    v_rest: Any
-    entries: Int[Array, ""]
+    loss: Float[Array, ""]  # sum of the terms
+    terms: dict[str, Float[Array, ""]]  # by name, weighted
+    v_shown: Any  # gradient by what `differentiable` takes of the splats
+    v_rest: Any  # by photometry and appearance
+    entries: Int[Array, ""]  # tile-list entries that were needed; `overflow`: they did not fit
     overflow: Bool[Array, ""]
-    visible: Bool[Array, " v"]
-    psnr: Float[Array, ""]
+    visible: Bool[Array, " v"]  # which of the listed Gaussians are in the training view
+    psnr: Float[Array, ""]  # of the view, dB
 
 
 def show(
@@ -96,15 +74,10 @@ def show(
 ) -> Listed:
     """List what the views of a step may show, and project it.
 
-    Args:
-        gaussians: the scene.
-        alive: slots in use.
-        frusta: the views.
-        active_degree: spherical-harmonics degree in use.
-        owner: the moving object that each Gaussian belongs to, or None.
-        cfg: rendering; whether what no view may show is left out.
-        room: length of the list; what finds no place is counted, not listed.
-        degree: highest spherical-harmonics degree that is evaluated.
+    Only what a view may show is listed, unless `cfg.optimizer.visible_only` is off. What finds no
+    place in a list of length `room` is counted, not listed. `degree` is the highest
+    spherical-harmonics degree that is evaluated, `owner` the moving object that each Gaussian
+    belongs to.
     """
     n, render = gaussians.capacity, cfg.render
     if cfg.optimizer.visible_only:
@@ -193,15 +166,8 @@ def image_loss(
 ) -> tuple[Float[Array, ""], LossAux]:
     """Return the loss of one view and its terms.
 
-    Args:
-        shown: splats and radiance in the view and in each of `partner.cameras`.
-        photometry: exposures and gammas of all views.
-        appearance: corrections of display values, or None.
-        batch: the photograph.
-        partner: the second view of the relative-exposure loss.
-        cfg: rendering, formation model, what a saturated pixel tells.
-        terms: by name.
-        capacity: tile-list entries.
+    `shown` are splats and radiance in the view and in each of `partner.cameras`; `photometry` and
+    `appearance` are those of all views; `capacity` is the length of the tile lists.
     """
     deep = any(getattr(term, "needs_depth", False) for term in terms.values())
     cameras = (batch.camera, *partner.cameras)
@@ -244,7 +210,7 @@ def total_loss(
 ) -> tuple[Float[Array, ""], LossAux]:
     """Return the loss of one view and its terms, as one function of the parameters.
 
-    The step computes the same in blocks (train/step.py). Arguments are those of `image_loss` and
+    The step computes the same in blocks (train/step.py). Arguments are those of `image_loss`,
     `show`.
     """
     cameras = (batch.camera, *partner.cameras)
@@ -266,15 +232,7 @@ def differentiate(
 ) -> ImageGradient:
     """Composite a view, compare it with its photograph and return the gradient of the loss.
 
-    Args:
-        shown: from `show`.
-        photometry: of all views.
-        appearance: corrections of all views, or None.
-        batch: the view and its photograph.
-        partner: the second view, as the loss needs it.
-        cfg: see `image_loss`.
-        terms: by name.
-        room: length of the tile lists.
+    Arguments are those of `image_loss`; `room` is the length of the tile lists.
     """
     (loss, aux), (v_shown, *v_rest) = jax.value_and_grad(
         image_loss, argnums=(0, 1, 2), has_aux=True, allow_int=True

@@ -30,11 +30,8 @@ PAIRS_PER_STEP = 4096
 class TrainingViews:
     """Photographs of the training views at any level of the coarse-to-fine schedule.
 
-    Args:
-        store: decodes and caches photographs.
-        rows: rows of the training views in the scene, in the order of `Photometry`.
-        seed: decides the order of every epoch.
-        measured: of every training view the depths that the loss compares with, or None.
+    `rows` are rows in the scene, in the order of `Photometry`; `seed` decides the order of every
+    epoch; `measured` are the depths that the loss compares each view with, or None.
     """
 
     def __init__(
@@ -117,13 +114,8 @@ def batches_of(
 ) -> list[tuple[int, ...]]:
     """Return an epoch as batches of views that one program can take, each view once at least.
 
-    Views of a kind stay in their order. What is left over of a kind is filled up from its
-    beginning; batches take the turn of their first view.
-
-    Args:
-        order: the views of the epoch.
-        kinds: of every view; those of one kind have images of one size.
-        count: views of a batch.
+    Views of a kind have images of one size and stay in their order. What is left over of a kind is
+    filled up from its beginning; batches take the turn of their first view.
     """
     by_kind: dict[Hashable, list[int]] = {}
     for view in order:
@@ -150,13 +142,7 @@ def _of_one_type(arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
 
 
 class Inputs(NamedTuple):
-    """Arguments of a step, all on the host.
-
-    Attributes:
-        batch: the view and its photograph; of several views, stacked.
-        partner: what the relative-exposure loss compares it with.
-        controls: of the schedule.
-    """
+    """Arguments of a step, all on the host; those of several views are stacked."""
 
     batch: Batch
     partner: Partner
@@ -171,11 +157,7 @@ class Inputs(NamedTuple):
 def controls_at(progress: float, pace: float, shown: float, cfg: FitConfig) -> Controls:
     """Return what the schedule says at this point of a run.
 
-    Args:
-        progress: fraction of the run completed.
-        pace: progress of one step.
-        shown: share of the scene that a view shows.
-        cfg: schedules, seed.
+    `pace` is the progress of one step, `shown` the share of the scene that a view shows.
     """
     degree = schedule.sh_degree_at(progress, cfg.train, cfg.render.sh_degree)
     rate = schedule.rate_factor(pace, shown, cfg.optimizer.settled)
@@ -193,13 +175,8 @@ def inputs_at(
 ) -> Inputs:
     """Return the inputs of a step.
 
-    Args:
-        step: views taken before it.
-        controls: of the schedule.
-        shrink: factor by which images are shrunk.
-        views: the training views.
-        pairs: corresponding observations, where the relative-exposure loss compares photographs.
-        cfg: the reading of that loss, views of a step, the seed.
+    `step` counts the views taken before it, `shrink` is the factor by which images are shrunk,
+    `pairs` are corresponding observations, where the relative-exposure loss compares photographs.
     """
     rows = views.indices_at(step, cfg.train.batch)
     each = [

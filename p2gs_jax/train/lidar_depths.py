@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import overload
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -66,13 +66,7 @@ class KeptDepths(Sequence[Measured]):
     def __len__(self) -> int:
         return len(self._kept)
 
-    @overload
-    def __getitem__(self, row: int) -> Measured: ...
-
-    @overload
-    def __getitem__(self, row: slice) -> list[Measured]: ...
-
-    def __getitem__(self, row: int | slice) -> Measured | list[Measured]:
+    def __getitem__(self, row: Any) -> Any:
         if isinstance(row, slice):
             return [self[k] for k in range(*row.indices(len(self)))]
         places, depths = self._kept[row]

@@ -59,14 +59,10 @@ PACE_SHARE = 0.3
 
 @dataclass(frozen=True)
 class TrainResult:
-    """The end of a run.
+    """The end of a run: state, counters, and the bound on its population.
 
-    Attributes:
-        state: parameters and population.
-        host: counters.
-        max_gaussians: bound on the population.
-        seconds: of this session, by name: compiling (waited for), steps, densification,
-            checkpoints.
+    `seconds` are those of this session, by name: compiling (waited for), steps, densification,
+    checkpoints.
     """
 
     state: FitState
@@ -201,10 +197,8 @@ class Trainer:
     def expect(self, params: Params, owner, images: bool) -> None:
         """Begin to compile the steps of a run before its colours and exposures are known.
 
-        Args:
-            params: as the run will have them, as far as they are known.
-            owner: see `run`.
-            images: the tone curve is known.
+        `params` are as the run will have them, as far as they are known; `images`: so is the tone
+        curve.
         """
         seeds = params.gaussians.capacity
         self.slots = strategies.started(self.strategy, seeds)
@@ -256,14 +250,8 @@ class Trainer:
         """Dispatch steps up to the next line of the log, then read how they went.
 
         Where a view finds no room, the steps that the device refused do not count, and the room
-        grows.
-
-        Args:
-            state: to start from; donated.
-            host: counters; changed.
-
-        Returns:
-            The state, and a report of every step that was taken.
+        grows. The state is donated, the counters of `host` change. A report of every step that was
+        taken is returned.
 
         Raises:
             DivergenceError: a loss term or gradient is not finite.
@@ -365,14 +353,9 @@ class Trainer:
         )
 
     def _expect(self, state: FitState, host: HostState, images: bool = True) -> None:
-        """Begin to compile what is known of the steps to come.
+        """Begin to compile what is known of the steps to come; `state` may be its shapes.
 
         Levels with images of several sizes are left out: it is not known which comes first.
-
-        Args:
-            state: to start from, or its shapes.
-            host: how far the run is, and its rooms.
-            images: see `expect`.
         """
         if not getattr(self.strategy, "slots_stay", True):
             return

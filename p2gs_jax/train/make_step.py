@@ -45,17 +45,11 @@ PIXELS = 640 * 480
 
 
 class Own(NamedTuple):
-    """What a caller brings to a fit, in the place of what its configuration says; see `make_step`.
+    """What a caller brings to a fit, in the place of what its configuration says (`make_step`)."""
 
-    Attributes:
-        terms: loss terms by name.
-        formation: an image formation, or None.
-        strategy: a densification, or None.
-    """
-
-    terms: Mapping[str, LossTerm | None] | None = None
-    formation: Formation | None = None
-    strategy: Strategy | None = None
+    terms: Mapping[str, LossTerm | None] | None = None  # loss terms by name
+    formation: Formation | None = None  # an image formation, or None
+    strategy: Strategy | None = None  # a densification, or None
 
     def among(self, params: Params) -> Params:
         """Return parameters with those of the formation, if there is one."""

@@ -24,13 +24,7 @@ WARMUP_START = 0.01
 
 
 class AdamState(NamedTuple):
-    """Moments, and how often they were updated.
-
-    Attributes:
-        counts: updates; one number, or one per row of the parameters.
-        mu: first moments.
-        nu: second moments.
-    """
+    """Moments, and counts of updates: one number, or one per row of the parameters."""
 
     counts: Int[Array, "..."]
     mu: Any
@@ -38,25 +32,19 @@ class AdamState(NamedTuple):
 
 
 class OptState(NamedTuple):
-    """The optimiser's state.
-
-    Attributes:
-        gaussians: of the Gaussians, updates counted one by one.
-        rest: of photometry and appearance.
-    """
+    """The optimiser's state; updates of the Gaussians are counted one by one."""
 
     gaussians: AdamState
     rest: AdamState
+    """Of (photometry, appearance)."""
 
 
 class Adam(NamedTuple):
     """Adam (Kingma and Ba 2015), as a static argument of compiled functions.
 
-    Attributes:
-        b1: share of the old mean of the gradients.
-        b2: share of the old mean of their squares.
-        eps: added to the root of the second moment.
-        by_row: count updates of every row, which the first axes of all parameters share.
+    `b1` and `b2` are the shares of the old means of the gradients and of their squares, `eps` is
+    added to the root of the second moment. With `by_row`, updates of every row are counted, which
+    the first axes of all parameters share.
     """
 
     b1: float = 0.9
@@ -91,12 +79,7 @@ class Adam(NamedTuple):
 
 
 class Optimizer(NamedTuple):
-    """Adam over the parameters; equal for equal constants.
-
-    Attributes:
-        gaussians: for any rows of the Gaussians.
-        rest: for (photometry, appearance).
-    """
+    """Adam for any rows of the Gaussians, and for (photometry, appearance)."""
 
     gaussians: Adam
     rest: Adam
@@ -150,13 +133,8 @@ def learning_rates(
 ) -> Params:
     """Return the rate of every parameter, shaped to broadcast against `like`.
 
-    Args:
-        progress: fraction of the run completed.
-        rate: factor on those of Gaussians but for colours (`schedule.rate_factor`).
-        extent: scene extent, scene units.
-        like: the parameters, for their structure.
-        cfg: rates and schedules.
-        bands: spherical-harmonics coefficients in use.
+    `rate` is the factor on those of Gaussians but for colours (`schedule.rate_factor`), `extent`
+    that of the scene in scene units, `bands` the number of spherical-harmonics coefficients in use.
     """
     o = cfg.optimizer
     final = o.final**progress

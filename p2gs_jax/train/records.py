@@ -29,11 +29,8 @@ def record_of(
 ) -> LogRecord:
     """Return what is logged of a burst.
 
-    Args:
-        reports: of its steps, one at least.
-        host: after it.
-        gaussians: population after it.
-        left_s: seconds that optimisation still takes, about; None: not known yet.
+    `reports` are those of its steps, `host` and `gaussians` the counters and the population after
+    it. `left_s` are the seconds that optimisation still takes, about; None: not known yet.
     """
     last = reports[-1]
     return LogRecord(
@@ -88,11 +85,7 @@ def pause_between(every_s: float, took_s: float) -> float:
 class RunCheckpoints:
     """State and counters of a run, what its scene decided, and how it continues from them.
 
-    Args:
-        store: where they lie.
-        cfg: what the run is optimised under.
-        decided: what the scene settled; a run that is resumed must have settled the same.
-        on_message: told what the user must know.
+    A run that is resumed must have `decided` the same.
     """
 
     def __init__(

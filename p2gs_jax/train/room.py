@@ -124,16 +124,8 @@ def allocate(
 ) -> Rooms:
     """Return rooms for every image size to come.
 
-    Args:
-        rooms: those that are known; they stay.
-        begun: those for which programs are compiled already, taken where they suffice.
-        views: the training views.
-        shrinks: factors by which images are still to be shrunk.
-        gaussians: the population.
-        alive: slots in use.
-        limit: the largest population to come.
-        cfg: near plane, blur, cutoffs, tile size.
-        owner: see `count_view`.
+    Those in `rooms` stay. Those in `begun`, for which programs are compiled already, are taken
+    where they suffice. `limit` is the largest population to come; for the rest see `count_view`.
     """
     found = dict(rooms)
     gaussians, alive, owner = jax.tree.map(np.asarray, (gaussians, alive, owner))

@@ -56,13 +56,8 @@ def shrinks_left(progress: float, plan: Levels) -> list[int]:
 def seconds_left(progress: float, per_step: float, step_s: float, plan: Levels) -> float:
     """Return about how many seconds the steps to come take.
 
-    Steps of every level count as a multiple of the present ones: finer ones cost more.
-
-    Args:
-        progress: fraction completed.
-        per_step: progress of one step.
-        step_s: measured seconds per step at the present level.
-        plan: the levels.
+    Steps of every level count as a multiple of the present ones, which take `step_s` seconds: finer
+    ones cost more. `per_step` is the progress of one step.
     """
     present, total = shrink_at(progress, plan), 0.0
     for end, shrink in plan:
@@ -92,12 +87,9 @@ def rate_factor(per_step: float, shown: float, settled: float | None) -> float:
     """Return the factor on rates of Gaussians but for colours in a fit of this length, at most 1.
 
     Near an optimum the noise of Adam's steps adds up as their number times the squared rate: so
-    long fits take rates lower by the root of their length (ours: BUILD_NOTES, "Length").
-
-    Args:
-        per_step: progress of one step.
-        shown: share of the Gaussians that one step updates, about.
-        settled: updates of a Gaussian up to which the configured rates hold; None: any number.
+    long fits take rates lower by the root of their length (ours: BUILD_NOTES, "Length"). `shown` is
+    the share of the Gaussians that one step updates, `settled` the updates of a Gaussian up to
+    which the configured rates hold; None: any number.
     """
     if settled is None:
         return 1.0
@@ -107,14 +99,9 @@ def rate_factor(per_step: float, shown: float, settled: float | None) -> float:
 def replanned(per_step: float, progress: float, left_s: float, step_s: float) -> float:
     """Return the progress of a step with which the run ends on time.
 
-    Under a budget, progress is the share of time: every level of the schedule gets its share
-    of the seconds, whatever its steps cost, and compilation counts like any other second.
-
-    Args:
-        per_step: progress of a step until now.
-        progress: where the run is.
-        left_s: seconds until the deadline.
-        step_s: measured seconds per step at the present level.
+    Under a budget, progress is the share of time: every level of the schedule gets its share of the
+    seconds, whatever its steps cost, and compilation counts like any other second. Until now a step
+    made `per_step` and takes `step_s` seconds; the deadline is in `left_s` seconds.
     """
     wanted = (1.0 - progress) * step_s / max(left_s, 1e-3)
     # One slow burst (another program, a page fault) must not use up the schedule.

@@ -23,19 +23,12 @@ FAULT_NONE, FAULT_OVERFLOW, FAULT_NONFINITE = 0, 1, 2
 
 
 class Fault(eqx.Module):
-    """Why the state stopped advancing; sticky, so the host need not look after every step.
+    """Why the state stopped advancing; sticky, so the host need not look after every step."""
 
-    Attributes:
-        kind: 0 none, 1 a view needs more room, 2 something is not finite.
-        needed: entries that the tile list needed.
-        visible: Gaussians that the view showed.
-        term: index into the names of loss terms and gradients that was not finite.
-    """
-
-    kind: Int[Array, ""]
-    needed: Int[Array, ""]
-    visible: Int[Array, ""]
-    term: Int[Array, ""]
+    kind: Int[Array, ""]  # 0 none, 1 a view needs more room, 2 something is not finite
+    needed: Int[Array, ""]  # entries that the tile list needed
+    visible: Int[Array, ""]  # Gaussians that the view showed
+    term: Int[Array, ""]  # index into the names of loss terms and gradients that was not finite
 
     @classmethod
     def none(cls) -> Fault:
@@ -44,15 +37,7 @@ class Fault(eqx.Module):
 
 
 class FitState(eqx.Module):
-    """Everything that a step reads and writes.
-
-    Attributes:
-        params: the differentiable pytree.
-        opt_state: the optimiser's.
-        population: who is alive.
-        step: steps completed, a view each.
-        fault: while it is set, steps leave the state as it is.
-    """
+    """Everything that a step reads and writes; `step` counts views."""
 
     params: Params
     opt_state: OptState
@@ -63,33 +48,20 @@ class FitState(eqx.Module):
 
 @dataclass
 class HostState:
-    """What the host remembers between bursts; saved with every checkpoint.
+    """What the host remembers between bursts; saved with every checkpoint."""
 
-    Attributes:
-        step: steps completed, a view each.
-        progress: fraction of the run completed.
-        pace: progress per step.
-        elapsed_s: seconds of earlier sessions and of this one.
-        densified_at: progress of the last densification.
-        reset_at: progress of the last opacity reset.
-        refused: densification requests that found no slot, summed.
-        overflows: tile lists grown.
-        rooms: room of a view for every "WxH".
-        shrink: factor by which images are shrunk at the present level.
-        step_s: running estimate of the seconds a step takes at this level, compiling apart; 0:
-            none was timed yet.
-    """
-
-    step: int = 0
-    progress: float = 0.0
-    pace: float = 0.0
-    elapsed_s: float = 0.0
-    densified_at: float = 0.0
-    reset_at: float = 0.0
-    refused: int = 0
-    overflows: int = 0
-    rooms: dict[str, Room] = field(default_factory=dict)
-    shrink: int = 0
+    step: int = 0  # steps completed, a view each
+    progress: float = 0.0  # fraction of the run completed
+    pace: float = 0.0  # progress per step
+    elapsed_s: float = 0.0  # seconds of earlier sessions and of this one
+    densified_at: float = 0.0  # progress of the last densification
+    reset_at: float = 0.0  # progress of the last opacity reset
+    refused: int = 0  # densification requests that found no slot, summed
+    overflows: int = 0  # tile lists grown
+    rooms: dict[str, Room] = field(default_factory=dict)  # room of a view for every "WxH"
+    shrink: int = 0  # factor by which images are shrunk at the present level
+    # running estimate of the seconds a step takes at this level, compiling apart; 0: none was timed
+    # yet
     step_s: float = 0.0
 
     @classmethod
@@ -105,14 +77,9 @@ def initial_state(
     slots: int = 0,
     owner: Int[Array, " n"] | None = None,
 ) -> FitState:
-    """Return the state before the first step.
+    """Return the state before the first step, with room for `slots` Gaussians at least.
 
-    Args:
-        params: the start.
-        alive: which Gaussians exist.
-        optimizer: from `make_optimizer`.
-        slots: room of the population, at least what `params` holds.
-        owner: the moving object that each Gaussian belongs to, or None.
+    `alive` says which of `params` exist, `owner` which moving object each belongs to.
     """
     # The step donates its state: the caller keeps its parameters.
     return jax.tree.map(jnp.asarray, _initial_state(params, alive, optimizer, slots, owner))

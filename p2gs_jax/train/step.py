@@ -71,24 +71,17 @@ class Step:
     """The step `(state, batch, partner, controls, room=..., degree=...)` of a fit.
 
     It gives the next state and a report; the state before is donated. Randomness follows from the
-    seed and the step number alone.
-
-    The loss is that of `total_loss`. What is done per Gaussian is done in blocks, for those that
-    the view may show; the others rest (`OptimizerConfig.visible_only`). What happens where
-    something does not fit or is not finite: `train/update.py`.
-
-    Attributes:
-        cfg: everything.
-        optimizer: from `make_optimizer`.
-        extent: scene extent, scene units.
-        noise: scale of the exploration noise, or None (`strategies.Strategy`).
-        terms: loss terms that differ from those of `cfg`; see `loss_terms`.
+    seed and the step number alone. The loss is that of `total_loss`. What is done per Gaussian is
+    done in blocks, for those that the view may show; the others rest
+    (`OptimizerConfig.visible_only`). What happens where something does not fit or is not finite:
+    `train/update.py`.
     """
 
-    cfg: FitConfig
-    optimizer: Optimizer
-    extent: float
-    noise: float | None = None
+    cfg: FitConfig  # everything
+    optimizer: Optimizer  # from `make_optimizer`
+    extent: float  # scene extent, scene units
+    noise: float | None = None  # scale of the exploration noise, or None (`strategies.Strategy`)
+    # loss terms that differ from those of `cfg`; see `loss_terms`
     terms: Mapping[str, LossTerm | None] = dataclasses.field(default_factory=dict)
 
     def __call__(
@@ -190,23 +183,14 @@ def compilations() -> int:
 
 
 class Key(NamedTuple):
-    """What a step is compiled for.
+    """What a step is compiled for."""
 
-    Attributes:
-        size: image width and height, pixels.
-        slots: room of the population.
-        room: of a view.
-        degree: highest spherical-harmonics degree in use.
-        pixels: type of the photograph as it is stored.
-        structure: what the state, and what comes with a photograph, consist of.
-    """
-
-    size: tuple[int, int]
-    slots: int
-    room: Room
-    degree: int
-    pixels: str
-    structure: Hashable = None
+    size: tuple[int, int]  # image width and height, pixels
+    slots: int  # room of the population
+    room: Room  # of a view
+    degree: int  # highest spherical-harmonics degree in use
+    pixels: str  # type of the photograph as it is stored
+    structure: Hashable = None  # what the state, and what comes with a photograph, consist of
 
 
 class StepPrograms:
@@ -232,11 +216,8 @@ class StepPrograms:
     def expect(self, step: Any, key: Key, *arguments: Any, images: bool = True) -> None:
         """Begin to compile a step in the background.
 
-        Args:
-            step: of the fit: a `Step`, or one of several views.
-            key: what for.
-            arguments: of the step, or their shapes.
-            images: the program between as well, which knows the tone curve.
+        `step` is a `Step`, or one of several views; `arguments` are its own, or their shapes.
+        Without `images`, the program between waits, which knows the tone curve.
         """
         self._parts(step, key, arguments, images)
 
@@ -267,11 +248,7 @@ class StepPrograms:
     def ahead(self, key: Hashable, program, *arguments: Any, **static: Any) -> Callable:
         """Begin to compile another program in the background, and return it.
 
-        Args:
-            key: tells it from others.
-            program: a jitted function.
-            arguments: its arguments, or their shapes.
-            static: its static arguments, which the returned function is called without.
+        `key` tells it from others; the returned function is called without the static arguments.
         """
         if key not in self._made:
             self._made[key] = self._worker.submit(

@@ -41,15 +41,10 @@ FULL_SIZE_COST = 2.0
 
 
 class Slots(NamedTuple):
-    """How large a population may become.
+    """How large a population may become."""
 
-    Attributes:
-        limit: bound on it, or None where there is none.
-        slots: room to begin with.
-    """
-
-    limit: int | None
-    slots: int
+    limit: int | None  # bound on it, or None where there is none
+    slots: int  # room to begin with
 
     @property
     def most(self) -> int:
@@ -58,22 +53,14 @@ class Slots(NamedTuple):
 
 
 class Moment(NamedTuple):
-    """What a strategy is told when it is asked.
+    """What a strategy is told when it is asked."""
 
-    Attributes:
-        key: randomness of this densification.
-        moments: Adam's of the Gaussians.
-        extent: scene extent, scene units.
-        interval: progress between two densifications.
-        limit: bound on the population, or None.
-        host: step, progress, pace and counters; a strategy that resets opacities sets `reset_at`.
-    """
-
-    key: PRNGKeyArray
-    moments: AdamState
-    extent: float
-    interval: float
-    limit: int | None
+    key: PRNGKeyArray  # randomness of this densification
+    moments: AdamState  # Adam's of the Gaussians
+    extent: float  # scene extent, scene units
+    interval: float  # progress between two densifications
+    limit: int | None  # bound on the population, or None
+    # step, progress, pace and counters; a strategy that resets opacities sets `reset_at`
     host: HostState
 
 
@@ -250,10 +237,7 @@ class Adaptive:
 
 
 def make_strategy(cfg: FitConfig, coverage: Coverage, levels: Levels) -> Strategy:
-    """Return the strategy that `DensifyConfig` asks for.
-
-    `coverage` is how much of the scene the views show, `levels` those of the schedule.
-    """
+    """Return the strategy that `DensifyConfig` asks for."""
     if cfg.densify.method == "mcmc":
         return Mcmc(cfg, coverage, levels)
     return Keep(cfg) if cfg.densify.method is None else Adaptive(cfg)
@@ -291,14 +275,8 @@ def densified(
 ) -> FitState:
     """Return the state after a densification; moments of new Gaussians are zero.
 
-    Args:
-        strategy: is asked.
-        state: before; donated.
-        host: counters; changed.
-        cfg: seed, interval.
-        extent: scene extent, scene units.
-        limit: bound on the population, or None.
-        on_message: told of the first Gaussians that found no slot.
+    The state is donated, the counters of `host` change. `on_message` is told of the first Gaussians
+    that found no slot.
 
     Raises:
         UserError: no Gaussian is left.

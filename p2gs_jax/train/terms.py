@@ -39,63 +39,42 @@ CONTRAST_LEVEL, POOL = 0.5, 4
 
 
 class Rendered(NamedTuple):
-    """A training view as it was rendered.
+    """A training view as it was rendered."""
 
-    Attributes:
-        linear: linear HDR radiance, premultiplied by alpha.
-        alpha: accumulated opacity.
-        depth: alpha-weighted camera z, scene units; None where no term has `needs_depth`.
-        ldr: display values, over the photograph's background where it has one; not clamped.
-        judged: the same where a saturated photograph can contradict it, and elsewhere the
-            photograph itself, from which no gradient comes (`LossConfig.censored`).
-        uncorrected: `ldr` without the learned correction; None unless Luminance-GS learns one.
-    """
-
-    linear: Float[Array, "h w 3"]
-    alpha: Float[Array, "h w"]
+    linear: Float[Array, "h w 3"]  # linear HDR radiance, premultiplied by alpha
+    alpha: Float[Array, "h w"]  # accumulated opacity
+    # alpha-weighted camera z, scene units; None where no term has `needs_depth`
     depth: Float[Array, "h w"] | None
+    # display values, over the photograph's background where it has one; not clamped
     ldr: Float[Array, "h w 3"]
+    # the same where a saturated photograph can contradict it, and elsewhere the photograph itself,
+    # from which no gradient comes (`LossConfig.censored`)
     judged: Float[Array, "h w 3"]
+    # `ldr` without the learned correction; None unless Luminance-GS learns one
     uncorrected: Float[Array, "h w 3"] | None
 
 
 class Target(NamedTuple):
-    """The photograph of the view.
+    """The photograph of the view."""
 
-    Attributes:
-        ldr: display values in [0, 1], over its background where it has one.
-        mask: 1 = use, 0 = ignore.
-        alpha: its opacity, or None.
-        measured: depths that a laser scanner measured, or None.
-    """
-
-    ldr: Float[Array, "h w 3"]
-    mask: Float[Array, "h w"]
-    alpha: Float[Array, "h w"] | None
-    measured: Measured | None
+    ldr: Float[Array, "h w 3"]  # display values in [0, 1], over its background where it has one
+    mask: Float[Array, "h w"]  # 1 = use, 0 = ignore
+    alpha: Float[Array, "h w"] | None  # its opacity, or None
+    measured: Measured | None  # depths that a laser scanner measured, or None
 
 
 class Aux(NamedTuple):
-    """What else a term may know.
+    """What else a term may know."""
 
-    Attributes:
-        view: row of the view in `Photometry`.
-        capture: what its camera did to the light.
-        photometry: of all training views.
-        appearance: learned corrections of all training views, or None.
-        correction: that of this view, or None.
-        other_view: row of a second view, drawn at random.
-        other_linear: its render, where `relative_exposure` subtracts renders; else None.
-        pairs: photographed colours of the same points in two views, where it compares them.
-    """
-
-    view: Int[Array, ""]
-    capture: Capture
-    photometry: Photometry
-    appearance: Corrections | None
-    correction: Correction | None
-    other_view: Int[Array, ""]
+    view: Int[Array, ""]  # row of the view in `Photometry`
+    capture: Capture  # what its camera did to the light
+    photometry: Photometry  # of all training views
+    appearance: Corrections | None  # learned corrections of all training views, or None
+    correction: Correction | None  # that of this view, or None
+    other_view: Int[Array, ""]  # row of a second view, drawn at random
+    # its render, where `relative_exposure` subtracts renders; else None
     other_linear: Float[Array, "h w 3"] | None
+    # photographed colours of the same points in two views, where it compares them
     pairs: ColorPairs | None
 
 
@@ -108,13 +87,9 @@ The attribute `needs_depth = True` on it makes `Rendered.depth` known.
 
 @dataclass(frozen=True)
 class Term:
-    """A built-in term; equal to another where its parts are, so that fits share programs.
+    """A built-in term, `weight` times `of(rendered, target, aux, *given)`.
 
-    Attributes:
-        of: a function of (rendered, target, aux, *given).
-        weight: factor on its value.
-        given: what else it is given.
-        needs_depth: see `LossTerm`.
+    It is equal to another where its parts are, so that fits share programs.
     """
 
     of: Callable[..., Float[Array, ""] | None]
@@ -131,12 +106,9 @@ class Term:
 def loss_terms(
     cfg: FitConfig, changed: Mapping[str, LossTerm | None] | None = None
 ) -> dict[str, LossTerm]:
-    """Return the terms that a configuration asks for, by name.
+    """Return the terms that a configuration asks for, by name; a weight of None leaves a term out.
 
-    Args:
-        cfg: weights; None leaves a term out.
-        changed: terms to add, or to put in the place of those of the same name; None takes the
-            term of that name away.
+    Those in `changed` are added, or take the place of those of the same name; None takes one away.
     """
     loss, photometry = cfg.loss, cfg.photometry
     found: dict[str, LossTerm] = {"l1": Term(_l1, given=(1 - (loss.dssim_weight or 0.0),))}

@@ -39,30 +39,18 @@ from p2gs_jax.types import Frustum, Gaussians, Params, Photometry, Population, V
 
 
 class Controls(eqx.Module):
-    """What the host says about this step.
+    """What the host says about this step."""
 
-    Attributes:
-        progress: fraction of the run completed.
-        active_degree: spherical-harmonics degree in use.
-        rate: factor on the rates of Gaussians but for colours, from the length of the fit.
-        seed: of the fit, from `device_seed`.
-    """
-
-    progress: Float[Array, ""]
-    active_degree: Int[Array, ""]
+    progress: Float[Array, ""]  # fraction of the run completed
+    active_degree: Int[Array, ""]  # spherical-harmonics degree in use
+    # factor on the rates of Gaussians but for colours, from the length of the fit
     rate: Float[Array, ""]
-    seed: UInt32[Array, ""]
+    seed: UInt32[Array, ""]  # of the fit, from `device_seed`
 
 
 class StepReport(NamedTuple):
-    """What a step tells the host, which reads it after a burst.
-
-    Attributes:
-        loss: sum of the terms.
-        terms: by name, weighted.
-        psnr: of the view, dB.
-        entries: tile-list entries that the view needed.
-        visible: Gaussians that it showed.
+    """What a step tells the host: the weighted terms of the loss and their sum, PSNR of the view in
+    dB, tile-list entries that it needed, and Gaussians that it showed.
     """
 
     loss: Float[Array, ""]
@@ -73,12 +61,9 @@ class StepReport(NamedTuple):
 
 
 class Updated(NamedTuple):
-    """Gaussians and their optimiser after a step.
+    """Gaussians and their moments after a step, with the listed ones moved.
 
-    Attributes:
-        gaussians: with the listed ones moved.
-        moments: likewise.
-        finite: whether the gradient of each array is finite, in the order of `Gaussians`.
+    `finite` says of the gradient of each array, in the order of `Gaussians`, whether it was finite.
     """
 
     gaussians: Gaussians
@@ -117,10 +102,10 @@ def advance(
     noise: float | None,
     degree: int,
 ) -> tuple[FitState, StepReport]:
-    """Move the listed Gaussians, photometry and corrections by one step.
+    """Move the listed Gaussians, photometry and corrections by one step; the state is donated.
 
     Args:
-        state: before the step; donated.
+        state: before the step.
         ids: of the listed Gaussians, from `show`.
         count: how many the views may show.
         gradient: of the images' loss.
@@ -256,16 +241,9 @@ def settled(
 ) -> tuple[FitState, StepReport]:
     """Move the rest, and return the state after a step with what became of it.
 
-    Args:
-        state: before the step.
-        moved: Gaussians after it, and the population with its statistics.
-        gradient: of the images' loss.
-        fits: everything found room.
-        count: Gaussians that a view may show.
-        rates: learning rates.
-        cfg: the gauge of the exposures.
-        optimizer: from `make_optimizer`.
-        views: that the step took.
+    `moved` are the Gaussians after it, and the population with its statistics. `fits` says that
+    everything found room, `count` how many Gaussians a view may show, `views` how many the step
+    took.
     """
     updated, population = moved
     first = state.fault.kind == FAULT_NONE

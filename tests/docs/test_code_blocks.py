@@ -16,7 +16,7 @@ import pytest
 from pages import LANGUAGES, PAGES, ROOT, Block, blocks, commands, prose
 from tiny_scene import make_scene
 
-from p2gs_jax import config
+from p2gs_jax import config, presets
 from p2gs_jax.cli import main
 from p2gs_jax.cli.fit import Calibrate, Fit, checked
 from p2gs_jax.cli.parser import COMMANDS, GROUPS, parse
@@ -50,7 +50,7 @@ def quick_presets(monkeypatch):
         init=dataclasses.replace(slow.init, shell="off"),
         train=dataclasses.replace(slow.train, steps=10, coarse_to_fine=()),
     )
-    monkeypatch.setattr(config, "_robust", lambda: quick)
+    monkeypatch.setattr(presets, "FitConfig", lambda **given: dataclasses.replace(quick, **given))
 
 
 @pytest.fixture

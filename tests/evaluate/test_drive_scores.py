@@ -71,7 +71,7 @@ def metrics(scene):
     )
     cfg = FitConfig()
     store = ImageStore(scene.views, cfg.data)
-    out = evaluate(params, scene, store, render, cfg)
+    out = evaluate(params, scene, store, cfg, render=render)
     store.close()
     assert set(out.unexplained) == set(scene.train_indices)
     return plain(out.metrics)

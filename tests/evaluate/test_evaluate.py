@@ -20,7 +20,6 @@ from p2gs_jax.evaluation.passes import ArrayStore
 from p2gs_jax.evaluation.scores import Untold, untold_notes
 from p2gs_jax.jobs.sweep import to_markdown
 from p2gs_jax.photometry.metering import meter
-from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.read import load_run
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import Gaussians, Params, Photometry, Render, Scene, View
@@ -65,8 +64,8 @@ def judged(scene, *, slope=0.0, **options):
         Params(gaussians, Photometry(jnp.zeros(2), jnp.zeros(2), "log"), None),
         scene,
         store,
-        shaded,
         FitConfig(),
+        render=shaded,
         reference=lambda row: store.get(row, 1)[0],
         **options,
     ).metrics
@@ -203,12 +202,7 @@ def test_hidden_views_are_left_out_of_the_scores(tmp_path, finished_run):
     scene = dataclasses.replace(run.scene, views=tuple(map(changed, run.scene.views)))
     shown = []
     now = evaluate(
-        run.params,
-        scene,
-        ImageStore(scene.views, run.cfg.data),
-        make_renderer(run.cfg.render, run.owner),
-        run.cfg,
-        on_view=shown.append,
+        run.params, scene, ImageStore(scene.views, run.cfg.data), run.cfg, on_view=shown.append
     ).metrics
     assert sorted(now["hidden"]) == sorted([trained[0], held_out[0]])
     assert now["exposures_unknown"] == [trained[1]]

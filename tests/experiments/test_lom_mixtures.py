@@ -14,9 +14,10 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "experiments"))
 import judging
 import lom_mixtures
 
-from p2gs_jax.config import CameraFormation, FitConfig, preset
+from p2gs_jax.config import CameraFormation, FitConfig
 from p2gs_jax.photometry.appearance import exposures_apart
 from p2gs_jax.photometry.ppisp import OneView, identity
+from p2gs_jax.presets import preset
 from p2gs_jax.run.read import Run
 from p2gs_jax.types import Params, Photometry, Scene, View
 

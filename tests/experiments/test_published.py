@@ -15,8 +15,8 @@ import lom_low
 import published_rows as rows
 import write_page
 
-from p2gs_jax.config import preset
 from p2gs_jax.photometry.display import DisplayTransform, develop
+from p2gs_jax.presets import preset
 
 PUBLISHED = json.loads((rows.HERE / "published.json").read_text(encoding="utf-8"))
 KEY = rows.Key("lego", "lego", "3dgs", 30_000)

@@ -12,7 +12,7 @@ import at_size
 import tables
 import towns
 
-from p2gs_jax.config import preset
+from p2gs_jax.presets import preset
 
 
 def metrics(level: float, **extra):

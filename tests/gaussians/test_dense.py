@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from p2gs_jax.config import DataConfig, DensifyConfig, FitConfig, InitConfig, preset
+from p2gs_jax.config import DataConfig, DensifyConfig, FitConfig, InitConfig
 from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.gaussians.dense import MATCH_SIDE, coverage_of, dense_limit, dense_seeds, wants_dense
 from p2gs_jax.gaussians.flow import CHECKS, Flows, depth_map
@@ -20,6 +20,7 @@ from p2gs_jax.gaussians.matching import (
 )
 from p2gs_jax.gaussians.population import Coverage
 from p2gs_jax.photometry.observations import Observations
+from p2gs_jax.presets import preset
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import Scene, View
 

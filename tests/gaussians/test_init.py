@@ -6,9 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from p2gs_jax.config import FitConfig, InitConfig, preset
+from p2gs_jax.config import FitConfig, InitConfig
 from p2gs_jax.gaussians.seeds import cameras_radius, gaussians_from_points, subsample
 from p2gs_jax.gaussians.shell import find_shell
+from p2gs_jax.presets import preset
 from p2gs_jax.render import view_radiance
 from p2gs_jax.types import Camera, View
 

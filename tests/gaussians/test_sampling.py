@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from p2gs_jax.config import preset
 from p2gs_jax.core.numerics import srgb_decode, srgb_encode
 from p2gs_jax.evaluation.alignment import exposure_error
 from p2gs_jax.photometry.calibrate import calibrate_observations, options_of
@@ -15,6 +14,7 @@ from p2gs_jax.photometry.observations import Observations, sample_pairs
 from p2gs_jax.photometry.response import Response
 from p2gs_jax.photometry.sources.points import MOST_PER_POINT, projected_colors, track_colors
 from p2gs_jax.photometry.sources.sampling import sample
+from p2gs_jax.presets import preset
 from p2gs_jax.render.warp import project_points
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.pixels.store import ImageStore

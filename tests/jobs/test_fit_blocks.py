@@ -175,9 +175,9 @@ def test_a_plan_is_kept_also_where_its_number_was_chosen(tmp_path):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("--blocks", "0"), "no number of blocks"),
-        (("--blocks", "many"), "no number of blocks"),
-        (("--jobs", "2"), "--jobs and --engine are of blocks"),
+        (("--blocks", "0"), "is not a number of blocks"),
+        (("--blocks", "many"), "is not a number of blocks"),
+        (("--jobs", "2"), "say nothing without --blocks"),
         (("--blocks", "2", "--jobs", "0"), "--jobs must be at least 1"),
         (("--blocks", "2", "--devices", "2"), "on one device"),
         (("--blocks", "2", "--engine", "ray"), "no engine 'ray'"),

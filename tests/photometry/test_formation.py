@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from p2gs_jax.config import CameraFormation, LossConfig, PhotometryConfig, RegularizerConfig, preset
+from p2gs_jax.config import CameraFormation, LossConfig, PhotometryConfig, RegularizerConfig
 from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
 from p2gs_jax.photometry.formation import (
     camera_row,
@@ -25,6 +25,7 @@ from p2gs_jax.photometry.formation import (
 )
 from p2gs_jax.photometry.parameters import recentre
 from p2gs_jax.photometry.response import KNOTS, Response, log_exposed
+from p2gs_jax.presets import preset
 from p2gs_jax.render.harmonics import radiance_activation, radiance_preactivation
 from p2gs_jax.train.terms import photometric_loss, photometry_regularizers, variance
 from p2gs_jax.types import Capture, Gaussians, Params, Photometry

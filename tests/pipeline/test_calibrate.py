@@ -9,10 +9,10 @@ import pytest
 
 import p2gs_jax
 from p2gs_jax import calibrate, calibrate_run, calibrate_stack
-from p2gs_jax.config import preset
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.alignment import exposure_error
 from p2gs_jax.photometry.sources.stack import read_stack
+from p2gs_jax.presets import preset
 from p2gs_jax.run.photometry_files import read_photometry
 
 

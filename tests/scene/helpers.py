@@ -2,14 +2,27 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pycolmap
+import pytest
 
-from p2gs_jax.types import Scene
+from p2gs_jax.errors import UserError
+from p2gs_jax.types import Scene, View
+
+
+@contextlib.contextmanager
+def refused(*words: str) -> Iterator[None]:
+    """Expect a UserError whose message matches the first pattern, and that holds other words."""
+    with pytest.raises(UserError, match=words[0]) as info:
+        yield
+    for word in words[1:]:
+        assert word in str(info.value)
 
 
 def reprojection_errors(scene: Scene) -> np.ndarray:
@@ -55,8 +68,57 @@ def write_tiny_model(
     lines = []
     for i in range(n):
         name = f"im {i}.png"
-        cv2.imwrite(str(root / "images" / name), np.full((30, 40), 100 + i, np.uint8))
+        write_image(root / "images" / name, 100 + i)
         lines.append(f"{i + 1} {pose} 1 {name}\n21.25 17.5 7 3.0 3.0 -1\n")
     (model / "images.txt").write_text("".join(lines))
     (model / "points3D.txt").write_text(points)
     return model
+
+
+def write_image(path: Path, value: int = 100, size: tuple[int, int] = (40, 30)) -> None:
+    """Write a grey image of a width and a height."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), np.full(size[::-1], value, np.uint8))
+
+
+def write_rgba(path: Path, value: int = 90, size: tuple[int, int] = (40, 30)) -> None:
+    """Write a grey square on a transparent ground, RGBA."""
+    width, height = size
+    image = np.zeros((height, width, 4), np.uint8)
+    image[height // 4 : -(height // 4), width // 4 : -(width // 4)] = (value, value, value, 255)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), image)
+
+
+def make_view(path: Path, image: np.ndarray | None = None, f: float = 60.0, **fields) -> View:
+    """Return a view of a file, written first where an image is given; its lens is a pinhole."""
+    size = fields.pop("size", (64, 48))
+    if image is not None:
+        assert cv2.imwrite(str(path), image)
+        size = image.shape[1::-1]
+    K = np.array([[f, 0, size[0] / 2], [0, f, size[1] / 2], [0, 0, 1]], np.float32)
+    return View(path.name, path, "0", np.eye(4, dtype=np.float32), K, *size, **fields)
+
+
+def around(count: int, distance: float = 4.0) -> np.ndarray:
+    """Return OpenGL camera-to-world poses on a ring, 30 degrees up, that look at the origin."""
+    poses = []
+    for angle in 2 * np.pi * np.arange(count) / count:
+        back = np.array([0.866 * np.cos(angle), 0.866 * np.sin(angle), 0.5])
+        back /= np.linalg.norm(back)
+        right = np.cross([0.0, 0.0, 1.0], back)
+        right /= np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([right, np.cross(back, right), back], 1)
+        pose[:3, 3] = distance * back
+        poses.append(pose)
+    return np.stack(poses)
+
+
+def blender(poses: np.ndarray, part: str, angle: float = 0.7) -> dict:
+    """Return what NeRF's synthetic scenes have in the .json of a part of the split."""
+    frames = [
+        {"file_path": f"./{part}/r_{k}", "rotation": 0.01, "transform_matrix": pose.tolist()}
+        for k, pose in enumerate(poses)
+    ]
+    return {"camera_angle_x": angle, "frames": frames}

@@ -1,80 +1,77 @@
-"""Detection of formats, masks, EXIF, splits."""
+"""Detection of formats, masks, alpha, EXIF; pictures that announce more than they should."""
 
 import csv
 import dataclasses
+import struct
+import tracemalloc
+import zlib
 
 import cv2
 import numpy as np
 import pytest
 from PIL import Image
-from scene.helpers import write_tiny_model
+from scene.helpers import refused, write_image, write_tiny_model
 
 from p2gs_jax.config import DataConfig
-from p2gs_jax.errors import UserError
+from p2gs_jax.run.scene_file import read_scene, write_scene
 from p2gs_jax.scene import ImageStore, PhotographsAlone, find_scene, load_scene
 from p2gs_jax.scene.convert.headers import ExifSettings, read_exif_ev, read_exif_settings
-from p2gs_jax.scene.split import assign_split
-from p2gs_jax.types import View
+from p2gs_jax.scene.files import image_size
+from p2gs_jax.scene.masks import background_color, has_alpha
+from p2gs_jax.train.inputs import TrainingViews
 
 CFG = DataConfig()
+RNG = np.random.default_rng(0)
+
+
+def store_of(root, **options):
+    cfg = DataConfig(**options)
+    return ImageStore(load_scene(root, cfg).views, cfg)
 
 
 def test_nothing_there(tmp_path):
-    with pytest.raises(UserError, match="no scene in") as info:
+    with refused("no scene in", str(tmp_path), "COLMAP", "transforms.json", "photographs"):
         load_scene(tmp_path, CFG)
-    for expected in (str(tmp_path), "COLMAP", "transforms.json", "photographs", "images"):
-        assert expected in str(info.value)
-    with pytest.raises(UserError, match="does not exist"):
+    with refused("does not exist"):
         load_scene(tmp_path / "nowhere", CFG)
-    file = tmp_path / "notes.txt"
-    file.write_bytes(b"")
-    with pytest.raises(UserError, match=r"notes.txt is neither"):
-        load_scene(file, CFG)
+    (tmp_path / "notes.txt").write_bytes(b"")
+    with refused(r"notes.txt is neither"):
+        load_scene(tmp_path / "notes.txt", CFG)
 
 
 def test_a_folder_of_cameras_is_one_if_asked_for(tmp_path):
-    for name in ("front/0.png", "left/0.png"):
-        (tmp_path / name).parent.mkdir()
-        cv2.imwrite(str(tmp_path / name), np.zeros((8, 8, 3), np.uint8))
-    with pytest.raises(UserError, match="no scene in") as info:
+    names = ["front/0.png", "left/0.png"]
+    for name in names:
+        write_image(tmp_path / name, size=(8, 8))
+    with refused("no scene in", "folder(s) front, left", "--data.images ."):
         load_scene(tmp_path, CFG)
-    assert "folder(s) front, left" in str(info.value.fix)
-    assert "--data.images ." in str(info.value.fix)
     found = find_scene(tmp_path, dataclasses.replace(CFG, images="."))
     assert isinstance(found, PhotographsAlone)
-    assert [p.relative_to(found.folder).as_posix() for p in found.paths] == [
-        "front/0.png",
-        "left/0.png",
-    ]
+    assert [p.relative_to(found.folder).as_posix() for p in found.paths] == names
 
 
 def test_masks_are_found_and_used(tmp_path):
     write_tiny_model(tmp_path, n=4)
-    masks = tmp_path / "masks"
+    masks, names = tmp_path / "masks", ["im 0.png", "im 1.png.png", "im 2.png"]
     masks.mkdir()
     mask = np.full((30, 40), 255, np.uint8)
     mask[:, :10] = 0
-    cv2.imwrite(str(masks / "im 0.png"), mask)
-    cv2.imwrite(str(masks / "im 1.png.png"), np.dstack([mask] * 3))
-    cv2.imwrite(str(masks / "im 2.png"), mask[:, ::2][::2])
+    for name, image in zip(names, (mask, np.dstack([mask] * 3), mask[::2, ::2]), strict=True):
+        cv2.imwrite(str(masks / name), image)
     scene = load_scene(tmp_path, CFG)
-    assert [v.mask_path and v.mask_path.name for v in scene.views] == [
-        "im 0.png",
-        "im 1.png.png",
-        "im 2.png",
-        None,
-    ]
+    assert [v.mask_path and v.mask_path.name for v in scene.views] == [*names, None]
     assert "1 of 4 views have no mask: im 3.png" in scene.notes[0]
-    store = ImageStore(scene.views, CFG)
-    for i in range(2):
-        _, m = store.get(i)
-        assert np.array_equal(m, (mask > 0).astype(np.float32))
-    assert store.get(2)[1][:, :10].max() == 0.0
-    assert store.get(2)[1][:, 12:].min() == 1.0
-    assert store.get(3)[1].min() == 1.0
+    found = [ImageStore(scene.views, CFG).get(i)[1] for i in range(4)]
+    for valid in found[:2]:
+        assert np.array_equal(valid, (mask > 0).astype(np.float32))
+    assert found[2][:, :10].max() == 0.0
+    assert found[2][:, 12:].min() == found[3].min() == 1.0
     cv2.imwrite(str(masks / "im 3.png"), mask.T)
-    with pytest.raises(UserError, match="wrong size: the mask"):
-        ImageStore(load_scene(tmp_path, CFG).views, CFG).get(3)
+    with refused("wrong size: the mask .*im 3.png is 30x40"):
+        store_of(tmp_path).get(3)
+
+
+# ------------------------------------------------------------------ EXIF
 
 
 def test_exif_of_sceaux_agrees_with_its_table(shared_data):
@@ -87,69 +84,217 @@ def test_exif_of_sceaux_agrees_with_its_table(shared_data):
     assert np.allclose(ev - ev.mean(), expected - expected.mean(), atol=1e-3)
 
 
-def _jpeg_with_exif(path, tags):
-    image = Image.new("RGB", (8, 8))
+TIME, F_NUMBER, ISO, TAKEN = 33434, 33437, 34855, 36867
+FULL = {TIME: 0.01, F_NUMBER: 2.0, ISO: 400}
+
+
+def jpeg_with_exif(path, tags):
     exif = Image.Exif()
     exif.get_ifd(0x8769).update(tags)
-    image.save(path, exif=exif)
+    Image.new("RGB", (8, 8)).save(path, exif=exif)
     return path
 
 
 def test_exif_rules(tmp_path):
-    full = {33434: 0.01, 33437: 2.0, 34855: 400}
     path = tmp_path / "a.jpg"
-    assert read_exif_ev(_jpeg_with_exif(path, full)) == pytest.approx(0.0)
-    no_iso = {k: full[k] for k in (33434, 33437)}
-    assert read_exif_ev(_jpeg_with_exif(path, no_iso)) == pytest.approx(-2.0)
-    for tag in (33434, 33437):
-        rest = {k: v for k, v in full.items() if k != tag}
-        assert read_exif_ev(_jpeg_with_exif(path, rest)) is None
-    assert read_exif_ev(_jpeg_with_exif(path, {**full, 33434: 0.0})) is None
-    data = bytearray(_jpeg_with_exif(path, full).read_bytes())
-    rng = np.random.default_rng(0)
+    for tags, ev in (
+        (FULL, 0.0),
+        ({TIME: 0.01, F_NUMBER: 2.0}, -2.0),
+        ({TIME: 0.01, ISO: 400}, None),
+        ({F_NUMBER: 2.0, ISO: 400}, None),
+        ({**FULL, TIME: 0.0}, None),
+    ):
+        assert read_exif_ev(jpeg_with_exif(path, tags)) == (ev if ev is None else pytest.approx(ev))
+    data = bytearray(jpeg_with_exif(path, FULL).read_bytes())
+    at = data.find(b"Exif") + 6
     for _ in range(50):
         broken = data.copy()
-        at = data.find(b"Exif") + 6
-        for i in rng.integers(at, at + 60, 8):
-            broken[i] = rng.integers(256)
+        for i in RNG.integers(at, at + 60, 8):
+            broken[i] = RNG.integers(256)
         path.write_bytes(broken)
         read_exif_ev(path)
     path.write_bytes(b"nothing")
-    assert read_exif_ev(path) is None
-    assert read_exif_ev(tmp_path / "absent.jpg") is None
+    assert read_exif_ev(path) is read_exif_ev(tmp_path / "absent.jpg") is None
 
 
 def test_how_a_photograph_was_taken(tmp_path):
-    path = tmp_path / "a.jpg"
-    taken = {36867: "2010:10:12 14:43:07"}
-    shot = read_exif_settings(_jpeg_with_exif(path, {33434: 0.01, 33437: 2.0, 34855: 400, **taken}))
-    assert shot == ExifSettings(pytest.approx(0.01), 2.0, 400.0, "2010:10:12 14:43:07")
-    assert (
-        read_exif_settings(_jpeg_with_exif(path, {36867: "    :  :     :  :  "})) == ExifSettings()
-    )
-    assert (
-        read_exif_settings(_jpeg_with_exif(path, {34855: 65535, 36867: "yesterday"}))
-        == ExifSettings()
-    )
+    path, taken = tmp_path / "a.jpg", "2010:10:12 14:43:07"
+    shot = read_exif_settings(jpeg_with_exif(path, {**FULL, TAKEN: taken}))
+    assert shot == ExifSettings(pytest.approx(0.01), 2.0, 400.0, taken)
+    for tags in ({TAKEN: "    :  :     :  :  "}, {ISO: 65535, TAKEN: "yesterday"}):
+        assert read_exif_settings(jpeg_with_exif(path, tags)) == ExifSettings()
     assert read_exif_settings(tmp_path / "absent.jpg") == ExifSettings()
 
 
-def _view(name, camera):
-    eye = np.eye(4, dtype=np.float32)
-    return View(name, None, camera, eye, eye[:3, :3], 4, 3)  # type: ignore[arg-type]
+# ------------------------------------------------------------------ alpha
 
 
-def test_split_per_camera():
-    views = [_view(f"l/{i:02d}", "l") for i in range(9)] + [_view(f"r/{i}", "r") for i in range(2)]
-    views.append(_view("s", "single"))
-    out = assign_split(tuple(reversed(views)), 4)
-    test = {v.name for v in out if v.split == "test"}
-    assert test == {"l/00", "l/04", "l/08", "r/0"}
-    assert [v.name for v in out] == [v.name for v in reversed(views)]
-    held_out = assign_split(tuple(views), 0)
-    assert all(v.split == "train" for v in held_out)
-    again = assign_split(tuple(dataclasses.replace(v, split="test") for v in views), 0)
-    assert all(v.split == "train" for v in again)
-    for n in (1, -2):
-        with pytest.raises(UserError, match="hold out"):
-            assign_split(tuple(views), n)
+@pytest.fixture
+def cutouts(tmp_path):
+    """Write four photographs 40x30, the first three with alpha; return their folder and values."""
+    write_tiny_model(tmp_path, n=4)
+    held = []
+    for k in range(3):
+        bgra = RNG.integers(0, 256, (30, 40, 4), dtype=np.uint8)
+        bgra[:10, :, 3], bgra[10:20, :, 3] = 0, 255
+        assert cv2.imwrite(str(tmp_path / "images" / f"im {k}.png"), bgra)
+        held.append(bgra[..., [2, 1, 0, 3]].astype(np.float64) / 255)
+    return tmp_path, held
+
+
+@pytest.mark.parametrize(
+    ("background", "color"),
+    [
+        ("white", (1, 1, 1)),
+        ("black", (0, 0, 0)),
+        ("0.2,0.4,0.6", (0.2, 0.4, 0.6)),
+        ("random", (1, 1, 1)),
+    ],
+)
+def test_photographs_are_composited(cutouts, background, color):
+    root, held = cutouts
+    store = store_of(root, background=background)
+    for k, rgba in enumerate(held):
+        ldr, mask = store.get(k)
+        alpha = rgba[..., 3:]
+        assert np.allclose(ldr, alpha * rgba[..., :3] + (1 - alpha) * color, atol=2e-5)
+        assert mask.min() == 1.0
+    assert np.allclose(store.get(3)[0], 103 / 255)
+    assert store.alpha(3).min() == 65535
+    # Exposures and seeds see opaque pixels only.
+    assert np.array_equal(store.only_opaque().get(1)[1], (held[1][..., 3] == 1).astype(np.float32))
+    assert store.only_opaque().get(3)[1].min() == 1.0
+
+
+def test_transparent_pixels_do_not_colour_their_neighbours(cutouts):
+    root, held = cutouts
+    ldr, _ = store_of(root, background="black").get(0, 2)
+    premultiplied = held[0][..., :3] * held[0][..., 3:]
+    expected = premultiplied.reshape(15, 2, 20, 2, 3).mean((1, 3))
+    assert np.allclose(ldr, expected, atol=2e-5)
+
+
+@pytest.mark.parametrize("alpha", ["mask", "ignore"])
+def test_alpha_as_a_mask_and_not_at_all(cutouts, alpha):
+    root, held = cutouts
+    store = store_of(root, alpha=alpha)
+    assert store.backdrop is store.alpha(0) is None
+    ldr, mask = store.get(0)
+    expected = held[0][..., 3] >= (0.5 if alpha == "mask" else 0)
+    assert np.array_equal(mask, expected.astype(np.float32))
+    assert np.allclose(ldr, held[0][..., :3])
+
+
+@pytest.mark.parametrize(
+    ("options", "note"),
+    [
+        ({}, "3 of 4 photographs have an alpha channel: photographs and renders are shown"),
+        ({"background": "random"}, "shown over a random colour at every step, and white to judge"),
+        ({"alpha": "mask"}, "transparent pixels are left out"),
+        ({"alpha": "ignore"}, "it is ignored"),
+    ],
+)
+def test_alpha_is_always_noted(cutouts, options, note):
+    assert note in load_scene(cutouts[0], DataConfig(**options)).notes[-1]
+
+
+def test_scenes_without_alpha_are_as_they_were(tmp_path):
+    write_tiny_model(tmp_path, n=3)
+    scene = load_scene(tmp_path, CFG)
+    store = ImageStore(scene.views, CFG)
+    assert not any("alpha" in note or "--background" in note for note in scene.notes)
+    assert store.backdrop is None
+    assert store.only_opaque() is store
+    batch = TrainingViews(store, range(3), 0).batch(0, 1, 5)
+    assert batch.alpha is batch.backdrop is None
+    assert batch.ldr.dtype == np.uint8
+    scene = load_scene(tmp_path, DataConfig(background="black"))
+    assert "--background black shows nowhere" in scene.notes[-1]
+
+
+def test_random_backgrounds_follow_from_seed_and_step(cutouts):
+    root, _ = cutouts
+    store = store_of(root, background="random")
+    views = TrainingViews(store, range(3), 0)
+    drawn = [views.batch(0, 1, step).backdrop for step in range(20)]
+    assert np.array_equal(drawn[7], TrainingViews(store, range(3), 0).batch(1, 1, 7).backdrop)
+    assert not np.array_equal(drawn[7], TrainingViews(store, range(3), 1).batch(0, 1, 7).backdrop)
+    assert len({tuple(color) for color in drawn}) == 20
+    assert 0 <= np.min(drawn) < 0.3
+    assert 0.7 < np.max(drawn) <= 1
+    # A fixed one is premultiplied, with the alpha beside it.
+    batch = TrainingViews(store_of(root), range(3), 0).batch(0, 1, 3)
+    assert np.array_equal(batch.backdrop, [1, 1, 1])
+    assert batch.ldr.dtype == batch.alpha.dtype == np.uint16
+    assert (batch.ldr.astype(int) <= batch.alpha[..., None].astype(int) + 1).all()
+
+
+def test_a_run_remembers_what_alpha_meant(cutouts, tmp_path_factory):
+    root, _ = cutouts
+    run = tmp_path_factory.mktemp("run")
+    scene = load_scene(root, CFG)
+    write_scene(run, scene)
+    again = read_scene(run, root)
+    assert [view.alpha for view in again.views] == [view.alpha for view in scene.views]
+    assert again.split_by == scene.split_by
+
+
+def test_which_files_have_alpha(cutouts):
+    folder = cutouts[0] / "images"
+    (folder / "broken.png").write_bytes(b"\x89PNG")
+    names = ("im 0.png", "im 3.png", "broken.png")
+    assert [has_alpha(folder / name) for name in names] == [True, False, False]
+
+
+@pytest.mark.parametrize("text", ["blue", "1,1", "0.5,0.5,1.5", "0,0,nan", "", "1,1,1,1"])
+def test_colours_that_are_none(text):
+    with refused("is not a valid colour"):
+        background_color(DataConfig(background=text))
+
+
+# ------------------------------------------------------------------ sizes of pictures
+
+SIDE = 20_000
+HUGE = r".png has more than 179 million pixels"
+
+
+@pytest.fixture(scope="module")
+def bomb() -> bytes:
+    """Return a black picture of one bit a pixel: 50 KB."""
+
+    def chunk(kind, data):
+        crc = zlib.crc32(kind + data)
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", crc)
+
+    header = struct.pack(">IIBBBBB", SIDE, SIDE, 1, 0, 0, 0, 0)
+    data = zlib.compress(bytes(SIDE * (1 + SIDE // 8)), 1)
+    parts = chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + parts
+
+
+def test_what_is_too_large_is_refused_by_its_header(tmp_path, bomb):
+    write_tiny_model(tmp_path)
+    (tmp_path / "masks").mkdir()
+    (tmp_path / "masks" / "im 1.png").write_bytes(bomb)
+    with refused(f"im 1{HUGE}"):
+        store_of(tmp_path).get(1)
+    (tmp_path / "images" / "im 1.png").write_bytes(bomb)
+    tracemalloc.start()
+    try:
+        with refused(f"im 1{HUGE}"):
+            load_scene(tmp_path, CFG)
+        assert tracemalloc.get_traced_memory()[1] < SIDE * SIDE / 4
+    finally:
+        tracemalloc.stop()
+
+
+def test_photographs_alone_are_looked_at_before_their_features_are(tmp_path, bomb):
+    (tmp_path / "a.png").write_bytes(bomb)
+    with refused(f"a{HUGE}"):
+        load_scene(tmp_path, CFG)
+
+
+def test_what_is_no_file_is_no_photograph(tmp_path):
+    (tmp_path / "a.png").mkdir()
+    with refused("cannot decode"):
+        image_size(tmp_path / "a.png")

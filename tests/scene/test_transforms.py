@@ -1,31 +1,48 @@
+"""transforms.json of nerfstudio, of instant-ngp and of Blender's scenes, and LLFF's table."""
+
+import dataclasses
 import json
+import os
 import shutil
 
 import cv2
 import numpy as np
 import pytest
-from scene.helpers import reprojection_errors
+from scene.helpers import (
+    around,
+    blender,
+    refused,
+    reprojection_errors,
+    write_image,
+    write_rgba,
+    write_tiny_model,
+)
 
 from p2gs_jax.config import DataConfig
-from p2gs_jax.errors import UserError
-from p2gs_jax.scene import load_scene
-from p2gs_jax.scene.transforms import load_transforms
+from p2gs_jax.scene import find_scene, load_scene
+from p2gs_jax.scene.seeds import FEWEST, common_points, depth_range
+from p2gs_jax.scene.sfm import triangulate
+from p2gs_jax.scene.transforms import load_blender
 
 CFG = DataConfig()
+ALL = DataConfig(test_every=0)
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+LENS = {"fl_x": 50, "w": 40, "h": 30}
 
 
-def read(path, cfg=CFG):
-    return load_transforms(path.parent, path, cfg)
-
-
-def write(folder, data, *, names=("images/a.png", "images/b.png"), size=(40, 30)):
+def write(folder, data, *, names=("images/a.png", "images/b.png")):
     for name in names:
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        assert cv2.imwrite(str(folder / name), np.zeros((size[1], size[0], 3), np.uint8))
+        write_image(folder / name)
     path = folder / "transforms.json"
     path.write_text(data if isinstance(data, str) else json.dumps(data))
     return path
+
+
+def edit(path, change):
+    """Let a function change what a .json holds."""
+    data = json.loads(path.read_text())
+    change(data)
+    path.write_text(json.dumps(data))
 
 
 def frames(*paths, **extra):
@@ -34,7 +51,7 @@ def frames(*paths, **extra):
 
 
 def test_fox(shared_data):
-    scene = read(shared_data("nerf_fox") / "transforms.json")
+    scene = find_scene(shared_data("nerf_fox") / "transforms.json", CFG)
     assert len(scene.views) == 50
     view = scene.views[0]
     assert (view.name, view.camera, view.width, view.height) == ("0001.jpg", "0", 540, 960)
@@ -48,17 +65,16 @@ def test_fox(shared_data):
 
 def test_fox_with_missing_frames(shared_data):
     path = shared_data("nerf_fox") / "transforms_with_missing.json"
-    with pytest.raises(UserError, match="17 of the 67 images") as info:
-        read(path)
-    assert "--allow-missing" in info.value.fix
-    scene = read(path, DataConfig(allow_missing=True))
+    with refused("17 of the 67 images", "--allow-missing"):
+        find_scene(path, CFG)
+    scene = find_scene(path, DataConfig(allow_missing=True))
     assert len(scene.views) == 50
     assert "17 of the 67" in scene.notes[0]
 
 
 def test_camera_angle_and_absent_extension(tmp_path):
     data = {"camera_angle_x": 2 * np.arctan(0.5), "frames": frames("./images/a", "images/b")}
-    scene = read(write(tmp_path, data))
+    scene = find_scene(write(tmp_path, data), CFG)
     assert [v.name for v in scene.views] == ["a.png", "b.png"]
     assert np.allclose(scene.views[0].K, np.array([[40, 0, 20], [0, 40, 15], [0, 0, 1]]))
     assert scene.views[0].distortion is None
@@ -67,10 +83,9 @@ def test_camera_angle_and_absent_extension(tmp_path):
 
 def test_frames_override_and_cameras_follow_folders(tmp_path):
     names = ("images/left/0.png", "images/right/0.png")
-    data = {"fl_x": 50, "w": 40, "h": 30, "frames": frames(*names)}
+    data = {**LENS, "frames": frames(*names)}
     data["frames"][1] |= {"fl_x": 60, "fl_y": 61, "cx": 19, "cy": 14, "k1": 0.1}
-    scene = read(write(tmp_path, data, names=names))
-    left, right = scene.views
+    left, right = find_scene(write(tmp_path, data, names=names), CFG).views
     assert (left.camera, right.camera) == ("left", "right")
     assert (left.name, right.name) == ("left/0.png", "right/0.png")
     assert left.K[0, 0] == left.K[1, 1] == 50
@@ -80,22 +95,16 @@ def test_frames_override_and_cameras_follow_folders(tmp_path):
 
 def test_other_size_is_rescaled(tmp_path):
     data = {"fl_x": 100, "w": 80, "h": 60, "frames": frames("images/a.png", "images/b.png")}
-    scene = read(write(tmp_path, data))
+    scene = find_scene(write(tmp_path, data), CFG)
     assert np.allclose(scene.views[0].K, np.array([[50, 0, 20], [0, 50, 15], [0, 0, 1]]))
     assert "2 images have another size" in scene.notes[0]
-    with pytest.raises(UserError, match="wrong size"):
-        read(write(tmp_path, {**data, "h": 80}))
-
-
-def test_malformed_json_names_the_line(tmp_path):
-    path = write(tmp_path, '{\n "fl_x": 50,\n "frames": [,]\n}')
-    with pytest.raises(UserError, match=r"transforms.json is not valid JSON.* line 3"):
-        load_scene(tmp_path, CFG)
-    with pytest.raises(UserError, match="line 3"):
-        load_scene(path, CFG)
+    with refused("wrong size"):
+        find_scene(write(tmp_path, {**data, "h": 80}), CFG)
 
 
 SINGULAR = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1]]
+NAN = (np.eye(4) * np.nan).tolist()
+POSE = "transform_matrix of a.png"
 
 
 @pytest.mark.parametrize(
@@ -104,13 +113,11 @@ SINGULAR = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1]]
         ({"frames": []}, "lists no frames"),
         ({"frames": 3}, 'no list "frames"'),
         ({"frames": [{}]}, 'frame 0 has no "file_path"'),
-        ({"frames": [{"file_path": "images/a.png"}]}, "transform_matrix of a.png"),
-        ({"frames": frames("images/a.png", transform_matrix="x")}, "transform_matrix of a.png"),
-        ({"frames": frames("images/a.png", transform_matrix=[[1]])}, "transform_matrix of a.png"),
-        (
-            {"frames": [{"file_path": "images/a.png", "transform_matrix": SINGULAR}]},
-            "not a rotation and a translation",
-        ),
+        ({"frames": [{"file_path": "images/a.png"}]}, POSE),
+        ({"frames": frames("images/a.png", transform_matrix="x")}, POSE),
+        ({"frames": frames("images/a.png", transform_matrix=[[1]])}, POSE),
+        ({"frames": frames("images/a.png", transform_matrix=NAN)}, f"{POSE} is not a finite"),
+        ({"frames": frames("images/a.png", transform_matrix=SINGULAR)}, "not a rotation and a tr"),
         ({"frames": frames("images/a.png", "./images/a.png")}, "a.png more than once"),
         ({"frames": frames("images/a.png", mask_path="m.png")}, "mask .*m.png of a.png"),
         ({"fl_x": 1e300}, "fl_x of a.png is 1e[+]300, not a number"),
@@ -124,19 +131,18 @@ SINGULAR = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1]]
     ],
 )
 def test_broken_files(tmp_path, change, message):
-    data = {"fl_x": 50, "w": 40, "h": 30, "frames": frames("images/a.png")}
-    path = write(tmp_path, {**data, **change})
-    with pytest.raises(UserError, match=message) as info:
-        read(path)
-    assert "transforms.json" in str(info.value)
+    path = write(tmp_path, {**LENS, "frames": frames("images/a.png"), **change})
+    with refused(message, "transforms.json"):
+        find_scene(path, CFG)
 
 
-@pytest.mark.parametrize("text", ["[" * 100_000, '{"frames": ' + "1" * 10_000 + "}"])
+@pytest.mark.parametrize(
+    "text", ["[" * 100_000, '{"frames": ' + "1" * 10_000 + "}", '{\n "a": 5,\n "frames": [,]\n}']
+)
 def test_what_python_will_not_parse_is_no_json(tmp_path, text):
-    path = write(tmp_path, {"frames": []})
-    path.write_text(text)
-    with pytest.raises(UserError, match=r"transforms.json is not valid JSON"):
-        read(path)
+    write(tmp_path, text)
+    with refused(r"transforms.json is not valid JSON", "line 3" if "\n" in text else "line 1"):
+        load_scene(tmp_path, CFG)
 
 
 @pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
@@ -145,38 +151,27 @@ def test_a_count_of_points_beyond_the_file_costs_no_memory(tmp_path, kind):
     axes = "".join(f"property float {axis}\n" for axis in "xyz")
     header = f"ply\nformat {kind} 1.0\nelement vertex 99999999999\n{axes}end_header\n0 0 1\n"
     (tmp_path / "points.ply").write_text(header)
-    with pytest.raises(UserError, match=r"points.ply announces 99999999999 records"):
-        read(write(tmp_path, data))
+    with refused(r"points.ply announces 99999999999 records"):
+        find_scene(write(tmp_path, data), CFG)
 
 
-def test_nan_pose(tmp_path):
-    data = {"fl_x": 50, "frames": frames("images/a.png")}
-    data["frames"][0]["transform_matrix"][1][3] = float("nan")
-    with pytest.raises(UserError, match=r"transform_matrix of a.png is not a finite"):
-        read(write(tmp_path, data))
-
-
-def as_transforms(shared_data, folder, n=5):
-    """Write bundler_et's first n views as a transforms.json; return the COLMAP scene."""
-    source = load_scene(shared_data("bundler_et"), CFG)
-    (folder / "images").mkdir(parents=True)
-    listed = []
-    for view in source.views[:n]:
-        shutil.copyfile(view.image_path, folder / "images" / view.name)
-        pose = np.linalg.inv(view.viewmat.astype(np.float64)) @ OPENGL
-        listed.append({"file_path": f"images/{view.name}", "transform_matrix": pose.tolist()})
-    K = source.views[0].K.tolist()
-    data = {"fl_x": K[0][0], "fl_y": K[1][1], "cx": K[0][2], "cy": K[1][2], "frames": listed}
-    (folder / "transforms.json").write_text(json.dumps(data))
-    return source
+# ------------------------------------------------------------------ triangulation
 
 
 def test_triangulation_with_known_poses_and_its_cache(shared_data, tmp_path):
-    source = as_transforms(shared_data, tmp_path / "scene")
+    source = load_scene(shared_data("bundler_et"), CFG)
+    listed = []
+    (tmp_path / "scene" / "images").mkdir(parents=True)
+    for view in source.views[:5]:
+        shutil.copyfile(view.image_path, tmp_path / "scene" / "images" / view.name)
+        pose = np.linalg.inv(view.viewmat.astype(np.float64)) @ OPENGL
+        listed.append({"file_path": f"images/{view.name}", "transform_matrix": pose.tolist()})
+    (fx, _, cx), (_, fy, cy) = source.views[0].K[:2].tolist()
+    data = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "frames": listed}
+    write(tmp_path / "scene", data, names=())
     said = []
     scene = load_scene(tmp_path / "scene", CFG, tmp_path / "work", said.append)
-    errors = reprojection_errors(scene)
-    assert np.median(errors) < 1.0
+    assert np.median(reprojection_errors(scene)) < 1.0
     assert len(scene.points) > 100
     for a, b in zip(scene.views, source.views, strict=False):
         assert np.allclose(a.viewmat, b.viewmat, atol=1e-5)
@@ -195,8 +190,7 @@ def test_triangulation_with_known_poses_and_its_cache(shared_data, tmp_path):
 
 def test_two_photographs_are_triangulated(tmp_path):
     shift, focal, baseline = 12, 200.0, 0.3
-    rng = np.random.default_rng(0)
-    blocks = rng.integers(0, 256, (20, 30, 3), np.uint8)
+    blocks = np.random.default_rng(0).integers(0, 256, (20, 30, 3), np.uint8)
     wall = cv2.resize(blocks, (300, 200), interpolation=cv2.INTER_CUBIC)
     (tmp_path / "images").mkdir()
     found = []
@@ -221,5 +215,286 @@ def test_fox_triangulation(shared_data):
 
 def test_one_blank_view_cannot_be_triangulated(tmp_path):
     write(tmp_path, {"fl_x": 50, "frames": frames("images/a.png")})
-    with pytest.raises(UserError, match="no point could be triangulated"):
+    with refused("no point could be triangulated"):
         load_scene(tmp_path, CFG)
+
+
+# ------------------------------------------------------------------ names that lead elsewhere
+
+OUTSIDE = ("../secret.png", "../../secret.png", "a/../../../secret.png", "ABSOLUTE")
+
+
+def outside(scene, name):
+    """Return a name of a photograph that is there, but not in the scene."""
+    for folder in (scene, scene.parent):
+        (folder / "secret.png").write_bytes((scene / "images" / "im 0.png").read_bytes())
+    return str(scene.parent / "secret.png") if name == "ABSOLUTE" else name
+
+
+@pytest.mark.parametrize("name", OUTSIDE)
+def test_a_model_s_names_stay_in_the_scene(tmp_path, name):
+    scene = tmp_path / "scene"
+    images = write_tiny_model(scene) / "images.txt"
+    images.write_text(images.read_text().replace("im 1.png", outside(scene, name)))
+    with refused(r"images.txt names .*secret.png, which lies outside"):
+        load_scene(scene, CFG)
+
+
+@pytest.mark.parametrize("key", ["file_path", "mask_path", "ply_file_path"])
+@pytest.mark.parametrize("name", OUTSIDE[1:])
+def test_names_in_transforms_stay_in_the_scene(tmp_path, key, name):
+    scene = tmp_path / "scene"
+    write_tiny_model(scene)
+    path = write(scene, {**LENS, "frames": frames("images/im 0.png")}, names=())
+    named = {key: outside(scene, name)}
+    edit(path, lambda data: (data if key[0] == "p" else data["frames"][0]).update(named))
+    with refused(r"transforms.json names .*secret.png, which lies outside"):
+        load_scene(path, ALL)
+
+
+def test_absolute_names_inside_and_a_folder_that_the_user_names_are_read(tmp_path):
+    scene = tmp_path / "scene"
+    listed = frames(str(scene / "images" / "a.png"))
+    path = write(scene, {**LENS, "ply_file_path": "", "frames": listed})
+    assert find_scene(path, ALL).views[0].name == "a.png"
+    (scene / "images").rename(tmp_path / "photographs")
+    edit(path, lambda data: data["frames"][0].update(file_path="../photographs/a.png"))
+    with refused("outside"):
+        find_scene(path, ALL)
+    found = find_scene(path, DataConfig(test_every=0, images="../photographs"))
+    assert found.views[0].name == "a.png"
+
+
+def test_a_name_that_is_not_utf_8_is_refused(tmp_path):
+    data = cv2.imencode(".png", np.zeros((4, 4), np.uint8))[1].tobytes()
+    with open(os.fsencode(tmp_path) + b"/\xff.png", "wb") as file:
+        file.write(data)
+    with refused("is not UTF-8"):
+        load_scene(tmp_path, CFG)
+
+
+# ------------------------------------------------------------------ Blender
+
+
+def write_blender(root, **counts):
+    for part, count in {"train": 6, "test": 3, "val": 0, **counts}.items():
+        if count:
+            root.mkdir(exist_ok=True)
+            data = blender(around(count), part)
+            (root / f"transforms_{part}.json").write_text(json.dumps(data))
+        for k in range(count):
+            write_rgba(root / part / f"r_{k}.png")
+    return root
+
+
+def held_out(scene):
+    return [view.name for view in scene.views if view.split == "test"]
+
+
+def test_lego(shared_data):
+    scene = find_scene(shared_data("nerf_synthetic_lego"), CFG)
+    assert scene.format == "blender"
+    assert (len(scene.train_indices), len(scene.test_indices)) == (100, 50)
+    assert scene.split_by == "transforms_test.json"
+    assert {view.camera for view in scene.views} == {"0"}
+    assert all(view.name.startswith(view.split) for view in scene.views)
+    K = scene.views[0].K
+    assert np.allclose(K, [[1111.111, 0, 400], [0, 1111.111, 400], [0, 0, 1]], atol=1e-3)
+    # The test cameras stand on the upper half sphere of radius 4.03 around the excavator.
+    for view in scene.views:
+        centre = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
+        assert np.linalg.norm(centre) == pytest.approx(4.0311, abs=1e-3)
+        assert view.viewmat[2, 3] == pytest.approx(4.0311, abs=1e-3)
+
+
+@pytest.mark.slow
+def test_seeds_of_lego_lie_on_it_and_come_from_training_views(shared_data):
+    scene = load_scene(shared_data("nerf_synthetic_lego"), CFG)
+    assert len(scene.points) > 3000
+    assert not scene.random_seeds
+    assert np.median(reprojection_errors(scene)) < 1.0
+    assert (np.abs(scene.points) < 1.3).all(1).mean() > 0.97
+    used = {scene.views[row].split for row in np.unique(scene.tracks.view_indices)}
+    assert used == {"train"}
+
+
+def test_val_takes_the_place_of_test_only_where_there_is_none(tmp_path):
+    both = load_blender(write_blender(tmp_path / "both", val=2), CFG)
+    assert {view.split for view in both.views} == {"train", "test"}
+    assert not any(view.name.startswith("val") for view in both.views)
+    scene = load_blender(write_blender(tmp_path / "val", test=0, val=2), CFG)
+    assert scene.split_by == "transforms_val.json"
+    assert held_out(scene) == ["val/r_0.png", "val/r_1.png"]
+    assert load_blender(write_blender(tmp_path / "alone", test=0), CFG).split_by is None
+
+
+def test_the_split_of_the_data_set_wins_and_random_seeds_follow(tmp_path):
+    scene = load_scene(write_blender(tmp_path), CFG)
+    assert len(scene.views) == 9
+    assert held_out(scene) == [f"test/r_{k}.png" for k in range(3)]
+    # Nothing matches in grey squares: seeds are drawn where all cameras look.
+    assert scene.random_seeds
+    assert scene.tracks is None
+    assert scene.point_colors is None
+    assert len(scene.points) > 10_000
+    assert "drawn at random" in scene.notes[-1]
+    assert np.linalg.norm(scene.points, axis=1).max() < 3.5
+    assert np.linalg.norm(scene.points.mean(0)) < 0.2
+    assert held_out(load_scene(tmp_path, ALL)) == []
+    every = load_scene(tmp_path, DataConfig(split="every", test_every=3))
+    assert every.split_by == "every 3rd view of each camera"
+    assert len(held_out(every)) == 3
+
+
+@pytest.mark.parametrize("count", [FEWEST - 1, FEWEST])
+def test_a_handful_of_matched_points_is_as_good_as_none(tmp_path, monkeypatch, count):
+    matched = np.random.default_rng(0).uniform(-1, 1, (count, 3)).astype(np.float32)
+    found = lambda scene, *_, **__: dataclasses.replace(scene, points=matched)  # noqa: E731
+    monkeypatch.setattr(triangulate, "triangulate", found)
+    scene = load_scene(write_blender(tmp_path), CFG)
+    assert scene.random_seeds == (count < FEWEST)
+    if scene.random_seeds:
+        assert f"Only {count} points were matched: {len(scene.points)} seeds" in scene.notes[-1]
+    else:
+        np.testing.assert_array_equal(scene.points, matched)
+
+
+def test_random_seeds_are_the_same_every_time_and_in_the_views(tmp_path):
+    views = load_blender(write_blender(tmp_path), CFG).training_views
+    near, far = depth_range(views)
+    assert 1.5 < near < 4 < far < 6.5
+    points = common_points(views, near, far, 500)
+    assert np.array_equal(points, common_points(views, near, far, 500))
+    local = points @ views[0].viewmat[:3, :3].T + views[0].viewmat[:3, 3]
+    assert (local[:, 2] > 0).all()
+    # Cameras that look apart get a range of their own.
+    data = blender(around(6) @ np.diag([-1.0, 1.0, -1.0, 1.0]), "train")
+    (tmp_path / "transforms_train.json").write_text(json.dumps(data))
+    near, far = depth_range(load_blender(tmp_path, CFG).training_views)
+    assert (near, far) == (pytest.approx(1.73, rel=0.1), pytest.approx(34.6, rel=0.1))
+
+
+TRAIN, TEST = "transforms_train.json", "transforms_test.json"
+BOTH = r"transforms_(test|train).json and transforms_(test|train).json both list train/r_0.png"
+
+
+def no_frame(root):
+    (root / "test" / "r_1.png").unlink()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (no_frame, rf"1 of the 3 images named by .*{TEST} do not exist: test/r_1"),
+        (
+            lambda root: write_rgba(root / "train" / "r_3.png", size=(40, 20)),
+            rf"wrong size: .*train/r_3.png is 40x20, .* 40x30.*{TRAIN}",
+        ),
+        (
+            lambda root: edit(root / TEST, lambda d: d["frames"][0].update(file_path="train/r_0")),
+            BOTH,
+        ),
+        (
+            lambda root: edit(root / TRAIN, lambda d: d.pop("camera_angle_x")),
+            rf"{TRAIN}: no focal length for train/r_0.png",
+        ),
+        (
+            lambda root: (root / TEST).write_text((root / TEST).read_text()[:-40]),
+            rf"{TEST} is not valid JSON",
+        ),
+    ],
+)
+def test_broken_copies(tmp_path, change, message):
+    change(write_blender(tmp_path))
+    with refused(message):
+        load_scene(tmp_path, CFG)
+
+
+def test_missing_frames_may_be_skipped(tmp_path):
+    no_frame(write_blender(tmp_path))
+    scene = find_scene(tmp_path, DataConfig(allow_missing=True))
+    assert len(scene.test_indices) == 2
+    assert "1 of the 3 images" in scene.notes[0]
+
+
+def test_a_smaller_copy_keeps_its_lens(tmp_path):
+    write_rgba(write_blender(tmp_path) / "train" / "r_3.png", size=(20, 15))
+    views = {view.name: view for view in find_scene(tmp_path, CFG).views}
+    small, large = views["train/r_3.png"], views["train/r_2.png"]
+    assert np.allclose(2 * small.K[:2], large.K[:2])
+
+
+# ------------------------------------------------------------------ LLFF
+
+
+def rows(count=4, focal=50.0):
+    """Return what LLFF writes for cameras on a ring."""
+    out = []
+    for pose in around(count):
+        # OpenGL's right, up, backwards; LLFF's down, right, backwards.
+        right, up, back = pose[:3, :3].T
+        matrix = np.stack([-up, right, back, pose[:3, 3], [30, 40, focal]], 1)
+        out.append([*matrix.ravel(), 2.0, 6.0])
+    return np.array(out)
+
+
+def write_llff(root, table, count=4, size=(40, 30), folder="images"):
+    for k in range(count):
+        write_image(root / folder / f"{k}.png", size=size)
+    np.save(root / "poses_bounds.npy", table)
+    return root
+
+
+def test_llff_axes_and_lens(tmp_path):
+    scene = find_scene(write_llff(tmp_path, rows()), CFG)
+    assert scene.format == "llff"
+    assert scene.depths == (2.0, 6.0)
+    for view, pose in zip(scene.views, around(4), strict=True):
+        assert np.allclose(view.viewmat, np.linalg.inv(pose @ OPENGL), atol=1e-6)
+        assert np.allclose(view.K, [[50, 0, 20], [0, 50, 15], [0, 0, 1]])
+    # The middle of the ring lies in the middle of every picture, four units ahead.
+    assert np.allclose([view.viewmat[:3, 3] for view in scene.views], [0, 0, 4], atol=1e-6)
+
+
+def test_smaller_llff_photographs_are_named_by_their_folder(tmp_path):
+    write_llff(tmp_path, rows(), size=(20, 15), folder="images_2")
+    scene = find_scene(tmp_path, DataConfig(images="images_2"))
+    assert np.allclose(scene.views[0].K, [[25, 0, 10], [0, 25, 7.5], [0, 0, 1]])
+    assert "4 images have another size" in scene.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("row", "columns", "values", "message"),
+    [
+        (1, 16, np.nan, "row 1 has impossible bounds: 2 to nan"),
+        (1, [15, 16], [6, 2], "row 1 has impossible bounds: 6 to 2"),
+        (2, 3, np.inf, "the pose in row 2 is not finite"),
+        (0, 14, 0, "row 0 has an impossible height, width or focal length"),
+        (3, [0, 5, 10], -rows()[3, [0, 5, 10]], "row 3 is not a rotation"),
+    ],
+)
+def test_broken_llff_tables(tmp_path, row, columns, values, message):
+    table = rows()
+    table[row, columns] = values
+    with refused(message, "poses_bounds.npy"):
+        find_scene(write_llff(tmp_path, table), CFG)
+
+
+def test_broken_llff_files(tmp_path):
+    path = write_llff(tmp_path, rows()) / "poses_bounds.npy"
+    whole = path.read_bytes()
+    for size in (0, 5, 40, len(whole) - 8):
+        path.write_bytes(whole[:size])
+        with refused(r"poses_bounds.npy cannot be read"):
+            find_scene(tmp_path, CFG)
+    for table, message in (
+        (np.array([{"a": 1}], dtype=object), r"poses_bounds.npy cannot be read"),
+        (np.array(["a"]), "holds no numbers"),
+        (rows()[:, :15], "holds 4x15 numbers, not N x 17"),
+        (rows(3), r"has 3 rows, and .*images holds 4 photographs"),
+    ):
+        np.save(path, table, allow_pickle=True)
+        with refused(message):
+            find_scene(tmp_path, CFG)
+    with refused("wrong size"):
+        find_scene(write_llff(tmp_path, rows(), size=(40, 40)), CFG)

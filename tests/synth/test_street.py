@@ -24,7 +24,14 @@ from p2gs_jax.synth.rig import (
     image_height,
     intrinsics,
 )
-from p2gs_jax.synth.sensor import draw_iso, photograph
+from p2gs_jax.synth.sensor import (
+    draw_shots,
+    photograph,
+    read_true_exposures,
+    read_true_shots,
+    write_true_exposures,
+)
+from p2gs_jax.synth.settings import Sensor
 from p2gs_jax.synth.town import Material
 from p2gs_jax.synth.write import write_street
 
@@ -72,21 +79,6 @@ def test_every_file_is_deterministic_in_the_seed(street, tmp_path):
 def test_another_seed_makes_another_town():
     a, b = build_town(0), build_town(1)
     assert a.size != b.size or not np.array_equal(a.hi, b.hi)
-
-
-@pytest.mark.parametrize("std", [2.0, 4.0])
-def test_iso_is_rounded_normal_with_a_floor(std):
-    iso = draw_iso((20_000,), std, seed=0)
-    assert iso.dtype.kind == "i"
-    assert iso.min() >= 1
-    assert np.mean(iso) == pytest.approx(8.0, abs=0.15)
-    assert np.std(iso) == pytest.approx(std, rel=0.06)
-    np.testing.assert_array_equal(draw_iso((5, 3), 0.0, seed=1), 8)
-
-
-def test_srgb_round_trip():
-    x = np.linspace(0, 1, 1001)
-    np.testing.assert_allclose(srgb_decode(srgb_encode(x)), x, atol=1e-12)
 
 
 def test_rig_follows_the_papers_mounts():
@@ -205,23 +197,6 @@ def test_seed_colours_are_from_photographs_of_views_that_are_not_held_out(street
     assert found.all()
 
 
-def test_card_and_refusals(street, tmp_path):
-    assert card_of(street)["seed"] == SIZE["seed"]
-    with pytest.raises(UserError, match="not an empty folder"):
-        write_street(street)
-    with pytest.raises(UserError, match="cannot render"):
-        write_street(tmp_path / "x", frames=0)
-    assert not (tmp_path / "x").exists()
-
-
-@pytest.mark.parametrize("layout", ["street", "town"])
-def test_a_drive_does_not_go_through_the_tower(tmp_path, layout):
-    with pytest.raises(UserError, match=r"101 frames of 1\.2 m go on for 120 m") as error:
-        write_street(tmp_path / "x", frames=101, step=1.2, layout=layout)
-    assert "--layout long" in str(error.value.fix)
-    assert not (tmp_path / "x").exists()
-
-
 @pytest.mark.parametrize("way", [90.0, 100.0, 120.0, 226.0, 300.0])
 def test_the_last_street_of_a_long_town_ends_behind_the_drive(way):
     town = build_town(3, "long", way)
@@ -243,3 +218,37 @@ def test_a_long_town_goes_on_as_far_as_the_drive():
     # No two streets are alike.
     first = long.color[houses & (long.lo[:, 0] < STREET_M - 22)]
     assert not np.array_equal(first, long.color[houses][len(first) : 2 * len(first)])
+
+
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        ({"frames": 0}, "cannot render"),
+        ({"frames": 101, "step": 1.2}, r"101 frames of 1\.2 m go on for 120 m"),
+        ({"frames": 101, "step": 1.2, "layout": "town"}, "use --layout long"),
+    ],
+)
+def test_what_cannot_be_made_is_refused(street, tmp_path, asked, words):
+    with pytest.raises(UserError, match=words):
+        write_street(tmp_path / "x", **asked)
+    assert not (tmp_path / "x").exists()
+    with pytest.raises(UserError, match="not an empty folder"):
+        write_street(street)
+
+
+def test_the_card_and_the_table_say_what_was_done(street, tmp_path):
+    assert card_of(street)["seed"] == SIZE["seed"]
+    assert card_of(street)["sensor"]["iso_std"] == 4.0
+    sensor = Sensor(iso_std=2.0, camera_gain_ev=0.3, white_balance_ev=0.1, vignetting=0.2)
+    shots = draw_shots(sensor, SIZE["frames"], 3, seed=5)
+    (tmp_path / "truth").mkdir()
+    write_true_exposures(tmp_path, NAMES, [name.split("/")[0] for name in NAMES], shots)
+    read = read_true_exposures(tmp_path)
+    assert list(read) == NAMES
+    assert list(read.values()) == pytest.approx(shots.mean_exposures, rel=1e-5)
+    shots = read_true_shots(tmp_path)
+    assert [s.exposure for s in shots.values()] == list(read.values())
+    assert {s.corners for s in shots.values()} == {0.8}
+    assert all(np.prod(s.balance) == pytest.approx(1, abs=1e-4) for s in shots.values())
+    assert len({s.balance for s in shots.values()}) == 3
+    assert read_true_shots(street / "images") == {}

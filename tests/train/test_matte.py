@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from p2gs_jax.config import FitConfig, LossConfig, PhotometryConfig, preset
+from p2gs_jax.config import FitConfig, LossConfig, PhotometryConfig
 from p2gs_jax.evaluation.alignment import fit_exposure
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import formation
+from p2gs_jax.presets import preset
 from p2gs_jax.train.image_gradient import compared
 from p2gs_jax.train.terms import loss_terms, photometric_loss
 from p2gs_jax.types import Batch, Camera, Capture, Photometry, Render

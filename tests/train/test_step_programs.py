@@ -8,8 +8,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from p2gs_jax.config import FitConfig, narrowed, preset
+from p2gs_jax.config import FitConfig, narrowed
 from p2gs_jax.jobs.configs import with_fields
+from p2gs_jax.presets import preset
 from p2gs_jax.render.capacity import Room
 from p2gs_jax.train.optimizer import make_optimizer
 from p2gs_jax.train.step import PARTS, Key, Step, StepPrograms

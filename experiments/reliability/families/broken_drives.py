@@ -51,11 +51,7 @@ def run(quick: bool, out: Path, report: Report) -> Family:
 
 
 def trials(made: Path) -> Iterator[Trial]:
-    """Yield all but those of runs.
-
-    Args:
-        made: a folder for whole drives, which are made once.
-    """
+    """Yield all but those of runs."""
     yield from _drives(made)
     yield from _ways_out(made)
     yield from _exposures()

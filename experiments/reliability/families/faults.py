@@ -9,6 +9,7 @@ import resource
 import shutil
 import signal
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -257,8 +258,6 @@ def run(quick: bool, out: Path, report: Report) -> Family:
 
 
 def _after(seconds: float) -> Callable[[], bool]:
-    import time
-
     end = time.monotonic() + seconds
     return lambda: time.monotonic() >= end
 

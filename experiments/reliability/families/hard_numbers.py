@@ -13,10 +13,10 @@ from reliability.families._scenes import SMALL_FIT, Made, in_a_row, write_scene
 from reliability.family import Failure, Family, Report
 
 from p2gs_jax import UserError, fit
-from p2gs_jax.config import preset
 from p2gs_jax.core.progress import Silent
 from p2gs_jax.formats.ply import read_ply
 from p2gs_jax.jobs.configs import with_fields
+from p2gs_jax.presets import preset
 
 NAME = "hard_numbers"
 ABOUT = """
@@ -119,6 +119,7 @@ CASES: dict[str, Case] = {
     "one view masked": Case(Made(mask=_hidden(2)), says=("2.png", "hidden"), least_db=DOTS),
     "held-out view masked": Case(Made(mask=_hidden(0)), says=("0.png", "hidden"), least_db=DOTS),
 }
+NOTHING: dict[str, str | float] = {"outcome": "", "training PSNR dB": "", "unknown": ""}
 QUICK = ("nothing hard", "all black", "one white", "10^6 m from the origin", "one view masked")
 
 
@@ -156,21 +157,13 @@ def attempt(case: Case, out: Path) -> tuple[str | None, dict[str, str | float]]:
         with np.errstate(all="ignore"):
             found = fit(scene, out / "run", cfg, reporter=heard)
     except UserError as error:
-        figure: dict[str, str | float] = {
-            "outcome": "refused",
-            "training PSNR dB": "",
-            "unknown": "",
-        }
+        figure = NOTHING | {"outcome": "refused"}
         if not case.refused:
             return f"refused: {error}", figure
         missing = [word for word in case.says if word not in str(error)]
         return (f"it does not say {missing[0]!r}: {error}" if missing else None), figure
     except Exception as error:
-        return f"{type(error).__name__}: {error}", {
-            "outcome": "an error",
-            "training PSNR dB": "",
-            "unknown": "",
-        }
+        return f"{type(error).__name__}: {error}", NOTHING | {"outcome": "an error"}
     psnr = found.metrics["train"]["psnr"]
     views = json.loads((out / "run" / "photometry.json").read_text())["views"]
     unknown = [view["image"] for view in views if view.get("exposure_unknown")]

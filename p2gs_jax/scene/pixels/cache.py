@@ -64,7 +64,7 @@ class PixelFiles:
     def read(self, key: Key) -> Decoded | None:
         """Return a photograph, mapped; None: it is not there, or damaged."""
         try:
-            records = np.load(self.path(key), mmap_mode="r")
+            records = np.load(self.path(key), mmap_mode="r", allow_pickle=False)
             fields = [np.asarray(records[name][0]) for name in records.dtype.names]
         except BROKEN_ARRAYS:
             return None

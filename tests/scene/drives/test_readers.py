@@ -124,6 +124,20 @@ def test_a_table_that_is_cut_off_or_gone_is_named(copied, read, name):
 
 
 @EVERY
+def test_reading_decodes_nothing(copied, read, name):
+    made = copied(name)
+    for file in made.scans:
+        (made.root / file).write_bytes(b"never read")
+    # The size of one photograph a camera is looked at, in sets that do not tell it.
+    for path in made.root.rglob("*.jpg"):
+        if path != min(path.parent.iterdir()):
+            path.write_bytes(b"never read")
+    drive = read(made.root)
+    assert len(drive.photographs) == len(made.photographs)
+    assert len(drive.sweeps) == len(made.sweeps)
+
+
+@EVERY
 def test_a_broken_sweep_is_named_when_it_is_read(copied, read, name):
     made = copied(name)
     for scan in made.scans:

@@ -1,16 +1,16 @@
 """Who decides what is held out: a file of the user, the data set, or every n-th view."""
 
+import dataclasses
 import json
 
 import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
-from scene.helpers import write_tiny_model
-from scene.posed import around, write_rgba
+from scene.helpers import around, make_view, refused, write_rgba, write_tiny_model
 
 from p2gs_jax.config import DataConfig
-from p2gs_jax.errors import UserError
 from p2gs_jax.scene import find_scene, load_scene
+from p2gs_jax.scene.split import assign_split
 
 CFG = DataConfig()
 
@@ -26,13 +26,29 @@ def model(tmp_path):
     return root
 
 
-def test_without_any_list_every_nth(model):
-    scene = load_scene(model, CFG)
-    assert (held_out(scene), scene.split_by) == (["im 0.png"], "every 8th view of each camera")
+def split_by(model, text, name="mine.json"):
+    """Load a model with a file that says how to split it."""
+    path = model.parent / name
+    path.write_text(text if isinstance(text, str) else json.dumps(text))
+    return load_scene(model, DataConfig(split=str(path)))
+
+
+def test_split_per_camera(tmp_path):
+    names = [("l", f"{i:02d}") for i in range(9)] + [("r", "0"), ("r", "1"), ("single", "s")]
+    views = [dataclasses.replace(make_view(tmp_path), name=f"{c}/{n}", camera=c) for c, n in names]
+    out = assign_split(tuple(reversed(views)), 4)
+    assert {v.name for v in out if v.split == "test"} == {"l/00", "l/04", "l/08", "r/0"}
+    assert [v.name for v in out] == [v.name for v in reversed(views)]
+    assert {v.split for v in assign_split(out, 0)} == {"train"}
+    for n in (1, -2):
+        with refused("hold out"):
+            assign_split(tuple(views), n)
 
 
 @pytest.mark.parametrize("folder", [".", "sparse/0"])
 def test_lists_beside_a_colmap_model(model, folder):
+    scene = load_scene(model, CFG)
+    assert (held_out(scene), scene.split_by) == (["im 0.png"], "every 8th view of each camera")
     (model / folder / "test.txt").write_text("# held out\nim 1.png\n\nim 3\n")
     scene = load_scene(model, CFG)
     assert (held_out(scene), scene.split_by) == (["im 1.png", "im 3.png"], "test.txt")
@@ -41,26 +57,26 @@ def test_lists_beside_a_colmap_model(model, folder):
     (model / folder / "train.txt").write_text("images/im 0.png\n")
     scene = load_scene(model, CFG)
     assert [view.name for view in scene.views] == ["im 0.png", "im 1.png", "im 3.png"]
-    assert (
-        "1 views are neither trained on nor held out by train.txt and test.txt" in scene.notes[-1]
-    )
+    note = "1 views are neither trained on nor held out by train.txt and test.txt"
+    assert note in scene.notes[-1]
     assert scene.tracks is not None
     assert sorted(scene.tracks.view_indices) == [0, 1, 2]
 
 
-def test_a_list_of_the_user_wins(model, tmp_path):
+def test_a_list_of_the_user_wins(model):
     (model / "test.txt").write_text("im 1.png\n")
-    text = tmp_path / "mine.txt"
-    text.write_text("im 2.png\n")
-    scene = load_scene(model, DataConfig(split=str(text)))
+    scene = split_by(model, "im 2.png\n", "mine.txt")
     assert (held_out(scene), scene.split_by) == (["im 2.png"], "mine.txt")
-    lists = tmp_path / "mine.json"
-    lists.write_text(json.dumps({"train": ["im 0.png", "im 2.png"]}))
-    assert held_out(load_scene(model, DataConfig(split=str(lists)))) == ["im 1.png", "im 3.png"]
-    lists.write_text(json.dumps({"train": ["im 0.png", "im 2.png"], "val": ["im 3.png"]}))
-    scene = load_scene(model, DataConfig(split=str(lists)))
+    train = ["im 0.png", "im 2.png"]
+    assert held_out(split_by(model, {"train": train})) == ["im 1.png", "im 3.png"]
+    scene = split_by(model, {"train": train, "val": ["im 3.png"]})
     assert held_out(scene) == ["im 3.png"]
     assert len(scene.views) == 3
+    # Tools write empty lists for what they lack.
+    assert held_out(split_by(model, {"test": [], "val": ["im 2.png"]})) == ["im 2.png"]
+    scene = split_by(model, {"train": [f"im {k}.png" for k in range(4)], "test": []})
+    assert held_out(scene) == []
+    assert "mine.json holds no view out" in scene.notes[-1]
 
 
 @pytest.mark.parametrize(
@@ -76,30 +92,14 @@ def test_a_list_of_the_user_wins(model, tmp_path):
         ("a.json", '{"test": ["im 1.png"], "train": []}', r"leaves no view to train on"),
     ],
 )
-def test_broken_lists(model, tmp_path, name, text, message):
-    path = tmp_path / name
-    path.write_text(text)
-    with pytest.raises(UserError, match=message):
-        load_scene(model, DataConfig(split=str(path)))
+def test_broken_lists(model, name, text, message):
+    with refused(message):
+        split_by(model, text, name)
+    with refused(r"nowhere.txt does not exist"):
+        load_scene(model, DataConfig(split="nowhere.txt"))
 
 
-def test_an_empty_list_holds_nothing_out_and_says_so(model, tmp_path):
-    lists = tmp_path / "mine.json"
-    lists.write_text(json.dumps({"test": [], "val": ["im 2.png"]}))
-    assert held_out(load_scene(model, DataConfig(split=str(lists)))) == ["im 2.png"]
-    names = [f"im {k}.png" for k in range(4)]
-    lists.write_text(json.dumps({"train": names, "test": []}))
-    scene = load_scene(model, DataConfig(split=str(lists)))
-    assert held_out(scene) == []
-    assert "mine.json holds no view out" in scene.notes[-1]
-
-
-def test_a_list_that_is_not_there(model, tmp_path):
-    with pytest.raises(UserError, match=r"nowhere.txt does not exist"):
-        load_scene(model, DataConfig(split=str(tmp_path / "nowhere.txt")))
-
-
-def test_photographs_that_colmap_did_not_register_are_only_told(model):
+def test_photographs_that_colmap_did_not_register_are_only_noted(model):
     write_rgba(model / "images" / "lost.png")
     (model / "test.txt").write_text("im 1.png\nlost.png\n")
     scene = load_scene(model, CFG)
@@ -123,13 +123,14 @@ def studio(root, **extra):
     return root
 
 
-def write_ply(path, points, **colors):
-    fields = [(axis, "f4") for axis in "xyz"] + [(name, v.dtype) for name, v in colors.items()]
+def write_ply(path, points, colors=None):
+    names = () if colors is None else ("red", "green", "blue")
+    fields = [(axis, "f4") for axis in "xyz"] + [(name, colors.dtype) for name in names]
     table = np.zeros(len(points), fields)
     for axis, column in zip("xyz", np.asarray(points, np.float32).T, strict=True):
         table[axis] = column
-    for name, values in colors.items():
-        table[name] = values
+    for name in names:
+        table[name] = colors
     PlyData([PlyElement.describe(table, "vertex")]).write(str(path))
 
 
@@ -146,40 +147,39 @@ def test_nerfstudio_lists(tmp_path):
     assert len(whole.views) == 5
     assert whole.split_by is None
     lists["test_filenames"] = ["images/f_9.png"]
-    with pytest.raises(UserError, match=r"transforms.json lists images/f_9.png"):
+    with refused(r"transforms.json lists images/f_9.png"):
         find_scene(studio(tmp_path, **lists), CFG)
 
 
 def test_nerfstudio_seeds(tmp_path):
     points = np.array([[0.0, 0.1, 0.2], [1.0, 1.1, 1.2]])
-    grey = np.array([10, 200], np.uint8)
     studio(tmp_path, ply_file_path="sparse_pc.ply")
-    write_ply(tmp_path / "sparse_pc.ply", points, red=grey, green=grey, blue=grey)
-    scene = load_scene(tmp_path, CFG)
-    assert np.allclose(scene.points, points)
-    assert not scene.random_seeds
-    assert scene.point_colors.tolist() == [[10] * 3, [200] * 3]
-    share = np.array([0.0, 1.0], np.float32)
-    write_ply(tmp_path / "sparse_pc.ply", points, red=share, green=share, blue=share)
-    assert load_scene(tmp_path, CFG).point_colors.tolist() == [[0] * 3, [255] * 3]
-    write_ply(tmp_path / "sparse_pc.ply", points)
-    assert load_scene(tmp_path, CFG).point_colors is None
+    for colors, expected in (
+        (np.array([10, 200], np.uint8), [[10] * 3, [200] * 3]),
+        (np.array([0.0, 1.0], np.float32), [[0] * 3, [255] * 3]),
+        (None, None),
+    ):
+        write_ply(tmp_path / "sparse_pc.ply", points, colors)
+        scene = load_scene(tmp_path, CFG)
+        assert np.allclose(scene.points, points)
+        assert not scene.random_seeds
+        assert (scene.point_colors is None) == (expected is None)
+        assert expected is None or scene.point_colors.tolist() == expected
 
 
 def test_broken_nerfstudio_seeds(tmp_path):
     studio(tmp_path, ply_file_path="sparse_pc.ply")
     path = tmp_path / "sparse_pc.ply"
-    with pytest.raises(UserError, match=r"seed points .*sparse_pc.ply do not exist"):
+    with refused(r"seed points .*sparse_pc.ply do not exist"):
         find_scene(tmp_path, CFG)
     write_ply(path, np.array([[0.0, 0.0, np.nan]]))
-    with pytest.raises(UserError, match=r"sparse_pc.ply: 1 of 1 points are not finite"):
+    with refused(r"sparse_pc.ply: 1 of 1 points are not finite"):
         find_scene(tmp_path, CFG)
     write_ply(path, np.zeros((9, 3)))
     path.write_bytes(path.read_bytes()[:-7])
-    with pytest.raises(UserError, match=r"sparse_pc.ply is no PLY of points"):
+    with refused(r"sparse_pc.ply is no PLY of points"):
         find_scene(tmp_path, CFG)
     write_ply(path, np.zeros((0, 3)))
     assert "sparse_pc.ply holds no points" in find_scene(tmp_path, CFG).notes[-1]
-    studio(tmp_path, ply_file_path=7)
-    with pytest.raises(UserError, match='"ply_file_path" is not the name of a file'):
-        find_scene(tmp_path, CFG)
+    with refused('"ply_file_path" is not the name of a file'):
+        find_scene(studio(tmp_path, ply_file_path=7), CFG)

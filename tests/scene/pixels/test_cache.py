@@ -1,0 +1,247 @@
+"""Photographs that memory does not hold are decoded once, by processes, and read bit for bit."""
+
+import dataclasses
+import errno
+import os
+import shutil
+import signal
+import time
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from scene.helpers import make_view, refused
+
+from p2gs_jax.config import DataConfig
+from p2gs_jax.scene.pixels import cache
+from p2gs_jax.scene.pixels.store import ImageStore
+from p2gs_jax.types import Distortion
+
+SIZE, SHRINKS = (48, 64), (2, 1)
+NONE = DataConfig(cache_mb=0)
+
+
+def noisy_view(folder, name, channels=3, dtype=np.uint8, **fields):
+    """Write noise and return a view of it."""
+    rng = np.random.default_rng(len(name) + sum(name.encode()))
+    pixels = rng.integers(0, np.iinfo(dtype).max, (*SIZE, channels), dtype=dtype, endpoint=True)
+    return make_view(folder / name, pixels, f=50, **fields)
+
+
+@pytest.fixture
+def kinds(tmp_path):
+    """Return one photograph of every kind that is stored in its own way."""
+    (tmp_path / "images").mkdir()
+    mask, car = np.full(SIZE, 255, np.uint8), np.zeros((12, 16), bool)
+    mask[10:20, 5:30], car[9:] = 0, True
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    fields = {
+        "plain.png": {},
+        "deep.png": {"dtype": np.uint16},
+        "masked.png": {"mask_path": tmp_path / "mask.png"},
+        "lens.png": {"distortion": Distortion((-0.1, 0.02, 0.0, 0.0))},
+        "matted.png": {"channels": 4, "alpha": "background"},
+        "matted_deep.png": {"channels": 4, "dtype": np.uint16, "alpha": "background"},
+        "cut_out.png": {"channels": 4, "alpha": "mask"},
+        "driven.png": {"own_car": car},
+    }
+    return [noisy_view(tmp_path / "images", name, **given) for name, given in fields.items()]
+
+
+@pytest.fixture
+def views(tmp_path):
+    (tmp_path / "images").mkdir()
+    return [noisy_view(tmp_path / "images", f"{k}.png") for k in range(12)]
+
+
+def in_files(tmp_path, views, cfg=NONE):
+    return ImageStore(views, cfg, folder=tmp_path / "pixels")
+
+
+def stored(store, count, shrink):
+    """Return all that a store holds of every photograph."""
+    return [(*store.stored(k, shrink), store.alpha(k, shrink)) for k in range(count)]
+
+
+def same(store, views, shrinks=SHRINKS):
+    """Assert that a store holds what another decodes."""
+    plain = ImageStore(views, DataConfig())
+    for shrink in shrinks:
+        expected, found = (stored(s, len(views), shrink) for s in (plain, store))
+        for a, b in zip(sum(expected, ()), sum(found, ()), strict=True):
+            assert (a is None) == (b is None)
+            assert a is None or (a.dtype, a.shape, a.tobytes()) == (b.dtype, b.shape, b.tobytes())
+        assert not any(array.flags.writeable for one in found for array in one[:2])
+    plain.close()
+
+
+@pytest.mark.parametrize("shrink", [1, 2, 3])
+def test_every_kind_comes_back_bit_for_bit(tmp_path, kinds, shrink):
+    store = in_files(tmp_path, kinds)
+    for _ in range(2):
+        same(store, kinds, [shrink])
+    assert store.decodings == len(kinds)
+    # Another start decodes nothing.
+    again = in_files(tmp_path, kinds)
+    stored(again, len(kinds), shrink)
+    assert again.decodings == 0
+
+
+def test_what_is_held_stays_below_the_bound(tmp_path):
+    """64 photographs of 512x512 take 64 MiB; 4 may be held, and none is decoded twice."""
+    pixels = np.zeros((512, 512, 3), np.uint8)
+    made = [make_view(tmp_path / f"{k}.png", pixels + k) for k in range(64)]
+    store = in_files(tmp_path, made, DataConfig(cache_mb=4))
+    for k in (*range(64), *range(64)):
+        assert store.stored(k)[0].max() == k
+        assert store.cached_bytes <= 4 * 2**20
+    assert store.decodings == 64
+
+
+def test_a_set_that_fits_writes_nothing_and_clears_what_an_earlier_start_wrote(tmp_path, kinds):
+    folder = tmp_path / "pixels"
+    stored(in_files(tmp_path, kinds), len(kinds), 1)
+    assert any(folder.rglob("*.px"))
+    stored(in_files(tmp_path, kinds, DataConfig()), len(kinds), 1)
+    assert not folder.exists()
+
+
+def _photograph(view, folder):
+    cv2.imwrite(str(view.image_path), np.full((*SIZE, 3), 7, np.uint8))
+    os.utime(view.image_path, ns=(1, 1))
+    return {}
+
+
+def _mask(view, folder):
+    cv2.imwrite(str(folder / "other.png"), np.zeros(SIZE, np.uint8))
+    return {"mask_path": folder / "other.png"}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        _photograph,
+        _mask,
+        lambda view, folder: {"distortion": Distortion((0.2, 0, 0, 0))},
+        lambda view, folder: {"own_car": np.ones((3, 4), bool)},
+        lambda view, folder: {"K": view.K * [[1.5], [1.5], [1]]},
+    ],
+    ids=["photograph", "mask", "lens", "car", "focal"],
+)
+def test_what_pixels_depend_on_makes_them_anew(tmp_path, change):
+    view = noisy_view(tmp_path, "a.png", distortion=Distortion((0.1, 0, 0, 0)))
+    in_files(tmp_path, [view]).stored(0)
+    (first,) = (tmp_path / "pixels").rglob("*.px")
+    changed = [dataclasses.replace(view, **change(view, tmp_path))]
+    store = in_files(tmp_path, changed)
+    assert not first.exists()
+    same(store, changed, [1])
+    assert store.decodings == 1
+
+
+@pytest.mark.parametrize("damage", [lambda d: d[:100], lambda d: d[:-64], lambda d: b"x" * len(d)])
+def test_a_damaged_file_is_made_again(tmp_path, damage):
+    view = noisy_view(tmp_path, "a.png")
+    in_files(tmp_path, [view]).stored(0)
+    (path,) = (tmp_path / "pixels").rglob("*.px")
+    path.write_bytes(damage(path.read_bytes()))
+    (path.parent / ".writing-killed.px").write_bytes(b"half")
+    same(in_files(tmp_path, [view]), [view], [1])
+    assert [p.name for p in path.parent.iterdir()] == [path.name]
+
+
+def test_a_disk_without_room_is_refused_at_once(tmp_path, kinds, monkeypatch):
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=1000))
+    message = r"8 decoded photographs take 1 MB of disk.*1 MB left"
+    with refused(message, "--data.cache-mb 1"):
+        in_files(tmp_path, kinds)
+    in_files(tmp_path, kinds, DataConfig())
+
+
+def test_a_disk_that_fills_names_the_option(tmp_path, kinds, monkeypatch):
+    def full(*args, **options):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(cache, "atomic_write", full)
+    with refused("No space left on device", "--data.cache-mb"):
+        in_files(tmp_path, kinds).stored(0)
+
+
+# ------------------------------------------------------------------ processes
+
+
+@pytest.fixture
+def started(monkeypatch):
+    """Let processes begin for a few photographs; return those that were started."""
+    found, begin = [], cache.subprocess.Popen
+
+    def kept(*args, **options):
+        found.append(begin(*args, **options))
+        return found[-1]
+
+    monkeypatch.setattr(cache, "FEWEST", 1)
+    monkeypatch.setattr(cache.subprocess, "Popen", kept)
+    return found
+
+
+def wait_for(processes, seconds=60):
+    end = time.monotonic() + seconds
+    while not all(p.poll() is not None for p in processes):
+        assert time.monotonic() < end, "nothing happens"
+        time.sleep(0.02)
+
+
+def test_processes_decode_all_sizes_and_the_caller_none(tmp_path, views, started):
+    views[5].image_path.write_bytes(b"no photograph")
+    store = in_files(tmp_path, views)
+    store.expect(SHRINKS)
+    assert started
+    wait_for(started)
+    # What a process cannot decode is reported to the caller that asks.
+    with refused(r"5\.png"):
+        store.stored(5)
+    for row in {*range(12)} - {5}:
+        assert [len(store.stored(row, s)[0]) for s in SHRINKS] == [24, 48]
+    assert store.decodings == 0
+    store.close()
+
+
+def test_the_caller_goes_on_where_a_process_dies(tmp_path, views, started):
+    store = in_files(tmp_path, views)
+    store.expect(SHRINKS)
+    for process in started:
+        os.kill(process.pid, signal.SIGKILL)
+    same(store, views)
+    assert store.decodings > 0
+    store.close()
+
+
+def test_one_who_decodes_alone_opens_a_photograph_once(tmp_path, views):
+    """Too few for processes: the size that is asked for first brings the others with it."""
+    store = in_files(tmp_path, views)
+    store.expect(SHRINKS)
+    store.stored(3, 1)
+    views[3].image_path.unlink()
+    assert store.stored(3, 2)[0].shape == (24, 32, 3)
+    assert store.decodings == 2
+    store.close()
+
+
+@pytest.mark.parametrize("end", ["closed", "forgotten"])
+def test_processes_end_with_the_store(tmp_path, views, started, end):
+    store = in_files(tmp_path, views)
+    store.expect(SHRINKS)
+    assert started
+    if end == "closed":
+        store.close()
+    del store
+    assert all(p.poll() is not None for p in started)
+
+
+def test_a_set_that_memory_holds_starts_none(tmp_path, views, started):
+    store = in_files(tmp_path, views, DataConfig())
+    store.expect(SHRINKS)
+    assert not started
+    same(store, views)
+    store.close()
