@@ -35,8 +35,7 @@ def _blur(maps: Float[Array, "m h w"], always: Bool[Array, ""]) -> Float[Array, 
     margin = WINDOW // 2
     padded = materialize(always, lambda: jnp.pad(maps, ((0, 0), (margin,) * 2, (margin,) * 2)))
     across = materialize(
-        always,
-        lambda: sum(k * padded[:, :, i : i + width] for i, k in enumerate(_kernel())),
+        always, lambda: sum(k * padded[:, :, i : i + width] for i, k in enumerate(_kernel()))
     )
     return jnp.asarray(sum(k * across[:, i : i + height] for i, k in enumerate(_kernel())))
 

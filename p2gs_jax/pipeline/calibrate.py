@@ -247,17 +247,13 @@ def _details(
     agreement: Agreement,
 ) -> dict[str, Any]:
     s = selection.solution
+    names = ("residual_ev", "view_residual_ev", "view_balance_ev", "outliers", "component")
     return {
         "messages": messages,
         "observations": observations,
         "seconds": seconds,
         "solution": s.state,
-        "residual_ev": s.residual_ev,
-        "view_residual_ev": s.view_residual_ev,
-        "view_balance_ev": s.view_balance_ev,
-        "outliers": s.outliers,
-        "component": s.component,
-        "observations_per_view": s.observations_per_view,
+        **{name: getattr(s, name) for name in (*names, "observations_per_view")},
         "agreement": agreement._asdict(),
         "candidates": [
             {

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import time
 from pathlib import Path
@@ -28,14 +27,13 @@ from p2gs_jax.photometry.sources.points import has_tracks, rendered_colors, trac
 from p2gs_jax.pipeline.calibrate import Calibration, solved, write_calibration
 from p2gs_jax.pipeline.exposures import decide
 from p2gs_jax.pipeline.finish import Account, finish
-from p2gs_jax.pipeline.fit import begun, compact, optimise
+from p2gs_jax.pipeline.fit import Optimiser, begun, compact
 from p2gs_jax.pipeline.preflight import Paths, check_run_dir
 from p2gs_jax.pipeline.prepare import Prepared
 from p2gs_jax.run.folder import RunFolder, locked
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.exposures import check_source
 from p2gs_jax.scene.pixels.store import ImageStore
-from p2gs_jax.train.step import StepPrograms
 from p2gs_jax.types import Gaussians, Params, Scene
 
 # Steps of refitting colours and opacities, one view each.
@@ -117,11 +115,8 @@ def _refit(
     clock = Stopwatch()
     clock.add("reading", found.seconds["reading"])
     clock.add("photometry", found.seconds["adjustment"])
-    with (
-        contextlib.closing(StepPrograms()) as programs,
-        begun(folder, paths, cfg, start.decisions),
-    ):
-        result = optimise(start, folder, reporter, programs, resume=False)
+    with Optimiser(folder, reporter) as optimiser, begun(folder, paths, cfg, start.decisions):
+        result = optimiser.run(start)
     params, _ = compact(result)
     account = Account(
         counts={

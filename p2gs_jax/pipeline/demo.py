@@ -21,14 +21,7 @@ from p2gs_jax.synth.write import write_street
 
 @dataclass(frozen=True)
 class DemoResult:
-    """What the demo found.
-
-    Attributes:
-        rows: (view, true stops, recovered stops), each from its mean.
-        error: exposure error after alignment.
-        metrics: what `metrics.json` holds.
-        run_dir: the run folder.
-    """
+    """What the demo found: rows of (view, true stops, recovered stops), each from its mean."""
 
     rows: list[tuple[str, float, float]]
     error: ExposureError

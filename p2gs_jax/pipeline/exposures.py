@@ -154,9 +154,7 @@ def decide(
     # Known exposures that are to be kept are not learned, and nothing pulls at their mean.
     keep = cfg.photometry.known_deviation_ev == 0
     return dataclasses.replace(
-        decided,
-        log_exposure_mean=None,
-        freeze_until=1.0 if keep else decided.freeze_until,
+        decided, log_exposure_mean=None, freeze_until=1.0 if keep else decided.freeze_until
     )
 
 
@@ -204,10 +202,7 @@ def unsolved(decided: Decisions) -> Decisions:
     """Return the decisions without what only a solution can give; views may still learn theirs."""
     by_view = decided.white_balance == "view"
     return dataclasses.replace(
-        decided,
-        white_balance="view" if by_view else None,
-        vignetting=None,
-        responses="all",
+        decided, white_balance="view" if by_view else None, vignetting=None, responses="all"
     )
 
 

@@ -14,7 +14,7 @@ from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.clock import CompileCounter, Stopwatch, over_budget
 from p2gs_jax.core.progress import Reporter
 from p2gs_jax.core.runtime import return_freed_memory
-from p2gs_jax.evaluation.evaluate import Evaluation, ViewResult, evaluate
+from p2gs_jax.evaluation.evaluate import ViewResult, evaluate
 from p2gs_jax.evaluation.lpips import LpipsWeights
 from p2gs_jax.evaluation.references import Reference, find_radiance
 from p2gs_jax.evaluation.scores import is_drive, untold_notes
@@ -107,7 +107,8 @@ def finish(
             on_view=on_view,
             on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
         )
-    _tell(_findings(found), account, reporter)
+    metered = [found.metering.sentence] if found.metering.telling else []
+    _tell([*untold_notes(found.metrics), *metered], account, reporter)
     # Views are written while they are judged.
     watch.add("evaluation", -watch.seconds.get("files", 0.0))
     reporter.stage("Writing files")
@@ -133,11 +134,6 @@ def finish(
     still_ours()
     write_json(folder.metrics, metrics)
     return metrics
-
-
-def _findings(found: Evaluation) -> list[str]:
-    metered = [found.metering.sentence] if found.metering.telling else []
-    return [*untold_notes(found.metrics), *metered]
 
 
 def _tell(notes: list[str], account: Account, reporter: Reporter) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import functools
 import shutil
 import time
 from collections.abc import Iterator, Mapping
@@ -108,45 +107,31 @@ def fit(
     require_free(paths.run)
     weights = preflight(cfg, paths, resume=resume)
     mesh, clock, compiler = mesh_of(cfg, devices), Stopwatch(), CompileCounter()
-    own = Own(terms, formation, strategy)
     with no_empty_folders(paths.run), locked(paths.run) as lock, memory_named():
         check_run_dir(paths.run, resume, cfg)  # another may have ended since
         scene = _read(paths, cfg, reporter, clock)
         truth = check_scene(scene, cfg, paths, weights)
-        with contextlib.closing(StepPrograms()) as programs:
+        kept = kept_choice(cfg, folder) if resume else None
+        with Optimiser(folder, reporter, mesh, Own(terms, formation, strategy)) as optimiser:
             start = prepare(
-                scene,
-                cfg,
-                reporter,
-                clock,
-                functools.partial(begin_programs, programs, folder=folder, mesh=mesh, own=own),
-                kept=kept_choice(cfg, folder) if resume else None,
-                pixels=folder.pixels,
+                scene, cfg, reporter, clock, optimiser.begin, kept=kept, pixels=folder.pixels
             )
             lock.require()
+            reserve_s = seconds_to_finish(scene, cfg, weights, reference=truth is not None)
             with begun(folder, paths, cfg, start.decisions), memory_named():
-                result = optimise(
-                    start,
-                    folder,
-                    reporter,
-                    programs,
-                    resume=resume,
-                    mesh=mesh,
-                    spent_s=time.monotonic() - begin,
-                    reserve_s=seconds_to_finish(scene, cfg, weights, reference=truth is not None),
-                    own=own,
-                )
+                spent_s, starting = time.monotonic() - begin, spent_s
+                result = optimiser.run(start, resume=resume, spent_s=spent_s, reserve_s=reserve_s)
         params, owner = compact(result)
         params = centred(exposures_apart(params), cfg)
         lock.require()
-        starting = {"starting": spent_s} if spent_s else {}
+        seconds = ({"starting": starting} if starting else {}) | clock.seconds
         metrics = finish(
             params,
             start.scene,
             start.store,
             start.cfg,
             folder,
-            _account(params, scene, start, result, {**starting, **clock.seconds}, begin, compiler),
+            _account(params, scene, start, result, seconds, begin, compiler),
             reporter,
             owner=owner,
             truth=truth,
@@ -169,90 +154,83 @@ def _read(paths: Paths, cfg: FitConfig, reporter: Reporter, clock: Stopwatch) ->
     return scene
 
 
-def trainer_of(
-    start: Prepared,
-    folder: RunFolder,
-    programs: StepPrograms,
-    reporter: Reporter | None = None,
-    mesh: Mesh | None = None,
-    own: Own = AS_CONFIGURED,
-) -> Trainer:
-    """Return what runs the steps of a fit; its messages are noted in `start` as well."""
-    reporter = reporter or Silent()
-
-    def say(text: str) -> None:
-        start.notes.append(text)
-        reporter.message(text)
-
-    rows, seed = start.scene.train_indices, start.cfg.train.seed
-    return Trainer(
-        start.cfg,
-        TrainingViews(start.fitted, rows, seed, start.measured),
-        start.extent,
-        start.pairs,
-        start.coverage,
-        folder.root,
-        programs,
-        start.decisions,
-        on_log=reporter.log,
-        on_message=say,
-        mesh=mesh,
-        terms=own.terms,
-        strategy=own.strategy,
-    )
-
-
-def optimise(
-    start: Prepared,
-    folder: RunFolder,
-    reporter: Reporter,
-    programs: StepPrograms,
-    *,
-    resume: bool,
-    spent_s: float = 0.0,
-    reserve_s: float = 0.0,
-    mesh: Mesh | None = None,
-    own: Own = AS_CONFIGURED,
-) -> TrainResult:
-    """Run the optimisation, from the start or from the newest checkpoint.
+class Optimiser:
+    """Compiles and runs the steps of a fit; as a context manager it ends the compilers.
 
     Args:
-        start: from `prepare`.
         folder: of the run: where the log and checkpoints go.
         reporter: receives progress.
-        programs: compiled steps, some of them perhaps begun.
-        resume: continue from the newest checkpoint.
-        spent_s: seconds of the budget that are already gone.
-        reserve_s: seconds of the budget to keep for evaluation and files.
         mesh: the devices of a step of several views; None: the default one.
         own: what the caller of `fit` brought.
     """
-    alive = np.ones(start.params.gaussians.capacity, bool)
-    return trainer_of(start, folder, programs, reporter, mesh, own).run(
-        own.among(start.params),
-        alive,
-        start.owner,
-        resume=resume,
-        spent_s=spent_s,
-        finish_s=reserve_s,
-    )
 
+    def __init__(
+        self,
+        folder: RunFolder,
+        reporter: Reporter | None = None,
+        mesh: Mesh | None = None,
+        own: Own = AS_CONFIGURED,
+    ):
+        self._folder, self._reporter = folder, reporter or Silent()
+        self._mesh, self._own = mesh, own
+        self._programs = StepPrograms()
 
-def begin_programs(
-    programs: StepPrograms,
-    known: Prepared,
-    curve: bool,
-    *,
-    folder: RunFolder,
-    mesh: Mesh | None = None,
-    own: Own = AS_CONFIGURED,
-) -> None:
-    """Begin to compile steps while the exposures are solved, mostly on one core.
+    def __enter__(self) -> Optimiser:
+        return self
 
-    `curve` says whether the tone curve of what is known is chosen.
-    """
-    trainer = trainer_of(known, folder, programs, mesh=mesh, own=own)
-    trainer.expect(own.among(known.params), known.owner, curve)
+    def __exit__(self, *exc) -> None:
+        self._programs.close()
+
+    def begin(self, known: Prepared, curve: bool) -> None:
+        """Begin to compile steps while the exposures are solved, mostly on one core.
+
+        `curve` says whether the tone curve of what is known is chosen.
+        """
+        trainer = self._trainer(known, Silent())
+        trainer.expect(self._own.among(known.params), known.owner, curve)
+
+    def run(
+        self,
+        start: Prepared,
+        *,
+        resume: bool = False,
+        spent_s: float = 0.0,
+        reserve_s: float = 0.0,
+    ) -> TrainResult:
+        """Run the optimisation, from the start or from the newest checkpoint.
+
+        Args:
+            start: from `prepare`; what the steps have to say is noted in it as well.
+            resume: continue from the newest checkpoint.
+            spent_s: seconds of the budget that are already gone.
+            reserve_s: seconds of the budget to keep for evaluation and files.
+        """
+        alive = np.ones(start.params.gaussians.capacity, bool)
+        params, owner = self._own.among(start.params), start.owner
+        how = {"resume": resume, "spent_s": spent_s, "finish_s": reserve_s}
+        return self._trainer(start, self._reporter).run(params, alive, owner, **how)
+
+    def _trainer(self, start: Prepared, reporter: Reporter) -> Trainer:
+        def say(text: str) -> None:
+            start.notes.append(text)
+            reporter.message(text)
+
+        rows, seed = start.scene.train_indices, start.cfg.train.seed
+        return Trainer(
+            start.cfg,
+            TrainingViews(start.fitted, rows, seed, start.measured),
+            start.extent,
+            start.pairs,
+            start.coverage,
+            self._folder.root,
+            self._programs,
+            start.decisions,
+            on_log=reporter.log,
+            on_message=say,
+            mesh=self._mesh,
+            terms=self._own.terms,
+            strategy=self._own.strategy,
+        )
 
 
 def compact(result: TrainResult) -> tuple[Params, np.ndarray | None]:

@@ -47,13 +47,7 @@ OPTIONS = "--gaussians, --max-width or --data.cache-mb"
 
 @dataclass(frozen=True)
 class Paths:
-    """What a fit reads and writes.
-
-    Attributes:
-        scene: folder or file that is fitted.
-        run: the run folder.
-        reference: photographs of the same views under one common exposure, or None.
-    """
+    """What a fit reads and writes; `reference` is under one common exposure."""
 
     scene: Path
     run: Path
@@ -105,28 +99,33 @@ def check_start(p: PhotometryConfig, preset: str) -> None:
     Raises:
         UserError: known exposures or the curve do not go with it.
     """
-    if p.known is not None and p.start != "tracks":
-        raise UserError(
+    curved, random = p.curve != "linear", "--photometry.curve linear --photometry.start random"
+    refused = [
+        (
+            p.known is not None and p.start != "tracks",
             f"the preset {preset!r} starts exposures at random: known ones would be ignored.",
-            fix="leave out --known-exposures, or add --photometry.start tracks",
-        )
-    if p.appearance == "ppisp" and p.curve != "linear":
-        raise UserError(
+            "leave out --known-exposures, or add --photometry.start tracks",
+        ),
+        (
+            p.appearance == "ppisp" and curved,
             f"ppisp learns a whole camera: the curve {p.curve!r} would come before it.",
-            fix="use --preset ppisp, or add --photometry.curve linear --photometry.start random",
-        )
-    if p.appearance == "luminance" and p.curve != "linear":
-        raise UserError(
+            f"use --preset ppisp, or add {random}",
+        ),
+        (
+            p.appearance == "luminance" and curved,
             f"Luminance-GS maps display values to display values: it knows no curve {p.curve!r}.",
-            fix="use --preset luminance_gs, or add --photometry.curve linear --photometry.start "
-            "random",
-        )
-    if p.curve == "linear" and p.start == "tracks":
-        raise UserError(
+            f"use --preset luminance_gs, or add {random}",
+        ),
+        (
+            not curved and p.start == "tracks",
             "the curve 'linear' splats display values; the tracks' bundle adjustment does not know "
             "it.",
-            fix="add --photometry.start random, or use the preset ppisp or one of 3dgs*",
-        )
+            "add --photometry.start random, or use the preset ppisp or one of 3dgs*",
+        ),
+    ]
+    for wrong, message, fix in refused:
+        if wrong:
+            raise UserError(message, fix=fix)
 
 
 def check_sizes(views: Sequence[View], cfg: FitConfig) -> None:
@@ -209,20 +208,12 @@ def _differences(saved: dict, now: dict, prefix: str = "") -> list[str]:
 
 
 class MemoryNeeded(NamedTuple):
-    """Bytes that a fit takes at its peak.
+    """Bytes that a fit takes at its peak, and the largest `population` there may be."""
 
-    Attributes:
-        programs: Python, libraries, compiling.
-        gaussians: parameters, moments, gradients, of the largest population.
-        photographs: decoded and kept.
-        view: pictures of the largest view and their gradients.
-        population: the largest there may be.
-    """
-
-    programs: float
-    gaussians: float
-    photographs: float
-    view: float
+    programs: float  # Python, libraries, compiling
+    gaussians: float  # parameters, moments, gradients
+    photographs: float  # decoded and kept
+    view: float  # pictures of the largest view and their gradients
     population: int
 
     @property

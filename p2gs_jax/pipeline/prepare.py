@@ -148,7 +148,7 @@ def prepare(
             # What cameras do enters the programs, and is only solved now.
             if expected is not None and form.vignetting is None and response.by == "all":
                 decisions = with_choice(expected.decisions, form, response)
-                on_expected(_under(expected, decisions, cfg), True)
+                on_expected(expect(found, decisions), True)
 
         exposures = given
         if exposures is None:
@@ -184,15 +184,6 @@ def expect(found: Survey, decisions: Decisions) -> Prepared:
         owner=owner,
         measured=found.measured,
     )
-
-
-def _under(expected: Prepared, decisions: Decisions, cfg: FitConfig) -> Prepared:
-    """Return what is expected under other decisions."""
-    under = decisions.resolve(cfg)
-    taken_by = [view.camera for view in expected.scene.training_views]
-    photometry = initial_photometry(None, taken_by, under)
-    params = dataclasses.replace(expected.params, photometry=photometry)
-    return dataclasses.replace(expected, params=params, decisions=decisions, cfg=under)
 
 
 def initialise(found: Survey, exposures: Exposures, reporter: Reporter | None = None) -> Prepared:

@@ -104,9 +104,7 @@ class CheckpointStore:
         return jax.tree.unflatten(jax.tree.structure(like), leaves), meta
 
     def restore_latest(
-        self,
-        like: Callable[[dict], Tree],
-        on_message: Callable[[str], None] = lambda text: None,
+        self, like: Callable[[dict], Tree], on_message: Callable[[str], None] = lambda text: None
     ) -> tuple[Tree, dict] | None:
         """Return the newest readable checkpoint and its values, or None where there is none.
 

@@ -261,12 +261,7 @@ def _fitted_rows(
 
 
 def write_solution(
-    path: Path,
-    solution: PhotometricSolution,
-    *,
-    views: Sequence[View],
-    pivot: float,
-    gauge: str,
+    path: Path, solution: PhotometricSolution, *, views: Sequence[View], pivot: float, gauge: str
 ) -> None:
     """Write `photometry.json` of a bundle adjustment; views it knows nothing about get nulls.
 

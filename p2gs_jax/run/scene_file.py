@@ -165,10 +165,7 @@ def _base(root: Path) -> Path:
 
 def _relative(path: Path, base: Path) -> str:
     """Return a path from the scene's folder where it lies below it, else an absolute one."""
-    for a, b in (
-        (os.path.abspath(path), os.path.abspath(base)),
-        (path.resolve(), base.resolve()),
-    ):
+    for a, b in ((os.path.abspath(path), os.path.abspath(base)), (path.resolve(), base.resolve())):
         if Path(a).is_relative_to(b):
             return Path(a).relative_to(b).as_posix()
     return Path(os.path.abspath(path)).as_posix()

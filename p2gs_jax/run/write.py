@@ -37,11 +37,7 @@ SUMMARY_VIEWS = 4
 
 
 def write_start(
-    folder: RunFolder,
-    scene: Path,
-    reference: Path | None,
-    cfg: FitConfig,
-    decisions: Decisions,
+    folder: RunFolder, scene: Path, reference: Path | None, cfg: FitConfig, decisions: Decisions
 ) -> None:
     """Write what was asked and what was decided: the folder is a run's from here on."""
     write_decisions(folder.decisions, decisions)

@@ -202,11 +202,7 @@ def test_hidden_views_are_left_out_of_the_scores(tmp_path, finished_run):
     scene = dataclasses.replace(run.scene, views=tuple(map(changed, run.scene.views)))
     shown = []
     now = evaluate(
-        run.params,
-        scene,
-        ImageStore(scene.views, run.cfg.data),
-        run.cfg,
-        on_view=shown.append,
+        run.params, scene, ImageStore(scene.views, run.cfg.data), run.cfg, on_view=shown.append
     ).metrics
     assert sorted(now["hidden"]) == sorted([trained[0], held_out[0]])
     assert now["exposures_unknown"] == [trained[1]]

@@ -121,7 +121,7 @@ def test_memory_that_runs_out_is_named(tmp_path, run_command, monkeypatch, error
             CheckpointStore(run / "checkpoints").save(3, {"a": np.zeros(2)}, {})
         raise error
 
-    monkeypatch.setattr(pipeline, "optimise", optimise)
+    monkeypatch.setattr(pipeline.Optimiser, "run", optimise)
     code, text = run_command("fit", made, "--out", run)
     assert code == 2
     assert "memory ran out" in text

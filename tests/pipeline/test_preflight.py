@@ -78,7 +78,8 @@ def test_a_folder_is_a_runs_once_there_is_something_to_continue(
 
     prepared = SimpleNamespace(cfg=FitConfig(), decisions=Decisions.as_asked(FitConfig()))
     monkeypatch.setattr(pipeline, "prepare", lambda *a, **k: prepared)
-    monkeypatch.setattr(pipeline, part, fails)
+    place, name = (pipeline, part) if part == "prepare" else (pipeline.Optimiser, "run")
+    monkeypatch.setattr(place, name, fails)
     with pytest.raises(DivergenceError):
         p2gs_jax.fit(scene, run, FitConfig())
     assert states == [part == "optimise"]

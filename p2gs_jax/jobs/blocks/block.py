@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import functools
 import shutil
 import time
 from pathlib import Path
@@ -25,14 +23,13 @@ from p2gs_jax.jobs.blocks.cut import Cut, whole_of
 from p2gs_jax.jobs.blocks.shared import Shared, photometry_of, read_shared
 from p2gs_jax.jobs.job import Job
 from p2gs_jax.pipeline.exposures import Exposures
-from p2gs_jax.pipeline.fit import begin_programs, begun, compact, optimise
+from p2gs_jax.pipeline.fit import Optimiser, begun, compact
 from p2gs_jax.pipeline.preflight import Paths
 from p2gs_jax.pipeline.prepare import load, prepare
 from p2gs_jax.run.folder import RunFolder, locked
 from p2gs_jax.scene.pixels.store import size_at
 from p2gs_jax.scene.visibility import shown_share
 from p2gs_jax.train.data_parallel import mesh_of
-from p2gs_jax.train.step import StepPrograms
 from p2gs_jax.types import Scene
 
 STATUS = Path("/proc/self/status")
@@ -171,19 +168,19 @@ def _fit(
 ) -> tuple[dict[str, int], dict[str, float]]:
     """Fit a block's scene and write its Gaussians; return counts and seconds."""
     clock, mesh = Stopwatch(), mesh_of(cfg)
-    with contextlib.closing(StepPrograms()) as programs:
+    with Optimiser(folder, reporter, mesh) as optimiser:
         prepared = prepare(
             block.scene,
             cfg,
             reporter,
             clock,
-            functools.partial(begin_programs, programs, folder=folder, mesh=mesh),
+            optimiser.begin,
             pixels=folder.pixels,
             given=block.exposures,
             sphere=block.shell,
         )
         with begun(folder, Paths(Path(scene), folder.root), cfg, prepared.decisions):
-            result = optimise(prepared, folder, reporter, programs, resume=True, mesh=mesh)
+            result = optimiser.run(prepared, resume=True)
     params, _ = compact(result)
     count = params.gaussians.capacity
     reporter.stage("Writing files")
