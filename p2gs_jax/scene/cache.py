@@ -53,7 +53,7 @@ def file_fingerprints(paths: Sequence[Path]) -> list[tuple[str, int, int]]:
 
 
 class StageProgress:
-    """Reports now and then how far a stage of `total` units is; the first message comes at once."""
+    """Reports now and then how far a stage is; the first message comes at once."""
 
     def __init__(
         self,

@@ -1,9 +1,9 @@
 """A COLMAP model, binary or text, and its photographs as a Scene.
 
-Why not `pycolmap.Reconstruction`: version 4.2.1 accepts a truncated `cameras.bin` without an error
-and never returns from a truncated `points3D.bin`. Here every count is checked against the size of
-the file. Newer models' `rigs.bin` and `frames.bin` are not needed: `images.bin` still holds every
-registered image with its own pose. Format: https://colmap.github.io/format.html
+Why not `pycolmap.Reconstruction`: version 4.2.1 accepts a truncated `cameras.bin` and never returns
+from a truncated `points3D.bin`. Here every count is checked against the size of the file. Newer
+models' `rigs.bin` and `frames.bin` are not needed: `images.bin` still holds every registered image
+with its own pose. Format: https://colmap.github.io/format.html
 """
 
 from __future__ import annotations
@@ -97,9 +97,8 @@ def load_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
 def tracks_of(model: Model, views: Sequence[View]) -> Tracks | None:
     """Return every observation of the model's points, in undistorted pixels of the views.
 
-    Views are matched by name, and keypoints rescaled from the resolution of the model's cameras.
-    Observations of points that the model does not have (some tools thin points3D without touching
-    the images file) and of images that are not among the views are left out.
+    Views are matched by name, and keypoints rescaled to their size. Observations of points that the
+    model lacks (some tools thin points3D alone) and of other images are left out.
     """
     if len(model.point_ids) == 0:
         return None
@@ -219,10 +218,9 @@ class ImageRecord(NamedTuple):
 
 
 class Model(NamedTuple):
-    """A COLMAP model as files of the suffix `kind` state it.
+    """A COLMAP model: cameras by id, images in the file's order, ascending `point_ids`.
 
-    Cameras are by id, images in the file's order, `point_ids` ascending; `xyz` are scene units,
-    `rgb` display-encoded.
+    `xyz` are scene units, `rgb` display-encoded, `kind` is the suffix of the files.
     """
 
     folder: Path

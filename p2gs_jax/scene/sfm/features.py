@@ -215,9 +215,8 @@ def pairs_by_name(names: Sequence[str], matching: Matching = "auto") -> list[Pai
 
     Sequences, one a top folder: each image meets the next 10 and those 16, 32, ... 512 later; where
     a sequence is asked for, every fifth also meets every other fifth, for who comes back to a
-    place; images of different folders meet at the same place in the sequence and next to it
-    (COLMAP's sequential matching would never match `left/` with `right/`). `auto` takes long lists
-    for sequences.
+    place; images of different folders meet at the same place in the sequence and next to it. `auto`
+    takes long lists for sequences.
     """
     if matching == "all" or (matching == "auto" and len(names) <= EXHAUSTIVE_LIMIT):
         return None

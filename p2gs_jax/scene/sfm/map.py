@@ -50,10 +50,9 @@ def load_images(
 ) -> Scene:
     """Run COLMAP's structure from motion on the photographs in a folder; read the largest model.
 
-    `work_dir` keeps it under `sfm/`, reused while names, sizes and modification times of the
-    photographs stay the same, and features and matches under `features/`, which serve more
-    photographs or another mapper. Raises UserError: fewer than two photographs, one of them is not
-    an image, none registered, or pycolmap lacks the mapper.
+    `work_dir` keeps it under `sfm/` while the photographs stay the same, and features and matches
+    under `features/`, which serve more photographs or another mapper. Raises UserError: fewer than
+    two photographs, one of them is not an image, none registered, or pycolmap lacks the mapper.
     """
     names = [path.relative_to(image_folder).as_posix() for path in paths]
     if len(paths) < 2:
