@@ -166,7 +166,9 @@ def _over_time(
         marker = CAMERA_MARKERS[k % len(CAMERA_MARKERS)]
         style = Style(CAMERA_COLORS[k % len(CAMERA_COLORS)], marker, line, size=4, width=1.2)
         empty = replace(style, line="", filled=False, size=5)
-        series.append(Series(short_name(name), seconds, found["found"], style, 2 * _errors(rows)))
+        known = np.isfinite(found["found"])
+        y, errors = found["found"][known], 2 * _errors(rows)[known]
+        series.append(Series(short_name(name), seconds[known], y, style, errors))
         series.append(Series("", seconds, found["held out"], empty))
     chart = charts.panels_chart(
         [("", series)],
