@@ -81,10 +81,7 @@ def mean_correction(appearance: Corrections | None, camera: str | None = None) -
 
 
 def exposures_apart(params: Params) -> Params:
-    """Return a finished fit with PPISP's exposures where all others have theirs: in `Photometry`.
-
-    Photographs stay as they are.
-    """
+    """Return a finished fit with PPISP's exposures in `Photometry`, as all others have theirs."""
     if not isinstance(params.appearance, Ppisp):
         return params
     stops, photometry = params.appearance.exposures, params.photometry
@@ -106,7 +103,7 @@ def without_place(correction: Correction | None, kind: Appearance | None) -> Cor
 
 
 def corrected(
-    ldr: Float[Array, "h w 3"], parameters: Correction, kind: Appearance
+    ldr: Float[Array, "h w 3"], parameters: Float[Array, "..."] | OneView | Curves, kind: Appearance
 ) -> Float[Array, "h w 3"]:
     """Return display values as one view shows them; `ldr` is rendered, for `ppisp` radiance."""
     if isinstance(parameters, OneView):
@@ -153,12 +150,9 @@ def _hats(pixels: int, cells: int) -> np.ndarray:
 
 
 def regularisation(parameters: Corrections, kind: Appearance) -> Float[Array, ""] | None:
-    """Return what a kind of correction asks of its parameters; None: nothing.
-
-    For bilateral grids it is the mean squared difference of neighbouring cells.
-    """
+    """Return the mean squared difference of neighbouring cells of grids, PPISP's own, or None."""
     if isinstance(parameters, Ppisp):
         return ppisp.regularisation_of(parameters)
-    if isinstance(parameters, Luminance) or kind != "bilateral":
+    if isinstance(parameters, Luminance | Formation) or kind != "bilateral":
         return None
     return sum((jnp.mean(jnp.diff(parameters, axis=k) ** 2) for k in (2, 3, 4)), jnp.zeros(()))

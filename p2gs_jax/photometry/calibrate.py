@@ -31,12 +31,11 @@ from p2gs_jax.photometry.models import (
     Curve,
     Form,
     Scope,
-    channel_powers,
     neighbours,
     parameter_count,
 )
 from p2gs_jax.photometry.observations import COARSEST, Observations
-from p2gs_jax.photometry.response import BASES, Response, spline_parameters
+from p2gs_jax.photometry.response import BASES, Response
 from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.scene.exposures import read_known_exposures
 from p2gs_jax.types import Scene
@@ -252,11 +251,9 @@ class _Search:
         return self._fitted[key]
 
     def parameters(self, choice: Choice) -> int:
-        """Return the number of free parameters of a choice, its curve not fitted yet."""
-        views, cameras = self.comparison.problem.observations.view_count, self.scope.cameras
-        count = parameter_count(choice.form, Response(), cameras, views)
-        by = choice.curve.splines
-        return count + spline_parameters(by, cameras) - channel_powers(choice.form, by)
+        """Return the number of free parameters of a choice."""
+        views = self.comparison.problem.observations.view_count
+        return parameter_count(choice.form, choice.curve.splines, self.scope.cameras, views)
 
     def solve(self, choices: Iterable[Choice]) -> bool:
         """Solve choices that are possible and not solved yet; return whether there were any."""

@@ -65,8 +65,8 @@ class Candidate:
 def choose(candidates: list[Candidate]) -> Candidate:
     """Return the simplest candidate that is not clearly worse than the best.
 
-    Of those as simple, or simpler, the one that predicts best: curves cost nothing within a form,
-    and a candidate may count as good only because nobody knows how much worse it is.
+    Of those as simple, or simpler, the one that predicts best: curves cost nothing within a
+    form.
     """
     simplest = min((c for c in candidates if c.good), key=lambda c: c.parameters)
     as_simple = [c for c in candidates if c.parameters <= simplest.parameters]
@@ -81,12 +81,7 @@ class Predicted(NamedTuple):
 
 
 class Comparison:
-    """Choices solved so far, and how well they predict what was `held` out.
-
-    Attributes:
-        problem: all observations.
-        fits: the solutions, and the curves they were solved under.
-    """
+    """Choices solved so far (`fits`), and how well they predict what was `held` out."""
 
     def __init__(self, problem: Problem, held: Bool[np.ndarray, " o"]):
         self.problem, self.fits = problem, dict[Choice, tuple[Fit, Response]]()
@@ -121,7 +116,7 @@ class Comparison:
     def _candidate(
         self, choice: Choice, density: float, found: Predicted, best: Predicted
     ) -> Candidate:
-        o, response = self.problem.observations, self.fits[choice][1]
+        o = self.problem.observations
         cameras = int(o.cameras.max(initial=0)) + 1
         # Neighbours in an image err alike, as do its pixels.
         lower = best.densities - found.densities
@@ -130,8 +125,8 @@ class Comparison:
         )
         return Candidate(
             choice,
-            response,
-            parameter_count(choice.form, response, cameras, o.view_count),
+            self.fits[choice][1],
+            parameter_count(choice.form, choice.curve.splines, cameras, o.view_count),
             density,
             deficit,
             max(of_views, of_regions),
@@ -147,10 +142,7 @@ def _mean(densities: Densities) -> float:
 def _predict(
     problem: Problem, fit: Fit, response: Response, held: np.ndarray, scale: float
 ) -> Predicted:
-    """Return what a fit says about observations in rows `held`, which it was not fitted to.
-
-    `scale` is that of the stated deviations.
-    """
+    """Return what a fit says about rows that were held out; `scale` is of the stated deviations."""
     o, layout = problem.observations, problem.layout
     sigma, slope = (a[held] for a in o.decoded(response)[1:])
     residual = fit.at.residual[held]

@@ -225,13 +225,14 @@ def formation(
     the view, or of each of loose pixels, which need `positions` if vignetting counts (see
     `gain`).
     """
+    shown: Any = linear
     if isinstance(correction, Formation):
-        return correction.apply(linear, capture)
+        return correction.apply(shown, capture)  # pyright: ignore[reportReturnType]
     exposed = expose(linear, capture, cfg, positions)
-    ldr: Any = tone_map(exposed, _by_pixel(capture.gamma), cfg, capture.camera)
-    if cfg.appearance is None or correction is None:
-        return ldr
-    return corrected(ldr, correction, cfg.appearance)
+    shown = tone_map(exposed, _by_pixel(capture.gamma), cfg, capture.camera)
+    if cfg.appearance is not None and correction is not None:
+        shown = corrected(shown, correction, cfg.appearance)
+    return shown
 
 
 def inverse_formation(
@@ -289,5 +290,5 @@ def composited(ldr: Values, matte: Matte | None) -> Values:
     """Return display values of what is there, over the background; None: there is none."""
     if matte is None:
         return ldr
-    alpha = matte.alpha[..., None]
+    alpha: Any = matte.alpha[..., None]
     return alpha * ldr + (1 - alpha) * matte.backdrop

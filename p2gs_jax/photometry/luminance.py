@@ -164,11 +164,7 @@ def pseudo_curve(shape: Float[Array, " 3"]) -> Float[Array, " k"]:
 def cumulative(
     grey: Float[Array, " p"], weight: Float[Array, " p"], steps: int
 ) -> Float[Array, " s"]:
-    """Return the share of pixels up to k / (steps - 1), for k from 0 to steps - 1.
-
-    `grey` is the mean of the channels. Without any weight, shares are those of evenly spread
-    values.
-    """
+    """Return the shares of greys up to k / (steps - 1); without any weight, even ones."""
     bins = jnp.clip(jnp.ceil(grey * (steps - 1)), 0, steps - 1).astype(jnp.int32)
     counts = jnp.zeros(steps, grey.dtype).at[bins].add(weight)
     total = counts.sum()
@@ -179,10 +175,7 @@ def cumulative(
 def statistics_of(
     photograph: Float[Array, "h w 3"], mask: Float[Array, "h w"]
 ) -> Float[Array, " s"]:
-    """Return what the network is given of a photograph: its histogram and its mean colour.
-
-    Every fourth pixel along both axes counts, where the mask is 1.
-    """
+    """Return the histogram and the mean colour of every fourth pixel along both axes."""
     seen, weight = photograph[::4, ::4].reshape(-1, 3), mask[::4, ::4].reshape(-1)
     mean = (weight[:, None] * seen).sum(0) / jnp.maximum(weight.sum(), 1.0)
     return jnp.concatenate([cumulative(seen.mean(-1), weight, LEVELS), mean])

@@ -55,10 +55,7 @@ WORTH_A_NUMBER = 0.85
 
 
 def meter(linear: Float[np.ndarray, "h w 3"], alpha: Float[np.ndarray, "h w"]) -> dict[str, float]:
-    """Return what every meter reads, natural logarithm of luminance; NaN where nothing is seen.
-
-    The radiance is premultiplied by the opacity.
-    """
+    """Return what meters read of premultiplied radiance, natural logarithm; NaN: nothing."""
     step = max(1, int(np.sqrt(alpha.size / PIXELS)))
     weight = np.asarray(alpha[::step, ::step], np.float64)
     light = np.asarray(linear[::step, ::step], np.float64) @ LUMINANCE
@@ -263,10 +260,9 @@ def _explains(best: Rule, errors: np.ndarray, constant: Rule, alone: np.ndarray)
 
 
 def adapted(log_exposures: Float[np.ndarray, " f"], frames: float) -> Float[np.ndarray, " f"]:
-    """Return exposures along a path that follow those metered as slowly as cameras adapt.
+    """Return exposures that follow those metered slowly, to 1/e in so many frames.
 
-    An exponential filter to both sides, so that a path played backwards looks the same; it falls to
-    1/e after so many frames.
+    An exponential filter to both sides, so that a path played backwards looks the same.
     """
     count = len(log_exposures)
     away = np.abs(np.arange(count)[:, None] - np.arange(count))

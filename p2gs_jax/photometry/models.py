@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from p2gs_jax.config import Level, ResponseKind, VignettingKind
 from p2gs_jax.config import PhotometricModel as ModelName
-from p2gs_jax.photometry.response import BASES, Base, Response
+from p2gs_jax.photometry.response import BASES, Base, spline_parameters
 
 
 class Model(NamedTuple):
@@ -74,8 +74,12 @@ def possible(form: Form, cameras: int) -> bool:
     return form.white_balance != "view" or varies.exposure == "view"
 
 
-def parameter_count(form: Form, response: Response, cameras: int, views: int) -> int:
-    """Return the number of free parameters, splines included; each level loses one to its gauge."""
+def parameter_count(form: Form, by: ResponseKind | None, cameras: int, views: int) -> int:
+    """Return the number of free parameters, with splines `by` camera or channel, if any.
+
+    Each level loses one to its gauge. Where every channel has exposures of its own, no photograph
+    tells its power: two more are gauges beside that of responses by themselves.
+    """
     size = {None: 0, "camera": cameras - 1, "view": views - 1}
     varies = MODELS[form.model]
     return (
@@ -83,17 +87,9 @@ def parameter_count(form: Form, response: Response, cameras: int, views: int) ->
         + size[varies.gamma]
         + 2 * size[form.white_balance]
         + cameras * polynomials(form.vignetting) * len(VIGNETTING_POWERS)
-        + response.extra_parameters
-        - channel_powers(form, response.by)
+        + spline_parameters(by, cameras)
+        - 2 * (by == "channel" and form.white_balance == "view")
     )
-
-
-def channel_powers(form: Form, by: ResponseKind | None) -> int:
-    """Return how many powers of channels are gauges beside that of responses by themselves.
-
-    Where every channel has exposures of its own, no photograph tells its power.
-    """
-    return 2 if by == "channel" and form.white_balance == "view" else 0
 
 
 class Curve(NamedTuple):

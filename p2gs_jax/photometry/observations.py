@@ -94,10 +94,7 @@ class Observations:
 def sample_pairs(
     observations: Observations, count: int, seed: int
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
-    """Draw `count` pairs of rows of the same point in different views, with replacement.
-
-    The first of each pair and the second are returned; none where no point is shared.
-    """
+    """Draw pairs of rows of a point in two views, with replacement; none if none is shared."""
     order = np.argsort(observations.points, kind="stable")
     bounds = np.flatnonzero(np.diff(observations.points[order], prepend=-1, append=-1))
     lengths = np.diff(bounds)

@@ -27,10 +27,7 @@ LEAST_EXPOSURE = 0.1
 def initial_photometry(
     solution: PhotometricSolution | None, taken_by: Sequence[str], cfg: FitConfig
 ) -> Photometry:
-    """Return the exposures, gammas and white balances that a fit starts from.
-
-    Without a solution of the bundle adjustment they are drawn at random (paper), or equal.
-    """
+    """Return what a fit starts from: a solution, else random exposures (paper), or equal ones."""
     count = len(taken_by)
     p = cfg.photometry
     if solution is not None:

@@ -28,6 +28,7 @@ KNOTS = np.array(
     ]
 )
 HELD = (6, 16)
+# The knots that are solved for; of several splines, the powers differ as well.
 FREE = tuple(k for k in range(len(KNOTS)) if k not in HELD)
 FREE_OF_EACH = tuple(k for k in range(len(KNOTS)) if k != HELD[0])
 # Darkest photographed value that is decoded: half a code of 8 bits.
@@ -37,6 +38,8 @@ DARKEST = 0.5 / 255
 SHOT_NOISE, READ_NOISE, FLOOR = 2e-4, 1e-6, 0.03
 # A curve with a spline may be at most this much flatter than its base, so that noise stays finite.
 SMALLEST_SLOPE = 0.2
+# d log exposure / d log value of mid tones; flatter curves are a collapse.
+SMALLEST_LOG_SLOPE = 0.3
 # Entries of a table.
 TABLE = 1024
 # The row of a camera that is not in `PhotometryConfig.cameras`; tables end with a row for it.
@@ -71,26 +74,9 @@ class Response:
         return self.base if self.spline is None else "spline"
 
     @property
-    def extra_parameters(self) -> int:
-        """Parameters besides those of the base curve."""
-        return spline_parameters(None if self.spline is None else self.by, len(self.splines))
-
-    @property
-    def each(self) -> tuple[Spline, ...]:
-        """All its splines."""
-        if self.spline is None:
-            return ()
-        return self.splines or (self.spline,)
-
-    @property
     def parts(self) -> tuple[Response, ...]:
         """Its curves, one for all channels each: of every camera or channel with its own."""
-        return tuple(Response(self.base, spline) for spline in self.each) or (self,)
-
-
-def free_knots(by: ResponseKind) -> tuple[int, ...]:
-    """Return the knots that are solved for: of several splines, the powers differ as well."""
-    return FREE if by == "all" else FREE_OF_EACH
+        return tuple(Response(self.base, spline) for spline in self.splines or (self.spline,))
 
 
 def spline_count(by: ResponseKind | None, cameras: int) -> int:
@@ -100,10 +86,9 @@ def spline_count(by: ResponseKind | None, cameras: int) -> int:
 
 def spline_parameters(by: ResponseKind | None, cameras: int) -> int:
     """Return the number of free parameters of all splines; arguments as for `spline_count`."""
-    if by is None:
-        return 0
     # Of several, each with a power and a shape, one power is a gauge.
-    return spline_count(by, cameras) * len(free_knots(by)) - (by != "all")
+    free = len(FREE) if by == "all" else len(FREE_OF_EACH)
+    return spline_count(by, cameras) * free - (by in ("camera", "channel"))
 
 
 def spline_groups(
@@ -137,14 +122,11 @@ def base_log(y: Numbers, base: Base) -> tuple[Numbers, Numbers]:
 def log_exposed(
     y: Numbers, response: Response, cameras: Int[np.ndarray, " o"] | None = None
 ) -> tuple[Numbers, Numbers]:
-    """Return z = F(y) and dz/dy of display values, which are (o, 3) where splines are several.
-
-    `cameras` is of each observation, where cameras have splines of their own.
-    """
+    """Return z = F(y) and dz/dy; y is (o, 3) where splines are several."""
     z, slope = base_log(y, response.base)
     if response.spline is None:
         return z, slope
-    table = np.asarray(response.each, np.float64)
+    table = np.asarray(response.splines or (response.spline,), np.float64)
     group: Int[np.ndarray, "..."] | int = 0
     if response.splines:
         of_camera = np.zeros(len(y), int) if cameras is None else cameras
@@ -169,17 +151,14 @@ def deviation(
     return np.sqrt((slope / (255 * np.sqrt(12))) ** 2 + shot**2 + (slope * spread) ** 2 + FLOOR**2)
 
 
-def monotone(response: Response) -> bool:
-    """Return whether the response rises everywhere between its outer knots."""
-    y = np.linspace(KNOTS[0], KNOTS[-1], 400)
-    return all(np.all(np.diff(log_exposed(y, one)[0]) > 0) for one in response.parts)
-
-
-def log_slope_minimum(response: Response) -> float:
-    """Return the smallest d log exposure / d log value over mid tones; a collapse shows here."""
-    y = np.linspace(0.06, 0.94, 90)
-    logs = [log_exposed(y, one)[0] for one in response.parts]
-    return min(float(np.gradient(z, np.log(y)).min()) for z in logs)
+def rises(response: Response) -> bool:
+    """Return whether it rises between its outer knots, and is not flat over mid tones."""
+    outer, middle = np.linspace(KNOTS[0], KNOTS[-1], 400), np.linspace(0.06, 0.94, 90)
+    return all(
+        np.all(np.diff(log_exposed(outer, one)[0]) > 0)
+        and np.gradient(log_exposed(middle, one)[0], np.log(middle)).min() > SMALLEST_LOG_SLOPE
+        for one in response.parts
+    )
 
 
 class Tables(NamedTuple):
@@ -217,7 +196,7 @@ def tables(cfg: PhotometryConfig) -> Tables:
     """
     if cfg.spline is None and not by_camera(cfg):
         raise ValueError("the curve 'spline' needs the values of its spline")
-    cameras = range(len(cfg.cameras)) if by_camera(cfg) else ()
+    cameras = range(len(cfg.cameras) if by_camera(cfg) else 0)
     each = [spline_of(cfg, camera) for camera in (*cameras, UNKNOWN)]
     channels = max(map(len, each))
     splines = [row for rows in each for row in _rows(rows, channels)]
@@ -230,11 +209,7 @@ def _rows(splines: tuple[Spline, ...], channels: int) -> tuple[Spline, ...]:
 
 
 def spline_of(cfg: PhotometryConfig, camera: int | None = None) -> tuple[Spline, ...]:
-    """Return the spline of a camera, on the host: one row for all channels, or one for each.
-
-    Without any spline the values are 0, which is sRGB. A camera of None or -1 is not in
-    `cfg.cameras`.
-    """
+    """Return the spline of a camera (None, -1: unknown): a row for all channels, or each."""
     own = () if camera is None or camera < 0 else cfg.cameras[camera].splines
     if own:
         return own

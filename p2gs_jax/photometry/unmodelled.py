@@ -64,47 +64,34 @@ class Evidence(NamedTuple):
 
 
 NOTHING = Evidence(float("nan"), 1.0)
-# Of every view, what residuals depend on besides their value: smoothly on the place in the image;
-# falling with the brightness of the surroundings, at equal value and place; in dark values, rising
-# with how near bright light is.
-Neighbourhood = Mapping[Kind, Sequence[Evidence]]
-
-
-class _Clear(NamedTuple):
-    """When a kind is worth a sentence, and what it says.
-
-    Few blocks hold what is dark and near light: asked for less chance, flare is never clear.
-    """
-
-    chance: float
-    least_ev: float
-    words: str
-
-
-KINDS: dict[Kind, _Clear] = {
-    "place": _Clear(
+# The chance and the size, stops, from which on a kind is worth a sentence, and what that says. Few
+# blocks hold what is dark and near light: asked for less chance, flare is never clear.
+KINDS: dict[Kind, tuple[float, float, str]] = {
+    "place": (
         2e-4,
         0.08,
-        "depend on the place in the image: flare, a shade, reflections, or vignetting that is not "
-        "modelled",
+        "depend on the place in the image: flare, a shade, reflections, or "
+        "vignetting that is not modelled",
     ),
-    "local": _Clear(
+    "local": (
         2e-4,
         0.08,
-        "fall where the surroundings are bright and rise where they are dark, at equal value: "
-        "local tone mapping, as phones do it",
+        "fall where the surroundings are bright and rise where they are dark, at "
+        "equal value: local tone mapping, as phones do it",
     ),
-    "flare": _Clear(5e-3, 0.1, "rise in the dark near bright light: flare"),
+    "flare": (5e-3, 0.1, "rise in the dark near bright light: flare"),
 }
 
 
 def neighbourhood(
     observations: Observations, residual_ev: PerChannel, usable: PerChannel
-) -> Neighbourhood:
-    """Test every view for residuals that depend on the place or on the surroundings.
+) -> Mapping[Kind, Sequence[Evidence]]:
+    """Test residuals of every view, in stops, for what they depend on besides their value.
 
-    Without positions nothing can be told, without surroundings no local tone mapping. Residuals
-    of log exposed radiance, in stops, count where `usable` is 1.
+    `place`: smoothly on the place in the image; `local`: falling with the brightness of the
+    surroundings, at equal value and place; `flare`: in dark values, rising with how near bright
+    light is. Without positions nothing can be told, without surroundings nothing local. Residuals
+    count where `usable` is 1.
     """
     o, count = observations, observations.view_count
     found: dict[Kind, list[Evidence]] = {kind: [NOTHING] * count for kind in KINDS}

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from p2gs_jax.config import FitConfig, require_config
+from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import no_empty_folders, write_json
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
@@ -33,6 +33,7 @@ from p2gs_jax.photometry.solution import Agreement, PhotometricSolution, compare
 from p2gs_jax.photometry.sources.points import has_tracks, rendered_colors, surface_colors
 from p2gs_jax.photometry.sources.stack import SATURATED, StackColors, read_stack, stack_colors
 from p2gs_jax.photometry.unmodelled import LOCAL_EV, Unexplained, residuals, unexplained
+from p2gs_jax.presets import require_config
 from p2gs_jax.run.photometry_files import write_solution
 from p2gs_jax.run.plots import write_calibration_plot
 from p2gs_jax.run.read import load_run

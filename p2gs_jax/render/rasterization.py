@@ -158,8 +158,9 @@ def _needed(gaussians, colors, viewmats, Ks, size, cfg, sh_degree):
 
     def one(each):
         color, viewmat, K = each
-        splats, _ = _seen(gaussians, color, Camera(viewmat, K, *size), cfg, sh_degree)
-        return count_entries(splats, *size, cfg)
+        camera = Camera(viewmat, K, *size)
+        splats, _ = _seen(gaussians, color, camera, cfg, sh_degree)
+        return count_entries(splats, camera.width, camera.height, cfg)
 
     return jnp.max(jax.lax.map(one, (colors, viewmats, Ks)))
 
@@ -174,7 +175,7 @@ def _measured(
     """
     fixed: tuple = jax.lax.stop_gradient(arrays)
     try:
-        needed = int(_needed(*fixed, size, cfg, sh_degree))  # pyright: ignore[reportCallIssue]
+        needed = int(_needed(*fixed, size, cfg, sh_degree))
     except jax.errors.ConcretizationTypeError as error:
         raise ValueError(
             "the capacity of the tile lists cannot be measured inside jax.jit: pass capacity=, "

@@ -20,11 +20,11 @@ from p2gs_jax.config import (
     PhotometricModel,
     ResponseKind,
     VignettingKind,
-    camera_formations,
 )
 from p2gs_jax.core.atomic import plain, write_json
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
+from p2gs_jax.presets import camera_formations
 
 # Under this name in the metadata of checkpoints.
 KEY = "decided"

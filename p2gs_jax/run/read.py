@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Bool, Float32, Int
 
-from p2gs_jax.config import FitConfig, from_dict
+from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
@@ -27,6 +27,7 @@ from p2gs_jax.photometry.display import (
 )
 from p2gs_jax.photometry.formation import camera_rows
 from p2gs_jax.photometry.metering import ExposureOf, Metering, meter
+from p2gs_jax.presets import from_dict
 from p2gs_jax.render.capacity import RenderView, make_renderer
 from p2gs_jax.run.decisions import read_decisions
 from p2gs_jax.run.folder import RunFolder, find

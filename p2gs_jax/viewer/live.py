@@ -279,7 +279,7 @@ class LivePicture:
         """Render the largest size up to `size` whose tile lists hold the view."""
         smaller = (s for s in ready if s[0] * s[1] < size[0] * size[1])
         for candidate in (size, *sorted(smaller, reverse=True)):
-            frame = self._viewed.render(self.camera(view, candidate))
+            frame = self._viewed.renderer.render(self.camera(view, candidate))
             if frame is not None:
                 self._frame, self._stale = frame, False
                 return

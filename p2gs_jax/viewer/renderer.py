@@ -9,12 +9,12 @@ compiled.
 from __future__ import annotations
 
 import math
-import sys
 import threading
-import traceback
 from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import jax
+import numpy as np
 from jaxtyping import Array, Bool
 
 from p2gs_jax.config import RenderConfig
@@ -28,6 +28,7 @@ from p2gs_jax.render.capacity import (
 )
 from p2gs_jax.types import Camera, Gaussians, Render
 from p2gs_jax.viewer.camera import Size
+from p2gs_jax.viewer.pictures import RenderedFrame
 
 # Most entries of a tile list; a camera inside a splat may need any number.
 MOST_ENTRIES = 2**26
@@ -49,10 +50,6 @@ class Renderer:
     """Renders views of compiled sizes, and compiles others in a thread.
 
     All methods may be called from any thread; one frame is rendered at a time.
-
-    Attributes:
-        compiling: what is being compiled, or None.
-        failure: what went wrong last, or None.
     """
 
     def __init__(
@@ -70,63 +67,78 @@ class Renderer:
             gaussians: the scene.
             alive: slots in use.
             cfg: rendering options.
-            probes: functions from a size to a typical camera; new programs are run on them.
+            probes: functions from a size to a typical camera; new programs are made for them.
             on_change: called when a program was compiled, or is about to be.
             warm_up: called with a render of every new size, to compile what uses it.
         """
-        self.compiling: Size | None = None
-        self.failure: str | None = None
         self._scene, self._cfg, self._probes = (gaussians, alive), cfg, probes
         self._on_change, self._warm_up = on_change, warm_up
         self._render_any = make_renderer(cfg)
-        self._programs: dict[Size, Callable[..., Render]] = {}
-        # The most entries of a tile list that views needed.
-        self._most: dict[Size, int] = {}
-        self._wanted: list[Size] = []
-        self._stopping = False
-        self._changed = threading.Condition()
-        self._one_frame = threading.Lock()
-        self._worker = threading.Thread(target=self._work, name="compile", daemon=True)
-        self._worker.start()
+        self._jobs: dict[Size, Future[Callable[..., Render]]] = {}
+        self._lock, self._one_frame = threading.RLock(), threading.Lock()
+        self._compiler = ThreadPoolExecutor(1, "compile")
 
     @property
     def ready(self) -> frozenset[Size]:
         """Sizes that render at once."""
-        with self._changed:
-            return frozenset(self._programs)
+        with self._lock:
+            return frozenset(s for s, job in self._jobs.items() if _succeeded(job))
+
+    @property
+    def compiling(self) -> Size | None:
+        """What is being compiled, or None."""
+        with self._lock:
+            return next((size for size, job in self._jobs.items() if job.running()), None)
+
+    @property
+    def failure(self) -> str | None:
+        """What could not be compiled, or None."""
+        with self._lock:
+            for (width, height), job in self._jobs.items():
+                if job.done() and (error := job.exception()) is not None:
+                    return f"{width} x {height} cannot be compiled: {error}"
+        return None
 
     def request(self, sizes: Sequence[Size]) -> None:
-        """Compile these sizes next, in this order, and then those requested before."""
-        with self._changed:
-            new = [s for s in sizes if s not in self._programs]
-            self._wanted = list(dict.fromkeys((*new, *self._wanted)))
-            self._changed.notify_all()
+        """Compile these sizes, in this order; what others wait for is put off."""
+        with self._lock:
+            for size in [s for s in self._jobs if s not in sizes]:
+                if self._jobs[size].cancel():
+                    del self._jobs[size]
+            for size in sizes:
+                if size not in self._jobs:
+                    self._submit(size, 0)
 
-    def render(self, camera: Camera) -> Render | None:
-        """Return a view, or None where its size is not compiled or its tile lists overflow.
+    def _submit(self, size: Size, needed: int) -> None:
+        def done(job: Future) -> None:
+            if not job.cancelled():
+                self._on_change()
+
+        job = self._jobs[size] = self._compiler.submit(self._compile, size, needed)
+        job.add_done_callback(done)
+
+    def render(self, camera: Camera) -> RenderedFrame | None:
+        """Return a frame, or None where its size is not compiled or its tile lists overflow.
 
         After an overflow the size is not ready until a program with longer lists is compiled.
         """
         size = (camera.width, camera.height)
-        with self._changed:
-            program = self._programs.get(size)
-        if program is None:
+        with self._lock:
+            job = self._jobs.get(size)
+        if job is None or not _succeeded(job):
             return None
         with self._one_frame:
-            result = program(*self._scene, camera)
+            result = job.result()(*self._scene, camera)
             needed = int(result.count)
         if not bool(result.overflow):
-            return result
-        with self._changed:
-            self._most[size] = max(self._most[size], needed)
-            if needed <= MOST_ENTRIES and self._programs.get(size) is program:
-                del self._programs[size]
-                self._wanted = [size, *(s for s in self._wanted if s != size)]
-                self._changed.notify_all()
+            return _frame(result, camera)
+        with self._lock:
+            if needed <= MOST_ENTRIES and self._jobs.get(size) is job:
+                self._submit(size, needed)
         return None
 
-    def render_now(self, camera: Camera) -> Render:
-        """Return a view of any size, however long its program takes to compile.
+    def render_now(self, camera: Camera) -> RenderedFrame:
+        """Return a frame of any size, however long its program takes to compile.
 
         Raises:
             UserError: it would need more memory than is reasonable.
@@ -137,65 +149,37 @@ class Renderer:
                 fix="move away from what is close, or choose a smaller width",
             )
         with self._one_frame:
-            return self._render_any(*self._scene, camera)
+            return _frame(self._render_any(*self._scene, camera), camera)
 
     def stop(self) -> None:
         """Stop compiling, and wait for the program that is being compiled.
 
         An interpreter that ends while JAX works in another thread aborts.
         """
-        with self._changed:
-            self._stopping = True
-            self._changed.notify_all()
-        self._worker.join()
+        self._compiler.shutdown(cancel_futures=True)
 
-    def _work(self) -> None:
-        while True:
-            with self._changed:
-                while not self._wanted and not self._stopping:
-                    self._changed.wait()
-                if self._stopping:
-                    return
-                size = self.compiling = self._wanted.pop(0)
-            self._on_change()
-            try:
-                self._compile(size)
-            except Exception as error:  # such as too little memory: other sizes may still do
-                traceback.print_exc(file=sys.stderr)
-                self.failure = f"{size[0]} x {size[1]} cannot be compiled: {error}"
-            self.compiling = None
-            self._on_change()
-
-    def _compile(self, size: Size) -> None:
-        """Compile a size, with tile lists as long as it is known to need, and run its probes."""
+    def _compile(self, size: Size, needed: int) -> Callable[..., Render]:
+        """Return the program of a size, with room for what probes and a given view need."""
+        self._on_change()
         cameras = [probe(size) for probe in self._probes]
-        most, fits = self._expected(size, cameras), False
-        while not fits and not self._stopping:
-            capacity = TileCapacity.allocate(most, ANYWHERE)
-            static = {"cfg": self._cfg, "capacity": capacity.entries}
-            run = compiled_renderer().lower(*self._scene, cameras[0], **static).compile()
-            for camera in cameras:
-                with self._one_frame:
-                    result = jax.block_until_ready(run(*self._scene, camera))
-                most = max(most, int(result.count))
-                self._warm_up(result)
-            fits = capacity.holds(most)
-            with self._changed:
-                self._most[size] = max(self._most.get(size, 0), most)
-                if fits:
-                    self._programs[size] = run
+        counts = [int(count_needed(*self._scene, c, cfg=self._cfg)) for c in cameras]
+        capacity = TileCapacity.allocate(max(needed, *counts), ANYWHERE)
+        static = {"cfg": self._cfg, "capacity": capacity.entries}
+        run = compiled_renderer().lower(*self._scene, cameras[0], **static).compile()
+        with self._one_frame:
+            result = jax.block_until_ready(run(*self._scene, cameras[0]))
+        self._warm_up(result)
+        return run
 
-    def _expected(self, size: Size, cameras: Sequence[Camera]) -> int:
-        """Return the entries that a size needs: as seen, in proportion to the area, or counted."""
-        with self._changed:
-            most, area = dict(self._most), _area(size)
-        if size in most:
-            return most[size]
-        if most:
-            near = min(most, key=lambda other: abs(_area(other) - area))
-            return int(most[near] * max(1.0, area / _area(near)))
-        # Cheaper than compiling twice.
-        return max(int(count_needed(*self._scene, c, cfg=self._cfg)) for c in cameras)
+
+def _succeeded(job: Future) -> bool:
+    return job.done() and not job.cancelled() and job.exception() is None
+
+
+def _frame(result: Render, camera: Camera) -> RenderedFrame:
+    assert result.depth is not None
+    alpha, depth = np.asarray(result.alpha), np.asarray(result.depth)
+    return RenderedFrame(result.linear, alpha, depth, camera)
 
 
 def full_size(canvas: Size, max_width: int) -> Size:

@@ -185,7 +185,7 @@ class BrowserSession:
         size = width, max(1, round(width / view.aspect))
 
         def render_and_send() -> None:
-            frame = self._viewed.render_now(self._live.camera(view, size))
+            frame = self._viewed.renderer.render_now(self._live.camera(view, size))
             darkroom = Darkroom(self._viewed, self._live.darkroom.depth_limits)
             if kind == "exr":
                 content = exr_bytes(frame, darkroom.transform(frame, settings).without_place())

@@ -17,7 +17,7 @@ from p2gs_jax.render.project import at_time
 from p2gs_jax.run.read import Run
 from p2gs_jax.scene.pixels.store import size_at
 from p2gs_jax.scene.rigid import camera_centers
-from p2gs_jax.types import Camera, Render
+from p2gs_jax.types import Camera
 from p2gs_jax.viewer.camera import (
     TYPICAL_DISTANCE,
     Pose,
@@ -31,7 +31,7 @@ from p2gs_jax.viewer.camera import (
     viewmat_between,
     viewmats_of,
 )
-from p2gs_jax.viewer.pictures import BrowserSplats, RenderedFrame, browser_splats, exposure_colors
+from p2gs_jax.viewer.pictures import BrowserSplats, browser_splats, exposure_colors
 from p2gs_jax.viewer.renderer import Renderer
 from p2gs_jax.viewer.settings import exposures_ev
 
@@ -88,19 +88,6 @@ class ViewedRun:
             return camera_of_browser(self.pose(index, aspect), aspect, size, self.space)
 
         return camera
-
-    def render(self, camera: Camera) -> RenderedFrame | None:
-        """Return a frame of a compiled size, or None where it is not compiled or overflows."""
-        result = self.renderer.render(camera)
-        return None if result is None else _frame(result, camera)
-
-    def render_now(self, camera: Camera) -> RenderedFrame:
-        """Return a frame of any size, however long its program takes to compile.
-
-        Raises:
-            UserError: it would need more memory than is reasonable.
-        """
-        return _frame(self.renderer.render_now(camera), camera)
 
     def view_at(self, camera: Camera) -> int | None:
         """Return the row of the view taken from the place of a camera, or None."""
@@ -201,9 +188,3 @@ class ViewedRun:
             seen_from=self._centers.mean(0),
             unit=self.space.unit,
         )
-
-
-def _frame(result: Render, camera: Camera) -> RenderedFrame:
-    assert result.depth is not None
-    alpha, depth = np.asarray(result.alpha), np.asarray(result.depth)
-    return RenderedFrame(result.linear, alpha, depth, camera)

@@ -1,25 +1,15 @@
+"""COLMAP models, binary and text: against pycolmap, and broken copies."""
+
 import numpy as np
 import pycolmap
 import pytest
-from scene.helpers import copy_model, reprojection_errors, write_tiny_model
+from scene.helpers import copy_model, refused, reprojection_errors, write_tiny_model
 
 from p2gs_jax.config import DataConfig
-from p2gs_jax.errors import UserError
 from p2gs_jax.scene import load_scene
 
 CFG = DataConfig()
 SETS = ("sceaux_castle", "sceaux_castle/undistorted", "bundler_et", "kitti_stereo_a")
-
-
-@pytest.mark.parametrize("name", SETS)
-def test_points_project_onto_their_tracks(shared_data, name):
-    scene = load_scene(shared_data(name), CFG)
-    errors = reprojection_errors(scene)
-    assert np.median(errors) < 0.7
-    assert errors.mean() < 1.0
-    assert [v.name for v in scene.views] == sorted(v.name for v in scene.views)
-    assert scene.format == "colmap"
-    assert scene.notes == ()
 
 
 def test_sceaux_distortion_is_kept_and_undistorted_variant_has_none(shared_data):
@@ -55,6 +45,11 @@ def test_kitti_cameras_are_named_after_their_folders(shared_data):
 def test_reader_agrees_with_pycolmap(shared_data, name):
     folder = shared_data(name)
     scene = load_scene(folder, CFG)
+    errors = reprojection_errors(scene)
+    assert np.median(errors) < 0.7
+    assert errors.mean() < 1.0
+    assert [v.name for v in scene.views] == sorted(v.name for v in scene.views)
+    assert (scene.format, scene.notes) == ("colmap", ())
     truth = pycolmap.Reconstruction(folder / "sparse" / "0")
     assert len(scene.views) == truth.num_reg_images()
     assert len(scene.tracks.xy) == truth.compute_num_observations()
@@ -92,35 +87,19 @@ def test_model_may_lie_in_the_folder_itself(shared_data):
     assert [v.image_path for v in a.views] == [v.image_path for v in b.views]
 
 
-@pytest.mark.parametrize("keep", [0.0, 0.3, 0.5, 0.97])
 @pytest.mark.parametrize("stem", ["cameras", "images", "points3D"])
-def test_truncated_binary_names_the_file(shared_data, tmp_path, stem, keep):
+def test_damaged_binary_names_the_file(shared_data, tmp_path, stem):
     file = copy_model(shared_data("bundler_et"), tmp_path) / f"{stem}.bin"
     data = file.read_bytes()
-    file.write_bytes(data[: int(keep * len(data))])
-    with pytest.raises(UserError, match=f"{stem}.bin is truncated"):
+    for keep in (0.0, 0.3, 0.5, 0.97):
+        file.write_bytes(data[: int(keep * len(data))])
+        with refused(f"{stem}.bin is truncated"):
+            load_scene(tmp_path, CFG)
+    file.write_bytes(np.random.default_rng(0).integers(0, 256, 4096, dtype=np.uint8).tobytes())
+    with refused(f"{stem}.bin"):
         load_scene(tmp_path, CFG)
-
-
-@pytest.mark.parametrize("stem", ["cameras", "images", "points3D"])
-def test_garbage_is_a_user_error(shared_data, tmp_path, stem):
-    file = copy_model(shared_data("bundler_et"), tmp_path) / f"{stem}.bin"
-    rng = np.random.default_rng(0)
-    file.write_bytes(rng.integers(0, 256, 4096, dtype=np.uint8).tobytes())
-    with pytest.raises(UserError, match=f"{stem}.bin"):
-        load_scene(tmp_path, CFG)
-
-
-@pytest.mark.parametrize("stem", ["cameras", "images", "points3D"])
-def test_absent_file_is_named(shared_data, tmp_path, stem):
-    (copy_model(shared_data("bundler_et"), tmp_path) / f"{stem}.bin").unlink()
-    with pytest.raises(UserError, match=f"{stem}.bin does not exist"):
-        load_scene(tmp_path, CFG)
-
-
-def test_text_line_is_named(tmp_path):
-    write_tiny_model(tmp_path, points="7 0.1 zwei 4 10 20 30 0.5 1 0\n")
-    with pytest.raises(UserError, match=r"points3D.txt is malformed in line 1"):
+    file.unlink()
+    with refused(f"{stem}.bin does not exist"):
         load_scene(tmp_path, CFG)
 
 
@@ -140,6 +119,7 @@ def test_tiny_model_and_names_with_blanks(tmp_path):
         ({"pose": "1 0 0 0 nan 0 0"}, "images.txt: the pose of im 0.png is not finite"),
         ({"pose": "0 0 0 0 0 0 0"}, "images.txt: the pose of im 0.png is not finite"),
         ({"points": f"{10**30} 0 0 4 1 2 3 0.5 1 0\n"}, "points3D.txt is malformed in line 1"),
+        ({"points": "7 0.1 zwei 4 10 20 30 0.5 1 0\n"}, "points3D.txt is malformed in line 1"),
         ({"points": "7 nan 0 4 1 2 3 0.5 1 0\n"}, "points3D.txt: 1 of 1 points are not finite"),
         ({"cameras": "1 FOV 40 30 50 50 20 15 0.1\n"}, "cameras.txt uses the camera model FOV"),
         ({"cameras": "1 PINHOLE 40 30 50 50 20\n"}, "cameras.txt is malformed in line 2"),
@@ -150,26 +130,16 @@ def test_tiny_model_and_names_with_blanks(tmp_path):
 )
 def test_broken_models(tmp_path, change, message):
     write_tiny_model(tmp_path, **change)
-    with pytest.raises(UserError, match=message):
+    with refused(message, *(["image_undistorter"] if "FOV" in message else [])):
         load_scene(tmp_path, CFG)
-
-
-def test_unsupported_camera_says_what_to_run(tmp_path):
-    write_tiny_model(tmp_path, cameras="1 FOV 40 30 50 50 20 15 0.1\n")
-    with pytest.raises(UserError) as info:
-        load_scene(tmp_path, CFG)
-    assert "image_undistorter" in info.value.fix
 
 
 def test_missing_images_are_listed_or_skipped(tmp_path):
     write_tiny_model(tmp_path, n=10)
     for i in range(7):
         (tmp_path / "images" / f"im {i}.png").unlink()
-    with pytest.raises(UserError, match="7 of the 10 images") as info:
+    with refused("7 of the 10 images", "im 4.png, ...\n", "--allow-missing"):
         load_scene(tmp_path, CFG)
-    assert "im 4.png, ..." in str(info.value)
-    assert "im 5.png" not in str(info.value)
-    assert "--allow-missing" in info.value.fix
     scene = load_scene(tmp_path, DataConfig(allow_missing=True))
     assert [v.name for v in scene.views] == ["im 7.png", "im 8.png", "im 9.png"]
     assert "7 of the 10 images" in scene.notes[0]
@@ -179,7 +149,7 @@ def test_missing_images_are_listed_or_skipped(tmp_path):
 def test_undecodable_image_is_named(tmp_path):
     write_tiny_model(tmp_path)
     (tmp_path / "images" / "im 1.png").write_bytes(b"not an image")
-    with pytest.raises(UserError, match=r"cannot decode the image .*im 1.png"):
+    with refused(r"cannot decode the image .*im 1.png"):
         load_scene(tmp_path, CFG)
 
 
@@ -200,11 +170,10 @@ def test_smaller_images_rescale_the_cameras(tmp_path):
 def test_image_folder_option(tmp_path):
     write_tiny_model(tmp_path)
     (tmp_path / "images").rename(tmp_path / "photos")
-    with pytest.raises(UserError, match="no image folder") as info:
+    with refused("no image folder", "--images"):
         load_scene(tmp_path, CFG)
-    assert "--images" in info.value.fix
     assert load_scene(tmp_path, DataConfig(images="photos")).views[0].image_path.is_file()
-    with pytest.raises(UserError, match="nowhere does not exist"):
+    with refused("nowhere does not exist"):
         load_scene(tmp_path, DataConfig(images="nowhere"))
 
 

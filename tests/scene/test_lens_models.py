@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scene.helpers import write_tiny_model
+from scene.helpers import make_view, write_image, write_tiny_model
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.scene import ImageStore, load_scene
@@ -20,7 +20,7 @@ from p2gs_jax.scene.lens import (
 )
 from p2gs_jax.scene.sfm.triangulate import camera_of
 from p2gs_jax.scene.transforms import load_transforms
-from p2gs_jax.types import Distortion, View
+from p2gs_jax.types import Distortion
 
 K = intrinsics(400.0, 410.0, 500.0, 300.0)
 ZERO = np.zeros(3)
@@ -54,9 +54,8 @@ def photographed(X: np.ndarray, lens: Distortion) -> np.ndarray:
 def test_radial_lenses_are_undone(coefficients):
     lens = Distortion(coefficients)
     X = rays(0.9 * min(_fold_radius(lens), 1.3))
-    np.testing.assert_allclose(
-        undistort_points(photographed(X, lens), K, lens), (X @ K.T)[:, :2], atol=0.02
-    )
+    found = undistort_points(photographed(X, lens), K, lens)
+    np.testing.assert_allclose(found, (X @ K.T)[:, :2], atol=0.02)
 
 
 @settings(max_examples=60, deadline=None)
@@ -64,9 +63,8 @@ def test_radial_lenses_are_undone(coefficients):
 def test_fisheyes_are_undone(coefficients):
     lens = Distortion(coefficients, "fisheye")
     X = rays(0.98 * min(_fold_radius(lens), 15.0))
-    np.testing.assert_allclose(
-        undistort_points(photographed(X, lens), K, lens), (X @ K.T)[:, :2], rtol=2e-5, atol=0.02
-    )
+    found = undistort_points(photographed(X, lens), K, lens)
+    np.testing.assert_allclose(found, (X @ K.T)[:, :2], rtol=2e-5, atol=0.02)
 
 
 @settings(max_examples=60, deadline=None)
@@ -75,10 +73,9 @@ def test_lenses_grow_up_to_their_fold_and_no_further(lens):
     limit = _fold_radius(lens)
     radii = np.linspace(0, min(limit, 20.0), 400)[:-1]
     X = np.stack([radii, np.zeros_like(radii), np.ones_like(radii)], 1)
-    straight = Distortion(
-        tuple(0.0 if k in (2, 3) and lens.model == "radial" else c for k, c in
-              enumerate(lens.coefficients)), lens.model
-    )  # fmt: skip
+    terms = list(lens.coefficients)
+    terms[2:4] = terms[2:4] if lens.model == "fisheye" else [0.0, 0.0]
+    straight = Distortion(tuple(terms), lens.model)
     seen = photographed(X, straight)[:, 0]
     assert (np.diff(seen) > -1e-9).all()
     if np.isfinite(limit) and limit < 20:
@@ -138,19 +135,16 @@ def test_pixels_beyond_a_rational_fold_are_masked():
 def test_a_fisheye_photograph_is_undistorted(tmp_path):
     """Stripes painted in undistorted coordinates, photographed through a fisheye, come back."""
     lens = Distortion((0.04, -0.01, 0.0, 0.0), "fisheye")
-    width, height, f = 160, 120, 80.0
-    small = intrinsics(f, f, width / 2, height / 2)
-    ys, xs = np.mgrid[:height, :width] + 0.5
+    small = intrinsics(80.0, 80.0, 80.0, 60.0)
+    ys, xs = np.mgrid[:120, :160] + 0.5
     straight = undistort_points(np.stack([xs.ravel(), ys.ravel()], 1), small, lens)
-    scene = np.where(np.isfinite(straight), straight, 0.0).reshape(height, width, 2)
+    x, y = np.where(np.isfinite(straight), straight, 0.0).reshape(120, 160, 2).transpose(2, 0, 1)
 
     def paint(x, y):
         return np.stack([128 + 100 * np.sin(x / 9), 128 + 100 * np.cos(y / 7), 128 + 0 * x], -1)
 
-    image = np.rint(paint(scene[..., 0], scene[..., 1])).astype(np.uint8)[..., ::-1]
-    path = tmp_path / "a.png"
-    assert cv2.imwrite(str(path), image)
-    view = View("a.png", path, "0", np.eye(4, dtype=np.float32), small, width, height, lens)
+    image = np.rint(paint(x, y)).astype(np.uint8)[..., ::-1]
+    view = make_view(tmp_path / "a.png", image, f=80.0, distortion=lens)
     ldr, valid = ImageStore((view,), DataConfig()).get(0, 1)
     inside = valid > 0.5
     assert inside.mean() > 0.5
@@ -176,20 +170,16 @@ def test_colmap_lenses(tmp_path, camera, model, coefficients):
     view = load_scene(tmp_path, DataConfig()).views[0]
     assert view.distortion == Distortion(coefficients, model)
     # COLMAP projects with its own model to where ours comes from.
-    back = camera_of(view, 1)
-    xy = back.img_from_cam(np.array([[0.2, -0.1, 1.0]]))
-    np.testing.assert_allclose(
-        undistort_points(xy, view.K, view.distortion)[0], (view.K @ [0.2, -0.1, 1.0])[:2], atol=1e-3
-    )
+    ray = np.array([0.2, -0.1, 1.0])
+    xy = undistort_points(camera_of(view, 1).img_from_cam(ray[None]), view.K, view.distortion)
+    np.testing.assert_allclose(xy[0], (view.K @ ray)[:2], atol=1e-3)
 
 
 @pytest.mark.parametrize("extra", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}])
 def test_transforms_with_fisheyes(tmp_path, extra):
-    pose = np.eye(4)
-    for k in range(2):
-        cv2.imwrite(str(tmp_path / f"{k}.png"), np.full((30, 40, 3), 99, np.uint8))
+    write_image(tmp_path / "a.png")
     lens = {"k1": 0.1, "k2": 0.02, "k3": -0.01, "k4": 0.003}
-    frames = [{"file_path": f"{k}.png", "transform_matrix": pose.tolist()} for k in range(2)]
+    frames = [{"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}]
     data = {"fl_x": 50, "fl_y": 51, "w": 40, "h": 30, **lens, **extra, "frames": frames}
     (tmp_path / "transforms.json").write_text(json.dumps(data))
     scene = load_transforms(tmp_path, tmp_path / "transforms.json", DataConfig())

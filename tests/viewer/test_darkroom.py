@@ -41,7 +41,7 @@ def darkroom(viewed):
 
 @pytest.fixture(scope="module")
 def frame(viewed):
-    return viewed.render_now(camera_of(viewed.store, 1))
+    return viewed.renderer.render_now(camera_of(viewed.store, 1))
 
 
 def moved(frame, axis, by):
@@ -157,7 +157,7 @@ def test_a_metered_exposure_follows_the_picture(darkroom, viewed, frame, run):
     assert more == pytest.approx(2 * here)
     plain = darkroom.transform(frame, replace(settings, metered=False)).exposure
     assert plain == pytest.approx(run.mean.exposure_geometric, rel=1e-5)
-    other = viewed.render_now(camera_of(viewed.store, 2))
+    other = viewed.renderer.render_now(camera_of(viewed.store, 2))
     there = run.metered_display(run.render(other.camera)).exposure
     adapting = darkroom.transform(other, settings, settled=False).exposure
     assert min(here, there) <= adapting <= max(here, there)

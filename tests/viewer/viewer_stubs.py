@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from p2gs_jax.render.capacity import make_renderer
-from p2gs_jax.viewer.renderer import full_size, render_sizes
+from p2gs_jax.viewer.renderer import _frame, full_size, render_sizes
 from p2gs_jax.viewer.settings import Settings
 
 CANVAS = (560, 400)
@@ -37,7 +37,7 @@ class FakeRenderer:
         self.rendered.append((camera.width, camera.height))
         if self.broken is not None:
             raise self.broken
-        return self.renderer(self.run.params.gaussians, self.run.alive, camera)
+        return _frame(self.renderer(self.run.params.gaussians, self.run.alive, camera), camera)
 
 
 class Client:

@@ -94,7 +94,7 @@ def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncerta
     few = _small_sample(clusters[seen], rows.layout.views[seen], rows.layout.view_count)
     bread = fit.normal * fit.at.curvature + system.priors.normal
     gauges = np.sqrt(gauge_strength(bread, system.unknowns)) * system.anchors.rows
-    if not is_small(system.directions):
+    if not is_small(system.basis.shape[1]):  # pyright: ignore
         drawn = _drawn(bread, gauges, each, system)
         return Uncertainty(drawn, np.zeros((len(drawn), 0)), few, system)
     # A prior is itself an observation with variance 1 / precision: it is its own meat.
@@ -161,10 +161,7 @@ def side_by_side(observations: Observations, row: Labels) -> Labels:
 
 
 def _small_sample(clusters: Labels, views: Labels, view_count: int) -> np.ndarray:
-    """Return what standard errors of a view are multiplied by for having few clusters.
-
-    A view's exposure is the mean of its clusters, and takes one of them away.
-    """
+    """Return the factors on errors of a view, whose mean takes one of its few clusters away."""
     pairs = np.unique(np.stack([views, clusters]), axis=1)[0]
     count = np.bincount(pairs, minlength=view_count)
     return np.sqrt(np.maximum(count, 2) / (np.maximum(count, 2) - 1))
@@ -201,10 +198,7 @@ def _shared_deviation(model: Forward, at: Weighted, labels: Labels) -> float:
 
 
 def _shared_scores(model: Forward, theta: Parameters, at: Weighted, labels: Labels) -> sp.csr_array:
-    """Return how the right side moves with a unit error of each region: (regions, d).
-
-    Points are eliminated: they take their part of an error.
-    """
+    """Return how the right side, points eliminated, moves with errors of regions: (regions, d)."""
     rows, u = model.rows, model.unknowns
     coupled = coupling(rows, theta, at)
     taken = [

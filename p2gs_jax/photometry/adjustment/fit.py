@@ -78,7 +78,12 @@ def explain(fit: Fit, problem: Problem, response: Response) -> Explained:
     for pick, points, part in _blocks(problem):
         at = _weighed(fit, part, response)
         mine, usable = part.observations, part.usable
-        radiance[points] = _of_points(part, at)
+        # The rows of each point are combined.
+        total, weight = (np.zeros((mine.point_count, 3)) for _ in range(2))
+        np.add.at(total, part.layout.point_of_row, at.precision * at.radiance)
+        np.add.at(weight, part.layout.point_of_row, at.precision)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            radiance[points] = np.where(weight > 0, total / weight, np.nan)
         of_exposure = at.residual / fit.theta.a[mine.views][:, None]
         residual[pick] = np.where(usable, of_exposure, 0.0)
         ideal = 1 / mine.decoded(response)[1] ** 2
@@ -118,15 +123,6 @@ def _weighed(fit: Fit, part: Problem, response: Response) -> Weighted:
     return at
 
 
-def _of_points(part: Problem, at: Weighted) -> Float[np.ndarray, "p 3"]:
-    """Combine the rows of each point."""
-    total, weight = (np.zeros((part.observations.point_count, 3)) for _ in range(2))
-    np.add.at(total, part.layout.point_of_row, at.precision * at.radiance)
-    np.add.at(weight, part.layout.point_of_row, at.precision)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(weight > 0, total / weight, np.nan)
-
-
 def solution_of(
     problem: Problem,
     form: Form,
@@ -135,59 +131,29 @@ def solution_of(
     explained: Explained,
     known: Uncertainty,
 ) -> PhotometricSolution:
-    """Return exposures in their gauge, with errors and warnings.
-
-    The problem holds all observations, whatever part of them `fit` was solved from.
-    """
-    o, component = problem.observations, problem.component
-    per_view = np.bincount(o.views[problem.usable.any(1)], minlength=o.view_count)
-    active = per_view > 0
-    free_scale = np.ones(o.view_count, bool)
+    """Return exposures in their gauge, with errors and warnings; the problem holds everything."""
+    o, used, residual = problem.observations, problem.usable, explained.residual
+    seen = used.any(1)
+    per_view = np.bincount(o.views[seen], minlength=o.view_count)
+    active, free = per_view > 0, np.ones(o.view_count, bool)
     if problem.known is not None:
         given = np.isfinite(problem.known.log_exposures)
-        anchored = np.unique(component[given])
-        free_scale = ~np.isin(component, anchored)
+        free = ~np.isin(problem.component, np.unique(problem.component[given]))
         active = active | given
-    scale, color = _Gauge(component, active & free_scale), _Gauge(component, active)
-    a, light = fit.theta.a, fit.theta.b / fit.theta.a[:, None]
-    h, balance = light.mean(1), light - light.mean(1, keepdims=True)
-    shift = scale.shift(h)
-    shifts = shift[:, None] + color.shift(balance)
-    of_cameras = known.system.unknowns.features.balance
-
-    def of_light(change: Parameters):
-        return (change.b - light[..., None] * change.a[:, None]) / a[:, None, None]
-
-    def of_balance(change: Parameters):
-        moved = of_light(change)
-        if of_cameras:
-            moved = moved + _balance_of_views(fit, change.k)
-        moved = np.broadcast_to(moved, (o.view_count, 3, moved.shape[2]))
-        return color.centred(moved - moved.mean(1, keepdims=True)).reshape(-1, moved.shape[2])
-
-    h_errors = known.few * known.of(lambda change: scale.centred(of_light(change).mean(1)))
-    a_errors = known.few * known.of(lambda change: change.a)
-    gamma = GAMMA_SRGB / a
-    lost = active & ~(np.isfinite(h_errors) & np.isfinite(a_errors))
-    seen = active & ~lost
-    if of_cameras:
-        balance = balance + _balance_of_views(fit, fit.theta.k[:, None])[..., 0]
-    balance = np.where(active[:, None], color.centred(np.broadcast_to(balance, (len(h), 3))), 0.0)
-    balance_errors = known.few[:, None] * known.of(of_balance).reshape(-1, 3)
-
-    used, residual = problem.usable, explained.residual
+    scale, color = (_Gauge(problem.component, active & one) for one in (free, True))
+    exposures, shifts, lost = _exposures(fit, known, active, scale, color)
+    # Points go the other way, as much as one of their views.
+    some_view = np.zeros(o.point_count, int)
+    some_view[o.points[seen]] = o.views[seen]
     view_residual, tint = _per_view_ev(o.views, residual, used, o.view_count)
     cameras, corner_errors = _cameras(fit, response, known, o)
     return PhotometricSolution(
         model=form.model,
         response=response,
-        log_exposures=np.where(active, h - shift, 0.0),
-        exposure_errors=np.where(seen, h_errors, np.inf),
-        gammas=np.where(active, gamma, GAMMA_SRGB),
-        gamma_errors=np.where(seen, gamma / a * a_errors, np.inf),
+        **exposures,
         observations_per_view=per_view,
-        component=component,
-        point_log_radiance=_point_radiance(problem, explained, shifts),
+        component=problem.component,
+        point_log_radiance=explained.log_radiance + shifts[some_view] + problem.log_pivot,
         residual_ev=_spread_ev(residual[used]) if used.any() else 0.0,
         view_residual_ev=view_residual,
         view_balance_ev=tint,
@@ -197,17 +163,57 @@ def solution_of(
         converged=fit.converged,
         unknown_errors=int(lost.sum()),
         warnings=(
-            *_of_solver(fit, h_errors[seen], np.flatnonzero(lost), o.names),
-            *_of_observations(per_view, component[active], tint, o.names),
+            *_of_solver(fit, exposures["exposure_errors"][active & ~lost], lost, o.names),
+            *_of_observations(per_view, problem.component[active], tint, o.names),
             *_unmodelled(problem, residual),
         ),
         white_balance_level=form.white_balance,
-        white_balance=balance,
-        white_balance_errors=np.where(seen[:, None], balance_errors, np.inf),
         vignetting=form.vignetting,
         cameras=cameras,
         corner_errors=corner_errors,
     )
+
+
+def _exposures(
+    fit: Fit, known: Uncertainty, active: Bool[np.ndarray, " v"], scale: _Gauge, color: _Gauge
+) -> tuple[dict[str, np.ndarray], Float[np.ndarray, "v x"], Bool[np.ndarray, " v"]]:
+    """Return exposures, gammas and tints with errors; shifts; views that have no errors."""
+    a, light = fit.theta.a, fit.theta.b / fit.theta.a[:, None]
+    h, balance = light.mean(1), light - light.mean(1, keepdims=True)
+    shift = scale.shift(h)
+    shifts = shift[:, None] + color.shift(balance)
+    features, cameras = fit.model.unknowns.features, fit.model.rows.layout.cameras
+
+    def of_light(change: Parameters):
+        return (change.b - light[..., None] * change.a[:, None]) / a[:, None, None]
+
+    def of_cameras(k: Float[np.ndarray, "k c"]) -> Float[np.ndarray, "v 3 c"]:
+        return np.stack([features.balance_of(column) for column in k.T], -1)[cameras]
+
+    def of_balance(change: Parameters):
+        moved = of_light(change)
+        if features.balance:
+            moved = moved + of_cameras(change.k)
+        moved = np.broadcast_to(moved, (len(h), 3, moved.shape[2]))
+        return color.centred(moved - moved.mean(1, keepdims=True)).reshape(-1, moved.shape[2])
+
+    h_errors = known.few * known.of(lambda change: scale.centred(of_light(change).mean(1)))
+    a_errors = known.few * known.of(lambda change: change.a)
+    balance_errors = known.few[:, None] * known.of(of_balance).reshape(-1, 3)
+    lost = active & ~(np.isfinite(h_errors) & np.isfinite(a_errors))
+    seen = active & ~lost
+    if features.balance:
+        balance = balance + of_cameras(fit.theta.k[:, None])[..., 0]
+    balance = color.centred(np.broadcast_to(balance, (len(h), 3)))
+    found = {
+        "log_exposures": np.where(active, h - shift, 0.0),
+        "exposure_errors": np.where(seen, h_errors, np.inf),
+        "gammas": np.where(active, GAMMA_SRGB / a, GAMMA_SRGB),
+        "gamma_errors": np.where(seen, GAMMA_SRGB / a / a * a_errors, np.inf),
+        "white_balance": np.where(active[:, None], balance, 0.0),
+        "white_balance_errors": np.where(seen[:, None], balance_errors, np.inf),
+    }
+    return found, shifts, lost
 
 
 class _Gauge:
@@ -234,12 +240,6 @@ class _Gauge:
         return values - self.shift(values)
 
 
-def _balance_of_views(fit: Fit, k: Float[np.ndarray, "k c"]) -> Float[np.ndarray, "v 3 c"]:
-    """Return the white balance of each view's camera."""
-    features, cameras = fit.model.unknowns.features, fit.model.rows.layout.cameras
-    return np.stack([features.balance_of(column) for column in k.T], -1)[cameras]
-
-
 def _cameras(
     fit: Fit, response: Response, known: Uncertainty, o: Observations
 ) -> tuple[tuple[CameraFormation, ...], Float[np.ndarray, "c j"]]:
@@ -262,17 +262,6 @@ def _cameras(
 
     errors = known.of(corner).reshape(shape) if np.prod(shape) else np.zeros(shape)
     return tuple(formations), errors
-
-
-def _point_radiance(
-    problem: Problem, explained: Explained, shifts: Float[np.ndarray, "v x"]
-) -> Float[np.ndarray, "p 3"]:
-    """Return log radiance in the gauge: the shift of a point's views goes the other way."""
-    o = problem.observations
-    seen = problem.usable.any(1)
-    some_view = np.zeros(o.point_count, int)
-    some_view[o.points[seen]] = o.views[seen]
-    return explained.log_radiance + shifts[some_view] + problem.log_pivot
 
 
 def _spread_ev(residual: Float[np.ndarray, " n"]) -> float:
@@ -299,7 +288,10 @@ def _per_view_ev(
 
 
 def _of_solver(
-    fit: Fit, errors: Float[np.ndarray, " k"], lost: Labels, names: Sequence[str]
+    fit: Fit,
+    errors: Float[np.ndarray, " k"],
+    lost: Bool[np.ndarray, " v"],
+    names: Sequence[str],
 ) -> list[str]:
     """Say where the numbers themselves are not to be trusted: `lost` views have no errors."""
     out = []
@@ -311,10 +303,10 @@ def _of_solver(
             "standard errors say. Compare them with --photometry.no-select and a simpler "
             "--photometry.model."
         )
-    if len(lost):
+    if lost.any():
         out.append(
-            f"The standard errors of {len(lost)} training view(s) cannot be told: what joins them "
-            f"to the others is lost in rounding ({_listed(lost, names)})."
+            f"The standard errors of {lost.sum()} training view(s) cannot be told: what joins them "
+            f"to the others is lost in rounding ({_listed(np.flatnonzero(lost), names)})."
         )
     return out
 

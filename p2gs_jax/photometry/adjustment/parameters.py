@@ -21,7 +21,7 @@ from p2gs_jax.photometry.adjustment.matrices import Terms
 from p2gs_jax.photometry.adjustment.problem import Rows
 from p2gs_jax.photometry.models import VIGNETTING_POWERS, polynomials
 from p2gs_jax.photometry.observations import PerChannel
-from p2gs_jax.photometry.response import FLOOR, HELD, KNOTS, SMALLEST_SLOPE, free_knots
+from p2gs_jax.photometry.response import FLOOR, FREE, FREE_OF_EACH, HELD, KNOTS, SMALLEST_SLOPE
 
 # Two directions that change the ratios of red, green and blue, and not their mean.
 CHROMA = np.array([[2.0, -1.0, -1.0], [0.0, 1.0, -1.0]]) / np.sqrt([[6.0], [2.0]])
@@ -85,7 +85,7 @@ class Splines:
     @property
     def free(self) -> np.ndarray:
         """Knots of a spline that are solved for."""
-        return np.array(free_knots(self.by))
+        return np.array(FREE if self.by == "all" else FREE_OF_EACH)
 
     @property
     def count(self) -> int:

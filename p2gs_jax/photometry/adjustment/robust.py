@@ -77,11 +77,7 @@ def weigh(model: Forward, theta: Parameters, weight: PerChannel, loss: Loss) -> 
 def _geman_mcclure(
     rows: Rows, square: PerObservation, share: PerObservation
 ) -> tuple[PerObservation, float]:
-    """Return weights, and the mean curvature of the loss over them.
-
-    `square` are squares of residuals, in widths of the loss; `share` is the share of each
-    observation's channels that count.
-    """
+    """Return weights of squares in widths of the loss, and its mean curvature over them."""
     robust, second = _derivatives(square)
     seen = share > 0
     return robust, float(second[seen].sum() / max(robust[seen].sum(), 1e-9))

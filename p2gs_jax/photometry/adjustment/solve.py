@@ -25,7 +25,7 @@ from p2gs_jax.photometry.adjustment.problem import Problem, Rows, make_rows
 from p2gs_jax.photometry.adjustment.robust import Loss, Weighted, noise_weight, weigh
 from p2gs_jax.photometry.adjustment.system import System, make_system, with_priors
 from p2gs_jax.photometry.models import Form
-from p2gs_jax.photometry.response import Response, log_slope_minimum, monotone
+from p2gs_jax.photometry.response import Response, rises
 
 # Rounds of both losses together are no more than MOST_ROUNDS.
 L1_ROUNDS, MOST_ROUNDS = 4, 60
@@ -41,8 +41,6 @@ PRECISION, MOST_ITERATIONS = 1e-7, 2000
 EXPOSURES = Form("view_exposure")
 # A spline may change the spread of exposures by this factor: the power gauge contradicts none.
 LARGEST_STRETCH = 1.6
-# d log exposure / d log value of mid tones; flatter ones are a collapse.
-SMALLEST_LOG_SLOPE = 0.3
 
 
 _libraries = functools.cache(threadpoolctl.ThreadpoolController)
@@ -58,10 +56,9 @@ def one_thread():
 
 
 class Balanced:
-    """A symmetric matrix over its free directions, its diagonal scaled to 1, ready to be solved.
+    """A symmetric matrix over its free directions (columns of `basis`), its diagonal scaled to 1.
 
-    Outer products of few rows, the gauges, are added to it. Columns of `basis` are the
-    directions.
+    Outer products of few rows, the gauges, are added to it.
     """
 
     def __init__(self, normal: Matrix, gauges: sp.csr_array, basis: sp.csr_array):
@@ -232,5 +229,4 @@ def fit_response(
     stretch = (np.std(fit.theta.b.mean(1)) + 1e-3) / (spread + 1e-3)
     if problem.known is None and not 1 / LARGEST_STRETCH < stretch < LARGEST_STRETCH:
         return None
-    rises = monotone(response) and log_slope_minimum(response) > SMALLEST_LOG_SLOPE
-    return response if rises else None
+    return response if rises(response) else None

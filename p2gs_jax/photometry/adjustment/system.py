@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import cast
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -52,8 +52,7 @@ class Held:
         return self.rows.T @ (self.precisions * (self.targets - self.rows @ vector))
 
 
-@dataclass(frozen=True)
-class System:
+class System(NamedTuple):
     """Which directions are free, and what is known besides the photographs."""
 
     unknowns: Unknowns  # what the parameters are
@@ -61,22 +60,15 @@ class System:
     anchors: Held  # the gauges; their precisions are relative (`gauge_strength`)
     priors: Held  # what is known
     log_exposure: Float[np.ndarray, " v"]  # prior mean of h: where rounds start
-    # Matrix whose quadratic form keeps a spline smooth, (k, k).
-    smoothness: Float[np.ndarray, "k k"]
-
-    @property
-    def directions(self) -> int:
-        """Number of free directions."""
-        return cast(tuple[int, int], self.basis.shape)[1]
+    smoothness: Float[np.ndarray, "k k"]  # its quadratic form keeps a spline smooth
 
     @property
     def start(self) -> Parameters:
         """Where rounds begin."""
         u = self.unknowns
         b = np.repeat(self.log_exposure[:, None], u.channels, 1)
-        return Parameters(
-            b, np.ones(u.views), np.zeros(u.features.count), np.zeros(u.splines.count)
-        )
+        k, c = (np.zeros(terms.count) for terms in (u.features, u.splines))
+        return Parameters(b, np.ones(u.views), k, c)
 
 
 def make_system(problem: Problem, form: Form, splines: ResponseKind | None = None) -> System:
@@ -113,11 +105,11 @@ def make_system(problem: Problem, form: Form, splines: ResponseKind | None = Non
 
 def _directions(level: Level | None, cameras: np.ndarray) -> sp.csr_array:
     """Return what may move together: nothing, the views of a camera, or each by itself."""
-    views = len(cameras)
+    views = np.arange(len(cameras))
     if level is None:
-        return sp.csr_array((views, 0))
-    column = np.arange(views) if level == "view" else cameras
-    return sp.csr_array((np.ones(views), (np.arange(views), column)))
+        return sp.csr_array((len(views), 0))
+    column = views if level == "view" else cameras
+    return sp.csr_array((np.ones(len(views)), (views, column)))
 
 
 def _anchors(problem: Problem, u: Unknowns, log_exposure, precision) -> Held:

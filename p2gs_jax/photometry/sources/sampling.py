@@ -46,10 +46,7 @@ def sample(
     xy: Float[np.ndarray, "o 2"],
     wider: Float[np.ndarray, " o"] | None = None,
 ) -> Samples:
-    """Sample an image, where its mask is 1, at pixel positions (centres at +0.5).
-
-    The averaged patches are wider than PATCH by the factors `wider`; None: 1.
-    """
+    """Sample an image, where its mask is 1, at positions; patches are wider by factors."""
     factors = np.ones(len(xy)) if wider is None else wider
     # Odd, so that patches are centred.
     widths = 2 * np.rint((PATCH * factors - 1) / 2).astype(int) + 1
@@ -100,10 +97,7 @@ def _sample_smooth(smooth, brightest, mask, xy, margin: int) -> Samples:
 def surroundings(
     ldr: Float32[np.ndarray, "h w 3"], xy: Float[np.ndarray, "o 2"]
 ) -> Float32[np.ndarray, " o"]:
-    """Return the mean log2 brightness about pixel positions, in stops by a power of 2.2.
-
-    Local tone mapping looks at how bright a photograph is about a place.
-    """
+    """Return the mean log2 brightness about pixel positions, in stops by a power of 2.2."""
     height, width = ldr.shape[:2]
     step = max(1, round(float(np.hypot(height, width)) / DIAGONAL))
     size = (max(1, width // step), max(1, height // step))
@@ -128,16 +122,10 @@ def point_colors(
     """Sample points in training views, all at the scale of the coarsest view that is used.
 
     A surface seen from afar shows less contrast, because a pixel averages more of it; compared
-    pixel for pixel, that looks like a gamma (BUILD_NOTES). So closer views are averaged over the
-    same patch of surface.
-
-    Args:
-        scene: its training views and points.
-        store: photographs.
-        points: for each training view the points to sample, rows in `scene.points`.
-        xy: for each training view their positions, full resolution.
-        uncertainty: of positions, in units of POSITION_DEVIATION.
-        on_view: progress: views done, views in all.
+    pixel for pixel, that looks like a gamma (BUILD_NOTES). So closer views are averaged over
+    the same patch of surface. For each training view, `points` are rows in `scene.points` and
+    `xy` their positions at full resolution, whose uncertainty is in units of
+    POSITION_DEVIATION.
     """
     wider, keep = _at_one_scale(scene, store, points)
     nothing = np.zeros((0, 3), np.float32)

@@ -76,9 +76,8 @@ def assemble(
         _view(p, cameras[p.camera], origin, _file_of(p, folder, write_embedded), masks)
         for p in photographs
     ]
-    objects = tuple(
-        dataclasses.replace(thing, poses=_moved(thing.poses, origin)) for thing in recording.objects
-    )
+    things = recording.objects
+    objects = tuple(dataclasses.replace(o, poses=_moved(o.poses, origin)) for o in things)
     lidar, points = None, np.zeros((0, 3), np.float32)
     if cfg.lidar:
         lidar, lidar_notes = _read_sweeps(recording, photographs, objects, origin, report)

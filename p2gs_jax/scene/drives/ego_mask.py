@@ -112,26 +112,21 @@ def find_ego_masks(
 
 
 def _kept(
-    camera: RigCamera,
-    photographs: Sequence[Photograph],
-    up: Float[np.ndarray, " 3"],
-    work_dir: Path | None,
+    camera: RigCamera, shots: Sequence[Photograph], up: np.ndarray, work_dir: Path | None
 ) -> EgoMask:
     """Return where a camera sees its car, from an earlier run if that found it."""
 
     def build(folder: Path) -> None:
-        pictures = np.array([_picture(p, camera) for p in photographs])
-        poses = np.array([p.pose for p in photographs]).reshape(-1, 4, 4)
+        pictures = np.array([_picture(p, camera) for p in shots])
+        poses = np.array([p.pose for p in shots]).reshape(-1, 4, 4)
         result = find_ego_mask(camera, pictures, poses, up)
         if result.mask is not None:
             with atomic_write(folder / "car.png") as temporary:
                 cv2.imwrite(str(temporary), result.mask.astype(np.uint8) * 255)
         (folder / "looked_at").write_text(str(result.looked_at))
 
-    stamps = [
-        (p.path.name, p.frame, 0 if p.embedded else p.path.stat().st_mtime_ns) for p in photographs
-    ]
-    places = [np.round(p.pose, 6).tolist() for p in photographs]
+    stamps = [(p.path.name, p.frame, 0 if p.embedded else p.path.stat().st_mtime_ns) for p in shots]
+    places = [np.round(p.pose, 6).tolist() for p in shots]
     key = [_VERSION, camera.name, camera.K.tolist(), stamps, places]
     with cached_folder(work_dir, f"own_car/{camera.name}", key, build) as folder:
         looked_at = int((folder / "looked_at").read_text())
@@ -192,14 +187,8 @@ def find_ego_mask(
 
 
 class Evidence(NamedTuple):
-    """What frames say of every pixel.
-
-    Attributes:
-        stays: an edge is there in nearly all frames.
-        strength: of this edge, log units a pixel.
-        own: how much it speaks for the car, 0 to 1.
-        change: of gradients between frames, log units a pixel.
-    """
+    """What frames say of every pixel: whether an edge is there in nearly all of them, its strength,
+    log units a pixel, how much it speaks for the car, 0 to 1, and the change of gradients."""
 
     stays: Bool[np.ndarray, "h w"]
     strength: Float32[np.ndarray, "h w"]
@@ -248,11 +237,9 @@ def expected_motion(
     return np.array(out)
 
 
-def weigh(
-    pictures: UInt8[np.ndarray, "n h w"], motion: Float32[np.ndarray, "n-1 h w 2"]
-) -> Evidence:
-    """Return what grey pictures, one a frame, and their `expected_motion` say of every pixel."""
-    gradients = np.array([_gradient(picture) for picture in pictures])
+def weigh(frames: UInt8[np.ndarray, "n h w"], motion: Float32[np.ndarray, "m h w 2"]) -> Evidence:
+    """Return what grey pictures and the `expected_motion` between them say of every pixel."""
+    gradients = np.array([_gradient(picture) for picture in frames])
     usual = np.median(gradients, axis=0)
     across = usual / np.maximum(np.linalg.norm(usual, axis=-1, keepdims=True), 1e-6)
     low, high, share = STEADY

@@ -294,6 +294,7 @@ def _objects(root: Path, turns: _Turns, scanner: _Track) -> tuple[list[TrackedOb
     if not path.is_file():
         return [], ["There are no boxes of moving things (tracklet_labels.xml)."]
     tracklets, empty = _read_tracklets(path)
+    turn = float(np.median(turns.lengths)) if len(turns.lengths) else TURN_S
     objects, left_out = [], 0
     for number, tracklet in enumerate(tracklets):
         frames = tracklet.first + np.arange(len(tracklet.poses))
@@ -302,9 +303,7 @@ def _objects(root: Path, turns: _Turns, scanner: _Track) -> tuple[list[TrackedOb
         left_out += int((~timed).sum())
         if timed.any():
             boxes = tracklet.poses[timed]
-            at = turns.forward[frames[timed]] + _passed(
-                boxes[:, :3, 3], 0.0, float(np.median(turns.lengths))
-            )
+            at = turns.forward[frames[timed]] + _passed(boxes[:, :3, 3], 0.0, turn)
             placed, _ = interpolated(scanner.times, scanner.poses, at)
             label, size = tracklet.label, tracklet.size
             objects.append(tracked(str(number), label, size, at, placed @ boxes, moving=None))

@@ -71,10 +71,9 @@ def read_nuscenes(root: Path, cfg: DataConfig) -> Recording:
     photographs, cameras, left_out = _photographs(drive)
     sweeps, absent = _sweeps(drive)
     objects, notes = _objects(drive)
-    if (claimed := scene.get("nbr_samples")) not in (None, len(drive.moments)):
-        notes.insert(
-            0, f"scene.json counts {claimed} samples, sample.json holds {len(drive.moments)}."
-        )
+    claimed, count = scene.get("nbr_samples"), len(drive.moments)
+    if claimed not in (None, count):
+        notes.insert(0, f"scene.json counts {claimed} samples, sample.json holds {count}.")
     notes += counted(left_out, "photographs have no pose in ego_pose.json: they are left out.")
     notes += counted(absent, "LiDAR sweeps of the keyframes are missing, or have no pose.")
     return Recording(root, "nuscenes", cameras, photographs, sweeps, objects, notes)
@@ -185,10 +184,8 @@ class _Drive:
             kind = known.get(row["sensor_token"])
             if kind is None:
                 raise broken(self.path("sensor"), f"has no sensor {row['sensor_token']}", _FIX)
-            pose = _pose(row, self.path("calibrated_sensor"))
-            sensors[row["token"]] = _Sensor(
-                kind["channel"], kind["modality"], pose, row["camera_intrinsic"]
-            )
+            pose, K = _pose(row, self.path("calibrated_sensor")), row["camera_intrinsic"]
+            sensors[row["token"]] = _Sensor(kind["channel"], kind["modality"], pose, K)
         return sensors
 
 

@@ -67,7 +67,6 @@ class Box(NamedTuple):
 
     Attributes:
         track: name of the thing.
-        label: what it is.
         size: length (x), width (y), height (z), metres.
         time: seconds.
         pose: box to world, the origin in the middle of the box.
@@ -103,10 +102,9 @@ def tracks(boxes: Iterable[Box]) -> tuple[TrackedObject, ...]:
 
 @dataclass(frozen=True)
 class MovingObjects:
-    """The objects that Gaussians belong to.
+    """The objects that Gaussians belong to, in the order of `Population.owner`.
 
     Attributes:
-        objects: in the order of `Population.owner`.
         offsets: by which somebody moved them, in the frame of each box, scene units; None: nobody.
         middle: of the drive, where Gaussians vibrate: the zero of `Placement.time`, seconds.
     """
@@ -211,7 +209,9 @@ def outline_of(
     camera = view.viewmat.astype(np.float64) @ pose
     points = corners @ camera[:3, :3].T + camera[:3, 3]
     z = points[:, 2]
-    cut = [_crossing(points[a], points[b]) for a, b in _EDGES if (z[a] < NEAR) != (z[b] < NEAR)]
+    ends = [(points[a], points[b]) for a, b in _EDGES if (z[a] < NEAR) != (z[b] < NEAR)]
+    # Where edges meet the near plane.
+    cut = [a + (NEAR - a[2]) / (b[2] - a[2]) * (b - a) for a, b in ends]
     points = np.concatenate([points[z >= NEAR], *(c[None] for c in cut)])
     if len(points) < 3:
         return None
@@ -220,12 +220,6 @@ def outline_of(
     if (high <= 0).any() or (low >= [view.width, view.height]).any():
         return None
     return cv2.convexHull(xy.astype(np.float32))[:, 0].astype(np.float64)
-
-
-def _crossing(a: np.ndarray, b: np.ndarray) -> Float[np.ndarray, " 3"]:
-    """Return where an edge meets the near plane."""
-    share = (NEAR - a[2]) / (b[2] - a[2])
-    return a + share * (b - a)
 
 
 def painted(

@@ -47,9 +47,7 @@ PICKLES = (".pkl.gz", ".pkl")
 TURN_S = 0.1
 # In `cuboids.sensor_id`: a second box of a moving thing, drawn on the forward scanner's points.
 FORWARD = 1
-FORWARD_ONLY = (
-    "moving things have boxes of the forward scanner only, whose times are known to 0.1 s."
-)
+ALONE = "moving things have boxes of the forward scanner only: times are known to 0.1 s."
 POSITION = ("position.x", "position.y", "position.z")
 # Length, width, height: the set's boxes are long in y.
 SIZE = ("dimensions.y", "dimensions.x", "dimensions.z")
@@ -142,9 +140,8 @@ def _sweeps(root: Path) -> tuple[list[Sweep], list[str]]:
     sweeps = [Sweep(k, float(times[k]), partial(_read_sweep, path)) for k, path in timed.items()]
     absent = len(times) - len(timed)
     notes = counted(absent, f"of {len(times)} LiDAR sweeps are missing.")
-    return sweeps, notes + counted(
-        len(files) - len(timed), "LiDAR sweeps have no time: they are left out."
-    )
+    notes += counted(len(files) - len(timed), "LiDAR sweeps have no time: they are left out.")
+    return sweeps, notes
 
 
 def _read_sweep(path: Path) -> SweepPoints:
@@ -180,7 +177,7 @@ def _objects(root: Path) -> tuple[list[TrackedObject], list[str]]:
         *counted(known - len(used), f"of {known} frames have no boxes."),
         *counted(len(files) - len(used), "tables of boxes are of frames without a time."),
         *counted(nameless, "boxes belong to no track: they are left out."),
-        *counted(len(alone), FORWARD_ONLY),
+        *counted(len(alone), ALONE),
     ]
     return objects, notes
 

@@ -80,8 +80,7 @@ class SweepPoints(NamedTuple):
     """One sweep of a laser scanner.
 
     Attributes:
-        points: world coordinates, each at its own time; NaN and inf as in the file (`assemble`
-            counts and drops them).
+        points: world coordinates, each at its own time; NaN and inf are as in the file.
         times: seconds; the same for all points where the set gives no more.
     """
 
@@ -91,10 +90,7 @@ class SweepPoints(NamedTuple):
 
 @dataclass(frozen=True)
 class Sweep:
-    """A sweep that is read on demand; `time` is seconds.
-
-    `read` raises UserError where its file is broken.
-    """
+    """A sweep, at a time, seconds; `read` raises UserError where its file is broken."""
 
     frame: int
     time: float
@@ -134,9 +130,8 @@ def chosen_cameras(asked: Sequence[str], there: Sequence[str]) -> list[str]:
         return list(there)
     found = []
     for name in asked:
-        fits = [c for c in there if c == name] or [
-            c for c in there if short_name(c) == short_name(name)
-        ]
+        short = short_name(name)
+        fits = [c for c in there if c == name] or [c for c in there if short_name(c) == short]
         if not fits:
             listed = ", ".join(map(short_name, there))
             raise UserError(f"there is no camera {name!r}", fix=f"choose one of {listed}")
@@ -164,7 +159,6 @@ def chosen_frames(asked: str | None, there: Sequence[int]) -> list[int]:
             fix="write FIRST:END or FIRST:END:STEP, as 0:30:2",
         ) from None
     if not found:
-        raise UserError(
-            f"--frames {asked} holds no frame of this drive", fix=f"it has {len(there)}, from 0 on"
-        )
+        fix = f"it has {len(there)}, from 0 on"
+        raise UserError(f"--frames {asked} holds no frame of this drive", fix=fix)
     return found

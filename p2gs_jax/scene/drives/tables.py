@@ -2,8 +2,7 @@
 
 A pickle names functions and calls them. Here every name that a table of numbers and texts may hold
 stands for an inert record of what it was called with; other names are refused. What the records
-mean is worked out afterwards, for the layouts that pandas has written since 0.14: nothing in a
-file is ever run.
+mean is worked out afterwards, for the layouts that pandas has written since 0.14.
 """
 
 from __future__ import annotations
@@ -50,9 +49,8 @@ def chosen_drive(asked: str | None, there: Sequence[str], root: Path) -> str:
 
     Nothing asked: the only one. UserError: none has this name, or several could be meant.
     """
-    fits = [name for name in there if name == asked] or [
-        name for name in there if asked is None or name.startswith(asked)
-    ]
+    fits = [name for name in there if asked is None or name.startswith(asked)]
+    fits = [name for name in fits if name == asked] or fits
     if len(fits) == 1:
         return fits[0]
     listed = sorted(fits or there)

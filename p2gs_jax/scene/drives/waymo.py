@@ -98,16 +98,12 @@ def read_waymo(root: Path, cfg: DataConfig) -> Recording:
     segment = _Segment(root, chosen_drive(cfg.drive, _segments(root), root))
     cameras, mounts, rolling = _cameras(segment.open("camera_calibration"))
     photographs, readouts, notes = _photographs(segment, mounts, rolling)
-    notes += [
-        f"{name} is missing: {why}." for name, why in MISSING.items() if not segment.has(name)
-    ]
+    notes += [f"{n} is missing: {why}." for n, why in MISSING.items() if not segment.has(n)]
     cars = _cars(segment.open("vehicle_pose")) if segment.has("vehicle_pose") else {}
     objects, box_notes = _objects(segment, cars) if segment.has("lidar_box") else ((), [])
     sweeps, sweep_notes = _sweeps(segment, cars) if cars and segment.has("lidar") else ([], [])
-    there = {photograph.camera for photograph in photographs}
-    rig = [
-        dataclasses.replace(c, readout_s=readouts.get(c.name)) for c in cameras if c.name in there
-    ]
+    own = {photograph.camera for photograph in photographs}
+    rig = [dataclasses.replace(c, readout_s=readouts.get(c.name)) for c in cameras if c.name in own]
     notes += [*box_notes, *sweep_notes]
     return Recording(root, "waymo", rig, photographs, sweeps, objects, notes)
 

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import OpenEXR
+import pillow_heif
 from PIL import ExifTags, Image
 
 # Linear sRGB to the made camera's colours, which are XYZ: LibRaw inverts this itself.
@@ -58,12 +60,8 @@ def write_dng(
         (50717, "I", [white]), (50721, "ii", of(*_XYZ_TO_CAMERA)),
         (50728, "II", of(*(1 / b for b in balance))), (50778, "H", [21]),
     ]  # fmt: skip
-    shot = [
-        (33434, "II", [time]),
-        (33437, "II", of(2.8)),
-        (34855, "H", [iso]),
-        (37386, "II", of(50)),
-    ]
+    shot = [(33434, "II", [time]), (33437, "II", of(2.8)), (34855, "H", [iso])]
+    shot += [(37386, "II", of(50))]
     places, first = _laid_out(main, 8)
     shot_places, second = _laid_out(shot, first)
     main = [
@@ -146,6 +144,21 @@ DISPLAY_P3 = icc_profile("Display P3", DISPLAY_P3_XYZ, SRGB_CURVE)
 ADOBE_RGB = icc_profile("Adobe RGB (1998)", ADOBE_RGB_XYZ, parametric(563 / 256))
 
 
+def write_exr(path: Path, light: np.ndarray, names: str = "RGB", **header) -> None:
+    """Write channels of light as an OpenEXR."""
+    channels = {c: np.ascontiguousarray(light[..., i]) for i, c in enumerate(names)}
+    with OpenEXR.File({"type": OpenEXR.scanlineimage, **header}, channels) as file:
+        file.write(str(path))
+
+
+def save_heic(path: Path, pixels: np.ndarray, **options) -> None:
+    """Write pixels of 8 or 16 bits as a HEIC."""
+    mode = "RGB;16" if pixels.dtype == np.uint16 else "RGB"
+    data = np.ascontiguousarray(pixels).tobytes()
+    image = pillow_heif.from_bytes(mode, pixels.shape[1::-1], data)
+    image.save(path, quality=100, chroma=444, **options)
+
+
 def settings(time: float = 1 / 60, aperture: float = 2.8, iso: int = 200) -> Image.Exif:
     """Return EXIF with exposure time, f-number and ISO."""
     exif = Image.Exif()
@@ -158,5 +171,4 @@ def patches(size: tuple[int, int] = (96, 64), *, seed: int = 0) -> np.ndarray:
     """Return a smooth coloured picture, float in [0, 1]."""
     rng = np.random.default_rng(seed)
     small = rng.random((4, 6, 3)).astype(np.float32)
-
     return np.clip(cv2.resize(small, size, interpolation=cv2.INTER_CUBIC), 0, 1)

@@ -1,0 +1,408 @@
+"""HEIC, raw and linear light, from their files to what the store gives and the user is told."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import struct
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image, features
+from scene.convert.made import DISPLAY_P3, patches, save_heic, settings, write_dng, write_exr
+from scene.helpers import refused, write_image, write_tiny_model
+
+from p2gs_jax.config import DataConfig, FitConfig
+from p2gs_jax.core.numerics import srgb_decode, srgb_encode
+from p2gs_jax.photometry.calibrate import options_of
+from p2gs_jax.run.scene_file import read_scene, write_scene
+from p2gs_jax.scene import ImageStore, load_scene
+from p2gs_jax.scene.convert.convert import Converted, convert_photographs, with_originals
+from p2gs_jax.scene.convert.headers import read_exif_ev, read_exif_settings
+from p2gs_jax.scene.convert.kinds import has_gain_map, kind_of
+from p2gs_jax.scene.files import image_size, list_images
+from p2gs_jax.scene.survey import survey
+
+CFG = DataConfig(test_every=0)
+LIGHT = np.full((30, 40, 3), (0.1, 0.3, 0.5), np.float32)
+GREY = np.full((64, 96, 3), 0.3)
+
+
+def converted(folder: Path) -> Converted:
+    work = folder.parent / "work"
+    return convert_photographs(folder, list_images(folder), work, lambda message: None)
+
+
+def stored(path: Path) -> np.ndarray:
+    """Return the codes in a file, R G B (A)."""
+    codes = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    return codes[..., [2, 1, 0, 3][: codes.shape[2]]]
+
+
+def light_of(path: Path) -> np.ndarray:
+    codes = stored(path)[..., :3]
+    assert codes.dtype == np.uint16
+    return srgb_decode(codes / 65535)
+
+
+def record_of(result: Converted) -> list[dict]:
+    return json.loads((result.folder / "photographs.json").read_text())["photographs"]
+
+
+def noted(result: Converted, words: str) -> bool:
+    return any(words in note for note in result.notes)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "photos").mkdir()
+    return tmp_path / "photos"
+
+
+def test_ordinary_photographs_stay_where_they_are(folder: Path) -> None:
+    for name in ("a.jpg", "b.png"):
+        write_image(folder / name)
+    result = converted(folder)
+    assert result.folder == folder
+    assert [path.name for path in result.paths] == ["a.jpg", "b.png"]
+    assert result.known is None
+    assert not (folder.parent / "work").exists()
+
+
+# ---------------------------------------------------------------------- raw
+
+
+def test_raw_is_linear_above_its_black_level(folder: Path) -> None:
+    light = 0.02 + 0.8 * patches((96, 64)) ** 2
+    write_dng(folder / "a.dng", light, orientation=6)
+    write_dng(folder / "b.dng", light / 4, orientation=1)
+    write_dng(folder / "c.dng", np.full((64, 96, 3), 3.0))
+    result = converted(folder)
+    assert result.known == "camera raw"
+    bright, dark, white = (light_of(path) for path in result.paths)
+    assert bright.shape == (64, 96, 3)  # as the sensor lies, whatever the orientation
+    inner = (slice(8, -8), slice(8, -8))
+    # The rest is LibRaw's guess between the pixels of the filter.
+    assert np.percentile(np.abs(bright - light)[inner], 99) < 0.02
+    # Two stops are two stops, down to the dark: black was subtracted and nothing was brightened.
+    ratio = bright[inner] / dark[inner]
+    assert np.median(ratio) == pytest.approx(4, rel=2e-3)
+    assert np.percentile(np.abs(ratio - 4), 95) < 0.1
+    # The sensor's white is saturated in all channels.
+    assert white.min() == pytest.approx(1, abs=1e-4)
+    assert record_of(result)[2]["saturated"] == 1
+
+
+def test_one_white_balance_for_all_raws_of_a_camera(folder: Path) -> None:
+    def neutral(balance) -> bytes:
+        """Return the tag AsShotNeutral as `write_dng` writes it."""
+        return b"".join(struct.pack("<II", round(1e6 / b), 1_000_000) for b in balance)
+
+    # The same light and sensor; the camera changed its mind about white.
+    light = np.full((64, 96, 3), (0.2, 0.3, 0.25))
+    for name, chosen in {"a": (2.0, 1, 1.5), "b": (2.2, 1, 1.4), "c": (1.6, 1, 1.8)}.items():
+        path = folder / f"{name}.dng"
+        write_dng(path, light, balance=(2.0, 1, 1.5))
+        assert neutral((2.0, 1, 1.5)) in path.read_bytes()
+        path.write_bytes(path.read_bytes().replace(neutral((2.0, 1, 1.5)), neutral(chosen)))
+    result = converted(folder)
+    colours = [light_of(path)[32, 48] for path in result.paths]
+    np.testing.assert_allclose(colours, np.broadcast_to((0.2, 0.3, 0.25), (3, 3)), atol=2e-3)
+    assert record_of(result)[1]["balance"] == pytest.approx((2.2, 1, 1.4), rel=1e-3)
+    (note,) = (note for note in result.notes if note.startswith("White balance of 3"))
+    assert "red 2.000, blue 1.500" in note
+
+
+def test_exif_of_raw_reaches_the_converted_file(folder: Path) -> None:
+    write_dng(folder / "a.dng", GREY, time=(1, 250), iso=400)
+    (path,) = converted(folder).paths
+    for file in (folder / "a.dng", path):
+        assert read_exif_ev(file) == pytest.approx(np.log2(1 / 250 * 400 / 2.8**2), abs=1e-3)
+    assert read_exif_settings(path).time == pytest.approx(1 / 250)
+    assert image_size(folder / "a.dng") == (96, 64)
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "command"),
+    [("rawpy", "a.dng", "p2gs-jax[raw]"), ("pillow_heif", "a.heic", "p2gs-jax[heic]")],
+)
+def test_what_to_install(folder: Path, monkeypatch, module: str, name: str, command: str) -> None:
+    (folder / name).write_bytes(b"whatever")
+    monkeypatch.setitem(sys.modules, module, None)
+    with refused(name, f"pip install '{command}'"):
+        converted(folder)
+
+
+def test_raw_beside_jpeg_is_one_photograph(folder: Path, monkeypatch) -> None:
+    write_dng(folder / "a.dng", GREY)
+    write_image(folder / "a.jpg", 90, (96, 64))
+    result = converted(folder)
+    assert list(result.originals.values()) == [folder / "a.dng"]
+    assert noted(result, "there twice")
+    # Without rawpy the JPEG is used.
+    monkeypatch.setattr("p2gs_jax.scene.convert.convert.find_spec", lambda name: None)
+    result = converted(folder)
+    assert list(result.originals.values()) == [folder / "a.jpg"]
+    assert result.known is None
+
+
+# ------------------------------------------------------ HEIC, AVIF and WebP
+
+
+def save(path: Path, pixels: np.ndarray, **options) -> None:
+    if path.suffix == ".heic":
+        save_heic(path, pixels, **options)
+        return
+    if not features.check(path.suffix[1:]):
+        pytest.skip(f"this Pillow knows no {path.suffix}")
+    how = {"quality": 100, "subsampling": "4:4:4"} if path.suffix == ".avif" else {"lossless": True}
+    Image.fromarray(pixels).save(path, **how, **options)
+
+
+@pytest.mark.parametrize("kind", ["heic", "avif", "webp"])
+def test_display_values_profile_and_settings_are_kept(folder: Path, kind: str) -> None:
+    pixels, file = (40 + 150 * patches()).astype(np.uint8), folder / f"a.{kind}"
+    save(file, pixels, exif=settings().tobytes(), icc_profile=DISPLAY_P3)
+    assert image_size(file) == (96, 64)
+    result = converted(folder)
+    assert result.known is None  # a phone's own curve is in it
+    (path,) = result.paths
+    assert stored(path).dtype == np.uint8
+    assert np.abs(stored(path).astype(int) - pixels).max() <= 4
+    with Image.open(path) as image:
+        assert image.info["icc_profile"] == DISPLAY_P3
+    for one in (path, file):
+        assert read_exif_ev(one) == pytest.approx(np.log2(200 / 60 / 2.8**2), abs=1e-3)
+    file.write_bytes(file.read_bytes()[: 300 if kind == "avif" else -60])
+    with refused(rf"a\.{kind} cannot be decoded"):
+        converted(folder)
+
+
+def test_ten_bit_heic_keeps_its_precision(folder: Path) -> None:
+    ramp = np.linspace(20_000, 22_000, 96).astype(np.uint16)
+    save_heic(folder / "a.heic", np.broadcast_to(ramp[None, :, None], (64, 96, 3)))
+    codes = stored(converted(folder).paths[0])
+    assert codes.dtype == np.uint16
+    assert len(np.unique(codes[32, :, 1])) > 25  # 8 bits have 8 levels here
+
+
+# ------------------------------------------------------------- linear light
+
+
+def test_exr_keeps_light_between_photographs(folder: Path) -> None:
+    light = (0.001 + 6 * patches() ** 3).astype(np.float32)
+    write_exr(folder / "a.exr", light)
+    write_exr(folder / "b.exr", light / 8)
+    assert image_size(folder / "a.exr") == (96, 64)
+    result = converted(folder)
+    assert result.known == "linear EXR"
+    assert [r["scale"] for r in record_of(result)] == [0.125, 0.125]
+    bright, dark = (light_of(path) for path in result.paths)
+    np.testing.assert_allclose(bright, np.minimum(light * 0.125, 1), atol=1e-4)
+    seen = dark > 1e-3
+    assert np.median(bright[seen] / dark[seen]) == pytest.approx(8, rel=5e-3)
+    assert noted(result, "multiplied by 0.125")
+
+
+def test_exr_of_a_sensor_keeps_its_white(folder: Path) -> None:
+    write_exr(folder / "a.exr", np.minimum(patches() * 1.3, 1).astype(np.float32))
+    assert record_of(converted(folder))[0]["scale"] == 1
+
+
+def test_exr_that_is_broken_inside(folder: Path) -> None:
+    light = np.full((8, 8, 3), 0.5, np.float32)
+    light[0, 0], light[0, 1], light[0, 2] = np.nan, np.inf, -1
+    write_exr(folder / "a.exr", light)
+    result = converted(folder)
+    assert noted(result, "1 pixels of linear photographs are not numbers")
+    np.testing.assert_array_equal(light_of(result.paths[0])[0, :3], [[0] * 3, [1] * 3, [0] * 3])
+
+
+def test_exr_grey_alpha_and_chromaticities(folder: Path) -> None:
+    grey = np.full((8, 8, 1), 0.3, np.float32)
+    write_exr(folder / "a.exr", grey, "Y", expTime=0.01, aperture=4.0, isoSpeed=100.0)
+    clear = np.full((8, 8, 4), 0.5, np.float32) * (0.6, 0.6, 0.6, 1)
+    write_exr(folder / "b.exr", clear.astype(np.float32), "RGBA")
+    p3 = (0.68, 0.32, 0.265, 0.69, 0.15, 0.06, 0.3127, 0.329)
+    green = np.broadcast_to(np.array([0, 0.5, 0], np.float32), (8, 8, 3))
+    write_exr(folder / "c.exr", green, chromaticities=p3)
+    a, b, c = converted(folder).paths
+    assert light_of(a)[4, 4] == pytest.approx(0.3, abs=1e-4)
+    assert read_exif_ev(a) == pytest.approx(np.log2(0.01 * 100 / 16), abs=1e-3)
+    assert stored(b).shape[2] == 4
+    assert light_of(b)[4, 4] == pytest.approx(0.6, abs=1e-3)
+    assert stored(b)[4, 4, 3] / 65535 == pytest.approx(0.5, abs=1e-3)
+    assert light_of(c)[4, 4] == pytest.approx((0, 0.521, 0), abs=2e-3)
+
+
+def cut_raw(path: Path) -> None:
+    write_dng(path, GREY)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+@pytest.mark.parametrize(
+    ("name", "make", "words"),
+    [
+        (
+            "a.nef",
+            lambda path: path.write_bytes(b"II*\0" + bytes(range(256)) * 40),
+            [r"does not know .*a\.nef", "DNG Converter"],
+        ),
+        ("a.dng", cut_raw, [r"a\.dng"]),
+        (
+            "a.exr",
+            lambda path: path.write_bytes(b"\x76\x2f\x31\x01 and nothing"),
+            [r"a\.exr is not a readable OpenEXR"],
+        ),
+        (
+            "a.exr",
+            lambda path: write_exr(path, np.ones((8, 8, 1), np.float32), "Z"),
+            ["has the channels Z"],
+        ),
+    ],
+)
+def test_files_that_are_refused(folder: Path, name: str, make, words: list[str]) -> None:
+    make(folder / name)
+    with refused(*words):
+        converted(folder)
+
+
+def test_tiff_of_floats_is_light_and_of_integers_is_not(folder: Path) -> None:
+    light, path = (0.9 * patches()).astype(np.float32), folder / "a.tif"
+    cv2.imwrite(str(path), light[..., ::-1])
+    assert kind_of(path) == "float_tiff"
+    result = converted(folder)
+    assert result.known == "TIFF of floats"
+    np.testing.assert_allclose(light_of(result.paths[0]), light, atol=1e-4)
+    cv2.imwrite(str(path), np.rint(srgb_encode(light) * 65535).astype(np.uint16)[..., ::-1])
+    assert kind_of(path) == "plain"
+
+
+# -------------------------------------------------------------------- mixed
+
+
+def test_kinds_beside_each_other(folder: Path) -> None:
+    (folder / "sub").mkdir()
+    write_dng(folder / "sub" / "a.dng", GREY)
+    write_image(folder / "b.jpg", 90, (96, 64))
+    result = converted(folder)
+    assert [p.relative_to(result.folder).as_posix() for p in result.paths] == ["b.jpg", "sub/a.png"]
+    assert (result.folder / "b.jpg").read_bytes() == (folder / "b.jpg").read_bytes()
+    assert result.known is None
+    assert noted(result, "of several kinds (1 ")
+
+
+def test_converted_once(folder: Path) -> None:
+    write_dng(folder / "a.dng", GREY)
+    (path,) = converted(folder).paths
+    before = path.stat().st_mtime_ns
+    assert converted(folder).paths[0].stat().st_mtime_ns == before
+    write_dng(folder / "a.dng", 2 * GREY)
+    assert light_of(converted(folder).paths[0])[32, 48, 1] == pytest.approx(0.6, abs=5e-3)
+
+
+def test_gain_maps_are_found_in_headers_only(folder: Path) -> None:
+    path = folder / "a.jpg"
+    write_image(path)
+    assert not has_gain_map(path)
+    data = path.read_bytes()
+    xmp = b'http://ns.adobe.com/xap/1.0/\0<x xmlns:hdrgm="http://ns.adobe.com/hdr-gain-map/1.0/"/>'
+    iso = b"urn:iso:std:iso:ts:21496:-1\0\0\0\0\0"
+    for marker, payload in ((b"\xff\xe1", xmp), (b"\xff\xe2", iso)):
+        segment = marker + (len(payload) + 2).to_bytes(2, "big") + payload
+        path.write_bytes(data[:2] + segment + data[2:])
+        assert has_gain_map(path)
+    # The second picture of such a file, behind the first, is not part of the header.
+    path.write_bytes(data + iso)
+    assert not has_gain_map(path)
+
+
+# ------------------------------------------------------------------- scenes
+
+
+def renamed(root: Path, suffix: str) -> None:
+    """Write a model whose photographs have another suffix; they are written afterwards."""
+    model = write_tiny_model(root) / "images.txt"
+    model.write_text(model.read_text().replace(".png", suffix))
+    for path in (root / "images").iterdir():
+        path.unlink()
+
+
+def test_a_model_of_exr_photographs(tmp_path: Path) -> None:
+    root = tmp_path / "scene"
+    renamed(root, ".exr")
+    (root / "masks").mkdir()
+    for k in range(2):
+        write_exr(root / "images" / f"im {k}.exr", LIGHT / (1 + k), expTime=0.01, aperture=2.0)
+        cv2.imwrite(str(root / "masks" / f"im {k}.png"), np.eye(30, 40, dtype=np.uint8) * 255)
+    assert survey(root, CFG).photographs == 2
+    scene = load_scene(root, CFG, tmp_path / "work")
+    assert [view.name for view in scene.views] == ["im 0.exr", "im 1.exr"]
+    assert scene.known_response == "linear EXR"
+    assert scene.views[0].exif_ev == pytest.approx(np.log2(0.01 * 100 / 4))
+    store = ImageStore(scene.views, CFG)
+    pixels, mask = store.get(1)
+    assert store.stored(1)[0].dtype == np.uint16
+    np.testing.assert_allclose(pixels, srgb_encode(LIGHT / 2), atol=2e-5)
+    np.testing.assert_array_equal(mask, np.eye(30, 40))
+    assert options_of(FitConfig(), scene).known_response == "linear EXR"
+    # A run remembers it.
+    (tmp_path / "run").mkdir()
+    write_scene(tmp_path / "run", scene)
+    again = read_scene(tmp_path / "run", root)
+    assert again is not None
+    assert again.known_response == "linear EXR"
+    assert again.views[0].image_path == scene.views[0].image_path
+
+
+def test_a_model_of_heic_photographs(tmp_path: Path) -> None:
+    root = tmp_path / "scene"
+    renamed(root, ".HEIC")
+    for k in range(2):
+        pixels = np.full((30, 40, 3), 90 + k, np.uint8)
+        save_heic(root / "images" / f"im {k}.HEIC", pixels, exif=settings().tobytes())
+    scene = load_scene(root, CFG, tmp_path / "work")
+    assert scene.known_response is None
+    assert scene.views[0].exif_ev is not None
+    pixels, _ = ImageStore(scene.views, CFG).stored(1)
+    assert pixels.dtype == np.uint8
+    assert np.abs(pixels.astype(int) - 91).max() <= 2
+
+
+def test_names_paths_and_masks_are_the_users_own(tmp_path: Path) -> None:
+    """Structure from motion of photographs alone sees the converted files."""
+    root = tmp_path / "scene"
+    folder, masks = root / "images", [root / "masks" / name for name in ("a.png", "b.png")]
+    write_image(folder / "a.jpg", 90, (96, 64))
+    write_dng(folder / "b.dng", GREY)
+    for mask in masks:
+        write_image(mask, 255, (96, 64))
+    paths = [folder / "a.jpg", folder / "b.dng"]
+    photographs = convert_photographs(folder, paths, tmp_path / "work", lambda message: None)
+    write_tiny_model(tmp_path / "tiny")
+    found = load_scene(tmp_path / "tiny", CFG)
+    views = tuple(
+        dataclasses.replace(view, name=path.name, image_path=path, mask_path=None)
+        for view, path in zip(found.views, photographs.paths, strict=True)
+    )
+    scene = with_originals(dataclasses.replace(found, views=views), photographs)
+    assert [view.name for view in scene.views] == ["a.jpg", "b.dng"]
+    files = [view.image_path for view in scene.views]
+    assert files == [folder / "a.jpg", photographs.folder / "b.png"]
+    assert [view.mask_path for view in scene.views] == masks
+    assert scene.known_response is None
+    raw = survey(folder, dataclasses.replace(CFG, images=".")).cameras[0]
+    assert raw.size == (96, 64)
+    assert raw.ev is not None
+
+
+def test_a_mixed_grey_and_colour_scene(tmp_path: Path) -> None:
+    write_tiny_model(tmp_path)
+    cv2.imwrite(str(tmp_path / "images" / "im 1.png"), np.full((30, 40, 3), (10, 20, 30), np.uint8))
+    store = ImageStore(load_scene(tmp_path, CFG, tmp_path / "work").views, CFG)
+    assert (store.stored(0)[0] == 100).all()
+    assert (store.stored(1)[0] == (30, 20, 10)).all()
+    assert not (tmp_path / "work").exists()

@@ -1,0 +1,226 @@
+"""Structure from motion: pairs, features that stay, reasons, and scenes of photographs alone."""
+
+import dataclasses
+import os
+import shutil
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+from scene.helpers import refused, reprojection_errors, write_image
+
+from p2gs_jax.config import DataConfig
+from p2gs_jax.scene import load_scene
+from p2gs_jax.scene.cache import StageProgress, cached_folder
+from p2gs_jax.scene.sfm.features import (
+    kept_features,
+    match_kept,
+    opened,
+    pairs_by_name,
+    pairs_by_pose,
+    quiet_colmap,
+)
+from p2gs_jax.scene.sfm.map import load_images, reasons, sentence
+
+CFG = DataConfig()
+
+
+def copied(shared_data, folder):
+    shutil.copytree(shared_data("bundler_et") / "images", folder, copy_function=shutil.copyfile)
+    return folder
+
+
+def test_bare_folder_with_a_stranger_and_its_cache(shared_data, tmp_path):
+    folder = copied(shared_data, tmp_path / "scene")
+    stranger = sorted((shared_data("sceaux_castle") / "images").iterdir())[0]
+    shutil.copyfile(stranger, folder / "stranger.jpg")
+    said = []
+    scene = load_scene(folder, CFG, tmp_path / "work", said.append)
+    assert scene.format == "images"
+    assert len(scene.views) >= 7
+    assert {v.camera for v in scene.views} == {scene.views[0].camera}
+    assert np.median(reprojection_errors(scene)) < 1.0
+    assert len(scene.points) > 300
+    note = next(note for note in scene.notes if "could not be registered" in note)
+    assert "stranger.jpg (matches no other photograph)" in note
+    assert "overlap" in note
+    assert any("detecting" in line for line in said)
+
+    said.clear()
+    again = load_scene(folder, CFG, tmp_path / "work", said.append)
+    assert not any("detecting" in line for line in said)
+    assert np.array_equal(again.points, scene.points)
+    assert again.notes == scene.notes
+
+    # Another mapper takes the features and matches that are there.
+    said.clear()
+    globally = dataclasses.replace(CFG, mapper="global")
+    other = load_scene(folder, globally, tmp_path / "work", said.append)
+    assert {v.name for v in other.views} == {v.name for v in scene.views}
+    assert np.median(reprojection_errors(other)) < 1.0
+    assert any("features of 10 images are kept" in line for line in said)
+    assert not any("detecting" in line for line in said)
+
+
+def test_cut_photograph_is_left_out_and_named(shared_data, tmp_path):
+    path = copied(shared_data, tmp_path / "images") / "et008.jpg"
+    path.write_bytes(path.read_bytes()[:3000])
+    scene = load_scene(tmp_path, CFG)
+    assert "et008.jpg" not in {v.name for v in scene.views}
+    assert "et008.jpg" in scene.notes[0]
+
+
+def test_nothing_registers_or_opens(tmp_path):
+    write_image(tmp_path / "0.png")
+    with refused("holds 1 image"):
+        load_scene(tmp_path, CFG)
+    for i in range(3):
+        write_image(tmp_path / f"{i}.png", 40 * i, (64, 48))
+    with refused(r"none of the 3 images.*no features", "overlap"):
+        load_scene(tmp_path, CFG)
+    (tmp_path / "0.png").write_bytes(b"nothing")
+    with refused(r"cannot decode the image .*0.png"):
+        load_scene(tmp_path, CFG)
+
+
+# ------------------------------------------------------------------ kept features
+
+
+@pytest.fixture
+def folder(noisy_street, tmp_path):
+    """Return a folder with five photographs of a street, those of one camera, and a blank one."""
+    quiet_colmap()
+    (tmp_path / "photos").mkdir()
+    photographs = sorted((noisy_street / "images").rglob("*.png"))[:5]
+    for k, path in enumerate(photographs):
+        shutil.copyfile(path, tmp_path / "photos" / f"{k}.png")
+    Image.new("RGB", (192, 128), (90, 90, 90)).save(tmp_path / "photos" / "blank.png")
+    return tmp_path / "photos"
+
+
+def names_in(database):
+    with opened(database) as db:
+        return {i.name: (i.camera_id, i.image_id) for i in db.read_all_images()}
+
+
+def test_only_what_is_new_is_done(folder, tmp_path):
+    said, names, keep = [], [f"{k}.png" for k in range(5)], tmp_path / "features"
+    database = kept_features(keep, folder, {("one",): names[:3]}, said.append)
+    assert match_kept(database, names[:3], None, said.append) == 3
+    before = names_in(database)
+    assert said == ["detecting features: 3 images", "matching: 3 image pairs"]
+
+    said.clear()
+    database = kept_features(keep, folder, {("one",): names}, said.append)
+    assert match_kept(database, names, None, said.append) == 10
+    after = names_in(database)
+    assert {n: after[n] for n in before} == before
+    assert len({camera for camera, _ in after.values()}) == 1, "still one camera"
+    assert "features of 3 images are kept from an earlier run" in said
+    assert "detecting features: 2 images" in said
+    assert "matches of 3 image pairs are kept from an earlier run" in said
+    assert "matching: 7 image pairs" in said
+
+    said.clear()
+    os.utime(folder / "1.png", ns=(1, 1))
+    kept_features(keep, folder, {("one",): names}, said.append)
+    assert said == ["detecting features: 5 images"], "one changed: all anew"
+
+    said.clear()
+    kept_features(keep, folder, {("one",): names[:3], ("two",): names[3:]}, said.append)
+    assert said == ["detecting features: 5 images"], "other cameras: all anew"
+
+
+def test_reasons(folder, tmp_path):
+    names = ["0.png", "1.png", "blank.png"]
+    database = kept_features(tmp_path / "f", folder, {("one",): names}, lambda text: None)
+    match_kept(database, names, None, lambda text: None)
+    why = reasons(database, names, [])
+    assert set(why) == set(names)
+    assert why["blank.png"].startswith("no features")
+    assert why["0.png"] == why["1.png"] == "matches only photographs that did not register either"
+    assert "0.png, 1.png (matches only" in sentence(why)
+
+
+def test_a_mapper_that_is_not_there_is_named(monkeypatch, folder, tmp_path):
+    monkeypatch.delattr(pycolmap, "global_mapping")
+    cfg = DataConfig(mapper="global")
+    with refused("no global mapper", "pip install --upgrade pycolmap"):
+        load_images(tmp_path, folder, sorted(folder.iterdir()), cfg, None, print)
+
+
+def test_progress_tells_what_is_left():
+    now, said = [0.0], []
+    progress = StageProgress(said.append, "matching", 100, "pairs", clock=lambda: now[0])
+    for seconds, done in ((1, 5), (20, 25), (21, 26), (3600, 50), (3700, 100)):
+        now[0] = seconds
+        progress(done)
+    assert said == [
+        "matching: 100 pairs",
+        "matching: 25 of 100 pairs, about 1:00 left at this pace",
+        "matching: 50 of 100 pairs, about 1:00:00 left at this pace",
+    ]
+    said.clear()
+    StageProgress(said.append, "matching", 0, "pairs")
+    assert said == []
+
+
+def test_cache_survives_interruption(tmp_path):
+    calls = []
+
+    def use(value, key, fail=False, work=tmp_path):
+        def build(folder):
+            calls.append(value)
+            assert list(folder.iterdir()) == []
+            (folder / "result").write_text(value)
+            if fail:
+                raise KeyboardInterrupt
+
+        with cached_folder(work, "x", key, build) as folder:
+            return (folder / "result").read_text(), folder
+
+    with pytest.raises(KeyboardInterrupt):
+        use("half", {"a": 1}, fail=True)
+    found = [use("one", {"a": 1})[0], use("other", {"a": 1})[0], use("two", {"a": 2})[0]]
+    assert found == ["one", "one", "two"]
+    assert calls == ["half", "one", "two"]
+    value, folder = use("t", {}, work=None)
+    assert value == "t"
+    assert not folder.exists()
+
+
+# ------------------------------------------------------------------ pairs
+
+
+def test_pairs_of_long_sequences():
+    left, right = ([f"{side}/{i:03d}.png" for i in range(40)] for side in ("left", "right"))
+    pairs = pairs_by_name(left + right)
+    assert len(pairs) == len(set(pairs))
+    for other in ("left/013", "left/019", "right/003", "right/004"):
+        assert ("left/003.png", f"{other}.png") in pairs
+    assert ("left/003.png", "left/014.png") not in pairs
+    assert pairs_by_name(left) is None
+    assert pairs_by_name(left * 2, "all") is None
+
+
+def test_a_sequence_meets_its_neighbours_and_itself_later():
+    pairs = pairs_by_name([f"{i:04d}.png" for i in range(40)], "sequence")
+    assert len(pairs) == len(set(pairs))
+    assert ("0000.png", "0010.png") in pairs
+    assert ("0000.png", "0035.png") in pairs, "who comes back after a round is found"
+    assert ("0001.png", "0036.png") not in pairs
+    assert len(pairs) < 40 * 39 / 2
+
+
+def test_pairs_by_pose_prefer_neighbours_that_look_the_same_way():
+    names = [f"{i:03d}" for i in range(100)]
+    viewmats = np.tile(np.eye(4, dtype=np.float32), (100, 1, 1))
+    viewmats[:, 0, 3] = -np.arange(100)  # a walk along x
+    viewmats[50, :3, :3] = np.diag([-1, 1, -1])  # one looks back
+    viewmats[50, 0, 3] = 50
+    pairs = pairs_by_pose(names, viewmats)
+    assert ("010", "011") in pairs
+    assert not any("050" in pair for pair in pairs)
+    assert max(abs(int(a) - int(b)) for a, b in pairs) <= 11
+    assert pairs_by_pose(names[:15], viewmats[:15]) is None
