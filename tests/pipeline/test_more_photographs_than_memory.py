@@ -6,8 +6,8 @@ from collections import Counter
 from dataclasses import replace
 from types import SimpleNamespace
 
-from p2gs_jax.config import from_dict
 from p2gs_jax.pipeline.preflight import check_run_dir
+from p2gs_jax.presets import from_dict
 from p2gs_jax.scene.pixels import store as held
 
 FIT = (

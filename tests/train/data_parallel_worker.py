@@ -20,7 +20,7 @@ from p2gs_jax.train.exposure_loss import Partner
 from p2gs_jax.train.inputs import stacked
 from p2gs_jax.train.optimizer import make_optimizer
 from p2gs_jax.train.state import initial_state
-from p2gs_jax.train.step import PARTS, Step
+from p2gs_jax.train.step import PROGRAMS, Step
 from p2gs_jax.train.update import Controls
 from p2gs_jax.types import Batch, Camera, Gaussians, Params, Photometry
 
@@ -99,12 +99,12 @@ def on_devices(count: int) -> dict:
     """A step without room, then two with it: losses, fault, moments and parameters."""
     cfg = config(VIEWS)
     optimizer, mesh = make_optimizer(cfg), default_mesh(count)
-    step, spread = ParallelStep(Step(cfg, optimizer, EXTENT), mesh), Spread(mesh)
+    step, spread = ParallelStep(cfg, optimizer, EXTENT, cfg.densify.noise, mesh=mesh), Spread(mesh)
     state = spread.spread(initial_state(start(), alive(), optimizer))
     inputs = (*map(stacked, zip(*map(view, range(VIEWS)), strict=True)), CONTROLS)
 
     def taken(state, room):
-        lowered = [step.lowered(n, state, *inputs, room=room, degree=DEGREE) for n in PARTS]
+        lowered = [step.lowered(n, state, *inputs, room=room, degree=DEGREE) for n in PROGRAMS]
         return step.chained(*(part.compile() for part in lowered))
 
     losses, first = [], None
