@@ -44,23 +44,14 @@ from p2gs_jax.types import Params, Scene
 
 @dataclass(frozen=True)
 class FitResult:
-    """What `fit` returns to a program.
+    """What `fit` returns to a program."""
 
-    Attributes:
-        params: the fit, live Gaussians only.
-        scene: what it was fitted to.
-        metrics: what `metrics.json` holds.
-        run_dir: the run folder.
-        selection: what the bundle adjustment found, or None.
-        decisions: what the scene settled.
-    """
-
-    params: Params
-    scene: Scene
-    metrics: dict
-    run_dir: Path
-    selection: Selection | None
-    decisions: Decisions
+    params: Params  # the fit, live Gaussians only
+    scene: Scene  # what it was fitted to
+    metrics: dict  # what `metrics.json` holds
+    run_dir: Path  # the run folder
+    selection: Selection | None  # what the bundle adjustment found, or None
+    decisions: Decisions  # what the scene settled
 
 
 def fit(
