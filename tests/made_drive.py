@@ -65,11 +65,7 @@ def make_recording(root, cameras=("front", "left", "back", "right"), frames=8):
 
         return read
 
-    return Recording(
-        root,
-        "pandaset",
-        tuple(RigCamera(name, K, WIDTH, HEIGHT) for name in cameras),
-        tuple(photographs),
-        tuple(Sweep(k, PERIOD * k, reader(k)) for k in range(frames)),
-        (tracked_car(frames), tracked_car(frames, moving=False)),
-    )
+    rig = [RigCamera(name, K, WIDTH, HEIGHT) for name in cameras]
+    sweeps = [Sweep(k, PERIOD * k, reader(k)) for k in range(frames)]
+    cars = (tracked_car(frames), tracked_car(frames, moving=False))
+    return Recording(root, "pandaset", rig, photographs, sweeps, cars)

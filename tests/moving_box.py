@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,14 +27,7 @@ RENDER = RenderConfig(sh_degree=0, blur=0.3)
 
 
 class World(NamedTuple):
-    """What is there.
-
-    Attributes:
-        wall: Gaussians in the world.
-        box: Gaussians in the frame of the box.
-        track: of the box.
-        exposures: of the photographs, by frame.
-    """
+    """A wall in the world, a box in its own frame, its track, and exposures by frame."""
 
     wall: Gaussians
     box: Gaussians
@@ -129,26 +123,13 @@ def write_photographs(root: Path, seed: int = 0) -> None:
 
 
 def recording(root: Path, seed: int = 0, points: bool = True) -> Recording:
-    """Return the drive as a reader gives it; the box stays in sight.
-
-    Args:
-        root: where the photographs are.
-        seed: of the world.
-        points: laser points, too.
-    """
+    """Return the drive as a reader gives it; the box stays in sight."""
     world = make_world(seed)
     cameras = tuple(RigCamera(f"cam{k}", lens(), WIDTH, HEIGHT) for k in range(2))
-    photographs = tuple(
-        Photograph(
-            f"cam{k}",
-            frame,
-            frame * INTERVAL,
-            root / f"cam{k}" / f"{frame:03d}.png",
-            camera_pose(frame, k),
-        )
-        for k in range(2)
-        for frame in range(FRAMES)
-    )
+    photographs = []
+    for k, frame in itertools.product(range(2), range(FRAMES)):
+        path, pose = root / f"cam{k}" / f"{frame:03d}.png", camera_pose(frame, k)
+        photographs.append(Photograph(f"cam{k}", frame, frame * INTERVAL, path, pose))
 
     def sweep(frame: int) -> SweepPoints:
         rng = np.random.default_rng((seed, frame))
@@ -160,9 +141,8 @@ def recording(root: Path, seed: int = 0, points: bool = True) -> Recording:
         return SweepPoints(found.astype(np.float64), np.full(len(found), time))
 
     sweeps = tuple(Sweep(f, f * INTERVAL, lambda f=f: sweep(f)) for f in range(FRAMES))
-    return Recording(
-        root, "pandaset", cameras, photographs, sweeps if points else (), (world.track,)
-    )
+    sweeps = sweeps if points else ()
+    return Recording(root, "pandaset", cameras, photographs, sweeps, (world.track,))
 
 
 def drive_format(seed: int = 0, points: bool = True) -> DriveFormat:

@@ -144,17 +144,11 @@ def _surface(
 
 
 class DepthErrors(NamedTuple):
-    """Rendered against measured depth, point by point.
+    """Rendered against measured depth, point by point."""
 
-    Attributes:
-        measured: camera z, metres.
-        error: absolute, metres; infinite where the render shows no surface.
-        moving: the point lies on something that moves.
-    """
-
-    measured: Float32[np.ndarray, " p"]
-    error: Float32[np.ndarray, " p"]
-    moving: Bool[np.ndarray, " p"]
+    measured: Float32[np.ndarray, " p"]  # camera z, metres
+    error: Float32[np.ndarray, " p"]  # absolute, metres; infinite where no surface is shown
+    moving: Bool[np.ndarray, " p"]  # the point lies on something that moves
 
 
 def depth_errors(
@@ -168,15 +162,8 @@ def depth_errors(
     """Return how rendered depth compares with the sweep nearest in time.
 
     Points on moving boxes are carried along with them to the time of the view; points that nearer
-    ones hide are left out.
-
-    Args:
-        lidar: measurements.
-        objects: that `lidar.objects` names.
-        view: with a time; K and size are those of the images.
-        depth: alpha-weighted camera z of the render.
-        alpha: opacity.
-        mask: 1 = compare; None: everywhere.
+    ones hide are left out. K and size of the view are those of the images, and the rendered depth
+    is alpha-weighted camera z.
     """
     assert view.time is not None
     rows = np.flatnonzero(np.abs(lidar.times - view.time) <= HALF_SWEEP_S)

@@ -159,15 +159,12 @@ def still_mask(
 
 @dataclass
 class Untold:
-    """Views that cannot be judged, and photographs whose exposure nothing tells.
+    """Views that cannot be judged, and photographs whose exposure nothing tells."""
 
-    Attributes:
-        hidden: names of views of which masks leave nothing: they have no scores.
-        exposures: names of views that are black or saturated everywhere: any exposure that is dark
-            or bright enough explains them.
-    """
-
+    # names of views of which masks leave nothing: they have no scores
     hidden: list[str] = field(default_factory=list)
+    # names of views that are black or saturated everywhere: any exposure that is dark or bright
+    # enough explains them
     exposures: list[str] = field(default_factory=list)
 
     def add(

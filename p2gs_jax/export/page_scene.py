@@ -102,7 +102,7 @@ def _rendering(fitted: Run, gaussians: Gaussians) -> dict[str, Any]:
 
 
 def _log_mean_radiance(fitted: Run, gaussians: Gaussians) -> float:
-    """Return the mean over views of what render/cutoff.py takes for each."""
+    """Return the mean over views of what render/tiles.py takes for each."""
     alive = on_device(np.ones(gaussians.capacity), bool)
     cfg, means = fitted.cfg.render, []
     seen = jax.jit(lambda camera: project(gaussians, alive, camera, cfg).visible)

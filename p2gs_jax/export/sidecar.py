@@ -25,7 +25,7 @@ ACTIVATIONS = {
     "exp": f"L = exp(clip(s, -{LOG_RADIANCE_LIMIT:g}, {LOG_RADIANCE_LIMIT:g}))",
     "linear": "L = max(0, s + 1/2)",
 }
-# The basis of render/spherical_harmonics.py, in order; d = (x, y, z) is the direction.
+# The basis of render/harmonics.py, in order; d = (x, y, z) is the direction.
 BASIS = (
     f"{C0}",
     f"-{C1} * y",

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from p2gs_jax.config import FitConfig, require_config
+from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import no_empty_folders, write_json
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
@@ -33,6 +33,7 @@ from p2gs_jax.photometry.solution import Agreement, PhotometricSolution, compare
 from p2gs_jax.photometry.sources.points import has_tracks, rendered_colors, surface_colors
 from p2gs_jax.photometry.sources.stack import SATURATED, StackColors, read_stack, stack_colors
 from p2gs_jax.photometry.unmodelled import LOCAL_EV, Unexplained, residuals, unexplained
+from p2gs_jax.presets import require_config
 from p2gs_jax.run.photometry_files import write_solution
 from p2gs_jax.run.plots import write_calibration_plot
 from p2gs_jax.run.read import load_run
@@ -48,36 +49,23 @@ STACK_GAUGE = "mean log exposure is 0; exposures and response can be stretched t
 
 @dataclass(frozen=True)
 class Calibration:
-    """What a calibration finds.
+    """What a calibration finds."""
 
-    Attributes:
-        views: the photographs, in the order of the solution; of a stack poses mean nothing.
-        selection: model, exposures, gammas, errors, reasons.
-        stated_ev: exposures from EXIF or a file, stops, laid over the recovered ones; NaN where
-            unknown.
-        agreement: of stated and recovered exposures.
-        known: where known exposures came from, or None.
-        gauge: what fixes the scale where none are known, in words.
-        pivot: linear value that gammas leave alone.
-        messages: what the user should know, in plain words.
-        details: the content of `calibration.json`.
-        observations: how many were used.
-        seconds: of `reading` and sampling, and of the `adjustment`.
-        metrics: of `calibrate_of`: what `metrics.json` holds; `of` has the scores of the model as
-            it was.
-    """
-
+    # the photographs, in the order of the solution; of a stack poses mean nothing
     views: tuple[View, ...]
-    selection: Selection
+    selection: Selection  # model, exposures, gammas, errors, reasons
+    # exposures from EXIF or a file, stops, laid over the recovered ones; NaN where unknown
     stated_ev: Float[np.ndarray, " v"]
-    agreement: Agreement
-    known: str | None
-    gauge: str
-    pivot: float
-    messages: tuple[str, ...]
-    details: dict[str, Any]
-    observations: int = 0
+    agreement: Agreement  # of stated and recovered exposures
+    known: str | None  # where known exposures came from, or None
+    gauge: str  # what fixes the scale where none are known, in words
+    pivot: float  # linear value that gammas leave alone
+    messages: tuple[str, ...]  # what the user should know, in plain words
+    details: dict[str, Any]  # the content of `calibration.json`
+    observations: int = 0  # how many were used
+    # of `reading` and sampling, and of the `adjustment`
     seconds: dict[str, float] = field(default_factory=dict)
+    # of `calibrate_of`: what `metrics.json` holds; `of` has the scores of the model as it was
     metrics: dict[str, Any] = field(default_factory=dict)
 
     @property

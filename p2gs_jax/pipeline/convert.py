@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from p2gs_jax.config import FitConfig, require_config
+from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import no_empty_folders
 from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.core.progress import Reporter, Silent
@@ -30,6 +30,7 @@ from p2gs_jax.pipeline.finish import Account, finish
 from p2gs_jax.pipeline.fit import Optimiser, begun, compact
 from p2gs_jax.pipeline.preflight import Paths, check_run_dir
 from p2gs_jax.pipeline.prepare import Prepared
+from p2gs_jax.presets import require_config
 from p2gs_jax.run.folder import RunFolder, locked
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.exposures import check_source

@@ -35,23 +35,16 @@ OnChosen = Callable[[Form, Response], None]
 
 @dataclass(frozen=True)
 class Exposures:
-    """What is known of the light of a scene's photographs before the first step.
+    """What is known of the light of a scene's photographs before the first step."""
 
-    Attributes:
-        photometry: parameters of the training views to start from.
-        decisions: what the scene settled.
-        observations: colours of shared points, or None.
-        selection: model, exposures and their errors, or None where nothing was solved here.
-        radiance: linear, of the scene's points; None: it follows from the selection.
-        notes: what the user should know.
-    """
-
-    photometry: Photometry
-    decisions: Decisions
-    observations: Observations | None = None
+    photometry: Photometry  # parameters of the training views to start from
+    decisions: Decisions  # what the scene settled
+    observations: Observations | None = None  # colours of shared points, or None
+    # model, exposures and their errors, or None where nothing was solved here
     selection: Selection | None = None
+    # linear, of the scene's points; None: it follows from the selection
     radiance: Float32[np.ndarray, "p 3"] | None = None
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # what the user should know
 
     @property
     def solved(self) -> bool:

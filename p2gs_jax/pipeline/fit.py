@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from p2gs_jax.config import FitConfig, require_config
+from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import no_empty_folders
 from p2gs_jax.core.clock import CompileCounter, Stopwatch
 from p2gs_jax.core.progress import Reporter, Silent
@@ -27,6 +27,7 @@ from p2gs_jax.pipeline.exposures import kept_choice
 from p2gs_jax.pipeline.finish import Account, finish, seconds_to_finish
 from p2gs_jax.pipeline.preflight import Paths, check_run_dir, check_scene, memory_named, preflight
 from p2gs_jax.pipeline.prepare import Prepared, load, prepare
+from p2gs_jax.presets import require_config
 from p2gs_jax.run.checkpoint import saved_steps
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.run.folder import RunFolder, locked, require_free
@@ -43,23 +44,14 @@ from p2gs_jax.types import Params, Scene
 
 @dataclass(frozen=True)
 class FitResult:
-    """What `fit` returns to a program.
+    """What `fit` returns to a program."""
 
-    Attributes:
-        params: the fit, live Gaussians only.
-        scene: what it was fitted to.
-        metrics: what `metrics.json` holds.
-        run_dir: the run folder.
-        selection: what the bundle adjustment found, or None.
-        decisions: what the scene settled.
-    """
-
-    params: Params
-    scene: Scene
-    metrics: dict
-    run_dir: Path
-    selection: Selection | None
-    decisions: Decisions
+    params: Params  # the fit, live Gaussians only
+    scene: Scene  # what it was fitted to
+    metrics: dict  # what `metrics.json` holds
+    run_dir: Path  # the run folder
+    selection: Selection | None  # what the bundle adjustment found, or None
+    decisions: Decisions  # what the scene settled
 
 
 def fit(

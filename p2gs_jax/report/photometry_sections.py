@@ -7,10 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from p2gs_jax.config import PhotometryConfig, camera_formations
+from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.formation import corner, inverse_tone_map, log_vignetting
 from p2gs_jax.photometry.models import MODELS
+from p2gs_jax.presets import camera_formations
 from p2gs_jax.report import charts, findings
 from p2gs_jax.report.charts import Series, Style
 from p2gs_jax.report.findings import against_exif, column, reasons
@@ -165,7 +166,9 @@ def _over_time(
         marker = CAMERA_MARKERS[k % len(CAMERA_MARKERS)]
         style = Style(CAMERA_COLORS[k % len(CAMERA_COLORS)], marker, line, size=4, width=1.2)
         empty = replace(style, line="", filled=False, size=5)
-        series.append(Series(short_name(name), seconds, found["found"], style, 2 * _errors(rows)))
+        known = np.isfinite(found["found"])
+        y, errors = found["found"][known], 2 * _errors(rows)[known]
+        series.append(Series(short_name(name), seconds[known], y, style, errors))
         series.append(Series("", seconds, found["held out"], empty))
     chart = charts.panels_chart(
         [("", series)],

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Bool, Float32, Int
 
-from p2gs_jax.config import FitConfig, from_dict
+from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
@@ -27,6 +27,7 @@ from p2gs_jax.photometry.display import (
 )
 from p2gs_jax.photometry.formation import camera_rows
 from p2gs_jax.photometry.metering import ExposureOf, Metering, meter
+from p2gs_jax.presets import from_dict
 from p2gs_jax.render.capacity import RenderView, make_renderer
 from p2gs_jax.run.decisions import read_decisions
 from p2gs_jax.run.folder import RunFolder, find
@@ -50,28 +51,20 @@ CONFIG_AGAIN = (
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run.
+    """A finished run."""
 
-    Attributes:
-        folder: where it lies.
-        params: the fit.
-        cfg: what it was made under: the options as asked, with what the scene decided filled in.
-        scene: what it was fitted to; its photographs may be gone.
-        reference: photographs under one common exposure, or None.
-        photometry: `photometry.json`, with what `params` does not hold: standard errors, EXIF,
-            exposures fitted to held-out photographs.
-        owner: the moving object that each Gaussian belongs to, -1: none; None: nothing moves.
-        moving: these objects.
-    """
-
-    folder: Path
-    params: Params
+    folder: Path  # where it lies
+    params: Params  # the fit
+    # what it was made under: the options as asked, with what the scene decided filled in
     cfg: FitConfig
-    scene: Scene
-    reference: Path | None
+    scene: Scene  # what it was fitted to; its photographs may be gone
+    reference: Path | None  # photographs under one common exposure, or None
+    # `photometry.json`, with what `params` does not hold: standard errors, EXIF, exposures fitted
+    # to held-out photographs
     photometry: PhotometryFile
+    # the moving object that each Gaussian belongs to, -1: none; None: nothing moves
     owner: Int[np.ndarray, " n"] | None = None
-    moving: MovingObjects | None = None
+    moving: MovingObjects | None = None  # these objects
 
     @cached_property
     def store(self) -> ImageStore:

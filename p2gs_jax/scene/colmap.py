@@ -165,11 +165,8 @@ def _find_images(root: Path, folder: Path, images: Sequence[ImageRecord]) -> Pat
             return place
     if any((root / image.name).is_file() for image in images):
         return root
-    looked = ", ".join(map(str, places))
-    raise UserError(
-        f"no image folder for the COLMAP model {folder}: looked for {looked}",
-        fix="name the folder with --images",
-    )
+    why = f"has no image folder: looked for {', '.join(map(str, places))}"
+    raise broken(f"the COLMAP model {folder}", why, "name the folder with --images")
 
 
 def _viewmat(image: ImageRecord, path: Path) -> Float[np.ndarray, "4 4"]:

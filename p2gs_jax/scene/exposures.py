@@ -25,10 +25,8 @@ def read_known_exposures(source: str, views: list[View]) -> Float[np.ndarray, " 
     if source == "exif":
         values = _exif_ev(views) * LN2
         if not np.isfinite(values).any():
-            raise UserError(
-                "no photograph carries exposure time, f-number and ISO in its EXIF.",
-                fix="give a CSV file to --known-exposures, or leave it out",
-            )
+            why = "no photograph carries exposure time, f-number and ISO in its EXIF."
+            raise UserError(why, fix="give a CSV file to --known-exposures, or leave it out")
         return values
     table = _read(Path(source))
     found = (table.get(view.name, table.get(Path(view.name).name)) for view in views)

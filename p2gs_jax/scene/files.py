@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import warnings
@@ -27,10 +28,7 @@ IMAGE_SUFFIXES = CONVERTED_SUFFIXES | {*(".jpg", ".jpeg", ".png", ".tif", ".tiff
 ASPECT_TOLERANCE = 0.01
 # Finite numbers from here on are not finite in float32 arithmetic.
 HUGE = 1e30
-_MOVED = (
-    "move it there; or name the folder of all photographs with --images, and give names relative "
-    "to it"
-)
+_MOVED = "move it there; or name the folder of all photographs with --images, and names in it"
 # Where Pillow takes a picture for an attack.
 MOST_PIXELS = 2 * (Image.MAX_IMAGE_PIXELS or 2**26)
 
@@ -113,13 +111,11 @@ def _size_in_header(path: Path) -> tuple[int, int]:
         pass
     if not path.is_file():
         raise undecodable(path)
-    try:
+    with contextlib.suppress(cv2.error):
         pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        pixels = None
-    if pixels is None:
-        raise undecodable(path)
-    return pixels.shape[1], pixels.shape[0]
+        if pixels is not None:
+            return pixels.shape[1], pixels.shape[0]
+    raise undecodable(path)
 
 
 def _too_large(path: Path) -> UserError:
@@ -140,10 +136,8 @@ def decode_grey(data: bytes, shrink: int) -> UInt8[np.ndarray, "h w"] | None:
 def undecodable(path: Path) -> UserError:
     """Return the error for a file that is not a readable image."""
     size = path.stat().st_size if path.is_file() else 0
-    return UserError(
-        f"cannot decode the image {path} ({size} bytes)",
-        fix="copy or export that photograph again, or remove it from the scene",
-    )
+    fix = "copy or export that photograph again, or remove it from the scene"
+    return broken("cannot decode the image", f"{path} ({size} bytes)", fix)
 
 
 def check_missing(missing: Sequence[str], total: int, source: Path, cfg: DataConfig) -> list[str]:
@@ -173,8 +167,7 @@ def at_file_size(
     w, h = image_size(path)
     sx, sy = w / size[0], h / size[1]
     if abs(sx / sy - 1.0) > ASPECT_TOLERANCE:
-        raise UserError(
-            f"wrong size: {path} is {w}x{h}, but {source} says {size[0]}x{size[1]}",
-            fix="use the photographs from which the model was made, neither cropped nor rotated",
-        )
+        why = f"is {w}x{h}, but {source} says {size[0]}x{size[1]}"
+        fix = "use the photographs from which the model was made, neither cropped nor rotated"
+        raise broken(f"wrong size: {path}", why, fix)
     return scale_intrinsics(K, sx, sy).astype(np.float32), w, h

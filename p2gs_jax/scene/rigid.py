@@ -12,6 +12,10 @@ from scipy.spatial.transform import Rotation
 from p2gs_jax.errors import broken
 from p2gs_jax.types import View
 
+Rotation3 = Float64[np.ndarray, "3 3"]
+Vector3 = Float[np.ndarray, " 3"]
+Pose = Float64[np.ndarray, "4 4"]
+Poses = Float64[np.ndarray, "n 4 4"]
 # Singular values of the rotations in driving data sets differ from 1 by rounding only.
 ORTHOGONAL = 1e-3
 # Poses are continued past the ends of their track by at most this, seconds.
@@ -24,10 +28,8 @@ SHORTEST_WAY = 0.3
 HEADING_WAY = 2.0
 
 
-def nearest_rotation(
-    matrix: Float[np.ndarray, "3 3"], tolerance: float = 0.01
-) -> Float64[np.ndarray, "3 3"] | None:
-    """Return the rotation nearest to a finite matrix, in the least squares of its elements.
+def nearest_rotation(matrix: Rotation3, tolerance: float = 0.01) -> Rotation3 | None:
+    """Return the rotation nearest to a finite matrix in least squares.
 
     None: the matrix mirrors, or one of its singular values differs from 1 by more than `tolerance`.
     """
@@ -37,9 +39,7 @@ def nearest_rotation(
     return u @ vt
 
 
-def rigid(
-    rotation: Float[np.ndarray, "3 3"], position: Float[np.ndarray, " 3"], source: Path, what: str
-) -> Float64[np.ndarray, "4 4"]:
+def rigid(rotation: Rotation3, position: Vector3, source: Path, what: str) -> Pose:
     """Return the matrix of a rotation and a position; rounding is taken out of the rotation.
 
     `source` and `what` name the file and the thing that has this pose. Raises UserError: it is not
@@ -60,7 +60,7 @@ def rigid(
 
 def from_quaternions(
     wxyz: Float[np.ndarray, "n 4"], positions: Float[np.ndarray, "n 3"], source: Path, what: str
-) -> Float64[np.ndarray, "n 4 4"]:
+) -> Poses:
     """Return the matrices of quaternions (w x y z) and positions.
 
     Raises UserError: a quaternion has not length 1 within a hundredth, or something is not finite.
@@ -78,8 +78,8 @@ def from_quaternions(
 
 
 def from_quaternion(
-    wxyz: Float[np.ndarray, " 4"], position: Float[np.ndarray, " 3"], source: Path, what: str
-) -> Float64[np.ndarray, "4 4"]:
+    wxyz: Float[np.ndarray, " 4"], position: Vector3, source: Path, what: str
+) -> Pose:
     """Return the matrix of one quaternion and a position; errors are as of `from_quaternions`."""
     wxyz = np.asarray(wxyz, np.float64)
     if wxyz.shape != (4,) or not abs(np.linalg.norm(wxyz) - 1) < 1e-2:
@@ -137,7 +137,7 @@ def moment_of(view: View) -> int | str:
     return PurePosixPath(view.name).stem if view.frame is None else view.frame
 
 
-def up_direction(viewmats: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, " 3"]:
+def up_direction(viewmats: Float[np.ndarray, "n 4 4"]) -> Vector3:
     """Return up from world-to-camera matrices: what level cameras that look different ways share.
 
     That is the normal of the plane that their right-hand axes span; pitch does not disturb it.
@@ -152,9 +152,7 @@ def up_direction(viewmats: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, " 3"
     return normal / max(np.linalg.norm(normal), 1e-12)
 
 
-def up_of_drive(
-    viewmats: Float[np.ndarray, "n 4 4"], cameras: Sequence[str]
-) -> Float[np.ndarray, " 3"]:
+def up_of_drive(viewmats: Float[np.ndarray, "n 4 4"], cameras: Sequence[str]) -> Vector3:
     """Return up, away from the road: square to the way that the cameras went, where they did.
 
     Poses are world-to-camera; `cameras` names the camera of each.
@@ -172,9 +170,7 @@ def up_of_drive(
 
 
 def headings(
-    centers: Float[np.ndarray, "n 3"],
-    up: Float[np.ndarray, " 3"],
-    otherwise: Float[np.ndarray, " 3"],
+    centers: Float[np.ndarray, "n 3"], up: Vector3, otherwise: Vector3
 ) -> Float[np.ndarray, "n 3"]:
     """Return the level direction in which a camera drives at each of its places, of length 1.
 
@@ -222,7 +218,7 @@ def time_order(view: View) -> tuple[int, str]:
     return (-1 if view.frame is None else view.frame, view.name)
 
 
-def level_ahead(views: Sequence[View], up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
+def level_ahead(views: Sequence[View], up: Vector3) -> Vector3:
     """Return where the first camera, or one called "front", looks, without up and down."""
     ahead = next((view for view in views if "front" in view.camera.lower()), views[0])
     axis = ahead.viewmat[2, :3].astype(np.float64)

@@ -53,14 +53,11 @@ def assign_split(views: tuple[View, ...], test_every: int) -> tuple[View, ...]:
 
     Within each camera, sorted by name, views 0, n, 2n, ... are `test`, as in 3DGS; where views have
     frames, the frames 0, n, 2n, ... among all of them are. A camera that would be left without a
-    training view holds out none; n = 0 holds out none. Raises UserError: n is negative, or 1, which
-    would leave nothing to train on.
+    training view holds out none, and so does n = 0. Raises UserError: n is negative, or 1.
     """
     if test_every < 0 or test_every == 1:
-        raise UserError(
-            f"cannot hold out every n-th view with n = {test_every}",
-            fix="use 0 (hold out none) or a number from 2 on; 8 is usual",
-        )
+        why = f"cannot hold out every n-th view with n = {test_every}"
+        raise UserError(why, fix="use 0 (hold out none) or a number from 2 on; 8 is usual")
     test: set[int] = set()
     if test_every:
         by_camera: dict[str, list[int]] = defaultdict(list)

@@ -26,7 +26,7 @@ from jaxtyping import Float, Float64
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.core.atomic import BROKEN_ARRAYS
-from p2gs_jax.errors import UserError, broken
+from p2gs_jax.errors import broken
 from p2gs_jax.scene.colmap import subfolder
 from p2gs_jax.scene.files import (
     ASPECT_TOLERANCE,
@@ -48,8 +48,9 @@ from p2gs_jax.types import Distortion, Scene, Split, View
 
 LLFF_FILE = "poses_bounds.npy"
 _LLFF_COLUMNS = 17
-# Columns of LLFF's rotation that are OpenCV's x, y, z, and their signs: right, down, forward.
-_LLFF_AXES, _LLFF_SIGNS = [1, 0, 2], np.array([1.0, 1.0, -1.0])
+# Columns of LLFF's pose that are OpenCV's x, y, z and position, and their signs.
+_LLFF_AXES, _LLFF_SIGNS = [1, 0, 2, 3], np.array([1.0, 1.0, -1.0, 1.0])
+_OPENGL_SIGNS = np.array([1.0, -1.0, -1.0, 1.0])
 _LLFF_FIX = "write it again with LLFF's imgs2poses.py, or remove it"
 _PINHOLES = frozenset({"PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"})
 _FISHEYE = "OPENCV_FISHEYE"
@@ -78,8 +79,8 @@ def load_transforms(root: Path, json_path: Path, cfg: DataConfig) -> Scene:
     Raises UserError: the file is malformed (the line or the frame is named), its lens model is not
     supported, images are missing or of another size, or it lists views that it lacks.
     """
-    data = _parse(json_path)
-    scene = _assembled(root, "transforms", _frames(json_path, data), cfg)
+    frames, data = _frames(json_path)
+    scene = _assembled(root, "transforms", frames, cfg)
     name = data.get("ply_file_path")
     if name:
         if not isinstance(name, str):
@@ -105,9 +106,9 @@ def load_blender(root: Path, cfg: DataConfig) -> Scene:
     train = root / "transforms_train.json"
     others = [root / f"transforms_{name}.json" for name in ("test", "val")]
     test = next((path for path in others if path.is_file()), None)
-    frames = _frames(train, _parse(train))
+    frames, _ = _frames(train)
     if test is not None:
-        frames += _frames(test, _parse(test), "test")
+        frames += _frames(test, "test")[0]
     scene = _assembled(root, "blender", frames, cfg)
     return scene if test is None else replace(scene, split_by=test.name)
 
@@ -136,8 +137,7 @@ def load_llff(root: Path, cfg: DataConfig) -> Scene:
         stated = (round(width), round(height))
         K, w, h = at_file_size(image, intrinsics(focal, focal, width / 2, height / 2), stated, path)
         resized += (w, h) != stated
-        rotation = matrix[:, _LLFF_AXES] * _LLFF_SIGNS
-        viewmat = _viewmat(rotation, matrix[:, 3], path, what, _LLFF_FIX)
+        viewmat = _viewmat(matrix[:, _LLFF_AXES] * _LLFF_SIGNS, path, what, _LLFF_FIX)
         views.append(View(image.name, image, "0", viewmat, K, w, h))
     bounds = (float(rows[:, 15].min()), float(rows[:, 16].max()))
     return replace(_scene(root, "llff", views, _rescaled(resized, LLFF_FILE)), depths=bounds)
@@ -154,19 +154,15 @@ def _rescaled(count: int, source: str) -> list[str]:
 
 
 def _viewmat(
-    rotation: Float[np.ndarray, "3 3"],
-    position: Float[np.ndarray, " 3"],
-    path: Path,
-    what: str,
-    fix: str,
+    pose: Float64[np.ndarray, "3 4"], path: Path, what: str, fix: str
 ) -> Float[np.ndarray, "4 4"]:
     """Return the world-to-camera matrix of a camera-to-world pose, both with OpenCV axes."""
-    nearest = nearest_rotation(rotation)
+    nearest = nearest_rotation(pose[:, :3])
     if nearest is None:
         raise broken(f"{path}:", f"{what} is not a rotation and a translation", fix)
     viewmat = np.eye(4)
     viewmat[:3, :3] = nearest.T
-    viewmat[:3, 3] = -viewmat[:3, :3] @ position
+    viewmat[:3, 3] = -viewmat[:3, :3] @ pose[:, 3]
     return viewmat.astype(np.float32)
 
 
@@ -199,10 +195,8 @@ def _assembled(root: Path, name: str, frames: Sequence[_Frame], cfg: DataConfig)
     asked = image_folder(folder, cfg)
     place = folder / common if asked is None else asked
     for frame in frames:
-        if asked is None:
-            require_inside(frame.path, folder, frame.source)
-        else:
-            require_inside(frame.path.relative_to(common), asked, frame.source)
+        name_of = frame.path if asked is None else frame.path.relative_to(common)
+        require_inside(name_of, asked or folder, frame.source)
     located = [(_with_suffix(place, f.path.relative_to(common)), f) for f in frames]
     notes: list[str] = []
     for source in dict.fromkeys(frame.source for frame in frames):
@@ -243,32 +237,28 @@ def _require_one_shape(views: Sequence[View], frames: Mapping[str, _Frame]) -> N
         first = free[0]
         shapes = (view.width / view.height) / (first.width / first.height)
         if abs(shapes - 1) > ASPECT_TOLERANCE:
-            raise UserError(
-                f"wrong size: {view.image_path} is {view.width}x{view.height}, {first.name} "
-                f"{first.width}x{first.height}, and {frames[view.name].source} gives all of them "
-                "one lens",
-                fix="use the photographs that belong to the poses, neither cropped nor rotated, or "
+            raise broken(
+                f"wrong size: {view.image_path}",
+                f"is {view.width}x{view.height}, {first.name} {first.width}x{first.height}, and "
+                f"{frames[view.name].source} gives all of them one lens",
+                "use the photographs that belong to the poses, neither cropped nor rotated, or "
                 'give frames their own "w", "h" and "fl_x"',
             )
 
 
-def _parse(path: Path) -> dict:
-    data = read_json(path, _FIX)
+def _frames(path: Path, split: Split = "train") -> tuple[list[_Frame], dict[str, Any]]:
+    """Return the frames in a file, and all that it holds."""
+    data, frames = read_json(path, _FIX), []
     if not isinstance(data, dict) or not isinstance(data.get("frames"), list):
         raise broken(path, 'has no list "frames"', _FIX)
     if not data["frames"]:
         raise broken(path, "lists no frames", _FIX)
-    return data
-
-
-def _frames(path: Path, data: dict, split: Split = "train") -> list[_Frame]:
-    frames = []
     for i, values in enumerate(data["frames"]):
         name = values.get("file_path") if isinstance(values, dict) else None
         if not isinstance(name, str) or not name:
             raise broken(f"{path}:", f'frame {i} has no "file_path"', _FIX)
         frames.append(_Frame(_relative(path, name), {**data, **values}, path, split))
-    return frames
+    return frames, data
 
 
 def _relative(source: Path, name: str) -> Path:
@@ -315,23 +305,17 @@ def _view(frame: _Frame, folder: Path, name: str) -> tuple[View, bool]:
     mask_path = _beside(path, mask) if isinstance(mask, str) and mask else None
     if mask_path is not None and not mask_path.is_file():
         raise broken(f"{path}:", f"the mask {mask_path} of {name} does not exist", _FIX)
-    c2w = _finite_pose(path, values.get("transform_matrix"), name)
-    rotation, what = c2w[:, :3] * np.array([1.0, -1.0, -1.0]), f"the transform_matrix of {name}"
-    viewmat = _viewmat(rotation, c2w[:, 3], path, what, _FIX)
-    camera = subfolder(name) or "0"
-    view = View(name, image_path, camera, viewmat, K, width, height, distortion, mask_path)
-    return replace(view, split=frame.split), (width, height) != size
-
-
-def _finite_pose(path: Path, matrix: object, name: str) -> Float64[np.ndarray, "3 4"]:
+    what = f"the transform_matrix of {name}"
     try:
-        c2w = np.array(matrix, np.float64)[:3]
+        c2w = np.array(values.get("transform_matrix"), np.float64)[:3]
     except (TypeError, ValueError, IndexError):
         c2w = np.zeros(0)
     if c2w.shape != (3, 4) or not (np.abs(c2w) < HUGE).all():
-        why = f"the transform_matrix of {name} is not a finite 4x4 matrix"
-        raise broken(f"{path}:", why, _FIX)
-    return c2w
+        raise broken(f"{path}:", f"{what} is not a finite 4x4 matrix", _FIX)
+    viewmat = _viewmat(c2w * _OPENGL_SIGNS, path, what, _FIX)
+    camera = subfolder(name) or "0"
+    view = View(name, image_path, camera, viewmat, K, width, height, distortion, mask_path)
+    return replace(view, split=frame.split), (width, height) != size
 
 
 def _lens(

@@ -1,14 +1,10 @@
 """The tables of experiments/: what their cells say, without fitting anything."""
 
 import json
-import sys
 from pathlib import Path
 
-import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "experiments"))
-
 import at_size
+import pytest
 import tables
 import towns
 

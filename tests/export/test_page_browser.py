@@ -2,6 +2,7 @@
 
 import base64
 import shutil
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -121,25 +122,15 @@ def test_the_exposure_slider_multiplies_light_by_exactly_two_to_the_ev(open_page
     np.testing.assert_allclose(page.light(1)[..., :3], dark * 2**0.35, rtol=3e-7)
 
 
-@pytest.mark.parametrize("curve", ["srgb", "power", "linear"])
-def test_the_picture_is_developed_as_ours(open_page, fitted, curve):
+def test_the_picture_is_developed_as_ours(open_page, fitted):
     camera, transform = fitted.camera(1), fitted.own_display(1)
     page = open_page(size=(camera.width, camera.height))
-    page(f'(p.go(1), p.set({{curve: "{curve}", gamma: 1.9}}))')
-    linear = np.ascontiguousarray(page.light(1, linear=True)[..., :3])
-    expected = 255 * develop(linear, _like(transform, curve, 1.9))
-    assert np.abs(page.canvas() - expected).max() < 1.01
-
-
-def _like(transform, curve, gamma):
-    from dataclasses import replace
-
-    return replace(transform.with_curve(curve), gamma=gamma)
-
-
-def test_the_white_point_leaves_grey_and_reaches_white_where_it_says(open_page, fitted):
-    camera = fitted.camera(1)
-    page = open_page(size=(camera.width, camera.height))
+    for curve in ("srgb", "power", "linear"):
+        page(f'(p.go(1), p.set({{curve: "{curve}", gamma: 1.9}}))')
+        linear = np.ascontiguousarray(page.light(1, linear=True)[..., :3])
+        expected = 255 * develop(linear, replace(transform.with_curve(curve), gamma=1.9))
+        assert np.abs(page.canvas() - expected).max() < 1.01
+    # The white point leaves grey alone and reaches white where it says.
     page('(p.go(1), p.set({curve: "linear", gamma: 2.2, white: 2, ev: 1}))')
     x = page.light(1)[..., :3].astype(float)
     shown = page.canvas() / 255
@@ -215,17 +206,12 @@ def test_a_link_brings_back_what_was_seen(open_page):
     assert (look["ev"], look["gamma"], look["white"]) == (1.25, 1.8, 1)
     for name in ("R", "c"):
         np.testing.assert_allclose(again("p.state.camera")[name], camera[name], atol=1e-5)
-
-
-def test_links_that_make_no_sense_are_ignored(open_page):
+    # Links that make no sense are ignored.
     page = open_page("#at=1e9&ev=abc&gamma=-7&c=1,2&q=0,0,0,0&curve=__proto__&show=x&camera=99")
     assert page("p.state.look.gamma") == 0.5
     assert page("p.state.look.ev") == page("p.exported.ev")
     assert page("p.state.at") == page("p.scene.start")
-
-
-def test_hostile_names_run_nothing(open_page):
-    page = open_page()
+    # A hostile name runs nothing.
     assert HOSTILE in page.tab.inner_text("h1")
     assert page.tab.evaluate("typeof hacked") == "undefined"
     assert page.tab.locator("img").count() == 0

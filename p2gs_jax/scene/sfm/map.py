@@ -15,7 +15,7 @@ import pycolmap
 from p2gs_jax.config import DataConfig
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.clock import Stopwatch
-from p2gs_jax.errors import UserError
+from p2gs_jax.errors import UserError, broken
 from p2gs_jax.scene.cache import Report, StageProgress, cached_folder, file_fingerprints
 from p2gs_jax.scene.colmap import load_colmap, subfolder
 from p2gs_jax.scene.convert.headers import read_exif_camera
@@ -57,10 +57,9 @@ def load_images(
     """
     names = [path.relative_to(image_folder).as_posix() for path in paths]
     if len(paths) < 2:
-        raise UserError(
-            f"{image_folder} holds {len(paths)} image(s); a reconstruction needs at least two",
-            fix="add photographs of the same place from different positions",
-        )
+        why = f"holds {len(paths)} image(s); a reconstruction needs at least two"
+        fix = "add photographs of the same place from different positions"
+        raise broken(image_folder, why, fix)
     groups: dict[tuple, list[str]] = defaultdict(list)
     for path, name in zip(paths, names, strict=True):
         groups[(image_size(path), read_exif_camera(path), subfolder(name))].append(name)
@@ -68,10 +67,8 @@ def load_images(
     if cfg.mapper != "incremental":
         key["mapper"] = cfg.mapper
     if cfg.mapper == "global" and not hasattr(pycolmap, "global_mapping"):
-        raise UserError(
-            f"pycolmap {pycolmap.__version__} has no global mapper.",
-            fix="pip install --upgrade pycolmap, or leave out --data.mapper global",
-        )
+        fix = "pip install --upgrade pycolmap, or leave out --data.mapper global"
+        raise broken(f"pycolmap {pycolmap.__version__}", "has no global mapper.", fix)
 
     def build(folder: Path) -> None:
         kept = (folder if work_dir is None else work_dir) / KEPT
