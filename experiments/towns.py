@@ -23,8 +23,9 @@ from checkout import commit
 from matplotlib.figure import Figure
 
 import p2gs_jax
-from p2gs_jax.config import FitConfig, PresetName, to_dict
+from p2gs_jax.config import FitConfig, PresetName
 from p2gs_jax.jobs.sweep import sweep
+from p2gs_jax.presets import to_dict
 from p2gs_jax.synth.rig import image_height
 from p2gs_jax.synth.sensor import Sensor
 

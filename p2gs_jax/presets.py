@@ -1,15 +1,19 @@
-"""The presets: ours, the method as printed, and the baselines that both are compared with.
+"""Configurations made of others: presets, other values by name, some fields only, from JSON.
 
-Each is a table of the fields in which it differs from `robust`, which is `FitConfig()`.
+A preset is a table of the fields in which it differs from `robust`, which is `FitConfig()`.
 """
 
 from __future__ import annotations
 
-from typing import Any, get_args
+import dataclasses
+import functools
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeVar, get_args
 
-from p2gs_jax.config import FitConfig, PresetName, with_values
+from p2gs_jax.config import CameraFormation, FitConfig, PhotometryConfig, PresetName
 from p2gs_jax.errors import UserError
 
+Record = TypeVar("Record")
 Fields = dict[str, Any]
 
 # The method exactly as printed; BUILD_NOTES.md says what it does. The paper prints no rates for e
@@ -131,3 +135,124 @@ def preset(name: PresetName) -> FitConfig:
             f"there is no preset {name!r}.", fix=f"choose {', '.join(get_args(PresetName))}"
         )
     return with_values(FitConfig(preset=name), PRESETS[name])
+
+
+def require_config(cfg: FitConfig | None) -> FitConfig:
+    """Return a configuration as it was given; None takes `robust`.
+
+    Raises:
+        UserError: it is something else, such as the name of a preset.
+    """
+    if cfg is None:
+        return FitConfig()
+    if not isinstance(cfg, FitConfig):
+        raise UserError(
+            f"{cfg!r} is no configuration.",
+            fix='give a FitConfig, for example p2gs_jax.preset("robust")',
+        )
+    return cfg
+
+
+def narrowed(record: Record, taken: Mapping[str, Any]) -> Record:
+    """Return a configuration with some of its fields only; reading another raises AttributeError.
+
+    What is compiled for it can therefore be shared by all configurations that agree in these
+    fields, and nothing can depend on one that was forgotten. Two are equal where the fields are.
+
+    Args:
+        record: a frozen dataclass.
+        taken: by the name of a field what of it is taken: None for all, the names of its fields,
+            or again a mapping like this.
+    """
+    kind = _narrowed_type(type(record), tuple(taken))
+    made = object.__new__(kind)
+    for name, inner in taken.items():
+        value = getattr(record, name)
+        if inner is not None:
+            inner = inner if isinstance(inner, Mapping) else dict.fromkeys(inner)
+            value = narrowed(value, inner)
+        object.__setattr__(made, name, value)
+    return made
+
+
+@functools.cache
+def _narrowed_type(kind: type, names: tuple[str, ...]) -> Any:
+    """Return a subclass whose instances have these fields only."""
+
+    def hidden(name: str) -> property:
+        def read(self):
+            raise AttributeError(f"{kind.__name__}.{name} was not given to this program")
+
+        return property(read)
+
+    def values(self) -> tuple:
+        return tuple(getattr(self, name) for name in names)
+
+    def equal(self, other) -> bool:
+        return type(self) is type(other) and values(self) == values(other)
+
+    fields = {f.name: hidden(f.name) for f in dataclasses.fields(kind) if f.name not in names}
+    methods = {"__eq__": equal, "__hash__": lambda self: hash(values(self))}
+    methods["__repr__"] = lambda self: (
+        f"{kind.__name__}{dict(zip(names, values(self), strict=True))}"
+    )
+    return type(kind.__name__, (kind,), fields | methods)
+
+
+def with_values(record: Record, values: Mapping[str, Any]) -> Record:
+    """Return a configuration with other values, by dotted names of fields; nothing is checked."""
+    for place, value in values.items():
+        name, _, inner = place.partition(".")
+        if inner:
+            value = with_values(getattr(record, name), {inner: value})
+        record = dataclasses.replace(record, **{name: value})  # pyright: ignore
+    return record
+
+
+def to_dict(config: FitConfig) -> dict:
+    """Return nested plain values, as saved in `config.json`."""
+    return dataclasses.asdict(config)
+
+
+def from_dict(values: dict) -> FitConfig:
+    """Rebuild a configuration from `to_dict`'s result.
+
+    Raises:
+        TypeError: a field is unknown to this version.
+    """
+    return _build(FitConfig, values)
+
+
+def camera_formations(values: Sequence[dict]) -> tuple[CameraFormation, ...]:
+    """Return cameras as `dataclasses.asdict` and JSON left them.
+
+    Raises:
+        KeyError, TypeError, ValueError: something is missing or of another kind.
+    """
+    return tuple(
+        CameraFormation(
+            str(each["name"]),
+            *(tuple(tuple(map(float, row)) for row in each[k]) for k in ("vignetting", "splines")),
+        )
+        for each in values
+    )
+
+
+def _build(cls, values: dict):
+    kwargs = {}
+    for f in dataclasses.fields(cls):
+        if f.name not in values:
+            continue
+        value = values[f.name]
+        factory = f.default_factory
+        if dataclasses.is_dataclass(factory) and isinstance(value, dict):
+            value = _build(factory, value)
+        elif cls is PhotometryConfig and f.name == "cameras":
+            value = camera_formations(value)
+        elif isinstance(value, list):
+            value = tuple(value)
+        kwargs[f.name] = value
+    unknown = set(values) - {f.name for f in dataclasses.fields(cls)}
+    if unknown:
+        raise TypeError(f"unknown field(s) in {cls.__name__}: {', '.join(sorted(unknown))}")
+    return cls(**kwargs)

@@ -9,8 +9,9 @@ from typing import Annotated
 
 import tyro
 
-from p2gs_jax.cli.fit import named_preset
 from p2gs_jax.cli.shared import parse_duration
+from p2gs_jax.config import PresetName
+from p2gs_jax.presets import preset
 from p2gs_jax.synth.settings import Layout, Sensor
 
 
@@ -26,7 +27,7 @@ class Demo:
 
     out: Path = Path("runs/demo")
     """Folder for the street and the run."""
-    preset: Annotated[str, tyro.conf.arg(metavar="NAME")] = "robust"
+    preset: Annotated[PresetName, tyro.conf.arg(metavar="NAME")] = "robust"
     """A preset of `fit`: robust, paper, paper_appendix, 3dgs, 3dgs_published, 3dgs_gain,
     3dgs_affine, 3dgs_bilateral, 3dgs_curve, luminance_gs, ppisp or ppisp_solved."""
     budget: Annotated[str, tyro.conf.arg(metavar="TIME")] = "125s"
@@ -46,7 +47,7 @@ class Demo:
         from p2gs_jax.core.progress import TerminalReporter
         from p2gs_jax.pipeline.demo import run_demo
 
-        cfg = named_preset(self.preset)
+        cfg = preset(self.preset)
         budget_s = parse_duration(self.budget)
         train = dataclasses.replace(cfg.train, budget_s=budget_s, seed=self.seed)
         with TerminalReporter() as reporter:

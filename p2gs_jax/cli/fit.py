@@ -11,7 +11,6 @@ import tyro
 
 from p2gs_jax.cli.shared import SHORT, check
 from p2gs_jax.config import FitConfig, PresetName
-from p2gs_jax.presets import preset
 
 Preset = Annotated[PresetName, tyro.conf.arg(metavar="NAME")]
 Config = Annotated[FitConfig, tyro.conf.arg(name="")]
@@ -241,13 +240,13 @@ def resolve_blocks(args: Fit) -> int | str | None:
     Raises:
         UserError: it is neither, or options of blocks are given without them.
     """
-    words = args.blocks
+    words, alone = args.blocks, args.jobs == 1 and args.engine == "local"
+    nothing, fix = (
+        "--jobs and --engine say nothing without --blocks",
+        "add --blocks auto, or a number",
+    )
+    check(words is not None or alone, nothing, fix=fix)
     if words is None:
-        check(
-            args.jobs == 1 and args.engine == "local",
-            "--jobs and --engine say nothing without --blocks",
-            fix="add --blocks auto, or a number",
-        )
         return None
     check(args.jobs >= 1, "--jobs must be at least 1")
     check(
@@ -255,11 +254,9 @@ def resolve_blocks(args: Fit) -> int | str | None:
         "--blocks fits every block on one device",
         fix="leave out --devices; blocks have --jobs and --engine",
     )
-    check(
-        words == "auto" or (words.isdigit() and int(words) >= 1),
-        f"--blocks {words!r} is not a number of blocks",
-        fix="write a whole number from 1 on, or auto",
-    )
+    fix = "write a whole number from 1 on, or auto"
+    right = words == "auto" or (words.isdigit() and int(words) >= 1)
+    check(right, f"--blocks {words!r} is not a number of blocks", fix=fix)
     return words if words == "auto" else int(words)
 
 
@@ -269,20 +266,9 @@ def resolve_devices(args: Fit) -> int | Literal["all"]:
     Raises:
         UserError: the number is not valid.
     """
-    if args.devices == "all":
+    words = args.devices
+    if words == "all":
         return "all"
-    check(
-        args.devices.isdecimal() and int(args.devices) >= 1,
-        f"--devices {args.devices} is not a number of devices",
-        fix="give 1 or more, or all",
-    )
-    return int(args.devices)
-
-
-def named_preset(name: str) -> FitConfig:
-    """Return a preset.
-
-    Raises:
-        UserError: there is none of that name.
-    """
-    return preset(name)  # pyright: ignore[reportArgumentType]
+    right = words.isdecimal() and int(words) >= 1
+    check(right, f"--devices {words} is not a number of devices", fix="give 1 or more, or all")
+    return int(words)

@@ -34,14 +34,10 @@ ADAPT_S = 0.5
 
 @dataclass(frozen=True)
 class Job:
-    """Frames to render.
+    """Frames to render, one by one as the iterator advances, and how many there are.
 
-    Attributes:
-        frames: rendered one by one as the iterator advances.
-        count: how many there are.
-        size: (width, height) of the largest, pixels.
-        shots: cameras that can be kept as a file; none for panoramas.
-        notes: what the user should know.
+    The size (width, height) is that of the largest, pixels. Shots are cameras that can be kept as
+    a file; panoramas have none. Notes are what the user should know.
     """
 
     frames: Iterator[OutputFrame]

@@ -16,12 +16,13 @@ from p2gs_jax.cli.doctor import Doctor
 from p2gs_jax.cli.evaluate import Eval
 from p2gs_jax.cli.experiments import Demo, Sweep, Synth
 from p2gs_jax.cli.export import Export
-from p2gs_jax.cli.fit import Calibrate, Fit, named_preset
+from p2gs_jax.cli.fit import Calibrate, Fit
 from p2gs_jax.cli.pages import Compare, Report, View
 from p2gs_jax.cli.render import PATHS, Render
 from p2gs_jax.cli.scene import Survey
 from p2gs_jax.cli.shared import check_option_names
 from p2gs_jax.errors import UserError
+from p2gs_jax.presets import preset
 
 # tyro completes no paths in the places of options; these lines let the shells do it.
 BASH_PATHS = """
@@ -165,13 +166,13 @@ def _defaults(name: str, argv: list[str]) -> Any:
     """Return the defaults of a command's options; those of the configuration are the preset's."""
     if name not in WITH_PRESET:
         return tyro.MISSING_NONPROP
-    preset = "robust"
+    name_of_preset: Any = "robust"
     for i, arg in enumerate(argv):
         if arg == "--preset" and i + 1 < len(argv):
-            preset = argv[i + 1]
+            name_of_preset = argv[i + 1]
         elif arg.startswith("--preset="):
-            preset = arg.split("=", 1)[1]
-    return COMMANDS[name](tyro.MISSING, tyro.MISSING, named_preset(preset))
+            name_of_preset = arg.split("=", 1)[1]
+    return COMMANDS[name](tyro.MISSING, tyro.MISSING, preset(name_of_preset))
 
 
 def _unknown(word: str) -> UserError:

@@ -157,18 +157,12 @@ def own_scores(metrics: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
 
 
 class Light(NamedTuple):
-    """What a render shows, so that it can be shown under another exposure.
+    """What a render shows, so that it can be shown under another exposure."""
 
-    Attributes:
-        linear: radiance, premultiplied by `alpha`.
-        shown: how it becomes the picture.
-        picture: display values.
-        alpha: opacity, over the backdrop of `shown`; None: it is over nothing.
-    """
-
-    linear: Float32[np.ndarray, "h w 3"]
-    shown: DisplayTransform
-    picture: Float32[np.ndarray, "h w 3"]
+    linear: Float32[np.ndarray, "h w 3"]  # radiance, premultiplied by `alpha`
+    shown: DisplayTransform  # how it becomes the picture
+    picture: Float32[np.ndarray, "h w 3"]  # display values
+    # opacity, over the backdrop of `shown`; None: it is over nothing
     alpha: Float32[np.ndarray, "h w"] | None
 
     def fitted(

@@ -76,16 +76,8 @@ def fit_exposure(
     """Return the one exposure with which a render fits a photograph best, in squared LDR error.
 
     A coarse search over +-12 stops around 1 followed by golden sections: the error of a clipped
-    image has flat stretches where Newton's method stalls.
-
-    Args:
-        linear: the render.
-        photograph: display values.
-        mask: 1 = use.
-        capture: all but the exposure, which is not looked at.
-        cfg: formation model.
-        correction: of display values, or None.
-        matte: what the render is put over, as the photograph is; None: nothing.
+    image has flat stretches where Newton's method stalls. `capture` has all but the exposure, which
+    is not looked at; `matte` is what the render is put over, as the photograph is.
     """
     # Imported late: of what evaluates, little searches.
     import optimistix

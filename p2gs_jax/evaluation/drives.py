@@ -41,16 +41,10 @@ AGREES, FAR = 0.05, 1e5
 
 
 class DriveScores:
-    """Collects rendered views, and judges them together.
+    """Collects rendered views of a drive, and judges them together.
 
-    Args:
-        scene: a drive.
-        store: photographs.
-        render: of a camera, with depth.
-        arrays: keeps what all views need to the end; None: memory does.
-
-    Attributes:
-        unexplained: after `summary`: what no static scene explains, by row of the view.
+    `arrays` keeps what all views need to the end; None: memory does. After `summary`, `unexplained`
+    has what no static scene explains, by row of the view.
     """
 
     def __init__(
@@ -144,17 +138,11 @@ def _surface(
 
 
 class DepthErrors(NamedTuple):
-    """Rendered against measured depth, point by point.
+    """Rendered against measured depth, point by point."""
 
-    Attributes:
-        measured: camera z, metres.
-        error: absolute, metres; infinite where the render shows no surface.
-        moving: the point lies on something that moves.
-    """
-
-    measured: Float32[np.ndarray, " p"]
-    error: Float32[np.ndarray, " p"]
-    moving: Bool[np.ndarray, " p"]
+    measured: Float32[np.ndarray, " p"]  # camera z, metres
+    error: Float32[np.ndarray, " p"]  # absolute, metres; infinite where no surface is shown
+    moving: Bool[np.ndarray, " p"]  # the point lies on something that moves
 
 
 def depth_errors(
@@ -168,15 +156,8 @@ def depth_errors(
     """Return how rendered depth compares with the sweep nearest in time.
 
     Points on moving boxes are carried along with them to the time of the view; points that nearer
-    ones hide are left out.
-
-    Args:
-        lidar: measurements.
-        objects: that `lidar.objects` names.
-        view: with a time; K and size are those of the images.
-        depth: alpha-weighted camera z of the render.
-        alpha: opacity.
-        mask: 1 = compare; None: everywhere.
+    ones hide are left out. K and size of the view are those of the images, and the rendered depth
+    is alpha-weighted camera z.
     """
     assert view.time is not None
     rows = np.flatnonzero(np.abs(lidar.times - view.time) <= HALF_SWEEP_S)
@@ -239,10 +220,7 @@ def shifted(
 ) -> Float32[np.ndarray, "4 4"]:
     """Return a world-to-camera matrix moved to the left, looking the same way.
 
-    Args:
-        viewmat: world-to-camera.
-        left: direction in the world, of length 1.
-        metres: how far; negative: to the right.
+    `left` is a direction in the world, of length 1; negative metres are to the right.
     """
     out = np.asarray(viewmat, np.float64).copy()
     out[:3, 3] -= out[:3, :3] @ (metres * np.asarray(left, np.float64))

@@ -59,53 +59,37 @@ from p2gs_jax.types import Camera, Params, Render, Scene
 
 @dataclass(frozen=True)
 class ViewResult:
-    """One rendered view.
+    """One rendered view, by its row in `Scene.views`.
 
-    Attributes:
-        index: row in `Scene.views`.
-        linear: linear radiance.
-        alpha: opacity.
-        depth: alpha-weighted depth.
-        ldr: display image under `transform`.
-        photograph: of the view.
-        transform: the view's own; of a held-out view the usual one with the exposure fitted to its
-            photograph.
+    It is shown under the view's own transform; of a held-out view under the usual one with the
+    exposure fitted to its photograph.
     """
 
     index: int
-    linear: Float32[np.ndarray, "h w 3"]
+    linear: Float32[np.ndarray, "h w 3"]  # radiance
     alpha: Float32[np.ndarray, "h w"]
-    depth: Float32[np.ndarray, "h w"]
-    ldr: Float32[np.ndarray, "h w 3"]
+    depth: Float32[np.ndarray, "h w"]  # alpha-weighted
+    ldr: Float32[np.ndarray, "h w 3"]  # display values under `transform`
     photograph: Float32[np.ndarray, "h w 3"]
     transform: DisplayTransform
 
 
 class Evaluation(NamedTuple):
-    """What an evaluation finds.
+    """What an evaluation finds."""
 
-    Attributes:
-        metrics: the `train`, `test`, `consistency`, `reference` and `radiance` parts of
-            `metrics.json`, those of drives, and the views without scores or exposure (`Untold`).
-        metering: the rule that explains the exposures of the training views.
-        unexplained: of a drive: what no static scene explains in the training views, by row.
-    """
-
+    # the `train`, `test`, `consistency`, `reference` and `radiance` parts of `metrics.json`, those
+    # of drives, and the views without scores or exposure (`Untold`)
     metrics: dict[str, Any]
-    metering: Metering
+    metering: Metering  # the rule that explains the exposures of the training views
+    # of a drive: what no static scene explains in the training views, by row
     unexplained: dict[int, Unexplained]
 
 
 class Judge:
     """By what renders are judged: photographs, how the run shows radiance, and which scores.
 
-    Args:
-        scene: the views.
-        store: their photographs.
-        params: the run's; its small arrays say how views are shown.
-        cfg: formation model.
-        lpips_weights: or None, which leaves LPIPS out.
-        reference: view row -> photograph under one common exposure, or None.
+    The small arrays of the run's parameters say how views are shown; without weights there is no
+    LPIPS; `reference` is as for `evaluate`.
     """
 
     def __init__(
@@ -164,8 +148,7 @@ def evaluate(
         render: from `make_renderer`, where it knows which Gaussians belong to moving objects.
         reference: view row -> photograph under the common exposure, or None where there is none.
         radiance: view row -> true linear radiance at the size of the photographs, or None.
-        lpips_weights: adds `lpips` wherever a view is compared with a photograph; None leaves it
-            out.
+        lpips_weights: adds `lpips` wherever a view is compared with a photograph.
         on_view: receives every rendered view.
         on_progress: views done, views in all.
 
@@ -188,28 +171,16 @@ def evaluate(
 
 
 class _Judged(NamedTuple):
-    """A view with its scores, and the references that need all views to compare with.
-
-    Attributes:
-        result: the view.
-        averaged: display image with the mean parameters.
-        mask: which pixels count.
-        scores: of `result.ldr`.
-        scores_averaged: of `averaged`.
-        scores_all: of a held-out view with all fitted that varies per view, or None.
-        radiance: true linear radiance, or None.
-        reference: photograph under the common exposure, or None.
-        readings: of the meters.
-    """
+    """A view with its scores, and the references that need all views to compare with."""
 
     result: ViewResult
-    averaged: Float32[np.ndarray, "h w 3"]
+    averaged: Float32[np.ndarray, "h w 3"]  # display values with the mean parameters
     mask: Float32[np.ndarray, "h w"]
-    scores: dict[str, Any]
+    scores: dict[str, Any]  # of `result.ldr`
     scores_averaged: dict[str, Any]
-    scores_all: dict[str, Any] | None
-    radiance: np.ndarray | None
-    reference: np.ndarray | None
+    scores_all: dict[str, Any] | None  # of a held-out view with all fitted that varies per view
+    radiance: np.ndarray | None  # true, linear
+    reference: np.ndarray | None  # photograph under the common exposure
     readings: Readings
 
 
@@ -363,12 +334,8 @@ def _against_reference(
     """Score all views against photographs of one common exposure.
 
     Those are taken to be what no camera in particular sees: without vignetting, and of mean white
-    balance.
-
-    Args:
-        views: row of each; linear radiance, reference photograph and mask, kept; over a background
-            also the opacity.
-        judge: how all are shown, and by which scores they are judged.
+    balance. Views have their row; radiance, reference photograph and mask, kept; over a background
+    also the opacity.
     """
     shown, mean = judge.usual(None), judge.mean
 

@@ -57,17 +57,11 @@ class Pool:
 
 @dataclass(frozen=True)
 class Network:
-    """A network without what follows its last convolution.
+    """A network without what follows its last convolution."""
 
-    Attributes:
-        name: as people write it.
-        blocks: features are compared after each of them.
-        seconds_per_pixel: of one comparison on two CPU cores (measured), for time budgets.
-    """
-
-    name: str
-    blocks: tuple[tuple[Convolution | Pool, ...], ...]
-    seconds_per_pixel: float
+    name: str  # as people write it
+    blocks: tuple[tuple[Convolution | Pool, ...], ...]  # features are compared after each of them
+    seconds_per_pixel: float  # of one comparison on two CPU cores (measured), for time budgets
 
     @property
     def convolutions(self) -> tuple[Convolution, ...]:
@@ -140,23 +134,15 @@ PACKAGED: dict[str, tuple[Network, str, str]] = {
 
 
 class LpipsWeights(eqx.Module):
-    """A network with its weights.
+    """A network with its weights."""
 
-    Attributes:
-        network: which one.
-        kernels: of each convolution, by its name.
-        biases: of each convolution, by its name.
-        lins: weight of each channel in the comparison after each block.
-        shift: subtracted from the colours, which then reach from -1 to 1.
-        scale: what they are divided by after that.
-    """
-
-    network: Network = eqx.field(static=True)
-    kernels: dict[str, Float[Array, "kh kw i o"]]
-    biases: dict[str, Float[Array, " o"]]
+    network: Network = eqx.field(static=True)  # which one
+    kernels: dict[str, Float[Array, "kh kw i o"]]  # of each convolution, by its name
+    biases: dict[str, Float[Array, " o"]]  # of each convolution, by its name
+    # weight of each channel in the comparison after each block
     lins: tuple[Float[Array, " c"], ...]
-    shift: Float[Array, " 3"]
-    scale: Float[Array, " 3"]
+    shift: Float[Array, " 3"]  # subtracted from the colours, which then reach from -1 to 1
+    scale: Float[Array, " 3"]  # what they are divided by after that
 
     def require_size(self, width: int, height: int, name: str = "the image") -> None:
         """Refuse an image, of a size in pixels, of which the network leaves nothing.

@@ -53,17 +53,11 @@ def most_bytes(cache_mb: int, share: float = 0.5) -> int:
 
 @dataclass(frozen=True)
 class StoredArray:
-    """An array in a store.
+    """An array in a store."""
 
-    Attributes:
-        held: the array; empty where it is on disk.
-        shape: of the array.
-        path: its file, or None.
-    """
-
-    held: np.ndarray
-    shape: tuple[int, ...]
-    path: Path | None = None
+    held: np.ndarray  # the array; empty where it is on disk
+    shape: tuple[int, ...]  # of the array
+    path: Path | None = None  # its file, or None
 
     def read(self) -> np.ndarray:
         """Return the array, bit for bit; from any thread."""

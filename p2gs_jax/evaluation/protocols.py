@@ -6,17 +6,11 @@ from typing import NamedTuple
 
 
 class Protocol(NamedTuple):
-    """A way to show views for a score.
+    """A way to show views for a score."""
 
-    Attributes:
-        views: which, in words.
-        shown: at which exposure, in words.
-        path: where `metrics.json` has the scores.
-    """
-
-    views: str
-    shown: str
-    path: tuple[str, ...]
+    views: str  # which, in words
+    shown: str  # at which exposure, in words
+    path: tuple[str, ...]  # where `metrics.json` has the scores
 
 
 PROTOCOLS = {

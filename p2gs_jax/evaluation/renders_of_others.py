@@ -24,48 +24,31 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
 # Where pictures by name lie below the folder given: here, nerfstudio's `ns-render dataset`, others.
 PLACES = (".", "rgb", "test/rgb", "renders", "test/renders", "test")
 # Luminance-GS, whose views are in that order as well; beside these pictures are dark ones.
-LUMINANCE_GS = re.compile(r"val_(\d+)_enh")
+LUMINANCE_GS = re.compile(r"val_(?P<step>)(?P<k>\d+)_enh")
 # gsplat's trainer writes photograph and render side by side, in the order of held-out views.
-GSPLAT = re.compile(r"(?:val|test)_step(\d+)_(\d+)")
+GSPLAT = re.compile(r"(?:val|test)_step(?P<step>\d+)_(?P<k>\d+)")
 
 
 class Rendered(NamedTuple):
-    """What a file holds.
-
-    Attributes:
-        pixels: display values in [0, 1], or linear radiance.
-        linear: which.
-        alpha: opacity, by which radiance is premultiplied; None: it has none.
-    """
+    """What a file holds: display values in [0, 1], or linear radiance."""
 
     pixels: Float32[np.ndarray, "h w 3"]
     linear: bool
-    alpha: Float32[np.ndarray, "h w"] | None
+    alpha: Float32[np.ndarray, "h w"] | None  # by which radiance is premultiplied, if it has any
 
 
 @dataclass(frozen=True)
 class OtherRenders:
-    """The files of a folder that show held-out views.
-
-    Attributes:
-        folder: as it was given.
-        layout: in words.
-        files: by row of the view.
-        missing: names of held-out views that no file shows.
-        of_training: files that show training views.
-        unknown: files that show no view.
-        numbered: files are in the order of held-out views, and their names say no more.
-        right_half: the photograph is to the left of the render in each file.
-    """
+    """The files of a folder that show held-out views, by the rows of these."""
 
     folder: Path
-    layout: str
+    layout: str  # in words
     files: dict[int, Path]
-    missing: tuple[str, ...] = ()
-    of_training: int = 0
-    unknown: int = 0
-    numbered: bool = False
-    right_half: bool = False
+    missing: tuple[str, ...] = ()  # names of held-out views that no file shows
+    of_training: int = 0  # files that show training views
+    unknown: int = 0  # files that show no view
+    numbered: bool = False  # in the order of held-out views; their names say no more
+    right_half: bool = False  # the photograph is to the left of the render in each file
 
     @property
     def remarks(self) -> tuple[str, ...]:
@@ -167,7 +150,7 @@ def find_renders(folder: str | Path, scene: Scene) -> OtherRenders:
         found = next(filter(None, by_name), None)
         if found is not None:
             return found
-        numbered = _of_gsplat(folder) or _of_luminance_gs(folder) or _of_numbers(folder)
+        numbered = _of_trainers(folder) or _of_numbers(folder)
     if numbered is None:
         raise UserError(
             f"{folder} holds no render of a held-out view (for example "
@@ -257,26 +240,20 @@ def _of_3dgs(folder: Path) -> _Numbered | None:
     return (f"3DGS, {last.name}", files, False) if files else None
 
 
-def _of_gsplat(folder: Path) -> _Numbered | None:
-    """Return the pictures of the last evaluation of gsplat's trainer, if there was one."""
-    steps: dict[int, list[tuple[int, Path]]] = {}
-    for place in (folder, folder / "renders"):
-        for path in place.glob("*.png") if place.is_dir() else ():
-            if match := GSPLAT.fullmatch(path.stem):
-                steps.setdefault(int(match[1]), []).append((int(match[2]), path))
-    if not steps:
-        return None
-    last = max(steps)
-    return f"gsplat, step {last}", [path for _, path in sorted(steps[last])], True
-
-
-def _of_luminance_gs(folder: Path) -> _Numbered | None:
-    """Return the enhanced pictures of the authors' trainer, if it wrote any."""
-    for place in (folder, folder / "renders"):
-        found = [(LUMINANCE_GS.fullmatch(p.stem), p) for p in place.glob("*.png")]
-        files = sorted((int(match[1]), path) for match, path in found if match)
-        if files:
-            return "Luminance-GS, enhanced", [path for _, path in files], False
+def _of_trainers(folder: Path) -> _Numbered | None:
+    """Return the pictures of gsplat's last evaluation, or of Luminance-GS, if there are any."""
+    for pattern, layout, beside in (
+        (GSPLAT, "gsplat, step {}", True),
+        (LUMINANCE_GS, "Luminance-GS, enhanced", False),
+    ):
+        found: dict[int, list[tuple[int, Path]]] = {}
+        for place in (folder, folder / "renders"):
+            for path in place.glob("*.png"):
+                if match := pattern.fullmatch(path.stem):
+                    found.setdefault(int(match["step"] or 0), []).append((int(match["k"]), path))
+        if found:
+            last = max(found)
+            return layout.format(last), [path for _, path in sorted(found[last])], beside
     return None
 
 

@@ -129,9 +129,7 @@ def is_drive(scene: Scene) -> bool:
 def parts_of(mask: Float32[np.ndarray, "h w"], moving: Bool[np.ndarray, "h w"]) -> Masks:
     """Return masks by name, without those that have too few pixels.
 
-    Args:
-        mask: 1 = use.
-        moving: covered by the boxes of what moves.
+    `moving` is covered by the boxes of what moves.
     """
     masks = {"whole": mask, "static": mask * ~moving, "moving": mask * moving}
     return {k: m.astype(np.float32) for k, m in masks.items() if m.sum() >= FEWEST_PIXELS}
@@ -159,15 +157,12 @@ def still_mask(
 
 @dataclass
 class Untold:
-    """Views that cannot be judged, and photographs whose exposure nothing tells.
+    """Views that cannot be judged, and photographs whose exposure nothing tells."""
 
-    Attributes:
-        hidden: names of views of which masks leave nothing: they have no scores.
-        exposures: names of views that are black or saturated everywhere: any exposure that is dark
-            or bright enough explains them.
-    """
-
+    # names of views of which masks leave nothing: they have no scores
     hidden: list[str] = field(default_factory=list)
+    # names of views that are black or saturated everywhere: any exposure that is dark or bright
+    # enough explains them
     exposures: list[str] = field(default_factory=list)
 
     def add(

@@ -49,41 +49,24 @@ BLANK = 0.5
 
 
 class Photographed(NamedTuple):
-    """A photograph with camera, depth and display transform.
-
-    Attributes:
-        ldr: display values.
-        mask: 1 = use.
-        camera: at the size of `ldr`.
-        depth: from `surface_depth`, 0 where the view shows no surface.
-        transform: how it was taken.
-    """
+    """A photograph with camera, depth and display transform."""
 
     ldr: Float32[np.ndarray, "h w 3"]
-    mask: Float32[np.ndarray, "h w"]
-    camera: Camera
-    depth: Float[np.ndarray, "h w"]
-    transform: DisplayTransform
+    mask: Float32[np.ndarray, "h w"]  # 1 = use
+    camera: Camera  # at the size of `ldr`
+    depth: Float[np.ndarray, "h w"]  # from `surface_depth`, 0 where there is no surface
+    transform: DisplayTransform  # how it was taken
 
 
 class Seam(NamedTuple):
-    """The difference of two photographs; see the module for the definitions.
+    """The difference of two photographs; see the module for the definitions."""
 
-    Attributes:
-        before_ev: as taken, stops.
-        after_ev: developed alike, stops.
-        before_codes: as taken, 8-bit codes.
-        after_codes: developed alike, 8-bit codes.
-        step_ev: by which the first is brighter throughout, developed alike, stops.
-        pixels: that both show.
-    """
-
-    before_ev: float
-    after_ev: float
-    before_codes: float
-    after_codes: float
-    step_ev: float
-    pixels: int
+    before_ev: float  # as taken, stops
+    after_ev: float  # developed alike, stops
+    before_codes: float  # as taken, 8-bit codes
+    after_codes: float  # developed alike, 8-bit codes
+    step_ev: float  # by which the first is brighter throughout, developed alike, stops
+    pixels: int  # that both show
 
 
 def neighbouring_pairs(scene: Scene, most: int) -> list[tuple[int, int]]:
@@ -211,17 +194,11 @@ def redeveloped(
 
 
 class SeamPicture(NamedTuple):
-    """One picture made of two photographs, with a hard edge in the middle.
+    """One picture made of two photographs, with a hard edge in the middle."""
 
-    Attributes:
-        before: of the photographs as taken.
-        after: of the photographs developed alike.
-        left_first: the left half is the first photograph.
-    """
-
-    before: Float32[np.ndarray, "h w 3"]
-    after: Float32[np.ndarray, "h w 3"]
-    left_first: bool
+    before: Float32[np.ndarray, "h w 3"]  # of the photographs as taken
+    after: Float32[np.ndarray, "h w 3"]  # of the photographs developed alike
+    left_first: bool  # the left half is the first photograph
 
 
 def seam_picture(

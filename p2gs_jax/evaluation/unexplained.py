@@ -44,29 +44,18 @@ _warp = jax.jit(warp)
 
 
 class Unexplained(NamedTuple):
-    """What of a photograph no static scene explains.
+    """What of a photograph no static scene explains."""
 
-    Attributes:
-        mask: which pixels, at a reduced size.
-        share: of the pixels that count.
-    """
-
-    mask: Bool[np.ndarray, "h w"]
-    share: float
+    mask: Bool[np.ndarray, "h w"]  # which pixels, at a reduced size
+    share: float  # of the pixels that count
 
 
 class Surface(NamedTuple):
-    """The surface that a view shows.
+    """The surface that a view shows."""
 
-    Attributes:
-        depth: camera z, 0 where there is none; perhaps kept.
-        viewmat: world-to-camera.
-        K: intrinsics in pixels, at the size of `depth`.
-    """
-
-    depth: Float32[np.ndarray, "h w"] | StoredArray
-    viewmat: Float[np.ndarray, "4 4"]
-    K: Float[np.ndarray, "3 3"]
+    depth: Float32[np.ndarray, "h w"] | StoredArray  # camera z, 0 where there is none; perhaps kept
+    viewmat: Float[np.ndarray, "4 4"]  # world-to-camera
+    K: Float[np.ndarray, "3 3"]  # intrinsics in pixels, at the size of `depth`
 
     def depths(self) -> Float32[np.ndarray, "h w"]:
         """Return `depth`, read."""
@@ -138,9 +127,7 @@ def shares_by_view(scene: Scene, found: Mapping[int, Unexplained]) -> dict:
 class Residuals:
     """Collects renders of training views, and finds what no static scene explains in them.
 
-    Args:
-        views: of the scene.
-        arrays: keeps what all views need to the end; None: memory does.
+    `arrays` keeps what all views need to the end; None: memory does.
     """
 
     def __init__(self, views: Sequence[View], arrays: ArrayStore | None = None):

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from p2gs_jax.config import FitConfig, from_dict, to_dict
+from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import write_json, write_text
 from p2gs_jax.core.clock import whole_run
 from p2gs_jax.core.progress import Reporter
@@ -25,6 +25,7 @@ from p2gs_jax.jobs.run import Runner, run_jobs
 from p2gs_jax.jobs.worker import run_in_process
 from p2gs_jax.pipeline.fit import fit
 from p2gs_jax.pipeline.preflight import check_run_dir
+from p2gs_jax.presets import from_dict, to_dict
 from p2gs_jax.run.folder import RunFolder, locked
 from p2gs_jax.synth.sensor import read_true_exposures
 

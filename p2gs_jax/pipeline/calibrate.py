@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from p2gs_jax.config import FitConfig, require_config
+from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import no_empty_folders, write_json
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
@@ -33,6 +33,7 @@ from p2gs_jax.photometry.solution import Agreement, PhotometricSolution, compare
 from p2gs_jax.photometry.sources.points import has_tracks, rendered_colors, surface_colors
 from p2gs_jax.photometry.sources.stack import SATURATED, StackColors, read_stack, stack_colors
 from p2gs_jax.photometry.unmodelled import LOCAL_EV, Unexplained, residuals, unexplained
+from p2gs_jax.presets import require_config
 from p2gs_jax.run.photometry_files import write_solution
 from p2gs_jax.run.plots import write_calibration_plot
 from p2gs_jax.run.read import load_run
@@ -48,36 +49,23 @@ STACK_GAUGE = "mean log exposure is 0; exposures and response can be stretched t
 
 @dataclass(frozen=True)
 class Calibration:
-    """What a calibration finds.
+    """What a calibration finds."""
 
-    Attributes:
-        views: the photographs, in the order of the solution; of a stack poses mean nothing.
-        selection: model, exposures, gammas, errors, reasons.
-        stated_ev: exposures from EXIF or a file, stops, laid over the recovered ones; NaN where
-            unknown.
-        agreement: of stated and recovered exposures.
-        known: where known exposures came from, or None.
-        gauge: what fixes the scale where none are known, in words.
-        pivot: linear value that gammas leave alone.
-        messages: what the user should know, in plain words.
-        details: the content of `calibration.json`.
-        observations: how many were used.
-        seconds: of `reading` and sampling, and of the `adjustment`.
-        metrics: of `calibrate_of`: what `metrics.json` holds; `of` has the scores of the model as
-            it was.
-    """
-
+    # the photographs, in the order of the solution; of a stack poses mean nothing
     views: tuple[View, ...]
-    selection: Selection
+    selection: Selection  # model, exposures, gammas, errors, reasons
+    # exposures from EXIF or a file, stops, laid over the recovered ones; NaN where unknown
     stated_ev: Float[np.ndarray, " v"]
-    agreement: Agreement
-    known: str | None
-    gauge: str
-    pivot: float
-    messages: tuple[str, ...]
-    details: dict[str, Any]
-    observations: int = 0
+    agreement: Agreement  # of stated and recovered exposures
+    known: str | None  # where known exposures came from, or None
+    gauge: str  # what fixes the scale where none are known, in words
+    pivot: float  # linear value that gammas leave alone
+    messages: tuple[str, ...]  # what the user should know, in plain words
+    details: dict[str, Any]  # the content of `calibration.json`
+    observations: int = 0  # how many were used
+    # of `reading` and sampling, and of the `adjustment`
     seconds: dict[str, float] = field(default_factory=dict)
+    # of `calibrate_of`: what `metrics.json` holds; `of` has the scores of the model as it was
     metrics: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -167,14 +155,9 @@ def calibrate_run(
 ) -> Calibration:
     """Solve the photometry of a finished run's training views anew, through its rendered depth.
 
-    Args:
-        run_dir: the run folder; it is not changed.
-        out: folder for the results; created.
-        cfg: its photometry says what to choose from and what is known; default `robust`. The run's
-            own choice is not used.
-        scene: see `load_run`.
-        compare_with: see `calibrate`.
-        reporter: receives progress.
+    The run is not changed. The photometry of `cfg` (default `robust`) says what to choose from and
+    what is known; the run's own choice is not used. `scene` is as for `load_run`, the others as for
+    `calibrate`.
 
     Raises:
         UserError: see `load_run`; the photographs are gone, the fit is opaque nowhere, or its views
@@ -283,15 +266,9 @@ def calibrate_stack(
     """Solve exposures and the common response of a stack: one fixed viewpoint, no poses needed.
 
     Without known exposures, their logarithms are found up to a factor: exposures and response
-    can be stretched together (the power gauge), which the standard curves' mid tones settle.
-
-    Args:
-        folder: photographs of one viewpoint.
-        out: folder for the results; None: nothing is written.
-        cfg: its photometry names known exposures, with which the response is then solved, and its
-            seed draws the sampled positions; default `robust`.
-        compare_with: stated exposures to report beside the recovered ones; default EXIF.
-        reporter: receives progress.
+    can be stretched together (the power gauge), which the standard curves' mid tones settle. The
+    photometry of `cfg` (default `robust`) names known exposures, and its seed draws the sampled
+    positions. Without `out` nothing is written; see `calibrate`.
 
     Raises:
         UserError: see `read_stack` and `read_known_exposures`.

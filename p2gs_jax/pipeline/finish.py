@@ -29,23 +29,16 @@ from p2gs_jax.types import Params, Scene
 
 @dataclass(frozen=True)
 class Account:
-    """What a fit has to say of itself for `metrics.json`, beside its scores.
+    """What a fit has to say of itself for `metrics.json`, beside its scores."""
 
-    Attributes:
-        counts: numbers.
-        seconds: times, by name.
-        compiler: counts what was compiled for this fit.
-        selection: what the bundle adjustment found, or None.
-        notes: what the user was told; what the evaluation finds is added.
-        of: scores of the model that was converted, as it was; None: this is a fit.
-    """
-
-    counts: dict[str, int]
-    seconds: dict[str, float]
+    counts: dict[str, int]  # numbers
+    seconds: dict[str, float]  # times, by name
+    # counts what was compiled for this fit
     compiler: CompileCounter = field(default_factory=CompileCounter)
-    selection: Selection | None = None
+    selection: Selection | None = None  # what the bundle adjustment found, or None
+    # what the user was told; what the evaluation finds is added
     notes: list[str] = field(default_factory=list)
-    of: dict | None = None
+    of: dict | None = None  # scores of the model that was converted, as it was; None: this is a fit
 
 
 def finish(

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from p2gs_jax.config import FitConfig, require_config
+from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import no_empty_folders
 from p2gs_jax.core.clock import CompileCounter, Stopwatch
 from p2gs_jax.core.progress import Reporter, Silent
@@ -27,6 +27,7 @@ from p2gs_jax.pipeline.exposures import kept_choice
 from p2gs_jax.pipeline.finish import Account, finish, seconds_to_finish
 from p2gs_jax.pipeline.preflight import Paths, check_run_dir, check_scene, memory_named, preflight
 from p2gs_jax.pipeline.prepare import Prepared, load, prepare
+from p2gs_jax.presets import require_config
 from p2gs_jax.run.checkpoint import saved_steps
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.run.folder import RunFolder, locked, require_free
@@ -43,23 +44,14 @@ from p2gs_jax.types import Params, Scene
 
 @dataclass(frozen=True)
 class FitResult:
-    """What `fit` returns to a program.
+    """What `fit` returns to a program."""
 
-    Attributes:
-        params: the fit, live Gaussians only.
-        scene: what it was fitted to.
-        metrics: what `metrics.json` holds.
-        run_dir: the run folder.
-        selection: what the bundle adjustment found, or None.
-        decisions: what the scene settled.
-    """
-
-    params: Params
-    scene: Scene
-    metrics: dict
-    run_dir: Path
-    selection: Selection | None
-    decisions: Decisions
+    params: Params  # the fit, live Gaussians only
+    scene: Scene  # what it was fitted to
+    metrics: dict  # what `metrics.json` holds
+    run_dir: Path  # the run folder
+    selection: Selection | None  # what the bundle adjustment found, or None
+    decisions: Decisions  # what the scene settled
 
 
 def fit(
@@ -157,11 +149,8 @@ def _read(paths: Paths, cfg: FitConfig, reporter: Reporter, clock: Stopwatch) ->
 class Optimiser:
     """Compiles and runs the steps of a fit; as a context manager it ends the compilers.
 
-    Args:
-        folder: of the run: where the log and checkpoints go.
-        reporter: receives progress.
-        mesh: the devices of a step of several views; None: the default one.
-        own: what the caller of `fit` brought.
+    The log and checkpoints go into `folder`; `mesh` has the devices of a step of several views, and
+    `own` what the caller of `fit` brought.
     """
 
     def __init__(
@@ -199,11 +188,8 @@ class Optimiser:
     ) -> TrainResult:
         """Run the optimisation, from the start or from the newest checkpoint.
 
-        Args:
-            start: from `prepare`; what the steps have to say is noted in it as well.
-            resume: continue from the newest checkpoint.
-            spent_s: seconds of the budget that are already gone.
-            reserve_s: seconds of the budget to keep for evaluation and files.
+        What the steps have to say is noted in `start` as well. Of the budget, `spent_s` seconds are
+        gone and `reserve_s` are kept for evaluation and files.
         """
         alive = np.ones(start.params.gaussians.capacity, bool)
         params, owner = self._own.among(start.params), start.owner

@@ -18,8 +18,6 @@ from typing import NamedTuple
 import jax
 
 from p2gs_jax.config import FitConfig, PhotometryConfig
-from p2gs_jax.config import from_dict as config_from_dict
-from p2gs_jax.config import to_dict as config_to_dict
 from p2gs_jax.core.atomic import plain
 from p2gs_jax.core.memory import left_to_process, ran_out, resident
 from p2gs_jax.core.text import parse_json
@@ -28,6 +26,8 @@ from p2gs_jax.evaluation.lpips import LpipsWeights, read_lpips_weights
 from p2gs_jax.evaluation.references import Reference, check_reference, load_reference
 from p2gs_jax.gaussians.dense import seed_bound
 from p2gs_jax.gaussians.population import Coverage
+from p2gs_jax.presets import from_dict as config_from_dict
+from p2gs_jax.presets import to_dict as config_to_dict
 from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.scene.exposures import check_source, read_known_exposures
 from p2gs_jax.scene.pixels.store import size_at

@@ -43,37 +43,21 @@ from p2gs_jax.types import Camera, Gaussians, Measured, Params, Scene, View
 
 @dataclass
 class Prepared:
-    """Everything known before the first optimisation step.
-
-    Attributes:
-        scene: views, points, tracks.
-        store: photographs, whole; its cameras see what moves.
-        fitted: the same photographs without the pixels that are left out of the fit.
-        params: initial parameters.
-        extent: what rates of the means are shares of, scene units.
-        coverage: how much of the scene the views show.
-        decisions: what the scene settled.
-        cfg: the options that the fit computes under: as asked, with `decisions` filled in.
-        owner: the moving object that each Gaussian belongs to (`Population.owner`), or None.
-        selection: photometric model, exposures and their errors from the tracks, or None.
-        pairs: corresponding observations, or None.
-        measured: of every training view the depths that the loss compares with, or None.
-        notes: what the user should know.
-    """
+    """Everything known before the first optimisation step."""
 
     scene: Scene
-    store: ImageStore
-    fitted: ImageStore
-    params: Params
-    extent: float
-    coverage: Coverage
-    decisions: Decisions
-    cfg: FitConfig
-    owner: np.ndarray | None = None
-    selection: Selection | None = None
-    pairs: ColorPairs | None = None
-    measured: Sequence[Measured] | None = None
-    notes: list[str] = field(default_factory=list)
+    store: ImageStore  # photographs, whole; its cameras see what moves
+    fitted: ImageStore  # the same without the pixels that are left out of the fit
+    params: Params  # initial parameters
+    extent: float  # what rates of the means are shares of, scene units
+    coverage: Coverage  # how much of the scene the views show
+    decisions: Decisions  # what the scene settled
+    cfg: FitConfig  # what the fit computes under: as asked, with `decisions` filled in
+    owner: np.ndarray | None = None  # moving object of each Gaussian (`Population.owner`)
+    selection: Selection | None = None  # model, exposures and their errors from the tracks
+    pairs: ColorPairs | None = None  # corresponding observations
+    measured: Sequence[Measured] | None = None  # depths of every training view for the loss
+    notes: list[str] = field(default_factory=list)  # what the user should know
 
     def view(self, index: int) -> tuple[Camera, Float32[np.ndarray, "h w 3"], np.ndarray]:
         """Return the camera, the photograph (display values) and the mask that a step takes."""

@@ -36,48 +36,26 @@ COARSE = 1e-4
 
 @dataclass(frozen=True)
 class Survey:
-    """A scene before its exposures are known.
-
-    Attributes:
-        scene: views, points, tracks.
-        cfg: as asked.
-        store: photographs, whole; its cameras see what moves.
-        fitted: the same photographs without the pixels that are left out of the fit.
-        still: those of what stands still and is opaque: exposures and seeds come from them.
-        nodes: moving objects and their points, or None.
-        vibrating: Gaussians move by themselves.
-        radius: of the cameras, scene units.
-        extent: what rates of the means are shares of, scene units.
-        near: near plane, scene units, where the one asked for would cut the scene, or None.
-        coverage: how much of the scene the views show.
-        measured: of every training view the depths that the loss compares with, or None.
-        dense: seeds come from matching photographs as well.
-        seeds: rows of the scene's points that become Gaussians.
-        init: options of seeds; no shell where a background lies behind everything.
-        sphere: where a shell lies, where that is given.
-        shell: what lies behind all points; None: nothing, or dense seeds decide it.
-        scale_notes: what the user should know of units and place.
-        seed_notes: likewise of the seeds.
-    """
+    """A scene before its exposures are known; lengths are in scene units."""
 
     scene: Scene
-    cfg: FitConfig
-    store: ImageStore
-    fitted: ImageStore
-    still: ImageStore
-    nodes: Nodes | None
-    vibrating: bool
-    radius: float
-    extent: float
-    near: float | None
-    coverage: Coverage
-    measured: Sequence[Measured] | None
-    dense: bool
-    seeds: Int[np.ndarray, " s"]
-    init: InitConfig
-    sphere: Sphere | None
-    shell: Shell | None
-    scale_notes: list[str]
+    cfg: FitConfig  # as asked
+    store: ImageStore  # photographs, whole; its cameras see what moves
+    fitted: ImageStore  # the same without the pixels that are left out of the fit
+    still: ImageStore  # of what stands still and is opaque: exposures and seeds come from them
+    nodes: Nodes | None  # moving objects and their points
+    vibrating: bool  # Gaussians move by themselves
+    radius: float  # of the cameras
+    extent: float  # what rates of the means are shares of
+    near: float | None  # near plane, where the one asked for would cut the scene
+    coverage: Coverage  # how much of the scene the views show
+    measured: Sequence[Measured] | None  # depths of every training view for the loss
+    dense: bool  # seeds come from matching photographs as well
+    seeds: Int[np.ndarray, " s"]  # rows of the scene's points that become Gaussians
+    init: InitConfig  # without a shell where a background lies behind everything
+    sphere: Sphere | None  # where a shell lies, where that is given
+    shell: Shell | None  # what lies behind all points; None: nothing, or dense seeds decide it
+    scale_notes: list[str]  # what the user should know of units and place
     seed_notes: list[str]
 
 

@@ -7,10 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from p2gs_jax.config import PhotometryConfig, camera_formations
+from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.formation import corner, inverse_tone_map, log_vignetting
 from p2gs_jax.photometry.models import MODELS
+from p2gs_jax.presets import camera_formations
 from p2gs_jax.report import charts, findings
 from p2gs_jax.report.charts import Series, Style
 from p2gs_jax.report.findings import against_exif, column, reasons

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from p2gs_jax.config import FitConfig, from_dict
+from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import read_jsonl
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
+from p2gs_jax.presets import from_dict
 from p2gs_jax.run.folder import find
 from p2gs_jax.run.photometry_files import PhotometryFile, ViewPhotometry, read_photometry
 

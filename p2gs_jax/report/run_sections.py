@@ -9,10 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from p2gs_jax.config import to_dict
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.protocols import PROTOCOLS
-from p2gs_jax.presets import preset
+from p2gs_jax.presets import preset, to_dict
 from p2gs_jax.report.charts import training_chart
 from p2gs_jax.report.findings import column, duration, seconds_of
 from p2gs_jax.report.page import figure, folded, paragraph, row, table, text

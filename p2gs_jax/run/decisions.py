@@ -20,11 +20,11 @@ from p2gs_jax.config import (
     PhotometricModel,
     ResponseKind,
     VignettingKind,
-    camera_formations,
 )
 from p2gs_jax.core.atomic import plain, write_json
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
+from p2gs_jax.presets import camera_formations
 
 # Under this name in the metadata of checkpoints.
 KEY = "decided"
@@ -32,36 +32,23 @@ KEY = "decided"
 
 @dataclass(frozen=True)
 class Decisions:
-    """Values that the scene settles where the options leave them open.
+    """Values that the scene settles where the options leave them open."""
 
-    Attributes:
-        model: photometric model.
-        curve: base of the tone curve.
-        spline: its correction, or None.
-        freeze_until: share of the run during which exposures and gammas keep still.
-        log_exposure_mean: weight of the pull on the mean log exposure; None: no pull.
-        exposure_rate: learning rate of the exposures.
-        gamma_rate: learning rate of the gammas.
-        reasons: for the model and the curve, in words.
-        white_balance: per what it varies, or None.
-        vignetting: whether cameras have it, and per what it varies, or None.
-        responses: what has a spline of its own.
-        cameras: what each physical camera does; empty: nothing of its own.
-        near: near plane, scene units, where the one asked for would cut the scene; None elsewhere.
-    """
-
-    model: PhotometricModel
-    curve: Literal["power", "srgb", "spline", "linear"]
-    spline: tuple[float, ...] | None
-    freeze_until: float
-    log_exposure_mean: float | None
-    exposure_rate: float
-    gamma_rate: float
-    reasons: tuple[str, ...] = ()
-    white_balance: Level | None = None
+    model: PhotometricModel  # photometric model
+    curve: Literal["power", "srgb", "spline", "linear"]  # base of the tone curve
+    spline: tuple[float, ...] | None  # its correction, or None
+    freeze_until: float  # share of the run during which exposures and gammas keep still
+    log_exposure_mean: float | None  # weight of the pull on the mean log exposure; None: no pull
+    exposure_rate: float  # learning rate of the exposures
+    gamma_rate: float  # learning rate of the gammas
+    reasons: tuple[str, ...] = ()  # for the model and the curve, in words
+    white_balance: Level | None = None  # per what it varies, or None
+    # whether cameras have it, and per what it varies, or None
     vignetting: VignettingKind | None = None
-    responses: ResponseKind = "all"
+    responses: ResponseKind = "all"  # what has a spline of its own
+    # what each physical camera does; empty: nothing of its own
     cameras: tuple[CameraFormation, ...] = ()
+    # near plane, scene units, where the one asked for would cut the scene; None elsewhere
     near: float | None = None
 
     @classmethod

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Bool, Float32, Int
 
-from p2gs_jax.config import FitConfig, from_dict
+from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
@@ -27,6 +27,7 @@ from p2gs_jax.photometry.display import (
 )
 from p2gs_jax.photometry.formation import camera_rows
 from p2gs_jax.photometry.metering import ExposureOf, Metering, meter
+from p2gs_jax.presets import from_dict
 from p2gs_jax.render.capacity import RenderView, make_renderer
 from p2gs_jax.run.decisions import read_decisions
 from p2gs_jax.run.folder import RunFolder, find
@@ -50,28 +51,20 @@ CONFIG_AGAIN = (
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run.
+    """A finished run."""
 
-    Attributes:
-        folder: where it lies.
-        params: the fit.
-        cfg: what it was made under: the options as asked, with what the scene decided filled in.
-        scene: what it was fitted to; its photographs may be gone.
-        reference: photographs under one common exposure, or None.
-        photometry: `photometry.json`, with what `params` does not hold: standard errors, EXIF,
-            exposures fitted to held-out photographs.
-        owner: the moving object that each Gaussian belongs to, -1: none; None: nothing moves.
-        moving: these objects.
-    """
-
-    folder: Path
-    params: Params
+    folder: Path  # where it lies
+    params: Params  # the fit
+    # what it was made under: the options as asked, with what the scene decided filled in
     cfg: FitConfig
-    scene: Scene
-    reference: Path | None
+    scene: Scene  # what it was fitted to; its photographs may be gone
+    reference: Path | None  # photographs under one common exposure, or None
+    # `photometry.json`, with what `params` does not hold: standard errors, EXIF, exposures fitted
+    # to held-out photographs
     photometry: PhotometryFile
+    # the moving object that each Gaussian belongs to, -1: none; None: nothing moves
     owner: Int[np.ndarray, " n"] | None = None
-    moving: MovingObjects | None = None
+    moving: MovingObjects | None = None  # these objects
 
     @cached_property
     def store(self) -> ImageStore:
@@ -123,9 +116,8 @@ class Run:
     def with_moved(self, name: str, offset: Sequence[float]) -> Run:
         """Return the run with one object elsewhere, at all times.
 
-        Args:
-            name: of its track (`Scene.objects`), or how that begins.
-            offset: forward, left and up in the frame of its box, scene units.
+        The object is named by its track (`Scene.objects`), or how that begins; the offset is
+        forward, left and up in the frame of its box, scene units.
 
         Raises:
             UserError: nothing moves, or no object has this name.
@@ -263,11 +255,8 @@ class Run:
 def load_run(folder: str | Path, scene: str | Path | None = None) -> Run:
     """Read parameters, configuration and cameras of a finished run.
 
-    Photographs are read when they are asked for; all else works without them.
-
-    Args:
-        folder: the run folder.
-        scene: where its scene lies now; None looks where it was, also relative to the run.
+    Photographs are read when they are asked for; all else works without them. `scene` says where
+    the scene lies now; None looks where it was, also relative to the run.
 
     Raises:
         UserError: the folder is not a run, is unfinished or damaged, or was made by a version that

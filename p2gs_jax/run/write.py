@@ -10,7 +10,6 @@ import jax
 import numpy as np
 
 from p2gs_jax.config import FitConfig
-from p2gs_jax.config import to_dict as config_to_dict
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.evaluation.evaluate import ViewResult
@@ -22,6 +21,7 @@ from p2gs_jax.gaussians.posed import posed
 from p2gs_jax.photometry.display import develop, usual_display
 from p2gs_jax.photometry.metering import Metering
 from p2gs_jax.photometry.solution import PhotometricSolution
+from p2gs_jax.presets import to_dict as config_to_dict
 from p2gs_jax.render.harmonics import MAX_DEGREE
 from p2gs_jax.render.project import at_time
 from p2gs_jax.run.decisions import Decisions, write_decisions

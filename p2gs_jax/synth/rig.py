@@ -18,6 +18,8 @@ from jaxtyping import Float
 # Pixels of the paper's images.
 IMAGE_WIDTH, IMAGE_HEIGHT = 1920, 1300
 FOV_DEGREES = 60.0
+# y of the middle of the lane.
+LANE = -1.75
 _FLIP = np.diag([1.0, -1.0, 1.0])  # CARLA's left-handed axes to ours, and back
 
 
@@ -38,9 +40,9 @@ MOUNTS: dict[str, Mount] = {
 
 
 def carla_rotation(roll: float, pitch: float, yaw: float) -> Float[np.ndarray, "3 3"]:
-    """Return Unreal's rotation; its columns are the forward, right and up axes, left-handed.
+    """Return Unreal's rotation from degrees; pitch is positive up, yaw to the right.
 
-    Angles are degrees; pitch is positive up, yaw to the right.
+    Its columns are the forward, right and up axes, left-handed.
     """
     (cr, cp, cy), (sr, sp, sy) = np.cos(a := np.deg2rad([roll, pitch, yaw])), np.sin(a)
     return np.array(
@@ -66,10 +68,7 @@ def camera_viewmat(
 
 
 def image_height(width: int, *, multiple: int = 1) -> int:
-    """Return the height, pixels, that gives images of a width the proportions of the paper's.
-
-    It is rounded to a multiple of a number, and is not 0.
-    """
+    """Return the height, a multiple of a number, with the proportions of the paper's images."""
     return max(round(width * IMAGE_HEIGHT / IMAGE_WIDTH / multiple), 1) * multiple
 
 
@@ -79,12 +78,7 @@ def intrinsics(width: int, height: int) -> Float[np.ndarray, "3 3"]:
     return np.array([[f, 0.0, width / 2.0], [0.0, f, height / 2.0], [0.0, 0.0, 1.0]])
 
 
-def drive(
-    frames: int, *, step: float = 0.9, lane: float = -1.75, start: float = 0.0
-) -> Float[np.ndarray, "frames 3"]:
-    """Return the vehicle's origin at every frame, `step` m apart, from x `start` on.
-
-    `lane` is y of the lane's middle; negative is the right-hand side.
-    """
-    x = start + step * np.arange(frames)
-    return np.stack([x, np.full(frames, lane), np.zeros(frames)], axis=1)
+def drive(frames: int, *, step: float = 0.9) -> Float[np.ndarray, "frames 3"]:
+    """Return the vehicle's origin at every frame, `step` m apart, in the right-hand lane."""
+    x = step * np.arange(frames)
+    return np.stack([x, np.full(frames, LANE), np.zeros(frames)], axis=1)

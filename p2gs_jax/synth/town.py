@@ -177,20 +177,17 @@ def pack(build: Builder, seed: int, light: Light) -> Town:
     solids = sorted(build.solids, key=lambda s: s.kind)
     tapered = [s for s in solids if s.kind == 1]
 
-    def column(name: str) -> np.ndarray:
-        return np.array([getattr(s, name) for s in solids], np.float32)
-
+    columns = {
+        name: np.array([getattr(s, name) for s in solids], np.float32)
+        for name in ("lo", "hi", "color", "accent", "params")
+    }
     return Town(
         n_boxes=sum(s.kind == 0 for s in solids),
         n_tapered=len(tapered),
-        lo=column("lo"),
-        hi=column("hi"),
         planes=np.array([_taper_planes(s) for s in tapered], np.float32),
         material=np.array([s.material for s in solids], np.int32),
-        color=column("color"),
-        accent=column("accent"),
-        params=column("params"),
         light=light,
         underpass=build.clear,
         seed=seed,
+        **columns,
     )

@@ -24,6 +24,7 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core.streams import noise_key
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.mcmc import shaped_noise
+from p2gs_jax.render.capacity import Room
 from p2gs_jax.render.harmonics import coefficient_count
 from p2gs_jax.render.visible import (
     block_size,
@@ -38,8 +39,8 @@ from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.train import image_gradient
 from p2gs_jax.train.image_gradient import ImageGradient, Listed, differentiable
 from p2gs_jax.train.optimizer import learning_rates, means_rate
-from p2gs_jax.train.state import Fault, FitState
-from p2gs_jax.train.step import Step, frusta_of, per_gaussian, static_sizes
+from p2gs_jax.train.state import FitState
+from p2gs_jax.train.step import Step, static_sizes
 from p2gs_jax.train.update import StepReport, is_healthy, settled, update_listed
 from p2gs_jax.types import Gaussians
 
@@ -103,28 +104,14 @@ def mesh_of(cfg: FitConfig, devices: Count = 1) -> Mesh | None:
     return default_mesh(count)
 
 
-@dataclasses.dataclass(frozen=True)
-class Spread:
-    """How a state lies on the devices of a fit: whole on each of `mesh`, or, None, on one."""
+def spread(state: FitState, mesh: Mesh | None) -> FitState:
+    """Return a state as steps take it: whole on each of the devices; None: where it is."""
+    return state if mesh is None else placed(state, mesh, EVERYWHERE)
 
-    mesh: Mesh | None
 
-    def spread(self, state: FitState) -> FitState:
-        """Return a state as steps take it."""
-        return state if self.mesh is None else placed(state, self.mesh, EVERYWHERE)
-
-    def whole(self, state: FitState) -> FitState:
-        """Return a state of steps on the default device, for what looks at all Gaussians."""
-        if self.mesh is None:
-            return state
-        return jax.tree.map(lambda a: jnp.asarray(np.asarray(a)), state)
-
-    def healed(self, state: FitState) -> FitState:
-        """Return a state of steps without its fault."""
-        fault = Fault.none()
-        if self.mesh is not None:
-            fault = placed(fault, self.mesh, EVERYWHERE)
-        return dataclasses.replace(state, fault=fault)
+def whole(state: FitState, mesh: Mesh | None) -> FitState:
+    """Return a state of steps on the default device, for what looks at all Gaussians."""
+    return state if mesh is None else jax.tree.map(lambda a: jnp.asarray(np.asarray(a)), state)
 
 
 def placed(tree: Any, mesh: Mesh, spec: P) -> Any:
@@ -315,6 +302,9 @@ PROGRAMS: dict[str, tuple[Any, Any, Any]] = {
         EVERYWHERE,
     ),
 }
+# Where the shapes lie that `Step.lowered` asks for.
+SPECS = {name: out for name, (_, _, out) in PROGRAMS.items()}
+SPECS["given"] = (EVERYWHERE, OF_VIEWS, OF_VIEWS, OF_VIEWS, EVERYWHERE)
 
 
 @functools.cache
@@ -329,70 +319,47 @@ def _compiled(name: str, *, mesh: Mesh, **static: Any) -> Any:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class ParallelStep:
-    """The step `(state, batch, partner, controls)` of `train/step.py`, of several views.
+class ParallelStep(Step):
+    """The step of several views; `train.batch` is a multiple of the devices.
 
-    Batches and partners come stacked, states spread (`Spread`).
+    Batches and partners come stacked, states by `spread`.
     """
 
-    single: Step  # the step of one view; its `train.batch` is a multiple of the devices
-    mesh: Mesh  # the devices
+    mesh: Mesh = dataclasses.field(default_factory=default_mesh)
 
     def settings(self, name: str) -> dict[str, Any]:
         """Return what one of the three programs takes from the configuration, by argument."""
-        views = {} if name == "show" else {"views": self.single.cfg.train.batch}
-        return self.single.settings(name) | views | {"mesh": self.mesh}
+        views = {} if name == "show" else {"views": self.cfg.train.batch}
+        return super().settings(name) | views | {"mesh": self.mesh}
 
-    def chained(self, show, differentiate, advance):
-        """Return the step made of its three programs, compiled or not."""
+    def program(self, name: str, room: Room, degree: int) -> Any:
+        """Return one of the three programs, divided over the mesh and jitted."""
+        return _compiled(name, **self.settings(name), **static_sizes(name, room, degree))
 
-        def step(state: FitState, batch, partner, controls):
-            views = (batch, partner, self._frusta(batch, partner))
-            batch, partner, frusta = placed(views, self.mesh, OF_VIEWS)
-            controls = placed(controls, self.mesh, EVERYWHERE)
-            params = state.params
-            listed = show(*per_gaussian(state, frusta, controls))
-            gradient = differentiate(
-                listed.shown, params.photometry, params.appearance, batch, partner
-            )
-            return advance(state, listed.ids, listed.visible, gradient, frusta, controls)
-
-        return step
-
-    def lowered(self, name: str, state: FitState, batch, partner, controls, *, room, degree: int):
-        """Return one of the three programs, by its name, traced for arguments of these shapes."""
-
-        def program(part: str):
-            return _compiled(part, **self.settings(part), **static_sizes(part, room, degree))
-
-        frusta = jax.eval_shape(self._frusta, batch, partner)
-        frusta, batch, partner = self._shapes((frusta, batch, partner), OF_VIEWS)
-        state, controls = self._shapes((state, controls), EVERYWHERE)
-        params, arguments = state.params, per_gaussian(state, frusta, controls)
-        if name == "show":
-            return program(name).lower(*arguments)
-        listed = self._shapes(program("show").eval_shape(*arguments), OF_VIEWS)
-        image = (listed.shown, params.photometry, params.appearance, batch, partner)
-        if name == "differentiate":
-            return program(name).lower(*image)
-        found = program("differentiate").eval_shape(*image)
-        gradient = (self._shapes(a, s) for a, s in zip(found, GRADIENT, strict=True))
-        moved = (state, listed.ids, listed.visible, ImageGradient(*gradient), frusta, controls)
-        return program(name).lower(*moved)
-
-    def _frusta(self, batch, partner):
+    def frusta(self, batch, partner):
         """Return the views of a step, stacked."""
-        every = (self.single.cfg.train.batch,)
-
-        def of_all(f):
-            sizes = (np.full(every, size, np.float32) for size in (f.width, f.height))
-            return dataclasses.replace(f, **dict(zip(("width", "height"), sizes, strict=True)))
-
-        return tuple(map(of_all, frusta_of(batch, partner)))
-
-    def _shapes(self, tree, spec: P):
-        """Return shapes with where their arrays lie."""
-        sharding = NamedSharding(self.mesh, spec)
-        return jax.tree.map(
-            lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype, sharding=sharding), tree
+        every = (self.cfg.train.batch,)
+        return tuple(
+            dataclasses.replace(
+                f,
+                width=np.full(every, f.width, np.float32),
+                height=np.full(every, f.height, np.float32),
+            )
+            for f in super().frusta(batch, partner)
         )
+
+    def given(self, batch, partner, controls):
+        """Return the inputs of a step and its views, on the devices."""
+        views = (batch, partner, self.frusta(batch, partner))
+        return *placed(views, self.mesh, OF_VIEWS), placed(controls, self.mesh, EVERYWHERE)
+
+    def shapes(self, name: str, tree: Any) -> Any:
+        """Return shapes with where their arrays lie."""
+
+        def of(spec: P, part: Any) -> Any:
+            sharding = NamedSharding(self.mesh, spec)
+            return jax.tree.map(
+                lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype, sharding=sharding), part
+            )
+
+        return jax.tree.map(of, SPECS[name], tree, is_leaf=lambda spec: isinstance(spec, P))

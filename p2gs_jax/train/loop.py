@@ -14,7 +14,6 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -31,7 +30,7 @@ from p2gs_jax.gaussians.population import STEP_SECONDS_PER_PIXEL, Coverage
 from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.train import room, schedule, strategies
-from p2gs_jax.train.data_parallel import ParallelStep, Spread, default_mesh
+from p2gs_jax.train.data_parallel import ParallelStep, default_mesh, spread, whole
 from p2gs_jax.train.exposure_loss import ColorPairs
 from p2gs_jax.train.inputs import Inputs, TrainingViews, controls_at, inputs_at
 from p2gs_jax.train.optimizer import make_optimizer
@@ -43,6 +42,7 @@ from p2gs_jax.train.state import (
     FitState,
     HostState,
     alive_in,
+    healed,
     initial_state,
 )
 from p2gs_jax.train.step import Key, Step, StepPrograms
@@ -71,71 +71,49 @@ class TrainResult:
     seconds: dict[str, float] = field(default_factory=dict)
 
 
+@dataclass(eq=False)
 class Trainer:
     """Runs one fit from its initial parameters to its final ones.
-
-    Args:
-        cfg: everything.
-        views: the training views.
-        extent: scene extent, scene units.
-        pairs: corresponding observations, where the relative-exposure loss compares photographs.
-        coverage: how much of the scene the views show.
-        run_dir: where `log.jsonl` and `checkpoints/` go.
-        programs: compiled steps, some of them perhaps begun.
-        decided: what the scene settled; a run that is resumed must have settled the same.
-        on_log: called with every log record.
-        on_message: called with everything the user must know.
-        mesh: the devices of a step of several views; None: the default one.
-        terms: loss terms to add to those of `cfg`, or to replace; None takes one away.
-        strategy: decides when and how the population changes; None: as `cfg` says.
-        now: seconds on a clock that never goes back.
-        store: of the checkpoints; None: `checkpoints/`.
 
     A formation of yours is passed as `params.appearance` of `run`.
     """
 
-    def __init__(
-        self,
-        cfg: FitConfig,
-        views: TrainingViews,
-        extent: float,
-        pairs: ColorPairs | None,
-        coverage: Coverage,
-        run_dir: Path,
-        programs: StepPrograms,
-        decided: Decisions,
-        on_log: Callable[[LogRecord], None] = lambda record: None,
-        on_message: Callable[[str], None] = lambda text: None,
-        mesh: Mesh | None = None,
-        terms: Mapping[str, LossTerm | None] | None = None,
-        strategy: Strategy | None = None,
-        now: Callable[[], float] = time.monotonic,
-        store: CheckpointStore | None = None,
-    ):
-        self.cfg, self.views, self.extent, self.pairs = cfg, views, extent, pairs
-        self.coverage, self.programs, self.on_message, self.now = (
-            coverage,
-            programs,
-            on_message,
-            now,
-        )
+    cfg: FitConfig
+    views: TrainingViews
+    extent: float  # scene extent, scene units
+    # corresponding observations, where the relative-exposure loss compares photographs
+    pairs: ColorPairs | None
+    coverage: Coverage  # how much of the scene the views show
+    run_dir: Path  # where `log.jsonl` and `checkpoints/` go
+    programs: StepPrograms  # compiled steps, some of them perhaps begun
+    decided: Decisions  # what the scene settled; a resumed run must have settled the same
+    on_log: Callable[[LogRecord], None] = lambda record: None
+    on_message: Callable[[str], None] = lambda text: None  # told what the user must know
+    mesh: Mesh | None = None  # the devices of a step of several views; None: the default one
+    # loss terms to add to those of `cfg`, or to replace; None takes one away
+    terms: Mapping[str, LossTerm | None] | None = None
+    strategy: Strategy | None = None  # how the population changes; None: as `cfg` says
+    now: Callable[[], float] = time.monotonic  # seconds on a clock that never goes back
+    store: CheckpointStore | None = None  # of checkpoints; None: `checkpoints/`
+
+    def __post_init__(self):
+        cfg, views = self.cfg, self.views
         sizes = [views.camera(i, 1) for i in range(len(views))]
         width, height = min(c.width for c in sizes), min(c.height for c in sizes)
         self.levels = schedule.levels(cfg.train, width, height)
         self.stopwatch = Stopwatch()
-        self.log = RunLog(run_dir, on_log)
-        store = store or CheckpointStore(run_dir / "checkpoints")
-        self.checkpoints = RunCheckpoints(store, cfg, decided, on_message)
+        self.log = RunLog(self.run_dir, self.on_log)
+        store = self.store or CheckpointStore(self.run_dir / "checkpoints")
+        self.checkpoints = RunCheckpoints(store, cfg, self.decided, self.on_message)
         self.asked = interrupts.Held()
         self.optimizer = make_optimizer(cfg)
-        self.strategy = strategy or strategies.make_strategy(cfg, coverage, self.levels)
-        if cfg.train.batch > 1:
-            mesh = mesh or default_mesh()
-        noise = getattr(self.strategy, "noise", None)
-        self.step: Any = Step(cfg, self.optimizer, extent, noise, terms or {})
-        if mesh is not None:
-            self.step = ParallelStep(self.step, mesh)
-        self.spread = Spread(mesh)
+        chosen = strategies.make_strategy(cfg, self.coverage, self.levels)
+        self.densification = self.strategy or chosen
+        mesh = self.mesh or (default_mesh() if cfg.train.batch > 1 else None)
+        noise = getattr(self.densification, "noise", None)
+        given = (cfg, self.optimizer, self.extent, noise, self.terms or {})
+        self.step = Step(*given) if mesh is None else ParallelStep(*given, mesh)
+        self.devices = mesh
 
     def run(
         self,
@@ -147,22 +125,18 @@ class Trainer:
         spent_s: float = 0.0,
         finish_s: float = 0.0,
     ) -> TrainResult:
-        """Optimise until the run is complete.
+        """Optimise until the run is complete, from initial parameters or the newest checkpoint.
 
-        Args:
-            params: initial parameters.
-            alive: which Gaussians exist.
-            owner: the moving object that each belongs to, or None.
-            resume: continue from the newest checkpoint, if there is one.
-            spent_s: seconds of a time budget that are gone.
-            finish_s: seconds of it to leave for what follows, on an unloaded machine.
+        `alive` says which Gaussians exist, `owner` which moving object each belongs to. `spent_s`
+        are the seconds of a time budget that are gone, `finish_s` those to leave for what follows,
+        on an unloaded machine.
 
         Raises:
             DivergenceError: a loss term or gradient is not finite.
             UserError: no Gaussian is left, or checkpoints cannot be continued from.
             Interrupted: a signal asked for the end; a checkpoint is written first.
         """
-        self.slots = strategies.started(self.strategy, int(np.sum(np.asarray(alive))))
+        self.slots = strategies.started(self.densification, int(np.sum(np.asarray(alive))))
         state = initial_state(params, alive, self.optimizer, self.slots.slots, owner)
         host = HostState(pace=1.0 / max(self.cfg.train.steps, 1))
         restored = self.checkpoints.restore(state) if resume else None
@@ -181,11 +155,11 @@ class Trainer:
         )
         population = state.population
         self._allocate(state.params.gaussians, population.alive, population.owner, host)
-        state = self.spread.spread(state)
+        state = spread(state, self.devices)
         self._expect(state, host)
         with interrupts.held() as self.asked:
             state = self._loop(state, host, clock)
-            state = self.spread.whole(state)
+            state = whole(state, self.devices)
             self._save(state, host)
         return TrainResult(
             state,
@@ -201,7 +175,7 @@ class Trainer:
         curve.
         """
         seeds = params.gaussians.capacity
-        self.slots = strategies.started(self.strategy, seeds)
+        self.slots = strategies.started(self.densification, seeds)
         alive, host = np.ones(seeds, bool), HostState(rooms=dict(self.programs.rooms))
         self._allocate(params.gaussians, alive, owner, host)
         self.programs.rooms = dict(host.rooms)
@@ -234,7 +208,7 @@ class Trainer:
             asked = self.asked.arrived
             if asked is not None or host.elapsed_s - saved > pause:
                 begun = host.elapsed_s
-                self._save(self.spread.whole(state), host)
+                self._save(whole(state, self.devices), host)
                 clock.tick(host)
                 saved = host.elapsed_s
                 pause = pause_between(every_s, saved - begun)
@@ -279,7 +253,7 @@ class Trainer:
             needed, visible = int(state.fault.needed), int(state.fault.visible)
             host.rooms = room.grown(host.rooms, sizes[taken], needed, visible)
             host.overflows += 1
-            state = self.spread.healed(state)
+            state = healed(state)
         elif done:
             pace, known = seconds / done, host.step_s > 0
             host.step_s = (1 - PACE_SHARE) * host.step_s + PACE_SHARE * pace if known else pace
@@ -320,19 +294,19 @@ class Trainer:
     def _densified(self, state: FitState, host: HostState) -> FitState:
         """Return the state with another population, where it is time to change it."""
         with self.stopwatch("densification"):
-            if not strategies.is_due(self.strategy, self.cfg.densify, host):
+            if not strategies.is_due(self.densification, self.cfg.densify, host):
                 return state
             host.densified_at = host.progress
             state = strategies.densified(
-                self.strategy,
-                self.spread.whole(state),
+                self.densification,
+                whole(state, self.devices),
                 host,
                 self.cfg,
                 self.extent,
                 self.slots.limit,
                 self.on_message,
             )
-            return self.spread.spread(state)
+            return spread(state, self.devices)
 
     def _save(self, state: FitState, host: HostState) -> None:
         with self.stopwatch("checkpoints"):
@@ -357,7 +331,7 @@ class Trainer:
 
         Levels with images of several sizes are left out: it is not known which comes first.
         """
-        if not getattr(self.strategy, "slots_stay", True):
+        if not getattr(self.densification, "slots_stay", True):
             return
         left = schedule.shrinks_left(host.progress, self.levels)
         ahead = [shrink for shrink in left if len(room.cameras_by_size(self.views, shrink)) == 1]
@@ -365,7 +339,7 @@ class Trainer:
             inputs = self._inputs(host.step, 0.0, host.pace, shrink)
             key = self._key(state, inputs, host, shrink)
             self.programs.expect(self.step, key, state, *inputs, images=images)
-            expect = getattr(self.strategy, "expect", None)
+            expect = getattr(self.densification, "expect", None)
             if number == 0 and expect is not None:
                 expect(self.programs, state)  # wanted soon after the first step
 

@@ -17,8 +17,9 @@ from typing import Any, NamedTuple
 
 import jax
 
-from p2gs_jax.config import FitConfig, narrowed
+from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import on_host
+from p2gs_jax.presets import narrowed
 from p2gs_jax.render.capacity import Room
 from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.train.exposure_loss import Partner
@@ -28,8 +29,6 @@ from p2gs_jax.train.state import FitState
 from p2gs_jax.train.terms import LossTerm, loss_terms
 from p2gs_jax.train.update import Controls, StepReport, advance
 from p2gs_jax.types import Batch, Frustum
-
-PARTS = ("show", "differentiate", "advance")
 
 # What each program takes of the configuration; None: all of it. Fits that differ elsewhere share
 # the program, and a program that reads anything else raises AttributeError.
@@ -54,16 +53,20 @@ TAKEN: dict[str, dict[str, Any]] = {
 WORKERS = 1 if (os.cpu_count() or 1) <= 2 else 2
 
 
+PROGRAMS: dict[str, Callable[..., Any]] = {
+    "show": show,
+    "differentiate": differentiate,
+    "advance": advance,
+}
+
+
 @functools.cache
-def _compiled(name: str) -> Any:
-    """Return a part of a step, jitted; on first use, since its options depend on the backend."""
-    options: dict[str, Any] = {"compiler_options": compiler_options()}
-    if name == "show":
-        return jax.jit(show, static_argnames=("cfg", "room", "degree"), **options)
-    if name == "differentiate":
-        return jax.jit(differentiate, static_argnames=("cfg", "terms", "room"), **options)
-    static = ("cfg", "optimizer", "extent", "noise", "degree")
-    return jax.jit(advance, static_argnames=static, donate_argnames="state", **options)
+def compiled(name: str, **static: Any) -> Any:
+    """Return a part of a step, jitted; the same where what is static is."""
+    # On first use: the options depend on the backend.
+    body = functools.partial(PROGRAMS[name], **static)
+    donated = (0,) if name == "advance" else ()
+    return jax.jit(body, compiler_options=compiler_options(), donate_argnums=donated)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -95,17 +98,15 @@ class Step:
         degree: int,
     ) -> tuple[FitState, StepReport]:
         """Take a step, compiling it on first use."""
-        parts = (
-            functools.partial(_compiled(n), **self.settings(n), **static_sizes(n, room, degree))
-            for n in PARTS
-        )
+        parts = (self.program(name, room, degree) for name in PROGRAMS)
         return self.chained(*parts)(state, batch, partner, controls)
 
     def chained(self, show, differentiate, advance):
         """Return the step made of its three programs, compiled or not."""
 
         def step(state: FitState, batch: Batch, partner: Partner, controls: Controls):
-            params, frusta = state.params, frusta_of(batch, partner)
+            params = state.params
+            batch, partner, frusta, controls = self.given(batch, partner, controls)
             listed = show(*per_gaussian(state, frusta, controls))
             gradient = differentiate(
                 listed.shown, params.photometry, params.appearance, batch, partner
@@ -133,29 +134,44 @@ class Step:
         self, name: str, state: FitState, batch, partner, controls, *, room: Room, degree: int
     ):
         """Return one of the three programs, by its name, traced for arguments of these shapes."""
-        program = {n: _compiled(n) for n in PARTS}
-        static = {n: self.settings(n) | static_sizes(n, room, degree) for n in PARTS}
-        params, frusta = state.params, frusta_of(batch, partner)
-        arguments = per_gaussian(state, frusta, controls)
+        program = functools.partial(self.program, room=room, degree=degree)
+        given = jax.eval_shape(self.frusta, batch, partner)
+        state, batch, partner, frusta, controls = self.shapes(
+            "given", (state, batch, partner, given, controls)
+        )
+        params, arguments = state.params, per_gaussian(state, frusta, controls)
         if name == "show":
-            return program[name].lower(*arguments, **static[name])
-        listed = program["show"].eval_shape(*arguments, **static["show"])
+            return program(name).lower(*arguments)
+        listed = self.shapes("show", program("show").eval_shape(*arguments))
         image = (listed.shown, params.photometry, params.appearance, batch, partner)
         if name == "differentiate":
-            return program[name].lower(*image, **static[name])
-        gradient = program["differentiate"].eval_shape(*image, **static["differentiate"])
+            return program(name).lower(*image)
+        gradient = self.shapes("differentiate", program("differentiate").eval_shape(*image))
         moved = (state, listed.ids, listed.visible, gradient, frusta, controls)
-        return program[name].lower(*moved, **static[name])
+        return program(name).lower(*moved)
 
+    # What a step of several views on several devices does otherwise (`data_parallel.py`).
 
-def frusta_of(batch: Batch, partner: Partner) -> tuple[Frustum, ...]:
-    """Return the views of a step, for the programs that know no image size."""
-    cameras = (batch.camera, *partner.cameras)
-    sizes = (map(c.K.dtype.type, (c.width, c.height)) for c in cameras)
-    return tuple(
-        on_host(Frustum, c.viewmat, c.K, width, height, c.objects)
-        for c, (width, height) in zip(cameras, sizes, strict=True)
-    )
+    def program(self, name: str, room: Room, degree: int) -> Any:
+        """Return one of the three programs, jitted."""
+        return compiled(name, **self.settings(name), **static_sizes(name, room, degree))
+
+    def frusta(self, batch: Batch, partner: Partner) -> tuple[Frustum, ...]:
+        """Return the views of a step, for the programs that know no image size."""
+        cameras = (batch.camera, *partner.cameras)
+        sizes = (map(c.K.dtype.type, (c.width, c.height)) for c in cameras)
+        return tuple(
+            on_host(Frustum, c.viewmat, c.K, width, height, c.objects)
+            for c, (width, height) in zip(cameras, sizes, strict=True)
+        )
+
+    def given(self, batch: Batch, partner: Partner, controls: Controls):
+        """Return the inputs of a step and its views, where its programs take them."""
+        return batch, partner, self.frusta(batch, partner), controls
+
+    def shapes(self, name: str, tree: Any) -> Any:
+        """Return shapes of inputs (`given`) or of a program's results with where they lie."""
+        return tree
 
 
 def static_sizes(name: str, room: Room, degree: int) -> dict[str, int]:
@@ -169,14 +185,6 @@ def per_gaussian(state: FitState, frusta: tuple[Frustum, ...], controls: Control
     """Return the arguments of `show`."""
     params, population = state.params, state.population
     return params.gaussians, population.alive, frusta, controls.active_degree, population.owner
-
-
-def compilations() -> int:
-    """Return the largest number of times that this process compiled one of the three programs.
-
-    Programs that `StepPrograms` compiled are not counted.
-    """
-    return max(_compiled(name)._cache_size() for name in PARTS)
 
 
 # ----------------------------------------------------------------------- compiled ahead

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from p2gs_jax.cli.shared import parse_duration
-from p2gs_jax.config import to_dict
 from p2gs_jax.core.atomic import no_empty_folders
 from p2gs_jax.errors import UserError
 from p2gs_jax.pipeline.preflight import check_run_dir
-from p2gs_jax.presets import preset
+from p2gs_jax.presets import preset, to_dict
 
 # What was written, and a word of the way on.
 WRONG = [

@@ -8,12 +8,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from p2gs_jax.config import FitConfig, narrowed
+from p2gs_jax.config import FitConfig
 from p2gs_jax.jobs.configs import with_fields
-from p2gs_jax.presets import preset
+from p2gs_jax.presets import narrowed, preset
 from p2gs_jax.render.capacity import Room
 from p2gs_jax.train.optimizer import make_optimizer
-from p2gs_jax.train.step import PARTS, Key, Step, StepPrograms
+from p2gs_jax.train.step import PROGRAMS, Key, Step, StepPrograms
 
 COARSE = Key((120, 80), 500, Room(4096, 4096), 3, "uint16")
 FULL = COARSE._replace(size=(240, 160), room=Room(8192, 4096), pixels="uint8")
@@ -23,7 +23,7 @@ SHAPES = tuple(np.zeros(k) for k in range(1, 5))
 def test_a_program_that_reads_what_it_was_not_given_raises():
     """Fits share programs: a default must never stand in for the value of a fit."""
     step = Step(preset("robust"), make_optimizer(FitConfig()), 1.0)
-    for name in PARTS:
+    for name in PROGRAMS:
         cfg = step.settings(name)["cfg"]
         assert cfg.render == FitConfig().render
         for missing in ("train", "densify", "data"):

@@ -1,27 +1,44 @@
-"""The thread behind one browser's picture, against a browser that only records."""
+"""The thread behind one browser's picture and what its controls do, without a browser."""
 
 import time
+from dataclasses import replace
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
+import cv2
 import numpy as np
 import pytest
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 
+import viser
 from viewer_stubs import CANVAS, SIZES, Client, FakeRenderer, Panel
 
 from p2gs_jax.errors import UserError
+from p2gs_jax.photometry.display import develop
 from p2gs_jax.run.read import load_run
+from p2gs_jax.scene.pixels.store import camera_of
 from p2gs_jax.viewer import live as live_module
-from p2gs_jax.viewer.live import LivePicture
-from p2gs_jax.viewer.settings import Settings
+from p2gs_jax.viewer import panel as panels
+from p2gs_jax.viewer import session as sessions
+from p2gs_jax.viewer.live import Darkroom, LivePicture
+from p2gs_jax.viewer.pictures import limits_of_depth
+from p2gs_jax.viewer.session import BrowserSession
+from p2gs_jax.viewer.settings import (
+    Settings,
+    common_settings,
+    display_of,
+    exposures_ev,
+    same_display,
+    settings_of_view,
+)
 from p2gs_jax.viewer.viewed_run import ViewedRun
 
 REST_S = 0.1
 
 
 @pytest.fixture(scope="module")
-def viewed(finished_run):
+def kept(finished_run):
     out = ViewedRun(load_run(finished_run), 1920)
     out.renderer.stop()
     yield out
@@ -29,35 +46,37 @@ def viewed(finished_run):
 
 
 @pytest.fixture
-def setup(viewed, monkeypatch):
+def viewed(kept, monkeypatch):
     monkeypatch.setattr(live_module, "REST_S", REST_S)
-    viewed.renderer = FakeRenderer(viewed.run)
-    client, panel = Client(), Panel()
+    kept.renderer = FakeRenderer(kept.run)
+    return kept
+
+
+@pytest.fixture(scope="module")
+def run(kept):
+    return kept.run
+
+
+@pytest.fixture
+def client():
+    return Client()
+
+
+# ------------------------------------------------------------------ the live picture
+
+
+@pytest.fixture
+def setup(viewed, client):
+    panel = Panel()
     live = LivePicture(client, viewed, panel)
-    yield SimpleNamespace(
-        live=live,
-        client=client,
-        panel=panel,
-        renderer=viewed.renderer,
-        viewed=viewed,
-        pictures=client.pictures,
-    )
+    renderer, pictures = viewed.renderer, client.pictures
+    yield SimpleNamespace(live=live, panel=panel, renderer=renderer, pictures=pictures)
     live.stop()
     assert viewed.listeners == []
 
 
-def started(setup):
-    setup.live.start()
-    setup.client.wait(lambda: sharp(setup))
-    return len(setup.pictures)
-
-
-def sharp(setup, after=0):
-    return len(setup.pictures) > after and setup.pictures[-1][0] == "png"
-
-
-def compiled(setup):
-    for listener in tuple(setup.viewed.listeners):
+def compiled(viewed):
+    for listener in tuple(viewed.listeners):
         listener()
 
 
@@ -65,83 +84,88 @@ def shape(picture):
     return picture[1].shape[1::-1]
 
 
-def test_it_sharpens_at_rest(setup):
-    started(setup)
+def move(setup, client, x):
+    client.camera.position = np.array([x, 0, 0])
+    setup.live.camera_moved()
+
+
+def shown_at(setup, viewed):
+    return -float(setup.live._frame.camera.viewmat[0, 3]) * viewed.space.unit
+
+
+def test_it_sharpens_at_rest(setup, client, viewed):
+    setup.live.start()
+    client.wait_sharp()
     assert [kind for kind, *_ in setup.pictures] == ["jpeg", "png"]
     assert shape(setup.pictures[-1]) == CANVAS
     assert set(setup.renderer.wanted[0]) == set(SIZES)
-    compiled(setup)  # another size is ready, and none is better
+    compiled(viewed)  # another size is ready, and none is better
     time.sleep(2 * REST_S)
     assert len(setup.pictures) == 2  # nothing changes, nothing is sent
 
 
-def test_a_new_look_renders_nothing(setup):
-    seen, before = started(setup), len(setup.renderer.rendered)
+def test_a_new_look_renders_nothing(setup, client):
+    setup.live.start()
+    seen, before = client.wait_sharp(), len(setup.renderer.rendered)
     for ev in (0.5, 1.0, 2.0):
         setup.panel.now = Settings(gamma=2.2, exposure_ev=ev)
         setup.live.display_changed()
-    setup.client.wait(lambda: sharp(setup, seen))
+    client.wait_sharp(seen)
     assert len(setup.renderer.rendered) == before
     assert setup.pictures[-1][1].mean() > setup.pictures[seen - 1][1].mean()
 
 
-def test_slow_frames_make_small_pictures_while_moving(setup, monkeypatch):
+def test_slow_frames_make_small_pictures_while_moving(setup, client, monkeypatch):
     monkeypatch.setattr("p2gs_jax.viewer.renderer.TARGET_MS", 1e-3)
-    seen = started(setup)
-    for step in range(2):
-        setup.client.camera.position = np.array([0.1 * step, 0, 0])
-        setup.live.camera_moved()
-        setup.client.wait(lambda: sharp(setup, seen))
+    setup.live.start()
+    seen = client.wait_sharp()
+    for x in (0.1, 0.2):
+        move(setup, client, x)
+        seen = client.wait_sharp(seen)
     assert {shape(p) for p in setup.pictures if p[0] == "jpeg"} == {SIZES[0]}
     assert shape(setup.pictures[-1]) == CANVAS
 
 
-def test_the_newest_camera_wins(setup):
-    seen = started(setup)
+def test_the_newest_camera_wins(setup, client, viewed):
+    setup.live.start()
+    seen = client.wait_sharp()
     for step in range(30):
-        setup.client.camera.position = np.array([0.02 * step, 0, 0])
-        setup.live.camera_moved()
-    setup.client.wait(lambda: sharp(setup, seen))
-    shown = -setup.live._frame.camera.viewmat[0, 3]
-    np.testing.assert_allclose(shown, 0.58 / setup.viewed.space.unit, rtol=1e-5)
+        move(setup, client, 0.02 * step)
+    client.wait_sharp(seen)
+    assert shown_at(setup, viewed) == pytest.approx(0.58)
     assert len(setup.renderer.rendered) < 32
 
 
-def test_the_best_there_is_until_more_is_compiled(setup):
+def test_the_best_there_is_until_more_is_compiled(setup, client, viewed):
     setup.renderer.ready = frozenset(SIZES[:1])
-    seen = started(setup)
+    setup.live.start()
+    seen = client.wait_sharp()
     assert shape(setup.pictures[-1]) == SIZES[0]
     setup.renderer.ready = frozenset(SIZES)
-    compiled(setup)
-    setup.client.wait(lambda: len(setup.pictures) > seen)
+    compiled(viewed)
+    client.wait_sharp(seen)
     assert shape(setup.pictures[-1]) == CANVAS
 
 
-def test_what_overflows_is_shown_smaller_and_not_tried_again_and_again(setup):
+def test_what_overflows_is_shown_smaller_and_later_when_there_is_room(setup, client, viewed):
     setup.renderer.refused = {SIZES[-1]}
-    seen = started(setup)
+    setup.live.start()
+    seen = client.wait_sharp()
     assert shape(setup.pictures[-1]) == SIZES[-2]
     time.sleep(2 * REST_S)
-    assert len(setup.pictures) == seen
-
-
-def test_what_no_size_holds_comes_once_there_is_room(setup):
-    started(setup)
+    assert len(setup.pictures) == seen  # it is not tried again and again
     setup.renderer.refused = set(SIZES)
-    setup.client.camera.position = np.array([0.4, 0, 0])
-    seen = len(setup.pictures)
-    setup.live.camera_moved()
-    setup.client.wait(lambda: sharp(setup, seen))
-    assert setup.live._frame.camera.viewmat[0, 3] == 0
-    setup.renderer.refused, seen = set(), len(setup.pictures)
-    compiled(setup)
-    setup.client.wait(lambda: sharp(setup, seen))
-    shown = -setup.live._frame.camera.viewmat[0, 3]
-    np.testing.assert_allclose(shown, 0.4 / setup.viewed.space.unit, rtol=1e-5)
+    move(setup, client, 0.4)
+    seen = client.wait_sharp(seen)
+    assert shown_at(setup, viewed) == 0
+    setup.renderer.refused = set()
+    compiled(viewed)
+    client.wait_sharp(seen)
+    assert shown_at(setup, viewed) == pytest.approx(0.4)
 
 
 @pytest.mark.parametrize("state", ["compiling", "overflowing"])
-def test_a_first_view_that_cannot_be_rendered_waits(setup, state):
+def test_a_first_view_that_cannot_be_rendered_waits(setup, client, viewed, state):
     if state == "compiling":
         setup.renderer.ready, setup.renderer.compiling = frozenset(), SIZES[1]
     else:
@@ -152,68 +176,272 @@ def test_a_first_view_that_cannot_be_rendered_waits(setup, state):
     assert len(setup.renderer.wanted) == 1  # at rest once, and no busy loop
     assert ("compiling" in setup.panel.status) == (state == "compiling")
     setup.renderer.ready, setup.renderer.refused = frozenset(SIZES), set()
-    compiled(setup)
-    setup.client.wait(lambda: sharp(setup))
+    compiled(viewed)
+    client.wait_sharp()
 
 
-def test_depth_travels_only_where_cameras_are_shown(setup):
-    seen = started(setup)
+@pytest.mark.parametrize("error", [UserError("no photo"), RuntimeError("no photo")])
+@pytest.mark.parametrize("part", ["render", "develop"])
+def test_what_fails_is_said_once_and_the_next_request_is_served(
+    setup, client, monkeypatch, error, part
+):
+    with monkeypatch.context() as patch:
+        if part == "render":
+            patch.setattr(setup.renderer, "broken", error)
+        else:
+            patch.setattr(setup.live.darkroom, "develop", MagicMock(side_effect=error))
+        setup.live.start()
+        time.sleep(4 * REST_S)
+        said = len(client.said)
+        assert 1 <= said <= 2  # for the request, and at rest
+        assert all("no photo" in text for text in client.said)
+    setup.live.camera_moved()
+    client.wait_sharp()
+    assert len(client.said) == said
+
+
+def test_depth_travels_only_where_cameras_are_shown(setup, client, viewed):
+    setup.live.start()
+    seen = client.wait_sharp()
     assert setup.pictures[-1][2]["depth"] is None
     setup.live.with_depth = True
     setup.live.display_changed()
-    setup.client.wait(lambda: sharp(setup, seen))
+    client.wait_sharp(seen)
     depth, frame = setup.pictures[-1][2]["depth"], setup.live._frame
-    step, opaque = frame.size[0] // depth.shape[1], frame.alpha > 0.9
-    assert step == 1
-    expected = setup.viewed.space.unit * frame.depth / np.maximum(frame.alpha, 1e-6)
+    opaque = frame.alpha > 0.9
+    expected = viewed.space.unit * frame.depth / np.maximum(frame.alpha, 1e-6)
     np.testing.assert_allclose(depth[opaque], np.minimum(expected[opaque], 167), atol=2e-3)
     assert np.all(depth[frame.alpha < 0.4] > 160)
 
 
-@pytest.mark.parametrize("error", [UserError("no photo"), RuntimeError("no photo")])
-def test_a_failing_render_is_said_once_and_the_next_request_is_served(setup, error):
-    setup.renderer.broken = error
+def test_the_browser_draws_splats_itself(setup, client):
     setup.live.start()
-    time.sleep(4 * REST_S)
-    tries = len(setup.renderer.rendered)
-    assert tries <= 2  # for the request, and at rest
-    assert len(setup.client.said) == tries
-    assert all("no photo" in text for text in setup.client.said)
-    setup.renderer.broken = None
-    setup.live.camera_moved()
-    setup.client.wait(lambda: sharp(setup))
-    assert len(setup.client.said) == tries
-
-
-def test_a_failing_development_is_said_and_the_next_picture_comes(setup, monkeypatch):
-    seen = started(setup)
-
-    def fail(*_, **__):
-        raise UserError("no photo")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(setup.live.darkroom, "develop", fail)
-        setup.live.display_changed()
-        setup.client.wait(lambda: setup.client.said)
-        time.sleep(2 * REST_S)
-    assert len(setup.client.said) <= 2
-    setup.live.display_changed()
-    setup.client.wait(lambda: sharp(setup, seen))
-
-
-def test_the_browser_draws_splats_itself(setup):
-    seen = started(setup)
-    before = len(setup.renderer.rendered)
+    seen, before = client.wait_sharp(), len(setup.renderer.rendered)
     for ev in (0.0, 1.0):
         setup.panel.now = Settings(gamma=2.2, exposure_ev=ev, splats=True)
         setup.live.display_changed()
-        setup.client.wait(lambda: "drawn by the browser" in setup.panel.status)
-        setup.client.wait(lambda seen=seen: len(setup.pictures) > seen)
-        seen = len(setup.pictures)
-    (handle,) = setup.client.splats
+        seen = client.wait_sharp(seen)
+    (handle,) = client.splats
     assert handle.visible
     assert len(setup.renderer.rendered) == before
     setup.panel.now = Settings(gamma=2.2)
     setup.live.camera_moved()
-    setup.client.wait(lambda: sharp(setup, seen) and shape(setup.pictures[-1]) == CANVAS)
+    client.wait(lambda: shape(setup.pictures[-1]) == CANVAS)
     assert not handle.visible
+
+
+# ------------------------------------------------------------------ the darkroom
+
+
+@pytest.fixture
+def darkroom(viewed):
+    return Darkroom(viewed)
+
+
+@pytest.fixture
+def frame(viewed):
+    return viewed.renderer.render_now(camera_of(viewed.store, 1))
+
+
+def moved(frame, axis, by):
+    viewmat = frame.camera.viewmat.at[axis, 3].add(by)
+    return replace(frame, camera=replace(frame.camera, viewmat=viewmat))
+
+
+def test_a_view_looks_as_the_run_says(darkroom, frame, run):
+    for index in (run.scene.train_indices[0], run.scene.test_indices[0]):
+        settings = settings_of_view(run, index, common_settings(run))
+        expected = develop(frame.linear, run.own_display(index))
+        np.testing.assert_allclose(darkroom.develop(frame, settings), expected, atol=1e-5)
+
+
+def test_exposures_count_from_the_mean_whatever_the_gauge(run):
+    old = run.params.photometry
+    shifted = replace(old, raw_exposures=old.raw_exposures + 1.3)
+    other = replace(run, params=replace(run.params, photometry=shifted))
+    index = run.scene.train_indices[1]
+    settings = settings_of_view(other, index, common_settings(other))
+    own = other.own_display(index).exposure
+    assert display_of(other, settings).exposure == pytest.approx(own, rel=1e-5)
+    assert settings.exposure_ev == pytest.approx(exposures_ev(run)[index], abs=1e-5)
+
+
+def test_looks_keep_what_does_not_belong_to_them(run):
+    before = Settings(gamma=3.0, exposure_ev=2.0, curve="linear", mode="stops", split=0.2)
+    common = common_settings(run, before)
+    assert (common.mode, common.split, common.curve, common.exposure_ev) == ("stops", 0.2, "run", 0)
+    view = settings_of_view(run, 1, before)
+    assert (view.mode, view.split, view.taken_as) == ("stops", 0.2, 1)
+    a = Settings(gamma=2.2, exposure_ev=0.5)
+    assert same_display(a, replace(a, mode="split", split=0.1, splats=True))
+    assert not same_display(a, replace(a, exposure_ev=0.6))
+
+
+def test_corrections_hold_under_the_curve_they_were_learned_with(run):
+    shape = (len(run.scene.train_indices), 3, 4)
+    corrections = np.random.default_rng(0).normal(size=shape).astype(np.float32)
+    photometry = replace(run.cfg.photometry, appearance="affine")
+    params = replace(run.params, appearance=corrections)
+    corrected = replace(run, params=params, cfg=replace(run.cfg, photometry=photometry))
+    own = settings_of_view(corrected, run.scene.train_indices[2], Settings(gamma=2.2))
+    np.testing.assert_array_equal(display_of(corrected, own).correction, corrections[2])
+    mean = display_of(corrected, replace(own, taken_as=None))
+    np.testing.assert_allclose(mean.correction, corrections.mean(0), atol=1e-6)
+    assert display_of(corrected, replace(own, curve="linear")).correction is None
+
+
+def test_the_split_shows_the_photograph_in_its_place(darkroom, viewed, frame, run):
+    settings = settings_of_view(run, 1, Settings(gamma=2.2, mode="split", split=0.5))
+    shown, photo = darkroom.develop(frame, settings), viewed.store.get(1)[0]
+    width = photo.shape[1]
+    left, right = np.s_[2:-2, 2 : width // 2 - 3], np.s_[:, width // 2 + 3 :]
+    np.testing.assert_allclose(shown[left], photo[left], atol=2e-3)
+    rendered = darkroom.develop(frame, replace(settings, mode="display"))
+    np.testing.assert_array_equal(shown[right], rendered[right])
+    # ... and it is about the same thing, so the halves belong together.
+    assert np.mean(np.abs(rendered[left] - photo[left])) < 0.15
+
+
+def test_where_no_photograph_can_be_shown_the_split_is_the_picture(
+    darkroom, viewed, frame, run, monkeypatch
+):
+    assert viewed.view_at(frame.camera) == 1
+    split = replace(common_settings(run), mode="split")
+    plain = darkroom.develop(frame, replace(split, mode="display"))
+    with monkeypatch.context() as patch:
+        patch.setattr(viewed.store, "get", MagicMock(side_effect=UserError("0.png is torn.")))
+        np.testing.assert_array_equal(darkroom.develop(frame, split), plain)
+        assert "0.png is torn." in darkroom.legend(frame, split)
+    assert np.any(darkroom.develop(frame, split) != plain)
+    assert darkroom.legend(frame, split) is None
+    away = moved(frame, 2, 0.4)
+    assert viewed.view_at(away.camera) is None
+    assert viewed.nearest_view(moved(frame, 0, 0.05).camera) == 1
+    np.testing.assert_array_equal(darkroom.develop(away, split), plain)
+    assert "No photograph" in darkroom.legend(away, split)
+
+
+def test_depth_colours_stay_until_they_are_set_anew(darkroom, frame):
+    settings = Settings(gamma=2.2, mode="depth")
+    darkroom.develop(frame, settings)
+    limits = limits_of_depth(frame)
+    darkroom.develop(replace(frame, depth=2 * frame.depth), settings)
+    assert darkroom.depth_limits == limits
+    assert "depth, scene units" in darkroom.legend(frame, settings)
+
+
+def test_a_metered_exposure_follows_the_picture(darkroom, viewed, frame, run):
+    settings = replace(common_settings(run), metered=True)
+    here = darkroom.transform(frame, settings).exposure
+    assert here == pytest.approx(run.metered_display(run.render(frame.camera)).exposure, rel=1e-4)
+    more = darkroom.transform(frame, replace(settings, exposure_ev=1.0)).exposure
+    assert more == pytest.approx(2 * here)
+    plain = darkroom.transform(frame, replace(settings, metered=False)).exposure
+    assert plain == pytest.approx(run.mean.exposure_geometric, rel=1e-5)
+    other = viewed.renderer.render_now(camera_of(viewed.store, 2))
+    there = run.metered_display(run.render(other.camera)).exposure
+    adapting = darkroom.transform(other, settings, settled=False).exposure
+    assert min(here, there) <= adapting <= max(here, there)
+    assert darkroom.transform(other, settings).exposure == pytest.approx(there, rel=1e-4)
+    assert darkroom.metered_exposure == pytest.approx(there, rel=1e-4)
+
+
+# ------------------------------------------------------------------ the session
+
+
+@pytest.fixture
+def session(viewed, client, monkeypatch):
+    """Return a session at the photograph in row 1, with +1 EV of the person's own."""
+    panel = Panel(replace(common_settings(viewed.run), exposure_ev=1.0))
+    monkeypatch.setattr(sessions, "Panel", lambda gui, viewed, actions: panel)
+    out = BrowserSession(client, viewed)
+    out._move(viewed.pose(1, CANVAS[0] / CANVAS[1]))
+    yield out
+    out.stop()
+
+
+def show(session, mode):
+    session._panel.now = replace(session._panel.now, mode=mode)
+    session.mode_changed()
+
+
+def test_a_split_gives_the_look_back(session, run):
+    before = session._panel.now
+    show(session, "split")
+    own = settings_of_view(run, 1, before)
+    assert session._panel.now.exposure_ev == pytest.approx(own.exposure_ev)
+    assert session._panel.now.exposure_ev != 1.0
+    session.go_to(2)
+    show(session, "display")
+    assert session._panel.now == before
+    show(session, "split")  # a look chosen meanwhile stays
+    session._panel.now = replace(session._panel.now, exposure_ev=2.5)
+    for mode in ("display", "depth"):
+        show(session, mode)
+        assert session._panel.now.exposure_ev == 2.5
+
+
+def test_the_exposure_can_be_locked(session):
+    session._panel.locked = True
+    before = session._panel.now
+    session.go_to(2)
+    assert (session._panel.at, session._panel.now) == (2, before)
+    show(session, "split")
+    show(session, "display")
+    assert session._panel.now == before
+    session._panel.locked = False
+    session.go_to(2)
+    assert session._panel.now.taken_as == 2
+
+
+def test_a_metered_exposure_stays_where_it_was_when_switched_off(session, run, client, monkeypatch):
+    session.set_metered(True)
+    assert session._panel.now.metered
+    assert session._panel.now.exposure_ev == 0
+    session._live.darkroom.metered_exposure = 4 * run.mean.exposure_geometric
+    session.set_metered(False)
+    assert session._panel.now.exposure_ev == pytest.approx(2)
+
+    def fail(run):
+        raise UserError("no photographs")
+
+    monkeypatch.setattr(type(run), "metering", property(fail))
+    session.set_metered(True)
+    assert "no photographs" in client.said
+    assert not session._panel.now.metered
+
+
+def test_a_view_is_saved_also_after_a_failure(session, viewed, client):
+    for error in (UserError("too much memory"), RuntimeError("too much memory")):
+        viewed.renderer.broken = error
+        session.save("png", 100)
+        assert "too much memory" in client.said[-1]
+        assert client.files == []
+    viewed.renderer.broken = None
+    session.save("png", 100)
+    session.save("exr", 100)
+    (png, content), (exr, light) = client.files
+    assert png.startswith("run_")
+    assert exr.endswith(".exr")
+    assert light[:4] == b"\x76\x2f\x31\x01"
+    picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+    assert picture.shape == (round(100 * CANVAS[1] / CANVAS[0]), 100, 3)
+
+
+def test_the_panel_holds_what_it_is_set_to(viewed, run):
+    server, actions = viser.ViserServer(port=0, verbose=False), MagicMock()
+    try:
+        panel = panels.Panel(server.gui, viewed, actions)
+        assert panel.settings() == common_settings(run)
+        wanted = settings_of_view(run, 1, panel.settings())
+        panel.put(wanted)
+        panel.put_view(2, 50.0)
+        panel.put_place(1.0)
+        panel.set_playing(True)
+        panel.set_legend("legend")
+        assert panel.settings() == replace(wanted, exposure_ev=pytest.approx(wanted.exposure_ev))
+        assert panel.drive == (run.scene.views[0].camera, 1.0)
+        assert (panel.speed, panel.locked, panel.own_exposures) == (2.0, False, False)
+    finally:
+        server.stop()
+    assert not actions.method_calls  # these are a person's alone

@@ -29,9 +29,7 @@ class FakeRenderer:
 
     def render(self, camera):
         size = (camera.width, camera.height)
-        if size not in self.ready or size in self.refused:
-            return None
-        return self.render_now(camera)
+        return self.render_now(camera) if size in self.ready - self.refused else None
 
     def render_now(self, camera):
         self.rendered.append((camera.width, camera.height))
@@ -49,32 +47,25 @@ class Client:
         self.scene = SimpleNamespace(
             set_background_image=self.show, add_gaussian_splats=self.add_splats
         )
-        self.camera = SimpleNamespace(
-            wxyz=np.array([1.0, 0, 0, 0]),
-            position=np.zeros(3),
-            fov=0.9,
-            image_width=CANVAS[0],
-            image_height=CANVAS[1],
-            on_update=lambda call: None,
-        )
-        self.gui, self.atomic = None, contextlib.nullcontext
+        place = {"wxyz": np.array([1.0, 0, 0, 0]), "position": np.zeros(3), "fov": 0.9}
+        size = {"image_width": CANVAS[0], "image_height": CANVAS[1]}
+        self.camera = SimpleNamespace(on_update=lambda call: None, **place, **size)
+        self.gui, self.atomic, self.flush = None, contextlib.nullcontext, lambda: None
+
+    def keep(self, where, item):
+        with self.came:
+            where.append(item)
+            self.came.notify_all()
 
     def show(self, image, kind, **more):
-        with self.came:
-            self.pictures.append((kind, image, more))
-            self.came.notify_all()
+        self.keep(self.pictures, (kind, image, more))
 
     def add_splats(self, *content):
         self.splats.append(SimpleNamespace(rgbs=content[3], visible=True))
         return self.splats[-1]
 
-    def flush(self):
-        pass
-
     def add_notification(self, title, body, **more):
-        with self.came:
-            self.said.append(body)
-            self.came.notify_all()
+        self.keep(self.said, body)
         return SimpleNamespace(remove=lambda: None)
 
     def send_file_download(self, name, content, **more):
@@ -83,6 +74,10 @@ class Client:
     def wait(self, holds):
         with self.came:
             assert self.came.wait_for(holds, PATIENCE_S), (len(self.pictures), self.said)
+
+    def wait_sharp(self, after=0):
+        self.wait(lambda: len(self.pictures) > after and self.pictures[-1][0] == "png")
+        return len(self.pictures)
 
 
 class Panel:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from p2gs_jax.config import FitConfig, from_dict, to_dict
+from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.core.memory import text_of
@@ -26,6 +26,7 @@ from p2gs_jax.pipeline.exposures import Exposures
 from p2gs_jax.pipeline.fit import Optimiser, begun, compact
 from p2gs_jax.pipeline.preflight import Paths
 from p2gs_jax.pipeline.prepare import load, prepare
+from p2gs_jax.presets import from_dict, to_dict
 from p2gs_jax.run.folder import RunFolder, locked
 from p2gs_jax.scene.pixels.store import size_at
 from p2gs_jax.scene.visibility import shown_share

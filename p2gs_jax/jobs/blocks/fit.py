@@ -11,7 +11,7 @@ from pathlib import Path
 
 import jax
 
-from p2gs_jax.config import FitConfig, require_config
+from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import no_empty_folders, write_json
 from p2gs_jax.core.clock import CompileCounter, Stopwatch
 from p2gs_jax.core.numerics import on_device
@@ -47,6 +47,7 @@ from p2gs_jax.pipeline.finish import Account, finish
 from p2gs_jax.pipeline.fit import FitResult, centred, fit, true_stops
 from p2gs_jax.pipeline.preflight import Paths, check_run_dir
 from p2gs_jax.pipeline.prepare import load
+from p2gs_jax.presets import require_config
 from p2gs_jax.run.decisions import read_decisions
 from p2gs_jax.run.folder import RunFolder, RunLock, locked, require_free
 from p2gs_jax.run.write import write_start
