@@ -16,7 +16,7 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.errors import UserError, broken
-from p2gs_jax.scene.cache import Report, StageProgress, cached_folder, file_fingerprints
+from p2gs_jax.scene.cache import Report, cached_folder, file_fingerprints, stage_progress
 from p2gs_jax.scene.colmap import load_colmap, subfolder
 from p2gs_jax.scene.convert.headers import read_exif_camera
 from p2gs_jax.scene.files import image_size
@@ -126,7 +126,7 @@ def _build(
 def _map(
     database: Path, image_folder: Path, output: Path, count: int, report: Report
 ) -> list[pycolmap.Reconstruction]:
-    registered, progress = 2, StageProgress(report, "mapping", count, "images")
+    registered, progress = 2, stage_progress(report, "mapping", count, "images")
 
     def on_next_image() -> None:
         nonlocal registered
