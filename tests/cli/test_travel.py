@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -75,9 +76,7 @@ def test_places_are_remembered_in_two_ways(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("street", "runs/first"):
         (tmp_path / name).mkdir(parents=True)
-    saved = remembered(
-        "scene", (tmp_path / "street").relative_to(tmp_path), tmp_path / "runs/first"
-    )
+    saved = remembered("scene", Path("street"), tmp_path / "runs/first")
     monkeypatch.chdir("/")
     assert find(saved, "scene", tmp_path / "runs/first") == tmp_path / "street"
     shutil.move(tmp_path / "street", tmp_path / "moved" / "street")
