@@ -217,15 +217,7 @@ def _balance_column(s: PhotometricSolution) -> dict[str, list[str]]:
 def print_against(
     against: dict[str, Any], run: Path, metrics: dict[str, Any], remarks: Iterable[str], path: Path
 ) -> None:
-    """Print the scores of other programs beside those of a run.
-
-    Args:
-        against: what `against.json` holds.
-        run: the run folder.
-        metrics: of the run, as `metrics.json`.
-        remarks: on the renders that were found.
-        path: of `against.json`.
-    """
+    """Print the scores of other programs, as against.json (`path`) has them, beside a run's."""
     protocols = {
         "averaged": "mean parameters",
         "as_rendered": "as rendered",

@@ -45,13 +45,8 @@ SAME_PLACE = 1e-3
 class ViewedRun:
     """A run with its photographs, its scale in the viewer and its compiled renderer.
 
-    Attributes:
-        run: the run.
-        max_width: widest picture to render, pixels.
-        store: its photographs.
-        space: scale and orientation of the scene in the viewer.
-        renderer: for the sizes that windows need.
-        listeners: called when a program was compiled, or is about to be.
+    No picture is rendered wider than `max_width` pixels. `listeners` are called when a program was
+    compiled, or is about to be.
     """
 
     def __init__(self, run: Run, max_width: int):
@@ -123,10 +118,7 @@ class ViewedRun:
     def pose_along(self, camera: str, place: float, aspect: float) -> tuple[Pose, int]:
         """Return the browser's camera on a drive, and the row of the view nearest to it.
 
-        Args:
-            camera: physical camera whose recorded poses are followed.
-            place: in its frames.
-            aspect: width / height of the canvas.
+        The place counts the frames of the physical camera whose recorded poses are followed.
         """
         frames, views = self.frames(camera), self.run.scene.views
         nearest = frames[int(np.clip(round(place), 0, len(frames) - 1))]
