@@ -35,14 +35,10 @@ def propose(
     prune_large: Bool[Array, ""] | bool,
     cfg: DensifyConfig,
 ) -> Proposal:
-    """Decide which Gaussians are pruned, cloned and split.
+    """Decide which Gaussians are pruned, cloned and split, from statistics since the last time.
 
-    Args:
-        gaussians: the scene.
-        population: statistics since the last densification.
-        extent: scene extent, scene units.
-        prune_large: whether oversized Gaussians go too (3DGS: after the first opacity reset).
-        cfg: thresholds.
+    `extent` is the scene's, scene units; with `prune_large` oversized Gaussians go too (3DGS: after
+    the first opacity reset).
     """
     largest = jnp.exp(jnp.max(gaussians.log_scales, -1))
     prune = opacities(gaussians) < cfg.prune_opacity

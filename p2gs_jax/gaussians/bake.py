@@ -261,15 +261,11 @@ def _all(gaussians: Gaussians) -> Array:
 
 
 def relit(gaussians: Gaussians, shown: DisplayTransform, cfg: RenderConfig) -> Gaussians:
-    """Return Gaussians with the radiance of their base colours, each by itself.
+    """Return Gaussians of 3DGS's display colours, max(0, sh + 1/2), with their radiance.
 
     What depends on the direction begins at nothing: in a model that knows no exposures it mostly
-    tells one photograph's exposure from another's.
-
-    Args:
-        gaussians: display colours, 3DGS's: max(0, sh + 1/2).
-        shown: how the photographs were taken, on average; nothing that depends on the place.
-        cfg: activation and degree of the result.
+    tells one photograph's exposure from another's. `shown` is how the photographs were taken on
+    average, without what depends on the place.
     """
     colors = np.clip(0.5 + C0 * np.asarray(gaussians.sh[:, 0]), 0.0, BRIGHTEST)
     sh = np.zeros((len(colors), coefficient_count(cfg.sh_degree), 3), np.float32)

@@ -60,16 +60,11 @@ ENOUGH_SEEDS = 0.5
 
 @dataclass(frozen=True)
 class Candidates:
-    """Pixels of one view that may become seeds.
+    """Pixels of one view that may become seeds: positions at the matched size and 1 / z.
 
-    Attributes:
-        row: training view.
-        xy: positions at the matched size.
-        inverse: 1 / z.
-        normals: camera coordinates, towards the camera; zero where the surface is not flat.
-        radiance: linear, in the gauge of the exposures.
-        texture: mean gradient about the pixel, display values a pixel.
-        counts: see `DepthMap`.
+    Normals are in camera coordinates, towards the camera, and zero where the surface is not flat;
+    radiance is in the gauge of the exposures; texture is the mean gradient about the pixel, display
+    values a pixel; for `counts` see `DepthMap`.
     """
 
     row: int
@@ -83,16 +78,11 @@ class Candidates:
 
 @dataclass(frozen=True)
 class DenseSeeds:
-    """Seeds from depth maps.
+    """Seeds from depth maps, scene units; radiance in the gauge of the exposures.
 
-    Attributes:
-        points: scene units.
-        radiance: linear, in the gauge of the exposures.
-        scales: standard deviations along the axes of `quats`.
-        quats: w, x, y, z.
-        counts: pixels in all; refused by each of `CHECKS`; accepted.
-        near_existing: seeds dropped in favour of an existing one.
-        views: how many views were matched.
+    `scales` are standard deviations along the axes of `quats` (w x y z); `counts` are pixels in
+    all, refused by each of `CHECKS`, accepted; `near_existing` seeds were dropped in favour of an
+    existing one; so many `views` were matched.
     """
 
     points: Float32[np.ndarray, "n 3"]
@@ -126,21 +116,14 @@ def dense_seeds(
     limit: int,
     on_view: Callable[[int, int], None] = lambda i, n: None,
 ) -> DenseSeeds:
-    """Return seeds from the depths of the training views; the same for the same seed.
+    """Return at most `limit` seeds from the depths of training views; the same for the same seed.
 
     Runs in threads of its own and calls no JAX, so it may run beside a compilation. The flow's
     stripes follow OpenCV's number of threads, so another number of cores may differ slightly.
 
-    Args:
-        scene: views with poses, and points to start the flow from.
-        store: photographs.
-        match: tones under which photographs are compared.
-        color: tones that make radiance of what a seed shows.
-        cfg: seed of the choices; black and saturation; a budget, which bounds the views that give
-            seeds: they are taken evenly, and their neighbours may be any.
-        existing: seeds that keep their place.
-        limit: most seeds to return.
-        on_view: called with views done and views in all.
+    Photographs are compared under the tones `match`; `color` makes radiance of what a seed shows.
+    Existing seeds keep their place. A budget bounds the views that give seeds: they are taken
+    evenly, and their neighbours may be any. `on_view` is called with views done and views in all.
     """
     rows = scene.train_indices
     empty = np.zeros((0, 3), np.float32)

@@ -46,15 +46,12 @@ CHECKS = ("unusable", "forward-backward", "epipolar", "parallax", "colour", "thi
 
 
 class DepthMap(NamedTuple):
-    """Depth of one view.
+    """Depth of one view: 1 / z, and which pixels passed every check.
 
-    Attributes:
-        inverse: 1 / z.
-        valid: passed every check.
-        slope: d(1/z)/dx, d(1/z)/dy per pixel, from the plane through the window.
-        flat: the window lies in that plane.
-        agreeing: [k h w] neighbours whose depth agrees, in the order given.
-        counts: pixels that matched at all, then those each of CHECKS refused, then the accepted.
+    `slope` is d(1/z)/dx, d(1/z)/dy per pixel, from the plane through the window; where it is
+    `flat`, the window lies in that plane. `agreeing` [k h w] are the neighbours, in the order
+    given, whose depth agrees; `counts` are the pixels that matched at all, those each of CHECKS
+    refused, and the accepted.
     """
 
     inverse: Float32[np.ndarray, "h w"]
@@ -214,7 +211,7 @@ def _match(flows: Flows, i: int, j: int) -> _Pair:
     return _Pair(inverse, precision, refused)
 
 
-def depth_map(flows: Flows, row: int, near: Sequence[int]) -> DepthMap:
+def depth_map(flows: Flows, row: int, near: Sequence[int] | Int[np.ndarray, " k"]) -> DepthMap:
     """Return the depth of a view, where at least two of its neighbours `near` agree on it."""
     pairs = [_match(flows, row, int(j)) for j in near]
     inverse = np.stack([p.inverse for p in pairs])

@@ -36,14 +36,10 @@ OPACITY = 0.1
 
 
 class Nodes(NamedTuple):
-    """Seeds of moving objects.
+    """Seeds of moving objects: points in the frame of their box, scene units.
 
-    Attributes:
-        moving: the objects, and where they are.
-        points: in the frame of their box, scene units.
-        owner: row of the object in `moving`.
-        left: moving objects that get none: their pixels are left out of the fit.
-        notes: for the user.
+    `owner` is the row of their object in `moving`; objects that are `left` get none, and their
+    pixels are left out of the fit; `notes` are for the user.
     """
 
     moving: MovingObjects
@@ -185,7 +181,7 @@ def _views_that_show(thing: TrackedObject, views: Sequence[View], cfg: DynamicsC
         if outline is None:
             continue
         height = max(1, round(AREA_WIDTH * view.height / view.width))
-        shown += painted([outline], view, AREA_WIDTH, height).mean() >= LEAST_AREA
+        shown += int(painted([outline], view, AREA_WIDTH, height).mean() >= LEAST_AREA)
         if shown >= cfg.least_views:
             break
     return shown

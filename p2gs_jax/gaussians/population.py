@@ -68,7 +68,7 @@ class Coverage(NamedTuple):
     pixels: int
     shown: float
 
-    def gaussians(self, steps: float) -> int:
+    def gaussians(self, steps: float | int) -> int:
         """Return how many Gaussians so many steps can fit."""
         share = min(max(steps / STEPS_PER_SHARE, SMALLEST_SHARE), LARGEST_SHARE)
         return int(share * self.pixels / self.shown)

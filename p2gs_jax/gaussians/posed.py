@@ -41,13 +41,10 @@ def posed(
     poses: Float[np.ndarray, "k 4 4"],
     there: Bool[np.ndarray, " k"],
 ) -> Gaussians:
-    """Return Gaussians in world coordinates; those of objects that are not there are left out.
+    """Return Gaussians in world coordinates; those of objects that are not `there` are left out.
 
-    Args:
-        gaussians: the scene, those of objects in the frames of their boxes.
-        owner: the moving object that each belongs to, -1: none; None: there are none.
-        poses: box to world.
-        there: which objects are.
+    Those of objects lie in the frames of their boxes; `owner` is their object, -1: none; `poses`
+    are box to world.
     """
     if owner is None:
         return gaussians

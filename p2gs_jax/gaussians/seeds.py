@@ -82,17 +82,10 @@ def gaussians_from_points(
     opacity: Float[np.ndarray, " p"] | float | None = None,
     quats: Float[np.ndarray, "p 4"] | None = None,
 ) -> Gaussians:
-    """Return one Gaussian per point.
+    """Return one Gaussian per point; radiance is linear, in the gauge of the exposures.
 
-    Args:
-        points: scene units.
-        radiance: linear radiance in the gauge of the exposures.
-        views: training views, for the distance that bounds the scales.
-        cfg: activation, degree, opacity.
-        scales: standard deviations, of each axis or of all; None takes the mean distance to three
-            neighbours (3DGS).
-        opacity: initial opacity; None takes the configured one.
-        quats: orientations, w x y z; None: none.
+    Standard deviations, of each axis or of all, are by default the mean distance to three
+    neighbours (3DGS), bounded by the distance from the views; orientations are w x y z.
     """
     count = len(points)
     if scales is None:

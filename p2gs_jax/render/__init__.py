@@ -86,16 +86,9 @@ def render_linear(
 ) -> Render:
     """Render linear HDR radiance of one view (paper, eq. 3).
 
-    Args:
-        gaussians: the scene.
-        alive: slots in use.
-        camera: the view.
-        cfg: rendering options.
-        capacity: tile-list entries; see `required_capacity`. A render whose `overflow` is set must
-            be discarded and the capacity grown.
-        owner: the moving object that each Gaussian belongs to (`Population.owner`), or None.
-        active_degree: highest spherical-harmonics degree in use, None for all.
-        with_depth: see `rasterize`.
+    A render whose `overflow` is set must be discarded and the `capacity` of the tile lists grown,
+    see `required_capacity`. `owner` is the moving object of each Gaussian (`Population.owner`);
+    `active_degree` is the highest spherical-harmonics degree in use, None for all.
     """
     if gaussians.capacity == 0:
         return _nothing(camera, cfg, with_depth)

@@ -32,12 +32,10 @@ ROWS = 8192
 
 
 class Boxes(NamedTuple):
-    """Where each splat stays above the cutoff.
+    """Boxes where splats stay above the cutoff: first and last columns and rows, pixels.
 
-    Attributes:
-        visible: reaches at least one pixel centre's row and column.
-        reach: log(opacity / cutoff): the exponent at which it falls below the cutoff.
-        first: first pixel column and row inside the box; `last`: the last ones.
+    A splat is visible if it reaches at least one pixel centre's row and column; `reach` is
+    log(opacity / cutoff), the exponent at which it falls below the cutoff.
     """
 
     visible: Bool[Array, " n"]

@@ -30,12 +30,7 @@ RenderView = Callable[..., Render]
 
 
 class Margins(NamedTuple):
-    """How much longer than needed a list is made.
-
-    Attributes:
-        first: factor when it is allocated.
-        grown: factor after an overflow.
-    """
+    """Factors by which a list is longer than needed: when allocated, and after an overflow."""
 
     first: float
     grown: float
@@ -101,12 +96,7 @@ def until_it_fits(
 
 
 class Room(NamedTuple):
-    """Static sizes of a training step.
-
-    Attributes:
-        entries: of the tile list.
-        visible: Gaussians that one view may show.
-    """
+    """Static sizes of a training step: tile-list entries, and Gaussians that one view may show."""
 
     entries: int
     visible: int
@@ -115,12 +105,9 @@ class Room(NamedTuple):
     def allocate(cls, entries: int, visible: int, growth: float, limit: int) -> Room:
         """Return room for all views of one image size, to the end of a run.
 
-        Args:
-            entries: that a view needs at most now, as counted.
-            visible: Gaussians that a view shows at most now.
-            growth: factor by which the population may still grow; a view goes on to show the same
-                share of it, and Gaussians that share a place are smaller.
-            limit: the largest population to come.
+        So many entries a view needs at most now, as counted, and so many Gaussians it shows. The
+        population may still grow by a factor, at most to `limit`: a view goes on to show the same
+        share of it, and Gaussians that share a place are smaller.
         """
         wanted = int(visible * TRAINING_VISIBLE.first * growth)
         lists = int(TRAINING.first * entries * growth**0.5)

@@ -27,6 +27,9 @@ C3 = (
 )
 MAX_DEGREE = 3
 
+Axis = Float[Array | np.ndarray, " n"]
+Directions = tuple[Axis, Axis, Axis]
+
 
 def coefficient_count(degree: int) -> int:
     """Return (degree + 1)^2."""
@@ -45,9 +48,7 @@ def degree_of(count: int) -> int:
     raise ValueError(f"{count} spherical-harmonics coefficients belong to no degree up to 3")
 
 
-def basis(
-    directions: tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]], degree: int
-) -> list[Float[Array, " n"]]:
+def basis(directions: Directions, degree: int) -> list[Float[Array, " n"]]:
     """Return the (degree + 1)^2 basis values of unit directions, as separate vectors."""
     x, y, z = directions
     xx, yy, zz = x * x, y * y, z * z
@@ -98,8 +99,8 @@ _combine.defvjp(_combine_fwd, _combine_bwd)
 
 
 def evaluate(
-    sh: Float[Array, "n k 3"],
-    directions: tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]],
+    sh: Float[Array | np.ndarray, "n k 3"],
+    directions: Directions,
     active_degree: Int[Array, ""] | int | None = None,
 ) -> Float[Array, "n 3"]:
     """Return the values of K = (degree + 1)^2 coefficients in unit directions, before activation.
@@ -142,11 +143,8 @@ def scaled(
 ) -> Float[np.ndarray, "n k 3"]:
     """Return coefficients whose radiance is larger by factors, exactly.
 
-    Args:
-        sh: spherical-harmonics coefficients.
-        log_scales: natural logarithms of the factors: of the channels (3,), of Gaussians (n, 1),
-            or of both (n, 3).
-        kind: how radiance follows from the coefficients.
+    `log_scales` are the natural logarithms of the factors: of the channels (3,), of Gaussians (n,
+    1), or of both (n, 3).
     """
     sh = np.array(sh)
     if kind == "exp":

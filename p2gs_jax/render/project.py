@@ -77,7 +77,7 @@ def at_time(gaussians: Gaussians, objects: Placement | None) -> Gaussians:
     )
 
 
-def camera_of_each(camera: AnyCamera, owner: Int[Array, " n"] | None) -> AnyCamera:
+def camera_of_each(camera: AnyCamera, owner: Int[Array | np.ndarray, " n"] | None) -> AnyCamera:
     """Return a camera with the view matrix of each Gaussian, along the last axis.
 
     `owner` is the moving object that each Gaussian belongs to, -1: none; without it, the camera is

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,6 @@ from p2gs_jax.render.tiles import with_cutoffs
 from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.types import Camera, Gaussians
 
-RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 # Opacities are kept this far off 0 and 1, where their logits are infinite.
 LEAST_OPACITY = 1e-7
@@ -34,7 +33,7 @@ def rasterization(
     quats: Float[Array, "n 4"],
     scales: Float[Array, "n 3"],
     opacities: Float[Array, " n"],
-    colors: Float[Array, "*c n 3"] | Float[Array, "*c n k 3"],
+    colors: Float[Array, "..."],
     viewmats: Float[Array, "c 4 4"],
     Ks: Float[Array, "c 3 3"],
     width: int,
@@ -44,7 +43,7 @@ def rasterization(
     eps2d: float = 0.3,
     sh_degree: int | None = None,
     backgrounds: Float[Array, "c 3"] | None = None,
-    render_mode: RenderMode = "RGB",
+    render_mode: str = "RGB",
     capacity: int | None = None,
     cfg: RenderConfig | None = None,
 ) -> tuple[Float[Array, "c h w x"], Float[Array, "c h w 1"], dict[str, Any]]:
@@ -55,8 +54,8 @@ def rasterization(
         quats: w x y z, of any length.
         scales: standard deviations along the axes, scene units.
         opacities: in [0, 1].
-        colors: linear radiance, for all cameras or for each; with `sh_degree`, coefficients of
-            spherical harmonics, whose radiance is max(0, value + 1/2).
+        colors: linear radiance (n 3), or (c n 3) for each camera; with `sh_degree`, coefficients of
+            spherical harmonics (n k 3), whose radiance is max(0, value + 1/2).
         viewmats: world to camera, OpenCV axes.
         Ks: intrinsics, pixels.
         width: pixels.

@@ -43,16 +43,10 @@ SEGMENTS_PER_LANE = 4
 
 
 class Segments(NamedTuple):
-    """Where each segment lies in the list of entries.
+    """Where each segment lies in the list of entries: its tile, its start, and the end behind it.
 
     Slot t < T is the first segment of tile t. The slots after those hold all others, tile by tile
-    from front to back; slots that are not needed are empty and come last.
-
-    Attributes:
-        tiles: whose list it is a part of.
-        starts: first entry.
-        ends: behind the last entry.
-        extra: how many slots behind the first T are in use.
+    from front to back, `extra` of them; slots that are not needed are empty and come last.
     """
 
     tiles: Int[Array, " s"]

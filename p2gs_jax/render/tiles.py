@@ -157,12 +157,10 @@ def geometry_gradient(
 ) -> tuple[Array, ...]:
     """Return the gradient to the first six columns of a row, from moments over a tile.
 
-    Args:
-        moments: sums over the tile's pixels of the gradient to the exponent, times 1, x, y, x^2,
-            x y, y^2, with x and y from the tile's centre.
-        factor: a11, a12, a22.
-        center: u, v, and the offsets x and y from the mean, at the tile's centre.
-        scale: the plan's `exponent_scale`.
+    `moments` are the sums over the tile's pixels of the gradient to the exponent times 1, x, y,
+    x^2, x y, y^2, with x and y from the tile's centre; `factor` is a11, a12, a22; `center` has u,
+    v, and the offsets x and y from the mean at the tile's centre; `scale` is the plan's
+    `exponent_scale`.
     """
     m1, mx, my, mxx, mxy, myy = moments
     a11, a12, a22 = factor

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -40,8 +41,11 @@ Shown = tuple[Splats2D, Float[Array, "v 3"]]
 
 
 def in_view(
-    gaussians: Gaussians, alive: Bool[Array, " n"], camera: Camera | Frustum, cfg: RenderConfig
-) -> Bool[Array, " n"]:
+    gaussians: Gaussians,
+    alive: Bool[Array | np.ndarray, " n"],
+    camera: Camera | Frustum,
+    cfg: RenderConfig,
+) -> Bool[Any, " n"]:
     """Return which Gaussians may reach a pixel: a conservative bound.
 
     The projected covariance is bounded by that of a ball as wide as the widest axis: along x its

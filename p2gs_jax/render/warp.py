@@ -18,12 +18,7 @@ DEPTH_TOLERANCE = 0.03
 
 
 class Warp(NamedTuple):
-    """Pixels of one view in another.
-
-    Attributes:
-        xy: positions in the other view, pixels, centres at +0.5.
-        seen: the pixel shows a surface, and the other view shows the same one.
-    """
+    """Positions of pixels in another view, centres at +0.5, and where it shows the same surface."""
 
     xy: Float[Array, "h w 2"]
     seen: Bool[Array, "h w"]

@@ -26,18 +26,12 @@ def run(**variables) -> str:
     return done.stdout.strip()
 
 
-def test_programs_are_kept_for_this_machine(tmp_path):
+def test_programs_are_kept_for_this_machine_where_they_can_be(tmp_path):
     folder = run(XDG_CACHE_HOME=str(tmp_path))
     assert folder.startswith(str(tmp_path / "p2gs-jax"))
     assert list((tmp_path / "p2gs-jax").rglob("*-cache"))
-
-
-def test_a_folder_of_the_users_choice_stays(tmp_path):
     chosen = str(tmp_path / "chosen")
     assert run(XDG_CACHE_HOME=str(tmp_path / "xdg"), JAX_COMPILATION_CACHE_DIR=chosen) == chosen
     assert not (tmp_path / "xdg").exists()
-
-
-def test_a_folder_that_cannot_be_made_is_no_obstacle(tmp_path):
     (tmp_path / "file").write_text("in the way")
     assert run(XDG_CACHE_HOME=str(tmp_path / "file")) == "None"

@@ -17,29 +17,21 @@ def container(monkeypatch, tmp_path):
     return tmp_path
 
 
-def test_memory_of_the_system(container):
-    assert memory.memory() == (8_000_000 * 1024, 6_000_000 * 1024)
-
-
-def test_memory_of_a_container(container):
+def test_memory_of_the_system_and_of_a_container(container, monkeypatch):
+    system = (8_000_000 * 1024, 6_000_000 * 1024)
+    assert memory.memory() == system
     (container / "memory.max").write_text("1000000000\n")
     (container / "memory.current").write_text("400000000\n")
     assert memory.memory() == (1_000_000_000, 600_000_000)
-    (container / "memory.max").write_text("max\n")
-    assert memory.memory() == (8_000_000 * 1024, 6_000_000 * 1024)
-
-
-def test_memory_without_proc(container, monkeypatch):
-    (container / "meminfo").unlink()
-    monkeypatch.setattr(memory, "_pages", {"SC_PHYS_PAGES": 5}.get)
-    assert memory.memory() == (5, None)
-
-
-def test_files_that_a_container_caches_can_go(container):
-    (container / "memory.max").write_text("1000000000\n")
+    # Files that it caches can go.
     (container / "memory.current").write_text("900000000\n")
     (container / "memory.stat").write_text("anon 300000000\ninactive_file 500000000\n")
     assert memory.memory() == (1_000_000_000, 600_000_000)
+    (container / "memory.max").write_text("max\n")
+    assert memory.memory() == system
+    (container / "meminfo").unlink()
+    monkeypatch.setattr(memory, "_pages", {"SC_PHYS_PAGES": 5}.get)
+    assert memory.memory() == (5, None)
 
 
 def test_what_is_left_is_the_least_of_machine_and_limit(container, monkeypatch):
@@ -68,14 +60,21 @@ def test_nothing_is_known_without_the_system(container, monkeypatch):
     assert (memory.left_to_process(), memory.resident()) == (None, 0)
 
 
-def test_errors_that_say_memory_ran_out():
-    class JaxRuntimeError(RuntimeError):
-        pass
+class JaxRuntimeError(RuntimeError):
+    """As JAX names its own."""
 
-    assert memory.ran_out(MemoryError())
-    assert memory.ran_out(JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 8 bytes."))
-    assert memory.ran_out(OSError(errno.ENOMEM, "Cannot allocate memory"))
-    assert memory.ran_out(RuntimeError("can't start new thread"))
-    assert not memory.ran_out(OSError(errno.ENOSPC, "No space left on device"))
-    assert not memory.ran_out(JaxRuntimeError("INTERNAL: no"))
-    assert not memory.ran_out(ValueError("RESOURCE_EXHAUSTED"))
+
+@pytest.mark.parametrize(
+    ("error", "ran_out"),
+    [
+        (MemoryError(), True),
+        (JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 8 bytes."), True),
+        (OSError(errno.ENOMEM, "Cannot allocate memory"), True),
+        (RuntimeError("can't start new thread"), True),
+        (OSError(errno.ENOSPC, "No space left on device"), False),
+        (JaxRuntimeError("INTERNAL: no"), False),
+        (ValueError("RESOURCE_EXHAUSTED"), False),
+    ],
+)
+def test_errors_that_say_memory_ran_out(error, ran_out):
+    assert memory.ran_out(error) == ran_out

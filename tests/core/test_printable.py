@@ -32,16 +32,13 @@ def printed(thing) -> str:
     return file.getvalue()
 
 
-def test_a_terminal_gets_no_control_characters():
+def test_a_terminal_gets_colours_and_no_control_characters():
     table = Table("\x1b]0;title\x07")
     table.add_row(Text("\x1b[31mred", style="bold"))
     for thing in ("\x1b[31mred", Text("\x1b[31mred"), table):
         assert "\x1b[31m" not in printed(thing)
         assert "\x1b]0" not in printed(thing)
         assert "\\x1b" in printed(thing)
-
-
-def test_colours_stay():
     assert "\x1b[1m" in printed(Text("bold", style="bold"))
 
 

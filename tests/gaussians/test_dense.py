@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from p2gs_jax.config import DataConfig, DensifyConfig, FitConfig, InitConfig
+from p2gs_jax.config import DataConfig, DensifyConfig, FitConfig
 from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.gaussians.dense import MATCH_SIDE, coverage_of, dense_limit, dense_seeds, wants_dense
 from p2gs_jax.gaussians.flow import CHECKS, Flows, depth_map
@@ -29,6 +29,7 @@ CENTERS = np.array([[0, 0, 0], [0.4, 0, 0], [-0.4, 0.1, 0], [0.1, 0.4, 0], [0, -
 BACK, FRONT = 5.0, 4.0
 # The foreground square, scene units.
 SQUARE = 0.8
+NONE = np.zeros((0, 3))
 
 
 def texture(seed, size=512):
@@ -63,6 +64,7 @@ class World:
     """A small scene on disk with its true depths."""
 
     def __init__(self, path, *, square=False, tilt=0.0, exposures=None, spoil=(), change=None):
+        path.mkdir(exist_ok=True)
         exposures = np.ones(len(CENTERS)) if exposures is None else np.asarray(exposures)
         paint, other = (texture(1), texture(2)), (texture(3), texture(4))
         views, self.depths = [], []
@@ -93,17 +95,9 @@ class World:
         found = depth_map(flows, row, [k for k in range(len(CENTERS)) if k != row])
         return found, np.abs(1 / np.maximum(found.inverse, 1e-9) / self.depths[row] - 1)
 
-    def seeds(self, limit=100_000, existing=None):
-        existing = np.zeros((0, 3)) if existing is None else existing
-        return dense_seeds(
-            self.scene,
-            self.store,
-            self.tones,
-            self.tones,
-            FitConfig(),
-            existing=existing,
-            limit=limit,
-        )
+    def seeds(self, limit=100_000, existing=NONE):
+        given = self.scene, self.store, self.tones, self.tones, FitConfig()
+        return dense_seeds(*given, existing=existing, limit=limit)
 
 
 @pytest.fixture(scope="module")
@@ -141,11 +135,12 @@ def test_wrong_matches_are_refused(tmp_path):
 
 
 def test_exposures_do_not_matter_once_they_are_solved(tmp_path):
-    even, mixed = tmp_path / "even", tmp_path / "mixed"
-    even.mkdir()
-    mixed.mkdir()
-    same = World(even)
-    other = World(mixed, exposures=[1.0, 0.5, 2.0, 0.5, 2.0])
+    same = World(tmp_path / "even")
+    other = World(tmp_path / "mixed", exposures=[1.0, 0.5, 2.0, 0.5, 2.0])
+    images = MatchImages(other.scene, other.store, other.tones, MATCH_SIDE, 0.02, 0.98)
+    first, second = at_common_exposure(images[0], images[2])
+    assert abs(float(first.mean()) - float(second.mean())) < 6
+    assert first.std() > 20
     a, b = same.depth()[0], other.depth()[0]
     assert b.valid.mean() > 0.9 * a.valid.mean()
     both = a.valid & b.valid
@@ -154,18 +149,17 @@ def test_exposures_do_not_matter_once_they_are_solved(tmp_path):
     for seeds in (same.seeds(), other.seeds()):
         assert abs(np.median(seeds.radiance) / 0.2 - 1) < 0.1
     # Unsolved, the photographs are refused by their colours.
-    blind = World(mixed, exposures=[1.0, 0.25, 4.0, 0.25, 4.0])
+    blind = World(tmp_path / "mixed", exposures=[1.0, 0.25, 4.0, 0.25, 4.0])
     blind.tones = same.tones
     assert blind.depth()[0].counts[1 + CHECKS.index("colour")] > 0.1 * WIDTH * HEIGHT
 
 
 def test_clipped_pixels_carry_no_seed(tmp_path):
     def lamp(k, linear):
-        centre = CENTERS[k]
         y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-        x = centre[0] + (x - WIDTH / 2) / FOCAL * (BACK - centre[2])
-        y = centre[1] + (y - HEIGHT / 2) / FOCAL * (BACK - centre[2])
-        linear[(np.abs(x) < 0.5) & (np.abs(y) < 0.5)] = 3.0
+        ray = np.stack([(x - WIDTH / 2) / FOCAL, (y - HEIGHT / 2) / FOCAL], -1)
+        place = CENTERS[k, :2] + ray * (BACK - CENTERS[k, 2])
+        linear[(np.abs(place) < 0.5).all(-1)] = 3.0
         return linear
 
     world = World(tmp_path, change=lamp)
@@ -175,8 +169,10 @@ def test_clipped_pixels_carry_no_seed(tmp_path):
     assert not in_lamp.any()
 
 
-def test_the_bound_binds_and_seeds_are_spread(plane):
+def test_the_bound_binds_and_seeds_are_spread_and_the_same_again(plane):
     many, few = plane.seeds(), plane.seeds(limit=150)
+    for field in ("points", "radiance", "scales", "quats"):
+        np.testing.assert_array_equal(getattr(few, field), getattr(plane.seeds(limit=150), field))
     assert len(many.points) > 1000
     assert 100 <= len(few.points) <= 150
     on_plane = np.abs(few.points[:, 2] - BACK - 0.5 * few.points[:, 0])
@@ -186,12 +182,6 @@ def test_the_bound_binds_and_seeds_are_spread(plane):
     # Fewer seeds stand for larger patches.
     assert np.median(few.scales[:, 1]) > 2 * np.median(many.scales[:, 1])
     assert len(plane.seeds(limit=0).points) == 0
-
-
-def test_seeds_are_the_same_again(plane):
-    a, b = plane.seeds(limit=300), plane.seeds(limit=300)
-    for field in ("points", "radiance", "scales", "quats"):
-        np.testing.assert_array_equal(getattr(a, field), getattr(b, field))
 
 
 def test_seeds_lie_flat_on_their_surface(plane):
@@ -227,14 +217,6 @@ def test_pairs_see_the_same_from_different_places(plane):
     assert near[1][0] == 0
 
 
-def test_photographs_are_alike_under_one_exposure(tmp_path):
-    world = World(tmp_path, exposures=[1.0, 1.0, 4.0, 1.0, 1.0], change=lambda k, image: image)
-    images = MatchImages(world.scene, world.store, world.tones, MATCH_SIDE, 0.02, 0.98)
-    first, second = at_common_exposure(images[0], images[2])
-    assert abs(float(first.mean()) - float(second.mean())) < 6
-    assert first.std() > 20
-
-
 def test_rough_tones_find_the_factors():
     rng = np.random.default_rng(0)
     log_exposures = rng.normal(0, 0.4, 8)
@@ -254,23 +236,23 @@ def with_seeds(cfg, **changes):
 def test_dense_seeds_leave_room_to_grow():
     cfg = FitConfig()
     bounded = dataclasses.replace(cfg, densify=DensifyConfig(max_gaussians=1000))
-    whole = Coverage(640 * 480, 1.0)
+    whole, quarter = Coverage(640 * 480, 1.0), Coverage(640 * 480, 0.25)
     assert dense_limit(bounded, 100, whole) == 500
     assert dense_limit(bounded, 2000, whole) == 0
     assert dense_limit(with_seeds(bounded, dense_points=5000), 100, whole) == 900
     assert dense_limit(with_seeds(cfg, dense_points=50_000), 100, whole) == 50_000
     assert 0 < dense_limit(cfg, 100, whole) < 640 * 480 / 10
-    # Of a scene of which a view shows a quarter there is four times as much.
-    part = Coverage(640 * 480, 0.25)
-    assert dense_limit(cfg, 0, part) == 4 * dense_limit(cfg, 0, whole) > 0
+    assert dense_limit(cfg, 0, quarter) == 4 * dense_limit(cfg, 0, whole) > 0
 
 
 def test_dense_starts_where_seeds_are_few(plane):
     scene, coverage = plane.scene, coverage_of(plane.scene, plane.store)
-    assert wants_dense(scene, coverage, FitConfig())
-    assert wants_dense(scene, coverage, preset("3dgs"))
-    assert not wants_dense(scene, coverage, preset("paper"))
-    assert not wants_dense(scene, coverage, with_seeds(FitConfig(), dense="off"))
     lidar = dataclasses.replace(scene, points=np.repeat(scene.points, 200, 0))
-    assert not wants_dense(lidar, coverage, FitConfig())
-    assert InitConfig().dense == "auto"
+    for given, cfg, wanted in (
+        (scene, FitConfig(), True),
+        (scene, preset("3dgs"), True),
+        (scene, preset("paper"), False),
+        (scene, with_seeds(FitConfig(), dense="off"), False),
+        (lidar, FitConfig(), False),
+    ):
+        assert wants_dense(given, coverage, cfg) == wanted

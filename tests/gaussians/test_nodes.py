@@ -1,31 +1,40 @@
-"""Seeds of things that move: which get any, where they are in their box, and of which colour."""
+"""Where things begin that move: in their boxes, of which colour; or vibrating, at which times."""
 
 import dataclasses
 
 import numpy as np
 import pytest
-from moving_box import FRAMES, SIZE, drive_format, make_world, write_photographs
+from moving_box import FRAMES, INTERVAL, SIZE, drive_format, make_world, write_photographs
 
 from p2gs_jax.config import DataConfig, DynamicsConfig, FitConfig
-from p2gs_jax.gaussians.moving import find_nodes, node_gaussians, nodes_radiance, on_surface
+from p2gs_jax.gaussians.moving import (
+    OPACITY,
+    clock_of,
+    find_nodes,
+    node_gaussians,
+    nodes_radiance,
+    on_surface,
+    vibrates,
+    with_vibration,
+)
+from p2gs_jax.gaussians.posed import standing
+from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.photometry.parameters import initial_photometry
+from p2gs_jax.render.project import STILL
 from p2gs_jax.scene import ImageStore, drives, load_scene
 from p2gs_jax.scene.rigid import interpolated, inverse
 from p2gs_jax.types import Photometry
 
 CFG = DynamicsConfig()
+VIBRATING = with_fields(FitConfig(), {"dynamics.method": "vibration", "dynamics.vibrating": 500})
 
 
 @pytest.fixture(scope="module")
-def folder(made_once):
-    return made_once("moving_box", write_photographs)
-
-
-@pytest.fixture
-def scene(folder, monkeypatch):
-    monkeypatch.setitem(drives.FORMATS, "pandaset", drive_format())
-    cfg = DataConfig(own_car=False, format="pandaset")
-    return load_scene(folder, cfg)
+def scene(made_once):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(drives.FORMATS, "pandaset", drive_format())
+        folder = made_once("moving_box", write_photographs)
+        return load_scene(folder, DataConfig(own_car=False, format="pandaset"))
 
 
 def test_laser_points_of_all_sweeps_meet_in_the_box(scene):
@@ -153,3 +162,58 @@ def test_points_get_the_colours_that_photographs_show(scene):
     scales = np.exp(np.asarray(g.log_scales))
     assert 0.01 < np.median(scales) < 0.2
     assert FRAMES == 16
+
+
+def rows(values):
+    return {tuple(row) for row in np.asarray(values)}
+
+
+def test_laser_points_begin_at_their_own_times(scene):
+    still = make_world().wall
+    g = with_vibration(still, scene, VIBRATING)
+    n, moves = still.capacity, g.vibration
+    assert g.capacity == n + 500
+    np.testing.assert_array_equal(g.means[:n], still.means)
+    np.testing.assert_array_equal(g.opacity_logits[:n], still.opacity_logits)
+    np.testing.assert_allclose(moves.log_lives[:n], np.log(STILL))
+    np.testing.assert_allclose(
+        np.exp(moves.log_lives[n:]), VIBRATING.dynamics.vibration_life, rtol=1e-5
+    )
+    np.testing.assert_allclose(1 / (1 + np.exp(-g.opacity_logits[n:])), OPACITY, rtol=1e-5)
+    assert not np.any(moves.velocities)
+    middle = clock_of(scene).middle
+    times = np.asarray(moves.peaks[n:]) + middle
+    for point, time in list(zip(np.asarray(g.means[n:]), times, strict=True))[::50]:
+        (row,) = np.flatnonzero((scene.lidar.points == point).all(1))
+        assert scene.lidar.times[row] == pytest.approx(time, abs=1e-5)
+    assert len(np.unique(times.round(2))) == FRAMES
+    assert standing(g, None).capacity == n
+    assert standing(g, None).vibration is None
+    # Colours of the wall behind, for want of better ones.
+    assert rows(g.sh[n:, 0]) <= rows(g.sh[:n, 0])
+
+
+def test_without_laser_points_they_begin_anywhere_at_any_time(scene):
+    still = make_world().wall
+    g = with_vibration(still, dataclasses.replace(scene, lidar=None), VIBRATING)
+    n = still.capacity
+    assert g.capacity == n + 500
+    assert rows(g.means[n:]) <= rows(g.means[:n])
+    half = (FRAMES - 1) * INTERVAL / 2
+    assert np.abs(g.vibration.peaks[n:]).max() <= half + 2 * INTERVAL
+    assert np.ptp(g.vibration.peaks[n:]) > 1.5 * half
+
+
+def test_it_is_only_where_it_is_asked_for_and_views_have_times(scene):
+    assert vibrates(scene, VIBRATING)
+    assert not vibrates(scene, FitConfig())
+    timeless = tuple(dataclasses.replace(v, time=None) for v in scene.views)
+    assert not vibrates(dataclasses.replace(scene, views=timeless), VIBRATING)
+
+
+def test_the_clock_says_the_time_of_a_view(scene):
+    clock = clock_of(scene)
+    assert len(clock) == 0
+    placed = clock.placement(np.eye(4), clock.middle + 0.25)
+    assert float(placed.time) == pytest.approx(0.25)
+    assert placed.viewmats.shape == (0, 4, 4)

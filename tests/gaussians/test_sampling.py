@@ -42,27 +42,40 @@ def test_behind_and_outside_are_invisible():
     assert not unoccluded(xy[1:2], z[1:2], 10, 10).any()
 
 
-def test_positions_are_those_of_the_tracks(noisy_street, tmp_path):
-    cfg = preset("robust")
-    scene = load_scene(noisy_street, cfg.data, tmp_path, lambda text: None)
-    tracks = scene.tracks
-    mine = tracks.view_indices == 3
-    xy, z = project_points(scene.points[tracks.point_indices[mine]], scene.views[3])
+CFG = preset("robust")
+
+
+@pytest.fixture
+def street(noisy_street, tmp_path):
+    return load_scene(noisy_street, CFG.data, tmp_path, lambda text: None)
+
+
+def test_positions_are_those_of_the_tracks(street):
+    mine = street.tracks.view_indices == 3
+    points = street.points[street.tracks.point_indices[mine]]
+    xy, z = project_points(points, street.views[3])
     assert np.all(z > 0)
-    assert np.median(np.abs(xy - tracks.xy[mine])) < 0.5
+    assert np.median(np.abs(xy - street.tracks.xy[mine])) < 0.5
 
 
-def test_exposures_without_tracks(noisy_street, tmp_path):
-    cfg = preset("robust")
-    scene = load_scene(noisy_street, cfg.data, tmp_path, lambda text: None)
-    scene = dataclasses.replace(scene, tracks=None)
-    observations = projected_colors(scene, ImageStore(scene.views, cfg.data))
+def test_exposures_without_tracks(street, noisy_street):
+    scene = dataclasses.replace(street, tracks=None)
+    observations = projected_colors(scene, ImageStore(scene.views, CFG.data))
     assert np.bincount(observations.points).max() <= MOST_PER_POINT
-    solved = calibrate_observations(observations, options_of(cfg, scene)).solution
+    solved = calibrate_observations(observations, options_of(CFG, scene)).solution
     with (noisy_street / "truth" / "exposures.csv").open(newline="") as file:
         truth = {r["image"]: float(r["exposure"]) for r in csv.DictReader(file)}
     expected = np.array([truth[scene.views[i].name] for i in scene.train_indices])
     assert exposure_error(np.exp(solved.log_exposures), expected)["ev"] < 0.03
+
+
+def test_what_was_left_out_is_said(street):
+    observations = track_colors(street, ImageStore(street.views, CFG.data))
+    options = dataclasses.replace(options_of(CFG, street), choice=("view_exposure", Response()))
+    reasons = calibrate_observations(observations, options).reasons
+    assert not any("left out" in r for r in reasons)
+    some = dataclasses.replace(observations, too_coarse=7)
+    assert calibrate_observations(some, options).reasons[0].startswith("7 of ")
 
 
 GREY_K = np.array([[50.0, 0, 30], [0, 50, 20], [0, 0, 1]], np.float32)
@@ -91,22 +104,18 @@ def seen_from(distances):
     return Scene(Path("."), "made", tuple(views), points, np.zeros((1, 3), np.uint8), tracks)
 
 
-def test_observations_from_too_far_away_are_left_out_and_counted():
-    found = track_colors(seen_from([2.0, 7.9, 8.1, 30.0]), Grey())
-    assert found.views.tolist() == [0, 1]
-    assert found.too_coarse == 2
-
-
-def test_a_track_behind_its_camera_is_not_the_closest():
-    found = track_colors(seen_from([-1.0, 3.0, 5.0]), Grey())
-    assert found.views.tolist() == [1, 2]
-    assert found.too_coarse == 1
-
-
-def test_a_track_behind_all_of_its_cameras_is_left_out():
-    found = track_colors(seen_from([-1.0, -3.0]), Grey())
-    assert len(found.views) == 0
-    assert found.too_coarse == 2
+@pytest.mark.parametrize(
+    ("distances", "kept", "left_out"),
+    [
+        ([2.0, 7.9, 8.1, 30.0], [0, 1], 2),  # too far away
+        ([-1.0, 3.0, 5.0], [1, 2], 1),  # a track behind its camera is not the closest
+        ([-1.0, -3.0], [], 2),  # behind all of its cameras
+    ],
+)
+def test_observations_from_too_far_away_are_left_out_and_counted(distances, kept, left_out):
+    found = track_colors(seen_from(distances), Grey())
+    assert found.views.tolist() == kept
+    assert found.too_coarse == left_out
 
 
 def encoded(linear):
@@ -177,17 +186,6 @@ def test_wide_patches_keep_away_from_the_border():
     xy = np.array([[3.5, 10.0], [10.0, 10.0]])
     assert sample(image, mask, xy).valid.tolist() == [True, True]
     assert sample(image, mask, xy, np.full(2, 4.0)).valid.tolist() == [False, True]
-
-
-def test_what_was_left_out_is_said(noisy_street, tmp_path):
-    cfg = preset("robust")
-    scene = load_scene(noisy_street, cfg.data, tmp_path, lambda text: None)
-    observations = track_colors(scene, ImageStore(scene.views, cfg.data))
-    options = dataclasses.replace(options_of(cfg, scene), choice=("view_exposure", Response()))
-    reasons = calibrate_observations(observations, options).reasons
-    assert not any("left out" in r for r in reasons)
-    some = dataclasses.replace(observations, too_coarse=7)
-    assert calibrate_observations(some, options).reasons[0].startswith("7 of ")
 
 
 def test_samples_sit_at_pixel_centres():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks import hard_cases
-from benchmarks.hard_cases import CASES, VIEW, HardCase, camera, crowd, gap
+from benchmarks.hard_cases import CASES, VIEW, HardCase, crowd, gap
 from p2gs_jax.render import render_linear
 
 BASE = hard_cases.CONFIG
@@ -51,40 +51,23 @@ def test_hard_case(case: HardCase, implementation: str):
     assert g.gradient <= case.gradient_tolerance + 4 * stop + g.undecided * cfg.alpha_cutoff, g
 
 
-def test_no_gaussians_at_all():
-    g = jax.tree.map(lambda a: a[:0], crowd(3))
-    r = render_linear(g, jnp.zeros(0, bool), camera(), BASE, 1)
-    assert float(jnp.sum(jnp.abs(r.linear))) == 0
-    assert int(r.count) == 0
-
-
-def test_none_alive():
-    g = crowd(5)
-    r = jax.jit(lambda g: render_linear(g, jnp.zeros(5, bool), camera(), BASE, 1))(g)
-    assert not np.any(r.linear)
-    assert not bool(r.overflow)
+def test_none_at_all_and_none_alive():
+    empty = jax.tree.map(lambda a: a[:0], crowd(3))
+    for g in (empty, crowd(5)):
+        r = jax.jit(lambda g: render_linear(g, jnp.zeros(g.capacity, bool), VIEW, BASE, 1))(g)
+        assert not np.any(r.linear)
+        assert not bool(r.overflow)
 
 
 def test_relative_error_over_a_high_dynamic_range():
     """10^4:1 radiance, bright lights behind nearly opaque dark surfaces: the default stop rule."""
-    cfg = IMPLEMENTATIONS["xla, counting"]
-    rng = np.random.default_rng(0)
-    n = 400
+    cfg, rng, n = IMPLEMENTATIONS["xla, counting"], np.random.default_rng(0), 400
     depth = np.sort(rng.uniform(2, 8, n))
     # The nearer half is dark, the farther half bright; transmittance falls gradually.
     radiance = np.where(np.arange(n) < n // 2, 1.0, 1e4)[:, None] * rng.uniform(0.5, 1, (n, 3))
-    spread = rng.uniform(-1, 1, (n, 2)) * depth[:, None] * 0.5
-    case = HardCase(
-        "bright behind dark",
-        "",
-        lambda: crowd(
-            n,
-            mean=np.concatenate([spread, depth[:, None]], 1),
-            radiance=radiance,
-            logit=np.full(n, -1.5),
-            scales=1.0,
-        ),
-    )
+    mean = np.c_[rng.uniform(-1, 1, (n, 2)) * depth[:, None] * 0.5, depth]
+    values = {"mean": mean, "radiance": radiance, "logit": np.full(n, -1.5), "scales": 1.0}
+    case = HardCase("bright behind dark", "", lambda: crowd(n, **values))
     g = gap(case, cfg)
     assert g.relative < 1e-3, g
     # Without the bound, the usual rule T < 1e-4 would be off by far more than that: the test bites.

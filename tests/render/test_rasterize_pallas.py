@@ -4,7 +4,6 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
 from scenes import camera, street
 
@@ -40,22 +39,10 @@ def test_the_ordered_sum_is_the_atomic_one():
     assert largest_gap(atomic, ordered) < 1e-6
 
 
-def test_the_ordered_sum_counts_every_entry():
-    rng = np.random.default_rng(0)
-    entries = rng.normal(size=(500, rasterize_pallas.COLUMNS)).astype(np.float32)
-    ids = rng.integers(0, 70, 500).astype(np.int32)
-    ids[ids == 13] = 14
-    expected = np.zeros((71, rasterize_pallas.COLUMNS))
-    np.add.at(expected, ids, entries)
-    summed = rasterize_pallas._in_order(jnp.asarray(entries), jnp.asarray(ids), 71)
-    np.testing.assert_allclose(summed, expected, atol=1e-5)
-
-
-@pytest.mark.parametrize("deterministic", [pytest.param(False, marks=pytest.mark.slow), True])
-def test_views_batch(deterministic):
+def test_views_batch():
     """A batch of cameras by vmap is one launch, and the sum of its views."""
     g, cam = street(n=60, width=24, height=16)
-    cfg = dataclasses.replace(CFG, deterministic=deterministic)
+    cfg = dataclasses.replace(CFG, deterministic=True)
     viewmats = jnp.stack([jnp.eye(4).at[0, 3].set(0.3 * i) for i in range(3)])
 
     def view(g, viewmat):

@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from p2gs_jax.render.rasterize_xla import SEGMENTS_PER_LANE, cut, merge
@@ -28,7 +28,12 @@ def offsets_of(lengths):
     return np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
 
 
-def check_cut(lengths):
+@settings(max_examples=100, deadline=None)
+@given(LENGTHS)
+@example([0] * TILES)
+@example(GIANT)
+@example(GIANT[::-1])
+def test_every_list_is_covered_once_and_in_order(lengths):
     offsets = offsets_of(lengths)
     tiles, starts, ends, extra = jax.tree.map(np.asarray, cut_here(jnp.asarray(offsets)))
     assert len(tiles) == TILES + MOST
@@ -49,18 +54,6 @@ def check_cut(lengths):
     assert (ends - starts).max() <= longest * CHUNK
 
 
-@settings(max_examples=100, deadline=None)
-@given(LENGTHS)
-def test_every_list_is_covered_once_and_in_order(lengths):
-    check_cut(lengths)
-
-
-def test_nothing_and_one_giant_list():
-    check_cut([0] * TILES)
-    check_cut(GIANT)
-    check_cut(GIANT[::-1])
-
-
 def composite(colors, alphas):
     """Return the colour and the transmittance of entries from front to back."""
     color, transmittance = np.zeros(PIXELS), np.ones(PIXELS)
@@ -69,7 +62,10 @@ def composite(colors, alphas):
     return color, transmittance
 
 
-def check_merge(lengths, seed):
+@settings(max_examples=25, deadline=None)
+@given(LENGTHS, st.integers(0, 100))
+@example(GIANT, 0)
+def test_merging_is_compositing(lengths, seed):
     rng = np.random.default_rng(seed)
     offsets = offsets_of(lengths)
     total = int(offsets[-1])
@@ -92,13 +88,3 @@ def check_merge(lengths, seed):
         front = composite(*(a[offsets[t] : start] for a in (colors, alphas)))
         for got, expected in zip(before, front, strict=True):
             np.testing.assert_allclose(np.asarray(got)[k], expected, rtol=1e-5, atol=1e-6)
-
-
-@settings(max_examples=25, deadline=None)
-@given(LENGTHS, st.integers(0, 100))
-def test_merging_is_compositing(lengths, seed):
-    check_merge(lengths, seed)
-
-
-def test_merging_one_giant_list():
-    check_merge(GIANT, 0)

@@ -32,20 +32,18 @@ def one_by_one():
     return np.stack([single(SCENE.gaussians, m) for m in VIEWS])
 
 
-def test_vmap(one_by_one):
-    batched = jax.jit(jax.vmap(image, (None, 0)))(SCENE.gaussians, VIEWS)
-    np.testing.assert_allclose(batched, one_by_one, rtol=1e-5, atol=1e-6)
-
-
-def test_several_views_in_one_program(one_by_one):
-    together = jax.jit(lambda g: jnp.stack([image(g, m) for m in VIEWS]))(SCENE.gaussians)
-    np.testing.assert_allclose(together, one_by_one, rtol=1e-5, atol=1e-6)
-
-
-def test_a_program_of_constants(one_by_one):
-    views = jnp.asarray(VIEWS)
-    constant = jax.jit(lambda: jnp.stack([image(SCENE.gaussians, m) for m in views]))()
-    np.testing.assert_allclose(constant, one_by_one, rtol=1e-5, atol=1e-6)
+@pytest.mark.parametrize(
+    "together",
+    [
+        lambda g, views: jax.vmap(image, (None, 0))(g, views),
+        lambda g, views: jnp.stack([image(g, m) for m in views]),
+        lambda g, views: jnp.stack([image(SCENE.gaussians, jnp.asarray(m)) for m in VIEWS]),
+    ],
+    ids=["vmap", "several views", "constants only"],
+)
+def test_views_in_one_program(one_by_one, together):
+    found = jax.jit(together)(SCENE.gaussians, VIEWS)
+    np.testing.assert_allclose(found, one_by_one, rtol=1e-5, atol=1e-6)
 
 
 def test_gradient_of_a_loop_over_views():
