@@ -82,33 +82,30 @@ def registry(brief: bool) -> ConstructorRegistry:
 def _number_rule(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
     """Return the parser of a number, a few words, or None, with plain error messages."""
     kinds = set(get_args(info.type)) if _is_union(info.type) else {info.type}
-    optional = NoneType in kinds
-    known = {word for k in kinds if get_origin(k) is Literal for word in get_args(k)}
-    kinds = {k for k in kinds if get_origin(k) is not Literal} - {NoneType}
-    if kinds not in ({int}, {float}) or not all(isinstance(word, str) for word in known):
+    words = [word for k in kinds if get_origin(k) is Literal for word in get_args(k)]
+    numbers = {k for k in kinds if get_origin(k) is not Literal} - {NoneType}
+    if numbers not in ({int}, {float}) or not all(isinstance(word, str) for word in words):
         return None
-    (kind,) = kinds
+    (kind,) = numbers
+    known: dict[str, Any] = {word: word for word in sorted(words)}
+    values = known | ({"None": None} if NoneType in kinds else {})
 
-    def read(words: list[str]) -> int | float | str | None:
-        if optional and words[0] == "None":
-            return None
-        if words[0] in known:
-            return words[0]
+    def read(given: list[str]) -> Any:
+        if given[0] in values:
+            return values[given[0]]
         try:
-            return kind(words[0])
+            return kind(given[0])
         except ValueError:
             what = "whole number" if kind is int else "number"
-            other = f", and not {' or '.join(sorted(known))}" if known else ""
-            raise ValueError(f"{words[0]!r} is not a {what}{other}") from None
+            other = f", and not {' or '.join(known)}" if known else ""
+            raise ValueError(f"{given[0]!r} is not a {what}{other}") from None
 
     def fits(value: Any) -> bool:
-        if isinstance(value, str):
-            return value in known
-        return value is None if not isinstance(value, kind) else not isinstance(value, bool)
+        return value in values.values() or type(value) is kind
 
     return PrimitiveConstructorSpec(
         nargs=1,
-        metavar="|".join([*sorted(known), PLACEHOLDERS[kind]]),
+        metavar="|".join([*known, PLACEHOLDERS[kind]]),
         instance_from_str=read,
         is_instance=fits,
         str_from_instance=lambda value: [str(value)],

@@ -112,7 +112,7 @@ class BrowserSession:
         self._panel.set_playing(False)
         pose = self._viewed.pose(index, browser_view(self._client).aspect)
         self._panel.put_view(index, float(np.rad2deg(pose.fov)))
-        if not self._panel.locked:
+        if not self._panel.locked.value:
             self.take_display_of(index)
             self._taken = self._panel.settings()
         self._move(pose)
@@ -158,7 +158,7 @@ class BrowserSession:
     def set_place(self, camera: str, place: float) -> None:
         """Move to a place on the drive of a camera."""
         pose, nearest = self._viewed.pose_along(camera, place, browser_view(self._client).aspect)
-        if self._panel.own_exposures and self._panel.settings().taken_as != nearest:
+        if self._panel.own_exposures.value and self._panel.settings().taken_as != nearest:
             self.take_display_of(nearest)
         self._move(pose)
 
@@ -169,7 +169,7 @@ class BrowserSession:
             return
         camera, place = self._panel.drive
         last = len(self._viewed.frames(camera)) - 1
-        self._player.play(0.0 if place >= last else place, last, lambda: self._panel.speed)
+        self._player.play(0.0 if place >= last else place, last, lambda: self._panel.speed.value)
 
     def _play_to(self, place: float) -> None:
         if time.monotonic() > self._shown_at + SLIDER_S:
