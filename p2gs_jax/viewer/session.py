@@ -62,8 +62,6 @@ class BrowserSession:
             camera.look_at = pose.look_at
             camera.wxyz = pose.wxyz
 
-    # ------------------------------------------------------------------ the picture
-
     def display_changed(self) -> None:
         """Show the frame under the new settings."""
         self._live.display_changed()
@@ -103,8 +101,6 @@ class BrowserSession:
         same = common_settings(run, now) if index is None else settings_of_view(run, index, now)
         self._panel.put(same)
         self._live.display_changed()
-
-    # ------------------------------------------------------------------ the camera
 
     def go_to(self, index: int) -> None:
         """Move to the camera of a view, and take its display transform unless that is locked."""
@@ -153,8 +149,6 @@ class BrowserSession:
         if missing:
             self._client.add_notification("Photographs", f"{missing} could not be read.")
 
-    # ------------------------------------------------------------------ the drive
-
     def set_place(self, camera: str, place: float) -> None:
         """Move to a place on the drive of a camera."""
         pose, nearest = self._viewed.pose_along(camera, place, browser_view(self._client).aspect)
@@ -176,8 +170,6 @@ class BrowserSession:
             self._shown_at = time.monotonic()
             self._panel.put_place(place)
         self.set_place(self._panel.drive[0], place)
-
-    # ------------------------------------------------------------------ files
 
     def save(self, kind: str, width: int) -> None:
         """Send the view as a file, rendered at a width of its own."""

@@ -62,7 +62,9 @@ class ViewedRun:
         self._points = points if len(points) else np.asarray(self._gaussians.means)
         self._centers = camera_centers(viewmats_of(run.scene.views))
         self.space = make_viewer_space(run.scene, self._points)
-        self.distance = cache(self._distance)
+        # Typical distance to what a view sees, scene units.
+        views = run.scene.views
+        self.distance = cache(lambda index: distance_seen(views[index].viewmat, self._points))
         probes = evenly_spaced(len(run.scene.views), PROBES)
         self.renderer = Renderer(
             self._gaussians,
@@ -125,10 +127,6 @@ class ViewedRun:
         viewmat = viewmat_between(viewmats_of([views[i] for i in frames]), place)
         fov, distance = fov_that_holds(views[nearest], aspect), self.distance(nearest)
         return pose_of(viewmat, self.space, distance=distance, fov=fov), nearest
-
-    def _distance(self, index: int) -> float:
-        """Return the typical distance to what a view sees, scene units."""
-        return distance_seen(self.run.scene.views[index].viewmat, self._points)
 
     def frames(self, camera: str) -> tuple[int, ...]:
         """Return the rows of a physical camera's views."""
