@@ -153,7 +153,9 @@ def check_address(host: str, port: int) -> None:
             host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
         )[0]
     except (OSError, UnicodeError) as error:
-        raise UserError(f"--host {host!r} is not a valid address: {error}.", fix="leave it out") from None
+        raise UserError(
+            f"--host {host!r} is not a valid address: {error}.", fix="leave it out"
+        ) from None
     with socket.socket(family, kind, protocol) as probe:
         if os.name == "posix":
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
