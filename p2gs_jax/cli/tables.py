@@ -44,7 +44,7 @@ def stdout() -> Console:
 
 def make_table(
     columns: Sequence[str],
-    rows: Iterable[Sequence[str | Text]],
+    rows: Iterable[Sequence[str]],
     title: str | None = None,
     *,
     plain: bool = False,
@@ -54,7 +54,7 @@ def make_table(
     for name in columns:
         out.add_column(Text(name), justify="left" if name in WORDS else "right")
     for row in rows:
-        out.add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in row))
+        out.add_row(*map(Text, row))
     return out
 
 
