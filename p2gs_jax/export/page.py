@@ -102,7 +102,7 @@ def write_page(
 def page_text(title: str, known: Mapping[str, Any], data: bytes) -> str:
     """Return the page.
 
-    `known` is what it reads besides the packed Gaussians (formats/packed.py): plain values or arrays.
+    `known` is what it reads besides the packed Gaussians (formats/packed.py).
     """
     script = '(() => {\n"use strict";\n' + "\n".join(map(_source, SCRIPTS)) + "})();\n"
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
