@@ -37,7 +37,7 @@ def scene():
 
 def said(scene, change):
     observations, noise, usable, _ = scene
-    return neighbourhood_warnings(observations, noise + change[:, None], usable, NAMES)
+    return neighbourhood_warnings(observations, noise + change[:, None], usable)
 
 
 def test_noise_and_values_say_nothing(scene):
@@ -73,7 +73,7 @@ def test_the_other_sign_is_no_tone_mapping_and_without_positions_nothing_can_be_
     change = np.where(observations.views == ODD, 0.25 * observations.surroundings, 0.0)
     assert not any("tone mapping" in line for line in said(scene, change))
     blind = replace(observations, positions=None)
-    assert neighbourhood_warnings(blind, noise, usable, NAMES) == []
+    assert neighbourhood_warnings(blind, noise, usable) == []
 
 
 def test_surroundings_are_the_blurred_photograph():

@@ -349,9 +349,7 @@ def _unmodelled(problem: Problem, residual: PerChannel) -> list[str]:
     if o.positions is None or not len(o.points):
         return []
     pick = o.thinned(UNMODELLED_PER_VIEW, 0)
-    return neighbourhood_warnings(
-        o.picked(pick), residual[pick] / LN2, problem.usable[pick], o.names
-    )
+    return neighbourhood_warnings(o.picked(pick), residual[pick] / LN2, problem.usable[pick])
 
 
 def _listed(rows: Sequence[int] | Labels, names: Sequence[str]) -> str:
