@@ -150,8 +150,10 @@ def find_renders(folder: str | Path, scene: Scene) -> OtherRenders:
         found = next(filter(None, by_name), None)
         if found is not None:
             return found
-        files = _numbers(folder)
-        numbered = _of_trainers(folder) or (files and ("numbered pictures", files, False)) or None
+        bare = _numbers(folder)
+        numbered = _of_trainers(folder)
+        if numbered is None and bare:
+            numbered = ("numbered pictures", bare, False)
     if numbered is None:
         raise UserError(
             f"{folder} holds no render of a held-out view (for example "
