@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from p2gs_jax.config import FitConfig, LossConfig, RegularizerConfig
+from p2gs_jax.config import FitConfig, LossConfig
 from p2gs_jax.evaluation.ssim import one_less_ssim
 from p2gs_jax.photometry.appearance import Correction, Corrections, regularisation
 from p2gs_jax.photometry.luminance import ENTRIES, Curves, cumulative, enhanced, pseudo_curve
@@ -202,14 +202,6 @@ PRIORS: dict[str, Callable[[Photometry], Float[Array, ""]]] = {
     "log_exposure_mean": lambda p: jnp.mean(p.log_exposures) ** 2,
     "gamma_mean_variance": lambda p: (jnp.mean(p.gammas) - GAMMA_SRGB) ** 2 + variance(p.gammas),
 }
-
-
-def photometry_regularizers(
-    photometry: Photometry, cfg: RegularizerConfig
-) -> dict[str, Float[Array, ""]]:
-    """Return the weighted terms on exposures and gammas, by name."""
-    weights = {name: getattr(cfg, name) for name in PRIORS}
-    return {k: w * PRIORS[k](photometry) for k, w in weights.items() if w is not None}
 
 
 # ------------------------------------------------------------------------- Luminance-GS
